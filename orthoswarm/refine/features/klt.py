@@ -8,92 +8,96 @@ allowed.
 import numpy as np
 
 from orthoswarm.compute.jit import kernel
+from orthoswarm.refine.features.window_sums import LANES, SIZE, WIDE, add_gradients, add_residuals
 
-HALF = 7
-"""Half the window, pixels: a layout of the compiled code (windows of 15 x 15, Lucas and Kanade 1981)."""
-_SIZE = 2 * HALF + 1
+_HALF = SIZE // 2
 
 
 @kernel
-def _sample(gray, u, v):  # type: ignore[no-untyped-def]
-    ui, vi = int(np.floor(u)), int(np.floor(v))
-    fu, fv = np.float32(u - ui), np.float32(v - vi)
-    low = gray[vi, ui] * (1 - fu) + gray[vi, ui + 1] * fu
-    high = gray[vi + 1, ui] * (1 - fu) + gray[vi + 1, ui + 1] * fu
-    return low * (1 - fv) + high * fv
+def _derivative(homography, u, v, affine):  # type: ignore[no-untyped-def]
+    """Derivative of a homography (3, 3) at a pixel, into affine (2, 2)."""
+    w = homography[2, 0] * u + homography[2, 1] * v + homography[2, 2]
+    for a in range(2):
+        q = (homography[a, 0] * u + homography[a, 1] * v + homography[a, 2]) / w
+        for b in range(2):
+            affine[a, b] = (homography[a, b] - q * homography[2, b]) / w
 
 
 @kernel
 def _template(gray, u, v, affine, wide):  # type: ignore[no-untyped-def]
     """Fill wide (17, 17) from the earlier picture about (u, v); False if it leaves the picture."""
     rows, cols = gray.shape
-    reach = HALF + 1
+    reach, one = _HALF + 1, np.uint32(1)
     span_u = reach * (abs(affine[0, 0]) + abs(affine[0, 1]))
     span_v = reach * (abs(affine[1, 0]) + abs(affine[1, 1]))
     if u - span_u < 0 or v - span_v < 0 or u + span_u >= cols - 1 or v + span_v >= rows - 1:
         return False
-    for r in range(2 * reach + 1):
-        for c in range(2 * reach + 1):
-            x, y = c - reach, r - reach
-            wide[r, c] = _sample(gray, u + affine[0, 0] * x + affine[0, 1] * y, v + affine[1, 0] * x + affine[1, 1] * y)
+    for r in range(WIDE):
+        line, y = wide[r], r - reach
+        u0, v0 = u + affine[0, 1] * y - affine[0, 0] * reach, v + affine[1, 1] * y - affine[1, 0] * reach
+        for c in range(WIDE):
+            uc, vc = u0 + affine[0, 0] * c, v0 + affine[1, 0] * c
+            ui, vi = np.uint32(np.int32(uc)), np.uint32(np.int32(vc))  # unsigned: not tested for being negative
+            fu, fv = np.float32(uc - ui), np.float32(vc - vi)
+            upper, lower = gray[vi], gray[vi + one]
+            left, below = np.float32(upper[ui]), np.float32(lower[ui])
+            high = left + fu * (np.float32(upper[ui + one]) - left)
+            line[c] = high + fv * (below + fu * (np.float32(lower[ui + one]) - below) - high)
     return True
 
 
 @kernel
-def _refine(gray, wide, q, rounds, texture, step):  # type: ignore[no-untyped-def]
+def _scratch():  # type: ignore[no-untyped-def]
+    """Template, its gradients, what lies under it, sums: see `window_sums`."""
+    return (
+        np.zeros((WIDE, WIDE), np.float32),
+        np.zeros((2, SIZE, LANES), np.float32),
+        np.zeros((SIZE + 1, LANES + 1), np.float32),
+        np.zeros((5, LANES), np.float32),
+    )
+
+
+@kernel
+def _total(lanes):  # type: ignore[no-untyped-def]
+    """Sum of the lanes that belong to the window."""
+    total = 0.0
+    for c in range(SIZE):
+        total += lanes[c]
+    return total
+
+
+@kernel
+def _refine(gray, scratch, q, rounds, texture, step):  # type: ignore[no-untyped-def]
     """Move q (2,) to the template's place in a picture; returns the final mean square error, negative if lost.
 
     rounds: most iterations. texture: least eigenvalue of the gradient matrix per pixel. step: stop below this step, px.
     """
+    wide, gradient, under, sums = scratch
     rows, cols = gray.shape
-    gx, gy = np.empty((_SIZE, _SIZE), np.float32), np.empty((_SIZE, _SIZE), np.float32)
-    hxx = hxy = hyy = np.float32(0.0)
-    mx = my = mean = np.float32(0.0)
-    for r in range(_SIZE):
-        for c in range(_SIZE):
-            a = np.float32(0.5) * (wide[r + 1, c + 2] - wide[r + 1, c])
-            b = np.float32(0.5) * (wide[r + 2, c + 1] - wide[r, c + 1])
-            gx[r, c], gy[r, c] = a, b
-            hxx += a * a
-            hxy += a * b
-            hyy += b * b
-            mx += a
-            my += b
-            mean += wide[r + 1, c + 1]
-    n = np.float32(_SIZE * _SIZE)
-    mean /= n
-    hxx -= mx * mx / n
-    hxy -= mx * my / n
-    hyy -= my * my / n
+    n = float(SIZE * SIZE)
+    add_gradients(wide, gradient, sums)
+    mx, my = _total(sums[3]), _total(sums[4])
+    hxx, hxy, hyy = _total(sums[0]) - mx * mx / n, _total(sums[1]) - mx * my / n, _total(sums[2]) - my * my / n
     det = hxx * hyy - hxy * hxy
     smallest = 0.5 * (hxx + hyy - np.sqrt((hxx - hyy) ** 2 + 4 * hxy * hxy))
     if smallest < texture * n or det <= 0:
         return -1.0
-    error = np.float32(-1.0)
+    error, at_u, at_v = -1.0, -1, -1
     for _ in range(rounds):
-        u0, v0 = q[0] - HALF, q[1] - HALF
+        u0, v0 = q[0] - _HALF, q[1] - _HALF
         ui, vi = int(np.floor(u0)), int(np.floor(v0))
-        if ui < 0 or vi < 0 or ui + _SIZE >= cols or vi + _SIZE >= rows:
+        if ui < 0 or vi < 0 or ui + SIZE >= cols or vi + SIZE >= rows:
             return -1.0
-        fu, fv = np.float32(u0 - ui), np.float32(v0 - vi)
-        w00, w01, w10, w11 = (1 - fu) * (1 - fv), fu * (1 - fv), (1 - fu) * fv, fu * fv
-        bx = by = total = square = np.float32(0.0)
-        for r in range(_SIZE):
-            for c in range(_SIZE):
-                e = (
-                    w00 * gray[vi + r, ui + c]
-                    + w01 * gray[vi + r, ui + c + 1]
-                    + w10 * gray[vi + r + 1, ui + c]
-                    + w11 * gray[vi + r + 1, ui + c + 1]
-                    - wide[r + 1, c + 1]
-                )
-                bx += gx[r, c] * e
-                by += gy[r, c] * e
-                total += e
-                square += e * e
-        bx -= mx * total / n
-        by -= my * total / n
-        error = (square - total * total / n) / n
+        if ui != at_u or vi != at_v:
+            at_u, at_v = ui, vi
+            for r in range(SIZE + 1):
+                seen, to = gray[vi + r, ui : ui + SIZE + 1], under[r]
+                for c in range(SIZE + 1):
+                    to[c] = seen[c]
+        add_residuals(under, wide, gradient, np.float32(u0 - ui), np.float32(v0 - vi), sums)
+        total = _total(sums[2])
+        bx, by = _total(sums[0]) - mx * total / n, _total(sums[1]) - my * total / n
+        error = (_total(sums[3]) - total * total / n) / n
         du, dv = (hyy * bx - hxy * by) / det, (hxx * by - hxy * bx) / det
         q[0] -= du
         q[1] -= dv
@@ -103,62 +107,54 @@ def _refine(gray, wide, q, rounds, texture, step):  # type: ignore[no-untyped-de
 
 
 @kernel
-def variance(wide):  # type: ignore[no-untyped-def]
+def _variance(wide):  # type: ignore[no-untyped-def]
     """Grey variance of a template."""
     total = square = 0.0
-    for r in range(1, _SIZE + 1):
-        for c in range(1, _SIZE + 1):
+    for r in range(1, SIZE + 1):
+        for c in range(1, SIZE + 1):
             total += wide[r, c]
             square += wide[r, c] * wide[r, c]
-    n = _SIZE * _SIZE
+    n = SIZE * SIZE
     return square / n - (total / n) ** 2
 
 
 @kernel
 def track(  # type: ignore[no-untyped-def]
-    before,
-    before_half,
-    after,
-    after_half,
-    points,
-    guess,
-    affine,
-    rounds,
-    texture,
-    step,
-    mismatch,
-    noise,
-    found,
-    ok,
-):
+    before, before_half, after, after_half, points, homography, back, rounds, texture, step, mismatch, noise,
+    guess, found, ok,
+):  # fmt: skip
     """Track K windows from one picture into the next.
 
     Args:
         before, after: uint8 pictures; before_half, after_half: the same at half size.
-        points: float32 (K, 2) in `before`. guess: float32 (K, 2) start in `after`.
-        affine: float64 (K, 2, 2), derivative of the map from `after` back to `before` at each point.
+        points: float32 (K, 2) in `before`.
+        homography: float64 (3, 3), predicted, from `before` to `after`. back: its inverse.
         rounds: most iterations at half and at full size. texture, step: see the configuration (klt_least_texture,
             klt_step_px). mismatch, noise: largest mean square error as a share of the window's variance, plus noise.
-        found: float32 (K, 2) out. ok: bool (K,) out.
+        guess: float32 (K, 2) out, as predicted. found: float32 (K, 2) out. ok: bool (K,) out.
     """
-    wide = np.empty((_SIZE + 2, _SIZE + 2), np.float32)
-    q = np.empty(2)
+    scratch = _scratch()
+    wide, affine, q = scratch[0], np.empty((2, 2)), np.empty(2)
     for k in range(len(points)):
         ok[k] = False
-        found[k, 0], found[k, 1] = guess[k, 0], guess[k, 1]
-        q[0], q[1] = (guess[k, 0] + 0.5) * 0.5 - 0.5, (guess[k, 1] + 0.5) * 0.5 - 0.5
+        x, y = float(points[k, 0]), float(points[k, 1])
+        w = homography[2, 0] * x + homography[2, 1] * y + homography[2, 2]
+        for a in range(2):
+            guess[k, a] = (homography[a, 0] * x + homography[a, 1] * y + homography[a, 2]) / w
+            found[k, a], q[a] = guess[k, a], (guess[k, a] + 0.5) * 0.5 - 0.5
+        _derivative(back, float(guess[k, 0]), float(guess[k, 1]), affine)
         u, v = (points[k, 0] + 0.5) * 0.5 - 0.5, (points[k, 1] + 0.5) * 0.5 - 0.5
         if (
-            _template(before_half, u, v, affine[k], wide)
-            and _refine(after_half, wide, q, rounds[0], texture, step) >= 0
+            _template(before_half, u, v, affine, wide)
+            and _refine(after_half, scratch, q, rounds[0], texture, step) >= 0
         ):
             q[0], q[1] = (q[0] + 0.5) * 2 - 0.5, (q[1] + 0.5) * 2 - 0.5
         else:
             q[0], q[1] = guess[k, 0], guess[k, 1]
-        if not _template(before, points[k, 0], points[k, 1], affine[k], wide):
+        if not _template(before, points[k, 0], points[k, 1], affine, wide):
             continue
-        error = _refine(after, wide, q, rounds[1], texture, step)
-        if error < 0 or error > mismatch * variance(wide) + noise:
+        error = _refine(after, scratch, q, rounds[1], texture, step)
+        if error < 0 or error > mismatch * _variance(wide) + noise:
             continue
         found[k, 0], found[k, 1] = q[0], q[1]
         ok[k] = True
@@ -166,39 +162,34 @@ def track(  # type: ignore[no-untyped-def]
 
 @kernel
 def anchor(  # type: ignore[no-untyped-def]
-    stack,
-    slot,
-    points,
-    after,
-    affine,
-    limit,
-    rounds,
-    texture,
-    step,
-    mismatch,
-    noise,
-    found,
-    ok,
+    stack, chain, slot, points, after, here, limit, rounds, texture, step, mismatch, noise, found, ok
 ):
     """Compare K windows with their first observation, so that errors do not accumulate from picture to picture.
 
     Args:
-        stack: uint8 (R, rows, columns), pictures in memory. slot: int64 (K,), the picture of each first observation.
+        stack: uint8 (R, rows, columns), pictures in memory. chain: float64 (R, 3, 3), homographies from the first
+            picture to them. slot: int64 (K,), the picture of each first observation.
         points: float32 (K, 2), its place there. after: the picture now.
-        affine: float64 (K, 2, 2), derivative of the map from `after` back to that picture.
+        here: float64 (3, 3), homography from the picture now to the first one.
         limit: farthest move in pixels. rounds (one number), texture, step, mismatch, noise: as for `track`.
         found: float32 (K, 2); in: as tracked from the last picture, out: improved.
         ok: bool (K,) out, False where the window no longer matches its first observation.
     """
-    wide = np.empty((_SIZE + 2, _SIZE + 2), np.float32)
-    q = np.empty(2)
+    scratch = _scratch()
+    wide, affine, q, back = scratch[0], np.empty((2, 2)), np.empty(2), np.empty((3, 3))
     for k in range(len(points)):
         ok[k] = False
-        if not _template(stack[slot[k]], points[k, 0], points[k, 1], affine[k], wide):
+        for a in range(3):
+            for b in range(3):
+                back[a, b] = 0.0
+                for i in range(3):
+                    back[a, b] += chain[slot[k], a, i] * here[i, b]
+        _derivative(back, float(found[k, 0]), float(found[k, 1]), affine)
+        if not _template(stack[slot[k]], points[k, 0], points[k, 1], affine, wide):
             continue
         q[0], q[1] = found[k, 0], found[k, 1]
-        error = _refine(after, wide, q, rounds, texture, step)
-        if error < 0 or error > mismatch * variance(wide) + noise:
+        error = _refine(after, scratch, q, rounds, texture, step)
+        if error < 0 or error > mismatch * _variance(wide) + noise:
             continue
         if (q[0] - found[k, 0]) ** 2 + (q[1] - found[k, 1]) ** 2 > limit * limit:
             continue

@@ -4,7 +4,7 @@ Optical flow between consecutive pictures, started from the recorded attitude an
 rotated and scaled as predicted, so that tracks survive the turns of the flight.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,15 +12,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.compute.jit import kernel
 from orthoswarm.config import active
 from orthoswarm.refine.bundle.block_arrays import Tracks
 from orthoswarm.refine.features import klt
-from orthoswarm.refine.features.pair_homography import (
-    apply_homography,
-    is_inside,
-    measured_homography,
-    shifted_prediction,
-)
+from orthoswarm.refine.features.corners import strongest
+from orthoswarm.refine.features.pair_homography import measured_homography, shifted_prediction
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
@@ -41,6 +38,16 @@ class _Live:
         return _Live(self.uv[keep], self.ident[keep], self.age[keep], self.anchor[keep], self.anchor_uv[keep])
 
 
+@dataclass(frozen=True, slots=True)
+class _Flow:
+    """Flow of K tracks: which are good, where they are now (K, 2), how many are good, how many stay in the picture."""
+
+    good: NDArray[np.bool_]
+    found: NDArray[np.float32]
+    kept: int
+    expected: int
+
+
 @dataclass(slots=True, kw_only=True)
 class Tracker:
     """Tracks corners from picture to picture: `add` the pictures in order, then read `tracks`.
@@ -56,7 +63,8 @@ class Tracker:
     _gray: Gray | None = None
     _half: Gray | None = None
     _stack: NDArray[np.uint8] | None = None
-    _chain: list[Array] = field(default_factory=list)
+    _chain: Array = field(default_factory=lambda: np.tile(np.eye(3), (active().features.anchor_photos, 1, 1)))
+    _count: int = 0
     _next: int = 0
     _log: list[tuple[int, NDArray[np.int64], NDArray[np.float32]]] = field(default_factory=list)
 
@@ -73,12 +81,12 @@ class Tracker:
         """
         half = np.asarray(cv2.resize(gray, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.uint8)
         survived = 1.0
+        self._count += 1
         if predicted is None or self._gray is None or self._gray.shape != gray.shape:
             self._live = _Live()
-            self._chain.append(np.eye(3))
+            self._go_on(None)
         else:
-            self._chain.append(predicted @ self._chain[-1])
-            self._chain[-1] /= self._chain[-1][2, 2]
+            self._go_on(predicted)
             if len(self._live.ident):
                 survived = self._follow(gray, half, predicted)
         self._hold(gray)
@@ -101,52 +109,51 @@ class Tracker:
         sigma = np.full(len(point), config.flow_sigma_px * self.scale, np.float32)
         return Tracks(camera[keep], point.astype(np.int32), uv, sigma)
 
+    def _go_on(self, homography: Array | None) -> None:
+        """Set the present picture's place in the chain of homographies from the first one; None begins another."""
+        photos = len(self._chain)
+        now = np.eye(3) if homography is None else homography @ self._chain[(self._count - 2) % photos]
+        self._chain[(self._count - 1) % photos] = now / now[2, 2]
+
     def _follow(self, gray: Gray, half: Gray, predicted: Array) -> float:
         config = active().features
         before, live = len(self._live.ident), self._live
-        guess = apply_homography(predicted, live.uv)
-        good, found = self._flow(gray, half, predicted, guess)
-        inside = is_inside(guess, gray.shape, 0.0)
-        if good.sum() < max(config.shift_below_corners, config.shift_below_share * inside.sum()):
+        flow = self._flow(gray, half, predicted)
+        if flow.kept < max(config.shift_below_corners, config.shift_below_share * flow.expected):
             shifted = shifted_prediction(self._gray, gray, predicted)
             if shifted is not None:
-                good, found, predicted = self._better(gray, half, shifted, (good, found, predicted))
-        if good.sum() < config.homography_below_share * inside.sum():
+                flow, predicted = self._better(gray, half, shifted, flow, predicted)
+        if flow.kept < config.homography_below_share * flow.expected:
             measured = measured_homography(self._gray, gray, live.uv, predicted)
             if measured is not None:
-                good, found, predicted = self._better(gray, half, measured, (good, found, predicted))
-                self._chain[-1] = predicted @ self._chain[-2]
-                self._chain[-1] /= self._chain[-1][2, 2]
-        followed = live.take(good)
-        followed.uv, followed.age = found[good], followed.age + 1
+                flow, predicted = self._better(gray, half, measured, flow, predicted)
+                self._go_on(predicted)
+        followed = live.take(flow.good)
+        followed.uv, followed.age = flow.found[flow.good], followed.age + 1
         self._correct_drift(followed, gray)
-        self._live = _oldest_per_cell(followed, gray.shape, self.cell_px)
-        return float(good.sum()) / max(before, 1)
+        self._live = followed.take(
+            _oldest_per_cell(followed.uv, followed.age, followed.ident, gray.shape[1], self.cell_px)
+        )
+        return flow.kept / max(before, 1)
 
-    def _better(
-        self, gray: Gray, half: Gray, other: Array, now: tuple[NDArray[np.bool_], NDArray[np.float32], Array]
-    ) -> tuple[NDArray[np.bool_], NDArray[np.float32], Array]:
+    def _better(self, gray: Gray, half: Gray, other: Array, now: "_Flow", predicted: Array) -> tuple["_Flow", Array]:
         """The present flow or, if it keeps more tracks, that from another prediction; with the prediction used."""
-        good, found = self._flow(gray, half, other, apply_homography(other, self._live.uv))
-        return (good, found, other) if good.sum() > now[0].sum() else now
+        flow = self._flow(gray, half, other)
+        return (flow, other) if flow.kept > now.kept else (now, predicted)
 
     def _correct_drift(self, live: _Live, gray: Gray) -> None:
         """Compare each window with its first observation; where that no longer matches, the present one replaces it."""
         if self._stack is None or not len(live.uv):
             return
         config = active().features
-        photos = len(self._stack)
-        now = len(self._chain) - 1
-        anchors, which = np.unique(live.anchor, return_inverse=True)
-        back = np.stack([self._chain[a] for a in anchors]) @ np.linalg.inv(self._chain[now])
-        affine = _derivative(back[which], live.uv)
-        ok = np.zeros(len(live.uv), bool)
+        photos, now, ok = len(self._stack), self._count - 1, np.zeros(len(live.uv), bool)
         klt.anchor(
             stack=self._stack,
+            chain=self._chain,
             slot=live.anchor % photos,
             points=live.anchor_uv,
             after=gray,
-            affine=affine,
+            here=np.linalg.inv(self._chain[now % photos]),
             limit=config.anchor_limit_px,
             rounds=config.klt_rounds[2],
             texture=config.klt_least_texture,
@@ -162,32 +169,34 @@ class Tracker:
     def _hold(self, gray: Gray) -> None:
         if self._stack is None or self._stack.shape[1:] != gray.shape:
             self._stack = np.zeros((active().features.anchor_photos, *gray.shape), np.uint8)
-        self._stack[(len(self._chain) - 1) % len(self._stack)] = gray
+        self._stack[(self._count - 1) % len(self._stack)] = gray
 
-    def _flow(
-        self, gray: Gray, half: Gray, predicted: Array, guess: NDArray[np.float32]
-    ) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
+    def _flow(self, gray: Gray, half: Gray, predicted: Array) -> "_Flow":
         """Flow of the live tracks from the predicted positions, without outliers."""
-        config = active().features
-        found, ok = np.empty_like(guess), np.zeros(len(guess), bool)
+        config, count = active().features, len(self._live.uv)
+        guess, found, good = np.empty((count, 2), np.float32), np.empty((count, 2), np.float32), np.zeros(count, bool)
         klt.track(
             before=self._gray,
             before_half=self._half,
             after=gray,
             after_half=half,
             points=self._live.uv,
-            guess=guess,
-            affine=_backward(predicted, guess),
+            homography=predicted,
+            back=np.linalg.inv(predicted),
             rounds=config.klt_rounds[:2],
             texture=config.klt_least_texture,
             step=config.klt_step_px,
             mismatch=config.klt_mismatch,
             noise=config.klt_noise_variance,
+            guess=guess,
             found=found,
-            ok=ok,
+            ok=good,
         )
-        expected = int(is_inside(guess, gray.shape, 0.0).sum())
-        return _gate(guess, found, ok, gray.shape, expected), found
+        kept, expected = _gate(
+            guess, found, good, *gray.shape, config.flow_inside_px, config.flow_least, config.flow_median_limit_px,
+            config.flow_gate_px, config.flow_chance_share,
+        )  # fmt: skip
+        return _Flow(good, found, kept, expected)
 
     def _start(self, gray: Gray) -> None:
         """New corners: the strongest of each empty cell."""
@@ -196,11 +205,16 @@ class Tracker:
         if rows == 0 or cols == 0:
             return
         top, left = (gray.shape[0] - rows * size) // 2, (gray.shape[1] - cols * size) // 2
-        occupied = np.zeros((rows, cols), bool)
+        empty = np.ones((rows, cols), bool)
         r = ((self._live.uv[:, 1] - top) // size).astype(int).clip(0, rows - 1)
         c = ((self._live.uv[:, 0] - left) // size).astype(int).clip(0, cols - 1)
-        occupied[r, c] = True
-        uv = corners(gray, ~occupied, size, top, left)
+        empty[r, c] = False
+        config, uv = active().features, np.empty((rows * cols, 2), np.float32)
+        uv = uv[
+            : strongest(
+                gray, empty, size, top, left, config.corner_window_px, config.border_px, config.corner_floor, uv
+            )
+        ]
         if len(uv):
             ident = np.arange(self._next, self._next + len(uv))
             self._next += len(uv)
@@ -208,94 +222,58 @@ class Tracker:
                 np.concatenate([self._live.uv, uv]),
                 np.concatenate([self._live.ident, ident]),
                 np.concatenate([self._live.age, np.zeros(len(uv), np.int64)]),
-                np.concatenate([self._live.anchor, np.full(len(uv), len(self._chain) - 1)]),
+                np.concatenate([self._live.anchor, np.full(len(uv), self._count - 1)]),
                 np.concatenate([self._live.anchor_uv, uv]),
             )
 
 
-def corners(gray: Gray, empty: NDArray[np.bool_], size: int, top: int = 0, left: int = 0) -> NDArray[np.float32]:
-    """The strongest corner (minimum eigenvalue) of each wanted cell: float32 (K, 2), column and row.
+@kernel
+def _gate(guess, found, ok, rows, cols, margin, least, limit, gate, chance):  # type: ignore[no-untyped-def]
+    """Keep flow close to the median residual, which must itself be close to the prediction, in ok, in place.
 
-    Cells without texture give no corner. Only the rows of wanted cells are computed.
+    None is kept where no more agree than corners on different ground would by chance (binomial, 3 sigma).
+
+    Returns:
+        How many are kept, and how many were expected inside the picture.
     """
-    config = active().features
-    window, reach = config.corner_window_px, (config.corner_window_px + 1) // 2
-    found: list[tuple[float, float]] = []
-    for row in np.flatnonzero(empty.any(1)):
-        y0 = top + int(row) * size
-        a, b = max(y0 - reach, 0), min(y0 + size + reach, gray.shape[0])
-        for first, last in _runs(empty[row]):
-            x0, x1 = left + first * size, left + last * size
-            c, d = max(x0 - reach, 0), min(x1 + reach, gray.shape[1])
-            score = cv2.cornerMinEigenVal(gray[a:b, c:d], window, ksize=3)[y0 - a : y0 - a + size, x0 - c : x1 - c]
-            _mask_border(score, y0, x0, gray.shape, config.border_px)
-            cells = score.reshape(size, last - first, size).transpose(1, 0, 2).reshape(last - first, -1)
-            best = cells.argmax(1)
-            for n, k in enumerate(best):
-                if cells[n, k] > config.corner_floor:
-                    found.append((x0 + n * size + int(k) % size, y0 + int(k) // size))
-    return np.array(found, np.float32).reshape(-1, 2)
+    expected = 0
+    for k in range(len(ok)):
+        u, v = guess[k, 0], guess[k, 1]
+        expected += u >= 0 and v >= 0 and u <= cols - 1 and v <= rows - 1
+        u, v = found[k, 0], found[k, 1]
+        ok[k] = ok[k] and u >= margin and v >= margin and u <= cols - 1 - margin and v <= rows - 1 - margin
+    kept = 0
+    if ok.sum() >= least:
+        residual = (found - guess)[ok]
+        u, v = np.median(residual[:, 0]), np.median(residual[:, 1])
+        if np.hypot(u, v) <= limit:
+            for k in range(len(ok)):
+                ok[k] = ok[k] and np.hypot(found[k, 0] - guess[k, 0] - u, found[k, 1] - guess[k, 1] - v) < gate
+                kept += ok[k]
+    if kept <= chance * expected + 3.0 * np.sqrt(chance * (1.0 - chance) * expected):
+        ok[:], kept = False, 0
+    return kept, expected
 
 
-def _runs(flags: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
-    yield from zip(edges[::2].tolist(), edges[1::2].tolist())
-
-
-def _mask_border(score: NDArray[np.float32], y0: int, x0: int, shape: tuple[int, ...], b: int) -> None:
-    """Suppress corners within b pixels of the border of a picture of this shape; the score's origin is (x0, y0)."""
-    score[: max(0, b - y0)] = 0
-    score[:, : max(0, b - x0)] = 0
-    below, right = y0 + score.shape[0] - (shape[0] - b), x0 + score.shape[1] - (shape[1] - b)
-    if below > 0:
-        score[-below:] = 0
-    if right > 0:
-        score[:, -right:] = 0
-
-
-def _backward(homography: Array, uv: NDArray[np.float32]) -> Array:
-    """Derivatives (K, 2, 2) of the inverse homography at pixels (K, 2) of the later picture."""
-    return _derivative(np.asarray(np.linalg.inv(homography), np.float64), uv)
-
-
-def _derivative(homography: Array, uv: NDArray[np.float32]) -> Array:
-    """Derivatives (K, 2, 2) of one homography (3, 3), or of one for each pixel (K, 3, 3), at pixels (K, 2)."""
-    x, y = uv[:, 0:1].astype(float), uv[:, 1:2].astype(float)
-    p = homography[..., 0] * x + homography[..., 1] * y + homography[..., 2]
-    q = p[:, :2] / p[:, 2:]
-    out = homography[..., :2, :2] - q[:, :, None] * homography[..., 2:, :2]
-    return np.asarray(out / p[:, 2:, None])
-
-
-def _gate(
-    guess: NDArray[np.float32], found: NDArray[np.float32], ok: NDArray[np.bool_], shape: tuple[int, ...], expected: int
-) -> NDArray[np.bool_]:
-    """Keep flow close to the median residual, which must itself be close to the prediction.
-
-    None is kept where no more agree than `expected` corners on different ground would by chance (binomial, 3 sigma).
-    """
-    config = active().features
-    good = ok & is_inside(found, shape, config.flow_inside_px)
-    if good.sum() < config.flow_least:
-        return np.zeros_like(good)
-    residual = found - guess
-    centre = np.median(residual[good], axis=0)
-    if np.hypot(*centre) > config.flow_median_limit_px:
-        return np.zeros_like(good)
-    agree = np.asarray(good & (np.hypot(*(residual - centre).T) < config.flow_gate_px))
-    share = config.flow_chance_share
-    by_chance = share * expected + 3.0 * np.sqrt(share * (1.0 - share) * expected)
-    return agree if agree.sum() > by_chance else np.zeros_like(good)
-
-
-def _oldest_per_cell(live: _Live, shape: tuple[int, ...], size: int) -> _Live:
-    """One track per cell, the longest."""
-    cols = shape[1] // size + 1
-    cell = (live.uv[:, 1] // size).astype(np.int64) * cols + (live.uv[:, 0] // size).astype(np.int64)
-    order = np.lexsort((live.ident, -live.age))
-    _, first = np.unique(cell[order], return_index=True)
-    keep = np.sort(order[first])
-    return live.take(keep)
+@kernel
+def _oldest_per_cell(uv, age, ident, cols, size):  # type: ignore[no-untyped-def]
+    """The track of each cell that has been followed for longest, bool (K,)."""
+    across = cols // size + 1
+    keep = np.zeros(len(uv), np.bool_)
+    if not len(uv):
+        return keep
+    cell = np.empty(len(uv), np.int64)
+    for k in range(len(uv)):
+        cell[k] = np.int64(uv[k, 1] // size) * across + np.int64(uv[k, 0] // size)
+    best = np.full(cell.max() + 1, -1)
+    for k in range(len(uv)):
+        b = best[cell[k]]
+        if b < 0 or age[k] > age[b] or (age[k] == age[b] and ident[k] < ident[b]):
+            best[cell[k]] = k
+    for b in best:
+        if b >= 0:
+            keep[b] = True
+    return keep
 
 
 def predicted_homography(before: Array, after: Array, height_m: float, step: Array, matrix: Array) -> Array:
