@@ -14,6 +14,7 @@ from scipy.sparse import coo_matrix, csc_matrix, diags
 from scipy.sparse.linalg import splu
 
 from orthoswarm.config import active
+from orthoswarm.refine.initial.heading import components
 from orthoswarm.refine.initial.planar_similarity import Array, Complex, Flags, Ints, PairGraph
 from orthoswarm.refine.initial.tilt_and_lens import spaced
 
@@ -106,12 +107,9 @@ def solve_free_network(graph: PairGraph, count: int, width: Array, anchors: Anch
 
 def _parts(graph: PairGraph, count: int) -> list[Ints]:
     """Photos connected by pairs, the largest part first; photos without a pair are left out."""
-    from scipy.sparse.csgraph import connected_components
-
-    links = coo_matrix((np.ones(len(graph)), (graph.first, graph.second)), shape=(count, count))
-    _, label = connected_components(links, directed=False)
-    groups = [np.flatnonzero(label == k).astype(np.int32) for k in np.unique(label)]
-    return sorted((g for g in groups if len(g) > 1), key=lambda g: (-len(g), g[0]))
+    label = components(graph, count)
+    groups = [np.flatnonzero(label == k).astype(np.int32) for k in range(int(label.max(initial=-1)) + 1)]
+    return [group for group in groups if len(group) > 1]
 
 
 def _pairs_of(graph: PairGraph, inside: Flags) -> PairGraph:
