@@ -80,7 +80,8 @@ def run_measured(
             with contextlib.suppress(ProcessLookupError, PermissionError):  # remaining child processes, or Ctrl-C
                 os.killpg(process.pid, signal.SIGKILL)
     used = max(used, usage.ru_utime + usage.ru_stime)
-    memory = max(memory, usage.ru_maxrss / 1024.0)  # of one that ended before the first look
+    if not memory:  # it ended before the first look; the kernel's figure is an upper bound, since it
+        memory = usage.ru_maxrss / 1024.0  # counts what the process that starts a program held at that time, too
     return Measured(None if stopped else process.returncode, time.monotonic() - start, used, memory)
 
 

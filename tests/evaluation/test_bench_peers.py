@@ -37,6 +37,12 @@ def test_time_and_memory_of_children_count(tmp_path):
     assert (tmp_path / "out").read_text() == "made\n"
 
 
+def test_memory_of_the_measuring_process_does_not_count(tmp_path):
+    held = np.ones(600_000_000 // 8)
+    used = meter.run_measured(python(BURN.format(0.7)), tmp_path / "log", 60.0)
+    assert held.all() and 150 < used.peak_rss_mb < 400
+
+
 def test_a_program_at_its_limit_is_stopped_with_its_children(tmp_path):
     code = (
         "import subprocess, sys, time\n"
