@@ -155,16 +155,15 @@ def find_weights(package: str, part: str) -> Path | None:
 
 
 def _gpu() -> Check:
-    cost = "learned matchers of the paper's refiner run 10 to 50 times slower; the default refiner uses no GPU"
+    """Whether learned matchers have a card; nothing else uses one."""
+    cost = "learned matchers run 10 to 50 times slower; everything else runs on the CPU anyway"
     if find_spec("torch") is None:
         return Check("gpu", False, "torch is not installed", cost=cost)
     import torch
 
     if torch.cuda.is_available():
-        return Check("gpu", True, str(torch.cuda.get_device_name(0)))
-    if torch.backends.mps.is_available():
-        return Check("gpu", True, "Apple Metal")
-    return Check("gpu", False, f"torch {torch.__version__} sees none", cost=cost)
+        return Check("gpu", True, f"{torch.cuda.get_device_name(0)}, for learned matchers; the rest runs on the CPU")
+    return Check("gpu", False, f"torch {torch.__version__} sees no CUDA card", cost=cost)
 
 
 def _kernels() -> Check:

@@ -7,6 +7,10 @@ from dataclasses import dataclass
 class MatchersConfig:
     """Matchers of pictures and of patches to the map."""
 
+    device: str = "auto"
+    """Where networks run: "cpu", "cuda", or "auto", a CUDA card where there is one (a match by RoMa takes a minute on
+    a CPU and half a second on a card)."""
+
     # CFOG (Ye et al., TGRS 2019)
 
     cfog_directions: int = 6

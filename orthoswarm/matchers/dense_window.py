@@ -12,7 +12,8 @@ import numpy as np
 from orthoswarm.config import active
 from orthoswarm.matchers import weight_files
 from orthoswarm.matchers.matcher import Floats, Gray, Mask, Matches
-from orthoswarm.matchers.sparse_learned import device, extractor, padded_tensor
+from orthoswarm.matchers.network_device import network_device
+from orthoswarm.matchers.sparse_learned import extractor, padded_tensor
 from orthoswarm.raster.subpixel_peak import vertices
 
 CELL_PX = 8
@@ -102,7 +103,7 @@ def _described(gray: Floats, valid: Mask) -> tuple[Any, Mask]:
     image = np.clip(filled, 0, 255).astype(np.uint8)
     rows, cols = gray.shape[0] // CELL_PX, gray.shape[1] // CELL_PX
     side = active().matchers.window_part_cells
-    dense = torch.zeros((64, rows, cols), device=device())
+    dense = torch.zeros((64, rows, cols), device=network_device())
     with torch.inference_mode():
         for r in range(0, rows, side):
             for c in range(0, cols, side):

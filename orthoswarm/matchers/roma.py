@@ -14,11 +14,12 @@ import numpy as np
 
 from orthoswarm.config import active
 from orthoswarm.matchers.matcher import Floats, Mask, Matches, UnavailableError
-from orthoswarm.matchers.sparse_learned import device, read_state
+from orthoswarm.matchers.network_device import network_device
+from orthoswarm.matchers.sparse_learned import read_state
 
 
-def load(state: dict[str, Any], backbone: dict[str, Any]) -> Any:
-    """The network from its own state and that of its DINOv2 backbone, on the fastest device of this machine.
+def load(state: dict[str, Any], backbone: dict[str, Any], device: Any) -> Any:
+    """The network from its own state and that of its DINOv2 backbone, on a torch device.
 
     Raises:
         UnavailableError: if the package is missing or the states do not fit it.
@@ -33,7 +34,7 @@ def load(state: dict[str, Any], backbone: dict[str, Any]) -> Any:
         ) from None
     import torch
 
-    on_gpu = device().type == "cuda"
+    on_gpu = device.type == "cuda"
     options = {
         "coarse_res": active().matchers.roma_coarse_px,
         "upsample_res": active().matchers.roma_fine_px,
@@ -43,7 +44,7 @@ def load(state: dict[str, Any], backbone: dict[str, Any]) -> Any:
     known = signature(roma_outdoor).parameters  # older releases have fewer
     try:
         return roma_outdoor(
-            device=device(),
+            device=device,
             weights=state,
             dinov2_weights=backbone,
             **{k: v for k, v in options.items() if k in known},
@@ -54,8 +55,8 @@ def load(state: dict[str, Any], backbone: dict[str, Any]) -> Any:
 
 
 @lru_cache(maxsize=1)
-def _network() -> Any:
-    return load(read_state("roma"), read_state("roma-dinov2"))
+def _network(device: Any) -> Any:
+    return load(read_state("roma"), read_state("roma-dinov2"), device)
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,14 +76,14 @@ class Roma:
         Raises:
             UnavailableError: if the package or the weights are missing.
         """
-        return cls(_network())
+        return cls(_network(network_device()))
 
     def match(self, patch: Floats, valid: Mask, window: Floats, known: Mask, reach: int) -> Matches:
         """See MapMatcher."""
         from PIL import Image
 
         first, second = (Image.fromarray(np.clip(g, 0, 255).astype(np.uint8)).convert("RGB") for g in (patch, window))
-        warp, certainty = self.network.match(first, second, device=device())
+        warp, certainty = self.network.match(first, second, device=network_device())
         found, sure = self.network.sample(warp, certainty, num=active().matchers.roma_samples)
         a, b = self.network.to_pixel_coordinates(found, *patch.shape, *window.shape)
         a, b = (t.detach().cpu().numpy().astype(np.float64) - 0.5 for t in (a, b))  # its pixel corners are integers

@@ -13,18 +13,12 @@ import numpy as np
 from orthoswarm.config import active
 from orthoswarm.matchers import weight_files
 from orthoswarm.matchers.matcher import Gray, Matches, UnavailableError
+from orthoswarm.matchers.network_device import network_device
 
 Kind = Literal["xfeat", "disk", "aliked"]
 _STRIDE = {"xfeat": 32, "disk": 16, "aliked": 32}
 _EXTRACTOR = {"xfeat": "xfeat", "disk": "disk", "aliked": "aliked"}
 _MATCHER = {"xfeat": "xfeat-lighterglue", "disk": "disk-lightglue", "aliked": "aliked-lightglue"}
-
-
-def device() -> Any:
-    """The fastest device of this machine: CUDA, else the CPU."""
-    import torch
-
-    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
 def read_state(name: str) -> dict[str, Any]:
@@ -43,9 +37,13 @@ def read_state(name: str) -> dict[str, Any]:
     return state
 
 
-@lru_cache(maxsize=3)
 def extractor(kind: Kind) -> Any:
-    """A network that finds and describes keypoints, in evaluation mode, on `device()`."""
+    """A network that finds and describes keypoints, in evaluation mode, on `network_device()`."""
+    return _extractor(kind, network_device())
+
+
+@lru_cache(maxsize=3)
+def _extractor(kind: Kind, device: Any) -> Any:
     import kornia.feature as features
 
     state = read_state(_EXTRACTOR[kind])
@@ -58,12 +56,16 @@ def extractor(kind: Kind) -> Any:
     else:
         model = features.ALIKED()
         model.load_state_dict(state, strict=False)
-    return model.to(device()).eval()
+    return model.to(device).eval()
+
+
+def glue(kind: Kind) -> Any:
+    """The LightGlue network for a kind of keypoints, in evaluation mode, on `network_device()`."""
+    return _glue(kind, network_device())
 
 
 @lru_cache(maxsize=3)
-def glue(kind: Kind) -> Any:
-    """The LightGlue network for a kind of keypoints, in evaluation mode, on `device()`."""
+def _glue(kind: Kind, device: Any) -> Any:
     import kornia.feature as features
 
     settings = {k: v for k, v in features.LightGlue.features[kind].items() if k != "weights"}
@@ -83,7 +85,7 @@ def glue(kind: Kind) -> Any:
         raise UnavailableError(
             f"the weights '{_MATCHER[kind]}' do not fit LightGlue of this kornia; install kornia 0.9"
         )
-    return model.to(device()).eval()
+    return model.to(device).eval()
 
 
 def padded_tensor(gray: Gray, stride: int, channels: int = 1) -> Any:
@@ -93,7 +95,7 @@ def padded_tensor(gray: Gray, stride: int, channels: int = 1) -> Any:
     rows, cols = gray.shape
     pad = ((0, -rows % stride), (0, -cols % stride))
     image = np.pad(gray, pad, mode="edge").astype(np.float32) / 255.0
-    return torch.from_numpy(image)[None, None].expand(1, channels, -1, -1).to(device())
+    return torch.from_numpy(image)[None, None].expand(1, channels, -1, -1).to(network_device())
 
 
 @dataclass(frozen=True, slots=True)

@@ -200,7 +200,7 @@ def test_roma_loads_its_code_or_says_what_is_missing():
         import romatch  # noqa: F401
     except ImportError:
         with pytest.raises(UnavailableError, match=r"orthoswarm\[roma\]"):
-            load({}, {})
+            load({}, {}, "cpu")
     else:
         with pytest.raises(UnavailableError, match="do not fit"):
             load({"nonsense": 1}, {"nonsense": 1})

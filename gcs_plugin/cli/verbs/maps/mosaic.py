@@ -10,6 +10,7 @@ from orthoswarm.stores.addresses import address_of, path_of
 
 if TYPE_CHECKING:
     from orthoswarm.compute.workers import Workers
+    from orthoswarm.config import Overrides
     from orthoswarm.model.frame import Ingest
 
 _REASONS = 5  # printed; all are in the report
@@ -78,6 +79,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     add("--workers", type=int, metavar="N", help="processes at once (default: one for each core, one for few photos)")
     add(
+        "--device", choices=("auto", "cpu", "cuda"),
+        help="where networks of learned matchers run (default auto: a CUDA card where there is one)",
+    )  # fmt: skip
+    add(
         "--cluster", metavar="URL", help="work on a Dask cluster, for example tcp://192.168.1.10:8786 (docs/cluster.md)"
     )
     add("--json", action="store_true", help="print the report as one JSON document on stdout")
@@ -103,7 +108,8 @@ def run(args: argparse.Namespace) -> int:
     from gcs_plugin.cli.progress import ProgressBars
     from orthoswarm.batch import pipeline
     from orthoswarm.batch.workspace import VIDEO, missing, unmake
-    from orthoswarm.config import override, read_overrides
+    from orthoswarm.config import override
+    from orthoswarm.matchers.network_device import require_device
     from orthoswarm.model.errors import InputError
     from orthoswarm.stores.addresses import is_stored
     from orthoswarm.stores.published_folder import PublishedFolder
@@ -126,10 +132,11 @@ def run(args: argparse.Namespace) -> int:
         pixel_scale=args.pixel_scale,
         covariance=args.covariance,
         tiles=args.tiles,
-        config=read_overrides(args.config) if args.config is not None else {},
+        config=_overrides(args),
     )
 
     override(options.config)  # before workers are started, which have their own values
+    require_device()
 
     def load(progress: pipeline.Progress) -> "Ingest":
         reading = telemetry.LoadOptions(
@@ -171,6 +178,16 @@ def run(args: argparse.Namespace) -> int:
     else:
         _tell(report, args.out)
     return 0
+
+
+def _overrides(args: argparse.Namespace) -> "Overrides":
+    """What differs from the defaults: the file of --config, and flags over it."""
+    from orthoswarm.config import read_overrides
+
+    values = read_overrides(args.config) if args.config is not None else {}
+    if args.device is None:
+        return values
+    return {**values, "matchers": {**values.get("matchers", {}), "device": args.device}}
 
 
 def _pools(args: argparse.Namespace, out: Path) -> "tuple[Workers, Workers | None]":
