@@ -90,20 +90,33 @@ class Daemon:
             raise
 
     def _open(self) -> None:
+        """Open the workspace; each part may need those before it."""
+        self._open_records()
+        self._open_drawing()
+        self._open_jobs()
+        self._open_links()
+        self._open_sources()
+
+    def _open_records(self) -> None:
+        """What is kept in the workspace, and what is published of it."""
         settings, folder = self.settings, self.settings.workspace
         self.journal = Journal(folder / "journal.db")
         self.store = PictureStore(folder / "pictures")
         self.layers = {name: Layer(name) for name in NAMES}
         self.tiles = TileServer(self.layers)
-        canvases = folder / "layers"
-        canvases.mkdir(exist_ok=True)
-        trusted = distrust_after_power_cut(self.journal)
+        self._trusted = distrust_after_power_cut(self.journal)
         self.tiles.basemap = None if settings.basemap is None else open_basemap(settings.basemap)
         self.refused = RefusedPictures(self.events.publish)
         self.console = ConsoleState(self.journal, self.events.publish)
         self.plans = Plans(
             folder / "plans", settings.dem, lambda: {} if self.links is None else self.links.autopilots()
         )
+
+    def _open_drawing(self) -> None:
+        """The map that grows in flight, and how well the area is seen."""
+        settings, folder = self.settings, self.settings.workspace
+        canvases = folder / "layers"
+        canvases.mkdir(exist_ok=True)
         fov = None if settings.fov_min_deg is None else math.radians(settings.fov_min_deg)
         self.drawer = Drawer(
             self.journal, self.store, self.layers["realtime"], canvases, self.events, gsd_m=settings.gsd_m,
@@ -117,8 +130,14 @@ class Daemon:
             epsg=lambda: None if self.drawer.area is None else self.drawer.area.epsg,
             vehicles=lambda: [] if self.links is None else self.links.latest, exposures=self.exposures,
         )  # fmt: skip
+
+    def _open_jobs(self) -> None:
+        """What refines, publishes and exports in the background, and what a stop left undone of it."""
+        settings, folder = self.settings, self.settings.workspace
         self.workers, self.background = WorkerPool(settings.workers), WorkerPool(1, LAST)
-        publisher = Publisher(self.journal, self.layers, canvases, folder / "solutions", self.drawer, trusted=trusted)
+        publisher = Publisher(
+            self.journal, self.layers, folder / "layers", folder / "solutions", self.drawer, trusted=self._trusted
+        )
         shared: dict[str, Any] = {"journal": self.journal, "publisher": publisher, "on_published": self._published}
         self.coarse = LegPlacement(store=self.store, workers=self.background, basemap=settings.basemap, **shared)
         self.refinement = SortieRefinement(
@@ -131,17 +150,10 @@ class Daemon:
         layer = "coarse" if settings.basemap is None else "fine"
         self.tones = ToneBalance(workers=self.background, layer=layer, **shared)
         self.exports = Exports(
-            settings=settings,
-            journal=self.journal,
-            store=self.store,
-            layers=self.layers,
-            console=self.console,
-            workers=self.background,
-            area=lambda: self.drawer.area,
-            vehicles=self.vehicles,
-            facts=self._facts,
+            settings=settings, journal=self.journal, store=self.store, layers=self.layers, console=self.console,
+            workers=self.background, area=lambda: self.drawer.area, vehicles=self.vehicles, facts=self._facts,
             cells=lambda: self.coverage.png,
-        )
+        )  # fmt: skip
         handlers = {
             "refine": self.refinement.refine, "together": self.together.solve, "coarse": self.coarse.make,
             "tones": self.tones.balance, "export": self.exports.write,
@@ -156,6 +168,10 @@ class Daemon:
         for vehicle, sortie in publisher.outdated:
             self.jobs.add("refine", vehicle, sortie)
         self.leg_watch = LegWatch(self._leg_over, self._refine_late, silent_s=settings.silent_s)
+
+    def _open_links(self) -> None:
+        """The vehicles on their links, what is asked of them and what is shown of them to others."""
+        settings = self.settings
         self.posted: Counter[str] = Counter()
         self.poses = Poses()
         self.links: VehicleLinks | None = None
@@ -177,33 +193,25 @@ class Daemon:
         self.gap_flights = GapFlights(
             self.coverage, self.plans, self.links, lambda: {} if self.takeoffs is None else self.takeoffs.rows()
         )
+
+    def _open_sources(self) -> None:
+        """Where pictures and poses come from beside the links: folders, videos, CAN buses."""
+        settings, folder = self.settings, self.settings.workspace
         self.sources = [
             Source(
-                v.id,
-                v.pictures,
-                take=self.add_picture,
-                pose_at=self.poses.at,
-                notify=self._say,
-                cache=folder / "videos",
-                link_log=self._link_log,
-                on_settled=self._card_read,
+                v.id, v.pictures, take=self.add_picture, pose_at=self.poses.at, notify=self._say,
+                cache=folder / "videos", link_log=self._link_log, on_settled=self._card_read,
             )
-            for v in settings.vehicles
-            if v.pictures
-        ]
+            for v in settings.vehicles if v.pictures
+        ]  # fmt: skip
         fleet = None if self.links is None else self.links.fleet
         self.buses = [
             CanReader(
-                v.id,
-                v.can,
-                poses=self.poses.of(v.id),
-                notify=self._say,
-                fleet=fleet,
+                v.id, v.can, poses=self.poses.of(v.id), notify=self._say, fleet=fleet,
                 system=v.system or system_of(v.id),
             )
-            for v in settings.vehicles
-            if v.can
-        ]
+            for v in settings.vehicles if v.can
+        ]  # fmt: skip
 
     def start(self) -> None:
         """Start drawing and processing."""

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from orthoswarm.stores.addresses import address_of, path_of
 
 if TYPE_CHECKING:
+    from orthoswarm.batch.pipeline import Options
     from orthoswarm.compute.workers import Workers
     from orthoswarm.config import Overrides
     from orthoswarm.model.frame import Ingest
@@ -115,25 +116,7 @@ def run(args: argparse.Namespace) -> int:
     from orthoswarm.stores.published_folder import PublishedFolder
 
     _check(args)
-    options = pipeline.Options(
-        basemap=args.basemap,
-        refine=args.refine,
-        until=args.until,
-        fov_min_deg=args.fov_min,
-        gsd_m=args.gsd,
-        surface=args.surface,
-        dem=args.dem,
-        split_legs=args.split == "legs",
-        gains=not args.no_gains,
-        tone=args.tone,
-        blend=args.blend,
-        control=args.control,
-        checkpoints=args.checkpoints,
-        pixel_scale=args.pixel_scale,
-        covariance=args.covariance,
-        tiles=args.tiles,
-        config=_overrides(args),
-    )
+    options = _options(args)
 
     override(options.config)  # before workers are started, which have their own values
     require_device()
@@ -178,6 +161,31 @@ def run(args: argparse.Namespace) -> int:
     else:
         _tell(report, args.out)
     return 0
+
+
+def _options(args: argparse.Namespace) -> "Options":
+    """What the pipeline is asked for."""
+    from orthoswarm.batch.pipeline import Options
+
+    return Options(
+        basemap=args.basemap,
+        refine=args.refine,
+        until=args.until,
+        fov_min_deg=args.fov_min,
+        gsd_m=args.gsd,
+        surface=args.surface,
+        dem=args.dem,
+        split_legs=args.split == "legs",
+        gains=not args.no_gains,
+        tone=args.tone,
+        blend=args.blend,
+        control=args.control,
+        checkpoints=args.checkpoints,
+        pixel_scale=args.pixel_scale,
+        covariance=args.covariance,
+        tiles=args.tiles,
+        config=_overrides(args),
+    )
 
 
 def _overrides(args: argparse.Namespace) -> "Overrides":
