@@ -169,11 +169,11 @@ class Reception:
         number, text = int(message.id), str(message.text)
         begun, parts = self._parts.pop(system, (number, []))
         texts = [] if begun == number else ["".join(parts)]
-        whole = [*parts, text] if begun == number else [text]
+        received = [*parts, text] if begun == number else [text]
         if number and len(text) >= _PART:
-            self._parts[system] = number, whole
+            self._parts[system] = number, received
         else:
-            texts.append("".join(whole))
+            texts.append("".join(received))
         return [text.strip("\x00\t ") for text in texts]
 
     def _text(self, vehicle: Vehicle, route: Route, text: str, severity: int, now: float) -> None:

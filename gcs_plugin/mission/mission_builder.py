@@ -24,7 +24,6 @@ from gcs_plugin.mission.items import (
     MissionItem,
 )
 from orthoswarm.model.errors import InputError
-from orthoswarm.model.plan import Plan, Sortie
 
 _CAPACITY: Final = 650
 _WITH_YAW: Final = frozenset({WAYPOINT, TAKEOFF, LAND})
@@ -59,13 +58,6 @@ def build_mission(
     return mission
 
 
-def sortie_mission(plan: Plan, sortie: Sortie, autopilot: Autopilot, name: str = "") -> Mission:
-    """The mission of one sortie of a plan: takeoff, legs with the camera's trigger on and off, the way home."""
-    dialect_name: mission_files.Autopilot = "ardupilot" if autopilot is Autopilot.ARDUPILOT else "px4"
-    items = mission_files.sortie_items(plan, sortie, dialect_name)
-    return build_mission(autopilot, items, (sortie.home_lat_deg, sortie.home_lon_deg, 0.0), name)
-
-
 def read_mission(path: Path, autopilot: Autopilot) -> Mission:
     """The mission in a `.plan` or `.waypoints` file, for one autopilot whichever it was written for.
 
@@ -78,21 +70,6 @@ def read_mission(path: Path, autopilot: Autopilot) -> Mission:
         raise InputError(f"{path} cannot be read ({error.strerror}); check the name") from None
     parsed = mission_files.parse_mission(text, path.name)
     return build_mission(autopilot, parsed.items, parsed.home, path.name)
-
-
-def trigger_sections(items: Sequence[MissionItem]) -> list[tuple[int, int, float]]:
-    """Sections with the camera on: sequence number of the trigger, of its end, and its distance in metres."""
-    sections: list[tuple[int, int, float]] = []
-    begun: tuple[int, float] | None = None
-    for seq, item in enumerate(items):
-        if item.command != TRIGGER_DISTANCE:
-            continue
-        if begun is not None:
-            sections.append((begun[0], seq, begun[1]))
-        begun = (seq, item.params[0]) if item.params[0] > 0 else None
-    if begun is not None:
-        sections.append((begun[0], len(items), begun[1]))
-    return sections
 
 
 def _wire(item: mission_files.MissionItem, autopilot: Autopilot) -> MissionItem:

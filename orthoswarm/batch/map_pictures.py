@@ -10,7 +10,7 @@ import numpy as np
 from orthoswarm.batch.run_state import COARSE, ORTHOIMAGE, SEAMLINES, RunContext, RunState
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.config import active
-from orthoswarm.export.atomic_file import written_whole
+from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.export.catalog.tiled_raster import copy_tiled, in_tiles, product_file, remove_tiles, write_tiled
 from orthoswarm.export.cog import write_cog
 from orthoswarm.export.product_files import describe_frame
@@ -222,7 +222,7 @@ def _write_seamlines(run: RunContext, canvas: Canvas, placed: Sequence[PlacedFra
 def _copy_coarse(run: RunContext, state: RunState) -> None:
     """Without a map the orthoimage is the coarse product, too."""
     if (run.out / ORTHOIMAGE).exists():
-        with written_whole(run.out / COARSE) as part:
+        with atomic_write(run.out / COARSE) as part:
             shutil.copyfile(run.out / ORTHOIMAGE, part)
         remove_tiles(run.out, COARSE)
     else:

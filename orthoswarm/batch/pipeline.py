@@ -166,11 +166,13 @@ def _height_model(run: RunContext, path: Path, grid: LocalGrid, recorded: Record
     """The user's height model for a refiner that uses one; an unusable one is refused now, not after hours."""
     bounds = placed_bounds(recorded.placed, 0.0, 0.0)
     at = np.array([p.camera.position for p in recorded.placed])
-    told = np.array([p.frame.fix.height_m is not None for p in recorded.placed])
+    has_height = np.array([p.frame.fix.height_m is not None for p in recorded.placed])
     if run.options.refine != "swarm":
-        check_dem(path, grid.epsg, bounds, at[told])
+        check_dem(path, grid.epsg, bounds, at[has_height])
         return None
-    return HeightModel.open(path, grid.epsg, bounds, np.column_stack([at[:, :2], np.where(told, at[:, 2], np.nan)]))
+    return HeightModel.open(
+        path, grid.epsg, bounds, np.column_stack([at[:, :2], np.where(has_height, at[:, 2], np.nan)])
+    )
 
 
 def _realtime(run: RunContext, state: RunState) -> list[PlacedFrame]:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import IO, Any, Generic, TypeVar
 
 from orthoswarm import __version__
-from orthoswarm.export.atomic_file import disk_error, written_whole
+from orthoswarm.export.atomic_file import atomic_write, disk_error
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.frame import Frame
 from orthoswarm.stores.addresses import is_stored
@@ -30,8 +30,8 @@ def run_key(frames: Sequence[Frame], options: Any, *files: Path | None) -> str:
     digest = hashlib.sha256(f"{__version__} {options!r}".encode())
     for file in files:
         with contextlib.suppress(OSError):
-            told = file and (stamp(file) or (file.stat().st_size, file.stat().st_mtime_ns))
-            digest.update(f"{told}".encode())
+            version = file and (stamp(file) or (file.stat().st_size, file.stat().st_mtime_ns))
+            digest.update(f"{version}".encode())
     for frame in frames:
         if is_stored(frame.path):
             digest.update(f"{known(frame.path)}".encode())
@@ -84,7 +84,7 @@ class Workspace:
         for entry in self._work.iterdir():
             if entry.name not in ("lock", VIDEO):
                 _remove(entry)
-        with written_whole(marker) as part:
+        with atomic_write(marker) as part:
             part.write_text(key)
         return False
 
@@ -101,7 +101,7 @@ class Workspace:
         Raises:
             OrthoSwarmError: if the disk is full.
         """
-        with written_whole(self._work / f"{name}.pickle") as part, part.open("wb") as file:
+        with atomic_write(self._work / f"{name}.pickle") as part, part.open("wb") as file:
             pickle.dump(value, file, pickle.HIGHEST_PROTOCOL)
 
     def file(self, name: str) -> Path:

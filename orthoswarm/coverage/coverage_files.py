@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from orthoswarm.coverage.coverage_grid import CoverageGrid, State
 from orthoswarm.coverage.gaps import CoverageGap, Gaps
-from orthoswarm.export.atomic_file import written_whole
+from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.export.product_files import write_json, write_text
 from orthoswarm.model.geo import GroundGrid, LocalGrid
 
@@ -41,7 +41,7 @@ def write_cells(path: Path, cover: CoverageGrid) -> None:
         "crs": f"EPSG:{grid.epsg}", "transform": grid.affine(), "compress": "deflate", "tiled": True,
         "photometric": "MINISBLACK", "alpha": "NO",
     }  # fmt: skip
-    with written_whole(path) as part, rasterio.open(part, "w", **profile) as file:
+    with atomic_write(path) as part, rasterio.open(part, "w", **profile) as file:
         file.write(cover.states(), 1)
         file.write(cover.best, 2)
         file.write(np.minimum(cover.good, 255).astype(np.uint8), 3)
@@ -122,7 +122,7 @@ def _write_gpkg(path: Path, gaps: Sequence[CoverageGap], rows: Sequence[dict[str
     shapes = np.array([shapely.to_wkb(g.polygon) for g in gaps], object)
     fields = {"area_m2": np.float64, "cause": object, "detail": object, "confidence": np.float64, "vehicle": object}
     columns: list[NDArray[Any]] = [np.array([r[name] for r in rows], kind) for name, kind in fields.items()]
-    with written_whole(path) as part:
+    with atomic_write(path) as part:
         pyogrio.raw.write(
             str(part), shapes, columns, list(fields), layer="gaps", driver="GPKG", geometry_type="Polygon",
             crs=f"EPSG:{epsg}",
@@ -168,7 +168,7 @@ def draw_cells(path: Path, cover: CoverageGrid, gaps: Gaps, ortho: Path | None =
     axes.set_xlabel("metres east")
     axes.set_ylabel("metres north")
     figure.tight_layout()
-    with written_whole(path) as part:
+    with atomic_write(path) as part:
         figure.savefig(part, format="png")
 
 

@@ -37,7 +37,7 @@ def paint(best, good, height, level, box, edges, camera, position, lens, quality
             pixel allowed in metres (0: any), least descent of a ray that is not oblique, and of one that sees at all.
     """
     focal, k1, k2, k3, cu, cv, columns, rows, reach = lens
-    sigma, focal_sigma, whole, coarsest, cos_oblique, cos_flattest = quality
+    sigma, focal_sigma, picture_flaws, coarsest, cos_oblique, cos_flattest = quality
     seen = 0
     flat = height.shape[0] == 1 and height.shape[1] == 1
     for r in range(box[0], box[1]):
@@ -61,7 +61,7 @@ def paint(best, good, height, level, box, edges, camera, position, lens, quality
             descent = -up / np.sqrt(east * east + north * north + up * up)
             if descent < cos_flattest:
                 continue
-            flaws = int(whole)
+            flaws = int(picture_flaws)
             along = focal_sigma * np.sqrt(u * u + v * v)
             place = (sigma + 0.5 * edges[2]) * focal / depth
             if inside * inside < along * along + place * place:

@@ -11,7 +11,7 @@ from orthoswarm.model.errors import DiskFullError, StorageError
 
 
 @contextmanager
-def written_whole(path: Path) -> Iterator[Path]:
+def atomic_write(path: Path) -> Iterator[Path]:
     """Yield a temporary path to write to; on success it replaces `path`, on failure it is removed.
 
     Raises:

@@ -21,7 +21,7 @@ from isal import isal_zlib
 from numpy.typing import NDArray
 
 from orthoswarm import __version__
-from orthoswarm.export.atomic_file import written_whole
+from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.model.geo import GroundGrid
 
 Bytes = NDArray[np.uint8]
@@ -72,7 +72,7 @@ def write_cog(
     row0, row1, col0, col1 = window or (0, source.grid.height, 0, source.grid.width)
     row1, col1 = max(row1, row0 + 1), max(col1, col0 + 1)
     levels = _levels(row1 - row0, col1 - col0)
-    with written_whole(path) as part, part.open("w+b") as file:
+    with atomic_write(path) as part, part.open("w+b") as file:
         tables = _write_directories(file, source.grid, (row0, col0), levels, _form_of(levels, classic_bytes))
         done, total = 0, sum(level.tiles for level in levels)
         for level, table in reversed(list(zip(levels, tables, strict=True))):

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from orthoswarm.export.atomic_file import written_whole
+from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.model.errors import InputError
 
 
@@ -36,7 +36,7 @@ def convert_cog(source: Path, path: Path, *, epsg: int | None = None, jpeg_quali
         settings |= {"compress": "JPEG", "quality": jpeg_quality}
         settings.pop("predictor")
     try:
-        with rasterio.open(source) as raster, written_whole(path) as part, rasterio.Env(CHECK_DISK_FREE_SPACE=True):
+        with rasterio.open(source) as raster, atomic_write(path) as part, rasterio.Env(CHECK_DISK_FREE_SPACE=True):
             crs = raster.crs if epsg is None else rasterio.crs.CRS.from_epsg(epsg)
             with WarpedVRT(raster, crs=crs, resampling=rasterio.enums.Resampling.cubic, warp_mem_limit=64) as vrt:
                 rasterio.shutil.copy(raster if crs == raster.crs else vrt, part, **settings)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.export.atomic_file import written_whole
+from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.export.exterior_orientation import OrientedPicture, by_lens, link_pictures, oriented_pictures
 from orthoswarm.model.camera import Lens
 
@@ -45,7 +45,7 @@ def write_colmap(
     positions = np.array([p.camera.position for p in pictures])
     origin = np.floor(positions[:, :2].min(0) / _ORIGIN_STEP_M) * _ORIGIN_STEP_M
     numbers = by_lens(pictures)
-    with written_whole(folder) as part:
+    with atomic_write(folder) as part:
         model = part / "sparse" / "0"
         model.mkdir(parents=True)
         cameras = [f"{number} {_model(lens)}" for lens, number in numbers.items()]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.export.atomic_file import written_whole
+from orthoswarm.export.atomic_file import atomic_write
 
 Array = NDArray[np.float64]
 Feature = tuple[Mapping[str, Any], Array]
@@ -64,7 +64,7 @@ def gpkg_file(path: Path) -> Iterator[Path]:
     """
     import pyogrio
 
-    with written_whole(path) as part:
+    with atomic_write(path) as part:
         try:
             yield part
         except (pyogrio.errors.DataSourceError, RuntimeError) as error:

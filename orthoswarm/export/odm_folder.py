@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from orthoswarm.export.atomic_file import written_whole
+from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.export.exterior_orientation import camera_of
 from orthoswarm.export.linked_pictures import link_file, unique_names
 from orthoswarm.export.opensfm_folder import brown_camera
@@ -45,7 +45,7 @@ def write_odm(
     names = unique_names([str(row["image"]) for row in placed])
     gone: list[str] = []
     lines = ["EPSG:4326"]
-    with written_whole(folder) as part:
+    with atomic_write(folder) as part:
         (part / "images").mkdir(parents=True)
         for done, row in enumerate(placed, 1):
             file = find(row)

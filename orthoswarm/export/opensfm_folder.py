@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.export.atomic_file import written_whole
+from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.export.exterior_orientation import OrientedPicture, by_lens, link_pictures, oriented_pictures
 from orthoswarm.model.camera import Lens
 from orthoswarm.model.geo import LocalGrid
@@ -53,7 +53,7 @@ def write_opensfm(
         for p, centre, rotation in zip(pictures, centres, rotations)
     }
     reconstruction = {"cameras": cameras, "shots": shots, "points": {}, "reference_lla": reference}
-    with written_whole(folder) as part:
+    with atomic_write(folder) as part:
         part.mkdir(parents=True)
         for name, document in (
             ("reconstruction.json", [reconstruction]),

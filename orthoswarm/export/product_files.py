@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from orthoswarm.compute.stage_times import Stage
 from orthoswarm.config import active
-from orthoswarm.export.atomic_file import written_whole
+from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.export.footprint_layer import write_footprints
 from orthoswarm.model.angles import wrap_deg
 from orthoswarm.model.camera import Camera, Lens, angles_from_rotation, ground_jacobian
@@ -240,7 +240,7 @@ def write_text(path: Path, lines: Iterable[str]) -> None:
     Raises:
         OrthoSwarmError: if the disk is full or the folder cannot be written.
     """
-    with written_whole(path) as part, part.open("w", encoding="utf-8", newline="\n") as file:
+    with atomic_write(path) as part, part.open("w", encoding="utf-8", newline="\n") as file:
         file.writelines(lines)
 
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from orthoswarm.export.atomic_file import written_whole
+from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.stereo.surface_cells import SurfaceModel
 
 NO_DATA = -9999.0
@@ -36,7 +36,7 @@ def write_surface(path: Path, surface: SurfaceModel, takeoff_altitude_m: float |
         "one sigma of the height, metres": surface.sigma_m,
         "pairs of pictures that agree": surface.pairs.astype(np.float32),
     }
-    with written_whole(path) as part, rasterio.open(part, "w", **profile) as file:
+    with atomic_write(path) as part, rasterio.open(part, "w", **profile) as file:
         for band, (name, values) in enumerate(bands.items(), start=1):
             file.write(np.where(unknown, np.float32(NO_DATA), values), band)
             file.set_band_description(band, name)

@@ -137,14 +137,14 @@ def _clip(rays: Array, least: float) -> Array:
     down = -rays[:, 2] - least
     if (down >= 0).all():
         return rays
-    kept = []
+    clipped = []
     for i in range(len(rays)):
         j = (i + 1) % len(rays)
         if down[i] >= 0:
-            kept.append(rays[i])
+            clipped.append(rays[i])
         if (down[i] >= 0) != (down[j] >= 0):
-            kept.append(rays[i] + (rays[j] - rays[i]) * (down[i] / (down[i] - down[j])))
-    return np.array(kept).reshape(-1, 3)
+            clipped.append(rays[i] + (rays[j] - rays[i]) * (down[i] / (down[i] - down[j])))
+    return np.array(clipped).reshape(-1, 3)
 
 
 def reach(camera: Camera, ground_z_m: float = 0.0) -> float:

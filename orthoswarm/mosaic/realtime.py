@@ -199,6 +199,6 @@ def mosaic(
         InputError: if the canvas has another plane.
         OrthoSwarmError: if the disk is full.
     """
-    alike = [replace(frame, weak=False) for frame in frames]
+    unmarked = [replace(frame, weak=False) for frame in frames]
     ground = Terrain.flat(ground_z_m)
-    return render(alike, ground, canvas, previews=previews, read=read, parts=parts, run=run, progress=progress)
+    return render(unmarked, ground, canvas, previews=previews, read=read, parts=parts, run=run, progress=progress)

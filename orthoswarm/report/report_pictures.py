@@ -116,8 +116,8 @@ class MapView:
     def read(cls, basemap: MapWindow, grid: GroundGrid) -> "MapView":
         """Read a window of a map."""
         gray, valid = basemap.gray(grid.bounds, grid.gsd_m)
-        whole = GroundGrid.around(grid.epsg, grid.bounds, grid.gsd_m)
-        return cls(np.clip(gray + 0.5, 0, 255).astype(np.uint8), valid, whole).on(grid)
+        full = GroundGrid.around(grid.epsg, grid.bounds, grid.gsd_m)
+        return cls(np.clip(gray + 0.5, 0, 255).astype(np.uint8), valid, full).on(grid)
 
     def on(self, grid: GroundGrid) -> "MapView":
         """The same on another grid, as far as it reaches."""

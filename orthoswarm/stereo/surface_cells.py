@@ -67,8 +67,8 @@ class SurfaceCells:
 
     def __init__(self, grid: GroundGrid, folder: Path) -> None:
         self.grid = grid
-        kept = active().stereo.pairs_kept
-        shape = (kept, grid.width * grid.height)
+        best_pairs = active().stereo.pairs_kept
+        shape = (best_pairs, grid.width * grid.height)
         self._height = np.memmap(folder / "height", np.float32, "w+", shape=shape)
         self._sigma = np.memmap(folder / "sigma", np.float16, "w+", shape=shape)
         self._count = np.zeros(shape[1], np.uint8)

@@ -136,8 +136,8 @@ def _fetch(path: Path, copy: Path) -> None:
     part = cache_folder() / "parts" / f"{os.getpid()}-{threading.get_ident()}"
     try:
         part.parent.mkdir(parents=True, exist_ok=True)
-        for told in (known(path), None):
-            found = told or look_up(path)
+        for listed in (known(path), None):
+            found = listed or look_up(path)
             request(path, lambda system, key: system.get_file(key, str(part)))
             size = part.stat().st_size
             if found.size in (None, size):

@@ -30,7 +30,7 @@ class Parts(Protocol):
     def read(self, offset: int, length: int) -> bytes:
         """Bytes from an offset, fewer at the end."""
 
-    def whole(self) -> mmap.mmap:
+    def whole_file(self) -> mmap.mmap:
         """All bytes, mapped; to be closed."""
 
 
@@ -47,7 +47,7 @@ class _LocalParts:
         os.lseek(self._fd, offset, os.SEEK_SET)
         return os.read(self._fd, length)
 
-    def whole(self) -> mmap.mmap:
+    def whole_file(self) -> mmap.mmap:
         """See Parts."""
         return mmap.mmap(self._fd, 0, access=mmap.ACCESS_READ)
 
@@ -79,7 +79,7 @@ class _StoredParts:
         joined = b"".join(self._blocks[i] for i in range(first, last + 1))
         return joined[offset - first * _BLOCK : end - first * _BLOCK]
 
-    def whole(self) -> mmap.mmap:
+    def whole_file(self) -> mmap.mmap:
         """See Parts."""
         with local_file(self._path).open("rb") as file:
             return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)

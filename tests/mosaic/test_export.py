@@ -15,7 +15,7 @@ from rasterio.warp import transform, transform_bounds
 
 from gcs_plugin.cli.main import main
 from orthoswarm.export import cog
-from orthoswarm.export.atomic_file import written_whole
+from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.export.cog import CLASSIC_BYTES, TILE_PX, write_cog
 from orthoswarm.export.cog_conversion import convert_cog
 from orthoswarm.export.linked_pictures import unique_names
@@ -135,7 +135,7 @@ def test_a_single_pixel_and_a_long_strip(tmp_path):
 def test_a_failed_write_leaves_the_old_file(tmp_path):
     path = tmp_path / "x.bin"
     path.write_bytes(b"old")
-    with pytest.raises(OrthoSwarmError, match="disk is full"), written_whole(path) as part:
+    with pytest.raises(OrthoSwarmError, match="disk is full"), atomic_write(path) as part:
         part.write_bytes(b"half")
         raise OSError(28, "No space left on device")
     assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]

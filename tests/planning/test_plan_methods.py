@@ -14,7 +14,7 @@ from orthoswarm.planning.lines.bricks import joins, maximum_matching
 from orthoswarm.planning.lines.columns import column_legs
 from orthoswarm.planning.lines.detours import Router, make_obstacles
 from orthoswarm.planning.lines.line_spacing import footprint
-from orthoswarm.planning.lines.spanning_tree import circumnavigate, count_turns, spanning_edges
+from orthoswarm.planning.lines.spanning_tree import circumnavigate, spanning_edges
 from orthoswarm.planning.lines.sweep_lines import Field
 from orthoswarm.planning.lines.tmstc import tmstc_legs
 from orthoswarm.planning.lines.visiting_order import shorten
@@ -27,12 +27,18 @@ WITH_HOLE = shapely.Polygon(
 )
 
 
+def count_turns(loop):
+    """Changes of direction on a closed path of sub-cells (n, 2)."""
+    steps = np.diff(np.concatenate([loop, loop[:1]]), axis=0)
+    return int((steps != np.roll(steps, 1, axis=0)).any(1).sum())
+
+
 @settings(max_examples=60, deadline=None)
 @given(arrays(np.bool_, st.tuples(st.integers(1, 12), st.integers(1, 12))))
 def test_matching_is_as_large_as_scipys(graph):
     start = np.concatenate([[0], np.cumsum(graph.sum(1))]).astype(np.int64)
     links = np.nonzero(graph)[1].astype(np.int64)
-    mates = maximum_matching(start, links, graph.shape[1])
+    mates, _ = maximum_matching(start, links, graph.shape[1])
     matched = np.flatnonzero(mates >= 0)
     assert all(graph[u, mates[u]] for u in matched)
     assert len(set(mates[matched])) == len(matched)

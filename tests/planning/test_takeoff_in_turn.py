@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from gcs_plugin.links.mavlink import Autopilot
-from gcs_plugin.mission.mission_builder import sortie_mission
 from gcs_plugin.mission.track import Airspace
 from orthoswarm.config import active
 from orthoswarm.planning.area.area import make_area
@@ -16,6 +15,7 @@ from orthoswarm.planning.planner import plan_area
 from orthoswarm.planning.sorties.assignment import Options
 from orthoswarm.planning.sorties.deconfliction import Separation
 from orthoswarm.planning.sorties.flight_time import Motion, autopilot_config
+from tests.kit.missions import sortie_mission
 from tests.kit.plan_checks import on_globe
 from tests.planning.test_plan_coverage import CONCAVE, HOLE, positions, start_at
 

@@ -21,10 +21,11 @@ from gcs_plugin.mission.items import (
     Mission,
     MissionItem,
 )
-from gcs_plugin.mission.mission_builder import build_mission, read_mission, sortie_mission, trigger_sections
+from gcs_plugin.mission.mission_builder import build_mission, read_mission
 from gcs_plugin.sim.mission_store import MissionStore
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.plan import Plan, Sortie, VehiclePlan, Waypoint
+from tests.kit.missions import sortie_mission
 
 AP, PX4 = Autopilot.ARDUPILOT, Autopilot.PX4
 BOTH = pytest.mark.parametrize("autopilot", [AP, PX4])
@@ -80,9 +81,9 @@ def test_a_sortie_takes_off_triggers_on_its_legs_and_comes_home(autopilot):
         TAKEOFF, 178, WAYPOINT, TRIGGER_DISTANCE, WAYPOINT, TRIGGER_DISTANCE, WAYPOINT, TRIGGER_DISTANCE, WAYPOINT,
         TRIGGER_DISTANCE, WAYPOINT, RTL,
     ]  # fmt: skip
-    sections = trigger_sections(mission.items)
-    assert [distance for _, _, distance in sections] == [12.5, 12.5]
-    for begin, end, _ in sections:  # right behind a leg's first waypoint, and right behind its last
+    triggers = [seq for seq, item in enumerate(mission.items) if item.command == TRIGGER_DISTANCE]
+    assert [mission.items[seq].params[0] for seq in triggers] == [12.5, 0.0, 12.5, 0.0]
+    for begin, end in zip(triggers[::2], triggers[1::2], strict=True):  # behind a leg's first waypoint and its last
         assert commands(mission)[begin - 1] == WAYPOINT and commands(mission)[begin + 1 : end] == [WAYPOINT]
     assert mission.ending is Ending.RTL
     assert not unflyable(mission.items, autopilot, in_air=False)

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.export.atomic_file import written_whole
+from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import Camera, Lens
 from orthoswarm.model.errors import OrthoSwarmError
@@ -59,7 +59,7 @@ class SolutionFile:
         Raises:
             StorageError: the disk is full.
         """
-        with written_whole(path) as part, part.open("wb") as file:
+        with atomic_write(path) as part, part.open("wb") as file:
             file.write(_header())
             pickle.dump(self, file, pickle.HIGHEST_PROTOCOL)
             file.flush()

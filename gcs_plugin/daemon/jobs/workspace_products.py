@@ -102,7 +102,7 @@ def _pictures(task: ExportTask) -> tuple[list[str], float]:
     """
     import shutil
 
-    from orthoswarm.export.atomic_file import written_whole
+    from orthoswarm.export.atomic_file import atomic_write
     from orthoswarm.export.cog import write_cog
     from orthoswarm.mosaic.extent import drawn_window
 
@@ -118,7 +118,7 @@ def _pictures(task: ExportTask) -> tuple[list[str], float]:
             write_cog(_WithOverviews(canvas), task.workspace / file, window=drawn_window(canvas), threads=1)
         made.append(file)
     if task.solutions and made[-1:] == ["coarse.tif"]:  # without a map the orthoimage is the coarse product
-        with written_whole(task.workspace / "orthoimage.tif") as part:
+        with atomic_write(task.workspace / "orthoimage.tif") as part:
             shutil.copyfile(task.workspace / "coarse.tif", part)
         made.append("orthoimage.tif")
     return made, area_ha

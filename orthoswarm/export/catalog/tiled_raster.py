@@ -16,7 +16,7 @@ from typing import Literal
 from pyproj import CRS
 
 from orthoswarm.config import active
-from orthoswarm.export.atomic_file import written_whole
+from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.export.cog import Source, write_cog
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.geo import GroundGrid
@@ -49,8 +49,8 @@ def product_file(folder: Path, name: str) -> Path | None:
     Returns:
         None if the folder holds neither.
     """
-    whole, virtual = folder / name, _virtual(folder, name)
-    return whole if whole.exists() else virtual if virtual.exists() else None
+    single, virtual = folder / name, _virtual(folder, name)
+    return single if single.exists() else virtual if virtual.exists() else None
 
 
 def remove_product(folder: Path, name: str) -> None:
@@ -101,7 +101,7 @@ def write_tiled(
         for r, c in _touched(bounds, grid, (row0, col0), side)
         if row0 + r * side < row1 and col0 + c * side < col1
     }
-    with written_whole(_tiles(folder, name)) as part:
+    with atomic_write(_tiles(folder, name)) as part:
         part.mkdir()
         for done, (r, c) in enumerate(sorted(filled), 1):
             top, left = row0 + r * side, col0 + c * side
@@ -109,23 +109,23 @@ def write_tiled(
             write_cog(source, part / f"r{r:03d}_c{c:03d}.tif", window=inside, threads=threads)
             if progress is not None:
                 progress(done, len(filled))
-    whole = replace(
+    raster = replace(
         grid, west=grid.west + col0 * grid.gsd_m, north=grid.north - row0 * grid.gsd_m, width=col1 - col0,
         height=row1 - row0,
     )  # fmt: skip
-    with written_whole(_virtual(folder, name)) as part:
+    with atomic_write(_virtual(folder, name)) as part:
         part.write_text(
-            _document(whole, _in_whole(folder, name, whole), Path(FOLDER, Path(name).stem)), encoding="utf-8"
+            _document(raster, _tiles_of(folder, name, raster), Path(FOLDER, Path(name).stem)), encoding="utf-8"
         )
     (folder / name).unlink(missing_ok=True)
 
 
 def copy_tiled(folder: Path, name: str, other: str) -> None:
     """Copy a raster in tiles to another name in the same folder."""
-    with written_whole(_tiles(folder, other)) as part:
+    with atomic_write(_tiles(folder, other)) as part:
         shutil.copytree(_tiles(folder, name), part)
     text = _virtual(folder, name).read_text(encoding="utf-8")
-    with written_whole(_virtual(folder, other)) as part:
+    with atomic_write(_virtual(folder, other)) as part:
         part.write_text(text.replace(f"{FOLDER}/{Path(name).stem}/", f"{FOLDER}/{Path(other).stem}/"), encoding="utf-8")
     (folder / other).unlink(missing_ok=True)
 
@@ -137,16 +137,16 @@ def tiles_of(folder: Path, name: str) -> list[RasterTile]:
     if not _virtual(folder, name).exists():
         return []
     with rasterio.open(_virtual(folder, name)) as raster:
-        whole = GroundGrid(
+        grid = GroundGrid(
             epsg=int(raster.crs.to_epsg()), west=float(raster.bounds.left), north=float(raster.bounds.top),
             gsd_m=float(raster.res[0]), width=int(raster.width), height=int(raster.height),
         )  # fmt: skip
-    return list(_in_whole(folder, name, whole))
+    return list(_tiles_of(folder, name, grid))
 
 
 def write_json(path: Path, document: object) -> None:
     """Write one JSON document that appears when it is complete."""
-    with written_whole(path) as part:
+    with atomic_write(path) as part:
         part.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
@@ -168,7 +168,7 @@ def _touched(
     return ((r, c) for r in range(rows[0], rows[1] + 1) for c in range(cols[0], cols[1] + 1))
 
 
-def _in_whole(folder: Path, name: str, whole: GroundGrid) -> Iterator[RasterTile]:
+def _tiles_of(folder: Path, name: str, raster: GroundGrid) -> Iterator[RasterTile]:
     """The tiles in a raster's folder, placed on its grid."""
     side = active().raster.tile_px
     for path in sorted(_tiles(folder, name).glob("*.tif")):
@@ -179,22 +179,22 @@ def _in_whole(folder: Path, name: str, whole: GroundGrid) -> Iterator[RasterTile
         yield RasterTile(
             path.name,
             replace(
-                whole, west=whole.west + c * side * whole.gsd_m, north=whole.north - r * side * whole.gsd_m,
-                width=min(side, whole.width - c * side), height=min(side, whole.height - r * side),
+                raster, west=raster.west + c * side * raster.gsd_m, north=raster.north - r * side * raster.gsd_m,
+                width=min(side, raster.width - c * side), height=min(side, raster.height - r * side),
             ),
         )  # fmt: skip
 
 
-def _document(whole: GroundGrid, tiles: Iterable[RasterTile], beside: Path) -> str:
+def _document(raster: GroundGrid, tiles: Iterable[RasterTile], tile_folder: Path) -> str:
     """The virtual raster: see https://gdal.org/en/stable/drivers/raster/vrt.html."""
     side = active().raster.tile_px
     placed = list(tiles)
     sources = []
     for tile in placed:
-        column = round((tile.grid.west - whole.west) / whole.gsd_m)
-        row = round((whole.north - tile.grid.north) / whole.gsd_m)
+        column = round((tile.grid.west - raster.west) / raster.gsd_m)
+        row = round((raster.north - tile.grid.north) / raster.gsd_m)
         size = f'xSize="{tile.grid.width}" ySize="{tile.grid.height}"'
-        file = (beside / tile.name).as_posix()
+        file = (tile_folder / tile.name).as_posix()
         sources.append(
             f'  <SimpleSource>\n   <SourceFilename relativeToVRT="1">{file}</SourceFilename>\n'
             "   <SourceBand>BAND</SourceBand>\n"
@@ -209,11 +209,11 @@ def _document(whole: GroundGrid, tiles: Iterable[RasterTile], beside: Path) -> s
         + " </VRTRasterBand>\n"
         for n, colour in enumerate(("Red", "Green", "Blue", "Alpha"), 1)
     )
-    step = repr(whole.gsd_m)
+    step = repr(raster.gsd_m)
     return (
-        f'<VRTDataset rasterXSize="{whole.width}" rasterYSize="{whole.height}">\n <!-- tiles of {side} pixels -->\n'
-        f' <SRS dataAxisToSRSAxisMapping="1,2">{_escaped(CRS.from_epsg(whole.epsg).to_wkt("WKT1_GDAL"))}</SRS>\n'
-        f" <GeoTransform>{whole.west!r}, {step}, 0.0, {whole.north!r}, 0.0, -{step}</GeoTransform>\n"
+        f'<VRTDataset rasterXSize="{raster.width}" rasterYSize="{raster.height}">\n <!-- tiles of {side} pixels -->\n'
+        f' <SRS dataAxisToSRSAxisMapping="1,2">{_escaped(CRS.from_epsg(raster.epsg).to_wkt("WKT1_GDAL"))}</SRS>\n'
+        f" <GeoTransform>{raster.west!r}, {step}, 0.0, {raster.north!r}, 0.0, -{step}</GeoTransform>\n"
         f"{bands}</VRTDataset>\n"
     )
 

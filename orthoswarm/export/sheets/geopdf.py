@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from orthoswarm.export.atomic_file import written_whole
+from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.export.reduced_raster import ReducedRaster
 from orthoswarm.export.sheets.mgrs import grid_zone, square, utm_zone
 from orthoswarm.export.sheets.stac_item import picture_times
@@ -86,7 +86,7 @@ def write_geopdf(cog: Path, path: Path, places: Sequence[Place] = (), title: str
     except RasterioError as error:
         raise InputError(f"{cog} cannot be read ({error}); make the map again") from None
     page = _page(frame, rgba, epsg, folder=cog.parent, places=places, title=title)
-    with written_whole(path) as part:
+    with atomic_write(path) as part:
         _save(page, frame, epsg, part, title)
 
 

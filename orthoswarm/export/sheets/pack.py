@@ -12,7 +12,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any, Final
 
-from orthoswarm.export.atomic_file import written_whole
+from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.export.sheets.geopdf import write_geopdf
 from orthoswarm.export.sheets.stac_item import picture_times, write_stac_item
 from orthoswarm.export.sheets.stated_accuracy import stated_accuracy
@@ -87,7 +87,7 @@ def write_pack(
         with ThreadPoolExecutor(2) as pool:  # the tiles take longest
             for running in [pool.submit(run, web), pool.submit(run, others)]:
                 running.result()
-        with closing(sqlite3.connect(tiles)) as database, written_whole(path) as part:
+        with closing(sqlite3.connect(tiles)) as database, atomic_write(path) as part:
             _zip(database, folder, part, places, title)
         tell(count, count)
 

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from orthoswarm.export.atomic_file import written_whole
+from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.export.product_files import read_frames
 from orthoswarm.export.sheets.stated_accuracy import stated_accuracy
 from orthoswarm.model.errors import InputError
@@ -52,7 +52,7 @@ def write_stac_item(cog: Path, path: Path) -> None:
         grid, identifier=_identifier(cog), href=Path(os.path.relpath(cog, path.parent)).as_posix(),
         title="Orthoimage", properties=_properties(cog), asset="orthoimage", bands=bands,
     )  # fmt: skip
-    with written_whole(path) as part:
+    with atomic_write(path) as part:
         part.write_text(json.dumps(item, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 

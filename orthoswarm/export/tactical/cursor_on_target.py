@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 from xml.etree import ElementTree
 
-from orthoswarm.export.atomic_file import written_whole
+from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.export.tactical.places import Place
 
 _TYPES: Final = {"vehicle": "a-f-A-M-H-Q", "find": "b-m-p-s-m"}
@@ -64,7 +64,7 @@ def write_data_package(places: Iterable[Place], path: Path, name: str = "OrthoSw
         OrthoSwarmError: the disk is full.
     """
     now = time.time()
-    with written_whole(path) as part, zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as archive:
+    with atomic_write(path) as part, zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as archive:
         manifest = ElementTree.Element("MissionPackageManifest", version="2")
         settings = ElementTree.SubElement(manifest, "Configuration")
         uid = str(uuid.uuid5(uuid.NAMESPACE_URL, f"orthoswarm/{name}"))

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 from xml.etree import ElementTree
 
-from orthoswarm.export.atomic_file import written_whole
+from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.export.tactical.places import Place
 
 _COLUMNS: Final = (
@@ -29,7 +29,7 @@ def write_csv(places: Iterable[Place], path: Path) -> None:
     for place in places:
         values = [getattr(place, key) for key in _COLUMNS[:-1]]
         rows.writerow(_cell(value) for value in [*values, " ".join(place.pictures)])
-    with written_whole(path) as part:
+    with atomic_write(path) as part:
         part.write_text(out.getvalue(), encoding="utf-8")
 
 
@@ -85,5 +85,5 @@ def _texts(parent: ElementTree.Element, texts: dict[str, str | None]) -> None:
 
 
 def _write(root: ElementTree.Element, path: Path) -> None:
-    with written_whole(path) as part:
+    with atomic_write(path) as part:
         part.write_bytes(ElementTree.tostring(root, encoding="utf-8", xml_declaration=True))

@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from orthoswarm.export.atomic_file import written_whole
+from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.model.errors import InputError
 
 FILE: Final = "places.geojson"
@@ -65,7 +65,7 @@ def write_geojson(places: Iterable[Place], path: Path) -> None:
         OrthoSwarmError: the disk is full.
     """
     document = {"type": "FeatureCollection", "features": [feature(place) for place in places]}
-    with written_whole(path) as part:
+    with atomic_write(path) as part:
         part.write_text(json.dumps(document, ensure_ascii=False, indent=1) + "\n", encoding="utf-8")
 
 

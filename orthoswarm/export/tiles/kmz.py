@@ -14,7 +14,7 @@ from xml.sax.saxutils import escape
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.export.atomic_file import written_whole
+from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.export.tiles.mbtiles import encode_tile
 from orthoswarm.export.tiles.tile_pyramid import SIDE, Pyramid, Quad, degrees_of, draw_tiles
 
@@ -48,7 +48,7 @@ def write_kmz(
 @contextlib.contextmanager
 def kmz_file(path: Path, name: str = "orthoimage") -> "Iterator[KmzFile]":
     """A KMZ file to fill by `draw_tiles`; see `write_kmz`. It appears when the block ends without an error."""
-    with written_whole(path) as part, zipfile.ZipFile(part, "w", zipfile.ZIP_STORED) as archive:
+    with atomic_write(path) as part, zipfile.ZipFile(part, "w", zipfile.ZIP_STORED) as archive:
         yield KmzFile(archive, name)
 
 

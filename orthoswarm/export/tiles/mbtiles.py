@@ -11,7 +11,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.export.atomic_file import written_whole
+from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.export.tiles.tile_pyramid import Pyramid, Quad, draw_tiles
 
 Bytes = NDArray[np.uint8]
@@ -57,7 +57,7 @@ def mbtiles_file(
     path: Path, *, name: str = "orthoimage", tile_format: Format = "png", quality: int = 85
 ) -> "Iterator[MbtilesFile]":
     """An MBTiles file to fill by `draw_tiles`; see `write_mbtiles`. It appears when the block ends without an error."""
-    with written_whole(path) as part, closing(sqlite3.connect(part)) as database:
+    with atomic_write(path) as part, closing(sqlite3.connect(part)) as database:
         try:
             yield MbtilesFile(database, name, tile_format, quality)
         except sqlite3.Error as error:

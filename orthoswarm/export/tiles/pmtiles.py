@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from orthoswarm.export.atomic_file import written_whole
+from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.model.errors import InputError
 
 _HEADER_BYTES: Final = 127
@@ -41,7 +41,7 @@ def write_pmtiles(mbtiles: Path, path: Path) -> None:
         OrthoSwarmError: the disk is full.
     """
     try:
-        with closing(sqlite3.connect(f"file:{mbtiles}?mode=ro", uri=True)) as database, written_whole(path) as part:
+        with closing(sqlite3.connect(f"file:{mbtiles}?mode=ro", uri=True)) as database, atomic_write(path) as part:
             about = dict(database.execute("SELECT name, value FROM metadata"))
             _write(database, about, part)
     except (sqlite3.Error, KeyError) as error:
@@ -115,9 +115,9 @@ def tile_number(zoom: int, x: int, y: int) -> int:
 
 def _directories(entries: Sequence[_Entry]) -> tuple[bytes, bytes]:
     """The root directory and the leaves; without leaves if the root holds all."""
-    whole = _directory(entries)
-    if len(whole) <= _ROOT_BYTES:
-        return whole, b""
+    single = _directory(entries)
+    if len(single) <= _ROOT_BYTES:
+        return single, b""
     size = 4096
     while True:
         leaves, root = b"", list[_Entry]()

@@ -127,11 +127,11 @@ def _range(values):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _taken(rows, kept):  # type: ignore[no-untyped-def]
-    taken = np.empty((rows.shape[0], kept.sum()), rows.dtype)
+def _columns_of(rows, chosen):  # type: ignore[no-untyped-def]
+    columns = np.empty((rows.shape[0], chosen.sum()), rows.dtype)
     for k in range(rows.shape[0]):
-        taken[k] = rows[k][kept]
-    return taken
+        columns[k] = rows[k][chosen]
+    return columns
 
 
 @kernel
@@ -167,8 +167,8 @@ def place(label, mark, window, position, rotation, lens, lattice, gsd, size, fac
     _owned(label, mark, window, lattice, index, at)
     shown = _project(owned, at, position, rotation, lens, gsd, size, 1.0 / factor, spots, sights)
     if shown < owned:  # beside a seam, at the picture's very border
-        kept = sights[2] > 0.0
-        index, spots, sights = index[kept], _taken(spots, kept), _taken(sights, kept)
+        visible = sights[2] > 0.0
+        index, spots, sights = index[visible], _columns_of(spots, visible), _columns_of(sights, visible)
     box = np.zeros(4, np.int32)
     if shown > 0:
         box[0], box[1] = _range(spots[0])

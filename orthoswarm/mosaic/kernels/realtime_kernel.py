@@ -39,7 +39,7 @@ def aim(position, rotation, corners, ground_z_m, least, west, north, gsd_m, plan
         planes: float64 (8, 3), set to rows a, b, c with a column + b row <= c inside, canvas pixels.
         box: float64 (4,), set to the least and greatest column, least and greatest row.
     """
-    rays, kept = np.empty((4, 3)), np.empty((8, 3))
+    rays, ring = np.empty((4, 3)), np.empty((8, 3))
     for i in range(4):
         x = corners[1] if i == 1 or i == 2 else corners[0]
         y = corners[3] if i >= 2 else corners[2]
@@ -50,31 +50,31 @@ def aim(position, rotation, corners, ground_z_m, least, west, north, gsd_m, plan
         here, there = rays[i], rays[(i + 1) % 4]
         a, b = -here[2] - least, -there[2] - least
         if a >= 0.0:
-            kept[n] = here
+            ring[n] = here
             n += 1
         if (a >= 0.0) != (b >= 0.0):
-            kept[n] = here + (there - here) * (a / (a - b))
+            ring[n] = here + (there - here) * (a / (a - b))
             n += 1
     if n < 3:
         return 0
     height = position[2] - ground_z_m
     box[0], box[1], box[2], box[3] = np.inf, -np.inf, np.inf, -np.inf
     for i in range(n):
-        scale = height / -kept[i, 2]
-        column = (position[0] + kept[i, 0] * scale - west) / gsd_m - 0.5
-        row = (north - position[1] - kept[i, 1] * scale) / gsd_m - 0.5
-        kept[i, 0], kept[i, 1] = column, row
+        scale = height / -ring[i, 2]
+        column = (position[0] + ring[i, 0] * scale - west) / gsd_m - 0.5
+        row = (north - position[1] - ring[i, 1] * scale) / gsd_m - 0.5
+        ring[i, 0], ring[i, 1] = column, row
         box[0], box[1] = min(box[0], column), max(box[1], column)
         box[2], box[3] = min(box[2], row), max(box[3], row)
     twice = 0.0
     for i in range(n):
         j = (i + 1) % n
-        twice += (kept[i, 0] - box[0]) * (kept[j, 1] - box[2]) - (kept[j, 0] - box[0]) * (kept[i, 1] - box[2])
+        twice += (ring[i, 0] - box[0]) * (ring[j, 1] - box[2]) - (ring[j, 0] - box[0]) * (ring[i, 1] - box[2])
     turn = 1.0 if twice > 0.0 else -1.0
     for i in range(n):
         j = (i + 1) % n
-        planes[i, 0], planes[i, 1] = turn * (kept[j, 1] - kept[i, 1]), turn * (kept[i, 0] - kept[j, 0])
-        planes[i, 2] = planes[i, 0] * kept[i, 0] + planes[i, 1] * kept[i, 1]
+        planes[i, 0], planes[i, 1] = turn * (ring[j, 1] - ring[i, 1]), turn * (ring[i, 0] - ring[j, 0])
+        planes[i, 2] = planes[i, 0] * ring[i, 0] + planes[i, 1] * ring[i, 1]
     return n
 
 

@@ -56,10 +56,10 @@ def make_area(polygons: Sequence[Polygon], no_fly: Iterable[Ring] = (), grid: Lo
     outlines, holes = [], []
     for number, polygon in enumerate(polygons, start=1):
         name = "the polygon" if len(polygons) == 1 else f"polygon {number}"
-        whole = shapely.Polygon(_to_grid(grid, polygon.shell), [_to_grid(grid, h) for h in polygon.holes])
-        _check(whole, grid, name)
-        outlines.append(shapely.Polygon(whole.exterior))
-        holes += [shapely.Polygon(r) for r in whole.interiors]
+        outline = shapely.Polygon(_to_grid(grid, polygon.shell), [_to_grid(grid, h) for h in polygon.holes])
+        _check(outline, grid, name)
+        outlines.append(shapely.Polygon(outline.exterior))
+        holes += [shapely.Polygon(r) for r in outline.interiors]
     for zone in no_fly:
         closed = shapely.Polygon(_to_grid(grid, zone))
         _check(closed, grid, "a no-fly zone")

@@ -116,15 +116,20 @@ def _independent(start, links, mate_left, mate_right):  # type: ignore[no-untype
     return left, right
 
 
-def maximum_matching(start: NDArray[np.int64], links: NDArray[np.int64], rights: int) -> NDArray[np.int64]:
-    """Right mate of each left vertex (-1 without) in a maximum matching (Hopcroft and Karp 1973).
+def maximum_matching(
+    start: NDArray[np.int64], links: NDArray[np.int64], rights: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Right mate of each left vertex and left mate of each right one (-1 without) in a maximum matching.
+
+    Hopcroft and Karp 1973.
 
     Args:
         start: int64 (lefts + 1,), where each left vertex's neighbours begin in `links`.
         links: int64, right neighbours, row by row.
         rights: number of right vertices.
     """
-    return np.asarray(_hopcroft_karp(start, links, rights)[0])
+    mate_left, mate_right = _hopcroft_karp(start, links, rights)
+    return mate_left, mate_right
 
 
 def joins(cells: Cells) -> tuple[Cells, Cells]:
@@ -155,7 +160,7 @@ def joins(cells: Cells) -> tuple[Cells, Cells]:
     lefts, rights = int(along_x.sum()), int(along_y.sum())
     start = np.searchsorted(edges[:, 0], np.arange(lefts + 1)).astype(np.int64)
     links = np.ascontiguousarray(edges[:, 1])
-    mates = _hopcroft_karp(start, links, rights)
+    mates = maximum_matching(start, links, rights)
     free_left, free_right = _independent(start, links, *mates)
     x_joins, y_joins = np.zeros_like(along_x), np.zeros_like(along_y)
     x_joins[along_x] = free_left

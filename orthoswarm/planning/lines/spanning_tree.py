@@ -125,9 +125,3 @@ def circumnavigate(cells: Cells, edges: NDArray[np.uint8]) -> list[NDArray[np.in
             seen[loop[:, 0] >> 1, loop[:, 1] >> 1] = True
             loops.append(loop)
     return loops
-
-
-def count_turns(loop: NDArray[np.int64]) -> int:
-    """Changes of direction on a closed path of sub-cells (n, 2)."""
-    steps = np.diff(np.concatenate([loop, loop[:1]]), axis=0)
-    return int((steps != np.roll(steps, 1, axis=0)).any(1).sum())

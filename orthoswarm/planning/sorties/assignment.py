@@ -1,4 +1,4 @@
-"""Who flies what: legs shared among the vehicles of a crew, and cut into sorties."""
+"""Who flies what: legs shared among the vehicles of a plan, and cut into sorties."""
 
 import math
 from collections.abc import Sequence
@@ -114,7 +114,7 @@ class Options:
 
 @dataclass(frozen=True)
 class Work:
-    """What each vehicle of a crew flies.
+    """What each vehicle of a plan flies.
 
     Attributes:
         sorties: per vehicle, its sorties' legs, float64 (n, 2, 2) each, in flying order.

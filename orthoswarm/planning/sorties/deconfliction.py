@@ -279,11 +279,11 @@ def separate(sorties: Sequence[Sequence[Maker]], motions: Sequence[Motion], apar
     pad_m = active().planning.pad_distances * apart.distance_m
     if all(np.hypot(*(a - b)) >= pad_m for k, a in enumerate(homes) for b in homes[:k]):
         return Schedule(in_turn)
-    beside = _separate(sorties, motions, apart, in_turn=False)
-    done, sooner = (_done_s(slots, motions) for slots in (in_turn, beside))
+    at_once = _separate(sorties, motions, apart, in_turn=False)
+    done, sooner = (_done_s(slots, motions) for slots in (in_turn, at_once))
     if done <= (1.0 + active().planning.in_turn_share) * sooner:
         return Schedule(in_turn)
-    return Schedule(beside, in_turn=False, saved_s=done - sooner)
+    return Schedule(at_once, in_turn=False, saved_s=done - sooner)
 
 
 def _done_s(slots: list[list[Slot]], motions: Sequence[Motion]) -> float:

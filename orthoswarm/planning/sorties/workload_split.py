@@ -159,7 +159,7 @@ def _cut_evenly(parts, leg, when, out, home, own, single, back, endurance, limit
 def _evenly(
     row: Row, out: Array, home: Array, motion: Motion, limits: Limits, *, own: bool, returns: bool, single: bool
 ) -> NDArray[np.int64] | None:
-    given = (
+    problem = (
         np.ascontiguousarray(row.parts),
         row.leg,
         np.stack([row.begin_s, row.end_s], axis=1),
@@ -175,9 +175,9 @@ def _evenly(
     # A cap that is met keeps the search narrow, so try small ones first.
     share_s = (row.end_s[-1] - row.begin_s[0]) / len(out)
     for cap in (*(share_s * 1.3 * 1.5 ** np.arange(8)), np.inf):
-        cuts, longest = _cut_evenly(*given, cut_price, cap, True)
+        cuts, longest = _cut_evenly(*problem, cut_price, cap, True)
         if cuts[0] >= 0:
-            return np.asarray(_cut_evenly(*given, cut_price, leeway * longest + 1e-6, False)[0])
+            return np.asarray(_cut_evenly(*problem, cut_price, leeway * longest + 1e-6, False)[0])
     return None
 
 

@@ -7,7 +7,8 @@ aircraft sway, and legs cross: the picture's movement with the recorded attitude
 (measured: heights that are 30 % off are recovered to a few per cent, from 20 pictures as from 300).
 """
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,6 +78,39 @@ def release_heights(adjustment: Adjustment) -> Flags:
         models = [replace(m, height_sigma=sigma_m) if w else m for m, w in zip(p.models, wrong, strict=True)]
         adjustment.priors = replace(p, models=tuple(models))
     return wrong
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FreeHeight:
+    """What the adjustment of one vehicle came to without its recorded heights.
+
+    Attributes:
+        focal_px: focal length after each of the last steps.
+        recorded_m: median recorded height above the takeoff point. solved_m: median height above the solved ground.
+        predicted: difference of the two that `predicted_height_offset` expected, and its tolerance, metres.
+    """
+
+    focal_px: Sequence[float]
+    recorded_m: float
+    solved_m: float
+    predicted: tuple[float, float]
+
+    @property
+    def converged(self) -> bool:
+        """Whether the focal length has stopped changing."""
+        return bool(np.ptp(np.log(self.focal_px[-3:])) < active().strategy.at_rest_share)
+
+    @property
+    def refutes_record(self) -> bool:
+        """Whether it shows that the recorded heights are wrong.
+
+        It must have converged, near the height that the normal equations predicted, and away from the recorded one: few
+        pictures of a levelled camera over flat ground hardly determine the focal length, which then drifts to another
+        minimum.
+        """
+        offset_m, (predicted_m, tolerance_m) = self.solved_m - self.recorded_m, self.predicted
+        agrees = abs(offset_m) < active().strategy.agreeing_share * self.recorded_m
+        return self.converged and abs(offset_m - predicted_m) <= tolerance_m and not agrees
 
 
 def height_disagreement(adjustment: Adjustment) -> float:

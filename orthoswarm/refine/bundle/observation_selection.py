@@ -18,14 +18,12 @@ class BestViews:
 
     Attributes (P points):
         camera: int32 (P,), of that observation, -1 where there is none. count: int32 (P,), inlier observations.
-        mean_weight: float64 (P,), mean robust weight. off_nadir: float64 (P,), horizontal distance of that camera and
-            the point, metres.
+        mean_weight: float64 (P,), mean robust weight.
     """
 
     camera: Ints
     count: Ints
     mean_weight: Array
-    off_nadir: Array
 
 
 def best_views(
@@ -45,12 +43,7 @@ def best_views(
     total = np.bincount(tracks.point, minlength=n)
     weight = np.bincount(tracks.point, obs_weight, minlength=n) / np.maximum(total, 1)
     count = np.bincount(tracks.point[obs_weight > inlier_weight], minlength=n)
-    return BestViews(
-        np.where(ok, tracks.camera[best], -1).astype(np.int32),
-        count.astype(np.int32),
-        weight,
-        np.where(ok, distance[best], np.inf),
-    )
+    return BestViews(np.where(ok, tracks.camera[best], -1).astype(np.int32), count.astype(np.int32), weight)
 
 
 def one_per_cell(points: Array, leg: Ints, cost: Array, cell_m: float) -> NDArray[np.int64]:

@@ -117,10 +117,13 @@ def thin_tracks(tracks: Tracks, width: NDArray[np.float64], rows: NDArray[np.flo
     cell = tracks.camera.astype(np.int64) * nx * ny + cy * nx + cx
     keep = np.zeros(len(order), np.bool_)
     _thin(cell[order], start, config.track_per_cell, nx * ny * len(width), keep)
-    kept = np.sort(order[keep])
-    _, point = np.unique(tracks.point[kept], return_inverse=True)
+    selected = np.sort(order[keep])
+    _, point = np.unique(tracks.point[selected], return_inverse=True)
     return Tracks(
-        tracks.camera[kept], point.reshape(-1).astype(np.int32), tracks.uv[kept], tracks.sigma_px[kept].copy()
+        tracks.camera[selected],
+        point.reshape(-1).astype(np.int32),
+        tracks.uv[selected],
+        tracks.sigma_px[selected].copy(),
     )
 
 

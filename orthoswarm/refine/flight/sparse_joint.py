@@ -117,9 +117,11 @@ def _extract_block(adjustment: Adjustment, start: SparseStart, rows: NDArray[np.
     t = adjustment.tracks
     mine = local[t.camera] >= 0
     count = np.bincount(t.point[mine], minlength=len(adjustment.points))
-    kept = np.flatnonzero(mine & (count[t.point] >= 2))
-    points, point = np.unique(t.point[kept], return_inverse=True)
-    tracks = Tracks(local[t.camera[kept]], point.reshape(-1).astype(np.int32), t.uv[kept], t.sigma_px[kept])
+    observations = np.flatnonzero(mine & (count[t.point] >= 2))
+    points, point = np.unique(t.point[observations], return_inverse=True)
+    tracks = Tracks(
+        local[t.camera[observations]], point.reshape(-1).astype(np.int32), t.uv[observations], t.sigma_px[observations]
+    )
     cameras = adjustment.cameras.take(rows)
     lens_row = int(cameras.lens_id[0])
     cameras = replace(cameras, lens=cameras.lens[lens_row : lens_row + 1].copy(), lens_id=np.zeros(len(rows), np.int32))

@@ -17,7 +17,7 @@ from orthoswarm.refine.bundle.block_arrays import HEIGHT, K1, WIDTH, CameraBlock
 from orthoswarm.refine.features.pair_matching import Pair
 from orthoswarm.refine.features.sift_features import Features
 from orthoswarm.refine.features.track_chaining import build_tracks, thin_tracks
-from orthoswarm.refine.flight.record_findings import findings, flipped_yaw, unplaced_reasons
+from orthoswarm.refine.flight.record_findings import findings, unplaced_reasons
 from orthoswarm.refine.initial.initial_orientation import InitialOrientation, find_initial_orientation
 from orthoswarm.refine.initial.lens_groups import lens_per_vehicle, split_unlike_lenses
 from orthoswarm.refine.initial.pair_graph import PairGraphBuilder, Progress, ReadGray, build_pair_graph
@@ -40,7 +40,6 @@ class SparseStart:
         log_focal: float64 (L,) by the tags (75 degrees without), pixels. log_focal_sigma: float64 (L,).
         placed: bool (N,), False where a photo has no tie points to others. reasons: photo -> why not.
         damaged: photos that cannot be decoded.
-        yaw_flipped: bool (N,), the recorded yaw is turned by 180 degrees.
         metres_per_pixel: float64 (N,). warnings: for the report. plane: the planar start values.
         records: what the photos recorded. pairs: pairs tried and matched.
     """
@@ -58,7 +57,6 @@ class SparseStart:
     placed: Flags
     reasons: dict[int, str]
     damaged: frozenset[int]
-    yaw_flipped: Flags
     metres_per_pixel: Array
     warnings: list[str]
     plane: InitialOrientation
@@ -184,7 +182,6 @@ def assemble(
         placed=held,
         reasons=unplaced_reasons(frames, records, held, damaged),
         damaged=frozenset(damaged),
-        yaw_flipped=flipped_yaw(records, start),
         metres_per_pixel=start.metres,
         warnings=findings(frames, records, start),
         plane=start,

@@ -48,7 +48,6 @@ class Network:
         position: complex (N,). metres: float64 (S,). offset: complex (S,), nadir pixel. offset_sigma: float64 (S,).
         lag: float64 (V,) seconds. pair_ok: bool (E,). gps_ok: bool (N,).
         gps_residual: complex (N,), recorded position minus the network's, lag removed.
-        pair_residual: complex (E,), metres.
     """
 
     position: Complex
@@ -59,7 +58,6 @@ class Network:
     pair_ok: Flags
     gps_ok: Flags
     gps_residual: Complex
-    pair_residual: Complex
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,7 +130,7 @@ def solve_network(graph: PairGraph, records: PhotoRecords, yaw: Array, beliefs: 
     config = active().initial
     at = _Columns(len(records), len(beliefs.metres), int(beliefs.lens.max()) + 1, int(beliefs.vehicle.max()) + 1)
     rows = _Rows(at.size)
-    pair_sigma = _pair_rows(rows, at, graph, records=records, unit=np.exp(-1j * yaw), b=beliefs)
+    _pair_rows(rows, at, graph, records=records, unit=np.exp(-1j * yaw), b=beliefs)
     velocity = _gps_rows(rows, at, records, beliefs.vehicle)
     _prior_rows(rows, at, beliefs)
     matrix, rhs = rows.finish()
@@ -161,7 +159,6 @@ def solve_network(graph: PairGraph, records: PhotoRecords, yaw: Array, beliefs: 
         pair_ok=_norm(residual[: 2 * pairs]) < config.network_gate_sigmas,
         gps_ok=_norm(residual[2 * pairs : 2 * (pairs + photos)]) < config.network_gate_sigmas,
         gps_residual=records.position + lag[beliefs.vehicle] * velocity - (x[:photos] + 1j * x[photos : 2 * photos]),
-        pair_residual=(residual[:pairs] + 1j * residual[pairs : 2 * pairs]) * pair_sigma,
     )
 
 
@@ -185,8 +182,8 @@ def _sigmas(factor: Any, at: _Columns) -> Array:
 
 def _pair_rows(
     rows: _Rows, at: _Columns, graph: PairGraph, *, records: PhotoRecords, unit: Complex, b: NetworkPriors
-) -> Array:
-    """East, then north rows of all pairs; returns their one sigma in metres (E,)."""
+) -> None:
+    """East, then north rows of all pairs."""
     config = active().initial
     i, j = graph.first, graph.second
     si, sj = records.segment[i], records.segment[j]
@@ -206,7 +203,6 @@ def _pair_rows(
             (at.offset + at.segments + si, (axis * ui * 1j).real / sigma),
             (at.offset + at.segments + sj, -(axis * uj * 1j).real / sigma),
         )
-    return sigma
 
 
 def _gps_rows(rows: _Rows, at: _Columns, records: PhotoRecords, vehicle: Ints) -> Complex:

@@ -119,8 +119,8 @@ def measure_map_offset(recorded: Sequence[PlacedFrame], refined: Sequence[Placed
 def _mean(moved: Array) -> tuple[Array, float]:
     """Mean of a vehicle's differences (n, 2) without gross errors, and their spread, an axis."""
     away = np.hypot(*(moved - np.median(moved, axis=0)).T)
-    kept = moved[away <= active().registration.offset_outlier * max(float(np.median(away)), 1e-6)]
-    return np.asarray(kept.mean(axis=0)), float(np.sqrt(kept.var(axis=0).mean()))
+    inliers = moved[away <= active().registration.offset_outlier * max(float(np.median(away)), 1e-6)]
+    return np.asarray(inliers.mean(axis=0)), float(np.sqrt(inliers.var(axis=0).mean()))
 
 
 def _together(means: Array, sigmas: Array) -> tuple[Array, float]:

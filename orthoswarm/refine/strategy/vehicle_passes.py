@@ -18,6 +18,7 @@ from orthoswarm.refine.bundle.adjustment import Adjustment, MapTies
 from orthoswarm.refine.bundle.block_arrays import WIDTH, F
 from orthoswarm.refine.bundle.covariance import stated_errors
 from orthoswarm.refine.bundle.height_consistency import (
+    FreeHeight,
     contradicted_heights,
     height_disagreement,
     predicted_height_offset,
@@ -195,14 +196,14 @@ def adjust_without_map(flight: Flight, surface: GroundModel | None = None) -> Gr
     """
     surface = surface or GroundModel()
     begun = flight.adjustment.copy()
-    found = _relative(flight, surface)
+    found = adjust_by_schedule(flight, surface)
     if focal_length_ran_away(flight):  # begin again with the focal length by optical flow as its prior
         flight.adjustment = begun
         p = flight.adjustment.priors
         sigma = p.lens_sigma.copy()
         sigma[:, 0] = flight.calibration.focal_sigma
         flight.adjustment.priors = replace(p, lens_sigma=sigma)
-        found = _relative(flight, surface)
+        found = adjust_by_schedule(flight, surface)
     found = _without_wrong_heights(flight, found)
     inliers = float((flight.adjustment.obs_weight > active().bundle.inlier_weight).mean())
     if inliers < active().strategy.solved_inliers:
@@ -225,7 +226,8 @@ def focal_length_ran_away(flight: Flight) -> bool:
     return away > max(config.runaway_share, config.runaway_sigmas * flow.focal_sigma)
 
 
-def _relative(flight: Flight, surface: GroundModel) -> GroundModel:
+def adjust_by_schedule(flight: Flight, surface: GroundModel) -> GroundModel:
+    """Adjust a tracked flight by the steps of `strategy.schedule`; returns the ground fitted to its points."""
     config, schedule = active().strategy, list(active().strategy.schedule)
     wide = config.first_ground_sigma_m, config.first_ground_robust_c
     narrow = config.ground_sigma_m, config.ground_robust_c
@@ -244,31 +246,32 @@ def _relative(flight: Flight, surface: GroundModel) -> GroundModel:
 def _without_wrong_heights(flight: Flight, surface: GroundModel) -> GroundModel:
     """Drop recorded heights that the pictures contradict; keep them where the pictures alone determine no height.
 
-    The contradiction must remain once the adjustment has converged, and the adjustment must also converge without the
-    heights, near the height that the normal equations predicted for that: few pictures of a levelled camera over flat
-    ground hardly determine the focal length, which then drifts to another minimum.
+    The contradiction must remain once the adjustment has converged, and the adjustment without the heights must confirm
+    it (`FreeHeight.refutes_record`).
     """
     config = active().strategy
     if not flight.records.has_height.any() or not contradicted_heights(flight.adjustment).any():
         return surface
     surface, _ = _steps(flight, surface, config.rest_steps)
     with_heights, calibration, ground_with_heights = flight.adjustment.copy(), flight.calibration, surface
-    predicted_m, tolerance_m = predicted_height_offset(flight.adjustment)
+    predicted = predicted_height_offset(flight.adjustment)
     if not release_heights(flight.adjustment).any():
         return surface
     flight.calibration = replace(calibration, trusted_height=False)
     for _ in range(config.free_rounds):
         surface, focal_px = _steps(flight, surface, config.free_steps)
-        converged = np.ptp(np.log(focal_px[-3:])) < config.at_rest_share
-        if converged:
+        free = FreeHeight(
+            focal_px=focal_px,
+            recorded_m=float(np.median(flight.records.position[flight.records.has_height, 2])),
+            solved_m=float(np.median(flight.adjustment.cameras.position[:, 2])) - surface.level_m,
+            predicted=predicted,
+        )
+        if free.converged:
             break
-    recorded_m = float(np.median(flight.records.position[flight.records.has_height, 2]))
-    solved_m = float(np.median(flight.adjustment.cameras.position[:, 2])) - surface.level_m
-    drifted = abs(solved_m - recorded_m - predicted_m) > tolerance_m
-    if not converged or drifted or abs(solved_m - recorded_m) < config.agreeing_share * recorded_m:
+    if not free.refutes_record:
         flight.adjustment, flight.calibration = with_heights, calibration
         return ground_with_heights
-    flight.warnings.append(contradiction(flight.frames[0].vehicle, recorded_m, solved_m))
+    flight.warnings.append(contradiction(flight.frames[0].vehicle, free.recorded_m, free.solved_m))
     return surface
 
 

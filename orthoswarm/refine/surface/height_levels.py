@@ -22,15 +22,13 @@ class LevelNetwork:
         sigma_m: float64 (V,), one sigma of each against the mean of its component; NaN without common ground.
         component: int64 (V,), number of the connected component that each vehicle belongs to.
         pairs: int64 (E, 2), pairs with enough common ground.
-        difference_m: float64 (E,), height of the first above the second there.
-        residual_m: float64 (E,), its residual in the network.
+        residual_m: float64 (E,), residual of the difference in height of the two there.
     """
 
     correction_m: Array
     sigma_m: Array
     component: NDArray[np.int64]
     pairs: NDArray[np.int64]
-    difference_m: Array
     residual_m: Array
 
 
@@ -120,7 +118,6 @@ def _adjust(count: int, edge: NDArray[np.int64], difference: Array, sigma: Array
         sigma_m=sd,
         component=component,
         pairs=edge,
-        difference_m=difference,
         residual_m=residual,
     )
 

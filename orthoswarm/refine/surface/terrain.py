@@ -50,13 +50,8 @@ class TerrainFit:
 
     @property
     def shrink(self) -> float:
-        """Share of the relief that enters the height prior, 0 to 1."""
+        """Share of the relief that enters the height prior, 0 to 1; 0 where it cannot be distinguished from noise."""
         return _shrink(self.sd_m, self.settings.flat_sd_m)
-
-    @property
-    def is_flat(self) -> bool:
-        """True if the relief cannot be distinguished from noise, so that the prior is a level plane."""
-        return self.shrink == 0.0
 
     def prior(self, z0_m: float = 0.0) -> Terrain:
         """The surface around which point heights are held: shrink (T - median T) + z0, a plane at z0 where flat.

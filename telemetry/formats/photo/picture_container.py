@@ -212,7 +212,7 @@ def _big_tiff(parts: Parts, little: bool) -> Container:
 
 
 def _tiff(parts: Parts) -> Container:
-    with parts.whole() as data:
+    with parts.whole_file() as data:
         tags = exif.parse_tiff(data)
     width, height = exif.number(tags.main.get(exif.WIDTH)), exif.number(tags.main.get(exif.HEIGHT))
     if not width or not height:

@@ -13,13 +13,14 @@ from orthoswarm.model.geo import LocalGrid
 from orthoswarm.raster.basemap import Basemap
 from orthoswarm.refine.bundle import height_consistency
 from orthoswarm.refine.bundle.covariance import systematic_tie_offset
-from orthoswarm.refine.bundle.height_consistency import height_disagreement
+from orthoswarm.refine.bundle.height_consistency import FreeHeight, height_disagreement
 from orthoswarm.refine.flight.relative_block import open_flight
 from orthoswarm.refine.registration.absolute_orientation import leg_corrections
 from orthoswarm.refine.registration.tie_points import MapMatches
 from orthoswarm.refine.strategy import vehicle_passes
 from orthoswarm.refine.strategy.vehicle_passes import (
     Options,
+    adjust_by_schedule,
     adjust_without_map,
     focal_length_ran_away,
     read_frame,
@@ -52,11 +53,11 @@ def test_wrong_tracks_at_a_turn_do_not_carry_the_field_of_view_away(made_up, con
     configure({"features": {"flow_chance_share": 0.0}})  # else they are dropped at once
     flight = opened(frames)
     configure({"features": {"flow_chance_share": 0.0}, "strategy": {"schedule": [1e4, 1e4, 100.0, 100.0, 9.0, 9.0]}})
-    vehicle_passes._relative(flight, Options().ground(ORIGIN))
+    adjust_by_schedule(flight, Options().ground(ORIGIN))
     assert fov_deg(flight) > 90.0 and focal_length_ran_away(flight)
     configure({"features": {"flow_chance_share": 0.0}})
     flight = opened(frames)
-    vehicle_passes._relative(flight, Options().ground(ORIGIN))
+    adjust_by_schedule(flight, Options().ground(ORIGIN))
     assert not focal_length_ran_away(flight)
     assert fov_deg(flight) == pytest.approx(70.0, abs=0.5)
 
@@ -69,59 +70,45 @@ def test_without_an_answer_of_the_flow_nothing_is_called_a_runaway(made_up):
     assert not focal_length_ran_away(flight)
 
 
-def test_heights_are_believed_where_the_pictures_tell_nothing_without_them(made_up, monkeypatch):
-    frames, _ = made_up  # straight down over flat ground: without heights no focal length is better than another
+def free_height(**changed):
+    """The adjustment of a flight that was recorded at 40 m, and comes to 32 m without that, as predicted."""
+    values = {"focal_px": [900.0, 900.1, 900.1], "recorded_m": 40.0, "solved_m": 32.0, "predicted": (-8.0, 6.0)}
+    return FreeHeight(**{**values, **changed})
 
-    def doubted(adjustment):
+
+def test_a_recorded_height_is_refuted_by_an_adjustment_that_comes_to_another():
+    assert free_height().refutes_record
+
+
+@pytest.mark.parametrize(
+    "result",
+    [
+        pytest.param({"solved_m": 39.9, "predicted": (0.0, 6.0)}, id="comes to the recorded height"),
+        pytest.param({"focal_px": [900.0 * 0.96**k for k in range(4)]}, id="does not converge"),
+        pytest.param({"solved_m": 14.0}, id="comes to another minimum than was predicted"),
+    ],
+)
+def test_a_recorded_height_is_kept_where_the_pictures_alone_determine_none(result):
+    """The last: pictures of a level camera on ArduCopter; 32 m were predicted for 40 m, it came to 14 m."""
+    assert not free_height(**result).refutes_record
+
+
+@pytest.mark.parametrize("at_rest_share", [None, 0.0])
+def test_heights_that_are_kept_are_those_of_the_adjustment_before(made_up, monkeypatch, configure, at_rest_share):
+    """Straight down over flat ground: set free it stays where it is, or (with a share of 0) counts as not converged."""
+
+    def recorded(adjustment):
         return np.array([m.height_sigma < active().bundle.unknown_height_sigma_m for m in adjustment.priors.models])
 
-    steps = vehicle_passes._steps
-
-    def wandering(flight, surface, count):
-        surface, focal_px = steps(flight, surface, count)
-        if not doubted(flight.adjustment).any():
-            flight.adjustment.cameras.lens[:, 0] *= 0.7
-            focal_px = [f * 0.96**k for k, f in enumerate(focal_px)]
-        return surface, focal_px
-
     for module in (vehicle_passes, height_consistency):
-        monkeypatch.setattr(module, "contradicted_heights", doubted)
-    for how in (steps, wandering):  # set free it stays where it is, or comes to no rest: both contradict nothing
-        monkeypatch.setattr(vehicle_passes, "_steps", how)
-        flight = opened(frames)
-        adjust_without_map(flight)
-        assert fov_deg(flight) == pytest.approx(70.0, abs=0.5)
-        assert flight.warnings == [] and flight.calibration.trusted_height
-        assert doubted(flight.adjustment).all() and height_disagreement(flight.adjustment) < 0.05
-
-
-def test_a_height_far_from_the_one_that_was_predicted_is_another_minimum(made_up, monkeypatch):
-    """Pictures of a level camera on ArduCopter: 32 m were predicted for 40 m, and the free adjustment came to 14 m."""
-    frames, _ = made_up
-    steps = vehicle_passes._steps
-
-    def doubted(adjustment):
-        return np.array([m.height_sigma < active().bundle.unknown_height_sigma_m for m in adjustment.priors.models])
-
-    def elsewhere(flight, surface, count):
-        surface, focal_px = steps(flight, surface, count)
-        if not doubted(flight.adjustment).any():
-            flight.adjustment.cameras.position[:, 2] *= 0.35
-            flight.adjustment.cameras.lens[:, 0] *= 0.35
-        return surface, focal_px
-
-    for module in (vehicle_passes, height_consistency):
-        monkeypatch.setattr(module, "contradicted_heights", doubted)
-    monkeypatch.setattr(vehicle_passes, "_steps", elsewhere)
-    height_m = frames[0].fix.height_m
-    for share, believed in ((-0.2, True), (-0.65, False)):
-        monkeypatch.setattr(
-            vehicle_passes, "predicted_height_offset", lambda _, s=share: (s * height_m, 0.15 * height_m)
-        )
-        flight = opened(frames)
-        adjust_without_map(flight)
-        assert flight.calibration.trusted_height is believed
-        assert (fov_deg(flight) == pytest.approx(70.0, abs=0.5)) is believed
+        monkeypatch.setattr(module, "contradicted_heights", recorded)
+    if at_rest_share is not None:
+        configure({"strategy": {"at_rest_share": at_rest_share}})
+    flight = opened(made_up[0])
+    adjust_without_map(flight)
+    assert fov_deg(flight) == pytest.approx(70.0, abs=0.5)
+    assert flight.warnings == [] and flight.calibration.trusted_height
+    assert recorded(flight.adjustment).all() and height_disagreement(flight.adjustment) < 0.05
 
 
 def test_an_adjustment_that_does_not_fit_its_observations_is_no_solution(made_up):

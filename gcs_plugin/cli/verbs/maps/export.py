@@ -120,14 +120,14 @@ def _kmz(args: argparse.Namespace, dest: Path, tell: Tell, notes: list[str]) -> 
 def _gpkg(args: argparse.Namespace, dest: Path, tell: Tell, notes: list[str]) -> Path:
     import shutil
 
-    from orthoswarm.export.atomic_file import written_whole
+    from orthoswarm.export.atomic_file import atomic_write
     from orthoswarm.model.errors import InputError
 
     source = args.map / "footprints.gpkg"
     if not source.exists():
         raise InputError(f"{args.map} holds no footprints.gpkg; make the map with `orthoswarm mosaic` first")
     path = dest / "footprints.gpkg"
-    with written_whole(path) as part:
+    with atomic_write(path) as part:
         shutil.copyfile(source, part)
     tell(1, 1)
     return path
