@@ -7,6 +7,10 @@ displacements have a root mean square length of A metres and a Gaussian correlat
 so that `sigma_m` has to cover what the map is wrong by. A set of a few hundred metres shows a handful of independent
 places of such a field only, so that shares are counted over `--fields` of them. A line a set and kind: the error of the
 pictures' middles on the stated plane, and the shares of it within one and two sigma, of each axis and of its length.
+
+`plane_rms_m` is the error of homographies over whole pictures (root mean square of its length) against the true cameras
+on the true plane of the same height over takeoff, `ground_rms_m` on the true ground's median level: the two differ by
+what the stated height of the ground is off.
 """
 
 import argparse
@@ -21,7 +25,7 @@ import numpy as np
 import telemetry
 from benchmarks.robustness.wrong_maps import altered, season
 from orthoswarm.batch.refiners import make_refiner
-from orthoswarm.evaluation.true_cameras import read_truth
+from orthoswarm.evaluation.true_cameras import read_truth, true_ground_level
 from orthoswarm.model.geo import local_origin
 from orthoswarm.mosaic.extent import from_takeoff, solved_level
 from orthoswarm.mosaic.recorded_pose import area_grid
@@ -60,8 +64,16 @@ def write_map(source, target, kind, field=1):
     altered(source, target, lambda picture, gsd_m: warped(picture, gsd_m, rms_m, length_m, field))
 
 
+GRID = np.stack(np.meshgrid(np.linspace(0.0, 1.0, 7), np.linspace(0.0, 1.0, 7)), -1).reshape(-1, 2)
+"""Places in a picture at which homographies are compared, as shares of its width and height."""
+
+
 def refined(folder, basemap_file):
-    """Errors (n, 2) and stated errors (n,) of a set's pictures with a map, stages, states of its legs, CPU seconds."""
+    """What a set's pictures have with a map.
+
+    Errors (n, 2), stated errors (n,), stages, states of the legs, CPU seconds, mean squares (n, 2) of the homographies'
+    errors at the stated height and on the true ground.
+    """
     frames = telemetry.load([folder / "photos"]).frames
     grid = area_grid(frames)
     vehicles = {}
@@ -74,13 +86,18 @@ def refined(folder, basemap_file):
     truth = read_truth(folder / "truth" / "frames.csv")
     placed = [p for solution in refinement.fine for p in solution.placed]
     placed, level = from_takeoff(placed, solved_level(refinement.fine), refinement.terrain)
-    error = []
+    true_level = true_ground_level(folder / "truth" / "dtm.tif", [truth[p.frame.image][2] for p in placed])
+    error, square = [], []
     for p in placed:
         true = truth[p.frame.image][2]
         middle = np.array(true.lens.principal_point)
         error.append(p.camera.to_ground(middle, level) - true.to_ground(middle, level))
+        pixels = GRID * [true.lens.width - 1, true.lens.height - 1]
+        there = p.camera.to_ground(pixels, level)
+        square.append([((there - true.to_ground(pixels, z)) ** 2).sum(1).mean() for z in (level, true_level)])
     states = [leg.state for solution in refinement.fine for leg in solution.legs]
-    return np.array(error), np.array([p.sigma_m for p in placed]), [p.stage for p in placed], states, seconds
+    sigma = np.array([p.sigma_m for p in placed])
+    return np.array(error), sigma, [p.stage for p in placed], states, seconds, np.array(square)
 
 
 def measure(folder, kind, fields):
@@ -94,12 +111,14 @@ def measure(folder, kind, fields):
     error, sigma = (np.concatenate([run[k] for run in runs]) for k in (0, 1))
     stages, states = ([value for run in runs for value in run[k]] for k in (2, 3))
     length = np.hypot(*error.T)
+    plane, ground = np.sqrt(np.concatenate([run[5] for run in runs]).mean(axis=0))
     return {
         "pictures": len(error), "fine": stages.count("fine"), "matched": states.count("matched"),
         "legs": len(states), "median_m": round(float(np.median(length)), 3),
         "p95_m": round(float(np.percentile(length, 95)), 3), "sigma_m": round(float(np.median(sigma)), 3),
         "axis_1": share(np.abs(error), sigma[:, None]), "axis_2": share(np.abs(error), 2 * sigma[:, None]),
         "length_1": share(length, sigma), "length_2": share(length, 2 * sigma),
+        "plane_rms_m": round(float(plane), 3), "ground_rms_m": round(float(ground), 3),
         "cpu_s": round(sum(run[4] for run in runs), 1),
     }  # fmt: skip
 

@@ -86,10 +86,11 @@ def evaluate_poses(poses: Path, truth: Path) -> PoseErrors:
         raise InputError(f"no placed frame of {poses} stands in {truth}; do both belong to the same set?")
     report = poses.with_name("report.json")
     plane = float(json.loads(report.read_text()).get("ground_z_m") or 0.0) if report.exists() else 0.0
-    return pose_errors(placed, cameras, plane, _ground_level(truth.with_name("dtm.tif"), cameras))
+    return pose_errors(placed, cameras, plane, true_ground_level(truth.with_name("dtm.tif"), cameras))
 
 
-def _ground_level(dtm: Path, cameras: list[Any]) -> float:
+def true_ground_level(dtm: Path, cameras: list[Any]) -> float:
+    """Median height of a truth's dtm.tif below cameras, metres; 0 where there is no such file."""
     if not dtm.exists():
         return 0.0
 

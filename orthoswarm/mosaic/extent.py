@@ -59,7 +59,8 @@ def from_takeoff(
     if terrain is None or not placed:
         return placed, level
     config = active().mosaic
-    relief = float(terrain.bare_ground().height(np.array([p.camera.nadir for p in placed])).std())
+    ground = terrain.bare_ground().height(np.array([p.camera.nadir for p in placed]))
+    relief = float(np.sqrt(max(0.0, ground.var() - active().surface.flat_relief_m ** 2)))  # less is the surface's noise
     recorded = [p.camera.position[2] - p.frame.fix.height_m for p in placed if p.frame.fix.height_m is not None]
     zeros = [(level, config.ground_level_sigma_m**2 + relief**2)]
     if recorded:
