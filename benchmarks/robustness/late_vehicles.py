@@ -66,8 +66,10 @@ def flown_tracks(plan: Plan, names: Sequence[str], left_s: list[Array]) -> list[
         path = np.column_stack([east_north[[0, 0, *range(1, len(places))]], np.zeros(len(places) + 1)])
         path[1:, 2] = [sortie.takeoff_height_m, *(w.height_m for w in sortie.waypoints)]
         path = np.vstack([path, [*path[0, :2], 0.0]])
-        times = Motion(autopilot=autopilot_config(name)).times(path)
-        behind = np.interp(times, times[[0, 1, 3, -3, -2, -1]], [0.0, *left])
+        motion = Motion(autopilot=autopilot_config(name))
+        passed = motion.times(path)
+        times, path = motion.course(path)
+        behind = np.interp(times, passed[[0, 1, 3, -3, -2, -1]], [0.0, *left])
         at = np.maximum.accumulate(sortie.start_s + times + behind)
         track = np.stack([np.interp(moments, at, path[:, axis], np.nan, np.nan) for axis in range(3)], 1)
         track[~(track[:, 2] > GROUND_M)] = np.nan

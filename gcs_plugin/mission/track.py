@@ -37,13 +37,20 @@ class Track:
 
     Attributes:
         places: float64 (n, 3), east and north of a common origin and height over takeoff, metres.
+        autopilot: whose times these are.
     """
 
     places: Array
+    autopilot: AutopilotConfig = field(default_factory=lambda: active().ardupilot)
 
     def pad(self, radius_m: float) -> NDArray[np.bool_]:
         """Samples near its start."""
         return np.asarray(np.hypot(*(self.places[:, :2] - self.places[0, :2]).T) < radius_m)
+
+    def pad_slack_s(self, radius_m: float) -> Array:
+        """Seconds off schedule that a plan allows each sample near its start: fewer before it has left it first."""
+        takes_off = np.arange(len(self.places)) < np.argmin(self.pad(radius_m))
+        return np.where(takes_off, self.autopilot.takeoff_slack_s, self.autopilot.landing_slack_s)
 
 
 def flight_path(mission: "Mission", origin: tuple[float, float]) -> tuple[Array, Array, float]:
@@ -88,9 +95,7 @@ def track_of(mission: "Mission", origin: tuple[float, float]) -> Track:
     if len(points) < 2:
         return Track(points)
     motion = Motion(speed_m_s=speed, autopilot=_autopilot_of(mission), lands=_lands(mission))
-    times = motion.times(points) + np.cumsum(waits)
-    moments = np.arange(0.0, times[-1] + _STEP_S, _STEP_S)
-    return Track(np.stack([np.interp(moments, times, points[:, axis]) for axis in range(3)], axis=1))
+    return Track(motion.places(points, waits, _STEP_S), motion.autopilot)
 
 
 def _lands(mission: "Mission") -> bool:
@@ -130,12 +135,14 @@ class _Approaches:
         delay: int64 (n,), by how many samples the second flight must start later for the pair to be at one time.
         at: int64 (n,), sample of the first flight. distance_m: float64 (n,), horizontal distance.
         at_start: bool (n,), both are around a start that they share.
+        start_slack_s: float64 (n,), seconds off schedule that a plan allows there.
     """
 
     delay: Ints
     at: Ints
     distance_m: Array
     at_start: NDArray[np.bool_]
+    start_slack_s: Array
 
 
 @dataclass(slots=True)
@@ -173,9 +180,9 @@ class Airspace:
         that they share a part of it.
         """
         near = self._approaches(one, other)
-        slack, pad_slack = math.ceil(self.slack_s / _STEP_S), -1
+        slack, pad_slack = math.ceil(self.slack_s / _STEP_S), np.full(len(near.at), -1.0)
         if self.in_turn:  # a sample less than the plan's, which lie at other moments
-            pad_slack = math.ceil(active().planning.pad_slack_share * self.slack_s / _STEP_S) - 1
+            pad_slack = np.ceil(np.minimum(near.start_slack_s, self.slack_s) / _STEP_S) - 1.0
         shift = round(later_s / _STEP_S)
         within = np.flatnonzero(np.abs(near.delay - shift) <= np.where(near.at_start, pad_slack, slack))
         if not len(within):
@@ -191,12 +198,15 @@ class Airspace:
             i, j = _near(a, b, self.distance_m) if len(a) and len(b) else (np.zeros(0, np.int64),) * 2
             counted = np.abs(a[i, 2] - b[j, 2]) < self.height_m - _HAIR_M
             i, j = i[counted], j[counted]
-            at_start = np.zeros(len(i), bool)
+            at_start, start_slack_s = np.zeros(len(i), bool), np.zeros(len(i))
             if self._share_a_start(one, other):
-                pads = [self.tracks[system].pad(_PAD * self.distance_m) for system in (one, other)]
-                at_start = pads[0][i] & pads[1][j]
+                first, second, radius_m = self.tracks[one], self.tracks[other], _PAD * self.distance_m
+                at_start = first.pad(radius_m)[i] & second.pad(radius_m)[j]
+                start_slack_s = np.maximum(first.pad_slack_s(radius_m)[i], second.pad_slack_s(radius_m)[j])
             distance_m = np.hypot(*(a[i, :2] - b[j, :2]).T)
-            known = _Approaches(delay=i - j, at=i, distance_m=distance_m, at_start=at_start)
+            known = _Approaches(
+                delay=i - j, at=i, distance_m=distance_m, at_start=at_start, start_slack_s=start_slack_s
+            )
             self._found[one, other] = known
         return known
 

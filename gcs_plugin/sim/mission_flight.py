@@ -227,6 +227,7 @@ class Flight:
             self._mission_changed()
         if not self.armed:
             return
+        self._pace()
         self.motion.step(time_s)
         match self._task:
             case Task.ITEM:
@@ -353,8 +354,23 @@ class Flight:
             return
         if item.command == TAKEOFF:
             self.landed = Landed.IN_AIR
+            times = self.motion.airframe.times
+            if times is not None:
+                self.motion.gathers_m_s2 = times.acceleration_m_s2
         self._reach(self.seq)
         self._run_from(self.seq + 1)
+
+    def _pace(self) -> None:
+        """How fast its autopilot lets it climb and gather speed now."""
+        motion, times = self.motion, self.motion.airframe.times
+        if times is None:
+            return
+        low = self.landed is Landed.TAKEOFF and motion.up < times.takeoff_below_m
+        usual_s = times.takeoff_below_m / motion.airframe.climb_m_s
+        lost_s = max(0.0, times.takeoff_below_s - _OWN_TAKEOFF_S)
+        motion.climb_m_s = times.takeoff_below_m / (usual_s + lost_s) if low else motion.airframe.climb_m_s
+        if math.hypot(motion.vn, motion.ve) > 0.9 * motion.speed:
+            motion.gathers_m_s2 = motion.airframe.accel_m_s2
 
     def _lost_s(self, item: MissionItem) -> float:
         """Seconds that the autopilot takes at a point beyond its motion."""
@@ -362,7 +378,7 @@ class Flight:
         if times is None or motion.target is None:
             return 0.0
         if item.command == TAKEOFF:
-            return times.takeoff_s + times.set_off_s - _OWN_TAKEOFF_S
+            return times.takeoff_s - max(times.takeoff_below_s, _OWN_TAKEOFF_S) + times.set_off_s
         came, goes = _step(motion.came_from, motion.target), _step(motion.target, self._next_place())
         if not came or not goes:
             return times.height_change_s

@@ -128,6 +128,7 @@ class Motion:
         chart: around home.
         north: true position with east and up; velocities vn, ve, vu.
         speed: present cruise speed, m/s.
+        climb_m_s: present rate of climb; gathers_m_s2: greatest gain of speed, less as it sets off.
         target: its target (north, east, up), None to stay on the ground; see `go`.
     """
 
@@ -144,6 +145,8 @@ class Motion:
     pitch: float = 0.0
     roll: float = 0.0
     speed: float = 8.0
+    climb_m_s: float = math.inf
+    gathers_m_s2: float = math.inf
     target: tuple[float, float, float] | None = None
     _an: float = 0.0
     _ae: float = 0.0
@@ -249,14 +252,15 @@ class Motion:
         scale = wanted / ahead if ahead > 1e-6 else 0.0
         an, ae = (dn * scale - self.vn) / 0.5, (de * scale - self.ve) / 0.5
         size = math.hypot(an, ae)
-        limit = min(1.0, frame.accel_m_s2 / size) if size > 0.0 else 1.0
+        most = min(frame.accel_m_s2, self.gathers_m_s2) if an * self.vn + ae * self.ve >= 0.0 else frame.accel_m_s2
+        limit = min(1.0, most / size) if size > 0.0 else 1.0
         lag = dt / 0.2
         self._an += lag * (an * limit - self._an)
         self._ae += lag * (ae * limit - self._ae)
         self.vn += dt * self._an
         self.ve += dt * self._ae
         rise = target[2] - self.up
-        wanted_up = max(-frame.sink_m_s, min(frame.climb_m_s, 1.0 * rise))
+        wanted_up = max(-frame.sink_m_s, min(frame.climb_m_s, self.climb_m_s, 1.0 * rise))
         self.vu += max(-1.5 * dt, min(1.5 * dt, wanted_up - self.vu))
         self.north += dt * self.vn
         self.east += dt * self.ve

@@ -19,6 +19,10 @@ class ArduPilotConfig:
     10 m/s; angles of 30 to 180 degrees follow from it within 1.3 s in ten turns)."""
     takeoff_s: float = 2.6
     """Seconds lost in the takeoff, against its rate of climb (measured: 2.3 to 2.9)."""
+    takeoff_below_s: float = 0.4
+    """Those of them that it loses in the first metres (measured: 0.4 to 0.5); the others at the top."""
+    takeoff_below_m: float = 2.0
+    """Height above home up to which it loses them, metres (measured)."""
     set_off_s: float = 0.7
     """Seconds above its home until it accelerates towards the first point (measured: 0.6 to 1.1)."""
     height_change_s: float = 1.4
@@ -34,6 +38,11 @@ class ArduPilotConfig:
     schedule_slack_s: float = 10.0
     """How much later than planned one vehicle may be than another while they stay separated, seconds: four times the
     greatest difference from these times in flight (measured: 2.4), for wind, loads and other settings."""
+    takeoff_slack_s: float = 2.5
+    """The same around a start that vehicles share, as they take off (two differed by up to 1.5). Four times as much, as
+    above, at each takeoff and landing would hold a swarm of one start on the ground."""
+    landing_slack_s: float = 3.5
+    """The same as they come home and land (two differed by up to 3.4)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,6 +59,10 @@ class Px4Config:
     """Speed at which it passes corners (it nearly stops)."""
     takeoff_s: float = 5.5
     """Seconds lost in the takeoff, against a rate of climb of 2.5 m/s (measured: 3.7 to 8.3)."""
+    takeoff_below_s: float = 5.5
+    """Those of them that it loses in the first metres: all (measured: 4.4 to 6.0)."""
+    takeoff_below_m: float = 10.0
+    """Height above home up to which it loses them, metres (measured: it climbs at 1.5 m/s up to there)."""
     set_off_s: float = 2.0
     """Seconds above its home until it accelerates towards the first point (measured: 0.5 to 2.7)."""
     height_change_s: float = 2.2
@@ -65,6 +78,10 @@ class Px4Config:
     schedule_slack_s: float = 20.0
     """How much later than planned one vehicle may be than another while they stay separated, seconds: more than two
     vehicles differed in flight (measured: up to 7 late at 10 m/s, up to 12 at 5 m/s, up to 6 early)."""
+    takeoff_slack_s: float = 7.5
+    """The same around a start that vehicles share, as they take off (two differed by up to 7.2)."""
+    landing_slack_s: float = 18.0
+    """The same as they come home and land (two differed by up to 18)."""
 
 
 AutopilotConfig = ArduPilotConfig | Px4Config

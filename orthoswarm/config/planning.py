@@ -102,8 +102,5 @@ class PlanningConfig:
     pad_distances: float = 1.5
     """Radius about a start that vehicles share, in separation distances; in it they take off and land in turn
     (chosen)."""
-    pad_slack_share: float = 0.25
-    """Share of an autopilot's `schedule_slack_s` for which the plan allows there. ArduCopter's slack is four times what
-    was measured; four times as much at each takeoff and landing would hold a swarm of one start on the ground."""
     in_turn_share: float = 0.25
     """Vehicles of one start take off and land in turn if the whole takes at most so much longer by that (chosen)."""

@@ -294,8 +294,8 @@ def _warnings(schedule: Schedule, work: Work, foot: Footprint, options: Options)
         apart = options.separation
         result.append(
             f"vehicles of one start take off and land beside each other, {apart.launch_s:g} s apart: in turn, all "
-            f"would be done {schedule.saved_s / 60:.1f} min later; give each its own start, {apart.distance_m:g} m or "
-            "more from the next"
+            f"would be done at least {schedule.saved_s / 60:.1f} min later; give each its own start, "
+            f"{apart.distance_m:g} m or more from the next"
         )
     return result
 

@@ -83,6 +83,77 @@ def test_times_hold_at_other_speeds_however_many_turns_there_are(name):
     assert replace(motion, lands=False).times(np.array(points, float))[-1] > times[-1] + 5.0
 
 
+# Seconds after it left the ground, distance from its start and height over it, metres; and what is allowed in metres.
+# The way: up, to (10, 20), a line of 300 m.
+SET_OFF = {
+    "ardupilot, 5 m/s": (
+        5.0, 30,
+        [(4.4, 0, 10), (8.4, 0, 20), (12.0, 0, 28), (16.0, 0.5, 30), (16.8, 2, 30), (17.8, 5, 30), (19.0, 10, 30)], 2.0,
+    ),
+    "ardupilot, 10 m/s": (
+        10.0, 40,
+        [(4.4, 0, 10), (8.4, 0, 20), (16.0, 0, 38), (20.0, 0.5, 40), (20.9, 2, 40), (21.9, 5, 40), (23.1, 10, 40)], 2.0,
+    ),
+    "px4, 5 m/s": (
+        5.0, 40,
+        [(3.8, 0, 2), (6.0, 0, 5), (10.0, 0, 10), (14.2, 0, 20), (20.5, 0, 38), (23.8, 1, 40), (25.0, 5, 40)], 6.0,
+    ),
+    "px4, 8 m/s": (
+        8.0, 30,
+        [(2.9, 0, 2), (5.1, 0, 5), (8.4, 0, 10), (12.2, 0, 20), (17.2, 0, 28), (20.2, 1, 30), (21.5, 5, 30)], 6.0,
+    ),
+    "px4, 10 m/s": (
+        10.0, 40,
+        [(3.3, 0, 2), (6.5, 0, 5), (9.7, 0, 10), (14.0, 0, 20), (20.9, 0, 38), (25.4, 1, 40), (27.8, 5, 40)], 6.0,
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SET_OFF)
+def test_a_vehicle_is_where_real_ones_were_as_it_climbs_and_sets_off(name):
+    """They climb slowly at first or at last, stand still above their start, and gather speed."""
+    speed, height, flown, allowed_m = SET_OFF[name]
+    motion = Motion(speed, autopilot=autopilot_config(name.partition(",")[0]))
+    places = motion.places(np.array(lines(300, height, 2), float), None, 0.1)
+    for seconds, away, up in flown:
+        place = places[round(seconds / 0.1)]
+        assert np.hypot(*place[:2]) == pytest.approx(away, abs=allowed_m), seconds
+        assert place[2] == pytest.approx(up, abs=allowed_m), seconds
+
+
+def test_a_vehicle_is_where_a_real_one_was_as_it_comes_home():
+    """An ArduCopter at 10 m/s from 40 m: it slows down and waits above home, and comes down slowly at last."""
+    flown = [(104.0, 40.0), (110.0, 40.0), (113.0, 40.0), (116.0, 38.3), (119.0, 34.0), (128.0, 20.3), (137.0, 9.4),
+             (146.0, 4.9), (155.0, 0.4)]  # fmt: skip
+    places = Motion(autopilot=autopilot_config("ardupilot")).places(np.array(lines(299, 40, 2), float), None, 0.1)
+    for seconds, up in flown:
+        place = places[round(seconds / 0.1)]
+        assert place[2] == pytest.approx(up, abs=2.0), seconds
+        assert np.hypot(*place[:2]) < 7.0
+
+
+@given(
+    st.lists(st.tuples(*[st.floats(-500.0, 500.0)] * 2, st.floats(20.0, 100.0)), min_size=1, max_size=6),
+    st.sampled_from(["ardupilot", "px4"]),
+    st.floats(1.0, 20.0),
+    st.booleans(),
+    st.integers(0, 6),
+)
+def test_a_course_keeps_to_the_path_and_its_times(points, autopilot, speed, lands, wait_at):
+    path = np.array([(0.0, 0.0, 0.0), (0.0, 0.0, 50.0), *points, (0.0, 0.0, 40.0), (0.0, 0.0, 0.0)])
+    motion = Motion(speed, autopilot=autopilot_config(autopilot), lands=lands)
+    waits = np.zeros(len(path))
+    waits[min(wait_at, len(path) - 2)] = 7.0
+    times, places = motion.course(path, waits)
+    assert (np.diff(times) >= 0.0).all() and times[-1] == pytest.approx(motion.times(path)[-1] + 7.0)
+    assert np.array_equal(places[0], path[0]) and places[-1] == pytest.approx(path[-1])
+    moved = np.linalg.norm(np.diff(places, axis=0), axis=1).sum()
+    assert moved == pytest.approx(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
+    in_step = np.diff(times) > 1e-6
+    rates = np.linalg.norm(np.diff(places, axis=0)[in_step], axis=1) / np.diff(times)[in_step]
+    assert rates.max() <= 1.01 * math.hypot(speed, motion.climb_m_s)
+
+
 @pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
 def test_a_turn_takes_no_more_than_a_stop_and_the_less_the_slower(autopilot):
     config = autopilot_config(autopilot)

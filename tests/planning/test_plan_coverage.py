@@ -224,7 +224,8 @@ def positions(plan, sortie, motion, step=0.25):
     path = np.column_stack([at, heights])
     if plan.end != "hover":
         path = np.vstack([path, [*path[0, :2], 0.0]])
-    times = sortie.start_s + motion.times(path)
+    times, path = motion.course(path)
+    times += sortie.start_s
     moments = np.arange(0, times[-1], step)
     return moments, np.stack([np.interp(moments, times, path[:, k]) for k in range(3)], 1), times[0]
 

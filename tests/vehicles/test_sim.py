@@ -20,7 +20,7 @@ from gcs_plugin.mission.items import (
     Mission,
     MissionItem,
 )
-from gcs_plugin.mission.track import flight_seconds
+from gcs_plugin.mission.track import flight_seconds, track_of
 from gcs_plugin.sim.lossy_radio import Channel, Faults
 from gcs_plugin.sim.memory_link import World
 from gcs_plugin.sim.multirotor import Airframe, Chart
@@ -392,6 +392,40 @@ def test_a_radio_carries_no_more_than_its_rate():
         radio.put("packet", 0.0, 100)  # three seconds' worth at once: what would wait longer than one is lost
     assert len(radio.take(0.55)) == 5 and radio.lost == 19
     assert len(radio.take(2.0)) == 6
+
+
+@BOTH
+def test_a_vehicle_as_flown_is_where_its_plan_has_it_around_its_start(autopilot):
+    """It stands still above its start before it sets off and before it comes down, as real ones do."""
+    items = [at(WAYPOINT, 0, 0)] if autopilot is AP else []
+    items += [at(TAKEOFF, 0, 0, 40.0, autopilot), MissionItem.do(CHANGE_SPEED, 1, 10)]
+    items += [at(WAYPOINT, *corner, 40.0, autopilot) for corner in ((0, 150), (40, 150), (40, 0), (0, 0))]
+    mission = Mission(autopilot, (*items, MissionItem.do(RTL)))
+    sim = SimVehicle(system=1, autopilot=autopilot, airframe=Airframe().as_flown(autopilot_config(autopilot.value)))
+    world = make_world([sim])
+    world.meet()
+    assert world.finish(world.fleet.upload(1, mission))[0].ok
+    assert world.finish(world.fleet.start(1))[0].ok
+    assert world.until(lambda: sim.flight.motion.up > 0.3, 30.0)
+    begun, flown = world.clock.now, []
+
+    def note():
+        motion = sim.flight.motion
+        flown.append((world.clock.now - begun, math.hypot(motion.north, motion.east), motion.up))
+        return not sim.flight.armed
+
+    assert world.until(note, 600.0)
+    places = track_of(mission, sim.home[:2]).places
+    planned_s, home = 0.5 * np.arange(len(places)), np.hypot(*places[:, :2].T)
+    rows = np.array(flown)
+    left = int(np.argmax(rows[:, 1] > 15.0))
+    assert np.abs(np.interp(rows[:left, 0], planned_s, home) - rows[:left, 1]).max() < 5.0
+    assert np.abs(np.interp(rows[:left, 0], planned_s, places[:, 2]) - rows[:left, 2]).max() < 2.5
+    # Home again: by its own time of arrival, since turns took it another time.
+    back, planned_back = (len(d) - int(np.argmax(d[::-1] > 15.0)) for d in (rows[:, 1], home))
+    late_s = rows[back, 0] - planned_s[planned_back]
+    assert abs(late_s) < 5.0
+    assert np.abs(np.interp(rows[back:, 0] - late_s, planned_s, places[:, 2]) - rows[back:, 2]).max() < 4.0
 
 
 @pytest.mark.parametrize("end", [RTL, LAND])

@@ -1,11 +1,11 @@
 """Keeping vehicles apart: heights for the ways out and home, and times of takeoff.
 
-Vehicles are placed one after the other, the longest flight first. Each takes the takeoff time and the layers (heights
-of its way out and of its way home) that cost least and keep it apart from all placed before: at any moment, and some
-seconds earlier or later, far enough away or at another height. For one pair of layers every moment at which two paths
-come close forbids a short interval of takeoff times, so the earliest time left is found in one pass. Around a start
-that they share, vehicles take off and land in turn, for which fewer seconds are allowed; where that would take too
-long, only some time after each other, because they stand some metres apart there.
+Vehicles are placed one after the other, the longest flight first, or the shortest. Each takes the takeoff time and the
+layers (heights of its way out and of its way home) that cost least and keep it apart from all placed before: at any
+moment, and some seconds earlier or later, far enough away or at another height. For one pair of layers every moment at
+which two paths come close forbids a short interval of takeoff times, so the earliest time left is found in one pass.
+Around a start that they share, vehicles take off and land in turn, for which fewer seconds are allowed; where that
+would take too long, only some time after each other, because they stand some metres apart there.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,6 +22,10 @@ from orthoswarm.planning.sorties.flight_time import Motion
 Array = NDArray[np.float64]
 Maker = Callable[[float, float], Flight]
 
+_HOPELESS = (
+    2 / 3
+)  # where not even so many vehicles have their turn within the limit, another order does not help either
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Separation:
@@ -31,8 +35,8 @@ class Separation:
         distance_m: horizontally, or
         height_m: vertically, the height of a layer.
         layers: how many layers there are above the legs' height.
-        slack_s: how much earlier or later than planned a vehicle may be; a share of it around a start that vehicles
-            share (`pad_slack_s`).
+        slack_s: how much earlier or later than planned a vehicle may be. Around a start that vehicles share, it is
+            what their autopilots need there (`takeoff_slack_s`, `landing_slack_s`), at most this.
         launch_s: time between takeoffs, and between landings, at one start.
         swap_s: time on the ground between a vehicle's sorties.
     """
@@ -43,11 +47,6 @@ class Separation:
     slack_s: float = field(default_factory=lambda: active().ardupilot.schedule_slack_s)
     launch_s: float = 5.0
     swap_s: float = 120.0
-
-    @property
-    def pad_slack_s(self) -> float:
-        """How much earlier or later than planned a vehicle may be around a start that it shares."""
-        return active().planning.pad_slack_share * self.slack_s
 
 
 @dataclass(frozen=True)
@@ -74,7 +73,7 @@ class Schedule:
     Attributes:
         slots: per vehicle and sortie.
         in_turn: vehicles of one start keep apart in height as they take off and land; if not, in time alone.
-        saved_s: how much sooner all is done without that, 0 if they do.
+        saved_s: by at least how much all is done sooner without that, 0 if they do.
     """
 
     slots: list[list[Slot]]
@@ -84,12 +83,19 @@ class Schedule:
 
 @dataclass(frozen=True)
 class _Track:
-    """Positions every half second in the air; `ground` samples pass on the ground before the first."""
+    """Positions every half second in the air.
+
+    Attributes:
+        home: float64 (2,), where it takes off. ground: so many samples pass on the ground before the first.
+        places: float64 (n, 3). pad: bool (n,), around its home.
+        slack: int64 (n,), off schedule by so many samples where it shares its start: less as it takes off.
+    """
 
     home: Array
     ground: int
     places: Array
     pad: NDArray[np.bool_]
+    slack: NDArray[np.int64]
 
 
 def _step_s() -> float:
@@ -97,17 +103,20 @@ def _step_s() -> float:
     return active().planning.step_s
 
 
-def _sampled(flight: Flight, motion: Motion, pad_m: float) -> _Track:
+def _sampled(flight: Flight, motion: Motion, apart: Separation) -> _Track:
     track = flight.track()
-    times = flight.times(motion)
+    waits = np.zeros(len(track))
     if flight.wait_s > 0.0:  # it comes to where it waits, and stays there
-        at = 2 + flight.last_leg_end
-        track, times = np.insert(track, at, track[at], axis=0), np.insert(times, at, times[at] - flight.wait_s)
-    moments = np.arange(0.0, times[-1] + _step_s(), _step_s())
-    places = np.stack([np.interp(moments, times, track[:, axis]) for axis in range(3)], axis=1)
+        at = 3 + flight.last_leg_end
+        track, waits = np.insert(track, at, track[at - 1], axis=0), np.insert(waits, at, flight.wait_s)
+    places = motion.places(track, waits, _step_s())
     flying = np.flatnonzero(places[:, 2] > flight.home_z_m + active().planning.on_ground_m)
     places = np.ascontiguousarray(places[flying[0] : flying[-1] + 1])
-    return _Track(flight.home, int(flying[0]), places, np.hypot(*(places[:, :2] - flight.home).T) < pad_m)
+    pad = np.hypot(*(places[:, :2] - flight.home).T) < active().planning.pad_distances * apart.distance_m
+    takes_off = np.arange(len(places)) < np.argmin(pad)
+    allowed_s = np.where(takes_off, motion.autopilot.takeoff_slack_s, motion.autopilot.landing_slack_s)
+    slack = np.ceil(np.minimum(allowed_s, apart.slack_s) / _step_s()).astype(np.int64)
+    return _Track(flight.home, int(flying[0]), places, pad, slack)
 
 
 @kernel
@@ -127,13 +136,13 @@ def _bins(points, low, cell, shape):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _forbid(mine, begin, others, when, bins, raster, apart, marks):  # type: ignore[no-untyped-def]
+def _forbid(mine, begin, slacks, others, when, other_slacks, bins, raster, apart, marks):  # type: ignore[no-untyped-def]
     """Mark delays (in samples) at which a track comes near others: +1 where an interval begins, -1 behind its end.
 
-    raster: low x, low y, cell, columns, rows; apart: distance, height, slack in samples.
+    slacks: in samples, of two the larger counts; raster: low x, low y, cell, columns, rows; apart: distance, height.
     """
     order, start = bins
-    distance, height, slack = apart[0], apart[1], int(apart[2])
+    distance, height = apart[0], apart[1]
     cell, columns, rows = raster[2], int(raster[3]), int(raster[4])
     for i in range(len(mine)):
         x, y = int(np.floor((mine[i, 0] - raster[0]) / cell)), int(np.floor((mine[i, 1] - raster[1]) / cell))
@@ -143,7 +152,7 @@ def _forbid(mine, begin, others, when, bins, raster, apart, marks):  # type: ign
                     j = order[k]
                     dx, dy, dz = mine[i, 0] - others[j, 0], mine[i, 1] - others[j, 1], mine[i, 2] - others[j, 2]
                     if dx * dx + dy * dy < distance * distance and abs(dz) < height:
-                        delay = when[j] - begin[i]
+                        delay, slack = when[j] - begin[i], max(slacks[i], other_slacks[j])
                         first, last = max(0, delay - slack), min(len(marks) - 2, delay + slack)
                         if last >= first:
                             marks[first] += 1
@@ -157,18 +166,30 @@ class _Frozen:
     pad: bool
     points: Array
     when: NDArray[np.int64]
+    slack: NDArray[np.int64]
     bins: tuple[NDArray[np.int64], NDArray[np.int64]]
     raster: Array
 
     @classmethod
-    def of(cls, pad: bool, points: Array, when: NDArray[np.int64], cell_m: float) -> "_Frozen":
+    def of(
+        cls, pad: bool, points: Array, when: NDArray[np.int64], slack: NDArray[np.int64], cell_m: float
+    ) -> "_Frozen":
         low, high = points[:, :2].min(0), points[:, :2].max(0)
         cell = max(cell_m, float((high - low).max()) / 1000.0)
         shape = ((high - low) / cell).astype(np.int64) + 1
-        return cls(pad, points, when, _bins(points, low, cell, shape), np.array([*low, cell, *shape], np.float64))
+        raster = np.array([*low, cell, *shape], np.float64)
+        return cls(pad, points, when, slack, _bins(points, low, cell, shape), raster)
 
-    def forbid(self, points: Array, when: NDArray[np.int64], apart: Array, marks: NDArray[np.int64]) -> None:
-        _forbid(points, when, self.points, self.when, self.bins, self.raster, apart, marks)
+    def forbid(
+        self,
+        points: Array,
+        when: NDArray[np.int64],
+        slack: NDArray[np.int64],
+        apart: Array,
+        marks: NDArray[np.int64],
+    ) -> None:
+        """Mark delays at which samples of another track come near; see `_forbid`."""
+        _forbid(points, when, slack, self.points, self.when, self.slack, self.bins, self.raster, apart, marks)
 
 
 class _Sky:
@@ -193,7 +214,7 @@ class _Sky:
             if best is not None and price + soonest >= best[0]:
                 break
             flight = make(out * self._apart.height_m, home * self._apart.height_m)
-            track = _sampled(flight, motion, active().planning.pad_distances * self._apart.distance_m)
+            track = _sampled(flight, motion, self._apart)
             marks = self._launches(track, ready)
             if best is None:  # whatever the layers, takeoffs at one start come one after the other
                 soonest = _first_zero(marks) * _step_s()
@@ -213,16 +234,20 @@ class _Sky:
         points = np.concatenate([t.places for _, t in self._tracks])
         pad = np.concatenate([t.pad & self._shared(t.home, home) for _, t in self._tracks])
         when = np.concatenate([s + t.ground + np.arange(len(t.places)) for s, t in self._tracks])
+        slack = np.concatenate([t.slack for _, t in self._tracks])
+        slack[~pad] = self._slack
         kinds = ((False, ~pad), (True, pad))
-        return [_Frozen.of(near, points[w], when[w], self._reach) for near, w in kinds if w.any()]
+        return [_Frozen.of(near, points[w], when[w], slack[w], self._reach) for near, w in kinds if w.any()]
+
+    @property
+    def _slack(self) -> int:
+        """How many samples a vehicle may be off schedule away from its start."""
+        return int(np.ceil(self._apart.slack_s / _step_s()))
 
     def _launches(self, track: _Track, ready: int) -> NDArray[np.int64]:
         """Delays that takeoffs from the same start forbid, as marks; room for all others."""
         apart = self._apart
-        slack, gap = (
-            int(np.ceil(apart.slack_s / _step_s())),
-            int(np.ceil(apart.launch_s / _step_s())),
-        )
+        slack, gap = self._slack, int(np.ceil(apart.launch_s / _step_s()))
         end = max((s + t.ground + len(t.places) for s, t in self._tracks), default=0)
         marks = np.zeros(max(1, end - ready) + slack + gap + 3, np.int64)
         for start, other in self._tracks:
@@ -238,16 +263,14 @@ class _Sky:
         """Mark delays that bring a track too near a placed one, or to the same start at the same time."""
         apart = self._apart
         # Layers are apart: the hair keeps neighbouring ones from clashing by rounding.
-        limits, at_pad = (
-            np.array([self._reach, apart.height_m - 0.01, np.ceil(slack_s / _step_s())])
-            for slack_s in (apart.slack_s, apart.pad_slack_s)
-        )
+        limits = np.array([self._reach, apart.height_m - 0.01])
         when = ready + track.ground + np.arange(len(track.places))
+        usual = np.full(len(when), self._slack)
         for other in frozen:
             away = ~track.pad if other.pad else np.ones(len(when), bool)
-            other.forbid(track.places[away], when[away], limits, marks)
+            other.forbid(track.places[away], when[away], usual[away], limits, marks)
             if self._in_turn:
-                other.forbid(track.places[~away], when[~away], at_pad, marks)
+                other.forbid(track.places[~away], when[~away], track.slack[~away], limits, marks)
         for start, placed in self._tracks:
             if self._shared(placed.home, track.home):
                 landing = start + placed.ground + len(placed.places) - track.ground - len(track.places)
@@ -274,33 +297,122 @@ def separate(sorties: Sequence[Sequence[Maker]], motions: Sequence[Motion], apar
         motions: say where each vehicle is when.
         apart: the distances to keep.
     """
-    in_turn = _separate(sorties, motions, apart, in_turn=True)
-    homes = [row[0].flight.home for row in in_turn]
-    pad_m = active().planning.pad_distances * apart.distance_m
-    if all(np.hypot(*(a - b)) >= pad_m for k, a in enumerate(homes) for b in homes[:k]):
-        return Schedule(in_turn)
-    at_once = _separate(sorties, motions, apart, in_turn=False)
-    done, sooner = (_done_s(slots, motions) for slots in (in_turn, at_once))
-    if done <= (1.0 + active().planning.in_turn_share) * sooner:
-        return Schedule(in_turn)
-    return Schedule(at_once, in_turn=False, saved_s=done - sooner)
+    usual = _Placing(sorties, motions, apart)
+    if not usual.shares_starts:
+        usual.place_within(np.inf)
+        return Schedule(usual.slots)
+    # In turn, flights that are home before others come home are worth as much as long ones that start early.
+    in_turn = [usual, _Placing(sorties, motions, apart, shortest_first=True)]
+    most = 1.0 + active().planning.in_turn_share
+    best = _soonest(in_turn, most * usual.soonest_s)
+    if best is not None:
+        return Schedule(best.slots)
+    at_once = _Placing(sorties, motions, apart, in_turn=False)
+    at_once.place_within(np.inf)
+    best = _soonest(in_turn, most * at_once.done_s)
+    if best is not None:
+        return Schedule(best.slots)
+    later_s = min(way.done_s for way in in_turn if way.done_s > most * at_once.done_s)
+    return Schedule(at_once.slots, in_turn=False, saved_s=later_s - at_once.done_s)
 
 
-def _done_s(slots: list[list[Slot]], motions: Sequence[Motion]) -> float:
-    last = [(row[-1], motion) for row, motion in zip(slots, motions, strict=True)]
-    return max(slot.start_s + slot.flight.time_s(motion) for slot, motion in last)
+def _soonest(ways: "Sequence[_Placing]", limit_s: float) -> "_Placing | None":
+    """The one that is done first, None if none can be done by the limit."""
+    best = None
+    for way in ways:
+        if way.place_within(limit_s if best is None else min(limit_s, best.done_s)):
+            best = way
+        elif way.placed_share < _HOPELESS:
+            break
+    return best
 
 
-def _separate(
-    sorties: Sequence[Sequence[Maker]], motions: Sequence[Motion], apart: Separation, *, in_turn: bool
-) -> list[list[Slot]]:
-    sky = _Sky(max(motion.speed_m_s for motion in motions), apart, in_turn)
-    result: list[list[Slot]] = [[] for _ in sorties]
-    ready = [0.0] * len(sorties)
-    for turn in range(max(map(len, sorties))):
-        due = {v: ready[v] + row[turn](0.0, 0.0).time_s(motions[v]) for v, row in enumerate(sorties) if turn < len(row)}
-        for vehicle in sorted(due, key=lambda v: -due[v]):  # a delay hurts least where there is time left: it goes last
-            slot = sky.place(sorties[vehicle][turn], motions[vehicle], ready[vehicle])
-            result[vehicle].append(slot)
-            ready[vehicle] = slot.start_s + slot.flight.time_s(motions[vehicle]) + apart.swap_s
-    return result
+class _Placing:
+    """Sorties on their way to a schedule: placed one after the other, and no further than it is worth.
+
+    Attributes:
+        slots: per vehicle, those of its sorties that are placed.
+        done_s: when the last of them ends, and what must follow it.
+    """
+
+    def __init__(
+        self,
+        sorties: Sequence[Sequence[Maker]],
+        motions: Sequence[Motion],
+        apart: Separation,
+        *,
+        in_turn: bool = True,
+        shortest_first: bool = False,
+    ) -> None:
+        self._sorties, self._motions, self._apart = sorties, motions, apart
+        self._shortest_first = shortest_first
+        self._sky = _Sky(max(motion.speed_m_s for motion in motions), apart, in_turn)
+        flights = [[make(0.0, 0.0) for make in row] for row in sorties]
+        self._least_s = [[f.time_s(motion) for f in row] for row, motion in zip(flights, motions, strict=True)]
+        self._homes = np.array([row[0].home for row in flights])
+        self._queue: list[int] = []  # vehicles in the order in which their next sorties are placed
+        self.slots: list[list[Slot]] = [[] for _ in sorties]
+        self.done_s = 0.0
+
+    @property
+    def shares_starts(self) -> bool:
+        """Two vehicles take off at one start."""
+        return bool(np.triu(self._one_start, 1).any())
+
+    @property
+    def soonest_s(self) -> float:
+        """No schedule is done sooner: at one start the longest flights take off first, one after the other."""
+        whole_s = np.array([self._needs_s(vehicle, 0) for vehicle in range(len(self._sorties))])
+        soonest = 0.0
+        for row in self._one_start:
+            near = self._one_start[np.ix_(row, row)].all()
+            together = np.sort(whole_s[row])[::-1] if near else whole_s[row].max(keepdims=True)
+            soonest = max(soonest, float((together + self._apart.launch_s * np.arange(len(together))).max()))
+        return soonest
+
+    def place_within(self, limit_s: float) -> bool:
+        """Place sorties while all can be done by then; may be called again with a later limit. False if they cannot."""
+        while self.done_s <= limit_s:
+            if not self._queue:
+                self._queue = self._next_turn()
+                if not self._queue:
+                    return True
+            self._place(self._queue.pop(0))
+        return False
+
+    @property
+    def placed_share(self) -> float:
+        """Share of the vehicles that have a place."""
+        return sum(map(bool, self.slots)) / len(self.slots)
+
+    @property
+    def _one_start(self) -> NDArray[np.bool_]:
+        away = np.hypot(*(self._homes[:, None] - self._homes[None]).transpose(2, 0, 1))
+        return np.asarray(away < active().planning.pad_distances * self._apart.distance_m)
+
+    def _needs_s(self, vehicle: int, sortie: int) -> float:
+        """Seconds from the takeoff of a sortie to the end of its vehicle's last one, if nothing delays them."""
+        times = self._least_s[vehicle][sortie:]
+        return sum(times) + self._apart.swap_s * (len(times) - 1)
+
+    def _ready_s(self, vehicle: int) -> float:
+        if not self.slots[vehicle]:
+            return 0.0
+        last = self.slots[vehicle][-1]
+        return last.start_s + last.flight.time_s(self._motions[vehicle]) + self._apart.swap_s
+
+    def _next_turn(self) -> list[int]:
+        """The vehicles that fly another sortie, those done last first: a delay hurts least where there is time left."""
+        left = [v for v, row in enumerate(self._sorties) if len(self.slots[v]) < len(row)]
+        done_s = {v: self._ready_s(v) + self._least_s[v][len(self.slots[v])] for v in left}
+        return sorted(left, key=lambda v: done_s[v] if self._shortest_first else -done_s[v])
+
+    def _place(self, vehicle: int) -> None:
+        number = len(self.slots[vehicle])
+        slot = self._sky.place(self._sorties[vehicle][number], self._motions[vehicle], self._ready_s(vehicle))
+        self.slots[vehicle].append(slot)
+        after_s = 0.0
+        if number + 1 < len(self._sorties[vehicle]):
+            after_s = self._apart.swap_s + self._needs_s(vehicle, number + 1)
+        ends_s = slot.start_s + slot.flight.time_s(self._motions[vehicle])
+        self.done_s = max(self.done_s, ends_s + after_s)

@@ -1,5 +1,6 @@
 """How long a multirotor takes along a path, and where it is when."""
 
+import itertools
 import math
 from dataclasses import KW_ONLY, dataclass, field, replace
 
@@ -14,6 +15,7 @@ Array = NDArray[np.float64]
 
 _TURN_RAD = np.radians(10.0)
 _SPOT_M = 0.01
+_RAMP = 5  # places at which a change of speed is followed
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,6 +102,73 @@ class Motion:
         seconds[upright & ~ends] += self.autopilot.height_change_s
         return np.concatenate([[0.0], np.cumsum(seconds)])
 
+    def course(self, points: Array, waits_s: Array | None = None) -> tuple[Array, Array]:
+        """Where it is when: times (m,) in seconds, and places (m, 3) between which it moves evenly.
+
+        Where time is lost is known as well as how much: slow first metres of the climb, a wait above home, gathering
+        speed; slowing down, a wait above home, slow last metres.
+
+        Args:
+            points: float64 (n, 3), the path. waits_s: float64 (n,), seconds that it stays before each point.
+        """
+        times = self.times(points) + (0.0 if waits_s is None else np.cumsum(waits_s))
+        step = np.diff(points, axis=0)
+        flat, rise = np.hypot(step[:, 0], step[:, 1]), step[:, 2]
+        upright, moving = (flat <= _SPOT_M) & (np.abs(rise) > _SPOT_M), np.flatnonzero(flat > _SPOT_M)
+        slows = np.zeros(len(step))  # by how much each way is left later than at its full speed
+        lands = bool(len(step)) and bool(upright[-1]) and rise[-1] < 0.0
+        if lands and len(moving) and not upright[moving[-1] + 1 : -1].any():
+            slows[moving[-1]] = min(0.5 * self.stop_s, self._wait_s)
+        knots = [(np.zeros(1), points[:1])]
+        for k, (begin, end) in enumerate(itertools.pairwise(times)):
+            if k == 0 and upright[0] and rise[0] > 0.0:
+                after, up = self._climbing(float(rise[0]))
+            elif lands and k == len(step) - 1:
+                after, up = self._landing(-float(rise[-1]))
+            elif slows[k] > 0.0 or (len(moving) and k == moving[0]):
+                after, up = self._between_stops(end - begin, k == moving[0], float(slows[k]))
+            else:
+                after, up = np.array([end - begin]), np.ones(1)
+            knots.append((begin + after, points[k] + up[:, None] * step[k]))
+        at, places = (np.concatenate(rows) for rows in zip(*knots, strict=True))
+        return np.maximum.accumulate(at), places
+
+    def places(self, points: Array, waits_s: Array | None, step_s: float) -> Array:
+        """Where it is at every time step from the start to the end of a path, (n, 3); see `course`."""
+        times, places = self.course(points, waits_s)
+        moments = np.arange(0.0, times[-1] + step_s, step_s)
+        return np.stack([np.interp(moments, times, places[:, axis]) for axis in range(3)], axis=1)
+
+    def _climbing(self, rise_m: float) -> tuple[Array, Array]:
+        """A takeoff: times, and shares of its height."""
+        low_m, low_s = min(rise_m, self.autopilot.takeoff_below_m), self.autopilot.takeoff_below_s
+        at = [low_m / self.climb_m_s + low_s, rise_m / self.climb_m_s + low_s]
+        return np.array([*at, rise_m / self.climb_m_s + self.autopilot.takeoff_s]), np.array([low_m / rise_m, 1.0, 1.0])
+
+    def _landing(self, fall_m: float) -> tuple[Array, Array]:
+        """A landing: times, and shares of its height."""
+        slow_m, all_s = min(fall_m, self.autopilot.landing_below_m), fall_m / self.descent_m_s + self.landing_s(fall_m)
+        at = [self._wait_s, all_s - slow_m / self.autopilot.landing_m_s, all_s]
+        return np.array(at), np.array([0.0, 1.0 - slow_m / fall_m, 1.0])
+
+    def _between_stops(self, lasts_s: float, sets_off: bool, slows_s: float) -> tuple[Array, Array]:
+        """A way that begins or ends at rest: times, and shares of the way.
+
+        Args:
+            lasts_s: seconds of it, without those that slowing down takes beyond. sets_off: it begins at rest.
+            slows_s: by how much it ends later at rest.
+        """
+        hold_s = min(self.autopilot.set_off_s, lasts_s) if sets_off else 0.0
+        moves_s = lasts_s - hold_s + slows_s
+        first, last = (self.stop_s if sets_off else 0.0), 2.0 * slows_s
+        shorter = min(1.0, moves_s / max(first + last, 1e-9))  # a way too short for the full speed
+        first, last = shorter * first, shorter * last
+        full = 1.0 / max(moves_s - 0.5 * (first + last), 1e-9)
+        part = np.linspace(0.0, 1.0, _RAMP)
+        begins, ends = 0.5 * full * first * part**2, 1.0 - 0.5 * full * last * (1.0 - part) ** 2
+        after = hold_s + np.concatenate([part * first, moves_s - (1.0 - part) * last])
+        return after, np.concatenate([begins, ends])
+
     @property
     def stop_s(self) -> float:
         """Seconds lost by a full stop and start."""
@@ -108,8 +177,12 @@ class Motion:
     def landing_s(self, height_m: float) -> float:
         """Seconds that coming down from above home takes longer than a descent at the usual rate."""
         slow_m = min(height_m, self.autopilot.landing_below_m)
-        wait_s = self.autopilot.land_wait_s if self.lands else self.autopilot.home_wait_s
-        return wait_s + slow_m / self.autopilot.landing_m_s - slow_m / self.descent_m_s
+        return self._wait_s + slow_m / self.autopilot.landing_m_s - slow_m / self.descent_m_s
+
+    @property
+    def _wait_s(self) -> float:
+        """Seconds of slowing down and waiting above home before it comes down."""
+        return self.autopilot.land_wait_s if self.lands else self.autopilot.home_wait_s
 
 
 def autopilot_config(name: str) -> AutopilotConfig:
