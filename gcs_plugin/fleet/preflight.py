@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 from gcs_plugin.fleet.flight_limits import ENDURANCE_S, LEGAL_HEIGHT_M, RESERVE
 from gcs_plugin.fleet.separation_watch import number_name
+from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.command_dialogues import unflyable
 from gcs_plugin.mission.comparison import difference
-from gcs_plugin.mission.track import Airspace, flight_seconds, highest_m
+from gcs_plugin.mission.track import Airspace, fastest_m_s, flight_seconds, highest_m
 from orthoswarm.model.earth import distance_m
 
 if TYPE_CHECKING:
@@ -21,11 +22,12 @@ if TYPE_CHECKING:
     from gcs_plugin.mission.items import Mission
 
 ITEMS: Final = (
-    "link", "gps", "ekf", "home", "pre-arm", "battery", "mission", "height", "separation",
+    "link", "gps", "ekf", "home", "pre-arm", "battery", "mission", "height", "speed", "separation",
 )  # fmt: skip
 _LINK_S: Final = (2.0, 5.0)
 _SATELLITES: Final = (6, 10)
 _HOME_M: Final = 50.0
+_SAME_M_S: Final = 0.05
 _UNKNOWN_SATELLITES: Final = 255
 
 
@@ -114,6 +116,7 @@ def preflight(vehicle: "Vehicle", wanted: Wanted, now: float) -> Check:
     items = (
         _link(vehicle, now), _gps(vehicle), _ekf(vehicle), _home(vehicle), _prearm(vehicle, now),
         _battery(vehicle, mission, wanted.endurance_s), _mission(vehicle, wanted), _height(mission, wanted),
+        _speed(vehicle, mission),
         Item("separation", Level.RED, wanted.near) if wanted.near else Item("separation", Level.OK, "keeps apart"),
     )  # fmt: skip
     return Check(vehicle.system, items)
@@ -263,3 +266,17 @@ def _height(mission: "Mission | None", wanted: Wanted) -> Item:
         text = f"goes up to {top:.0f} m, above {wanted.legal_height_m:.0f} m; allow it if you may fly there"
         return Item("height", Level.RED, text)
     return Item("height", Level.OK, f"goes up to {top:.0f} m")
+
+
+def _speed(vehicle: "Vehicle", mission: "Mission | None") -> Item:
+    asked = fastest_m_s(mission) if mission is not None else None
+    if asked is None:
+        return Item("speed", Level.OK, "its mission leaves the speed to it")
+    if vehicle.top_speed is None:
+        return Item("speed", Level.OK, f"asks for {asked:g} m/s; the vehicle has not said what it is set to")
+    name, most = vehicle.top_speed
+    if asked <= most + _SAME_M_S:
+        return Item("speed", Level.OK, f"asks for {asked:g} m/s, {name} is {most:g} m/s")
+    flies = f"flies at {most:g} m/s" if vehicle.autopilot is Autopilot.PX4 else "may not reach that"
+    text = f"is asked for {asked:g} m/s but {flies} ({name} is {most:g} m/s) and falls behind its plan"
+    return Item("speed", Level.WARNING, f"{text}; plan at most {most:g} m/s, or raise {name} if it can fly faster")

@@ -18,9 +18,10 @@ from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.mavlink import Autopilot, Message, dialect, is_autopilot
 from gcs_plugin.links.packets import Packet
 from gcs_plugin.links.transports import Peer
-from gcs_plugin.mission.completion import RELEVANT, CompletionDetector, MissionEvent
+from gcs_plugin.mission.completion import RELEVANT, CompletionDetector, MissionEvent, Phase
 from gcs_plugin.mission.exchange import Address
 from gcs_plugin.mission.flight_modes import modes_of
+from gcs_plugin.mission.lateness import Lateness
 
 Handler = Callable[[Vehicle, Message, float], None]
 
@@ -69,6 +70,7 @@ class Reception:
         self._counters: dict[tuple[Peer, int, int], int] = {}
         self._said: dict[tuple[int, str], tuple[float, Route]] = {}
         self._parts: dict[int, tuple[int, list[str]]] = {}
+        self._lateness: dict[int, Lateness] = {}
         self.separation = SeparationWatch()
         self.handlers: dict[int, list[Handler]] = {}
         self.taps: list[Callable[[Packet, float], None]] = []
@@ -239,6 +241,7 @@ class Reception:
         for vehicle in self._vehicles.values():
             if vehicle.lost:
                 continue
+            self._watch_times(vehicle)
             self._dialogues.send(vehicle.system, vehicle.streams.tick(now))
             self._ask_why(vehicle, now)
             if now - vehicle.heard > _LOST_S:
@@ -262,6 +265,34 @@ class Reception:
             self._event("near", self._vehicles[near.other], near_text(near, self.separation), near.pair)
         for pair in ended:
             self._event("apart", self._vehicles[pair[1]], apart_text(pair), pair)
+
+    def _watch_times(self, vehicle: Vehicle) -> None:
+        """Compare a vehicle on its mission with the times of its plan."""
+        watched, mission = self._lateness.get(vehicle.system), vehicle.mission
+        phase = vehicle.detector.phase
+        flown = vehicle.armed and mission is not None and phase in (Phase.ACTIVE, Phase.SUSPENDED)
+        if watched is not None and (not flown or watched.mission is not mission):
+            del self._lateness[vehicle.system]
+            if watched.behind:
+                self._event("caught_up", vehicle, "is no longer behind its plan: it has ended its mission")
+            return
+        if (
+            not flown
+            or phase is Phase.SUSPENDED
+            or mission is None
+            or vehicle.lat_deg is None
+            or vehicle.lon_deg is None
+        ):
+            return
+        if watched is None:
+            watched = self._lateness[vehicle.system] = Lateness(mission)
+        was = watched.behind
+        watched.look(vehicle.time_boot_s, vehicle.lat_deg, vehicle.lon_deg, vehicle.height_m)
+        if watched.behind and not was:
+            text = f"is {watched.late_s:.0f} s behind its plan, which keeps others apart for {watched.allowed_s:.0f} s"
+            self._event("behind", vehicle, f"{text}: watch its distances, and pause it before it comes near another")
+        elif was and not watched.behind:
+            self._event("caught_up", vehicle, f"is {watched.late_s:.0f} s behind its plan, which is allowed for")
 
     def _compare_routes(self, vehicle: Vehicle, now: float) -> None:
         """Decide by the clocks whether one vehicle is on two links, or several vehicles share a system id."""

@@ -23,6 +23,13 @@ _PREARM_S: Final = 45.0  # autopilots repeat what is wrong every 30 s
 _EKF_NEEDED: Final = int(dialect.EKF_ATTITUDE | dialect.EKF_POS_HORIZ_ABS | dialect.EKF_POS_VERT_ABS)
 _EKF_WRONG: Final = int(dialect.EKF_CONST_POS_MODE | dialect.EKF_UNINITIALIZED)
 _MISSION_PAUSED: Final = int(dialect.MISSION_STATE_PAUSED)
+SPEED_PARAMETERS: Final[dict[Autopilot, dict[str, float]]] = {
+    Autopilot.ARDUPILOT: {"WPNAV_SPEED": 0.01},
+    Autopilot.PX4: {"MPC_XY_VEL_MAX": 1.0},
+}
+"""What an autopilot's speed on missions is set by, and the factor to m/s. PX4 flies no faster than MPC_XY_VEL_MAX,
+whatever is asked for. ArduCopter tries to reach what is asked for, up to the lean of its ANGLE_MAX; its WPNAV_SPEED is
+what it has been set up for."""
 _STILL_M_S: Final = (0.6, 0.25)  # horizontally, vertically; slower than the last metres of a landing
 
 
@@ -56,6 +63,7 @@ class Vehicle:
         ask_why_at: when it may be asked again why it would not arm (the fleet's clock).
         pace: seconds of its clock in one of ours; 1 but for a simulation that runs fast or slow.
         launch: where it armed last, latitude and longitude in degrees.
+        top_speed: the parameter that it was asked for about its speed, and its value in m/s; None before it answers.
         paused_in_mission: MISSION_CURRENT says "paused", and a HEARTBEAT after it still shows the mission's mode. A
             change to RTL or hold suspends the mission as well, and its HEARTBEAT may come a second later.
     """
@@ -101,6 +109,7 @@ class Vehicle:
     prearm_ok: bool | None = None
     home: tuple[float, float] | None = None
     launch: tuple[float, float] | None = None
+    top_speed: tuple[str, float] | None = None
     ask_why_at: float = 0.0
     pace: float = 1.0
     texts: "deque[str]" = field(default_factory=lambda: deque(maxlen=50))
@@ -151,6 +160,16 @@ class Vehicle:
     def prearm_texts(self, now: float) -> list[str]:
         """What it said lately about why it would not arm."""
         return [text for text, said in self._prearm.items() if now - said < _PREARM_S]
+
+    def speed_questions(self) -> list[Message]:
+        """Requests for the parameters of its speed, none once they are known."""
+        if self.top_speed is not None:
+            return []
+        to = self.address
+        return [
+            dialect.MAVLink_param_request_read_message(to.system, to.component, name.encode(), -1)
+            for name in SPEED_PARAMETERS[self.autopilot]
+        ]
 
     @property
     def pilot(self) -> Pilot:
@@ -259,6 +278,11 @@ class Vehicle:
     def _home(self, m: Message) -> None:
         self.home = (m.latitude / 1e7, m.longitude / 1e7)
 
+    def _parameter(self, m: Message) -> None:
+        name, scale = str(m.param_id).strip("\x00"), SPEED_PARAMETERS[self.autopilot]
+        if name in scale and math.isfinite(m.param_value) and m.param_value > 0.0:
+            self.top_speed = name, scale[name] * float(m.param_value)
+
     def _photo(self, m: Message) -> None:
         index = m.img_idx if m.get_type() == "CAMERA_FEEDBACK" else m.image_index
         known = len(self._pictures)
@@ -278,6 +302,7 @@ _HANDLERS: Final = {
     int(dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT): Vehicle._filter,
     int(dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS): Vehicle._filter,
     int(dialect.MAVLINK_MSG_ID_HOME_POSITION): Vehicle._home,
+    int(dialect.MAVLINK_MSG_ID_PARAM_VALUE): Vehicle._parameter,
     int(dialect.MAVLINK_MSG_ID_CAMERA_FEEDBACK): Vehicle._photo,
     int(dialect.MAVLINK_MSG_ID_CAMERA_IMAGE_CAPTURED): Vehicle._photo,
 }

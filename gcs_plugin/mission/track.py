@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-_STEP_S: Final = 0.5
+STEP_S: Final = 0.5
+"""Time between the samples of a track, seconds."""
 _GROUND_M: Final = 2.0
 _SPEED_M_S: Final = 5.0
 _HAIR_M: Final = 0.01
@@ -61,25 +62,25 @@ def flight_path(mission: "Mission", origin: tuple[float, float]) -> tuple[Array,
     """
     points: list[tuple[float, float, float]] = []
     waits: dict[int, float] = {}
-    home, speed = _home_of(mission), _SPEED_M_S
+    home, speed = home_of(mission), _SPEED_M_S
     base = _ground_m(mission)
     if home is not None:
-        points.append((*_metres(*home, origin), 0.0))
+        points.append((*metres(*home, origin), 0.0))
     for item in mission.items[mission.first_seq :]:
         if item.command == CHANGE_SPEED and item.params[1] > 0.0:
             speed = item.params[1]
         elif item.command == RTL and home is not None and points:
             top = points[-1][2]
-            points += [(*_metres(*home, origin), top), (*_metres(*home, origin), 0.0)]
+            points += [(*metres(*home, origin), top), (*metres(*home, origin), 0.0)]
         elif item.is_nav and item.has_place:
             height = item.z - (base if PLAIN_FRAME.get(item.frame, item.frame) == FRAME_GLOBAL else 0.0)
             place = (item.lat_deg, item.lon_deg) if item.x or item.y else home
             if place is None:
                 continue
             if item.command in (LAND, VTOL_LAND) and points:
-                points.append((*_metres(*place, origin), points[-1][2]))
+                points.append((*metres(*place, origin), points[-1][2]))
                 height = 0.0
-            points.append((*_metres(*place, origin), height))
+            points.append((*metres(*place, origin), height))
             if item.command == LOITER_TIME:
                 points.append(points[-1])
                 waits[len(points) - 1] = item.params[0]
@@ -95,7 +96,7 @@ def track_of(mission: "Mission", origin: tuple[float, float]) -> Track:
     if len(points) < 2:
         return Track(points)
     motion = Motion(speed_m_s=speed, autopilot=_autopilot_of(mission), lands=_lands(mission))
-    return Track(motion.places(points, waits, _STEP_S), motion.autopilot)
+    return Track(motion.places(points, waits, STEP_S), motion.autopilot)
 
 
 def _lands(mission: "Mission") -> bool:
@@ -112,8 +113,14 @@ def _autopilot_of(mission: "Mission") -> AutopilotConfig:
 
 def flight_seconds(mission: "Mission") -> float:
     """Duration of a mission by the planner's model, seconds."""
-    home = _home_of(mission)
-    return 0.0 if home is None else _STEP_S * max(0, len(track_of(mission, home).places) - 1)
+    home = home_of(mission)
+    return 0.0 if home is None else STEP_S * max(0, len(track_of(mission, home).places) - 1)
+
+
+def fastest_m_s(mission: "Mission") -> float | None:
+    """The greatest speed that a mission asks for, None if it leaves that to the vehicle."""
+    speeds = [item.params[1] for item in mission.items if item.command == CHANGE_SPEED and item.params[1] > 0.0]
+    return max(speeds, default=None)
 
 
 def highest_m(mission: "Mission") -> float | None:
@@ -168,7 +175,7 @@ class Airspace:
     @classmethod
     def of(cls, missions: Mapping[int, "Mission"], distance_m: float = 10.0, height_m: float = 5.0) -> "Airspace":
         """Of missions by system id."""
-        origin = next((home for mission in missions.values() if (home := _home_of(mission))), (0.0, 0.0))
+        origin = next((home for mission in missions.values() if (home := home_of(mission))), (0.0, 0.0))
         tracks = {s: track_of(mission, origin) for s, mission in missions.items()}
         slack_s = max((_autopilot_of(mission).schedule_slack_s for mission in missions.values()), default=0.0)
         return cls(tracks, distance_m=distance_m, height_m=height_m, slack_s=slack_s)
@@ -180,15 +187,15 @@ class Airspace:
         that they share a part of it.
         """
         near = self._approaches(one, other)
-        slack, pad_slack = math.ceil(self.slack_s / _STEP_S), np.full(len(near.at), -1.0)
+        slack, pad_slack = math.ceil(self.slack_s / STEP_S), np.full(len(near.at), -1.0)
         if self.in_turn:  # a sample less than the plan's, which lie at other moments
-            pad_slack = np.ceil(np.minimum(near.start_slack_s, self.slack_s) / _STEP_S) - 1.0
-        shift = round(later_s / _STEP_S)
+            pad_slack = np.ceil(np.minimum(near.start_slack_s, self.slack_s) / STEP_S) - 1.0
+        shift = round(later_s / STEP_S)
         within = np.flatnonzero(np.abs(near.delay - shift) <= np.where(near.at_start, pad_slack, slack))
         if not len(within):
             return None
         at = within[np.argmin(near.distance_m[within])]
-        return float(near.at[at]) * _STEP_S, float(near.distance_m[at])
+        return float(near.at[at]) * STEP_S, float(near.distance_m[at])
 
     def _approaches(self, one: int, other: int) -> "_Approaches":
         """All moments of two flights too near each other, found once; they meet for some delays of the other."""
@@ -236,7 +243,7 @@ class Airspace:
         start = earliest_s
         known = {other: at for other, at in others.items() if other != system and other in self.tracks}
         while any(self._too_near(other, system, start - at) for other, at in known.items()):
-            start += _STEP_S
+            start += STEP_S
         return start
 
     def _too_near(self, one: int, other: int, later_s: float) -> bool:
@@ -262,8 +269,8 @@ def _near(a: Array, b: Array, distance_m: float) -> tuple[Ints, Ints]:
     return i[nearer], j[nearer]
 
 
-def _home_of(mission: "Mission") -> tuple[float, float] | None:
-    """Where it takes off: its takeoff's place, ArduPilot's item 0, or the first waypoint."""
+def home_of(mission: "Mission") -> tuple[float, float] | None:
+    """Where a mission takes off, degrees: its takeoff's place, ArduPilot's item 0, or the first waypoint."""
     for item in mission.items[mission.first_seq :]:
         if item.command == TAKEOFF and (item.x or item.y):
             return item.lat_deg, item.lon_deg
@@ -277,6 +284,7 @@ def _ground_m(mission: "Mission") -> float:
     return mission.items[0].z if mission.first_seq and mission.items else 0.0
 
 
-def _metres(lat: float, lon: float, origin: tuple[float, float]) -> tuple[float, float]:
+def metres(lat: float, lon: float, origin: tuple[float, float]) -> tuple[float, float]:
+    """East and north of an origin, in metres; all in degrees."""
     east = (lon - origin[1]) * DEGREE_M * math.cos(math.radians(origin[0]))
     return east, (lat - origin[0]) * DEGREE_M

@@ -90,6 +90,7 @@ class Airframe:
         drag: forward lean at speed, m/s2 per m/s.
         yaw_rate: turning speed, rad/s.
         gps_sigma_m: one sigma of the receiver's horizontal error, which wanders with gps_tau_s.
+        top_m_s: its top speed, whatever is asked for.
         times: what an autopilot takes beyond its motion; None flies as fast as the motion allows.
     """
 
@@ -101,6 +102,7 @@ class Airframe:
     yaw_rate: float = math.radians(60.0)
     gps_sigma_m: float = 0.0
     gps_tau_s: float = 60.0
+    top_m_s: float = math.inf
     times: AutopilotConfig | None = None
 
     def as_flown(self, times: AutopilotConfig) -> "Airframe":
@@ -117,7 +119,8 @@ class Airframe:
 
     def held_m_s(self, speed_m_s: float) -> float:
         """The speed that its autopilot holds where so much is asked for."""
-        return speed_m_s if self.times is None else self.times.speed_share * speed_m_s
+        share = 1.0 if self.times is None else self.times.speed_share
+        return min(share * speed_m_s, self.top_m_s)
 
 
 @dataclass(slots=True, kw_only=True)

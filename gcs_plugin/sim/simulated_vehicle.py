@@ -7,7 +7,7 @@ as a ground station is there. Both answer commands and missions as measured (doc
 import heapq
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 from gcs_plugin.links.file_transfer import payload_of
@@ -35,6 +35,7 @@ _CHECKS_MISSION_S: Final = 1.0  # PX4 looks at a new mission for so long, and do
 _WHY_S: Final = 30.0
 _EKF: Final = int(dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT)
 _ESTIMATOR: Final = int(dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS)
+_WPNAV_SPEED_M_S, _PX4_TOP_M_S = 10.0, 12.0  # factory settings; ArduCopter flies faster if it is asked to and can
 _HOME: Final = (47.397742, 8.545594, 488.0)
 
 
@@ -90,6 +91,8 @@ class SimVehicle:
 
     def __post_init__(self) -> None:
         """Stand at home with an empty store."""
+        if self.autopilot is Autopilot.PX4:
+            self.airframe = replace(self.airframe, top_m_s=min(self.airframe.top_m_s, _PX4_TOP_M_S))
         home = MissionItem.at(WAYPOINT, *self.home, frame=FRAME_GLOBAL)
         items = [home] if self.autopilot is Autopilot.ARDUPILOT else []
         self.store = MissionStore(autopilot=self.autopilot, home=home, items=items)
@@ -160,6 +163,8 @@ class SimVehicle:
         if kind == "FILE_TRANSFER_PROTOCOL" and self.files is not None:
             request = payload_of(message)
             return [] if request is None else [self.files.answer(request).message(sender.system, sender.component)]
+        if kind == "PARAM_REQUEST_READ":
+            return self._parameter(str(message.param_id).strip("\x00"))
         if kind == "MISSION_SET_CURRENT":
             self.flight.set_current(int(message.seq))
         if kind in ("COMMAND_LONG", "COMMAND_INT"):
@@ -168,6 +173,16 @@ class SimVehicle:
             ack = dialect.MAVLink_command_ack_message(message.command, result, 0, 0, sender.system, sender.component)
             return [*texts, ack, *self._change()]
         return []
+
+    def _parameter(self, name: str) -> list[Message]:
+        """The value of a parameter; an autopilot does not answer about one that it has not."""
+        known = {"WPNAV_SPEED": 100.0 * _WPNAV_SPEED_M_S}
+        if self.autopilot is Autopilot.PX4:
+            known = {"MPC_XY_VEL_MAX": self.airframe.top_m_s}
+        if name not in known:
+            return []
+        real = int(dialect.MAV_PARAM_TYPE_REAL32)
+        return [dialect.MAVLink_param_value_message(name.encode(), known[name], real, len(known), 0)]
 
     def _command(self, message: Message) -> int:
         flight, p1, p2, p3 = self.flight, message.param1, message.param2, message.param3

@@ -57,6 +57,7 @@ const KINDS = {
     const row = state.vehicles.get(String(event.vehicle));
     if (row && event.said) { row.texts = [...row.texts, ...messages([{ text: event.said, time: event.time, severity: event.severity }])].slice(-MOST_TEXTS); changed("vehicles"); }
     if (event.kind === "near" || event.kind === "apart") announce({ key: `near/${list(event.pair).join("/") || event.vehicle}`, text: event.text, vehicle: String(event.vehicle), active: event.kind === "near" });
+    if (event.kind === "behind" || event.kind === "caught_up") announce({ key: `behind/${event.vehicle}`, text: event.text, vehicle: String(event.vehicle), active: event.kind === "behind" });
     soon("/api/vehicles");
   },
   frame: (event) => {

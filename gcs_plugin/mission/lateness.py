@@ -1,0 +1,78 @@
+"""How far a vehicle is behind the times of its mission, by where it is on its way.
+
+Plans keep vehicles apart for some seconds off schedule (`schedule_slack_s`). One that is later than that, because of
+wind, or a speed that it does not reach, is where others do not expect it.
+"""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from gcs_plugin.mission.track import STEP_S, Track, home_of, metres, track_of
+
+if TYPE_CHECKING:
+    from gcs_plugin.mission.items import Mission
+
+_LIFTED_M: Final = (0.5, 5.0)
+"""A flight begins as it is first seen between these heights over its takeoff; one seen higher is under way already."""
+_AHEAD_S: Final = 30.0
+"""How far ahead of the place where it was last its next place is looked for, seconds of its plan."""
+_OFF_M: Final = 15.0
+"""A vehicle that is farther from its way is not on it: it was paused, sent elsewhere, or blown off."""
+_AS_NEAR_M: Final = 1.0
+"""Places so much farther than the nearest one count as well: where it stands still, many moments have one place."""
+
+
+@dataclass(slots=True)
+class Lateness:
+    """One flight of a mission, compared with its times.
+
+    Attributes:
+        mission: what is flown.
+        late_s: how far it was behind at the last look, seconds of its own clock; negative: ahead.
+        behind: True once it was later than plans allow for, until it is no more than half of that.
+    """
+
+    mission: "Mission"
+    late_s: float = 0.0
+    behind: bool = False
+    _track: Track | None = None
+    _home: tuple[float, float] = (0.0, 0.0)
+    _begun_s: float | None = None
+    _at: int = 0
+    _seen_m: float = float("inf")
+
+    def __post_init__(self) -> None:
+        home = home_of(self.mission)
+        if home is not None:
+            self._home, self._track = home, track_of(self.mission, home)
+
+    @property
+    def allowed_s(self) -> float:
+        """How late it may be, seconds."""
+        return self._track.autopilot.schedule_slack_s if self._track is not None else float("inf")
+
+    def look(self, time_s: float, lat_deg: float, lon_deg: float, height_m: float) -> None:
+        """Compare a position.
+
+        Args:
+            time_s: on the vehicle's clock. lat_deg, lon_deg: where it is. height_m: over its takeoff.
+        """
+        track = self._track
+        if track is None or len(track.places) < 2:
+            return
+        if self._begun_s is None:
+            seen, self._seen_m = self._seen_m, height_m
+            if seen < _LIFTED_M[0] <= height_m < _LIFTED_M[1]:
+                self._begun_s = time_s - STEP_S * int(np.argmax(track.places[:, 2] >= height_m))
+            return
+        flown_s = time_s - self._begun_s
+        window = track.places[self._at : self._at + round(_AHEAD_S / STEP_S) + 1]
+        here = np.array([*metres(lat_deg, lon_deg, self._home), height_m])
+        away = np.linalg.norm(window - here, axis=1)
+        if away.min() < _OFF_M:
+            as_near = self._at + np.flatnonzero(away <= away.min() + _AS_NEAR_M)
+            self._at = int(as_near[np.argmin(np.abs(STEP_S * as_near - flown_s))])
+        self.late_s = flown_s - STEP_S * self._at
+        self.behind = self.late_s > (0.5 if self.behind else 1.0) * self.allowed_s
