@@ -4,7 +4,7 @@ Plans keep vehicles apart for some seconds off schedule (`schedule_slack_s`). On
 wind, or a speed that it does not reach, is where others do not expect it.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -35,13 +35,13 @@ class Lateness:
     """
 
     mission: "Mission"
-    late_s: float = 0.0
-    behind: bool = False
-    _track: Track | None = None
-    _home: tuple[float, float] = (0.0, 0.0)
-    _begun_s: float | None = None
-    _at: int = 0
-    _seen_m: float = float("inf")
+    late_s: float = field(default=0.0, init=False)
+    behind: bool = field(default=False, init=False)
+    _track: Track | None = field(default=None, init=False)
+    _home: tuple[float, float] = field(default=(0.0, 0.0), init=False)
+    _begun_s: float | None = field(default=None, init=False)
+    _at: int = field(default=0, init=False)
+    _seen_m: float = field(default=float("inf"), init=False)
 
     def __post_init__(self) -> None:
         home = home_of(self.mission)

@@ -159,7 +159,7 @@ def _forbid(mine, begin, slacks, others, when, other_slacks, bins, raster, apart
                             marks[last + 1] -= 1
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Frozen:
     """Samples of the placed flights in raster cells: around a start that the next one shares, or elsewhere."""
 
@@ -178,7 +178,8 @@ class _Frozen:
         cell = max(cell_m, float((high - low).max()) / 1000.0)
         shape = ((high - low) / cell).astype(np.int64) + 1
         raster = np.array([*low, cell, *shape], np.float64)
-        return cls(pad, points, when, slack, _bins(points, low, cell, shape), raster)
+        bins = _bins(points, low, cell, shape)
+        return cls(pad=pad, points=points, when=when, slack=slack, bins=bins, raster=raster)
 
     def forbid(
         self,
