@@ -1,4 +1,4 @@
-"""How much longer autopilots with their factory settings take than constant speed on straight lines.
+"""How much longer autopilots with their factory settings take than constant speed on straight lines; their memory.
 
 Measured in flights of both firmwares in simulation: 44 of ArduCopter 4.7 and 8 of PX4 1.17 (docs/vehicles.md).
 """
@@ -34,6 +34,8 @@ class ArduPilotConfig:
     schedule_slack_s: float = 10.0
     """How much later than planned one vehicle may be than another while they stay separated, seconds: four times the
     greatest difference from these times in flight (measured: 2.4), for wind, loads and other settings."""
+    most_items: int = 650
+    """Mission items that it stores, home among them (measured)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,6 +67,8 @@ class Px4Config:
     schedule_slack_s: float = 20.0
     """How much later than planned one vehicle may be than another while they stay separated, seconds: more than two
     vehicles differed in flight (measured: up to 7 late at 10 m/s, up to 12 at 5 m/s, up to 6 early)."""
+    most_items: int = 1900
+    """Mission items that it stores (the table of its dataman)."""
 
 
 AutopilotConfig = ArduPilotConfig | Px4Config
