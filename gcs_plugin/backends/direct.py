@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gcs_plugin.backends.backend import ENDED, Backend, Report, Say, coming_home, command_all
+from gcs_plugin.config import HEARING
 from gcs_plugin.fleet.commands import Order, Verb
 from gcs_plugin.fleet.fleet import Fleet
 from gcs_plugin.fleet.fleet_events import FleetEvent
@@ -21,8 +22,6 @@ from orthoswarm.model.errors import OrthoSwarmError
 
 if TYPE_CHECKING:
     from gcs_plugin.mission.track import Airspace
-
-_QUIET_S = 2.2  # two heartbeats: no further vehicle is expected after such a silence
 
 
 class DirectBackend(Backend):
@@ -54,7 +53,7 @@ class DirectBackend(Backend):
             known = all(v.reported and v.landed for v in fleet.vehicles.values())
             if wanted and all(system in fleet.vehicles for system in wanted) and known:
                 break
-            if not wanted and found and known and time.monotonic() - since > _QUIET_S:
+            if not wanted and found and known and time.monotonic() - since > HEARING.all_found_s:
                 break
         return sorted(fleet.vehicles)
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
 from gcs_plugin.backends.backend import ENDED, Backend, Report, Say, coming_home, command_all
+from gcs_plugin.config import HEARING
 from gcs_plugin.fleet.commands import URGENT, Order, Verb
 from gcs_plugin.fleet.fleet_events import FleetEvent, mission_event
 from gcs_plugin.fleet.message_rates import Rates, Streams
@@ -39,9 +40,7 @@ _HEARD: Final = (
     "EKF_STATUS_REPORT", "ESTIMATOR_STATUS", "HOME_POSITION",
 )  # fmt: skip
 _RATES: Final = Rates({33: 2.0, 42: 2.0, 245: 1.0, 1: 1.0, 24: 1.0}, {193: 1.0, 230: 1.0, 242: 0.2})
-_ATTEMPTS: Final = 4
-_LOST_S: Final = 5.0
-_QUIET_S: Final = 2.2
+_ATTEMPTS: Final = 4  # uploads until what is stored agrees
 
 
 class JsonMessage:
@@ -114,7 +113,7 @@ class MavsdkBackend(Backend):
             known = all(c.vehicle.lat_deg is not None and c.vehicle.landed for c in self._crafts.values())
             if wanted and all(system in self._crafts for system in wanted) and known:
                 break
-            if not wanted and found and known and time.monotonic() - since > _QUIET_S:
+            if not wanted and found and known and time.monotonic() - since > HEARING.all_found_s:
                 break
         return sorted(self._crafts)
 
@@ -266,9 +265,9 @@ class MavsdkBackend(Backend):
                     self._drive(craft, job, job.tick(now))
             craft.jobs = [job for job in craft.jobs if job.outcome is None]
             vehicle = craft.vehicle
-            if not vehicle.lost and now - vehicle.heard > _LOST_S:
+            if not vehicle.lost and now - vehicle.heard > HEARING.lost_s:
                 vehicle.lost = True
-                self._event("lost", vehicle.system, f"has been silent for {_LOST_S:.0f} s")
+                self._event("lost", vehicle.system, f"has been silent for {HEARING.lost_s:.0f} s")
 
     def _take(self, craft: _Craft, message: Message, now: float) -> None:
         vehicle = craft.vehicle

@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-_LEAST_CAMERAS = 4
-_LEAST_INLIERS = 40
+_LEAST_CAMERAS = 4  # to fit a similarity
+_LEAST_INLIERS = 40  # matches
 _MATCHED_PX = 6_000_000
 
 

@@ -16,7 +16,7 @@ from orthoswarm.model.errors import InputError
 
 _PROC = Path("/proc")
 _EVERY_S = 0.25
-_WALL_FACTOR = 20.0
+_WALL_FACTOR = 20.0  # a program may wait so many times its limit of CPU time
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ from orthoswarm.model.errors import InputError
 
 FLAT = 0.2
 """Cost per picture counts as constant if it differs by at most this share from that of the smallest block."""
-_SMALLEST_BLOCK = 1000
+_SMALLEST_BLOCK = 1000  # pictures
 
 
 def run_scaling(

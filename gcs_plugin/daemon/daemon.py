@@ -58,7 +58,7 @@ from orthoswarm.model.frame import Frame
 from orthoswarm.raster.basemap import Basemap
 from telemetry.live.live_poses import Poses
 
-_FEW: Final = 10
+_FEW: Final = 10  # posted pictures of a vehicle, after which the kernels of a refinement are compiled
 _SOURCES_S: Final = 1.0
 _REPLACED: Final = "dropped: the vehicle's refinement takes its place"
 _log = logging.getLogger(__name__)

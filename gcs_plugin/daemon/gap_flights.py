@@ -4,10 +4,10 @@ import json
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
+from gcs_plugin.config import LIMITS
 from gcs_plugin.daemon.flight_coverage.live_coverage import LiveCoverage
 from gcs_plugin.daemon.vehicles import VehicleLinks
 from gcs_plugin.daemon.web_plans import Plans
-from gcs_plugin.fleet.flight_limits import RESERVE
 from orthoswarm.model.earth import distance_m
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 
@@ -43,7 +43,7 @@ class GapFlights:
         rows: list[dict[str, Any]] = []
         due = [vehicle for vehicle, takeoff in self._takeoffs().items() if "in_s" in takeoff]
         for row in [] if self._links is None else self._links.rows():
-            seconds = self._coverage.battery.seconds(str(row["id"]), RESERVE)
+            seconds = self._coverage.battery.seconds(str(row["id"]), LIMITS.reserve_share)
             rows.append({
                 "id": row["id"], "battery": row["battery"],
                 "minutes": None if seconds is None else round(seconds / 60.0, 1),

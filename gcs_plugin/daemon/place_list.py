@@ -10,7 +10,7 @@ from orthoswarm.export.tactical.places import Place
 from orthoswarm.export.tactical.seen_in import sightings
 from orthoswarm.model.geo import LocalGrid
 
-_MOST_SIGHTINGS = 24
+_MOST_SIGHTINGS = 24  # pictures of one place
 
 
 def places_of(

@@ -13,7 +13,7 @@ from orthoswarm.export.tactical.tak_sender import TakAddress, TakSender
 from orthoswarm.model.errors import OrthoSwarmError
 
 _EVERY_S: Final = 2.0
-_FINDS_EVERY: Final = 15
+_FINDS_EVERY: Final = 15  # rounds after which all finds are sent again
 _log = logging.getLogger(__name__)
 
 

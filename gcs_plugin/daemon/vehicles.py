@@ -55,9 +55,9 @@ _WATCH_S: Final = 0.5
 _SOON_S: Final = 5.0
 _READ_S: Final = 20.0
 _OUTCOME_S: Final = 60.0
-_TRAIL: Final = 600
-_MOST_TEXTS: Final = 50
-_COMPLETE_EVERY: Final = 20
+_TRAIL: Final = 600  # positions of a vehicle on the page
+_MOST_TEXTS: Final = 50  # of a vehicle on the page
+_COMPLETE_EVERY: Final = 20  # looks after which all rows are sent, not only changed ones
 _REPLACED: Final = "dropped: the vehicle is complete, its refinement takes its place"
 _log = logging.getLogger(__name__)
 
@@ -284,7 +284,7 @@ class VehicleLinks:
         Raises:
             OrthoSwarmError: a vehicle was not heard on any link.
         """
-        from gcs_plugin.fleet.flight_limits import ENDURANCE_S, LEGAL_HEIGHT_M
+        from gcs_plugin.config import LIMITS
         from gcs_plugin.fleet.preflight import preflight_all
 
         names = [self.name_of(s) for s in sorted(self.fleet.vehicles)] if vehicles is None else list(vehicles)
@@ -299,8 +299,8 @@ class VehicleLinks:
                 stored,
                 times,
                 time.monotonic(),
-                endurance_s=endurance_s or ENDURANCE_S,
-                legal_height_m=legal_height_m or LEGAL_HEIGHT_M,
+                endurance_s=endurance_s or LIMITS.endurance_s,
+                legal_height_m=legal_height_m or LIMITS.legal_height_m,
                 name=self.name_of,
             )
         ).result(_READ_S)

@@ -13,7 +13,7 @@ from typing import Any, Final
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.items import Mission
-from gcs_plugin.plans.plan_request import ENDS, METHODS, MOST_ITEMS, RELIEFS, PlanRequest, make_plan
+from gcs_plugin.plans.plan_request import AUTOPILOTS, ENDS, METHODS, RELIEFS, PlanRequest, make_plan
 from orthoswarm.model.errors import InputError
 
 _NAME: Final = re.compile(r"[0-9a-z][0-9a-z-]{0,63}\Z")
@@ -21,7 +21,7 @@ _NUMBERS: Final = (
     "altitude_m", "fov_min_deg", "speed_m_s", "endurance_min", "side_overlap", "forward_overlap", "separation_m",
     "clearance_m", "height_tolerance_m", "wait_min", "wind_m_s", "wind_from_deg",
 )  # fmt: skip
-_MOST_NUMBER: Final = 1e6
+_MOST_NUMBER: Final = 1e6  # in a request
 _NO_FLY_FILE: Final = "no-fly.geojson"
 _CHOICES: Final = {"method": METHODS, "end": ENDS, "relief": RELIEFS}
 
@@ -224,8 +224,8 @@ def _autopilots(value: Any) -> list[str]:
         InputError: there is no such autopilot.
     """
     names = value if isinstance(value, list) else [value]
-    if not names or not all(isinstance(name, str) and name in MOST_ITEMS for name in names):
-        raise InputError(f"autopilot is none of {', '.join(MOST_ITEMS)} and no list of these; choose one")
+    if not names or not all(isinstance(name, str) and name in AUTOPILOTS for name in names):
+        raise InputError(f"autopilot is none of {', '.join(AUTOPILOTS)} and no list of these; choose one")
     return names
 
 

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
 _POSITION_M: Final = 0.8
 _JITTER_RAD: Final = float(np.radians(0.2))
-_CLOCK: Final = 90_000
-_MOST_WAITING: Final = 512
+_CLOCK: Final = 90_000  # ticks a second of a video's time stamps
+_MOST_WAITING: Final = 512  # pictures
 _NEXT: Final = b"\0\0\0\1\x09\xf0"
 """Access unit delimiter of the next picture, sent after each picture: the reader knows at once that it is complete."""
 

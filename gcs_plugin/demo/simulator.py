@@ -8,8 +8,8 @@ from typing import Any, Final
 
 from gcs_plugin.demo.setting import Setting
 
-_MOST_WAITING: Final = 4
-_SLOW: Final = 0.15
+_MOST_WAITING: Final = 4  # pictures
+_SLOW: Final = 0.15  # times real time while cameras lag behind
 _BEHIND_S: Final = 0.05
 
 

@@ -5,7 +5,8 @@ import os
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, Literal
 
-from gcs_plugin.mission.exchange import COMMAND_S, Outcome, Verdict
+from gcs_plugin.config import COMMAND
+from gcs_plugin.mission.exchange import Outcome, Verdict
 
 if TYPE_CHECKING:
     from gcs_plugin.mission.exchange import Exchange
@@ -56,7 +57,7 @@ class Order:
 
     Attributes:
         verb: the command. system: the vehicle's system id.
-        given_s: when it was given (the fleet's monotonic clock); it is not sent later than COMMAND_S after that.
+        given_s: when it was given (the fleet's monotonic clock); it is not sent later than COMMAND.fresh_s after that.
         id: of the command.
         exchange: the dialogue with the vehicle, None if none was started.
     """
@@ -71,7 +72,7 @@ class Order:
     @property
     def expires_s(self) -> float:
         """Time after which it may not be sent."""
-        return self.given_s + COMMAND_S
+        return self.given_s + COMMAND.fresh_s
 
     @property
     def outcome(self) -> Outcome | None:

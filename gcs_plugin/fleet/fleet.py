@@ -12,6 +12,7 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
+from gcs_plugin.config import COMMAND
 from gcs_plugin.fleet.commands import URGENT, Order, Verb
 from gcs_plugin.fleet.dialogues import Dialogues
 from gcs_plugin.fleet.fleet_events import FleetEvent
@@ -24,7 +25,7 @@ from gcs_plugin.links.packets import Packet
 from gcs_plugin.links.transports import Link
 from gcs_plugin.mission.completion import Phase
 from gcs_plugin.mission.download import MissionDownload
-from gcs_plugin.mission.exchange import COMMAND_S, GROUND_STATION, Address, Exchange, Verdict
+from gcs_plugin.mission.exchange import GROUND_STATION, Address, Exchange, Verdict
 from gcs_plugin.mission.flight_modes import why_no_missions
 from gcs_plugin.mission.geofence import FENCE
 from gcs_plugin.mission.items import Mission
@@ -139,7 +140,7 @@ class Fleet:
     def order(self, order: Order) -> Order:
         """Give a command to a vehicle; its outcome is set some time later while the fleet is polled.
 
-        A command is sent only while it is fresh (COMMAND_S after it was given). Pause, RTL and land are never held
+        A command is sent only while it is fresh (`COMMAND.fresh_s`). Pause, RTL and land are never held
         back for doubts about identity or link: with several claimants of one system id they go to all of them, and
         to a lost vehicle on every route on which it was heard.
         """
@@ -257,7 +258,7 @@ class Fleet:
             OrthoSwarmError: it cannot be given.
         """
         exchange = self._dialogue(verb, system)
-        exchange.expires = self._clock() + COMMAND_S
+        exchange.expires = self._clock() + COMMAND.fresh_s
         return self.begin(exchange)
 
     def _dialogue(self, verb: Verb, system: int) -> Exchange:

@@ -12,7 +12,7 @@ from gcs_plugin.mission.exchange import Address
 
 _COMMAND: Final = int(dialect.MAV_CMD_SET_MESSAGE_INTERVAL)
 _ANSWER_S: Final = 0.7
-_TRIES: Final = 4
+_TRIES: Final = 4  # requests for one stream
 _CHECK_S: Final = 1.0
 _WINDOW_S: Final = 5.0
 _BACKOFF_S: Final = (3.0, 60.0)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from gcs_plugin.fleet.flight_limits import ENDURANCE_S, LEGAL_HEIGHT_M, RESERVE
+from gcs_plugin.config import LIMITS
 from gcs_plugin.fleet.separation_watch import number_name
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.command_dialogues import unflyable
@@ -101,8 +101,8 @@ class Wanted:
 
     mission: "Mission | None" = None
     stored: "Mission | None" = None
-    endurance_s: float = ENDURANCE_S
-    legal_height_m: float = LEGAL_HEIGHT_M
+    endurance_s: float = LIMITS.endurance_s
+    legal_height_m: float = LIMITS.legal_height_m
     near: str = ""
 
 
@@ -129,8 +129,8 @@ def preflight_all(
     starts: Mapping[int, float],
     now: float,
     *,
-    endurance_s: float = ENDURANCE_S,
-    legal_height_m: float = LEGAL_HEIGHT_M,
+    endurance_s: float = LIMITS.endurance_s,
+    legal_height_m: float = LIMITS.legal_height_m,
     name: Callable[[int], str] = number_name,
 ) -> list[Check]:
     """Check vehicles that are to start together.
@@ -236,10 +236,10 @@ def _battery(vehicle: "Vehicle", mission: "Mission | None", endurance_s: float) 
         return Item("battery", Level.WARNING, "it does not report its battery")
     needed = flight_seconds(mission) / endurance_s if mission is not None else 0.0
     text = f"{100 * left:.0f} % left, the mission needs about {100 * needed:.0f} %"
-    if left < needed or left < 0.5 * RESERVE:
+    if left < needed or left < 0.5 * LIMITS.reserve_share:
         return Item("battery", Level.RED, f"{text}; change the battery")
-    if left < needed + RESERVE:
-        return Item("battery", Level.WARNING, f"{text}; less than {100 * RESERVE:.0f} % would be left")
+    if left < needed + LIMITS.reserve_share:
+        return Item("battery", Level.WARNING, f"{text}; less than {100 * LIMITS.reserve_share:.0f} % would be left")
     return Item("battery", Level.OK, text)
 
 

@@ -7,6 +7,7 @@ reasons why a vehicle would not arm.
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
+from gcs_plugin.config import HEARING
 from gcs_plugin.fleet.dialogues import Dialogues
 from gcs_plugin.fleet.fleet_events import FleetEvent, Pair, mission_event
 from gcs_plugin.fleet.link_hub import Hub, Side
@@ -25,7 +26,6 @@ from gcs_plugin.mission.lateness import Lateness
 
 Handler = Callable[[Vehicle, Message, float], None]
 
-_LOST_S: Final = 5.0
 _ASK_WHY_S: Final = 10.0
 MESSAGE_IDS: Final = {kind.msgname: number for number, kind in dialect.mavlink_map.items()}
 _HEARTBEAT, _ACK, _TEXT = MESSAGE_IDS["HEARTBEAT"], MESSAGE_IDS["COMMAND_ACK"], MESSAGE_IDS["STATUSTEXT"]
@@ -41,7 +41,7 @@ _REPEATED: Final = frozenset({
 })  # fmt: skip
 _POSITION: Final = MESSAGE_IDS["GLOBAL_POSITION_INT"]
 _SAME_TEXT_S: Final = 1.5
-_OVERTAKEN: Final = 64
+_OVERTAKEN: Final = 64  # packets of its sender that a late one may be behind
 _PART: Final = 50  # characters of a STATUSTEXT
 _PHOTOS: Final = frozenset({MESSAGE_IDS["CAMERA_FEEDBACK"], MESSAGE_IDS["CAMERA_IMAGE_CAPTURED"]})
 
@@ -244,9 +244,9 @@ class Reception:
             self._watch_times(vehicle)
             self._dialogues.send(vehicle.system, vehicle.streams.tick(now))
             self._ask_why(vehicle, now)
-            if now - vehicle.heard > _LOST_S:
+            if now - vehicle.heard > HEARING.lost_s:
                 vehicle.lost = True
-                self._event("lost", vehicle, f"has been silent for {_LOST_S:.0f} s")
+                self._event("lost", vehicle, f"has been silent for {HEARING.lost_s:.0f} s")
             if len(vehicle.routes.known) > 1 or vehicle.claimants:
                 self._compare_routes(vehicle, now)
 

@@ -7,16 +7,17 @@ start at their boots, distinguish them.
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
+from gcs_plugin.config import HEARING
+
 if TYPE_CHECKING:
     from gcs_plugin.fleet.link_hub import Side
     from gcs_plugin.links.transports import Peer
 
-FRESH_S: Final = 2.0
 _KNOWN_S: Final = 30.0
 _VERDICT_S: Final = 10.0
 _BOOT_GAP_S: Final = 3.0
-_BETTER: Final = 0.2
-_SMOOTHING: Final = 0.02
+_BETTER: Final = 0.2  # share of lost packets by which another route must be better
+_SMOOTHING: Final = 0.02  # weight of the newest packet in that share
 _CLOCK_S: Final = 1.5
 _ASK_CLOCK_S: Final = 3.0
 _PACE_S: Final = 2.0
@@ -120,7 +121,7 @@ class Routes:
             route = self.known[side, peer] = Route(side=side, peer=peer, heard=now, clock=self._clock(now))
         route.heard = now
         best = self.best
-        if best is None or (best is not route and now - best.heard > FRESH_S):
+        if best is None or (best is not route and now - best.heard > HEARING.fresh_s):
             self.best = route
             return route, best is not None
         return route, False
@@ -132,13 +133,13 @@ class Routes:
         watch goes on, so that the clock that has gone back is noticed.
         """
         best = self.best
-        return BootClock() if best is None or now - best.heard < FRESH_S else replace(best.clock)
+        return BootClock() if best is None or now - best.heard < HEARING.fresh_s else replace(best.clock)
 
     def stale(self, route: Route, now: float) -> bool:
         """True for a route that is not the active one: its state of the vehicle may be late."""
         return route is not self.best and self.best is not None and now - self.best.heard < 1.0
 
-    def fresh(self, now: float, within_s: float = FRESH_S) -> list[Route]:
+    def fresh(self, now: float, within_s: float = HEARING.fresh_s) -> list[Route]:
         """The routes with recent packets."""
         return [route for route in self.known.values() if now - route.heard < within_s]
 

@@ -5,24 +5,15 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
+from gcs_plugin.config import ALARM, HEARING
+from orthoswarm.config import active
 from orthoswarm.model.earth import DEGREE_M, distance_m
 
 if TYPE_CHECKING:
     from gcs_plugin.fleet.vehicle_state import Vehicle
 
-_FRESH_S: Final = 2.0
-_OVER: Final = 1.2
-_HELD_M: Final = 0.5
-"""How well vehicles hold their height, metres: those that a plan puts `height_m` apart are a little less apart."""
-_AHEAD_S: Final = 4.0
-"""How far ahead vehicles are followed on straight lines, seconds."""
-_LESS_S: Final = 0.15
-"""By this share a second the distances that count ahead are less, since vehicles turn. Of 35 real autopilots in
-simulation three pairs came within 10 m: said 3.0 to 4.0 s before they were nearest, as of one pair that turned away (at
-12 m). Without this share two pairs turned away, and five if they are followed for 5 s."""
 _LOOK_S: Final = 0.5
-_PAD: Final = 1.5
-"""Radius about a start that vehicles share, in separation distances: there the plan keeps them apart by time alone."""
+"""Step in which the next seconds are looked at."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,13 +52,13 @@ class SeparationWatch:
         alarms: pairs that are too near now or soon, by their system ids in order.
     """
 
-    distance_m: float = 10.0
-    height_m: float = 5.0
+    distance_m: float = field(default_factory=lambda: active().planning.separation_m)
+    height_m: float = field(default_factory=lambda: active().planning.layer_m)
     alarms: dict[tuple[int, int], Near] = field(default_factory=dict)
 
     def look(self, vehicles: "Iterable[Vehicle]", now: float) -> tuple[list[Near], list[tuple[int, int]]]:
         """Compare all pairs; returns new alarms, and the pairs whose alarm is over."""
-        flying = [v for v in vehicles if v.flying and v.lat_deg is not None and now - v.heard < _FRESH_S]
+        flying = [v for v in vehicles if v.flying and v.lat_deg is not None and now - v.heard < HEARING.fresh_s]
         found: dict[tuple[int, int], Near] = {}
         if len(flying) > 1:
             shrink = math.cos(math.radians(flying[0].lat_deg or 0.0))
@@ -77,7 +68,7 @@ class SeparationWatch:
                     if abs(north2 - north) >= reach + reach2 or abs(east2 - east) >= reach + reach2:
                         continue  # most pairs: they cannot meet
                     apart = north2 - north, east2 - east, first.height_m - second.height_m
-                    met = self._meeting(apart, first, second, _OVER if (one, other) in self.alarms else 1.0)
+                    met = self._meeting(apart, first, second, ALARM.over_share if (one, other) in self.alarms else 1.0)
                     if met is not None:
                         found[one, other] = Near(*_proposal(first, second), *met)
         new = [near for pair, near in found.items() if pair not in self.alarms]
@@ -94,7 +85,7 @@ class SeparationWatch:
 
     def _reach(self, vehicle: "Vehicle") -> float:
         """Half the distance from which two vehicles can come too near in the time that is looked ahead, metres."""
-        return 0.5 * _OVER * self.distance_m + _AHEAD_S * math.hypot(*vehicle.velocity_m_s[:2])
+        return 0.5 * ALARM.over_share * self.distance_m + ALARM.ahead_s * math.hypot(*vehicle.velocity_m_s[:2])
 
     def _meeting(
         self, apart: tuple[float, float, float], one: "Vehicle", other: "Vehicle", over: float
@@ -104,19 +95,19 @@ class SeparationWatch:
         `apart` is from one to the other: north, east, down.
         """
         closing = [b - a for a, b in zip(one.velocity_m_s, other.velocity_m_s, strict=True)]
-        reach, step = over * self.distance_m, over * (self.height_m - _HELD_M)
+        reach, step = over * self.distance_m, over * (self.height_m - ALARM.height_kept_m)
         met = []
-        for look in range(1 + round(_AHEAD_S / _LOOK_S)):
+        for look in range(1 + round(ALARM.ahead_s / _LOOK_S)):
             ahead = look * _LOOK_S
             north, east, down = (a + ahead * v for a, v in zip(apart, closing, strict=True))
-            metres, height, share = math.hypot(north, east), abs(down), 1.0 - _LESS_S * ahead
+            metres, height, share = math.hypot(north, east), abs(down), 1.0 - ALARM.less_a_second * ahead
             if metres < share * reach and height < share * step and not self._at_start(one, other, ahead):
                 met.append((metres, height, ahead))
         return min(met, default=None)
 
     def _at_start(self, one: "Vehicle", other: "Vehicle", ahead_s: float) -> bool:
         """Both are above a start that they share, so many seconds ahead."""
-        reach = _PAD * self.distance_m
+        reach = active().planning.pad_distances * self.distance_m
         if one.launch is None or other.launch is None or distance_m(*one.launch, *other.launch) > reach:
             return False
         return all(distance_m(*_place(v, ahead_s), *(v.launch or (0.0, 0.0))) < reach for v in (one, other))

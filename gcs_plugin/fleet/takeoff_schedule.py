@@ -9,10 +9,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
+from gcs_plugin.config import COMMAND
 from gcs_plugin.mission.track import Airspace
 
-LATE_S: Final = 5.0
-"""A takeoff later than this is late: arming and the start take up to three seconds of themselves."""
 _MOVED_S: Final = 0.5
 
 
@@ -58,8 +57,8 @@ class TakeoffSchedule:
         self._undecided.pop(system, None)
         planned = self._planned.get(system, now)
         late = now - planned
-        self.flown[system] = now if late > LATE_S else planned
-        if late <= LATE_S:
+        self.flown[system] = now if late > COMMAND.takeoff_late_s else planned
+        if late <= COMMAND.takeoff_late_s:
             return []
         said = [f"v{system} took off {late:.0f} s late"]
         if self.airspace is None:

@@ -24,10 +24,10 @@ Peer = Any
 
 NEVER: Final = float("inf")
 
-_DATAGRAM: Final = 65536
-_AT_ONCE: Final = 2000
-_BUFFER: Final = 4 << 20
-_BACKLOG: Final = 1 << 16
+_DATAGRAM: Final = 65536  # bytes, UDP's most
+_AT_ONCE: Final = 2000  # datagrams read in one go
+_BUFFER: Final = 4 << 20  # bytes that the system keeps for us
+_BACKLOG: Final = 1 << 16  # bytes that a slow receiver may be behind
 _RETRY_S: Final = 2.0
 _AGAIN: Final = (errno.EAGAIN, errno.EWOULDBLOCK)
 EXAMPLES: Final = "udpin:0.0.0.0:14550, udpout:192.168.1.7:14550, tcp:127.0.0.1:5760 or serial:/dev/ttyUSB0:57600"
@@ -436,7 +436,7 @@ _SERIAL = re.compile(
 )
 _KINDS: Final = {"udp": "udpin", "udpin": "udpin", "udpout": "udpout", "tcp": "tcpout", "tcpout": "tcpout",
                  "tcpin": "tcpin"}  # fmt: skip
-_BAUD: Final = 57600
+_BAUD: Final = 57600  # of a serial link, MAVLink's usual
 
 
 @dataclass(frozen=True, slots=True)

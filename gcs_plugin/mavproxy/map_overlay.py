@@ -19,9 +19,9 @@ from gcs_plugin.mavproxy.daemon_client import Client
 KEY: Final = "orthoswarm mosaic"
 LAYER: Final = "0 OrthoSwarm"
 """Sorts before MAVProxy's own layers, so that icons and missions stay visible."""
-_TILE: Final = 256
-_MOST_TILES: Final = 48
-_DEEPEST: Final = 21
+_TILE: Final = 256  # pixels a side
+_MOST_TILES: Final = 48  # on the screen
+_DEEPEST: Final = 21  # zoom
 
 Pixels = NDArray[np.uint8]
 

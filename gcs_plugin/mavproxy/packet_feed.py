@@ -17,7 +17,7 @@ from typing import Any, Final
 from gcs_plugin.links.packets import Framer
 from gcs_plugin.mavproxy.daemon_client import Client
 
-_BUFFER: Final = 1 << 20
+_BUFFER: Final = 1 << 20  # bytes
 _START_S: Final = 120.0
 _END_S: Final = 60.0
 

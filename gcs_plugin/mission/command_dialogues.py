@@ -10,9 +10,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
+from gcs_plugin.config import COMMAND
 from gcs_plugin.links.mavlink import Autopilot, Message, dialect
 from gcs_plugin.mission.download import MissionDownload
-from gcs_plugin.mission.exchange import COMMAND_S, NEVER, Address, Exchange, Outcome, Verdict
+from gcs_plugin.mission.exchange import NEVER, Address, Exchange, Outcome, Verdict
 from gcs_plugin.mission.flight_modes import Modes, mode_params
 from gcs_plugin.mission.items import TAKEOFF, Mission, MissionItem
 
@@ -102,7 +103,7 @@ class Command(Exchange):
             advice = "watch whether it obeys, then give it again or use the radio control"
             self._end(False, f"{name} did not answer to '{self.verb}'; {advice}", Verdict.UNKNOWN)
         elif not self._sent:
-            late = now - self.expires + COMMAND_S
+            late = now - self.expires + COMMAND.fresh_s
             text = f"{name}: '{self.verb}' was given {late:.0f} s ago and was not sent; give it again"
             self._end(False, text, Verdict.NOT_SENT)
         else:
@@ -278,7 +279,7 @@ class InOrder(_Several):
     carried: int = field(default=1000, kw_only=True)
 
     def _step_expires(self, now: float) -> float:
-        return now + COMMAND_S if self._at >= self.carried and self.expires < NEVER else self.expires
+        return now + COMMAND.fresh_s if self._at >= self.carried and self.expires < NEVER else self.expires
 
     def _ended(self, outcome: Outcome, last: bool) -> bool:
         if not outcome.ok:
@@ -301,7 +302,7 @@ class OrUndo(_Several):
     _refusal: str = field(default="", init=False)
 
     def _step_expires(self, now: float) -> float:
-        return self.expires if self._at == 0 else now + COMMAND_S
+        return self.expires if self._at == 0 else now + COMMAND.fresh_s
 
     def _ended(self, outcome: Outcome, last: bool) -> bool:
         if last:
@@ -366,7 +367,7 @@ class Pilot:
             steps.append(CheckMission(self.vehicle, self.own, autopilot=self.autopilot, in_air=in_air))
         arm = Command(
             self.vehicle, self.own, command=dialect.MAV_CMD_COMPONENT_ARM_DISARM, params=(1.0,), verb="arm",
-            insist_s=COMMAND_S,
+            insist_s=COMMAND.fresh_s,
         )  # fmt: skip
         go: Exchange = Command(
             self.vehicle, self.own, command=dialect.MAV_CMD_MISSION_START, verb="start the mission", insist_s=3.0

@@ -14,8 +14,6 @@ from typing import Final
 from gcs_plugin.links.mavlink import AUTOPILOT_COMPONENT, BROADCAST, Message, dialect
 
 NEVER: Final = float("inf")
-COMMAND_S: Final = 5.0
-"""How long after it was given a command may still be sent; a later one could surprise whoever gave it."""
 MISSION: Final = int(dialect.MAV_MISSION_TYPE_MISSION)
 
 

@@ -23,9 +23,9 @@ from gcs_plugin.mission.items import (
     Mission,
     MissionItem,
 )
+from orthoswarm.config import active
 from orthoswarm.model.errors import InputError
 
-_CAPACITY: Final = 650
 _WITH_YAW: Final = frozenset({WAYPOINT, TAKEOFF, LAND})
 
 
@@ -103,8 +103,9 @@ def _first_place(items: Sequence[MissionItem]) -> tuple[float, float, float] | N
 
 def _check(mission: Mission) -> None:
     name = mission.name or "the mission"
-    if mission.autopilot is Autopilot.ARDUPILOT and len(mission) > _CAPACITY:
-        raise InputError(f"{name} has {len(mission)} items, ArduPilot holds {_CAPACITY}; plan more sorties or vehicles")
+    most = active().ardupilot.most_items
+    if mission.autopilot is Autopilot.ARDUPILOT and len(mission) > most:
+        raise InputError(f"{name} has {len(mission)} items, ArduPilot holds {most}; plan more sorties or vehicles")
     for seq, item in enumerate(mission.items):
         if item.has_place and not (abs(item.lat_deg) <= 90.0 and abs(item.lon_deg) <= 180.0):
             where = f"{item.lat_deg:g}, {item.lon_deg:g}"

@@ -26,10 +26,8 @@ Ints = NDArray[np.int64]
 
 STEP_S: Final = 0.5
 """Time between the samples of a track, seconds."""
-_GROUND_M: Final = 2.0
 _SPEED_M_S: Final = 5.0
 _HAIR_M: Final = 0.01
-_PAD: Final = 1.5  # radius about a start that vehicles share, in separation distances
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,20 +163,20 @@ class Airspace:
 
     tracks: dict[int, Track]
     _: KW_ONLY
-    distance_m: float = 10.0
-    height_m: float = 5.0
+    distance_m: float = field(default_factory=lambda: active().planning.separation_m)
+    height_m: float = field(default_factory=lambda: active().planning.layer_m)
     slack_s: float = field(default_factory=lambda: active().ardupilot.schedule_slack_s)
-    launch_s: float = 5.0
+    launch_s: float = field(default_factory=lambda: active().planning.launch_s)
     in_turn: bool = False
     _found: dict[tuple[int, int], "_Approaches"] = field(default_factory=dict, repr=False)
 
     @classmethod
-    def of(cls, missions: Mapping[int, "Mission"], distance_m: float = 10.0, height_m: float = 5.0) -> "Airspace":
+    def of(cls, missions: Mapping[int, "Mission"]) -> "Airspace":
         """Of missions by system id."""
         origin = next((home for mission in missions.values() if (home := home_of(mission))), (0.0, 0.0))
         tracks = {s: track_of(mission, origin) for s, mission in missions.items()}
         slack_s = max((_autopilot_of(mission).schedule_slack_s for mission in missions.values()), default=0.0)
-        return cls(tracks, distance_m=distance_m, height_m=height_m, slack_s=slack_s)
+        return cls(tracks, slack_s=slack_s)
 
     def meeting(self, one: int, other: int, later_s: float) -> tuple[float, float] | None:
         """When (seconds after the first one's start) and how close two vehicles come if the other starts later.
@@ -207,7 +205,11 @@ class Airspace:
             i, j = i[counted], j[counted]
             at_start, start_slack_s = np.zeros(len(i), bool), np.zeros(len(i))
             if self._share_a_start(one, other):
-                first, second, radius_m = self.tracks[one], self.tracks[other], _PAD * self.distance_m
+                first, second, radius_m = (
+                    self.tracks[one],
+                    self.tracks[other],
+                    active().planning.pad_distances * self.distance_m,
+                )
                 at_start = first.pad(radius_m)[i] & second.pad(radius_m)[j]
                 start_slack_s = np.maximum(first.pad_slack_s(radius_m)[i], second.pad_slack_s(radius_m)[j])
             distance_m = np.hypot(*(a[i, :2] - b[j, :2]).T)
@@ -250,16 +252,20 @@ class Airspace:
         launches = self._share_a_start(one, other) and abs(later_s) < self.launch_s
         return launches or self.meeting(one, other, later_s) is not None
 
+    def _pad_m(self) -> float:
+        """Radius about a start that vehicles share."""
+        return active().planning.pad_distances * self.distance_m
+
     def _share_a_start(self, one: int, other: int) -> bool:
         a, b = self.tracks[one].places, self.tracks[other].places
-        return bool(len(a) and len(b) and np.hypot(*(a[0, :2] - b[0, :2])) < _PAD * self.distance_m)
+        return bool(len(a) and len(b) and np.hypot(*(a[0, :2] - b[0, :2])) < self._pad_m())
 
 
 def _near(a: Array, b: Array, distance_m: float) -> tuple[Ints, Ints]:
     """Pairs of samples (n, 3), (m, 3) in the air that are less than a horizontal distance apart: their numbers."""
     from scipy.spatial import cKDTree
 
-    flying_a, flying_b = (np.flatnonzero(places[:, 2] > _GROUND_M) for places in (a, b))
+    flying_a, flying_b = (np.flatnonzero(places[:, 2] > active().planning.on_ground_m) for places in (a, b))
     if not len(flying_a) or not len(flying_b):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     found = cKDTree(a[flying_a, :2]).query_ball_tree(cKDTree(b[flying_b, :2]), distance_m)

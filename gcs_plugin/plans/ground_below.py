@@ -16,8 +16,6 @@ from orthoswarm.model.plan import Plan
 from orthoswarm.planning.relief_plan import GroundBelow
 from orthoswarm.raster.height_model import HeightModel
 
-_AROUND_M = 50.0
-
 
 def read_ground(dem: Path, wanted: shapely.Geometry, grid: LocalGrid, starts: NDArray[np.float64]) -> GroundBelow:
     """The ground below what is to be flown, over that of the lowest start.
@@ -30,7 +28,7 @@ def read_ground(dem: Path, wanted: shapely.Geometry, grid: LocalGrid, starts: ND
         InputError: the model cannot be read, or has no heights there.
     """
     points = np.concatenate([shapely.get_coordinates(wanted), starts])
-    bounds = BoundingBox.around_points(points, _AROUND_M)
+    bounds = BoundingBox.around_points(points, active().raster.dem_margin_m)
     found = HeightModel.open(dem, grid.epsg, bounds, np.empty((0, 3))).window(bounds, active().raster.dem_most_nodes)
     terrain = found.terrain
     rows, columns = terrain.z.shape

@@ -9,8 +9,8 @@ from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.plan import Plan, Sortie
 from orthoswarm.planning.area.area import Area
 
-_INCHES = 10.0
-_LABELS = 24
+_INCHES = 10.0  # of the longer side
+_LABELS = 24  # vehicles that are named in the legend
 
 
 def draw(plan: Plan, area: Area | None) -> bytes:

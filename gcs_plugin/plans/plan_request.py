@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
@@ -13,6 +13,7 @@ from gcs_plugin.mission.mission_files import Autopilot
 from gcs_plugin.plans.area_files import read_shapes
 from gcs_plugin.plans.gap_area import gap_area, read_gaps
 from gcs_plugin.plans.ground_below import read_ground, relief_notes
+from orthoswarm.config import active
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid, area_epsg
 from orthoswarm.model.plan import End, Plan
@@ -27,14 +28,13 @@ from orthoswarm.planning.sorties.deconfliction import Separation
 from orthoswarm.planning.sorties.flight_heights import FlightHeights
 from orthoswarm.planning.sorties.flight_time import Motion, autopilot_config
 
-MOST_ITEMS: Final[dict[Autopilot, int]] = {"ardupilot": 650, "px4": 1900}
-"""Mission items that an autopilot stores (ArduPilot: measured; PX4: its dataman's table)."""
+AUTOPILOTS: Final[tuple[Autopilot, ...]] = ("ardupilot", "px4")
 METHODS: Final = ("columns", "bcd", "tmstc")
 WITH_TERRAIN: Final = frozenset({"ardupilot"})
 """Autopilots whose missions can state heights above the ground (MAV_FRAME_GLOBAL_TERRAIN_ALT)."""
 RELIEFS: Final = ("auto", "follow", "level")
 ENDS: Final = ("rtl", "land", "hover")
-_MOST_LAYERS: Final = 12.0
+_MOST_LAYERS: Final = 12.0  # of ways out and home
 _TOLERANCE: Final = 0.1
 """Of the height above ground, as a share of it."""
 
@@ -86,8 +86,8 @@ class PlanRequest:
     forward_overlap: float = 0.8
     aspect: float = 4.0 / 3.0
     clearance_m: float | None = None
-    separation_m: float = 10.0
-    height_step_m: float = 5.0
+    separation_m: float = field(default_factory=lambda: active().planning.separation_m)
+    height_step_m: float = field(default_factory=lambda: active().planning.layer_m)
     ceiling_m: float | None = None
     follow: bool = False
     gaps: bool = False
@@ -139,7 +139,7 @@ class PlanRequest:
                 swap_s=60.0 * self.swap_min,
                 slack_s=max(autopilot_config(name).schedule_slack_s for name in self.autopilots),
             ),
-            most_items=min(MOST_ITEMS[name] for name in self.autopilots),
+            most_items=min(autopilot_config(name).most_items for name in self.autopilots),
             run_in_m=self.run_in_m,
             wait_s=60.0 * self.wait_min,
         )

@@ -18,6 +18,7 @@ from gcs_plugin.mission.refusal import (
     UNSUPPORTED,
     UNSUPPORTED_FRAME,
 )
+from orthoswarm.config import active
 
 _MISSION: Final = dialect.MAV_MISSION_TYPE_MISSION
 _FRAMES: Final = frozenset({0, 2, 3, 5, 6, 10, 11})
@@ -26,7 +27,6 @@ _COMMANDS: Final = frozenset({
     16, 17, 18, 19, 20, 21, 22, 82, 84, 85, 92, 93, 94, 112, 114, 115, 177, 178, 179, 181, 183, 189, 195, 197, 201, 203,
     205, 206, 207, 210, 212, 218, 222, 530, 2000, 2001, 2500, 2501,
 })  # fmt: skip
-_CAPACITY: Final = 650
 # (requests again after, gives up after) seconds without an item.
 _TIMING: Final = {Autopilot.ARDUPILOT: (1.0, 8.0), Autopilot.PX4: (0.25, 5.0)}
 
@@ -153,7 +153,7 @@ class MissionStore:
             return self._ask(transfer, now) if transfer.wanted == 0 else [self._ack(sender, ERROR)]
         if self._sent_to is not None and now - self._sent_at < _TIMING[Autopilot.PX4][1]:
             return [self._ack(sender, ERROR)]  # PX4 is still handing its mission out
-        if count > _CAPACITY:
+        if count > (active().px4 if self.autopilot is Autopilot.PX4 else active().ardupilot).most_items:
             return [self._ack(sender, NO_SPACE)]
         if count == 0:
             self.items = []

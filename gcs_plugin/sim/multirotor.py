@@ -20,8 +20,8 @@ from orthoswarm.model.angles import wrap_rad
 from orthoswarm.model.earth import EQUATOR_RADIUS_M
 from orthoswarm.planning.sorties import flight_time as planner
 
-_GRAVITY: Final = 9.80665
-_ECCENTRICITY2: Final = 6.69437999014e-3
+_GRAVITY: Final = 9.80665  # m/s2
+_ECCENTRICITY2: Final = 6.69437999014e-3  # of WGS 84
 STEP_S: Final = 0.05
 _FILTER_S: Final = 3.0
 _LOOK_AHEAD_S: Final = 0.8

@@ -12,7 +12,7 @@ from gcs_plugin.web.answers import JsonAnswer, body_of
 from orthoswarm.planning.area.shape_files import Ring
 
 MOST_BYTES: Final = 20_000_000
-_MOST_NAME: Final = 200
+_MOST_NAME: Final = 200  # characters
 
 
 async def read_area(

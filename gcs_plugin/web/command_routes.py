@@ -17,11 +17,12 @@ from typing import Any, Final
 
 from fastapi import HTTPException, Request, Response
 
+from gcs_plugin.config import COMMAND
 from gcs_plugin.daemon.daemon import Daemon
 from gcs_plugin.daemon.takeoffs import Takeoffs, names_of
 from gcs_plugin.daemon.vehicles import VehicleLinks
 from gcs_plugin.fleet.commands import VERBS, CommandResult, new_id
-from gcs_plugin.mission.exchange import COMMAND_S, Verdict
+from gcs_plugin.mission.exchange import Verdict
 from gcs_plugin.web.answers import JsonAnswer, in_thread, json_body
 from gcs_plugin.web.standstill import Standstill
 from orthoswarm.model.errors import InputError, OrthoSwarmError
@@ -32,8 +33,8 @@ ALL: Final = "all"
 _ALL_VERBS: Final = ("pause", "resume", "rtl", "land")
 _AHEAD_S: Final = 2.0
 _MOST_ID: Final = 200
-_REMEMBERED: Final = 1000
-_THREADS: Final = 128
+_REMEMBERED: Final = 1000  # commands, so that one that is sent twice is carried out once
+_THREADS: Final = 128  # commands under way
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,7 +207,7 @@ def _begin(
 def _late(issue: Issue) -> str | None:
     """Why a command has expired or lies in the future, None if it is valid."""
     age = issue.age_s
-    if age > COMMAND_S:
+    if age > COMMAND.fresh_s:
         return f"it was given {age:.0f} s ago, too long to be executed now; look at the vehicle and give it again"
     if age < -_AHEAD_S:
         return f"it was given {-age:.0f} s from now; take the time from the daemon's heartbeats and give it again"

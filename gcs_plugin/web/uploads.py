@@ -26,8 +26,8 @@ from gcs_plugin.web.guard import TooLarge, bounded
 from orthoswarm.model.errors import InputError, StorageError
 
 _MOST_POSE_BYTES: Final = 16_000_000
-_SHORT_POSE: Final = 65_536
-_THREADS: Final = 12
+_SHORT_POSE: Final = 65_536  # bytes
+_THREADS: Final = 12  # pictures that are being stored
 
 
 @dataclass(frozen=True, slots=True)

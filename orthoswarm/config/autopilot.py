@@ -1,4 +1,4 @@
-"""How much longer autopilots with their factory settings take than constant speed on straight lines.
+"""How much longer autopilots with their factory settings take than constant speed on straight lines; their memory.
 
 Measured in flights of both firmwares in simulation: 44 of ArduCopter 4.7 and 8 of PX4 1.17 (docs/vehicles.md).
 """
@@ -43,6 +43,8 @@ class ArduPilotConfig:
     above, at each takeoff and landing would hold a swarm of one start on the ground."""
     landing_slack_s: float = 3.5
     """The same as they come home and land (two differed by up to 3.4)."""
+    most_items: int = 650
+    """Mission items that it stores, home among them (measured)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,6 +84,8 @@ class Px4Config:
     """The same around a start that vehicles share, as they take off (two differed by up to 7.2)."""
     landing_slack_s: float = 18.0
     """The same as they come home and land (two differed by up to 18)."""
+    most_items: int = 1900
+    """Mission items that it stores (the table of its dataman)."""
 
 
 AutopilotConfig = ArduPilotConfig | Px4Config

@@ -47,8 +47,37 @@ class PlanningConfig:
     tooth_spacings: float = 0.1
     """Outlines are simplified by so many line spacings before they are cut into cells: a ragged coast has a critical
     point at every tooth (chosen)."""
+    edge_spacings: float = 0.1
+    """Edges of an area whose directions are tried are those of its outline simplified by so many line spacings
+    (chosen)."""
+    edge_directions: int = 24
+    """Longest edges of which the directions are tried (chosen for its time)."""
+    direction_step_deg: float = 15.0
+    """Further directions are tried at this step, degrees (chosen for its time)."""
+    same_direction_deg: float = 1.0
+    """Directions nearer to each other than this are tried once, degrees (chosen)."""
+    same_grid_rad: float = 0.02
+    """The same for the grid of the spanning tree, radians (chosen)."""
+    ranked_spacings: float = 0.05
+    """Outlines are simplified by so many line spacings before directions are ranked (chosen for its time)."""
+    shortest_m: float = 0.01
+    """Shorter parts of lines are rounding, metres."""
+    gap_least_share: float = 0.2
+    """A gap of which further legs would show a smaller share is left as it is (chosen)."""
+    gap_walls: int = 8
+    """Longest edges, of the gap and of obstacles around it, along which legs for it are tried (chosen for its time)."""
+    gap_shifts: int = 7
+    """Places across a gap at which they are tried (chosen for its time)."""
+    gap_leg_price: float = 0.02
+    """Price of a line spacing of flight, in shares of the gap (chosen)."""
     exact_cells: int = 8
     """So many cells are put in the shortest order exactly (0.02 s)."""
+    row_starts: int = 60
+    """More cells are put in order from so many of them at most (chosen for its time) ..."""
+    row_many: int = 80
+    """... and up to this number of cells the order is improved ..."""
+    row_rounds: tuple[int, int] = (20, 2)
+    """... in so many rounds at most, with more cells in so many (chosen for its time)."""
     ordered_most_legs: int = 500
     """Orders of more legs are not improved: cost grows with the square (chosen for its time)."""
     tries_if_few: int = 12
@@ -61,6 +90,10 @@ class PlanningConfig:
     """Gaps are not filled for a direction whose path is so many times as long as the best (chosen)."""
     detour_inside_m: float = 0.02
     """How far a detour may pass inside an obstacle, metres: its corners touch it (chosen: rounding)."""
+    obstacle_tolerance: float = 0.1
+    """Obstacles are simplified outwards by this share of the clearance (chosen) ..."""
+    obstacle_tolerance_m: float = 50.0
+    """... doubled until they have few corners, up to this, metres (chosen)."""
     detour_most_corners: int = 300
     """Obstacles are simplified to so many corners: cost grows with their square (chosen for its time)."""
 
@@ -69,13 +102,19 @@ class PlanningConfig:
     """The longest sortie over the mean up to which a division is fair (chosen)."""
     unfair_balance: float = 1.22
     """... and from which on it is priced steeply (chosen)."""
+    balance_prices: tuple[float, float] = (2.0, 6.0)
+    """Prices of what the balance is above either, in shares of the longest sortie (chosen)."""
     fair_enough: float = 1.25
     """From here on the plan says that it is uneven (chosen)."""
     better_share: float = 0.99
     """A later candidate must be better by this factor: the first ones are in the method's own, tidier order
     (chosen)."""
     clearance_m: float = 1.0
-    """Distance that is kept from no-fly zones where none is asked for, metres; less with a small footprint (chosen)."""
+    """Distance that is kept from no-fly zones where none is asked for, metres (chosen), but at most ..."""
+    clearance_widths: float = 0.125
+    """... so many widths of a picture, so that no gap is left at a zone, and at least ..."""
+    least_clearance_m: float = 0.1
+    """... so many metres (chosen)."""
     quickest_s: float = 0.5
     """A warning says that cameras seldom release at shorter intervals, seconds (chosen)."""
     straight_cos: float = 0.985
@@ -84,6 +123,26 @@ class PlanningConfig:
     """Mission items that a leg takes (two ends, camera on and off), to keep within an autopilot's limit."""
     spare_items: int = 40
     """Mission items kept for ways, takeoff and landing (chosen)."""
+    least_leg_triggers: float = 4.0
+    """Legs are not cut shorter than so many distances of pictures (chosen), if the endurance allows it."""
+    sortie_parts: float = 40.0
+    """A leg's parts are at most this fraction of a sortie long, so that a sortie's limit is met closely (chosen)."""
+    row_parts: float = 2000.0
+    """Most parts of a vehicle's legs (chosen for its time)."""
+    sortie_tries: int = 12
+    """Most times that legs are cut again because a sortie is longer than was estimated (chosen) ..."""
+    sortie_shorter: float = 0.005
+    """... each time shorter by this share (chosen) ..."""
+    sortie_shorter_growth: float = 1.6
+    """... times this with each further one (chosen)."""
+    endurance_spare: float = 1.05
+    """Where an endurance is too short, so many times what the farthest line needs is asked for (chosen)."""
+    first_cap: float = 1.3
+    """Divisions are searched up to so many times the mean share first, which keeps the search narrow (chosen) ..."""
+    cap_growth: float = 1.5
+    """... then up to so many times more ..."""
+    caps: int = 8
+    """... so often, and at last without a limit (chosen)."""
     cut_price: float = 0.25
     """Price of a cut within a leg, in the unit of what is divided, so that legs stay whole where that costs little
     (chosen)."""
@@ -93,6 +152,12 @@ class PlanningConfig:
     """Possible cuts in a share (chosen for its time)."""
 
     # Deconfliction
+    separation_m: float = 10.0
+    """Least horizontal distance of vehicles, metres, if the user gives none (chosen: receivers err by 3 m) ..."""
+    layer_m: float = 5.0
+    """... or else their least difference in height, metres: that of the layers of ways out and home (chosen)."""
+    launch_s: float = 5.0
+    """Time between takeoffs, and between landings, at one start, seconds (chosen)."""
     step_s: float = 0.5
     """Time step in which flights are compared, seconds (chosen for its time)."""
     on_ground_m: float = 2.0

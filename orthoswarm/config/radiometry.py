@@ -19,6 +19,14 @@ class RadiometryConfig:
     map_sigma: float = 0.25
     """Log ratio of a picture's block to a map: another season, light and sensor, local changes (chosen; not
     measured)."""
+    map_block_px: int = 4
+    """Side of such a block, pixels of a thumbnail (chosen: a picture is some metres off where it is not registered)."""
+    map_block_least_m: float = 0.1
+    """Least side of a block on the ground, metres."""
+    map_parts: int = 7
+    """Pixels of the map across a block (chosen for its time)."""
+    map_covered_share: float = 0.9
+    """Least share of a block that the map shows: what lies in its holes may be darker or brighter (chosen)."""
     dark_level: float = 8.0
     """Thumbnail levels from 0 to here are partly clipped and say nothing about a gain (chosen)."""
     bright_level: float = 247.0
@@ -30,6 +38,8 @@ class RadiometryConfig:
     """Most ratios a picture at seams and beside them, those with neighbours not counted (chosen for cost)."""
     neighbours: int = 6
     """Nearest pictures, of any vehicle, with which each is compared on a grid; with 2 or 3 a lawn's steps stay."""
+    neighbour_places: tuple[tuple[float, ...], tuple[float, ...]] = ((0.2, 0.5, 0.8), (0.3, 0.7))
+    """That grid: shares of a picture's width, and of its height (chosen)."""
     label_cells: int = 64
     """Cells across a picture on which the seams for this comparison are found (chosen for cost)."""
     label_most_cells: int = 2_000_000
@@ -57,6 +67,18 @@ class RadiometryConfig:
     greatest_factor: float = 1.8
     """Greatest factor, and the least is its inverse: what would need more has another cause (burnt out, cloud shadow;
     chosen)."""
+    held_least_factor: float = 0.1
+    """Factors of pictures that keep theirs count as at least so much where their logarithm is needed."""
+    flattest_descent: float = 0.2
+    """Rays count as falling at least so much for their length: tangents of the view direction grow without limit."""
+
+    # What is said of it
+    limited_share: float = 0.02
+    """A warning says how many photos would need more than the greatest factor if more than so many do (chosen) ..."""
+    limited_log_share: float = 0.95
+    """... which is taken from this share of its logarithm on."""
+    tint_ratio: float = 1.15
+    """A warning says that a map has another tint where its colours' factors differ by more than this (chosen)."""
 
     # Seam leveling: what is left at the seams of the orthoimage
     level_cells: int = 32

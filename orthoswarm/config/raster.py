@@ -35,6 +35,8 @@ class RasterConfig:
     dem_finest_m: float = 2.0
     """Finest distance of the nodes on which a height model is read, metres: buildings that lean in it are averaged
     (chosen; not measured)."""
+    dem_margin_m: float = 50.0
+    """A height model is read so far beyond the places that are asked for, metres (chosen: some of its nodes)."""
     dem_most_nodes: int = 4_000_000
     """Most nodes read from a height model as a whole (chosen for memory)."""
     dem_window_nodes: int = 250_000

@@ -19,13 +19,6 @@ from orthoswarm.model.placement import Terrain
 from orthoswarm.mosaic.kernels.render_arrays import Shots
 from orthoswarm.mosaic.overlap_colors import Bytes, OverlapColors, grid_on_ground
 
-_BLOCK_PX = 4
-"""Side of a block in pixels of the thumbnails."""
-_PARTS = 7
-"""Pixels of the map across a block."""
-_COVERED = 0.9
-"""Least share of a block that the map shows: what lies in its holes may be darker or brighter."""
-
 
 class ColorMap(Protocol):
     """A map in colour (raster.basemap.Basemap)."""
@@ -44,11 +37,12 @@ def map_colors(
         terrain: the ground. tone: the map; where it is grey its hue says nothing.
     """
     config, count = active().radiometry, len(cameras)
-    rows, columns = small.shape[1] // _BLOCK_PX, small.shape[2] // _BLOCK_PX
+    side = config.map_block_px
+    rows, columns = small.shape[1] // side, small.shape[2] // side
     u, v = np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows)
     share = np.stack([u.ravel(), v.ravel()], 1)
-    blocks = small[:, : rows * _BLOCK_PX, : columns * _BLOCK_PX].astype(np.float64)
-    seen = blocks.reshape(count, rows, _BLOCK_PX, columns, _BLOCK_PX, 3).mean((2, 4)).reshape(count, -1, 3)
+    blocks = small[:, : rows * side, : columns * side].astype(np.float64)
+    seen = blocks.reshape(count, rows, side, columns, side, 3).mean((2, 4)).reshape(count, -1, 3)
     ground = grid_on_ground(cameras, shots, terrain, share)
     drawn, valid = _at(tone, ground, columns)
     valid &= ((seen > config.dark_level) & (seen < config.bright_level)).all(-1)
@@ -75,14 +69,15 @@ def _at(tone: ColorMap, ground: NDArray[np.float64], columns: int) -> tuple[NDAr
     if not known.any():
         return np.zeros((*ground.shape[:2], 3)), known
     across = np.hypot(*(ground[:, columns - 1] - ground[:, 0]).T)
-    block = max(float(np.nanmedian(across)) / max(columns - 1, 1), 0.1)
+    config = active().radiometry
+    block, parts = max(float(np.nanmedian(across)) / max(columns - 1, 1), config.map_block_least_m), config.map_parts
     low, high = ground[known].min(0) - block, ground[known].max(0) + block
     bounds = BoundingBox(float(low[0]), float(low[1]), float(high[0]), float(high[1]))
-    fine = block / _PARTS
+    fine = block / parts
     colors, mask = tone.rgb(bounds, fine)
-    share = cv2.blur(mask.astype(np.float32), (_PARTS, _PARTS))
-    means = cv2.blur(np.where(mask[..., None], colors, 0).astype(np.float32), (_PARTS, _PARTS))
+    share = cv2.blur(mask.astype(np.float32), (parts, parts))
+    means = cv2.blur(np.where(mask[..., None], colors, 0).astype(np.float32), (parts, parts))
     cell = np.rint(GroundGrid.around(0, bounds, fine).to_pixel(np.where(known[..., None], ground, low))).astype(int)
     column, row = cell[..., 0].clip(0, mask.shape[1] - 1), cell[..., 1].clip(0, mask.shape[0] - 1)
     covered = share[row, column]
-    return means[row, column] / np.maximum(covered, 1e-3)[..., None], known & (covered > _COVERED)
+    return means[row, column] / np.maximum(covered, 1e-3)[..., None], known & (covered > config.map_covered_share)

@@ -112,10 +112,10 @@ def _seams(labels: Ints, grid: GroundGrid) -> _Meetings:
 
 
 def _neighbours(cameras: Sequence[Camera], shots: Shots, terrain: Terrain) -> _Meetings:
-    """A 3 x 2 grid of points of each frame, with each of the frames that have the nearest nadirs."""
+    """A grid of points of each frame, with each of the frames that have the nearest nadirs."""
     from scipy.spatial import cKDTree
 
-    u, v = np.meshgrid([0.2, 0.5, 0.8], [0.3, 0.7])
+    u, v = np.meshgrid(*active().radiometry.neighbour_places)
     share = np.stack([u.ravel(), v.ravel()], 1)
     ground = grid_on_ground(cameras, shots, terrain, share)
 

@@ -57,13 +57,14 @@ def tone_warning(fields: Mapping[str, Field]) -> str:
         return "the tones are those of the photos: there is nothing to compare"
     red, green, blue = np.median(factors, axis=0)
     text = f"the tones follow the basemap: red, green and blue times {red:.2f}, {green:.2f} and {blue:.2f} (median)"
-    greatest = active().radiometry.greatest_factor
-    at_limit = float((np.abs(np.log(factors)).max(1) > 0.95 * np.log(greatest)).mean())
-    if at_limit > 0.02:
+    config = active().radiometry
+    greatest = config.greatest_factor
+    at_limit = float((np.abs(np.log(factors)).max(1) > config.limited_log_share * np.log(greatest)).mean())
+    if at_limit > config.limited_share:
         text += (
             f"; {at_limit:.0%} of the photos would need more than {greatest:g}, the greatest factor, and differ from it"
         )
-    if max(red, green, blue) > 1.15 * min(red, green, blue):
+    if max(red, green, blue) > config.tint_ratio * min(red, green, blue):
         text += "; the map has another tint than the photos (season, light, sensor), which the orthoimage now has, too"
     return text
 
@@ -137,7 +138,7 @@ def _with_held(colors: OverlapColors, held: Sequence[Field | None]) -> OverlapCo
         x, y = colors.place[:, side, 0], colors.place[:, side, 1]
         basis = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], 1)
         factor = np.einsum("mk,mck->mc", basis, coefficients[colors.frame[:, side]])
-        ratio += sign * np.log(np.maximum(factor, 0.1))
+        ratio += sign * np.log(np.maximum(factor, active().radiometry.held_least_factor))
     return replace(colors, ratio=ratio.astype(np.float32))
 
 
@@ -292,7 +293,8 @@ def _log_factors(of_vehicle: Array, of_frame: Array, *, x: Array, y: Array, shot
     u, v = half * (x + 1.0) - 0.5, half * y + 0.5 * shots.size[:, 1:] - 0.5
     rays = np.stack([(u - shots.lens[:, [U]]) / shots.lens[:, [F]], (v - shots.lens[:, [V]]) / shots.lens[:, [F]]], -1)
     rays = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], -1) @ shots.rotation.transpose(0, 2, 1)
-    down = np.maximum(-rays[..., 2:], 0.2 * np.linalg.norm(rays, axis=-1, keepdims=True))
+    flattest = active().radiometry.flattest_descent
+    down = np.maximum(-rays[..., 2:], flattest * np.linalg.norm(rays, axis=-1, keepdims=True))
     e, n = np.moveaxis(rays[..., :2] / down, -1, 0)
     one = np.ones_like(y)
     common = np.stack([one, x, y, x * x, x * y, y * y, e, n, e * e, e * n, n * n], -1)

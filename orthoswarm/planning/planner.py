@@ -95,8 +95,8 @@ def plan_area(
     options = options or Options()
     options.check()
     over = _Over(altitude_m, foot, heights or LevelHeights(altitude_m))
-    clearance = options.clearance_m or max(0.1, min(active().planning.clearance_m, 0.125 * foot.width_m))
-    router = Router(make_obstacles(area.no_fly, clearance))
+    clearance_m = _clearance_m(options, foot)
+    router = Router(make_obstacles(area.no_fly, clearance_m))
     swarm = Swarm(vehicles, over.heights, foot=foot, grid=area.grid, router=router, options=options)
     progress("lines")
     best = _best_work(
@@ -106,7 +106,7 @@ def plan_area(
         method=method,
         motion=options.motion,
         router=router,
-        reach_m=min(foot.reach_m, 2.0 * clearance),
+        reach_m=min(foot.reach_m, 2.0 * clearance_m),
     )
     progress("separation")
     schedule = swarm.schedule(best)
@@ -123,6 +123,13 @@ def plan_area(
     return _plan(
         method, schedule, over, grid=area.grid, options=options, warnings=warnings, covered=(area.size_m2, seen, gaps)
     )
+
+
+def _clearance_m(options: Options, foot: Footprint) -> float:
+    """Distance from no-fly zones: that of the user, or a default that leaves small pictures no gaps."""
+    config = active().planning
+    usual = min(config.clearance_m, config.clearance_widths * foot.width_m)
+    return options.clearance_m or max(config.least_clearance_m, usual)
 
 
 def _best_work(
@@ -177,8 +184,7 @@ def plan_gaps(
     options = options or Options()
     options.check()
     over = _Over(altitude_m, foot, heights or LevelHeights(altitude_m))
-    clearance = options.clearance_m or max(0.1, min(active().planning.clearance_m, 0.125 * foot.width_m))
-    router = Router(make_obstacles(area.no_fly, clearance))
+    router = Router(make_obstacles(area.no_fly, _clearance_m(options, foot)))
     progress("lines")
     found = [_gap_legs(piece, router, foot) for piece in planned_coverage.pieces(area.ground)]
     legs = np.concatenate([np.empty((0, 2, 2)), *found])

@@ -88,3 +88,22 @@ def test_documents_name_what_exists(path):
         assert (ROOT / module.replace(".", "/")).with_suffix(".py").is_file(), f"there is no {module}"
     for file in re.findall(r"`((?:orthoswarm|telemetry|gcs_plugin|benchmarks|docs)/[\w/.]+)`", text):
         assert (ROOT / file).exists(), f"there is no {file}"
+
+
+QUOTED = re.findall(
+    r"Here, `([^`]+)`:\n\n```python\n(.*?)```", (ROOT / "docs" / "style.md").read_text(encoding="utf-8"), re.S
+)
+
+
+@pytest.mark.parametrize(("path", "quote"), QUOTED, ids=[path for path, _ in QUOTED])
+def test_quoted_code_is_what_stands_in_the_file(path, quote):
+    """Word for word and in its order; a line of three dots stands for lines left out."""
+    source, at = (ROOT / path).read_text(encoding="utf-8"), 0
+    for part in re.split(r"^ *\.\.\.\n", quote, flags=re.MULTILINE):
+        found = source.find(part, at)
+        assert found >= 0, f"{path} has no longer:\n{part}"
+        at = found + len(part)
+
+
+def test_five_kinds_of_code_are_quoted():
+    assert len(QUOTED) == 5

@@ -247,7 +247,7 @@ def test_a_refusal_names_item_field_and_reason(autopilot, code):
 @BOTH
 def test_too_many_items_are_refused_as_a_whole(autopilot):
     rig = Rig(autopilot)
-    uploading = upload(rig, make_mission(autopilot, legs=170))
+    uploading = upload(rig, make_mission(autopilot, legs=170 if autopilot is AP else 480))
     (outcome,) = rig.run(uploading)
     assert not outcome.ok
     assert (uploading.refusal.code, uploading.refusal.item) == (4, None)

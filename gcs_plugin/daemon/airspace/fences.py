@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from gcs_plugin.fleet.fleet import Fleet
     from gcs_plugin.mission.download import MissionDownload
 
-_AT_ONCE: Final = 4
+_AT_ONCE: Final = 4  # fences that are read at a time, so that links stay free
 _AGAIN_S: Final = 60.0
 _FAILED_S: Final = 15.0
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcs_plugin.links.mavlink import Message, dialect
+from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.geo import LocalGrid, area_epsg
@@ -24,12 +25,11 @@ if TYPE_CHECKING:
     from gcs_plugin.fleet.fleet import Fleet
     from gcs_plugin.fleet.vehicle_state import Vehicle
 
-_TILES_EAST: Final = 8
+_TILES_EAST: Final = 8  # of a request's mask (MAVLink TERRAIN_REQUEST)
 _TILES_NORTH: Final = 7
-_TILE: Final = 4
+_TILE: Final = 4  # points a side
 _DEG_M: Final = 111318.84502145034  # metres a degree of latitude, as ArduPilot counts
-_MOST_WAITING: Final = 100
-_AROUND_M: Final = 50.0
+_MOST_WAITING: Final = 100  # requests; vehicles repeat theirs
 _log = logging.getLogger(__name__)
 
 
@@ -102,7 +102,7 @@ def _block(dem: Path, lat_e7: int, lon_e7: int, spacing_m: int) -> tuple[NDArray
     lats, lons = np.meshgrid(north, east, indexing="ij")
     epsg = area_epsg(lats.ravel(), lons.ravel())
     places = LocalGrid(epsg).to_grid(lats, lons)
-    bounds = BoundingBox.around_points(places.reshape(-1, 2), _AROUND_M)
+    bounds = BoundingBox.around_points(places.reshape(-1, 2), active().raster.dem_margin_m)
     model = HeightModel.open(dem, epsg, bounds, np.empty((0, 3)))
     ground = model.window(bounds)
     return ground.terrain.height(places) + model.zero_m, ground.knows(places)

@@ -4,9 +4,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
-_LEAST_DROP: Final = 0.03
-_LEAST_S: Final = 60.0
-_SWAPPED: Final = 0.05
+_LEAST_DROP: Final = 0.03  # share of the battery after which its use is known
+_LEAST_S: Final = 60.0  # of flight for that
+_SWAPPED: Final = 0.05  # a charge that rises by this share is another battery
 
 
 @dataclass(slots=True)

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 
 _CAPTURED: Final = int(dialect.MAVLINK_MSG_ID_CAMERA_IMAGE_CAPTURED)
 _REQUEST: Final = int(dialect.MAV_CMD_REQUEST_MESSAGE)
-_AT_ONCE: Final = 5
-_TRIES: Final = 8
+_AT_ONCE: Final = 5  # numbers that are asked for in one go
+_TRIES: Final = 8  # requests for one number
 _AGAIN_S: Final = 2.0
 _LONGEST_HOLE: Final = 200
 """A camera whose numbers jump by more has restarted its count."""

@@ -11,9 +11,9 @@ from typing import Final
 from gcs_plugin.daemon.store.picture_store import MOST_PICTURE_BYTES
 from gcs_plugin.links.file_transfer import MOST_DATA, FtpPayload, Nak, Opcode, file_crc32
 
-_MOST_FILES: Final = 100_000
-_DEPTH: Final = 2
-_RESET_AFTER: Final = 3
+_MOST_FILES: Final = 100_000  # of a vehicle's card
+_DEPTH: Final = 2  # of folders below the root
+_RESET_AFTER: Final = 3  # answers that the server is busy
 
 
 class FtpJob:

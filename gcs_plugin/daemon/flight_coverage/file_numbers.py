@@ -8,8 +8,8 @@ from typing import Final
 
 import numpy as np
 
-_SURE: Final = 0.9
-_LEAST: Final = 3
+_SURE: Final = 0.9  # share of the pictures that agree on the shift of numbers
+_LEAST: Final = 3  # pictures for it
 _PICTURES: Final = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
 
 

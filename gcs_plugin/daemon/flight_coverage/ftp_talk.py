@@ -11,7 +11,7 @@ from gcs_plugin.links.mavlink import Message
 
 _AT_ONCE: Final = 4
 """ArduPilot's server holds five requests."""
-_PATIENCE: Final = 4.0
+_PATIENCE: Final = 4.0  # times the quickest answer
 _LEAST_PATIENCE_S, _MOST_PATIENCE_S = 0.5, 4.0
 _SILENT_S: Final = 12.0
 _BUSY_S: Final = 5.0

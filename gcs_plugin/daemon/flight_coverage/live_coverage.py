@@ -43,7 +43,7 @@ Rows = list[dict[str, Any]]
 _LOOK_S: Final = 0.5
 _LEAST_PAUSE: Final = 3.0
 """Pause after finding gaps, in multiples of the time that it took: a quarter of one core at most."""
-_MOST_CELLS: Final = 16_000_000
+_MOST_CELLS: Final = 16_000_000  # of the grid; cells grow beyond it
 _ON_THE_WAY_S: Final = 15.0
 _FACT: Final = "coverage"
 _log = logging.getLogger(__name__)

@@ -30,7 +30,7 @@ _AGAIN_S: Final = 60.0
 _LIST_AGAIN_S, _LIST_AT_LEAST_S = 10.0, 600.0
 _QUIET_S: Final = 1.0
 _TELL_S: Final = 2.0
-_MOST_URLS: Final = 20_000
+_MOST_URLS: Final = 20_000  # of one camera's list
 _log = logging.getLogger(__name__)
 
 

@@ -20,7 +20,7 @@ from orthoswarm.raster.picture_quality import PictureQuality
 Key = tuple[str, str]
 Measured = Sequence[tuple[View, PictureQuality | None]]
 """Views with what the pixels of their pictures say."""
-_AT_ONCE: Final = 500
+_AT_ONCE: Final = 500  # rows of the journal that are read in one go
 
 
 class PictureViews:

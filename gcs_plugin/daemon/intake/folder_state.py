@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 from typing import Final
 
-_HEAD: Final = 1 << 20
+_HEAD: Final = 1 << 20  # bytes at either end that identify a file
 
 Stamp = tuple[int, int]
 """Size of a file and time of its last change, nanoseconds."""

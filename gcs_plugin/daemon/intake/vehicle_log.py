@@ -5,7 +5,7 @@ import os
 from pathlib import Path
 from typing import Final
 
-_STEP: Final = 8
+_STEP: Final = 8  # bytes of the time before each packet of a tlog
 _MARKS: Final = (0xFD, 0xFE)
 
 

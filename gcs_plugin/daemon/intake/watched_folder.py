@@ -28,10 +28,10 @@ if TYPE_CHECKING:
     from orthoswarm.model.frame import Frame, Ingest, Rejection
 
 _POLL_S: Final = 0.25
-_SCAN_SHARE: Final = 0.1
+_SCAN_SHARE: Final = 0.1  # of the time that looking at the folder may take
 _QUIET_S: Final = 1.0
 _SETTLED_S: Final = 3.0
-_BATCH: Final = 32
+_BATCH: Final = 32  # pictures that are handed over at a time
 _BATCH_BYTES: Final = 64 << 20
 _STALLED_S: Final = 30.0
 _UNCHANGED_S: Final = 2.0

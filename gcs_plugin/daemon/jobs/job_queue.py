@@ -19,16 +19,16 @@ from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.journal import Change, Journal, packed, unpacked
 from orthoswarm.model.errors import OrthoSwarmError, StorageError, WorkerStoppedError
 
-_MOST_ATTEMPTS: Final = 3
-_MOST_RESTARTS: Final = 20
-_MOST_LISTED: Final = 1000
+_MOST_ATTEMPTS: Final = 3  # of a job whose worker stopped
+_MOST_RESTARTS: Final = 20  # of a job by the daemon's own restarts
+_MOST_LISTED: Final = 1000  # finished jobs
 _BACKGROUND: Final = frozenset({"coarse", "together", "tones", "redraw", "export"})
 _IN_FLIGHT: Final = "(kind = 'coarse' AND json_extract(detail, '$.after') IS NULL)"
 """A coarse map of a vehicle that still flies, as SQL; one with `after` completes the layer after a refinement."""
 _PREEMPTED: Final = frozenset({"coarse", "together", "tones"})
 _AFTER_REFINEMENT: Final = _PREEMPTED | {"export"}
 """An export that was asked for during a refinement holds its result."""
-_WAITING_THREADS: Final = 2
+_WAITING_THREADS: Final = 2  # beyond those of the workers, for jobs that wait for pictures
 _JOURNAL_AGAIN_S: Final = 1.0
 _log = logging.getLogger(__name__)
 

@@ -12,12 +12,11 @@ from typing import Final
 
 import numpy as np
 
+from gcs_plugin.config import SORTIE
 from gcs_plugin.daemon.stoppable_thread import StoppableThread
 from orthoswarm.model.earth import DEGREE_M
 from orthoswarm.refine.flight.finished_legs import ended_legs
 
-FEWEST: Final = 10
-"""Least number of new pictures of finished legs for a coarse map."""
 _LOOK_S: Final = 0.5
 _log = logging.getLogger(__name__)
 
@@ -80,7 +79,8 @@ class LegWatch:
                 due = [
                     (key, path)
                     for key, path in self._paths.items()
-                    if (path.dirty and len(path.times) >= FEWEST) or 0 < path.heard < now - self.silent_s
+                    if (path.dirty and len(path.times) >= SORTIE.coarse_map_pictures)
+                    or 0 < path.heard < now - self.silent_s
                 ]
             for key, path in due:
                 try:
@@ -99,13 +99,13 @@ class LegWatch:
                 path.heard = 0.0  # reported once
         if silent:
             self._silent(*key)
-        if len(times) < FEWEST:
+        if len(times) < SORTIE.coarse_map_pictures:
             return
         lat, lon = np.array(places).T
         north = (lat - lat[0]) * DEGREE_M
         east = (lon - lon[0]) * DEGREE_M * np.cos(np.radians(lat[0]))
         legs = ended_legs(np.column_stack([east, north]), np.array(times), over=silent)
-        if sum(last + 1 - first for first, last in legs) < FEWEST:
+        if sum(last + 1 - first for first, last in legs) < SORTIE.coarse_map_pictures:
             return
         with self._lock:
             past = set(times[: legs[-1][1] + 1])

@@ -9,6 +9,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
 
+from gcs_plugin.config import SORTIE
 from gcs_plugin.daemon.jobs.job_queue import Job, ReportProgress, new_job
 from gcs_plugin.daemon.jobs.joint_refinement import together_jobs
 from gcs_plugin.daemon.jobs.placed_sorties import detail_of, others_near, refined_change, solution_row, sortie_frames
@@ -28,8 +29,6 @@ _BEGUN_S: Final = 60.0
 _QUIET_S: Final = 0.7
 _MOST_QUIET_S: Final = 3.0
 _LATE_S: Final = 15.0
-_AGAIN: Final = 10
-"""With so many late pictures a vehicle is refined again; fewer are registered to its refined ones."""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -162,7 +161,7 @@ class SortieRefinement:
             return None
         row = solution_row(self.journal, job)
         refined = None if row is None else json.loads(row["detail"]).get("refined")
-        return row if refined is not None and count - refined < _AGAIN else None
+        return row if refined is not None and count - refined < SORTIE.again_pictures else None
 
     def _neighbours(self, job: Job, box: BoundingBox) -> list[Path]:
         """Solutions of other vehicles nearby."""

@@ -28,7 +28,7 @@ from orthoswarm.model.placement import PlacedFrame, Terrain
 from orthoswarm.mosaic.radiometry import estimate_fields
 
 _GROUND_STEP_M = 10.0
-_MOST_NODES = 250_000
+_MOST_NODES = 250_000  # of the ground's height
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -15,8 +15,8 @@ from orthoswarm.config import active
 from orthoswarm.model.earth import DEGREE_M
 from orthoswarm.model.frame import Frame
 
-LEVELS: Final = 8
-_STEP_SHARE: Final = 0.06
+LEVELS: Final = 8  # of spacing, the coarsest first
+_STEP_SHARE: Final = 0.06  # of the height above ground: distance of pictures on the finest level
 
 
 @dataclass(frozen=True, slots=True)

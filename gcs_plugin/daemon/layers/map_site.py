@@ -28,8 +28,8 @@ from orthoswarm.mosaic.footprint import default_gsd, footprint_boxes, rejection
 from orthoswarm.mosaic.realtime import RealtimeMosaic
 from orthoswarm.mosaic.recorded_pose import recorded_cameras
 
-_FEW: Final = 200
-_OTHER_GSD: Final = 3.0
+_FEW: Final = 200  # pictures drawn, up to which another ground pixel is chosen anew
+_OTHER_GSD: Final = 3.0  # times the map's ground pixel
 _FAR_M: Final = 100_000.0
 _SEEN_HEIGHTS: Final = 4.0  # nothing is drawn beyond 3.8 heights (`reach`)
 _log = logging.getLogger(__name__)

@@ -36,8 +36,8 @@ from orthoswarm.mosaic.render_passes import thumbnail
 from orthoswarm.raster.picture_file import read_rgba
 from orthoswarm.raster.picture_quality import PictureQuality, picture_quality
 
-_IN_MEMORY: Final = 2000
-_AT_ONCE: Final = 16
+_IN_MEMORY: Final = 2000  # frames that wait; the journal has the others
+_AT_ONCE: Final = 16  # pictures drawn between two looks at the queue
 _LATE_S: Final = 1.0
 _LOOK_S: Final = 0.5
 _COLUMNS: Final = "seq, vehicle, image, time, arrived, path, width, height, pose, sortie"

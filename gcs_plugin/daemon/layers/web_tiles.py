@@ -28,9 +28,9 @@ Bytes = NDArray[np.uint8]
 Array = NDArray[np.float64]
 
 SIDE: Final = 256
-DEEPEST: Final = 24
+DEEPEST: Final = 24  # zoom: 1 cm at the equator
 _HALF_WORLD_M: Final = 0.5 * WEB_MERCATOR_M
-_NODES: Final = 9
+_NODES: Final = 9  # a side between which coordinates are interpolated
 _CACHE_BYTES: Final = 64 << 20
 _local = threading.local()
 

@@ -11,7 +11,7 @@ from orthoswarm.model.errors import InputError, OrthoSwarmError
 
 _PLAN_FIELDS: Final = ("area", "settings", "plan", "vehicles")
 _MOST_FINDS: Final = 10_000
-_MOST_NOTE: Final = 10_000
+_MOST_NOTE: Final = 10_000  # characters
 
 
 class OutdatedError(OrthoSwarmError):

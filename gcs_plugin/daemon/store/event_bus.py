@@ -6,7 +6,7 @@ import threading
 from collections import deque
 from typing import Any, Final
 
-_MOST_WAITING: Final = 2000
+_MOST_WAITING: Final = 2000  # events of one listener; it is told that it missed some
 
 
 class Subscription:

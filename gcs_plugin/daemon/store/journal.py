@@ -52,7 +52,7 @@ CREATE TABLE IF NOT EXISTS exposures (
 CREATE TABLE IF NOT EXISTS completions (
     id INTEGER PRIMARY KEY AUTOINCREMENT, vehicle TEXT NOT NULL, sortie INTEGER NOT NULL, detail TEXT NOT NULL);
 """
-_BATCH: Final = 256
+_BATCH: Final = 256  # changes in one transaction
 _BUSY_S: Final = 30.0
 
 Change = Callable[[sqlite3.Connection], Any]

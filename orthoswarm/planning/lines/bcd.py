@@ -166,10 +166,12 @@ def order_cells(ways: Array) -> list[int]:
     n = len(ways) // 4
     if n == 1:
         return [0]
-    if n <= active().planning.exact_cells:
+    config = active().planning
+    if n <= config.exact_cells:
         return _shortest_order(ways)
-    first = np.arange(n) if n <= 60 else np.linspace(0, n - 1, 60).astype(int)
-    row, code = _best_row(np.ascontiguousarray(ways), first)
+    first = np.linspace(0, n - 1, min(n, config.row_starts)).astype(int)
+    rounds = config.row_rounds[0] if n <= config.row_many else config.row_rounds[1]
+    row, code = _best_row(np.ascontiguousarray(ways), first, rounds)
     return [4 * int(cell) + int(way) for cell, way in zip(row, code)]
 
 
@@ -239,7 +241,7 @@ def _nearest_row(ways, first):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _best_row(ways, starts):  # type: ignore[no-untyped-def]
+def _best_row(ways, starts, rounds):  # type: ignore[no-untyped-def]
     n = len(ways) // 4
     code = np.empty(n, np.int64)
     best, row = np.inf, np.arange(n)
@@ -248,7 +250,7 @@ def _best_row(ways, starts):  # type: ignore[no-untyped-def]
         cost = _row_cost(ways, trial, code)
         if cost < best:
             best, row = cost, trial
-    for _ in range(20 if n <= 80 else 2):
+    for _ in range(rounds):
         better = False
         for i in range(n):
             for j in range(n):

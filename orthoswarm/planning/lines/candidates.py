@@ -54,7 +54,11 @@ def candidates(
     angles = rank_directions(field, foot, turn_m, vehicles)
     if method == "tmstc":  # a grid looks the same after a right angle
         quarter = [a % (0.5 * np.pi) for a in angles]
-        angles = [a for k, a in enumerate(quarter) if not any(abs(a - b) < 0.02 for b in quarter[:k])]
+        angles = [
+            a
+            for k, a in enumerate(quarter)
+            if not any(abs(a - b) < active().planning.same_grid_rad for b in quarter[:k])
+        ]
     few, least = False, np.inf
     for number, angle in enumerate(angles):
         if number >= (active().planning.tries_if_few if few else _TRIES[method]):

@@ -28,12 +28,14 @@ def make_obstacles(no_fly: Geometry, clearance_m: float) -> Geometry:
     """
     if no_fly.is_empty:
         return shapely.MultiPolygon()
-    tolerance = 0.1 * clearance_m
+    config = active().planning
+    tolerance = config.obstacle_tolerance * clearance_m
     while True:
         grown = no_fly.buffer(clearance_m + tolerance, join_style="mitre", mitre_limit=2.0).simplify(tolerance)
         parts = [shapely.Polygon(p.exterior) for p in shapely.get_parts(grown)]
         obstacles = shapely.union_all(parts)
-        if shapely.get_num_coordinates(obstacles) <= active().planning.detour_most_corners or tolerance > 50.0:
+        corners = shapely.get_num_coordinates(obstacles)
+        if corners <= config.detour_most_corners or tolerance > config.obstacle_tolerance_m:
             return obstacles
         tolerance *= 2.0
 

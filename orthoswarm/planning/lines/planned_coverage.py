@@ -84,7 +84,7 @@ def mend(field: Field, legs: Array, foot: Footprint, *, router: Router, reach_m:
             if excess <= 0.0 or any(h.contains(gap.centroid) for h in hopeless):
                 continue
             more, gained = legs_for(gap, field.obstacles, foot, reach_m, angle_rad)
-            if gained < 0.2 * gap.area:
+            if gained < active().planning.gap_least_share * gap.area:
                 hopeless.append(gap)
                 continue
             excess -= gained
@@ -110,7 +110,8 @@ def legs_for(gap: Geometry, obstacles: Geometry, foot: Footprint, reach_m: float
     box = shapely.get_coordinates(shapely.minimum_rotated_rectangle(gap))
     edges = [np.diff(shapely.get_coordinates(r), axis=0) for p in pieces(near) for r in shapely.get_rings(p)]
     walls = np.concatenate([np.diff(box[:3], axis=0), *edges]) if len(box) > 2 else np.array([[1.0, 0.0]])
-    walls = walls[np.argsort(-np.hypot(*walls.T))][:8]
+    config = active().planning
+    walls = walls[np.argsort(-np.hypot(*walls.T))][: config.gap_walls]
     # Lines run along +y of a turned frame: a wall's direction less a right angle.
     angles = np.unique(np.round([*(np.arctan2(walls[:, 1], walls[:, 0]) - np.pi / 2) % np.pi, angle % np.pi], 3))
     best: tuple[float, Array, float] = (-np.inf, np.empty((0, 2, 2)), 0.0)
@@ -120,7 +121,7 @@ def legs_for(gap: Geometry, obstacles: Geometry, foot: Footprint, reach_m: float
         x0, y0, x1, y1 = local.ground.bounds
         count = max(1, int(np.ceil((x1 - x0) / foot.width_m - 1e-6)))
         play = max(0.0, 0.5 * (count * foot.width_m - (x1 - x0)))
-        for shift in np.linspace(-play, play, 7):
+        for shift in np.linspace(-play, play, config.gap_shifts):
             middle = 0.5 * (x0 + x1) + shift + foot.width_m * (np.arange(count) - 0.5 * (count - 1))
             new = [
                 leg
@@ -134,7 +135,7 @@ def legs_for(gap: Geometry, obstacles: Geometry, foot: Footprint, reach_m: float
             legs = np.array(new)
             seen = local.ground.area - missed(local.ground, legs, foot.width_m, reach_m).area
             cost = float(np.hypot(*(legs[:, 1] - legs[:, 0]).T).sum()) + 2.0 * foot.spacing_m * len(legs)
-            score = seen / local.ground.area - 0.02 * cost / foot.spacing_m
+            score = seen / local.ground.area - config.gap_leg_price * cost / foot.spacing_m
             if score > best[0] and seen > 0.0:
                 best = (score, frame.to_grid(legs), seen)
     return best[1], best[2]

@@ -106,7 +106,7 @@ def strip_legs(field: Field, box: tuple[float, float, float, float], foot: Footp
     for low, high in reaches:
         for free_low, free_high in _free_parts(field.obstacles, x, low - more, high + more):
             inside = [(max(b[1] - more, free_low), min(b[3] + more, free_high)) for b in bounds]
-            seen = [(a, b) for a, b in inside if b - a > 0.01]
+            seen = [(a, b) for a, b in inside if b - a > active().planning.shortest_m]
             if seen:
                 ends = (min(a for a, _ in seen), max(b for _, b in seen))
                 legs.append(_at_least(field.obstacles, x, ends, foot.trigger_m))
@@ -117,19 +117,19 @@ def _free_parts(obstacles: Geometry, x: float, low: float, high: float) -> list[
     line = shapely.LineString([(x, low), (x, high)])
     free = line.difference(obstacles) if not obstacles.is_empty else line
     parts = [shapely.bounds(p) for p in shapely.get_parts(free)]
-    return [(float(b[1]), float(b[3])) for b in parts if b[3] - b[1] > 0.01]
+    return [(float(b[1]), float(b[3])) for b in parts if b[3] - b[1] > active().planning.shortest_m]
 
 
 def _at_least(obstacles: Geometry, x: float, ends: tuple[float, float], length: float) -> Array:
     """A leg of at least a length about its middle, if nothing stands in the way."""
-    low, high = ends
+    (low, high), slip = ends, active().planning.shortest_m
     if high - low < length:
         middle = 0.5 * (low + high)
         low, high = next(
             (
                 (a, b)
                 for a, b in _free_parts(obstacles, x, middle - 0.5 * length, middle + 0.5 * length)
-                if a <= low + 0.01 and b >= high - 0.01
+                if a <= low + slip and b >= high - slip
             ),
             ends,
         )
@@ -151,22 +151,23 @@ def line_count(width_m: float, spacing_m: float) -> int:
 
 
 def candidate_angles(ground: Geometry, spacing_m: float) -> Array:
-    """Turning angles worth trying, radians in [0, pi): of long edges, of the tightest box, and every 15 degrees."""
-    outline = ground.simplify(0.1 * spacing_m)
+    """Turning angles worth trying, radians in [0, pi): of long edges, of the tightest box, and at even steps."""
+    config = active().planning
+    outline = ground.simplify(config.edge_spacings * spacing_m)
     edges = [
         np.diff(shapely.get_coordinates(r), axis=0) for p in shapely.get_parts(outline) for r in shapely.get_rings(p)
     ]
     steps = np.concatenate(edges)
     length, angle = np.hypot(*steps.T), np.arctan2(steps[:, 1], steps[:, 0]) % np.pi
-    found = list(angle[np.argsort(-length, kind="stable")][:24])
+    found = list(angle[np.argsort(-length, kind="stable")][: config.edge_directions])
     box = shapely.get_coordinates(shapely.minimum_rotated_rectangle(ground))
     found.append(float(np.arctan2(*(box[1] - box[0])[::-1]) % np.pi))
-    found += list(np.radians(np.arange(0, 180, 15)))
+    found += list(np.radians(np.arange(0, 180, config.direction_step_deg)))
     # Lines run across the sweep, so a line along an edge means a sweep turned by a right angle: both are worth a try.
     both = np.array([*found, *[(a + 0.5 * np.pi) % np.pi for a in found]])
-    distinct: list[float] = []
+    same, distinct = np.radians(config.same_direction_deg), list[float]()
     for a in both:
-        if all(abs((a - k + 0.5 * np.pi) % np.pi - 0.5 * np.pi) > np.radians(1.0) for k in distinct):
+        if all(abs((a - k + 0.5 * np.pi) % np.pi - 0.5 * np.pi) > same for k in distinct):
             distinct.append(float(a))
     return np.array(distinct)
 
@@ -191,7 +192,7 @@ def stretches(lengths_m: Array, spacing_m: float) -> int:
 
 def rank_directions(field: Field, foot: Footprint, turn_m: float, vehicles: int) -> list[float]:
     """Sweep angles in radians from the cheapest on; those with too few lines for the vehicles come last."""
-    outline = Field(field.ground.simplify(0.05 * foot.spacing_m), field.obstacles)
+    outline = Field(field.ground.simplify(active().planning.ranked_spacings * foot.spacing_m), field.obstacles)
     ranked = []
     for angle in candidate_angles(outline.ground, foot.spacing_m):
         cost, lines = direction_cost(outline, float(angle), foot.spacing_m, turn_m)

@@ -61,7 +61,7 @@ class Options:
     endurances_s: Sequence[float] = ()
     clearance_m: float | None = None
     separation: Separation = field(default_factory=Separation)
-    most_items: int = 650
+    most_items: int = field(default_factory=lambda: active().ardupilot.most_items)
     run_in_m: float = 0.0
     wait_s: float = 0.0
 
@@ -131,9 +131,9 @@ class Work:
     @property
     def score(self) -> float:
         """Less is better: the makespan, dearer where the work is shared unevenly."""
-        price = 2.0 * max(0.0, self.balance - active().planning.fair_balance) + 6.0 * max(
-            0.0, self.balance - active().planning.unfair_balance
-        )
+        config = active().planning
+        limits = config.fair_balance, config.unfair_balance
+        price = sum(p * max(0.0, self.balance - limit) for p, limit in zip(config.balance_prices, limits, strict=True))
         return self.longest_s * (1.0 + price)
 
 
@@ -267,19 +267,20 @@ class Swarm:
 
     @property
     def _least_leg_m(self) -> float:
-        return 4.0 * self._foot.trigger_m
+        return active().planning.least_leg_triggers * self._foot.trigger_m
 
     def _sorties(self, legs: Array, home: Array, endurance_s: float) -> list[Array]:
         """A vehicle's legs, cut into as many flights as endurance and mission size ask for."""
-        options, least, within_s = self._options, self._least_leg_m, endurance_s
+        options, least, within_s, config = self._options, self._least_leg_m, endurance_s, active().planning
         limits = replace(self._limits, endurance_s=within_s)
         top = options.separation.layers * options.separation.height_m
-        for attempt in range(12):
+        for attempt in range(config.sortie_tries):
             step = least
             if np.isfinite(within_s):
-                step = min(max(within_s * options.motion.speed_m_s / 40.0, self._foot.trigger_m), least)
+                step = min(max(within_s * options.motion.speed_m_s / config.sortie_parts, self._foot.trigger_m), least)
             total = float(np.hypot(*(legs[:, 1] - legs[:, 0]).T).sum())
-            row = cut(legs, self._router, options.motion, shares=1, least_m=step, step_m=max(step, total / 2000.0))
+            coarse = max(step, total / config.row_parts)
+            row = cut(legs, self._router, options.motion, shares=1, least_m=step, step_m=coarse)
             found = sorties(row, home, self._returns, router=self._router, motion=options.motion, limits=limits)
             if found is None:
                 raise self._too_short(row, home[None], endurance_s)
@@ -291,8 +292,8 @@ class Swarm:
             # The cut knows turns and detours only roughly: cut again a little shorter, and by more where that does not
             # move the cut.
             fewer = limits.most_legs if most <= options.most_items else limits.most_legs * options.most_items // most
-            hair = 0.995 - 0.005 * (1.6**attempt - 1.0)
-            within_s = hair * within_s * min(1.0, endurance_s / longest)
+            shorter = 1.0 - config.sortie_shorter * config.sortie_shorter_growth**attempt
+            within_s = shorter * within_s * min(1.0, endurance_s / longest)
             limits = replace(limits, endurance_s=within_s, most_legs=max(1, fewer))
         raise self._too_short(row, home[None], endurance_s)
 
@@ -304,7 +305,8 @@ class Swarm:
         start, part = np.unravel_index(np.argmax(far), far.shape)
         home = row.parts[part, 0] if starts is None else places[start]
         needed = self._flight(row.parts[part][None], home, top, top).time_s(self._options.motion)
+        asked_for = active().planning.endurance_spare * needed
         return InputError(
             f"the endurance of {endurance_s / 60:.1f} min is too short: the farthest line needs about "
-            f"{math.ceil(1.05 * needed / 6) / 10:.1f} min; start nearer, fly faster or lower, or use larger batteries"
+            f"{math.ceil(asked_for / 6) / 10:.1f} min; start nearer, fly faster or lower, or use larger batteries"
         )

@@ -41,11 +41,11 @@ class Separation:
         swap_s: time on the ground between a vehicle's sorties.
     """
 
-    distance_m: float = 10.0
-    height_m: float = 5.0
+    distance_m: float = field(default_factory=lambda: active().planning.separation_m)
+    height_m: float = field(default_factory=lambda: active().planning.layer_m)
     layers: int = 4
     slack_s: float = field(default_factory=lambda: active().ardupilot.schedule_slack_s)
-    launch_s: float = 5.0
+    launch_s: float = field(default_factory=lambda: active().planning.launch_s)
     swap_s: float = 120.0
 
 

@@ -171,13 +171,13 @@ def _evenly(
         np.array(np.broadcast_to(np.asarray(limits.endurance_s, np.float64), len(out))),
         np.array([limits.fixed_s, limits.swap_s, limits.most_legs], np.float64),
     )
-    cut_price, leeway = active().planning.cut_price, active().planning.leeway
+    config = active().planning
     # A cap that is met keeps the search narrow, so try small ones first.
     share_s = (row.end_s[-1] - row.begin_s[0]) / len(out)
-    for cap in (*(share_s * 1.3 * 1.5 ** np.arange(8)), np.inf):
-        cuts, longest = _cut_evenly(*problem, cut_price, cap, True)
+    for cap in (*(share_s * config.first_cap * config.cap_growth ** np.arange(config.caps)), np.inf):
+        cuts, longest = _cut_evenly(*problem, config.cut_price, cap, True)
         if cuts[0] >= 0:
-            return np.asarray(_cut_evenly(*problem, cut_price, leeway * longest + 1e-6, False)[0])
+            return np.asarray(_cut_evenly(*problem, config.cut_price, config.leeway * longest + 1e-6, False)[0])
     return None
 
 

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gcs_plugin.fleet.flight_limits import LEGAL_HEIGHT_M
+from gcs_plugin.config import LIMITS
 from gcs_plugin.mission.plan_folder import number_in, read_plan_folder
 from orthoswarm.model.errors import InputError
 
@@ -101,8 +101,8 @@ def _start_arguments(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("--plan", type=Path, metavar="DIR", help="folder of a plan: its vehicles, at its times")
     verb.add_argument("--sortie", type=int, default=1, metavar="N", help="which flight of the plan (default 1)")
     verb.add_argument(
-        "--max-height", type=float, default=LEGAL_HEIGHT_M, metavar="M",
-        help=f"height above takeoff that may be flown (default {LEGAL_HEIGHT_M:g}, the usual legal limit)",
+        "--max-height", type=float, default=LIMITS.legal_height_m, metavar="M",
+        help=f"height above takeoff that may be flown (default {LIMITS.legal_height_m:g}, the usual legal limit)",
     )  # fmt: skip
 
 

@@ -1,0 +1,75 @@
+"""Numbers that steer several places of the ground station, or that an operator wants to know: one dataclass a subject.
+
+They belong to the safety of a flight and are not overridden; the distances that vehicles keep are a plan's
+(`orthoswarm.config.planning`). What only one module uses (a polling period, a buffer) stands at its top.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HearingConfig:
+    """When a vehicle counts as heard."""
+
+    lost_s: float = 5.0
+    """A vehicle that was silent for so long is lost, seconds: five heartbeats of 1 Hz (chosen)."""
+    fresh_s: float = 2.0
+    """A state up to this old is that of now, seconds: two heartbeats (chosen)."""
+    all_found_s: float = 2.2
+    """After so long without a further vehicle no more are expected, seconds: two heartbeats (chosen)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlightLimits:
+    """What a flight may use, where plan and user do not say it."""
+
+    legal_height_m: float = 120.0
+    """Height up to which drones fly without a permit in the EU (2019/947, UAS.OPEN.010), metres; 400 ft in the US."""
+    endurance_s: float = 1200.0
+    """Flight time of a full battery, seconds (chosen: a small multicopter's)."""
+    reserve_share: float = 0.2
+    """Share of the battery that is to be left after landing (chosen: what pilots keep)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AlarmConfig:
+    """When two vehicles in the air come too near each other."""
+
+    over_share: float = 1.2
+    """An alarm ends where they are so many times farther apart than it begins at (chosen: it must not come and go)."""
+    height_kept_m: float = 0.5
+    """How well vehicles keep their height, metres: those that a plan puts a layer apart are a little less apart."""
+    ahead_s: float = 4.0
+    """How far ahead vehicles are followed on straight lines, seconds."""
+    less_a_second: float = 0.15
+    """By this share a second the distances that count ahead are less, since vehicles turn. Of 35 real autopilots in
+    simulation three pairs came within 10 m: said 3.0 to 4.0 s before they were nearest, as of one pair that turned away
+    (at 12 m). Without this share two pairs turned away, and five if they are followed for 5 s."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CommandConfig:
+    """When a command is too late."""
+
+    fresh_s: float = 5.0
+    """How long after it was given a command may still be sent, seconds; a later one could surprise whoever gave it."""
+    takeoff_late_s: float = 5.0
+    """A takeoff later than planned by more is late, seconds: arming and the start take up to three of themselves."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SortieConfig:
+    """How many pictures a flight's steps take."""
+
+    coarse_map_pictures: int = 10
+    """Least number of new pictures of finished legs for a coarse map during the flight (chosen)."""
+    again_pictures: int = 10
+    """With so many late pictures a sortie is refined again; fewer are resected from its refined ones (chosen)."""
+
+
+HEARING: Final = HearingConfig()
+LIMITS: Final = FlightLimits()
+ALARM: Final = AlarmConfig()
+COMMAND: Final = CommandConfig()
+SORTIE: Final = SortieConfig()
