@@ -25,7 +25,7 @@ class ProgressBars:
                 MofNCompleteColumn(),
                 TimeRemainingColumn(elapsed_when_finished=True),
                 console=Console(stderr=True),
-                refresh_per_second=4,
+                auto_refresh=False,  # its thread would keep workers from being forked, see cheapest_context
             )
             self._bars.start()
         return self
@@ -47,4 +47,4 @@ class ProgressBars:
         elif now - self._shown < 0.1 and done < total:
             return
         self._shown = now
-        self._bars.update(self._tasks[what], completed=done, total=total)
+        self._bars.update(self._tasks[what], completed=done, total=total, refresh=True)

@@ -8,6 +8,7 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import IO, Any, Generic, TypeVar
+from weakref import WeakSet
 
 from orthoswarm import __version__
 from orthoswarm.export.atomic_file import atomic_write, disk_error
@@ -72,6 +73,7 @@ class Workspace:
         if not _try_lock(self._lock):
             self._lock.close()
             raise InputError(f"another run is writing to {out}; wait for it or choose another folder")
+        _locked.add(self)
 
     def begin(self, key: str) -> bool:
         """Get ready for a run with a key; True if results of an interrupted one with the same key are there."""
@@ -186,6 +188,19 @@ def unmake(folders: Iterable[Path]) -> None:
     for folder in folders:
         with contextlib.suppress(OSError):
             folder.rmdir()
+
+
+_locked: "WeakSet[Workspace]" = WeakSet()
+
+
+def _let_go() -> None:
+    """In a forked worker: close its copies of locks, which would hold the folders until the worker has ended, too."""
+    for space in list(_locked):
+        space.close()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_let_go)
 
 
 def _try_lock(file: IO[bytes]) -> bool:

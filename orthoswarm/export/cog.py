@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from orthoswarm import __version__
 from orthoswarm.export.atomic_file import atomic_write
+from orthoswarm.export.predictor import predict
 from orthoswarm.model.geo import GroundGrid
 
 Bytes = NDArray[np.uint8]
@@ -147,12 +148,10 @@ def _tile(source: Source, first: tuple[int, int], level: _Level, r: int, c: int)
 
 def _deflate(tile: Bytes) -> bytes:
     """Horizontal differences (TIFF predictor 2) and deflate; nothing for a transparent tile."""
-    if not tile[..., 3].any():
+    differences = np.empty(tile.shape[:2], np.uint32)
+    if not predict(np.ascontiguousarray(tile).view(np.uint32)[..., 0], differences):
         return b""
-    tile = tile.copy()
-    tile[tile[..., 3] == 0] = 0
-    tile[:, 1:] = tile[:, 1:] - tile[:, :-1]
-    return isal_zlib.compress(tile.tobytes(), _LEVEL)
+    return isal_zlib.compress(differences, _LEVEL)
 
 
 # -- TIFF ---------------------------------------------------------------------------------------------------------

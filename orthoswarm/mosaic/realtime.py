@@ -67,7 +67,7 @@ class RealtimeMosaic:
             raise InputError(f"the canvas in {canvas.path} was rendered, not drawn in real time; use another folder")
         self.canvas = canvas
         self._reals = np.empty((3, canvas.tile_px + RUN), np.float32)
-        self._integers = np.empty((2, canvas.tile_px + RUN), np.uint32)
+        self._integers = np.empty((6, canvas.tile_px + RUN), np.uint32)
 
     def add(self, picture: Bytes, camera: Camera, ground_z_m: float = 0.0, *, weak: bool = False) -> Added:
         """Draw one frame.

@@ -170,3 +170,44 @@ def test_a_worker_does_not_inherit_the_path_that_opencv_is_imported_with():
     for _ in range(3):
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
+
+
+FORKING = """
+import os, sys, threading
+from orthoswarm.batch.workspace import Workspace
+from orthoswarm.compute.workers import Processes, cheapest_context
+from pathlib import Path
+from tests.batch.test_workers import forked
+
+print(cheapest_context().get_start_method())
+wait = threading.Event()
+thread = threading.Thread(target=wait.wait)
+thread.start()
+print(cheapest_context().get_start_method())
+wait.set()
+thread.join()
+with Workspace(Path(sys.argv[1])) as space:
+    with Processes(2) as two:
+        others = {}
+        while not others:
+            others = {pid: parent for pid, parent in two.map(forked, range(40)) if pid != os.getpid()}
+        space.close()
+        with Workspace(Path(sys.argv[1])):  # the worker lives on, and holds no lock
+            print(*set(others.values()))"""
+
+
+def forked(_):
+    """This process, and whether it has what its parent made after it had started."""
+    import __main__
+
+    where(0)
+    return os.getpid(), hasattr(__main__, "FORKED_FROM")
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="this system does not tell the number of threads")
+def test_workers_are_forked_from_a_process_of_one_thread_only(tmp_path):
+    root = Path(__file__).parents[2]
+    code = FORKING.replace("with Workspace", "FORKED_FROM = os.getpid()\nwith Workspace", 1)
+    done = subprocess.run([sys.executable, "-c", code, tmp_path], cwd=root, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == ["fork", "spawn", "True"]

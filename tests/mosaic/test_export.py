@@ -20,6 +20,7 @@ from orthoswarm.export.cog import CLASSIC_BYTES, TILE_PX, write_cog
 from orthoswarm.export.cog_conversion import convert_cog
 from orthoswarm.export.linked_pictures import unique_names
 from orthoswarm.export.odm_folder import write_odm
+from orthoswarm.export.predictor import predict
 from orthoswarm.export.product_files import iso_time, simple_lens
 from orthoswarm.export.tiles.kmz import write_kmz
 from orthoswarm.export.tiles.mbtiles import write_mbtiles
@@ -123,6 +124,18 @@ def test_transparent_tiles_take_no_room(tmp_path):
     assert (tmp_path / "s.tif").stat().st_size < 40_000
     with rasterio.open(tmp_path / "s.tif") as image:
         assert image.read(4).sum() == 25 * 255
+
+
+def test_differences_are_taken_channel_by_channel():
+    rng = np.random.default_rng(3)
+    for columns in (1, 2, 7, 64):
+        tile = rng.integers(0, 256, (5, columns, 4), np.uint8)
+        tile[rng.random((5, columns)) < 0.3, 3] = 0
+        differences = np.empty((5, columns), np.uint32)
+        assert predict(tile.view(np.uint32)[..., 0], differences) == tile[..., 3].any()
+        summed = np.cumsum(differences.view(np.uint8).reshape(tile.shape), axis=1, dtype=np.uint8)
+        assert np.array_equal(summed, np.where(tile[..., 3:] > 0, tile, 0))
+    assert not predict(np.full((3, 4), 0x00FFFFFF, np.uint32), np.empty((3, 4), np.uint32))
 
 
 def test_a_single_pixel_and_a_long_strip(tmp_path):

@@ -13,7 +13,6 @@ from orthoswarm.model.camera import LEAST_RADIAL_SLOPE
 _EVEN = np.uint32(0x00FF00FF)
 _ODD = np.uint32(0xFF00FF00)
 _HALF = np.uint32(0x00800080)
-_ONE = np.uint32(1)
 _8 = np.uint32(8)
 _FULL = np.uint32(256)
 _FRACTION = np.uint32(255)
@@ -135,16 +134,20 @@ def _distort(us, vs, k1, k2, k3):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _blend(texels, stride, at, weight, keep, target):  # type: ignore[no-untyped-def]
+def _blend(texels, stride, at, weight, keep, corners, target):  # type: ignore[no-untyped-def]
     """Bilinear samples of packed pixels into a row where keep > 0; two channels at a time in 16-bit lanes.
 
-    The four weights sum to 256, so no lane overflows.
+    The four weights sum to 256, so no lane overflows. The four texels of each pixel are fetched first, into corners:
+    fetching cannot be vector code, and with it in the same loop nothing else would be.
     """
-    zero = np.float32(0.0)
+    zero, one, below = np.float32(0.0), np.uint64(1), np.uint64(stride)
+    here, right, low, low_right = corners[0], corners[1], corners[2], corners[3]
     for i in range(target.shape[0]):
-        p = at[i]
-        q = p + stride
-        t00, t01, t10, t11 = texels[p], texels[p + _ONE], texels[q], texels[q + _ONE]
+        p = np.uint64(at[i])
+        q = p + below
+        here[i], right[i], low[i], low_right[i] = texels[p], texels[p + one], texels[q], texels[q + one]
+    for i in range(target.shape[0]):
+        t00, t01, t10, t11 = here[i], right[i], low[i], low_right[i]
         fx, fy = weight[i] & _FRACTION, weight[i] >> _8
         w11 = (fx * fy) >> _8
         w01, w10 = fx - w11, fy - w11
@@ -231,7 +234,7 @@ def fuse(packed, score, part, picture, planes, centre, radius, matrix, lens, gsd
             used, least and greatest row used (they may lie half a pixel beyond the outermost centres).
         gsd_m: ground pixel.
         reals: float32 (3, T + RUN), scratch.
-        integers: uint32 (2, T + RUN), scratch.
+        integers: uint32 (6, T + RUN), scratch.
     """
     row0, col0, rows, columns = part
     height, width = picture.shape
@@ -279,7 +282,7 @@ def fuse(packed, score, part, picture, planes, centre, radius, matrix, lens, gsd
         if hits == 0:
             continue
         won += hits
-        _blend(texels, stride, at, weight, run, packed[r, left + begin : left + end])
+        _blend(texels, stride, at, weight, run, integers[2:], packed[r, left + begin : left + end])
         row_score, new = row_score[begin:end], new[begin:end]
         for i in range(end - begin):
             row_score[i] = max(row_score[i], new[i])
