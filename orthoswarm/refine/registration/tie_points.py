@@ -1,6 +1,6 @@
 """Tie points on the map, roofs that show how the map leans, and links between legs."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -24,6 +24,8 @@ class MapMatches:
 
     Attributes (Q): point: int32. camera: int32 whose picture was compared. shift: float64 (Q, 2) metres from the
         point to its place on the map. peak, ratio: float64 correlation and second peak / peak.
+        pixel: float64 (Q, 2), the middle of the compared patch in the picture, working pixels. place: float64 (Q, 2),
+        where that lies on the map, local frame. These two were measured; the shift follows from them and the solution.
     """
 
     point: Ints
@@ -31,10 +33,24 @@ class MapMatches:
     shift: Array
     peak: Array
     ratio: Array
+    pixel: Array
+    place: Array
+
+    @classmethod
+    def joined(cls, parts: "Sequence[MapMatches]") -> "MapMatches":
+        """All matches of at least one part, one part after the other."""
+        return cls(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in cls.__slots__})
+
+    @classmethod
+    def none(cls) -> "MapMatches":
+        """No matches."""
+        number, pair = np.zeros(0), np.zeros((0, 2))
+        ints = np.zeros(0, np.int32)
+        return cls(point=ints, camera=ints, shift=pair, peak=number, ratio=number, pixel=pair, place=pair)
 
     def take(self, keep: NDArray[np.bool_] | NDArray[np.integer]) -> "MapMatches":
         """Some of the matches."""
-        return MapMatches(self.point[keep], self.camera[keep], self.shift[keep], self.peak[keep], self.ratio[keep])
+        return MapMatches(**{name: getattr(self, name)[keep] for name in self.__slots__})
 
 
 def match_points(
@@ -78,13 +94,16 @@ def match_points(
             config.patch_share, found[part],
         )  # fmt: skip
     good = found[:, 2] > 0
-    found = found[good]
+    found, by, place = found[good], by[good], place[good]
+    shift = found[:, :2] * [ground.gsd_m, -ground.gsd_m]
     return MapMatches(
-        chosen[good].astype(np.int32),
-        by[good].astype(np.int32),
-        found[:, :2] * [ground.gsd_m, -ground.gsd_m],
-        found[:, 2],
-        found[:, 3] / found[:, 2],
+        point=chosen[good].astype(np.int32),
+        camera=by.astype(np.int32),
+        shift=shift,
+        peak=found[:, 2],
+        ratio=found[:, 3] / found[:, 2],
+        pixel=cameras.project(by, place),
+        place=place[:, :2] + shift,
     )
 
 

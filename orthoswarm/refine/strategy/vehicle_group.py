@@ -40,14 +40,7 @@ def pooled_lean(states: Sequence[VehicleState]) -> tuple[float, float]:
     mapped = [s for s in states if s.on_map]
     if not mapped:
         return (0.0, 0.0)
-    roofs = [s.roofs[0] for s in mapped]
-    joint = MapMatches(
-        np.concatenate([r.point for r in roofs]),
-        np.concatenate([r.camera for r in roofs]),
-        np.concatenate([r.shift for r in roofs]),
-        np.concatenate([r.peak for r in roofs]),
-        np.concatenate([r.ratio for r in roofs]),
-    )
+    joint = MapMatches.joined([s.roofs[0] for s in mapped])
     return vote_lean(joint, np.concatenate([s.roofs[1] for s in mapped]), np.zeros(2)) or (0.0, 0.0)
 
 

@@ -156,7 +156,7 @@ def registered_state(
         lens=adj.cameras.lens.copy(),
     )
     watch.lap("relative")
-    none = MapMatches(*(np.zeros(0, np.int32),) * 2, np.zeros((0, 2)), np.zeros(0), np.zeros(0))
+    none = MapMatches.none()
     state = VehicleState(
         vehicle=flight.frames[0].vehicle,
         flight=flight,

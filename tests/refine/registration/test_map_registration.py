@@ -275,7 +275,8 @@ def roofs(height, lean, seed=0, wild=0.3):
     bad = rng.random(len(height)) < wild
     shift[bad] = rng.uniform(-8, 8, (int(bad.sum()), 2))
     n = len(height)
-    return MapMatches(np.arange(n, dtype=np.int32), np.zeros(n, np.int32), shift, np.ones(n), np.zeros(n))
+    none = np.zeros((n, 2))
+    return MapMatches(np.arange(n, dtype=np.int32), np.zeros(n, np.int32), shift, np.ones(n), np.zeros(n), none, none)
 
 
 def in_light(ground, things, east, north):

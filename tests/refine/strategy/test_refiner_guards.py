@@ -152,7 +152,8 @@ def legs_and_matches(seed=0):
 
 def as_matches(camera, shift):
     n = len(camera)
-    return MapMatches(np.arange(n, dtype=np.int32), camera, shift, np.full(n, 0.5), np.full(n, 0.4))
+    none = np.zeros((n, 2))
+    return MapMatches(np.arange(n, dtype=np.int32), camera, shift, np.full(n, 0.5), np.full(n, 0.4), none, none)
 
 
 def test_a_leg_whose_matches_agree_on_another_line_is_moved_by_it():
