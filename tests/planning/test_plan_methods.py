@@ -201,28 +201,41 @@ def test_lines_of_every_method_see_a_free_area_and_keep_their_distance(lay):
     assert gaps.max() <= FOOT.spacing_m + 1e-3
 
 
+def ways(row, depot):
+    """Length of the ways between legs, and from and to the depot if there is one."""
+    total = np.hypot(*(row[1:, 0] - row[:-1, 1]).T).sum()
+    return total if depot is None else total + np.hypot(*(row[0, 0] - depot)) + np.hypot(*(row[-1, 1] - depot))
+
+
+def scattered(n, seed, with_depot):
+    rng = np.random.default_rng(seed)
+    return rng.uniform(0, 500, (n, 2, 2)), rng.uniform(0, 500, 2) if with_depot else None
+
+
 @settings(max_examples=25, deadline=None)
 @given(st.integers(2, 9), st.integers(0, 1000), st.booleans())
 def test_local_search_keeps_all_legs_and_never_lengthens_the_row(n, seed, with_depot):
-    rng = np.random.default_rng(seed)
-    legs, depot = rng.uniform(0, 500, (n, 2, 2)), rng.uniform(0, 500, 2) if with_depot else None
-    router = Router(FREE)
-
-    def ways(row):
-        total = np.hypot(*(row[1:, 0] - row[:-1, 1]).T).sum()
-        return total if depot is None else total + np.hypot(*(row[0, 0] - depot)) + np.hypot(*(row[-1, 1] - depot))
-
-    better = shorten(legs, router, depot)
+    legs, depot = scattered(n, seed, with_depot)
+    better = shorten(legs, Router(FREE), depot)
 
     def unordered(row):
         return sorted(sorted(map(tuple, leg.tolist())) for leg in row)
 
     assert unordered(better) == unordered(legs)
-    assert ways(better) <= ways(legs) + 1e-6
-    if n <= 4:
+    assert ways(better, depot) <= ways(legs, depot) + 1e-6
+
+
+def test_local_search_mostly_finds_the_shortest_row():
+    """A local search can stop at a row that no single move shortens; that is to be rare, and then near."""
+    over = []
+    for seed in range(100):
+        legs, depot = scattered(4, seed, seed % 2 == 0)
         tried = [
-            ways(np.array([legs[k][::-1] if f else legs[k] for k, f in zip(row, flips, strict=True)]))
-            for row in itertools.permutations(range(n))
-            for flips in itertools.product([False, True], repeat=n)
+            ways(np.array([legs[k][::-1] if f else legs[k] for k, f in zip(row, flips, strict=True)]), depot)
+            for row in itertools.permutations(range(4))
+            for flips in itertools.product([False, True], repeat=4)
         ]
-        assert ways(better) <= 1.25 * min(tried) + 1e-6
+        over.append(ways(shorten(legs, Router(FREE), depot), depot) / min(tried) - 1.0)
+    assert np.mean(np.array(over) < 1e-6) > 0.8 and np.percentile(over, 95) < 0.15, np.percentile(
+        over, [50, 80, 95, 100]
+    )

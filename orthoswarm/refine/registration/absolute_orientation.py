@@ -356,7 +356,7 @@ def orient_on_map(flight: Flight, ground: LoadedMap, matches: MapMatches, surfac
     _step(flight, surface, ties, config.tie_scales[1])
     surface = refit_ground(flight, surface, as_smooth=True)
     ties = with_sigma_of_residuals(ties, flight.adjustment.tie_residual)
-    surface, ties, matches = _second_round(flight, ground, surface, ties, config.second_steps)
+    surface, ties, matches = _second_round(flight, ground, surface, ties, steps=config.second_steps)
     return AbsoluteOrientation(surface, ties, matches, roofs, links)
 
 
@@ -375,7 +375,8 @@ def reorient_on_map(
     """
     config = active().registration
     _step(flight, surface, ties, config.tie_scales[1])
-    return _second_round(flight, ground, refit_ground(flight, surface), ties, config.renewed_steps, pictures)
+    surface = refit_ground(flight, surface)
+    return _second_round(flight, ground, surface, ties, steps=config.renewed_steps, pictures=pictures)
 
 
 def _step(flight: Flight, surface: GroundModel, ties: MapTies, tie_scale: float) -> None:
@@ -389,6 +390,7 @@ def _second_round(
     ground: LoadedMap,
     surface: GroundModel,
     before: MapTies,
+    *,
     steps: int,
     pictures: NDArray[np.bool_] | None = None,
 ) -> tuple[GroundModel, MapTies, MapMatches]:

@@ -18,7 +18,7 @@ Ints = NDArray[np.int32]
 Gray = NDArray[np.uint8]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class MapMatches:
     """Points found on the map.
 

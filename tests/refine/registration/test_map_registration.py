@@ -276,7 +276,10 @@ def roofs(height, lean, seed=0, wild=0.3):
     shift[bad] = rng.uniform(-8, 8, (int(bad.sum()), 2))
     n = len(height)
     none = np.zeros((n, 2))
-    return MapMatches(np.arange(n, dtype=np.int32), np.zeros(n, np.int32), shift, np.ones(n), np.zeros(n), none, none)
+    return MapMatches(
+        point=np.arange(n, dtype=np.int32), camera=np.zeros(n, np.int32), shift=shift, peak=np.ones(n),
+        ratio=np.zeros(n), pixel=none, place=none,
+    )  # fmt: skip
 
 
 def in_light(ground, things, east, north):

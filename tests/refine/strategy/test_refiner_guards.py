@@ -153,7 +153,10 @@ def legs_and_matches(seed=0):
 def as_matches(camera, shift):
     n = len(camera)
     none = np.zeros((n, 2))
-    return MapMatches(np.arange(n, dtype=np.int32), camera, shift, np.full(n, 0.5), np.full(n, 0.4), none, none)
+    return MapMatches(
+        point=np.arange(n, dtype=np.int32), camera=camera, shift=shift, peak=np.full(n, 0.5), ratio=np.full(n, 0.4),
+        pixel=none, place=none,
+    )  # fmt: skip
 
 
 def test_a_leg_whose_matches_agree_on_another_line_is_moved_by_it():
