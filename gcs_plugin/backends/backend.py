@@ -5,9 +5,11 @@ import time
 from collections.abc import Callable, Collection, Mapping
 from typing import TYPE_CHECKING, Any
 
+from gcs_plugin.config import HEARING
 from gcs_plugin.fleet.commands import Verb
 from gcs_plugin.fleet.fleet_events import FleetEvent
 from gcs_plugin.fleet.flight_state import Word, flight_state
+from gcs_plugin.fleet.preflight import Check, preflight_all
 from gcs_plugin.fleet.takeoff_schedule import TakeoffSchedule
 from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.mavlink import Autopilot
@@ -16,7 +18,6 @@ from gcs_plugin.mission.items import Mission
 
 if TYPE_CHECKING:
     from gcs_plugin.fleet.commands import Order
-    from gcs_plugin.fleet.preflight import Check
     from gcs_plugin.mission.track import Airspace
 
 Report = Callable[[str, int, int], None]
@@ -35,6 +36,24 @@ class Backend(abc.ABC):
     events: list[FleetEvent]
 
     @abc.abstractmethod
+    def vehicles(self) -> Mapping[int, Vehicle]:
+        """The vehicles that were found, by system id."""
+
+    @abc.abstractmethod
+    def vehicle(self, system: int) -> Vehicle:
+        """One of them.
+
+        Raises:
+            InputError: it was not found.
+        """
+
+    @abc.abstractmethod
+    def is_known(self, vehicle: Vehicle) -> bool:
+        """Whether a vehicle has reported its state, so that there is no more to wait for."""
+
+    def look(self) -> None:  # noqa: B027 (most backends have nothing to do)
+        """Look for further vehicles, where `pump` does not find them by itself."""
+
     def discover(self, wait_s: float, wanted: Collection[int] = ()) -> list[int]:
         """Wait for vehicles: until all wanted ones are found, without `wanted` until no further one appears.
 
@@ -45,14 +64,29 @@ class Backend(abc.ABC):
         Returns:
             The system ids that were found, in order.
         """
+        end, found, since = time.monotonic() + wait_s, -1, 0.0
+        while time.monotonic() < end:
+            self.look()
+            self.pump(0.1)
+            vehicles = self.vehicles()
+            if len(vehicles) != found:
+                found, since = len(vehicles), time.monotonic()
+            if not all(self.is_known(vehicle) for vehicle in vehicles.values()):
+                continue
+            if wanted and all(system in vehicles for system in wanted):
+                break
+            if not wanted and found and time.monotonic() - since > HEARING.all_found_s:
+                break
+        return sorted(self.vehicles())
 
-    @abc.abstractmethod
     def autopilot(self, system: int) -> Autopilot:
         """The type of a vehicle's autopilot."""
+        return self.vehicle(system).autopilot
 
-    @abc.abstractmethod
     def summaries(self) -> list[dict[str, Any]]:
         """The state of all vehicles as JSON values."""
+        now = time.monotonic()
+        return [vehicle.summary(now) for _, vehicle in sorted(self.vehicles().items())]
 
     @abc.abstractmethod
     def problems(self) -> list[str]:
@@ -76,7 +110,6 @@ class Backend(abc.ABC):
             report: as for `upload`.
         """
 
-    @abc.abstractmethod
     def check(
         self,
         systems: Collection[int],
@@ -84,13 +117,15 @@ class Backend(abc.ABC):
         stored: Mapping[int, Mission],
         starts: Mapping[int, float],
         legal_height_m: float,
-    ) -> "list[Check]":
+    ) -> list[Check]:
         """Preflight check of vehicles with their present telemetry.
 
         Args:
             systems: the vehicles. missions: of the plan. stored: missions downloaded from the vehicles.
             starts: takeoffs in seconds after the first. legal_height_m: legal height limit, metres.
         """
+        vehicles = {s: self.vehicle(s) for s in systems}
+        return preflight_all(vehicles, missions, stored, starts, time.monotonic(), legal_height_m=legal_height_m)
 
     @abc.abstractmethod
     def command(

@@ -3,16 +3,14 @@
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from gcs_plugin.backends.backend import ENDED, Backend, Report, Say, coming_home, command_all
-from gcs_plugin.config import HEARING
 from gcs_plugin.fleet.commands import Order, Verb
 from gcs_plugin.fleet.fleet import Fleet
 from gcs_plugin.fleet.fleet_events import FleetEvent
 from gcs_plugin.fleet.message_rates import default_rates
-from gcs_plugin.fleet.preflight import Check, preflight_all
-from gcs_plugin.links.mavlink import Autopilot
+from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.transports import Link
 from gcs_plugin.mission.completion import Phase
 from gcs_plugin.mission.download import MissionDownload
@@ -42,29 +40,17 @@ class DirectBackend(Backend):
         self.events: list[FleetEvent] = []
         self.fleet.on_event(self.events.append)
 
-    def discover(self, wait_s: float, wanted: Collection[int] = ()) -> list[int]:
-        """Poll until all vehicles have been heard."""
-        fleet, end = self.fleet, time.monotonic() + wait_s
-        found, since = -1, 0.0
-        while time.monotonic() < end:
-            fleet.poll(0.1)
-            if len(fleet.vehicles) != found:
-                found, since = len(fleet.vehicles), time.monotonic()
-            known = all(v.reported and v.landed for v in fleet.vehicles.values())
-            if wanted and all(system in fleet.vehicles for system in wanted) and known:
-                break
-            if not wanted and found and known and time.monotonic() - since > HEARING.all_found_s:
-                break
-        return sorted(fleet.vehicles)
+    def vehicles(self) -> Mapping[int, Vehicle]:
+        """The fleet's vehicles."""
+        return self.fleet.vehicles
 
-    def autopilot(self, system: int) -> Autopilot:
-        """The type of a vehicle's autopilot."""
-        return self.fleet.vehicle(system).autopilot
+    def vehicle(self, system: int) -> Vehicle:
+        """One of them."""
+        return self.fleet.vehicle(system)
 
-    def summaries(self) -> list[dict[str, Any]]:
-        """The state of all vehicles."""
-        now = time.monotonic()
-        return [vehicle.summary(now) for _, vehicle in sorted(self.fleet.vehicles.items())]
+    def is_known(self, vehicle: Vehicle) -> bool:
+        """Whether it has answered what the fleet asks at first."""
+        return vehicle.reported and bool(vehicle.landed)
 
     def problems(self) -> list[str]:
         """Broken links, rejected packets, signing and shared system ids."""
@@ -100,18 +86,6 @@ class DirectBackend(Backend):
             if job.items is not None:
                 found[system] = Mission(fleet.vehicles[system].autopilot, tuple(job.items))
         return found
-
-    def check(
-        self,
-        systems: Collection[int],
-        missions: Mapping[int, Mission],
-        stored: Mapping[int, Mission],
-        starts: Mapping[int, float],
-        legal_height_m: float,
-    ) -> list[Check]:
-        """Preflight check with the fleet's state."""
-        vehicles = {s: self.fleet.vehicles[s] for s in systems}
-        return preflight_all(vehicles, missions, stored, starts, time.monotonic(), legal_height_m=legal_height_m)
 
     def command(
         self, verb: Verb, delays: Mapping[int, float], say: Say, airspace: "Airspace | None" = None

@@ -19,7 +19,6 @@ from gcs_plugin.config import HEARING
 from gcs_plugin.fleet.commands import URGENT, Order, Verb
 from gcs_plugin.fleet.fleet_events import FleetEvent, mission_event
 from gcs_plugin.fleet.message_rates import Rates, Streams
-from gcs_plugin.fleet.preflight import Check, preflight_all
 from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.mavlink import Autopilot, Message
 from gcs_plugin.links.transports import parse_address
@@ -102,29 +101,17 @@ class MavsdkBackend(Backend):
         self._crafts.clear()
         self._mavsdk.destroy()
 
-    def discover(self, wait_s: float, wanted: Collection[int] = ()) -> list[int]:
-        """Poll until all vehicles have been heard."""
-        end, found, since = time.monotonic() + wait_s, -1, 0.0
-        while time.monotonic() < end:
-            self._add_systems()
-            self.pump(0.1)
-            if len(self._crafts) != found:
-                found, since = len(self._crafts), time.monotonic()
-            known = all(c.vehicle.lat_deg is not None and c.vehicle.landed for c in self._crafts.values())
-            if wanted and all(system in self._crafts for system in wanted) and known:
-                break
-            if not wanted and found and known and time.monotonic() - since > HEARING.all_found_s:
-                break
-        return sorted(self._crafts)
+    def vehicles(self) -> Mapping[int, Vehicle]:
+        """Those whose messages MAVSDK passes on."""
+        return {system: craft.vehicle for system, craft in self._crafts.items()}
 
-    def autopilot(self, system: int) -> Autopilot:
-        """The type of a vehicle's autopilot."""
-        return self._craft(system).vehicle.autopilot
+    def vehicle(self, system: int) -> Vehicle:
+        """One of them."""
+        return self._craft(system).vehicle
 
-    def summaries(self) -> list[dict[str, Any]]:
-        """The state of all vehicles."""
-        now = time.monotonic()
-        return [craft.vehicle.summary(now) for _, craft in sorted(self._crafts.items())]
+    def is_known(self, vehicle: Vehicle) -> bool:
+        """Whether its place and landed state have arrived."""
+        return vehicle.lat_deg is not None and bool(vehicle.landed)
 
     def problems(self) -> list[str]:
         """Empty: MAVSDK does not report problems of links."""
@@ -151,18 +138,6 @@ class MavsdkBackend(Backend):
             found[system] = self._crafts[system].vehicle.mission = self._read(system)
             report("read", len(found), len(systems))
         return found
-
-    def check(
-        self,
-        systems: Collection[int],
-        missions: Mapping[int, Mission],
-        stored: Mapping[int, Mission],
-        starts: Mapping[int, float],
-        legal_height_m: float,
-    ) -> list[Check]:
-        """Preflight check with the telemetry so far."""
-        vehicles = {s: self._craft(s).vehicle for s in systems}
-        return preflight_all(vehicles, missions, stored, starts, time.monotonic(), legal_height_m=legal_height_m)
 
     def command(
         self, verb: Verb, delays: Mapping[int, float], say: Say, airspace: "Airspace | None" = None
@@ -198,7 +173,7 @@ class MavsdkBackend(Backend):
                 return True
             if time.monotonic() >= end:
                 return False
-            self._add_systems()
+            self.look()
             self.pump(0.2)
 
     # --- vehicles ---
@@ -210,7 +185,7 @@ class MavsdkBackend(Backend):
             raise OrthoSwarmError(f"vehicle {system} is not on the links (heard: {known}); check links and system ids")
         return craft
 
-    def _add_systems(self) -> None:
+    def look(self) -> None:
         """Add systems that MAVSDK has discovered."""
         from mavsdk import Autopilot as Kind
         from mavsdk.plugins.mavlink_direct import MavlinkDirect

@@ -169,3 +169,5 @@ class PlanningConfig:
     (chosen)."""
     in_turn_share: float = 0.25
     """Vehicles of one start take off and land in turn if the whole takes at most so much longer by that (chosen)."""
+    orders_tried_share: float = 2.0 / 3.0
+    """Where a smaller share of the vehicles has its turn within that, another order of them does not help (chosen)."""

@@ -5,15 +5,17 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
-_MAD_TO_SIGMA = 1.4826
+MAD_TO_SIGMA = 1.4826
 """Sigma of a Gaussian over the median of its absolute values: 1 / 0.6745 (Huber 1981)."""
+MEDIAN_SIGMA = 1.25
+"""Sigma of the median of n Gaussian values, times sqrt(n), over theirs: sqrt(pi / 2)."""
 
 
 def mad_sigma(deviation: ArrayLike) -> float:
     """Robust sigma of deviations from their median: the median absolute deviation, scaled for Gaussian errors."""
-    return _MAD_TO_SIGMA * float(np.median(np.abs(deviation)))
+    return MAD_TO_SIGMA * float(np.median(np.abs(deviation)))
 
 
 def mad_sigmas(deviation: ArrayLike) -> Array:
     """The same of each column of deviations (N, K): float64 (K,)."""
-    return np.asarray(_MAD_TO_SIGMA * np.median(np.abs(deviation), axis=0), np.float64)
+    return np.asarray(MAD_TO_SIGMA * np.median(np.abs(deviation), axis=0), np.float64)

@@ -10,6 +10,7 @@ from scipy.ndimage import maximum_filter, minimum_filter
 
 from orthoswarm.config import active
 from orthoswarm.model.geo import GroundGrid
+from orthoswarm.model.robust import MAD_TO_SIGMA
 from orthoswarm.stereo.rectified_pair import PairPoints
 
 Float32 = NDArray[np.float32]
@@ -121,7 +122,7 @@ def merge_heights(
     spread = np.zeros(z.shape[1])
     if known.any():
         middle[known] = np.nanmedian(z[:, known], axis=0)
-        spread[known] = 1.4826 * np.nanmedian(np.abs(z[:, known] - middle[known]), axis=0)
+        spread[known] = MAD_TO_SIGMA * np.nanmedian(np.abs(z[:, known] - middle[known]), axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
         agree = valid & (np.abs(z - middle) <= c.inlier_sigmas * np.hypot(s, spread))
         weight = np.where(agree, 1.0 / (s**2 + c.block_sigma_m**2), 0.0)

@@ -76,7 +76,7 @@ def test_where_it_would_take_too_long_they_take_off_beside_each_other_and_the_pl
 
 
 @pytest.mark.parametrize("vehicles", [5, 24])
-def test_taking_off_in_turn_is_tried_no_further_than_it_can_win(vehicles, monkeypatch):
+def test_taking_off_in_turn_is_tried_no_further_than_it_can_win(vehicles, monkeypatch, configure):
     placed, place = [], deconfliction._Sky.place
 
     def count(sky, *args):
@@ -91,7 +91,7 @@ def test_taking_off_in_turn_is_tried_no_further_than_it_can_win(vehicles, monkey
         assert "in turn" in plan.separation
     else:
         assert beside == vehicles and in_turn < vehicles
-    monkeypatch.setattr(deconfliction, "_HOPELESS", 0.0)
+    configure({"planning": {"orders_tried_share": 0.0}})
     monkeypatch.setattr(deconfliction._Placing, "soonest_s", 0.0)
     whole, _ = planned(vehicles, [start_at(-60.0, 200.0)])
     assert whole.vehicles == plan.vehicles

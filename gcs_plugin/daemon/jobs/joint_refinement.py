@@ -10,19 +10,19 @@ refinement waits, and gives way to any that arrives.
 import json
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gcs_plugin.daemon.jobs.job_queue import Job, Preempted, ReportProgress, new_job
+from gcs_plugin.daemon.jobs.job_queue import Job, ReportProgress, new_job
 from gcs_plugin.daemon.jobs.placed_sorties import detail_of, others_near, refined_change, solution_row
+from gcs_plugin.daemon.jobs.preemption import Preemption
 from gcs_plugin.daemon.jobs.publisher import Publisher
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
 from gcs_plugin.daemon.jobs.worker_tasks import JointTask, SortieResult, refine_jointly
 from gcs_plugin.daemon.layers.layers import new_name
 from gcs_plugin.daemon.store.journal import Change, Journal, unpacked
 from orthoswarm.model.bounding_box import BoundingBox
-from orthoswarm.model.errors import OrthoSwarmError
 
 
 def together_jobs(journal: Journal, job: Job, box: BoundingBox) -> list[Callable[[Any], Job]]:
@@ -49,32 +49,28 @@ class JointRefinement:
     basemap: Path | None
     least_px: float
     on_published: Callable[[str, Job], None] = lambda layer, job: None
-    _working: bool = False
-    _aside: bool = False
+    _preemption: Preemption = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._preemption = Preemption(self.workers)
 
     def solve(self, job: Job, report: ReportProgress) -> Change:
         """The handler of `together`."""
         target = self.publisher.solutions / f"{new_name('solution')}.pickle"
         began = time.monotonic()
-        self._working, self._aside = True, False
+        published = False
         try:
-            if not self._solve(job, report, target):
-                target.unlink(missing_ok=True)
-        except OrthoSwarmError:
-            target.unlink(missing_ok=True)
-            if self._aside:
-                raise Preempted from None
-            raise
+            with self._preemption.running():
+                published = self._solve(job, report, target)
         finally:
-            self._working = False
+            if not published:
+                target.unlink(missing_ok=True)
         job.detail["seconds"] = round(time.monotonic() - began, 3)
         return lambda db: None
 
     def give_up(self) -> None:
         """Stop the running job; it is done later."""
-        if self._working:
-            self._aside = True
-            self.workers.abandon()
+        self._preemption.stop()
 
     def _solve(self, job: Job, report: ReportProgress, target: Path) -> bool:
         """Solve and publish; False if nothing changes."""

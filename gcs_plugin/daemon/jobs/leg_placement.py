@@ -10,7 +10,7 @@ import logging
 import sqlite3
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,6 +18,7 @@ import numpy as np
 
 from gcs_plugin.daemon.jobs.job_queue import Job, Preempted, ReportProgress
 from gcs_plugin.daemon.jobs.placed_sorties import detail_of, sortie_frames
+from gcs_plugin.daemon.jobs.preemption import Preemption
 from gcs_plugin.daemon.jobs.publisher import Publisher
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
 from gcs_plugin.daemon.jobs.worker_tasks import SolveTask, SortieResult, coarse_after, near, place
@@ -52,36 +53,32 @@ class LegPlacement:
     workers: WorkerPool
     basemap: Path | None
     on_published: Callable[[str, Job], None] = lambda layer, job: None
-    _working: str | None = None
-    _aside: bool = False
+    _preemption: Preemption = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._preemption = Preemption(self.workers)
 
     def make(self, job: Job, report: ReportProgress) -> Change:
         """The handler of `coarse`."""
         target = self.publisher.solutions / f"{new_name('coarse')}.pickle"
-        self._working, self._aside = str(job.vehicle), False
         began = time.monotonic()
         try:
-            change = self._after(job, report, target) if "after" in job.detail else self._legs(job, report, target)
+            with self._preemption.running(str(job.vehicle)):
+                change = self._after(job, report, target) if "after" in job.detail else self._legs(job, report, target)
+        except (Preempted, WorkerStoppedError, StorageError):
+            target.unlink(missing_ok=True)
+            raise
         except OrthoSwarmError as error:
             target.unlink(missing_ok=True)
-            if self._aside:
-                raise Preempted from None
-            if isinstance(error, WorkerStoppedError | StorageError):
-                raise
             job.detail["note"] = str(error)  # the map in flight stays as it is until the refinement
             return lambda db: None
-        finally:
-            self._working = None
         job.detail["seconds"] = round(time.monotonic() - began, 3)
         return change
 
     def give_up(self, vehicle: str | None, layer: str | None = None) -> None:
         """Stop a vehicle's running job (None: any), or the one that uses a layer."""
-        if self._working is None or (vehicle is not None and vehicle != self._working):
-            return
-        if layer is None or layer in self.publisher.drawing:
-            self._aside = True
-            self.workers.abandon()
+        if vehicle in (None, self._preemption.vehicle) and (layer is None or layer in self.publisher.drawing):
+            self._preemption.stop()
 
     # -- in flight ------------------------------------------------------------------------------------------------
 
@@ -189,7 +186,7 @@ class LegPlacement:
 
         with self.publisher.turn("coarse"):
             report(0.7, "drawing")
-            if self._aside or ("after" not in job.detail and self._is_refined(job)):
+            if self._preemption.requested or ("after" not in job.detail and self._is_refined(job)):
                 raise OrthoSwarmError("a refinement takes its place")
             job.detail["version_before"], job.detail["version"] = self.publisher.publish(
                 "coarse", self.workers, (str(job.vehicle), job.sortie), target=target, changed=changed, change=change

@@ -9,13 +9,14 @@ are drawn again.
 import sqlite3
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gcs_plugin.daemon.jobs.job_queue import Job, Preempted, ReportProgress
+from gcs_plugin.daemon.jobs.job_queue import Job, ReportProgress
+from gcs_plugin.daemon.jobs.preemption import Preemption
 from gcs_plugin.daemon.jobs.publisher import Publisher
 from gcs_plugin.daemon.jobs.solution_file import Bytes, Gain, SolutionFile, read_solution, uniquely_named
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
@@ -23,7 +24,6 @@ from gcs_plugin.daemon.layers.layers import new_name
 from gcs_plugin.daemon.store.journal import Change, Journal, unpacked
 from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
-from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.placement import PlacedFrame, Terrain
 from orthoswarm.mosaic.radiometry import estimate_fields
 
@@ -120,22 +120,19 @@ class ToneBalance:
     workers: WorkerPool
     layer: str
     on_published: Callable[[str, Job], None] = lambda layer, job: None
-    _working: bool = False
-    _aside: bool = False
+    _preemption: Preemption = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._preemption = Preemption(self.workers)
 
     def balance(self, job: Job, report: ReportProgress) -> Change:
         """The handler of `tones`."""
         began = time.monotonic()
-        self._working, self._aside = True, False
         targets: list[Path] = []
         try:
-            self._balance(job, report, targets)
-        except OrthoSwarmError:
-            if self._aside:
-                raise Preempted from None
-            raise
+            with self._preemption.running():
+                self._balance(job, report, targets)
         finally:
-            self._working = False
             for target in targets:  # of those that were not published
                 target.unlink(missing_ok=True)
         job.detail["seconds"] = round(time.monotonic() - began, 3)
@@ -143,9 +140,7 @@ class ToneBalance:
 
     def give_up(self) -> None:
         """Stop the running job; it is done later."""
-        if self._working:
-            self._aside = True
-            self.workers.abandon()
+        self._preemption.stop()
 
     def _balance(self, job: Job, report: ReportProgress, targets: list[Path]) -> None:
         refined = {(r["vehicle"], r["sortie"]) for r in self.journal.rows("SELECT vehicle, sortie FROM solutions")}

@@ -22,10 +22,6 @@ from orthoswarm.planning.sorties.flight_time import Motion
 Array = NDArray[np.float64]
 Maker = Callable[[float, float], Flight]
 
-_HOPELESS = (
-    2 / 3
-)  # where not even so many vehicles have their turn within the limit, another order does not help either
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Separation:
@@ -323,7 +319,7 @@ def _soonest(ways: "Sequence[_Placing]", limit_s: float) -> "_Placing | None":
     for way in ways:
         if way.place_within(limit_s if best is None else min(limit_s, best.done_s)):
             best = way
-        elif way.placed_share < _HOPELESS:
+        elif way.placed_share < active().planning.orders_tried_share:
             break
     return best
 

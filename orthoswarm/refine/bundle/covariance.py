@@ -7,15 +7,12 @@ from numpy.typing import NDArray
 
 from orthoswarm.config import active
 from orthoswarm.model.camera import fov_rad, ground_jacobian
-from orthoswarm.model.robust import mad_sigma
+from orthoswarm.model.robust import MEDIAN_SIGMA, mad_sigma
 from orthoswarm.refine.bundle.adjustment import Adjustment, HeightPrior, MapTies
 from orthoswarm.refine.bundle.block_arrays import WIDTH, F
 from orthoswarm.refine.bundle.priors import Priors
 
 Array = NDArray[np.float64]
-
-_MEDIAN_SIGMA = 1.25
-"""Sigma of the median of n Gaussian values, times sqrt(n): sqrt(pi / 2)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,7 +156,7 @@ def systematic_tie_offset(leg: NDArray[np.int32], camera: NDArray[np.integer], r
         middle = np.median(mine, axis=0)
         spread = mad_sigma(mine - middle)
         out[i] = max(
-            0.0, float(np.hypot(*middle)) - config.systematic_sigmas * _MEDIAN_SIGMA * spread / np.sqrt(len(mine))
+            0.0, float(np.hypot(*middle)) - config.systematic_sigmas * MEDIAN_SIGMA * spread / np.sqrt(len(mine))
         )
     return out
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from orthoswarm.config import active
-from orthoswarm.model.robust import mad_sigma
+from orthoswarm.model.robust import MEDIAN_SIGMA, mad_sigma
 
 Array = NDArray[np.float64]
 
@@ -58,7 +58,7 @@ def level_network(ground: Sequence[Array]) -> LevelNetwork:
                 pairs.append((i, j))
                 difference.append(float(np.median(d)))
                 spread = mad_sigma(d - difference[-1])
-                sigma.append(float(np.hypot(1.25 * spread / np.sqrt(len(d)), c.level_sigma_floor_m)))
+                sigma.append(float(np.hypot(MEDIAN_SIGMA * spread / np.sqrt(len(d)), c.level_sigma_floor_m)))
     edge = np.array(pairs, np.int64).reshape(-1, 2)
     return _adjust(count, edge, np.array(difference, float), np.array(sigma, float))
 
