@@ -30,7 +30,7 @@ from orthoswarm.planning.sorties.flight_time import Motion, autopilot_config
 Array = NDArray[np.float64]
 
 LEFT_S = {
-    "ardupilot": ((-0.3, 0.3), (-0.7, 0.8), (-1.0, 2.4), (-1.0, 2.4), (-1.0, 2.1)),
+    "ardupilot": ((-0.3, 0.3), (-0.7, 0.8), (-1.0, 2.4), (-1.0, 2.4), (-2.0, 3.4)),
     "px4": ((-3.7, 3.5), (-3.3, 3.5), (-6.0, 12.0), (-6.2, 12.0), (-6.2, 11.7)),
 }
 """Range of the seconds beyond those times: after the takeoff, the first line, the last line, the way home, landing."""

@@ -4,18 +4,26 @@ Each holds one flight: every change of mode, mission item, landed state, each te
 every one and a half seconds; those of failsafes were numbered anew, so that what was left out is no loss.
 """
 
+from operator import attrgetter
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from gcs_plugin.fleet.fleet import Fleet
 from gcs_plugin.fleet.flight_state import flight_state
 from gcs_plugin.fleet.preflight import Level, Wanted, preflight
+from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.links.tlog_writer import read_tlog
 from gcs_plugin.links.transports import Link
 from gcs_plugin.mission.completion import MissionEvent
-from gcs_plugin.sim.memory_link import VirtualClock
+from gcs_plugin.mission.items import CHANGE_SPEED, RTL, TAKEOFF, WAYPOINT, Mission, MissionItem
+from gcs_plugin.mission.track import STEP_S, track_of
+from gcs_plugin.sim.memory_link import VirtualClock, World
+from gcs_plugin.sim.multirotor import Airframe
+from gcs_plugin.sim.simulated_vehicle import SimVehicle
 from orthoswarm.model.earth import distance_m
+from orthoswarm.planning.sorties.flight_time import autopilot_config
 
 FLIGHTS = Path(__file__).parents[1] / "data" / "flights"
 
@@ -186,3 +194,71 @@ def test_vehicles_that_are_about_to_meet_are_named_while_a_pause_still_helps():
     assert nearest_m < 6.0 and nearest_s - said_s > 2.5
     assert near.pair == (2, 3) and near.metres < 10.0 and near.height_m < 1.0
     assert [event.kind for event in events if event.kind in ("near", "apart")] == ["near", "apart"]
+
+
+# What they flew: autopilot, height and speed, and latitude and longitude of their start and points; what may be between
+# them and their plans, metres.
+AROUND_A_START = {
+    "arducopter_start": (
+        Autopilot.ARDUPILOT, 40.0, 8.0,
+        [(48.137, 11.605134), (48.13716011, 11.6090813), (48.13689791, 11.60834633), (48.137, 11.605134)], 5.0,
+    ),
+    "px4_start": (
+        Autopilot.PX4, 40.0, 8.0,
+        [(48.137, 11.605), (48.13832149, 11.60539392), (48.13823949, 11.60900608), (48.13847974, 11.60900608),
+         (48.13856164, 11.60539806), (48.137, 11.605)], 10.0,
+    ),
+}  # fmt: skip
+
+
+def around(seconds, lat_deg, lon_deg, heights):
+    """Rows of seconds, distance from the start and height: from leaving the ground to 40 m away; and from there home.
+
+    The second ones count seconds from 40 m away on, since turns and winds have come between.
+    """
+    up = int(np.argmax(heights > 0.3))
+    away = np.array([distance_m(lat_deg[up], lon_deg[up], *place) for place in zip(lat_deg, lon_deg, strict=True)])
+    left, back = up + int(np.argmax(away[up:] > 40.0)), len(away) - int(np.argmax(away[::-1] > 40.0))
+    rows = np.column_stack([seconds, away, heights])
+    return [rows[a:b] - [rows[a, 0], 0.0, 0.0] for a, b in ((up, left), (back, len(rows)))]
+
+
+def between(flown, other):
+    """The greatest distance along the way and in height between two that were recorded at other moments, metres."""
+    seconds = other[other[:, 0] <= flown[-1, 0], 0]
+    return [np.abs(np.interp(seconds, flown[:, 0], flown[:, k]) - other[: len(seconds), k]).max() for k in (1, 2)]
+
+
+@pytest.mark.parametrize("name", AROUND_A_START)
+def test_plans_and_simulated_vehicles_are_where_a_real_one_was_around_its_start(name):
+    """It stands still above it before it sets off, gathers speed, and waits above it before it comes down."""
+    autopilot, height, speed, places, allowed_m = AROUND_A_START[name]
+    items = [MissionItem.at(WAYPOINT, *places[0], 0.0)] if autopilot is Autopilot.ARDUPILOT else []
+    items += [MissionItem.at(TAKEOFF, *places[0], height), MissionItem.do(CHANGE_SPEED, 1, speed)]
+    items += [MissionItem.at(WAYPOINT, *place, height) for place in places[1:]]
+    mission = Mission(autopilot, (*items, MissionItem.do(RTL)))
+
+    seen = []
+    here = attrgetter("time_boot_s", "lat_deg", "lon_deg", "height_m")
+    replay(name, lambda v: v.lat_deg and seen.append(here(v)))
+    flown = around(*np.unique(seen, axis=0).T)
+
+    track = track_of(mission, places[0]).places
+    away = np.hypot(*track[:, :2].T)
+    left, back = int(np.argmax(away > 40.0)), len(away) - int(np.argmax(away[::-1] > 40.0))
+    rows = np.column_stack([STEP_S * np.arange(len(track)), away, track[:, 2]])
+    begins = int(np.argmax(track[:, 2] > 0.3))
+    planned = [rows[a:b] - [rows[a, 0], 0.0, 0.0] for a, b in ((begins, left), (back, len(rows)))]
+
+    frame = Airframe().as_flown(autopilot_config(autopilot.value))
+    with World([SimVehicle(system=1, autopilot=autopilot, home=(*places[0], 500.0), airframe=frame)]) as world:
+        world.meet()
+        assert world.finish(world.fleet.upload(1, mission))[0].ok
+        assert world.finish(world.fleet.start(1))[0].ok
+        vehicle, sim = world.fleet.vehicles[1], []
+        world.until(lambda: sim.append(here(vehicle)), 250.0)
+    simulated = around(*np.unique(sim, axis=0).T)
+
+    for other in (planned, simulated):
+        for real, rows in zip(flown, other, strict=True):
+            assert max(between(real, rows)) < allowed_m

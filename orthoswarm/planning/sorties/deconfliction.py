@@ -360,9 +360,9 @@ class _Placing:
     def soonest_s(self) -> float:
         """No schedule is done sooner: at one start the longest flights take off first, one after the other."""
         whole_s = np.array([self._needs_s(vehicle, 0) for vehicle in range(len(self._sorties))])
-        soonest = 0.0
-        for row in self._one_start:
-            near = self._one_start[np.ix_(row, row)].all()
+        one_start, soonest = self._one_start, 0.0
+        for row in one_start:
+            near = one_start[np.ix_(row, row)].all()
             together = np.sort(whole_s[row])[::-1] if near else whole_s[row].max(keepdims=True)
             soonest = max(soonest, float((together + self._apart.launch_s * np.arange(len(together))).max()))
         return soonest
@@ -384,6 +384,7 @@ class _Placing:
 
     @property
     def _one_start(self) -> NDArray[np.bool_]:
+        """Pairs of vehicles that take off at one start, (n, n)."""
         away = np.hypot(*(self._homes[:, None] - self._homes[None]).transpose(2, 0, 1))
         return np.asarray(away < active().planning.pad_distances * self._apart.distance_m)
 
