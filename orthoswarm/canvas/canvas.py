@@ -30,6 +30,8 @@ from orthoswarm.model.geo import GroundGrid
 Bytes = NDArray[np.uint8]
 Plane = Literal["orthogonality", "frame"]
 TILE_PX = 512
+MEMORY_MB = 128.0
+"""Bound on the tiles that a canvas keeps mapped."""
 _FORMAT = "orthoswarm-canvas-1"
 _DTYPES: dict[str, type[np.generic]] = {"orthogonality": np.float32, "frame": np.int32}
 
@@ -101,7 +103,7 @@ class Canvas:
         *,
         plane: Plane = "orthogonality",
         tile_px: int = TILE_PX,
-        memory_mb: float = 128.0,
+        memory_mb: float = MEMORY_MB,
     ) -> "Canvas":
         """A new, empty canvas in a folder. The grid may be generous: empty ground costs 16 bytes a tile.
 
@@ -134,7 +136,7 @@ class Canvas:
         return canvas
 
     @classmethod
-    def open(cls, path: Path, *, memory_mb: float = 128.0, writable: bool = True) -> "Canvas":
+    def open(cls, path: Path, *, memory_mb: float = MEMORY_MB, writable: bool = True) -> "Canvas":
         """Open the canvas of a folder, also one left by a killed process.
 
         Args:
@@ -158,7 +160,9 @@ class Canvas:
         return cls(path, header, memory_mb=memory_mb, writable=writable)
 
     @classmethod
-    def at(cls, path: Path, grid: GroundGrid, *, plane: Plane = "orthogonality", memory_mb: float = 128.0) -> "Canvas":
+    def at(
+        cls, path: Path, grid: GroundGrid, *, plane: Plane = "orthogonality", memory_mb: float = MEMORY_MB
+    ) -> "Canvas":
         """The canvas of a folder, made if there is none.
 
         Raises:
@@ -248,7 +252,7 @@ class Canvas:
                     raise StorageError(f"the canvas in {self.path} cannot be written ({error.strerror})") from None
                 self.commit(key)
 
-    def staging(self, name: str, *, memory_mb: float = 128.0) -> TileStore:
+    def staging(self, name: str, *, memory_mb: float = MEMORY_MB) -> TileStore:
         """A store of the same layout in a sub-folder, for preparing tiles for `adopt`."""
         return TileStore(
             self.path / name, tile_px=self.tile_px, dtype=_DTYPES[self.plane], memory_mb=memory_mb, writable=True

@@ -24,6 +24,10 @@ class ComputeConfig:
     """A cluster without workers is given up after so many seconds: machines restart within that (chosen)."""
     canvas_mb: float = 48.0
     """Memory that a canvas keeps of its tiles, megabytes; tiles beyond it are on disk (chosen)."""
+    live_canvas_mb: float = 512.0
+    """Memory that the live map's real-time canvas keeps of its tiles, megabytes: with the tiles of all vehicles mapped
+    a picture of 96 vehicles in turn is drawn in 0.6 instead of 0.9 ms (measured; 128 megabytes hold a third of them).
+    The system can take these pages back."""
     tile_store_mb: float = 64.0
     """Memory that a drawing task keeps of the tiles that it writes, megabytes (chosen)."""
     working_pictures_mb: float = 160.0

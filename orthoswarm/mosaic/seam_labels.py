@@ -18,6 +18,7 @@ Labels = NDArray[np.int32]
 Heights = NDArray[np.float32]
 _BLOCK = 64
 OUTSIDE, _PARTLY, _INSIDE = 0, 1, 2
+_ROUNDING = 1e-5  # of squared distances in float32, relative, with a margin
 
 
 @kernel
@@ -105,11 +106,30 @@ def _contest(best, label, r0, r1, c0, c1, mark, position, rotation, lens, lattic
 
 
 @kernel
+def _beaten(owners, count, x0, x1, y0, y1, x, y):  # type: ignore[no-untyped-def]
+    """Whether one of the frames that see all of a block is nearer than a nadir point everywhere in it.
+
+    What one nadir point is nearer than another grows evenly across the block, so its corners tell; by more than the
+    distances are rounded by.
+    """
+    for n in range(count):
+        nearer = True
+        for corner in range(4):
+            cx, cy = x1 if corner & 1 else x0, y1 if corner & 2 else y0
+            own = (cx - owners[n, 0]) ** 2 + (cy - owners[n, 1]) ** 2
+            other = (cx - x) ** 2 + (cy - y) ** 2
+            nearer &= own < other * (1.0 - _ROUNDING)
+        if nearer:
+            return True
+    return False
+
+
+@kernel
 def _label(best, label, position, rotation, lens, marks, lattice, gsd, tan2):  # type: ignore[no-untyped-def]
     """Solve a tile: lower best (squared metres) and set label to a frame's mark wherever it is the nearest."""
     rows, columns = best.shape
     n = len(marks)
-    least = np.empty(n)
+    least, owners = np.empty(n), np.empty((n, 2))
     low, high = block_heights(lattice, 0, rows, 0, columns)
     flat = low == high
     for r0 in range(0, rows, _BLOCK):
@@ -125,9 +145,12 @@ def _label(best, label, position, rotation, lens, marks, lattice, gsd, tan2):  #
             for r in range(r0, r1):
                 for c in range(c0, c1):
                     worst = max(worst, best[r, c])
+            owning = 0
             for k in np.argsort(least, kind="mergesort"):
                 if least[k] > worst:
                     break
+                if _beaten(owners, owning, x0, x1, y0, y1, position[k, 0], position[k, 1]):
+                    continue
                 seen = sight(position[k], rotation[k], lens[k], x0, x1, y0, y1, z0, z1)
                 if seen == OUTSIDE:
                     continue
@@ -138,6 +161,8 @@ def _label(best, label, position, rotation, lens, marks, lattice, gsd, tan2):  #
                 rise = position[k, 2] - z1
                 if seen == _INSIDE and rise > 0.0 and far_x * far_x + far_y * far_y <= tan2 * rise * rise:
                     worst = _claim(best, label, r0, r1, c0, c1, marks[k], position[k, 0], position[k, 1], gsd)
+                    owners[owning, 0], owners[owning, 1] = position[k, 0], position[k, 1]
+                    owning += 1
                 else:
                     worst = _contest(
                         best, label, r0, r1, c0, c1, marks[k], position[k], rotation[k], lens[k], lattice, flat, gsd,

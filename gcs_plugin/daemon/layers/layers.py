@@ -20,7 +20,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from orthoswarm.canvas.canvas import TILE_PX, Canvas, Plane
+from orthoswarm.canvas.canvas import MEMORY_MB, TILE_PX, Canvas, Plane
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.geo import GroundGrid
@@ -177,7 +177,9 @@ def new_name(layer: str) -> str:
     return f"{layer}-{uuid.uuid4().hex[:12]}"
 
 
-def successor(old: Canvas | None, path: Path, grid: GroundGrid, plane: Plane, *, share: bool) -> Canvas:
+def successor(
+    old: Canvas | None, path: Path, grid: GroundGrid, plane: Plane, *, share: bool, memory_mb: float = MEMORY_MB
+) -> Canvas:
     """A canvas in a new folder with the old one's content, on a grid that contains the old one's.
 
     Args:
@@ -186,11 +188,12 @@ def successor(old: Canvas | None, path: Path, grid: GroundGrid, plane: Plane, *,
         grid: where the new canvas lies; shifted against the old one by whole tiles.
         plane: meaning of the auxiliary plane.
         share: True to share tile files with the old one, where tiles are only ever replaced as a whole.
+        memory_mb: see Canvas.create.
     """
     if old is not None and old.grid == grid:
         _copy_canvas(old.path, path, share=share)
-        return Canvas.open(path)
-    canvas = Canvas.create(path, grid, plane=plane)
+        return Canvas.open(path, memory_mb=memory_mb)
+    canvas = Canvas.create(path, grid, plane=plane, memory_mb=memory_mb)
     if old is None:
         return canvas
     side = old.tile_px * old.grid.gsd_m

@@ -18,6 +18,7 @@ from gcs_plugin.daemon.layers.anchor import Anchor
 from gcs_plugin.daemon.layers.layers import Area, Layer, new_name, successor
 from gcs_plugin.daemon.store.journal import Journal, fact_change
 from orthoswarm.canvas.canvas import Canvas
+from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import Camera
 from orthoswarm.model.earth import DEGREE_M, distance_m
@@ -202,13 +203,16 @@ class MapSite:
             return str(error)
         old = self._layer.canvas
         name = new_name("realtime")
-        self._adopt(area, successor(old, self._folder / name, area.grid, "orthogonality", share=True))
+        memory_mb = active().compute.live_canvas_mb
+        path = self._folder / name
+        self._adopt(area, successor(old, path, area.grid, "orthogonality", share=True, memory_mb=memory_mb))
         return None
 
     # -- the layer ------------------------------------------------------------------------------------------------
 
     def _begin(self, area: Area, *, again: bool = False) -> None:
-        canvas = Canvas.create(self._folder / new_name("realtime"), area.grid)
+        memory_mb = active().compute.live_canvas_mb
+        canvas = Canvas.create(self._folder / new_name("realtime"), area.grid, memory_mb=memory_mb)
         self._adopt(area, canvas, again=again)
 
     def _adopt(self, area: Area, canvas: Canvas, *, again: bool = False) -> None:
@@ -234,7 +238,7 @@ class MapSite:
         """The canvas that the last daemon drew on; drawn anew from the journal if it is damaged."""
         assert self.area is not None
         try:
-            canvas = Canvas.open(self._folder / str(name))
+            canvas = Canvas.open(self._folder / str(name), memory_mb=active().compute.live_canvas_mb)
         except (OrthoSwarmError, OSError):
             _log.warning("the real-time layer is damaged and is drawn again")
             self._begin(self.area, again=True)
