@@ -1,15 +1,21 @@
 """The error that a refined picture states of itself."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from orthoswarm.config import active
 from orthoswarm.model.camera import ground_jacobian, rotation_from_angles
+from orthoswarm.refine.bundle.adjustment import Adjustment, HeightPrior, MapTies
 from orthoswarm.refine.bundle.covariance import (
     common_map_sigma,
+    stated_errors,
     systematic_tie_offset,
     with_distance_errors,
 )
+from orthoswarm.refine.flight.relative_block import first_points
+from tests.kit.swarm_block import make_block
 
 BUNDLE = active().bundle
 
@@ -67,3 +73,28 @@ def test_what_the_focal_length_makes_up_for_moves_a_camera_along_its_axis():
         j = ground_jacobian(r, 80.0, 0.2)
         np.testing.assert_allclose(j @ after @ j.T, j @ before @ j.T, atol=1e-5)
         np.testing.assert_array_equal(after[3:], before[3:])
+
+
+def test_a_solved_principal_point_does_not_move_the_ground_in_the_pictures_middle():
+    """Rotations make up for it: the stated error is the scatter of repeated flights, not that of the optical axis."""
+    errors, stated = [], []
+    for seed in range(8):
+        block = make_block(seed=seed, per_leg=15, legs=2)
+        sigma = block.priors.lens_sigma.copy()
+        sigma[:, 4:] = 8.0
+        chosen = np.arange(0, len(block.points), 10, dtype=np.int32)
+        noise = np.random.default_rng(seed + 99).normal(0, 0.05, (len(chosen), 2))
+        ties = MapTies(chosen, block.points[chosen, :2] + noise, np.full(len(chosen), 0.05))
+        priors = replace(block.priors, lens_sigma=sigma)
+        adj = Adjustment.begin(block.start, block.tracks, priors, first_points(block.start, block.tracks))
+        heights = HeightPrior(np.zeros(len(adj.points)), 1.0, 20.0, c=9.0)
+        for c in (1e4, 1e4, 100.0, 100.0, 9.0, 9.0, 9.0):
+            adj.step(c, heights, ties)
+        for i in (7, 22):
+            true, found = (cameras.camera(i, np.zeros(2)) for cameras in (block.true, adj.cameras))
+            middle = np.array([0.5 * (true.lens.width - 1), 0.5 * (true.lens.height - 1)])
+            errors.append(found.to_ground(middle) - true.to_ground(middle))
+        said = stated_errors(adj, 9.0, heights, ties=ties, tie_c=6.0, floor_m=0.0).sigma_m
+        stated.append(said / (BUNDLE.stated_sigma_factor * BUNDLE.tied_covariance_share))
+    ratio = np.sqrt(np.mean(np.square(errors))) / np.sqrt(np.mean(np.square(stated)))
+    assert 0.5 < ratio < 1.7
