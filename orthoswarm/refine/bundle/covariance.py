@@ -89,6 +89,21 @@ def with_seen_drift(adjustment: Adjustment) -> Priors:
     return replace(p, models=tuple(models))
 
 
+def receiver_sigma(adjustment: Adjustment) -> Array:
+    """Sigma (2,) of a flight's place by its own receiver, east and north, metres: its bias, and its drift's mean.
+
+    A receiver that drifts to the east may be right in the north. What all receivers have in common is none of it.
+
+    Args:
+        adjustment: without a map, after its last step.
+    """
+    p, config = adjustment.priors, active()
+    drift = adjustment.layout.drift(adjustment.common, p.group)
+    groups = [drift[p.group == g] for g in range(len(p.models)) if (p.group == g).any()]
+    seen = np.average([own.var(axis=0) for own in groups], axis=0, weights=[len(own) for own in groups])
+    return np.asarray(np.sqrt(config.registration.receiver_bias_sigma_m**2 + config.bundle.drift_mean_share * seen))
+
+
 def _between(chosen: NDArray[np.integer], covariance: Array, n: int) -> Array:
     """Covariances (n, 6, 6) of all pictures, interpolated between those of the chosen ones (ascending)."""
     after = np.searchsorted(chosen, np.arange(n)).clip(1, max(len(chosen) - 1, 1))

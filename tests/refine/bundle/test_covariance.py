@@ -7,9 +7,11 @@ import pytest
 
 from orthoswarm.config import active
 from orthoswarm.model.camera import ground_jacobian, rotation_from_angles
+from orthoswarm.model.plane_similarity import Similarity
 from orthoswarm.refine.bundle.adjustment import Adjustment, HeightPrior, MapTies
 from orthoswarm.refine.bundle.covariance import (
     common_map_sigma,
+    receiver_sigma,
     stated_errors,
     systematic_tie_offset,
     with_distance_errors,
@@ -98,3 +100,23 @@ def test_a_solved_principal_point_does_not_move_the_ground_in_the_pictures_middl
         stated.append(said / (BUNDLE.stated_sigma_factor * BUNDLE.tied_covariance_share))
     ratio = np.sqrt(np.mean(np.square(errors))) / np.sqrt(np.mean(np.square(stated)))
     assert 0.5 < ratio < 1.7
+
+
+def test_a_receiver_that_drifts_east_is_not_doubted_in_the_north():
+    block = make_block()
+    adj = Adjustment.begin(block.start, block.tracks, block.priors, first_points(block.start, block.tracks))
+    first, knots = adj.layout.offset[0] + 5, adj.layout.knots[0]
+    adj.common[first : first + 2 * knots : 2] = np.linspace(-9.0, 9.0, knots)
+    bias = active().registration.receiver_bias_sigma_m
+    east, north = receiver_sigma(adj)
+    assert north == pytest.approx(bias)
+    assert east == pytest.approx(np.hypot(bias, 9.0), rel=0.1), "an even drift of 18 m since the receiver was right"
+
+
+def test_places_are_weighed_by_axis():
+    at = np.array([[0.0, 0.0], [100.0, 0.0]])
+    away = np.array([[3.0, 0.0], [0.0, 3.0]])
+    sigma = np.array([[0.1, 10.0], [10.0, 0.1]])
+    held = np.array([100.0, 100.0, 1e-6, 1e-6])
+    found = Similarity.between(at, at + away, sigma, middle=at.mean(axis=0), prior_sigma=held)
+    np.testing.assert_allclose(found.values[:2], [3.0, 3.0], atol=0.01)
