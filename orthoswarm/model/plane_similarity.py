@@ -38,14 +38,16 @@ class Similarity:
         """The similarity that moves points to where they should be.
 
         Args:
-            before, after: float64 (n, 2), metres. sigma_m: float64 (n,), of each difference, an axis.
+            before, after: float64 (n, 2), metres. sigma_m: float64 (n,), of each difference, an axis, or (n, 2), of its
+                east and north.
             middle: float64 (2,). prior_sigma: float64 (4,), of shift (metres), turn (radians) and scale minus one.
             prior: float64 (4,), their values before; None: zeros.
         """
-        a = _design(before - middle) / sigma_m[:, None, None]
+        sigma_m = sigma_m.reshape(len(before), -1)
+        a = _design(before - middle) / sigma_m[:, :, None]
         known = np.diag(1.0 / prior_sigma**2)
         normal = known + np.einsum("nij,nik->jk", a, a)
-        right = np.einsum("nij,ni->j", a, (after - before) / sigma_m[:, None])
+        right = np.einsum("nij,ni->j", a, (after - before) / sigma_m)
         right += 0.0 if prior is None else known @ prior
         covariance = np.asarray(np.linalg.inv(normal), np.float64)
         return cls(middle, np.asarray(covariance @ right, np.float64), covariance)

@@ -301,10 +301,16 @@ def _verdict(report: Mapping[str, Any], placed: Sequence[PlacedFrame], shifts: M
     if not fine:
         text = "Consistent in itself, but placed where the drones' receivers say, not on a map"
         return {"kind": "rough", "text": f"{text}; expect errors of about {usual:.1f} m."}
-    text = f"Lies on the pre-disaster map; expected error against it {_expected(sigma)}"
+    text = (
+        f"Lies on the pre-disaster map; expected error against it {_expected(sigma)}: so far may open ground lie from "
+        "its place on the map, computed from how well pictures and map fit together"
+    )
     if shifts is not None and len(shifts.at) >= 10:
         median = float(np.median(shifts.size_m))
-        text += f"; compared with it block by block {median:.2f} m (median), roofs that lean apart included"
+        text += (
+            f". Blocks of the orthoimage differ from the map by {median:.2f} m (median), measured by laying one over "
+            "the other: roofs and trees count in this, which lean apart in the two, so it is usually larger"
+        )
         if median > 3 * max(usual, 0.3):
             return {"kind": "doubt", "text": text + ". The two disagree: check the pictures below before use."}
     offset = report.get("map_offset_m")
@@ -355,7 +361,7 @@ def _facts(report: Mapping[str, Any], placed: Sequence[PlacedFrame], shifts: Mov
     area = float(report["area_ha"])
     facts.append((f"{area:,.1f} ha" if area < 1000 else f"{area / 100:,.1f} km²", "mapped"))
     if shifts is not None and len(shifts.at):
-        facts.append((f"{np.median(shifts.size_m):.2f} m", "from the map (median)"))
+        facts.append((f"{np.median(shifts.size_m):.2f} m", "blocks off the map (median, roofs too)"))
     checked = report.get("checkpoints")
     if checked is not None:
         facts.append((f"{checked['rmse_h_m']:.2f} m", f"RMSE horizontal at {checked['checkpoints']} checkpoints"))

@@ -175,14 +175,15 @@ class Adjustment:
         heights: HeightPrior,
         ties: MapTies | None = None,
         tie_c: float | None = None,
-    ) -> tuple[Array, Array]:
+    ) -> tuple[Array, Array, Array]:
         """Covariances at the present state, with the points eliminated (not held fixed).
 
         Args:
             chosen: (K,) free cameras. c, heights, ties, tie_c: as for `step`.
 
         Returns:
-            float64 (K, 6, 6) of position and rotation about the camera's axes, and (size, size) of the common unknowns.
+            float64 (K, 6, 6) of position and rotation about the camera's axes, (size, size) of the common unknowns, and
+            (K, 6, size) between both.
         """
         system = self._assemble(c, heights, MapTies.none() if ties is None else ties, tie_c)
         factor = factorise(system.band)
@@ -192,11 +193,12 @@ class Adjustment:
         unit = np.zeros((system.band.shape[1], len(rows)), order="F")
         unit[rows, np.arange(len(rows))] = 1.0
         solved = solve_factored(factor, unit)
-        out = np.empty((len(chosen), 6, 6))
+        out, between = np.empty((len(chosen), 6, 6)), np.empty((len(chosen), 6, len(inverse)))
         for k in range(len(chosen)):
             own = rows[6 * k : 6 * k + 6]
-            out[k] = solved[own, 6 * k : 6 * k + 6] + y[own] @ inverse @ y[own].T
-        return out, np.asarray(inverse, np.float64)
+            between[k] = -y[own] @ inverse
+            out[k] = solved[own, 6 * k : 6 * k + 6] - between[k] @ y[own].T
+        return out, np.asarray(inverse, np.float64), between
 
     def _assemble(self, c: float, heights: HeightPrior, ties: MapTies, tie_c: float | None) -> BandedSystem:
         """Build the reduced normal equations at the present state."""

@@ -14,6 +14,9 @@ from orthoswarm.refine.bundle.priors import Priors
 
 Array = NDArray[np.float64]
 
+_LENS_CX = 4
+"""Column of the principal point's cx among a lens's unknowns, cy is the next (see priors.Priors)."""
+
 
 @dataclass(frozen=True, slots=True)
 class StatedErrors:
@@ -48,8 +51,10 @@ def stated_errors(
         adjustment = replace(adjustment, priors=with_seen_drift(adjustment))
     free = np.flatnonzero(adjustment.free)
     chosen = np.unique(np.r_[free[:: config.covariance_every_photos], free[-1]])
-    covariance, common = adjustment.covariance(chosen, c, heights, ties, tie_c)
-    variance = np.array([_ground_variance(adjustment, int(i), q) for i, q in zip(chosen, covariance)])
+    covariance, common, between = adjustment.covariance(chosen, c, heights, ties, tie_c)
+    variance = np.array(
+        [_ground_variance(adjustment, int(i), q, common, b) for i, q, b in zip(chosen, covariance, between)]
+    )
     share = 1.0 if ties is None else config.tied_covariance_share
     sigma = np.hypot(share * np.sqrt(np.interp(np.arange(n), chosen, variance)), floor_m)
     lens = adjustment.cameras.lens[0]
@@ -80,6 +85,21 @@ def with_seen_drift(adjustment: Adjustment) -> Priors:
             size = min(float(np.sqrt(bias2 + config.bundle.drift_mean_share * seen)), model.drift_sigma)
             models[g] = replace(model, drift_sigma=size * float(np.sqrt(knots)))  # the knots' mean has that sigma
     return replace(p, models=tuple(models))
+
+
+def receiver_sigma(adjustment: Adjustment) -> Array:
+    """Sigma (2,) of a flight's place by its own receiver, east and north, metres: its bias, and its drift's mean.
+
+    A receiver that drifts to the east may be right in the north. What all receivers have in common is none of it.
+
+    Args:
+        adjustment: without a map, after its last step.
+    """
+    p, config = adjustment.priors, active()
+    drift = adjustment.layout.drift(adjustment.common, p.group)
+    groups = [drift[p.group == g] for g in range(len(p.models)) if (p.group == g).any()]
+    seen = np.average([own.var(axis=0) for own in groups], axis=0, weights=[len(own) for own in groups])
+    return np.asarray(np.sqrt(config.registration.receiver_bias_sigma_m**2 + config.bundle.drift_mean_share * seen))
 
 
 def _between(chosen: NDArray[np.integer], covariance: Array, n: int) -> Array:
@@ -161,8 +181,25 @@ def systematic_tie_offset(leg: NDArray[np.int32], camera: NDArray[np.integer], r
     return out
 
 
-def _ground_variance(adjustment: Adjustment, i: int, covariance: Array) -> float:
-    """Variance per axis (mean of both) of the point where the picture's optical axis meets the ground at height 0."""
-    height = max(float(adjustment.cameras.position[i, 2]), 1.0)
-    j = ground_jacobian(adjustment.cameras.rotation[i], height, active().bundle.oblique_axis_down)
-    return height**2 if j is None else float(np.trace(j @ covariance @ j.T)) / 2
+def _ground_variance(adjustment: Adjustment, i: int, covariance: Array, common: Array, between: Array) -> float:
+    """Variance per axis (mean of both) of the ground at height 0 that a picture's central pixel shows.
+
+    A principal point that is solved with the pictures is known far worse than the line of sight of that pixel: an error
+    of it is one of the rotation, which makes up for it.
+
+    Args:
+        adjustment: after its last step. i: camera. covariance: float64 (6, 6), its own. common: float64 (size, size),
+            of the common unknowns. between: float64 (6, size).
+    """
+    cameras = adjustment.cameras
+    height = max(float(cameras.position[i, 2]), 1.0)
+    j = ground_jacobian(cameras.rotation[i], height, active().bundle.oblique_axis_down)
+    if j is None:
+        return height**2
+    lens = int(cameras.lens_id[i])
+    columns = [6 * lens + _LENS_CX, 6 * lens + _LENS_CX + 1]
+    # a pixel's ray turns about the camera's y against cx, about its x with cy
+    by_centre = np.column_stack([-j[:, 4], j[:, 3]]) / cameras.lens[lens, F]
+    mixed = j @ between[:, columns] @ by_centre.T
+    own = j @ covariance @ j.T + by_centre @ common[np.ix_(columns, columns)] @ by_centre.T
+    return float(np.trace(own + mixed + mixed.T)) / 2

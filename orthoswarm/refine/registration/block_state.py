@@ -49,7 +49,8 @@ class VehicleState:
         false_matches: expected number of agreements with a map of other ground as good as the one that put it there.
         map_distortion_m2: variance of an axis of the map's own local distortion as its ties show it, as far as it is
             more than the error that all ties have in common; NaN without ties.
-        sigma_m: float64 (N,) own error estimates, coarse_sigma_m before the map.
+        sigma_m: float64 (N,) own error estimates, coarse_sigma_m before the map. receiver_sigma_m: float64 (2,) of its
+            place by its receiver alone, east and north.
         pose_covariance: float32 (N, 6, 6) of the adjusted cameras, see bundle.covariance.StatedErrors.
         fov_sigma_deg: of the field of view. timings: stage -> CPU seconds.
     """
@@ -66,6 +67,7 @@ class VehicleState:
     confidence: float
     sigma_m: Array
     coarse_sigma_m: Array
+    receiver_sigma_m: Array
     fov_sigma_deg: float
     pose_covariance: NDArray[np.float32] | None = None
     timings: dict[str, float] = field(default_factory=dict)

@@ -102,30 +102,22 @@ def _back_to_receivers(out: list[VehicleState], block: Block) -> None:
     prior = np.array([0.0, 0.0, turn, float(np.mean(alone[:, 2] / now[:, 2])) - 1.0])
     prior_sigma = np.array([shift_sigma, shift_sigma, 1.0 / np.sqrt(weight.sum()), level_sigma])
     common = config.registration.receiver_common_sigma_m
-    sigma_m, counts = np.array([_receiver_sigma_m(out[k]) for k in block]), np.ones(len(block))
+    sigma_m, counts = np.array([out[k].receiver_sigma_m for k in block]), np.ones(len(block))
     for _ in range(config.registration.datum_rounds):
         similarity = Similarity.between(
             now[:, :2],
             alone[:, :2],
-            sigma_m / np.sqrt(counts),
+            sigma_m / np.sqrt(counts)[:, None],
             middle=now[:, :2].mean(axis=0),
             prior_sigma=prior_sigma,
             prior=prior,
         )
-        away = ((similarity.moved(now[:, :2]) - alone[:, :2]) ** 2).sum(axis=1) / sigma_m**2
+        away = (((similarity.moved(now[:, :2]) - alone[:, :2]) / sigma_m) ** 2).sum(axis=1)
         counts = 1.0 / (1.0 + away / config.bundle.position_robust_c) ** 2
     level_m, factor = _level_m(out, block), config.bundle.stated_sigma_factor
     for k in block:
         placed = np.hypot(similarity.sigma_m(out[k].flight.cameras().position[:, :2]), common)
         out[k] = replace(_moved(out[k], similarity, level_m), datum_sigma_m=factor * placed)
-
-
-def _receiver_sigma_m(state: VehicleState) -> float:
-    """Sigma of a vehicle's place by its receiver alone, an axis, without the part that all receivers share, metres."""
-    config = active()
-    own = float(np.median(state.coarse_sigma_m)) / config.bundle.stated_sigma_factor
-    rest = own**2 - config.registration.receiver_common_sigma_m**2
-    return float(np.sqrt(max(rest, config.registration.receiver_bias_sigma_m**2)))
 
 
 def _onto_coarse_map(out: list[VehicleState], block: Block, basemap: MapWindow, origin: Array) -> None:

@@ -16,7 +16,7 @@ from orthoswarm.raster.height_model import HeightModel
 from orthoswarm.raster.picture_file import read_gray, reduction
 from orthoswarm.refine.bundle.adjustment import Adjustment, MapTies
 from orthoswarm.refine.bundle.block_arrays import WIDTH, F
-from orthoswarm.refine.bundle.covariance import stated_errors
+from orthoswarm.refine.bundle.covariance import receiver_sigma, stated_errors
 from orthoswarm.refine.bundle.height_consistency import (
     FreeHeight,
     contradicted_heights,
@@ -170,6 +170,7 @@ def registered_state(
         confidence=0.0,
         sigma_m=stated.sigma_m,
         coarse_sigma_m=stated.sigma_m,
+        receiver_sigma_m=receiver_sigma(adj),
         fov_sigma_deg=stated.fov_sigma_deg,
         pose_covariance=stated.pose,
         coarse_surface=surface,

@@ -138,7 +138,7 @@ def test_stated_covariance_is_the_scatter_of_repeated_flights():
         ties = MapTies(chosen, block.points[chosen, :2] + noise, np.full(len(chosen), 0.2))
         adj = solved(block, ties=ties)
         middle = np.array([7, 22])
-        covariance, _ = adj.covariance(middle, 9.0, level(len(adj.points)), ties)
+        covariance, _, _ = adj.covariance(middle, 9.0, level(len(adj.points)), ties)
         errors.append((adj.cameras.position - block.true.position)[middle, :2])
         stated.append(np.sqrt(covariance[:, [0, 1], [0, 1]]))
     ratio = np.sqrt(np.mean(np.square(errors))) / np.sqrt(np.mean(np.square(stated)))

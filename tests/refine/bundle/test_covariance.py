@@ -1,15 +1,23 @@
 """The error that a refined picture states of itself."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from orthoswarm.config import active
 from orthoswarm.model.camera import ground_jacobian, rotation_from_angles
+from orthoswarm.model.plane_similarity import Similarity
+from orthoswarm.refine.bundle.adjustment import Adjustment, HeightPrior, MapTies
 from orthoswarm.refine.bundle.covariance import (
     common_map_sigma,
+    receiver_sigma,
+    stated_errors,
     systematic_tie_offset,
     with_distance_errors,
 )
+from orthoswarm.refine.flight.relative_block import first_points
+from tests.kit.swarm_block import make_block
 
 BUNDLE = active().bundle
 
@@ -67,3 +75,48 @@ def test_what_the_focal_length_makes_up_for_moves_a_camera_along_its_axis():
         j = ground_jacobian(r, 80.0, 0.2)
         np.testing.assert_allclose(j @ after @ j.T, j @ before @ j.T, atol=1e-5)
         np.testing.assert_array_equal(after[3:], before[3:])
+
+
+def test_a_solved_principal_point_does_not_move_the_ground_in_the_pictures_middle():
+    """Rotations make up for it: the stated error is the scatter of repeated flights, not that of the optical axis."""
+    errors, stated = [], []
+    for seed in range(8):
+        block = make_block(seed=seed, per_leg=15, legs=2)
+        sigma = block.priors.lens_sigma.copy()
+        sigma[:, 4:] = 8.0
+        chosen = np.arange(0, len(block.points), 10, dtype=np.int32)
+        noise = np.random.default_rng(seed + 99).normal(0, 0.05, (len(chosen), 2))
+        ties = MapTies(chosen, block.points[chosen, :2] + noise, np.full(len(chosen), 0.05))
+        priors = replace(block.priors, lens_sigma=sigma)
+        adj = Adjustment.begin(block.start, block.tracks, priors, first_points(block.start, block.tracks))
+        heights = HeightPrior(np.zeros(len(adj.points)), 1.0, 20.0, c=9.0)
+        for c in (1e4, 1e4, 100.0, 100.0, 9.0, 9.0, 9.0):
+            adj.step(c, heights, ties)
+        for i in (7, 22):
+            true, found = (cameras.camera(i, np.zeros(2)) for cameras in (block.true, adj.cameras))
+            middle = np.array([0.5 * (true.lens.width - 1), 0.5 * (true.lens.height - 1)])
+            errors.append(found.to_ground(middle) - true.to_ground(middle))
+        said = stated_errors(adj, 9.0, heights, ties=ties, tie_c=6.0, floor_m=0.0).sigma_m
+        stated.append(said / (BUNDLE.stated_sigma_factor * BUNDLE.tied_covariance_share))
+    ratio = np.sqrt(np.mean(np.square(errors))) / np.sqrt(np.mean(np.square(stated)))
+    assert 0.5 < ratio < 1.7
+
+
+def test_a_receiver_that_drifts_east_is_not_doubted_in_the_north():
+    block = make_block()
+    adj = Adjustment.begin(block.start, block.tracks, block.priors, first_points(block.start, block.tracks))
+    first, knots = adj.layout.offset[0] + 5, adj.layout.knots[0]
+    adj.common[first : first + 2 * knots : 2] = np.linspace(-9.0, 9.0, knots)
+    bias = active().registration.receiver_bias_sigma_m
+    east, north = receiver_sigma(adj)
+    assert north == pytest.approx(bias)
+    assert east == pytest.approx(np.hypot(bias, 9.0), rel=0.1), "an even drift of 18 m since the receiver was right"
+
+
+def test_places_are_weighed_by_axis():
+    at = np.array([[0.0, 0.0], [100.0, 0.0]])
+    away = np.array([[3.0, 0.0], [0.0, 3.0]])
+    sigma = np.array([[0.1, 10.0], [10.0, 0.1]])
+    held = np.array([100.0, 100.0, 1e-6, 1e-6])
+    found = Similarity.between(at, at + away, sigma, middle=at.mean(axis=0), prior_sigma=held)
+    np.testing.assert_allclose(found.values[:2], [3.0, 3.0], atol=0.01)
