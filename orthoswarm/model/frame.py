@@ -66,6 +66,10 @@ class Frame:
     damaged: bool = False
     ambiguous: bool = False
 
+    def __deepcopy__(self, memo: dict[int, object]) -> "Frame":
+        """Itself: nobody changes a frame."""
+        return self
+
 
 @dataclass(frozen=True, slots=True)
 class Rejection:

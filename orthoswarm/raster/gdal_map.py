@@ -340,9 +340,10 @@ def _blank(values: NDArray[Any]) -> Mask:
     box = np.ones((side, side), np.uint8)
     wider = np.ones((side + 4, side + 4), np.uint8)  # interpolation blurs a collar's edge by two pixels
     out = np.zeros(values.shape[1:], bool)
-    lowest, highest = values.min(axis=0), values.max(axis=0)
     for value in (0, 255) if values.dtype == np.uint8 else (0,):
-        flat = (lowest == value) & (highest == value)
+        flat = values[0] == value
+        for band in values[1:]:
+            flat &= band == value
         if np.count_nonzero(flat) >= side**2:
             core = cv2.erode(flat.astype(np.uint8), box, borderValue=1)
             out |= cv2.dilate(core, wider, borderValue=0).astype(bool)

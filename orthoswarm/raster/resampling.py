@@ -47,6 +47,16 @@ def _area_means(data, valid, left, top, sx, sy, out, share):  # type: ignore[no-
     bands, rows, cols = data.shape
     weight = np.empty(cols, np.float32)
     sums = np.empty((bands, cols), np.float32)
+    width = out.shape[2]
+    first, count = np.empty(width, np.int64), np.empty(width, np.int64)  # columns of the data under each of the answer
+    part = np.empty((width, int(np.ceil(sx)) + 2), np.float32)  # ... and how much of each
+    for c in range(width):
+        x0, x1 = left + c * sx, left + (c + 1) * sx
+        first[c] = max(int(np.floor(x0)), 0)
+        count[c] = max(min(int(np.ceil(x1)), cols) - first[c], 0)
+        for k in range(count[c]):
+            j = first[c] + k
+            part[c, k] = np.float32(min(x1, j + 1.0) - max(x0, float(j)))
     for r in range(out.shape[1]):
         y0, y1 = top + r * sy, top + (r + 1) * sy
         weight[:] = 0.0
@@ -58,15 +68,13 @@ def _area_means(data, valid, left, top, sx, sy, out, share):  # type: ignore[no-
             for b in range(bands):
                 for j in range(cols):
                     sums[b, j] += high * np.float32(valid[i, j]) * np.float32(data[b, i, j])
-        for c in range(out.shape[2]):
-            x0, x1 = left + c * sx, left + (c + 1) * sx
-            first, last = max(int(np.floor(x0)), 0), min(int(np.ceil(x1)), cols)
+        for c in range(width):
             total = np.float32(0.0)
-            for j in range(first, last):
-                total += np.float32(min(x1, j + 1.0) - max(x0, float(j))) * weight[j]
+            for k in range(count[c]):
+                total += part[c, k] * weight[first[c] + k]
             share[r, c] = total / (sx * sy)
             for b in range(bands):
                 value = np.float32(0.0)
-                for j in range(first, last):
-                    value += np.float32(min(x1, j + 1.0) - max(x0, float(j))) * sums[b, j]
+                for k in range(count[c]):
+                    value += part[c, k] * sums[b, first[c] + k]
                 out[b, r, c] = np.uint8(value / total + np.float32(0.5)) if total > 1e-6 else np.uint8(0)

@@ -6,10 +6,12 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from orthoswarm.compute.workers import Processes, Serial, cores, peak_rss_mb, prepare_process, workers
 from orthoswarm.model.errors import OrthoSwarmError
+from orthoswarm.model.frame import Fix, Frame
 
 
 def square(n):
@@ -20,6 +22,10 @@ def square(n):
 def grow(numbers):
     numbers.append(1)
     return len(numbers) - 1
+
+
+def identity(item):
+    return item
 
 
 def where(_):
@@ -61,6 +67,15 @@ def test_a_function_changes_a_copy_of_its_own():
         with Processes(count) as some:
             assert list(some.map(grow, [shared] * 6)) == [1] * 6
     assert list(Serial().map(grow, [shared] * 3)) == [1] * 3 and shared == [0]
+
+
+def test_a_copy_has_the_same_frames_and_its_own_arrays():
+    frame = Frame(image="a.jpg", path=Path("a.jpg"), vehicle="uav01", time_s=None, fix=Fix(1.0, 2.0), width=4, height=3)
+    given = [frame, frame], np.zeros(3)
+    ((frames, array),) = Serial().map(identity, [given])
+    assert frames is not given[0] and all(f is frame for f in frames)
+    array[0] = 1.0
+    assert given[1][0] == 0.0
 
 
 def test_the_caller_works_too_and_the_others_are_measured():

@@ -19,7 +19,7 @@ from orthoswarm.refine.bundle.block_arrays import (
     WIDTH,
     F,
 )
-from orthoswarm.refine.features.shift_products import LANES, ROWS, add_products, padded
+from orthoswarm.refine.features.shift_products import LANES, ROWS, add_products, add_wanted_products, padded
 
 
 @kernel
@@ -159,10 +159,72 @@ def locate(template, window, reach, exclude):  # type: ignore[no-untyped-def]
     score = np.zeros((padded(shifts, ROWS), padded(shifts, LANES)), np.float32)
     add_products(template, window, score)
     _normalise(template, window, n, shifts, score)
+    return _located(score, shifts, exclude)
+
+
+@kernel
+def locate_wanted(template, window, reach, exclude, wanted):  # type: ignore[no-untyped-def]
+    """As `locate`, among the blocks of shifts that are wanted, see `promising_blocks`."""
+    n, shifts = template.shape[2], 2 * reach + 1
+    score = np.zeros((padded(shifts, ROWS), padded(shifts, LANES)), np.float32)
+    add_wanted_products(template, window, score, wanted)
+    _normalise(template, window, n, shifts, score)
+    return _located(score, shifts, exclude)
+
+
+@kernel
+def promising_blocks(patch, seen, reach, texture, floor, share):  # type: ignore[no-untyped-def]
+    """Where a patch may lie in a window by their half-size pictures: a sixteenth of the products finds all its peaks.
+
+    Args:
+        patch, seen: float32, square, the patch and the window around it with `reach` pixels more to each side, NaN
+            where they are not known. texture, floor: see `gradients`.
+        share: shifts with at least this share of the highest correlation are promising.
+
+    Returns:
+        Which blocks of ROWS x LANES shifts of `locate` hold a promising one or a neighbour of it, bool.
+    """
+    own, around = _halved(patch), _halved(seen)
+    n, shifts = own.shape[0] - 2, around.shape[0] - own.shape[0] + 1
+    template = np.zeros((2, n + 2 * (ROWS - 1), n), np.float32)
+    window = np.zeros((2, padded(shifts, ROWS) + n + ROWS - 1, padded(shifts, LANES) + n), np.float32)
+    gradients(own, texture, floor, template, ROWS - 1)
+    gradients(around, texture, floor, window, 0)
+    score = np.zeros((padded(shifts, ROWS), padded(shifts, LANES)), np.float32)
+    add_products(template, window, score)
+    _normalise(template, window, n, shifts, score)
+    size = 2 * reach + 1
+    wanted = np.zeros((padded(size, ROWS) // ROWS, padded(size, LANES) // LANES), np.bool_)
+    least = share * score[:shifts, :shifts].max()
+    for i in range(shifts):
+        for j in range(shifts):
+            if score[i, j] >= least:
+                # its place is 2 i, 2 j, good to two; a peak's neighbours give its place between the pixels
+                top, left = max(2 * i - 3, 0) // ROWS, max(2 * j - 3, 0) // LANES
+                bottom, right = min(2 * i + 3, size - 1) // ROWS, min(2 * j + 3, size - 1) // LANES
+                wanted[top : bottom + 1, left : right + 1] = True
+    return wanted
+
+
+@kernel
+def _halved(gray):  # type: ignore[no-untyped-def]
+    """Means of 2 x 2 pixels, from the first on."""
+    rows, cols = gray.shape[0] // 2, gray.shape[1] // 2
+    out, quarter = np.empty((rows, cols), np.float32), np.float32(0.25)
+    for r in range(rows):
+        upper, lower, line = gray[2 * r], gray[2 * r + 1], out[r]
+        for c in range(cols):
+            line[c] = quarter * (upper[2 * c] + upper[2 * c + 1] + lower[2 * c] + lower[2 * c + 1])
+    return out
+
+
+@kernel
+def _located(score, shifts, exclude):  # type: ignore[no-untyped-def]
+    """What `locate` returns, from the correlations."""
     r, c, second = _peaks(score[:shifts, :shifts], exclude)
     if not (0 < c < shifts - 1 and 0 < r < shifts - 1):
         return 0.0, 0.0, 0.0, 1.0
-    peak = float(score[r, c])
+    reach, peak = shifts // 2, float(score[r, c])
     dc = vertex(float(score[r, c - 1]), peak, float(score[r, c + 1]))
     dr = vertex(float(score[r - 1, c]), peak, float(score[r + 1, c]))
     return c + dc - reach, r + dr - reach, peak, float(second)

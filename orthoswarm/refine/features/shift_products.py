@@ -130,3 +130,28 @@ def add_products(template, window, score):  # type: ignore[no-untyped-def]
                 else:
                     _four(window, seen + j, step, template, own, n, lines - ROWS + 1, n, score, out + j, columns)
                     j += 4 * LANES
+
+
+@kernel
+def add_wanted_products(template, window, score, wanted):  # type: ignore[no-untyped-def]
+    """The same, only for the blocks of ROWS x LANES shifts that are wanted: bool (rows / ROWS, columns / LANES)."""
+    channels, lines, n = template.shape
+    rows, columns = score.shape
+    step, blocks = window.shape[2], columns // LANES
+    for channel in range(channels):
+        own = (channel * lines + ROWS - 1) * n
+        for i in range(0, rows, ROWS):
+            row, seen, out, k = wanted[i // ROWS], (channel * window.shape[1] + i) * step, i * columns, 0
+            while k < blocks:
+                j = k * LANES
+                if not row[k]:
+                    k += 1
+                elif k + 2 < blocks and row[k + 1] and row[k + 2]:
+                    _three(window, seen + j, step, template, own, n, lines - ROWS + 1, n, score, out + j, columns)
+                    k += 3
+                elif k + 1 < blocks and row[k + 1]:
+                    _two(window, seen + j, step, template, own, n, lines - ROWS + 1, n, score, out + j, columns)
+                    k += 2
+                else:
+                    _one(window, seen + j, step, template, own, n, lines - ROWS + 1, n, score, out + j, columns)
+                    k += 1

@@ -4,14 +4,22 @@ import numpy as np
 
 from orthoswarm.compute.jit import kernel
 from orthoswarm.refine.bundle.block_arrays import HEIGHT, WIDTH, project_point
-from orthoswarm.refine.features.patch_matching import gradients, locate, rectify, template_of, window_of
+from orthoswarm.refine.features.patch_matching import (
+    gradients,
+    locate,
+    locate_wanted,
+    promising_blocks,
+    rectify,
+    template_of,
+    window_of,
+)
 from orthoswarm.refine.features.shift_products import ROWS
 
 
 @kernel
 def search_map(  # type: ignore[no-untyped-def]
     position, rotation, lens, gray, place, pixel, ground, valid, gsd, half, reach, texture, floor, exclude,
-    window_share, patch_share, found,
+    window_share, patch_share, wide, share, found,
 ):  # fmt: skip
     """Find the surroundings of K points of one picture on the map.
 
@@ -22,6 +30,7 @@ def search_map(  # type: ignore[no-untyped-def]
         ground, valid: uint8 and bool (rows, columns), the map. gsd: its pixel, metres.
         half, reach: half the patch and the search, pixels. texture, floor: see `gradients`. exclude: see `locate`.
         window_share, patch_share: least share of the window that the map, of the patch that the picture shows.
+        wide, share: searches of more than so many pixels look first at half size, see `promising_blocks`.
         found: float64 (K, 4) out, column and row of the shift, peak, second peak; peak 0 where there is none.
     """
     patch = np.empty((2 * half + 3, 2 * half + 3), np.float32)
@@ -47,7 +56,11 @@ def search_map(  # type: ignore[no-untyped-def]
             continue
         gradients(patch, texture, floor, template, ROWS - 1)
         gradients(seen, texture, floor, window, 0)
-        found[k, 0], found[k, 1], found[k, 2], found[k, 3] = locate(template, window, reach, exclude)
+        if reach > wide:
+            wanted = promising_blocks(patch, seen, reach, texture, floor, share)
+            found[k, 0], found[k, 1], found[k, 2], found[k, 3] = locate_wanted(template, window, reach, exclude, wanted)
+        else:
+            found[k, 0], found[k, 1], found[k, 2], found[k, 3] = locate(template, window, reach, exclude)
 
 
 @kernel

@@ -91,7 +91,7 @@ def match_points(
             cameras.position[i], cameras.rotation[i], cameras.lens[cameras.lens_id[i]], gray(i), place[part],
             pixel[part], ground.gray, ground.valid, ground.gsd_m, half, reach, texture,
             np.float32(features.gradient_floor), features.peak_exclude_px, config.map_window_share,
-            config.patch_share, found[part],
+            config.patch_share, features.search_wide_px, features.search_promising_share, found[part],
         )  # fmt: skip
     good = found[:, 2] > 0
     found, by, place = found[good], by[good], place[good]

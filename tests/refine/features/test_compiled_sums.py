@@ -6,7 +6,14 @@ import pytest
 
 from orthoswarm.raster.subpixel_peak import vertex
 from orthoswarm.refine.features.corners import strongest
-from orthoswarm.refine.features.patch_matching import locate, template_of, window_of
+from orthoswarm.refine.features.patch_matching import (
+    gradients,
+    locate,
+    locate_wanted,
+    promising_blocks,
+    template_of,
+    window_of,
+)
 from orthoswarm.refine.features.shift_products import ROWS
 
 
@@ -29,6 +36,27 @@ def test_a_patch_is_found_where_opencv_finds_it(half, reach):
     rest[max(row - 3, 0) : row + 4, max(column - 3, 0) : column + 4] = -1.0
     expected = column - reach + sub[0], row - reach + sub[1], score.max(), rest.max()
     np.testing.assert_allclose(locate(template, window, reach, 3), expected, atol=1e-4)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_search_at_half_size_first_finds_the_same_peaks(seed):
+    rng = np.random.default_rng(seed)
+    half, reach, floor = 20, 28 - seed % 2, np.float32(1.0)
+    size = 2 * (half + reach + 1) + 1
+    seen = cv2.GaussianBlur(rng.normal(0.0, 300.0, (size, size)), (0, 0), 1.5).astype(np.float32) + 120
+    row, column = rng.integers(3, 2 * reach - 3, 2)
+    patch = seen[row : row + 2 * half + 3, column : column + 2 * half + 3].copy()
+    patch += cv2.GaussianBlur(rng.normal(0.0, 150.0, patch.shape), (0, 0), 1.0).astype(np.float32)
+    template, window = template_of(half), window_of(half, reach)
+    gradients(patch, True, floor, template, ROWS - 1)
+    gradients(seen, True, floor, window, 0)
+    wanted = promising_blocks(patch, seen, reach, True, floor, 0.6)
+    whole = locate(template, window, reach, 4)
+    found = locate_wanted(template, window, reach, 4, wanted)
+    assert wanted.mean() < 0.5
+    np.testing.assert_allclose(whole[:2], (column - reach, row - reach), atol=0.3)
+    np.testing.assert_allclose(found[:3], whole[:3], atol=1e-5)
+    assert found[3] <= whole[3] + 1e-6
 
 
 def test_the_strongest_corner_of_each_empty_cell_is_opencvs():
