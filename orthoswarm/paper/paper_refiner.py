@@ -21,7 +21,7 @@ from orthoswarm.paper.leg_cameras import carried_shift, fit_camera, pixel_grid
 from orthoswarm.paper.leg_patches import PatchFit, PatchOptions, PatchTask, match_patch
 from orthoswarm.refine.bundle.flight_records import Array
 from orthoswarm.refine.flight.solve_units import merge_units
-from orthoswarm.refine.flight.vehicle_refinement import refine_vehicle, unit_states, units_of_area
+from orthoswarm.refine.flight.vehicle_refinement import UnitRefiner, unit_states, units_of_area
 
 Progress = Callable[[str, int, int], None]
 
@@ -47,40 +47,27 @@ class PaperState:
 
 
 @dataclass(frozen=True, slots=True)
-class PaperRefiner:
+class PaperRefiner(UnitRefiner):
     """The paper's refiner behind the interface `placement.Refiner`.
 
     Attributes:
-        epsg: the area's grid. origin: (2,) of the local frame, the same for all vehicles of an area.
         options: see Options.
     """
 
-    epsg: int
-    origin: Array
     options: Options = field(default_factory=Options)
 
-    def refine(self, frames: Sequence[Frame], neighbours: Sequence[Solution], basemap: MapWindow | None) -> Solution:
-        """Place one vehicle's frames; if none of its legs is found on the map, it gets its neighbours' correction.
-
-        Raises:
-            OrthoSwarmError: if there are no frames.
-        """
-        from_neighbours = [pair for n in neighbours for pair in _found(n)]
-
-        def solve(units: list[list[Frame]]) -> Solution:
-            grid = LocalGrid(self.epsg)
-            return _refine(
-                units,
-                from_neighbours,
-                basemap,
-                grid=grid,
-                origin=self.origin,
-                options=self.options,
-                run=serial,
-                progress=None,
-            ).fine[0]
-
-        return refine_vehicle(frames, self.epsg, solve)
+    def solve(self, units: list[list[Frame]], neighbours: Sequence[Solution], basemap: MapWindow | None) -> Solution:
+        """All steps for one vehicle; if none of its legs is found on the map, it gets its neighbours' correction."""
+        return _refine(
+            units,
+            [pair for n in neighbours for pair in _found(n)],
+            basemap,
+            grid=LocalGrid(self.epsg),
+            origin=self.origin,
+            options=self.options,
+            run=serial,
+            progress=None,
+        ).fine[0]
 
     def again(self, solution: Solution, neighbours: Sequence[Solution], basemap: MapWindow | None) -> Solution:
         """Place a vehicle again with later neighbours; changes only a vehicle with no leg of its own on the map."""

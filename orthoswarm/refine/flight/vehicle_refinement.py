@@ -1,48 +1,67 @@
 """What every refiner does with one vehicle's frames before and after its units are solved."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
-from orthoswarm.model.placement import Leg, PlacedFrame, Solution
+from orthoswarm.model.placement import Leg, MapWindow, PlacedFrame, Solution
 from orthoswarm.mosaic.recorded_pose import hint_lone_photos, recorded_cameras
 from orthoswarm.refine.flight.solve_units import split_units
 from orthoswarm.refine.flight.unsolved_pictures import place_by_neighbours, split_refinable
 
+Array = NDArray[np.float64]
 
-def refine_vehicle(frames: Sequence[Frame], epsg: int, solve: Callable[[list[list[Frame]]], Solution]) -> Solution:
-    """Solve one vehicle's frames as far as they can be solved, and place the others.
 
-    Frames too few of their camera and size move as their solved neighbours do; a vehicle that took all pictures at one
-    spot stays as recorded; a frame whose position cannot be true is left out.
+@dataclass(frozen=True, slots=True)
+class UnitRefiner(ABC):
+    """What refiners have in common: the area's grid, and a vehicle that is solved unit by unit (placement.Refiner).
 
-    Args:
-        frames: of one vehicle, in order of time. epsg: the area's grid.
-        solve: solves the vehicle's units (frames of one lens each) to one solution.
-
-    Raises:
-        OrthoSwarmError: if there are no frames, or nothing can be made of them.
+    Attributes:
+        epsg: the area's grid. origin: (2,) of the local frame, the same for all vehicles of an area.
     """
-    if not frames:
-        raise OrthoSwarmError("there are no frames to refine; check the vehicle's pictures")
-    recorded = recorded_cameras(frames, LocalGrid(epsg))
-    kinds = split_refinable(recorded.placed)
-    vehicle = frames[0].vehicle
-    if kinds.fit:
-        solution = solve(split_units({vehicle: hint_lone_photos(kinds.fit)}))
-    else:
-        solution = as_recorded(vehicle, kinds.still)
-    return replace(
-        solution,
-        placed=[*solution.placed, *place_by_neighbours(kinds.odd, kinds.fit, solution.placed)],
-        dropped={**solution.dropped, **{r.image: r.reason for r in recorded.rejected}},
-        warnings=[*solution.warnings, *kinds.warnings],
-    )
+
+    epsg: int
+    origin: Array
+
+    def refine(self, frames: Sequence[Frame], neighbours: Sequence[Solution], basemap: MapWindow | None) -> Solution:
+        """Solve one vehicle's frames as far as they can be solved, and place the others.
+
+        Frames too few of their camera and size move as their solved neighbours do; a vehicle that took all pictures at
+        one spot stays as recorded; a frame whose position cannot be true is left out.
+
+        Args:
+            frames: of one vehicle, in order of time. neighbours: earlier results of this refiner, held as they are.
+            basemap: the map, or None.
+
+        Raises:
+            OrthoSwarmError: if there are no frames, or nothing can be made of them.
+        """
+        if not frames:
+            raise OrthoSwarmError("there are no frames to refine; check the vehicle's pictures")
+        recorded = recorded_cameras(frames, LocalGrid(self.epsg))
+        kinds = split_refinable(recorded.placed)
+        vehicle = frames[0].vehicle
+        if kinds.fit:
+            solution = self.solve(split_units({vehicle: hint_lone_photos(kinds.fit)}), neighbours, basemap)
+        else:
+            solution = as_recorded(vehicle, kinds.still)
+        return replace(
+            solution,
+            placed=[*solution.placed, *place_by_neighbours(kinds.odd, kinds.fit, solution.placed)],
+            dropped={**solution.dropped, **{r.image: r.reason for r in recorded.rejected}},
+            warnings=[*solution.warnings, *kinds.warnings],
+        )
+
+    @abstractmethod
+    def solve(self, units: list[list[Frame]], neighbours: Sequence[Solution], basemap: MapWindow | None) -> Solution:
+        """Solve the units of one vehicle (frames of one lens each) to one solution."""
 
 
 def units_of_area(vehicles: Mapping[str, Sequence[Frame]]) -> list[list[Frame]]:

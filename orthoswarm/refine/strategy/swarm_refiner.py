@@ -22,7 +22,7 @@ from orthoswarm.model.task_runner import Run, serial
 from orthoswarm.mosaic.recorded_pose import recorded_cameras
 from orthoswarm.refine.flight.solve_units import merge_units
 from orthoswarm.refine.flight.unsolved_pictures import move_with_neighbours
-from orthoswarm.refine.flight.vehicle_refinement import as_recorded, refine_vehicle, unit_states, units_of_area
+from orthoswarm.refine.flight.vehicle_refinement import UnitRefiner, as_recorded, unit_states, units_of_area
 from orthoswarm.refine.registration.block_state import VehicleState, findings, lies_on_map, to_solution
 from orthoswarm.refine.registration.neighbour_registration import register_to_neighbours
 from orthoswarm.refine.strategy.first_pass import first_passes
@@ -47,31 +47,20 @@ Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, slots=True)
-class SwarmRefiner:
+class SwarmRefiner(UnitRefiner):
     """The default refiner of an area (placement.Refiner): each vehicle by itself, then again with its neighbours held.
 
     Attributes:
-        epsg: the area's grid. origin: (2,) of the local frame, the same for all vehicles of an area.
         options: see Options.
     """
 
-    epsg: int
-    origin: Array
     options: Options = field(default_factory=Options)
 
-    def refine(self, frames: Sequence[Frame], neighbours: Sequence[Solution], basemap: MapWindow | None) -> Solution:
-        """Refine one vehicle's frames; neighbours (earlier results of this refiner) are held as they are.
-
-        Raises:
-            OrthoSwarmError: if nothing can be made of the frames.
-        """
+    def solve(self, units: list[list[Frame]], neighbours: Sequence[Solution], basemap: MapWindow | None) -> Solution:
+        """Each unit by itself, then their second pass with the neighbours held."""
         others = [state for n in neighbours for state in states_of(n)]
-
-        def solve(units: list[list[Frame]]) -> Solution:
-            place = partial(refine_alone, epsg=self.epsg, origin=self.origin, basemap=basemap, options=self.options)
-            return self._second_pass([place(unit) for unit in units], others, basemap)
-
-        return refine_vehicle(frames, self.epsg, solve)
+        place = partial(refine_alone, epsg=self.epsg, origin=self.origin, basemap=basemap, options=self.options)
+        return self._second_pass([place(unit) for unit in units], others, basemap)
 
     def again(self, solution: Solution, neighbours: Sequence[Solution], basemap: MapWindow | None) -> Solution:
         """Refine a vehicle again with neighbours that were not refined, or refined without a map, when it was.
