@@ -75,6 +75,28 @@ def invert3(a, out):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def _subtract_block(band, row, column, left, right):  # type: ignore[no-untyped-def]
+    """Subtract left (6, 3) times the transpose of right (6, 3) from a block below the diagonal of a lower band."""
+    for q in range(6):
+        r0, r1, r2 = right[q, 0], right[q, 1], right[q, 2]
+        to = band[row - column - q : row - column - q + 6, column + q]
+        for a in range(6):
+            to[a] -= left[a, 0] * r0 + left[a, 1] * r1 + left[a, 2] * r2
+
+
+@kernel
+def _subtract_own_block(band, row, left, right, both):  # type: ignore[no-untyped-def]
+    """The same on the diagonal; both: the transposed product, too, of another observation by the same camera."""
+    for a in range(6):
+        for q in range(6):
+            value = left[a, 0] * right[q, 0] + left[a, 1] * right[q, 1] + left[a, 2] * right[q, 2]
+            if a >= q:
+                band[a - q, row + q] -= value
+            if both and q >= a:
+                band[q - a, row + a] -= value
+
+
+@kernel
 def build(  # type: ignore[no-untyped-def]
     position,
     rotation,
@@ -210,22 +232,10 @@ def build(  # type: ignore[no-untyped-def]
                 o = slot[camera[n]]
                 if o < 0 or o > s or obs_weight[n] == 0.0:
                     continue
-                if o == s and n > m:
-                    continue
-                for a in range(6):
-                    row = 6 * s + a
-                    for q in range(6):
-                        column = 6 * o + q
-                        if row >= column:
-                            value = wv[a, 0] * w_obs[n, q, 0] + wv[a, 1] * w_obs[n, q, 1] + wv[a, 2] * w_obs[n, q, 2]
-                            band[row - column, column] -= value
-                        if o == s and n != m:
-                            # two observations by one camera: the transposed product belongs to the same block
-                            row2, column2 = 6 * o + q, 6 * s + a
-                            if row2 >= column2:
-                                band[row2 - column2, column2] -= (
-                                    wv[a, 0] * w_obs[n, q, 0] + wv[a, 1] * w_obs[n, q, 1] + wv[a, 2] * w_obs[n, q, 2]
-                                )
+                if o < s:
+                    _subtract_block(band, 6 * s, 6 * o, wv, w_obs[n])
+                elif n <= m:
+                    _subtract_own_block(band, 6 * s, wv, w_obs[n], n != m)
         for li in range(lenses):
             for a in range(6):
                 t0 = t1 = t2 = 0.0
