@@ -7,8 +7,10 @@ With --legs the pictures show one ground along legs there and back, over a map, 
 meanwhile; without, they are alike, and nothing but the real-time layer is made of them.
 
 Prints a line of JSON for each number of vehicles: frames accepted a second, time of a POST (median, 95, 99 %), time
-from arrival to the map (by the daemon's own metrics; 1 is the slowest of the last thousand), CPU share of the daemon's
-process and of the senders, memory, coarse maps made and the share of the time in which one was being made.
+from arrival to the map (by the daemon's own metrics; 1 is the slowest of the last thousand), how long the map waited
+for the newest pictures of the vehicle that it was furthest behind (looked at four times a second; what is put off
+because later pictures of its vehicle are drawn does not count), CPU share of the daemon's process and of the senders,
+memory, coarse maps made and the share of the time in which one was being made.
 """
 
 import argparse
@@ -190,9 +192,12 @@ async def load(url: str, vehicles: int, rate: float, seconds: float, course: Cou
         before = figures((await client.get("/metrics")).text)
         began, cpu = time.monotonic(), time.process_time()
         connections = [Connection(url) for _ in range(vehicles)]
+        behind: list[float] = []
+        watching = asyncio.create_task(watch(client, behind))
         await asyncio.gather(
             *(fly(c, v, rate, until=began + seconds, course=course, took=took) for v, c in enumerate(connections))
         )
+        watching.cancel()
         wall, cpu = time.monotonic() - began, time.process_time() - cpu
         posted = figures((await client.get("/metrics")).text)
         while figures((await client.get("/metrics")).text)["frames_drawn_total"] < len(took):
@@ -205,6 +210,7 @@ async def load(url: str, vehicles: int, rate: float, seconds: float, course: Cou
         "accepted_per_s": round(len(took) / wall, 1),
         "post_ms": {q: round(1e3 * float(np.percentile(took, q)), 1) for q in (50, 95, 99, 100)},
         "on_map_s": {q: round(after.get(f'draw_latency_seconds{{quantile="{q}"}}', 0.0), 3) for q in (0.5, 0.99, 1)},
+        "behind_s": {q: round(float(np.percentile(behind, q)), 2) for q in (50, 95, 100)},
         "later_than_1_s": int(after["frames_late_total"]),
         "cpu_share_of_a_core": round((posted["cpu_seconds_total"] - before["cpu_seconds_total"]) / wall, 2),
         "cpu_share_of_the_senders": round(cpu / wall, 2),
@@ -212,6 +218,13 @@ async def load(url: str, vehicles: int, rate: float, seconds: float, course: Cou
         "frames": len(took),
         "coarse": coarse_figures(jobs, wall),
     }
+
+
+async def watch(client: httpx.AsyncClient, behind: list[float]) -> None:
+    """Note how far the map is behind, until cancelled."""
+    while True:
+        behind.append(figures((await client.get("/metrics")).text)["draw_behind_seconds"])
+        await asyncio.sleep(0.25)
 
 
 def coarse_figures(jobs: list[dict], wall_s: float) -> dict:

@@ -34,6 +34,8 @@ def prometheus(daemon: Daemon, uploads_waiting: int = 0) -> str:
     single("frames_late_total", "counter", "Frames drawn later than a second after they came.", drawer.late)
     single("draw_backlog", "gauge", "Frames that wait to be drawn.", drawer.backlog)
     single("draw_put_off", "gauge", "Frames that wait because they would show least.", drawer.put_off)
+    text = "Longest time for which newer pictures of a vehicle have come than any that is drawn."
+    single("draw_behind_seconds", "gauge", text, drawer.behind_s)
     recent = sorted(drawer.latencies)
     metric(
         "draw_latency_seconds", "gauge", "From arrival to the map, of the last thousand frames.",

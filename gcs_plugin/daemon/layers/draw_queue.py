@@ -29,6 +29,31 @@ class Pending:
     frame: Frame
 
 
+class MapDelay:
+    """How long the map has been waiting for a vehicle's newest pictures.
+
+    Pictures that are put off because later ones of their vehicle were drawn do not count: the map shows where the
+    vehicle is. It is not thread-safe.
+    """
+
+    def __init__(self) -> None:
+        self._newer: dict[str, deque[float]] = {}  # when those came that are newer than their vehicle's last drawn one
+
+    def came(self, vehicle: str, arrived: float) -> None:
+        """Note a picture that came (UTC epoch seconds)."""
+        self._newer.setdefault(vehicle, deque()).append(arrived)
+
+    def drawn(self, vehicle: str, arrived: float) -> None:
+        """Note that the picture of a vehicle that came at this time is drawn."""
+        newer = self._newer.get(vehicle, deque())
+        while newer and newer[0] <= arrived:
+            newer.popleft()
+
+    def seconds(self, now: float) -> float:
+        """The longest time that any vehicle has had pictures newer than all that are drawn of it."""
+        return max((now - newer[0] for newer in self._newer.values() if newer), default=0.0)
+
+
 class DrawQueue:
     """The queue; it is not thread-safe.
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcs_plugin.daemon.layers.anchor import Anchor
-from gcs_plugin.daemon.layers.draw_queue import DrawQueue, Pending
+from gcs_plugin.daemon.layers.draw_queue import DrawQueue, MapDelay, Pending
 from gcs_plugin.daemon.layers.journal_frames import frame_of_row
 from gcs_plugin.daemon.layers.layers import Area, Layer, new_name
 from gcs_plugin.daemon.layers.map_site import MapSite
@@ -98,6 +98,7 @@ class Drawer:
         self._on_rejected, self._on_drawn = on_rejected, on_drawn
         self._begun = 0
         self._queue = DrawQueue(self._in_memory)
+        self._delay = MapDelay()
         self._waiting: set[int] = set()
         self._looked = 0.0
         self._more, self._looking = True, False
@@ -130,6 +131,7 @@ class Drawer:
     def add(self, seq: int, frame: Frame, arrived: float, sortie: int) -> None:
         """Add a frame that is in the journal."""
         with self._condition:
+            self._delay.came(frame.vehicle, arrived)
             if seq not in self._waiting:
                 self._put(Pending(seq, arrived, sortie, frame))
             self._condition.notify_all()
@@ -143,6 +145,12 @@ class Drawer:
     def backlog(self) -> int:
         """Number of frames that wait in memory, up to a bound; the others are in the journal."""
         return len(self._queue)
+
+    @property
+    def behind_s(self) -> float:
+        """How long the map has been waiting for some vehicle's newest pictures, seconds, see MapDelay."""
+        with self._condition:
+            return self._delay.seconds(time.time())
 
     def wait_idle(self, timeout_s: float) -> bool:
         """Wait until nothing is left to draw; False after the time-out."""
@@ -270,6 +278,8 @@ class Drawer:
 
     def _note(self, pending: Pending, result: Drawn) -> None:
         took = time.time() - pending.arrived
+        with self._condition:
+            self._delay.drawn(pending.frame.vehicle, pending.arrived)
         self.drawn += 1
         self.late += took > self._late_s
         self.latencies.append(took)

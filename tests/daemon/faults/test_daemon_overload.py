@@ -2,13 +2,14 @@
 
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gcs_plugin.daemon.intake.posted_pose import frame_of, parse_pose
-from gcs_plugin.daemon.layers.draw_queue import DrawQueue, Pending
+from gcs_plugin.daemon.layers.draw_queue import DrawQueue, MapDelay, Pending
 from gcs_plugin.daemon.layers.layers import Layer
 from gcs_plugin.daemon.layers.realtime_layer import Drawer
 from gcs_plugin.daemon.store.event_bus import Events
@@ -72,6 +73,40 @@ def test_the_first_few_of_a_jam_are_spread_over_its_ground():
         queue.put(pending(seq, 2.0 * seq))
     first = sorted(2.0 * queue.take().seq for _ in range(40))
     assert max(np.diff([0.0, *first, 800.0])) < 60.0
+
+
+def test_in_a_jam_the_map_follows_every_vehicle():
+    """96 vehicles send 192 pictures a second, 96 can be drawn: no vehicle's newest waits for two seconds."""
+    queue, delay, behind = DrawQueue(2000), MapDelay(), []
+    for turn in range(20):  # each half a second
+        for vehicle in range(96):
+            seq, arrived = 96 * turn + vehicle, 0.5 * turn + vehicle / 192
+            came = pending(seq, 100.0 * vehicle, 8.0 * turn)
+            queue.put(replace(came, arrived=arrived, frame=replace(came.frame, vehicle=f"v{vehicle}")))
+            delay.came(f"v{vehicle}", arrived)
+            if vehicle % 2:
+                drawn = queue.take()
+                delay.drawn(drawn.frame.vehicle, drawn.arrived)
+                behind.append(delay.seconds(arrived))
+    assert len(queue) == 960
+    assert 0.0 < max(behind) < 2.0
+
+
+def test_what_a_later_picture_shows_does_not_count_as_waiting():
+    delay = MapDelay()
+    assert delay.seconds(5.0) == 0.0
+    for arrived in (1.0, 2.0, 3.0):
+        delay.came("v1", arrived)
+    delay.came("v2", 2.5)
+    assert delay.seconds(5.0) == 4.0
+    delay.drawn("v1", 2.0)
+    assert delay.seconds(5.0) == 2.5
+    delay.drawn("v1", 1.0)
+    delay.drawn("v2", 2.5)
+    assert delay.seconds(5.0) == 2.0
+    delay.drawn("v1", 3.0)
+    delay.drawn("v3", 3.0)
+    assert delay.seconds(5.0) == 0.0
 
 
 @settings(deadline=None, max_examples=40)
