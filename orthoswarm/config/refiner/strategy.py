@@ -73,6 +73,8 @@ class StrategyConfig:
     # Neighbours
     neighbour_reach_heights: float = 1.5
     """Vehicles whose paths come within so many flying heights share ground (chosen; not measured)."""
+    leg_link_steps: int = 6
+    """Steps of a flight without a map once its legs are linked to each other (chosen; not measured)."""
     second_steps: int = 4
     """Steps of the second pass without a map (chosen; not measured)."""
 

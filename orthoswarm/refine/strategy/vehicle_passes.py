@@ -33,7 +33,7 @@ from orthoswarm.refine.flight.relative_block import (
     weigh_records,
 )
 from orthoswarm.refine.flight.sparse_block import open_sparse_flight
-from orthoswarm.refine.registration.absolute_orientation import orient_on_map
+from orthoswarm.refine.registration.absolute_orientation import add_links, orient_on_map, working_gsd
 from orthoswarm.refine.registration.block_state import Stopwatch, VehicleState
 from orthoswarm.refine.registration.coarse_map import is_coarse
 from orthoswarm.refine.registration.coarse_registration import CoarseFit, coarse_fits, learned_fit
@@ -118,6 +118,8 @@ def refine_tracked(
         return None
     try:
         surface = adjust_without_map(flight, options.ground(origin))
+        if basemap is None:
+            surface = link_own_legs(flight, surface)
         config = active().strategy
         if not config.narrowest_fov_deg < field_of_view_deg(flight.adjustment, flight) < config.widest_fov_deg:
             return None  # a recorded height that leads to such a lens is wrong
@@ -210,6 +212,17 @@ def adjust_without_map(flight: Flight, surface: GroundModel | None = None) -> Gr
     if inliers < active().strategy.solved_inliers:
         raise AdjustmentError(f"only {inliers:.0%} of the observations fit the adjustment")
     return found
+
+
+def link_own_legs(flight: Flight, surface: GroundModel) -> GroundModel:
+    """Observe points of each leg in pictures of the others and adjust again; returns the ground.
+
+    Corners are followed from picture to picture only: without a map nothing else holds the legs together, and what
+    tracks and receiver drift by along the way bends and scales the block.
+    """
+    if not add_links(flight, working_gsd(flight)):
+        return surface
+    return _steps(flight, surface, active().strategy.leg_link_steps)[0]
 
 
 def field_of_view_deg(adjustment: Adjustment, flight: Flight) -> float:

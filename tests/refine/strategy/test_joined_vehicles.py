@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from orthoswarm.model.geo import local_origin
+from orthoswarm.refine.strategy import vehicle_passes
 from orthoswarm.refine.strategy.swarm_refiner import SwarmRefiner
 from tests.kit.refine import refine_all
 from tests.kit.scenes import scene_of, tiny_twin
@@ -95,3 +96,19 @@ def test_a_vehicle_over_other_ground_stays_where_its_receiver_says(scene):
     alone = refine_all({"far": far}, None, grid).fine[0]
     beside = refine_all({"near": first, "far": far}, None, grid).fine[1]
     np.testing.assert_allclose(place_errors(beside, truth, grid), place_errors(alone, truth, grid), atol=0.05)
+
+
+def test_ground_continues_from_leg_to_leg_of_a_vehicle(scene, monkeypatch):
+    """Corners are followed along the path only; without links the legs drift apart."""
+    vehicles, grid, truth = scene
+    name = sorted(vehicles)[0]
+
+    def apart():
+        solution = refine_all({name: vehicles[name]}, None, grid).fine[0]
+        leg = solution.state.flight.leg
+        legs = [replace(solution, placed=[p for p, k in zip(solution.placed, leg) if k == n]) for n in (0, 1)]
+        return jump_m(*legs, truth, grid)
+
+    linked = apart()
+    monkeypatch.setattr(vehicle_passes, "link_own_legs", lambda flight, surface: surface)
+    assert linked < 0.85 * apart()
