@@ -234,6 +234,21 @@ def test_a_height_above_the_legal_one_is_asked_about(folder, capsys):  # noqa: F
         assert fleet(capsys, "start", "--vehicle", 1, "--max-height", 500, "--link", link)[0] == 0
 
 
+def test_a_speed_that_a_vehicle_may_not_reach_is_said_as_it_starts(folder, capsys):  # noqa: F811
+    swarm, link = swarm_of(make_swarm(1, home=HOME))
+    with swarm:
+        rows = [line.split("\t") for line in (folder / "v1.waypoints").read_text().splitlines()]
+        for row in rows:
+            if row[3:4] == [str(CHANGE_SPEED)]:
+                row[5] = "14"
+        path = folder / "fast.waypoints"
+        path.write_text("\n".join("\t".join(row) for row in rows) + "\n")
+        assert fleet(capsys, "upload", path, "--vehicle", 1, "--link", link)[0] == 0
+        code, said = fleet(capsys, "start", "--vehicle", 1, "--link", link)
+        assert code == 0
+        assert "warning: v1 speed: is asked for 14 m/s but may not reach that (WPNAV_SPEED is 10 m/s)" in said
+
+
 def test_what_is_overridden_must_be_named(folder, capsys):  # noqa: F811
     swarm, link = swarm_of(make_swarm(1, home=HOME))
     with swarm:

@@ -344,7 +344,7 @@ def _ready(
     backend: "Backend", args: argparse.Namespace, prepared: _Prepared, systems: list[int]
 ) -> "Airspace | dict[int, Outcome]":
     """Wait until all vehicles have passed their check; returns their missions, or why none was started."""
-    from gcs_plugin.fleet.preflight import ITEMS, red_text
+    from gcs_plugin.fleet.preflight import ITEMS, Level, red_text
     from gcs_plugin.mission.exchange import Outcome, Verdict
     from gcs_plugin.mission.track import Airspace
 
@@ -371,6 +371,10 @@ def _ready(
             for s in systems
             for failure in (Verdict.REFUSED if s in red else Verdict.NOT_SENT,)
         }
+    for check in checks:
+        for item in check.items:
+            if item.level is Level.WARNING and item.name not in _PASSING:
+                _say(args, f"warning: v{check.system} {item.name}: {item.reason}")
     return Airspace.of({s: m for s in systems if (m := missions.get(s) or stored.get(s)) is not None})
 
 
