@@ -24,8 +24,8 @@ class FleetEvent:
     Attributes:
         kind: `found`, `lost`, `regained`, `rebooted`, `link` (commands go another way), `conflict` (several vehicles
             with one system id), `single` (no longer), `near` (too near another vehicle), `apart` (no longer), `behind`
-            (later on its mission than plans allow for), `caught_up` (no longer), `text`, or a mission's `started`,
-            `suspended`, `resumed`, `complete`, `aborted`.
+            (later on its mission than plans allow for), `caught_up` (no longer: it has ended), `text`, or a mission's
+            `started`, `suspended`, `resumed`, `complete`, `aborted`.
         system: system id.
         time_s: UTC epoch seconds.
         text: one sentence.

@@ -291,8 +291,6 @@ class Reception:
         if watched.behind and not was:
             text = f"is {watched.late_s:.0f} s behind its plan, which keeps others apart for {watched.allowed_s:.0f} s"
             self._event("behind", vehicle, f"{text}: watch its distances, and pause it before it comes near another")
-        elif was and not watched.behind:
-            self._event("caught_up", vehicle, f"is {watched.late_s:.0f} s behind its plan, which is allowed for")
 
     def _compare_routes(self, vehicle: Vehicle, now: float) -> None:
         """Decide by the clocks whether one vehicle is on two links, or several vehicles share a system id."""

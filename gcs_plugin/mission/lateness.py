@@ -31,7 +31,7 @@ class Lateness:
     Attributes:
         mission: what is flown.
         late_s: how far it was behind at the last look, seconds of its own clock; negative: ahead.
-        behind: True once it was later than plans allow for, until it is no more than half of that.
+        behind: True once it was later than plans allow for: where it stands still, it is not known how late it is.
     """
 
     mission: "Mission"
@@ -71,8 +71,11 @@ class Lateness:
         window = track.places[self._at : self._at + round(_AHEAD_S / STEP_S) + 1]
         here = np.array([*metres(lat_deg, lon_deg, self._home), height_m])
         away = np.linalg.norm(window - here, axis=1)
-        if away.min() < _OFF_M:
-            as_near = self._at + np.flatnonzero(away <= away.min() + _AS_NEAR_M)
-            self._at = int(as_near[np.argmin(np.abs(STEP_S * as_near - flown_s))])
+        nearest = int(np.argmin(away))
+        if away[nearest] < _OFF_M:
+            far = np.flatnonzero(away > away[nearest] + _AS_NEAR_M)  # another leg beside this one does not count
+            first = max(far[far < nearest], default=-1) + 1
+            last = min(far[far > nearest], default=len(away)) - 1
+            self._at += int(np.clip(round(flown_s / STEP_S) - self._at, first, last))
         self.late_s = flown_s - STEP_S * self._at
-        self.behind = self.late_s > (0.5 if self.behind else 1.0) * self.allowed_s
+        self.behind |= self.late_s > self.allowed_s
