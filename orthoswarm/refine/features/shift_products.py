@@ -6,9 +6,11 @@ in LLVM's own terms: a block of four rows by up to four vectors of shifts stays 
 The order of the sums is fixed, so that the result is the same on each run.
 """
 
+import platform
 from typing import Any
 
 from llvmlite import ir
+from llvmlite.binding import get_host_cpu_features
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
@@ -21,7 +23,8 @@ ROWS = 4
 
 _FLOAT, _INT = ir.FloatType(), ir.IntType(32)
 _VECTOR = ir.VectorType(_FLOAT, LANES)
-_FUSED = ("contract",)
+_FUSES = get_host_cpu_features().get("fma", False) or platform.machine() in ("arm64", "aarch64")
+"""Whether this machine multiplies and adds in one instruction."""
 
 
 def _block(vectors: int) -> Any:
@@ -71,8 +74,7 @@ def _block(vectors: int) -> Any:
                     at = builder.sub(column.index, builder.mul(number(row), template_step))
                     factor = _everywhere(builder, builder.load(builder.gep(own, [at])))
                     for value, total in zip(values, sums[row], strict=True):
-                        product = builder.fmul(factor, value, flags=_FUSED)
-                        builder.store(builder.fadd(product, builder.load(total), flags=_FUSED), total)
+                        builder.store(_product_and_sum(builder, factor, value, builder.load(total)), total)
         for row in range(ROWS):
             for k, total in enumerate(sums[row]):
                 at = builder.add(score_at, builder.add(builder.mul(number(row), score_step), number(LANES * k)))
@@ -81,6 +83,17 @@ def _block(vectors: int) -> Any:
         return context.get_dummy_value()
 
     return block
+
+
+def _product_and_sum(builder: Any, a: Any, b: Any, c: Any) -> Any:
+    """A b + c, rounded once on machines that do that in one instruction.
+
+    Left to the compiler (the flag "contract") it would depend on what is compiled around it, see `jit.kernel`.
+    """
+    if not _FUSES:
+        return builder.fadd(builder.fmul(a, b), c)
+    kind = ir.FunctionType(_VECTOR, [_VECTOR] * 3)
+    return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.fma.v{LANES}f32"), [a, b, c])
 
 
 def _everywhere(builder: Any, value: Any) -> Any:

@@ -20,7 +20,6 @@ LANES = 16
 
 _FLOAT, _INT = ir.FloatType(), ir.IntType(32)
 _VECTOR = ir.VectorType(_FLOAT, LANES)
-_FUSED = ("contract",)
 
 
 class _Lanes:
@@ -59,7 +58,7 @@ class _Lanes:
     def add(self, totals: list[Any], values: Sequence[Any]) -> None:
         """Add a vector to each of the totals."""
         for total, value in zip(totals, values, strict=True):
-            self.builder.store(self.builder.fadd(self.builder.load(total), value, flags=_FUSED), total)
+            self.builder.store(self.builder.fadd(self.builder.load(total), value), total)
 
     def write(self, totals: list[Any], array: int) -> None:
         """Put the totals into the lines of an array of LANES columns."""
@@ -67,8 +66,8 @@ class _Lanes:
             self.store(self.builder.load(total), array, ir.Constant(self.number, line), 0)
 
     def times(self, a: Any, b: Any) -> Any:
-        """Product of two vectors, which may be fused with a sum."""
-        return self.builder.fmul(a, b, flags=_FUSED)
+        """Product of two vectors."""
+        return self.builder.fmul(a, b)
 
     def everywhere(self, value: Any) -> Any:
         """A vector of one value."""
@@ -118,8 +117,8 @@ def add_residuals(typing, under, wide, gradient, part_u, part_v, sums):  # type:
             rows = []
             for k in range(2):
                 left, right = (lanes.load(0, row.index, LANES + 1, (LANES + 1) * k + q) for q in range(2))
-                rows.append(builder.fadd(left, lanes.times(u, builder.fsub(right, left)), flags=_FUSED))
-            seen = builder.fadd(rows[0], lanes.times(v, builder.fsub(rows[1], rows[0])), flags=_FUSED)
+                rows.append(builder.fadd(left, lanes.times(u, builder.fsub(right, left))))
+            seen = builder.fadd(rows[0], lanes.times(v, builder.fsub(rows[1], rows[0])))
             error = builder.fsub(seen, lanes.load(1, row.index, WIDE, WIDE + 1))
             x, y = lanes.load(2, row.index, LANES, 0), lanes.load(2, row.index, LANES, SIZE * LANES)
             lanes.add(totals, (lanes.times(x, error), lanes.times(y, error), error, lanes.times(error, error)))
