@@ -167,10 +167,10 @@ class RegistrationConfig:
     """Robust scales of the first tie points in its steps (chosen; not measured)."""
     tie_scales: tuple[float, float] = (9.0, 6.0)
     """The same of the next ones, in the first step and in all others (chosen; not measured)."""
-    second_steps: int = 2
-    """Steps with the second tie points; the ground is fitted again before the last (docs/benchmarks.md has figures)."""
-    renewed_steps: int = 2
-    """The same with renewed tie points of a flight that lies on the map already, after one with the old ones."""
+    second_steps: int = 3
+    """Steps with the second tie points (chosen)."""
+    renewed_steps: int = 4
+    """Steps with renewed tie points of a flight that lies on the map already, after two with the old ones (chosen)."""
 
     # Roofs, which show how the map leans
     roof_views: int = 6

@@ -217,32 +217,14 @@ def _line(t: Array, shift: Array) -> tuple[Array, NDArray[np.bool_]]:
     return line, np.asarray(np.hypot(*(shift - a @ line).T) < config.line_agrees_m)
 
 
-def as_ties(matches: MapMatches, points: Array, before: MapTies | None = None) -> MapTies:
-    """Tie points for the adjustment: each ground point with its place on the map, metres, and a sigma.
+def as_ties(matches: MapMatches, points: Array) -> MapTies:
+    """Tie points for the adjustment: each ground point with its place on the map, metres, and a first sigma.
 
     The surroundings of a point were compared, which are ground and do not lean. So an error of the height datum does
     not displace them.
-
-    Args:
-        points: float64 (P, 3), all tie points. before: earlier ties, whose sigma they take over; None or none of them:
-            the first sigma.
     """
-    config = active().registration
-    sigma = float(np.median(before.sigma_m)) if before is not None and len(before.point) else config.tie_sigma_m
-    return MapTies(matches.point, points[matches.point, :2] + matches.shift, np.full(len(matches.point), sigma))
-
-
-def on_present_ground(flight: Flight, surface: GroundModel, matches: MapMatches) -> MapMatches:
-    """The same matches after cameras and ground have moved, without comparing again.
-
-    What was measured is that a picture's pixel shows a place on the map. Where the pixel meets the ground now tells how
-    far that is from its place: to first order what another comparison would find, as the patch is only displaced.
-    """
-    adj = flight.adjustment
-    level = surface.height(adj.points[matches.point, :2])
-    here = adj.cameras.to_ground(matches.camera, matches.pixel, level)
-    shift = matches.place - here
-    return replace(matches, shift=np.where(np.isfinite(shift), shift, matches.shift))
+    sigma = np.full(len(matches.point), active().registration.tie_sigma_m)
+    return MapTies(matches.point, points[matches.point, :2] + matches.shift, sigma)
 
 
 def with_sigma_of_residuals(ties: MapTies, residual: Array) -> MapTies:
@@ -355,8 +337,7 @@ def orient_on_map(flight: Flight, ground: LoadedMap, matches: MapMatches, surfac
     links = 0 if flight.sparse else add_links(flight, working_gsd(flight))
     _step(flight, surface, ties, config.tie_scales[1])
     surface = refit_ground(flight, surface, as_smooth=True)
-    ties = with_sigma_of_residuals(ties, flight.adjustment.tie_residual)
-    surface, ties, matches = _second_round(flight, ground, surface, ties, steps=config.second_steps)
+    surface, ties, matches = _second_round(flight, ground, surface, config.second_steps)
     return AbsoluteOrientation(surface, ties, matches, roofs, links)
 
 
@@ -374,9 +355,9 @@ def reorient_on_map(
         pictures: bool (N,), the ones to compare with the map, None for all.
     """
     config = active().registration
-    _step(flight, surface, ties, config.tie_scales[1])
-    surface = refit_ground(flight, surface)
-    return _second_round(flight, ground, surface, ties, steps=config.renewed_steps, pictures=pictures)
+    for _ in range(2):
+        _step(flight, surface, ties, config.tie_scales[1])
+    return _second_round(flight, ground, refit_ground(flight, surface), config.renewed_steps, pictures)
 
 
 def _step(flight: Flight, surface: GroundModel, ties: MapTies, tie_scale: float) -> None:
@@ -389,29 +370,21 @@ def _second_round(
     flight: Flight,
     ground: LoadedMap,
     surface: GroundModel,
-    before: MapTies,
-    *,
-    steps: int,
+    rounds: int,
     pictures: NDArray[np.bool_] | None = None,
 ) -> tuple[GroundModel, MapTies, MapMatches]:
-    """New tie points, compared on the ground as the caller has just fitted it, and steps with them.
-
-    The ground is fitted once more before the last step, and the ties follow it.
-    """
+    """New tie points, compared on the ground as the caller has just fitted it, and steps with them."""
     config = active().registration
     cell_m, reach_m = config.tie_cell_sparse_m if flight.sparse else config.tie_cell_m, config.tie_reach_m
     matches = clear_matches(tie_matches(flight, surface, ground, cell_m=cell_m, reach_m=reach_m, pictures=pictures))
-    off = edge_displacement(flight, surface, ground, matches, reach_m)
-    matches = replace(matches, shift=matches.shift - off, place=matches.place - off)
-    ties = as_ties(matches, flight.adjustment.points, before)
-    for k in range(steps):
-        if k == steps - 1:
-            surface = refit_ground(flight, surface, as_smooth=True)
-            matches = on_present_ground(flight, surface, matches)
-            ties = as_ties(matches, flight.adjustment.points, ties)
+    matches = replace(matches, shift=matches.shift - edge_displacement(flight, surface, ground, matches, reach_m))
+    ties = as_ties(matches, flight.adjustment.points)
+    for k in range(rounds):
         _step(flight, surface, ties, config.tie_scales[min(k, 1)])
-        ties = with_sigma_of_residuals(ties, flight.adjustment.tie_residual)
-    flight.adjustment.tie_residual = ties.xy - flight.adjustment.points[ties.point, :2]  # after the last step
+        if k in (0, 1):
+            ties = with_sigma_of_residuals(ties, flight.adjustment.tie_residual)
+        if k == rounds - 2:
+            surface = refit_ground(flight, surface, as_smooth=True)
     return surface, ties, matches
 
 

@@ -24,8 +24,6 @@ class MapMatches:
 
     Attributes (Q): point: int32. camera: int32 whose picture was compared. shift: float64 (Q, 2) metres from the
         point to its place on the map. peak, ratio: float64 correlation and second peak / peak.
-        pixel: float64 (Q, 2), the middle of the compared patch in the picture, working pixels. place: float64 (Q, 2),
-        where that lies on the map, local frame. These two were measured; the shift follows from them and the solution.
     """
 
     point: Ints
@@ -33,8 +31,6 @@ class MapMatches:
     shift: Array
     peak: Array
     ratio: Array
-    pixel: Array
-    place: Array
 
     @classmethod
     def joined(cls, parts: "Sequence[MapMatches]") -> "MapMatches":
@@ -46,7 +42,7 @@ class MapMatches:
         """No matches."""
         number, pair = np.zeros(0), np.zeros((0, 2))
         ints = np.zeros(0, np.int32)
-        return cls(point=ints, camera=ints, shift=pair, peak=number, ratio=number, pixel=pair, place=pair)
+        return cls(point=ints, camera=ints, shift=pair, peak=number, ratio=number)
 
     def take(self, keep: NDArray[np.bool_] | NDArray[np.integer]) -> "MapMatches":
         """Some of the matches."""
@@ -94,7 +90,7 @@ def match_points(
             config.patch_share, features.search_wide_px, features.search_promising_share, found[part],
         )  # fmt: skip
     good = found[:, 2] > 0
-    found, by, place = found[good], by[good], place[good]
+    found, by = found[good], by[good]
     shift = found[:, :2] * [ground.gsd_m, -ground.gsd_m]
     return MapMatches(
         point=chosen[good].astype(np.int32),
@@ -102,8 +98,6 @@ def match_points(
         shift=shift,
         peak=found[:, 2],
         ratio=found[:, 3] / found[:, 2],
-        pixel=cameras.project(by, place),
-        place=place[:, :2] + shift,
     )
 
 

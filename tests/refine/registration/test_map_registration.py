@@ -275,10 +275,9 @@ def roofs(height, lean, seed=0, wild=0.3):
     bad = rng.random(len(height)) < wild
     shift[bad] = rng.uniform(-8, 8, (int(bad.sum()), 2))
     n = len(height)
-    none = np.zeros((n, 2))
     return MapMatches(
         point=np.arange(n, dtype=np.int32), camera=np.zeros(n, np.int32), shift=shift, peak=np.ones(n),
-        ratio=np.zeros(n), pixel=none, place=none,
+        ratio=np.zeros(n),
     )  # fmt: skip
 
 

@@ -152,10 +152,9 @@ def legs_and_matches(seed=0):
 
 def as_matches(camera, shift):
     n = len(camera)
-    none = np.zeros((n, 2))
     return MapMatches(
         point=np.arange(n, dtype=np.int32), camera=camera, shift=shift, peak=np.full(n, 0.5), ratio=np.full(n, 0.4),
-        pixel=none, place=none,
+
     )  # fmt: skip
 
 
