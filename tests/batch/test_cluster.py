@@ -1,8 +1,10 @@
 """A Dask cluster on loopback gives what the local workers give, and a worker that dies loses nothing."""
 
+import gc
 import hashlib
 import os
 import time
+import warnings
 from functools import partial
 
 import numpy as np
@@ -14,6 +16,15 @@ from orthoswarm.compute.dask_cluster import Cluster, ClusterLostError
 from orthoswarm.compute.workers import Processes, Serial
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 from tests.kit.servers.loopback_cluster import SMALL, Loopback
+
+
+@pytest.fixture(autouse=True)
+def _no_sockets_left_for_other_tests():
+    """Connections to a killed scheduler are left to the garbage collector, whose warning would hit any other test."""
+    yield
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ResourceWarning)
+        gc.collect()
 
 
 def squares(n):
