@@ -268,21 +268,14 @@ class Reception:
 
     def _watch_times(self, vehicle: Vehicle) -> None:
         """Compare a vehicle on its mission with the times of its plan."""
-        watched, mission = self._lateness.get(vehicle.system), vehicle.mission
-        phase = vehicle.detector.phase
-        flown = vehicle.armed and mission is not None and phase in (Phase.ACTIVE, Phase.SUSPENDED)
-        if watched is not None and (not flown or watched.mission is not mission):
+        watched, mission, phase = self._lateness.get(vehicle.system), vehicle.mission, vehicle.detector.phase
+        over = not vehicle.armed or mission is None or phase not in (Phase.ACTIVE, Phase.SUSPENDED)
+        if watched is not None and (over or watched.mission is not mission):
             del self._lateness[vehicle.system]
             if watched.behind:
                 self._event("caught_up", vehicle, "is no longer behind its plan: it has ended its mission")
             return
-        if (
-            not flown
-            or phase is Phase.SUSPENDED
-            or mission is None
-            or vehicle.lat_deg is None
-            or vehicle.lon_deg is None
-        ):
+        if over or phase is Phase.SUSPENDED or mission is None or vehicle.lat_deg is None or vehicle.lon_deg is None:
             return
         if watched is None:
             watched = self._lateness[vehicle.system] = Lateness(mission)

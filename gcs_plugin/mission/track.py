@@ -48,8 +48,9 @@ class Track:
 
     def pad_slack_s(self, radius_m: float) -> Array:
         """Seconds off schedule that a plan allows each sample near its start: fewer before it has left it first."""
-        takes_off = np.arange(len(self.places)) < np.argmin(self.pad(radius_m))
-        return np.where(takes_off, self.autopilot.takeoff_slack_s, self.autopilot.landing_slack_s)
+        from orthoswarm.planning.sorties.flight_time import start_slack_s
+
+        return start_slack_s(self.pad(radius_m), self.autopilot)
 
 
 def flight_path(mission: "Mission", origin: tuple[float, float]) -> tuple[Array, Array, float]:
@@ -205,11 +206,7 @@ class Airspace:
             i, j = i[counted], j[counted]
             at_start, start_slack_s = np.zeros(len(i), bool), np.zeros(len(i))
             if self._share_a_start(one, other):
-                first, second, radius_m = (
-                    self.tracks[one],
-                    self.tracks[other],
-                    active().planning.pad_distances * self.distance_m,
-                )
+                first, second, radius_m = self.tracks[one], self.tracks[other], self._pad_m()
                 at_start = first.pad(radius_m)[i] & second.pad(radius_m)[j]
                 start_slack_s = np.maximum(first.pad_slack_s(radius_m)[i], second.pad_slack_s(radius_m)[j])
             distance_m = np.hypot(*(a[i, :2] - b[j, :2]).T)

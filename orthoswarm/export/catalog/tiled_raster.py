@@ -115,7 +115,7 @@ def write_tiled(
     )  # fmt: skip
     with atomic_write(_virtual(folder, name)) as part:
         part.write_text(
-            _document(raster, _tiles_of(folder, name, raster), Path(FOLDER, Path(name).stem)), encoding="utf-8"
+            _document(raster, _placed_tiles(folder, name, raster), Path(FOLDER, Path(name).stem)), encoding="utf-8"
         )
     (folder / name).unlink(missing_ok=True)
 
@@ -141,7 +141,7 @@ def tiles_of(folder: Path, name: str) -> list[RasterTile]:
             epsg=int(raster.crs.to_epsg()), west=float(raster.bounds.left), north=float(raster.bounds.top),
             gsd_m=float(raster.res[0]), width=int(raster.width), height=int(raster.height),
         )  # fmt: skip
-    return list(_tiles_of(folder, name, grid))
+    return list(_placed_tiles(folder, name, grid))
 
 
 def write_json(path: Path, document: object) -> None:
@@ -168,7 +168,7 @@ def _touched(
     return ((r, c) for r in range(rows[0], rows[1] + 1) for c in range(cols[0], cols[1] + 1))
 
 
-def _tiles_of(folder: Path, name: str, raster: GroundGrid) -> Iterator[RasterTile]:
+def _placed_tiles(folder: Path, name: str, raster: GroundGrid) -> Iterator[RasterTile]:
     """The tiles in a raster's folder, placed on its grid."""
     side = active().raster.tile_px
     for path in sorted(_tiles(folder, name).glob("*.tif")):

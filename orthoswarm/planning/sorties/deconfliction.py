@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from orthoswarm.compute.jit import kernel
 from orthoswarm.config import active
 from orthoswarm.planning.sorties.flight_path import Flight
-from orthoswarm.planning.sorties.flight_time import Motion
+from orthoswarm.planning.sorties.flight_time import Motion, start_slack_s
 
 Array = NDArray[np.float64]
 Maker = Callable[[float, float], Flight]
@@ -43,6 +43,11 @@ class Separation:
     slack_s: float = field(default_factory=lambda: active().ardupilot.schedule_slack_s)
     launch_s: float = field(default_factory=lambda: active().planning.launch_s)
     swap_s: float = 120.0
+
+    @property
+    def pad_m(self) -> float:
+        """Radius about a start that vehicles share, metres."""
+        return active().planning.pad_distances * self.distance_m
 
 
 @dataclass(frozen=True)
@@ -108,10 +113,8 @@ def _sampled(flight: Flight, motion: Motion, apart: Separation) -> _Track:
     places = motion.places(track, waits, _step_s())
     flying = np.flatnonzero(places[:, 2] > flight.home_z_m + active().planning.on_ground_m)
     places = np.ascontiguousarray(places[flying[0] : flying[-1] + 1])
-    pad = np.hypot(*(places[:, :2] - flight.home).T) < active().planning.pad_distances * apart.distance_m
-    takes_off = np.arange(len(places)) < np.argmin(pad)
-    allowed_s = np.where(takes_off, motion.autopilot.takeoff_slack_s, motion.autopilot.landing_slack_s)
-    slack = np.ceil(np.minimum(allowed_s, apart.slack_s) / _step_s()).astype(np.int64)
+    pad = np.hypot(*(places[:, :2] - flight.home).T) < apart.pad_m
+    slack = np.ceil(np.minimum(start_slack_s(pad, motion.autopilot), apart.slack_s) / _step_s()).astype(np.int64)
     return _Track(flight.home, int(flying[0]), places, pad, slack)
 
 
@@ -254,7 +257,7 @@ class _Sky:
 
     def _shared(self, home: Array, other: Array) -> bool:
         """Two places of takeoff count as one start."""
-        return bool(np.hypot(*(home - other)) < active().planning.pad_distances * self._apart.distance_m)
+        return bool(np.hypot(*(home - other)) < self._apart.pad_m)
 
     def _meetings(self, track: _Track, ready: int, frozen: list[_Frozen], marks: NDArray[np.int64]) -> None:
         """Mark delays that bring a track too near a placed one, or to the same start at the same time."""
@@ -386,7 +389,7 @@ class _Placing:
     def _one_start(self) -> NDArray[np.bool_]:
         """Pairs of vehicles that take off at one start, (n, n)."""
         away = np.hypot(*(self._homes[:, None] - self._homes[None]).transpose(2, 0, 1))
-        return np.asarray(away < active().planning.pad_distances * self._apart.distance_m)
+        return np.asarray(away < self._apart.pad_m)
 
     def _needs_s(self, vehicle: int, sortie: int) -> float:
         """Seconds from the takeoff of a sortie to the end of its vehicle's last one, if nothing delays them."""

@@ -185,6 +185,16 @@ class Motion:
         return self.autopilot.land_wait_s if self.lands else self.autopilot.home_wait_s
 
 
+def start_slack_s(near_start: NDArray[np.bool_], autopilot: AutopilotConfig) -> Array:
+    """Seconds off schedule that a plan allows a flight around a start that vehicles share, float64 (n,).
+
+    Args:
+        near_start: bool (n,), which of its samples are there. Before it has left it first it takes off, then it lands.
+    """
+    takes_off = np.arange(len(near_start)) < np.argmin(near_start)
+    return np.where(takes_off, autopilot.takeoff_slack_s, autopilot.landing_slack_s)
+
+
 def autopilot_config(name: str) -> AutopilotConfig:
     """What is known of an autopilot's times: of PX4 if its name is `px4`, otherwise of ArduCopter."""
     return active().px4 if name == "px4" else active().ardupilot

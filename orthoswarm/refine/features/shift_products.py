@@ -86,7 +86,7 @@ def _block(vectors: int) -> Any:
 
 
 def _product_and_sum(builder: Any, a: Any, b: Any, c: Any) -> Any:
-    """A b + c, rounded once on machines that do that in one instruction.
+    """The sum a b + c, rounded once on machines that do that in one instruction.
 
     Left to the compiler (the flag "contract") it would depend on what is compiled around it, see `jit.kernel`.
     """

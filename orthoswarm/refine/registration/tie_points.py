@@ -91,11 +91,10 @@ def match_points(
         )  # fmt: skip
     good = found[:, 2] > 0
     found, by = found[good], by[good]
-    shift = found[:, :2] * [ground.gsd_m, -ground.gsd_m]
     return MapMatches(
         point=chosen[good].astype(np.int32),
         camera=by.astype(np.int32),
-        shift=shift,
+        shift=found[:, :2] * [ground.gsd_m, -ground.gsd_m],
         peak=found[:, 2],
         ratio=found[:, 3] / found[:, 2],
     )
