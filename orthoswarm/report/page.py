@@ -302,14 +302,14 @@ def _verdict(report: Mapping[str, Any], placed: Sequence[PlacedFrame], shifts: M
         text = "Consistent in itself, but placed where the drones' receivers say, not on a map"
         return {"kind": "rough", "text": f"{text}; expect errors of about {usual:.1f} m."}
     text = (
-        f"Lies on the pre-disaster map; expected error against it {_expected(sigma)}: so far may open ground lie from "
-        "its place on the map, computed from how well pictures and map fit together"
+        f"Lies on the pre-disaster map; expected error against it {_expected(sigma)}, of open ground, "
+        "computed from how well pictures and map fit together"
     )
     if shifts is not None and len(shifts.at) >= 10:
         median = float(np.median(shifts.size_m))
         text += (
-            f". Blocks of the orthoimage differ from the map by {median:.2f} m (median), measured by laying one over "
-            "the other: roofs and trees count in this, which lean apart in the two, so it is usually larger"
+            f". Blocks of the orthoimage differ from the map by {median:.2f} m (median), which is usually more, "
+            "because roofs and trees count, too, and lean differently in the two"
         )
         if median > 3 * max(usual, 0.3):
             return {"kind": "doubt", "text": text + ". The two disagree: check the pictures below before use."}
@@ -321,7 +321,7 @@ def _verdict(report: Mapping[str, Any], placed: Sequence[PlacedFrame], shifts: M
             return {"kind": "doubt", "text": text + ": one of the two is wrong, see below."}
     checked = report.get("checkpoints")
     text += (
-        ". These are errors against the map; against the ground only surveyed points tell them"
+        ". These are errors against the map; only surveyed points show the error against the ground"
         if checked is None
         else f". Against the ground: {checked['statement']}"
     )
