@@ -99,7 +99,7 @@ class Adjustment:
         order = np.lexsort((tracks.camera, tracks.point))
         tracks = Tracks(tracks.camera[order], tracks.point[order], tracks.uv[order], tracks.sigma_px[order])
         free = np.ones(len(cameras), bool) if free is None else free
-        slot, bandwidth = camera_order(tracks, len(points), free)
+        slot, bandwidth = camera_order(tracks, cameras.position, len(points), free)
         layout = Layout.of(priors)
         return cls(
             cameras=cameras.copy(),

@@ -112,11 +112,16 @@ def _blocks_of(factor: Array, a: int, b: int, end: int) -> tuple[Array, Array]:
     return columns[: b - a], columns[b - a :]
 
 
-def camera_order(tracks: Tracks, points: int, free: NDArray[np.bool_]) -> tuple[Ints, int]:
+def camera_order(tracks: Tracks, position: Array, points: int, free: NDArray[np.bool_]) -> tuple[Ints, int]:
     """Slot of each free camera in the band (-1 if held), int32 (N,), and the band's width in cameras.
 
-    Cameras that observe a common point must lie within the band. Takes the better of the input order and that of
-    Cuthill and McKee (1969).
+    Cameras that observe a common point must lie within the band. Takes the best of the input order, that of Cuthill and
+    McKee (1969), and that along the longer side of the flown area, which is a fifth narrower for parallel legs: it
+    advances in all of them together.
+
+    Args:
+        tracks: observations. position: float64 (N, 3) of the cameras, metres. points: how many there are.
+        free: bool (N,), False for cameras that are held.
     """
     count = len(free)
     index = np.flatnonzero(free)
@@ -128,8 +133,13 @@ def camera_order(tracks: Tracks, points: int, free: NDArray[np.bool_]) -> tuple[
     cam, pt = local[tracks.camera[use]], tracks.point[use]
     observes = csr_matrix((np.ones(len(cam), np.float32), (cam, pt)), shape=(len(index), points))
     graph = (observes @ observes.T).tocoo()
+    orders = (
+        np.arange(len(index)),
+        reverse_cuthill_mckee(graph.tocsr(), symmetric_mode=True),
+        np.argsort(_along_longer_side(position[index, :2]), kind="stable"),
+    )
     best: tuple[int, NDArray[np.int64]] = (len(index), np.arange(len(index)))
-    for permutation in (np.arange(len(index)), reverse_cuthill_mckee(graph.tocsr(), symmetric_mode=True)):
+    for permutation in orders:
         place = np.empty(len(index), np.int64)
         place[permutation] = np.arange(len(index))
         width = int(np.abs(place[graph.row] - place[graph.col]).max()) if graph.nnz else 0
@@ -138,3 +148,9 @@ def camera_order(tracks: Tracks, points: int, free: NDArray[np.bool_]) -> tuple[
     slot = np.full(count, -1, np.int32)
     slot[index] = best[1]
     return slot, min(best[0], max(len(index) - 1, 0))
+
+
+def _along_longer_side(xy: Array) -> Array:
+    """Coordinate (N,) of points (N, 2) along the direction in which they extend most."""
+    centred = np.nan_to_num(xy - xy.mean(0))
+    return np.asarray(centred @ np.linalg.eigh(centred.T @ centred)[1][:, -1])
