@@ -105,16 +105,17 @@ def test_a_full_rectangle_turns_no_oftener_than_up_and_down(shape):
     assert count_turns(loop) == 4 * min(shape)
 
 
-@settings(max_examples=30, deadline=None)
-@given(st.integers(0, 10_000))
-def test_joining_bricks_with_few_turns_beats_joining_them_in_any_order(seed):
-    rng = np.random.default_rng(seed)
-    grid = rng.random((8, 8)) < 0.85
-    x_joins, y_joins = joins(grid)
-    chosen = sum(map(count_turns, circumnavigate(grid, spanning_edges(grid, x_joins, y_joins))))
-    nothing = (np.zeros_like(x_joins), np.zeros_like(y_joins))
-    plain = sum(map(count_turns, circumnavigate(grid, spanning_edges(grid, *nothing))))
-    assert chosen <= plain + 8  # greedy both: bricks must not cost
+@pytest.mark.parametrize("first", [0, 1000, 2000])
+def test_joining_bricks_with_few_turns_beats_joining_them_in_any_order(first):
+    saved = []
+    for seed in range(first, first + 100):
+        grid = np.random.default_rng(seed).random((8, 8)) < 0.85
+        x_joins, y_joins = joins(grid)
+        chosen = sum(map(count_turns, circumnavigate(grid, spanning_edges(grid, x_joins, y_joins))))
+        nothing = (np.zeros_like(x_joins), np.zeros_like(y_joins))
+        plain = sum(map(count_turns, circumnavigate(grid, spanning_edges(grid, *nothing))))
+        saved.append(plain - chosen)
+    assert np.mean(saved) > 1.0  # both are greedy, so that a single grid may come out either way
 
 
 def test_critical_points_are_where_the_sweep_line_splits():
