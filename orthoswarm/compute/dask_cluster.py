@@ -24,6 +24,7 @@ from orthoswarm import __version__
 from orthoswarm.compute.workers import Usage, peak_rss_mb, prepare_process
 from orthoswarm.config import active, overridden, override
 from orthoswarm.model.errors import InputError, RunInterruptedError
+from orthoswarm.model.task_runner import Continued, whole
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -86,8 +87,8 @@ class Cluster:
         """Number of items processed at the same time: the present workers."""
         return max(1, len(self._workers()))
 
-    def map(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
-        """See Workers."""
+    def map(self, function: Callable[[Item], Result | Continued[Result]], items: Iterable[Item]) -> Iterator[Result]:
+        """See Workers; a task is continued where it began, since there are mostly more flights than workers."""
         source = iter(items)
         queue: deque[_Task] = deque()
         try:
@@ -264,7 +265,7 @@ def _work(payload: bytes) -> _Outcome:
     override(config)
     raised = False
     try:
-        value = pickle.dumps(function(item), pickle.HIGHEST_PROTOCOL)
+        value = pickle.dumps(whole(function, item), pickle.HIGHEST_PROTOCOL)
     except Exception as error:  # raised again at its item's turn, as by Processes; Dask would retry some
         value, raised = pickle.dumps(error, pickle.HIGHEST_PROTOCOL), True
     return _Outcome(value, raised, _process(), time.process_time(), peak_rss_mb())

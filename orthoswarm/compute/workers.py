@@ -20,17 +20,18 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from itertools import chain, islice
 from multiprocessing.context import BaseContext, SpawnContext
 from types import TracebackType
-from typing import Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 from orthoswarm.config import Overrides, active, overridden, override
 from orthoswarm.model.errors import WorkerStoppedError
 from orthoswarm.model.frame import Frame
+from orthoswarm.model.task_runner import Continued
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -111,7 +112,7 @@ class Workers(Protocol):
     def count(self) -> int:
         """Number of items processed at the same time."""
 
-    def map(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+    def map(self, function: Callable[[Item], Result | Continued[Result]], items: Iterable[Item]) -> Iterator[Result]:
         """Results in the order of the items; items are taken as workers become free.
 
         Raises:
@@ -130,7 +131,7 @@ class Serial:
 
     count = 1
 
-    def map(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+    def map(self, function: Callable[[Item], Result | Continued[Result]], items: Iterable[Item]) -> Iterator[Result]:
         """See Workers."""
         return (_alone(function, item) for item in items)
 
@@ -157,7 +158,7 @@ class Processes:
         self._cpu_s: dict[int, float] = {}
         self._rss_mb: dict[int, float] = {}
 
-    def map(self, function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
+    def map(self, function: Callable[[Item], Result | Continued[Result]], items: Iterable[Item]) -> Iterator[Result]:
         """See Workers."""
         if self.count == 1:
             yield from (_alone(function, item) for item in items)
@@ -169,28 +170,53 @@ class Processes:
             return
         source = chain(first, source)
         ahead = active().compute.queue_per_process * self.count
-        queue: deque[Future[_Outcome[Result]]] = deque()
+        queue: deque[_Place[Result]] = deque()
         try:
             while True:
-                while sum(not f.done() for f in queue) < self.count and len(queue) < ahead:
-                    for item in source:
-                        queue.append(self._started().submit(_measured, function, item, overridden()))
-                        break
-                    else:
-                        break
+                self._fill(queue, function, source, ahead)
                 if not queue:
                     return
-                if not queue[0].done() and len(queue) < ahead:
-                    for item in source:  # rather than wait, do one here
-                        queue.append(_here(function, item))
-                        break
-                    else:
-                        yield self._account(queue.popleft())
-                    continue
-                yield self._account(queue.popleft())
+                if queue[0].complete:
+                    yield self._account(queue.popleft().future)
+                elif (place := _continued(queue)) is not None:
+                    self._go_on(place, _here)
+                elif len(queue) < ahead and (more := list(islice(source, 1))):
+                    queue.append(_Place(_here(function, more[0])))  # rather than wait, do one here
+                else:
+                    wait([place.future for place in queue if not place.future.done()], return_when=FIRST_COMPLETED)
         finally:
-            for future in queue:
-                future.cancel()
+            for place in queue:
+                place.future.cancel()
+
+    def _fill(
+        self,
+        queue: "deque[_Place[Result]]",
+        function: Callable[[Item], Result | Continued[Result]],
+        source: Iterator[Item],
+        ahead: int,
+    ) -> None:
+        """Give the other processes work: what is to be continued if one is free, and items so that one more waits."""
+
+        def busy() -> int:
+            return sum(not place.future.done() for place in queue)
+
+        while busy() < self.count - 1 and (place := _continued(queue)) is not None:
+            self._go_on(place, self._submitted)
+        while busy() < self.count and len(queue) < ahead and (more := list(islice(source, 1))):
+            queue.append(_Place(self._submitted(function, more[0])))
+
+    def _go_on(self, place: "_Place[Result]", begin: Callable[..., "Future[_Outcome[Any]]"]) -> None:
+        """Begin the continuation of a place's task."""
+        continued = self._account(place.future)
+        place.future = begin(continued.function, continued.item)
+
+    def _submitted(self, function: Callable[[Any], Any], item: Any) -> "Future[_Outcome[Any]]":
+        try:
+            return self._started().submit(_measured, function, item, overridden())
+        except BrokenProcessPool as error:  # told at its item's turn, as if the task had begun
+            failed: Future[_Outcome[Any]] = Future()
+            failed.set_exception(error)
+            return failed
 
     def fit(self, pixels: int) -> None:
         """Work in this process alone from now on where pictures have too few pixels for others, see `alone_mpx`."""
@@ -222,7 +248,7 @@ class Processes:
             self._pool = ProcessPoolExecutor(self.count - 1, mp_context=cheapest_context(), initializer=prepare_worker)
         return self._pool
 
-    def _account(self, future: "Future[_Outcome[Result]]") -> Result:
+    def _account(self, future: "Future[_Outcome[Any]]") -> Any:
         try:
             outcome = future.result()
         except BrokenProcessPool:
@@ -244,6 +270,31 @@ class _Outcome(Generic[Result]):
     pid: int
     cpu_s: float
     rss_mb: float
+
+
+@dataclass(slots=True)
+class _Place(Generic[Result]):
+    """An item's place in the order of the results, with the task that it has come to."""
+
+    future: "Future[_Outcome[Result | Continued[Result]]]"
+
+    @property
+    def continuation(self) -> "Continued[Result] | None":
+        """What the task that has ended is to be continued by, if it is."""
+        if not self.future.done() or self.future.exception() is not None:
+            return None
+        value = self.future.result().value
+        return value if isinstance(value, Continued) else None
+
+    @property
+    def complete(self) -> bool:
+        """Whether its result, or its error, is there."""
+        return self.future.done() and self.continuation is None
+
+
+def _continued(queue: "Iterable[_Place[Result]]") -> "_Place[Result] | None":
+    """The first place whose task is to be continued."""
+    return next((place for place in queue if place.continuation is not None), None)
 
 
 def _measured(function: Callable[[Item], Result], item: Item, config: Overrides) -> _Outcome[Result]:
@@ -300,7 +351,15 @@ def _frame_of_copy(number: int) -> Frame:
     return frame
 
 
-def _alone(function: Callable[[Item], Result], item: Item) -> Result:
+def _alone(function: Callable[[Item], Result | Continued[Result]], item: Item) -> Result:
+    """A whole task in this process, its continuation included."""
+    value = _as_elsewhere(function, item)
+    while isinstance(value, Continued):
+        value = _as_elsewhere(value.function, value.item)
+    return value
+
+
+def _as_elsewhere(function: Callable[[Item], Result], item: Item) -> Result:
     """Apply a function in this process as in another one: argument and result are pickled copies."""
     return _own(_tidily(function, _own(item)))
 
@@ -308,7 +367,7 @@ def _alone(function: Callable[[Item], Result], item: Item) -> Result:
 def _here(function: Callable[[Item], Result], item: Item) -> "Future[_Outcome[Result]]":
     future: Future[_Outcome[Result]] = Future()
     try:
-        future.set_result(_Outcome(_alone(function, item), os.getpid(), 0.0, 0.0))
+        future.set_result(_Outcome(_as_elsewhere(function, item), os.getpid(), 0.0, 0.0))
     except Exception as error:
         future.set_exception(error)
     return future

@@ -12,6 +12,7 @@ import pytest
 from orthoswarm.compute.workers import Processes, Serial, cores, peak_rss_mb, prepare_process, workers
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.frame import Fix, Frame
+from orthoswarm.model.task_runner import Continued, serial
 
 
 def square(n):
@@ -59,6 +60,42 @@ def test_results_do_not_depend_on_the_number_of_workers():
     with Processes(3) as three:
         assert list(three.map(square, iter(items))) == expected
         assert list(three.map(square, [])) == []
+
+
+def halved(n):
+    """Its second half tells in which process each half ran."""
+    return Continued(second_half, (n, where(n)))
+
+
+def second_half(item):
+    n, first = item
+    if n == 3:
+        raise ValueError("three")
+    return n, first, where(n)
+
+
+def test_tasks_in_halves_give_the_same_results_in_order():
+    items = list(range(40, 50))
+    numbers = [n for n, _, _ in Serial().map(halved, items)]
+    assert numbers == items == [n for n, _, _ in serial(halved, items)]
+    for count in (1, 2, 3):
+        with Processes(count) as pool:
+            assert [n for n, _, _ in pool.map(halved, iter(items))] == items
+            assert [n for n, _, _ in pool.map(halved, [40])] == [40]
+
+
+def test_a_second_half_runs_where_a_process_is_free():
+    with Processes(2) as pool:
+        list(pool.map(where, range(2)))  # started
+        assert any(first != second for _, first, second in pool.map(halved, [0, 1, 2]))
+
+
+def test_an_error_in_the_second_half_comes_at_its_items_turn():
+    with Processes(2) as pool:
+        results = pool.map(halved, [0, 1, 3, 4])
+        assert [next(results)[0] for _ in range(2)] == [0, 1]
+        with pytest.raises(ValueError, match="three"):
+            next(results)
 
 
 def test_a_function_changes_a_copy_of_its_own():

@@ -4,7 +4,7 @@ Candidate pairs depend on where the photos look, hence on the tilt, which is onl
 of time are matched first, then near ones, then more for photos with few pairs.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -93,7 +93,7 @@ class PairGraphBuilder:
 
     def _detect(self, photos: list[int], pixels: int) -> None:
         task = partial(features_of, read_gray=self.read_gray, pixels=pixels)
-        found = self.run(task, [self.frames[k] for k in photos])
+        found: Iterable[Features | str] = self.run(task, [self.frames[k] for k in photos])
         for n, (k, result) in enumerate(zip(photos, found, strict=True)):
             if isinstance(result, str):
                 self.damaged[k] = result

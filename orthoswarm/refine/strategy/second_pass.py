@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from orthoswarm.config import active
 from orthoswarm.model.camera import fov_rad
 from orthoswarm.model.placement import MapWindow
+from orthoswarm.model.task_runner import Continued
 from orthoswarm.refine.bundle.block_arrays import WIDTH, F
 from orthoswarm.refine.bundle.covariance import (
     common_map_sigma,
@@ -36,7 +37,7 @@ def second_pass(
     *,
     basemap: MapWindow | None,
     origin: Array,
-) -> VehicleState:
+) -> Continued[VehicleState]:
     """Adjust one vehicle again on the common level, linked to its neighbours and tied to the map; densify its ground.
 
     Args:
@@ -62,6 +63,16 @@ def second_pass(
         for _ in range(active().strategy.second_steps):
             flight.adjustment.step(active().bundle.track_robust_c, state.surface.height_prior(flight.adjustment.points))
     watch.lap("second adjustment")
+    watch.add_to(state.timings)
+    return Continued(_errors_and_ground, (state, others, ground, pictures))
+
+
+def _errors_and_ground(
+    item: tuple[VehicleState, list[VehicleState], LoadedMap | None, NDArray[np.bool_] | None],
+) -> VehicleState:
+    """The second half: sigmas, and denser ground."""
+    state, others, ground, pictures = item
+    flight, watch = state.flight, Stopwatch()
     _own_errors(state, others, ground)
     remove_fixed(flight)
     if not flight.sparse:

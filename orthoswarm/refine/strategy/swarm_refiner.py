@@ -18,7 +18,7 @@ from orthoswarm.model.errors import AdjustmentError
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import MapWindow, Refinement, Solution, Terrain
-from orthoswarm.model.task_runner import Run, serial
+from orthoswarm.model.task_runner import Continued, Run, serial, whole
 from orthoswarm.mosaic.recorded_pose import recorded_cameras
 from orthoswarm.refine.flight.solve_units import merge_units
 from orthoswarm.refine.flight.unsolved_pictures import move_with_neighbours
@@ -44,6 +44,7 @@ __all__ = ["Options", "SwarmRefiner", "refine_alone", "states_of"]
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
+Task = Callable[..., VehicleState | Continued[VehicleState]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,10 +102,11 @@ class SwarmRefiner(UnitRefiner):
         network = level_network([ground_points(s.flight.adjustment)[0] for s in everyone])
         anchor = float(np.mean(network.correction_m[len(own) :])) if others else 0.0
         done = list(own)
+        task: Task = partial(second_pass, basemap=basemap, origin=self.origin)
         for k in sorted(range(len(own)), key=lambda k: not own[k].on_map):  # carried blocks last
             neighbours = neighbours_of(own[k], everyone if own[k].on_map else [*done, *others])
             item = (own[k], neighbours, float(network.correction_m[k]) - anchor)
-            done[k] = second_pass(item, basemap=basemap, origin=self.origin)
+            done[k] = whole(task, item)
         distortion = map_distortion_sigma([*done, *others])
         for state in done:
             if state.on_map:  # what neighbours carry has it with their sigma
@@ -203,7 +205,7 @@ def _second_passes(
     states = register_unfound(states, [], epsg, origin, run)
     states, unmapped = join_unmapped(states, [], basemap, epsg, origin=origin, run=run)
     network = level_network([ground_points(s.flight.adjustment)[0] for s in states])
-    task = partial(second_pass, basemap=basemap, origin=origin)
+    task: Task = partial(second_pass, basemap=basemap, origin=origin)
     mapped = [k for k, s in enumerate(states) if s.on_map]
     items = [(states[k], neighbours_of(states[k], states), float(network.correction_m[k])) for k in mapped]
     out = list(states)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from orthoswarm.model.errors import AdjustmentError
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import MapWindow
+from orthoswarm.model.task_runner import Continued, whole
 from orthoswarm.raster.height_model import HeightModel
 from orthoswarm.raster.picture_file import read_gray, reduction
 from orthoswarm.refine.bundle.adjustment import Adjustment, MapTies
@@ -79,7 +81,8 @@ def refine_alone(
     frames: Sequence[Frame], *, epsg: int, origin: Array, basemap: MapWindow | None, options: Options
 ) -> VehicleState:
     """Refine one vehicle by itself: relative adjustment, then onto the map where there is one."""
-    state = refine_tracked(frames, epsg=epsg, origin=origin, basemap=basemap, options=options)
+    track = partial(refine_tracked, epsg=epsg, origin=origin, basemap=basemap, options=options)
+    state = whole(track, frames)
     if state is None:
         watch = Stopwatch()
         flight = open_sparse_flight(frames, LocalGrid(epsg), origin, options.read)
@@ -98,8 +101,8 @@ def refine_tracked(
     basemap: MapWindow | None,
     options: Options,
     learned: bool = True,
-) -> VehicleState | None:
-    """Refine one vehicle by itself, with corners tracked from picture to picture.
+) -> VehicleState | Continued[VehicleState | None] | None:
+    """Refine one vehicle by itself, with corners tracked from picture to picture; continued on the map, if any.
 
     Args:
         learned: True: where correlation does not find it on the map, try learned matching in this process; False: the
@@ -125,9 +128,19 @@ def refine_tracked(
             return None  # a recorded height that leads to such a lens is wrong
         if len(frames) < active().flight.few_photos and distorts_strongly(flight):
             return None  # too few corners for all parameters of such a lens; photos matched in pairs have more
-        return registered_state(flight, surface, origin, basemap=basemap, watch=watch, learned=learned)
+        state = adjusted_state(flight, surface, watch)
     except AdjustmentError:
         return None
+    return Continued(partial(_registered, origin=origin, basemap=basemap, learned=learned), state)
+
+
+def _registered(state: VehicleState, *, origin: Array, basemap: MapWindow | None, learned: bool) -> VehicleState | None:
+    """The second half of `refine_tracked`."""
+    try:
+        register_on_map(state, origin, basemap=basemap, learned=learned)
+    except AdjustmentError:
+        return None
+    return state
 
 
 def refine_matched(
@@ -147,7 +160,14 @@ def registered_state(
     watch: Stopwatch,
     learned: bool = True,
 ) -> VehicleState:
-    """The state of a vehicle that is adjusted without a map: its sigmas, and its registration where there is a map."""
+    """The state of a vehicle that is adjusted without a map, registered where there is a map."""
+    state = adjusted_state(flight, surface, watch)
+    register_on_map(state, origin, basemap=basemap, learned=learned)
+    return state
+
+
+def adjusted_state(flight: Flight, surface: GroundModel, watch: Stopwatch) -> VehicleState:
+    """The state of a vehicle that is adjusted without a map, with its sigmas."""
     adj, c = flight.adjustment, active().bundle
     belief = surface.height_prior(adj.points)
     stated = stated_errors(adj, c.track_robust_c, belief, ties=None, tie_c=c.tie_robust_c, floor_m=c.sigma_floor_m)
@@ -159,7 +179,7 @@ def registered_state(
     )
     watch.lap("relative")
     none = MapMatches.none()
-    state = VehicleState(
+    return VehicleState(
         vehicle=flight.frames[0].vehicle,
         flight=flight,
         coarse=coarse,
@@ -176,7 +196,18 @@ def registered_state(
         fov_sigma_deg=stated.fov_sigma_deg,
         pose_covariance=stated.pose,
         coarse_surface=surface,
+        timings=dict(watch.seconds),
     )
+
+
+def register_on_map(state: VehicleState, origin: Array, *, basemap: MapWindow | None, learned: bool = True) -> None:
+    """Register an adjusted vehicle on the map, if there is one, and free its pictures' memory.
+
+    Args:
+        state: changed in place. origin: float64 (2,) of the local frame. basemap: the map, or None. learned: see
+            `refine_tracked`.
+    """
+    flight, watch = state.flight, Stopwatch()
     if basemap is not None:
         state.had_map = not (is_coarse(flight, basemap) and had_corrections(flight.frames))
     if basemap is not None and not is_coarse(flight, basemap):
@@ -184,8 +215,7 @@ def registered_state(
         if state.unfound and learned:
             _onto_map_by_learning(state, learned_fit(flight, basemap, origin), basemap, origin, watch)
     flight.pictures.drop()
-    state.timings = watch.seconds
-    return state
+    watch.add_to(state.timings)
 
 
 def adjust_without_map(flight: Flight, surface: GroundModel | None = None) -> GroundModel:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from orthoswarm.model.geo import local_origin
+from orthoswarm.model.task_runner import Continued
 from orthoswarm.refine.strategy import vehicle_passes
 from orthoswarm.refine.strategy.swarm_refiner import SwarmRefiner
 from tests.kit.refine import refine_all
@@ -40,8 +41,11 @@ def blind(monkeypatch):
 def through_pickle(function, items):
     """Run tasks as processes would; one that asks learned matching would show."""
     for item in items:
-        f, i = pickle.loads(pickle.dumps((function, item)))
-        yield pickle.loads(pickle.dumps(f(i)))
+        task = Continued(function, item)
+        while isinstance(task, Continued):
+            half = pickle.loads(pickle.dumps(task))
+            task = pickle.loads(pickle.dumps(half.function(half.item)))
+        yield task
 
 
 def test_a_flight_that_only_learned_matching_finds_is_mapped_as_well(scene, blind):
