@@ -8,7 +8,13 @@ class ControlConfig:
     """Ground control."""
 
     survey_sigma_m: float = 0.05
-    """Sigma of a surveyed position, an axis, where its file states none, metres: a network receiver's (chosen)."""
+    """Sigma of a surveyed position, an axis, where its file states none, metres: a network receiver's (chosen). Where
+    there are enough points to see how far they really scatter, that counts instead if it is more."""
+    scatter_told_m: float = 0.5
+    """Points that scatter by more than this are warned about, one sigma of an axis, metres (chosen: more than receivers
+    with corrections are off)."""
+    scatter_fewest: int = 5
+    """Fewest points without a stated sigma whose scatter is estimated (chosen): with fewer one mistake decides it."""
     pointing_sigma_px: float = 1.0
     """Sigma of a point's place in a photo, in pixels; photos of a point count as independent (chosen)."""
     height_sigma_m: float = 2.0

@@ -28,12 +28,14 @@ class ControlObservation:
         name: of the point.
         placed: float64 (2,), east and north in the block. surveyed: float64 (2,), east and north by survey; same grid.
         sigma_m: of the difference, per axis: survey, pointing, and deformation of the block at that point.
+        stated: whether the survey's sigma is known; False where it is assumed.
     """
 
     name: str
     placed: Array
     surveyed: Array
     sigma_m: float
+    stated: bool = True
 
 
 def check_control(
@@ -86,7 +88,7 @@ def in_photos(
         pointing = config.pointing_sigma_px * gsd / np.sqrt(len(photos))
         bent = float(np.median([p.sigma_m for p, _ in photos])) if on_map else config.receivers_local_sigma_m
         sigma = float(np.linalg.norm([_survey_sigma(point), pointing, bent]))
-        out.append(ControlObservation(point.name, found, _in_grid(point.surveyed, grid), sigma))
+        out.append(ControlObservation(point.name, found, _in_grid(point.surveyed, grid), sigma, point.sigma_m > 0.0))
     return out
 
 
@@ -95,7 +97,7 @@ def on_basemap(points: Iterable[Checkpoint], grid: LocalGrid, map_gsd_m: float) 
     return [
         ControlObservation(
             point.name, _in_grid(point.on_map, grid), _in_grid(point.surveyed, grid),
-            float(np.hypot(_survey_sigma(point), map_gsd_m)),
+            float(np.hypot(_survey_sigma(point), map_gsd_m)), point.sigma_m > 0.0,
         )
         for point in points
         if point.on_map is not None

@@ -173,6 +173,11 @@ def _warnings(fits: dict[bool, ControlFit], placed: Sequence[PlacedFrame]) -> li
                 f"control point {o.name} was left out: the others put it {np.hypot(*away):.1f} m ({away[0]:+.1f} east, "
                 f"{away[1]:+.1f} north) from its survey; check its coordinates and where it was marked"
             )
+        if fit.scatter_m > active().control.scatter_told_m:
+            said.append(
+                f"the control points agree to {fit.scatter_m:.1f} m only (one sigma of an axis; no sigma_m was given): "
+                "the map's place is as good as they are; survey them better, or check their marks"
+            )
         if fit.contradiction:
             names = ", ".join(o.name for o in fit.used)
             worst = float(np.hypot(*fit.residual.T).max())

@@ -5,7 +5,7 @@ shift the block, and more of them turn and scale it.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,8 @@ from orthoswarm.control.control_observations import ControlObservation
 from orthoswarm.model.plane_similarity import Similarity
 
 Array = NDArray[np.float64]
+_HALVINGS = 20
+"""Of a bracket of a kilometre, to a millimetre."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +28,7 @@ class ControlFit:
         used: the observations used. residual: float64 (n, 2), of each of them, block minus survey.
         left_out: observations rejected as outliers.
         contradiction: True where the observations disagree, but are too few to find the outlier.
+        scatter_m: how far points whose sigma is not stated scatter more than was assumed, one sigma of an axis.
     """
 
     similarity: Similarity
@@ -33,12 +36,15 @@ class ControlFit:
     residual: Array
     left_out: list[ControlObservation]
     contradiction: bool
+    scatter_m: float = 0.0
 
 
 def fit_similarity(observations: Sequence[ControlObservation], nadirs: Array, border_m: float) -> ControlFit:
     """The similarity that moves a block onto its control points.
 
-    Outliers are rejected, the worst first, as long as three other observations remain.
+    Outliers are rejected, the worst first, as long as three other observations remain. Points whose survey states no
+    sigma are believed as far as they agree: a handheld receiver's are metres off, and of nine such points those that
+    agree by chance must not reject the others.
 
     Args:
         observations: at least one. nadirs: float64 (N, 2), nadir points of the photos, for their centre and extent.
@@ -49,14 +55,45 @@ def fit_similarity(observations: Sequence[ControlObservation], nadirs: Array, bo
     shift = active().control.shift_sigma_m
     prior_sigma = np.array([shift, shift, border_m / radius, border_m / radius])
     limit = -2.0 * np.log(active().control.mistake_probability)
-    used, left_out = list(observations), []
+    used, left_out, scatter_m = list(observations), [], np.inf
     while True:
-        chi2 = _left_out_chi2(used, middle, prior_sigma)
+        scatter_m = min(_scatter(used, middle, prior_sigma, scatter_m), scatter_m)
+        weighed = _widened(used, scatter_m)
+        chi2 = _left_out_chi2(weighed, middle, prior_sigma)
         worst = int(np.argmax(chi2))
         if chi2[worst] <= limit or len(used) <= 3:
             break
         left_out.append(used.pop(worst))
-    return ControlFit(*_adjusted(used, middle, prior_sigma), left_out, bool(chi2[worst] > limit))
+    fitted = _adjusted(weighed, middle, prior_sigma)
+    return ControlFit(*fitted, left_out, bool(chi2[worst] > limit), scatter_m)
+
+
+def _scatter(used: Sequence[ControlObservation], middle: Array, prior_sigma: Array, before_m: float) -> float:
+    """What has to be added to unstated sigmas so that half of the points lie within their median distance, metres.
+
+    The median of the points' squared distances from their predictions by the others, in sigmas, is 2 ln 2 (two axes).
+    With too few points that of before stays; 0 where none was found.
+    """
+    unstated = np.array([not o.stated for o in used])
+    if unstated.sum() < active().control.scatter_fewest:
+        return before_m if np.isfinite(before_m) else 0.0
+
+    def too_small(scatter_m: float) -> bool:
+        chi2 = _left_out_chi2(_widened(used, scatter_m), middle, prior_sigma)
+        return bool(np.median(chi2[unstated]) > 2.0 * np.log(2.0))
+
+    low, high = 0.0, active().control.farthest_m
+    if not too_small(low):
+        return 0.0
+    for _ in range(_HALVINGS):
+        half = 0.5 * (low + high)
+        low, high = (half, high) if too_small(half) else (low, half)
+    return high
+
+
+def _widened(used: Sequence[ControlObservation], scatter_m: float) -> list[ControlObservation]:
+    """The observations, those without a stated sigma with a scatter more."""
+    return [o if o.stated else replace(o, sigma_m=float(np.hypot(o.sigma_m, scatter_m))) for o in used]
 
 
 def _adjusted(

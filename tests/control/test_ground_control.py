@@ -1,5 +1,6 @@
 """Surveyed points move a block onto the ground: shift, turn, scale, mistakes among them, sigma, photos and terrain."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -61,6 +62,26 @@ def test_a_mistaken_point_is_found_and_left_out():
     fit = fit_similarity(observed(surveyed, placed), NADIRS, 0.5)
     assert [o.name for o in fit.left_out] == ["p4"]
     assert np.abs(fit.similarity.moved(NADIRS + SHIFT) - NADIRS).max() < 0.3
+
+
+@pytest.mark.parametrize("sigma", [0.05, 1.5])
+def test_points_without_a_sigma_are_believed_as_far_as_they_agree(sigma):
+    rng, errors, sigmas, left_out = np.random.default_rng(6), [], [], 0
+    for seed in range(100):
+        surveyed = truth((9,), seed)
+        points = [
+            ControlObservation(f"p{k}", p + SHIFT, p + rng.normal(0, sigma, 2), 0.05, stated=False)
+            for k, p in enumerate(surveyed)
+        ]
+        points[4] = replace(points[4], surveyed=points[4].surveyed + np.array([0.0, 28.0]))
+        fit = fit_similarity(points, NADIRS, 0.5)
+        assert "p4" in [o.name for o in fit.left_out]
+        left_out += len(fit.left_out) - 1
+        errors.append(fit.similarity.moved(MIDDLE + SHIFT) - MIDDLE)
+        sigmas.append(float(fit.similarity.sigma_m(MIDDLE + SHIFT)))
+    assert left_out < 0.02 * 8 * 100  # of right points
+    within = np.abs(errors) / np.array(sigmas)[:, None]
+    assert 0.5 < (within < 1).mean() < 0.95 and (within < 2).mean() > 0.88
 
 
 def test_two_points_that_contradict_each_other_are_told():
