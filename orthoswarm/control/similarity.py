@@ -19,7 +19,7 @@ _HALVINGS = 20
 """Of a bracket of a kilometre, to a millimetre."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ControlFit:
     """A similarity and the residuals of the control points.
 
@@ -64,8 +64,11 @@ def fit_similarity(observations: Sequence[ControlObservation], nadirs: Array, bo
         if chi2[worst] <= limit or len(used) <= 3:
             break
         left_out.append(used.pop(worst))
-    fitted = _adjusted(weighed, middle, prior_sigma)
-    return ControlFit(*fitted, left_out, bool(chi2[worst] > limit), scatter_m)
+    similarity, residual = _adjusted(weighed, middle, prior_sigma)
+    return ControlFit(
+        similarity=similarity, used=weighed, residual=residual, left_out=left_out,
+        contradiction=bool(chi2[worst] > limit), scatter_m=scatter_m,
+    )  # fmt: skip
 
 
 def _scatter(used: Sequence[ControlObservation], middle: Array, prior_sigma: Array, before_m: float) -> float:
@@ -96,17 +99,15 @@ def _widened(used: Sequence[ControlObservation], scatter_m: float) -> list[Contr
     return [o if o.stated else replace(o, sigma_m=float(np.hypot(o.sigma_m, scatter_m))) for o in used]
 
 
-def _adjusted(
-    used: list[ControlObservation], middle: Array, prior_sigma: Array
-) -> tuple[Similarity, list[ControlObservation], Array]:
-    """The adjustment; its covariance grows where residuals are larger than the observations' sigmas (Birge ratio)."""
+def _adjusted(used: list[ControlObservation], middle: Array, prior_sigma: Array) -> tuple[Similarity, Array]:
+    """The adjustment and its residuals; its covariance grows where they are larger than their sigmas (Birge ratio)."""
     similarity = _solved(used, middle, prior_sigma)
     residual = np.array([similarity.moved(o.placed) - o.surveyed for o in used])
     weight = 1.0 / np.array([o.sigma_m for o in used]) ** 2
     left = float((weight[:, None] * residual**2).sum() + ((similarity.values / prior_sigma) ** 2).sum())
     variance = left / (2 * len(used))  # four observations more, the priors, stand against four unknowns
     factor = max(1.0, variance)
-    return Similarity(middle, similarity.values, np.asarray(similarity.covariance * factor, np.float64)), used, residual
+    return Similarity(middle, similarity.values, np.asarray(similarity.covariance * factor, np.float64)), residual
 
 
 def _solved(used: Sequence[ControlObservation], middle: Array, prior_sigma: Array) -> Similarity:
