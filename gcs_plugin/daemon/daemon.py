@@ -46,6 +46,7 @@ from gcs_plugin.daemon.settings import Settings, system_of
 from gcs_plugin.daemon.store.console_state import ConsoleState
 from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.journal import Journal, add_frame, late_frames, packed, unpacked
+from gcs_plugin.daemon.store.kept_pictures import KeptPictures
 from gcs_plugin.daemon.store.picture_store import PictureStore, frame_key, picture_size
 from gcs_plugin.daemon.store.workspace_lock import distrust_after_power_cut, open_basemap, require_space, take_over
 from gcs_plugin.daemon.tak_feed import TakFeed
@@ -139,16 +140,15 @@ class Daemon:
             self.journal, self.layers, folder / "layers", folder / "solutions", self.drawer, trusted=self._trusted
         )
         shared: dict[str, Any] = {"journal": self.journal, "publisher": publisher, "on_published": self._published}
-        self.coarse = LegPlacement(store=self.store, workers=self.background, basemap=settings.basemap, **shared)
+        one = shared | {"store": self.store, "kept": KeptPictures(folder / "kept"), "basemap": settings.basemap}
+        self.coarse = LegPlacement(workers=self.background, **one)
         self.refinement = SortieRefinement(
-            store=self.store, workers=self.workers, drawer=self.drawer, basemap=settings.basemap,
-            make_way=self._make_way, stopped=lambda: self.jobs.stopping, **shared,
-        )  # fmt: skip
+            workers=self.workers, drawer=self.drawer, make_way=self._make_way, stopped=lambda: self.jobs.stopping, **one
+        )
         self.together = JointRefinement(
             workers=self.background, basemap=settings.basemap, least_px=settings.redraw_px, **shared
         )
-        layer = "coarse" if settings.basemap is None else "fine"
-        self.tones = ToneBalance(workers=self.background, layer=layer, **shared)
+        self.tones = ToneBalance(workers=self.background, layer="fine" if settings.basemap else "coarse", **shared)
         self.exports = Exports(
             settings=settings, journal=self.journal, store=self.store, layers=self.layers, console=self.console,
             workers=self.background, area=lambda: self.drawer.area, vehicles=self.vehicles, facts=self._facts,

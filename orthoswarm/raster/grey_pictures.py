@@ -29,9 +29,11 @@ class GreyPictures:
 
     Attributes:
         folder: where the files are; an existing folder.
+        from_colors: False to decode only the grey values of small pictures, too, where colours are read elsewhere.
     """
 
     folder: Path
+    from_colors: bool = True
 
     @classmethod
     def create(cls, folder: Path, frames: Iterable[Frame]) -> "GreyPictures | None":
@@ -40,8 +42,7 @@ class GreyPictures:
         Returns:
             None where it would take more than `grey_pictures_mb` megabytes, or the folder cannot be made.
         """
-        sizes = (frame.width * frame.height // _factor(frame.width, frame.height) ** 2 for frame in frames)
-        if sum(sizes) > active().raster.grey_pictures_mb * 1e6:
+        if stored_bytes(frames) > active().raster.grey_pictures_mb * 1e6:
             return None
         try:
             folder.mkdir(exist_ok=True)
@@ -65,7 +66,8 @@ class GreyPictures:
         picture = self._stored(frame.path)
         if picture is None:
             factor = _factor(frame.width, frame.height)
-            picture = _luma(read_rgb(frame.path)) if factor == 1 else read_gray(frame.path, factor)
+            colors = self.from_colors and factor == 1
+            picture = _luma(read_rgb(frame.path)) if colors else read_gray(frame.path, factor)
             self._store(frame.path, picture)
         return picture
 
@@ -92,6 +94,11 @@ class GreyPictures:
         except OSError:  # the disk is full: what is needed more is written there next
             with contextlib.suppress(OSError):
                 part.unlink()
+
+
+def stored_bytes(frames: Iterable[Frame]) -> int:
+    """How much frames take in a store."""
+    return sum(frame.width * frame.height // _factor(frame.width, frame.height) ** 2 for frame in frames)
 
 
 def _luma(picture: Bytes) -> Bytes:

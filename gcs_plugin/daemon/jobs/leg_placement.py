@@ -24,6 +24,7 @@ from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
 from gcs_plugin.daemon.jobs.worker_tasks import SolveTask, SortieResult, coarse_after, near, place
 from gcs_plugin.daemon.layers.layers import new_name
 from gcs_plugin.daemon.store.journal import Change, Journal, packed
+from gcs_plugin.daemon.store.kept_pictures import KeptPictures
 from gcs_plugin.daemon.store.picture_store import PictureStore
 from orthoswarm.export.product_files import finite
 from orthoswarm.model.bounding_box import BoundingBox
@@ -43,12 +44,13 @@ class LegPlacement:
     """Does the jobs `coarse`.
 
     Attributes:
-        journal, store, publisher: of the workspace. workers: compute the job; used by nothing else meanwhile.
+        journal, store, kept, publisher: of the workspace. workers: compute the job; used by nothing else meanwhile.
         basemap: the map, or None. on_published: called with layer and job when pixels have changed.
     """
 
     journal: Journal
     store: PictureStore
+    kept: KeptPictures
     publisher: Publisher
     workers: WorkerPool
     basemap: Path | None
@@ -88,6 +90,7 @@ class LegPlacement:
             job.detail["note"] = "it is refined already"
             return lambda db: None
         frames, thumbnails = sortie_frames(self.journal, self.store, vehicle, job.sortie)
+        kept = self.kept.of(vehicle, job.sortie, frames)
         frames, count = newest_legs(frames, area.epsg, over=bool(job.detail.get("over")))
         if not frames:
             raise OrthoSwarmError("no leg is over yet")
@@ -103,6 +106,7 @@ class LegPlacement:
             neighbours=self._others(job, frames),
             target=target,
             before=None if before is None else self.publisher.solutions / before["path"],
+            kept=kept,
         )
         solved = self.workers.run(place, task)
         job.detail |= {"frames": len(frames), "solve_cpu_s": round(solved.cpu_s, 3), "legs": len(solved.legs)}

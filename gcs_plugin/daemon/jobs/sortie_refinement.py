@@ -1,6 +1,7 @@
 """Refinement of one vehicle's sortie: gather its frames, solve and draw in worker processes, publish at once."""
 
 import json
+import logging
 import sqlite3
 import time
 from collections.abc import Callable
@@ -15,12 +16,14 @@ from gcs_plugin.daemon.jobs.joint_refinement import together_jobs
 from gcs_plugin.daemon.jobs.placed_sorties import detail_of, others_near, refined_change, solution_row, sortie_frames
 from gcs_plugin.daemon.jobs.publisher import Publisher
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
-from gcs_plugin.daemon.jobs.worker_tasks import SolveTask, SortieResult, near, register_late, solve
+from gcs_plugin.daemon.jobs.worker_tasks import SolveTask, SortieResult, follow, near, register_late, solve
 from gcs_plugin.daemon.layers.layers import new_name
 from gcs_plugin.daemon.layers.realtime_layer import Drawer
 from gcs_plugin.daemon.store.journal import Change, Journal, late_frames, packed
+from gcs_plugin.daemon.store.kept_pictures import KeptPictures
 from gcs_plugin.daemon.store.picture_store import PictureStore
 from orthoswarm.model.bounding_box import BoundingBox
+from orthoswarm.model.errors import OrthoSwarmError
 
 _REACH_M: Final = 400.0
 _DRAWN_S: Final = 3.0
@@ -29,6 +32,7 @@ _BEGUN_S: Final = 60.0
 _QUIET_S: Final = 0.7
 _MOST_QUIET_S: Final = 3.0
 _LATE_S: Final = 15.0
+_log = logging.getLogger(__name__)
 
 
 @dataclass(slots=True, kw_only=True)
@@ -36,13 +40,14 @@ class SortieRefinement:
     """Does the jobs `refine`.
 
     Attributes:
-        journal, store, publisher: of the workspace. workers: compute the job. drawer: of the real-time layer.
+        journal, store, kept, publisher: of the workspace. workers: compute the job. drawer: of the real-time layer.
         basemap: the map, or None. on_published: called with layer and job when pixels have changed.
         make_way: called with vehicle and layer before the work starts, and before the layer is needed.
     """
 
     journal: Journal
     store: PictureStore
+    kept: KeptPictures
     publisher: Publisher
     workers: WorkerPool
     drawer: Drawer
@@ -57,6 +62,8 @@ class SortieRefinement:
         began = time.monotonic()
         report(0.02, "waiting for the last pictures")
         self.make_way(vehicle, None)
+        if job.detail.get("trigger") != "late":
+            self._follow(job)
         if job.detail.get("trigger") == "complete":
             self._wait_quiet(job)
         self.wait_drawn(job)
@@ -76,7 +83,33 @@ class SortieRefinement:
         }  # fmt: skip
         self._show(job, report, target, solved, before)
         job.detail["seconds"] = round(time.monotonic() - began, 3)
+        self.kept.drop(vehicle, job.sortie)
         return lambda db: None
+
+    def _follow(self, job: Job) -> None:
+        """Track the pictures that have come, while the last ones come and are drawn; if a process is free.
+
+        If others come nevertheless, or one turns out to be unreadable, all are tracked again with the solution.
+        """
+        try:
+            area = self.publisher.area()
+            frames, _ = sortie_frames(self.journal, self.store, str(job.vehicle), job.sortie)
+            task = SolveTask(
+                frames=frames,
+                epsg=area.epsg,
+                origin=area.origin,
+                basemap=self.basemap,
+                thumbnails={},
+                neighbours=[],
+                target=self.publisher.solutions,
+                kept=self.kept.of(str(job.vehicle), job.sortie, frames),
+            )
+            used = None if task.kept is None else self.workers.run_if_free(follow, task)
+        except OrthoSwarmError as error:  # the solution will fail, or not, for its own reason
+            _log.debug("the tracks of %s: %s", job.vehicle, error)
+        else:
+            if used is not None:
+                job.detail["follow_cpu_s"] = round(used, 3)
 
     def _solve(self, job: Job, report: ReportProgress) -> tuple[Any, Path, int, SortieResult]:
         """Solve the pictures that have arrived, in the reserved process.
@@ -102,6 +135,7 @@ class SortieRefinement:
             neighbours=self._neighbours(job, near(frames, area.epsg)),
             target=target,
             before=None if before is None else self.publisher.solutions / before["path"],
+            kept=self.kept.of(str(job.vehicle), job.sortie, frames),
         )
         return before, target, len(frames), self.workers.run(solve if before is None else register_late, task)
 

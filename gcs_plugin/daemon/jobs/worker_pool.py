@@ -87,6 +87,17 @@ class WorkerPool:
             self._reserved.held = False
             self._free.release()
 
+    def run_if_free(self, function: Callable[[Any], Result], item: Any) -> Result | None:
+        """As `run`; None, without waiting, if no process is free."""
+        if not self._free.acquire(blocking=False):
+            return None
+        self._reserved.held = True
+        try:
+            return self.run(function, item)
+        finally:
+            self._reserved.held = False
+            self._free.release()
+
     def run(self, function: Callable[[Any], Result], item: Any) -> Result:
         """Run a function once a process is free, and wait for it.
 

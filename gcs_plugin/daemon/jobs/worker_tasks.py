@@ -7,7 +7,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -32,6 +32,10 @@ from orthoswarm.model.placement import Leg, PlacedFrame, Solution
 from orthoswarm.mosaic.oblique import stray_warning, strays
 from orthoswarm.mosaic.renderer import render
 from orthoswarm.raster.basemap import Basemap
+from orthoswarm.raster.grey_pictures import GreyPictures
+
+if TYPE_CHECKING:
+    from orthoswarm.refine.strategy.swarm_refiner import Options, SwarmRefiner
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,6 +47,7 @@ class SolveTask:
         thumbnails: image -> uint8 (12, 16, 3).
         neighbours: solution files nearby, held fixed. target: path of the new one.
         before: the solution file of the sortie's earlier legs (in flight) or of its refinement (for late pictures).
+        kept: folder with what is kept of its pictures until it is refined, None if nothing is.
     """
 
     frames: list[Frame]
@@ -53,6 +58,7 @@ class SolveTask:
     neighbours: list[Path]
     target: Path
     before: Path | None = None
+    kept: Path | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -107,11 +113,38 @@ def solve(task: SolveTask) -> SortieResult:
     """
     watch = _Watch()
     others = [read_solution(path) for path in task.neighbours]
-    refiner = make_refiner("swarm", task.epsg, np.array(task.origin))
-    solution = without_strays(refiner.refine(task.frames, [sortie.solution for sortie in others], _basemap(task)))
+    solution = without_strays(
+        _refiner(task).refine(task.frames, [sortie.solution for sortie in others], _basemap(task))
+    )
     sortie = SolutionFile(solution, task.thumbnails, gains_of(solution, task.thumbnails, others))
     sortie.write(task.target)
     return watch.solved(solution, _in_units(task.frames), sortie, visible_ground(solution.placed, sortie.terrain))
+
+
+def follow(task: SolveTask) -> float:
+    """Track the pictures of a sortie for `solve`, while it is not certain yet that no more will come.
+
+    Returns the CPU seconds used.
+    """
+    began = time.process_time()
+    _refiner(task).follow(task.frames)
+    return time.process_time() - began
+
+
+def _refiner(task: SolveTask) -> "SwarmRefiner":
+    from orthoswarm.refine.strategy.swarm_refiner import SwarmRefiner
+
+    return SwarmRefiner(task.epsg, np.array(task.origin), _options(task))
+
+
+def _options(task: SolveTask) -> "Options":
+    """Options that use what is kept of the sortie's pictures, and keep what is made."""
+    from orthoswarm.refine.flight.kept_tracks import KeptTracks
+    from orthoswarm.refine.strategy.swarm_refiner import Options
+
+    if task.kept is None:
+        return Options()
+    return Options(read=GreyPictures(task.kept, from_colors=False).gray, kept=KeptTracks(task.kept))
 
 
 def register_late(task: SolveTask) -> SortieResult:
@@ -216,7 +249,10 @@ def place(task: SolveTask) -> SortieResult:
     from orthoswarm.refine.strategy.in_flight import place_in_flight
 
     watch = _Watch()
-    solution = place_in_flight(task.frames, epsg=task.epsg, origin=np.array(task.origin), basemap=_basemap(task))
+    options = replace(_options(task), kept=None)  # the next leg's tracks will be others
+    solution = place_in_flight(
+        task.frames, epsg=task.epsg, origin=np.array(task.origin), basemap=_basemap(task), options=options
+    )
     mine = {frame.image for frame in task.frames}
     before = SolutionFile(replace(solution, placed=[])) if task.before is None else read_solution(task.before)
     earlier = [p for p in before.solution.placed if p.frame.image not in mine]

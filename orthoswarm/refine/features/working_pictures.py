@@ -69,6 +69,15 @@ class Pictures:
             self.gray(i)
         return self._small[i]
 
+    def reduced(self) -> dict[int, Gray]:
+        """The reduced pictures so far, by index."""
+        return dict(self._small)
+
+    def restore(self, reduced: dict[int, Gray], damaged: dict[int, str]) -> None:
+        """Take over what an earlier reading of the same pictures found: see `reduced` and `damaged`."""
+        self._small.update(reduced)
+        self.damaged.update(damaged)
+
     def drop(self) -> None:
         """Free the memory of all pictures; they are read again when they are needed."""
         self._cache.clear()

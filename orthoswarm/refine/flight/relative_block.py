@@ -20,6 +20,7 @@ from orthoswarm.refine.bundle.rotation_vectors import log_rotation
 from orthoswarm.refine.features.flow_calibration import Calibration, calibrate
 from orthoswarm.refine.features.tracks import follow, predicted_homography
 from orthoswarm.refine.features.working_pictures import Pictures
+from orthoswarm.refine.flight.kept_tracks import Followed, KeptTracks
 from orthoswarm.trajectory.legs import leads_one_way, split_legs
 
 Array = NDArray[np.float64]
@@ -62,20 +63,56 @@ class Flight:
 
 
 def open_flight(
-    frames: Sequence[Frame], grid: LocalGrid, origin: Array, read: Callable[[Frame], Gray], fov_start: float
+    frames: Sequence[Frame],
+    grid: LocalGrid,
+    origin: Array,
+    read: Callable[[Frame], Gray],
+    fov_start: float,
+    kept: KeptTracks | None = None,
 ) -> Flight | None:
     """Track corners through a vehicle's pictures and set up its adjustment, without solving it.
+
+    Args:
+        frames: in order. grid: the area's. origin: float64 (2,) of the local frame. read: reads a grey picture.
+        fov_start: assumed horizontal field of view, radians.
+        kept: where the tracks are kept; they are taken from there if they were made of the same before.
 
     Returns None where pictures cannot be tracked from one to the next and are matched in pairs instead (see
     `open_sparse_flight`): too little overlap, a height that contradicts the scale, or, where no height was recorded, a
     chain that breaks, or a single straight line, on which drift and scale cannot be separated.
     """
-    c = active().flight
-    if len(frames) < c.followed_photos:
+    if len(frames) < active().flight.followed_photos:
         return None
     records = read_records(frames, grid, origin)
     leg = split_legs(records.position, records.time_s if records.timed else None)
     pictures = Pictures(frames, read)
+    file = None if kept is None else kept.file(frames, grid.epsg, origin, fov_start)
+    followed = None if kept is None or file is None else kept.read(file)
+    if followed is not None:
+        pictures.restore(followed.small, followed.damaged)
+    else:
+        followed = _follow(records, leg, pictures, fov_start)
+        if followed is None:
+            return None
+        if kept is not None and file is not None:
+            kept.write(file, followed)
+    calibration = followed.calibration
+    records = records.with_yaw(records.yaw + calibration.yaw_offset)
+    return Flight(
+        frames=frames,
+        records=records,
+        leg=leg,
+        pictures=pictures,
+        calibration=calibration,
+        adjustment=_begin(records, pictures, calibration, followed.tracks),
+        survived=followed.survived,
+        warnings=list(calibration.warnings),
+    )
+
+
+def _follow(records: FlightRecords, leg: NDArray[np.int32], pictures: Pictures, fov_start: float) -> Followed | None:
+    """Measure the flow and track the corners of a flight's pictures; None where they cannot be tracked."""
+    c = active().flight
     calibration = calibrate(records, leg, pictures.gray, pictures.size, fov_start)
     steps = np.hypot(*records.steps()[1:, :2].T)
     flow = float(np.median(steps)) * calibration.focal_px / calibration.height_m / pictures.size[1]
@@ -84,22 +121,18 @@ def open_flight(
     unknown = not records.has_height.any()
     if leads_one_way(records.position, leg) if unknown else not calibration.trusted_height:
         return None
-    records = records.with_yaw(records.yaw + calibration.yaw_offset)
-    tracks, survived = _track(records, pictures, calibration)
-    if np.median(survived[1:]) < c.followed_survival or tracks.count < c.followed_tracks_factor * len(frames) ** 0.5:
+    tracks, survived = _track(records.with_yaw(records.yaw + calibration.yaw_offset), pictures, calibration)
+    few = c.followed_tracks_factor * len(records.position) ** 0.5
+    if np.median(survived[1:]) < c.followed_survival or tracks.count < few:
         return None
     if unknown and survived[1:].min() < c.unbroken_survival:
         return None
-    adjustment = _begin(records, pictures, calibration, tracks)
-    return Flight(
-        frames=frames,
-        records=records,
-        leg=leg,
-        pictures=pictures,
+    return Followed(
         calibration=calibration,
-        adjustment=adjustment,
+        tracks=tracks,
         survived=survived,
-        warnings=list(calibration.warnings),
+        small=pictures.reduced(),
+        damaged=dict(pictures.damaged),
     )
 
 

@@ -14,7 +14,7 @@ from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import Leg, MapWindow, PlacedFrame, Solution
 from orthoswarm.mosaic.recorded_pose import hint_lone_photos, recorded_cameras
 from orthoswarm.refine.flight.solve_units import split_units
-from orthoswarm.refine.flight.unsolved_pictures import place_by_neighbours, split_refinable
+from orthoswarm.refine.flight.unsolved_pictures import RefinableSplit, place_by_neighbours, split_refinable
 
 Array = NDArray[np.float64]
 
@@ -47,11 +47,10 @@ class UnitRefiner(ABC):
             raise OrthoSwarmError("there are no frames to refine; check the vehicle's pictures")
         recorded = recorded_cameras(frames, LocalGrid(self.epsg))
         kinds = split_refinable(recorded.placed)
-        vehicle = frames[0].vehicle
         if kinds.fit:
-            solution = self.solve(split_units({vehicle: hint_lone_photos(kinds.fit)}), neighbours, basemap)
+            solution = self.solve(_units(kinds), neighbours, basemap)
         else:
-            solution = as_recorded(vehicle, kinds.still)
+            solution = as_recorded(frames[0].vehicle, kinds.still)
         return replace(
             solution,
             placed=[*solution.placed, *place_by_neighbours(kinds.odd, kinds.fit, solution.placed)],
@@ -59,9 +58,18 @@ class UnitRefiner(ABC):
             warnings=[*solution.warnings, *kinds.warnings],
         )
 
+    def units(self, frames: Sequence[Frame]) -> list[list[Frame]]:
+        """The units that `refine` solves of one vehicle's frames."""
+        kinds = split_refinable(recorded_cameras(frames, LocalGrid(self.epsg)).placed)
+        return _units(kinds) if kinds.fit else []
+
     @abstractmethod
     def solve(self, units: list[list[Frame]], neighbours: Sequence[Solution], basemap: MapWindow | None) -> Solution:
         """Solve the units of one vehicle (frames of one lens each) to one solution."""
+
+
+def _units(kinds: RefinableSplit) -> list[list[Frame]]:
+    return split_units({kinds.fit[0].frame.vehicle: hint_lone_photos(kinds.fit)})
 
 
 def units_of_area(vehicles: Mapping[str, Sequence[Frame]]) -> list[list[Frame]]:

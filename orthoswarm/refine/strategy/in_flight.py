@@ -18,7 +18,7 @@ from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid, local_origin
 from orthoswarm.model.placement import Leg, LegState, MapWindow, Solution
 from orthoswarm.mosaic.recorded_pose import recorded_cameras
-from orthoswarm.refine.flight.relative_block import Flight, open_flight
+from orthoswarm.refine.flight.relative_block import Flight
 from orthoswarm.refine.flight.solve_units import merge_units, split_units
 from orthoswarm.refine.flight.sparse_block import open_sparse_flight
 from orthoswarm.refine.flight.unsolved_pictures import hovering_vehicles
@@ -27,7 +27,7 @@ from orthoswarm.refine.registration.block_state import Stopwatch, VehicleState, 
 from orthoswarm.refine.registration.coarse_map import is_coarse
 from orthoswarm.refine.registration.coarse_registration import CoarseFit, coarse_fits
 from orthoswarm.refine.registration.confirmed_registration import confirmed
-from orthoswarm.refine.strategy.vehicle_passes import Options, adjust_without_map, read_frame, registered_state
+from orthoswarm.refine.strategy.vehicle_passes import Options, adjust_without_map, registered_state, tracked_flight
 from orthoswarm.refine.surface.vehicle_ground import GroundModel, fit_surface
 from orthoswarm.trajectory.legs import leads_one_way
 
@@ -88,15 +88,13 @@ def coarse_of(solution: Solution, origin: Array) -> Solution:
 
 
 def _unit(frames: Sequence[Frame], epsg: int, origin: Array, basemap: MapWindow | None, options: Options) -> Solution:
-    hints = [f.fov_hint_rad for f in frames if f.fov_hint_rad is not None]
-    start = float(np.median(hints)) if hints else options.fov_start_rad
     grid, watch = LocalGrid(epsg), Stopwatch()
     enough = len(frames) >= active().strategy.followed_fewest
-    flight = open_flight(frames, grid, origin, read_frame, start) if enough else None
+    flight = tracked_flight(frames, grid, origin, options) if enough else None
     if flight is None:
         if len(frames) > active().strategy.sparse_most:
             raise OrthoSwarmError("its pictures overlap too little to be placed in flight; the refinement places them")
-        flight = open_sparse_flight(frames, grid, origin, read_frame)
+        flight = open_sparse_flight(frames, grid, origin, options.read)
         one_way = leads_one_way(flight.records.position, flight.leg)
     else:
         one_way = leads_one_way(flight.records.position, flight.leg)

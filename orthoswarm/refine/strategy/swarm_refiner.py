@@ -36,7 +36,7 @@ from orthoswarm.refine.strategy.vehicle_group import (
     neighbours_of,
     pooled_lean,
 )
-from orthoswarm.refine.strategy.vehicle_passes import Options, refine_alone
+from orthoswarm.refine.strategy.vehicle_passes import Options, refine_alone, tracked_flight
 from orthoswarm.refine.surface.height_levels import level_network
 from orthoswarm.refine.surface.vehicle_ground import ground_points
 
@@ -62,6 +62,11 @@ class SwarmRefiner(UnitRefiner):
         others = [state for n in neighbours for state in states_of(n)]
         place = partial(refine_alone, epsg=self.epsg, origin=self.origin, basemap=basemap, options=self.options)
         return self._second_pass([place(unit) for unit in units], others, basemap)
+
+    def follow(self, frames: Sequence[Frame]) -> None:
+        """Track a vehicle's pictures and keep that (`Options.kept`), for `refine` of the same frames."""
+        for unit in self.units(frames):
+            tracked_flight(unit, LocalGrid(self.epsg), self.origin, self.options)
 
     def again(self, solution: Solution, neighbours: Sequence[Solution], basemap: MapWindow | None) -> Solution:
         """Refine a vehicle again with neighbours that were not refined, or refined without a map, when it was.

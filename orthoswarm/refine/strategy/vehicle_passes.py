@@ -26,6 +26,7 @@ from orthoswarm.refine.bundle.height_consistency import (
     predicted_height_offset,
     release_heights,
 )
+from orthoswarm.refine.flight.kept_tracks import KeptTracks
 from orthoswarm.refine.flight.record_findings import contradiction
 from orthoswarm.refine.flight.relative_block import (
     Flight,
@@ -59,11 +60,13 @@ class Options:
         fov_start_rad: field of view to start from where the tags hint at none.
         dem: given height model of the ground, None to find the ground from the pictures.
         read: reads a frame's grey picture, see `read_frame`; picklable.
+        kept: where tracks are kept for a refinement of the same pictures, None if they are not.
     """
 
     fov_start_rad: float = field(default_factory=lambda: float(np.radians(active().strategy.start_fov_deg)))
     dem: HeightModel | None = None
     read: ReadGray = field(default_factory=lambda: read_frame)
+    kept: KeptTracks | None = None
 
     def ground(self, origin: Array) -> GroundModel:
         """The ground before any picture is used, in the local frame: level, or the given height model."""
@@ -113,9 +116,7 @@ def refine_tracked(
     """
     watch = Stopwatch()
     copy_ahead(f.path for f in frames)
-    hints = [f.fov_hint_rad for f in frames if f.fov_hint_rad is not None]
-    start = float(np.median(hints)) if hints else options.fov_start_rad
-    flight = open_flight(frames, LocalGrid(epsg), origin, options.read, start)
+    flight = tracked_flight(frames, LocalGrid(epsg), origin, options)
     watch.lap("tracks")
     if flight is None:
         return None
@@ -141,6 +142,13 @@ def _registered(state: VehicleState, *, origin: Array, basemap: MapWindow | None
     except AdjustmentError:
         return None
     return state
+
+
+def tracked_flight(frames: Sequence[Frame], grid: LocalGrid, origin: Array, options: Options) -> Flight | None:
+    """A vehicle's pictures with corners tracked from one to the next, see `open_flight`."""
+    hints = [f.fov_hint_rad for f in frames if f.fov_hint_rad is not None]
+    start = float(np.median(hints)) if hints else options.fov_start_rad
+    return open_flight(frames, grid, origin, options.read, start, options.kept)
 
 
 def refine_matched(

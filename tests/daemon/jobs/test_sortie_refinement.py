@@ -42,17 +42,17 @@ class Drawing:
 @pytest.mark.parametrize("busy", [0, 5])
 def test_it_waits_until_the_first_picture_has_begun_the_map(busy):
     drawing = Drawing(busy)
-    SortieRefinement(journal=None, store=None, publisher=None, workers=None, drawer=drawing, basemap=None).wait_drawn(
-        JOB
-    )
+    SortieRefinement(
+        journal=None, store=None, kept=None, publisher=None, workers=None, drawer=drawing, basemap=None
+    ).wait_drawn(JOB)
     assert drawing.area is not None and drawing.asked == busy + 1
 
 
 def test_it_waits_no_longer_where_no_picture_can_begin_it():
     drawing = Drawing(2, begins=False)
-    SortieRefinement(journal=None, store=None, publisher=None, workers=None, drawer=drawing, basemap=None).wait_drawn(
-        JOB
-    )
+    SortieRefinement(
+        journal=None, store=None, kept=None, publisher=None, workers=None, drawer=drawing, basemap=None
+    ).wait_drawn(JOB)
     assert drawing.asked == 3
 
 
@@ -61,6 +61,7 @@ def test_it_waits_no_longer_once_the_daemon_ends():
     SortieRefinement(
         journal=None,
         store=None,
+        kept=None,
         publisher=None,
         workers=None,
         drawer=drawing,

@@ -1,0 +1,88 @@
+"""Tracks of a vehicle's pictures, kept on disk so that a refinement that follows need not make them again.
+
+They are found by a digest of all that they depend on, so those of other records, pictures or settings are never used.
+"""
+
+import contextlib
+import hashlib
+import os
+import pickle
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.config import active
+from orthoswarm.model.frame import Frame
+from orthoswarm.refine.bundle.block_arrays import Tracks
+from orthoswarm.refine.features.flow_calibration import Calibration
+
+_SUFFIX = ".tracks"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Followed:
+    """What was measured in the pictures of a flight (N) from one to the next.
+
+    Attributes:
+        calibration: focal length and headings by the flow. tracks: corners that were tracked, in working pixels.
+        survived: float64 (N,), share of the tracks that survived into each picture.
+        small: index -> reduced picture, uint8 (rows, columns).
+        damaged: index -> why that picture cannot be used.
+    """
+
+    calibration: Calibration
+    tracks: Tracks
+    survived: NDArray[np.float64]
+    small: dict[int, NDArray[np.uint8]]
+    damaged: dict[int, str]
+
+
+@dataclass(frozen=True, slots=True)
+class KeptTracks:
+    """A folder of tracks, one file for each flight; what cannot be written or read is made again.
+
+    Attributes:
+        folder: an existing folder, of this version of the program only.
+    """
+
+    folder: Path
+
+    def file(self, frames: Sequence[Frame], epsg: int, origin: NDArray[np.float64], fov_start: float) -> Path:
+        """Where the tracks of a flight are kept.
+
+        Args:
+            frames: in order; their records, names, sizes and files count. epsg: the area's grid.
+            origin: float64 (2,) of the local frame. fov_start: assumed horizontal field of view, radians.
+        """
+        asked = (frames, [_state(frame.path) for frame in frames], epsg, origin.tolist(), fov_start, active())
+        return self.folder / (hashlib.sha256(repr(asked).encode()).hexdigest() + _SUFFIX)
+
+    def read(self, file: Path) -> Followed | None:
+        """What was written into a file; None if there is nothing."""
+        try:
+            found = pickle.loads(file.read_bytes())
+        except Exception:  # a damaged pickle can raise anything
+            return None
+        return found if isinstance(found, Followed) else None
+
+    def write(self, file: Path, followed: Followed) -> None:
+        """Keep the tracks of a flight; those of other flights in the folder stay."""
+        part = file.with_suffix(f".{os.getpid()}")
+        try:
+            part.write_bytes(pickle.dumps(followed, pickle.HIGHEST_PROTOCOL))
+            part.replace(file)
+        except OSError:  # the disk is full: what is needed more is written there next
+            with contextlib.suppress(OSError):
+                part.unlink()
+
+
+def _state(path: Path) -> tuple[int, int] | None:
+    """A file's size and time of change, None if it is not on this machine."""
+    try:
+        found = os.stat(path)
+    except OSError:
+        return None
+    return found.st_size, found.st_mtime_ns

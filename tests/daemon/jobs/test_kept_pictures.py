@@ -1,0 +1,114 @@
+"""What the daemon keeps of pictures until their sortie is refined: used for the same result, then removed."""
+
+import time
+
+import numpy as np
+import pytest
+
+from gcs_plugin.daemon.daemon import Daemon
+from gcs_plugin.daemon.jobs.kernel_warmup import made_up_flight, made_up_ground, write_map
+from gcs_plugin.daemon.jobs.placed_sorties import sortie_frames
+from gcs_plugin.daemon.jobs.solution_file import read_solution
+from gcs_plugin.daemon.jobs.worker_tasks import near
+from gcs_plugin.daemon.settings import Settings
+from gcs_plugin.daemon.store.kept_pictures import KeptPictures
+from orthoswarm.config import override
+from orthoswarm.raster.basemap import Basemap
+from orthoswarm.refine.strategy.swarm_refiner import SwarmRefiner
+from tests.kit.made_up import LIMIT_S, after_job, complete, post
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory):
+    """Frames as taken, and the map's file."""
+    folder = tmp_path_factory.mktemp("flight")
+    ground = made_up_ground()
+    write_map(ground, folder / "map.tif")
+    return made_up_flight(ground, folder, "v1"), folder / "map.tif"
+
+
+def settings_of(tmp_path, flight, **others):
+    settings = Settings(workspace=tmp_path / "w", basemap=flight[1], **others)
+    settings.workspace.mkdir(exist_ok=True)
+    return settings
+
+
+def kept(daemon):
+    return [path for path in (daemon.settings.workspace / "kept").rglob("*") if path.is_file()]
+
+
+def until(true):
+    end = time.monotonic() + LIMIT_S
+    while not true():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+def solutions(daemon):
+    """Camera positions and sigmas by picture, as bytes: of the daemon's solution, and of one by the refiner alone."""
+    row = daemon.journal.one("SELECT path FROM solutions")
+    found = read_solution(daemon.settings.workspace / "solutions" / row["path"]).solution
+    frames, _ = sortie_frames(daemon.journal, daemon.store, "v1", 1)
+    area = daemon.drawer.area
+    basemap = Basemap.open(daemon.settings.basemap, area.epsg, near(frames, area.epsg))
+    alone = SwarmRefiner(area.epsg, np.array(area.origin)).refine(frames, [], basemap)
+    return [{p.frame.image: (p.camera.position.tobytes(), p.sigma_m) for p in s.placed} for s in (found, alone)]
+
+
+def test_a_sortie_is_followed_while_its_last_pictures_may_come(tmp_path, flight):
+    with Daemon(settings_of(tmp_path, flight, coarse=False)) as daemon:
+        post(daemon, flight[0])
+        complete(daemon)
+        until(lambda: [path for path in kept(daemon) if path.suffix == ".tracks"])
+        (job,) = after_job(daemon, 1)
+        assert job.state == "done", job.message
+        assert job.detail["follow_cpu_s"] > 0.0
+        found, alone = solutions(daemon)
+        assert len(found) == 28
+        assert found == alone
+        assert kept(daemon) == []
+
+
+def test_a_picture_that_comes_meanwhile_is_refined_with_the_others(tmp_path, flight):
+    with Daemon(settings_of(tmp_path, flight, coarse=False)) as daemon:
+        post(daemon, flight[0][:27])
+        complete(daemon)
+        post(daemon, flight[0][27:])
+        (job,) = after_job(daemon, 1)
+        assert job.state == "done", job.message
+        assert job.detail["frames"] == 28
+        found, alone = solutions(daemon)
+        assert found == alone
+
+
+def test_what_legs_left_is_not_needed_after_a_restart(tmp_path, flight):
+    with Daemon(settings_of(tmp_path, flight, silent_s=0.5)) as daemon:
+        post(daemon, flight[0][:20])
+        until(lambda: len(kept(daemon)) >= 14)
+    with Daemon(settings_of(tmp_path, flight, coarse=False)) as daemon:
+        assert kept(daemon) == []
+        post(daemon, flight[0][20:])
+        complete(daemon)
+        (job,) = after_job(daemon, 1)
+        assert job.state == "done", job.message
+        found, alone = solutions(daemon)
+        assert found == alone
+
+
+def test_folders_take_no_more_than_is_allowed_and_one_for_a_vehicle(tmp_path, flight):
+    frames = flight[0]
+    kept = KeptPictures(tmp_path / "kept")
+    try:
+        override({"raster": {"grey_pictures_mb": 240 * 180 * 30 / 1e6}})
+        assert kept.of("v1", 1, frames[:20]) == kept.of("v1", 1, frames)
+        assert kept.of("v2", 1, frames[:3]) is None
+        second = kept.of("v1", 2, frames[:20])
+        assert second is not None and second.is_dir()
+        assert kept.of("v2", 1, frames[:3]) not in (None, second)
+        assert len(list((tmp_path / "kept").iterdir())) == 2
+        kept.drop("v1", 2)
+        kept.drop("v1", 2)
+        assert not second.exists()
+        assert kept.of("v2", 1, frames) is not None
+    finally:
+        override({})
