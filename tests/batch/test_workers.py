@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from orthoswarm.compute.threads import on_threads
 from orthoswarm.compute.workers import Processes, Serial, cores, peak_rss_mb, prepare_process, workers
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.frame import Fix, Frame
@@ -188,6 +189,7 @@ def test_helpers(monkeypatch):
 
 PARENT = """
 import os, sys
+from orthoswarm.compute.threads import on_threads
 from orthoswarm.compute.workers import Processes
 from tests.batch.test_workers import where
 pool, others = Processes(3), set()
@@ -227,6 +229,7 @@ def test_a_worker_does_not_inherit_the_path_that_opencv_is_imported_with():
 FORKING = """
 import os, sys, threading
 from orthoswarm.batch.workspace import Workspace
+from orthoswarm.compute.threads import on_threads
 from orthoswarm.compute.workers import Processes, cheapest_context
 from pathlib import Path
 from tests.batch.test_workers import forked
@@ -263,3 +266,19 @@ def test_workers_are_forked_from_a_process_of_one_thread_only(tmp_path):
     done = subprocess.run([sys.executable, "-c", code, tmp_path], cwd=root, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert done.stdout.split() == ["fork", "spawn", "True"]
+
+
+def test_threads_take_arguments_as_they_are_needed_and_give_results_in_order():
+    taken = []
+    results = on_threads(lambda k: k * k, (taken.append(k) or k for k in range(1000)), count=3)
+    assert [next(results) for _ in range(5)] == [0, 1, 4, 9, 16]
+    assert 5 <= len(taken) <= 12
+    assert list(results) == [k * k for k in range(5, 1000)]
+
+
+def test_an_error_on_a_thread_ends_the_work():
+    taken = []
+    results = on_threads(lambda k: 1 // (5 - k), (taken.append(k) or k for k in range(1000)), count=2)
+    with pytest.raises(ZeroDivisionError):
+        list(results)
+    assert len(taken) < 20

@@ -1,12 +1,15 @@
 """The renderer: where pixels come from, how exactly, and what happens when something is wrong."""
 
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from multiprocessing import get_context
 
 import numpy as np
 import pytest
 
 from orthoswarm.canvas.canvas import Canvas
+from orthoswarm.compute.threads import on_threads
+from orthoswarm.config import override
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import Lens
 from orthoswarm.model.errors import InputError
@@ -14,7 +17,7 @@ from orthoswarm.model.placement import Terrain
 from orthoswarm.mosaic.kernels.pixel_sampling import UNIT, cubic_weights
 from orthoswarm.mosaic.kernels.render_arrays import crop, heights
 from orthoswarm.mosaic.radiometry import uniform
-from orthoswarm.mosaic.renderer import render
+from orthoswarm.mosaic.renderer import render, serial
 from orthoswarm.mosaic.visible_ground import coverage
 from orthoswarm.raster.picture_file import PictureError
 from orthoswarm.raster.picture_parts import PictureParts
@@ -228,6 +231,23 @@ def test_bounds_renew_only_the_tiles_they_touch(canvas):
     assert (new[:128, :128] != old[:128, :128]).any()
     assert stats.pixels.sum() == (new[:128, :128, 3] == 255).sum()
     assert 0.95 < stats.covered_share <= 1.0
+
+
+def test_threads_give_the_same_picture(tmp_path):
+    flight = scene.survey(12)
+    pictures, stats = [], []
+    try:
+        override({"compute": {"pictures_per_task": 2}})
+        for name, run in (("one", serial), ("three", partial(on_threads, count=3))):
+            with Canvas.create(tmp_path / name, scene.grid(260.0), plane="frame", tile_px=64) as canvas:
+                stats.append(render(flight.frames, FLAT, canvas, read=flight.read, run=run))
+                pictures.append(whole(canvas))
+    finally:
+        override({})
+    assert (pictures[0] == pictures[1]).all()
+    assert pictures[0].any()
+    assert stats[0].pixels.tolist() == stats[1].pixels.tolist()
+    assert stats[0].thumbnails.keys() == stats[1].thumbnails.keys()
 
 
 def test_processes_give_the_same_picture(canvas, tmp_path):

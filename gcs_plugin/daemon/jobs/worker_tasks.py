@@ -24,6 +24,7 @@ from gcs_plugin.daemon.jobs.solution_file import (
 from gcs_plugin.daemon.layers.layers import drawn_bounds, successor
 from orthoswarm.batch.refiners import make_refiner
 from orthoswarm.canvas.canvas import Canvas
+from orthoswarm.compute.threads import on_threads
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import Camera
 from orthoswarm.model.frame import Frame
@@ -358,7 +359,7 @@ def draw(task: DrawTask) -> dict[str, str]:
     old = None if task.old is None else Canvas.open(task.old, writable=False)
     canvas = successor(old, task.new, task.grid, "frame", share=True)
     try:
-        stats = render(placed, terrain, canvas, gains=gains, bounds=task.bounds)
+        stats = render(placed, terrain, canvas, gains=gains, bounds=task.bounds, run=on_threads)
         canvas.flush()
         assert drawn_bounds(canvas) is not None or not stats.pixels.any()
     finally:
