@@ -10,7 +10,7 @@ import logging
 import sqlite3
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,7 +21,7 @@ from gcs_plugin.daemon.jobs.placed_sorties import detail_of, sortie_frames
 from gcs_plugin.daemon.jobs.preemption import Preemption
 from gcs_plugin.daemon.jobs.publisher import Publisher
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
-from gcs_plugin.daemon.jobs.worker_tasks import SolveTask, SortieResult, coarse_after, near, place
+from gcs_plugin.daemon.jobs.worker_tasks import SolveTask, SortieResult, coarse_after, follow, near, place
 from gcs_plugin.daemon.layers.layers import new_name
 from gcs_plugin.daemon.store.journal import Change, Journal, packed
 from gcs_plugin.daemon.store.kept_pictures import KeptPictures
@@ -90,7 +90,7 @@ class LegPlacement:
             job.detail["note"] = "it is refined already"
             return lambda db: None
         frames, thumbnails = sortie_frames(self.journal, self.store, vehicle, job.sortie)
-        kept = self.kept.of(vehicle, job.sortie, frames)
+        everything, kept = frames, self.kept.of(vehicle, job.sortie, frames)
         frames, count = newest_legs(frames, area.epsg, over=bool(job.detail.get("over")))
         if not frames:
             raise OrthoSwarmError("no leg is over yet")
@@ -114,7 +114,17 @@ class LegPlacement:
         mine = {frame.image for frame in frames}
         earlier = [] if before is None else json.loads(before["detail"])["legs"]
         legs = [leg for leg in earlier if leg.get("images") and leg["images"][0] not in mine | fresh]
-        return self._publish(job, report, target, solved, [*legs, *solved.legs])
+        change = self._publish(job, report, target, solved, [*legs, *solved.legs])
+        if job.detail.get("over") and kept is not None:
+            self._follow(job, replace(task, frames=everything))
+        return change
+
+    def _follow(self, job: Job, task: SolveTask) -> None:
+        """Track all pictures of a vehicle that has fallen silent: they may be all of its sortie when it completes."""
+        try:
+            job.detail["follow_cpu_s"] = round(self.workers.run(follow, task), 3)
+        except OrthoSwarmError as error:  # the legs are placed, whatever stopped this
+            _log.debug("the tracks of %s: %s", job.vehicle, error)
 
     def _others(self, job: Job, frames: list[Frame]) -> list[Path]:
         """Drawn sorties nearby, whose exposure is fixed."""

@@ -69,6 +69,25 @@ def test_a_sortie_is_followed_while_its_last_pictures_may_come(tmp_path, flight)
         assert kept(daemon) == []
 
 
+def test_a_vehicle_that_is_silent_before_it_completes_is_followed_then(tmp_path, flight):
+    with Daemon(settings_of(tmp_path, flight, silent_s=0.5)) as daemon:
+        post(daemon, flight[0])
+        until(lambda: any(job.ended and "follow_cpu_s" in job.detail for job in daemon.jobs.all()))
+        (tracks,) = [path for path in kept(daemon) if path.suffix == ".tracks"]
+        seen = set()
+        complete(daemon)
+
+        def refined():
+            seen.update(path.name for path in kept(daemon) if path.suffix == ".tracks")
+            return any(job.kind == "refine" and job.ended for job in daemon.jobs.all())
+
+        until(refined)
+        assert seen <= {tracks.name}  # their refinement asks for the same, and makes no others
+        found, alone = solutions(daemon)
+        assert len(found) == 28
+        assert found == alone
+
+
 def test_a_picture_that_comes_meanwhile_is_refined_with_the_others(tmp_path, flight):
     with Daemon(settings_of(tmp_path, flight, coarse=False)) as daemon:
         post(daemon, flight[0][:27])
