@@ -8,12 +8,14 @@ import shutil
 import threading
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Final
 
 from orthoswarm.config import active
 from orthoswarm.model.frame import Frame
 from orthoswarm.raster.grey_pictures import stored_bytes
 
 Key = tuple[str, int | None]
+_FREE_MB: Final = 1000.0
 
 
 class KeptPictures:
@@ -21,13 +23,14 @@ class KeptPictures:
 
     Args:
         folder: emptied, as another version of the program may have written what is in there.
+        free_mb: nothing is kept where less is free on the disk, megabytes: new pictures need it more.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self._folder, self._lock = folder, threading.Lock()
+    def __init__(self, folder: Path, free_mb: float = _FREE_MB) -> None:
+        self._folder, self._free_mb, self._lock = folder, free_mb, threading.Lock()
         self._bytes: dict[Key, int] = {}
-        self._made = 0
         self._names: dict[Key, str] = {}
+        self._made = 0
         shutil.rmtree(folder, ignore_errors=True)
 
     def of(self, vehicle: str, sortie: int | None, frames: Sequence[Frame]) -> Path | None:
@@ -36,23 +39,30 @@ class KeptPictures:
         Args:
             frames: those so far. A vehicle's other sorties are not kept any longer.
         """
-        for other in [key for key in list(self._names) if key[0] == vehicle and key[1] != sortie]:
-            self.drop(*other)
         key = (vehicle, sortie)
         with self._lock:
-            size = max(stored_bytes(frames), self._bytes.get(key, 0))
-            if size + sum(b for k, b in self._bytes.items() if k != key) > active().raster.grey_pictures_mb * 1e6:
+            others = [other for other in self._names if other[0] == vehicle and other != key]
+        for other in others:
+            self.drop(*other)
+        path = self._reserved(key, stored_bytes(frames))
+        if path is None:
+            self.drop(vehicle, sortie)
+        return path
+
+    def _reserved(self, key: Key, size: int) -> Path | None:
+        with self._lock:
+            self._bytes[key] = max(size, self._bytes.get(key, 0))
+            if sum(self._bytes.values()) > active().raster.grey_pictures_mb * 1e6:
                 return None
             if key not in self._names:
                 self._made += 1
                 self._names[key] = str(self._made)
-            self._bytes[key] = size
             path = self._folder / self._names[key]
             try:
                 path.mkdir(parents=True, exist_ok=True)
+                return path if shutil.disk_usage(path).free > self._free_mb * 1e6 + size else None
             except OSError:
                 return None
-            return path
 
     def drop(self, vehicle: str, sortie: int | None) -> None:
         """Remove what is kept of a sortie."""

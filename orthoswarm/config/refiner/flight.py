@@ -12,6 +12,8 @@ class FlightConfig:
     longest_unit_photos: int = 600
     """Longer flights are solved in stretches that hold each other as neighbours, so that cost and memory stay bounded
     (chosen)."""
+    kept_tracks: int = 8
+    """Stretches whose tracks are kept for a refinement that follows, 7 MB each; older ones are removed (chosen)."""
     own_unit_photos: int = 6
     """Fewer photos of another camera name but the same size stay with the vehicle's main camera (chosen)."""
     least_photos_of_kind: int = 3

@@ -69,11 +69,14 @@ class KeptTracks:
         return found if isinstance(found, Followed) else None
 
     def write(self, file: Path, followed: Followed) -> None:
-        """Keep the tracks of a flight; those of other flights in the folder stay."""
+        """Keep the tracks of a flight, and those of the last few before."""
         part = file.with_suffix(f".{os.getpid()}")
         try:
             part.write_bytes(pickle.dumps(followed, pickle.HIGHEST_PROTOCOL))
             part.replace(file)
+            there = sorted(self.folder.glob(f"*{_SUFFIX}"), key=lambda path: path.stat().st_mtime_ns)
+            for old in there[: -active().flight.kept_tracks]:
+                old.unlink()
         except OSError:  # the disk is full: what is needed more is written there next
             with contextlib.suppress(OSError):
                 part.unlink()

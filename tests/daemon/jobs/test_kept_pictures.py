@@ -131,3 +131,9 @@ def test_folders_take_no_more_than_is_allowed_and_one_for_a_vehicle(tmp_path, fl
         assert kept.of("v2", 1, frames) is not None
     finally:
         override({})
+
+
+def test_nothing_is_kept_on_a_disk_that_is_nearly_full(tmp_path, flight):
+    kept = KeptPictures(tmp_path / "kept", free_mb=1e12)
+    assert kept.of("v1", 1, flight[0]) is None
+    assert list((tmp_path / "kept").iterdir()) == []
