@@ -58,6 +58,7 @@ def solutions(daemon):
 def test_a_sortie_is_followed_while_its_last_pictures_may_come(tmp_path, flight):
     with Daemon(settings_of(tmp_path, flight, coarse=False)) as daemon:
         post(daemon, flight[0])
+        until(lambda: daemon.drawer.area is not None)  # the first picture begins the map
         complete(daemon)
         until(lambda: [path for path in kept(daemon) if path.suffix == ".tracks"])
         (job,) = after_job(daemon, 1)
