@@ -227,7 +227,7 @@ def test_a_worker_does_not_inherit_the_path_that_opencv_is_imported_with():
 
 
 FORKING = """
-import os, sys, threading
+import os, sys, threading, time
 from orthoswarm.batch.workspace import Workspace
 from orthoswarm.compute.threads import on_threads
 from orthoswarm.compute.workers import Processes, cheapest_context
@@ -241,6 +241,8 @@ thread.start()
 print(cheapest_context().get_start_method())
 wait.set()
 thread.join()
+while len(os.listdir("/proc/self/task")) > 1:  # a thread that was joined may still be ending
+    time.sleep(0.001)
 with Workspace(Path(sys.argv[1])) as space:
     with Processes(2) as two:
         others = {}
