@@ -68,6 +68,7 @@ def open_flight(
     origin: Array,
     read: Callable[[Frame], Gray],
     fov_start: float,
+    *,
     kept: KeptTracks | None = None,
 ) -> Flight | None:
     """Track corners through a vehicle's pictures and set up its adjustment, without solving it.

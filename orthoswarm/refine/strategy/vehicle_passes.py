@@ -148,7 +148,7 @@ def tracked_flight(frames: Sequence[Frame], grid: LocalGrid, origin: Array, opti
     """A vehicle's pictures with corners tracked from one to the next, see `open_flight`."""
     hints = [f.fov_hint_rad for f in frames if f.fov_hint_rad is not None]
     start = float(np.median(hints)) if hints else options.fov_start_rad
-    return open_flight(frames, grid, origin, options.read, start, options.kept)
+    return open_flight(frames, grid, origin, options.read, start, kept=options.kept)
 
 
 def refine_matched(

@@ -1,15 +1,12 @@
 """Flights that edges do not find on the map: learned matching asks for them in one process, then they are settled."""
 
-import pickle
-
 import numpy as np
 import pytest
 
 from orthoswarm.model.geo import local_origin
-from orthoswarm.model.task_runner import Continued
 from orthoswarm.refine.strategy import vehicle_passes
 from orthoswarm.refine.strategy.swarm_refiner import SwarmRefiner
-from tests.kit.refine import refine_all
+from tests.kit.refine import refine_all, through_pickle
 from tests.kit.scenes import scene_of, tiny_twin
 from tests.refine.strategy.test_swarm_refiner import errors
 
@@ -36,16 +33,6 @@ def blind(monkeypatch):
     monkeypatch.setattr(vehicle_passes, "coarse_fits", first)
     monkeypatch.setattr(vehicle_passes, "learned_fit", second)
     return asked
-
-
-def through_pickle(function, items):
-    """Run tasks as processes would; one that asks learned matching would show."""
-    for item in items:
-        task = Continued(function, item)
-        while isinstance(task, Continued):
-            half = pickle.loads(pickle.dumps(task))
-            task = pickle.loads(pickle.dumps(half.function(half.item)))
-        yield task
 
 
 def test_a_flight_that_only_learned_matching_finds_is_mapped_as_well(scene, blind):

@@ -13,7 +13,7 @@ from orthoswarm.mosaic.extent import placed_bounds
 from orthoswarm.mosaic.recorded_pose import recorded_cameras
 from orthoswarm.raster.height_model import HeightModel
 from orthoswarm.refine.strategy.swarm_refiner import Options, SwarmRefiner
-from tests.kit.refine import refine_all
+from tests.kit.refine import refine_all, through_pickle
 from tests.kit.scenes import scene_of, tiny_twin
 from tests.refine.strategy.test_swarm_refiner import errors
 
@@ -42,13 +42,6 @@ def options(folder, scene, heights):
     placed = recorded_cameras([f for frames in vehicles.values() for f in frames], grid).placed
     at = [p.camera.position for p in placed]
     return Options(dem=HeightModel.open(path, grid.epsg, placed_bounds(placed, 0.0, 0.0), at))
-
-
-def through_pickle(function, items):
-    """Run tasks as processes would: what goes there and what comes back is pickled."""
-    for item in items:
-        f, i = pickle.loads(pickle.dumps((function, item)))
-        yield pickle.loads(pickle.dumps(f(i)))
 
 
 def off_ground(refined, scene, terrain=None):
