@@ -23,6 +23,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from functools import partial
 from itertools import chain, islice
 from multiprocessing.context import BaseContext, SpawnContext
 from types import TracebackType
@@ -31,7 +32,7 @@ from typing import Any, Generic, Protocol, TypeVar
 from orthoswarm.config import Overrides, active, overridden, override
 from orthoswarm.model.errors import WorkerStoppedError
 from orthoswarm.model.frame import Frame
-from orthoswarm.model.task_runner import Continued
+from orthoswarm.model.task_runner import Continued, whole
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -352,11 +353,8 @@ def _frame_of_copy(number: int) -> Frame:
 
 
 def _alone(function: Callable[[Item], Result | Continued[Result]], item: Item) -> Result:
-    """A whole task in this process, its continuation included."""
-    value = _as_elsewhere(function, item)
-    while isinstance(value, Continued):
-        value = _as_elsewhere(value.function, value.item)
-    return value
+    """A whole task in this process; its halves need no copies between them."""
+    return _as_elsewhere(partial(whole, function), item)
 
 
 def _as_elsewhere(function: Callable[[Item], Result], item: Item) -> Result:
