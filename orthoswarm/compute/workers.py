@@ -11,6 +11,7 @@ import copyreg
 import ctypes
 import gc
 import io
+import math
 import multiprocessing
 import os
 import pickle
@@ -19,7 +20,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sized
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
@@ -169,6 +170,8 @@ class Processes:
         if len(first) < 2:  # no other process need start, nor hold what this one has imported and read
             yield from (_alone(function, item) for item in first)
             return
+        if not self._halves_pay(items):
+            function = partial(whole, function)
         source = chain(first, source)
         ahead = active().compute.queue_per_process * self.count
         queue: deque[_Place[Result]] = deque()
@@ -188,6 +191,16 @@ class Processes:
         finally:
             for place in queue:
                 place.future.cancel()
+
+    def _halves_pay(self, items: Iterable[Item]) -> bool:
+        """Whether processes would be idle for long at the end if each item were one task.
+
+        Halves are copied between processes with all that they need: 5 % more CPU and 120 MB at 32 flights.
+        """
+        if not isinstance(items, Sized) or len(items) <= self.count:
+            return False
+        rounds = math.ceil(len(items) / self.count)
+        return rounds * self.count / len(items) > 1.0 + active().compute.idle_share
 
     def _fill(
         self,

@@ -12,6 +12,9 @@ class ComputeConfig:
     other process takes 1.1 to 2 s to start, 65 photos of 640 x 480 pixels 5 s (measured on two cores)."""
     queue_per_process: int = 4
     """Items begun or done ahead of the one that is waited for, for each process (chosen; bounds memory)."""
+    idle_share: float = 0.1
+    """Tasks that can be halved are, where processes would be idle for more than this share of the work, being too few
+    (chosen: halves cost 5 % of CPU)."""
     trim_after_s: float = 0.5
     """After a task that took more CPU seconds unused memory goes back to the system (chosen)."""
     cluster_connect_s: float = 20.0

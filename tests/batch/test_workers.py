@@ -91,6 +91,13 @@ def test_a_second_half_runs_where_a_process_is_free():
         assert any(first != second for _, first, second in pool.map(halved, [0, 1, 2]))
 
 
+def test_tasks_are_halved_only_where_processes_would_be_idle():
+    with Processes(2) as pool:
+        list(pool.map(where, range(2)))  # started
+        for items in ([0, 1], [0, 1, 2, 4, 5, 6, 7, 8]):
+            assert all(first == second for _, first, second in pool.map(halved, items))
+
+
 def test_an_error_in_the_second_half_comes_at_its_items_turn():
     with Processes(2) as pool:
         results = pool.map(halved, [0, 1, 3, 4])

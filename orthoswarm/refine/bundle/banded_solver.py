@@ -116,7 +116,7 @@ def camera_order(tracks: Tracks, position: Array, points: int, free: NDArray[np.
     """Slot of each free camera in the band (-1 if held), int32 (N,), and the band's width in cameras.
 
     Cameras that observe a common point must lie within the band. Takes the best of the input order, that of Cuthill and
-    McKee (1969), and that along the longer side of the flown area, which is a fifth narrower for parallel legs: it
+    McKee (1969), and that along the longer side of the flown area, which is a seventh narrower for parallel legs: it
     advances in all of them together.
 
     Args:
