@@ -21,8 +21,7 @@ import threading
 import time
 from pathlib import Path
 
-import numpy as np
-
+from benchmarks.speed.daemon_refine import record
 from gcs_plugin.daemon.daemon import Daemon
 from gcs_plugin.daemon.intake.posted_pose import parse_pose
 from gcs_plugin.daemon.settings import Settings
@@ -32,25 +31,13 @@ from orthoswarm.model.frame import Frame
 BESIDE_HZ = 2.0
 
 
-def add(daemon: Daemon, frame: Frame) -> None:
-    """A picture with its record."""
-    fix = frame.fix
-    angles = {"yaw_deg": fix.yaw_rad, "pitch_deg": fix.pitch_rad, "roll_deg": fix.roll_rad}
-    pose = {
-        "vehicle": frame.vehicle, "image": frame.image, "time": frame.time_s, "lat_deg": fix.lat_deg,
-        "lon_deg": fix.lon_deg, "height_m": fix.height_m,
-        **{key: float(np.degrees(value)) for key, value in angles.items() if value is not None},
-    }  # fmt: skip
-    daemon.add_picture(parse_pose(pose), frame.path.read_bytes())
-
-
 def fly(daemon: Daemon, frames: list[Frame], rate_hz: float, stop: threading.Event) -> None:
     """Add pictures at a rate until told to stop."""
     start = time.monotonic()
     for k, frame in enumerate(frames):
         if stop.wait(max(0.0, start + k / rate_hz - time.monotonic())):
             return
-        add(daemon, frame)
+        daemon.add_picture(parse_pose(record(frame)), frame.path.read_bytes())
 
 
 def complete(daemon: Daemon, vehicle: str) -> dict[str, float]:

@@ -18,6 +18,7 @@ import tempfile
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import httpx
 import numpy as np
@@ -27,17 +28,21 @@ from orthoswarm.model.frame import Frame
 RATE_HZ = 4.0
 
 
-def post(client: httpx.Client, frame: Frame) -> None:
-    """A picture with its record."""
+def record(frame: Frame) -> dict[str, Any]:
+    """A picture's record as a companion computer posts it."""
     fix = frame.fix
     angles = {"yaw_deg": fix.yaw_rad, "pitch_deg": fix.pitch_rad, "roll_deg": fix.roll_rad}
-    pose = {
+    return {
         "vehicle": frame.vehicle, "image": frame.image, "time": frame.time_s, "lat_deg": fix.lat_deg,
         "lon_deg": fix.lon_deg, "height_m": fix.height_m,
         **{key: float(np.degrees(value)) for key, value in angles.items() if value is not None},
     }  # fmt: skip
+
+
+def post(client: httpx.Client, frame: Frame) -> None:
+    """A picture with its record."""
     files = {"image": (frame.path.name, frame.path.read_bytes(), "image/jpeg")}
-    client.post("/api/frames", files=files, data={"pose": json.dumps(pose)}).raise_for_status()
+    client.post("/api/frames", files=files, data={"pose": json.dumps(record(frame))}).raise_for_status()
 
 
 def slowly(client: httpx.Client, frames: list[Frame], stop: threading.Event) -> None:

@@ -196,7 +196,6 @@ def test_helpers(monkeypatch):
 
 PARENT = """
 import os, sys
-from orthoswarm.compute.threads import on_threads
 from orthoswarm.compute.workers import Processes
 from tests.batch.test_workers import where
 pool, others = Processes(3), set()
@@ -236,7 +235,6 @@ def test_a_worker_does_not_inherit_the_path_that_opencv_is_imported_with():
 FORKING = """
 import os, sys, threading, time
 from orthoswarm.batch.workspace import Workspace
-from orthoswarm.compute.threads import on_threads
 from orthoswarm.compute.workers import Processes, cheapest_context
 from pathlib import Path
 from tests.batch.test_workers import forked

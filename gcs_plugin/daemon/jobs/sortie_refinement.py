@@ -16,7 +16,7 @@ from gcs_plugin.daemon.jobs.joint_refinement import together_jobs
 from gcs_plugin.daemon.jobs.placed_sorties import detail_of, others_near, refined_change, solution_row, sortie_frames
 from gcs_plugin.daemon.jobs.publisher import Publisher
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
-from gcs_plugin.daemon.jobs.worker_tasks import SolveTask, SortieResult, follow, near, register_late, solve
+from gcs_plugin.daemon.jobs.worker_tasks import FollowTask, SolveTask, SortieResult, follow, near, register_late, solve
 from gcs_plugin.daemon.layers.layers import new_name
 from gcs_plugin.daemon.layers.realtime_layer import Drawer
 from gcs_plugin.daemon.store.journal import Change, Journal, late_frames, packed
@@ -94,16 +94,8 @@ class SortieRefinement:
         try:
             area = self.publisher.area()
             frames, _ = sortie_frames(self.journal, self.store, str(job.vehicle), job.sortie)
-            task = SolveTask(
-                frames=frames,
-                epsg=area.epsg,
-                origin=area.origin,
-                basemap=self.basemap,
-                thumbnails={},
-                neighbours=[],
-                target=self.publisher.solutions,
-                kept=self.kept.of(str(job.vehicle), job.sortie, frames),
-            )
+            kept = self.kept.of(str(job.vehicle), job.sortie, frames)
+            task = FollowTask(frames=frames, epsg=area.epsg, origin=area.origin, kept=kept)
             used = None if task.kept is None else self.workers.run_if_free(follow, task)
         except OrthoSwarmError as error:  # the solution will fail, or not, for its own reason
             _log.debug("the tracks of %s: %s", job.vehicle, error)

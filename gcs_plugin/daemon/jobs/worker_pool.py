@@ -80,20 +80,22 @@ class WorkerPool:
         while not self._free.acquire(timeout=_LOOK_S):
             if self._closed:
                 raise OrthoSwarmError("the daemon is stopping; start it again")
-        self._reserved.held = True
-        try:
+        with self._holding():
             yield
-        finally:
-            self._reserved.held = False
-            self._free.release()
 
     def run_if_free(self, function: Callable[[Any], Result], item: Any) -> Result | None:
         """As `run`; None, without waiting, if no process is free."""
         if not self._free.acquire(blocking=False):
             return None
+        with self._holding():
+            return self.run(function, item)
+
+    @contextmanager
+    def _holding(self) -> Iterator[None]:
+        """This thread's work has the process that was acquired, which is free again afterwards."""
         self._reserved.held = True
         try:
-            return self.run(function, item)
+            yield
         finally:
             self._reserved.held = False
             self._free.release()

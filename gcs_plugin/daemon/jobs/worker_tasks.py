@@ -40,26 +40,35 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SolveTask:
-    """One vehicle's sortie, or the part that has arrived.
+class FollowTask:
+    """What is needed to track a sortie's pictures.
 
     Attributes:
-        frames: in order of time. epsg, origin: the area's. basemap: the map, or None.
-        thumbnails: image -> uint8 (12, 16, 3).
-        neighbours: solution files nearby, held fixed. target: path of the new one.
-        before: the solution file of the sortie's earlier legs (in flight) or of its refinement (for late pictures).
+        frames: of one sortie, in order of time. epsg, origin: the area's grid.
         kept: folder with what is kept of its pictures until it is refined, None if nothing is.
     """
 
     frames: list[Frame]
     epsg: int
     origin: tuple[float, float]
+    kept: Path | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SolveTask(FollowTask):
+    """One vehicle's sortie, or the part that has arrived.
+
+    Attributes:
+        basemap: the map, or None. thumbnails: image -> uint8 (12, 16, 3).
+        neighbours: solution files nearby, held fixed. target: path of the new one.
+        before: the solution file of the sortie's earlier legs (in flight) or of its refinement (for late pictures).
+    """
+
     basemap: Path | None
     thumbnails: dict[str, Bytes]
     neighbours: list[Path]
     target: Path
     before: Path | None = None
-    kept: Path | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -122,7 +131,7 @@ def solve(task: SolveTask) -> SortieResult:
     return watch.solved(solution, _in_units(task.frames), sortie, visible_ground(solution.placed, sortie.terrain))
 
 
-def follow(task: SolveTask) -> float:
+def follow(task: FollowTask) -> float:
     """Track the pictures of a sortie for `solve`, while it is not certain yet that no more will come.
 
     Returns the CPU seconds used.
@@ -132,13 +141,13 @@ def follow(task: SolveTask) -> float:
     return time.process_time() - began
 
 
-def _refiner(task: SolveTask) -> "SwarmRefiner":
+def _refiner(task: FollowTask) -> "SwarmRefiner":
     from orthoswarm.refine.strategy.swarm_refiner import SwarmRefiner
 
     return SwarmRefiner(task.epsg, np.array(task.origin), _options(task))
 
 
-def _options(task: SolveTask) -> "Options":
+def _options(task: FollowTask) -> "Options":
     """Options that use what is kept of the sortie's pictures, and keep what is made."""
     from orthoswarm.refine.flight.kept_tracks import KeptTracks
     from orthoswarm.refine.strategy.swarm_refiner import Options

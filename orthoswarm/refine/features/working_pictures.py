@@ -16,9 +16,7 @@ Gray = NDArray[np.uint8]
 
 
 class Pictures:
-    """Grey pictures by index; the most recently read ones stay in memory, reduced ones until `drop`.
-
-    Copies to other processes have the reduced ones, too: reading all pictures again would take longer.
+    """Grey pictures by index; the most recently read ones stay in memory, reduced ones always do.
 
     Attributes:
         scale: full-resolution pixels per working pixel. size: (width, height) at working scale.
@@ -79,12 +77,11 @@ class Pictures:
         self.damaged.update(damaged)
 
     def drop(self) -> None:
-        """Free the memory of all pictures; they are read again when they are needed."""
+        """Free the memory of the working-scale pictures (the reduced ones stay)."""
         self._cache.clear()
-        self._small.clear()
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_cache": OrderedDict()}
+        return {**self.__dict__, "_cache": OrderedDict(), "_small": {}}
 
     def _load(self, i: int) -> Gray:
         if self._frames[i].damaged:  # parts of it may show another moment: its record is used, its content is not

@@ -132,11 +132,20 @@ def refine_tracked(
         state = adjusted_state(flight, surface, watch)
     except AdjustmentError:
         return None
-    return Continued(partial(_registered, origin=origin, basemap=basemap, learned=learned), state)
+    register = partial(_registered, origin=origin, basemap=basemap, learned=learned)
+    return Continued(register, (state, flight.pictures.reduced()))
 
 
-def _registered(state: VehicleState, *, origin: Array, basemap: MapWindow | None, learned: bool) -> VehicleState | None:
-    """The second half of `refine_tracked`."""
+def _registered(
+    item: tuple[VehicleState, dict[int, NDArray[np.uint8]]],
+    *,
+    origin: Array,
+    basemap: MapWindow | None,
+    learned: bool,
+) -> VehicleState | None:
+    """The second half of `refine_tracked`; item: the state, and its reduced pictures, which it does not take along."""
+    state, reduced = item
+    state.flight.pictures.restore(reduced, {})
     try:
         register_on_map(state, origin, basemap=basemap, learned=learned)
     except AdjustmentError:

@@ -7,20 +7,10 @@ import numpy as np
 import pytest
 
 from gcs_plugin.daemon.daemon import Daemon
-from gcs_plugin.daemon.jobs.kernel_warmup import made_up_flight, made_up_ground, write_map
 from gcs_plugin.daemon.jobs.leg_watch import LegWatch
 from gcs_plugin.daemon.jobs.solution_file import read_solution
 from gcs_plugin.daemon.settings import Settings
 from tests.kit.made_up import LIMIT_S, after_job, complete, post, truth
-
-
-@pytest.fixture(scope="module")
-def flight(tmp_path_factory):
-    """Frames as taken, and the map's file."""
-    folder = tmp_path_factory.mktemp("flight")
-    ground = made_up_ground()
-    write_map(ground, folder / "map.tif")
-    return made_up_flight(ground, folder, "v1"), folder / "map.tif"
 
 
 @pytest.fixture

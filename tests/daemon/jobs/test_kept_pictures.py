@@ -3,10 +3,8 @@
 import time
 
 import numpy as np
-import pytest
 
 from gcs_plugin.daemon.daemon import Daemon
-from gcs_plugin.daemon.jobs.kernel_warmup import made_up_flight, made_up_ground, write_map
 from gcs_plugin.daemon.jobs.placed_sorties import sortie_frames
 from gcs_plugin.daemon.jobs.solution_file import read_solution
 from gcs_plugin.daemon.jobs.worker_tasks import near
@@ -16,15 +14,6 @@ from orthoswarm.config import override
 from orthoswarm.raster.basemap import Basemap
 from orthoswarm.refine.strategy.swarm_refiner import SwarmRefiner
 from tests.kit.made_up import LIMIT_S, after_job, complete, post
-
-
-@pytest.fixture(scope="module")
-def flight(tmp_path_factory):
-    """Frames as taken, and the map's file."""
-    folder = tmp_path_factory.mktemp("flight")
-    ground = made_up_ground()
-    write_map(ground, folder / "map.tif")
-    return made_up_flight(ground, folder, "v1"), folder / "map.tif"
 
 
 def settings_of(tmp_path, flight, **others):
