@@ -1,10 +1,7 @@
 """Grey pictures of a run on disk, so that each file is decoded once for all stages that read its grey values."""
 
-import contextlib
-import os
 from collections.abc import Iterable
 from dataclasses import dataclass
-from hashlib import blake2b
 from pathlib import Path
 
 import cv2
@@ -13,6 +10,7 @@ from numpy.typing import NDArray
 
 from orthoswarm.config import active
 from orthoswarm.model.frame import Frame
+from orthoswarm.raster.packed_records import records
 from orthoswarm.raster.picture_file import read_gray, read_rgb, reduction
 
 Bytes = NDArray[np.uint8]
@@ -21,11 +19,10 @@ _SHAPE = np.dtype("<i4")
 
 @dataclass(frozen=True, slots=True)
 class GreyPictures:
-    """Grey pictures as they were decoded first, one file each; what cannot be written is decoded again.
+    """Grey pictures as they were decoded first; what cannot be written is decoded again.
 
     Grey values of pictures of at most the refiner's working size come from the colours, which are read for drawing
-    anyhow; larger ones are decoded once more, reduced. Any number of processes may use a store at the same time: a
-    file appears as a whole.
+    anyhow; larger ones are decoded once more, reduced. Any number of processes may use a store at the same time.
 
     Attributes:
         folder: where the files are; an existing folder.
@@ -53,7 +50,7 @@ class GreyPictures:
     def rgb(self, path: Path) -> Bytes:
         """See `read_rgb`; the grey values are stored."""
         picture = read_rgb(path)
-        if _factor(picture.shape[1], picture.shape[0]) == 1 and not self._file(path).exists():
+        if _factor(picture.shape[1], picture.shape[0]) == 1 and path not in records(self.folder):
             self._store(path, _luma(picture))
         return picture
 
@@ -71,29 +68,17 @@ class GreyPictures:
             self._store(frame.path, picture)
         return picture
 
-    def _file(self, path: Path) -> Path:
-        return self.folder / blake2b(os.fsencode(path), digest_size=16).hexdigest()
-
     def _stored(self, path: Path) -> Bytes | None:
         """The stored picture; None if it is not stored."""
-        try:
-            with self._file(path).open("rb", buffering=0) as file:
-                rows, columns = np.fromfile(file, _SHAPE, 2).tolist()
-                return np.fromfile(file, np.uint8, rows * columns).reshape(rows, columns)
-        except (OSError, ValueError):
+        record = records(self.folder).get(path)
+        if record is None:
             return None
+        rows, columns = record[: _SHAPE.itemsize * 2].view(_SHAPE).tolist()
+        return record[_SHAPE.itemsize * 2 :].reshape(rows, columns)
 
     def _store(self, path: Path, picture: Bytes) -> None:
-        file = self._file(path)
-        part = file.with_suffix(f".{os.getpid()}")
-        try:
-            with part.open("wb", buffering=0) as out:
-                np.array(picture.shape, _SHAPE).tofile(out)
-                np.ascontiguousarray(picture).tofile(out)
-            part.replace(file)
-        except OSError:  # the disk is full: what is needed more is written there next
-            with contextlib.suppress(OSError):
-                part.unlink()
+        shape = np.array(picture.shape, _SHAPE).view(np.uint8)
+        records(self.folder).put(path, shape, np.ascontiguousarray(picture))
 
 
 def stored_bytes(frames: Iterable[Frame]) -> int:

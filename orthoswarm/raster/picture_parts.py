@@ -1,16 +1,14 @@
 """Parts of pictures on disk, so that a picture of which a part is drawn again need not be decoded again."""
 
-import contextlib
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from hashlib import blake2b
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.config import active
+from orthoswarm.raster.packed_records import records
 
 Bytes = NDArray[np.uint8]
 _HEAD = np.dtype("<i4")
@@ -59,10 +57,9 @@ class Part:
 
 @dataclass(frozen=True, slots=True)
 class PictureParts:
-    """Parts of the pictures of a run, one file each; what cannot be written is decoded again.
+    """Parts of the pictures of a run; what cannot be written is decoded again.
 
-    Any number of processes may use a store at the same time, as long as one at a time keeps a picture. A file that a
-    killed process left unfinished counts as none.
+    Any number of processes may use a store at the same time, as long as one at a time keeps a picture.
 
     Attributes:
         folder: where the files are; an existing folder.
@@ -83,17 +80,14 @@ class PictureParts:
 
     def get(self, path: Path, needs: Box) -> Part | None:
         """What was kept of a picture; None if nothing was, or not all that is needed."""
-        try:
-            with self._file(path).open("rb", buffering=0) as file:
-                columns, rows, left, top = np.fromfile(file, _HEAD, _NUMBERS).tolist()
-                if needs.left < left or needs.right >= left + columns:
-                    return None
-                if needs.top < top or needs.bottom >= top + rows:
-                    return None
-                pixels = np.fromfile(file, np.uint8, rows * columns * 3).reshape(rows, columns, 3)
-        except (OSError, ValueError):
+        record = records(self.folder).get(path)
+        if record is None:
             return None
-        return Part(pixels, (left, top))
+        head = _NUMBERS * _HEAD.itemsize
+        columns, rows, left, top = record[:head].view(_HEAD).tolist()
+        if needs.left < left or needs.right >= left + columns or needs.top < top or needs.bottom >= top + rows:
+            return None
+        return Part(record[head:].reshape(rows, columns, 3), (left, top))
 
     def keep(self, path: Path, picture: Bytes, drawn: Box) -> None:
         """Keep what was drawn of a picture and `part_margin` around it, unless some of it is kept already.
@@ -101,21 +95,10 @@ class PictureParts:
         Args:
             path: its file. picture: uint8 (rows, columns, 3), all of it. drawn: lies in it.
         """
-        file = self._file(path)
         margin = round(active().raster.part_margin * max(picture.shape))
         left, top = max(drawn.left - margin, 0), max(drawn.top - margin, 0)
         part = picture[top : drawn.bottom + margin + 1, left : drawn.right + margin + 1]
-        if drawn.right < drawn.left or part.size > self.most_bytes or file.exists():
+        if drawn.right < drawn.left or part.size > self.most_bytes or path in records(self.folder):
             return
-        data = np.empty(_NUMBERS * _HEAD.itemsize + part.size, np.uint8)
-        data[: -part.size] = np.array([part.shape[1], part.shape[0], left, top], _HEAD).view(np.uint8)
-        data[-part.size :].reshape(part.shape)[...] = part
-        try:
-            with file.open("wb", buffering=0) as out:
-                data.tofile(out)
-        except OSError:  # the disk is full: what is needed more is written there next
-            with contextlib.suppress(OSError):
-                file.unlink()
-
-    def _file(self, path: Path) -> Path:
-        return self.folder / blake2b(os.fsencode(path), digest_size=16).hexdigest()
+        head = np.array([part.shape[1], part.shape[0], left, top], _HEAD).view(np.uint8)
+        records(self.folder).put(path, head, np.ascontiguousarray(part))

@@ -93,7 +93,7 @@ def test_a_picture_that_comes_meanwhile_is_refined_with_the_others(tmp_path, fli
 def test_what_legs_left_is_not_needed_after_a_restart(tmp_path, flight):
     with Daemon(settings_of(tmp_path, flight, silent_s=0.5)) as daemon:
         post(daemon, flight[0][:20])
-        until(lambda: len(kept(daemon)) >= 14)
+        until(lambda: sum(path.stat().st_size for path in kept(daemon)) >= 14 * 240 * 180)
     with Daemon(settings_of(tmp_path, flight, coarse=False)) as daemon:
         assert kept(daemon) == []
         post(daemon, flight[0][20:])
