@@ -7,6 +7,7 @@ import importlib
 import json
 import os
 import platform
+import re
 import shutil
 import sys
 import time
@@ -190,7 +191,7 @@ def kernel_modules() -> list[tuple[str, bool]]:
     out = []
     for source in sorted(root.rglob("*.py")):
         simulated = "twin" in source.relative_to(root).parts
-        if not simulated and "\n@kernel\n" in source.read_text(encoding="utf-8"):
+        if not simulated and re.search(r"^@(in_place_)?kernel$", source.read_text(encoding="utf-8"), re.MULTILINE):
             name = ".".join(["orthoswarm", *source.relative_to(root).with_suffix("").parts])
             out.append((name, _is_warm(name, source)))
     return out

@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.compute.jit import kernel
+from orthoswarm.compute.jit import in_place_kernel
 from orthoswarm.model.errors import StorageError
 
 Bytes = NDArray[np.uint8]
 FACTORS = (8, 64)
 
 
-@kernel
+@in_place_kernel
 def _reduce(source, factor, target):  # type: ignore[no-untyped-def]
     rows, cols = target.shape[0], target.shape[1]
     none = np.int64(0)

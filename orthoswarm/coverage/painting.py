@@ -2,14 +2,14 @@
 
 import numpy as np
 
-from orthoswarm.compute.jit import kernel
+from orthoswarm.compute.jit import in_place_kernel
 
 UNSEEN = 255
 """Value of `best` in a cell that no picture sees."""
 _EDGE, _OBLIQUE, _COARSE = 1, 2, 64
 
 
-@kernel
+@in_place_kernel
 def _count(flaws):  # type: ignore[no-untyped-def]
     """Number of set bits."""
     number = 0
@@ -19,7 +19,7 @@ def _count(flaws):  # type: ignore[no-untyped-def]
     return number
 
 
-@kernel
+@in_place_kernel
 def paint(best, good, height, level, box, edges, camera, position, lens, quality):  # type: ignore[no-untyped-def]
     """Enter a view into the cells of a box; returns how many cells it sees well.
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.compute.jit import kernel
+from orthoswarm.compute.jit import in_place_kernel
 from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import Camera, Lens
@@ -177,7 +177,7 @@ def _compared(meetings: _Meetings, shots: Shots, small: Bytes, terrain: Terrain)
     return OverlapColors(np.stack([meetings.a, meetings.b], 1)[usable], ratio[usable], seen[usable], sigma[usable])
 
 
-@kernel
+@in_place_kernel
 def _compare(a, b, place, position, rotation, lens, size, small, dark, bright, ratio, usable, seen, contrast):  # type: ignore[no-untyped-def]
     rows, columns = small.shape[1], small.shape[2]
     for m in range(len(a)):

@@ -20,7 +20,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.compute.jit import kernel
+from orthoswarm.compute.jit import in_place_kernel, kernel
 from orthoswarm.config import active
 from orthoswarm.model.placement import PlacedFrame, Terrain
 from orthoswarm.mosaic.kernels.lens_arrays import F, U, V
@@ -197,7 +197,7 @@ def _solve(
     return x[: vehicles * _COMMON].reshape(vehicles, _COMMON, 3), x[vehicles * _COMMON :].reshape(-1, _OWN, 3)
 
 
-@kernel
+@in_place_kernel
 def _bases(place, of_vehicle, of_frame):  # type: ignore[no-untyped-def]
     """Factors of a side's unknowns: (11,) of the vehicle, (6,) of the frame."""
     x, y, e, n = place[0], place[1], place[2], place[3]

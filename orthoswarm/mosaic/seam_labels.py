@@ -9,7 +9,7 @@ pixels projected into it, distortion and terrain included.
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.compute.jit import kernel
+from orthoswarm.compute.jit import in_place_kernel, kernel
 from orthoswarm.mosaic.footprint import tan_limit
 from orthoswarm.mosaic.kernels.lens_arrays import INNER, OUTER, U_HIGH, U_LOW, V_HIGH, V_LOW
 from orthoswarm.mosaic.kernels.render_arrays import STEP, Shots, height_at, project
@@ -21,7 +21,7 @@ OUTSIDE, _PARTLY, _INSIDE = 0, 1, 2
 _ROUNDING = 1e-5  # of squared distances in float32, relative, with a margin
 
 
-@kernel
+@in_place_kernel
 def block_heights(lattice, r0, r1, c0, c1):  # type: ignore[no-untyped-def]
     """Least and greatest height of a tile's rows r0 to r1 and columns c0 to c1."""
     low, high = lattice[r0 // STEP, c0 // STEP], lattice[r0 // STEP, c0 // STEP]
@@ -31,7 +31,7 @@ def block_heights(lattice, r0, r1, c0, c1):  # type: ignore[no-untyped-def]
     return low, high
 
 
-@kernel
+@in_place_kernel
 def sight(position, rotation, lens, x0, x1, y0, y1, z0, z1):  # type: ignore[no-untyped-def]
     """Whether a camera sees a box of ground wholly, not at all, or perhaps; by its corners, since both are convex."""
     inside, behind, left, right, above, below = 0, 0, 0, 0, 0, 0
@@ -61,7 +61,7 @@ def sight(position, rotation, lens, x0, x1, y0, y1, z0, z1):  # type: ignore[no-
     return OUTSIDE if max(left, right, above, below) == 8 else _PARTLY
 
 
-@kernel
+@in_place_kernel
 def _claim(best, label, r0, r1, c0, c1, mark, x, y, gsd):  # type: ignore[no-untyped-def]
     """Give a block's pixels to a frame that sees all of it where it is nearer; gives the block's greatest distance."""
     worst = np.float32(0.0)
@@ -80,7 +80,7 @@ def _claim(best, label, r0, r1, c0, c1, mark, x, y, gsd):  # type: ignore[no-unt
     return worst
 
 
-@kernel
+@in_place_kernel
 def _contest(best, label, r0, r1, c0, c1, mark, position, rotation, lens, lattice, flat, gsd, tan2):  # type: ignore[no-untyped-def]
     """The same for a frame that sees part of the block: pixel by pixel where it would be nearer."""
     worst = np.float32(0.0)
@@ -105,7 +105,7 @@ def _contest(best, label, r0, r1, c0, c1, mark, position, rotation, lens, lattic
     return worst
 
 
-@kernel
+@in_place_kernel
 def _beaten(owners, count, x0, x1, y0, y1, x, y):  # type: ignore[no-untyped-def]
     """Whether one of the frames that see all of a block is nearer than a nadir point everywhere in it.
 
@@ -197,7 +197,7 @@ def label_tile(
         _label(best, label, position[index], rotation[index], shots.lens[index], marks[index], lattice, gsd_m, limit)
 
 
-@kernel
+@in_place_kernel
 def _windows(label, count, windows):  # type: ignore[no-untyped-def]
     """Boxes (row0, row1, col0, col1, pixels) of the labels 1..count in a tile."""
     for k in range(count):
@@ -218,7 +218,7 @@ def label_windows(local: Labels, count: int) -> NDArray[np.int32]:
     return windows
 
 
-@kernel
+@in_place_kernel
 def write_labels(local, ids, plane):  # type: ignore[no-untyped-def]
     """Put ids[k - 1] + 1 where a tile's local label is k > 0."""
     for r in range(local.shape[0]):

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.compute.jit import kernel
+from orthoswarm.compute.jit import in_place_kernel
 
 _BLOCK_PX = 16
 _COLUMNS, _ROWS = 12, 9
@@ -50,7 +50,7 @@ def picture_quality(picture: NDArray[np.uint8]) -> PictureQuality:
     )
 
 
-@kernel
+@in_place_kernel
 def _sample(plane):  # type: ignore[no-untyped-def]
     """Sums over the blocks of a lattice: difference energies over 1 and 4 pixels, mean, mean square, shares."""
     rows, columns = plane.shape

@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from orthoswarm.compute.jit import kernel
+from orthoswarm.compute.jit import in_place_kernel, kernel
 
 _STRAIGHT = 1e-9
 """Less bend than this is rounding (correlations are of order one): the sample itself is the top."""
 
 
-@kernel
+@in_place_kernel
 def vertex(left, middle, right):  # type: ignore[no-untyped-def]
     """Vertex of the parabola through three neighbouring samples: -0.5 to 0.5 steps from the middle one.
 

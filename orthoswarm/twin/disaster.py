@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.compute.jit import kernel
+from orthoswarm.compute.jit import in_place_kernel, kernel
 from orthoswarm.twin.city import scene as kinds
 from orthoswarm.twin.city.procedural_noise import hash01, lattice, noise_field
 from orthoswarm.twin.city.scene import TEXEL_M, Scene
@@ -56,7 +56,7 @@ def zone_depth(scene: Scene, zone: Zone, step: int, seed: int) -> Floats:
     return np.asarray((1.0 - norm) * 0.5 * min(zone.across_m, zone.along_m) + 14.0 * ragged, np.float32)
 
 
-@kernel
+@in_place_kernel
 def _wreckage(x, y, seed, piece):  # type: ignore[no-untyped-def]
     """Wreckage on the mud at x, y: piece[0] its height, piece[1:4] its colour; False where there is only mud.
 

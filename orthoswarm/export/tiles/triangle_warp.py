@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.compute.jit import kernel
+from orthoswarm.compute.jit import in_place_kernel
 
 Bytes = NDArray[np.uint8]
 Array = NDArray[np.float64]
@@ -55,7 +55,7 @@ def _pixels_of_source(places: Array, step: int) -> Array:
     return np.array([np.median(across[..., 0]), np.median(down[..., 1])]) / step
 
 
-@kernel
+@in_place_kernel
 def _draw(source, nodes, step, across, down, target):  # type: ignore[no-untyped-def]
     height, width = source.shape[1], source.shape[2]
     for i in range(target.shape[0]):

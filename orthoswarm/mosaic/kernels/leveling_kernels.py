@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from orthoswarm.compute.jit import kernel
+from orthoswarm.compute.jit import in_place_kernel, kernel
 
 SLOTS = 8
 """Most pictures, and pairs of them, in a cell; any beyond are left as they are."""
@@ -11,7 +11,7 @@ BOTH = 9
 ratio of their brightness and its square."""
 
 
-@kernel
+@in_place_kernel
 def _slot(labels, wanted):  # type: ignore[no-untyped-def]
     """Place of a label in a list that ends with zeros; it is added if there is room, else -1."""
     for k in range(len(labels)):
@@ -23,7 +23,7 @@ def _slot(labels, wanted):  # type: ignore[no-untyped-def]
     return -1
 
 
-@kernel
+@in_place_kernel
 def sum_colors(rgba, label, other_rgba, other, cell, dark, bright, labels, pixels, pairs, both):  # type: ignore[no-untyped-def]
     """Count the pixels of a tile's pictures by cell, and sum the colours of two pictures at the same ground near seams.
 
@@ -85,9 +85,15 @@ def apply_factors(rgba, label, cell, labels, factors):  # type: ignore[no-untype
         labels: int32 (R + 2, C + 2, SLOTS), of the cells of the tile and one beyond each border.
         factors: float32 (R + 2, C + 2, SLOTS, 3), and their factors.
     """
+    corner, has = np.ones((2, 2, 3), np.float32), np.zeros((2, 2), np.bool_)
+    _apply(rgba, label, cell, labels, factors, corner, has, np.ones((3, 3), np.float32))
+
+
+@in_place_kernel
+def _apply(rgba, label, cell, labels, factors, corner, has, channels):  # type: ignore[no-untyped-def]
+    """What `apply_factors` does. corner, has, channels: room for the factors of four cells, and three times three."""
     half = np.float32(0.5)
-    corner = np.ones((2, 2, 3), np.float32)
-    left, rise = np.ones(3, np.float32), np.zeros(3, np.float32)
+    left, rise, total = channels[0], channels[1], channels[2]
     for r in range(label.shape[0]):
         y = (r + 0.5) / cell + 0.5
         i = int(y)
@@ -101,7 +107,7 @@ def apply_factors(rgba, label, cell, labels, factors):  # type: ignore[no-untype
             j = int(x)
             if a != last or j != last_j:
                 last, last_j = a, j
-                _corners(labels, factors, i, j, a, corner)
+                _corners(labels, factors, i, j, a, corner, total, has)
                 for channel in range(3):
                     west = corner[0, 0, channel] + fy * (corner[1, 0, channel] - corner[0, 0, channel])
                     east = corner[0, 1, channel] + fy * (corner[1, 1, channel] - corner[0, 1, channel])
@@ -112,12 +118,12 @@ def apply_factors(rgba, label, cell, labels, factors):  # type: ignore[no-untype
                 rgba[r, c, channel] = np.uint8(min(value, np.float32(255.0)))
 
 
-@kernel
-def _corners(labels, factors, i, j, wanted, corner):  # type: ignore[no-untyped-def]
+@in_place_kernel
+def _corners(labels, factors, i, j, wanted, corner, total, has):  # type: ignore[no-untyped-def]
     """A picture's factors in four cells; where it has none, the mean of those that it has."""
     found = 0
-    total = np.zeros(3, np.float32)
-    has = np.zeros((2, 2), np.bool_)
+    total[:] = 0.0
+    has[:] = False
     for p in range(2):
         for q in range(2):
             for k in range(SLOTS):
@@ -135,7 +141,7 @@ def _corners(labels, factors, i, j, wanted, corner):  # type: ignore[no-untyped-
                     corner[p, q, channel] = total[channel] / found if found else 1.0
 
 
-@kernel
+@in_place_kernel
 def laplacian(first, second, weight, anchor, x, out):  # type: ignore[no-untyped-def]
     """The normal matrix of differences and anchors times x, float64 (M, 3)."""
     for m in range(len(x)):

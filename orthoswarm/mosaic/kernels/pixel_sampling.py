@@ -11,7 +11,7 @@ for the negative weights, lies within 0 to 65,535; what is carried between lanes
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.compute.jit import kernel
+from orthoswarm.compute.jit import in_place_kernel, kernel
 from orthoswarm.mosaic.kernels.lens_arrays import K1, K2, K3, F, U, V
 from orthoswarm.mosaic.kernels.render_arrays import STEP
 
@@ -46,7 +46,7 @@ def cubic_weights() -> NDArray[np.int64]:
 WEIGHTS = cubic_weights()
 
 
-@kernel
+@in_place_kernel
 def _owned(label, mark, window, lattice, index, at):  # type: ignore[no-untyped-def]
     """The pixels of a tile that have a label: their number in the tile, column, row and height; gives how many.
 
@@ -82,7 +82,7 @@ def _owned(label, mark, window, lattice, index, at):  # type: ignore[no-untyped-
     return count
 
 
-@kernel
+@in_place_kernel
 def _project(count, at, position, m, lens, gsd, size, shrink, spots, sights):  # type: ignore[no-untyped-def]
     """Where some pixels (column, row, height) lie in the picture, see `place`; gives how many the picture shows."""
     offset = 0.5 * shrink - 0.5 + 0.5 / UNIT  # of reduced pixels, and to round to the nearest fraction
@@ -118,7 +118,7 @@ def _project(count, at, position, m, lens, gsd, size, shrink, spots, sights):  #
     return seen
 
 
-@kernel
+@in_place_kernel
 def _range(values):  # type: ignore[no-untyped-def]
     low = high = values[0]
     for value in values:
@@ -203,7 +203,7 @@ def widen(part, corner, box, size, lanes):  # type: ignore[no-untyped-def]
             target[j] = target[last - 1]
 
 
-@kernel
+@in_place_kernel
 def _row(flat, at, w0, w1, w2, w3):  # type: ignore[no-untyped-def]
     """Three channels of a row, interpolated, each plus _LOW, 9 bits in 16-bit lanes."""
     one = np.uint64(1)
@@ -211,7 +211,7 @@ def _row(flat, at, w0, w1, w2, w3):  # type: ignore[no-untyped-def]
     return (total >> 7) & _LANES
 
 
-@kernel
+@in_place_kernel
 def _totals(index, spots, flat, stride, left, top, weights, totals):  # type: ignore[no-untyped-def]
     """Sums of the rows, all channels."""
     us, vs = spots[0], spots[1]
@@ -229,14 +229,14 @@ def _totals(index, spots, flat, stride, left, top, weights, totals):  # type: ig
         )
 
 
-@kernel
+@in_place_kernel
 def _level(lanes):  # type: ignore[no-untyped-def]
     """One channel, 0 to 255, of a sum of rows: both biases taken off, rounded."""
     value = (np.int32(lanes & 0xFFFF) - np.int32(3 * _LOW * UNIT - UNIT // 2)) >> 7
     return np.int32(min(max(value, np.int32(0)), np.int32(255)))
 
 
-@kernel
+@in_place_kernel
 def _colors(totals, sights, field, colors):  # type: ignore[no-untyped-def]
     """Sums of rows as colours, one word each, under factors that vary over the picture."""
     half, low, high = np.float32(0.5), np.float32(0.0), np.float32(255.0)

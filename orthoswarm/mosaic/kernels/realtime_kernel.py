@@ -7,7 +7,7 @@ Loops are split so that all but the sampling compile to vector code; constants a
 
 import numpy as np
 
-from orthoswarm.compute.jit import kernel
+from orthoswarm.compute.jit import in_place_kernel, kernel
 from orthoswarm.model.camera import LEAST_RADIAL_SLOPE
 
 _EVEN = np.uint32(0x00FF00FF)
@@ -77,7 +77,7 @@ def aim(position, rotation, corners, ground_z_m, least, west, north, gsd_m, plan
     return n
 
 
-@kernel
+@in_place_kernel
 def row_span(planes, centre, radius, row, first, last):  # type: ignore[no-untyped-def]
     """Columns [first, last) cut down to the pixel centres in a convex polygon and a circle, on a row.
 
@@ -109,7 +109,7 @@ def row_span(planes, centre, radius, row, first, last):  # type: ignore[no-untyp
     return int(np.ceil(low)), int(np.floor(high)) + 1
 
 
-@kernel
+@in_place_kernel
 def touches(planes, centre, radius, row0, col0, rows, columns):  # type: ignore[no-untyped-def]
     """Whether any pixel centre of a part of the canvas lies in the polygon and the circle."""
     for r in range(row0, row0 + rows):
@@ -119,7 +119,7 @@ def touches(planes, centre, radius, row0, col0, rows, columns):  # type: ignore[
     return False
 
 
-@kernel
+@in_place_kernel
 def _distort(us, vs, k1, k2, k3):  # type: ignore[no-untyped-def]
     """Apply radial distortion in place; far outside where it folds the picture over and nothing is visible."""
     one = np.float32(1.0)
@@ -133,7 +133,7 @@ def _distort(us, vs, k1, k2, k3):  # type: ignore[no-untyped-def]
         vs[i] *= s
 
 
-@kernel
+@in_place_kernel
 def _blend(texels, stride, at, weight, keep, corners, target):  # type: ignore[no-untyped-def]
     """Bilinear samples of packed pixels into a row where keep > 0; two channels at a time in 16-bit lanes.
 
@@ -163,7 +163,7 @@ def _blend(texels, stride, at, weight, keep, corners, target):  # type: ignore[n
         target[i] = ((even >> _8) & _EVEN) | (odd & _ODD) if keep[i] > zero else target[i]
 
 
-@kernel
+@in_place_kernel
 def _score(new, row_score, dx0, dy2, area, outside_left, inside_end):  # type: ignore[no-untyped-def]
     """Set new to the orthogonality of a row's pixels where it beats what is there, else 0; first and last such pixel.
 
@@ -183,7 +183,7 @@ def _score(new, row_score, dx0, dy2, area, outside_left, inside_end):  # type: i
     return first, last
 
 
-@kernel
+@in_place_kernel
 def _locate(new, us, vs, at, weight, start, step, lens, limits, stride):  # type: ignore[no-untyped-def]
     """Texel indices and weights of a run of pixels; sets new to 0 outside the picture; gives how many stay.
 

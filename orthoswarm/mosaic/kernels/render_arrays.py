@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.compute.jit import kernel
+from orthoswarm.compute.jit import in_place_kernel
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import LEAST_RADIAL_SLOPE, Camera
 from orthoswarm.model.placement import Terrain
@@ -120,7 +120,7 @@ def crop(terrain: Terrain, bounds: BoundingBox) -> Terrain:
     return Terrain(terrain.west + c0 * step, terrain.south + r0 * step, step, terrain.z[r0:r1, c0:c1].copy(), bare)
 
 
-@kernel
+@in_place_kernel
 def height_at(lattice, row, column):  # type: ignore[no-untyped-def]
     """Height at a pixel centre, bilinear in a tile's lattice (whose nodes lie on pixel CORNERS every STEP pixels)."""
     y, x = (row + 0.5) / STEP, (column + 0.5) / STEP
@@ -131,7 +131,7 @@ def height_at(lattice, row, column):  # type: ignore[no-untyped-def]
     return top * (1.0 - fy) + low * fy
 
 
-@kernel
+@in_place_kernel
 def project(position, rotation, lens, x, y, z):  # type: ignore[no-untyped-def]
     """Pixel (u, v) of a point in the tile's frame; (-1e9, -1e9) where it cannot be seen.
 

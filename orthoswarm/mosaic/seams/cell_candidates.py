@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.compute.jit import kernel
+from orthoswarm.compute.jit import in_place_kernel, kernel
 from orthoswarm.config import active
 from orthoswarm.mosaic.footprint import tan_limit
 from orthoswarm.mosaic.kernels.lens_arrays import U_HIGH, U_LOW, V_HIGH, V_LOW
@@ -117,7 +117,7 @@ def _smoothed(contrast: Floats) -> Floats:
     return np.array([np.sqrt(cv2.blur(c * c, (5, 5), borderType=cv2.BORDER_REPLICATE)) for c in contrast], np.float32)
 
 
-@kernel
+@in_place_kernel
 def _haze(position, rotation, lens, size, usable, contrast, lattice, gsd, cell, ignored, haze):  # type: ignore[no-untyped-def]
     """Log of the contrast that each picture lacks against the clearest one, at the corners of blocks of cells."""
     last = (lattice.shape[0] - 1) * 8 - 1
@@ -138,7 +138,7 @@ def _haze(position, rotation, lens, size, usable, contrast, lattice, gsd, cell, 
                 haze[i, j, k] = max(best - haze[i, j, k] - ignored, np.float32(0.0))
 
 
-@kernel
+@in_place_kernel
 def _gray(gray, tone, u, v, width, height):  # type: ignore[no-untyped-def]
     """A picture's grey level at a pixel of the full picture, bilinear in its preview, evened out."""
     rows, columns = gray.shape

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.canvas.tile_store import Key, TileStore
-from orthoswarm.compute.jit import kernel
+from orthoswarm.compute.jit import in_place_kernel
 
 Ints = NDArray[np.int32]
 
@@ -59,7 +59,7 @@ def transition(around: Ints, width_px: int) -> tuple[Ints, NDArray[np.float32]]:
     return other, share
 
 
-@kernel
+@in_place_kernel
 def _transition(around, near, offsets, distance, border, other, share):  # type: ignore[no-untyped-def]
     rows, columns = near.shape
     for r in range(rows):
@@ -75,7 +75,7 @@ def _transition(around, near, offsets, distance, border, other, share):  # type:
                     break
 
 
-@kernel
+@in_place_kernel
 def mix(rgba, labels, second, other, share):  # type: ignore[no-untyped-def]
     """Mix into a tile's colours those of the other pictures near seams.
 

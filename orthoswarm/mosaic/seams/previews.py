@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.compute.jit import kernel
+from orthoswarm.compute.jit import in_place_kernel
 from orthoswarm.config import active
 from orthoswarm.model.errors import StorageError
 from orthoswarm.raster.picture_quality import LEAST_SIDE_PX, picture_quality
@@ -90,7 +90,7 @@ def make_preview(picture: Bytes) -> NDArray[np.void]:
     return record
 
 
-@kernel
+@in_place_kernel
 def _contrasts(gray, glare_level, glare_share, contrast):  # type: ignore[no-untyped-def]
     """Standard deviation of each block of a preview, at least half a level; 0 where too much of it is glare."""
     pixels = np.int64(BLOCK_PX * BLOCK_PX)

@@ -9,7 +9,7 @@ Besag 1986, on several scales): a block the size of a house escapes minima in wh
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.compute.jit import kernel
+from orthoswarm.compute.jit import in_place_kernel, kernel
 from orthoswarm.config import active
 from orthoswarm.mosaic.seams.cell_candidates import SLOTS, Cells
 
@@ -43,7 +43,7 @@ def relax(cells: Cells, fixed: Ints, standing_m: Floats) -> Ints:
     return label
 
 
-@kernel
+@in_place_kernel
 def _slot(candidate, r, c, k):  # type: ignore[no-untyped-def]
     for s in range(SLOTS):
         if candidate[r, c, s] == k:
@@ -51,7 +51,7 @@ def _slot(candidate, r, c, k):  # type: ignore[no-untyped-def]
     return -1
 
 
-@kernel
+@in_place_kernel
 def _differ(candidate, level, scale, r, c, a, b, costs):  # type: ignore[no-untyped-def]
     """Cost of the difference of two pictures at a cell."""
     s, t = _slot(candidate, r, c, a), _slot(candidate, r, c, b)
@@ -61,7 +61,7 @@ def _differ(candidate, level, scale, r, c, a, b, costs):  # type: ignore[no-unty
     return min(d * d * scale[r, c], costs[1])
 
 
-@kernel
+@in_place_kernel
 def _edge(candidate, level, scale, over, costs, r, c, a, r2, c2, b):  # type: ignore[no-untyped-def]
     """Cost of the seam between two neighbouring cells with labels a and b."""
     if a == b or min(a, b) == NONE or max(a, b) == NONE:
@@ -75,7 +75,7 @@ def _edge(candidate, level, scale, over, costs, r, c, a, r2, c2, b):  # type: ig
     )
 
 
-@kernel
+@in_place_kernel
 def _moved(label, held, candidate, r, c, k):  # type: ignore[no-untyped-def]
     """A cell's label once its block is moved to k: the old one where k is not a candidate."""
     if k < 0 or held[r, c] or _slot(candidate, r, c, k) < 0:
@@ -83,7 +83,7 @@ def _moved(label, held, candidate, r, c, k):  # type: ignore[no-untyped-def]
     return k
 
 
-@kernel
+@in_place_kernel
 def _energy(label, held, candidate, cost, level, scale, over, costs, r0, r1, c0, c1, k):  # type: ignore[no-untyped-def]
     """Cost of a block and of all seams in and around it, once it is moved to k (-1: as it is)."""
     rows, columns = label.shape
@@ -144,7 +144,7 @@ def _sweep(label, held, candidate, cost, level, scale, over, costs, side, offset
                         label[r, c] = _moved(label, held, candidate, r, c, best)
 
 
-@kernel
+@in_place_kernel
 def to_pixels(label, candidate, cell, border, pixels):  # type: ignore[no-untyped-def]
     """Draw the labels of cells (plus 1) on the pixels of a tile, seams rounded: each pixel by the nearest cells' vote.
 

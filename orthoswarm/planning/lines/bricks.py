@@ -10,12 +10,12 @@ from a maximum matching by alternating paths from the unmatched vertices.
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.compute.jit import kernel
+from orthoswarm.compute.jit import in_place_kernel, kernel
 
 Cells = NDArray[np.bool_]
 
 
-@kernel
+@in_place_kernel
 def _layers(start, links, mate_left, mate_right, level, queue):  # type: ignore[no-untyped-def]
     """Breadth-first levels from the unmatched left vertices; True if an unmatched right vertex is in reach."""
     tail = 0
@@ -40,7 +40,7 @@ def _layers(start, links, mate_left, mate_right, level, queue):  # type: ignore[
     return reached
 
 
-@kernel
+@in_place_kernel
 def _augment(root, start, links, mate_left, mate_right, level, cursor, stack):  # type: ignore[no-untyped-def]
     """Depth-first search for an augmenting path along rising levels; flips it. No recursion: paths get long."""
     depth = 0

@@ -10,7 +10,7 @@ import heapq
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.compute.jit import kernel
+from orthoswarm.compute.jit import in_place_kernel
 
 Cells = NDArray[np.bool_]
 
@@ -79,7 +79,7 @@ def _unite(label: NDArray[np.int64], a: int, b: int) -> None:
     label[_root(label, b)] = _root(label, a)
 
 
-@kernel
+@in_place_kernel
 def _walk(edges, i, j, path):  # type: ignore[no-untyped-def]
     """Sub-cells counter-clockwise around the tree from cell (i, j)'s south-east one; returns how many."""
     x, y, n = 2 * i + 1, 2 * j, 0

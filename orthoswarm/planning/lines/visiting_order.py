@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.compute.jit import kernel
+from orthoswarm.compute.jit import in_place_kernel, kernel
 from orthoswarm.config import active
 from orthoswarm.planning.lines.detours import Router
 
@@ -49,17 +49,17 @@ def _improve(between, order, fixed, rounds):  # type: ignore[no-untyped-def]
             break
 
 
-@kernel
+@in_place_kernel
 def _entry(code):  # type: ignore[no-untyped-def]
     return 2 * (code >> 1) + (code & 1)
 
 
-@kernel
+@in_place_kernel
 def _exit(code):  # type: ignore[no-untyped-def]
     return 2 * (code >> 1) + 1 - (code & 1)
 
 
-@kernel
+@in_place_kernel
 def _way(between, order, k, fixed, to):  # type: ignore[no-untyped-def]
     """Way from the end of order[k] (or the depot) to an end (or the depot): 0 where the row just ends."""
     a = _exit(order[k]) if k >= 0 else fixed

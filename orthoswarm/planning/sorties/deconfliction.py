@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.compute.jit import kernel
+from orthoswarm.compute.jit import in_place_kernel, kernel
 from orthoswarm.config import active
 from orthoswarm.planning.sorties.flight_path import Flight
 from orthoswarm.planning.sorties.flight_time import Motion, start_slack_s
@@ -134,7 +134,7 @@ def _bins(points, low, cell, shape):  # type: ignore[no-untyped-def]
     return order, start
 
 
-@kernel
+@in_place_kernel
 def _forbid(mine, begin, slacks, others, when, other_slacks, bins, raster, apart, marks):  # type: ignore[no-untyped-def]
     """Mark delays (in samples) at which a track comes near others: +1 where an interval begins, -1 behind its end.
 

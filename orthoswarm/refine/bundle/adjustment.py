@@ -247,6 +247,7 @@ class Adjustment:
             b_point=system.b_point,
             obs_weight=self.obs_weight,
             tie_residual=self.tie_residual,
+            room=normal_equations.room_of_a_point(),
         )
         system.side[:, :k], system.corner[:k, :k], system.rhs_common[:k] = lens_side, lens_corner, rhs_lens
         add_priors(system, self.cameras, self.priors, self.layout, common=self.common, free=self.free, slot=self.slot)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.compute.jit import kernel
+from orthoswarm.compute.jit import in_place_kernel
 from orthoswarm.model.camera import LEAST_RADIAL_SLOPE, Camera, Lens
 
 Array = NDArray[np.float64]
@@ -117,7 +117,7 @@ class Tracks:
         return int(self.point.max()) + 1 if len(self.point) else 0
 
 
-@kernel
+@in_place_kernel
 def project_point(position, rotation, lens, x, y, z):  # type: ignore[no-untyped-def]
     """Pixel (u, v) of a ground point in one camera (position (3,), rotation (3, 3), lens (8,)); NaN if behind it.
 
@@ -136,7 +136,7 @@ def project_point(position, rotation, lens, x, y, z):  # type: ignore[no-untyped
     return s * cx + 0.5 * (lens[6] - 1.0) + lens[4], s * cy + 0.5 * (lens[7] - 1.0) + lens[5]
 
 
-@kernel
+@in_place_kernel
 def pixel_ray(rotation, lens, u, v):  # type: ignore[no-untyped-def]
     """Ground direction (3 numbers, camera depth 1) of a pixel, distortion removed by Newton's method on the radius."""
     xd = (u - 0.5 * (lens[6] - 1.0) - lens[4]) / lens[0]
@@ -161,7 +161,7 @@ def pixel_ray(rotation, lens, u, v):  # type: ignore[no-untyped-def]
     )
 
 
-@kernel
+@in_place_kernel
 def _project_many(position, rotation, lens_id, lens, camera, points, uv):  # type: ignore[no-untyped-def]
     for m in range(len(camera)):
         i = camera[m]
@@ -170,7 +170,7 @@ def _project_many(position, rotation, lens_id, lens, camera, points, uv):  # typ
         )
 
 
-@kernel
+@in_place_kernel
 def _ground_many(position, rotation, lens_id, lens, camera, uv, z, xy):  # type: ignore[no-untyped-def]
     for m in range(len(camera)):
         i = camera[m]

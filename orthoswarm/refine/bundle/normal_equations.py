@@ -6,13 +6,14 @@ The camera system is stored as LAPACK's lower band (row = distance from the diag
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
-from orthoswarm.compute.jit import kernel
+from orthoswarm.compute.jit import in_place_kernel, kernel
 from orthoswarm.model.camera import LEAST_RADIAL_SLOPE
 from orthoswarm.refine.bundle.robust_kernel import robust_weight
 
 
-@kernel
+@in_place_kernel
 def linearise(position, rotation, lens, x, y, z, u, v, r, jc, jp, jl):  # type: ignore[no-untyped-def]
     """Residual (2,) in pixels and Jacobians of one projection by camera (2, 6), point (2, 3) and lens (2, 6).
 
@@ -56,7 +57,7 @@ def linearise(position, rotation, lens, x, y, z, u, v, r, jc, jp, jl):  # type: 
     return True
 
 
-@kernel
+@in_place_kernel
 def invert3(a, out):  # type: ignore[no-untyped-def]
     """Inverse of a symmetric positive 3x3 matrix; returns False (and zeros) where it is singular."""
     c00 = a[1, 1] * a[2, 2] - a[1, 2] * a[1, 2]
@@ -74,7 +75,7 @@ def invert3(a, out):  # type: ignore[no-untyped-def]
     return True
 
 
-@kernel
+@in_place_kernel
 def _subtract_block(band, row, column, left, right):  # type: ignore[no-untyped-def]
     """Subtract left (6, 3) times the transpose of right (6, 3) from a block below the diagonal of a lower band."""
     for q in range(6):
@@ -84,7 +85,7 @@ def _subtract_block(band, row, column, left, right):  # type: ignore[no-untyped-
             to[a] -= left[a, 0] * r0 + left[a, 1] * r1 + left[a, 2] * r2
 
 
-@kernel
+@in_place_kernel
 def _subtract_own_block(band, row, left, right, both):  # type: ignore[no-untyped-def]
     """The same on the diagonal; both: the transposed product, too, of another observation by the same camera."""
     for a in range(6):
@@ -96,7 +97,12 @@ def _subtract_own_block(band, row, left, right, both):  # type: ignore[no-untype
                 band[q - a, row + a] -= value
 
 
-@kernel
+def room_of_a_point() -> tuple[NDArray[np.float64], ...]:
+    """Room for a residual, its three Jacobians, and a point's normal matrix, right side and product with it."""
+    return tuple(np.zeros(shape) for shape in (2, (2, 6), (2, 3), (2, 6), (3, 3), 3, (6, 3)))
+
+
+@in_place_kernel
 def build(  # type: ignore[no-untyped-def]
     position,
     rotation,
@@ -128,6 +134,7 @@ def build(  # type: ignore[no-untyped-def]
     b_point,
     obs_weight,
     tie_residual,
+    room,
 ):
     """Accumulate the reduced normal equations of all points.
 
@@ -142,14 +149,12 @@ def build(  # type: ignore[no-untyped-def]
         band: (6 (bandwidth + 1), 6 n) lower band, side: (6 n, 6 L), corner: (6 L, 6 L), rhs: (6 n,), rhs_lens: (6 L,).
         w_obs: (M, 6, 3), w_lens: (P, L, 6, 3), v_inverse: (P, 3, 3), b_point: (P, 3): for back substitution.
         obs_weight: (M,) robust weight times 1 (0 where invisible). tie_residual: (Q, 2).
+        room: see `room_of_a_point`.
 
     Returns:
         Sum of the robust cost of the reprojections, number of visible observations.
     """
-    r, jc, jp, jl = np.zeros(2), np.zeros((2, 6)), np.zeros((2, 3)), np.zeros((2, 6))
-    v = np.zeros((3, 3))
-    b = np.zeros(3)
-    wv = np.zeros((6, 3))
+    r, jc, jp, jl, v, b, wv = room
     cost, visible = 0.0, 0
     lenses = lens.shape[0]
     for p in range(len(points)):
@@ -252,7 +257,7 @@ def build(  # type: ignore[no-untyped-def]
     return cost, visible
 
 
-@kernel
+@in_place_kernel
 def back_substitute(points, start, camera, slot, w_obs, w_lens, v_inverse, b_point, step_camera, step_lens, limit):  # type: ignore[no-untyped-def]
     """Move the points (P, 3) in place by V^-1 (b - W^T step), a step no longer than `limit` metres."""
     lenses = w_lens.shape[1]

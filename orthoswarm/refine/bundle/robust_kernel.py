@@ -7,10 +7,10 @@ squared sigmas, sets where. Used as iteratively reweighted least squares.
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.compute.jit import kernel
+from orthoswarm.compute.jit import in_place_kernel
 
 
-@kernel
+@in_place_kernel
 def robust_weight(e2, c):  # type: ignore[no-untyped-def]
     """Weight 1 / (1 + e2 / c)^2 of a squared normalised residual, for compiled code."""
     q = 1.0 + e2 / c

@@ -6,7 +6,7 @@ computed, in whole numbers that float32 holds exactly.
 
 import numpy as np
 
-from orthoswarm.compute.jit import kernel
+from orthoswarm.compute.jit import in_place_kernel, kernel
 
 
 @kernel
@@ -18,16 +18,30 @@ def strongest(gray, empty, size, top, left, window, border, floor, uv):  # type:
         window: side of the square, odd. border: corners nearer to the picture's border are none.
         floor: least measure; cells without texture give no corner.
     """
+    cells, cols = empty.shape[1], gray.shape[1]
+    best, where, score = np.empty(cells, np.float32), np.empty((cells, 2), np.int64), np.empty(cols, np.float32)
+    sums = np.zeros((window + 3, 3, cols), np.float32)
+    return _search(gray, empty, size, top, left, window, border, floor, uv, best, where, score, sums)
+
+
+@in_place_kernel
+def _search(  # type: ignore[no-untyped-def]
+    gray, empty, size, top, left, window, border, floor, uv, best, where, score, sums,
+):  # fmt: skip
+    """What `strongest` does.
+
+    Args:
+        best, where: (cells of a row,), (.., 2) room for the highest measure of each cell, and its pixel.
+        score: float32 (columns,) room for the measures of a row.
+        sums: float32 (window + 3, 3, columns) room for the products of as many rows, their total, those of a new row,
+            and their sums over columns.
+    """
     rows, cols = gray.shape
     reach = window // 2
     margin = max(border, reach + 1)
     scale = 1.0 / (4.0 * window * 255.0) ** 2
     found = 0
-    best = np.empty(empty.shape[1], np.float32)
-    where = np.empty((empty.shape[1], 2), np.int64)
-    score = np.empty(cols, np.float32)
-    lines = np.zeros((window, 3, cols), np.float32)
-    total, product = np.zeros((3, cols), np.float32), np.empty((3, cols), np.float32)
+    lines, total, product, across = sums[:window], sums[window], sums[window + 1], sums[window + 2]
     for row in range(empty.shape[0]):
         y0, y1 = max(top + row * size, margin), min(top + (row + 1) * size, rows - margin)
         first = 0
@@ -50,7 +64,7 @@ def strongest(gray, empty, size, top, left, window, border, floor, uv):  # type:
                     for k in range(3):
                         _exchange(product[k, :n], old[k, :n], total[k, :n])
                     if y >= y0 + reach:
-                        _measure(total, x1 - x0, window, score)
+                        _measure(total, x1 - x0, window, across, score)
                         _highest(score, x1 - x0, x0, y - reach, left, size, best, where)
             for cell in range(first, last):
                 if best[cell] * scale > floor:
@@ -60,7 +74,7 @@ def strongest(gray, empty, size, top, left, window, border, floor, uv):  # type:
     return found
 
 
-@kernel
+@in_place_kernel
 def _products(gray, y, x, n, product):  # type: ignore[no-untyped-def]
     """Products of the Sobel gradients (xx, xy, yy) of n pixels of a row from a column on; slices vectorise."""
     nw, north, ne = gray[y - 1, x - 1 : x - 1 + n], gray[y - 1, x : x + n], gray[y - 1, x + 1 : x + 1 + n]
@@ -75,7 +89,7 @@ def _products(gray, y, x, n, product):  # type: ignore[no-untyped-def]
         xx[c], xy[c], yy[c] = gx * gx, gx * gy, gy * gy
 
 
-@kernel
+@in_place_kernel
 def _exchange(new, old, total):  # type: ignore[no-untyped-def]
     """Take an old row from the total, add a new one, and keep it in the old one's place."""
     for c in range(len(total)):
@@ -83,10 +97,13 @@ def _exchange(new, old, total):  # type: ignore[no-untyped-def]
         old[c] = new[c]
 
 
-@kernel
-def _measure(total, n, window, score):  # type: ignore[no-untyped-def]
+@in_place_kernel
+def _measure(total, n, window, across, score):  # type: ignore[no-untyped-def]
     """Smaller eigenvalue of the gradient matrix about n pixels, whose sums over rows are known for each column."""
-    xx, xy, yy = np.zeros(n, np.float32), np.zeros(n, np.float32), np.zeros(n, np.float32)
+    xx, xy, yy = across[0, :n], across[1, :n], across[2, :n]
+    xx[:] = 0.0
+    xy[:] = 0.0
+    yy[:] = 0.0
     for k in range(window):
         a, b, d = total[0, k : k + n], total[1, k : k + n], total[2, k : k + n]
         for c in range(n):
@@ -99,7 +116,7 @@ def _measure(total, n, window, score):  # type: ignore[no-untyped-def]
         to[c] = half * (xx[c] + yy[c]) - np.sqrt(difference * difference + xy[c] * xy[c])
 
 
-@kernel
+@in_place_kernel
 def _highest(score, n, x, y, left, size, best, where):  # type: ignore[no-untyped-def]
     """Compare the scores of a row with the best of their cells so far."""
     c = 0

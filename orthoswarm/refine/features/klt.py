@@ -7,13 +7,13 @@ allowed.
 
 import numpy as np
 
-from orthoswarm.compute.jit import kernel
+from orthoswarm.compute.jit import in_place_kernel, kernel
 from orthoswarm.refine.features.window_sums import LANES, SIZE, WIDE, add_gradients, add_residuals
 
 _HALF = SIZE // 2
 
 
-@kernel
+@in_place_kernel
 def _derivative(homography, u, v, affine):  # type: ignore[no-untyped-def]
     """Derivative of a homography (3, 3) at a pixel, into affine (2, 2)."""
     w = homography[2, 0] * u + homography[2, 1] * v + homography[2, 2]
@@ -23,7 +23,7 @@ def _derivative(homography, u, v, affine):  # type: ignore[no-untyped-def]
             affine[a, b] = (homography[a, b] - q * homography[2, b]) / w
 
 
-@kernel
+@in_place_kernel
 def _template(gray, u, v, affine, wide):  # type: ignore[no-untyped-def]
     """Fill wide (17, 17) from the earlier picture about (u, v); False if it leaves the picture."""
     rows, cols = gray.shape
@@ -57,7 +57,7 @@ def _scratch():  # type: ignore[no-untyped-def]
     )
 
 
-@kernel
+@in_place_kernel
 def _total(lanes):  # type: ignore[no-untyped-def]
     """Sum of the lanes that belong to the window."""
     total = 0.0
@@ -66,7 +66,7 @@ def _total(lanes):  # type: ignore[no-untyped-def]
     return total
 
 
-@kernel
+@in_place_kernel
 def _refine(gray, scratch, q, rounds, texture, step):  # type: ignore[no-untyped-def]
     """Move q (2,) to the template's place in a picture; returns the final mean square error, negative if lost.
 
@@ -106,7 +106,7 @@ def _refine(gray, scratch, q, rounds, texture, step):  # type: ignore[no-untyped
     return error
 
 
-@kernel
+@in_place_kernel
 def _variance(wide):  # type: ignore[no-untyped-def]
     """Grey variance of a template."""
     total = square = 0.0

@@ -5,7 +5,7 @@ All compiled: the callers compare all patches of a picture in one call.
 
 import numpy as np
 
-from orthoswarm.compute.jit import kernel
+from orthoswarm.compute.jit import in_place_kernel, kernel
 from orthoswarm.model.camera import LEAST_RADIAL_SLOPE
 from orthoswarm.raster.subpixel_peak import vertex
 from orthoswarm.refine.bundle.block_arrays import (
@@ -218,7 +218,7 @@ def _halved(gray):  # type: ignore[no-untyped-def]
     return out
 
 
-@kernel
+@in_place_kernel
 def _located(score, shifts, exclude):  # type: ignore[no-untyped-def]
     """What `locate` returns, from the correlations."""
     r, c, second = _peaks(score[:shifts, :shifts], exclude)
@@ -263,7 +263,7 @@ def _normalise(template, window, n, shifts, score):  # type: ignore[no-untyped-d
             energy[c] -= x[c] * x[c] + y[c] * y[c]
 
 
-@kernel
+@in_place_kernel
 def _peaks(score, exclude):  # type: ignore[no-untyped-def]
     """Row and column of the highest score, and the best score farther than `exclude` from it (-1 if none)."""
     rows, cols = score.shape

@@ -14,7 +14,7 @@ from llvmlite.binding import get_host_cpu_features
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
-from orthoswarm.compute.jit import kernel
+from orthoswarm.compute.jit import in_place_kernel
 
 LANES = 8
 """Shifts of one vector: 32 bytes, which all x86 processors with AVX add at once; others take them in parts."""
@@ -106,13 +106,13 @@ def _everywhere(builder: Any, value: Any) -> Any:
 _one, _two, _three, _four = _block(1), _block(2), _block(3), _block(4)
 
 
-@kernel
+@in_place_kernel
 def padded(count, step):  # type: ignore[no-untyped-def]
     """The next multiple of a step."""
     return -(-count // step) * step
 
 
-@kernel
+@in_place_kernel
 def add_products(template, window, score):  # type: ignore[no-untyped-def]
     """Add to `score` the products of a template and a window at each shift, over all their channels.
 
@@ -145,7 +145,7 @@ def add_products(template, window, score):  # type: ignore[no-untyped-def]
                     j += 4 * LANES
 
 
-@kernel
+@in_place_kernel
 def add_wanted_products(template, window, score, wanted):  # type: ignore[no-untyped-def]
     """The same, only for the blocks of ROWS x LANES shifts that are wanted: bool (rows / ROWS, columns / LANES)."""
     channels, lines, n = template.shape

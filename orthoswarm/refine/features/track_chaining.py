@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.compute.jit import kernel
+from orthoswarm.compute.jit import in_place_kernel, kernel
 from orthoswarm.config import active
 from orthoswarm.refine.bundle.block_arrays import Tracks
 from orthoswarm.refine.features.pair_matching import Pair
@@ -54,7 +54,7 @@ def _tracks(root: NDArray[np.int64], photo: Ints, features: Sequence[Features]) 
     )
 
 
-@kernel
+@in_place_kernel
 def _find(parent, x):  # type: ignore[no-untyped-def]
     while parent[x] != x:
         parent[x] = parent[parent[x]]

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.compute.jit import kernel
+from orthoswarm.compute.jit import in_place_kernel, kernel
 from orthoswarm.config import active
 from orthoswarm.refine.features.pair_matching import Pair
 from orthoswarm.refine.features.sift_features import Features
@@ -208,7 +208,7 @@ def corner_radius(records: PhotoRecords) -> Array:
     return np.asarray(0.5 * np.hypot(records.width[first], records.rows[first]))
 
 
-@kernel
+@in_place_kernel
 def _flatten(z, level, focal, bend, radius2, right, up):  # type: ignore[no-untyped-def]
     """Pixel (complex, y up) of a level, undistorted camera; right and up rotate it further by small angles.
 
@@ -264,7 +264,7 @@ def _fit(p, q, n, floor, rounds, robust, w):  # type: ignore[no-untyped-def]
     return a, cp, cq, scale
 
 
-@kernel
+@in_place_kernel
 def _derivatives(z, flat, level, focal, bend, radius2, factor, g):  # type: ignore[no-untyped-def]
     """Change of factor * flattened pixels (n,) by nadir right, nadir up, log f and bend: into g, complex (4, n)."""
     h = 1e-5
@@ -275,7 +275,7 @@ def _derivatives(z, flat, level, focal, bend, radius2, factor, g):  # type: igno
         g[3, k] = factor * (_flatten(z[k], level, focal, bend + h, radius2, 0.0, 0.0) - flat[k]) / h
 
 
-@kernel
+@in_place_kernel
 def _project_out(g, p, cp, w, n):  # type: ignore[no-untyped-def]
     """Subtract from g (n,) the best-fitting similarity of p (n,), whose weighted mean is cp."""
     mean, total = 0.0j, 0.0

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.compute.jit import kernel
+from orthoswarm.compute.jit import in_place_kernel, kernel
 from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
 
@@ -349,7 +349,7 @@ def _tail(a, row, first, count):  # type: ignore[no-untyped-def]
     return a[row, first : first + count]
 
 
-@kernel
+@in_place_kernel
 def _robust(z, cell, share, inner, height, sigma, above, below, weight):  # type: ignore[no-untyped-def]
     """Geman-McClure weights of residuals, each scale widened by the point's own sigma."""
     for m in range(len(cell)):
@@ -381,7 +381,7 @@ def _assemble(penalty, cell, share, inner, height, weight, band, rhs):  # type: 
                 band[node[i], node[j] - node[i]] += w * b[i] * b[j]
 
 
-@kernel
+@in_place_kernel
 def _add_row(band, nodes, values):  # type: ignore[no-untyped-def]
     for i in range(len(nodes)):
         for j in range(len(nodes)):

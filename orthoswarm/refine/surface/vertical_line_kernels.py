@@ -5,12 +5,12 @@ Cameras come as the arrays of a CameraBlock; `plane` is float64 (C, 3): terrain 
 
 import numpy as np
 
-from orthoswarm.compute.jit import kernel
+from orthoswarm.compute.jit import in_place_kernel, kernel
 from orthoswarm.raster.subpixel_peak import vertex
 from orthoswarm.refine.bundle.block_arrays import project_point
 
 
-@kernel
+@in_place_kernel
 def _sees(position, rotation, lens, x, y, z, half_m):  # type: ignore[no-untyped-def]
     """True where a camera sees a complete patch of this half width (its diagonal counts)."""
     u, v = project_point(position, rotation, lens, x, y, z)
@@ -18,7 +18,7 @@ def _sees(position, rotation, lens, x, y, z, half_m):  # type: ignore[no-untyped
     return u > margin and v > margin and u < lens[6] - 1.0 - margin and v < lens[7] - 1.0 - margin
 
 
-@kernel
+@in_place_kernel
 def choose(  # type: ignore[no-untyped-def]
     position, rotation, lens_id, lens, key, leg, along, cells, plane, half_m, wished, least, enough, ref, partner
 ):
@@ -60,7 +60,7 @@ def choose(  # type: ignore[no-untyped-def]
         )
 
 
-@kernel
+@in_place_kernel
 def _fill_from_other_legs(  # type: ignore[no-untyped-def]
     position, rotation, lens_id, lens, key, leg, r, x, y, z, half_m, wished, least, enough, partner
 ):
@@ -94,7 +94,7 @@ def _fill_from_other_legs(  # type: ignore[no-untyped-def]
         count += 1
 
 
-@kernel
+@in_place_kernel
 def _on_plane(x, y, z, gx, gy, cx, cy, cz, px, py, pz, h):  # type: ignore[no-untyped-def]
     """Where a partner's (p) ray meets the plane, for the point at height h above it on the reference's (c) ray.
 
@@ -152,14 +152,14 @@ def _rectify(  # type: ignore[no-untyped-def]
     return first, last
 
 
-@kernel
+@in_place_kernel
 def _inside(i, half_u, um, ua, ub, vm, va, vb, rows, columns):  # type: ignore[no-untyped-def]
     s = (i - half_u) / half_u
     u, v = um + s * (ua + s * ub), vm + s * (va + s * vb)
     return u >= 0.0 and v >= 0.0 and u < columns - 1.0 and v < rows - 1.0
 
 
-@kernel
+@in_place_kernel
 def _leaves(first, last, half_u, middle, slope, bend, size):  # type: ignore[no-untyped-def]
     """True if a row that begins and ends inside the picture leaves it in between (at a cliff)."""
     if bend == 0.0:
@@ -171,7 +171,7 @@ def _leaves(first, last, half_u, middle, slope, bend, size):  # type: ignore[no-
     return not (extreme >= 0.0 and extreme < size - 1.0)
 
 
-@kernel
+@in_place_kernel
 def _zncc_along(patch, strip, first, last, least_variance, score):  # type: ignore[no-untyped-def]
     """Normalised correlation of a square patch with every place in a strip; NaN where the strip has no data."""
     n = len(patch)
@@ -296,7 +296,7 @@ def correlate(  # type: ignore[no-untyped-def]
             curve[c, h] = total[h] / seen[h] if seen[h] >= 2 else np.nan
 
 
-@kernel
+@in_place_kernel
 def peaks(curve, heights, rival_m, rival_share, found):  # type: ignore[no-untyped-def]
     """Height and score of each curve's peak; score -1 if it lies at an end or if another peak is about as high.
 
@@ -325,7 +325,7 @@ def peaks(curve, heights, rival_m, rival_share, found):  # type: ignore[no-untyp
             found[c, 1] = best
 
 
-@kernel
+@in_place_kernel
 def raise_points(position, ref, cells, plane, height, points):  # type: ignore[no-untyped-def]
     """Points at heights above the cells' planes, on the reference cameras' rays through the cells."""
     for m in range(len(cells)):

@@ -3,10 +3,10 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.compute.jit import kernel
+from orthoswarm.compute.jit import in_place_kernel
 
 
-@kernel
+@in_place_kernel
 def hash01(x, y, seed):  # type: ignore[no-untyped-def]
     """A number in [0, 1) that looks random but depends only on two integers and a seed."""
     h = (x * 374761393 + y * 668265263 + seed * 1274126177) & 0xFFFFFFFF
@@ -16,7 +16,7 @@ def hash01(x, y, seed):  # type: ignore[no-untyped-def]
     return h * 2.3283064365386963e-10
 
 
-@kernel
+@in_place_kernel
 def lattice(x, y, seed):  # type: ignore[no-untyped-def]
     """Smooth value noise in [-1, 1] with a feature size of one unit."""
     xi, yi = np.int64(np.floor(x)), np.int64(np.floor(y))
@@ -28,7 +28,7 @@ def lattice(x, y, seed):  # type: ignore[no-untyped-def]
     return 2.0 * (top + (low - top) * fy) - 1.0
 
 
-@kernel
+@in_place_kernel
 def _fill(out, step, scale, octaves, seed):  # type: ignore[no-untyped-def]
     rows, cols = out.shape
     for r in range(rows):
@@ -57,7 +57,7 @@ def noise_field(shape: tuple[int, int], step_m: float, scale_m: float, octaves: 
     return out
 
 
-@kernel
+@in_place_kernel
 def add_detail(albedo, kind, amplitude, tint, seed):  # type: ignore[no-untyped-def]
     """Add fine texture to colours in place: five octaves (0.25, 0.7, 2.3, 9, 45 m) with amplitudes per kind.
 

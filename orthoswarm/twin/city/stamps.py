@@ -5,14 +5,14 @@ Positions in metres: X = easting - west, Y = north - northing (rows grow downwar
 
 import numpy as np
 
-from orthoswarm.compute.jit import kernel
+from orthoswarm.compute.jit import in_place_kernel
 from orthoswarm.twin.city.procedural_noise import hash01, lattice
 from orthoswarm.twin.city.scene import CAR, CELL_M, ROOF, TEXEL_M, TREE
 
 FLAT, GABLE, HIP, DOME = range(4)
 
 
-@kernel
+@in_place_kernel
 def _roof_rise(shape, lu, lv, hu, hv):  # type: ignore[no-untyped-def]
     """Height of a roof over its eaves, 0 to 1, at a local position."""
     if shape == GABLE:
@@ -24,7 +24,7 @@ def _roof_rise(shape, lu, lv, hu, hv):  # type: ignore[no-untyped-def]
     return 0.0
 
 
-@kernel
+@in_place_kernel
 def stamp_building(  # type: ignore[no-untyped-def]
     albedo, kind, dsm, wall, facade, x, y, angle, hu, hv, base, eave, rise, shape, color, wall_color, windows, seed
 ):
@@ -71,7 +71,7 @@ def stamp_building(  # type: ignore[no-untyped-def]
                     wall[r, c, b] = wall_color[b]
 
 
-@kernel
+@in_place_kernel
 def _crown(dx, dy, radius, height, seed):  # type: ignore[no-untyped-def]
     """Height of a ragged tree crown over the ground at an offset from the trunk; negative outside."""
     ragged = radius * (1.0 + 0.18 * lattice(dx / (0.5 * radius) + 31.0, dy / (0.5 * radius), seed))
@@ -81,7 +81,7 @@ def _crown(dx, dy, radius, height, seed):  # type: ignore[no-untyped-def]
     return height * (0.45 + 0.55 * np.sqrt(1.0 - d2)) * (1.0 + 0.10 * lattice(dx / 0.9, dy / 0.9, seed + 5))
 
 
-@kernel
+@in_place_kernel
 def stamp_tree(albedo, kind, dsm, dtm, wall, facade, x, y, radius, height, color, seed):  # type: ignore[no-untyped-def]
     """A tree: a ragged dome of leaves with clumps, over the ground at its foot."""
     rows, cols = dsm.shape
@@ -108,7 +108,7 @@ def stamp_tree(albedo, kind, dsm, dtm, wall, facade, x, y, radius, height, color
                     wall[r, c, b] = color[b] * 0.55
 
 
-@kernel
+@in_place_kernel
 def stamp_car(albedo, kind, dsm, dtm, wall, facade, x, y, angle, length, color):  # type: ignore[no-untyped-def]
     """A car: a box of 1.5 m with dark windows; nothing is drawn where something already stands."""
     ca, sa = np.cos(angle), np.sin(angle)

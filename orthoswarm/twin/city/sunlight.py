@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.compute.jit import kernel
+from orthoswarm.compute.jit import in_place_kernel
 from orthoswarm.twin.city import scene as kinds
 from orthoswarm.twin.city.procedural_noise import add_detail
 from orthoswarm.twin.city.scene import CELL_M, Scene
@@ -36,7 +36,7 @@ class Sun:
         )
 
 
-@kernel
+@in_place_kernel
 def _shade(dsm, top, sun, ambient, cell, out):  # type: ignore[no-untyped-def]
     """Light on each cell (128 for level ground in the sun): Lambertian reflection by slope, and cast shadows."""
     rows, cols = dsm.shape
@@ -80,7 +80,7 @@ def light_map(scene: Scene, sun: Sun) -> Pixels:
     return out
 
 
-@kernel
+@in_place_kernel
 def _lit(albedo, light, gain, out):  # type: ignore[no-untyped-def]
     """Colour = albedo * light / 128 * gain; light lies on cells of two texels, bilinear between their centres."""
     rows, cols = albedo.shape[:2]
@@ -114,7 +114,7 @@ def lit_texture(scene: Scene, sun: Sun, gain: tuple[float, float, float] = (1.0,
     return out
 
 
-@kernel
+@in_place_kernel
 def _tone(image, kind, matrix, offset, contrast):  # type: ignore[no-untyped-def]
     rows, cols = kind.shape
     for r in range(rows):

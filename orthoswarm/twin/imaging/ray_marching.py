@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.compute.jit import kernel
+from orthoswarm.compute.jit import in_place_kernel, kernel
 from orthoswarm.model.camera import Camera, Lens
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.twin.city.procedural_noise import noise_field
@@ -67,7 +67,7 @@ def make_stage(scene: Scene, lit: Pixels, sun: tuple[float, float, float], ambie
     )
 
 
-@kernel
+@in_place_kernel
 def _march(dsm, tiles, ax, ay, zc, bx, by, top):  # type: ignore[no-untyped-def]
     """Follow the ray (ax, ay) + (bx, by) (zc - z), in cells, downwards from height `top` to the surface.
 
@@ -115,7 +115,7 @@ def _march(dsm, tiles, ax, ay, zc, bx, by, top):  # type: ignore[no-untyped-def]
                 break
 
 
-@kernel
+@in_place_kernel
 def _slope(dsm, r, c):  # type: ignore[no-untyped-def]
     """Slope of a column's top per cell, columns and rows: the smaller one-sided difference, none across a step."""
     rows, cols = dsm.shape
@@ -127,7 +127,7 @@ def _slope(dsm, r, c):  # type: ignore[no-untyped-def]
     return (gx if abs(gx) < 0.6 else 0.0), (gy if abs(gy) < 0.6 else 0.0)
 
 
-@kernel
+@in_place_kernel
 def _texture(texture, x, y, scale, rgb):  # type: ignore[no-untyped-def]
     """Bilinear colour at x, y (metres from the upper left) of a texture with texels of 1/scale m."""
     rows, cols = texture.shape[:2]
@@ -142,7 +142,7 @@ def _texture(texture, x, y, scale, rgb):  # type: ignore[no-untyped-def]
         rgb[i] = a * texture[r0, c0, i] + b * texture[r0, c1, i] + d * texture[r1, c0, i] + e * texture[r1, c1, i]
 
 
-@kernel
+@in_place_kernel
 def _wall_color(dsm, wall, facade, r, c, side, bx, by, x, y, z, sun, ambient, ca, sa, rgb):  # type: ignore[no-untyped-def]
     """Colour of a vertical face: its paint, rows of windows, sun or shade."""
     nx = (-1.0 if bx > 0 else 1.0) if side == 1 else 0.0
@@ -168,7 +168,7 @@ def _wall_color(dsm, wall, facade, r, c, side, bx, by, x, y, z, sun, ambient, ca
         rgb[i] = min(255.0, wall[r, c, i] * light * gain)
 
 
-@kernel
+@in_place_kernel
 def _noise_at(noise, x, y):  # type: ignore[no-untyped-def]
     """Bilinear interpolation in the noise, with wrap-around."""
     xi, yi = int(np.floor(x)), int(np.floor(y))
@@ -179,7 +179,7 @@ def _noise_at(noise, x, y):  # type: ignore[no-untyped-def]
     return (a * (1 - fx) + b * fx) * (1 - fy) + (c * (1 - fx) + d * fx) * fy
 
 
-@kernel
+@in_place_kernel
 def _water_color(noise, x, y, motion, rgb):  # type: ignore[no-untyped-def]
     """Moving water: an even colour with waves and glints that differ in every picture."""
     wave = _noise_at(noise, x * 17.0 + motion[0], y * 17.0 + motion[1])
@@ -189,7 +189,7 @@ def _water_color(noise, x, y, motion, rgb):  # type: ignore[no-untyped-def]
         rgb[i] = min(255.0, rgb[i] + 5.0 * wave + 4.0 * swell + glint)
 
 
-@kernel
+@in_place_kernel
 def _veil(haze, noise, x, y, motion, rgb):  # type: ignore[no-untyped-def]
     """White haze of uneven, moving opacity; the ray crosses the haze layer at x, y."""
     u, v = x / HAZE_CELL_M - 0.5, y / HAZE_CELL_M - 0.5
@@ -208,7 +208,7 @@ def _veil(haze, noise, x, y, motion, rgb):  # type: ignore[no-untyped-def]
         rgb[i] = rgb[i] * (1.0 - a) + (228.0 + 10.0 * drift) * a
 
 
-@kernel
+@in_place_kernel
 def _highest_below(tiles, rays, rotation, cx, cy, cz, r0, c0, r1, c1, top, floor):  # type: ignore[no-untyped-def]
     """An upper bound of the heights that the rays of a small block (corners r0, c0 to r1, c1) can hit.
 
@@ -344,7 +344,7 @@ def render(stage: Stage, camera: Camera, rays: Floats, motion: NDArray[np.float6
     return out
 
 
-@kernel
+@in_place_kernel
 def _rise_inside(x, lean, side):  # type: ignore[no-untyped-def]
     """Height above its ground point x up to which an oblique ray stays inside the scene, which spans 0 to `side`."""
     if abs(lean) < 1e-9:
