@@ -209,6 +209,35 @@ class SurfaceConfig:
     tall_wall_sigma_nodes: float = 0.7
     """Sigma of the smoothing of walls, nodes (chosen; not measured)."""
 
+    # Plane sweep: heights of tall things measured on the nodes that they are drawn on
+
+    tall_cell_m: float = 1.25
+    """Distance of the nodes whose heights are measured, metres at the reference height (chosen; not measured)."""
+    tall_block_nodes: int = 96
+    """Side of the blocks of nodes that are measured at a time (chosen for memory)."""
+    tall_block_border_nodes: int = 16
+    """Nodes around a block that it is measured with (chosen; not measured)."""
+    tall_height_step_m: float = 0.75
+    """Step of the heights, metres at the reference height: a third of a pixel's parallax (chosen; not measured)."""
+    tall_best_base: float = 0.35
+    """Wished distance of the pictures compared over the flying height (chosen; not measured)."""
+    tall_least_base: float = 0.12
+    """... and the least: nearer pictures give inaccurate heights (chosen; not measured)."""
+    tall_noise_levels: float = 2.0
+    """Sigma of grey values below which a cell's texture says nothing (chosen; not measured)."""
+    tall_doubt: float = 0.1
+    """Cost of any height against the ground, in correlation: what is not sure is ground (chosen; not measured)."""
+    tall_slope_cost: float = 0.15
+    """Cost of a step to the next height between cells, in correlation (chosen; not measured)."""
+    tall_edge_cost: tuple[float, float] = (0.3, 1.2)
+    """Cost of a larger step across a strong edge of the picture, and on even ground (chosen; not measured)."""
+    tall_edge_levels: float = 8.0
+    """Difference of grey values that halves what is between these costs (chosen; not measured)."""
+    tall_reach_heights: float = 1.5
+    """Pictures whose nadir points are farther away, in flying heights, are not compared (chosen for its time)."""
+    tall_rim_share_px: float = 0.05
+    """Share of a picture's sides at its rim that a block's middle must not lie in (chosen; not measured)."""
+
     # Levels of vehicles
 
     level_radius_m: float = 25.0
