@@ -180,43 +180,23 @@ class SurfaceConfig:
     """Baselines of that search, metres at the reference height: what stands high is near the cameras, so fewer pictures
     show it."""
 
-    # Tall surfaces as wide as a hall or a wood
+    # What stands on the ground, measured by a plane sweep on the nodes that it is drawn on
 
     tall_from_m: float = 1.5
     """What differs less from the ground belongs to it, metres (chosen; not measured)."""
-    tall_reach_m: float = 25.0
-    """Radius within which points must agree on a height, half of what counts as wide, metres (chosen)."""
-    tall_reach_cells: float = 1.8
-    """... at least so many distances of the points (chosen; not measured)."""
-    tall_points: int = 5
-    """Least points within that radius (chosen; not measured)."""
-    tall_share: float = 0.5
-    """Least share of them that stands as high (chosen; not measured)."""
-    very_tall_from_m: float = 6.0
-    """From this height on a larger share must agree, metres: drifting haze has a false parallax."""
-    very_tall_share: float = 0.7
-    """... this share (chosen; not measured)."""
-    tall_rim_share: float = 0.3
-    """Least share at the rim of a tall surface (chosen; not measured)."""
-    tall_agreement_m: float = 4.0
-    """Heights that differ by less stand as high as each other, metres (chosen; not measured)."""
-    tall_node_spacing_m: float = 7.5
-    """Distance of nodes on which tall surfaces are drawn, metres: their walls become slopes of about so much."""
-    tall_node_points: int = 5
-    """A node gets the median of so many nearest points (chosen; not measured)."""
-    tall_hole_cells: float = 1.5
-    """... if the second of them is no farther than so many distances of the points (chosen; not measured)."""
-    tall_wall_sigma_nodes: float = 0.7
+    tall_near_m: float = 18.0
+    """Heights are measured within this distance of raised points, metres at the reference height: more than that of the
+    dense cells (chosen; not measured)."""
+    tall_wall_sigma_nodes: float = 0.5
     """Sigma of the smoothing of walls, nodes (chosen; not measured)."""
-
-    # Plane sweep: heights of tall things measured on the nodes that they are drawn on
-
     tall_cell_m: float = 1.25
     """Distance of the nodes whose heights are measured, metres at the reference height (chosen; not measured)."""
     tall_block_nodes: int = 96
     """Side of the blocks of nodes that are measured at a time (chosen for memory)."""
     tall_block_border_nodes: int = 16
     """Nodes around a block that it is measured with (chosen; not measured)."""
+    tall_blocks_per_task: int = 8
+    """Blocks of one task, so that neighbours read a picture once (chosen for memory)."""
     tall_height_step_m: float = 0.75
     """Step of the heights, metres at the reference height: a third of a pixel's parallax (chosen; not measured)."""
     tall_best_base: float = 0.35
