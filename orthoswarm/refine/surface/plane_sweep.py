@@ -69,7 +69,7 @@ class _Block:
     views: list[int]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _Task:
     """Some blocks beside each other with their pictures.
 
@@ -167,7 +167,9 @@ def _tasks(swath: _Swath, ground: Terrain, tallest: Float32) -> Iterator[_Task]:
             for block, chosen in pending
         ]
         views = [swath.view(i) for i in pictures]
-        return _Task(ground.west, ground.south, ground.step_m, step_m, views, blocks)
+        return _Task(
+            west=ground.west, south=ground.south, cell_m=ground.step_m, step_m=step_m, views=views, blocks=blocks
+        )
 
     rows, columns = tallest.shape
     for row in range(0, rows, c.tall_block_nodes):

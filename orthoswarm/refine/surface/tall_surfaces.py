@@ -63,11 +63,11 @@ def _finer(ground: Terrain, parts: int) -> Terrain:
 
 
 def _tallest(xy: Array, over: Array, nodes: Terrain, near_m: float) -> Float32:
-    """How high something may stand at each node: the highest of the raised points within a distance, 0 without any."""
+    """How high something may stand at each node, metres: above all raised points within a distance; 0 without any."""
     place = np.rint((xy - (nodes.west, nodes.south)) / nodes.step_m).astype(int)
     within = ((place >= 0) & (place < nodes.z.shape[::-1])).all(1)
     columns, rows = place[within].T
     highest = np.zeros(nodes.z.shape, np.float32)
-    np.maximum.at(highest, (rows, columns), over[within].astype(np.float32))
+    np.maximum.at(highest, (rows, columns), np.float32(active().surface.tall_above_m) + over[within].astype(np.float32))
     side = 2 * int(near_m / nodes.step_m) + 1
     return np.asarray(cv2.dilate(highest, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))), np.float32)

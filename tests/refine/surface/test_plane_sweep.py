@@ -10,12 +10,12 @@ ROWS, COLUMNS, LEVELS = 9, 24, 6
 
 def heights(cost: np.ndarray, gray: np.ndarray) -> np.ndarray:
     """Heights in steps of 1 m of a block whose rim is on the ground."""
-    wanted = np.zeros((ROWS, COLUMNS), bool)
-    wanted[1:-1, 1:-1] = True
+    levels = np.zeros((ROWS, COLUMNS), np.int32)
+    levels[1:-1, 1:-1] = LEVELS
     total, out = np.zeros_like(cost), np.zeros((ROWS, COLUMNS), np.float32)
     f = np.float32
-    kernels.semi_global(cost, gray, wanted, f(0.15), f(0.3), f(1.2), f(1.0 / 8.0), total)
-    kernels.lowest(total, wanted, f(1.0), out)
+    kernels.semi_global(cost, gray, levels, f(0.15), f(0.3), f(1.2), f(1.0 / 8.0), total)
+    kernels.lowest(total, levels, f(1.0), out)
     return out
 
 
