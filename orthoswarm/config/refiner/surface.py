@@ -194,11 +194,12 @@ class SurfaceConfig:
     """Sigma of the smoothing of walls, nodes (chosen; not measured)."""
     tall_cell_m: float = 1.25
     """Distance of the nodes whose heights are measured, metres at the reference height (chosen; not measured)."""
-    tall_block_nodes: int = 96
-    """Side of the blocks of nodes that are measured at a time (chosen for memory)."""
+    tall_block_nodes: int = 48
+    """Side of the blocks of nodes that are measured at a time, in the same pictures (measured: of 96 nodes 82.9 % of
+    those on wide roofs are right within 1 m instead of 84.5 %, beside them 90.4 instead of 93.2; 32 are no better)."""
     tall_block_border_nodes: int = 8
-    """Nodes around a block that it is measured with (chosen; not measured)."""
-    tall_blocks_per_task: int = 8
+    """Nodes around a block that it is measured with (chosen for time: 16 are no better)."""
+    tall_blocks_per_task: int = 16
     """Blocks of one task, so that neighbours read a picture once (chosen for memory)."""
     tall_height_step_m: float = 0.75
     """Step of the heights, metres at the reference height: a third of a pixel's parallax (chosen; not measured)."""

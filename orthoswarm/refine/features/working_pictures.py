@@ -83,6 +83,10 @@ class Pictures:
         alone._frames, alone._cache, alone._small, alone.damaged = [self._frames[i]], OrderedDict(), {}, {}
         return alone
 
+    def once(self, i: int) -> Gray:
+        """As `gray`, of a picture that is asked for once: nothing of it is kept."""
+        return self._load(i)
+
     def drop(self) -> None:
         """Free the memory of the working-scale pictures (the reduced ones stay)."""
         self._cache.clear()

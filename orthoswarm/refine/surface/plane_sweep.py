@@ -43,12 +43,22 @@ class SweepViews:
 
 @dataclass(frozen=True, slots=True)
 class _View:
-    """A picture by itself: position float64 (3,), rotation (3, 3), lens (8,)."""
+    """A picture by itself: position float64 (3,), rotation (3, 3), lens (8,), and by how much it is reduced."""
 
     position: Array
     rotation: Array
     lens: Array
     picture: Pictures
+    factor: int
+
+    def reduced(self) -> NDArray[np.uint8]:
+        """The picture with pixels about as large as the cells."""
+        picture = self.picture.once(0)
+        if self.factor == 1:
+            return picture
+        rows, columns = picture.shape[0] // self.factor, picture.shape[1] // self.factor
+        cut = picture[: rows * self.factor, : columns * self.factor]
+        return np.asarray(cv2.resize(cut, (columns, rows), interpolation=cv2.INTER_AREA), np.uint8)
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +106,7 @@ def tall_heights(
         height_m: flying height above the ground. run: how tasks are run.
     """
     out = np.zeros(tallest.shape, np.float32)
-    tasks = list(_tasks(_Swath(views, height_m), ground, tallest))
+    tasks = list(_tasks(_Swath(views, ground, height_m), tallest))
     for task, found in zip(tasks, run(_measure, tasks), strict=True):
         for block, heights in zip(task.blocks, found, strict=True):
             top, bottom, left, right = block.inner
@@ -107,8 +117,8 @@ def tall_heights(
 class _Swath:
     """All pictures that may be compared, and which of them show a place best."""
 
-    def __init__(self, views: Sequence[SweepViews], height_m: float) -> None:
-        self.views, self.height_m = views, height_m
+    def __init__(self, views: Sequence[SweepViews], ground: Terrain, height_m: float) -> None:
+        self.views, self.ground, self.height_m = views, ground, height_m
         self._owner = np.repeat(np.arange(len(views)), [len(v.usable) for v in views])
         self._index = np.concatenate([np.arange(len(v.usable)) for v in views])
         self._usable = np.concatenate([v.usable for v in views])
@@ -118,8 +128,10 @@ class _Swath:
         """A picture by its index among all."""
         views, i = self.views[self._owner[picture]], int(self._index[picture])
         cameras = views.cameras
-        lens = cameras.lens[cameras.lens_id[i]].copy()
-        return _View(cameras.position[i].copy(), cameras.rotation[i].copy(), lens, views.pictures.only(i))
+        position, lens = cameras.position[i].copy(), cameras.lens[cameras.lens_id[i]].copy()
+        pixel_m = (position[2] - float(self.ground.height(position[:2]))) / lens[F]
+        factor = max(1, int(self.ground.step_m / max(pixel_m, 1e-3)))
+        return _View(position, cameras.rotation[i].copy(), lens, views.pictures.only(i), factor)
 
     def chosen(self, place: Array) -> list[int]:
         """The picture most nearly above a place (3,), and others around it that see the place."""
@@ -153,9 +165,9 @@ class _Swath:
         return seen
 
 
-def _tasks(swath: _Swath, ground: Terrain, tallest: Float32) -> Iterator[_Task]:
+def _tasks(swath: _Swath, tallest: Float32) -> Iterator[_Task]:
     """The blocks with nodes that may be raised and with pictures to measure them, row by row, some a task."""
-    c = active().surface
+    c, ground = active().surface, swath.ground
     step_m = c.tall_height_step_m * swath.height_m / c.reference_height_m
     pending: list[tuple[_Block, list[int]]] = []
 
@@ -211,45 +223,33 @@ def _middle(block: _Block, ground: Terrain) -> Array:
 
 def _measure(task: _Task) -> list[Float32]:
     """The heights of the inner nodes of each block of a task, metres."""
+    pictures = [view.reduced() for view in task.views]
     out = []
     for block in task.blocks:
-        heights = _heights(task, block)
+        heights = _heights(task, block, pictures)
         top, left = block.corner
         r0, r1, c0, c1 = block.inner
         out.append(heights[r0 - top : r1 - top, c0 - left : c1 - left].copy())
     return out
 
 
-def _heights(task: _Task, block: _Block) -> Float32:
+def _heights(task: _Task, block: _Block, pictures: Sequence[NDArray[np.uint8]]) -> Float32:
     """The heights of a block's nodes, those around the inner ones included."""
     c, f = active().surface, np.float32
     levels, most = block.levels, int(block.levels.max())
     around = np.asarray(cv2.dilate(levels.astype(np.uint16), np.ones((3, 3), np.uint8)), np.int32)
-    volumes = np.empty((len(block.views), *levels.shape, most), np.float32)
-    for volume, view in zip(volumes, block.views, strict=True):
-        _lay(task, block, task.views[view], around, volume)
-    cost, total = np.empty(volumes.shape[1:], np.float32), np.zeros(volumes.shape[1:], np.float32)
+    volumes = np.empty((len(block.views), levels.shape[0], most, levels.shape[1]), np.float32)
+    west, south = task.west + block.corner[1] * task.cell_m, task.south + block.corner[0] * task.cell_m
+    for volume, i in zip(volumes, block.views, strict=True):
+        view = task.views[i]
+        kernels.sample(
+            pictures[i], float(view.factor), view.position, view.rotation, view.lens, west, south, task.cell_m,
+            block.ground, around, f(task.step_m), volume,
+        )  # fmt: skip
+    cost = np.empty(volumes.shape[1:], np.float32)
     kernels.unlikeness(volumes, levels, f(c.tall_noise_levels**2), f(c.tall_doubt), cost)
-    kernels.semi_global(
-        cost, volumes[0], levels, f(c.tall_slope_cost), f(c.tall_edge_cost[0]), f(c.tall_edge_cost[1]),
-        f(1.0 / c.tall_edge_levels), total,
-    )  # fmt: skip
+    steps = f(c.tall_slope_cost), f(c.tall_edge_cost[0]), f(c.tall_edge_cost[1]), f(1.0 / c.tall_edge_levels)
+    total = kernels.semi_global(cost, volumes[0], levels, steps)
     found = np.zeros(levels.shape, np.float32)
     kernels.lowest(total, levels, f(task.step_m), found)
     return found
-
-
-def _lay(task: _Task, block: _Block, view: _View, levels: Ints, out: Float32) -> None:
-    """Lay a picture on the surfaces at a block's heights; out: float32 (rows, columns, H), set at the levels."""
-    depth_m = float(view.position[2]) - float(np.median(block.ground))
-    factor = max(1, int(task.cell_m / (depth_m / view.lens[F])))
-    picture = view.picture.gray(0)
-    if factor > 1:
-        rows, columns = picture.shape[0] // factor, picture.shape[1] // factor
-        cut = picture[: rows * factor, : columns * factor]
-        picture = np.asarray(cv2.resize(cut, (columns, rows), interpolation=cv2.INTER_AREA), np.uint8)
-    west, south = task.west + block.corner[1] * task.cell_m, task.south + block.corner[0] * task.cell_m
-    kernels.sample(
-        picture, float(factor), view.position, view.rotation, view.lens, west, south, task.cell_m, block.ground, levels,
-        np.float32(task.step_m), out,
-    )  # fmt: skip

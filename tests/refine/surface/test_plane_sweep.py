@@ -12,9 +12,11 @@ def heights(cost: np.ndarray, gray: np.ndarray) -> np.ndarray:
     """Heights in steps of 1 m of a block whose rim is on the ground."""
     levels = np.zeros((ROWS, COLUMNS), np.int32)
     levels[1:-1, 1:-1] = LEVELS
-    total, out = np.zeros_like(cost), np.zeros((ROWS, COLUMNS), np.float32)
+    cost, gray = (np.ascontiguousarray(volume.transpose(0, 2, 1)) for volume in (cost, gray))
+    cost[np.broadcast_to(np.arange(LEVELS)[:, None] >= np.maximum(levels, 1)[:, None], cost.shape)] = 1e6
+    out = np.zeros((ROWS, COLUMNS), np.float32)
     f = np.float32
-    kernels.semi_global(cost, gray, levels, f(0.15), f(0.3), f(1.2), f(1.0 / 8.0), total)
+    total = kernels.semi_global(cost, gray, levels, (f(0.15), f(0.3), f(1.2), f(1.0 / 8.0)))
     kernels.lowest(total, levels, f(1.0), out)
     return out
 
