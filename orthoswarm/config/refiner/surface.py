@@ -26,6 +26,8 @@ class SurfaceConfig:
     """With fewer points no terrain is fitted; the ground stays level, or as it was (chosen; not measured)."""
     terrain_reach_heights: float = 1.08
     """How far beyond the outermost cameras the terrain reaches, in flying heights (chosen: past the pictures' edge)."""
+    level_spacing_m: float = 7.5
+    """Nodes that are nearer to each other than this are thinned for the level of the mapped ground, metres (chosen)."""
     level_reach_heights: float = 0.5
     """Ground within so many flying heights of a camera counts for the level of the mapped ground: what lies farther out
     is seen obliquely, and its height is known less well (chosen; on flat ground 0 to 1 agree within 0.05 m)."""
