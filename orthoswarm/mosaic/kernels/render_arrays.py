@@ -17,7 +17,7 @@ from orthoswarm.model.placement import Terrain
 from orthoswarm.mosaic.kernels.lens_arrays import K1, K2, K3, F, U, V, lens_row
 
 Array = NDArray[np.float64]
-STEP = 8
+STEP = 4
 """Pixels between heights of a tile's lattice (bilinear between them)."""
 MARGIN_PX = 0.0
 """How far inside the outermost pixel centres a picture is used. At the very border the outermost pixels stand in for
