@@ -13,7 +13,7 @@ from orthoswarm.compute.jit import kernel
 from orthoswarm.config import active
 from orthoswarm.mosaic.footprint import tan_limit
 from orthoswarm.mosaic.kernels.lens_arrays import U_HIGH, U_LOW, V_HIGH, V_LOW
-from orthoswarm.mosaic.kernels.render_arrays import Shots, lattice_height, project
+from orthoswarm.mosaic.kernels.render_arrays import LATTICE_PX, Shots, lattice_height, project
 from orthoswarm.mosaic.seam_labels import OUTSIDE, block_heights, sight
 from orthoswarm.mosaic.seams.previews import Previews
 
@@ -120,7 +120,7 @@ def _smoothed(contrast: Floats) -> Floats:
 @kernel
 def _haze(position, rotation, lens, size, usable, contrast, lattice, gsd, cell, ignored, haze):  # type: ignore[no-untyped-def]
     """Log of the contrast that each picture lacks against the clearest one, at the corners of blocks of cells."""
-    last = (lattice.shape[0] - 1) * 8 - 1
+    last = (lattice.shape[0] - 1) * LATTICE_PX - 1
     rows, columns = contrast.shape[1], contrast.shape[2]
     for i in range(haze.shape[0]):
         for j in range(haze.shape[1]):
