@@ -12,7 +12,8 @@ def kernel(function: Kernel) -> Kernel:
     """Compile a function on arrays with numba, cached on disk, releasing the GIL.
 
     The cache is next to the module (or in the user's cache folder if that is read-only), so only the first run on a
-    machine compiles. Kernels may call each other; after an edit of a callee touch its callers too.
+    machine compiles. Kernels may call each other. The cache knows a file by its content: after an edit of a callee, or
+    of a constant of another file, callers in other files must change, too, or their old code is used.
 
     Of `fastmath` only the sign of zero is given up. What depends on how much the compiler sees at once (reassociation,
     multiplications fused with additions, reciprocals) makes a kernel just compiled differ in its last digits from the
