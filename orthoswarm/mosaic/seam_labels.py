@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from orthoswarm.compute.jit import in_place_kernel, kernel
 from orthoswarm.mosaic.footprint import tan_limit
 from orthoswarm.mosaic.kernels.lens_arrays import INNER, OUTER, U_HIGH, U_LOW, V_HIGH, V_LOW
-from orthoswarm.mosaic.kernels.render_arrays import STEP, Shots, height_at, project
+from orthoswarm.mosaic.kernels.render_arrays import LATTICE_PX, Shots, lattice_height, project
 
 Labels = NDArray[np.int32]
 Heights = NDArray[np.float32]
@@ -24,9 +24,9 @@ _ROUNDING = 1e-5  # of squared distances in float32, relative, with a margin
 @in_place_kernel
 def block_heights(lattice, r0, r1, c0, c1):  # type: ignore[no-untyped-def]
     """Least and greatest height of a tile's rows r0 to r1 and columns c0 to c1."""
-    low, high = lattice[r0 // STEP, c0 // STEP], lattice[r0 // STEP, c0 // STEP]
-    for i in range(r0 // STEP, (r1 + STEP - 1) // STEP + 1):
-        for j in range(c0 // STEP, (c1 + STEP - 1) // STEP + 1):
+    low, high = lattice[r0 // LATTICE_PX, c0 // LATTICE_PX], lattice[r0 // LATTICE_PX, c0 // LATTICE_PX]
+    for i in range(r0 // LATTICE_PX, (r1 + LATTICE_PX - 1) // LATTICE_PX + 1):
+        for j in range(c0 // LATTICE_PX, (c1 + LATTICE_PX - 1) // LATTICE_PX + 1):
             low, high = min(low, lattice[i, j]), max(high, lattice[i, j])
     return low, high
 
@@ -95,7 +95,7 @@ def _contest(best, label, r0, r1, c0, c1, mark, position, rotation, lens, lattic
             d2 = dx * dx + dy2
             if d2 < best[r, c] or (d2 == best[r, c] and mark < label[r, c]):
                 if not flat:
-                    z = height_at(lattice, r, c)
+                    z = lattice_height(lattice, r, c)
                 rise = position[2] - z
                 if rise > 0.0 and d2 <= limit * rise * rise:
                     u, v = project(position, rotation, lens, (c + 0.5) * gsd, (r + 0.5) * gsd, z)

@@ -13,7 +13,7 @@ PACKAGES = ("orthoswarm", "telemetry", "gcs_plugin")
 def by_position(node: ast.AST) -> int:
     """How many arguments a function, or the constructor of a dataclass, takes by position."""
     if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-        if any(ast.unparse(d) in ("kernel", "intrinsic") for d in node.decorator_list):
+        if any(ast.unparse(d) in ("kernel", "in_place_kernel", "intrinsic") for d in node.decorator_list):
             return 0  # compiled by numba, which dispatches on positions
         names = [a.arg for a in node.args.posonlyargs + node.args.args]
         return len(names) - (names[:1] in (["self"], ["cls"]))

@@ -83,7 +83,7 @@ def test_each_pixel_comes_from_the_nearest_frame_that_sees_it(tmp_path, seed, ti
         render(flight.frames, terrain, canvas, read=flight.read)
         mine = labels(canvas)
         drawn = whole(canvas)[..., 3] == 255
-    # the renderer's heights (bicubic, then bilinear over 8 pixels) differ from the hills by centimetres, which may
+    # the renderer's heights (bicubic, then bilinear over 4 pixels) differ from the hills by centimetres, which may
     # move a picture's border over a pixel: compare where the borders are not within 0.3 pixels
     d2 = np.full((len(flight.frames), grid.height, grid.width), np.inf)
     sure = np.ones((grid.height, grid.width), bool)
@@ -306,7 +306,7 @@ def test_large_lens_distortion_that_folds_draws_nothing_twice(canvas):
 def test_heights_pass_through_the_nodes_and_are_smooth_between():
     terrain = scene.terrain_of(scene.hills)
     west, north = scene.EAST - 240.0, scene.NORTH + 240.0
-    lattice = heights(terrain, west, north, 1.25, 256)  # lattice every 10 m, nodes every 30 m
+    lattice = heights(terrain, west, north, 2.5, 128)  # lattice every 10 m, nodes every 30 m
     points = np.stack(np.meshgrid(west + 10.0 * np.arange(33), north - 10.0 * np.arange(33)), -1)
     assert np.abs(lattice - scene.hills(points)).max() < 0.05
     assert np.abs(terrain.height(points) - scene.hills(points)).max() > 0.15  # bilinear would not be as good

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel, kernel
 from orthoswarm.mosaic.kernels.lens_arrays import K1, K2, K3, F, U, V
-from orthoswarm.mosaic.kernels.render_arrays import STEP
+from orthoswarm.mosaic.kernels.render_arrays import LATTICE_PX
 
 UNIT = 128
 """Sum of the weights, and number of steps of a fraction of a pixel."""
@@ -50,20 +50,20 @@ WEIGHTS = cubic_weights()
 def _owned(label, mark, window, lattice, index, at):  # type: ignore[no-untyped-def]
     """The pixels of a tile that have a label: their number in the tile, column, row and height; gives how many.
 
-    The height is that of render_arrays.height_at, its sums over a row taken out of the loop.
+    The height is that of render_arrays.lattice_height, its sums over a row taken out of the loop.
     """
     r0, r1, c0, c1 = np.int64(window[0]), np.int64(window[1]), np.int64(window[2]), np.int64(window[3])
     level = np.float64(lattice[0, 0])
     flat = True
-    for row in range(r0 // STEP, (r1 - 1) // STEP + 2):
-        for k in range(c0 // STEP, (c1 - 1) // STEP + 2):
+    for row in range(r0 // LATTICE_PX, (r1 - 1) // LATTICE_PX + 2):
+        for k in range(c0 // LATTICE_PX, (c1 - 1) // LATTICE_PX + 2):
             flat &= np.float64(lattice[row, k]) == level
     columns, rows, heights = at[0], at[1], at[2]
     count, side = np.uint64(0), label.shape[1]
     one = np.uint64(1)
     for r in range(r0, r1):
         labels = label[r]
-        node, fy = r // STEP, (r % STEP + 0.5) / STEP
+        node, fy = r // LATTICE_PX, (r % LATTICE_PX + 0.5) / LATTICE_PX
         before = count
         for c in range(c0, c1):
             if labels[np.uint64(c)] == mark:  # unsigned: not tested for being negative
@@ -74,7 +74,7 @@ def _owned(label, mark, window, lattice, index, at):  # type: ignore[no-untyped-
         if not flat:
             for n in range(before, count):
                 column = np.int64(columns[n])
-                at_left, fx = np.uint64(column // STEP), (column % STEP + 0.5) / STEP
+                at_left, fx = np.uint64(column // LATTICE_PX), (column % LATTICE_PX + 0.5) / LATTICE_PX
                 at_right = at_left + one
                 left = lattice[node, at_left] * (1.0 - fy) + lattice[node + 1, at_left] * fy
                 right = lattice[node, at_right] * (1.0 - fy) + lattice[node + 1, at_right] * fy

@@ -1,7 +1,7 @@
 """Cameras and terrain as the compiled kernels of the renderer want them: plain arrays about a tile's corner.
 
 A tile's frame: x east and y SOUTH in metres from its upper left corner, so that both grow with column and row;
-heights as they are. Terrain enters as a lattice of heights every STEP pixels, smooth (bicubic) between its nodes.
+heights as they are. Terrain enters as a lattice of heights every LATTICE_PX pixels, smooth (bicubic) between its nodes.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from orthoswarm.model.placement import Terrain
 from orthoswarm.mosaic.kernels.lens_arrays import K1, K2, K3, F, U, V, lens_row
 
 Array = NDArray[np.float64]
-STEP = 8
+LATTICE_PX = 4
 """Pixels between heights of a tile's lattice (bilinear between them)."""
 MARGIN_PX = 0.0
 """How far inside the outermost pixel centres a picture is used. At the very border the outermost pixels stand in for
@@ -68,13 +68,13 @@ class Shots:
 
 
 def heights(terrain: Terrain, west: float, north: float, gsd_m: float, tile_px: int) -> NDArray[np.float32]:
-    """Heights every STEP pixels from a tile's corner, float32 (tile_px / STEP + 1, ...), rows going south.
+    """Heights every LATTICE_PX pixels from a tile's corner, float32 (tile_px / LATTICE_PX + 1, ...), rows going south.
 
     Cubic convolution (Keys 1981, a = -1/2) between the terrain's nodes, so slopes are continuous; constant beyond
     its border.
     """
-    n = tile_px // STEP + 1
-    offset = np.arange(n) * (STEP * gsd_m)
+    n = tile_px // LATTICE_PX + 1
+    offset = np.arange(n) * (LATTICE_PX * gsd_m)
     column = _cubic(np.asarray((west + offset - terrain.west) / terrain.step_m, float), terrain.z.shape[1])
     row = _cubic(np.asarray((north - offset - terrain.south) / terrain.step_m, float), terrain.z.shape[0])
     rows, cols = np.unique(row[0]), np.unique(column[0])
@@ -121,9 +121,9 @@ def crop(terrain: Terrain, bounds: BoundingBox) -> Terrain:
 
 
 @in_place_kernel
-def height_at(lattice, row, column):  # type: ignore[no-untyped-def]
-    """Height at a pixel centre, bilinear in a tile's lattice (whose nodes lie on pixel CORNERS every STEP pixels)."""
-    y, x = (row + 0.5) / STEP, (column + 0.5) / STEP
+def lattice_height(lattice, row, column):  # type: ignore[no-untyped-def]
+    """Height at a pixel centre, bilinear in a tile's lattice (whose nodes lie on pixel CORNERS)."""
+    y, x = (row + 0.5) / LATTICE_PX, (column + 0.5) / LATTICE_PX
     i, j = int(y), int(x)
     fy, fx = y - i, x - j
     top = lattice[i, j] * (1.0 - fx) + lattice[i, j + 1] * fx

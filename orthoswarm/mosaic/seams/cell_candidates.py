@@ -13,7 +13,7 @@ from orthoswarm.compute.jit import in_place_kernel, kernel
 from orthoswarm.config import active
 from orthoswarm.mosaic.footprint import tan_limit
 from orthoswarm.mosaic.kernels.lens_arrays import U_HIGH, U_LOW, V_HIGH, V_LOW
-from orthoswarm.mosaic.kernels.render_arrays import Shots, height_at, project
+from orthoswarm.mosaic.kernels.render_arrays import LATTICE_PX, Shots, lattice_height, project
 from orthoswarm.mosaic.seam_labels import OUTSIDE, block_heights, sight
 from orthoswarm.mosaic.seams.previews import Previews
 
@@ -120,12 +120,12 @@ def _smoothed(contrast: Floats) -> Floats:
 @in_place_kernel
 def _haze(position, rotation, lens, size, usable, contrast, lattice, gsd, cell, ignored, haze):  # type: ignore[no-untyped-def]
     """Log of the contrast that each picture lacks against the clearest one, at the corners of blocks of cells."""
-    last = (lattice.shape[0] - 1) * 8 - 1
+    last = (lattice.shape[0] - 1) * LATTICE_PX - 1
     rows, columns = contrast.shape[1], contrast.shape[2]
     for i in range(haze.shape[0]):
         for j in range(haze.shape[1]):
             r, c = min(i * BLOCK * cell, last), min(j * BLOCK * cell, last)
-            z = height_at(lattice, r, c)
+            z = lattice_height(lattice, r, c)
             best = np.float32(-1e9)
             for k in usable:
                 u, v = project(position[k], rotation[k], lens[k], (c + 0.5) * gsd, (r + 0.5) * gsd, z)
@@ -208,7 +208,7 @@ def _candidates(  # type: ignore[no-untyped-def]
                     for c in range(b1, c1):
                         x = (c + 0.5) * step
                         fx = (c - b1 + 0.5) / BLOCK
-                        z = height_at(lattice, (r + 0.5) * cell - 0.5, (c + 0.5) * cell - 0.5)
+                        z = lattice_height(lattice, (r + 0.5) * cell - 0.5, (c + 0.5) * cell - 0.5)
                         dx, dy, rise = x - position[k, 0], y - position[k, 1], position[k, 2] - z
                         limit = min(cost[r, c, SLOTS - 1], cost[r, c, 0] + np.float32(weight * spread))
                         tan2 = (dx * dx + dy * dy) / (rise * rise) if rise > 0.0 else np.inf

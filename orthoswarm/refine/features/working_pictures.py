@@ -2,6 +2,7 @@
 
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
+from copy import copy
 from typing import Any
 
 import cv2
@@ -75,6 +76,16 @@ class Pictures:
         """Take over what an earlier reading of the same pictures found: see `reduced` and `damaged`."""
         self._small.update(reduced)
         self.damaged.update(damaged)
+
+    def only(self, i: int) -> "Pictures":
+        """Picture i by itself, as number 0, read in the same way."""
+        alone = copy(self)
+        alone._frames, alone._cache, alone._small, alone.damaged = [self._frames[i]], OrderedDict(), {}, {}
+        return alone
+
+    def once(self, i: int) -> Gray:
+        """As `gray`, of a picture that is asked for once: nothing of it is kept."""
+        return self._load(i)
 
     def drop(self) -> None:
         """Free the memory of the working-scale pictures (the reduced ones stay)."""

@@ -17,6 +17,12 @@ def observations_per_camera(flight: Flight) -> NDArray[np.int64]:
     return np.bincount(adj.tracks.camera[good], minlength=n)
 
 
+def weakly_held(flight: Flight) -> NDArray[np.bool_]:
+    """Whether too few observations hold a camera: bool (N,)."""
+    fewest = active().registration.sparse_fewest_observations if flight.sparse else active().flight.held_observations
+    return np.asarray(observations_per_camera(flight) < fewest)
+
+
 def without_outliers(recorded: Array, leg: NDArray[np.int32]) -> Array:
     """Records (N, 3) with single outlying positions, across or along their leg's course, put back on it.
 

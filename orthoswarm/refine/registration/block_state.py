@@ -12,7 +12,7 @@ from orthoswarm.model.placement import Leg, LegState, PlacedFrame, Solution, Sta
 from orthoswarm.refine.bundle.adjustment import MapTies
 from orthoswarm.refine.bundle.block_arrays import CX, CY, WIDTH, CameraBlock, F
 from orthoswarm.refine.flight.relative_block import Flight
-from orthoswarm.refine.flight.weakly_held_pictures import observations_per_camera
+from orthoswarm.refine.flight.weakly_held_pictures import weakly_held
 from orthoswarm.refine.registration.coarse_map import CoarseMapShift
 from orthoswarm.refine.registration.map_evidence import agreement_probability
 from orthoswarm.refine.registration.tie_points import MapMatches
@@ -139,8 +139,7 @@ def to_solution(
     cameras = full_resolution(cameras, flight)
     sigma = state.coarse_sigma_m if coarse else state.sigma_m
     covariance = None if coarse else state.pose_covariance
-    fewest = active().registration.sparse_fewest_observations if flight.sparse else active().flight.held_observations
-    weak = observations_per_camera(flight) < (fewest)
+    weak = weakly_held(flight)
     placed = [
         PlacedFrame(
             frame,

@@ -116,7 +116,7 @@ class SwarmRefiner(UnitRefiner):
         for state in done:
             if state.on_map:  # what neighbours carry has it with their sigma
                 state.sigma_m = np.hypot(state.sigma_m, distortion)
-        terrain = common_terrain([*done, *others], self.options.ground(self.origin).dem)[0]
+        terrain = common_terrain(done, others, dem=self.options.ground(self.origin).dem)[0]
         level = mapped_level(done, terrain)
         terrain = _shifted(terrain, self.origin)
         lean = pooled_lean(everyone)
@@ -148,7 +148,7 @@ class SwarmRefiner(UnitRefiner):
         for state in states:
             if lies_on_map(state):
                 state.sigma_m = np.hypot(state.sigma_m, distortion)
-        terrain, warnings = common_terrain(states, self.options.ground(origin).dem)
+        terrain, warnings = common_terrain(states, dem=self.options.ground(origin).dem, run=run)
         level = mapped_level(states, terrain)
         terrain = _shifted(terrain, origin)
         lean = pooled_lean(states)

@@ -9,11 +9,14 @@ from scipy.spatial import cKDTree
 from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.placement import Terrain
+from orthoswarm.model.task_runner import Run, serial
+from orthoswarm.refine.flight.weakly_held_pictures import weakly_held
 from orthoswarm.refine.registration.block_state import VehicleState, surface_points
 from orthoswarm.refine.registration.tie_points import MapMatches, vote_lean
 from orthoswarm.refine.surface.dem_surface import LocalDem, fit_over_dem
-from orthoswarm.refine.surface.ground_densification import dense_cell, flying_height
+from orthoswarm.refine.surface.ground_densification import flying_height
 from orthoswarm.refine.surface.mapped_level import mapped_ground_level
+from orthoswarm.refine.surface.plane_sweep import SweepViews
 from orthoswarm.refine.surface.smooth_surface import FitSettings
 from orthoswarm.refine.surface.tall_surfaces import with_tall_surfaces
 from orthoswarm.refine.surface.terrain import fit_terrain
@@ -44,16 +47,27 @@ def pooled_lean(states: Sequence[VehicleState]) -> tuple[float, float]:
     return vote_lean(joint, np.concatenate([s.roofs[1] for s in mapped]), np.zeros(2)) or (0.0, 0.0)
 
 
-def common_terrain(states: Sequence[VehicleState], dem: LocalDem | None = None) -> tuple[Terrain | None, list[str]]:
+def common_terrain(
+    states: Sequence[VehicleState],
+    others: Sequence[VehicleState] = (),
+    *,
+    dem: LocalDem | None = None,
+    run: Run = serial,
+) -> tuple[Terrain | None, list[str]]:
     """One surface over all vehicles for rendering, in the local frame; None where there are too few points.
 
     A given height model is shifted to their level; where the points contradict it, a warning says so.
+
+    Args:
+        states: vehicles that are drawn: what stands on the ground is measured where they have found raised points.
+        others: more that the ground is common to. dem: the given height model. run: how tasks are run.
     """
+    own, states = states, [*states, *others]
     if not states:
         return None, []
-    own = [ground_points(s.flight.adjustment) for s in states]
-    points = np.concatenate([p for p, _ in own] + [s.dense[0] for s in states])
-    sigma = np.concatenate([q for _, q in own] + [s.dense[1] for s in states])
+    tied = [ground_points(s.flight.adjustment) for s in states]
+    points = np.concatenate([p for p, _ in tied] + [s.dense[0] for s in states])
+    sigma = np.concatenate([q for _, q in tied] + [s.dense[1] for s in states])
     if len(points) < active().strategy.terrain_points:
         return states[0].surface.terrain(), []
     path = np.concatenate([s.flight.adjustment.cameras.position for s in states])
@@ -66,10 +80,20 @@ def common_terrain(states: Sequence[VehicleState], dem: LocalDem | None = None) 
     if dem is not None:
         fit, off = fit_over_dem(dem, points, sigma, bounds, settings=how, most_nodes=drawn_nodes)
     drawn = (fit or fit_terrain(points, sigma, bounds, settings=how)).rendering(lift)
-    tops = np.concatenate([surface_points(s) for s in states])
-    cell = dense_cell(float(np.median([flying_height(s.flight, s.surface) for s in states])))
-    drawn = with_tall_surfaces(drawn, tops, cell, drawn_nodes)
+    height_m = float(np.median([flying_height(s.flight, s.surface) for s in states]))
+    drawn = with_tall_surfaces(
+        drawn, np.concatenate([surface_points(s) for s in own]), [_sweep_views(s) for s in states], height_m=height_m,
+        most_nodes=drawn_nodes, run=run,
+    )  # fmt: skip
     return drawn, _dem_warnings(dem, fit is None, off, states) if dem is not None else []
+
+
+def _sweep_views(state: VehicleState) -> SweepViews:
+    """A vehicle's pictures for the plane sweep, without those that are damaged or weakly held."""
+    flight = state.flight
+    usable = ~weakly_held(flight)
+    usable[[i for i, frame in enumerate(flight.frames) if frame.damaged or i in flight.pictures.damaged]] = False
+    return SweepViews(flight.cameras(), flight.pictures, usable)
 
 
 def map_distortion_sigma(states: Sequence[VehicleState]) -> float:

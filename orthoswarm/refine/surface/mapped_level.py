@@ -32,11 +32,13 @@ def mapped_ground_level(terrain: Terrain | None, camera_position: Array, dense: 
     position = np.asarray(camera_position, float)
     below = ground.height(position[:, :2])
     height = float(np.median(position[:, 2] - below))
-    rows, columns = np.indices(ground.z.shape)
+    stride = max(1, int(config.level_spacing_m / ground.step_m))
+    z = ground.z[::stride, ::stride]
+    rows, columns = np.indices(z.shape) * stride
     nodes = np.column_stack([columns.ravel(), rows.ravel()]) * ground.step_m + [ground.west, ground.south]
     near = cKDTree(position[:, :2]).query(nodes, distance_upper_bound=config.level_reach_heights * height)[0]
     mapped = np.isfinite(near)
-    heights = ground.z.ravel()[mapped] if mapped.any() else below
+    heights = z.ravel()[mapped] if mapped.any() else below
     level = float(np.median(heights))
     points = np.concatenate([np.zeros((0, 3)), *dense])
     if len(points) < config.terrain_points:

@@ -1,99 +1,86 @@
-"""Tops of halls and stands: drawn where they stand, while houses and trees leave the ground as it is."""
+"""What stands on the ground is drawn where it stands, up to its edges, and the ground beside it on the ground."""
 
 import numpy as np
-from hypothesis import given
-from hypothesis import strategies as st
+import pytest
 
 from orthoswarm.config import active
 from orthoswarm.model.placement import Terrain
+from orthoswarm.model.task_runner import serial
+from orthoswarm.refine.features.working_pictures import Pictures
+from orthoswarm.refine.strategy.swarm_refiner import Options
+from orthoswarm.refine.surface.plane_sweep import SweepViews
 from orthoswarm.refine.surface.tall_surfaces import with_tall_surfaces
+from tests.kit.refine import refine_all, through_pickle
+from tests.refine.surface.hall_flight import GRID, HALF, HEIGHT_M, MIDDLE, ROOF_M, HallFlight, away
 
-CELL_M = 14.0
 MANY = 4_000_000
+GROUND = Terrain(-60.0, -60.0, 30.0, np.zeros((13, 11), np.float32))
 
 
-def slope() -> Terrain:
-    """Ground that rises by 3 % to the east, 600 m by 600 m, nodes 30 m apart."""
-    return Terrain(0.0, 0.0, 30.0, np.tile(0.03 * 30.0 * np.arange(21, dtype=np.float32), (21, 1)))
+@pytest.fixture(scope="module")
+def flight() -> HallFlight:
+    return HallFlight()
 
 
-def sights(ground: Terrain, over: object, seed: int = 0) -> np.ndarray:
-    """Points about CELL_M apart on the ground plus over(x, y), with 0.1 m of noise."""
-    rng = np.random.default_rng(seed)
-    x, y = (a.ravel() for a in np.meshgrid(np.arange(7.0, 600.0, CELL_M), np.arange(7.0, 600.0, CELL_M)))
-    xy = np.column_stack([x, y]) + rng.uniform(-2.0, 2.0, (len(x), 2))
-    z = ground.height(xy) + over(xy[:, 0], xy[:, 1]) + rng.normal(0.0, 0.1, len(xy))  # type: ignore[operator]
-    return np.column_stack([xy, z])
+@pytest.fixture(scope="module")
+def places() -> np.ndarray:
+    """Places every 2 m on and round the hall."""
+    east, north = (MIDDLE[k] + np.arange(-HALF[k] - 20.0, HALF[k] + 20.1, 2.0) for k in (0, 1))
+    return np.stack(np.meshgrid(east, north), -1).reshape(-1, 2)
 
 
-def hall(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """A flat roof of 80 m by 60 m, 12 m high."""
-    return np.where((np.abs(x - 300.0) < 40.0) & (np.abs(y - 200.0) < 30.0), 12.0, 0.0)
+def raised(roof_m: float = ROOF_M) -> np.ndarray:
+    """Points every 14 m on the hall's roof, and on the ground elsewhere."""
+    east, north = (a.ravel() for a in np.meshgrid(np.arange(-30.0, 180.0, 14.0), np.arange(-30.0, 240.0, 14.0)))
+    xy = np.column_stack([east, north])
+    return np.column_stack([xy, np.where(away(xy) < -2.0, roof_m, 0.0)])
 
 
-def test_hall_is_drawn_on_its_roof_and_the_street_beside_it_on_the_ground() -> None:
-    ground = slope()
-    drawn = with_tall_surfaces(ground, sights(ground, hall), CELL_M, MANY)
-    inside = np.stack(np.meshgrid(np.linspace(280.0, 320.0, 9), np.linspace(190.0, 210.0, 5)), -1)
-    assert np.abs(drawn.height(inside) - ground.height(inside) - 12.0).max() < 1.0
-    x, y = (a.ravel() for a in np.meshgrid(np.arange(0.0, 600.0, 5.0), np.arange(0.0, 600.0, 5.0)))
-    beside = (np.abs(x - 300.0) > 60.0) | (np.abs(y - 200.0) > 50.0)
-    there = np.column_stack([x, y])[beside]
-    assert np.abs(drawn.height(there) - ground.height(there)).max() < 0.05
-    assert drawn.step_m == active().surface.tall_node_spacing_m
-    middle = np.array([300.0, 200.0])
-    assert abs(float(drawn.bare_ground().height(middle) - ground.height(middle))) < 0.01
+def drawn(flight: HallFlight, points: np.ndarray, *, usable: object = True, most_nodes: int = MANY) -> Terrain:
+    count = len(flight.frames)
+    views = SweepViews(flight.cameras, Pictures(flight.frames, flight.read), np.full(count, usable, bool))
+    return with_tall_surfaces(GROUND, points, [views], height_m=HEIGHT_M, most_nodes=most_nodes, run=serial)
 
 
-def test_stand_keeps_its_slope() -> None:
-    def stand(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        return np.where((np.abs(x - 300.0) < 50.0) & (np.abs(y - 300.0) < 100.0), 0.2 * (x - 250.0), 0.0)
-
-    ground = slope()
-    drawn = with_tall_surfaces(ground, sights(ground, stand), CELL_M, MANY)
-    x = np.arange(265.0, 331.0, 5.0)
-    at = np.column_stack([x, np.full(len(x), 300.0)])
-    assert np.abs(drawn.height(at) - ground.height(at) - 0.2 * (x - 250.0)).max() < 2.5
-
-
-def test_houses_and_trees_leave_the_ground_as_it_is() -> None:
-    def houses(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        return np.where((x % 42.0 < 13.0) & (y % 42.0 < 13.0), 8.0, 0.0)
-
-    ground = slope()
-    assert with_tall_surfaces(ground, sights(ground, houses), CELL_M, MANY) is ground
+def test_a_hall_is_drawn_on_its_roof_up_to_the_edges_and_the_ground_beside_it_on_the_ground(flight, places) -> None:
+    refined = refine_all({"a": flight.frames}, None, GRID, options=Options(read=flight.read))
+    offset = np.median(
+        [p.camera.position - t for p, t in zip(refined.fine[0].placed, flight.cameras.position, strict=True)], axis=0
+    )
+    terrain = refined.terrain
+    height = terrain.height(places + offset[:2])
+    bare = terrain.bare_ground().height(places + offset[:2])
+    roof, beside = away(places) < -3.0, away(places) > 3.0
+    assert np.median(np.abs(height[roof] - bare[roof] - ROOF_M)) < 0.5
+    assert (np.abs(height[roof] - bare[roof] - ROOF_M) < 1.5).mean() > 0.95
+    assert (np.abs(height[beside] - bare[beside]) < 1.5).mean() > 0.95
+    halves = refine_all({"a": flight.frames}, None, GRID, options=Options(read=flight.read), run=through_pickle)
+    np.testing.assert_array_equal(terrain.z, halves.terrain.z)
 
 
-def test_lone_wrong_heights_on_a_roof_do_not_dent_it() -> None:
-    def big(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        return np.where((np.abs(x - 300.0) < 60.0) & (np.abs(y - 200.0) < 60.0), 12.0, 0.0)
-
-    ground = slope()
-    points = sights(ground, big)
-    middle = np.abs(points[:, :2] - (300.0, 200.0)).max(1) < 30.0
-    points[np.flatnonzero(middle)[::7], 2] += 9.0
-    drawn = with_tall_surfaces(ground, points, CELL_M, MANY)
-    inside = np.stack(np.meshgrid(np.linspace(270.0, 330.0, 9), np.linspace(170.0, 230.0, 9)), -1)
-    assert np.abs(drawn.height(inside) - ground.height(inside) - 12.0).max() < 1.0
+def test_it_is_measured_as_far_as_the_edges_from_points_that_lie_well_inside(flight, places) -> None:
+    height = drawn(flight, raised()).height(places)
+    assert (np.abs(height[away(places) < -3.0] - ROOF_M) < 1.0).mean() > 0.97
+    assert (np.abs(height[away(places) > 3.0]) < 1.0).mean() > 0.97
 
 
-def test_pit_is_drawn_at_its_bottom() -> None:
-    ground = slope()
-    drawn = with_tall_surfaces(ground, sights(ground, lambda x, y: -0.6 * hall(x, y)), CELL_M, MANY)
-    middle = np.array([300.0, 200.0])
-    assert abs(float(drawn.height(middle) - ground.height(middle)) + 7.2) < 1.0
+def test_points_that_are_raised_by_mistake_leave_the_ground_as_it_is(places) -> None:
+    level = HallFlight(roof_m=0.0)
+    surface = drawn(level, raised())
+    assert (np.abs(surface.height(places)) < 1.0).mean() > 0.99
 
 
-def test_number_of_nodes_stays_bounded() -> None:
-    ground = slope()
-    drawn = with_tall_surfaces(ground, sights(ground, hall), CELL_M, 4 * ground.z.size)
-    assert ground.z.size < drawn.z.size <= 4 * ground.z.size
+def test_what_too_few_pictures_show_stays_on_the_ground(flight) -> None:
+    usable = np.zeros(len(flight.frames), bool)
+    usable[[5, 17]] = True
+    assert drawn(flight, raised(), usable=usable) is GROUND
 
 
-@given(seed=st.integers(0, 2**32 - 1), rough=st.floats(0.0, 0.9), count=st.integers(0, 40))
-def test_ground_that_is_only_rough_is_given_back(seed: int, rough: float, count: int) -> None:
-    ground = slope()
-    rng = np.random.default_rng(seed)
-    xy = rng.uniform(0.0, 600.0, (count, 2))
-    z = ground.height(xy) + rng.uniform(-rough, rough, count) * active().surface.tall_from_m
-    assert with_tall_surfaces(ground, np.column_stack([xy, z]), CELL_M, MANY) is ground
+def test_ground_without_raised_points_is_given_back(flight) -> None:
+    assert drawn(flight, raised(0.9 * active().surface.tall_from_m)) is GROUND
+    assert drawn(flight, np.zeros((0, 3))) is GROUND
+
+
+def test_number_of_nodes_stays_bounded(flight) -> None:
+    surface = drawn(flight, raised(), most_nodes=200 * GROUND.z.size)
+    assert GROUND.z.size < surface.z.size <= 200 * GROUND.z.size

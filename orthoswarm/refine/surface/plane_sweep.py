@@ -1,0 +1,255 @@
+"""Heights of tall things by a plane sweep over several pictures, with steps where the pictures have edges.
+
+Surfaces parallel to the ground are laid through the pictures (Collins 1996). At each cell and height the picture most
+nearly above is correlated with four around it, of which the two most alike count, since a wall hides a place from some
+(Kang et al. 2001); semi-global optimisation (Hirschmüller 2008) chooses the heights. What the pictures do not decide
+stays on the ground.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.config import active
+from orthoswarm.model.placement import Terrain
+from orthoswarm.model.task_runner import Run
+from orthoswarm.refine.bundle.block_arrays import HEIGHT, WIDTH, CameraBlock, F, Ints
+from orthoswarm.refine.features.working_pictures import Pictures
+from orthoswarm.refine.surface import plane_sweep_kernels as kernels
+
+Array = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+
+_LEAST_PICTURES = 3
+"""One and two others: of fewer the two most alike are none."""
+
+
+@dataclass(frozen=True, slots=True)
+class SweepViews:
+    """Pictures of one vehicle with their cameras.
+
+    Attributes:
+        cameras: of the pictures, in working pixels. pictures: the same.
+        usable: bool (N,), False for pictures whose content or camera is not to be relied on.
+    """
+
+    cameras: CameraBlock
+    pictures: Pictures
+    usable: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class _View:
+    """A picture by itself: position float64 (3,), rotation (3, 3), lens (8,), and by how much it is reduced."""
+
+    position: Array
+    rotation: Array
+    lens: Array
+    picture: Pictures
+    factor: int
+
+    def reduced(self) -> NDArray[np.uint8]:
+        """The picture with pixels about as large as the cells."""
+        picture = self.picture.once(0)
+        if self.factor == 1:
+            return picture
+        rows, columns = picture.shape[0] // self.factor, picture.shape[1] // self.factor
+        cut = picture[: rows * self.factor, : columns * self.factor]
+        return np.asarray(cv2.resize(cut, (columns, rows), interpolation=cv2.INTER_AREA), np.uint8)
+
+
+@dataclass(frozen=True, slots=True)
+class _Block:
+    """Nodes that are measured together.
+
+    Attributes:
+        inner: rows and columns (from, to, from, to) of the ground's nodes whose heights are kept; those around them are
+            measured to hold them. corner: row and column of the first node.
+        ground: float32, its nodes. levels: int32, heights that each can have.
+        views: indices of the pictures among the task's, the one that the others are compared with first.
+    """
+
+    inner: tuple[int, int, int, int]
+    corner: tuple[int, int]
+    ground: Float32
+    levels: Ints
+    views: list[int]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Task:
+    """Some blocks beside each other with their pictures.
+
+    Attributes:
+        west, south: place of node (0, 0). cell_m: distance of nodes. step_m: of heights.
+    """
+
+    west: float
+    south: float
+    cell_m: float
+    step_m: float
+    views: list[_View]
+    blocks: list[_Block]
+
+
+def tall_heights(
+    views: Sequence[SweepViews], ground: Terrain, tallest: Float32, *, height_m: float, run: Run
+) -> Float32:
+    """Heights above the ground, float32 (rows, columns) of its nodes, 0 where it is the surface.
+
+    Args:
+        views: pictures of each vehicle. ground: its nodes are the cells whose heights are measured.
+        tallest: float32 (rows, columns), how high something may stand, metres; 0: the node is on the ground.
+        height_m: flying height above the ground. run: how tasks are run.
+    """
+    out = np.zeros(tallest.shape, np.float32)
+    tasks = list(_tasks(_Swath(views, ground, height_m), tallest))
+    for task, found in zip(tasks, run(_measure, tasks), strict=True):
+        for block, heights in zip(task.blocks, found, strict=True):
+            top, bottom, left, right = block.inner
+            out[top:bottom, left:right] = heights
+    return out
+
+
+class _Swath:
+    """All pictures that may be compared, and which of them show a place best."""
+
+    def __init__(self, views: Sequence[SweepViews], ground: Terrain, height_m: float) -> None:
+        self.views, self.ground, self.height_m = views, ground, height_m
+        self._owner = np.repeat(np.arange(len(views)), [len(v.usable) for v in views])
+        self._index = np.concatenate([np.arange(len(v.usable)) for v in views])
+        self._usable = np.concatenate([v.usable for v in views])
+        self._nadir = np.concatenate([v.cameras.position[: len(v.usable), :2] for v in views])
+
+    def view(self, picture: int) -> _View:
+        """A picture by its index among all."""
+        views, i = self.views[self._owner[picture]], int(self._index[picture])
+        cameras = views.cameras
+        position, lens = cameras.position[i].copy(), cameras.lens[cameras.lens_id[i]].copy()
+        pixel_m = (position[2] - float(self.ground.height(position[:2]))) / lens[F]
+        factor = max(1, int(self.ground.step_m / max(pixel_m, 1e-3)))
+        return _View(position, cameras.rotation[i].copy(), lens, views.pictures.only(i), factor)
+
+    def chosen(self, place: Array) -> list[int]:
+        """The picture most nearly above a place (3,), and others around it that see the place."""
+        c = active().surface
+        away = np.hypot(*(self._nadir - place[:2]).T)
+        near = np.flatnonzero((away < c.tall_reach_heights * self.height_m) & self._usable)
+        near = near[self._see(near, place)]
+        if not len(near):
+            return []
+        chosen = [int(near[np.argmin(away[near])])]
+        own = self._nadir[chosen[0]]
+        base = np.hypot(*(self._nadir[near] - own).T)
+        fit = near[base >= c.tall_least_base * self.height_m].tolist()
+        for angle in np.arange(4) * np.pi / 2:
+            wished = own + c.tall_best_base * self.height_m * np.array([np.cos(angle), np.sin(angle)])
+            left = [i for i in fit if i not in chosen]
+            if left:
+                chosen.append(left[int(np.argmin(np.hypot(*(self._nadir[left] - wished).T)))])
+        return chosen
+
+    def _see(self, pictures: NDArray[np.intp], place: Array) -> NDArray[np.bool_]:
+        """Which pictures show a place well inside their border."""
+        rim = active().surface.tall_rim_share_px
+        seen = np.zeros(len(pictures), bool)
+        for k in np.unique(self._owner[pictures]):
+            mine = self._owner[pictures] == k
+            cameras, index = self.views[k].cameras, self._index[pictures[mine]]
+            size = cameras.lens[cameras.lens_id[index]][:, [WIDTH, HEIGHT]]
+            share = cameras.project(index, np.tile(place, (len(index), 1))) / size
+            seen[mine] = ((share > rim) & (share < 1.0 - rim)).all(1)
+        return seen
+
+
+def _tasks(swath: _Swath, tallest: Float32) -> Iterator[_Task]:
+    """The blocks with nodes that may be raised and with pictures to measure them, row by row, some a task."""
+    c, ground = active().surface, swath.ground
+    step_m = c.tall_height_step_m * swath.height_m / c.reference_height_m
+    pending: list[tuple[_Block, list[int]]] = []
+
+    def task() -> _Task:
+        pictures = sorted({i for _, chosen in pending for i in chosen})
+        place = {i: k for k, i in enumerate(pictures)}
+        blocks = [
+            _Block(block.inner, block.corner, block.ground, block.levels, [place[i] for i in chosen])
+            for block, chosen in pending
+        ]
+        views = [swath.view(i) for i in pictures]
+        return _Task(
+            west=ground.west, south=ground.south, cell_m=ground.step_m, step_m=step_m, views=views, blocks=blocks
+        )
+
+    rows, columns = tallest.shape
+    for row in range(0, rows, c.tall_block_nodes):
+        for column in range(0, columns, c.tall_block_nodes):
+            block = _block((row, column), ground, tallest, step_m)
+            chosen = [] if block is None else swath.chosen(_middle(block, ground))
+            if block is not None and len(chosen) >= _LEAST_PICTURES:
+                pending.append((block, chosen))
+            if len(pending) == c.tall_blocks_per_task:
+                yield task()
+                pending.clear()
+    if pending:
+        yield task()
+
+
+def _block(first: tuple[int, int], ground: Terrain, tallest: Float32, step_m: float) -> _Block | None:
+    """The block whose inner nodes begin at a row and column; None where nothing is raised."""
+    c = active().surface
+    (row, column), side, border = first, c.tall_block_nodes, c.tall_block_border_nodes
+    rows, columns = tallest.shape
+    inner = (row, min(row + side, rows), column, min(column + side, columns))
+    if not tallest[inner[0] : inner[1], inner[2] : inner[3]].any():
+        return None
+    top, left = max(row - border, 0), max(column - border, 0)
+    outer = (slice(top, row + side + border), slice(left, column + side + border))
+    high = tallest[outer]
+    levels = np.where(high > 0.0, np.ceil(high / np.float32(step_m)) + 2, 0).astype(np.int32)
+    levels[[0, -1]] = 0
+    levels[:, [0, -1]] = 0
+    return _Block(inner, (top, left), ground.z[outer].copy(), levels, []) if levels.any() else None
+
+
+def _middle(block: _Block, ground: Terrain) -> Array:
+    """The middle of a block's raised nodes on the ground, float64 (3,)."""
+    row, column = (index.mean() + first for index, first in zip(np.nonzero(block.levels), block.corner, strict=True))
+    z = np.median(block.ground[block.levels > 0])
+    return np.array([ground.west + column * ground.step_m, ground.south + row * ground.step_m, z])
+
+
+def _measure(task: _Task) -> list[Float32]:
+    """The heights of the inner nodes of each block of a task, metres."""
+    pictures = [view.reduced() for view in task.views]
+    out = []
+    for block in task.blocks:
+        heights = _heights(task, block, pictures)
+        top, left = block.corner
+        r0, r1, c0, c1 = block.inner
+        out.append(heights[r0 - top : r1 - top, c0 - left : c1 - left].copy())
+    return out
+
+
+def _heights(task: _Task, block: _Block, pictures: Sequence[NDArray[np.uint8]]) -> Float32:
+    """The heights of a block's nodes, those around the inner ones included."""
+    c, f = active().surface, np.float32
+    levels, most = block.levels, int(block.levels.max())
+    around = np.asarray(cv2.dilate(levels.astype(np.uint16), np.ones((3, 3), np.uint8)), np.int32)
+    volumes = np.empty((len(block.views), levels.shape[0], most, levels.shape[1]), np.float32)
+    west, south = task.west + block.corner[1] * task.cell_m, task.south + block.corner[0] * task.cell_m
+    for volume, i in zip(volumes, block.views, strict=True):
+        view = task.views[i]
+        kernels.sample(
+            pictures[i], float(view.factor), view.position, view.rotation, view.lens, west, south, task.cell_m,
+            block.ground, around, f(task.step_m), volume,
+        )  # fmt: skip
+    cost = np.empty(volumes.shape[1:], np.float32)
+    kernels.unlikeness(volumes, levels, f(c.tall_noise_levels**2), f(c.tall_doubt), cost)
+    steps = f(c.tall_slope_cost), f(c.tall_edge_cost[0]), f(c.tall_edge_cost[1]), f(1.0 / c.tall_edge_levels)
+    total = kernels.semi_global(cost, volumes[0], levels, steps)
+    found = np.zeros(levels.shape, np.float32)
+    kernels.lowest(total, levels, f(task.step_m), found)
+    return found
