@@ -21,7 +21,8 @@ from orthoswarm.stores.local_copies import cache_folder, clear_old_copies, conte
 from orthoswarm.stores.published_folder import PublishedFolder
 from orthoswarm.stores.requests import NotStoredError, StoreLostError, StoreRequestError
 from tests.kit.scene import Scene, legs
-from tests.kit.servers.store_server import ENVIRONMENT, FaultyProxy, free_port, s3_server
+from tests.kit.servers.ports import free_port
+from tests.kit.servers.store_server import ENVIRONMENT, FaultyProxy, s3_server
 
 PRODUCTS = ("realtime.tif", "coarse.tif", "orthoimage.tif", "frames.jsonl")
 

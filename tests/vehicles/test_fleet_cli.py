@@ -9,22 +9,15 @@ import pytest
 from gcs_plugin.cli.main import main
 from gcs_plugin.cli.verbs.vehicles.fleet import parse_systems
 from gcs_plugin.links.mavlink import Autopilot
-from gcs_plugin.links.transports import UdpLink
 from gcs_plugin.mission import mission_files
 from gcs_plugin.mission.plan_folder import read_plan_folder
 from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
 from orthoswarm.model.errors import InputError
+from tests.kit.servers.ports import free_port
 from tests.vehicles.test_mission_builder import make_plan
 
 AP, PX4 = Autopilot.ARDUPILOT, Autopilot.PX4
 HOME = (47.3977, 8.5456, 488.0)
-
-
-def free_port():
-    link = UdpLink("probe", "127.0.0.1", 0, listens=True)
-    port = link.port
-    link.close()
-    return port
 
 
 @pytest.fixture

@@ -17,7 +17,8 @@ from gcs_plugin.sim.multirotor import Chart
 from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
 from orthoswarm.model.earth import distance_m
-from tests.vehicles.test_fleet_cli import HOME, fleet, folder, free_port  # noqa: F401
+from tests.kit.servers.ports import free_port
+from tests.vehicles.test_fleet_cli import HOME, fleet, folder  # noqa: F401
 from tests.vehicles.test_sim import mission
 
 AP, PX4 = Autopilot.ARDUPILOT, Autopilot.PX4

@@ -14,7 +14,8 @@ import pytest
 
 from orthoswarm.model.geo import LocalGrid, utm_epsg
 from tests.kit.daemon_kit import exported, serving
-from tests.vehicles.autopilots.test_twin_camera import PLACES, RATE_HZ, CameraProcess, free_port, small_area
+from tests.kit.servers.ports import free_port
+from tests.vehicles.autopilots.test_twin_camera import PLACES, RATE_HZ, CameraProcess, small_area
 
 REAL = [place for place in PLACES if any(mark.name == "sitl" for mark in place.marks)]
 LENGTH_M, WIDTH_M, ALTITUDE_M = 240.0, 60.0, 40.0

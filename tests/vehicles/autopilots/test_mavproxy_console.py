@@ -11,9 +11,10 @@ import pytest
 pytest.importorskip("MAVProxy")
 
 from tests.kit.daemon_kit import Served, exported
+from tests.kit.servers.ports import free_port
 from tests.vehicles.autopilots.test_fleet_scenarios import charge
 from tests.vehicles.autopilots.test_gap_flight import REAL, row_of
-from tests.vehicles.autopilots.test_twin_camera import RATE_HZ, CameraProcess, free_port, small_area
+from tests.vehicles.autopilots.test_twin_camera import RATE_HZ, CameraProcess, small_area
 from tests.vehicles.test_mavproxy import MavProxy
 
 

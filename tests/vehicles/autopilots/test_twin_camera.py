@@ -8,7 +8,6 @@ import json
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -31,6 +30,7 @@ from orthoswarm.model.geo import LocalGrid, utm_epsg
 from telemetry.live.live_stream import open_stream
 from telemetry.samples.sample import Sample
 from tests.kit.daemon_kit import end_with_us, exported, serving
+from tests.kit.servers.ports import free_port
 
 ADDRESSES = [a.strip() for a in os.environ.get("ORTHOSWARM_SITL", "").split(",") if a.strip()]
 HOME = (-35.363262, 149.165237, 584.0)  # ArduPilot's own default: far from the twin's city, south of the equator
@@ -78,11 +78,6 @@ PLACES = [
         for number, address in enumerate(ADDRESSES or ["no address in ORTHOSWARM_SITL"])
     ],
 ]
-
-
-def free_port():
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return server.getsockname()[1]
 
 
 class CameraProcess:
