@@ -66,6 +66,11 @@ class MosaicConfig:
     """Grey levels from here on are taken for glints of water or burnt-out ground (chosen)."""
     glare_share: float = 0.05
     """A block of the preview with a larger share of glare says nothing about haze (chosen)."""
+    hidden_cost: float = 10000.0
+    """Cost of a picture from which something taller hides the cell; chosen: as of a view at 39 degrees, more than
+    `candidate_tan2` allows."""
+    hidden_m: float = 1.0
+    """What stands over the line of sight by less hides nothing, metres: heights of walls are no better (chosen)."""
     blur_cost: float = 6000.0
     """Cost of a picture that is less sharp than the median of those around, times the logarithm of the ratio; chosen
     like `haze_cost`."""

@@ -1,7 +1,8 @@
 """Candidate pictures of each cell of a tile, with their costs and grey levels in the cell.
 
 The cost of a picture grows with the squared tangent of its view angle (obliqueness), with the contrast that it lacks
-against the clearest picture on the same ground (haze), and with the sharpness that it lacks as a whole (blur).
+against the clearest picture on the same ground (haze), and with the sharpness that it lacks as a whole (blur). One from
+which something taller hides the cell shows that instead: it costs more than any oblique view.
 """
 
 from dataclasses import dataclass
@@ -105,7 +106,7 @@ def cell_candidates(region: Region, shots: Shots, tone: Floats, previews: Previe
         *arrays, usable, penalty, haze, previews.gray, previews.rows, tone, region.lattice, region.gsd_m,
         region.cell_px, unit * config.obliqueness_cost, cells.candidate, cells.cost, cells.level,
         np.ascontiguousarray(local, np.float32), cells.texture, unit * config.glare_cost,
-        config.glare_level, config.candidate_tan2, tan_limit() ** 2,
+        config.glare_level, config.candidate_tan2, tan_limit() ** 2, unit * config.hidden_cost, config.hidden_m,
     )  # fmt: skip
     return cells
 
@@ -153,6 +154,31 @@ def _gray(gray, tone, u, v, width, height):  # type: ignore[no-untyped-def]
     return (top * (1.0 - fy) + low * fy) * factor
 
 
+@in_place_kernel
+def _hidden(lattice, position, x, y, z, gsd, top, above):  # type: ignore[no-untyped-def]
+    """Whether the ground stands more than `above` metres over the line from a point (x, y, z) to a camera.
+
+    Nodes of the lattice are met at every step along the line, from the second on, up to the height `top`.
+    """
+    step = LATTICE_PX * gsd
+    dx, dy = position[0] - x, position[1] - y
+    away = max(np.hypot(dx, dy), 1e-6)
+    rise = (position[2] - z) / away * step
+    col, row, ec, er = x / step, y / step, dx / away, dy / away
+    last = lattice.shape[0] - 1
+    n = 1
+    line = z + above + rise
+    while line < top:
+        n += 1
+        line += rise
+        i, j = int(row + n * er + 0.5), int(col + n * ec + 0.5)
+        if i < 0 or j < 0 or i > last or j > last:
+            return False
+        if lattice[i, j] > line:
+            return True
+    return False
+
+
 @kernel
 def _candidates(  # type: ignore[no-untyped-def]
     position,
@@ -178,8 +204,11 @@ def _candidates(  # type: ignore[no-untyped-def]
     glare_level,
     spread,
     tan2_limit,
+    hidden,
+    above,
 ):
     side = candidate.shape[0]
+    top = np.float64(lattice.max())
     step = cell * gsd
     least = np.empty(len(usable))
     for b0 in range(0, side, BLOCK):
@@ -230,6 +259,8 @@ def _candidates(  # type: ignore[no-untyped-def]
                                     g = _gray(gray[record[k]], tone[k], u, v, size[k, 0], size[k, 1])
                                     if g >= glare_level:
                                         here += glare
+                                    if here < limit and _hidden(lattice, position[k], x, y, z, gsd, top, above):
+                                        here += hidden
                                 if inside and here < limit:
                                     s = SLOTS - 1
                                     while s > 0 and cost[r, c, s - 1] > here:
