@@ -45,6 +45,10 @@ class MosaicConfig:
     """... and so many sigmas of the ground's heights: the refiner holds the ground's median at its zero, and the place
     of takeoff may lie anywhere in the relief."""
 
+    # Surface
+    wall_slope: float = 1.2
+    """Steeper measured surfaces are walls (chosen: 50 degrees; roofs and rubble are flatter)."""
+
     # Candidates of a cell of the seam lines
     weak_cost: float = 1e6
     """Cost of a picture that is used only where no other sees (damaged, weakly determined): above all other costs."""

@@ -17,7 +17,8 @@ from orthoswarm.model.camera import Camera, Lens
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import Terrain
 from orthoswarm.mosaic.footprint import footprint_boxes, least_descent
-from orthoswarm.mosaic.kernels.render_arrays import Shots, heights, project
+from orthoswarm.mosaic.kernels.drawn_heights import heights
+from orthoswarm.mosaic.kernels.render_arrays import Shots, project
 from orthoswarm.mosaic.seam_labels import label_tile
 from orthoswarm.mosaic.visible_ground import by_tile
 

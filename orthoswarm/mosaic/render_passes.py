@@ -17,8 +17,9 @@ from orthoswarm.model.errors import OrthoSwarmError, RunInterruptedError
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import Terrain
 from orthoswarm.mosaic.kernels.downsampling import bearable, reduced, reduced_exactly
+from orthoswarm.mosaic.kernels.drawn_heights import heights
 from orthoswarm.mosaic.kernels.pixel_sampling import AFTER, BEFORE, WEIGHTS, blend, place, widen
-from orthoswarm.mosaic.kernels.render_arrays import Shots, heights
+from orthoswarm.mosaic.kernels.render_arrays import Shots
 from orthoswarm.mosaic.seam_labels import label_tile, label_windows, write_labels
 from orthoswarm.mosaic.seams.feather import labels_around, mix, transition
 from orthoswarm.mosaic.seams.leveling import TileColors, TileFactors, tile_colors

@@ -10,7 +10,8 @@ from orthoswarm.model.camera import Camera
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import Terrain
 from orthoswarm.mosaic.footprint import footprint_boxes
-from orthoswarm.mosaic.kernels.render_arrays import Shots, heights
+from orthoswarm.mosaic.kernels.drawn_heights import heights
+from orthoswarm.mosaic.kernels.render_arrays import Shots
 from orthoswarm.mosaic.seam_labels import label_tile
 
 _PART = 512

@@ -14,8 +14,9 @@ from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import Lens
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.placement import Terrain
+from orthoswarm.mosaic.kernels.drawn_heights import heights
 from orthoswarm.mosaic.kernels.pixel_sampling import UNIT, cubic_weights
-from orthoswarm.mosaic.kernels.render_arrays import crop, heights
+from orthoswarm.mosaic.kernels.render_arrays import LATTICE_PX, crop
 from orthoswarm.mosaic.radiometry import uniform
 from orthoswarm.mosaic.renderer import render, serial
 from orthoswarm.mosaic.visible_ground import coverage
@@ -306,10 +307,31 @@ def test_large_lens_distortion_that_folds_draws_nothing_twice(canvas):
 def test_heights_pass_through_the_nodes_and_are_smooth_between():
     terrain = scene.terrain_of(scene.hills)
     west, north = scene.EAST - 240.0, scene.NORTH + 240.0
-    lattice = heights(terrain, west, north, 2.5, 128)  # lattice every 10 m, nodes every 30 m
-    points = np.stack(np.meshgrid(west + 10.0 * np.arange(33), north - 10.0 * np.arange(33)), -1)
+    lattice = heights(terrain, west, north, 2.5, 128)  # nodes every 30 m
+    at = 2.5 * LATTICE_PX * np.arange(len(lattice))
+    points = np.stack(np.meshgrid(west + at, north - at), -1)
     assert np.abs(lattice - scene.hills(points)).max() < 0.05
     assert np.abs(terrain.height(points) - scene.hills(points)).max() > 0.15  # bilinear would not be as good
+
+
+@pytest.mark.parametrize("angle_deg", [0.0, 15.0, 45.0])
+def test_a_measured_wall_is_a_step_along_a_straight_line_and_its_roof_stays_as_it_is(angle_deg):
+    nodes = np.arange(-30.0, 30.1, 1.25)
+    along = np.array([np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))])
+    on_roof = np.stack(np.meshgrid(nodes, nodes), -1) @ along > 0.3
+    over = np.where(on_roof, 9.0 + 0.2 * np.sin(nodes), 0.0).astype(np.float32)
+    bare = np.full(over.shape, 100.0, np.float32)
+    lattice = heights(Terrain(-30.0, -30.0, 1.25, bare + over, bare), -25.6, 25.6, 0.4, 128)
+    at = 0.4 * LATTICE_PX * np.arange(len(lattice))
+    away = np.stack(np.meshgrid(at - 25.6, 25.6 - at), -1) @ along - 0.3
+    assert (((lattice < 100.5) | (lattice > 108.5)) & (lattice < 109.5)).all()  # nothing in between, nothing above
+    assert (lattice[away > 1.0] > 108.5).all() and (np.abs(lattice[away < -1.0] - 100.0) < 1e-3).all()
+
+
+def test_a_surface_that_no_picture_told_keeps_its_slopes():
+    z = np.where(np.arange(40) > 20, 9.0, 0.0)[:, None].repeat(40, 1).astype(np.float32)
+    lattice = heights(Terrain(0.0, 0.0, 1.25, z), 10.0, 40.0, 0.25, 128)
+    assert ((lattice > 2.0) & (lattice < 7.0)).any()
 
 
 def test_cropped_terrain_gives_the_same_heights():

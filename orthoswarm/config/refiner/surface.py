@@ -192,8 +192,6 @@ class SurfaceConfig:
     tall_above_m: float = 2.0
     """... and up to so much above the highest of them, metres (chosen: 0 and larger distances change the share of
     nodes within 1 m by at most 0.008 on two scenes)."""
-    tall_wall_sigma_nodes: float = 0.5
-    """Sigma of the smoothing of walls, nodes (chosen; not measured)."""
     tall_cell_m: float = 1.25
     """Distance of the nodes whose heights are measured, metres at the reference height (chosen; not measured)."""
     tall_block_nodes: int = 48
@@ -216,6 +214,11 @@ class SurfaceConfig:
     tall_doubt: float = 0.1
     """Cost of any height against the ground, in correlation: what is not sure is ground (measured: with 0.07 more roofs
     are whole and more of the ground beside them is raised, with 0.15 the other way round)."""
+    tall_hidden_cost: tuple[float, float] = (0.2, 0.35)
+    """Least and greatest cost, in correlation, of a height at which something taller hides the cell from the picture
+    compared (measured: with greater ones more roofs are whole and more of the ground behind them is raised)."""
+    tall_hidden_m: float = 1.0
+    """What stands over a line of sight by less hides nothing, metres (0.5 is no better)."""
     tall_slope_cost: float = 0.15
     """Cost of a step to the next height between cells, in correlation (chosen; not measured)."""
     tall_edge_cost: tuple[float, float] = (0.15, 1.2)

@@ -1,7 +1,7 @@
 """Cameras and terrain as the compiled kernels of the renderer want them: plain arrays about a tile's corner.
 
 A tile's frame: x east and y SOUTH in metres from its upper left corner, so that both grow with column and row;
-heights as they are. Terrain enters as a lattice of heights every LATTICE_PX pixels, smooth (bicubic) between its nodes.
+heights as they are. Terrain enters as a lattice of heights every LATTICE_PX pixels, see drawn_heights.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from orthoswarm.model.placement import Terrain
 from orthoswarm.mosaic.kernels.lens_arrays import K1, K2, K3, F, U, V, lens_row
 
 Array = NDArray[np.float64]
-LATTICE_PX = 4
+LATTICE_PX = 2
 """Pixels between heights of a tile's lattice (bilinear between them)."""
 MARGIN_PX = 0.0
 """How far inside the outermost pixel centres a picture is used. At the very border the outermost pixels stand in for
@@ -65,47 +65,6 @@ class Shots:
         """Positions (N, 3) and ground-to-camera rotations (N, 3, 3) in the frame of a tile's corner."""
         position = self.position * (1.0, -1.0, 1.0) + (-west, north, 0.0)
         return position, np.ascontiguousarray(self.rotation.transpose(0, 2, 1) * (1.0, -1.0, 1.0))
-
-
-def heights(terrain: Terrain, west: float, north: float, gsd_m: float, tile_px: int) -> NDArray[np.float32]:
-    """Heights every LATTICE_PX pixels from a tile's corner, float32 (tile_px / LATTICE_PX + 1, ...), rows going south.
-
-    Cubic convolution (Keys 1981, a = -1/2) between the terrain's nodes, so slopes are continuous; constant beyond
-    its border.
-    """
-    n = tile_px // LATTICE_PX + 1
-    offset = np.arange(n) * (LATTICE_PX * gsd_m)
-    column = _cubic(np.asarray((west + offset - terrain.west) / terrain.step_m, float), terrain.z.shape[1])
-    row = _cubic(np.asarray((north - offset - terrain.south) / terrain.step_m, float), terrain.z.shape[0])
-    rows, cols = np.unique(row[0]), np.unique(column[0])
-    part = terrain.z[np.ix_(rows, cols)].astype(float)
-    return np.asarray(_weights(row, rows) @ part @ _weights(column, cols).T, np.float32)
-
-
-def _cubic(at: Array, count: int) -> tuple[NDArray[np.intp], Array]:
-    """Node indices (n, 4) and weights (n, 4) of cubic convolution at positions in nodes, clamped to the border."""
-    at = np.clip(at, 0.0, count - 1.0)
-    base = np.minimum(at.astype(np.intp), max(0, count - 2))
-    t = at - base
-    w = np.stack(
-        [
-            t * (-0.5 + t * (1.0 - 0.5 * t)),
-            1.0 + t * t * (1.5 * t - 2.5),
-            t * (0.5 + t * (2.0 - 1.5 * t)),
-            t * t * (0.5 * t - 0.5),
-        ],
-        1,
-    )
-    return np.clip(base[:, None] + np.arange(-1, 3), 0, count - 1), w
-
-
-def _weights(cubic: tuple[NDArray[np.intp], Array], nodes: NDArray[np.intp]) -> Array:
-    """The weights as a matrix (n, nodes)."""
-    index, w = cubic
-    matrix = np.zeros((len(index), len(nodes)))
-    for k in range(4):
-        np.add.at(matrix, (np.arange(len(index)), np.searchsorted(nodes, index[:, k])), w[:, k])
-    return matrix
 
 
 def crop(terrain: Terrain, bounds: BoundingBox) -> Terrain:

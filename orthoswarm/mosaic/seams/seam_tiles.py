@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from orthoswarm.canvas.tile_store import Key, TileStore
 from orthoswarm.config import active
 from orthoswarm.model.placement import Terrain
-from orthoswarm.mosaic.kernels.render_arrays import Shots, heights
+from orthoswarm.mosaic.kernels.drawn_heights import heights
+from orthoswarm.mosaic.kernels.render_arrays import Shots
 from orthoswarm.mosaic.seams.cell_candidates import Region, cell_candidates
 from orthoswarm.mosaic.seams.feather import labels_around
 from orthoswarm.mosaic.seams.previews import COLUMNS, read_previews

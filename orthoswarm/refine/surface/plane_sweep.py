@@ -2,8 +2,9 @@
 
 Surfaces parallel to the ground are laid through the pictures (Collins 1996). At each cell and height the picture most
 nearly above is correlated with four around it, of which the two most alike count, since a wall hides a place from some
-(Kang et al. 2001); semi-global optimisation (Hirschmüller 2008) chooses the heights. What the pictures do not decide
-stays on the ground.
+(Kang et al. 2001); semi-global optimisation (Hirschmüller 2008) chooses the heights. They are chosen twice: what lies
+behind a tower that was found the first time cannot be seen by the picture from above, and its likeness to others says
+little. What the pictures do not decide stays on the ground.
 """
 
 from collections.abc import Iterator, Sequence
@@ -249,7 +250,12 @@ def _heights(task: _Task, block: _Block, pictures: Sequence[NDArray[np.uint8]]) 
     cost = np.empty(volumes.shape[1:], np.float32)
     kernels.unlikeness(volumes, levels, f(c.tall_noise_levels**2), f(c.tall_doubt), cost)
     steps = f(c.tall_slope_cost), f(c.tall_edge_cost[0]), f(c.tall_edge_cost[1]), f(1.0 / c.tall_edge_levels)
-    total = kernels.semi_global(cost, volumes[0], levels, steps)
-    found = np.zeros(levels.shape, np.float32)
-    kernels.lowest(total, levels, f(task.step_m), found)
-    return found
+    found = np.empty(levels.shape, np.float32)
+    kernels.lowest(kernels.semi_global(cost, volumes[0], levels, steps, aslant=False), levels, f(task.step_m), found)
+    above, hidden = task.views[block.views[0]].position, (f(c.tall_hidden_cost[0]), f(c.tall_hidden_cost[1]))
+    kernels.bound_hidden(
+        cost, levels, found, block.ground, west, south, task.cell_m, f(task.step_m), above, *hidden, f(c.tall_doubt),
+        f(c.tall_hidden_m),
+    )  # fmt: skip
+    kernels.lowest(kernels.semi_global(cost, volumes[0], levels, steps), levels, f(task.step_m), found)
+    return np.asarray(cv2.medianBlur(found, 3), np.float32)  # single cells tell nothing

@@ -10,7 +10,6 @@ from dataclasses import replace
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
 
 from orthoswarm.config import active
 from orthoswarm.model.placement import Terrain
@@ -47,8 +46,7 @@ def with_tall_surfaces(
     heights[heights < c.tall_from_m] = 0.0
     if not heights.any():
         return ground
-    tops = np.asarray(gaussian_filter(heights, c.tall_wall_sigma_nodes), np.float32)
-    return replace(fine, z=fine.z + tops, bare=fine.z)
+    return replace(fine, z=fine.z + heights, bare=fine.z)
 
 
 def _finer(ground: Terrain, parts: int) -> Terrain:

@@ -19,9 +19,9 @@ MIDDLE, HALF = np.array([60.0, 100.0]), np.array([32.0, 24.0])
 FOV, SIZE = np.radians(80.0), (320, 240)
 
 
-def away(xy: np.ndarray) -> np.ndarray:
-    """Distance from the hall's walls, negative inside it."""
-    return (np.abs(xy - MIDDLE) - HALF).max(-1)
+def away(xy: np.ndarray, half: np.ndarray = HALF) -> np.ndarray:
+    """Distance from the walls of the hall, or of another round its middle, negative inside it."""
+    return (np.abs(xy - MIDDLE) - half).max(-1)
 
 
 class HallFlight:
@@ -31,8 +31,8 @@ class HallFlight:
         frames: with exact records. cameras: the true ones, about ORIGIN.
     """
 
-    def __init__(self, roof_m: float = ROOF_M) -> None:
-        self.roof_m = roof_m
+    def __init__(self, roof_m: float = ROOF_M, half: np.ndarray = HALF) -> None:
+        self.roof_m, self.half = roof_m, half
         position, rotation = [], []
         for leg in range(4):
             for k in range(12):
@@ -53,8 +53,8 @@ class HallFlight:
         rows, columns = np.mgrid[0 : SIZE[1], 0 : SIZE[0]].astype(float)
         uv, index = np.stack([columns, rows], -1).reshape(-1, 2), np.full(rows.size, i)
         roof, ground = (self.cameras.to_ground(index, uv, np.full(len(uv), z)) for z in (self.roof_m, 0.0))
-        on_roof = away(roof) < 0.0
-        between = np.array([away(roof + s * (ground - roof)) < 0.0 for s in np.linspace(0.0, 1.0, 9)]).any(0)
+        on_roof = away(roof, self.half) < 0.0
+        between = np.array([away(roof + s * (ground - roof), self.half) < 0.0 for s in np.linspace(0.0, 1.0, 9)]).any(0)
         shown = np.where(on_roof, laid(self._roof, roof), np.where(between, 60.0, laid(self._ground, ground)))
         noise = np.random.default_rng(i).normal(0.0, 1.5, len(uv))
         return np.clip(shown + noise, 0.0, 255.0).reshape(rows.shape).astype(np.uint8)

@@ -64,6 +64,14 @@ def test_it_is_measured_as_far_as_the_edges_from_points_that_lie_well_inside(fli
     assert (np.abs(height[away(places) > 3.0]) < 1.0).mean() > 0.97
 
 
+def test_a_tower_has_its_own_size_although_it_hides_the_ground_behind_it_from_the_picture_above(places) -> None:
+    half, roof_m = np.array([10.0, 10.0]), 25.0
+    height = drawn(HallFlight(roof_m, half), np.array([[*MIDDLE, roof_m]])).height(places)
+    far = away(places, half)
+    assert (np.abs(height[far < -2.5] - roof_m) < 1.5).mean() > 0.95
+    assert (height[(far > 2.5) & (far < 15.0)] < 1.5).mean() > 0.98
+
+
 def test_points_that_are_raised_by_mistake_leave_the_ground_as_it_is(places) -> None:
     level = HallFlight(roof_m=0.0)
     surface = drawn(level, raised())
