@@ -13,13 +13,13 @@ from tests.kit import mosaic_scene as scene
 FLAT = Terrain.flat(0.0)
 
 
-def drawn(folder, flight, *, blend="none", seams=True, run=serial, size_m=260.0, tile_px=128):
+def drawn(folder, flight, *, blend="none", seams=True, run=serial, size_m=260.0, tile_px=128, ground=FLAT):
     """The mosaic of a flight: colours, labels and what was rendered."""
     folder.mkdir()
     previews = PreviewFile.create(folder / "previews", [f.frame.image for f in flight.frames])
     how = Seams(previews, blend) if seams else None
     with Canvas.create(folder / "canvas", scene.grid(size_m), plane="frame", tile_px=tile_px) as canvas:
-        stats = render(flight.frames, FLAT, canvas, seams=how, read=flight.read, run=run)
+        stats = render(flight.frames, ground, canvas, seams=how, read=flight.read, run=run)
         grid = canvas.grid
         window = (0, grid.height, 0, grid.width)
         return canvas.read(*window), canvas.read_plane(*window), stats
@@ -60,6 +60,18 @@ def test_in_haze_the_clearest_picture_wins(tmp_path):
     both = np.logical_and(*(scene.seen(c, scene.grid(260.0), margin=20.0)[0] for c in flight.cameras))
     assert (nearest[both] == 1).mean() > 0.4
     assert (drawn(tmp_path / "cost", flight)[1][both] == 2).mean() > 0.95
+
+
+def test_ground_behind_a_tall_thing_is_drawn_from_a_picture_that_sees_it(tmp_path):
+    flight = scene.Flight().take(scene.camera(east=-10.0)).take(scene.camera(east=50.0))
+    nodes = np.arange(-140.0, 141.0, 1.0)
+    tower = np.where((nodes >= 2.0) & (nodes <= 8.0), 25.0, 0.0).astype(np.float32)
+    tower = np.where(np.abs(nodes)[:, None] < 40.0, tower, np.float32(0.0))
+    ground = Terrain(scene.EAST - 140.0, scene.NORTH - 140.0, 1.0, tower, np.zeros_like(tower))
+    east, north = np.moveaxis(scene.pixel_centres(scene.grid(260.0)) - (scene.EAST, scene.NORTH), -1, 0)
+    behind = (east > 9.5) & (east < 11.5) & (np.abs(north) < 20.0)
+    assert (drawn(tmp_path / "level", flight)[1][behind] == 1).all()  # it is nearer to the first
+    assert (drawn(tmp_path / "tower", flight, ground=ground)[1][behind] == 2).mean() > 0.9
 
 
 def test_alike_pictures_are_parted_near_the_line_of_equal_distance(tmp_path):
