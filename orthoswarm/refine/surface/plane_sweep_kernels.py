@@ -2,7 +2,7 @@
 
 Volumes are float32 (rows, H, columns): a row's cells at heights 0, 1, ... steps above the ground, so that loops over
 columns are vectorised. Rows go north. `levels`, int32 (rows, columns), says how many heights a cell can have; 0: it is
-on the ground. Cells at the border of the block are.
+on the ground. Cells at the border of the block have 0 and may lie at any height: what is beyond is not known.
 """
 
 import numpy as np
@@ -107,7 +107,7 @@ def unlikeness(volumes, levels, noise, doubt, cost):  # type: ignore[no-untyped-
         volumes: float32 (N, rows, H, columns), N pictures, known at the heights of each cell's neighbours, too.
         levels: see above. noise: variance of grey values below which nothing is said: it is added to both variances.
         doubt: cost of all heights above the ground. cost: a volume, set; 1 where nothing is known, 0 on the ground of
-        cells without heights, `_FAR` at heights that a cell cannot have.
+        cells without heights and at the border, `_FAR` at heights that a cell cannot have.
     """
     count, rows, _, columns = volumes.shape
     ninth, least = np.float32(1.0 / 9.0), np.float32(9.0) * noise
@@ -142,6 +142,8 @@ def unlikeness(volumes, levels, noise, doubt, cost):  # type: ignore[no-untyped-
                 known = _ONE - _HALF * (first[c] + second[c]) if second[c] > -_ONE else _ONE
                 possible = known + more if k < here[c] else _FAR
                 own[c] = _ZERO if here[c] == 0 and k == 0 else possible
+    cost[0], cost[rows - 1] = _ZERO, _ZERO
+    cost[:, :, 0], cost[:, :, columns - 1] = _ZERO, _ZERO
 
 
 @in_place_kernel
@@ -258,7 +260,7 @@ def _from_rows(cost, gray, levels, aslant, small, low, high, scale, total):  # t
     for turn in range(2):
         way = 1 if turn == 0 else -1
         paths[:], least[:] = _FAR, _ZERO
-        paths[:, :, 1] = _ZERO
+        paths[:, :, 1 : most + 1] = _ZERO
         for q in range(1, rows):
             r = q if turn == 0 else rows - 1 - q
             n = max(levels[r].max(), levels[r - way].max(), 1)

@@ -5,11 +5,11 @@ import pytest
 
 from orthoswarm.refine.surface import plane_sweep_kernels as kernels
 
-ROWS, COLUMNS, LEVELS = 9, 24, 6
+ROWS, COLUMNS, LEVELS = 21, 24, 6
 
 
 def heights(cost: np.ndarray, gray: np.ndarray) -> np.ndarray:
-    """Heights in steps of 1 m of a block whose rim is on the ground."""
+    """Heights in steps of 1 m of a block whose rim is not measured."""
     levels = np.zeros((ROWS, COLUMNS), np.int32)
     levels[1:-1, 1:-1] = LEVELS
     cost, gray = (np.ascontiguousarray(volume.transpose(0, 2, 1)) for volume in (cost, gray))
@@ -29,7 +29,7 @@ def test_a_step_lies_at_the_edge_of_the_picture_where_the_likeness_does_not_tell
     gray = np.full(cost.shape, 100.0, np.float32)
     gray[2:-2, edge:-2, 4] = 160.0
     gray[:, 12:, 1] = 160.0  # an edge on another height is none
-    found = heights(cost, gray)[2:-2, 1:-2]
+    found = heights(cost, gray)[6:-6, 1:-2]
     assert (found[:, : edge - 1] == 0.0).all() and (np.abs(found[:, edge - 1 :] - 4.0) < 0.5).all()
 
 
@@ -46,15 +46,15 @@ def test_likeness_says_little_at_heights_that_something_taller_hides_from_the_ca
     surface[2:-2, 8:11] = tower
     cost = np.full((ROWS, LEVELS, COLUMNS), unlike, np.float32)
     levels = np.full(shape, LEVELS, np.int32)
-    west_of_it = np.array([-12.0, 4.0, 24.0])  # a line of sight falls by about a metre a cell
+    west_of_it = np.array([-12.0, 10.0, 24.0])  # a line of sight falls by about a metre a cell
     kernels.bound_hidden(
         cost, levels, surface, np.zeros(shape, np.float32), 0.0, 0.0, cell, f(1.0), west_of_it, f(0.2), f(0.35), f(0.1),
         f(0.2),
     )  # fmt: skip
     touched = cost != f(unlike)
-    assert not touched[4, :, :8].any()  # before it, seen as it is
-    assert touched[4, 0, 11:13].all() and not touched[4, 4:, 11:].any()  # behind it, up to the line of sight
-    assert not touched[4, :, 16:].any()  # farther than its shadow
-    bounded = cost[4, :, 11][touched[4, :, 11]]
+    assert not touched[10, :, :8].any()  # before it, seen as it is
+    assert touched[10, 0, 11:13].all() and not touched[10, 4:, 11:].any()  # behind it, up to the line of sight
+    assert not touched[10, :, 16:].any()  # farther than its shadow
+    bounded = cost[4, :, 11][touched[10, :, 11]]
     bound = f(0.2) if unlike < 0.2 else f(0.35)
     np.testing.assert_allclose(bounded, bound + np.array([0.0, 0.1, 0.1, 0.1])[: len(bounded)], atol=1e-6)
