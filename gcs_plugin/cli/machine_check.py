@@ -209,7 +209,11 @@ def _is_warm(module: str, source: Path) -> bool:
 
 
 def warm_kernels(say: Callable[[str], None]) -> float:
-    """Compile the kernels by making two tiny maps of simulated pictures and two plans; returns the seconds needed."""
+    """Compile the kernels by making tiny maps of simulated pictures, plans, and a map of what is covered.
+
+    Returns:
+        The seconds needed.
+    """
     import tempfile
 
     started = time.perf_counter()
@@ -217,6 +221,7 @@ def warm_kernels(say: Callable[[str], None]) -> float:
     with tempfile.TemporaryDirectory() as folder:
         _make_maps(Path(folder))
         _make_plans(Path(folder))
+        _find_covered(Path(folder))
     return time.perf_counter() - started
 
 
@@ -241,15 +246,37 @@ def _make_maps(folder: Path) -> None:
 
 
 def _make_plans(folder: Path) -> None:
-    """Make plans by two methods around a hole."""
+    """Make plans by two methods around holes, so many that cells between them are not ordered exactly."""
     from gcs_plugin.plans.plan_request import PlanRequest, make_plan
 
-    ring = [[9.0, 47.0], [9.01, 47.0], [9.01, 47.006], [9.0, 47.006], [9.0, 47.0]]
-    hole = [[9.004, 47.002], [9.004, 47.004], [9.006, 47.004], [9.006, 47.002], [9.004, 47.002]]
+    holes = [_box(9.001 + 0.002 * k, 47.002, 9.002 + 0.002 * k, 47.004) for k in range(4)]
     area = folder / "area.geojson"
-    area.write_text(json.dumps({"type": "Polygon", "coordinates": [ring, hole]}), encoding="utf-8")
+    polygon = {"type": "Polygon", "coordinates": [_box(9.0, 47.0, 9.01, 47.006), *holes]}
+    area.write_text(json.dumps(polygon), encoding="utf-8")
     request = PlanRequest(
         area=area, vehicles=3, altitude_m=60.0, fov_min_deg=60.0, starts=[(46.999, 9.0)], endurance_min=12.0
     )
     for method in ("bcd", "tmstc"):
         make_plan(replace(request, method=method))
+
+
+def _find_covered(folder: Path) -> None:
+    """Find what the pictures of the dense map cover."""
+    from contextlib import redirect_stdout
+    from io import StringIO
+
+    from gcs_plugin.cli.main import main
+    from orthoswarm.export.product_files import read_frames
+
+    cameras = [row["camera"] for row in read_frames(folder / "dense" / "frames.jsonl") if row.get("camera")]
+    lats, lons = [c["lat_deg"] for c in cameras], [c["lon_deg"] for c in cameras]
+    area, out = folder / "covered.geojson", folder / "coverage"
+    polygon = {"type": "Polygon", "coordinates": [_box(min(lons), min(lats), max(lons), max(lats))]}
+    area.write_text(json.dumps(polygon), encoding="utf-8")
+    with redirect_stdout(StringIO()):
+        main(["coverage", str(folder / "dense"), "--area", str(area), "--out", str(out)])
+
+
+def _box(west: float, south: float, east: float, north: float) -> list[list[float]]:
+    """A ring around a box, degrees."""
+    return [[west, south], [east, south], [east, north], [west, north], [west, south]]

@@ -24,8 +24,8 @@ def heights(terrain: Terrain, west: float, north: float, gsd_m: float, tile_px: 
     """
     n = tile_px // LATTICE_PX + 1
     offset = np.arange(n) * (LATTICE_PX * gsd_m)
-    columns = _Taps((west + offset - terrain.west) / terrain.step_m, terrain.z.shape[1])
-    rows = _Taps((north - offset - terrain.south) / terrain.step_m, terrain.z.shape[0])
+    columns = _Taps(np.asarray((west + offset - terrain.west) / terrain.step_m, float), terrain.z.shape[1])
+    rows = _Taps(np.asarray((north - offset - terrain.south) / terrain.step_m, float), terrain.z.shape[0])
     z = np.ascontiguousarray(terrain.z[rows.nodes, columns.nodes])
     out = np.empty((n, n), np.float32)
     _smooth(z, rows.index, rows.cubic, columns.index, columns.cubic, np.empty((len(z), n), np.float32), out)
