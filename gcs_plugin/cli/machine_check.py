@@ -209,7 +209,7 @@ def _is_warm(module: str, source: Path) -> bool:
 
 
 def warm_kernels(say: Callable[[str], None]) -> float:
-    """Compile the kernels by making tiny maps of simulated pictures, plans, and a map of what is covered.
+    """Compile the kernels by making tiny maps of simulated pictures, plans, tiles, and a map of what is covered.
 
     Returns:
         The seconds needed.
@@ -221,7 +221,7 @@ def warm_kernels(say: Callable[[str], None]) -> float:
     with tempfile.TemporaryDirectory() as folder:
         _make_maps(Path(folder))
         _make_plans(Path(folder))
-        _find_covered(Path(folder))
+        _use_map(Path(folder))
     return time.perf_counter() - started
 
 
@@ -260,12 +260,13 @@ def _make_plans(folder: Path) -> None:
         make_plan(replace(request, method=method))
 
 
-def _find_covered(folder: Path) -> None:
-    """Find what the pictures of the dense map cover."""
+def _use_map(folder: Path) -> None:
+    """Find what the pictures of the dense map cover, export it as tiles, and draw a picture as the daemon does."""
     from contextlib import redirect_stdout
     from io import StringIO
 
     from gcs_plugin.cli.main import main
+    from gcs_plugin.daemon.layers.realtime_layer import load_kernels
     from orthoswarm.export.product_files import read_frames
 
     cameras = [row["camera"] for row in read_frames(folder / "dense" / "frames.jsonl") if row.get("camera")]
@@ -275,6 +276,8 @@ def _find_covered(folder: Path) -> None:
     area.write_text(json.dumps(polygon), encoding="utf-8")
     with redirect_stdout(StringIO()):
         main(["coverage", str(folder / "dense"), "--area", str(area), "--out", str(out)])
+        main(["export", str(folder / "dense"), "--to", "mbtiles"])
+    load_kernels(folder)
 
 
 def _box(west: float, south: float, east: float, north: float) -> list[list[float]]:

@@ -176,7 +176,7 @@ class Drawer:
     # -- the thread -----------------------------------------------------------------------------------------------
 
     def _run(self) -> None:
-        _warm_up(self._folder)
+        load_kernels(self._folder)
         while True:
             with self._condition:
                 while not len(self._queue) and not self._more and not self._stop:
@@ -334,8 +334,8 @@ class Drawer:
         return drawn
 
 
-def _warm_up(folder: Path) -> None:
-    """Load the compiled kernels before the first picture needs them."""
+def load_kernels(folder: Path) -> None:
+    """Load the compiled kernels before the first picture needs them; draws for a moment in a folder."""
     path = folder / new_name("warm")
     try:
         lens = Lens(32, 24, 30.0)
