@@ -212,10 +212,10 @@ class SurfaceConfig:
     tall_noise_levels: float = 1.0
     """Sigma of grey values below which a cell's texture says nothing (measured: with 2 a tenth fewer of a plain roof's
     nodes are right within 1 m; less than 1 is the noise of a JPEG)."""
-    tall_doubt: float = 0.1
-    """Cost of any height against the ground, in correlation: what is not sure is ground (measured: with 0.07 more roofs
-    are whole and more of the ground beside them is raised, with 0.15 the other way round)."""
-    tall_hidden_cost: tuple[float, float] = (0.2, 0.35)
+    tall_doubt: float = 0.07
+    """Cost of any height against the ground, in correlation: what is not sure is ground (measured: with 0.05 more roofs
+    are whole and more of the ground beside them is raised, with 0.1 the other way round)."""
+    tall_hidden_cost: tuple[float, float] = (0.2, 0.4)
     """Least and greatest cost, in correlation, of a height at which something taller hides the cell from the picture
     compared (measured: with greater ones more roofs are whole and more of the ground behind them is raised)."""
     tall_hidden_m: float = 1.0
