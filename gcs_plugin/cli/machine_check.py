@@ -267,16 +267,11 @@ def _use_map(folder: Path) -> None:
 
     from gcs_plugin.cli.main import main
     from gcs_plugin.daemon.layers.realtime_layer import load_kernels
-    from orthoswarm.export.product_files import read_frames
 
-    cameras = [row["camera"] for row in read_frames(folder / "dense" / "frames.jsonl") if row.get("camera")]
-    lats, lons = [c["lat_deg"] for c in cameras], [c["lon_deg"] for c in cameras]
-    area, out = folder / "covered.geojson", folder / "coverage"
-    polygon = {"type": "Polygon", "coordinates": [_box(min(lons), min(lats), max(lons), max(lats))]}
-    area.write_text(json.dumps(polygon), encoding="utf-8")
+    dense, area = str(folder / "dense"), str(folder / "twin" / "plan.geojson")
     with redirect_stdout(StringIO()):
-        main(["coverage", str(folder / "dense"), "--area", str(area), "--out", str(out)])
-        main(["export", str(folder / "dense"), "--to", "mbtiles"])
+        main(["coverage", dense, "--area", area, "--out", str(folder / "coverage")])
+        main(["export", dense, "--to", "mbtiles"])
     load_kernels(folder)
 
 

@@ -74,7 +74,8 @@ class MosaicConfig:
     """Cost of a picture from which something taller hides the cell; chosen: as of a view at 39 degrees, more than
     `candidate_tan2` allows."""
     hidden_m: float = 1.0
-    """What stands over the line of sight by less hides nothing, metres: heights of walls are no better (chosen)."""
+    """What rises above the line of sight by less than this hides nothing, metres (chosen: about the error of heights
+    beside walls)."""
     blur_cost: float = 6000.0
     """Cost of a picture that is less sharp than the median of those around, times the logarithm of the ratio; chosen
     like `haze_cost`."""

@@ -84,7 +84,7 @@ def test_each_pixel_comes_from_the_nearest_frame_that_sees_it(tmp_path, seed, ti
         render(flight.frames, terrain, canvas, read=flight.read)
         mine = labels(canvas)
         drawn = whole(canvas)[..., 3] == 255
-    # the renderer's heights (bicubic, then bilinear over 4 pixels) differ from the hills by centimetres, which may
+    # the renderer's heights (bicubic, then bilinear in the lattice) differ from the hills by centimetres, which may
     # move a picture's border over a pixel: compare where the borders are not within 0.3 pixels
     d2 = np.full((len(flight.frames), grid.height, grid.width), np.inf)
     sure = np.ones((grid.height, grid.width), bool)

@@ -198,8 +198,8 @@ class SurfaceConfig:
     """Side of the blocks of nodes that are measured at a time, in the same pictures (measured: of 96 nodes 82.9 % of
     those on wide roofs are right within 1 m instead of 84.5 %, beside them 90.4 instead of 93.2; 32 are no better)."""
     tall_block_border_nodes: int = 4
-    """Nodes around a block that it is measured with (measured: with 8 0.3 per cent more nodes on wide roofs are right
-    within 1 m, for a third more time; the outermost may lie at any height)."""
+    """Nodes around a block that it is measured with (measured: 8 nodes take a third more time, and 0.3 per cent more
+    nodes on wide roofs are right within 1 m). The outermost may lie at any height."""
     tall_blocks_per_task: int = 16
     """Blocks of one task, so that neighbours read a picture once (chosen for memory)."""
     tall_height_step_m: float = 0.75
@@ -219,7 +219,7 @@ class SurfaceConfig:
     """Least and greatest cost, in correlation, of a height at which something taller hides the cell from the picture
     compared (measured: with greater ones more roofs are whole and more of the ground behind them is raised)."""
     tall_hidden_m: float = 1.0
-    """What stands over a line of sight by less hides nothing, metres (0.5 is no better)."""
+    """What rises above a line of sight by less than this hides nothing, metres (measured: 0.5 is no better)."""
     tall_slope_cost: float = 0.15
     """Cost of a step to the next height between cells, in correlation (chosen; not measured)."""
     tall_edge_cost: tuple[float, float] = (0.15, 1.2)

@@ -1,7 +1,7 @@
 """Heights that pictures are drawn on, on the lattice of a tile: smooth on ground and roofs, with steps at walls.
 
 Between the nodes of the surface heights are interpolated. Across a wall that would make a slope, on which a picture
-shows roof and facade once more, mirrored. There each place is either on the top or at the foot.
+shows roof and facade once more, mirrored. At a wall each place is either on its top or at its foot.
 """
 
 import numpy as np
@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from orthoswarm.compute.jit import in_place_kernel
 from orthoswarm.config import active
 from orthoswarm.model.placement import Terrain
+from orthoswarm.mosaic.kernels.pixel_sampling import cubic_convolution
 from orthoswarm.mosaic.kernels.render_arrays import LATTICE_PX
 
-_SIXTH = 1.0 / 6.0
 _NEAR_WALL, _WALL = np.uint8(1), np.uint8(2)
 
 
@@ -53,12 +53,9 @@ class _Taps:
         self.nodes = slice(int(index.min()), int(index.max()) + 1)
         self.index = index - self.nodes.start
         t, s = at - base, 1.0 - (at - base)
-        cubic = [
-            t * (-0.5 + t * (1.0 - 0.5 * t)), 1.0 + t * t * (1.5 * t - 2.5),
-            t * (0.5 + t * (2.0 - 1.5 * t)), t * t * (0.5 * t - 0.5),
-        ]  # fmt: skip
         spline = [s**3, 4.0 + t * t * (3.0 * t - 6.0), 4.0 + s * s * (3.0 * s - 6.0), t**3]
-        self.cubic, self.spline = np.array(cubic, np.float32), np.array(spline, np.float32) * np.float32(_SIXTH)
+        self.cubic = cubic_convolution(t).astype(np.float32)
+        self.spline = np.array(spline, np.float32) * np.float32(1.0 / 6.0)
 
 
 @in_place_kernel

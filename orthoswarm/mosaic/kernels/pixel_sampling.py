@@ -25,18 +25,22 @@ _BIAS2 = np.int64((2 * _LOW * UNIT) * (1 + (1 << 16) + (1 << 32)))
 _LANES = np.int64(0x01FF_01FF_01FF)
 
 
-def cubic_weights() -> NDArray[np.int64]:
-    """Weights at -1, 0, 1, 2 for every fraction k / UNIT, int64 (UNIT, 4), each row's sum UNIT."""
-    t = np.arange(UNIT) / UNIT
-    exact = np.stack(
+def cubic_convolution(t: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Weights of the samples at -1, 0, 1, 2 for places t (N,) between 0 and 1 (Keys 1981, a = -1/2), float64 (4, N)."""
+    return np.stack(
         [
             t * (-0.5 + t * (1.0 - 0.5 * t)),
             1.0 + t * t * (1.5 * t - 2.5),
             t * (0.5 + t * (2.0 - 1.5 * t)),
             t * t * (0.5 * t - 0.5),
-        ],
-        1,
+        ]
     )
+
+
+def cubic_weights() -> NDArray[np.int64]:
+    """Weights at -1, 0, 1, 2 for every fraction k / UNIT, int64 (UNIT, 4), each row's sum UNIT."""
+    t = np.arange(UNIT) / UNIT
+    exact = cubic_convolution(t).T
     weights = np.rint(exact * UNIT).astype(np.int64)
     rows = np.arange(UNIT)
     weights[rows, np.where(t < 0.5, 1, 2)] += UNIT - weights.sum(1)

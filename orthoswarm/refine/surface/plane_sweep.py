@@ -252,10 +252,10 @@ def _heights(task: _Task, block: _Block, pictures: Sequence[NDArray[np.uint8]]) 
     steps = f(c.tall_slope_cost), f(c.tall_edge_cost[0]), f(c.tall_edge_cost[1]), f(1.0 / c.tall_edge_levels)
     found = np.empty(levels.shape, np.float32)
     kernels.lowest(kernels.semi_global(cost, volumes[0], levels, steps, aslant=False), levels, f(task.step_m), found)
-    above, hidden = task.views[block.views[0]].position, (f(c.tall_hidden_cost[0]), f(c.tall_hidden_cost[1]))
+    above, (low, high) = task.views[block.views[0]].position, c.tall_hidden_cost
     kernels.bound_hidden(
-        cost, levels, found, block.ground, west, south, task.cell_m, f(task.step_m), above, *hidden, f(c.tall_doubt),
-        f(c.tall_hidden_m),
+        cost, levels, found, block.ground, west, south, task.cell_m, f(task.step_m), above, f(low), f(high),
+        f(c.tall_doubt), f(c.tall_hidden_m),
     )  # fmt: skip
     kernels.lowest(kernels.semi_global(cost, volumes[0], levels, steps), levels, f(task.step_m), found)
     return np.asarray(cv2.medianBlur(found, 3), np.float32)  # single cells tell nothing

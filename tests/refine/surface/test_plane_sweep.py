@@ -55,6 +55,6 @@ def test_likeness_says_little_at_heights_that_something_taller_hides_from_the_ca
     assert not touched[10, :, :8].any()  # before it, seen as it is
     assert touched[10, 0, 11:13].all() and not touched[10, 4:, 11:].any()  # behind it, up to the line of sight
     assert not touched[10, :, 16:].any()  # farther than its shadow
-    bounded = cost[4, :, 11][touched[10, :, 11]]
+    bounded = cost[10, :, 11][touched[10, :, 11]]
     bound = f(0.2) if unlike < 0.2 else f(0.35)
     np.testing.assert_allclose(bounded, bound + np.array([0.0, 0.1, 0.1, 0.1])[: len(bounded)], atol=1e-6)

@@ -13,6 +13,7 @@ import pytest
 from telemetry.live.live_stream import open_stream
 from telemetry.videos.video_file import NotAVideo
 from telemetry.write.sei_writer import add_sei
+from tests.kit.servers.ports import free_port
 from tests.telemetry.videos.test_video import make_video, pose
 
 av = pytest.importorskip("av")
@@ -83,10 +84,7 @@ def test_a_lost_link_is_opened_again_until_stopped(marked):
 def test_a_stream_over_udp(marked):
     data = marked.read_bytes()
     stop = threading.Event()
-    probe = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    probe.bind(("127.0.0.1", 0))
-    port = probe.getsockname()[1]
-    probe.close()
+    port = free_port()
 
     def send() -> None:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
@@ -129,9 +127,7 @@ for _ in range(50):
 
 def test_a_stream_over_rtsp(marked):
     """The camera pushes from a process of its own; the reader plays the server."""
-    probe = socket.create_server(("127.0.0.1", 0))
-    url = f"rtsp://127.0.0.1:{probe.getsockname()[1]}/live"
-    probe.close()
+    url = f"rtsp://127.0.0.1:{free_port()}/live"
     camera = subprocess.Popen([sys.executable, "-c", PUSH, str(marked), url])
     try:
         options = {"rtsp_flags": "listen", "listen_timeout": "10"}
