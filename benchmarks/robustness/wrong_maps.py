@@ -141,7 +141,7 @@ def measure(folder, basemap_file, refiner="swarm"):
     return {
         **{state: states.count(state) for state in ("matched", "carried", "failed")},
         "fine": sum(p.stage == "fine" for p in placed), "pictures": len(placed),
-        "median_m": round(float(np.median(error)), 2), "p95_m": round(float(np.percentile(error, 95)), 2),
+        "median_m": round(float(np.median(error)), 3), "p95_m": round(float(np.percentile(error, 95)), 3),
         "sigma_m": round(float(np.median([p.sigma_m for p in placed])), 2), "cpu_s": round(seconds, 1),
     }  # fmt: skip
 

@@ -88,8 +88,12 @@ class RegistrationConfig:
     """Least mean robust weight of its observations (chosen; not measured)."""
     tie_height_m: float = 3.0
     """Points farther above or below the ground are not compared, metres: what is around them leans (chosen)."""
-    tie_half_m: float = 10.0
-    """Half a patch, metres (chosen; not measured)."""
+    tie_half_share: float = 0.1
+    """Half a patch, as a share of the flying height: larger ones are found where little of the ground has stayed as it
+    is in the map, and still follow the ground (measured: half patches of 10, 13, 16 and 20 m from 150 m, see
+    benchmarks/accuracy/other_dates.py) ..."""
+    tie_half_limits_m: tuple[float, float] = (10.0, 20.0)
+    """... within these limits, metres (chosen: what is on the ground does not grow with the flying height)."""
     tie_half_px: int = 8
     """... and at least so many pixels (chosen)."""
     tie_reach_px: int = 4
@@ -124,6 +128,8 @@ class RegistrationConfig:
     """Fewer tie points do not tell how far strong edges are displaced from texture (chosen: a mean to centimetres)."""
     edge_most: int = 300
     """More are not compared (chosen for cost)."""
+    edge_search_m: float = 2.5
+    """How far their edges are searched, metres: a flight that lies on the map is decimetres off (chosen for cost)."""
     edge_reach_m: float = 1.0
     """Differences farther than this from their median are gross errors, metres (chosen)."""
 
@@ -290,6 +296,8 @@ class RegistrationConfig:
     """... and at least this, metres (chosen)."""
     oblique_slope: float = 0.35
     """Horizontal distance over height from which on a view counts as oblique: 19 degrees (chosen; not measured)."""
+    oblique_half_m: float = 10.0
+    """Half a patch, metres: smaller than a tie point's, since ground seen obliquely tilts what is around (chosen)."""
     oblique_reach_m: float = 6.0
     """How far a patch is searched, metres (chosen; not measured)."""
     oblique_across_m: float = 0.6

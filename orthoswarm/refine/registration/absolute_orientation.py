@@ -65,7 +65,7 @@ def tie_matches(
 
     Args:
         flight: its adjusted cameras and points. surface: its ground. ground: the map below it.
-        cell_m: side of a cell. reach_m: search to each side. half_m: half a patch, None: as configured. All metres.
+        cell_m: side of a cell. reach_m: search to each side. half_m: half a patch, None: as `tie_half_m`. All metres.
         pictures: bool (N,), the ones to compare, None for all.
     """
     config = active().registration
@@ -75,7 +75,7 @@ def tie_matches(
     fewest = config.tie_views_sparse if flight.sparse else config.tie_views
     usable = (seen.camera >= 0) & (seen.count >= fewest) & (seen.mean_weight > config.tie_view_weight)
     usable &= np.abs(height) < config.tie_height_m
-    half_m = config.tie_half_m if half_m is None else half_m
+    half_m = tie_half_m(flight) if half_m is None else half_m
     leg = flight.leg[np.maximum(seen.camera, 0)]
     chosen = one_per_cell(adj.points, leg, np.where(usable, np.abs(height), np.inf), cell_m)
     return _ground_matches(
@@ -113,9 +113,7 @@ def _ground_matches(
     )
 
 
-def edge_displacement(
-    flight: Flight, surface: GroundModel, ground: LoadedMap, matches: MapMatches, reach_m: float
-) -> Array:
+def edge_displacement(flight: Flight, surface: GroundModel, ground: LoadedMap, matches: MapMatches) -> Array:
     """Mean displacement (2,), metres, of strong edges against texture at the same tie points; zero if it is not known.
 
     Shadows of another hour and what leans in the map displace strong edges most, but texture, too, by as much as edges
@@ -127,7 +125,7 @@ def edge_displacement(
     some = matches.take(np.arange(0, len(matches.point), step))
     camera = np.full(len(flight.adjustment.points), -1, np.int32)
     camera[some.point] = some.camera
-    half_m = config.tie_half_m
+    half_m = tie_half_m(flight)
     edges = clear_matches(
         _ground_matches(
             flight,
@@ -135,7 +133,7 @@ def edge_displacement(
             ground,
             chosen=some.point,
             camera=camera,
-            reach_m=reach_m,
+            reach_m=config.edge_search_m,
             half_m=half_m,
             texture=False,
         )
@@ -377,7 +375,7 @@ def _second_round(
     config = active().registration
     cell_m, reach_m = config.tie_cell_sparse_m if flight.sparse else config.tie_cell_m, config.tie_reach_m
     matches = clear_matches(tie_matches(flight, surface, ground, cell_m=cell_m, reach_m=reach_m, pictures=pictures))
-    matches = replace(matches, shift=matches.shift - edge_displacement(flight, surface, ground, matches, reach_m))
+    matches = replace(matches, shift=matches.shift - edge_displacement(flight, surface, ground, matches))
     ties = as_ties(matches, flight.adjustment.points)
     for k in range(rounds):
         _step(flight, surface, ties, config.tie_scales[min(k, 1)])
@@ -386,6 +384,13 @@ def _second_round(
         if k == rounds - 2:
             surface = refit_ground(flight, surface, as_smooth=True)
     return surface, ties, matches
+
+
+def tie_half_m(flight: Flight) -> float:
+    """Half the patch about a tie point, metres: a share of the flying height."""
+    config = active().registration
+    height = float(np.median(flight.cameras().position[:, 2]))
+    return float(np.clip(config.tie_half_share * height, *config.tie_half_limits_m))
 
 
 def working_gsd(flight: Flight) -> float:

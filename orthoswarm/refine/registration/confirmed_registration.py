@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from orthoswarm.config import active
 from orthoswarm.model.placement import MapWindow
 from orthoswarm.refine.flight.relative_block import Flight
-from orthoswarm.refine.registration.absolute_orientation import first_ties, load_map, map_gsd, small_ties
+from orthoswarm.refine.registration.absolute_orientation import first_ties, load_map, map_gsd, small_ties, tie_half_m
 from orthoswarm.refine.registration.coarse_registration import CoarseFit, shift_cameras
 from orthoswarm.refine.registration.map_evidence import false_matches_log10
 from orthoswarm.refine.registration.map_windows import LoadedMap
@@ -53,7 +53,7 @@ def confirmed(
         ground = load_map(flight, basemap, origin, map_gsd(flight, basemap))
         matches = first_ties(flight, surface, ground)
         tests += 1  # each test is one more chance to agree
-        chance = _false_matches_log10(flight, matches, config.tie_half_m) + np.log10(tests)
+        chance = _false_matches_log10(flight, matches, tie_half_m(flight)) + np.log10(tests)
         if chance > limit:  # a few photos have room for a few patches of this size only: more and smaller ones
             half_m, tests = config.evidence_small_half_m, tests + 1
             chance = _false_matches_log10(flight, small_ties(flight, surface, ground, half_m), half_m) + np.log10(tests)

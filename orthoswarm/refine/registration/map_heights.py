@@ -47,7 +47,7 @@ def map_heights(
     points = np.column_stack([cells, surface.terrain().height(cells)])
     camera = _best_views(cameras, points, own)
     chosen = np.flatnonzero(camera >= 0)
-    half = max(config.tie_half_px, round(config.tie_half_m / ground.gsd_m))
+    half = max(config.tie_half_px, round(config.oblique_half_m / ground.gsd_m))
     reach = max(config.tie_reach_px, round(config.oblique_reach_m / ground.gsd_m))
     gray, level = flight.pictures.gray, points[:, 2]
     found = clear_matches(

@@ -13,7 +13,12 @@ from orthoswarm.model.geo import GroundGrid
 from orthoswarm.refine.bundle.block_arrays import CameraBlock
 from orthoswarm.refine.bundle.observation_selection import one_per_cell
 from orthoswarm.refine.features.patch_matching import gradients, locate, template_of, window_of
-from orthoswarm.refine.registration.absolute_orientation import clear_matches, edge_displacement, mode_shift
+from orthoswarm.refine.registration.absolute_orientation import (
+    clear_matches,
+    edge_displacement,
+    mode_shift,
+    tie_half_m,
+)
 from orthoswarm.refine.registration.map_heights import map_heights
 from orthoswarm.refine.registration.map_windows import LoadedMap
 from orthoswarm.refine.registration.orientation_correlation import (
@@ -315,6 +320,34 @@ def test_shadows_of_another_hour_pull_less_where_texture_is_compared():
     assert texture < 0.6 * edges
 
 
+def test_larger_patches_are_found_where_most_of_the_ground_looks_different():
+    rng = np.random.default_rng(5)
+    as_it_was, now = texture(1000, 1), texture(1000, 9)
+    same = cv2.GaussianBlur(rng.normal(size=as_it_was.shape).astype(np.float32), (0, 0), 12)
+    today = FlatMap(np.where(same > np.quantile(same, 0.8), as_it_was, now))
+    cameras, images = pictures_of(today, (0.0, 0.0))
+    points = np.array([[x, y, 0.0] for x in range(-84, 85, 8) for y in range(-12, 33, 8)], float)
+    camera = np.abs(points[:, None, 0] - cameras.position[None, :, 0]).argmin(1).astype(np.int32)
+    ground = LoadedMap.load(FlatMap(as_it_was), np.zeros(2), BoundingBox(-160.0, -120.0, 160.0, 140.0), GSD)
+
+    def right_ones(half):
+        found = clear_matches(
+            match_points(
+                cameras, points, np.arange(len(points)), camera=camera, gray=lambda i: 255 - images[i], ground=ground,
+                half=half, reach=10, level=np.zeros(len(points)), texture=True,
+            )
+        )  # fmt: skip
+        return float((np.hypot(*found.shift.T) < 0.25).sum()) / len(points)
+
+    assert right_ones(30) > 1.3 * right_ones(20) > 0.1
+
+
+@pytest.mark.parametrize(("height_m", "half_m"), [(30.0, 10.0), (150.0, 15.0), (600.0, 20.0)])
+def test_patches_grow_with_the_flying_height_within_limits(height_m, half_m):
+    cameras = SimpleNamespace(position=np.array([[0.0, 0.0, height_m]]))
+    assert tie_half_m(SimpleNamespace(cameras=lambda: cameras)) == pytest.approx(half_m)
+
+
 def test_what_strong_edges_pull_more_is_what_they_pull_texture():
     rng = np.random.default_rng(7)
     ground = 60.0 + 0.4 * texture(1000, 3)
@@ -327,6 +360,7 @@ def test_what_strong_edges_pull_more_is_what_they_pull_texture():
         adjustment=SimpleNamespace(cameras=cameras, points=points),
         pictures=SimpleNamespace(size=(320, 320), gray=lambda i: 255 - images[i]),
         best_views=lambda: SimpleNamespace(camera=camera),
+        cameras=lambda: cameras,
     )
     level = SimpleNamespace(height=lambda xy: np.zeros(len(xy)))
     loaded = LoadedMap.load(before, np.zeros(2), BoundingBox(-160.0, -120.0, 160.0, 140.0), GSD)
@@ -346,11 +380,11 @@ def test_what_strong_edges_pull_more_is_what_they_pull_texture():
         )
     )
     off = found.shift.mean(0)
-    left = off - edge_displacement(flight, level, loaded, found, 5.0)
+    left = off - edge_displacement(flight, level, loaded, found)
     assert np.hypot(*off) > 0.02
     assert np.hypot(*left) < 0.6 * np.hypot(*off)
     few = found.take(np.arange(10))
-    assert not edge_displacement(flight, level, loaded, few, 5.0).any()  # so few tell nothing
+    assert not edge_displacement(flight, level, loaded, few).any()  # so few tell nothing
 
 
 def test_the_lean_is_voted_among_outliers():

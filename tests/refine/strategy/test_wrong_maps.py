@@ -1,8 +1,11 @@
 """A map of other ground is refused; a right one that only looks otherwise is used."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 
+from benchmarks.accuracy.other_dates import other_detail
 from benchmarks.robustness.wrong_maps import altered, blank, darkened, mirror_ew, mirror_ns, noise, season
 from orthoswarm.model.geo import local_origin
 from orthoswarm.raster.basemap import Basemap
@@ -40,7 +43,7 @@ def test_nothing_takes_its_place_from_a_map_of_other_ground(twin, scene, change,
         assert np.abs(away).max() < 0.5
 
 
-@pytest.mark.parametrize("change", [darkened, season])
+@pytest.mark.parametrize("change", [darkened, season, partial(other_detail, share=0.85)])
 def test_a_right_map_that_looks_otherwise_is_used(twin, scene, change, tmp_path):
     vehicles, grid, right, truth = with_map(twin, scene, change, tmp_path)
     for solution in refine_all(vehicles, right, grid).fine:
