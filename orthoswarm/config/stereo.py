@@ -43,6 +43,13 @@ class StereoConfig:
     """Search range above the terrain, metres (chosen: a tower block)."""
     tallest_heights: float = 0.45
     """The same as a share of the camera's height above the ground; the lower of both counts (chosen)."""
+    wide_px: int = 128
+    """Pairs with a search range of more disparities are matched at half size first, to find those that occur (chosen:
+    for fewer the time saved is less than what it takes) ..."""
+    wide_region_px: int = 400
+    """... in regions of alike disparity of at least so many pixels at half size (chosen: 40 x 40 pixels) ..."""
+    wide_margin: float = 0.15
+    """... with this share of their range to either side, and 2 pixels at half size (chosen: smaller regions)."""
 
     # One surface of all pairs
     cell_pixels: float = 2.0

@@ -79,7 +79,7 @@ def match_pair(first: View, second: View, terrain: Terrain) -> PairPoints:
         return PairPoints(np.zeros((0, 3)), np.zeros(0))
     left, valid_left = _resampled(first, frame, 0)
     right, valid_right = _resampled(second, frame, frame.shift)
-    disparity = _disparities(left, right, frame.count)
+    disparity = _disparities(left, right, valid_left, frame.count)
     rows, columns = np.nonzero(valid_left & (disparity >= 0.0))
     found = disparity[rows, columns]
     other = np.rint(columns - found).astype(np.intp)
@@ -120,7 +120,7 @@ def _common_frame(left: View, right: View, terrain: Terrain) -> _Rectified | Non
         return None
     disparity = focal * base_m / np.concatenate(depths)
     shift = int(np.floor(disparity.min()))
-    count = 16 * int(np.ceil((float(disparity.max()) - shift + 1.0) / 16.0))
+    count = _whole_steps(float(disparity.max()) - shift + 1.0)
     return _Rectified(
         axes=axes, base_m=base_m, focal_px=focal, left=int(np.floor(low[0])), top=int(np.floor(top)), width=width,
         height=height, shift=shift, count=count,
@@ -175,15 +175,53 @@ def _resampled(view: View, frame: _Rectified, shift: int) -> tuple[Gray, NDArray
     return np.asarray(picture, np.uint8), seen
 
 
-def _disparities(left: Gray, right: Gray, count: int) -> NDArray[np.float32]:
-    """Disparity of each pixel of the left picture, float32, negative where no match is found."""
+def _disparities(left: Gray, right: Gray, valid: NDArray[np.bool_], count: int) -> NDArray[np.float32]:
+    """Disparity of each pixel of the left picture, float32 in 0 to count - 1, negative where no match is found.
+
+    Args:
+        left, right: rectified. valid: where the left one has content. count: disparities that may occur.
+    """
+    least = 0
+    if count > active().stereo.wide_px:
+        least, count = _occurring(left, right, valid, count)
+    return _matched(left, right, least, count)
+
+
+def _occurring(left: Gray, right: Gray, valid: NDArray[np.bool_], count: int) -> tuple[int, int]:
+    """The least disparity that occurs at half size, and how many from it on: an eighth of the work, and often few.
+
+    Only large regions of alike disparity count: false matches are small and have any disparity.
+    """
     c = active().stereo
-    area = c.block_px**2
+    one, two = (np.asarray(cv2.resize(p, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)) for p in (left, right))
+    half = _whole_steps(count / 2)
+    found = _matched(one, two, 0, half)
+    content = cv2.resize(valid.astype(np.uint8), one.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
+    whole = np.where(content & (found >= 1.0) & (found < half - 2.0), found * _FRACTION, -_FRACTION).astype(np.int16)
+    cv2.filterSpeckles(whole, -_FRACTION, c.wide_region_px, _FRACTION)
+    occurring = whole[whole >= 0] / _FRACTION
+    if len(occurring) == 0:
+        return 0, count
+    low, high = float(occurring.min()), float(occurring.max())
+    margin = c.wide_margin * (high - low) + 2.0
+    least = 16 * max(0, int(2.0 * (low - margin) / 16.0))
+    return least, min(count - least, _whole_steps(2.0 * (high + margin) - least))
+
+
+def _whole_steps(disparities: float) -> int:
+    """A number of disparities that the matcher takes: a multiple of 16."""
+    return 16 * max(1, int(np.ceil(disparities / 16.0)))
+
+
+def _matched(left: Gray, right: Gray, least: int, count: int) -> NDArray[np.float32]:
+    """`_disparities` among `count` ones from `least` on."""
+    c = active().stereo
+    area, last = c.block_px**2, least + count
     matcher = cv2.StereoSGBM.create(
-        minDisparity=0, numDisparities=count, blockSize=c.block_px, P1=int(c.smoothness[0] * area),
+        minDisparity=least, numDisparities=count, blockSize=c.block_px, P1=int(c.smoothness[0] * area),
         P2=int(c.smoothness[1] * area), disp12MaxDiff=1, uniquenessRatio=c.unique_percent,
         speckleWindowSize=c.speckle_px, speckleRange=1, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     )  # fmt: skip
-    pads = (0, 0, count, 0, cv2.BORDER_REPLICATE)  # the matcher leaves out as many columns as there are disparities
-    found = matcher.compute(cv2.copyMakeBorder(left, *pads), cv2.copyMakeBorder(right, *pads))
-    return np.asarray(found[:, count:], np.float32) / np.float32(_FRACTION)
+    pads = (0, 0, last, 0, cv2.BORDER_REPLICATE)  # the matcher leaves out as many columns as the largest disparity
+    found = matcher.compute(cv2.copyMakeBorder(left, *pads), cv2.copyMakeBorder(right, *pads))[:, last:]
+    return np.where(found < least * _FRACTION, -1.0, found / _FRACTION).astype(np.float32)

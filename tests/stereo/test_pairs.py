@@ -2,11 +2,13 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from orthoswarm.config import override
 from orthoswarm.model.camera import Lens
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import Terrain
@@ -36,6 +38,34 @@ def test_heights_of_a_pair_are_true_for_all_headings_and_tilts(yaws, towards):
     assert abs(np.median(error)) < 0.5  # a pixel is 0.74 m, the waves of this ground are long
     assert np.quantile(np.abs(error), 0.68) < 0.8  # 0.3 of a pixel at a base of 0.4 is 0.6 m
     assert 0.2 < np.median(found.sigma_m) < 0.8
+
+
+def slab(east_north):
+    """Level ground with a platform 20 m high, 16 m wide, 30 m east of the first camera."""
+    p = np.abs(np.asarray(east_north) - (EAST + 30.0, NORTH))
+    return np.where(p.max(-1) < 8.0, 20.0, 0.0)
+
+
+def test_of_a_wide_search_range_only_what_occurs_is_searched(monkeypatch):
+    large = Lens(960, 720, 540.0)
+    flight = Flight().take(camera(lens=large), slab).take(camera(east=45.0, lens=large), slab)
+    searched = []
+    create = cv2.StereoSGBM.create
+    monkeypatch.setattr(
+        cv2.StereoSGBM, "create", lambda **how: searched.append(how["numDisparities"]) or create(**how)
+    )
+    found = match_pair(view(flight, 0), view(flight, 1), FLAT).points
+    half, narrow = searched
+    override({"stereo": {"wide_px": 10_000}})
+    try:
+        whole = match_pair(view(flight, 0), view(flight, 1), FLAT).points
+    finally:
+        override({})
+    assert half < 0.6 * searched[-1] and narrow < 0.7 * searched[-1]
+    assert len(found) > 0.98 * len(whole)
+    top = np.abs(found[:, :2] - (EAST + 30.0, NORTH)).max(1) < 5.0
+    assert top.sum() > 1_000 and abs(np.median(found[top, 2]) - 20.0) < 0.5
+    assert np.quantile(np.abs(found[:, 2] - slab(found[:, :2])), 0.9) < 0.5
 
 
 def test_pictures_without_overlap_give_no_points():
