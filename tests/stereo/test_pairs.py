@@ -51,9 +51,7 @@ def test_of_a_wide_search_range_only_what_occurs_is_searched(monkeypatch):
     flight = Flight().take(camera(lens=large), slab).take(camera(east=45.0, lens=large), slab)
     searched = []
     create = cv2.StereoSGBM.create
-    monkeypatch.setattr(
-        cv2.StereoSGBM, "create", lambda **how: searched.append(how["numDisparities"]) or create(**how)
-    )
+    monkeypatch.setattr(cv2.StereoSGBM, "create", lambda **how: searched.append(how["numDisparities"]) or create(**how))
     found = match_pair(view(flight, 0), view(flight, 1), FLAT).points
     half, narrow = searched
     override({"stereo": {"wide_px": 10_000}})
