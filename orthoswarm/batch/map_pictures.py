@@ -61,7 +61,8 @@ def refined_pictures(run: RunContext, state: RunState, refinement: Refinement | 
     if run.options.gains:
         with run.clock.stage("final: gains", len(fine)):
             tone = state.basemap if run.options.tone == "map" and with_map and on_map else None
-            state.gains = estimate_fields(fine, state.thumbnails, terrain or Terrain.flat(), tone=tone)
+            ground, threads = terrain or Terrain.flat(), run.drawers.count
+            state.gains = estimate_fields(fine, state.thumbnails, ground, tone=tone, threads=threads)
         if run.options.tone == "map":
             state.warnings.append(tone_warning(state.gains) if tone else NO_MAP_TONE)
     if run.options.until != "fine":

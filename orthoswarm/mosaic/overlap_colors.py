@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel
+from orthoswarm.compute.threads import on_threads
 from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import Camera, Lens
@@ -47,6 +48,12 @@ class OverlapColors:
     place: NDArray[np.float32]
     sigma: NDArray[np.float32]
 
+    @classmethod
+    def joined(cls, parts: "Sequence[OverlapColors]") -> "OverlapColors":
+        """All samples of one or more parts."""
+        names = ("frame", "ratio", "place", "sigma")
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
 
 @dataclass(frozen=True, slots=True)
 class _Meetings:
@@ -58,27 +65,26 @@ class _Meetings:
 
 
 def overlap_colors(
-    cameras: Sequence[Camera], shots: Shots, small: Bytes, terrain: Terrain
+    cameras: Sequence[Camera], shots: Shots, small: Bytes, terrain: Terrain, threads: int = 1
 ) -> tuple[OverlapColors, Array]:
     """Compare the frames' colours where they overlap.
 
     Args:
         cameras: N cameras; shots: the same as arrays. small: uint8 (N, rows, columns, 3) thumbnails.
-        terrain: the ground.
+        terrain: the ground. threads: that share the work.
 
     Returns:
         The samples, and each frame's share (N,) of the orthoimage in cells.
     """
-    labels, grid = _coarse_labels(cameras, shots, terrain)
+    labels, grid = _coarse_labels(cameras, shots, terrain, threads)
     seams = _seams(labels, grid)
     towards = [_towards(seams, side, shots) for side in (seams.a, seams.b)]
     meetings = [*(_thinned(m, len(cameras)) for m in (seams, *towards)), _neighbours(cameras, shots, terrain)]
-    some = _Meetings(*(np.concatenate([getattr(m, name) for m in meetings]) for name in ("a", "b", "ground")))
     area = np.bincount(labels[labels > 0] - 1, minlength=len(cameras)).astype(float)
-    return _compared(some, shots, small, terrain), area
+    return _compared(meetings, shots, small, terrain, threads), area
 
 
-def _coarse_labels(cameras: Sequence[Camera], shots: Shots, terrain: Terrain) -> tuple[Ints, GroundGrid]:
+def _coarse_labels(cameras: Sequence[Camera], shots: Shots, terrain: Terrain, threads: int) -> tuple[Ints, GroundGrid]:
     """The mosaic's labels (index + 1) on cells of a 64th of a picture."""
     boxes = footprint_boxes(cameras, float(terrain.z.min()), float(terrain.z.max()))
     boxes = boxes[boxes[:, 0] <= boxes[:, 2]]
@@ -90,12 +96,17 @@ def _coarse_labels(cameras: Sequence[Camera], shots: Shots, terrain: Terrain) ->
     cell = max(side / config.label_cells, float(np.sqrt(box.width * box.height / config.label_most_cells)), 1e-3)
     grid = GroundGrid.around(0, box, cell)
     labels = np.zeros((grid.height, grid.width), np.int32)
-    for (r, c), ids in by_tile(cameras, grid, _TILE, terrain).items():
+
+    def label(tile: tuple[tuple[int, int], Ints]) -> None:
+        (r, c), ids = tile
         part = np.zeros((min(_TILE, grid.height - r), min(_TILE, grid.width - c)), np.int32)
         left, top = grid.west + c * cell, grid.north - r * cell
         lattice = heights(terrain, left, top, cell, _TILE)
         label_tile(part, shots.take(ids), (ids + 1).astype(np.int32), lattice=lattice, west=left, north=top, gsd_m=cell)
         labels[r : r + part.shape[0], c : c + part.shape[1]] = part
+
+    for _ in on_threads(label, by_tile(cameras, grid, _TILE, terrain).items(), threads):
+        pass
     return labels, grid
 
 
@@ -156,26 +167,34 @@ def _thinned(meetings: _Meetings, frames: int) -> _Meetings:
     return _Meetings(meetings.a[::step], meetings.b[::step], meetings.ground[::step])
 
 
-def _compared(meetings: _Meetings, shots: Shots, small: Bytes, terrain: Terrain) -> OverlapColors:
+def _compared(
+    meetings: Sequence[_Meetings], shots: Shots, small: Bytes, terrain: Terrain, threads: int
+) -> OverlapColors:
     """The samples at places whose colour both frames show."""
-    count = len(meetings.a)
-    ratio, usable = np.zeros((count, 3), np.float32), np.zeros(count, bool)
-    contrast = np.zeros(count, np.float32)
-    seen = np.zeros((count, 2, 4), np.float32)
     west, north = (float(v) for v in shots.position[:, :2].mean(0))
     position, rotation = shots.about(west, north)
     config, at_once = active().radiometry, active().compute.ratios_at_once
-    for first in range(0, count, at_once):
-        some = slice(first, first + at_once)
-        ground = np.nan_to_num(meetings.ground[some])
+
+    def compare(some: _Meetings) -> OverlapColors:
+        count = len(some.a)
+        ratio, usable = np.zeros((count, 3), np.float32), np.zeros(count, bool)
+        contrast, seen = np.zeros(count, np.float32), np.zeros((count, 2, 4), np.float32)
+        ground = np.nan_to_num(some.ground)
         place = np.stack([ground[:, 0] - west, north - ground[:, 1], terrain.height(ground)], 1)
         _compare(
-            meetings.a[some], meetings.b[some], place, position, rotation, shots.lens, shots.size, small,
-            config.dark_level, config.bright_level, ratio[some], usable[some], seen[some], contrast[some],
+            some.a, some.b, place, position, rotation, shots.lens, shots.size, small, config.dark_level,
+            config.bright_level, ratio, usable, seen, contrast,
         )  # fmt: skip
-    usable &= np.asarray(np.isfinite(meetings.ground).all(axis=1))
-    sigma = np.sqrt(config.ratio_sigma**2 + np.square(config.misplaced * contrast))
-    return OverlapColors(np.stack([meetings.a, meetings.b], 1)[usable], ratio[usable], seen[usable], sigma[usable])
+        usable &= np.asarray(np.isfinite(some.ground).all(axis=1))
+        sigma = np.sqrt(config.ratio_sigma**2 + np.square(config.misplaced * contrast))
+        return OverlapColors(np.stack([some.a, some.b], 1)[usable], ratio[usable], seen[usable], sigma[usable])
+
+    parts = (
+        _Meetings(*(getattr(kind, name)[first : first + at_once] for name in ("a", "b", "ground")))
+        for kind in meetings
+        for first in range(0, max(1, len(kind.a)), at_once)
+    )
+    return OverlapColors.joined(list(on_threads(compare, parts, threads)))
 
 
 @in_place_kernel

@@ -16,11 +16,13 @@ place in the picture, which the renderer evaluates at each pixel that it takes.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel, kernel
+from orthoswarm.compute.threads import on_threads
 from orthoswarm.config import active
 from orthoswarm.model.placement import PlacedFrame, Terrain
 from orthoswarm.mosaic.kernels.lens_arrays import F, U, V
@@ -38,6 +40,10 @@ _BRIGHTNESS_HUE = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], 
 _COMMON, _OWN = 11, 6
 """Vehicle unknowns: gain, five of the lens, five of the view direction. Frame unknowns: gain, two slopes, three
 curvatures."""
+
+
+_PARTS = 8
+"""Parts in which samples are summed, at most so many threads (chosen)."""
 
 
 def uniform(gain: Sequence[float] | NDArray[np.floating]) -> Field:
@@ -74,7 +80,9 @@ def estimate_fields(
     thumbnails: Mapping[str, Bytes],
     terrain: Terrain,
     held: Mapping[str, Field] | None = None,
+    *,
     tone: ColorMap | None = None,
+    threads: int = 1,
 ) -> dict[str, Field]:
     """Factors that make neighbouring frames alike.
 
@@ -88,6 +96,7 @@ def estimate_fields(
         terrain: the ground's height.
         held: image -> field of frames that are drawn already and stay as they are.
         tone: a map that the mosaic's tone is to follow at low frequency.
+        threads: that share the work; the result does not depend on them.
 
     Returns:
         image -> field for every frame; factors lie within `greatest_factor` and its inverse.
@@ -102,16 +111,16 @@ def estimate_fields(
     some = np.array(known)
     small = np.stack([thumbnails[frames[i].frame.image] for i in known])
     cameras = [frames[i].camera for i in known]
-    colors, area = overlap_colors(cameras, shots.take(some), small, terrain)
+    colors, area = overlap_colors(cameras, shots.take(some), small, terrain, threads)
     fixed = np.array([frames[i].frame.image in held for i in known], bool)
     if fixed.any():
         colors = _with_held(colors, [held.get(frames[i].frame.image) for i in known])
     of_some = vehicle[some]
     shared = None if tone is None else map_colors(cameras, shots.take(some), small, terrain, tone)
     if shared is not None and len(shared.frame):  # the map is one more frame, which is held
-        colors = _together(colors, shared)
+        colors = OverlapColors.joined([colors, shared])
         of_some, fixed = np.append(of_some, of_some[:1]), np.append(fixed, True)
-    of_vehicle, of_known = _solve(colors, of_some, len(names), fixed)
+    of_vehicle, of_known = _solve(colors, of_some, len(names), fixed, threads)
     of_frame = np.zeros((len(frames), _OWN, 3))
     of_frame[some] = of_known[: len(known)]
     x, y = _nodes(shots.size)
@@ -122,12 +131,6 @@ def estimate_fields(
     limit = float(np.log(active().radiometry.greatest_factor))
     fields = _as_polynomials(np.exp(np.clip(log, -limit, limit)), x, y)
     return {f.frame.image: held.get(f.frame.image, field) for f, field in zip(frames, fields)}
-
-
-def _together(one: OverlapColors, other: OverlapColors) -> OverlapColors:
-    """All samples of two kinds."""
-    pairs = [(getattr(one, name), getattr(other, name)) for name in ("frame", "ratio", "place", "sigma")]
-    return OverlapColors(*(np.concatenate(pair) for pair in pairs))
 
 
 def _with_held(colors: OverlapColors, held: Sequence[Field | None]) -> OverlapColors:
@@ -143,7 +146,7 @@ def _with_held(colors: OverlapColors, held: Sequence[Field | None]) -> OverlapCo
 
 
 def _solve(
-    colors: OverlapColors, vehicle: NDArray[np.int32], vehicles: int, fixed: NDArray[np.bool_]
+    colors: OverlapColors, vehicle: NDArray[np.int32], vehicles: int, fixed: NDArray[np.bool_], threads: int
 ) -> tuple[Array, Array]:
     """Unknowns of vehicles (V, 11, 3) and of frames (N, 6, 3), by conjugate gradients within reweighting rounds."""
     config = active().radiometry
@@ -153,36 +156,18 @@ def _solve(
     of_hue = np.ones(len(prior), bool)
     of_hue[: vehicles * _COMMON : _COMMON] = False
     prior[of_hue, 1:] /= config.hue_share**2
-    measured = colors.ratio @ _BRIGHTNESS_HUE.T
-    precision = np.square(colors.sigma.astype(np.float64)) ** -1
+    samples = _Samples(colors, vehicle, vehicles, (~fixed).astype(np.float64), threads)
     x = np.zeros((len(prior), 3))
-    free = (~fixed).astype(np.float64)
-    sample = (colors.frame, colors.place, vehicle, free, vehicles)
-
-    def differences(values: Array) -> Array:
-        out = np.empty((len(colors.frame), 3))
-        _forward(*sample, values, out)
-        return out
-
-    def gathered(weighted: Array) -> Array:
-        out = np.zeros_like(x)
-        _backward(*sample, weighted, out)
-        return out
-
     for _ in range(config.reweightings):
-        residual = differences(x) + measured
-        error2 = np.square(residual).mean(1) * precision
-        weight = ((1.0 + error2 / config.robust_sigmas**2) ** -2 * precision)[:, None]
-        diagonal = np.zeros(len(prior))
-        _diagonal(*sample, weight[:, 0], diagonal)
+        right, diagonal = samples.weigh(x)
         scale = 1.0 / (diagonal[:, None] + prior)
         # the step from x: (A' W A + P) d = -(A' W r + P x)
-        left = -(gathered(weight * residual) + prior * x)
+        left = -(right + prior * x)
         step, z = np.zeros_like(x), scale * left
         towards, product = z.copy(), (left * z).sum(0)
         enough = config.solver_tolerance**2 * product
         for _ in range(config.solver_steps):
-            image = gathered(weight * differences(towards)) + prior * towards
+            image = samples.applied(towards) + prior * towards
             curve = (towards * image).sum(0)
             alpha = product / np.where(curve > 0.0, curve, 1.0)
             step += alpha * towards
@@ -197,85 +182,132 @@ def _solve(
     return x[: vehicles * _COMMON].reshape(vehicles, _COMMON, 3), x[vehicles * _COMMON :].reshape(-1, _OWN, 3)
 
 
-@in_place_kernel
-def _bases(place, of_vehicle, of_frame):  # type: ignore[no-untyped-def]
-    """Factors of a side's unknowns: (11,) of the vehicle, (6,) of the frame."""
-    x, y, e, n = place[0], place[1], place[2], place[3]
-    of_vehicle[0], of_vehicle[1], of_vehicle[2] = 1.0, x, y
-    of_vehicle[3], of_vehicle[4], of_vehicle[5] = x * x, x * y, y * y
-    of_vehicle[6], of_vehicle[7], of_vehicle[8], of_vehicle[9], of_vehicle[10] = e, n, e * e, e * n, n * n
-    of_frame[0], of_frame[1], of_frame[2] = 1.0, x, y
-    of_frame[3], of_frame[4], of_frame[5] = x * x, x * y, y * y
+class _Samples:
+    """The samples in the normal equations, without a matrix: A gives the difference of a sample's two sides.
 
-
-@kernel
-def _forward(frame, place, vehicle, free, vehicles, values, out):  # type: ignore[no-untyped-def]
-    """Difference of the log factors of the two sides of each sample (M, 3)."""
-    of_vehicle, of_frame = np.empty(_COMMON), np.empty(_OWN)
-    out[:] = 0.0
-    for m in range(len(frame)):
-        for side in range(2):
-            k = frame[m, side]
-            sign = (1.0 - 2.0 * side) * free[k]
-            if sign == 0.0:
-                continue
-            _bases(place[m, side], of_vehicle, of_frame)
-            first = _COMMON * vehicle[k]
-            for q in range(_COMMON):
-                factor = sign * of_vehicle[q]
-                for channel in range(3):
-                    out[m, channel] += factor * values[first + q, channel]
-            first = _COMMON * vehicles + _OWN * k
-            for q in range(_OWN):
-                factor = sign * of_frame[q]
-                for channel in range(3):
-                    out[m, channel] += factor * values[first + q, channel]
-
-
-@kernel
-def _backward(frame, place, vehicle, free, vehicles, weighted, out):  # type: ignore[no-untyped-def]
-    """The transpose of `_forward`: samples' values gathered in the unknowns (added to out)."""
-    of_vehicle, of_frame = np.empty(_COMMON), np.empty(_OWN)
-    for m in range(len(frame)):
-        for side in range(2):
-            k = frame[m, side]
-            sign = (1.0 - 2.0 * side) * free[k]
-            if sign == 0.0:
-                continue
-            _bases(place[m, side], of_vehicle, of_frame)
-            first = _COMMON * vehicle[k]
-            for q in range(_COMMON):
-                factor = sign * of_vehicle[q]
-                for channel in range(3):
-                    out[first + q, channel] += factor * weighted[m, channel]
-            first = _COMMON * vehicles + _OWN * k
-            for q in range(_OWN):
-                factor = sign * of_frame[q]
-                for channel in range(3):
-                    out[first + q, channel] += factor * weighted[m, channel]
-
-
-@kernel
-def _diagonal(frame, place, vehicle, free, vehicles, weight, out):  # type: ignore[no-untyped-def]
-    """The diagonal of the normal matrix (added to out).
-
-    Of two frames of one vehicle, its unknowns count by the difference of the two places, which for the gain is none.
+    They are summed in parts, always the same ones, so that the result does not depend on the number of threads.
     """
-    of_vehicle, of_frame = np.empty((2, _COMMON)), np.empty(_OWN)
-    for m in range(len(frame)):
-        for side in range(2):
-            k = frame[m, side]
-            _bases(place[m, side], of_vehicle[side], of_frame)
-            of_vehicle[side] *= free[k]
-            for q in range(_OWN):
-                out[_COMMON * vehicles + _OWN * k + q] += weight[m] * free[k] * of_frame[q] * of_frame[q]
-        one, other = vehicle[frame[m, 0]], vehicle[frame[m, 1]]
+
+    def __init__(
+        self, colors: OverlapColors, vehicle: NDArray[np.int32], vehicles: int, free: Array, threads: int
+    ) -> None:
+        self._threads = threads
+        self._weight = np.empty(len(colors.frame))
+        edges = np.linspace(0, len(colors.frame), _PARTS + 1).astype(int)
+        parts = [slice(a, b) for a, b in pairwise(edges.tolist())]
+        self._parts = [(colors.frame[p], colors.place[p], vehicle, free, vehicles) for p in parts]
+        self._seen = [(colors.ratio[p], colors.sigma[p], self._weight[p]) for p in parts]
+
+    def weigh(self, x: Array) -> tuple[Array, Array]:
+        """Set the weights W by the residuals r at x; returns A' W r and the diagonal of A' W A."""
+        robust = active().radiometry.robust_sigmas
+
+        def part(k: int) -> tuple[Array, Array]:
+            right, diagonal = np.zeros_like(x), np.zeros(len(x))
+            _weigh(*self._parts[k], *self._seen[k][:2], _BRIGHTNESS_HUE, robust, x, self._seen[k][2], right, diagonal)
+            return right, diagonal
+
+        right, diagonal = zip(*on_threads(part, range(_PARTS), self._threads), strict=True)
+        return sum(right[1:], right[0]), sum(diagonal[1:], diagonal[0])
+
+    def applied(self, x: Array) -> Array:
+        """A' W A x."""
+
+        def part(k: int) -> Array:
+            out = np.zeros_like(x)
+            _apply(*self._parts[k], self._seen[k][2], x, out)
+            return out
+
+        first, *others = on_threads(part, range(_PARTS), self._threads)
+        return np.asarray(sum(others, first))
+
+
+@in_place_kernel
+def _bases(frame, place, vehicle, free, of_vehicle, of_frame):  # type: ignore[no-untyped-def]
+    """Factors of the unknowns in a sample, less those of its other frame: (2, 11) of vehicles and (2, 6) of frames.
+
+    Returns how many vehicles it has: of two frames of one vehicle, row 0 is the difference of the two places.
+    """
+    for side in range(2):
+        x, y, e, n = place[side, 0], place[side, 1], place[side, 2], place[side, 3]
+        one = (1.0 - 2.0 * side) * free[frame[side]]
+        own, lens = of_frame[side], of_vehicle[side]
+        own[0], own[1], own[2], own[3], own[4], own[5] = one, one * x, one * y, one * x * x, one * x * y, one * y * y
+        for q in range(_OWN):
+            lens[q] = own[q]
+        lens[6], lens[7], lens[8], lens[9], lens[10] = one * e, one * n, one * e * e, one * e * n, one * n * n
+    if vehicle[frame[0]] != vehicle[frame[1]]:
+        return 2
+    for q in range(_COMMON):
+        of_vehicle[0, q] += of_vehicle[1, q]
+    return 1
+
+
+@in_place_kernel
+def _difference(frame, vehicle, vehicles, of_vehicle, of_frame, count, values):  # type: ignore[no-untyped-def]
+    """Difference of the log factors of a sample's two frames, three numbers; count: see `_bases`."""
+    a, b, c = 0.0, 0.0, 0.0
+    for side in range(count):
+        first = _COMMON * vehicle[frame[side]]
         for q in range(_COMMON):
-            if one == other:
-                out[_COMMON * one + q] += weight[m] * (of_vehicle[0, q] - of_vehicle[1, q]) ** 2
-            else:
-                out[_COMMON * one + q] += weight[m] * of_vehicle[0, q] ** 2
-                out[_COMMON * other + q] += weight[m] * of_vehicle[1, q] ** 2
+            factor, own = of_vehicle[side, q], values[first + q]
+            a, b, c = a + factor * own[0], b + factor * own[1], c + factor * own[2]
+    for side in range(2):
+        first = _COMMON * vehicles + _OWN * frame[side]
+        for q in range(_OWN):
+            factor, own = of_frame[side, q], values[first + q]
+            a, b, c = a + factor * own[0], b + factor * own[1], c + factor * own[2]
+    return a, b, c
+
+
+@in_place_kernel
+def _gather(frame, vehicle, vehicles, of_vehicle, of_frame, count, a, b, c, out):  # type: ignore[no-untyped-def]
+    """The transpose of `_difference`: three numbers of a sample, added to the unknowns in out."""
+    for side in range(count):
+        first = _COMMON * vehicle[frame[side]]
+        for q in range(_COMMON):
+            factor, own = of_vehicle[side, q], out[first + q]
+            own[0], own[1], own[2] = own[0] + factor * a, own[1] + factor * b, own[2] + factor * c
+    for side in range(2):
+        first = _COMMON * vehicles + _OWN * frame[side]
+        for q in range(_OWN):
+            factor, own = of_frame[side, q], out[first + q]
+            own[0], own[1], own[2] = own[0] + factor * a, own[1] + factor * b, own[2] + factor * c
+
+
+@kernel
+def _weigh(  # type: ignore[no-untyped-def]
+    frame, place, vehicle, free, vehicles, ratio, sigma, axes, robust, values, weight, right, diagonal
+):
+    """Weights (M,) of samples by their residuals, and what they add to the right side and to the diagonal."""
+    of_vehicle, of_frame = np.empty((2, _COMMON)), np.empty((2, _OWN))
+    for m in range(len(frame)):
+        count = _bases(frame[m], place[m], vehicle, free, of_vehicle, of_frame)
+        a, b, c = _difference(frame[m], vehicle, vehicles, of_vehicle, of_frame, count, values)
+        red, green, blue = ratio[m, 0], ratio[m, 1], ratio[m, 2]
+        a += axes[0, 0] * red + axes[0, 1] * green + axes[0, 2] * blue
+        b += axes[1, 0] * red + axes[1, 1] * green + axes[1, 2] * blue
+        c += axes[2, 0] * red + axes[2, 1] * green + axes[2, 2] * blue
+        precision = 1.0 / (float(sigma[m]) * float(sigma[m]))
+        w = precision / (1.0 + (a * a + b * b + c * c) / 3.0 * precision / robust**2) ** 2
+        weight[m] = w
+        _gather(frame[m], vehicle, vehicles, of_vehicle, of_frame, count, w * a, w * b, w * c, right)
+        for side in range(count):
+            for q in range(_COMMON):
+                diagonal[_COMMON * vehicle[frame[m, side]] + q] += w * of_vehicle[side, q] ** 2
+        for side in range(2):
+            for q in range(_OWN):
+                diagonal[_COMMON * vehicles + _OWN * frame[m, side] + q] += w * of_frame[side, q] ** 2
+
+
+@kernel
+def _apply(frame, place, vehicle, free, vehicles, weight, values, out):  # type: ignore[no-untyped-def]
+    """A' W A values, added to out."""
+    of_vehicle, of_frame = np.empty((2, _COMMON)), np.empty((2, _OWN))
+    for m in range(len(frame)):
+        count, w = _bases(frame[m], place[m], vehicle, free, of_vehicle, of_frame), weight[m]
+        a, b, c = _difference(frame[m], vehicle, vehicles, of_vehicle, of_frame, count, values)
+        _gather(frame[m], vehicle, vehicles, of_vehicle, of_frame, count, w * a, w * b, w * c, out)
 
 
 def _nodes(size: NDArray[np.int32]) -> tuple[Array, Array]:

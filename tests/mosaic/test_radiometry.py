@@ -172,6 +172,16 @@ def test_dark_and_burnt_out_pictures_say_nothing():
     assert middle(gains) == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize("threads", [2, 3, 16])
+def test_the_result_does_not_depend_on_the_number_of_threads(threads):
+    flight = scene.survey(4, scene.hills)
+    small, ground = thumbnails_of(flight), scene.terrain_of(scene.hills)
+    alone = estimate_fields(flight.frames, small, ground)
+    shared = estimate_fields(flight.frames, small, ground, threads=threads)
+    assert len(alone) == len(flight.frames)
+    assert all(np.array_equal(alone[image], shared[image]) for image in alone)
+
+
 def test_nothing_to_compare_gives_no_gains():
     flight = scene.survey(0, count=1)
     assert estimate_fields(flight.frames, thumbnails_of(flight), FLAT) == {}
