@@ -39,5 +39,7 @@ class ComputeConfig:
     """Pictures that a drawing task reads, or copies to previews (chosen: its overhead is small then)."""
     ratios_at_once: int = 65_536
     """Places whose colours are compared at once (chosen for memory)."""
+    fields_at_once: int = 2048
+    """Pictures whose factors of colour are evaluated at once, 15 kB each (chosen for memory)."""
     map_pixels_at_once: int = 8_000_000
     """Pixels of a map read at once (chosen for memory)."""

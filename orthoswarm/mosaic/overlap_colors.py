@@ -189,8 +189,9 @@ def _compared(
         sigma = np.sqrt(config.ratio_sigma**2 + np.square(config.misplaced * contrast))
         return OverlapColors(np.stack([some.a, some.b], 1)[usable], ratio[usable], seen[usable], sigma[usable])
 
+    names = "a", "b", "ground"
     parts = (
-        _Meetings(*(getattr(kind, name)[first : first + at_once] for name in ("a", "b", "ground")))
+        _Meetings(*(np.ascontiguousarray(getattr(kind, name)[first : first + at_once]) for name in names))
         for kind in meetings
         for first in range(0, max(1, len(kind.a)), at_once)
     )

@@ -123,13 +123,15 @@ def estimate_fields(
     of_vehicle, of_known = _solve(colors, of_some, len(names), fixed, threads)
     of_frame = np.zeros((len(frames), _OWN, 3))
     of_frame[some] = of_known[: len(known)]
-    x, y = _nodes(shots.size)
-    log = _log_factors(of_vehicle[vehicle], of_frame, x=x, y=y, shots=shots, terrain=terrain)
+    every, at_once = np.arange(len(frames)), active().compute.fields_at_once
+    blocks = [every[first : first + at_once] for first in range(0, len(frames), at_once)]
+    log = np.concatenate([_log_factors(of_vehicle[vehicle[b]], of_frame[b], shots.take(b)) for b in blocks])
     if not fixed.any() and area.sum() > 0:
         middle = log[some].mean(1)
         log -= (area[:, None] * middle).sum(0) / area.sum()
     limit = float(np.log(active().radiometry.greatest_factor))
-    fields = _as_polynomials(np.exp(np.clip(log, -limit, limit)), x, y)
+    factor = np.exp(np.clip(log, -limit, limit))
+    fields = np.concatenate([_as_polynomials(factor[b], shots.size[b]) for b in blocks])
     return {f.frame.image: held.get(f.frame.image, field) for f, field in zip(frames, fields)}
 
 
@@ -319,8 +321,9 @@ def _nodes(size: NDArray[np.int32]) -> tuple[Array, Array]:
     return np.broadcast_to(x, y.shape), y
 
 
-def _log_factors(of_vehicle: Array, of_frame: Array, *, x: Array, y: Array, shots: Shots, terrain: Terrain) -> Array:
+def _log_factors(of_vehicle: Array, of_frame: Array, shots: Shots) -> Array:
     """Log factors (N, nodes, 3) of frames with their vehicles' unknowns (N, 11, 3) and their own (N, 6, 3)."""
+    x, y = _nodes(shots.size)
     half = 0.5 * shots.size[:, :1]
     u, v = half * (x + 1.0) - 0.5, half * y + 0.5 * shots.size[:, 1:] - 0.5
     rays = np.stack([(u - shots.lens[:, [U]]) / shots.lens[:, [F]], (v - shots.lens[:, [V]]) / shots.lens[:, [F]]], -1)
@@ -334,8 +337,9 @@ def _log_factors(of_vehicle: Array, of_frame: Array, *, x: Array, y: Array, shot
     return np.asarray(common @ of_vehicle + own @ of_frame)
 
 
-def _as_polynomials(factor: Array, x: Array, y: Array) -> Field:
-    """Coefficients (N, 3, 6) of the polynomials nearest to factors (N, nodes, 3) at places (N, nodes)."""
+def _as_polynomials(factor: Array, size: NDArray[np.int32]) -> Field:
+    """Coefficients (N, 3, 6) of the polynomials nearest to factors (N, nodes, 3) of pictures of these sizes (N, 2)."""
+    x, y = _nodes(size)
     basis = np.stack([np.ones_like(y), x, y, x * x, x * y, y * y], -1)
     normal = np.swapaxes(basis, 1, 2) @ basis
     right = np.swapaxes(basis, 1, 2) @ factor

@@ -182,6 +182,18 @@ def test_the_result_does_not_depend_on_the_number_of_threads(threads):
     assert all(np.array_equal(alone[image], shared[image]) for image in alone)
 
 
+def test_fields_evaluated_few_at_a_time_are_the_same():
+    flight = scene.survey(4, scene.hills)
+    small, ground = thumbnails_of(flight), scene.terrain_of(scene.hills)
+    at_once = estimate_fields(flight.frames, small, ground)
+    override({"compute": {"fields_at_once": 5, "ratios_at_once": 100}})
+    try:
+        few = estimate_fields(flight.frames, small, ground)
+    finally:
+        override({})
+    assert all(np.array_equal(at_once[image], few[image]) for image in at_once)
+
+
 def test_nothing_to_compare_gives_no_gains():
     flight = scene.survey(0, count=1)
     assert estimate_fields(flight.frames, thumbnails_of(flight), FLAT) == {}
