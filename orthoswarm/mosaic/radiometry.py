@@ -194,11 +194,11 @@ class _Samples:
         self, colors: OverlapColors, vehicle: NDArray[np.int32], vehicles: int, free: Array, threads: int
     ) -> None:
         self._threads = threads
-        self._weight = np.empty(len(colors.frame))
         edges = np.linspace(0, len(colors.frame), _PARTS + 1).astype(int)
         parts = [slice(a, b) for a, b in pairwise(edges.tolist())]
-        self._parts = [(colors.frame[p], colors.place[p], vehicle, free, vehicles) for p in parts]
-        self._seen = [(colors.ratio[p], colors.sigma[p], self._weight[p]) for p in parts]
+        self._unknowns = [(colors.frame[p], colors.place[p], vehicle, free, vehicles) for p in parts]
+        self._measured = [(colors.ratio[p], colors.sigma[p]) for p in parts]
+        self._weights = [np.empty(p.stop - p.start) for p in parts]
 
     def weigh(self, x: Array) -> tuple[Array, Array]:
         """Set the weights W by the residuals r at x; returns A' W r and the diagonal of A' W A."""
@@ -206,22 +206,22 @@ class _Samples:
 
         def part(k: int) -> tuple[Array, Array]:
             right, diagonal = np.zeros_like(x), np.zeros(len(x))
-            _weigh(*self._parts[k], *self._seen[k][:2], _BRIGHTNESS_HUE, robust, x, self._seen[k][2], right, diagonal)
+            seen, weight = self._measured[k], self._weights[k]
+            _weigh(*self._unknowns[k], *seen, _BRIGHTNESS_HUE, robust, x, weight, right, diagonal)
             return right, diagonal
 
-        right, diagonal = zip(*on_threads(part, range(_PARTS), self._threads), strict=True)
-        return sum(right[1:], right[0]), sum(diagonal[1:], diagonal[0])
+        rights, diagonals = zip(*on_threads(part, range(_PARTS), self._threads), strict=True)
+        return np.asarray(sum(rights)), np.asarray(sum(diagonals))
 
     def applied(self, x: Array) -> Array:
         """A' W A x."""
 
         def part(k: int) -> Array:
             out = np.zeros_like(x)
-            _apply(*self._parts[k], self._seen[k][2], x, out)
+            _apply(*self._unknowns[k], self._weights[k], x, out)
             return out
 
-        first, *others = on_threads(part, range(_PARTS), self._threads)
-        return np.asarray(sum(others, first))
+        return np.asarray(sum(on_threads(part, range(_PARTS), self._threads)))
 
 
 @in_place_kernel

@@ -188,9 +188,10 @@ def _disparities(left: Gray, right: Gray, valid: NDArray[np.bool_], count: int) 
 
 
 def _occurring(left: Gray, right: Gray, valid: NDArray[np.bool_], count: int) -> tuple[int, int]:
-    """The least disparity that occurs at half size, and how many from it on: an eighth of the work, and often few.
+    """The range of disparities that occurs, by matching at half size, which takes an eighth of the time.
 
-    Only large regions of alike disparity count: false matches are small and have any disparity.
+    Only large regions of alike disparity count: false matches are small and have any disparity. Returns the least
+    disparity and the number of them.
     """
     c = active().stereo
     one, two = (np.asarray(cv2.resize(p, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)) for p in (left, right))

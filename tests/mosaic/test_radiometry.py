@@ -182,15 +182,12 @@ def test_the_result_does_not_depend_on_the_number_of_threads(threads):
     assert all(np.array_equal(alone[image], shared[image]) for image in alone)
 
 
-def test_fields_evaluated_few_at_a_time_are_the_same():
+def test_fields_evaluated_few_at_a_time_are_the_same(configure):
     flight = scene.survey(4, scene.hills)
     small, ground = thumbnails_of(flight), scene.terrain_of(scene.hills)
     at_once = estimate_fields(flight.frames, small, ground)
-    override({"compute": {"fields_at_once": 5, "ratios_at_once": 100}})
-    try:
-        few = estimate_fields(flight.frames, small, ground)
-    finally:
-        override({})
+    configure({"compute": {"fields_at_once": 5, "ratios_at_once": 100}})
+    few = estimate_fields(flight.frames, small, ground)
     assert all(np.array_equal(at_once[image], few[image]) for image in at_once)
 
 

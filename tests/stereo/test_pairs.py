@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthoswarm.config import override
 from orthoswarm.model.camera import Lens
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import Terrain
@@ -46,7 +45,7 @@ def slab(east_north):
     return np.where(p.max(-1) < 8.0, 20.0, 0.0)
 
 
-def test_of_a_wide_search_range_only_what_occurs_is_searched(monkeypatch):
+def test_of_a_wide_search_range_only_what_occurs_is_searched(monkeypatch, configure):
     large = Lens(960, 720, 540.0)
     flight = Flight().take(camera(lens=large), slab).take(camera(east=45.0, lens=large), slab)
     searched = []
@@ -54,11 +53,8 @@ def test_of_a_wide_search_range_only_what_occurs_is_searched(monkeypatch):
     monkeypatch.setattr(cv2.StereoSGBM, "create", lambda **how: searched.append(how["numDisparities"]) or create(**how))
     found = match_pair(view(flight, 0), view(flight, 1), FLAT).points
     half, narrow = searched
-    override({"stereo": {"wide_px": 10_000}})
-    try:
-        whole = match_pair(view(flight, 0), view(flight, 1), FLAT).points
-    finally:
-        override({})
+    configure({"stereo": {"wide_px": 10_000}})
+    whole = match_pair(view(flight, 0), view(flight, 1), FLAT).points
     assert half < 0.6 * searched[-1] and narrow < 0.7 * searched[-1]
     assert len(found) > 0.98 * len(whole)
     top = np.abs(found[:, :2] - (EAST + 30.0, NORTH)).max(1) < 5.0

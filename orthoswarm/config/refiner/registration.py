@@ -89,9 +89,8 @@ class RegistrationConfig:
     tie_height_m: float = 3.0
     """Points farther above or below the ground are not compared, metres: what is around them leans (chosen)."""
     tie_half_share: float = 0.1
-    """Half a patch, as a share of the flying height: larger ones are found where little of the ground has stayed as it
-    is in the map, and still follow the ground (measured: half patches of 10, 13, 16 and 20 m from 150 m, see
-    benchmarks/accuracy/other_dates.py) ..."""
+    """Half a patch, as a share of the flying height. Measured with half patches of 10, 13, 16 and 20 m from 150 m: on
+    maps of another date (benchmarks/accuracy/other_dates.py) errors fall up to 16 m, on relief of 25 m they stay ..."""
     tie_half_limits_m: tuple[float, float] = (10.0, 20.0)
     """... within these limits, metres (chosen: what is on the ground does not grow with the flying height)."""
     tie_half_px: int = 8
@@ -129,7 +128,7 @@ class RegistrationConfig:
     edge_most: int = 300
     """More are not compared (chosen for cost)."""
     edge_search_m: float = 2.5
-    """How far their edges are searched, metres: a flight that lies on the map is decimetres off (chosen for cost)."""
+    """How far the edges of tie points are searched, metres: the flight is decimetres off by then (chosen for cost)."""
     edge_reach_m: float = 1.0
     """Differences farther than this from their median are gross errors, metres (chosen)."""
 
