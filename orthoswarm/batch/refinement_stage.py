@@ -2,13 +2,18 @@
 
 import logging
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+import numpy as np
+
+from orthoswarm.batch.area_refinement import refine_by_area
+from orthoswarm.batch.areas import Area, divide
 from orthoswarm.batch.refiners import make_refiner
 from orthoswarm.batch.run_state import RunContext, RunState
 from orthoswarm.compute.stage_times import Clock, Stage
 from orthoswarm.compute.workers import trim_memory
+from orthoswarm.config import active
 from orthoswarm.control.ground_control import place_on_control
 from orthoswarm.model.errors import OrthoSwarmError, RunInterruptedError
 from orthoswarm.model.frame import Frame
@@ -97,14 +102,24 @@ def _call_refiner(run: RunContext, frames: Sequence[Frame], state: RunState) -> 
     basemap = state.basemap if run.options.until == "fine" else None
     # Vehicles that were refined with a map that was lost later are not the same as those without it.
     lost = state.basemap is None and run.options.basemap is not None
-    tasks = run.space.remembering("vehicle without map" if lost else "vehicle", run.workers.map)
-    refinement = refiner.refine_batch(vehicles, basemap, tasks, run.progress)
+    label = "vehicle without map" if lost else "vehicle"
+    areas = _areas(vehicles, state)
+    if len(areas) > 1:
+        return refine_by_area(run, refiner, vehicles, basemap, areas=areas, label=label)
+    refinement = refiner.refine_batch(vehicles, basemap, run.space.remembering(label, run.workers.map), run.progress)
     # The states behind the solutions are by far the largest part and are not needed any more.
     refinement.coarse, refinement.fine = (
         [replace(s, state=None) for s in solutions] for solutions in (refinement.coarse, refinement.fine)
     )
     trim_memory()
     return refinement
+
+
+def _areas(vehicles: Mapping[str, Sequence[Frame]], state: RunState) -> list[Area]:
+    """The areas that the vehicles are solved in."""
+    at = {p.frame.image: p.camera.position for p in state.recorded.placed}
+    paths = {vehicle: np.array([at[frame.image] for frame in frames]) for vehicle, frames in vehicles.items()}
+    return divide(paths, active().strategy.area_pictures)
 
 
 def _append_carried(solutions: list[Solution], carried: Sequence[PlacedFrame]) -> None:

@@ -124,9 +124,15 @@ class Workspace:
         """Remove temporary files that a later run cannot use."""
         _remove(self._work / "scratch")
 
-    def remembering(self, name: str, run: Callable[..., Iterable[Result]]) -> "RememberingRun[Result]":
-        """A `run` (function, items) that stores each result, and does not repeat stored ones."""
-        return RememberingRun(self, name, run)
+    def remembering(
+        self, name: str, run: Callable[..., Iterable[Result]], *, shared: "Shared | None" = None
+    ) -> "RememberingRun[Result]":
+        """A `run` (function, items) that stores each result, and does not repeat stored ones.
+
+        Args:
+            name: of the results. run: runs what is missing. shared: tells results that other calls have in common.
+        """
+        return RememberingRun(self, name, run, shared)
 
     def complete(self) -> None:
         """Remove all intermediate results: the run is done."""
@@ -151,11 +157,17 @@ class Workspace:
             unmake(self._missing)
 
 
+Shared = Callable[[Callable[..., Any], Any], str | None]
+"""Tells the name of function(item) among all results of the run; None where it belongs to its call alone."""
+
+
 class RememberingRun(Generic[Result]):
     """See Workspace.remembering. Calls are told apart by their order, which is the same in every run."""
 
-    def __init__(self, workspace: Workspace, name: str, run: Callable[..., Iterable[Result]]) -> None:
-        self._workspace, self._name, self._run = workspace, name, run
+    def __init__(
+        self, workspace: Workspace, name: str, run: Callable[..., Iterable[Result]], shared: Shared | None = None
+    ) -> None:
+        self._workspace, self._name, self._run, self._shared = workspace, name, run, shared
         self._calls = 0
 
     def __call__(self, function: Callable[[Any], Result], items: Sequence[Any], /) -> Iterator[Result]:
@@ -165,6 +177,8 @@ class RememberingRun(Generic[Result]):
 
     def _results(self, call: int, function: Callable[[Any], Result], items: Sequence[Any]) -> Iterator[Result]:
         names = [f"{self._name}-{call}-{i}" for i in range(len(items))]
+        if self._shared is not None:
+            names = [self._shared(function, item) or name for item, name in zip(items, names, strict=True)]
         known = [self._workspace.recall(name) for name in names]
         missing = [i for i, value in enumerate(known) if value is None]
         fresh = iter(self._run(function, [items[i] for i in missing]))

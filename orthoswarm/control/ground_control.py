@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from orthoswarm.config import active
 from orthoswarm.control.control_observations import in_photos, on_basemap
+from orthoswarm.control.moved_block import moved_terrain
 from orthoswarm.control.similarity import ControlFit, fit_similarity
 from orthoswarm.evaluation.checkpoints import Checkpoint
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import Leg, PlacedFrame, Refinement, Solution, Terrain
-from orthoswarm.model.plane_similarity import Similarity
 
 Array = NDArray[np.float64]
 
@@ -105,7 +105,7 @@ def place_on_control(
         return replace(s, placed=own, legs=_restated(s.legs, own), ground_z_m=level + scale * (s.ground_z_m - level))
 
     fine = [solution(s) for s in refinement.fine]
-    ground = None if refinement.terrain is None else _moved_terrain(refinement.terrain, main.similarity, level)
+    ground = None if refinement.terrain is None else moved_terrain(refinement.terrain, main.similarity, level)
     return replace(refinement, fine=fine, terrain=ground), result
 
 
@@ -136,28 +136,6 @@ def _moved(placed: PlacedFrame, fit: ControlFit, level_m: float, base_sigma_m: f
     return replace(
         placed, camera=replace(camera, position=position, rotation=similarity.about_up @ camera.rotation), sigma_m=sigma
     )
-
-
-def _moved_terrain(terrain: Terrain, similarity: Similarity, level_m: float) -> Terrain:
-    """The ground after a similarity, on nodes as far apart as before."""
-    rows, columns = terrain.z.shape
-    step = terrain.step_m
-    if rows <= 2 and columns <= 2 and terrain.bare is None and float(np.ptp(terrain.z)) == 0.0:
-        return terrain  # a level plane
-    west, south = terrain.west, terrain.south
-    east, north = west + (columns - 1) * step, south + (rows - 1) * step
-    corners = similarity.moved(np.array([[west, south], [east, south], [east, north], [west, north]]))
-    low = np.floor(corners.min(axis=0) / step) * step
-    count = np.ceil((corners.max(axis=0) - low) / step).astype(int) + 1
-    e, n = np.meshgrid(low[0] + step * np.arange(count[0]), low[1] + step * np.arange(count[1]))
-    before = similarity.back(np.stack([e, n], axis=-1))
-
-    def moved(z: NDArray[np.float32]) -> NDArray[np.float32]:
-        heights = replace(terrain, z=z, bare=None).height(before)
-        return np.asarray(similarity.moved_heights(heights, level_m), np.float32)
-
-    bare = None if terrain.bare is None else moved(terrain.bare)
-    return Terrain(float(low[0]), float(low[1]), step, moved(terrain.z), bare)
 
 
 def _warnings(fits: dict[bool, ControlFit], placed: Sequence[PlacedFrame]) -> list[str]:

@@ -1,6 +1,6 @@
 """Placed frames and what belongs to them: the refiner's result and the renderer's input."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import Any, Literal, Protocol
 
@@ -213,6 +213,8 @@ class Refiner(Protocol):
         basemap: MapWindow | None,
         run: Run = serial,
         progress: Callable[[str, int, int], None] | None = None,
+        *,
+        halo: Collection[str] = (),
     ) -> Refinement:
         """Place all vehicles, on one height level and one terrain.
 
@@ -221,6 +223,8 @@ class Refiner(Protocol):
             basemap: the map on the area's grid, or None.
             run: how tasks are run; the result does not depend on it.
             progress: called with what is being done, how many are done, how many there are.
+            halo: vehicles that only hold their neighbours: they are solved as far as that needs, and no tall surfaces
+                are measured for them.
 
         Raises:
             OrthoSwarmError: if there is nothing to refine.

@@ -44,7 +44,7 @@ class Similarity:
             prior: float64 (4,), their values before; None: zeros.
         """
         sigma_m = sigma_m.reshape(len(before), -1)
-        a = _design(before - middle) / sigma_m[:, :, None]
+        a = design(before - middle) / sigma_m[:, :, None]
         known = np.diag(1.0 / prior_sigma**2)
         normal = known + np.einsum("nij,nik->jk", a, a)
         right = np.einsum("nij,ni->j", a, (after - before) / sigma_m)
@@ -71,7 +71,7 @@ class Similarity:
     def moved(self, east_north: Array) -> Array:
         """Points (..., 2) after it."""
         p = np.asarray(east_north, float)
-        return np.asarray(p + _design(p - self.middle) @ self.values)
+        return np.asarray(p + design(p - self.middle) @ self.values)
 
     def back(self, east_north: Array) -> Array:
         """Points (..., 2) before it."""
@@ -86,12 +86,12 @@ class Similarity:
 
     def sigma_m(self, east_north: Array) -> Array:
         """Sigma per axis (...,) of moved points from the similarity's covariance; points (..., 2) before the move."""
-        a = _design(np.asarray(east_north, float) - self.middle)
+        a = design(np.asarray(east_north, float) - self.middle)
         variance = np.einsum("...ij,jk,...ik->...i", a, self.covariance, a)
         return np.asarray(np.sqrt(variance.mean(axis=-1)))
 
 
-def _design(away: Array) -> Array:
+def design(away: Array) -> Array:
     """Derivatives (..., 2, 4) of a point's move by shift east, north, turn and scale, at (..., 2) from the middle."""
     east, north = away[..., 0], away[..., 1]
     one, zero = np.ones_like(east), np.zeros_like(east)

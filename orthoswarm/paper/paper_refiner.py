@@ -4,7 +4,7 @@ Legs are independent tasks (III.E). By Eq. 5 a run takes as long as its slowest 
 enough workers; `Refinement.equation_5` compares this with the time measured.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from time import perf_counter, process_time
@@ -86,8 +86,10 @@ class PaperRefiner(UnitRefiner):
         basemap: MapWindow | None,
         run: Run = serial,
         progress: Progress | None = None,
+        *,
+        halo: Collection[str] = (),
     ) -> Refinement:
-        """Place all vehicles of an area (placement.Refiner); the paper's ground is flat."""
+        """Place all vehicles of an area (placement.Refiner), those of the halo as all; the paper's ground is flat."""
         grid, units = LocalGrid(self.epsg), units_of_area(vehicles)
         return _refine(
             units, [], basemap, grid=grid, origin=self.origin, options=self.options, run=run, progress=progress

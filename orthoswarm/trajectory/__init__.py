@@ -1,1 +1,1 @@
-"""The flown path: straight legs, and whether they lead in one direction only."""
+"""The flown path: straight legs, whether they lead in one direction only, and paths near each other."""

@@ -6,7 +6,7 @@ The relief displacement of the map's roofs (its lean) is voted over all vehicles
 ground and are not displaced.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -132,6 +132,8 @@ class SwarmRefiner(UnitRefiner):
         basemap: MapWindow | None,
         run: Run = serial,
         progress: Progress | None = None,
+        *,
+        halo: Collection[str] = (),
     ) -> Refinement:
         """Place all vehicles of an area (placement.Refiner)."""
         grid, origin, units = LocalGrid(self.epsg), self.origin, units_of_area(vehicles)
@@ -142,14 +144,16 @@ class SwarmRefiner(UnitRefiner):
             raise AdjustmentError(lost[0])
         below = _shifted(coarse_terrain(states), origin)
         coarse = [to_solution(s, origin, below, coarse=True) for s in states]
-        states = _second_passes(states, basemap, self.epsg, origin=origin, run=run, progress=progress)
+        states = _second_passes(states, basemap, self.epsg, origin=origin, halo=halo, run=run, progress=progress)
         _level(states)
         distortion = map_distortion_sigma(states)
         for state in states:
             if lies_on_map(state):
                 state.sigma_m = np.hypot(state.sigma_m, distortion)
-        terrain, warnings = common_terrain(states, dem=self.options.ground(origin).dem, run=run)
-        level = mapped_level(states, terrain)
+        own = [s for s in states if s.vehicle not in halo]
+        beside = [s for s in states if s.vehicle in halo]
+        terrain, warnings = common_terrain(own, beside, dem=self.options.ground(origin).dem, run=run)
+        level = mapped_level(own, terrain)
         terrain = _shifted(terrain, origin)
         lean = pooled_lean(states)
         fine = [to_solution(s, origin, terrain, map_lean=lean, ground_z_m=level) for s in states]
@@ -203,15 +207,19 @@ def _second_passes(
     epsg: int,
     *,
     origin: Array,
+    halo: Collection[str],
     run: Run,
     progress: Progress | None,
 ) -> list[VehicleState]:
-    """All vehicles again, on a common level, each with its neighbours held as the first pass left them."""
+    """All vehicles again, on a common level, each with its neighbours held as the first pass left them.
+
+    Those of the halo that were found on the map have done their part with that.
+    """
     states = register_unfound(states, [], epsg, origin, run)
     states, unmapped = join_unmapped(states, [], basemap, epsg, origin=origin, run=run)
     network = level_network([ground_points(s.flight.adjustment)[0] for s in states])
     task: Task = partial(second_pass, basemap=basemap, origin=origin)
-    mapped = [k for k, s in enumerate(states) if s.on_map]
+    mapped = [k for k, s in enumerate(states) if s.on_map and s.vehicle not in halo]
     items = [(states[k], neighbours_of(states[k], states), float(network.correction_m[k])) for k in mapped]
     out = list(states)
     for done, (k, state) in enumerate(zip(mapped, run(task, items), strict=True)):

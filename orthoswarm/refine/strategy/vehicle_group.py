@@ -21,21 +21,16 @@ from orthoswarm.refine.surface.smooth_surface import FitSettings
 from orthoswarm.refine.surface.tall_surfaces import with_tall_surfaces
 from orthoswarm.refine.surface.terrain import fit_terrain
 from orthoswarm.refine.surface.vehicle_ground import ground_points
+from orthoswarm.trajectory.near_paths import near_paths
 
 Array = NDArray[np.float64]
 
 
 def neighbours_of(state: VehicleState, states: Sequence[VehicleState]) -> list[VehicleState]:
     """The other vehicles whose flight paths come near enough for common ground."""
-    own = state.flight.adjustment.cameras.position
-    reach = active().strategy.neighbour_reach_heights * float(np.median(own[:, 2]))
-    low, high = own[:, :2].min(0) - reach, own[:, :2].max(0) + reach
-    out = []
-    for other in states:
-        xy = other.flight.adjustment.cameras.position[:, :2]
-        if other is not state and ((xy > low) & (xy < high)).all(1).any():
-            out.append(other)
-    return out
+    others = [other for other in states if other is not state]
+    paths = [other.flight.adjustment.cameras.position for other in others]
+    return [others[k] for k in near_paths(state.flight.adjustment.cameras.position, paths)]
 
 
 def pooled_lean(states: Sequence[VehicleState]) -> tuple[float, float]:

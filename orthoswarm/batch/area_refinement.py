@@ -1,0 +1,163 @@
+"""A large swarm refined area by area, each with its halo, then moved onto each other and joined."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.batch.areas import Area
+from orthoswarm.batch.merged_ground import merged_ground
+from orthoswarm.batch.run_state import RunContext
+from orthoswarm.compute.workers import trim_memory
+from orthoswarm.control.area_adjustment import AreaMove, AreaTie, adjust_areas
+from orthoswarm.control.moved_block import moved_terrain
+from orthoswarm.model.frame import Frame
+from orthoswarm.model.placement import MapWindow, PlacedFrame, Refinement, Refiner, Terrain
+
+Array = NDArray[np.float64]
+_TIE_PLACES = 8
+"""Camera positions of a vehicle that tie two areas: they move as one, a few tell shift, turn and scale."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Solved:
+    """What is kept of an area.
+
+    Attributes:
+        own: its refinement, without its halo. places: vehicle -> float64 (N, 3), some camera positions in its frame, of
+            all its vehicles and those of its halo.
+    """
+
+    own: Refinement
+    places: dict[str, Array]
+
+    @property
+    def nadirs(self) -> Array:
+        return np.array([p.camera.nadir for s in self.own.fine for p in s.placed]).reshape(-1, 2)
+
+    @property
+    def on_map(self) -> bool:
+        return any(p.stage == "fine" for s in self.own.fine for p in s.placed)
+
+
+def refine_by_area(
+    run: RunContext,
+    refiner: Refiner,
+    vehicles: Mapping[str, Sequence[Frame]],
+    basemap: MapWindow | None,
+    *,
+    areas: Sequence[Area],
+    label: str,
+) -> Refinement:
+    """Refine all vehicles (`Refiner.refine_batch`) with no more than one area in memory.
+
+    An interrupted run goes on with the area that it was at. What vehicles give by themselves is done once, for the area
+    that they belong to and those whose halo they are in.
+
+    Args:
+        run: the run. refiner: of the whole swarm. vehicles: id -> frames in order of time. basemap: the map, or None.
+        areas: that the vehicles are divided into. label: name of stored results.
+    """
+    solved = []
+    for k, area in enumerate(areas):
+        name = f"{label} area-{k}"
+        one: _Solved | None = run.space.recall(name)
+        if one is None:
+            one = _solve(run, refiner, vehicles, basemap, area=area, of=(k, len(areas), label))
+            run.space.remember(name, one)
+            trim_memory()
+        solved.append(one)
+    return _joined(solved)
+
+
+def _solve(
+    run: RunContext,
+    refiner: Refiner,
+    vehicles: Mapping[str, Sequence[Frame]],
+    basemap: MapWindow | None,
+    *,
+    area: Area,
+    of: tuple[int, int, str],
+) -> _Solved:
+    """Refine one area; `of`: its number, how many there are, name of stored results."""
+    k, count, label = of
+    names = {*area.own, *area.halo}
+    frames = {vehicle: own for vehicle, own in vehicles.items() if vehicle in names}
+    tasks = run.space.remembering(f"{label}-{k}", run.workers.map, shared=partial(_single_vehicle, label=label))
+
+    def progress(what: str, done: int, all_: int) -> None:
+        run.progress(f"{what}, area {k + 1} of {count}", done, all_)
+
+    refined = refiner.refine_batch(frames, basemap, tasks, progress, halo=frozenset(area.halo))
+    places = {s.vehicle: _some_places(s.placed) for s in refined.fine if s.placed}
+    coarse, fine = (
+        [replace(s, state=None) for s in solutions if s.vehicle in area.own]
+        for solutions in (refined.coarse, refined.fine)
+    )
+    return _Solved(replace(refined, coarse=coarse, fine=fine), places)
+
+
+def _single_vehicle(function: Callable[..., Any], item: Any, *, label: str) -> str | None:
+    """Name of a result that depends on one vehicle alone, whatever area it is solved in: that of its first pass."""
+    if getattr(function, "func", function).__name__ != "refine_tracked":
+        return None
+    first, last = item[0].image, item[-1].image
+    return f"{label} alone-{first}-{last}-{len(item)}"
+
+
+def _some_places(placed: Sequence[PlacedFrame]) -> Array:
+    index = np.unique(np.linspace(0, len(placed) - 1, _TIE_PLACES).round().astype(int))
+    return np.array([placed[i].camera.position for i in index])
+
+
+def _joined(solved: Sequence[_Solved]) -> Refinement:
+    """Move areas onto each other, and join them."""
+    ties = []
+    home = {s.vehicle: k for k, area in enumerate(solved) for s in area.own.fine}
+    for k, area in enumerate(solved):
+        for vehicle, place in area.places.items():
+            other = home.get(vehicle, k)
+            known = solved[other].places.get(vehicle)
+            if other != k and known is not None and known.shape == place.shape:
+                ties.append(AreaTie(other, k, np.stack([known, place])))
+    nadirs = [area.nadirs for area in solved]
+    moves = adjust_areas(nadirs, [area.on_map for area in solved], ties)
+    own = [_moved(area.own, move) for area, move in zip(solved, moves, strict=True)]
+    ground = merged_ground([r.terrain for r in own], nadirs)
+    below = merged_ground([next((s.terrain for s in r.coarse if s.terrain), None) for r in own], nadirs)
+    levels = np.concatenate([np.full(len(s.placed), s.ground_z_m) for r in own for s in r.fine])
+    level = float(np.median(levels)) if len(levels) else 0.0
+    return Refinement(
+        [replace(s, terrain=s.terrain and below) for r in own for s in r.coarse],
+        [replace(s, terrain=s.terrain and ground, ground_z_m=level) for r in own for s in r.fine],
+        ground,
+        list(dict.fromkeys(warning for r in own for warning in r.warnings)),
+    )
+
+
+def _moved(refinement: Refinement, move: AreaMove) -> Refinement:
+    """An area after its move, as refined; before that each of its vehicles lies where it was found by itself."""
+    plane = move.plane
+    level = float(np.median([s.ground_z_m for s in refinement.fine])) if refinement.fine else 0.0
+
+    def camera(p: PlacedFrame) -> PlacedFrame:
+        height = float(plane.moved_heights(p.camera.position[2], level)) + move.up_m
+        position = np.array([*plane.moved(p.camera.nadir), height])
+        return replace(p, camera=replace(p.camera, position=position, rotation=plane.about_up @ p.camera.rotation))
+
+    fine = [
+        replace(s, placed=[camera(p) for p in s.placed], ground_z_m=s.ground_z_m + move.up_m) for s in refinement.fine
+    ]
+    return replace(refinement, fine=fine, terrain=_moved_ground(refinement.terrain, move, level))
+
+
+def _moved_ground(terrain: Terrain | None, move: AreaMove, level_m: float) -> Terrain | None:
+    if terrain is None:
+        return None
+    # Where the map holds an area, it is not resampled.
+    moved = terrain if np.abs(move.plane.values).max() < 1e-5 else moved_terrain(terrain, move.plane, level_m)
+    up = np.float32(move.up_m)
+    return replace(moved, z=moved.z + up, bare=None if moved.bare is None else moved.bare + up)

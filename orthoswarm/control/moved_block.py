@@ -1,0 +1,35 @@
+"""A block's ground after a similarity in the plane."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.model.placement import Terrain
+from orthoswarm.model.plane_similarity import Similarity
+
+
+def moved_terrain(terrain: Terrain, similarity: Similarity, level_m: float) -> Terrain:
+    """The ground after a similarity, on nodes as far apart as before.
+
+    Args:
+        terrain: before it. level_m: heights over this level are scaled.
+    """
+    rows, columns = terrain.z.shape
+    step = terrain.step_m
+    if rows <= 2 and columns <= 2 and terrain.bare is None and float(np.ptp(terrain.z)) == 0.0:
+        return terrain  # a level plane
+    west, south = terrain.west, terrain.south
+    east, north = west + (columns - 1) * step, south + (rows - 1) * step
+    corners = similarity.moved(np.array([[west, south], [east, south], [east, north], [west, north]]))
+    low = np.floor(corners.min(axis=0) / step) * step
+    count = np.ceil((corners.max(axis=0) - low) / step).astype(int) + 1
+    e, n = np.meshgrid(low[0] + step * np.arange(count[0]), low[1] + step * np.arange(count[1]))
+    before = similarity.back(np.stack([e, n], axis=-1))
+
+    def moved(z: NDArray[np.float32]) -> NDArray[np.float32]:
+        heights = replace(terrain, z=z, bare=None).height(before)
+        return np.asarray(similarity.moved_heights(heights, level_m), np.float32)
+
+    bare = None if terrain.bare is None else moved(terrain.bare)
+    return Terrain(float(low[0]), float(low[1]), step, moved(terrain.z), bare)
