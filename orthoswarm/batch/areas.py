@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.trajectory.near_paths import near_paths
+from orthoswarm.trajectory.near_paths import near_paths, reach_m
 
 Array = NDArray[np.float64]
 
@@ -41,12 +41,18 @@ def divide(paths: Mapping[str, Array], most: int) -> list[Area]:
     count = np.array([len(path) for path in paths.values()])
     parts = _halves(np.arange(len(names)), middle, count, most)
     every = list(paths.values())
+    low, high = (np.array([end(path[:, :2], axis=0) for path in every]) for end in (np.min, np.max))
     areas = []
-    for part in parts:
+    for part in parts if len(parts) > 1 else []:
         own = set(part.tolist())
-        near = {j for k in part.tolist() for j in near_paths(every[k], every)}
+        near = set[int]()
+        for k in part.tolist():
+            reach = reach_m(every[k])
+            meets = ((low < high[k] + reach) & (high > low[k] - reach)).all(1)  # thousands of vehicles are quick so
+            others = np.flatnonzero(meets).tolist()
+            near.update(others[j] for j in near_paths(every[k], [every[other] for other in others]))
         areas.append(Area(tuple(names[k] for k in sorted(own)), tuple(names[k] for k in sorted(near - own))))
-    return areas
+    return areas or [Area(tuple(names), ())]
 
 
 def _halves(members: NDArray[np.intp], middle: Array, count: NDArray[np.intp], most: int) -> Sequence[NDArray[np.intp]]:
