@@ -1,6 +1,6 @@
 """A large swarm refined area by area, each with its halo, then moved onto each other and joined."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -15,7 +15,7 @@ from orthoswarm.compute.workers import trim_memory
 from orthoswarm.control.area_adjustment import AreaMove, AreaTie, adjust_areas
 from orthoswarm.control.moved_block import moved_terrain
 from orthoswarm.model.frame import Frame
-from orthoswarm.model.placement import MapWindow, PlacedFrame, Refinement, Refiner, Terrain
+from orthoswarm.model.placement import MapWindow, PlacedFrame, Refinement, Refiner, Solution, Terrain
 
 Array = NDArray[np.float64]
 _TIE_PLACES = 8
@@ -68,9 +68,24 @@ def refine_by_area(
         if one is None:
             one = _solve(run, refiner, vehicles, basemap, area=area, of=(k, len(areas), label))
             run.space.remember(name, one)
-            trim_memory()
-        solved.append(one)
+        members = {*area.own}
+        own = (frame for vehicle, frames in vehicles.items() if vehicle in members for frame in frames)
+        solved.append(replace(one, own=with_frames(one.own, own)))
+        del one
+        trim_memory()
     return _joined(solved)
+
+
+def with_frames(refinement: Refinement, frames: Iterable[Frame]) -> Refinement:
+    """The same with these frames; those that came back from other processes or a file take 2 kB a picture each."""
+    known = {frame.image: frame for frame in frames}
+
+    def own(solution: Solution) -> Solution:
+        placed = [replace(p, frame=known.get(p.frame.image, p.frame)) for p in solution.placed]
+        return replace(solution, placed=placed)
+
+    coarse, fine = ([own(s) for s in solutions] for solutions in (refinement.coarse, refinement.fine))
+    return replace(refinement, coarse=coarse, fine=fine)
 
 
 def _solve(

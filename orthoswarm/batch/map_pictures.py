@@ -9,6 +9,7 @@ import numpy as np
 
 from orthoswarm.batch.run_state import COARSE, ORTHOIMAGE, SEAMLINES, RunContext, RunState
 from orthoswarm.canvas.canvas import Canvas
+from orthoswarm.compute.workers import trim_memory
 from orthoswarm.config import active
 from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.export.catalog.tiled_raster import copy_tiled, in_tiles, product_file, remove_tiles, write_tiled
@@ -63,6 +64,7 @@ def refined_pictures(run: RunContext, state: RunState, refinement: Refinement | 
             tone = state.basemap if run.options.tone == "map" and with_map and on_map else None
             ground, threads = terrain or Terrain.flat(), run.drawers.count
             state.gains = estimate_fields(fine, state.thumbnails, ground, tone=tone, threads=threads)
+        trim_memory()
         if run.options.tone == "map":
             state.warnings.append(tone_warning(state.gains) if tone else NO_MAP_TONE)
     if run.options.until != "fine":

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from orthoswarm.batch.area_refinement import refine_by_area
+from orthoswarm.batch.area_refinement import refine_by_area, with_frames
 from orthoswarm.batch.areas import Area, divide
 from orthoswarm.batch.refiners import make_refiner
 from orthoswarm.batch.run_state import RunContext, RunState
@@ -34,14 +34,14 @@ def refine(run: RunContext, state: RunState) -> Refinement | None:
         if state.basemap is not None and run.options.until == "fine":
             state.warnings.append("the basemap was not used; the orthoimage lies where the receivers say")
         return None
+    frames = hint_lone_photos(by_kind.fit)
     known: tuple[Refinement, list[Stage], bool] | None = run.space.recall("refinement")
     if known is not None:
         refinement, stages, map_unreadable = known
         run.clock.stages += stages
         state.basemap = None if map_unreadable else state.basemap
-        return refinement
+        return with_frames(refinement, frames)
     outer = Clock(run.workers.usage)
-    frames = hint_lone_photos(by_kind.fit)
     with outer.stage("refine", len(frames)) as stage:
         try:
             refinement = _refined(run, frames, state)
@@ -111,6 +111,7 @@ def _call_refiner(run: RunContext, frames: Sequence[Frame], state: RunState) -> 
     refinement.coarse, refinement.fine = (
         [replace(s, state=None) for s in solutions] for solutions in (refinement.coarse, refinement.fine)
     )
+    refinement = with_frames(refinement, frames)
     trim_memory()
     return refinement
 

@@ -6,6 +6,7 @@ other obliquely), and on a grid over each frame and its nearest neighbours, of a
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,8 +52,20 @@ class OverlapColors:
     @classmethod
     def joined(cls, parts: "Sequence[OverlapColors]") -> "OverlapColors":
         """All samples of one or more parts."""
-        names = ("frame", "ratio", "place", "sigma")
-        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+        return cls(*(np.concatenate(arrays) for arrays in zip(*(part._arrays for part in parts), strict=True)))
+
+    def put(self, at: int, part: "OverlapColors") -> None:
+        """Write other samples over those from `at` on."""
+        for own, its in zip(self._arrays, part._arrays, strict=True):
+            own[at : at + len(its)] = its
+
+    def first(self, count: int) -> "OverlapColors":
+        """The first samples."""
+        return OverlapColors(*(own[:count] for own in self._arrays))
+
+    @property
+    def _arrays(self) -> tuple[NDArray[Any], ...]:
+        return self.frame, self.ratio, self.place, self.sigma
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,7 +208,16 @@ def _compared(
         for kind in meetings
         for first in range(0, max(1, len(kind.a)), at_once)
     )
-    return OverlapColors.joined(list(on_threads(compare, parts, threads)))
+    places = sum(len(kind.a) for kind in meetings)
+    all_ = OverlapColors(
+        np.empty((places, 2), np.int32), np.empty((places, 3), np.float32), np.empty((places, 2, 4), np.float32),
+        np.empty(places, np.float32),
+    )  # fmt: skip
+    filled = 0
+    for part in on_threads(compare, parts, threads):  # which are not all there at once
+        all_.put(filled, part)
+        filled += len(part.frame)
+    return all_.first(filled)
 
 
 @in_place_kernel

@@ -121,6 +121,7 @@ def estimate_fields(
         colors = OverlapColors.joined([colors, shared])
         of_some, fixed = np.append(of_some, of_some[:1]), np.append(fixed, True)
     of_vehicle, of_known = _solve(colors, of_some, len(names), fixed, threads)
+    del colors  # 5 kB a picture
     of_frame = np.zeros((len(frames), _OWN, 3))
     of_frame[some] = of_known[: len(known)]
     every, at_once = np.arange(len(frames)), active().compute.fields_at_once

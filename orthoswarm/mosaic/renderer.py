@@ -27,6 +27,7 @@ from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import PlacedFrame, Terrain
 from orthoswarm.mosaic.footprint import rejections
+from orthoswarm.mosaic.frame_windows import FrameWindows
 from orthoswarm.mosaic.kernels.downsampling import reduction
 from orthoswarm.mosaic.kernels.render_arrays import Shots, crop
 from orthoswarm.mosaic.radiometry import Field, uniform
@@ -42,7 +43,6 @@ from orthoswarm.mosaic.render_passes import (
     SampleTask,
     Shot,
     TaskLayer,
-    Window,
     color_pass,
     feather_pass,
     finish_pass,
@@ -252,15 +252,6 @@ def _sample_tasks(jobs: Sequence["_Job"], read: Read, parts: PictureParts | None
         yield SampleTask([job.layer_of(indices) for job, indices in zip(jobs, own, strict=True)], shots, read, parts)
 
 
-def _by_frame(results: Iterable[Iterable[tuple[int, Window]]]) -> dict[int, list[Window]]:
-    """Windows by frame, frames and tiles in order."""
-    windows: dict[int, list[Window]] = defaultdict(list)
-    for result in results:
-        for i, window in result:
-            windows[i].append(window)
-    return {i: sorted(windows[i], key=lambda w: w.key) for i in sorted(windows)}
-
-
 def _tiles_within(canvas: Canvas, bounds: BoundingBox) -> set[Key]:
     r0, r1, c0, c1 = canvas.window(bounds)
     t = canvas.tile_px
@@ -282,8 +273,7 @@ class _Job:
         self.rejected: dict[str, str] = {}
         self.thumbnails: dict[str, Bytes] = {}
         self.pixels = np.zeros(len(self.frames), np.int64)
-        self.windows: dict[int, list[Window]] = {}
-        self.near_seams: dict[int, list[Window]] = {}
+        self.windows = self.near_seams = FrameWindows()
         self.seams, self.previews = layer.seams, layer.previews
         self.failed: dict[int, str] = {}
         reasons = rejections([f.camera for f in self.frames], self.ground, self.canvas.grid.gsd_m)
@@ -330,11 +320,11 @@ class _Job:
 
         # Tiles of one turn do not touch; seams go on from the tiles of earlier turns, whoever works on them.
         turns = [(0, 0), (0, 1), (1, 0), (1, 1)] if self.seams is not None and not len(again) else [None]
-        self.windows = _by_frame(result for turn in turns for result in self.run(label_pass, tasks(turn)))
+        self.windows = FrameWindows(result for turn in turns for result in self.run(label_pass, tasks(turn)))
         for i, own in self.windows.items():
             self.pixels[i] += sum(w.pixels for w in own)
         first = self.seams is not None and (self.seams.blend == "seam" or self.seams.level) and not len(again)
-        self.near_seams = _by_frame(self.run(feather_pass, self.feather_tasks())) if first else {}
+        self.near_seams = FrameWindows(self.run(feather_pass, self.feather_tasks()) if first else ())
 
     def feather_tasks(self) -> Iterator[FeatherTask]:
         width = active().mosaic.feather_px
