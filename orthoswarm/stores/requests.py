@@ -7,7 +7,7 @@
         └── StoreLostError       a store cannot be reached: the run ends, and goes on when started again
 
 Credentials come from where the stores' own libraries look for them (environment, ~/.aws, ~/.config/gcloud, the
-machine's role), addresses of other S3 servers from AWS_ENDPOINT_URL.
+machine's role), addresses of other servers from AWS_ENDPOINT_URL and STORAGE_EMULATOR_HOST.
 """
 
 import errno
@@ -29,12 +29,16 @@ _GONE = (
     ("botocore.exceptions", "EndpointConnectionError"),
     ("botocore.exceptions", "ConnectTimeoutError"),
     ("aiohttp", "ClientConnectorError"),
+    ("aiohttp", "ConnectionTimeoutError"),
+    ("google.auth.exceptions", "TransportError"),
 )
 _NO_CREDENTIALS = (
     ("botocore.exceptions", "NoCredentialsError"),
     ("botocore.exceptions", "PartialCredentialsError"),
     ("google.auth.exceptions", "DefaultCredentialsError"),
+    ("orthoswarm.stores.google_store", "AnonymousError"),
 )
+_LOGGED_OUT = (("google.auth.exceptions", "RefreshError"),)
 _file_systems: dict[tuple[str, int], Any] = {}
 
 
@@ -79,10 +83,10 @@ def request(path: Path, what: Callable[[Any, str], T]) -> T:
         InputError: if packages or credentials are missing.
         NotStoredError, StoreRequestError, StoreLostError: see above.
     """
-    config, system, key = active().stores, file_system(path), key_of(path)
+    config, key = active().stores, key_of(path)
     for attempt in range(1, config.attempts + 1):
         try:
-            return what(system, key)
+            return what(file_system(path), key)
         except Exception as error:  # each backend raises errors of its own library
             _raise_final(path, error)
             if attempt == config.attempts:
@@ -93,6 +97,10 @@ def request(path: Path, what: Callable[[Any, str], T]) -> T:
 
 def _connected(scheme: str) -> Any:
     try:
+        if scheme == "gs":
+            from orthoswarm.stores.google_store import GoogleFileSystem
+
+            return GoogleFileSystem(**_settings(scheme))
         import fsspec
 
         system = fsspec.filesystem(scheme, **_settings(scheme))
@@ -101,8 +109,7 @@ def _connected(scheme: str) -> Any:
         return system
     except ImportError:
         package = _PACKAGES[scheme]
-        extra = "orthoswarm[cloud]" if package != "gcsfs" else "orthoswarm[cloud] gcsfs"
-        raise InputError(f"{scheme}:// needs the package {package}; pip install {extra}") from None
+        raise InputError(f"{scheme}:// needs the package {package}; pip install orthoswarm[cloud]") from None
 
 
 def _settings(scheme: str) -> dict[str, Any]:
@@ -112,11 +119,11 @@ def _settings(scheme: str) -> dict[str, Any]:
     if scheme == "s3":
         retries = {"max_attempts": 1, "mode": "standard"}
         settings["config_kwargs"] = {"read_timeout": limit, "connect_timeout": limit, "retries": retries}
-    elif scheme.startswith("http"):
+    else:
         import aiohttp
 
         bounds = aiohttp.ClientTimeout(total=None, sock_connect=limit, sock_read=limit)
-        settings["client_kwargs"] = {"timeout": bounds}
+        settings |= {"requests_timeout": bounds} if scheme == "gs" else {"client_kwargs": {"timeout": bounds}}
     return settings
 
 
@@ -125,12 +132,12 @@ def _raise_final(path: Path, error: Exception) -> None:
     address = address_of(path)
     if isinstance(error, FileNotFoundError):
         raise NotStoredError(f"{address} is not there; check the address") from None
-    if isinstance(error, PermissionError):
-        raise NotStoredError(f"{address} is refused by its store; give credentials that may use it") from None
     if _is(error, _NO_CREDENTIALS):
         raise InputError(
             f"there are no credentials for {address}; set them as for the store's own program (docs/cluster.md)"
         ) from None
+    if isinstance(error, PermissionError):
+        raise NotStoredError(f"{address} is refused by its store; give credentials that may use it") from None
     if isinstance(error, ImportError):
         raise InputError(f"{address} needs a package ({error}); pip install orthoswarm[cloud]") from None
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS):
@@ -145,12 +152,14 @@ def _raise_spent(path: Path, error: Exception, attempts: int) -> None:
         raise StoreLostError(
             f"the store of {address} cannot be reached; run the same command again to go on when it is back"
         ) from None
+    if _is(error, _LOGGED_OUT):
+        raise InputError(f"the login for {address} is no longer valid; log in again (docs/cluster.md)") from None
     raise StoreRequestError(f"{address} failed in {attempts} attempts ({_short(error)}); try again later") from None
 
 
 def _is(error: BaseException | None, kinds: tuple[tuple[str, str], ...]) -> bool:
     """Whether an error or one of its causes is of a library's type; a library that was not imported raised nothing."""
-    types = tuple(getattr(sys.modules[m], name) for m, name in kinds if m in sys.modules)
+    types = tuple(getattr(sys.modules[m], name, ()) for m, name in kinds if m in sys.modules)
     while error is not None:
         if isinstance(error, types):
             return True

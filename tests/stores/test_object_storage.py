@@ -1,4 +1,4 @@
-"""Maps from and into an S3 server on loopback: the same products as from folders, and failures in one sentence."""
+"""Maps from and into servers of object storage on loopback: products as from folders, failures in one sentence."""
 
 import json
 import re
@@ -6,10 +6,6 @@ import shutil
 import sys
 
 import pytest
-
-pytest.importorskip("s3fs", reason="needs the extra 'cloud'")
-pytest.importorskip("moto", reason="needs the S3 server of moto[s3] with flask and flask-cors")
-pytest.importorskip("flask_cors", reason="needs the S3 server of moto[s3] with flask and flask-cors")
 
 from gcs_plugin.cli.main import main
 from orthoswarm.config import active
@@ -22,15 +18,19 @@ from orthoswarm.stores.published_folder import PublishedFolder
 from orthoswarm.stores.requests import NotStoredError, StoreLostError, StoreRequestError
 from tests.kit.scene import Scene, legs
 from tests.kit.servers.ports import free_port
-from tests.kit.servers.store_server import ENVIRONMENT, FaultyProxy, s3_server
+from tests.kit.servers.store_server import KINDS, FaultyProxy, store_server
 
 PRODUCTS = ("realtime.tif", "coarse.tif", "orthoimage.tif", "frames.jsonl")
+UPLOADS = ("PUT", "POST")
 
 
-@pytest.fixture(scope="module")
-def server():
-    with s3_server() as address:
-        yield address
+@pytest.fixture(scope="module", params=KINDS)
+def server(request):
+    """A server of each kind, and its address."""
+    kind = KINDS[request.param]
+    kind.require()
+    with store_server(kind) as address:
+        yield kind, address
 
 
 @pytest.fixture(scope="module")
@@ -46,10 +46,11 @@ def site(tmp_path_factory):
 @pytest.fixture
 def store(server, monkeypatch, tmp_path, configure):
     """A proxy before the server that this process uses, with an empty cache of its own; quick to give up."""
-    proxy = FaultyProxy(server)
+    kind, address = server
+    proxy = FaultyProxy(address, kind)
     for name, value in {
-        **ENVIRONMENT,
-        "AWS_ENDPOINT_URL": proxy.address,
+        **kind.environment,
+        kind.endpoint: proxy.address,
         "ORTHOSWARM_CACHE": str(tmp_path / "cache"),
     }.items():
         monkeypatch.setenv(name, value)
@@ -66,11 +67,12 @@ def bucket(store, request):
     name = re.sub("[^a-z0-9]+", "-", request.node.name.lower())[:50].strip("-")
 
     def fill(folder=None):
-        system = requests.file_system(path_of(f"s3://{name}"))
+        address = f"{store.kind.scheme}://{name}"
+        system = requests.file_system(path_of(address))
         system.mkdir(name)
         if folder is not None:
             system.put(f"{folder}/", f"{name}/site", recursive=True)
-        return f"s3://{name}"
+        return address
 
     return fill
 
@@ -134,26 +136,28 @@ def test_a_silent_store_is_given_up(bucket, store, site, configure):
 
 
 def test_a_store_that_is_gone_ends_the_run_in_one_sentence(store, monkeypatch, capsys, tmp_path, hasty):
-    monkeypatch.setenv("AWS_ENDPOINT_URL", f"http://127.0.0.1:{free_port()}")
+    monkeypatch.setenv(store.kind.endpoint, f"http://127.0.0.1:{free_port()}")
     requests._file_systems.clear()
+    flood = f"{store.kind.scheme}://flood"
     with pytest.raises(StoreLostError, match="cannot be reached"):
-        content(path_of("s3://flood/a.jpg"))
-    assert main(["mosaic", "s3://flood/photos", "--out", str(tmp_path / "out"), "--config", hasty]) == 1
+        content(path_of(f"{flood}/a.jpg"))
+    assert main(["mosaic", f"{flood}/photos", "--out", str(tmp_path / "out"), "--config", hasty]) == 1
     assert len(capsys.readouterr().err.strip().splitlines()) == 1
 
 
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        (["s3://absent-bucket/photos", "--out", "OUT"], "s3://absent-bucket/photos does not exist"),
+        (["ABSENT/photos", "--out", "OUT"], "://absent-bucket/photos does not exist"),
         (["BUCKET/nothing", "--out", "OUT"], "does not exist"),
         (["PHOTOS", "--basemap", "BUCKET/no.tif", "--out", "OUT"], "no.tif does not exist"),
-        (["PHOTOS", "--out", "s3://absent-bucket/map"], "cannot be written"),
+        (["PHOTOS", "--out", "ABSENT/map"], "cannot be written"),
         (["PHOTOS", "--out", "https://example.org/map"], "nothing can be written to https://example.org/map"),
     ],
 )
-def test_wrong_addresses_are_refused(bucket, site, tmp_path, capsys, arguments, text):
+def test_wrong_addresses_are_refused(bucket, store, site, tmp_path, capsys, arguments, text):
     values = {"BUCKET": bucket(), "PHOTOS": str(site / "photos"), "OUT": str(tmp_path / "out")}
+    values["ABSENT"] = f"{store.kind.scheme}://absent-bucket"
     for name, value in values.items():
         arguments = [a.replace(name, value) for a in arguments]
     assert main(["mosaic", *arguments]) == 2
@@ -169,13 +173,13 @@ def test_an_upload_that_fails_goes_on_and_the_report_comes_last(bucket, store, t
         (out.local / name).write_text(name)
     (out.local / ".work").mkdir()
     (out.local / ".work" / "key").write_text("")
-    store.fault = lambda method, path: 500 if "b.tif" in path and method == "PUT" else None
+    store.fault = lambda method, path: 500 if "b.tif" in path and method in UPLOADS else None
     with pytest.raises(StoreRequestError):
         out.publish(["a.tif", "b.tif"])
     assert [p.name for p in list_folder(address)] == ["a.tif"]
     store.fault, store.seen = (lambda method, path: None), []
     PublishedFolder(address).publish(["a.tif", "b.tif"])
-    put = [path for method, path in store.seen if method == "PUT" and "writable" not in path]
+    put = [path for method, path in store.seen if method in UPLOADS and "writable" not in path]
     assert [p.rpartition("/")[2] for p in put] == ["b.tif", "report.json"]
     assert not out.local.exists() and len(list_folder(address)) == 3
 
@@ -200,10 +204,10 @@ def test_a_large_file_goes_up_in_parts(bucket, store, tmp_path, configure):
     out.local.mkdir(parents=True)
     data = bytes(range(256)) * (12 << 12)  # 12.6 MB
     (out.local / "a.tif").write_bytes(data)
-    failures = iter([503])
-    store.fault = lambda method, path: next(failures, None) if "partNumber=2" in path else None
+    answers = iter([None, 503])
+    store.fault = lambda method, path: next(answers, None) if store.kind.part in path else None
     out.publish(["a.tif"])
-    assert sum("partNumber" in path for _, path in store.seen) >= 3
+    assert sum(store.kind.part in path for method, path in store.seen if method in UPLOADS) >= 4
     assert content(address / "a.tif") == data
 
 
@@ -264,13 +268,63 @@ def test_a_file_that_changed_in_its_store_is_fetched_again(bucket, configure):
         local_file(path)
 
 
+def test_files_with_any_name_and_end_arrive_whole(bucket, store):
+    address = path_of(bucket()) / "map"
+    out = PublishedFolder(address)
+    files = {"a#1 50%.tif": b"a\r\n", "ü{0}.tif": b"b\r", "[c]?.tif": b"", "d.json": b"{}\n"}
+    out.local.mkdir(parents=True)
+    for name, data in files.items():
+        (out.local / name).write_bytes(data)
+    requests.file_system(address).pipe_file(
+        "/".join([*address.parts[2:], ""]), b""
+    )  # as store's own pages make folders
+    out.publish([])
+    assert {p.name: content(p) for p in list_folder(address)} == files
+
+
+def test_a_file_that_was_listed_comes_in_one_request(bucket, store, site):
+    path = list_folder(path_of(bucket(site)) / "site" / "photos")[0]
+    store.seen.clear()
+    assert content(path) and len(store.seen) == 1
+
+
+@pytest.mark.parametrize("server", ["gs"], indirect=True)
+def test_requests_without_credentials_that_need_them_say_so(bucket, store, site, tmp_path, capsys):
+    photos = f"{bucket(site)}/site/photos"
+    store.fault = lambda method, path: 401
+    assert main(["mosaic", photos, "--out", str(tmp_path / "out")]) == 2
+    assert f"there are no credentials for {photos}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("server", ["gs"], indirect=True)
+@pytest.mark.parametrize(("answers", "failure"), [(True, InputError), (False, StoreLostError)])
+def test_a_login_that_ended_is_told_from_a_lost_network(store, monkeypatch, tmp_path, answers, failure):
+    from cryptography.hazmat.primitives.asymmetric import rsa
+    from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
+
+    key = rsa.generate_private_key(public_exponent=65537, key_size=2048)
+    pem = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()).decode()
+    token = f"{store.address}/token" if answers else f"http://127.0.0.1:{free_port()}/token"
+    account = {"type": "service_account", "project_id": "flood", "private_key_id": "1", "private_key": pem}
+    account |= {"client_email": "a@flood.example", "client_id": "1", "token_uri": token}
+    (tmp_path / "account.json").write_text(json.dumps(account))
+    monkeypatch.setenv("GOOGLE_APPLICATION_CREDENTIALS", str(tmp_path / "account.json"))
+    store.fault = lambda method, path: 400 if path == "/token" else None
+    with pytest.raises(failure):
+        content(path_of("gs://flood/a.jpg"))
+    assert not answers or any(path == "/token" for _, path in store.seen)
+
+
 def test_missing_packages_are_named(monkeypatch, capsys, tmp_path):
     requests._file_systems.clear()
-    for scheme in ("s3", "gs"):
-        monkeypatch.delitem(sys.modules["fsspec.registry"]._registry, scheme, raising=False)
-    monkeypatch.setitem(sys.modules, "s3fs", None)
-    assert main(["mosaic", "s3://flood/photos", "--out", str(tmp_path / "out")]) == 2
-    assert "pip install orthoswarm[cloud]" in capsys.readouterr().err
+    registry = pytest.importorskip("fsspec.registry", reason="needs the extra 'cloud'")
+    monkeypatch.delitem(registry._registry, "s3", raising=False)
+    monkeypatch.delitem(sys.modules, "orthoswarm.stores.google_store", raising=False)
+    for scheme, package in (("s3", "s3fs"), ("gs", "gcsfs")):
+        for name in [package, *(name for name in sys.modules if name.startswith(f"{package}."))]:
+            monkeypatch.setitem(sys.modules, name, None)
+        assert main(["mosaic", f"{scheme}://flood/photos", "--out", str(tmp_path / "out")]) == 2
+        assert f"needs the package {package}; pip install orthoswarm[cloud]" in capsys.readouterr().err
     monkeypatch.setitem(sys.modules, "fsspec", None)
     with pytest.raises(InputError, match="pip install"):
         content(path_of("gs://flood/a.jpg"))
