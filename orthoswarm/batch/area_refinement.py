@@ -1,5 +1,6 @@
 """A large swarm refined area by area, each with its halo, then moved onto each other and joined."""
 
+import hashlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -14,8 +15,11 @@ from orthoswarm.batch.run_state import RunContext
 from orthoswarm.compute.workers import trim_memory
 from orthoswarm.control.area_adjustment import AreaMove, AreaTie, adjust_areas
 from orthoswarm.control.moved_block import moved_terrain
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.placement import MapWindow, PlacedFrame, Refinement, Refiner, Solution, Terrain
+from orthoswarm.mosaic.kernels.render_arrays import crop
+from orthoswarm.trajectory.near_paths import reach_m
 
 Array = NDArray[np.float64]
 _TIE_PLACES = 8
@@ -112,15 +116,21 @@ def _solve(
         [replace(s, state=None) for s in solutions if s.vehicle in area.own]
         for solutions in (refined.coarse, refined.fine)
     )
-    return _Solved(replace(refined, coarse=coarse, fine=fine), places)
+    own = _Solved(replace(refined, coarse=coarse, fine=fine, terrain=None), places)
+    if refined.terrain is None or not len(own.nadirs):
+        return own
+    reach = max(reach_m(np.array([p.camera.position for p in s.placed])) for s in fine if s.placed)
+    near = crop(refined.terrain, BoundingBox.around_points(own.nadirs, reach))
+    fine = [replace(s, terrain=s.terrain and near) for s in fine]  # that of the halo is its own area's
+    return replace(own, own=replace(own.own, fine=fine, terrain=near))
 
 
 def _single_vehicle(function: Callable[..., Any], item: Any, *, label: str) -> str | None:
     """Name of a result that depends on one vehicle alone, whatever area it is solved in: that of its first pass."""
     if getattr(function, "func", function).__name__ != "refine_tracked":
         return None
-    first, last = item[0].image, item[-1].image
-    return f"{label} alone-{first}-{last}-{len(item)}"
+    unit = hashlib.sha256("\n".join(frame.image for frame in item).encode()).hexdigest()
+    return f"{label} alone-{unit[:32]}"
 
 
 def _some_places(placed: Sequence[PlacedFrame]) -> Array:
