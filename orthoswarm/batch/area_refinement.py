@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.batch.areas import Area
 from orthoswarm.batch.merged_ground import merged_ground
 from orthoswarm.batch.run_state import RunContext
+from orthoswarm.batch.swarm_areas import Area
 from orthoswarm.compute.workers import trim_memory
 from orthoswarm.control.area_adjustment import AreaMove, AreaTie, adjust_areas
 from orthoswarm.control.moved_block import moved_terrain

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthoswarm.batch.areas import divide
 from orthoswarm.batch.merged_ground import merged_ground
 from orthoswarm.batch.pipeline import PRODUCTS, Options, run
+from orthoswarm.batch.swarm_areas import divide
 from orthoswarm.batch.workspace import Workspace
 from orthoswarm.compute.workers import Processes, Serial
 from orthoswarm.control.area_adjustment import AreaTie, adjust_areas
