@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from orthoswarm.model.placement import Terrain
 
@@ -54,6 +53,8 @@ def merged_ground(grounds: Sequence[Terrain | None], nadirs: Sequence[Array]) ->
 
 def _nearest_areas(low: Array, step: float, shape: tuple[int, int], nadirs: Sequence[Array]) -> NDArray[np.intp]:
     """For each block of nodes the area with the nearest camera."""
+    from scipy.spatial import cKDTree  # a tenth of a second that runs of one area do without here
+
     rows, columns = (-(-n // _BLOCK) for n in shape)
     side = _BLOCK * step
     middle = np.stack(
