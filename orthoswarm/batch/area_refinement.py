@@ -16,9 +16,13 @@ from orthoswarm.compute.workers import trim_memory
 from orthoswarm.control.area_adjustment import AreaMove, AreaTie, adjust_areas
 from orthoswarm.control.moved_block import moved_terrain
 from orthoswarm.model.bounding_box import BoundingBox
+from orthoswarm.model.errors import AdjustmentError
 from orthoswarm.model.frame import Frame
+from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import MapWindow, PlacedFrame, Refinement, Refiner, Solution, Terrain
+from orthoswarm.mosaic.extent import solved_level
 from orthoswarm.mosaic.kernels.render_arrays import crop
+from orthoswarm.refine.flight.vehicle_refinement import unrefined
 from orthoswarm.trajectory.near_paths import reach_m
 
 Array = NDArray[np.float64]
@@ -32,11 +36,12 @@ class _Solved:
 
     Attributes:
         own: its refinement, without its halo. places: vehicle -> float64 (N, 3), some camera positions in its frame, of
-            all its vehicles and those of its halo.
+            all its vehicles and those of its halo. failure: why none of them could be refined; empty if some were.
     """
 
     own: Refinement
     places: dict[str, Array]
+    failure: str = ""
 
     @property
     def nadirs(self) -> Array:
@@ -54,6 +59,7 @@ def refine_by_area(
     basemap: MapWindow | None,
     *,
     areas: Sequence[Area],
+    grid: LocalGrid,
     label: str,
 ) -> Refinement:
     """Refine all vehicles (`Refiner.refine_batch`) with no more than one area in memory.
@@ -63,20 +69,25 @@ def refine_by_area(
 
     Args:
         run: the run. refiner: of the whole swarm. vehicles: id -> frames in order of time. basemap: the map, or None.
-        areas: that the vehicles are divided into. label: name of stored results.
+        areas: that the vehicles are divided into. grid: of the swarm. label: name of stored results.
+
+    Raises:
+        AdjustmentError: if no vehicle of any area could be refined.
     """
-    solved = []
+    solved: list[_Solved] = []
     for k, area in enumerate(areas):
         name = f"{label} area-{k}"
         one: _Solved | None = run.space.recall(name)
         if one is None:
-            one = _solve(run, refiner, vehicles, basemap, area=area, of=(k, len(areas), label))
+            one = _solve(run, refiner, vehicles, basemap, area=area, grid=grid, of=(k, len(areas), label))
             run.space.remember(name, one)
         members = {*area.own}
         own = (frame for vehicle, frames in vehicles.items() if vehicle in members for frame in frames)
         solved.append(replace(one, own=with_frames(one.own, own)))
         del one
         trim_memory()
+    if all(one.failure for one in solved):
+        raise AdjustmentError(solved[0].failure)
     return _joined(solved)
 
 
@@ -99,6 +110,7 @@ def _solve(
     basemap: MapWindow | None,
     *,
     area: Area,
+    grid: LocalGrid,
     of: tuple[int, int, str],
 ) -> _Solved:
     """Refine one area; `of`: its number, how many there are, name of stored results."""
@@ -110,7 +122,11 @@ def _solve(
     def progress(what: str, done: int, all_: int) -> None:
         run.progress(f"{what}, area {k + 1} of {count}", done, all_)
 
-    refined = refiner.refine_batch(frames, basemap, tasks, progress, halo=frozenset(area.halo))
+    try:
+        refined = refiner.refine_batch(frames, basemap, tasks, progress, halo=frozenset(area.halo))
+    except AdjustmentError as error:  # of all its vehicles; those of other areas are mapped
+        as_recorded = [unrefined(frames[vehicle], str(error), grid) for vehicle in area.own]
+        return _Solved(Refinement(as_recorded, as_recorded, None), {}, failure=str(error))
     places = {s.vehicle: _some_places(s.placed) for s in refined.fine if s.placed}
     coarse, fine = (
         [replace(s, state=None) for s in solutions if s.vehicle in area.own]
@@ -138,8 +154,9 @@ def _some_places(placed: Sequence[PlacedFrame]) -> Array:
     return np.array([placed[i].camera.position for i in index])
 
 
-def _joined(solved: Sequence[_Solved]) -> Refinement:
+def _joined(every: Sequence[_Solved]) -> Refinement:
     """Move areas onto each other, and join them."""
+    solved = [area for area in every if len(area.nadirs)]  # all pictures of an area may be damaged
     ties = []
     home = {s.vehicle: k for k, area in enumerate(solved) for s in area.own.fine}
     for k, area in enumerate(solved):
@@ -153,11 +170,15 @@ def _joined(solved: Sequence[_Solved]) -> Refinement:
     own = [_moved(area.own, move) for area, move in zip(solved, moves, strict=True)]
     ground = merged_ground([r.terrain for r in own], nadirs)
     below = merged_ground([next((s.terrain for s in r.coarse if s.terrain), None) for r in own], nadirs)
-    levels = np.concatenate([np.full(len(s.placed), s.ground_z_m) for r in own for s in r.fine])
-    level = float(np.median(levels)) if len(levels) else 0.0
+    own += [area.own for area in every if not len(area.nadirs)]
+    level = solved_level([s for r in own for s in r.fine])
+
+    def on_ground(s: Solution) -> Solution:
+        return s if s.terrain is None else replace(s, terrain=ground, ground_z_m=level)
+
     return Refinement(
         [replace(s, terrain=s.terrain and below) for r in own for s in r.coarse],
-        [replace(s, terrain=s.terrain and ground, ground_z_m=level) for r in own for s in r.fine],
+        [on_ground(s) for r in own for s in r.fine],
         ground,
         list(dict.fromkeys(warning for r in own for warning in r.warnings)),
     )

@@ -105,7 +105,7 @@ def _call_refiner(run: RunContext, frames: Sequence[Frame], state: RunState) -> 
     label = "vehicle without map" if lost else "vehicle"
     areas = _areas(vehicles, state)
     if len(areas) > 1:
-        return refine_by_area(run, refiner, vehicles, basemap, areas=areas, label=label)
+        return refine_by_area(run, refiner, vehicles, basemap, areas=areas, grid=state.grid, label=label)
     refinement = refiner.refine_batch(vehicles, basemap, run.space.remembering(label, run.workers.map), run.progress)
     # The states behind the solutions are by far the largest part and are not needed any more.
     refinement.coarse, refinement.fine = (

@@ -13,8 +13,10 @@ from orthoswarm.batch.swarm_areas import divide
 from orthoswarm.batch.workspace import Workspace
 from orthoswarm.compute.workers import Processes, Serial
 from orthoswarm.control.area_adjustment import AreaTie, adjust_areas
+from orthoswarm.model.errors import AdjustmentError
 from orthoswarm.model.placement import Terrain
 from orthoswarm.model.plane_similarity import Similarity
+from orthoswarm.refine.strategy.swarm_refiner import SwarmRefiner
 from orthoswarm.trajectory.near_paths import near_paths
 from telemetry import LoadOptions, load
 from tests.kit.scene import Scene, legs
@@ -157,6 +159,28 @@ def test_a_run_in_areas_has_all_products_and_its_pictures_lie_as_in_one(flight, 
     make(folder, tmp_path / "one", config={})
     ours, theirs = errors_m(scene, shots, out), errors_m(scene, shots, tmp_path / "one")
     assert np.median(ours) < 1.2 * np.median(theirs) + 0.02 and ours.max() < 1.5
+
+
+def test_an_area_that_cannot_be_refined_lies_where_its_receivers_say(flight, tmp_path, monkeypatch):
+    scene, shots, folder = flight
+    refine_batch = SwarmRefiner.refine_batch
+
+    def fails_once(self, vehicles, *args, halo=(), **kwargs):
+        if "v0" not in {*vehicles} - {*halo}:
+            raise AdjustmentError("nothing fits")
+        return refine_batch(self, vehicles, *args, halo=halo, **kwargs)
+
+    monkeypatch.setattr(SwarmRefiner, "refine_batch", fails_once)
+    report = make(folder, tmp_path / "out")
+    states = {leg["vehicle"]: leg["state"] for leg in report["legs"]}
+    assert states == {"v0": "matched", "v1": "matched", "v2": "failed", "v3": "failed"}
+    assert sum("nothing fits" in warning for warning in report["warnings"]) == 2
+    assert np.median(errors_m(scene, shots, tmp_path / "out")[:32]) < 0.3
+    monkeypatch.setattr(
+        SwarmRefiner, "refine_batch", lambda *_, **__: (_ for _ in ()).throw(AdjustmentError("nothing"))
+    )
+    report = make(folder, tmp_path / "none")
+    assert any("could not be refined (nothing)" in w for w in report["warnings"]) and not report["legs"]
 
 
 def test_without_a_map_areas_are_moved_onto_each_other(flight, tmp_path):

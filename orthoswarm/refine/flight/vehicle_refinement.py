@@ -103,3 +103,14 @@ def as_recorded(vehicle: str, placed: Sequence[PlacedFrame]) -> Solution:
         fov_sigma_deg=float("nan"),
         terrain=None,
     )
+
+
+def unrefined(frames: Sequence[Frame], why: str, grid: LocalGrid) -> Solution:
+    """A vehicle that could not be refined, placed as recorded.
+
+    Args:
+        frames: its own. why: the reason, for its warning. grid: the area's.
+    """
+    placed = recorded_cameras(frames, grid).placed
+    warning = f"it could not be refined ({why}); it lies where its receiver says"
+    return replace(as_recorded(frames[0].vehicle, placed), warnings=[warning])

@@ -19,10 +19,9 @@ from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import MapWindow, Refinement, Solution, Terrain
 from orthoswarm.model.task_runner import Continued, Run, serial, whole
-from orthoswarm.mosaic.recorded_pose import recorded_cameras
 from orthoswarm.refine.flight.solve_units import merge_units
 from orthoswarm.refine.flight.unsolved_pictures import move_with_neighbours
-from orthoswarm.refine.flight.vehicle_refinement import UnitRefiner, as_recorded, unit_states, units_of_area
+from orthoswarm.refine.flight.vehicle_refinement import UnitRefiner, unit_states, units_of_area, unrefined
 from orthoswarm.refine.registration.block_state import VehicleState, findings, lies_on_map, to_solution
 from orthoswarm.refine.registration.neighbour_registration import register_to_neighbours
 from orthoswarm.refine.strategy.first_pass import first_passes
@@ -157,20 +156,13 @@ class SwarmRefiner(UnitRefiner):
         terrain = _shifted(terrain, origin)
         lean = pooled_lean(states)
         fine = [to_solution(s, origin, terrain, map_lean=lean, ground_z_m=level) for s in states]
-        left = [_unrefined(units[k], why, grid) for k, why in lost.items()]
+        left = [unrefined(units[k], why, grid) for k, why in lost.items()]
         return Refinement(merge_units([*coarse, *left]), merge_units([*fine, *left]), terrain, warnings)
 
 
 def states_of(solution: Solution) -> list[VehicleState]:
     """The states behind a solution of this refiner (several for a vehicle with several lenses)."""
     return unit_states(solution)
-
-
-def _unrefined(frames: Sequence[Frame], why: str, grid: LocalGrid) -> Solution:
-    """A vehicle that could not be refined, placed as recorded."""
-    placed = recorded_cameras(frames, grid).placed
-    warning = f"it could not be refined ({why}); it lies where its receiver says"
-    return replace(as_recorded(frames[0].vehicle, placed), warnings=[warning])
 
 
 def register_unfound(
