@@ -88,7 +88,10 @@ def refine_by_area(
         trim_memory()
     if all(one.failure for one in solved):
         raise AdjustmentError(solved[0].failure)
-    return _joined(solved)
+    joined, order = _joined(solved), {vehicle: k for k, vehicle in enumerate(vehicles)}
+    for solutions in (joined.coarse, joined.fine):
+        solutions.sort(key=lambda s: order[s.vehicle])
+    return joined
 
 
 def with_frames(refinement: Refinement, frames: Iterable[Frame]) -> Refinement:

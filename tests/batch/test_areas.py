@@ -1,6 +1,7 @@
 """Large swarms in areas: how vehicles are divided, how areas are moved onto each other, and whole runs."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -189,6 +190,16 @@ def test_without_a_map_areas_are_moved_onto_each_other(flight, tmp_path):
     make(folder, tmp_path / "one", basemap=False, config={})
     ours, theirs = errors_m(scene, shots, tmp_path / "areas"), errors_m(scene, shots, tmp_path / "one")
     assert np.median(ours) < 1.2 * np.median(theirs) + 0.3
+
+
+def test_vehicles_stand_in_their_order_whatever_areas_they_are_in(flight, tmp_path):
+    """Folders by name, places from north to south: areas divide them another way."""
+    scene, _, folder = flight
+    for k, place in enumerate((2, 0, 3, 1)):
+        shutil.copytree(folder / "photos" / f"v{place}", tmp_path / "photos" / f"w{k}")
+    scene.basemap(tmp_path / "map.tif")
+    report = make(tmp_path, tmp_path / "out")
+    assert [v["id"] for v in report["vehicles"]] == ["w0", "w1", "w2", "w3"]
 
 
 def test_areas_do_not_depend_on_the_number_of_workers(flight, mapped, tmp_path):
