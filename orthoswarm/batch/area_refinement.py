@@ -15,15 +15,12 @@ from orthoswarm.batch.swarm_areas import Area
 from orthoswarm.compute.workers import trim_memory
 from orthoswarm.control.area_adjustment import AreaMove, AreaTie, adjust_areas
 from orthoswarm.control.moved_block import moved_terrain
-from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import AdjustmentError
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import MapWindow, PlacedFrame, Refinement, Refiner, Solution, Terrain
 from orthoswarm.mosaic.extent import solved_level
-from orthoswarm.mosaic.kernels.render_arrays import crop
 from orthoswarm.refine.flight.vehicle_refinement import unrefined
-from orthoswarm.trajectory.near_paths import reach_m
 
 Array = NDArray[np.float64]
 _TIE_PLACES = 8
@@ -135,13 +132,7 @@ def _solve(
         [replace(s, state=None) for s in solutions if s.vehicle in area.own]
         for solutions in (refined.coarse, refined.fine)
     )
-    own = _Solved(replace(refined, coarse=coarse, fine=fine, terrain=None), places)
-    if refined.terrain is None or not len(own.nadirs):
-        return own
-    reach = max(reach_m(np.array([p.camera.position for p in s.placed])) for s in fine if s.placed)
-    near = crop(refined.terrain, BoundingBox.around_points(own.nadirs, reach))
-    fine = [replace(s, terrain=s.terrain and near) for s in fine]  # that of the halo is its own area's
-    return replace(own, own=replace(own.own, fine=fine, terrain=near))
+    return _Solved(replace(refined, coarse=coarse, fine=fine), places)
 
 
 def _single_vehicle(function: Callable[..., Any], item: Any, *, label: str) -> str | None:

@@ -149,9 +149,10 @@ class SwarmRefiner(UnitRefiner):
         for state in states:
             if lies_on_map(state):
                 state.sigma_m = np.hypot(state.sigma_m, distortion)
-        own = [s for s in states if s.vehicle not in halo]
-        beside = [s for s in states if s.vehicle in halo]
-        terrain, warnings = common_terrain(own, beside, dem=self.options.ground(origin).dem, run=run)
+        own = [s for s in states if s.vehicle not in halo] or states  # none of them may have been adjusted
+        beside = [s for s in states if s.vehicle in halo] if len(own) < len(states) else []
+        dem = self.options.ground(origin).dem
+        terrain, warnings = common_terrain(own, beside, near_own=True, dem=dem, run=run)
         level = mapped_level(own, terrain)
         terrain = _shifted(terrain, origin)
         lean = pooled_lean(states)

@@ -46,6 +46,7 @@ def common_terrain(
     states: Sequence[VehicleState],
     others: Sequence[VehicleState] = (),
     *,
+    near_own: bool = False,
     dem: LocalDem | None = None,
     run: Run = serial,
 ) -> tuple[Terrain | None, list[str]]:
@@ -55,7 +56,8 @@ def common_terrain(
 
     Args:
         states: vehicles that are drawn: what stands on the ground is measured where they have found raised points.
-        others: more that the ground is common to. dem: the given height model. run: how tasks are run.
+        others: more that the ground is common to. near_own: without the ground of others alone.
+        dem: the given height model. run: how tasks are run.
     """
     own, states = states, [*states, *others]
     if not states:
@@ -65,7 +67,7 @@ def common_terrain(
     sigma = np.concatenate([q for _, q in tied] + [s.dense[1] for s in states])
     if len(points) < active().strategy.terrain_points:
         return states[0].surface.terrain(), []
-    path = np.concatenate([s.flight.adjustment.cameras.position for s in states])
+    path = np.concatenate([s.flight.adjustment.cameras.position for s in (own if near_own else states)])
     reach = active().strategy.terrain_reach_heights * float(np.median(path[:, 2]))
     bounds = BoundingBox.around_points(path[:, :2], reach)
     lift = float(np.median([s.surface.ground_offset_m for s in states]))
