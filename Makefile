@@ -19,7 +19,7 @@ demo: $(STAMP)
 	@$(BIN)/orthoswarm demo --out $(DEMO) --median 0.5
 	@echo "The map: $(DEMO)/orthoimage.tif; how it was made: $(DEMO)/report.html"
 
-# Two processes: tests in real time (the daemon; vehicles and the page) in one each, then those that compute in both.
+# Two processes: tests with vehicles, the daemon and the page one after the other in one, those that compute in both.
 # PYTEST="-n 2 --dist loadgroup -m 'not sitl'" runs the slow tests as well (half an hour).
 PYTEST ?= -n 2 --dist loadgroup
 test: check

@@ -17,18 +17,15 @@ settings.register_profile("unhurried", deadline=None, derandomize=bool(os.enviro
 settings.load_profile("unhurried")
 
 ROOT = Path(__file__).resolve().parent.parent
-IN_REAL_TIME = {"daemon": "daemon", "vehicles": "stations", "page": "stations", "cli": "stations"}
-"""Rooms whose tests wait for vehicles, servers and browsers, and the group that each runs in, one test after the other.
-
-Two groups of about the same time: two processes begin with them (the largest groups come first), one each, and mostly
-wait."""
+IN_REAL_TIME = {"vehicles", "daemon", "page", "cli"}
+"""Rooms whose tests wait for vehicles, servers and browsers: never two of them at once (see the Makefile)."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Which tests stay in one process where there are several: files that share what they made, and real time."""
     for item in items:
         place = item.path.relative_to(ROOT / "tests")
-        item.add_marker(pytest.mark.xdist_group(IN_REAL_TIME.get(place.parts[0], place.as_posix())))
+        item.add_marker(pytest.mark.xdist_group("real time" if place.parts[0] in IN_REAL_TIME else place.as_posix()))
 
 
 def data_root() -> Path:
