@@ -14,7 +14,7 @@ from orthoswarm.batch.run_state import RunContext
 from orthoswarm.batch.swarm_areas import Area
 from orthoswarm.compute.workers import trim_memory
 from orthoswarm.control.area_adjustment import AreaMove, AreaTie, adjust_areas
-from orthoswarm.control.moved_block import moved_terrain
+from orthoswarm.control.moved_block import moved_camera, moved_terrain
 from orthoswarm.model.errors import AdjustmentError
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
@@ -78,8 +78,7 @@ def refine_by_area(
         if one is None:
             one = _solve(run, refiner, vehicles, basemap, area=area, grid=grid, of=(k, len(areas), label))
             run.space.remember(name, one)
-        members = {*area.own}
-        own = (frame for vehicle, frames in vehicles.items() if vehicle in members for frame in frames)
+        own = (frame for vehicle in area.own for frame in vehicles[vehicle])
         solved.append(replace(one, own=with_frames(one.own, own)))
         del one
         trim_memory()
@@ -137,7 +136,9 @@ def _solve(
 
 def _single_vehicle(function: Callable[..., Any], item: Any, *, label: str) -> str | None:
     """Name of a result that depends on one vehicle alone, whatever area it is solved in: that of its first pass."""
-    if getattr(function, "func", function).__name__ != "refine_tracked":
+    from orthoswarm.refine.strategy.vehicle_passes import refine_tracked  # which the paper's refiner does without
+
+    if getattr(function, "func", function) is not refine_tracked:
         return None
     unit = hashlib.sha256("\n".join(frame.image for frame in item).encode()).hexdigest()
     return f"{label} alone-{unit[:32]}"
@@ -183,14 +184,10 @@ def _moved(refinement: Refinement, move: AreaMove) -> Refinement:
     plane = move.plane
     level = float(np.median([s.ground_z_m for s in refinement.fine])) if refinement.fine else 0.0
 
-    def camera(p: PlacedFrame) -> PlacedFrame:
-        height = float(plane.moved_heights(p.camera.position[2], level)) + move.up_m
-        position = np.array([*plane.moved(p.camera.nadir), height])
-        return replace(p, camera=replace(p.camera, position=position, rotation=plane.about_up @ p.camera.rotation))
+    def placed(s: Solution) -> list[PlacedFrame]:
+        return [replace(p, camera=moved_camera(p.camera, plane, level, move.up_m)) for p in s.placed]
 
-    fine = [
-        replace(s, placed=[camera(p) for p in s.placed], ground_z_m=s.ground_z_m + move.up_m) for s in refinement.fine
-    ]
+    fine = [replace(s, placed=placed(s), ground_z_m=s.ground_z_m + move.up_m) for s in refinement.fine]
     return replace(refinement, fine=fine, terrain=_moved_ground(refinement.terrain, move, level))
 
 

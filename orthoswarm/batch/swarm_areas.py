@@ -40,10 +40,12 @@ def divide(paths: Mapping[str, Array], most: int) -> list[Area]:
     middle = np.array([path[:, :2].mean(0) for path in paths.values()])
     count = np.array([len(path) for path in paths.values()])
     parts = _halves(np.arange(len(names)), middle, count, most)
+    if len(parts) == 1:
+        return [Area(tuple(names), ())]
     every = list(paths.values())
     low, high = (np.array([end(path[:, :2], axis=0) for path in every]) for end in (np.min, np.max))
     areas = []
-    for part in parts if len(parts) > 1 else []:
+    for part in parts:
         own = set(part.tolist())
         near = set[int]()
         for k in part.tolist():
@@ -52,7 +54,7 @@ def divide(paths: Mapping[str, Array], most: int) -> list[Area]:
             others = np.flatnonzero(meets).tolist()
             near.update(others[j] for j in near_paths(every[k], [every[other] for other in others]))
         areas.append(Area(tuple(names[k] for k in sorted(own)), tuple(names[k] for k in sorted(near - own))))
-    return areas or [Area(tuple(names), ())]
+    return areas
 
 
 def _halves(members: NDArray[np.intp], middle: Array, count: NDArray[np.intp], most: int) -> Sequence[NDArray[np.intp]]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from orthoswarm.config import active
 from orthoswarm.control.control_observations import in_photos, on_basemap
-from orthoswarm.control.moved_block import moved_terrain
+from orthoswarm.control.moved_block import moved_camera, moved_terrain
 from orthoswarm.control.similarity import ControlFit, fit_similarity
 from orthoswarm.evaluation.checkpoints import Checkpoint
 from orthoswarm.model.geo import LocalGrid
@@ -125,17 +125,13 @@ def _smallest_sigma(placed: Sequence[PlacedFrame]) -> float:
 
 
 def _moved(placed: PlacedFrame, fit: ControlFit, level_m: float, base_sigma_m: float) -> PlacedFrame:
-    """A photo after a similarity; heights over the ground's level are scaled, too, so that no pixel's ray is bent."""
+    """A photo after a similarity, and its sigma."""
     similarity, camera = fit.similarity, placed.camera
-    height = similarity.moved_heights(camera.position[2], level_m)
-    position = np.array([*similarity.moved(camera.nadir), height])
     own = placed.sigma_m
     if placed.stage != "fine":  # the receivers' common error has given way to that of the control points
         own = float(np.hypot(np.sqrt(max(own**2 - base_sigma_m**2, 0.0)), active().control.receivers_local_sigma_m))
     sigma = float(np.hypot(own, similarity.sigma_m(camera.nadir)))
-    return replace(
-        placed, camera=replace(camera, position=position, rotation=similarity.about_up @ camera.rotation), sigma_m=sigma
-    )
+    return replace(placed, camera=moved_camera(camera, similarity, level_m), sigma_m=sigma)
 
 
 def _warnings(fits: dict[bool, ControlFit], placed: Sequence[PlacedFrame]) -> list[str]:

@@ -1,12 +1,24 @@
-"""A block's ground after a similarity in the plane."""
+"""A block's cameras and ground after a similarity in the plane."""
 
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.model.camera import Camera
 from orthoswarm.model.placement import Terrain
 from orthoswarm.model.plane_similarity import Similarity
+
+
+def moved_camera(camera: Camera, similarity: Similarity, level_m: float, up_m: float = 0.0) -> Camera:
+    """A camera after a similarity; heights over a level are scaled, too, so that no pixel's ray is bent.
+
+    Args:
+        camera: before it. level_m: of the ground. up_m: added to its height.
+    """
+    height = float(similarity.moved_heights(camera.position[2], level_m)) + up_m
+    position = np.array([*similarity.moved(camera.nadir), height])
+    return replace(camera, position=position, rotation=similarity.about_up @ camera.rotation)
 
 
 def moved_terrain(terrain: Terrain, similarity: Similarity, level_m: float) -> Terrain:

@@ -74,9 +74,8 @@ class StrategyConfig:
     neighbour_reach_heights: float = 1.5
     """Vehicles whose paths come within so many flying heights share ground (chosen; not measured)."""
     area_pictures: int = 10_000
-    """More pictures are solved in areas of about so many, each together with its neighbours (chosen for memory: the
-    states of 10,000 pictures of 640 x 480 pixels and their neighbours take 0.2 GB; and for `drawn_nodes`, which leave
-    such an area nodes 1.2 m apart)."""
+    """More pictures are solved in areas of no more than so many, each together with its neighbours (chosen for memory,
+    and for the distance of nodes that `drawn_nodes` allows: 1.4 m where 32,544 pictures in one area have 1.8 m)."""
     area_shift_sigma_m: float = 1.0
     """How well an area's receivers tell its place, an axis, and its level, metres; over its extent the same of its turn
     and scale: some 30 of them, 2 m each, and what they have in common (chosen; areas that no map holds are moved onto
