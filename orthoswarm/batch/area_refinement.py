@@ -61,8 +61,8 @@ def refine_by_area(
 ) -> Refinement:
     """Refine all vehicles (`Refiner.refine_batch`) with no more than one area in memory.
 
-    An interrupted run goes on with the area that it was at. What vehicles give by themselves is done once, for the area
-    that they belong to and those whose halo they are in.
+    An interrupted run goes on with the area that it was at. The first pass of a vehicle is run once, also where it lies
+    in the halo of other areas.
 
     Args:
         run: the run. refiner: of the whole swarm. vehicles: id -> frames in order of time. basemap: the map, or None.
@@ -91,7 +91,7 @@ def refine_by_area(
 
 
 def with_frames(refinement: Refinement, frames: Iterable[Frame]) -> Refinement:
-    """The same with these frames; those that came back from other processes or a file take 2 kB a picture each."""
+    """Replace copies of frames, which came back from other processes or a file, by the frames: 2 kB a picture less."""
     known = {frame.image: frame for frame in frames}
 
     def own(solution: Solution) -> Solution:
@@ -135,7 +135,7 @@ def _solve(
 
 
 def _single_vehicle(function: Callable[..., Any], item: Any, *, label: str) -> str | None:
-    """Name of a result that depends on one vehicle alone, whatever area it is solved in: that of its first pass."""
+    """Name of a vehicle's first pass, which is the same in all areas; None for other results."""
     from orthoswarm.refine.strategy.vehicle_passes import refine_tracked  # which the paper's refiner does without
 
     if getattr(function, "func", function) is not refine_tracked:
@@ -180,7 +180,7 @@ def _joined(every: Sequence[_Solved]) -> Refinement:
 
 
 def _moved(refinement: Refinement, move: AreaMove) -> Refinement:
-    """An area after its move, as refined; before that each of its vehicles lies where it was found by itself."""
+    """An area with its fine cameras and its ground moved; coarse cameras stay where each vehicle was placed alone."""
     plane = move.plane
     level = float(np.median([s.ground_z_m for s in refinement.fine])) if refinement.fine else 0.0
 
