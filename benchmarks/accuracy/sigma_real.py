@@ -40,6 +40,7 @@ from orthoswarm.control.ground_control import place_on_control
 from orthoswarm.evaluation.checkpoints import read_checkpoints
 from orthoswarm.evaluation.displacement import FieldSettings, displacement_field
 from orthoswarm.evaluation.photo_names import photo_named
+from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import local_origin
 from orthoswarm.model.robust import mad_sigma
 from orthoswarm.mosaic.recorded_pose import area_grid
@@ -114,7 +115,7 @@ def at_points(photos, table, pixel_scale):
     """Rows for each number of control points."""
     frames = telemetry.load([photos]).frames
     grid = area_grid(frames)
-    vehicles = {}
+    vehicles: dict[str, list[Frame]] = {}
     for frame in frames:
         vehicles.setdefault(frame.vehicle, []).append(frame)
     refined = make_refiner("swarm", grid.epsg, local_origin(grid, frames)).refine_batch(vehicles, None)
@@ -124,6 +125,7 @@ def at_points(photos, table, pixel_scale):
         for chosen in combinations(points, count):
             moved = place_on_control(refined, list(chosen), grid, None)[0] if chosen else refined
             placed = {p.frame.image: p for s in moved.fine for p in s.placed}
+            assert moved.terrain is not None
             checked = [p for p in points if p not in chosen]
             for found in in_photos(checked, list(placed.values()), moved.terrain, grid, False):
                 marks = next(p.marks for p in points if p.name == found.name)

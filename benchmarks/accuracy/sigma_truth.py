@@ -26,6 +26,7 @@ import telemetry
 from benchmarks.robustness.wrong_maps import altered, season
 from orthoswarm.batch.refiners import make_refiner
 from orthoswarm.evaluation.true_cameras import read_truth, true_ground_level
+from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import local_origin
 from orthoswarm.mosaic.extent import from_takeoff, solved_level
 from orthoswarm.mosaic.recorded_pose import area_grid
@@ -76,7 +77,7 @@ def refined(folder, basemap_file):
     """
     frames = telemetry.load([folder / "photos"]).frames
     grid = area_grid(frames)
-    vehicles = {}
+    vehicles: dict[str, list[Frame]] = {}
     for frame in frames:
         vehicles.setdefault(frame.vehicle, []).append(frame)
     start = time.process_time()
@@ -85,10 +86,10 @@ def refined(folder, basemap_file):
     seconds = time.process_time() - start
     truth = read_truth(folder / "truth" / "frames.csv")
     placed = [p for solution in refinement.fine for p in solution.placed]
-    placed, level = from_takeoff(placed, solved_level(refinement.fine), refinement.terrain)
-    true_level = true_ground_level(folder / "truth" / "dtm.tif", [truth[p.frame.image][2] for p in placed])
+    taken, level = from_takeoff(placed, solved_level(refinement.fine), refinement.terrain)
+    true_level = true_ground_level(folder / "truth" / "dtm.tif", [truth[p.frame.image][2] for p in taken])
     error, square = [], []
-    for p in placed:
+    for p in taken:
         true = truth[p.frame.image][2]
         middle = np.array(true.lens.principal_point)
         error.append(p.camera.to_ground(middle, level) - true.to_ground(middle, level))
@@ -96,8 +97,8 @@ def refined(folder, basemap_file):
         there = p.camera.to_ground(pixels, level)
         square.append([((there - true.to_ground(pixels, z)) ** 2).sum(1).mean() for z in (level, true_level)])
     states = [leg.state for solution in refinement.fine for leg in solution.legs]
-    sigma = np.array([p.sigma_m for p in placed])
-    return np.array(error), sigma, [p.stage for p in placed], states, seconds, np.array(square)
+    sigma = np.array([p.sigma_m for p in taken])
+    return np.array(error), sigma, [p.stage for p in taken], states, seconds, np.array(square)
 
 
 def measure(folder, kind, fields):

@@ -93,7 +93,7 @@ def seam_steps(grey, labels, pixel, limit):
             standard deviation of the grey levels within a strip.
     """
     wide = max(2, round(_STRIP_M / pixel))
-    found: dict[tuple[int, int], list[np.ndarray]] = {}
+    found: dict[int, list[np.ndarray]] = {}
     for value, label in ((grey, labels), (grey.T, labels.T)):
         columns = label.shape[1] - 2 * wide
         part = [label[:, k : k + columns + 1] for k in range(2 * wide)]
@@ -144,7 +144,7 @@ def _quantiles(found):
     step, length = (np.concatenate(parts) for parts in zip(*found))
     order = np.argsort(step)
     share = np.cumsum(length[order]) / length.sum()
-    return [step[order[min(np.searchsorted(share, q), len(order) - 1)]] for q in (0.5, 0.95)]
+    return [step[order[min(int(np.searchsorted(share, q)), len(order) - 1)]] for q in (0.5, 0.95)]
 
 
 def _means(values, mask, side):

@@ -20,6 +20,7 @@ from rasterio.enums import Resampling
 import telemetry
 from orthoswarm.batch.refiners import make_refiner
 from orthoswarm.evaluation.true_cameras import read_truth
+from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import local_origin
 from orthoswarm.mosaic.recorded_pose import area_grid
 from orthoswarm.raster.basemap import Basemap
@@ -61,8 +62,8 @@ def noise(picture, _):
     random = np.random.default_rng(5)
     total = np.zeros(picture.shape[1:], np.float32)
     for size in (1, 3, 10, 30):
-        blobs = cv2.GaussianBlur(random.normal(size=total.shape).astype(np.float32), (0, 0), size)
-        total += blobs / blobs.std()
+        blobs = cv2.GaussianBlur(np.asarray(random.normal(size=total.shape), np.float32), (0, 0), size)
+        total += blobs / float(blobs.std())
     gray = np.clip(128 + 30 * total, 0, 255).astype(np.uint8)
     return np.repeat(gray[None], len(picture), axis=0)
 
@@ -125,7 +126,7 @@ def measure(folder, basemap_file, refiner="swarm"):
     frames = telemetry.load([folder / "photos"]).frames
     grid = area_grid(frames)
     basemap = Basemap.open(basemap_file, grid.epsg)
-    vehicles = {}
+    vehicles: dict[str, list[Frame]] = {}
     for frame in frames:
         vehicles.setdefault(frame.vehicle, []).append(frame)
     start = time.process_time()

@@ -29,7 +29,7 @@ import httpx
 import numpy as np
 from PIL import Image
 
-from benchmarks.speed.daemon_load import alike
+from benchmarks.speed.daemon_load import same_course
 from gcs_plugin.sim.multirotor import Airframe
 from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
 from orthoswarm.coverage.coverage_grid import State
@@ -90,7 +90,7 @@ class Flight:
 
 def post(flight: Flight, client: httpx.Client) -> None:
     """Post pictures as they are taken, until the process ends."""
-    course, number = alike(), 0
+    course, number = same_course(), 0
     while True:
         system, exposure, time_s = flight.pictures.get()
         number += 1

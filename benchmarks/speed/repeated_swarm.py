@@ -46,7 +46,7 @@ def moved(frame: Frame, grid: LocalGrid, *, photos: Path, east_m: float, south_m
     fix = frame.fix
     east, north = grid.to_grid([fix.lat_deg], [fix.lon_deg])[0]
     lat, lon = (float(v) for v in grid.to_geographic([east + east_m, north - south_m]))
-    turn = grid.convergence_rad(lat, lon) - grid.convergence_rad(fix.lat_deg, fix.lon_deg)
+    turn = float(grid.convergence_rad(lat, lon) - grid.convergence_rad(fix.lat_deg, fix.lon_deg))
 
     def turned(yaw_rad: float | None) -> float | None:
         return None if yaw_rad is None else yaw_rad + turn

@@ -193,7 +193,7 @@ def command_all(
             if order.verb != "start":
                 continue
             if outcome.ok:
-                for text in schedule.started(system, time.monotonic()):
+                for text in schedule.started(system, time.monotonic(), "vehicle {}".format):
                     say(text)
                 continue
             for cancelled in schedule.failed(system):

@@ -37,7 +37,7 @@ def places_of(
             Place(
                 uid=f"orthoswarm-{workspace}-{row['id']}", kind="vehicle", name=row.get("name") or row["id"],
                 lat_deg=row["lat_deg"], lon_deg=row["lon_deg"], time_s=now_s - float(row.get("silent_s") or 0.0),
-                height_m=row.get("alt_m"), course_deg=row.get("heading_deg"), speed_m_s=row.get("speed_m_s"),
+                course_deg=row.get("heading_deg"), speed_m_s=row.get("speed_m_s"),
                 note=(row.get("flight") or {}).get("text", ""),
             )
         )  # fmt: skip

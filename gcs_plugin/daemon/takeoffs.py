@@ -191,7 +191,7 @@ class Takeoffs:
         """Apply the outcome of one start to the waiting ones."""
         with self._condition:
             if outcome.ok:
-                said = self._schedule.started(system, self._clock())
+                said = self._schedule.started(system, self._clock(), self._names.__getitem__)
             else:
                 self._failed[vehicle] = outcome.text
                 held = [self._names[waiter] for waiter in self._schedule.failed(system)]

@@ -427,8 +427,9 @@ class VehicleLinks:
             since = record.lost_since
             if since is None or time.monotonic() - since < self._settings.lost_after_s or not _under_way(vehicle):
                 continue
-            record.lost_since = None
-            if self._missions.give_up(record.id):
+            given_up = self._missions.give_up(record.id)
+            record.lost_since = None  # after that: if the disk is full, it is tried again
+            if given_up:
                 _log.info("%s has been silent for long; what it sent is refined", record.id)
                 self._jobs.wake()
 

@@ -5,7 +5,7 @@ wait on the ground; one that took off late moves them to the next times that kee
 measure (`Airspace`).
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -52,26 +52,31 @@ class TakeoffSchedule:
         """When the next one starts, None if none waits."""
         return min(self.waiting.values(), default=None)
 
-    def started(self, system: int, now: float) -> list[str]:
-        """A vehicle flies its mission; returns the changes for others, in words."""
+    def started(self, system: int, now: float, name: Callable[[int], str]) -> list[str]:
+        """A vehicle flies its mission; returns the changes for others, in words.
+
+        Args:
+            system: its id. now: when, on the caller's clock. name: of a vehicle, from its system id.
+        """
         self._undecided.pop(system, None)
         planned = self._planned.get(system, now)
         late = now - planned
         self.flown[system] = now if late > COMMAND.takeoff_late_s else planned
         if late <= COMMAND.takeoff_late_s:
             return []
-        said = [f"v{system} took off {late:.0f} s late"]
+        said = [f"{name(system)} took off {late:.0f} s late"]
         if self.airspace is None:
             return said
-        for other, _, at, metres in self._met():
-            said.append(f"v{system} may come within {metres:.0f} m of v{other} in {at - now:.0f} s: pause one of them")
+        for one, two, at, metres in self.airspace.conflicts(self.flown):
+            if system in (one, two):  # others that meet were told when the later one of them started
+                both = f"{name(system)} may come within {metres:.0f} m of {name(two if system == one else one)}"
+                said.append(f"{both} in {max(0.0, at - now):.0f} s: pause one of them")
         for waiter in sorted(self.waiting, key=lambda s: self.waiting[s]):
             others = {**self.flown, **{s: at for s, at in self.waiting.items() if at < self.waiting[waiter]}}
             start = self.airspace.next_start(waiter, max(now, self.waiting[waiter]), others)
             if start > self.waiting[waiter] + _MOVED_S:
-                said.append(
-                    f"v{waiter} takes off {start - self.waiting[waiter]:.0f} s later, to keep apart from others"
-                )
+                later = start - self.waiting[waiter]
+                said.append(f"{name(waiter)} takes off {later:.0f} s later, to keep apart from others")
                 self.waiting[waiter] = start
         return said
 
@@ -81,6 +86,3 @@ class TakeoffSchedule:
         held = sorted(self.waiting)
         self.waiting.clear()
         return held
-
-    def _met(self) -> list[tuple[int, int, float, float]]:
-        return [] if self.airspace is None else self.airspace.conflicts(self.flown)

@@ -48,7 +48,7 @@ class Vehicle:
         heard: when it was heard last (the fleet's clock).
         lat_deg: latitude, None before the first position; lon_deg: longitude.
         reported: True once it has sent a position message, if only to say that it has no position.
-        alt_m: above sea level; height_m: above takeoff.
+        height_m: above takeoff.
         velocity_m_s: north, east, down. heading_rad: clockwise from north, None if it does not know.
         roll_rad: attitude of the airframe, with pitch_rad and yaw_rad.
         boot_utc_s: UTC epoch seconds of its start, from its SYSTEM_TIME; None before it knows the time.
@@ -83,7 +83,6 @@ class Vehicle:
     lat_deg: float | None = None
     lon_deg: float | None = None
     reported: bool = False
-    alt_m: float = 0.0
     height_m: float = 0.0
     velocity_m_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
     heading_rad: float | None = None
@@ -238,7 +237,7 @@ class Vehicle:
     def _position(self, m: Message) -> None:
         self.reported = True
         self.lat_deg, self.lon_deg = (m.lat / 1e7, m.lon / 1e7) if has_place(m) else (None, None)
-        self.alt_m, self.height_m = m.alt / 1e3, m.relative_alt / 1e3
+        self.height_m = m.relative_alt / 1e3
         self.velocity_m_s = (m.vx / 100.0, m.vy / 100.0, m.vz / 100.0)
         self.heading_rad = None if m.hdg == 65535 else math.radians(m.hdg / 100.0)
         self.time_boot_s = m.time_boot_ms / 1e3

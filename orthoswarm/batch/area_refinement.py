@@ -176,6 +176,7 @@ def _joined(every: Sequence[_Solved]) -> Refinement:
         [on_ground(s) for r in own for s in r.fine],
         ground,
         list(dict.fromkeys(warning for r in own for warning in r.warnings)),
+        {name: sum(r.equation_5[name] for r in own if r.equation_5) for r in own for name in r.equation_5},
     )
 
 

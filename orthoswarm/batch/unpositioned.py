@@ -51,4 +51,4 @@ def _reduced(frame: Frame) -> NDArray[np.uint8]:
 def _in_order(frames: list[Frame], ingest: Ingest) -> list[Frame]:
     """By vehicle and time; where times are unknown, photos keep the order of their names."""
     vehicles = {f.vehicle: k for k, f in reversed(list(enumerate([*ingest.frames, *ingest.unpositioned])))}
-    return sorted(frames, key=lambda f: (vehicles[f.vehicle], math.inf if f.time_s is None else f.time_s))
+    return sorted(frames, key=lambda f: (vehicles[f.vehicle], math.inf if f.time_s is None else f.time_s, f.image))

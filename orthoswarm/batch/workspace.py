@@ -66,12 +66,10 @@ class Workspace:
         if out.exists() and not out.is_dir():
             raise InputError(f"{out} is a file; choose a folder for --out")
         try:
-            self._work.mkdir(parents=True, exist_ok=True)
-            self._lock: IO[bytes] | None = (self._work / "lock").open("ab")
+            self._lock: IO[bytes] | None = _locked_file(self._work / "lock")
         except OSError as error:
             raise disk_error(error, out) from None
-        if not _try_lock(self._lock):
-            self._lock.close()
+        if self._lock is None:
             raise InputError(f"another run is writing to {out}; wait for it or choose another folder")
         _locked.add(self)
 
@@ -90,12 +88,12 @@ class Workspace:
             part.write_text(key)
         return False
 
-    def recall(self, name: str) -> Any:
-        """A result stored by an earlier run under a name; None without a usable one."""
+    def recall(self, name: str, default: Any = None) -> Any:
+        """A result stored by an earlier run under a name; `default` without a usable one."""
         try:
             return pickle.loads((self._work / f"{name}.pickle").read_bytes())
         except Exception:  # damaged or of another version: do it again
-            return None
+            return default
 
     def remember(self, name: str, value: Any) -> None:
         """Store a result for a later run.
@@ -136,8 +134,19 @@ class Workspace:
 
     def complete(self) -> None:
         """Remove all intermediate results: the run is done."""
+        self._discard()
+
+    def _discard(self) -> None:
+        """Remove the folder and release it; another run may take it only when its files are gone."""
+        for entry in self._work.glob("*"):
+            if entry.name != "lock":
+                _remove(entry)
+        if os.name == "nt":  # where an open file cannot be removed
+            self.close()
+        _remove(self._work / "lock")
         self.close()
-        _remove(self._work)
+        with contextlib.suppress(OSError):
+            self._work.rmdir()
 
     def close(self) -> None:
         """Release the folder for other runs; stored results stay."""
@@ -149,14 +158,18 @@ class Workspace:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if self._lock is None:  # complete
+            return
         self.clear_scratch()
-        self.close()
         failed = kind is not None and issubclass(kind, Exception)  # and not interrupted
         if failed and self._afresh and not any(self._work.glob("*.pickle")):
-            _remove(self._work)
+            self._discard()
             unmake(self._missing)
+        self.close()
 
 
+_NOTHING = object()
+"""In the place of a result that is not stored; None is a result."""
 Shared = Callable[[Callable[..., Any], Any], str | None]
 """Tells the name of function(item) among all results of the run; None where it belongs to its call alone."""
 
@@ -179,16 +192,14 @@ class RememberingRun(Generic[Result]):
         names = [f"{self._name}-{call}-{i}" for i in range(len(items))]
         if self._shared is not None:
             names = [self._shared(function, item) or name for item, name in zip(items, names, strict=True)]
-        known = [self._workspace.recall(name) for name in names]
-        missing = [i for i, value in enumerate(known) if value is None]
+        known = [self._workspace.recall(name, _NOTHING) for name in names]
+        missing = [i for i, value in enumerate(known) if value is _NOTHING]
         fresh = iter(self._run(function, [items[i] for i in missing]))
         for i, name in enumerate(names):
-            if known[i] is not None:
-                yield known[i]
-                known[i] = None
-                continue
-            value = next(fresh)
-            self._workspace.remember(name, value)
+            value, known[i] = known[i], None
+            if value is _NOTHING:
+                value = next(fresh)
+                self._workspace.remember(name, value)
             yield value
 
 
@@ -215,6 +226,20 @@ def _let_go() -> None:
 
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_let_go)
+
+
+def _locked_file(path: Path) -> IO[bytes] | None:
+    """The lock's file, made and locked; None if another run holds it."""
+    while True:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = path.open("ab")
+        if not _try_lock(file):
+            file.close()
+            return None
+        with contextlib.suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(file.fileno()), path.stat()):
+                return file
+        file.close()  # the run that held it has ended meanwhile, and removed it
 
 
 def _try_lock(file: IO[bytes]) -> bool:

@@ -284,7 +284,11 @@ def vehicle_rows(solutions: Sequence[Solution], placed: Sequence[PlacedFrame]) -
 def leg_rows(solutions: Sequence[Solution]) -> list[dict[str, Any]]:
     """`legs` of report.json."""
     rows = [asdict(leg) for s in solutions for leg in s.legs]
-    return [row | {"confidence": finite(row["confidence"]), "sigma_m": finite(row["sigma_m"])} for row in rows]
+    return [
+        row
+        | {"images": list(row["images"]), "confidence": finite(row["confidence"]), "sigma_m": finite(row["sigma_m"])}
+        for row in rows
+    ]
 
 
 def stage_row(stage: Stage) -> dict[str, Any]:

@@ -45,7 +45,8 @@ class Leg:
     """A straight run of one vehicle's frames, and how well the map held it.
 
     Attributes:
-        vehicle: id. first: index of its first frame among the vehicle's frames; last: of its last, inclusive.
+        vehicle: id. first: index of its first frame among the vehicle's solved frames, lens after lens; last: of its
+            last, inclusive. images: names of both.
         state: matched to the map by evidence of its own; carried by legs that were, of its vehicle or of neighbours;
             failed: it lies where the receiver says.
         confidence: 0 to 1. sigma_m: own error estimate in metres.
@@ -54,6 +55,7 @@ class Leg:
     vehicle: str
     first: int
     last: int
+    images: tuple[str, str]
     state: LegState = "failed"
     confidence: float = 0.0
     sigma_m: float = float("nan")

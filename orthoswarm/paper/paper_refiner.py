@@ -281,6 +281,7 @@ def _legs(vehicle: CoarseVehicle, fits: Mapping[int, PatchFit], sigma: Array, ca
                 vehicle=vehicle.vehicle,
                 first=int(members[0]),
                 last=int(members[-1]),
+                images=(vehicle.frames[members[0]].image, vehicle.frames[members[-1]].image),
                 state=how,
                 confidence=confidence,
                 sigma_m=float(np.median(sigma[members])),

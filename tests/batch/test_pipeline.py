@@ -126,7 +126,8 @@ def test_the_report_has_its_keys(mapped):
     assert all({"id", "frames", "fov_deg", "fov_sigma_deg", "legs", "gsd_m"} <= set(v) for v in report["vehicles"])
     assert all(0 <= v["false_matches"] < 1e-4 for v in report["vehicles"])  # the map has evidence for both
     for leg in report["legs"]:
-        assert {"vehicle", "first", "last", "state", "confidence", "sigma_m"} <= set(leg)
+        assert {"vehicle", "first", "last", "images", "state", "confidence", "sigma_m"} <= set(leg)
+        assert len(leg["images"]) == 2 and all(name.startswith(f"{leg['vehicle']}/") for name in leg["images"])
         assert leg["state"] in {"matched", "carried", "failed"}
     names = [s["name"] for s in report["stages"]]
     heads = ("load", "realtime", "coarse", "fine", "final")

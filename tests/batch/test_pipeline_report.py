@@ -108,6 +108,48 @@ def test_results_are_remembered_one_by_one(tmp_path):
         assert space.recall("v-1-0") is None
 
 
+def test_that_there_is_no_result_is_remembered_as_well(tmp_path):
+    asked = []
+
+    def run(function, items):
+        asked.extend(items)
+        return map(function, items)
+
+    for _ in range(2):
+        with Workspace(tmp_path / "out") as space:
+            space.begin("key")
+            assert list(space.remembering("v", run)(only_even, [1, 2])) == [None, 2]
+    assert asked == [1, 2]
+
+
+def test_the_folder_is_released_only_when_its_files_are_gone(tmp_path, monkeypatch):
+    """Another run that takes it loses nothing that it has written by then."""
+    left = []
+    close = Workspace.close
+
+    def noted(space):
+        left.extend(p.name for p in (tmp_path / "out" / ".work").rglob("*"))
+        close(space)
+
+    monkeypatch.setattr(Workspace, "close", noted)
+    with Workspace(tmp_path / "out") as space:
+        space.begin("key")
+        space.remember("x", 1)
+        space.scratch("tiles")
+        space.complete()
+        assert left == [] and not (tmp_path / "out" / ".work").exists()
+        with Workspace(tmp_path / "out") as next_one:  # before the first is left
+            next_one.begin("key")
+            file = next_one.scratch("tiles") / "1"
+            file.write_text("mine")
+            space.__exit__(None, None, None)
+            assert file.read_text() == "mine"
+
+
+def only_even(x):
+    return None if x % 2 else x
+
+
 def test_what_is_damaged_is_done_again(tmp_path):
     with Workspace(tmp_path / "out") as space:
         space.begin("key")

@@ -136,7 +136,9 @@ def block(stage="fine", move=distorted) -> tuple[dict[str, Camera], Refinement]:
                 vehicle="a",
                 placed=placed,
                 dropped={},
-                legs=[Leg(vehicle="a", first=0, last=8, state="matched", confidence=1.0, sigma_m=0.1)],
+                legs=[
+                    Leg(vehicle="a", first=0, last=8, images=("0", "8"), state="matched", confidence=1.0, sigma_m=0.1)
+                ],
                 fov_deg=63.0,
                 fov_sigma_deg=0.1,
                 terrain=None,

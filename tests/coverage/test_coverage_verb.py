@@ -32,6 +32,19 @@ def test_all_seen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert out["area_m2"] == pytest.approx(400 * 300, rel=0.01)
 
 
+def test_without_a_folder_for_results_figures_are_printed_and_nothing_is_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flown = FlownArea(dropped=_hole(), spacing_m=66.0)
+    inputs = [flown.write(tmp_path / "map"), "--area", flown.area(tmp_path / "a.geojson")]
+    before = sorted(tmp_path.rglob("*"))
+    assert _run(capsys, *inputs)["gaps"]
+    assert main(["coverage", *map(str, inputs)]) == 0
+    said = capsys.readouterr().out
+    assert "gap of" in said and "written" not in said
+    assert sorted(tmp_path.rglob("*")) == before
+
+
 @pytest.mark.parametrize(("skip_numbers", "cause"), [(True, "pictures not arrived"), (False, "not triggered")])
 def test_a_hole_in_a_leg_is_told_by_the_file_numbers(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], skip_numbers: bool, cause: str

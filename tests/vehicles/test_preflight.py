@@ -139,12 +139,26 @@ def test_one_that_is_late_moves_those_that_wait():
     apart = Airspace.of(missions).next_start(2, 0.0, {1: 0.0})
     schedule = TakeoffSchedule.of({1: 0.0, 2: apart}, 100.0, Airspace.of(missions))
     assert schedule.due(100.0) == [1]
-    assert schedule.started(1, 103.0) == [] and schedule.waiting == {2: 100.0 + apart}  # in time
+    assert schedule.started(1, 103.0, str) == [] and schedule.waiting == {2: 100.0 + apart}  # in time
     schedule = TakeoffSchedule.of({1: 0.0, 2: apart}, 100.0, Airspace.of(missions))
     assert schedule.due(100.0 + apart) == [1] and schedule.due(100.0 + apart) == []  # the first is undecided
-    said = schedule.started(1, 100.0 + 14.0)
-    assert said[0] == "v1 took off 14 s late" and "v2 takes off 14 s later" in said[1]
+    said = schedule.started(1, 100.0 + 14.0, "north {}".format)
+    assert said[0] == "north 1 took off 14 s late" and "north 2 takes off 14 s later" in said[1]
     assert schedule.waiting[2] == pytest.approx(100.0 + apart + 14.0, abs=1.0)
+
+
+@pytest.mark.parametrize("late", [1, 2])
+def test_one_that_is_late_and_comes_near_another_is_told_with_the_others_name(late):
+    """Vehicles 1 and 2 fly lines that they share, vehicle 3 one far away."""
+    missions = {1: line(AP, 40, 60), 2: line(AP, 40, 60, home_east=80.0), 3: line(AP, 400, 60, home_east=360.0)}
+    schedule = TakeoffSchedule.of({1: 0.0, 2: 0.0, 3: 0.0}, 0.0, Airspace.of(missions))
+    early = 3 - late
+    assert {*schedule.due(0.0)} == {1, 2, 3}
+    assert schedule.started(early, 0.0, str) == [] and schedule.started(3, 0.0, str) == []
+    off = next(s for s in range(6, 60) if schedule.airspace.conflicts({early: 0.0, late: float(s)}))
+    said = schedule.started(late, float(off), {1: "red", 2: "blue", 3: "far"}.__getitem__)
+    one, other = ("red", "blue") if late == 1 else ("blue", "red")
+    assert len(said) == 2 and said[1].startswith(f"{one} may come within ") and f" m of {other} in " in said[1]
 
 
 def test_one_that_does_not_take_off_holds_those_that_wait():

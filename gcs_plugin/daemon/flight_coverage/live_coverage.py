@@ -193,6 +193,7 @@ class LiveCoverage:
 
     def _take(self) -> bool:
         """Process new data; returns whether anything has changed."""
+        changed = self._exposures.write()
         source = self._source()
         if source is None or source == self._refused:
             self._fresh.clear()
@@ -200,7 +201,6 @@ class LiveCoverage:
             return gone
         epsg = self._epsg()
         here = self._followed
-        changed = self._exposures.write()
         if here is None or here.source != source or (epsg is not None and here.cover.cells.grid.epsg != epsg):
             here = self._followed = self._begin(source, epsg)
             if here is None:

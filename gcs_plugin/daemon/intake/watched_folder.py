@@ -110,6 +110,7 @@ class FolderReader:
         self._files: dict[Path, _File] = {}
         self._folder_state = FolderState(intake.cache, intake.vehicle, folder)
         self._tried: object = None
+        self._told: frozenset[Path] = frozenset()
         self._again_at, self._again_s = 0.0, _AGAIN_S[0]
         self._fresh_at: float | None = None
 
@@ -353,8 +354,8 @@ class FolderReader:
             found = self._load([copies])
             if found is not None:
                 self._take_paired(waiting, found, copies)
-        if self.poseless and state[0] == tuple(waiting):
-            count = len(self.poseless)
+        if self.poseless and self.poseless != self._told:
+            self._told, count = frozenset(self.poseless), len(self.poseless)
             self._intake.notify(
                 f"{count} files of {self._intake.vehicle} wait for poses; put the flight's log next to them"
             )

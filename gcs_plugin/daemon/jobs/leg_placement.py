@@ -110,7 +110,7 @@ class LegPlacement:
         )
         solved = self.workers.run(place, task)
         job.detail |= {"frames": len(frames), "solve_cpu_s": round(solved.cpu_s, 3), "legs": len(solved.legs)}
-        fresh = {leg["images"][0] for leg in solved.legs if "images" in leg}
+        fresh = {leg["images"][0] for leg in solved.legs}
         mine = {frame.image for frame in frames}
         earlier = [] if before is None else json.loads(before["detail"])["legs"]
         legs = [leg for leg in earlier if leg.get("images") and leg["images"][0] not in mine | fresh]

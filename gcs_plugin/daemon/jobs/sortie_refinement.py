@@ -70,18 +70,24 @@ class SortieRefinement:
         if job.detail.get("trigger") == "late" and not late_frames(self.journal, vehicle, job.sortie, job.id):
             return _nothing_came(job)
         report(0.03, "waiting for a free worker process")
-        with self.workers.reserved():
-            before, target, frames, solved = self._solve(job, report)
-        if before is not None:
-            job.detail["beside"] = len(solved.stages)
-            if not solved.stages and not solved.dropped:
+        target = self.publisher.solutions / f"{new_name('solution')}.pickle"
+        published = False
+        try:
+            with self.workers.reserved():
+                before, frames, solved = self._solve(job, report, target)
+            if before is not None:
+                job.detail["beside"] = len(solved.stages)
+                if not solved.stages and not solved.dropped:
+                    return _nothing_came(job)
+            job.detail |= {
+                "frames": frames, "solve_cpu_s": round(solved.cpu_s, 3), "solve_s": round(solved.wall_s, 3),
+                "warnings": solved.warnings,
+            }  # fmt: skip
+            self._show(job, report, target, solved, before)
+            published = True
+        finally:
+            if not published:
                 target.unlink(missing_ok=True)
-                return _nothing_came(job)
-        job.detail |= {
-            "frames": frames, "solve_cpu_s": round(solved.cpu_s, 3), "solve_s": round(solved.wall_s, 3),
-            "warnings": solved.warnings,
-        }  # fmt: skip
-        self._show(job, report, target, solved, before)
         job.detail["seconds"] = round(time.monotonic() - began, 3)
         self.kept.drop(vehicle, job.sortie)
         return lambda db: None
@@ -103,12 +109,12 @@ class SortieRefinement:
             if used is not None:
                 job.detail["follow_cpu_s"] = round(used, 3)
 
-    def _solve(self, job: Job, report: ReportProgress) -> tuple[Any, Path, int, SortieResult]:
-        """Solve the pictures that have arrived, in the reserved process.
+    def _solve(self, job: Job, report: ReportProgress, target: Path) -> tuple[Any, int, SortieResult]:
+        """Solve the pictures that have arrived into a new solution file, in the reserved process.
 
         Returns:
-            The row of the solution to which late pictures were registered (None: all were refined), the new solution's
-            file, the number of pictures, and their result.
+            The row of the solution to which late pictures were registered (None: all were refined), the number of
+            pictures, and their result.
         """
         job.detail["refine_started_s"] = time.time()  # pictures that arrive later are late
         area = self.publisher.area()
@@ -117,7 +123,6 @@ class SortieRefinement:
         report(
             0.05, f"refining {len(frames)} pictures" if before is None else "registering late pictures to the others"
         )
-        target = self.publisher.solutions / f"{new_name('solution')}.pickle"
         task = SolveTask(
             frames=frames,
             epsg=area.epsg,
@@ -129,7 +134,7 @@ class SortieRefinement:
             before=None if before is None else self.publisher.solutions / before["path"],
             kept=self.kept.of(str(job.vehicle), job.sortie, frames),
         )
-        return before, target, len(frames), self.workers.run(solve if before is None else register_late, task)
+        return before, len(frames), self.workers.run(solve if before is None else register_late, task)
 
     def _show(self, job: Job, report: ReportProgress, target: Path, solved: SortieResult, before: Any) -> None:
         """Draw and publish what was solved."""
@@ -138,6 +143,7 @@ class SortieRefinement:
         self.make_way(vehicle, layer)
         with self.publisher.turn(layer):
             report(0.7, "drawing")
+            old = solution_row(self.journal, job)
             shown = self.publisher.shown(layer).get((packed(vehicle), job.sortie or 0))
             changed = solved.changed
             if before is None and shown is not None:  # its old ground changes, too
@@ -153,6 +159,8 @@ class SortieRefinement:
                 ),
             )
         job.detail["published_s"] = time.time()
+        if old is not None:  # the journal names it no more
+            self.publisher.retire(self.publisher.solutions / old["path"])
         self.on_published(layer, job)
 
     # -- the parts ------------------------------------------------------------------------------------------------
@@ -202,7 +210,6 @@ class SortieRefinement:
         else:
             detail = json.loads(before["detail"]) | {"bounds": solved.bounds}
         stands = refined_change(job, solved, rejected, target.name, detail)
-        old = solution_row(self.journal, job)
         then = []
         if self.basemap is not None:  # the coarse layer shows all of the sortie, too
             then.append(new_job("coarse", str(job.vehicle), job.sortie, {"after": "refine"}))
@@ -215,8 +222,6 @@ class SortieRefinement:
             for queue in then:
                 queue(db)
 
-        if old is not None:
-            self.publisher.retire(self.publisher.solutions / old["path"])
         return change
 
 

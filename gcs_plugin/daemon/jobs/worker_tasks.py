@@ -5,7 +5,7 @@ Large results are passed as files: a solution is pickled next to the journal, a 
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -104,7 +104,7 @@ class _Watch:
         return SortieResult(
             stages={p.frame.image: (p.stage, p.sigma_m) for p in solution.placed},
             dropped=dict(solution.dropped),
-            legs=[_leg(leg, frames) for leg in solution.legs],
+            legs=_legs(solution.legs, frames),
             fov_deg=solution.fov_deg,
             fov_sigma_deg=solution.fov_sigma_deg,
             warnings=list(solution.warnings),
@@ -128,7 +128,7 @@ def solve(task: SolveTask) -> SortieResult:
     )
     sortie = SolutionFile(solution, task.thumbnails, gains_of(solution, task.thumbnails, others))
     sortie.write(task.target)
-    return watch.solved(solution, _in_units(task.frames), sortie, visible_ground(solution.placed, sortie.terrain))
+    return watch.solved(solution, task.frames, sortie, visible_ground(solution.placed, sortie.terrain))
 
 
 def follow(task: FollowTask) -> float:
@@ -274,7 +274,7 @@ def place(task: SolveTask) -> SortieResult:
     sortie = SolutionFile(complete, thumbnails, gains)
     sortie.write(task.target)
     changed = visible_ground([*solution.placed, *moved], sortie.terrain)
-    return watch.solved(solution, _in_units(task.frames), sortie, changed)
+    return watch.solved(solution, task.frames, sortie, changed)
 
 
 def coarse_after(task: tuple[Path, tuple[float, float], Path]) -> SortieResult:
@@ -309,24 +309,11 @@ def near(frames: Sequence[Frame], epsg: int) -> BoundingBox:
     return BoundingBox.around_points(ground)
 
 
-def _in_units(frames: Sequence[Frame]) -> list[Frame]:
-    """Frames in the order that legs refer to: unit by unit."""
-    from orthoswarm.refine.flight.solve_units import split_units
-
-    return [frame for unit in split_units({frames[0].vehicle: frames}) for frame in unit]
-
-
-def _leg(leg: Leg, frames: Sequence[Frame]) -> dict[str, Any]:
-    """A leg as JSON values, with the recorded positions of its ends and the pictures there."""
-    values: dict[str, Any] = {
-        "vehicle": leg.vehicle, "first": leg.first, "last": leg.last, "state": leg.state,
-        "confidence": leg.confidence, "sigma_m": leg.sigma_m,
-    }  # fmt: skip
-    if 0 <= leg.first < leg.last < len(frames):
-        ends = [frames[leg.first], frames[leg.last]]
-        values["line"] = [[f.fix.lon_deg, f.fix.lat_deg] for f in ends]
-        values["images"] = [f.image for f in ends]
-    return values
+def _legs(legs: Sequence[Leg], frames: Sequence[Frame]) -> list[dict[str, Any]]:
+    """Legs as JSON values, each with the recorded positions of its ends as `line`."""
+    at = {frame.image: [frame.fix.lon_deg, frame.fix.lat_deg] for frame in frames}
+    lines = [[at[image] for image in dict.fromkeys(leg.images) if image in at] for leg in legs]
+    return [asdict(leg) | ({"line": line} if len(line) == 2 else {}) for leg, line in zip(legs, lines, strict=True)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -96,7 +96,15 @@ def as_recorded(vehicle: str, placed: Sequence[PlacedFrame]) -> Solution:
         vehicle=vehicle,
         placed=list(placed),
         dropped={},
-        legs=[Leg(vehicle=vehicle, first=0, last=len(placed) - 1, state="failed", confidence=0.0, sigma_m=sigma)]
+        legs=[
+            Leg(
+                vehicle=vehicle,
+                first=0,
+                last=len(placed) - 1,
+                images=(placed[0].frame.image, placed[-1].frame.image),
+                sigma_m=sigma,
+            )
+        ]
         if placed
         else [],
         fov_deg=float(np.degrees(np.median([p.camera.lens.fov_rad for p in placed]))) if placed else float("nan"),

@@ -232,6 +232,7 @@ def leg_states(state: VehicleState) -> list[Leg]:
                 vehicle=state.vehicle,
                 first=int(members[0]),
                 last=int(members[-1]),
+                images=(flight.frames[members[0]].image, flight.frames[members[-1]].image),
                 state=how,
                 confidence=share,
                 sigma_m=sigma,

@@ -95,11 +95,9 @@ def _unit(frames: Sequence[Frame], epsg: int, origin: Array, basemap: MapWindow 
         if len(frames) > active().strategy.sparse_most:
             raise OrthoSwarmError("its pictures overlap too little to be placed in flight; the refinement places them")
         flight = open_sparse_flight(frames, grid, origin, options.read)
-        one_way = leads_one_way(flight.records.position, flight.leg)
-    else:
-        one_way = leads_one_way(flight.records.position, flight.leg)
-        if one_way:
-            _hold_drift(flight)
+    one_way = leads_one_way(flight.records.position, flight.leg)
+    if one_way and not flight.sparse:
+        _hold_drift(flight)
     surface = fit_surface(flight.adjustment, GroundModel()) if flight.sparse else adjust_without_map(flight)
     _check(flight)
     state = registered_state(flight, surface, origin, basemap=None, watch=watch)
@@ -189,7 +187,15 @@ def _legs(state: VehicleState, fit: CoarseFit | None) -> list[Leg]:
         how: LegState = "failed" if fit is None else "matched" if part > least else "carried"
         sigma = float(np.median(state.coarse_sigma_m[own]))
         out.append(
-            Leg(vehicle=state.vehicle, first=int(own[0]), last=int(own[-1]), state=how, confidence=part, sigma_m=sigma)
+            Leg(
+                vehicle=state.vehicle,
+                first=int(own[0]),
+                last=int(own[-1]),
+                images=(state.flight.frames[own[0]].image, state.flight.frames[own[-1]].image),
+                state=how,
+                confidence=part,
+                sigma_m=sigma,
+            )
         )
     return out
 

@@ -8,8 +8,10 @@ import pytest
 
 from gcs_plugin.daemon.daemon import Daemon
 from gcs_plugin.daemon.jobs.leg_watch import LegWatch
+from gcs_plugin.daemon.jobs.publisher import Publisher
 from gcs_plugin.daemon.jobs.solution_file import read_solution
 from gcs_plugin.daemon.settings import Settings
+from orthoswarm.model.errors import StorageError
 from tests.kit.made_up import LIMIT_S, after_job, complete, post, truth
 
 
@@ -65,6 +67,32 @@ def test_a_few_late_pictures_are_laid_beside_the_others_and_many_refined_with_th
     assert "beside" not in again.detail
     assert again.detail["frames"] == 28
     assert not [job for job in daemon.jobs.all() if job.state == "failed"]
+
+
+def test_a_refinement_that_cannot_be_published_leaves_the_former_one(daemon, flight, monkeypatch):
+    """Its file stays, as the journal names it, and the new file is not left behind."""
+    frames, _ = flight
+    post(daemon, frames[:14])
+    complete(daemon)
+    (refined,) = after_job(daemon, 1)
+    assert refined.state == "done", refined.message
+    retired = []
+
+    def full(publisher, *_, change, **__):
+        change({})
+        raise StorageError("the disk is full")
+
+    monkeypatch.setattr(Publisher, "publish", full)
+    monkeypatch.setattr(Publisher, "retire", lambda _, path: retired.append(path))
+    post(daemon, frames[14:])
+    end = time.monotonic() + LIMIT_S
+    while not (failed := [job for job in daemon.jobs.all() if job.state == "failed"]):
+        assert time.monotonic() < end
+        time.sleep(0.05)
+    assert "disk is full" in failed[0].message
+    row = daemon.journal.one("SELECT path FROM solutions")
+    files = (daemon.settings.workspace / "solutions").glob("solution-*")
+    assert [path.name for path in files] == [row["path"]] and retired == []
 
 
 def test_late_pictures_are_remembered_over_a_restart(tmp_path, flight):

@@ -104,7 +104,7 @@ def solution(vehicle, first, count):
         vehicle=vehicle,
         placed=placed,
         dropped={},
-        legs=[Leg(vehicle=vehicle, first=0, last=count - 1, state="matched")],
+        legs=[Leg(vehicle=vehicle, first=0, last=count - 1, images=("0", str(count - 1)), state="matched")],
         fov_deg=80.0 + first,
         fov_sigma_deg=0.1,
         terrain=None,

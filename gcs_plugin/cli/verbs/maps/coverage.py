@@ -23,13 +23,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "OUT is the output folder of `orthoswarm mosaic`, or a workspace of `orthoswarm serve`. Several polygons are\n"
         "one area; holes in them are excluded. DIR gets cells.tif, gaps (.geojson, .gpkg, .kml), coverage.json and\n"
-        "coverage.png; gaps.geojson goes into `orthoswarm plan --gaps`.\n\n"
+        "coverage.png; without --out nothing is written. gaps.geojson goes into `orthoswarm plan --gaps`.\n\n"
         "example:\n  orthoswarm coverage map --area town.geojson --plan missions --want-m 0.05 --out coverage"
     )
     add = parser.add_argument
     add("map", type=Path, metavar="OUT", help="folder with frames.jsonl and report.json")
     add("--area", type=Path, required=True, metavar="AREA", help="the area that was to be mapped (GeoJSON, KML, .plan)")
-    add("--out", type=Path, required=True, metavar="DIR", help="folder for the results")
+    add("--out", type=Path, metavar="DIR", help="folder for the results")
     add("--want-m", type=float, metavar="GSD", help="largest ground pixel that counts as well seen, metres")
     add("--want-sigma-m", type=float, metavar="M", help="largest position error of a picture, one sigma, metres")
     add("--plan", type=Path, metavar="DIR", help="folder of the plan that was flown: tells causes apart")
@@ -74,13 +74,14 @@ def run(args: argparse.Namespace) -> int:
     if not (cover.best[cover.cells.wanted] != 255).any():
         warnings.append("no picture sees any of the area: check that the area and the flight belong together")
     figures = _figures(cover, gaps, missing, area.grid, warnings)
-    args.out.mkdir(parents=True, exist_ok=True)
-    write_cells(args.out / "cells.tif", cover)
-    write_gaps(args.out, gaps, area.grid)
-    rasters = (product_file(args.map, name) for name in ("orthoimage.tif", "coarse.tif", "realtime.tif"))
-    ortho = next((path for path in rasters if path is not None), None)
-    draw_cells(args.out / "coverage.png", cover, gaps, ortho)
-    write_json(args.out / "coverage.json", figures)
+    if args.out is not None:
+        args.out.mkdir(parents=True, exist_ok=True)
+        write_cells(args.out / "cells.tif", cover)
+        write_gaps(args.out, gaps, area.grid)
+        rasters = (product_file(args.map, name) for name in ("orthoimage.tif", "coarse.tif", "realtime.tif"))
+        ortho = next((path for path in rasters if path is not None), None)
+        draw_cells(args.out / "coverage.png", cover, gaps, ortho)
+        write_json(args.out / "coverage.json", figures)
     if args.json:
         print(json.dumps(figures))
     else:
@@ -185,7 +186,7 @@ def _figures(
     }  # fmt: skip
 
 
-def _print(figures: dict[str, Any], out: Path) -> None:
+def _print(figures: dict[str, Any], out: Path | None) -> None:
     parts = ", ".join(f"{name} {100 * figures[f'{name}_share']:.2f} %" for name in ("seen", "poor", "missed"))
     print(f"{figures['area_m2'] / 1e4:.2f} ha in cells of {figures['cell_m']:g} m: {parts}")
     for gap in figures["gaps"][:20]:
@@ -196,11 +197,12 @@ def _print(figures: dict[str, Any], out: Path) -> None:
         print(f"gap of {gap['area_m2']:.0f} m2 at {place}: {gap['cause']}{detail}{who}, {sure}")
     more = len(figures["gaps"]) - 20
     if more > 0:
-        print(f"and {more} further gaps in {out / 'gaps.geojson'}")
+        print(f"and {more} further gaps (--out writes all)" if out is None else f"and {more} further gaps in {out}")
     if figures["small_gaps"]["count"]:
         print(f"and {figures['small_gaps']['count']} below 4 m2, {figures['small_gaps']['area_m2']:.0f} m2 together")
     if figures["missing_pictures"]:
-        print(f"{len(figures['missing_pictures'])} pictures are missing in the legs flown (coverage.json names them)")
+        print(f"{len(figures['missing_pictures'])} pictures are missing in the legs flown (--json names them)")
     for warning in figures["warnings"]:
         print(f"warning: {warning}", file=sys.stderr)
-    print(f"written to {out}")
+    if out is not None:
+        print(f"written to {out}")
