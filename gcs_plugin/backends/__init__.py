@@ -17,7 +17,6 @@ def open_backend(
     own: Address = GROUND_STATION,
     key: bytes | None = None,
     tlog: Path | None = None,
-    pose_hz: float = 10.0,
 ) -> Backend:
     """Open links with a backend.
 
@@ -27,7 +26,6 @@ def open_backend(
         own: our address.
         key: signing key (pymavlink only).
         tlog: telemetry log (pymavlink only).
-        pose_hz: rate of position and attitude that vehicles are asked for.
 
     Raises:
         InputError: an address is wrong, or the backend lacks an option.
@@ -35,7 +33,7 @@ def open_backend(
     if name == "pymavlink":
         from gcs_plugin.backends.direct import DirectBackend
 
-        return DirectBackend(links, own=own, key=key, tlog=tlog, pose_hz=pose_hz)
+        return DirectBackend(links, own=own, key=key, tlog=tlog)
     if name == "mavsdk":
         from gcs_plugin.backends.mavsdk import MavsdkBackend
 

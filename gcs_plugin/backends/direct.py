@@ -9,7 +9,6 @@ from gcs_plugin.backends.backend import ENDED, Backend, Report, Say, coming_home
 from gcs_plugin.fleet.commands import Order, Verb
 from gcs_plugin.fleet.fleet import Fleet
 from gcs_plugin.fleet.fleet_events import FleetEvent
-from gcs_plugin.fleet.message_rates import default_rates
 from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.transports import Link
 from gcs_plugin.mission.completion import Phase
@@ -34,9 +33,8 @@ class DirectBackend(Backend):
         own: Address,
         key: bytes | None = None,
         tlog: Path | None = None,
-        pose_hz: float = 10.0,
     ) -> None:
-        self.fleet = Fleet(links, own=own, key=key, tlog=tlog, rates=default_rates(pose_hz))
+        self.fleet = Fleet(links, own=own, key=key, tlog=tlog)
         self.events: list[FleetEvent] = []
         self.fleet.on_event(self.events.append)
 

@@ -88,7 +88,7 @@ class GapFlights:
         """Field of view in degrees, altitude in metres, and notes about them."""
         plan = self._coverage.document["plan"]
         figures = {} if plan is None else json.loads((self._plans.folder / plan / "plan.json").read_text("utf-8"))
-        over = figures.get("over_ground") or {"nominal_m": figures.get("altitude_m"), "terrain_items": False}
+        over = figures.get("over_ground") or {"nominal_m": figures.get("altitude_m")}
         altitude = body.get("altitude_m", over["nominal_m"])
         if isinstance(altitude, bool) or not isinstance(altitude, int | float) or not 1.0 <= altitude <= 10_000.0:
             raise InputError("altitude_m is missing or not a height; send metres above takeoff, for example 80")

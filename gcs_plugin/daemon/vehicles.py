@@ -9,8 +9,8 @@ For the HTTP API and the page, all in JSON values:
   `not_sent`, `unknown`), `reason`. Verbs are `start`, `pause`, `resume`, `rtl`, `land`; no vehicles named: all on the
   links at once.
 - `preflight(...)` gives a row a vehicle: `vehicle`, `state` and `items`, each with `name` (`link`, `gps`, `ekf`,
-  `home`, `pre-arm`, `battery`, `mission`, `height`, `separation`), `state` (`ok`, `warning`, `red`) and `reason`. A
-  red item stops `start` unless it is overridden by its name.
+  `home`, `pre-arm`, `battery`, `mission`, `height`, `speed`, `separation`), `state` (`ok`, `warning`, `red`) and
+  `reason`. A red item stops `start` unless it is overridden by its name.
 - `flight_state(vehicle)`, and `flight` in each row of `rows()`: `state` (`on ground`, `taking off`, `on mission`,
   `paused`, `returning`, `landing`, `holding`, `flying`, `lost`, `complete`), `text` (`on mission 7/13`), `item` and
   `items`.

@@ -2,7 +2,7 @@
 
 One thread polls it (`poll`, or `run` until `stop` is set); other threads submit work with `call`. Nothing that a
 vehicle could act on is sent without a request: the fleet by itself sends its heartbeat, which announces a
-ground station, and asks for streams.
+ground station, asks for streams and clocks, and asks a vehicle that would not arm for the reasons.
 """
 
 import threading

@@ -96,11 +96,6 @@ class Hub:
         """Number of packets rejected for their signature."""
         return sum(side.signing.rejected for side in self.sides if side.signing)
 
-    @property
-    def deadline(self) -> float:
-        """Latest time for the next poll."""
-        return self._beat_at
-
     def close(self) -> None:
         """Close links and log."""
         for side in self.sides:

@@ -43,8 +43,9 @@ class Rates:
         return Rates(wanted, optional)
 
 
-def default_rates(pose_hz: float = 10.0) -> Rates:
-    """Position and attitude at one rate, the state of the mission at 2 Hz, the rest at 1 Hz."""
+def default_rates() -> Rates:
+    """Position and attitude at 10 Hz, the state of the mission at 2 Hz, the rest at 1 Hz."""
+    pose_hz = 10.0
     return Rates(
         {
             GLOBAL_POSITION_INT: pose_hz,
@@ -72,7 +73,6 @@ class _Stream:
     optional: bool
     count: int = 0
     last: float = 0.0
-    asked: int = 0
     again_at: float = 0.0
     backoff_s: float = _BACKOFF_S[0]
 
@@ -157,7 +157,6 @@ class Streams:
         self._tries += 1
         self.deadline = now + _ANSWER_S
         stream = self._streams[kind]
-        stream.asked += 1
         to = self.vehicle
         interval_us = 1e6 / stream.hz if stream.hz > 0 else -1.0
         return [

@@ -124,7 +124,7 @@ class CompletionDetector:
         return [MissionEvent.ABORTED]
 
     def feed(self, message: Message) -> list[MissionEvent]:
-        """Process one message; returns the mission's event, mostly None."""
+        """Process one message; returns the mission's events, mostly none."""
         match message.get_type():
             case "HEARTBEAT":
                 return self._heartbeat(message) if is_autopilot(message) else []

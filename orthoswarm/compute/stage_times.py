@@ -30,7 +30,6 @@ class Clock:
     Attributes:
         usage: what other processes have used so far.
         stages: those done, in order.
-        earlier_s: wall and CPU seconds of a run that was interrupted and is continued.
     """
 
     usage: Callable[[], Usage]

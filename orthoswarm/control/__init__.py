@@ -1,1 +1,1 @@
-"""Ground control points: the similarity that moves a refined block onto surveyed points."""
+"""Refined blocks are moved: onto surveyed points (ground control), or onto each other (areas of a large swarm)."""

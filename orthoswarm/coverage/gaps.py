@@ -85,7 +85,6 @@ def find_gaps(
     cover: CoverageGrid,
     missing: Sequence[MissingPicture] = (),
     plan: PlannedFlight | None = None,
-    smallest_m2: float | None = None,
     due: Due = True,
 ) -> Gaps:
     """Gaps and their causes.
@@ -97,7 +96,6 @@ def find_gaps(
 
     Args:
         cover: with all pictures. missing: of `missing_pictures`. plan: what was to be flown, None if not known.
-        smallest_m2: smaller gaps are only counted, None: as configured.
         due: cells whose flight is over, as for `CoverageGrid.states`; no other is a gap.
     """
     state = cover.states(due)
@@ -125,8 +123,7 @@ def find_gaps(
         explained.enter(missed & below_legs(cover.cells, plan, plan.legs), Cause.NOT_FLOWN, 0.9)
         explained.enter(missed, Cause.NOT_PLANNED, 0.9)
     explained.enter(missed, Cause.NOT_FLOWN, 0.5)
-    least_m2 = active().coverage.smallest_gap_m2 if smallest_m2 is None else smallest_m2
-    return _polygons(cover, explained, vehicles, least_m2)
+    return _polygons(cover, explained, vehicles, active().coverage.smallest_gap_m2)
 
 
 def _is_narrow(fov_rad: float, focal_sigma: float, planned_rad: float) -> bool:

@@ -93,13 +93,11 @@ class View:
         )
 
     @classmethod
-    def of_frame(
-        cls, placed: PlacedFrame, flaws: Flaw = NO_FLAW, focal_sigma: float = 0.0, ground: Terrain | None = None
-    ) -> "View":
+    def of_frame(cls, placed: PlacedFrame, focal_sigma: float = 0.0, ground: Terrain | None = None) -> "View":
         """The view of a placed frame."""
         frame = placed.frame
         return cls.of_camera(
-            placed.camera, frame.image, frame.vehicle, placed.sigma_m, frame.time_s, flaws=flaws,
+            placed.camera, frame.image, frame.vehicle, placed.sigma_m, frame.time_s,
             focal_sigma=focal_sigma, placed=placed.stage != "realtime", ground=ground,
             recorded_height_m=frame.fix.height_m,
         )  # fmt: skip

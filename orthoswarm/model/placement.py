@@ -25,7 +25,7 @@ class PlacedFrame:
         frame: the picture.
         camera: position (east, north, height over the common datum), orientation and lens.
         stage: how far it was refined.
-        sigma_m: own estimate of the ground error at the picture's nadir, one sigma per axis, metres.
+        sigma_m: own estimate of the ground error at the picture's central pixel, one sigma per axis, metres.
         weak: True where too few observations hold it; it is placed but left out of the mosaic while others cover.
         pose_covariance: float32 (6, 6) of position (east, north, up, metres) and rotation about the camera's axes
             (radians) in the adjustment, without errors common to all frames; None where it is not known.
@@ -179,7 +179,8 @@ class Refiner(Protocol):
     """The seam of both refiners (swarm, paper): the unit is a vehicle, a batch is a loop over vehicles.
 
     The daemon calls `refine` when a vehicle completes and `again` when its neighbours have; the batch and the
-    benchmarks call `refine_batch`. None of them knows which refiner it is.
+    benchmarks call `refine_batch`, and do not know which refiner it is. What the daemon does in flight (tracks, coarse
+    placement) only the default refiner offers.
     """
 
     def refine(

@@ -2,8 +2,8 @@
 
 A job that was queued or running when the daemon ended is queued again; it must be repeatable up to the
 journal change that also marks it as done. Refinements have their own threads; background jobs
-(coarse maps in flight, joint refinements of neighbours, tones, exports) run one at a time in another thread. Coarse
-maps, joint refinements and tones start only while no refinement waits or runs.
+(coarse maps in flight, joint refinements of neighbours, tones, exports) run one at a time in another thread. They
+start only while no refinement waits or runs; drawing a layer again does not wait.
 """
 
 import json

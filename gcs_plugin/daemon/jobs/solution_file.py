@@ -41,7 +41,7 @@ class SolutionFile:
 
     Attributes:
         solution: its frames' cameras.
-        thumbnails: image -> uint8 (12, 16, 3). gains: image -> float32 (3,), as it was drawn.
+        thumbnails: image -> uint8 (12, 16, 3). gains: image -> float32 (3, 6), see `Field`, as it was drawn.
     """
 
     solution: Solution

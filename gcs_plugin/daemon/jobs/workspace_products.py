@@ -1,4 +1,4 @@
-"""The workspace's products: the same files as those of a batch run, made in a worker from the journal."""
+"""The workspace's products: those of a batch run without seam lines, made in a worker from the journal."""
 
 import json
 from collections import Counter
@@ -280,7 +280,7 @@ def facts_of(
         ),
         *_summed("coarse: in flight", "coarse", jobs),
         *_summed("fine: neighbours together", "together", jobs),
-        *_summed("tones of all", "tones", jobs),
+        *_summed("final: tones", "tones", jobs),
     ]  # fmt: skip
     document = {
         "stages": stages, "wall_s": wall_s, "cpu_s": cpu_s + sum(other.cpu_s for other in others),

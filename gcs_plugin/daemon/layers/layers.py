@@ -57,7 +57,7 @@ class Area:
         return cls(epsg, gsd, origin, _on_tiles(BoundingBox(east, north, east, north).grown(half), gsd))
 
     def grown(self, bounds: BoundingBox) -> "Area":
-        """The area extended to the bounds and as much again beyond them.
+        """The area extended to the bounds and 1.5 km beyond them.
 
         Raises:
             OrthoSwarmError: that would be too large for one map.

@@ -28,12 +28,11 @@ MEDIAN_LENGTH_SIGMAS = 1.1774
 """Median length of a Gaussian residual of two axes, in sigmas of an axis: sqrt(2 ln 2)."""
 
 
-def solve_sparse(start: SparseStart, *, full_lens: bool = True) -> Adjustment:
+def solve_sparse(start: SparseStart) -> Adjustment:
     """Adjust cameras, lenses and points without a map.
 
     Args:
         start: from `sparse_start`.
-        full_lens: also estimate k3 and the principal point in the last stage, of lenses with enough observations.
 
     Returns:
         The adjustment, with its observations' sigmas scaled to the residuals and its attitude priors to their scatter.
@@ -47,9 +46,9 @@ def solve_sparse(start: SparseStart, *, full_lens: bool = True) -> Adjustment:
             _free_lens(adjustment, start, full=False)
         if k >= 2:
             _widen_position_sigmas(adjustment)
-        if k == len(schedule) - 1:  # the last stage solves the full lens
+        if k == len(schedule) - 1:  # k3 and principal point, too, of lenses with enough observations
             _attitude_sigmas_from_residuals(adjustment)
-            _free_lens(adjustment, start, full=full_lens)
+            _free_lens(adjustment, start, full=True)
         for _ in range(steps):
             ground = plane_prior(adjustment) if k == 0 else datum_prior(adjustment)
             damping = config.sparse_first_damping if k == 0 else config.sparse_damping

@@ -37,7 +37,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     add("--gsd", type=float, metavar="M", help="ground pixel of the products (default: the pictures' own)")
     add("--sei-layout", type=Path, action="append", default=[], metavar="FILE", help="layout of a maker's private SEI")
-    add("--config", type=Path, metavar="FILE.toml", help="thresholds of the refiner other than their defaults")
+    add("--config", type=Path, metavar="FILE.toml", help="thresholds of any stage other than their defaults")
     add(
         "--dem",
         type=path_of,
