@@ -42,7 +42,7 @@ from gcs_plugin.daemon.layers.layers import NAMES, Area, Layer
 from gcs_plugin.daemon.layers.realtime_layer import Drawer
 from gcs_plugin.daemon.layers.web_tiles import TileServer
 from gcs_plugin.daemon.mission_journal import completion_rows, note_completion
-from gcs_plugin.daemon.settings import Settings, system_of
+from gcs_plugin.daemon.settings import Settings, system_in_name
 from gcs_plugin.daemon.store.console_state import ConsoleState
 from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.journal import Journal, add_frame, late_frames, packed, unpacked
@@ -208,7 +208,7 @@ class Daemon:
         self.buses = [
             CanReader(
                 v.id, v.can, poses=self.poses.of(v.id), notify=self._say, fleet=fleet,
-                system=v.system or system_of(v.id),
+                system=v.system or system_in_name(v.id),
             )
             for v in settings.vehicles if v.can
         ]  # fmt: skip
@@ -348,7 +348,7 @@ class Daemon:
         from gcs_plugin.daemon.intake.vehicle_log import write_link_log
 
         systems = {v.id: v.system for v in self.settings.vehicles}
-        system = systems.get(vehicle) or system_of(vehicle)
+        system = systems.get(vehicle) or system_in_name(vehicle)
         return system is not None and write_link_log(self.settings.workspace / "telemetry.tlog", system, out) > 0
 
     def _say(self, text: str) -> None:

@@ -185,14 +185,14 @@ def _vehicle(entry: Any, path: Path) -> VehicleSettings:
     unknown = set(entry) - {"id", "system", "name", "pictures", "can"}
     if unknown:
         raise InputError(f"a [[vehicle]] in {path} says '{unknown.pop()}'; it has id, system, name, pictures and can")
-    system = entry.get("system", system_of(entry["id"]))
+    system = entry.get("system", system_in_name(entry["id"]))
     if system is not None and (isinstance(system, bool) or not isinstance(system, int) or not 1 <= system <= 255):
         raise InputError(f"the system id of {entry['id']} in {path} is not 1 to 255; correct it")
     texts = (str(entry.get(key, "")) for key in ("name", "pictures", "can"))
     return VehicleSettings(entry["id"], system, *texts)
 
 
-def system_of(vehicle: str) -> int | None:
+def system_in_name(vehicle: str) -> int | None:
     """The MAVLink system id that a vehicle's name stands for (v7: 7), None if it is no such name."""
     found = re.fullmatch(r"v(\d{1,3})", vehicle)
     return int(found[1]) if found and 1 <= int(found[1]) <= 255 else None

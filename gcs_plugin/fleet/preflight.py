@@ -145,7 +145,7 @@ def preflight_all(
         name: name of a vehicle by its system id.
     """
     flown = {s: m for s, v in vehicles.items() if (m := missions.get(s) or stored.get(s) or v.mission) is not None}
-    near = near_text(flown, starts, name) if set(flown) - set(missions) else {}
+    near = conflict_texts(flown, starts, name) if set(flown) - set(missions) else {}
     return [
         preflight(
             vehicle,
@@ -156,7 +156,7 @@ def preflight_all(
     ]
 
 
-def near_text(
+def conflict_texts(
     missions: "Mapping[int, Mission]", starts: Mapping[int, float], name: Callable[[int], str] = number_name
 ) -> dict[int, str]:
     """For vehicles whose missions come too close with these starts: the other vehicle, the time, the distance.

@@ -60,7 +60,7 @@ class SwarmRefiner(UnitRefiner):
         """Each unit by itself, then their second pass with the neighbours held."""
         others = [state for n in neighbours for state in states_of(n)]
         place = partial(refine_alone, epsg=self.epsg, origin=self.origin, basemap=basemap, options=self.options)
-        return self._second_pass([place(unit) for unit in units], others, basemap)
+        return self._beside_held_others([place(unit) for unit in units], others, basemap)
 
     def follow(self, frames: Sequence[Frame]) -> None:
         """Track a vehicle's pictures and keep that (`Options.kept`), for `refine` of the same frames."""
@@ -85,7 +85,7 @@ class SwarmRefiner(UnitRefiner):
         if not own or not any(neighbours_of(state, others) for state in own):
             return solution
         outdated = {warning for state in own for warning in findings(state)}
-        now = self._second_pass(own, others, basemap)
+        now = self._beside_held_others(own, others, basemap)
         refined = {p.frame.image for p in now.placed}
         extra = [p for p in solution.placed if p.frame.image not in refined]
         own_frames = [p for p in now.placed if p.frame.image not in solution.dropped]
@@ -96,10 +96,10 @@ class SwarmRefiner(UnitRefiner):
             warnings=list(dict.fromkeys([*now.warnings, *(w for w in solution.warnings if w not in outdated)])),
         )
 
-    def _second_pass(
+    def _beside_held_others(
         self, own: list[VehicleState], others: Sequence[VehicleState], basemap: MapWindow | None
     ) -> Solution:
-        """The second pass of a vehicle's units, with others held as they are."""
+        """The second pass of one vehicle's units, others held as they are."""
         own = register_unfound(own, others, self.epsg, self.origin, serial)
         own = join_unmapped(own, others, basemap, self.epsg, origin=self.origin, run=serial)[0]
         everyone = [*own, *others]
@@ -143,7 +143,7 @@ class SwarmRefiner(UnitRefiner):
             raise AdjustmentError(lost[0])
         below = _shifted(coarse_terrain(states), origin)
         coarse = [to_solution(s, origin, below, coarse=True) for s in states]
-        states = _second_passes(states, basemap, self.epsg, origin=origin, halo=halo, run=run, progress=progress)
+        states = _all_together(states, basemap, self.epsg, origin=origin, halo=halo, run=run, progress=progress)
         _level(states)
         distortion = map_distortion_sigma(states)
         for state in states:
@@ -194,7 +194,7 @@ def register_unfound(
     return out
 
 
-def _second_passes(
+def _all_together(
     states: list[VehicleState],
     basemap: MapWindow | None,
     epsg: int,
