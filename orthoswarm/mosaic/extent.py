@@ -92,4 +92,6 @@ def partial_cover(basemap: MapWindow, placed: Sequence[PlacedFrame]) -> list[str
     inside = (xy[:, 0] >= west) & (xy[:, 0] <= east) & (xy[:, 1] >= south) & (xy[:, 1] <= north)
     if inside.mean() > active().mosaic.map_cover_share:
         return []
-    return [f"the basemap covers {inside.mean():.0%} of the pictures; the others are carried by their neighbours"]
+    return [
+        f"the basemap covers {inside.mean():.0%} of the pictures; the others lie on it only if neighbours carry them"
+    ]

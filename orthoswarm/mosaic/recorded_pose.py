@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.config import active
-from orthoswarm.model.angles import wrap_rad
 from orthoswarm.model.camera import NADIR_PITCH_RAD, Camera, Lens, focal_px, rotation_from_angles
 from orthoswarm.model.frame import Frame, Ingest, Rejection
 from orthoswarm.model.geo import LocalGrid, area_epsg
 from orthoswarm.model.placement import PlacedFrame
+from orthoswarm.trajectory.courses import course
 
 Array = NDArray[np.float64]
 
@@ -138,28 +138,6 @@ def usual_height(ground: Array, lenses: Sequence[Lens]) -> float:
     if step <= config.moved_m:
         return config.default_height_m
     return float(np.clip(step / (1.0 - config.usual_overlap) / short, *config.usual_heights_m))
-
-
-def course(ground: Array) -> Array:
-    """Grid azimuth of flight at each of a vehicle's positions (N, 2), radians; at a corner that of the leg it ends.
-
-    Steps under `moved_m` have no direction and take that of the nearest step that has; 0 where nothing moved.
-    """
-    config = active().records
-    corner_rad = np.radians(config.corner_deg)
-    n = len(ground)
-    steps = np.diff(ground, axis=0)
-    moved = np.nonzero(np.hypot(*steps.T) > config.moved_m)[0] if n > 1 else np.empty(0, np.intp)
-    if len(moved) == 0:
-        return np.zeros(n)
-    azimuth = np.arctan2(steps[moved, 0], steps[moved, 1])
-    after = np.searchsorted(moved, np.arange(n))  # the first step that begins here or later
-    into, out = azimuth[np.maximum(after - 1, 0)], azimuth[np.minimum(after, len(moved) - 1)]
-    before = azimuth[np.maximum(after - 2, 0)]
-    corner = np.abs(wrap_rad(out - into)) > corner_rad
-    straight_in = np.abs(wrap_rad(into - before)) < corner_rad
-    middle = into + 0.5 * wrap_rad(out - into)
-    return np.asarray(np.where(corner, np.where(straight_in, into, out), middle))
 
 
 def _sigma(frame: Frame, camera: Camera) -> float:

@@ -10,8 +10,9 @@ from orthoswarm.config import active
 from orthoswarm.model.camera import Camera, angles_from_rotation, rotation_from_angles
 from orthoswarm.model.frame import Fix, Frame
 from orthoswarm.model.geo import LocalGrid
-from orthoswarm.mosaic.recorded_pose import area_grid, course, recorded_cameras
+from orthoswarm.mosaic.recorded_pose import area_grid, recorded_cameras
 from orthoswarm.refine.flight.unsolved_pictures import few_of_their_kind, hovering_vehicles, place_by_neighbours
+from orthoswarm.trajectory.courses import course
 
 GRID = LocalGrid(32632)
 MIDDLE = np.array([465_000.0, 5_250_000.0])

@@ -16,6 +16,9 @@ class FlightConfig:
     """Stretches whose tracks are kept for a refinement that follows, 7 MB each; older ones are removed (chosen)."""
     own_unit_photos: int = 6
     """Fewer photos of another camera name but the same size stay with the vehicle's main camera (chosen)."""
+    unit_gap_m: float = 500.0
+    """Groups of photos at least so far apart are solved like different vehicles: they show no common ground, so what
+    places the one says nothing about the other (chosen: more than the footprint of a photo from 200 m)."""
     least_photos_of_kind: int = 3
     """Fewer photos of one camera and size are not refined but placed by their neighbours (chosen)."""
     hover_share: float = 0.05

@@ -11,6 +11,7 @@ from orthoswarm.model.angles import wrap_rad
 from orthoswarm.model.camera import rotation_from_angles
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
+from orthoswarm.trajectory.courses import course
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -93,10 +94,9 @@ def read_records(frames: Sequence[Frame], grid: LocalGrid, origin: Array) -> Fli
     filled = float(np.median(height[has_height])) if has_height.any() else active().records.default_height_m
     position = np.column_stack([xy, np.where(has_height, height, filled)])
     time, timed = _times(frames)
-    course = _course(xy)
     return FlightRecords(
         position=position,
-        yaw=wrap_rad(np.where(has_yaw, yaw, course)),
+        yaw=wrap_rad(np.where(has_yaw, yaw, course(xy))),
         pitch=np.where(has_tilt, pitch, -np.pi / 2),
         roll=np.where(np.isfinite(roll), roll, 0.0),
         time_s=time,
@@ -117,12 +117,3 @@ def _times(frames: Sequence[Frame]) -> tuple[Array, bool]:
     if len(frames) > 1 and np.isfinite(time).all() and (np.diff(time) >= 0).all() and time[-1] > time[0]:
         return time - time[0], True
     return np.arange(len(frames), dtype=float), False
-
-
-def _course(xy: Array) -> Array:
-    n = len(xy)
-    if n < 2:
-        return np.zeros(n)
-    a, b = np.maximum(np.arange(n) - 1, 0), np.minimum(np.arange(n) + 1, n - 1)
-    d = xy[b] - xy[a]
-    return np.asarray(np.arctan2(d[:, 0], d[:, 1]))

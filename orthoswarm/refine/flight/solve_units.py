@@ -9,14 +9,14 @@ import numpy as np
 from orthoswarm.config import active
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.placement import Solution
+from orthoswarm.trajectory.separate_places import separate_places
 
 
 def split_units(vehicles: Mapping[str, Sequence[Frame]]) -> list[list[Frame]]:
-    """Split frames into units of one vehicle, camera and size, in order.
+    """Split frames into units of one vehicle, camera, size and place, in order.
 
-    A change of zoom or orientation starts a new lens.
-
-    A few frames with another camera name but the same size stay with the vehicle's main camera.
+    A change of zoom or orientation starts a new lens. A few frames with another camera name but the same size stay
+    with the vehicle's main camera; a few frames far from all others stay with them, since their positions may be wrong.
     """
     units: list[list[Frame]] = []
     for frames in vehicles.values():
@@ -24,9 +24,20 @@ def split_units(vehicles: Mapping[str, Sequence[Frame]]) -> list[list[Frame]]:
         for frame in frames:
             groups.setdefault((frame.camera, frame.width, frame.height), []).append(frame)
         for group in _absorb(groups):
-            parts = max(1, int(np.ceil(len(group) / active().flight.longest_unit_photos)))
-            units += [list(part) for part in _even(group, parts)]
+            for there in _by_place(group):
+                parts = max(1, int(np.ceil(len(there) / active().flight.longest_unit_photos)))
+                units += [list(part) for part in _even(there, parts)]
     return units
+
+
+def _by_place(frames: list[Frame]) -> list[list[Frame]]:
+    """Frames by the place where they were taken, groups of a few with the largest."""
+    config = active().flight
+    lat, lon = (np.array([getattr(f.fix, name) for f in frames], float) for name in ("lat_deg", "lon_deg"))
+    group = separate_places(lat, lon, config.unit_gap_m)
+    count = np.bincount(group)
+    group[count[group] < config.own_unit_photos] = count.argmax()
+    return [[f for f, k in zip(frames, group, strict=True) if k == number] for number in np.unique(group)]
 
 
 def _absorb(groups: dict[tuple[str, int, int], list[Frame]]) -> list[list[Frame]]:

@@ -5,9 +5,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.sparse.csgraph import connected_components
 
 from orthoswarm.config import active
+from orthoswarm.model.angles import wrap_rad
 from orthoswarm.model.camera import Camera, Lens, rotation_from_angles
+from orthoswarm.model.earth import distance_m
 from orthoswarm.model.frame import Fix, Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import Leg, PlacedFrame, Solution
@@ -15,6 +20,7 @@ from orthoswarm.refine.bundle.flight_records import read_records
 from orthoswarm.refine.flight.solve_units import merge_units, split_units
 from orthoswarm.refine.flight.weakly_held_pictures import interpolate_weak
 from orthoswarm.trajectory.legs import split_legs
+from orthoswarm.trajectory.separate_places import separate_places
 
 
 def frame(i, vehicle="a", camera="x", size=(640, 480), **fix):
@@ -97,6 +103,39 @@ def test_long_flights_are_cut_into_even_stretches():
     assert max(map(len, units)) <= active().flight.longest_unit_photos
 
 
+def test_photos_of_another_place_are_a_unit_of_their_own():
+    """There and back: what was taken at one place is one unit, in order of time."""
+    away = [frame(200 + i, lat_deg=48.1 + 1e-4 * i) for i in range(20)]
+    frames = [*(frame(i) for i in range(20)), *away, *[frame(400 + i, lat_deg=48.0 + 1e-4 * i) for i in range(20)]]
+    one, other = split_units({"a": frames})
+    assert [f.image for f in one] == [f.image for f in [*frames[:20], *frames[40:]]]
+    assert [f.image for f in other] == [f.image for f in away]
+
+
+def test_a_few_photos_with_wrong_positions_stay_with_the_others():
+    frames = [frame(i, **({"lat_deg": 48.3} if i in (7, 8, 30) else {})) for i in range(60)]
+    (unit,) = split_units({"a": frames})
+    assert len(unit) == 60
+
+
+places = st.lists(
+    st.tuples(st.floats(-89, 89), st.floats(-180, 180), st.integers(1, 5), st.floats(0, 300)), min_size=1, max_size=6
+)
+
+
+@given(places, st.floats(50, 2000))
+def test_places_of_different_groups_are_far_apart_and_those_of_one_are_linked(rows, gap):
+    lat = np.concatenate([a + np.arange(n) * step / 111_200 for a, _, n, step in rows])
+    lon = np.concatenate([np.full(n, b) for _, b, n, _ in rows])
+    group = separate_places(lat, lon, gap)
+    away = np.array([[distance_m(a, b, c, d) for c, d in zip(lat, lon)] for a, b in zip(lat, lon)])
+    linked = connected_components(away < gap)[1]
+    clear = np.abs(away - gap).min() > 0.01 * gap  # chords are a little shorter than arcs
+    if clear:
+        assert (group[:, None] == group).tolist() == (linked[:, None] == linked).tolist()
+    assert group[0] == 0 and set(group) == set(range(group.max() + 1))
+
+
 def solution(vehicle, first, count):
     camera = Camera(np.zeros(3), rotation_from_angles(0.0, -np.pi / 2, 0.0), Lens(640, 480, 320.0))
     placed = [PlacedFrame(frame(first + i, vehicle), camera, "fine", 0.1) for i in range(count)]
@@ -130,6 +169,16 @@ def test_records_fill_what_is_missing_and_mark_it():
     np.testing.assert_allclose(records.pitch, -np.pi / 2)
     grid_north = -LocalGrid(32632).convergence_rad(48.0, 11.0)
     np.testing.assert_allclose(records.yaw, grid_north, atol=0.01)
+
+
+def test_photos_at_the_ends_of_legs_without_headings_point_along_their_leg():
+    """Not half across to the next leg: a photo assumed to be turned is not found in its neighbours."""
+    path = boustrophedon(legs=4, count=10, step=15.0, apart=30.0)
+    lat, lon = 48.0 + path[:, 1] / 111_200, 11.0 + path[:, 0] / 74_500
+    frames = [frame(i, lat_deg=a, lon_deg=b, yaw_rad=None) for i, (a, b) in enumerate(zip(lat, lon))]
+    yaw = read_records(frames, LocalGrid(32632), np.zeros(2)).yaw
+    along = np.repeat([0.0, np.pi, 0.0, np.pi], 10)
+    assert np.degrees(np.abs(wrap_rad(yaw - along))).max() < 5.0
 
 
 def test_clocks_that_go_backwards_are_replaced_by_picture_numbers():

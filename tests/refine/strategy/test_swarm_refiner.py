@@ -348,3 +348,19 @@ def test_pictures_that_lost_parts_are_placed_by_their_neighbours_and_hold_nothin
         assert [p.weak for p in solution.placed] == damaged.tolist()
         assert np.median(errors(solution, truth, grid)[~damaged]) < 0.5
         assert np.median(errors(solution, truth, grid)[damaged]) < 5.0
+
+
+def test_a_place_that_the_map_does_not_show_takes_nothing_from_one_that_it_shows(scene):
+    """Photos of one folder from two places 3 km apart, the map of one: the other lies where its receiver says."""
+    vehicles, grid, basemap, _ = scene
+    here = next(iter(vehicles.values()))[:30]
+    there = [
+        replace(f, image=f"z/{f.image}", time_s=f.time_s + 3600.0, fix=replace(f.fix, lat_deg=f.fix.lat_deg + 0.027))
+        for f in here
+    ]
+    (solution,) = refine_all({"a": [*here, *there]}, basemap, grid).fine
+    placed = {p.frame.image: p for p in solution.placed}
+    assert {placed[f.image].stage for f in here} == {"fine"}
+    assert {placed[f.image].stage for f in there} == {"coarse"}
+    assert min(placed[f.image].sigma_m for f in there) > 2.0
+    assert {leg.state for leg in solution.legs} == {"matched", "failed"}
