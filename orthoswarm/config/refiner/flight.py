@@ -81,6 +81,11 @@ class FlightConfig:
     """First sigma of recorded headings about their common bias, degrees (chosen; not measured)."""
     free_yaw_sigma_deg: float = 5.0
     """Sigma of headings that were not recorded, degrees (chosen; not measured)."""
+    heading_reach_photos: int = 7
+    """A heading that was not recorded follows from those of so many photos before and after (chosen: a turn between
+    legs takes fewer)."""
+    heading_least_corners: int = 10
+    """Fewest tracked corners that tell how far a photo is turned from the one before (chosen; not measured)."""
     untimed_lag_sigma_s: float = 0.3
     """Sigma of the lag of recorded positions where photos have no time, in steps between photos (chosen)."""
     lens_sigma: tuple[float, float, float] = (0.3, 0.1, 0.03)

@@ -21,6 +21,7 @@ from orthoswarm.refine.features.flow_calibration import Calibration, calibrate
 from orthoswarm.refine.features.tracks import follow, predicted_homography
 from orthoswarm.refine.features.working_pictures import Pictures
 from orthoswarm.refine.flight.kept_tracks import Followed, KeptTracks
+from orthoswarm.refine.flight.track_headings import with_measured_headings
 from orthoswarm.trajectory.legs import leads_one_way, split_legs
 
 Array = NDArray[np.float64]
@@ -98,7 +99,7 @@ def open_flight(
         if kept is not None and file is not None:
             kept.write(file, followed)
     calibration = followed.calibration
-    records = records.with_yaw(records.yaw + calibration.yaw_offset)
+    records = with_measured_headings(records.with_yaw(records.yaw + calibration.yaw_offset), followed.tracks)
     return Flight(
         frames=frames,
         records=records,
