@@ -10,6 +10,7 @@ import jsonschema
 import numpy as np
 import pytest
 import rasterio
+from PIL import ImageDraw
 
 from gcs_plugin.cli.main import main
 from orthoswarm.export.reduced_raster import ReducedRaster
@@ -61,6 +62,64 @@ def test_a_stac_item_is_valid_and_names_the_cog(folder):
     assert item["properties"]["datetime"] == "2026-05-28T20:26:40Z"
     assert "2 of 3 legs" in item["properties"]["description"]
     assert item["bbox"][0] == pytest.approx(8.5426, abs=1e-3) and item["bbox"][3] == pytest.approx(47.399, abs=1e-3)
+
+
+MATCHED, FAILED = {"state": "matched", "sigma_m": 0.2}, {"state": "failed", "sigma_m": 3.0}
+CONTROL = {"points": 5, "left_out": [], "residuals": [{"name": "P0"}, {"name": "P1"}]}
+CHECKED = {"checkpoints": 4, "rmse_h_m": 0.3, "survey_rmse_h_m": 0.4, "points": [{"name": "P1"}, {"name": "Q"}]}
+
+
+@pytest.mark.parametrize(
+    ("report", "words", "never", "values"),
+    [
+        ({"legs": [FAILED], "control": CONTROL}, "Placed on 5 control points. Expected error: 1.10 m", "receivers",
+         {"placed_on": "control points", "sigma_median_m": 1.1, "sigma_most_m": 1.7}),
+        ({"legs": [MATCHED], "control": CONTROL, "checkpoints": CHECKED},
+         "RMSE_H at 4 checkpoints, 1 of which placed it: 0.50 m", "Not checked",
+         {"placed_on": "control points", "rmse_h_m": 0.5, "checkpoints": 4}),
+        ({"legs": [FAILED], "control": None}, "placed where the receivers say. Expected error: 1.10 m", "control",
+         {"placed_on": "receivers", "sigma_median_m": 1.1}),
+        ({"legs": [], "refine": "none"}, "Not refined", "found", {"placed_on": "receivers", "sigma_median_m": 1.1}),
+        ({"legs": [MATCHED, FAILED], "checkpoints": CHECKED | {"points": []}},
+         "Expected error against it: 1.10 m (one sigma an axis; median of the pictures, largest 1.70 m)", "within",
+         {"placed_on": "map", "sigma_median_m": 1.1, "rmse_h_m": 0.5}),
+        ({"legs": [MATCHED], "map_offset_m": {"doubted": True}}, "The map and the receivers disagree", "within",
+         {"placed_on": "map"}),
+    ],
+)  # fmt: skip
+def test_accuracy_is_stated_as_the_map_was_placed_and_checked(folder, monkeypatch, report, words, never, values):
+    (folder / "report.json").write_text(json.dumps(report))
+    rows = [{"image": f"{k}.jpg", "vehicle": "v1", "sigma_m": sigma} for k, sigma in enumerate((0.5, 1.1, 1.7))]
+    rows.append({"image": "r.jpg", "vehicle": "v1", "stage": "rejected"})
+    (folder / "frames.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    write_stac_item(folder / "orthoimage.tif", folder / "orthoimage.stac.json")
+    properties = json.loads((folder / "orthoimage.stac.json").read_text())["properties"]
+    assert words in properties["description"] and never not in properties["description"]
+    found = {name: properties[f"orthoswarm:{name}"] for name in values}
+    assert found == pytest.approx(values)
+    drawn = []
+    text = ImageDraw.ImageDraw.text
+    monkeypatch.setattr(
+        ImageDraw.ImageDraw, "text", lambda self, at, said, **how: drawn.append(said) or text(self, at, said, **how)
+    )
+    write_geopdf(folder / "orthoimage.tif", folder / "sheet.pdf", (), "Flood")
+    assert words in " ".join(drawn)
+
+
+def test_a_long_statement_stays_on_the_sheet(folder, monkeypatch):
+    many = {f"vehicle-{k:02d}": 100 + k for k in range(40)}
+    (folder / "report.json").write_text(json.dumps({"legs": [MATCHED], "unrefined": many}))
+    ends = []
+    text = ImageDraw.ImageDraw.text
+
+    def recorded(self, at, said, **how):
+        ends.append(self.textbbox(at, said, font=how["font"], anchor=how.get("anchor"))[2:])
+        text(self, at, said, **how)
+
+    monkeypatch.setattr(ImageDraw.ImageDraw, "text", recorded)
+    write_geopdf(folder / "orthoimage.tif", folder / "sheet.pdf", (), "Flood")
+    right, bottom = np.max(ends, axis=0)
+    assert right <= 2339 - 80 and bottom <= 3307 - 80  # A3 at 200 points an inch, standing
 
 
 def varints(data):

@@ -29,6 +29,8 @@ _FOOT_MM: Final = 46.0
 _SCALES: Final = tuple(int(m * 10**k) for k in range(2, 6) for m in (1, 1.5, 2, 2.5, 3, 4, 5, 7.5))
 _STEPS_M: Final = tuple(m * 10**k for k in range(5) for m in (1, 2, 5))
 _STEP_MM: Final = 30.0
+_MOST_LINES: Final = 3
+"""Of the statement on accuracy: so many leave room for the scale bar above the page's edge."""
 _INK, _GRID, _MARK = (20, 24, 28), (28, 100, 176), (214, 64, 159)
 
 
@@ -199,13 +201,13 @@ def _foot(
     lines = [
         f"Scale 1:{frame.scale:,} on A3; grid lines every {step:g} m, WGS 84, {where}; up is grid north",
         f"Upper left corner {_degrees(lat, 'NS')}, {_degrees(lon, 'EW')}; {taken}",
-        stated.sentence if stated else "Accuracy: no leg was found on a map; the sheet lies where the receivers say.",
+        *_wrapped(stated.sentence if stated else "There is no report that states the accuracy.", right - left),
     ]
     y = bottom + 4.0 * _MM
     draw.text((left, y), title[:80], fill=_INK, font=_font(6.0))
     for k, line in enumerate(lines):
         draw.text((left, y + (9.0 + 5.0 * k) * _MM), line, fill=_INK, font=_font(3.0))
-    y += 27.0 * _MM
+    y += (12.0 + 5.0 * len(lines)) * _MM
     _scale_bar(draw, frame, left, y)
     x = right - 90.0 * _MM
     draw.line((x, y, x + 8 * _MM, y), fill=_GRID, width=2)
@@ -213,6 +215,18 @@ def _foot(
     if finds:
         draw.ellipse((x + 2 * _MM, y + 3 * _MM, x + 6 * _MM, y + 7 * _MM), outline=_MARK, width=5)
         draw.text((x + 10 * _MM, y + 5 * _MM), f"find ({finds})", fill=_INK, font=_font(3.0), anchor="lm")
+
+
+def _wrapped(text: str, room_px: int) -> list[str]:
+    """Lines of a text as wide as the frame; what the foot has no room for is not shown, and dots say so."""
+    font, lines = _font(3.0), [""]
+    for word in text.split():
+        longer = f"{lines[-1]} {word}".strip()
+        if font.getlength(longer) <= room_px:
+            lines[-1] = longer
+        else:
+            lines.append(word)
+    return lines if len(lines) <= _MOST_LINES else [*lines[: _MOST_LINES - 1], lines[_MOST_LINES - 1] + " ..."]
 
 
 def _scale_bar(draw: "ImageDraw", frame: _Frame, x: float, y: float) -> None:
