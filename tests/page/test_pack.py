@@ -5,6 +5,7 @@ import zipfile
 
 from orthoswarm.export.sheets.pack import write_pack
 from orthoswarm.export.tactical.places import FILE, read_places, write_geojson
+from tests.export.test_date_line import make
 from tests.export.test_sheets import FIND, folder  # noqa: F401
 from tests.kit.page_kit import DESK, PHONE
 
@@ -49,3 +50,23 @@ def test_the_pack_says_which_pictures_are_not_refined(browser, folder, tmp_path)
     page.wait_for_function("document.getElementById('accuracy').textContent")
     assert "pictures 120 of v2" in page.inner_text("#accuracy") and "2 of 3 legs" in page.inner_text("#accuracy")
     page.close()
+
+
+def test_the_page_shows_a_map_on_the_meridian_of_180_degrees_in_one_piece(browser, tmp_path):
+    make(tmp_path / "map", 400, 600)
+    write_pack(tmp_path / "map" / "orthoimage.tif", tmp_path / "pack.zip")
+    with zipfile.ZipFile(tmp_path / "pack.zip") as archive:
+        archive.extractall(tmp_path / "out")
+    context = browser.new_context(viewport={"width": DESK[0], "height": DESK[1]})
+    page = context.new_page()
+    page.goto((tmp_path / "out" / "map-map" / "index.html").as_uri())
+    page.wait_for_function("() => [...document.querySelectorAll('#map img')].some((i) => i.naturalWidth === 256)")
+    tiles = page.eval_on_selector_all(
+        "#map img",
+        "images => images.map((i) => [...i.src.match(/(\\d+)\\/(\\d+)\\/\\d+.webp/).slice(1, 3), i.style.left])",
+    )
+    at = {int(column): float(left.removesuffix("px")) for _, column, left in tiles}
+    last = 2 ** int(tiles[0][0]) - 1
+    assert 0 < at[0] - at[last] < 600 and -600 < at[last] < DESK[0]  # side by side, and on the screen
+    assert abs(float(page.inner_text("#where").split(",")[1])) > 179.9
+    context.close()

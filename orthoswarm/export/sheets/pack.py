@@ -62,8 +62,9 @@ def write_pack(
         folder = Path(name)
         tiles = folder / "orthoimage.mbtiles"
         title = cog.resolve().parent.name or "map"
+        bounds: list[tuple[float, ...]] = []
         web: list[Callable[[], None]] = [
-            lambda: _draw_tiles(cog, tiles, folder / "orthoimage.kmz"),
+            lambda: bounds.append(_draw_tiles(cog, tiles, folder / "orthoimage.kmz")),
             lambda: write_pmtiles(tiles, folder / "orthoimage.pmtiles"),
         ]
         others: list[Callable[[], None]] = [
@@ -88,14 +89,14 @@ def write_pack(
             for running in [pool.submit(run, web), pool.submit(run, others)]:
                 running.result()
         with closing(sqlite3.connect(tiles)) as database, atomic_write(path) as part:
-            _zip(database, folder, part, places, title)
+            _zip(database, folder, part, places=places, title=title, bounds=bounds[0])
         tell(count, count)
 
 
-def _draw_tiles(cog: Path, mbtiles: Path, kmz: Path) -> None:
-    """Both files of one drawing."""
+def _draw_tiles(cog: Path, mbtiles: Path, kmz: Path) -> tuple[float, ...]:
+    """Both files of one drawing; returns its bounds, see `Pyramid`."""
     with mbtiles_file(mbtiles, tile_format="webp") as web, kmz_file(kmz) as globe:
-        draw_tiles(cog, [web, globe])
+        return draw_tiles(cog, [web, globe]).whole_pixel_bounds()
 
 
 def _copy(cog: Path, folder: Path) -> None:
@@ -106,7 +107,10 @@ def _copy(cog: Path, folder: Path) -> None:
             shutil.copyfile(cog.parent / name, folder / name)
 
 
-def _zip(database: sqlite3.Connection, folder: Path, path: Path, places: Sequence[Place], title: str) -> None:
+def _zip(
+    database: sqlite3.Connection, folder: Path, path: Path, *, places: Sequence[Place], title: str,
+    bounds: Sequence[float],
+) -> None:  # fmt: skip
     top = f"{title}-map"
     about = dict(database.execute("SELECT name, value FROM metadata"))
     files = [name for name in _PURPOSES if (folder / name).is_file()]
@@ -115,9 +119,8 @@ def _zip(database: sqlite3.Connection, folder: Path, path: Path, places: Sequenc
         for name, data in _tiles(database):
             names.append(name)
             archive.writestr(f"{top}/tiles/{name}.webp", data, zipfile.ZIP_STORED)
-        page = _PAGE.read_text(encoding="utf-8").replace(
-            "/*PACK*/null", _script(_document(folder, about, names, files=files, places=places, title=title))
-        )
+        document = _document(folder, about, names, files=files, places=places, title=title) | {"bounds": bounds}
+        page = _PAGE.read_text(encoding="utf-8").replace("/*PACK*/null", _script(document))
         archive.writestr(f"{top}/index.html", page)
         for name in files:
             packed = zipfile.ZIP_STORED if Path(name).suffix in _STORED else zipfile.ZIP_DEFLATED
@@ -139,7 +142,6 @@ def _document(
         "title": title,
         "about": "" if first is None or last is None else f"Pictures of {_minute(first)} to {_minute(last)} UTC.",
         "accuracy": "" if stated is None else stated.sentence,
-        "bounds": [float(v) for v in about["bounds"].split(",")],
         "minzoom": int(about["minzoom"]), "maxzoom": int(about["maxzoom"]), "tiles": tiles,
         "finds": [
             {"name": p.name, "lat": p.lat_deg, "lon": p.lon_deg, "sigma": p.sigma_m, "note": p.note}

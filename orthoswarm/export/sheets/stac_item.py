@@ -10,6 +10,7 @@ import numpy as np
 
 from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.export.product_files import read_frames
+from orthoswarm.export.sheets.geojson_outline import outline
 from orthoswarm.export.sheets.stated_accuracy import stated_accuracy
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import GroundGrid, LocalGrid
@@ -68,7 +69,6 @@ def raster_item(
     """
     west, south, east, north = grid.bounds
     ring = np.array([[west, south], [east, south], [east, north], [west, north], [west, south]])
-    corners = np.round(LocalGrid(grid.epsg).to_geographic(ring)[:, ::-1], 8)
     described = {
         "href": href, "type": _COG, "roles": ["data"],
         "title": title, "proj:shape": [grid.height, grid.width], "proj:transform": list(grid.affine()),
@@ -80,8 +80,7 @@ def raster_item(
     }  # fmt: skip
     return {
         "type": "Feature", "stac_version": "1.1.0", "stac_extensions": _EXTENSIONS, "id": identifier,
-        "geometry": {"type": "Polygon", "coordinates": [corners.tolist()]},
-        "bbox": [*corners.min(0).tolist(), *corners.max(0).tolist()],
+        **outline(LocalGrid(grid.epsg).to_geographic(ring)),
         "properties": {**properties, "proj:code": f"EPSG:{grid.epsg}", "gsd": grid.gsd_m},
         "links": [], "assets": {asset: described},
     }  # fmt: skip

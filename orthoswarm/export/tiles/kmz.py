@@ -39,7 +39,7 @@ def write_kmz(
 
     Raises:
         InputError: if the raster cannot be read.
-        OrthoSwarmError: if the disk is full.
+        OrthoSwarmError: if the disk is full, or the raster shows nothing.
     """
     with kmz_file(path, name) as file:
         draw_tiles(source, [file], progress)
@@ -118,14 +118,25 @@ class KmzFile:
     def _write_single(self, rgba: Bytes) -> None:
         left, top, right, bottom = self._pyramid.pixels()
         aside, above = self._pyramid.finest.left % 2 * SIDE, self._pyramid.finest.top % 2 * SIDE
-        shown = np.ascontiguousarray(rgba[above + top : above + bottom, aside + left : aside + right])
-        overlay = _overlay(self._name, "overlay.png", self._pyramid.whole_pixel_bounds(), 0)
-        self._archive.writestr("doc.kml", _document(self._name, overlay))
-        self._archive.writestr("overlay.png", encode_tile(shown, "png"))
+        shown = rgba[above + top : above + bottom, aside + left : aside + right]
+        west, south, east, north = self._pyramid.whole_pixel_bounds()
+        pictures = {"overlay.png": (shown, (west, south, east, north))}
+        if self._pyramid.crosses:  # an overlay on either side: not all viewers draw one beyond 180 degrees
+            side = (2**self._pyramid.finest.zoom - self._pyramid.finest.left) * SIDE - left
+            pictures = {
+                "overlay.png": (shown[:, :side], (west, south, 180.0, north)),
+                "overlay-east.png": (shown[:, side:], (-180.0, south, east - 360.0, north)),
+            }
+        overlays = "".join(_overlay(self._name, image, box, 0) for image, (_, box) in pictures.items())
+        self._archive.writestr("doc.kml", _document(self._name, overlays))
+        for image, (part, _) in pictures.items():
+            self._archive.writestr(image, encode_tile(np.ascontiguousarray(part), "png"))
 
 
 def _box(zoom: int, x: int, y: int) -> Box:
-    (west, north), (east, south) = degrees_of(x, y, zoom), degrees_of(x + 1, y + 1, zoom)
+    """Place of a node; its column may be one beyond 180 degrees, its longitudes are not."""
+    column = x % 2**zoom
+    (west, north), (east, south) = degrees_of(column, y, zoom), degrees_of(column + 1, y + 1, zoom)
     return west, south, east, north
 
 

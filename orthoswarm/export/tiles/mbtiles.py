@@ -46,7 +46,7 @@ def write_mbtiles(
 
     Raises:
         InputError: if the raster cannot be read.
-        OrthoSwarmError: if the disk is full.
+        OrthoSwarmError: if the disk is full, or the raster shows nothing.
     """
     with mbtiles_file(path, name=name, tile_format=tile_format, quality=quality) as file:
         draw_tiles(source, [file], progress)
@@ -75,15 +75,18 @@ class MbtilesFile:
         """Write the metadata."""
         self._database.executescript(_TABLES)
         west, south, east, north = pyramid.bounds
-        finest = pyramid.finest.zoom
+        finest, middle = pyramid.finest.zoom, (west + east) / 2
+        bounds = pyramid.whole_pixel_bounds()
+        if pyramid.crosses:  # bounds must not wrap around this meridian (TileJSON 3.0); the centre says where to look
+            bounds = (-180.0, bounds[1], 180.0, bounds[3])
         rows = {
             "name": self._name,
             "format": self._format,
             "type": "overlay",
             "version": "1.0",
             "description": "orthoimage made by OrthoSwarm",
-            "bounds": ",".join(f"{v:.10f}" for v in pyramid.whole_pixel_bounds()),
-            "center": f"{(west + east) / 2:.6f},{(south + north) / 2:.6f},{finest - 1}",
+            "bounds": ",".join(f"{v:.10f}" for v in bounds),
+            "center": f"{middle - 360.0 if middle >= 180.0 else middle:.6f},{(south + north) / 2:.6f},{finest - 1}",
             "minzoom": str(pyramid.levels[-1].zoom),
             "maxzoom": str(finest),
         }

@@ -3,6 +3,9 @@
 The finest zoom is warped from the orthoimage in blocks of 8 x 8 tiles; each coarser tile is the mean of its four finer
 ones. Tiles come four at a time, as the quad that their parent is made of, children before parents, so that no more than
 one block and one quad a zoom are in memory.
+
+A map on the meridian of 180 degrees is drawn as one that goes on to the east of it: longitudes beyond 180 degrees and
+columns beyond the last one. Files get columns and longitudes as they are counted from the west again.
 """
 
 import math
@@ -20,7 +23,7 @@ from orthoswarm.canvas.overviews import reduce_rgba
 from orthoswarm.export.reduced_raster import ReducedRaster
 from orthoswarm.export.tiles.triangle_warp import warp
 from orthoswarm.model.earth import WEB_MERCATOR_M
-from orthoswarm.model.errors import InputError
+from orthoswarm.model.errors import InputError, OrthoSwarmError
 
 Bytes = NDArray[np.uint8]
 Tell = Callable[[int, int], None]
@@ -67,8 +70,9 @@ class Pyramid:
     """The tiles of an orthoimage.
 
     Attributes:
-        bounds: west, south, east, north of the orthoimage in degrees.
-        levels: from the finest zoom to the one where a single tile holds all.
+        bounds: west, south, east, north of the orthoimage in degrees; east is beyond 180 where the map lies on that
+            meridian, and columns are beyond the last one there.
+        levels: from the finest zoom to the one where a single tile holds all, or zoom 1 with a tile on either side.
     """
 
     bounds: tuple[float, float, float, float]
@@ -78,6 +82,11 @@ class Pyramid:
     def finest(self) -> Range:
         """The tiles of the finest zoom."""
         return self.levels[0]
+
+    @property
+    def crosses(self) -> bool:
+        """True if the map lies on both sides of the meridian of 180 degrees."""
+        return self.bounds[2] > 180.0
 
     def pixels(self) -> tuple[int, int, int, int]:
         """Left, top, right, bottom of the orthoimage in whole pixels of the finest zoom, counted from its first tile.
@@ -98,7 +107,7 @@ class Pyramid:
         )
 
     def whole_pixel_bounds(self) -> tuple[float, float, float, float]:
-        """West, south, east, north in degrees of `pixels`."""
+        """West, south, east, north in degrees of `pixels`; east as in `bounds`."""
         left, top, right, bottom = self.pixels()
         x, y, zoom = self.finest.left, self.finest.top, self.finest.zoom
         west, north = degrees_of(x + left / SIDE, y + top / SIDE, zoom)
@@ -111,7 +120,8 @@ class Quad:
     """Four tiles, those that the tile `zoom`, `x`, `y` is made of.
 
     Attributes:
-        zoom: of the parent; -1 for the one tile of zoom 0. x, y: column, and row from the north, of the parent.
+        zoom: of the parent; -1 for the one tile of zoom 0. x, y: column, and row from the north, of the parent; the
+            column as `Pyramid` counts.
         rgba: uint8 (512, 512, 4), something drawn.
     """
 
@@ -121,12 +131,16 @@ class Quad:
     rgba: Bytes
 
     def tiles(self) -> Iterator[tuple[int, int, Bytes]]:
-        """Column, row from the north and pixels, uint8 (256, 256, 4), of its tiles where something is drawn."""
+        """Column, row from the north and pixels, uint8 (256, 256, 4), of its tiles where something is drawn.
+
+        Columns are from 0 to the zoom's last one.
+        """
+        count = 2 ** (self.zoom + 1)
         for i in (0, 1):
             for j in (0, 1):
                 tile = np.ascontiguousarray(self.rgba[i * SIDE : (i + 1) * SIDE, j * SIDE : (j + 1) * SIDE])
                 if tile[..., 3].any():
-                    yield 2 * self.x + j, 2 * self.y + i, tile
+                    yield (2 * self.x + j) % count, 2 * self.y + i, tile
 
 
 class TileFile(Protocol):
@@ -145,15 +159,18 @@ class TileFile(Protocol):
         """Called once, after the last quad."""
 
 
-def draw_tiles(source: Path, files: Sequence[TileFile], progress: Tell | None = None) -> None:
+def draw_tiles(source: Path, files: Sequence[TileFile], progress: Tell | None = None) -> Pyramid:
     """Draw the tiles of a georeferenced RGBA raster and store them in files.
 
     Args:
         source: the raster, an orthoimage. files: what is filled. progress: called with blocks done and blocks in all.
 
+    Returns:
+        What was drawn.
+
     Raises:
         InputError: if the raster cannot be read.
-        OrthoSwarmError: if the disk is full.
+        OrthoSwarmError: if the disk is full, or the raster shows nothing.
     """
     from rasterio.errors import RasterioError
 
@@ -163,14 +180,18 @@ def draw_tiles(source: Path, files: Sequence[TileFile], progress: Tell | None = 
             for file in files:
                 file.begin(pyramid)
             waiting: deque[tuple[TileFile, Quad, Future[Any]]] = deque()
+            quad: Quad | None = None
             for quad in _Drawing(raster, pyramid, progress).quads():
                 waiting.extend((file, quad, encoders.submit(file.encode, quad)) for file in files)
                 while len(waiting) > _AHEAD:
                     _store(*waiting.popleft())
             while waiting:
                 _store(*waiting.popleft())
+            if quad is None:
+                raise OrthoSwarmError(f"{source.name} shows nothing, so that it has no tiles; look at the map's report")
             for file in files:
                 file.end()
+            return pyramid
     except RasterioError as error:
         raise InputError(f"{source} cannot be read ({error}); make the map again") from None
 
@@ -189,13 +210,15 @@ def _pyramid(raster: Any) -> Pyramid:
     from rasterio.warp import transform_bounds
 
     west, south, east, north = transform_bounds(raster.crs, "EPSG:4326", *raster.bounds, densify_pts=21)
+    east += 360.0 if east < west else 0.0
     latitude = math.radians(0.5 * (south + north))
     zoom = math.ceil(math.log2(WEB_MERCATOR_M * math.cos(latitude) / SIDE / raster.res[0]) - 0.3)
     zoom = min(max(zoom, 0), _DEEPEST)
     left, top = _tile_of(west, north, zoom)
     right, bottom = _tile_of(east, south, zoom)
     levels = [Range(zoom, left, right, top, bottom)]
-    while levels[-1].count > 1 and levels[-1].zoom > 0:
+    coarsest = 1 if east > 180.0 else 0  # at zoom 0 both sides are in the same tile
+    while levels[-1].count > 1 and levels[-1].zoom > coarsest:
         levels.append(levels[-1].parent())
     return Pyramid((west, south, east, north), tuple(levels))
 
@@ -203,7 +226,8 @@ def _pyramid(raster: Any) -> Pyramid:
 def _tile_of(lon: float, lat: float, zoom: int) -> tuple[int, int]:
     n = 2**zoom
     x, y = _tiles_from_north_west(lon, lat, zoom)
-    return min(max(int(x), 0), n - 1), min(max(int(y), 0), n - 1)
+    most = 2 * n - 1 if lon > 180.0 else n - 1
+    return min(max(int(x), 0), most), min(max(int(y), 0), n - 1)
 
 
 def _tiles_from_north_west(lon: float, lat: float, zoom: int) -> tuple[float, float]:
@@ -227,14 +251,14 @@ class _Drawing:
         self._progress, self._done, self._blocks = progress, 0, self._levels[self._block_zoom].count
 
     def quads(self) -> Iterator[Quad]:
-        """All quads with something drawn; the last one has the coarsest tile alone."""
-        root = self._root
-        tile = yield from self._below(root.zoom, root.left, root.top)
-        if tile is not None:
-            rgba = np.zeros((2 * SIDE, 2 * SIDE, 4), np.uint8)
-            top, left = root.top % 2 * SIDE, root.left % 2 * SIDE
-            rgba[top : top + SIDE, left : left + SIDE] = tile
-            yield Quad(root.zoom - 1, root.left // 2, root.top // 2, rgba)
+        """All quads with something drawn; a coarsest tile is alone in its quad."""
+        for x, y in self._root.tiles():
+            tile = yield from self._below(self._root.zoom, x, y)
+            if tile is not None:
+                rgba = np.zeros((2 * SIDE, 2 * SIDE, 4), np.uint8)
+                top, left = y % 2 * SIDE, x % 2 * SIDE
+                rgba[top : top + SIDE, left : left + SIDE] = tile
+                yield Quad(self._root.zoom - 1, x // 2, y // 2, rgba)
 
     def _below(self, zoom: int, x: int, y: int) -> Generator[Quad, None, Bytes | None]:
         """The quads of a tile and of all below it; returns the tile itself."""
