@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +42,7 @@ class OrientedPicture:
 def camera_of(row: Row) -> Camera:
     """The camera of a line of frames.jsonl, in the grid of its `epsg`."""
     block = row["camera"]
-    grid = LocalGrid(int(row["epsg"]))
+    grid = _grid(int(row["epsg"]))
     lat, lon = float(block["lat_deg"]), float(block["lon_deg"])
     position = np.append(grid.to_grid(lat, lon), float(block["height_m"]))
     yaw = math.radians(float(block["yaw_deg"])) - float(grid.convergence_rad(lat, lon))
@@ -49,6 +50,12 @@ def camera_of(row: Row) -> Camera:
     terms = {name: float(block.get(name, 0.0)) for name in ("k1", "k2", "k3", "cx", "cy")}
     lens = Lens(int(row["width"]), int(row["height"]), float(block["focal_px"]), **terms)
     return Camera(position, rotation_from_angles(*angles), lens)
+
+
+@lru_cache(maxsize=4)
+def _grid(epsg: int) -> LocalGrid:
+    """A grid by its code; its transformer takes a thousand times as long to make as to use."""
+    return LocalGrid(epsg)
 
 
 def oriented_pictures(rows: Sequence[Row]) -> list[OrientedPicture]:

@@ -3,15 +3,24 @@
 import json
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import jsonschema
 import numpy as np
+import pyogrio
 import pytest
 import rasterio
+import shapely
+from pyproj import Transformer
 
 from gcs_plugin.cli.main import main
-from orthoswarm.export.catalog.tiled_raster import in_tiles, product_file
+from orthoswarm.export.catalog.stac_collection import write_collection
+from orthoswarm.export.catalog.tiled_raster import in_tiles, product_file, write_tiled
+from orthoswarm.export.product_files import iso_time, write_frames
+from orthoswarm.model.bounding_box import BoundingBox
+from orthoswarm.model.geo import LocalGrid
+from tests.kit import mosaic_scene
 from tests.kit.scene import Scene, legs
 
 RASTERS = ("realtime", "coarse", "orthoimage")
@@ -83,6 +92,45 @@ def test_the_collection_has_an_item_for_each_tile_and_vehicle(maps):
                 assert asset["proj:shape"] == list(raster.shape) and asset["proj:transform"] == list(raster.transform)
     for asset in collection["assets"].values():
         assert (maps / "tiled" / "tiles" / asset["href"]).is_file()
+
+
+class Painted:
+    """A source of windows, all of one colour."""
+
+    def __init__(self, grid):
+        self.grid = grid
+
+    def read_reduced(self, factor, row0, row1, col0, col1):
+        return np.full((row1 - row0, col1 - col0, 4), 255, np.uint8)
+
+
+def test_vehicles_and_times_are_those_of_the_footprints(tmp_path, configure):
+    configure({"raster": {"tile_px": 512}})
+    level = 2.0
+    flight = mosaic_scene.survey(0, lens=mosaic_scene.small_lens(k1=-0.05))
+    placed = [replace(p, frame=replace(p.frame, time_s=1e9 + k)) for k, p in enumerate(flight.frames)]
+    grid = mosaic_scene.grid(320.0, 0.25)
+    drawn, window = [BoundingBox(*grid.bounds)], (0, grid.height, 0, grid.width)
+    write_tiled(Painted(grid), tmp_path, "orthoimage.tif", window=window, drawn=drawn)
+    write_frames(tmp_path, placed, [], LocalGrid(grid.epsg), level)
+    (tmp_path / "report.json").write_text(json.dumps({"ground_z_m": level}))
+    assert write_collection(tmp_path, "2026-01-01T00:00:00Z") > 5
+    meta, _, shapes, fields = pyogrio.raw.read(tmp_path / "footprints.gpkg")
+    values, seen = dict(zip(meta["fields"], fields, strict=True)), shapely.from_wkb(shapes)
+    to_degrees = Transformer.from_crs(meta["crs"], 4326, always_xy=True)
+    items = [d["properties"] | d for d in documents(tmp_path).values() if "properties" in d]
+    for item in [i for i in items if "orthoswarm:vehicle" in i]:
+        own = seen[values["vehicle"] == item["orthoswarm:vehicle"]]
+        hull = shapely.transform(shapely.convex_hull(shapely.union_all(own)), to_degrees.transform, interleaved=False)
+        assert len(own) and shapely.hausdorff_distance(shapely.geometry.shape(item["geometry"]), hull) < 1e-7  # 1 cm
+    times = dict(zip(values["image"], (iso_time(p.frame.time_s) for p in placed), strict=True))
+    for item in [i for i in items if "proj:code" in i]:
+        ((step, _, west, _, _, north, *_), (rows, cols)) = (
+            item["assets"]["orthoimage"][k] for k in ("proj:transform", "proj:shape")
+        )
+        tile = shapely.box(west, north - rows * step, west + cols * step, north)
+        over = [times[name] for name, s in zip(values["image"], seen, strict=True) if tile.intersects(s.envelope)]
+        assert (item["start_datetime"], item["end_datetime"]) == (min(over), max(over))
 
 
 def test_pystac_reads_and_validates_the_collection(maps):

@@ -3,6 +3,7 @@
 All links are relative, so that the folder may be moved, copied or uploaded as it is (a self-contained catalog).
 """
 
+import json
 import re
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -14,18 +15,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.export.catalog.tiled_raster import COLLECTION, FOLDER, VEHICLES, RasterTile, tiles_of, write_json
+from orthoswarm.export.exterior_orientation import camera_of
 from orthoswarm.export.product_files import read_frames
+from orthoswarm.export.sheets.geojson_outline import joined_bbox, outline
 from orthoswarm.export.sheets.stac_item import raster_item
 from orthoswarm.export.sheets.stated_accuracy import stated_accuracy
 from orthoswarm.model.geo import LocalGrid
+from orthoswarm.mosaic.footprint import footprint
 
 Array = NDArray[np.float64]
 _TITLES = {"realtime.tif": "Real-time picture", "coarse.tif": "Coarse orthoimage", "orthoimage.tif": "Orthoimage"}
+_LEAST_M = 0.1
+"""Half the width of an outline that would have none."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Picture:
-    """A placed picture: vehicle, time (ISO 8601) or None, ring float64 (4, 2) of what it sees on the grid."""
+    """A placed picture: vehicle, time (ISO 8601) or None, ring float64 (K, 2) of what it sees on the grid."""
 
     vehicle: str
     time: str | None
@@ -73,25 +79,15 @@ def write_collection(folder: Path, made: str) -> int:
 
 
 def _placed_pictures(folder: Path) -> list[_Picture]:
+    """The pictures of frames.jsonl that see ground, with the outlines of footprints.gpkg."""
+    level = float(json.loads((folder / "report.json").read_text(encoding="utf-8")).get("ground_z_m") or 0.0)
     pictures = []
     for row in read_frames(folder / "frames.jsonl"):
-        if "homography" in row and row.get("width"):
-            ring = _ring(np.array(row["homography"]), int(row["width"]), int(row["height"]))
-            pictures.append(_Picture(str(row["vehicle"]), row.get("time"), ring))
+        if "focal_px" in row.get("camera", {}):
+            ring = footprint(camera_of(row), level, inset_px=-0.5)
+            if len(ring) >= 3:
+                pictures.append(_Picture(str(row["vehicle"]), row.get("time"), ring))
     return pictures
-
-
-def _ring(homography: Array, width: int, height: int) -> Array:
-    """What a picture sees, float64 (4, 2) on the grid; the horizon does not count, where it is in the picture."""
-    corners = np.array(
-        [[-0.5, -0.5, 1], [width - 0.5, -0.5, 1], [width - 0.5, height - 0.5, 1], [-0.5, height - 0.5, 1]]
-    )
-    ground = corners @ homography.T
-    middle = float(homography[2] @ [(width - 1) / 2, (height - 1) / 2, 1])
-    if (ground[:, 2] * middle <= 0).any():
-        at = homography @ [(width - 1) / 2, (height - 1) / 2, 1]
-        return np.repeat((at[:2] / at[2])[None], 4, axis=0)
-    return np.asarray(ground[:, :2] / ground[:, 2:], np.float64)
 
 
 def _tile_item(
@@ -120,9 +116,7 @@ def _vehicle_items(pictures: Sequence[_Picture], epsg: int, name: str, made: str
     for vehicle in sorted(by_vehicle):
         own = by_vehicle[vehicle]
         hull = shapely.convex_hull(shapely.multipoints(np.concatenate([p.ring for p in own])))
-        outline = np.array(hull.exterior.coords) if hull.geom_type == "Polygon" else np.array(hull.envelope.coords)
-        lat_lon = grid.to_geographic(outline)
-        ring = np.round(lat_lon[:, ::-1], 8)
+        around = hull if hull.geom_type == "Polygon" else shapely.buffer(hull, _LEAST_M)
         slug = _slug(vehicle)
         while slug in used:
             slug += "_"
@@ -136,8 +130,7 @@ def _vehicle_items(pictures: Sequence[_Picture], epsg: int, name: str, made: str
         }  # fmt: skip
         item: dict[str, Any] = {
             "type": "Feature", "stac_version": "1.1.0", "stac_extensions": [], "id": f"{name}-vehicle-{slug}",
-            "geometry": {"type": "Polygon", "coordinates": [ring.tolist()]},
-            "bbox": [*ring.min(0).tolist(), *ring.max(0).tolist()],
+            **outline(grid.to_geographic(np.array(around.exterior.coords))),
             "properties": {"title": f"Pictures of {vehicle}", "orthoswarm:vehicle": vehicle,
                            "orthoswarm:pictures": len(own), **_times(own, made)},
             "assets": assets,
@@ -156,7 +149,6 @@ def _times(pictures: Sequence[_Picture], made: str) -> dict[str, str]:
 def _collection(
     folder: Path, name: str, items: Sequence[tuple[str, Mapping[str, Any]]], rasters: Sequence[str]
 ) -> dict[str, Any]:
-    boxes = np.array([item["bbox"] for _, item in items])
     times = [item["properties"] for _, item in items]
     starts = sorted(p.get("start_datetime", p["datetime"]) for p in times)
     ends = sorted(p.get("end_datetime", p["datetime"]) for p in times)
@@ -177,7 +169,7 @@ def _collection(
         "description": stated.sentence if stated else "An orthoimage of drone photos in tiles.",
         "license": "other",
         "extent": {
-            "spatial": {"bbox": [[*boxes[:, :2].min(0).tolist(), *boxes[:, 2:].max(0).tolist()]]},
+            "spatial": {"bbox": [joined_bbox([item["bbox"] for _, item in items])]},
             "temporal": {"interval": [[starts[0], ends[-1]]]},
         },
         "links": links, "assets": assets,
