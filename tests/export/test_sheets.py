@@ -2,6 +2,7 @@
 
 import gzip
 import json
+import re
 import sqlite3
 import zipfile
 from pathlib import Path
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 import rasterio
 from PIL import ImageDraw
+from rasterio.warp import transform
 
 from gcs_plugin.cli.main import main
 from orthoswarm.export.reduced_raster import ReducedRaster
@@ -161,6 +163,14 @@ def test_a_sheet_is_a_pdf_with_georeferencing_and_a_round_scale(folder, tmp_path
     data = (tmp_path / "sheet.pdf").read_bytes()
     assert data.startswith(b"%PDF") and b"/Measure" in data and b"/GPTS" in data and b"/LPTS" in data
     assert b"/MediaBox" in data and not (tmp_path / "sheet.pdf.aux.xml").exists()
+    box, corners = (
+        np.array(re.search(rb"/" + key + rb" \[([^\]]*)", data)[1].split(), float) for key in (b"BBox", b"GPTS")
+    )
+    east, north = transform("EPSG:4326", "EPSG:32632", corners[1::2], corners[::2])
+    assert np.ptp(east[:2]) < 1e-3 and np.ptp(east[2:]) < 1e-3 and abs(north[0] - north[3]) < 1e-3  # to a millimetre
+    sides = np.array([(east[2] - east[0]) / (box[2] - box[0]), (north[0] - north[1]) / (box[3] - box[1])])
+    assert sides * 72 / 0.0254 == pytest.approx([500, 500], rel=1e-6)  # 1:500; a point is 1/72 inch
+    assert east[0] < WEST < WEST + 125 < east[2] and north[1] < NORTH - 150 < NORTH < north[0]
 
 
 def test_every_form_is_written_by_the_command_line(folder, capsys):
