@@ -5,6 +5,7 @@ right, y down, z forward); its pixel (0, 0) is the upper left CORNER of the uppe
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,8 @@ from orthoswarm.model.camera import Lens
 
 Array = NDArray[np.float64]
 _ORIGIN_STEP_M = 100.0
+_ENOUGH_PX = 0.01
+"""Terms that move no pixel by more are left out: the adjustment returns terms that it holds at zero as 1e-16."""
 
 
 def write_colmap(
@@ -61,16 +64,23 @@ def write_colmap(
 
 
 def _model(lens: Lens) -> str:
-    """COLMAP's camera model of a lens with its parameters: the simplest one with all its terms."""
+    """COLMAP's camera model of a lens with its parameters: the simplest one that holds its terms to _ENOUGH_PX."""
     u, v = (c + 0.5 for c in lens.principal_point)
     f = lens.focal_px
-    if lens.is_pinhole:
+    if _difference_px(lens, replace(lens, k1=0.0, k2=0.0, k3=0.0)) < _ENOUGH_PX:
         name, values = "SIMPLE_PINHOLE", [f, u, v]
-    elif lens.k3 == 0.0:
+    elif _difference_px(lens, replace(lens, k3=0.0)) < _ENOUGH_PX:
         name, values = "RADIAL", [f, u, v, lens.k1, lens.k2]
     else:
         name, values = "FULL_OPENCV", [f, f, u, v, lens.k1, lens.k2, 0.0, 0.0, lens.k3, 0.0, 0.0, 0.0]
     return f"{name} {lens.width} {lens.height} " + " ".join(repr(float(v)) for v in values)
+
+
+def _difference_px(lens: Lens, simpler: Lens) -> float:
+    """How far apart two lenses of one focal length show a point of the picture's corners, pixels."""
+    corners = np.array([[u, v] for u in (-0.5, lens.width - 0.5) for v in (-0.5, lens.height - 0.5)])
+    seen = lens.undistort((corners - np.array(lens.principal_point)) / lens.focal_px)
+    return float(np.abs(lens.distort(seen) - simpler.distort(seen)).max() * lens.focal_px)
 
 
 def _image(number: int, picture: OrientedPicture, camera: int, origin: Array) -> str:

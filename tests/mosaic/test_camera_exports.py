@@ -100,6 +100,30 @@ def test_colmap_projects_ground_where_we_do(tmp_path):
         assert np.abs(projected - 0.5 - pixels).max() < 1e-3  # COLMAP counts from the corner of the first pixel
 
 
+@pytest.mark.parametrize(
+    ("terms", "kind"),
+    [
+        ({"k1": 1e-17, "k2": -1e-16, "k3": 2e-16}, "SIMPLE_PINHOLE"),
+        ({"k1": -0.08, "k2": 0.01, "k3": 2.5e-16, "cx": 7e-19}, "RADIAL"),
+        ({"k1": -0.08, "k2": 0.01, "k3": 2e-6, "cx": 5.0}, "RADIAL"),  # 0.005 px in the corner
+        ({"k1": -0.08, "k2": 0.01, "k3": 1e-4}, "FULL_OPENCV"),
+    ],
+)
+def test_colmap_has_the_terms_that_move_pixels(tmp_path, terms, kind):
+    camera = Camera(
+        np.append(GRID.to_grid(30.57, 103.2), 100.0),
+        rotation_from_angles(0.0, -1.5, 0.0),
+        Lens(640, 480, 350.0, **terms),
+    )
+    frame = Frame(
+        image="a.jpg", path=tmp_path / "a.jpg", vehicle="uav", time_s=None, fix=Fix(0, 0), width=640, height=480
+    )
+    rows = [frame_row(PlacedFrame(frame, camera, "fine", 0.1), GRID, 0.0)]
+    write_colmap(rows, lambda row: None, tmp_path / "colmap")
+    line = (tmp_path / "colmap" / "sparse" / "0" / "cameras.txt").read_text().splitlines()[1].split()
+    assert line[1] == kind
+
+
 def test_colmap_itself_reads_the_model(tmp_path):
     pycolmap = pytest.importorskip("pycolmap")
     cameras, rows = flight(tmp_path)
