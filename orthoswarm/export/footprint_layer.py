@@ -16,16 +16,18 @@ Feature = tuple[Mapping[str, Any], Array]
 """What is known about a frame, and its outline."""
 
 Column = type[np.generic]
-"""np.object_ for text, np.float64 for numbers."""
+"""np.object_ for text, np.float64 for numbers, np.datetime64 for times (ISO 8601, UTC; kept to a millisecond)."""
 _COLUMNS: dict[str, Column] = {
     "image": np.object_,
     "vehicle": np.object_,
-    "time": np.object_,
+    "time": np.datetime64,
     "stage": np.object_,
     "fov_deg": np.float64,
     "sigma_m": np.float64,
 }
 _AT_ONCE = 4096
+_UTC = 100
+"""GDAL's number of the time zone."""
 
 
 def write_footprints(path: Path, features: Iterable[Feature], epsg: int) -> None:
@@ -99,6 +101,7 @@ def append_polygons(
     import pyogrio
     import shapely
 
+    times = [name for name, kind in columns.items() if kind is np.datetime64]
     multi = len(shapes) > 0 and shapely.get_type_id(shapes[0]) == 6
     pyogrio.raw.write(
         str(part),
@@ -110,12 +113,15 @@ def append_polygons(
         geometry_type="MultiPolygon" if multi else "Polygon",
         crs=f"EPSG:{epsg}",
         append=part.exists(),
+        gdal_tz_offsets={name: np.full(len(rows), _UTC) for name in times},
     )
 
 
 def _column(values: list[Any], kind: type[np.generic]) -> NDArray[Any]:
     if kind is np.float64:
         return np.array([np.nan if v is None else v for v in values], np.float64)
+    if kind is np.datetime64:
+        return np.array([v.removesuffix("Z") if v else "NaT" for v in values], "datetime64[ms]")
     column = np.empty(len(values), object)
     column[:] = values
     return column

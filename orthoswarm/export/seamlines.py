@@ -11,12 +11,10 @@ from numpy.typing import NDArray
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.export.footprint_layer import Column, append_polygons, gpkg_file
 
-_EVERY_PX = 2
-"""Polygons are drawn from every second row and column: their borders are right to a pixel, with half the vertices."""
 _COLUMNS: dict[str, Column] = {
     "image": np.object_,
     "vehicle": np.object_,
-    "time": np.object_,
+    "time": np.datetime64,
     "stage": np.object_,
     "sigma_m": np.float64,
     "area_m2": np.float64,
@@ -60,12 +58,12 @@ def _tile_polygons(canvas: Canvas) -> Iterator[tuple[int, Any]]:
     from rasterio.transform import from_origin
 
     grid, t = canvas.grid, canvas.tile_px
-    step = _EVERY_PX * grid.gsd_m
     for row, col in sorted(canvas.changed_since(0)):
         labels: NDArray[np.int32] = canvas.read_plane(
             row * t, min(grid.height, (row + 1) * t), col * t, min(grid.width, (col + 1) * t)
-        )[::_EVERY_PX, ::_EVERY_PX]
-        corner = from_origin(grid.west + col * t * grid.gsd_m, grid.north - row * t * grid.gsd_m, step, step)
+        )
+        left, top = grid.west + col * t * grid.gsd_m, grid.north - row * t * grid.gsd_m
+        corner = from_origin(left, top, grid.gsd_m, grid.gsd_m)
         for shape, value in shapes(np.ascontiguousarray(labels), mask=labels > 0, transform=corner):
             shell, *holes = shape["coordinates"]
             yield int(value) - 1, shapely.Polygon(shell, holes)

@@ -155,7 +155,8 @@ def test_footprints_open_as_polygons(flight, mapped):
     polygons = shapely.from_wkb(shapes)
     assert len(polygons) == 32 and meta["crs"] == f"EPSG:{flight[0].grid.epsg}"
     assert all(p.is_valid and 2000 < p.area < 40_000 for p in polygons)
-    assert list(meta["fields"])[:2] == ["image", "vehicle"] and "a/DJI_0000.JPG" in fields[0]
+    assert list(meta["fields"])[:3] == ["image", "vehicle", "time"] and "a/DJI_0000.JPG" in fields[0]
+    assert meta["dtypes"][2] == "datetime64[ms]"
 
 
 def test_results_do_not_depend_on_the_number_of_workers(flight, mapped, tmp_path):
