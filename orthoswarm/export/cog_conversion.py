@@ -1,8 +1,10 @@
 """A COG in another coordinate system, or compressed as JPEG with a mask, by GDAL's own writer."""
 
+import tempfile
 from pathlib import Path
 from typing import Any
 
+from orthoswarm import __version__
 from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.model.errors import InputError
 
@@ -21,7 +23,6 @@ def convert_cog(source: Path, path: Path, *, epsg: int | None = None, jpeg_quali
         OrthoSwarmError: if the disk is full.
     """
     import rasterio
-    import rasterio.shutil
     from rasterio.errors import CRSError, RasterioError
     from rasterio.vrt import WarpedVRT
 
@@ -38,8 +39,47 @@ def convert_cog(source: Path, path: Path, *, epsg: int | None = None, jpeg_quali
     try:
         with rasterio.open(source) as raster, atomic_write(path) as part, rasterio.Env(CHECK_DISK_FREE_SPACE=True):
             crs = raster.crs if epsg is None else rasterio.crs.CRS.from_epsg(epsg)
+            if crs == raster.crs:
+                copy_dataset(raster, part, **settings)
+                return
             with WarpedVRT(raster, crs=crs, resampling=rasterio.enums.Resampling.cubic, warp_mem_limit=64) as vrt:
-                rasterio.shutil.copy(raster if crs == raster.crs else vrt, part, **settings)
+                _copy_warped(vrt, part, settings)
     except (CRSError, RasterioError) as error:
         text = str(error).splitlines()[0]
         raise InputError(f"{source.name} cannot be written as asked ({text}); check --epsg") from None
+
+
+def software() -> str:
+    """What the TIFF tag "Software" says of a file that is made here."""
+    return f"OrthoSwarm {__version__}"
+
+
+def copy_dataset(dataset: Any, part: Path, **settings: Any) -> None:
+    """Copy an open dataset by a driver of GDAL.
+
+    Args:
+        dataset: what is copied. part: the file. settings: driver and its creation options.
+
+    Raises:
+        OSError: the file cannot be written; GDAL does not say why.
+    """
+    import rasterio.shutil
+    from rasterio._err import CPLE_BaseError
+
+    try:
+        rasterio.shutil.copy(dataset, part, **settings)
+    except CPLE_BaseError as error:  # which is none of rasterio's own errors
+        raise OSError(0, str(error).splitlines()[0]) from None
+
+
+def _copy_warped(vrt: Any, part: Path, settings: dict[str, Any]) -> None:
+    """Copy a warped raster, which has none of its source's tags, by way of a description that has."""
+    import rasterio
+
+    with tempfile.TemporaryDirectory(dir=part.parent, prefix=".warped") as folder:
+        described = Path(folder) / "warped.vrt"
+        copy_dataset(vrt, described, driver="VRT")
+        with rasterio.open(described, "r+") as file:
+            file.update_tags(TIFFTAG_SOFTWARE=software())
+        with rasterio.open(described) as file:
+            copy_dataset(file, part, **settings)

@@ -1,18 +1,28 @@
-"""The surface model as a GeoTIFF."""
+"""The surface model as a cloud-optimised GeoTIFF."""
 
+import tempfile
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
 from orthoswarm.export.atomic_file import atomic_write
+from orthoswarm.export.cog_conversion import copy_dataset, software
 from orthoswarm.stereo.surface_cells import SurfaceModel
 
 NO_DATA = -9999.0
 """What other programs expect for "no height"."""
+_UNITS: Final = ("m", "m", "")
+_DATUM: Final = "that of the altitudes in the photos: the ellipsoid, the geoid or another one, as their maker has it"
+_NO_DATUM: Final = "none: heights are over the takeoff level"
+_COG: Final = {
+    "driver": "COG", "compress": "deflate", "predictor": "floating_point", "overview_resampling": "average",
+    "bigtiff": "if_safer",
+}  # fmt: skip
 
 
 def write_surface(path: Path, surface: SurfaceModel, takeoff_altitude_m: float | None) -> None:
-    """Write a tiled GeoTIFF, float32: band 1 height, band 2 one sigma, both metres, band 3 number of agreeing pairs.
+    """Write a COG, float32: band 1 height, band 2 one sigma, both metres, band 3 number of agreeing pairs.
 
     Args:
         path: the file. surface: heights over the takeoff level.
@@ -26,8 +36,8 @@ def write_surface(path: Path, surface: SurfaceModel, takeoff_altitude_m: float |
     grid = surface.grid
     profile = {
         "driver": "GTiff", "width": grid.width, "height": grid.height, "count": 3, "dtype": "float32",
-        "crs": f"EPSG:{grid.epsg}", "transform": grid.affine(), "nodata": NO_DATA, "compress": "deflate",
-        "predictor": 3, "tiled": True,
+        "crs": f"EPSG:{grid.epsg}", "transform": grid.affine(), "nodata": NO_DATA, "tiled": True,
+        "bigtiff": "if_safer",
     }  # fmt: skip
     unknown = ~np.isfinite(surface.height_m)
     zero = "the takeoff level" if takeoff_altitude_m is None else "the zero of the receivers' altitudes"
@@ -36,10 +46,16 @@ def write_surface(path: Path, surface: SurfaceModel, takeoff_altitude_m: float |
         "one sigma of the height, metres": surface.sigma_m,
         "pairs of pictures that agree": surface.pairs.astype(np.float32),
     }
-    with atomic_write(path) as part, rasterio.open(part, "w", **profile) as file:
-        for band, (name, values) in enumerate(bands.items(), start=1):
-            file.write(np.where(unknown, np.float32(NO_DATA), values), band)
-            file.set_band_description(band, name)
-        file.update_tags(HEIGHTS_FROM=zero)
-        if takeoff_altitude_m is not None:
-            file.update_tags(TAKEOFF_ALTITUDE_M=f"{takeoff_altitude_m:.2f}")
+    tags = {"HEIGHTS_FROM": zero, "VERTICAL_DATUM": _NO_DATUM, "TIFFTAG_SOFTWARE": software()}
+    if takeoff_altitude_m is not None:
+        tags |= {"TAKEOFF_ALTITUDE_M": f"{takeoff_altitude_m:.2f}", "VERTICAL_DATUM": _DATUM}
+    with atomic_write(path) as part, tempfile.TemporaryDirectory(dir=path.parent, prefix=".surface") as folder:
+        plain = Path(folder) / "plain.tif"  # overviews are made of a whole file
+        with rasterio.open(plain, "w", **profile) as file:
+            for band, (name, values) in enumerate(bands.items(), start=1):
+                file.write(np.where(unknown, np.float32(NO_DATA), values), band)
+                file.set_band_description(band, name)
+            file.units = _UNITS
+            file.update_tags(**tags)
+        with rasterio.open(plain) as file:
+            copy_dataset(file, part, **_COG)

@@ -18,8 +18,10 @@ from gcs_plugin.cli.main import main
 from orthoswarm.export.catalog.stac_collection import write_collection
 from orthoswarm.export.catalog.tiled_raster import in_tiles, product_file, write_tiled
 from orthoswarm.export.product_files import iso_time, write_frames
+from orthoswarm.export.surface_file import write_surface
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.geo import LocalGrid
+from orthoswarm.stereo.surface_cells import SurfaceModel
 from tests.kit import mosaic_scene
 from tests.kit.scene import Scene, legs
 
@@ -113,8 +115,13 @@ def test_vehicles_and_times_are_those_of_the_footprints(tmp_path, configure):
     drawn, window = [BoundingBox(*grid.bounds)], (0, grid.height, 0, grid.width)
     write_tiled(Painted(grid), tmp_path, "orthoimage.tif", window=window, drawn=drawn)
     write_frames(tmp_path, placed, [], LocalGrid(grid.epsg), level)
-    (tmp_path / "report.json").write_text(json.dumps({"ground_z_m": level}))
+    (tmp_path / "report.json").write_text(json.dumps({"ground_z_m": level, "surface": {"file": "dsm.tif"}}))
+    cells = np.ones((4, 4), np.float32)
+    write_surface(
+        tmp_path / "dsm.tif", SurfaceModel(mosaic_scene.grid(4.0), cells, cells, cells.astype(np.uint8)), None
+    )
     assert write_collection(tmp_path, "2026-01-01T00:00:00Z") > 5
+    assert documents(tmp_path)[Path("tiles/collection.json")]["assets"]["surface"]["href"] == "../dsm.tif"
     meta, _, shapes, fields = pyogrio.raw.read(tmp_path / "footprints.gpkg")
     values, seen = dict(zip(meta["fields"], fields, strict=True)), shapely.from_wkb(shapes)
     to_degrees = Transformer.from_crs(meta["crs"], 4326, always_xy=True)

@@ -19,9 +19,12 @@ from orthoswarm.export.reduced_raster import ReducedRaster
 from orthoswarm.export.sheets.geopdf import write_geopdf
 from orthoswarm.export.sheets.mgrs import mgrs, utm_zone
 from orthoswarm.export.sheets.stac_item import write_stac_item
+from orthoswarm.export.surface_file import write_surface
 from orthoswarm.export.tactical.places import FILE, Place, write_geojson
 from orthoswarm.export.tiles.mbtiles import write_mbtiles
 from orthoswarm.export.tiles.pmtiles import tile_number, write_pmtiles
+from orthoswarm.model.geo import GroundGrid
+from orthoswarm.stereo.surface_cells import SurfaceModel
 
 WEST, NORTH, GSD = 465_500.0, 5_249_600.0, 0.25
 FIND = Place(uid="f", kind="find", name="Roof", lat_deg=47.3975, lon_deg=8.5437, time_s=1.78e9, note="</script>")
@@ -190,6 +193,31 @@ def test_every_form_is_written_by_the_command_line(folder, capsys):
     assert {f"flood-map/{name}" for name in inside} <= names
     assert page.count("</script>") == 1  # a note cannot end the page's script
     assert not [p for p in (folder / "export").iterdir() if p.name.startswith(".")]
+
+
+def test_the_surface_model_and_the_seamlines_go_along(folder):
+    report = json.loads((folder / "report.json").read_text()) | {"surface": {"file": "/elsewhere/heights.tif"}}
+    (folder / "report.json").write_text(json.dumps(report))
+    cells = np.ones((30, 40), np.float32)
+    grid = GroundGrid(epsg=32632, west=WEST, north=NORTH, gsd_m=0.5, width=40, height=30)
+    write_surface(folder / "heights.tif", SurfaceModel(grid, cells, cells, cells.astype(np.uint8)), 400.0)
+    (folder / "seamlines.gpkg").write_bytes(b"polygons")
+    assert main(["export", str(folder), "--to", "stac", "pack"]) == 0
+    item = json.loads((folder / "orthoimage.stac.json").read_text())
+    asset = item["assets"]["surface"]
+    assert asset["href"] == "heights.tif" and asset["proj:shape"] == [30, 40]
+    assert [band.get("unit") for band in asset["raster:bands"]] == ["m", "m", None]
+    jsonschema.validate(item, json.loads(Path(__file__).with_name("stac_item.schema.json").read_text()))
+    with zipfile.ZipFile(folder / "export" / "flood-map.zip") as archive:
+        assert {"flood-map/dsm.tif", "flood-map/seamlines.gpkg"} <= set(archive.namelist())
+        packed = json.loads(archive.read("flood-map/orthoimage.stac.json"))
+    assert packed["assets"]["surface"]["href"] == "dsm.tif"
+
+
+def test_a_surface_model_of_an_earlier_run_is_not_named(folder):
+    (folder / "dsm.tif").write_bytes(b"old")
+    write_stac_item(folder / "orthoimage.tif", folder / "orthoimage.stac.json")
+    assert "surface" not in json.loads((folder / "orthoimage.stac.json").read_text())["assets"]
 
 
 def test_without_places_the_command_line_says_where_they_come_from(folder, capsys):

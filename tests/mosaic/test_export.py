@@ -17,7 +17,7 @@ from gcs_plugin.cli.main import main
 from orthoswarm.export import cog
 from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.export.cog import CLASSIC_BYTES, TILE_PX, write_cog
-from orthoswarm.export.cog_conversion import convert_cog
+from orthoswarm.export.cog_conversion import convert_cog, copy_dataset
 from orthoswarm.export.linked_pictures import unique_names
 from orthoswarm.export.odm_folder import write_odm
 from orthoswarm.export.predictor import predict
@@ -266,7 +266,8 @@ def test_a_cog_in_another_system_and_as_jpeg(ortho, tmp_path):
     convert_cog(ortho, tmp_path / "w.tif", epsg=3857)
     convert_cog(ortho, tmp_path / "j.tif", jpeg_quality=85)
     with rasterio.open(tmp_path / "w.tif") as image:
-        assert image.crs.to_epsg() == 3857
+        assert image.crs.to_epsg() == 3857 and image.tags()["TIFFTAG_SOFTWARE"].startswith("OrthoSwarm")
+        assert image.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
         found = colours_at(image.read().transpose(1, 2, 0), image.transform, 3857, PLACES)
         assert np.abs(found[:, :3] - ground(*PLACES.T)).max() < 12
     with rasterio.open(tmp_path / "j.tif") as image:
@@ -275,6 +276,11 @@ def test_a_cog_in_another_system_and_as_jpeg(ortho, tmp_path):
     assert (tmp_path / "j.tif").stat().st_size < 0.5 * ortho.stat().st_size
     with pytest.raises(InputError):
         convert_cog(ortho, tmp_path / "n.tif", epsg=999_999)
+
+
+def test_what_gdal_cannot_write_is_an_error_of_the_system(ortho, tmp_path):
+    with rasterio.open(ortho) as image, pytest.raises(OSError, match="gone"):
+        copy_dataset(image, tmp_path / "gone" / "o.tif", driver="COG")
 
 
 def row(image, **more):

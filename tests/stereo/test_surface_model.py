@@ -7,7 +7,10 @@ import pytest
 import rasterio
 
 from gcs_plugin.cli.main import main
+from orthoswarm.export.surface_file import write_surface
+from orthoswarm.model.geo import GroundGrid
 from orthoswarm.report.surface_picture import relief
+from orthoswarm.stereo.surface_cells import SurfaceModel
 from tests.kit.scenes import tiny_twin
 
 
@@ -43,6 +46,25 @@ def test_heights_and_sigmas_are_those_of_the_scene(twin, made):
     assert np.median(error) < 0.4 and np.median(error[tall]) < 1.2  # a pixel is 0.67 m
     assert 0.6 < (error < stated).mean() < 0.9 and (error < 2 * stated).mean() > 0.9
     assert pairs.min() >= 2
+
+
+def test_the_file_is_a_cog_that_says_what_its_heights_are(tmp_path):
+    grid = GroundGrid(epsg=32632, west=465_000.0, north=5_250_000.0, gsd_m=0.1, width=1300, height=700)
+    height = np.linspace(3.0, 9.0, grid.height * grid.width, dtype=np.float32).reshape(grid.height, grid.width)
+    height[:, 500:613] = np.nan
+    for altitude, datum in ((400.0, "altitudes in the photos"), (None, "over the takeoff level")):
+        surface = SurfaceModel(grid, height, np.full_like(height, 0.2), np.full(height.shape, 3, np.uint8))
+        write_surface(tmp_path / "dsm.tif", surface, altitude)
+        assert [path.name for path in tmp_path.iterdir()] == ["dsm.tif"]
+        with rasterio.open(tmp_path / "dsm.tif") as file:
+            assert file.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG" and file.overviews(1) == [2, 4]
+            assert file.units[:2] == ("m", "m") and file.tags()["TIFFTAG_SOFTWARE"].startswith("OrthoSwarm")
+            assert datum in file.tags()["VERTICAL_DATUM"]
+            whole = file.read(1, masked=True)
+            assert np.array_equal(whole.filled(np.nan), height + np.float32(altitude or 0.0), equal_nan=True)
+        with rasterio.open(tmp_path / "dsm.tif", OVERVIEW_LEVEL=0) as half:
+            reduced = half.read(1, masked=True)
+        assert reduced.mask.any() and whole.min() <= reduced.min() < reduced.max() <= whole.max()  # gaps take no part
 
 
 def test_the_report_says_what_was_made(made):

@@ -18,8 +18,9 @@ from orthoswarm.export.catalog.tiled_raster import COLLECTION, FOLDER, VEHICLES,
 from orthoswarm.export.exterior_orientation import camera_of
 from orthoswarm.export.product_files import read_frames
 from orthoswarm.export.sheets.geojson_outline import joined_bbox, outline
-from orthoswarm.export.sheets.stac_item import raster_item
+from orthoswarm.export.sheets.stac_item import EXTENSIONS, raster_item
 from orthoswarm.export.sheets.stated_accuracy import stated_accuracy
+from orthoswarm.export.sheets.surface_asset import surface_assets
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.mosaic.footprint import footprint
 
@@ -161,10 +162,12 @@ def _collection(
     assets["report"] = {
         "href": "../report.html", "type": "text/html", "roles": ["metadata"], "title": "The map's accuracy",
     }  # fmt: skip
+    surface = surface_assets(folder, folder / FOLDER / COLLECTION)
+    assets |= surface
     links = [{"rel": "root", "href": f"./{COLLECTION}", "type": "application/json"}]
     links += [{"rel": "item", "href": f"./{where}", "type": "application/geo+json"} for where, _ in items]
     return {
-        "type": "Collection", "stac_version": "1.1.0", "stac_extensions": [], "id": name,
+        "type": "Collection", "stac_version": "1.1.0", "stac_extensions": EXTENSIONS if surface else [], "id": name,
         "title": "Orthoimage of drone photos",
         "description": stated.sentence if stated else "An orthoimage of drone photos in tiles.",
         "license": "other",

@@ -16,6 +16,7 @@ from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.export.sheets.geopdf import write_geopdf
 from orthoswarm.export.sheets.stac_item import picture_times, write_stac_item
 from orthoswarm.export.sheets.stated_accuracy import stated_accuracy
+from orthoswarm.export.sheets.surface_asset import SURFACE, surface_path
 from orthoswarm.export.tactical.cursor_on_target import write_data_package
 from orthoswarm.export.tactical.place_files import write_csv, write_gpx, write_kml
 from orthoswarm.export.tactical.places import Place, write_geojson
@@ -29,6 +30,8 @@ _PURPOSES: Final = {
     "orthoimage.tif": "For QGIS: the orthoimage (GeoTIFF)",
     "orthoimage.stac.json": "For catalogues: what it is, when and how accurate (STAC)",
     "footprints.gpkg": "For QGIS: footprints of the pictures (GeoPackage)",
+    "seamlines.gpkg": "For QGIS: which picture shows which ground (GeoPackage)",
+    SURFACE: "For QGIS: heights of the surface (GeoTIFF)",
     "orthoimage.mbtiles": "For phones and tablets (MBTiles)",
     "orthoimage.pmtiles": "For web maps (PMTiles)",
     "orthoimage.kmz": "For Google Earth (KMZ)",
@@ -49,7 +52,8 @@ def write_pack(
     """Write the pack of a map.
 
     Args:
-        cog: the orthoimage; footprints.gpkg, report.html, report.json and frames.jsonl beside it go in if there.
+        cog: the orthoimage; the surface model, footprints.gpkg, seamlines.gpkg and report.html beside it go in if
+            there.
         path: the ZIP. places: finds and vehicles. progress: called with steps done and steps in all.
 
     Raises:
@@ -102,7 +106,10 @@ def _draw_tiles(cog: Path, mbtiles: Path, kmz: Path) -> tuple[float, ...]:
 def _copy(cog: Path, folder: Path) -> None:
     """The files that there are beside the orthoimage already; report.json and frames.jsonl say time and accuracy."""
     shutil.copyfile(cog, folder / "orthoimage.tif")
-    for name in ("footprints.gpkg", "report.html", "report.json", "frames.jsonl"):
+    surface = surface_path(cog.parent)
+    if surface is not None:
+        shutil.copyfile(surface, folder / SURFACE)
+    for name in ("footprints.gpkg", "seamlines.gpkg", "report.html", "report.json", "frames.jsonl"):
         if (cog.parent / name).is_file():
             shutil.copyfile(cog.parent / name, folder / name)
 

@@ -12,10 +12,11 @@ from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.export.product_files import read_frames
 from orthoswarm.export.sheets.geojson_outline import outline
 from orthoswarm.export.sheets.stated_accuracy import stated_accuracy
+from orthoswarm.export.sheets.surface_asset import surface_assets
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import GroundGrid, LocalGrid
 
-_EXTENSIONS: Final = [
+EXTENSIONS: Final = [
     "https://stac-extensions.github.io/projection/v2.0.0/schema.json",
     "https://stac-extensions.github.io/raster/v1.1.0/schema.json",
 ]
@@ -26,7 +27,8 @@ _COLOURS: Final = ("red", "green", "blue", "alpha")
 def write_stac_item(cog: Path, path: Path) -> None:
     """Write the item of an orthoimage.
 
-    Time is that of its pictures (`frames.jsonl` beside it), accuracy what `report.json` beside it states.
+    Time is that of its pictures (`frames.jsonl` beside it), accuracy what `report.json` beside it states. A surface
+    model that the same run left beside it is a second asset.
 
     Args:
         cog: the orthoimage. path: the item, best in the same folder: it names the COG relatively to itself.
@@ -53,6 +55,7 @@ def write_stac_item(cog: Path, path: Path) -> None:
         grid, identifier=_identifier(cog), href=Path(os.path.relpath(cog, path.parent)).as_posix(),
         title="Orthoimage", properties=_properties(cog), asset="orthoimage", bands=bands,
     )  # fmt: skip
+    item["assets"] |= surface_assets(cog.parent, path)
     with atomic_write(path) as part:
         part.write_text(json.dumps(item, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
@@ -79,7 +82,7 @@ def raster_item(
         "bands": [{"name": name} for name in _COLOURS[:bands]],
     }  # fmt: skip
     return {
-        "type": "Feature", "stac_version": "1.1.0", "stac_extensions": _EXTENSIONS, "id": identifier,
+        "type": "Feature", "stac_version": "1.1.0", "stac_extensions": EXTENSIONS, "id": identifier,
         **outline(LocalGrid(grid.epsg).to_geographic(ring)),
         "properties": {**properties, "proj:code": f"EPSG:{grid.epsg}", "gsd": grid.gsd_m},
         "links": [], "assets": {asset: described},
