@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from orthoswarm.batch.run_state import RunContext, RunState
-from orthoswarm.export.product_files import takeoff_altitudes
 from orthoswarm.export.surface_file import write_surface
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.placement import PlacedFrame, Refinement, Terrain
+from orthoswarm.mosaic.takeoff_altitude import takeoff_levels
 from orthoswarm.stereo.surface_model import surface_model
 
 
@@ -37,8 +37,8 @@ def make_surface(
     terrain = replace(
         terrain, z=terrain.z + np.float32(moved_m), bare=None if terrain.bare is None else terrain.bare + moved_m
     )
-    levels = takeoff_altitudes(placed)
-    altitude = statistics.median(levels.values()) if levels else None
+    levels = takeoff_levels(placed)
+    altitude = statistics.median(level.altitude_m for level in levels.values()) if levels else None
     try:
         with run.clock.stage("final: surface", len(placed)):
             model = surface_model(

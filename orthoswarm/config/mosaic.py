@@ -45,6 +45,10 @@ class MosaicConfig:
     """... and so many sigmas of the ground's heights: the refiner holds the ground's median at its zero, and the place
     of takeoff may lie anywhere in the relief."""
 
+    vertical_sigmas: float = 2.0
+    """Sigma of a recorded altitude over that of the recorded place (an axis): satellites stand on one side of the
+    receiver only (vertical dilution of precision is 1.5 to 2.5 times the horizontal one of an axis)."""
+
     # Surface
     wall_slope: float = 1.2
     """Steeper measured surfaces are walls (chosen: 50 degrees; roofs and rubble are flatter)."""

@@ -22,7 +22,8 @@ def write_odm(
     """Write `images/`, `geo.txt` and `cameras.json`.
 
     geo.txt has longitude, latitude, altitude, yaw from true north, pitch (0 looks straight down, as ODM counts),
-    roll, and one sigma of the position. If the photos have no altitude, the height above the takeoff level is used.
+    roll, and one sigma of the position, across and up. If the photos have no altitude, the height above the takeoff
+    level is used.
     cameras.json, for ODM's `--cameras`, holds the solved lens. It is written where all photos share one: ODM tells
     lenses apart by the photos' tags, which are the same for two drones of a kind.
 
@@ -70,8 +71,9 @@ def write_odm(
 def _line(name: str, row: Mapping[str, Any]) -> str:
     camera = row["camera"]
     sigma = max(float(row["sigma_m"]), 0.01)
-    altitude = float(camera.get("altitude_m", camera["height_m"]))
+    up, up_sigma = ("altitude_m", "altitude_sigma_m") if "altitude_m" in camera else ("height_m", "height_sigma_m")
+    vertical = max(float(camera.get(up_sigma, 2.0 * sigma)), 0.01)  # a map of an earlier version has none
     return (
-        f"{name} {camera['lon_deg']:.9f} {camera['lat_deg']:.9f} {altitude:.3f} "
-        f"{camera['yaw_deg']:.4f} {camera['pitch_deg'] + 90.0:.4f} {camera['roll_deg']:.4f} {sigma:.3f} {2 * sigma:.3f}"
+        f"{name} {camera['lon_deg']:.9f} {camera['lat_deg']:.9f} {float(camera[up]):.3f} "
+        f"{camera['yaw_deg']:.4f} {camera['pitch_deg'] + 90.0:.4f} {camera['roll_deg']:.4f} {sigma:.3f} {vertical:.3f}"
     )

@@ -24,6 +24,7 @@ from orthoswarm.model.frame import Frame, Rejection
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import PlacedFrame, Solution
 from orthoswarm.mosaic.footprint import footprint
+from orthoswarm.mosaic.takeoff_altitude import TakeoffLevel, height_sigma_m, takeoff_levels
 from orthoswarm.stores.addresses import address_of
 
 Array = NDArray[np.float64]
@@ -87,15 +88,14 @@ def _camera_row(camera: Camera, grid: LocalGrid) -> dict[str, float]:
     }
 
 
-def takeoff_altitudes(placed: Sequence[PlacedFrame]) -> dict[str, float]:
-    """Absolute altitude of each vehicle's takeoff level, from photos with an altitude; absent without one."""
-    found: dict[str, list[float]] = {}
-    for p in placed:
-        if p.frame.fix.altitude_m is not None:
-            level = p.frame.fix.altitude_m - float(p.camera.position[2])
-            if -500.0 < level < 9000.0:
-                found.setdefault(p.frame.vehicle, []).append(level)
-    return {vehicle: statistics.median(levels) for vehicle, levels in found.items()}
+def _vertical(placed: PlacedFrame, level: TakeoffLevel | None) -> dict[str, float]:
+    """What `camera` says of a camera's height: one sigma of it, its altitude, and one sigma of that."""
+    found = {"height_sigma_m": height_sigma_m(placed)} if placed.pose_covariance is not None else {}
+    if level is not None:
+        altitude_m, sigma_m = level.of_camera(placed)
+        found |= {"altitude_m": altitude_m}
+        found |= {"altitude_sigma_m": sigma_m} if math.isfinite(sigma_m) else {}
+    return found
 
 
 def camera_matrix(camera: Camera, ground_z_m: float) -> Array:
@@ -204,14 +204,14 @@ def write_frames(
     Raises:
         OrthoSwarmError: if the disk is full or the folder cannot be written.
     """
-    levels = takeoff_altitudes(placed)
+    levels = takeoff_levels(placed)
 
     def lines() -> Iterator[str]:  # one at a time: 32,544 pictures have 60 MB of lines
         both: list[PlacedFrame | Rejection] = [*placed, *rejected]
         for one in sorted(both, key=_image):
             row = rejection_row(one, grid.epsg) if isinstance(one, Rejection) else frame_row(one, grid, z)
-            if "camera" in row and row["vehicle"] in levels:
-                row["camera"]["altitude_m"] = row["camera"]["height_m"] + levels[row["vehicle"]]
+            if isinstance(one, PlacedFrame):
+                row["camera"] |= _vertical(one, levels.get(one.frame.vehicle))
             if covariance and isinstance(one, PlacedFrame) and (of_pose := pose_covariance(one, z)) is not None:
                 row["camera"]["covariance"] = [[float(f"{v:.6g}") for v in line] for line in of_pose]
             yield json.dumps(row, ensure_ascii=False) + "\n"
