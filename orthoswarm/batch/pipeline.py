@@ -30,6 +30,7 @@ from orthoswarm.compute.workers import Workers, usage_of
 from orthoswarm.config import override
 from orthoswarm.control.control_observations import check_control
 from orthoswarm.evaluation.checkpoints import Checkpoint, read_checkpoints
+from orthoswarm.evaluation.independent_points import shared_points, shared_warning
 from orthoswarm.export.atomic_file import disk_error
 from orthoswarm.export.catalog.tiled_raster import product_file
 from orthoswarm.model.errors import InputError, OrthoSwarmError
@@ -136,7 +137,8 @@ def _load(run: RunContext, load: Load) -> RunState:
         warnings += partial_cover(basemap, recorded.placed)
     dem = None if run.options.dem is None else _height_model(run, run.options.dem, grid, recorded)
     rejected = {r.image: r for r in (*ingest.rejected, *recorded.rejected)}
-    control = _control_points(run, grid, recorded, basemap)
+    control, said = _control_points(run, grid, recorded, basemap)
+    warnings += said
     return RunState(
         ingest=ingest,
         grid=grid,
@@ -150,16 +152,18 @@ def _load(run: RunContext, load: Load) -> RunState:
     )
 
 
-def _control_points(run: RunContext, grid: LocalGrid, recorded: Recorded, basemap: Basemap | None) -> list[Checkpoint]:
-    """Read the points of --control; refuse unusable ones, and an unreadable file of --checkpoints, before the work."""
+def _control_points(
+    run: RunContext, grid: LocalGrid, recorded: Recorded, basemap: Basemap | None
+) -> tuple[list[Checkpoint], list[str]]:
+    """Read the points of --control, and warnings; refuse unusable ones and those of --checkpoints before the work."""
     options = run.options
-    if options.checkpoints is not None:
-        read_checkpoints(options.checkpoints, options.pixel_scale)
+    checks = [] if options.checkpoints is None else read_checkpoints(options.checkpoints, options.pixel_scale)
     if options.control is None:
-        return []
+        return [], []
     points = read_checkpoints(options.control, options.pixel_scale)
     check_control(points, recorded.placed, grid, basemap is not None)
-    return points
+    shared = shared_points(checks, points, options.checkpoints.name if options.checkpoints else "")
+    return points, shared_warning(shared, len(checks))
 
 
 def _height_model(run: RunContext, path: Path, grid: LocalGrid, recorded: Recorded) -> HeightModel | None:

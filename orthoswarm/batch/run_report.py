@@ -7,6 +7,7 @@ from typing import Any
 
 from orthoswarm.batch.run_state import COARSE, ORTHOIMAGE, PRODUCTS, REALTIME, SEAMLINES, RunContext, RunState
 from orthoswarm.evaluation.checkpoints import evaluate_checkpoints
+from orthoswarm.evaluation.independent_points import control_rows
 from orthoswarm.export.catalog.tiled_raster import remove_collection, remove_product, tiles_of
 from orthoswarm.export.product_files import (
     image_root,
@@ -43,7 +44,7 @@ def write_products(
     with run.clock.stage("final: report", len(placed)) as stage:
         write_frames(run.out, stated, list(state.rejected.values()), state.grid, z, covariance=run.options.covariance)
         report = _report(run, state, placed, refinement, z) | {"surface": surface}
-        _add_checkpoints(run, report, z)
+        _add_checkpoints(run, state, report, z)
         left_out = list(state.rejected.values())
         try:
             report["against_map_m"] = write_page(run.out, report, stated, rejected=left_out, basemap=state.basemap)
@@ -63,14 +64,16 @@ def write_products(
     return report
 
 
-def _add_checkpoints(run: RunContext, report: dict[str, Any], ground_z_m: float) -> None:
+def _add_checkpoints(run: RunContext, state: RunState, report: dict[str, Any], ground_z_m: float) -> None:
     """The errors at surveyed points, where the run was given some; from the placements that were just written."""
     report["checkpoints"] = None
     table = run.options.checkpoints
     if table is None:
         return
     try:
-        report["checkpoints"] = evaluate_checkpoints(run.out, table, run.options.pixel_scale, ground_z_m).figures()
+        report["checkpoints"] = evaluate_checkpoints(
+            run.out, table, run.options.pixel_scale, ground_z_m, control=state.control_points
+        ).figures()
     except InputError as error:
         report["warnings"].append(f"the checkpoints could not be measured: {error}")
 
@@ -110,6 +113,7 @@ def _report(
         "covered_share": state.drawn[1],
         "basemap": address_of(run.options.basemap) if run.options.basemap and state.basemap else None,
         "map_offset_m": None if state.map_offset is None else state.map_offset.document(),
+        "control_points": control_rows(state.control_points),
         "control": None if state.control is None else state.control.document(),
         "until": run.options.until,
         "config": {stage: dict(values) for stage, values in run.options.config.items()},

@@ -13,7 +13,7 @@ import csv
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.config import active
+from orthoswarm.evaluation.independent_points import Surveyed, control_of_report, shared_points
 from orthoswarm.evaluation.photo_names import photo_named
 from orthoswarm.model.camera import Lens, focal_px
 from orthoswarm.model.errors import InputError
@@ -81,6 +82,7 @@ class CheckpointAccuracy:
         survey_m: root mean square of the survey's own horizontal error, metres.
         unused: names of the points that no mapped photo shows.
         how: `photos`, `orthoimage` or both.
+        control: names of the points that were left out because they had placed the map.
     """
 
     names: list[str]
@@ -88,6 +90,8 @@ class CheckpointAccuracy:
     survey_m: float
     unused: list[str]
     how: str
+    _: KW_ONLY
+    control: list[str] = field(default_factory=list)
 
     @property
     def rmse(self) -> tuple[float, float]:
@@ -125,6 +129,7 @@ class CheckpointAccuracy:
             "measured_in": self.how,
             "statement": self.statement(),
             "unused": self.unused,
+            "control_left_out": self.control,
             "points": [
                 {"name": n, "east_m": float(e), "north_m": float(v)} for n, (e, v) in zip(self.names, self.error)
             ],
@@ -132,7 +137,12 @@ class CheckpointAccuracy:
 
 
 def evaluate_checkpoints(
-    out: Path, table: Path, pixel_scale: float = 1.0, ground_z_m: float | None = None
+    out: Path,
+    table: Path,
+    pixel_scale: float = 1.0,
+    ground_z_m: float | None = None,
+    *,
+    control: Sequence[Surveyed] | None = None,
 ) -> CheckpointAccuracy:
     """Errors of a product at surveyed points.
 
@@ -141,12 +151,15 @@ def evaluate_checkpoints(
         table: the points, see the module.
         pixel_scale: pixels of the mapped photos to one of the photos in which the points were measured.
         ground_z_m: level of the homographies, None to read it from report.json.
+        control: points that placed the map and do not count, None to read them from report.json.
 
     Raises:
         InputError: if the table cannot be read, or no point of it can be measured.
     """
     folder = out if out.is_dir() else out.parent
-    points = read_checkpoints(table, pixel_scale)
+    every = read_checkpoints(table, pixel_scale)
+    shared = shared_points(every, _control_of(folder) if control is None else control, table.name)
+    points = [point for point in every if point.name not in shared]
     views = _Views.read(folder, ground_z_m) if any(p.marks for p in points) else None
     grid = LocalGrid(views.epsg if views else _epsg(points))
     names, errors, sigmas, unused, how = [], [], [], [], set()
@@ -170,7 +183,17 @@ def evaluate_checkpoints(
             f"none of the {len(points)} points of {table.name} is seen in a mapped photo; check the names of the images"
         )
     survey = float(np.sqrt(2.0 * np.mean(np.square(sigmas))))
-    return CheckpointAccuracy(names, np.array(errors), survey, unused, " and ".join(sorted(how)))
+    measured_in = " and ".join(sorted(how))
+    return CheckpointAccuracy(names, np.array(errors), survey, unused, measured_in, control=shared)
+
+
+def _control_of(folder: Path) -> Sequence[Surveyed]:
+    """The control points of a map; none where it has no report that can be read (see _Views.read for its message)."""
+    try:
+        report = json.loads((folder / "report.json").read_text("utf-8"))
+        return control_of_report(report.get("control_points") or [])
+    except (OSError, ValueError, AttributeError, KeyError, TypeError):
+        return []
 
 
 def read_checkpoints(table: Path, pixel_scale: float = 1.0) -> list[Checkpoint]:

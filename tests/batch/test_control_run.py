@@ -79,6 +79,34 @@ def test_control_points_move_a_map_that_lies_beside_its_place(flight, tmp_path, 
     assert alone["rmse_h_m"] == pytest.approx(report["checkpoints"]["rmse_h_m"], abs=0.01)
 
 
+def test_control_points_are_no_checkpoints(flight, tmp_path, capsys):
+    control, check, both = flight / "control.csv", flight / "check.csv", tmp_path / "both.csv"
+    renamed = (line.replace("p", "q", 1) for line in control.read_text().splitlines()[1:])
+    both.write_text("\n".join([check.read_text(), *renamed]))
+    options = ["--checkpoints", both, "--control", control]
+    report = mosaic(flight, tmp_path / "out", *options)
+    found = report["checkpoints"]
+    assert found["checkpoints"] == 4 and found["control_left_out"] == ["q0", "q1", "q2"]
+    assert any("3 of 7 checkpoints" in warning for warning in report["warnings"])
+    capsys.readouterr()
+    assert main(["evaluate", str(tmp_path / "out"), "--checkpoints", str(both), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["checkpoints"] == 4
+    assert main(["evaluate", str(tmp_path / "out"), "--checkpoints", str(control)]) == 2
+    assert "keep some points out of --control" in capsys.readouterr().err
+
+    head, *rows = (line.split(",") for line in control.read_text().splitlines())
+    moved = tmp_path / "moved.csv"  # the same names in a system 2 m off
+    moved.write_text(
+        "\n".join(",".join(cells) for cells in [head, *([r[0], str(float(r[1]) + 2e-5), *r[2:]] for r in rows)])
+    )
+    for table in (control, moved):
+        out = tmp_path / "none"
+        options = ["--control", str(control), "--checkpoints", str(table)]
+        assert main(["mosaic", str(flight / "photos"), "--out", str(out), *options]) == 2
+        assert "keep some points out of --control" in capsys.readouterr().err
+        assert not (out / "orthoimage.tif").exists()
+
+
 def test_control_points_of_elsewhere_are_refused_before_the_work(flight, tmp_path, capsys):
     table = tmp_path / "far.csv"
     lines = (flight / "control.csv").read_text().splitlines()
