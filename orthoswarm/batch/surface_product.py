@@ -1,7 +1,8 @@
 """The surface model of a run (`--surface`)."""
 
+import math
 import statistics
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -12,7 +13,7 @@ from orthoswarm.batch.run_state import RunContext, RunState
 from orthoswarm.export.surface_file import write_surface
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.placement import PlacedFrame, Refinement, Terrain
-from orthoswarm.mosaic.takeoff_altitude import takeoff_levels
+from orthoswarm.mosaic.takeoff_altitude import TakeoffLevel, takeoff_levels
 from orthoswarm.stereo.surface_model import surface_model
 
 
@@ -39,13 +40,14 @@ def make_surface(
     )
     levels = takeoff_levels(placed)
     altitude = statistics.median(level.altitude_m for level in levels.values()) if levels else None
+    scale_sigma, common_m = _common_errors(placed, terrain, refinement, levels)
     try:
         with run.clock.stage("final: surface", len(placed)):
             model = surface_model(
                 placed, terrain, state.grid.epsg, run.space.scratch("surface"), run=run.drawers.map,
                 progress=partial(run.progress, "matching the surface"),
             )  # fmt: skip
-            write_surface(path, model, altitude)
+            write_surface(path, model, altitude, common_m)
     except OrthoSwarmError as error:
         state.warnings.append(f"the surface model was not made: {error}")
         return None
@@ -56,5 +58,30 @@ def make_surface(
         "cell_m": model.grid.gsd_m,
         "known_ha": round(float(known.sum()) * model.grid.gsd_m**2 / 1e4, 3),
         "median_sigma_m": round(float(np.median(model.sigma_m[known])), 3) if known.any() else None,
+        "common_sigma_m": None if common_m is None else round(common_m, 2),
+        "scale_sigma": None if scale_sigma is None else round(scale_sigma, 4),
         "takeoff_altitude_m": None if altitude is None else round(altitude, 2),
     }
+
+
+def _common_errors(
+    placed: Sequence[PlacedFrame], terrain: Terrain, refinement: Refinement, levels: Mapping[str, TakeoffLevel]
+) -> tuple[float | None, float | None]:
+    """What is wrong with all heights alike, which no comparison of pairs shows.
+
+    Over level ground pictures hardly tell a longer focal length from a higher flight: the ground's distance from the
+    cameras is as uncertain as the focal length, df / f = dfov / sin(fov). Altitudes have the receivers' error besides.
+
+    Returns:
+        One sigma of the scale of heights, as a share, and of all heights together, metres; None where not known.
+    """
+    known = {s.vehicle: s.fov_sigma_deg for s in refinement.fine if math.isfinite(s.fov_sigma_deg)}
+    own = [p for p in placed if p.frame.vehicle in known]
+    if not own:
+        return None, None
+    share = np.array([math.radians(known[p.frame.vehicle]) / math.sin(p.camera.lens.fov_rad) for p in own])
+    over_ground = np.array([p.camera.position[2] for p in own]) - terrain.height(
+        np.array([p.camera.nadir for p in own])
+    )
+    of_zero = statistics.median(level.sigma_m for level in levels.values()) if levels else 0.0
+    return float(np.median(share)), math.hypot(float(np.median(share * over_ground)), of_zero)

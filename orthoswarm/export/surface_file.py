@@ -21,12 +21,17 @@ _COG: Final = {
 }  # fmt: skip
 
 
-def write_surface(path: Path, surface: SurfaceModel, takeoff_altitude_m: float | None) -> None:
+def write_surface(
+    path: Path, surface: SurfaceModel, takeoff_altitude_m: float | None, common_sigma_m: float | None = None
+) -> None:
     """Write a COG, float32: band 1 height, band 2 one sigma, both metres, band 3 number of agreeing pairs.
+
+    The sigma is that of a height against those around. What is wrong with all heights alike stands in its description.
 
     Args:
         path: the file. surface: heights over the takeoff level.
         takeoff_altitude_m: altitude of that level as the receivers state it, added to the heights; None where unknown.
+        common_sigma_m: one sigma that all heights have in common, metres; None where unknown.
 
     Raises:
         StorageError: if the disk is full or the folder cannot be written.
@@ -41,9 +46,14 @@ def write_surface(path: Path, surface: SurfaceModel, takeoff_altitude_m: float |
     }  # fmt: skip
     unknown = ~np.isfinite(surface.height_m)
     zero = "the takeoff level" if takeoff_altitude_m is None else "the zero of the receivers' altitudes"
+    common = (
+        "what all heights have in common is not known"
+        if common_sigma_m is None
+        else f"all heights together have {common_sigma_m:.2f} m besides (one sigma)"
+    )
     bands = {
         f"height of the visible surface over {zero}, metres": surface.height_m + np.float32(takeoff_altitude_m or 0.0),
-        "one sigma of the height, metres": surface.sigma_m,
+        f"one sigma of the height against those around, metres; {common}": surface.sigma_m,
         "pairs of pictures that agree": surface.pairs.astype(np.float32),
     }
     tags = {"HEIGHTS_FROM": zero, "VERTICAL_DATUM": _NO_DATUM, "TIFFTAG_SOFTWARE": software()}

@@ -39,10 +39,13 @@ def surface_picture(surface: Mapping[str, Any]) -> tuple[NDArray[np.uint8], str]
         height = file.read(1, out_shape=shape, masked=True, resampling=Resampling.nearest)
         cell_m = file.res[0] * file.height / shape[0]
     z = np.ma.filled(height.astype(np.float64), np.nan)
+    common = surface.get("common_sigma_m")
+    zero = "the takeoff level" if surface["takeoff_altitude_m"] is None else "the zero of the receivers' altitudes"
     low, high = np.nanquantile(z, [0.01, 0.99]) if np.isfinite(z).any() else (np.nan, np.nan)
     text = (
-        f"Shaded heights of ground, roofs and crowns, from {low:.0f} to {high:.0f} m (98 % of the cells); cells of "
-        f"{surface['cell_m']:.2f} m, usual sigma {surface['median_sigma_m'] or np.nan:.2f} m. Empty: fewer than two "
-        "pairs of photos agree."
+        f"Shaded heights of ground, roofs and crowns, from {low:.0f} to {high:.0f} m above {zero} (98 % of the cells); "
+        f"cells of {surface['cell_m']:.2f} m. Usual sigma {surface['median_sigma_m'] or np.nan:.2f} m against the "
+        f"heights around{'' if common is None else f', and {common:.1f} m that all heights have in common'}. Empty: "
+        "fewer than two pairs of photos agree."
     )
     return relief(z, cell_m), text

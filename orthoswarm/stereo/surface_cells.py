@@ -38,7 +38,9 @@ class SurfaceModel:
     Attributes:
         grid: its cells.
         height_m: float32 (rows, columns), over the cameras' zero of heights, NaN where it is not known.
-        sigma_m: float32 (rows, columns), one sigma. pairs: uint8 (rows, columns), pairs of pictures that agree.
+        sigma_m: float32 (rows, columns), one sigma against the heights around, without what all heights have in common
+            (a wrong focal length moves and stretches them all).
+        pairs: uint8 (rows, columns), pairs of pictures that agree.
     """
 
     grid: GroundGrid

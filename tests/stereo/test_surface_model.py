@@ -11,6 +11,7 @@ from orthoswarm.export.surface_file import write_surface
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.report.surface_picture import relief
 from orthoswarm.stereo.surface_cells import SurfaceModel
+from orthoswarm.twin.make import SEA_LEVEL_M
 from tests.kit.scenes import tiny_twin
 
 
@@ -71,6 +72,26 @@ def test_the_report_says_what_was_made(made):
     surface = json.loads((made / "report.json").read_text())["surface"]
     assert surface["file"].endswith("dsm.tif") and surface["known_ha"] > 3.0
     assert 0.1 < surface["median_sigma_m"] < 1.0 < surface["cell_m"] < 2.0
+
+
+def test_the_error_that_all_heights_share_is_stated_with_them(twin, made):
+    surface = json.loads((made / "report.json").read_text())["surface"]
+    with rasterio.open(made / "dsm.tif") as file, rasterio.open(twin / "truth" / "dsm.tif") as truth:
+        height = file.read(1, masked=True)
+        rows, columns = np.nonzero(~np.ma.getmaskarray(height))
+        east, north = rasterio.transform.xy(file.transform, rows, columns)
+        row, column = (np.array(v) for v in rasterio.transform.rowcol(truth.transform, east, north))
+        inside = (row >= 0) & (column >= 0) & (row < truth.height) & (column < truth.width)
+        error = (height[rows, columns].data - SEA_LEVEL_M)[inside] - truth.read(1)[row[inside], column[inside]]
+        assert f"{surface['common_sigma_m']:.2f} m besides" in file.descriptions[1]
+    assert abs(np.median(error)) < 2.0 * surface["common_sigma_m"] < 12.0
+    fov = json.loads((made / "report.json").read_text())["vehicles"]
+    share = [np.radians(v["fov_sigma_deg"]) / np.sin(np.radians(v["fov_deg"])) for v in fov]
+    assert min(share) - 1e-4 <= surface["scale_sigma"] <= max(share) + 1e-4
+    assert surface["common_sigma_m"] > 80.0 * min(share)  # they fly 90 m up
+    page = (made / "report.html").read_text()
+    assert f"{surface['common_sigma_m']:.1f} m that all heights have in common" in page
+    assert "above the zero of the receivers" in page
 
 
 def test_the_page_shows_the_surface_and_the_range_of_the_expected_error(made):
