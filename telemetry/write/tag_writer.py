@@ -82,7 +82,7 @@ def exif_of(frame: Frame) -> bytes:
         stamp = moment.strftime("%Y:%m:%d %H:%M:%S")
         main.append(_text(0x0132, stamp))
         detail += [_text(0x9003, stamp), _text(0x9291, f"{moment.microsecond:06d}")]
-        if not frame.origin.get("time", "").endswith(ZONE_UNKNOWN):
+        if ZONE_UNKNOWN not in frame.origin.get("time", ""):
             detail.append(_text(0x9011, "+00:00"))
             seconds = moment.second * 1_000_000 + moment.microsecond
             gps += [

@@ -160,6 +160,18 @@ def test_frames_state_a_zone_only_where_it_is_known(tmp_path, capsys, offset, wr
         assert exif.get_ifd(0x8769)[0x9003] == ("2024:05:06 10:00:01" if offset else "2024:05:06 12:00:01")
 
 
+def test_times_without_a_zone_are_told_once(tmp_path):
+    for name, offset in (("a/1", None), ("a/2", None), ("b/1", None), ("c/1", "+02:00")):
+        path = tmp_path / f"{name}.jpg"
+        path.parent.mkdir(exist_ok=True)
+        jpeg(path, exif_bytes=gps_exif(offset=offset))
+    said = [w for w in load([tmp_path]).warnings if "zone" in w]
+    assert len(said) == 1 and said[0].startswith("times of 3 pictures have no zone and are taken as UTC")
+    found = summarise(survey([tmp_path]))["findings"]
+    assert [f["code"] for f in found if "zone" in f["message"]] == ["time-without-zone"]
+    assert not any("zone" in w for w in load([tmp_path / "c"]).warnings)
+
+
 def test_frames_without_anything_to_take_is_one_clear_error(tmp_path, capsys):
     make_video(tmp_path / "a.mp4", count=3)
     assert main(["frames", str(tmp_path / "a.mp4"), "--out", str(tmp_path / "o")]) == 2
