@@ -33,10 +33,12 @@ Array = NDArray[np.float64]
 def frame_row(placed: PlacedFrame, grid: LocalGrid, ground_z_m: float) -> dict[str, Any]:
     """The line of frames.jsonl of a placed frame.
 
-    `homography` maps a pixel (column, row, 1), distortion removed, to easting and northing on the plane
-    `ground_z_m`; `camera` has the camera's position, attitude (yaw from true north) and lens (focal
-    length in pixels, and those of k1, k2, k3, cx, cy of model.camera.Lens that are not 0), for other programs;
-    `recorded_height_m` is the height above takeoff that was recorded with the picture, absent if none was.
+    `homography` maps a pixel (column, row, 1), distortion removed by `k1` and `k2` beside it alone, to easting and
+    northing on the plane `ground_z_m`; both are refitted to a lens without `cx`, `cy` and `k3`, which stand there only
+    to say that the full lens, that of `camera`, has them. `camera` has the camera's position, attitude (yaw from true
+    north) and lens (focal length in pixels, and those of k1, k2, k3, cx, cy of model.camera.Lens that are not 0), for
+    other programs; `recorded_height_m` is the height above takeoff that was recorded with the picture, absent if none
+    was.
     """
     frame, camera = placed.frame, placed.camera
     lens = camera.lens

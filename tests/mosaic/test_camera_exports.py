@@ -68,6 +68,19 @@ def test_the_camera_block_of_frames_jsonl_is_the_camera(tmp_path):
         assert np.abs(camera_of(row).project(ground) - pixels).max() < 1e-3
 
 
+def test_a_reader_of_the_homography_needs_the_two_terms_beside_it_and_no_more(tmp_path):
+    cameras, rows = flight(tmp_path)
+    for camera, row in zip(cameras, rows):
+        wide, (_, pixels) = camera.lens, ground_seen(camera)
+        lens = Lens(wide.width, wide.height, wide.focal_px, k1=row.get("k1", 0.0), k2=row.get("k2", 0.0))
+        assert row["fov_deg"] == pytest.approx(np.degrees(lens.fov_rad))
+        middle = np.array(lens.principal_point)
+        plain = lens.undistort((pixels - middle) / lens.focal_px) * lens.focal_px + middle
+        found = np.c_[plain, np.ones(len(plain))] @ np.array(row["homography"]).T
+        pixel_m = camera.position[2] / lens.focal_px
+        assert np.abs(found[:, :2] / found[:, 2:] - camera.to_ground(pixels, 0.0)).max() < 0.5 * pixel_m
+
+
 def test_colmap_projects_ground_where_we_do(tmp_path):
     cameras, rows = flight(tmp_path)
     assert write_colmap(rows, lambda row: tmp_path / row["image"], tmp_path / "colmap") == []
