@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from orthoswarm import __version__
 from orthoswarm.export.catalog.tiled_raster import product_file
-from orthoswarm.export.product_files import write_text
+from orthoswarm.export.product_files import iso_time, write_text
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.frame import Rejection
 from orthoswarm.model.geo import GroundGrid
@@ -118,7 +118,7 @@ def write_page(
     values["facts"] = _facts(report, placed, shifts)
     values["fov"] = charts.fields_of_view(report["vehicles"])
     values["times"] = charts.times(report["stages"])
-    values["legs"] = _leg_summary(report)
+    values["legs"], values["on_map"] = _leg_summary(report), _on_map(report)
     write_text(out / "report.html", [environment.get_template("page.html.j2").render(values)])
     return None if shifts is None or not len(shifts.at) else _against_map(shifts)
 
@@ -274,11 +274,11 @@ def _paths(reduced: Picture, placed: Sequence[PlacedFrame], report: Mapping[str,
         draw_lines(picture, [np.array([p.camera.nadir for p in own])], (150, 155, 165), 1)
     for leg in report["legs"]:
         own = by_vehicle.get(leg["vehicle"], [])[leg["first"] : leg["last"] + 1]
-        colour = _LEGS[leg["state"]] if report["basemap"] else _VEHICLES[0]
+        colour = _LEGS[leg["state"]] if _on_map(report) else _VEHICLES[0]
         draw_lines(picture, [np.array([p.camera.nadir for p in own])] if own else [], colour, 3)
     scale_bar(picture)
     text = "Green: matched to the map. Orange: carried by the others. Red: failed. Grey: turns."
-    if not report["basemap"]:
+    if not _on_map(report):
         text = "Straight legs of the flights; grey: turns."
     return Figure("Legs", data_uri(picture.rgb), text)
 
@@ -294,13 +294,13 @@ def _verdict(report: Mapping[str, Any], placed: Sequence[PlacedFrame], shifts: M
     if report["until"] == "realtime" or report["refine"] == "none":
         return {
             "kind": "rough",
-            "text": f"Rough picture from recorded positions; expect errors of about {usual:.0f} m.",
+            "text": f"Rough picture from recorded positions; expect errors of about {usual:.0f} m (one sigma an axis).",
         }
     if report.get("control"):
         return _control_verdict(report["control"], _expected(sigma))
     if not fine:
         text = "Consistent in itself, but placed where the drones' receivers say, not on a map"
-        return {"kind": "rough", "text": f"{text}; expect errors of about {usual:.1f} m."}
+        return {"kind": "rough", "text": f"{text}; expect errors of about {usual:.1f} m (one sigma an axis)."}
     text = (
         f"Lies on the pre-disaster map; expected error against it {_expected(sigma)}, of open ground, "
         "computed from how well pictures and map fit together"
@@ -353,7 +353,10 @@ def _control_verdict(control: Mapping[str, Any], expected: str) -> dict[str, str
 def _facts(report: Mapping[str, Any], placed: Sequence[PlacedFrame], shifts: Moved | None) -> list[tuple[str, str]]:
     frames = report["frames"]
     gsd = float(report["gsd_m"])
+    days = _days(placed)
     facts = [
+        (f"EPSG:{report['epsg']}", crs_name(report["epsg"])),
+        *([(days, "taken")] if days else []),
         (f"{frames['used']:,} of {frames['input']:,}", "pictures mapped"),
         (str(len(report["vehicles"])), "vehicle" if len(report["vehicles"]) == 1 else "vehicles"),
         (f"{gsd * 100:.1f} cm" if gsd < 1 else f"{gsd:.2f} m", "ground pixel"),
@@ -366,6 +369,27 @@ def _facts(report: Mapping[str, Any], placed: Sequence[PlacedFrame], shifts: Mov
     if checked is not None:
         facts.append((f"{checked['rmse_h_m']:.2f} m", f"RMSE horizontal at {checked['checkpoints']} checkpoints"))
     return [*facts, (f"{report['wall_s']:.0f} s", "to make"), (f"{report['peak_rss_mb']:,.0f} MB", "memory")]
+
+
+def crs_name(epsg: int) -> str:
+    """Name of a coordinate system, as QGIS and others show it."""
+    from pyproj import CRS
+
+    return str(CRS.from_epsg(epsg).name)
+
+
+def _days(placed: Sequence[PlacedFrame]) -> str:
+    """First and last day of the pictures' times; empty where none is known."""
+    times = [text[:10] for p in placed if (text := iso_time(p.frame.time_s))]
+    if not times:
+        return ""
+    first, last = min(times), max(times)
+    return first if first == last else f"{first} to {last}"
+
+
+def _on_map(report: Mapping[str, Any]) -> bool:
+    """Whether the pictures were to be found on a map: without that, no leg has failed at it."""
+    return bool(report["basemap"]) and report["until"] == "fine"
 
 
 def _leg_summary(report: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -145,6 +145,10 @@ def test_the_page_stands_alone_and_has_its_pictures(mapped):
     assert page.count("data:image/jpeg;base64,") >= 6
     assert not re.search(r"""(src|href)=["']?(http|/|\w+\.)""", page)
     assert "broken.jpg" in page and "Lies on the pre-disaster map" in page
+    report, rows = mapped[1], rows_of(mapped[0])
+    day = min(row["time"] for row in rows.values() if row["time"])[:10]
+    assert f"<b>EPSG:{report['epsg']}</b><span>WGS 84 / UTM zone" in page and f"<b>{day}</b><span>taken" in page
+    assert 'class="leg matched"' in page
 
 
 def test_footprints_open_as_polygons(flight, mapped):
@@ -325,6 +329,8 @@ def test_stopping_early_makes_what_was_asked(flight, tmp_path):
     report = make(folder / "photos" / "a", tmp_path / "c", Options(basemap=folder / "map.tif", until="coarse"))
     assert {p.name for p in (tmp_path / "c").iterdir()} == set(PRODUCTS) - {"orthoimage.tif", "seamlines.gpkg"}
     assert {r["stage"] for r in rows_of(tmp_path / "c").values()} == {"coarse", "rejected"}
+    page = (tmp_path / "c" / "report.html").read_text()  # nothing was searched for on the map, so nothing failed
+    assert "failed" not in page.partition("<main>")[2] and " m (one sigma an axis)" in page
     assert abs(report["vehicles"][0]["fov_deg"] - FOV) < 4
 
 
