@@ -162,12 +162,14 @@ class LivePoses:
         """Process a MAVLink message of this vehicle; if it is a camera event, returns it with its complete pose.
 
         Args:
-            message: decoded by pymavlink.
-            arrival_s: time of arrival, UTC epoch seconds, for vehicles that do not know UTC; None for now.
+            message: decoded by pymavlink, of any component of the vehicle.
+            arrival_s: time of arrival, UTC epoch seconds, for vehicles that do not know UTC and components with
+                clocks of their own; None for now.
         """
-        reboots = self._mavlink.reboots
-        found = self._mavlink.feed(message)
-        if self._mavlink.reboots != reboots:
+        arrival_s = self._clock() if arrival_s is None else arrival_s
+        bases = self._mavlink.bases
+        found = self._mavlink.feed(message, arrival_s)
+        if self._mavlink.bases != bases:
             self._arrival_offset = None
         if found is None:
             return None
@@ -233,22 +235,21 @@ class LivePoses:
         """Whether any message contained the camera's own attitude."""
         return self._mavlink.has_gimbal or self._camera.filled
 
-    def _utc(self, boot_s: float, arrival_s: float | None) -> float:
+    def _utc(self, boot_s: float, arrival_s: float) -> float:
         """UTC of a time since boot: by the vehicle's clock, else by the quickest arrival so far."""
         known = self._mavlink.utc(boot_s)
         if known is not None:
             return known
-        offset = (self._clock() if arrival_s is None else arrival_s) - boot_s
+        offset = arrival_s - boot_s
         if self._arrival_offset is None or offset < self._arrival_offset:
             self._arrival_offset = offset
         return boot_s + self._arrival_offset
 
-    def _event(self, event: CameraEvent, arrival_s: float | None) -> CameraEvent:
+    def _event(self, event: CameraEvent, arrival_s: float) -> CameraEvent:
         """Complete an exposure: the autopilot's values, replaced by more accurate ones of the bus."""
         if event.time_s is None:
             boot_s = event.boot_s
-            now_s = self._clock() if arrival_s is None else arrival_s
-            event.time_s = now_s if boot_s is None else self._utc(boot_s, arrival_s)
+            event.time_s = arrival_s if boot_s is None else self._utc(boot_s, arrival_s)
         own = event.sample
         own.vehicle, own.time_s = self.vehicle, event.time_s
         around = self.read(event.time_s)

@@ -180,9 +180,9 @@ class _TlogVehicle:
         self._latest: dict[tuple[bool, bool, bool], float] = {}
 
     def feed(self, message: object, arrival_s: float) -> None:
-        reboots = self._poses.reboots
-        found = self._poses.feed(message)
-        if self._poses.reboots != reboots:
+        bases = self._poses.bases
+        found = self._poses.feed(message, arrival_s)
+        if self._poses.bases != bases:
             self._close()
         clock = self._poses.utc_minus_boot_s
         if clock is not None and (not self._clocks or clock != self._clocks[-1]):

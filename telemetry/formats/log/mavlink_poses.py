@@ -2,7 +2,8 @@
 
 Used both for live links (`telemetry.live`) and for tlogs (`flight_logs`). Angles of a gimbal are interpreted in the
 frame that its flags name; without any gimbal message the camera is assumed fixed under the airframe, its picture's up
-towards the nose. Message fields: MAVLink common and ardupilotmega.
+towards the nose. All components of a vehicle may be fed: position, attitude and UTC are taken from the autopilot's,
+times of others are converted to its clock. Message fields: MAVLink common and ardupilotmega.
 """
 
 import math
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from telemetry.formats.log.sender_clocks import AUTOPILOT, SenderClocks
 from telemetry.samples.rotations import camera_angles_deg, euler_ned, mounted_down_deg, quaternion_ned
 from telemetry.samples.sample import Sample, checked, is_position
 from telemetry.samples.times import YEAR_2000_S
@@ -22,7 +24,6 @@ Array = NDArray[np.float64]
 _YAW_LOCK, _YAW_IN_VEHICLE, _YAW_IN_EARTH = 16, 32, 64
 _LEAST_HEIGHT_M = 0.5
 _DOWNWARD = 25
-_REBOOT_S = 10.0
 _MOST_H_ACC_MM = 1_000_000
 _LOOKS_DOWN = 0.7
 """Sine of 45 degrees: no airframe flies that far nose down."""
@@ -31,10 +32,19 @@ TYPES = frozenset(
     {
         "SYSTEM_TIME", "GLOBAL_POSITION_INT", "ATTITUDE", "ATTITUDE_QUATERNION", "GIMBAL_DEVICE_ATTITUDE_STATUS",
         "MOUNT_ORIENTATION", "CAMERA_FEEDBACK", "CAMERA_IMAGE_CAPTURED", "CAMERA_TRIGGER",
-        "TERRAIN_REPORT", "RANGEFINDER", "DISTANCE_SENSOR", "HOME_POSITION", "GPS_RAW_INT",
+        "TERRAIN_REPORT", "RANGEFINDER", "DISTANCE_SENSOR", "HOME_POSITION", "GPS_RAW_INT", "HEARTBEAT",
     }
 )  # fmt: skip
 """Message types that say anything here."""
+
+_OF_AUTOPILOT = frozenset(
+    {"SYSTEM_TIME", "GLOBAL_POSITION_INT", "ATTITUDE", "ATTITUDE_QUATERNION", "HOME_POSITION", "GPS_RAW_INT"}
+)
+"""Types that count only from the autopilot: a gimbal's ATTITUDE is not the airframe's, and MAVROS sends SYSTEM_TIME."""
+_NO_AUTOPILOT = 8
+"""MAV_AUTOPILOT_INVALID, which HEARTBEATs of everything but autopilots contain."""
+_NO_VEHICLES = frozenset({6, 26, 30})
+"""MAV_TYPE of ground stations, gimbals and cameras, some of which fill in an autopilot nevertheless."""
 
 
 @dataclass(slots=True)
@@ -59,29 +69,56 @@ class MavlinkPoses:
     """Turns one vehicle's messages into samples and camera events.
 
     Attributes:
-        utc_minus_boot_s: offset from time since boot to UTC, None until the vehicle knows UTC.
         heading_deg: of the airframe, latest. has_gimbal: whether a gimbal reported.
-        reboots: number of times that the time since boot went back. home_altitude_m: altitude of home above sea level.
+        home_altitude_m: altitude of home above sea level.
         position_sigma_m: horizontal sigma stated by the receiver, None if it states none.
     """
 
-    utc_minus_boot_s: float | None = None
     heading_deg: float | None = None
     has_gimbal: bool = False
-    reboots: int = 0
     home_altitude_m: float | None = None
     position_sigma_m: float | None = None
-    _boot_s: float = field(default=0.0, repr=False)
+    _clocks: SenderClocks = field(default_factory=SenderClocks, repr=False)
+    _arrival_s: float | None = field(default=None, repr=False)
 
-    def feed(self, message: Any) -> Sample | CameraEvent | None:
-        """Process a message; returns its sample (time in seconds since boot) or event, None if it has neither."""
-        handler = _HANDLERS.get(message.get_type())
+    @property
+    def utc_minus_boot_s(self) -> float | None:
+        """Offset from the autopilot's time since boot to UTC, None until it knows UTC."""
+        return self._clocks.utc_minus_boot_s
+
+    @property
+    def reboots(self) -> int:
+        """Number of times that the autopilot's time since boot went back."""
+        return self._clocks.reboots
+
+    @property
+    def bases(self) -> int:
+        """Number of times that times since boot began to count from another moment; earlier ones do not compare."""
+        return self._clocks.bases
+
+    def feed(self, message: Any, arrival_s: float | None = None) -> Sample | CameraEvent | None:
+        """Process a message of any component of the vehicle.
+
+        Args:
+            message: decoded by pymavlink.
+            arrival_s: when it came, seconds of any clock; None if unknown, then other components' clocks are compared
+                with the autopilot's latest message.
+
+        Returns:
+            Its sample (time in seconds since the autopilot's boot) or event, None if it has neither.
+        """
+        name = message.get_type()
+        handler = _HANDLERS.get(name)
         if handler is None:
             return None
+        positions = name == "GLOBAL_POSITION_INT"
+        if not self._clocks.is_autopilot(_sender(message), positions=positions) and name in _OF_AUTOPILOT:
+            return None
+        self._arrival_s = arrival_s
         result: Sample | CameraEvent | None = handler(self, message)
         if isinstance(result, Sample):
             if result.time_s is None:
-                result.time_s = self._boot_s
+                result.time_s = self._clocks.boot_s
             return _checked(result)
         return result
 
@@ -91,22 +128,21 @@ class MavlinkPoses:
             return None
         return boot_s + self.utc_minus_boot_s
 
-    def _boot(self, milliseconds: int) -> float:
-        boot_s = milliseconds * 1e-3
-        if boot_s < self._boot_s - _REBOOT_S:
-            self.reboots += 1
-            self.utc_minus_boot_s = None
-        self._boot_s = boot_s
-        return boot_s
+    def _boot(self, m: Any) -> float | None:
+        """Seconds since the autopilot's boot of a message's time_boot_ms; None while that clock is unknown."""
+        return self._clocks.heard(_sender(m), m.time_boot_ms * 1e-3, self._arrival_s)
+
+    def _heartbeat(self, m: Any) -> None:
+        flies = m.autopilot != _NO_AUTOPILOT and m.type not in _NO_VEHICLES
+        self._clocks.is_autopilot(_sender(m), flies=flies)
 
     def _system_time(self, m: Any) -> None:
-        boot_s = self._boot(m.time_boot_ms)
-        utc_s = m.time_unix_usec * 1e-6
-        if utc_s > YEAR_2000_S:
-            self.utc_minus_boot_s = utc_s - boot_s
+        utc_s, boot_s = m.time_unix_usec * 1e-6, self._boot(m)
+        if utc_s > YEAR_2000_S and m.time_boot_ms > 0 and boot_s is not None:  # 0: the sender has no clock of its own
+            self._clocks.utc_minus_boot_s = utc_s - boot_s
 
     def _position(self, m: Any) -> Sample | None:
-        boot_s = self._boot(m.time_boot_ms)
+        boot_s = self._boot(m)
         if not is_position(m.lat * 1e-7, m.lon * 1e-7):
             return None  # no fix yet: the height is invalid, too
         return Sample(
@@ -119,13 +155,13 @@ class MavlinkPoses:
 
     def _attitude(self, m: Any) -> Sample:
         yaw, pitch, roll = math.degrees(m.yaw), math.degrees(m.pitch), math.degrees(m.roll)
-        return self._airframe(self._boot(m.time_boot_ms), yaw, pitch, roll)
+        return self._airframe(self._boot(m), yaw, pitch, roll)
 
     def _attitude_quaternion(self, m: Any) -> Sample:
         yaw, pitch, roll = euler_deg(quaternion_ned(m.q1, m.q2, m.q3, m.q4))
-        return self._airframe(self._boot(m.time_boot_ms), yaw, pitch, roll)
+        return self._airframe(self._boot(m), yaw, pitch, roll)
 
-    def _airframe(self, boot_s: float, yaw: float, pitch: float, roll: float) -> Sample:
+    def _airframe(self, boot_s: float | None, yaw: float, pitch: float, roll: float) -> Sample:
         self.heading_deg = yaw
         return Sample(time_s=boot_s, flight_yaw_deg=yaw, flight_pitch_deg=pitch, flight_roll_deg=roll)
 
@@ -133,8 +169,7 @@ class MavlinkPoses:
         rotation = gimbal_rotation(m.q, m.flags, self.heading_deg)
         if rotation is None:
             return None
-        self.has_gimbal = True
-        return _camera(self._boot(m.time_boot_ms), rotation)
+        return self._camera(m, rotation)
 
     def _mount(self, m: Any) -> Sample | None:
         yaw = m.yaw_absolute
@@ -144,8 +179,15 @@ class MavlinkPoses:
             yaw = self.heading_deg + m.yaw
         if not all(map(math.isfinite, (yaw, m.pitch, m.roll))):
             return None
+        return self._camera(m, euler_ned(yaw, m.pitch, m.roll))
+
+    def _camera(self, m: Any, forward_ned: Any) -> Sample | None:
         self.has_gimbal = True
-        return _camera(self._boot(m.time_boot_ms), euler_ned(yaw, m.pitch, m.roll))
+        boot_s = self._boot(m)
+        if boot_s is None:
+            return None
+        yaw, pitch, roll = camera_angles_deg(forward_ned)
+        return Sample(time_s=boot_s, yaw_deg=yaw, pitch_deg=pitch, roll_deg=roll)
 
     def _home(self, m: Any) -> None:
         self.home_altitude_m = m.altitude * 1e-3
@@ -175,7 +217,7 @@ class MavlinkPoses:
             flight_pitch_deg=m.pitch,
             flight_roll_deg=m.roll,
         )
-        return self._event(m.time_usec * 1e-6, m.img_idx, sample, "CAMERA_FEEDBACK")
+        return self._event(m, m.time_usec * 1e-6, m.img_idx, sample)
 
     def _captured(self, m: Any) -> CameraEvent | None:
         if m.capture_result == 0:
@@ -186,26 +228,26 @@ class MavlinkPoses:
         elif self.home_altitude_m is not None and sample.altitude_m is not None:
             sample.height_m = sample.altitude_m - self.home_altitude_m
         put_capture_attitude(sample, m.q)
-        utc_s = m.time_utc * 1e-6
-        boot_s = self._boot(m.time_boot_ms)
-        event = self._event(utc_s, m.image_index, sample, "CAMERA_IMAGE_CAPTURED")
-        event.boot_s = boot_s
-        if event.time_s is None:
-            event.time_s = self.utc(boot_s)
-        return event
+        utc_s = m.time_utc * 1e-6  # 0, or time since boot, from a camera that does not know UTC
+        return self._event(m, utc_s if utc_s > YEAR_2000_S else m.time_boot_ms * 1e-3, m.image_index, sample)
 
     def _trigger(self, m: Any) -> CameraEvent:
-        return self._event(m.time_usec * 1e-6, m.seq, Sample(), "CAMERA_TRIGGER")
+        return self._event(m, m.time_usec * 1e-6, m.seq, Sample())
 
-    def _event(self, seconds: float, number: int, sample: Sample, kind: str) -> CameraEvent:
+    def _event(self, m: Any, seconds: float, number: int, sample: Sample) -> CameraEvent:
         """An event whose time is UTC, or time since boot where the value is too small for UTC."""
         if seconds > YEAR_2000_S:
             boot_s = None if self.utc_minus_boot_s is None else seconds - self.utc_minus_boot_s
             time_s: float | None = seconds
         else:
-            boot_s, time_s = (seconds if seconds > 0 else self._boot_s), None
+            boot_s = self._clocks.of(_sender(m), seconds, self._arrival_s)
             time_s = self.utc(boot_s)
-        return CameraEvent(time_s, boot_s, int(number), checked(sample) or Sample(), kind)
+        return CameraEvent(time_s, boot_s, int(number), checked(sample) or Sample(), m.get_type())
+
+
+def _sender(message: Any) -> int:
+    """The component that sent a message."""
+    return message.get_srcComponent() or AUTOPILOT
 
 
 def _checked(sample: Sample) -> Sample | None:
@@ -257,11 +299,6 @@ def put_capture_attitude(sample: Sample, q: Sequence[float]) -> None:
         sample.flight_yaw_deg, sample.flight_pitch_deg, sample.flight_roll_deg = euler_deg(rotation)
 
 
-def _camera(boot_s: float, forward_ned: Any) -> Sample:
-    yaw, pitch, roll = camera_angles_deg(forward_ned)
-    return Sample(time_s=boot_s, yaw_deg=yaw, pitch_deg=pitch, roll_deg=roll)
-
-
 def _above_ground(metres: float) -> Sample | None:
     if not math.isfinite(metres) or not _LEAST_HEIGHT_M < metres < 5000.0:
         return None
@@ -277,6 +314,7 @@ def fixed_camera(sample: Sample) -> Sample:
 
 
 _HANDLERS: dict[str, Any] = {
+    "HEARTBEAT": MavlinkPoses._heartbeat,
     "SYSTEM_TIME": MavlinkPoses._system_time,
     "GLOBAL_POSITION_INT": MavlinkPoses._position,
     "ATTITUDE": MavlinkPoses._attitude,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from telemetry.formats.log.dataflash import read_dataflash
-from telemetry.formats.log.flight_logs import read_tlog
+from telemetry.formats.log.flight_logs import read_log, read_tlog
 from telemetry.formats.log.mavlink_poses import MavlinkPoses, fixed_camera
 from telemetry.live.live_poses import LivePoses
 from telemetry.samples.sample import Sample
@@ -195,3 +195,125 @@ def test_dataflash_heights_of_a_rangefinder_and_gimbal_are_read(tmp_path):
     assert (sample.height_m, sample.height_is_ground) == (pytest.approx(41.5), True)
     assert (sample.yaw_deg, sample.pitch_deg) == pytest.approx((77.0, -90.0), abs=1e-4)
     assert timeline.span[0] == pytest.approx(315_964_800 + 2300 * 604_800 + 100.0 - 18.0, abs=0.01)
+
+
+# --- several components with clocks of their own -------------------------------------------------------------------
+
+
+T0 = 1_780_000_000.0
+DOWN = [math.cos(-math.pi / 4), 0.0, math.sin(-math.pi / 4), 0.0]
+GIMBAL, COMPANION, CAMERA = 154, 240, 100
+
+
+def flight(*, autopilot=1, gimbal_late_s=None, mavros=False, camera_boot_s=None, jitter_s=0.0, pace=1.0, utc=True):
+    """Arrival, component and message of 120 s northwards at 10 Hz; every 30 s the heading turns by 180 degrees."""
+    rng = np.random.default_rng(3)
+    for i in range(1200):
+        t = i * 0.1
+        boot_ms = round((t + 100) * 1000)
+
+        def put(component, message, t=t):
+            message.pack(mavlink.MAVLink(None, srcSystem=1, srcComponent=component))
+            return T0 + t / pace + jitter_s * rng.random(), component, message
+
+        if gimbal_late_s is not None and t + 100 > gimbal_late_s:
+            yield put(GIMBAL, gimbal(boot_ms - round(gimbal_late_s * 1000), DOWN, 32))
+        if i % 10 == 0:
+            yield put(autopilot, mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 0, 3))
+            if utc:
+                yield put(autopilot, mavlink.MAVLink_system_time_message(round((T0 + t) * 1e6), boot_ms))
+        yield put(autopilot, position(boot_ms, 47.5 + i * 1e-5))
+        yield put(autopilot, attitude(boot_ms, yaw=heading(t)))
+        if mavros and i % 10 == 5:
+            yield put(COMPANION, mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 0, 3))
+            yield put(COMPANION, mavlink.MAVLink_system_time_message(round((T0 + t) * 1e6), 0))
+            yield put(COMPANION, attitude(5000, yaw=77.0))
+        if camera_boot_s is not None and i % 20 == 8:
+            own = round((t + camera_boot_s) * 1000)
+            yield put(
+                CAMERA,
+                mavlink.MAVLink_camera_image_captured_message(
+                    own, 0, 1, 0, 0, 0, 0, [math.nan] * 4, i // 20, 1, b""
+                ),
+            )  # fmt: skip
+
+
+def heading(t):
+    return 0.0 if int(t // 30) % 2 == 0 else 180.0
+
+
+def tlog(path, heard):
+    """A tlog of arrivals and packed messages."""
+    order = sorted(heard, key=lambda row: row[0])
+    path.write_bytes(b"".join(struct.pack(">Q", round(at * 1e6)) + bytes(m.get_msgbuf()) for at, _, m in order))
+    return path
+
+
+def yaw_errors(at):
+    """Errors in degrees of the camera's yaw, away from the turns by 180 degrees."""
+    times = [t for t in np.arange(5.03, 115.0, 0.5) if 0.5 < t % 30 < 29.5]
+    poses = [(at(T0 + t).yaw_deg, heading(t)) for t in times]
+    assert all(yaw is not None for yaw, _ in poses)
+    return np.abs([(yaw - true + 180) % 360 - 180 for yaw, true in poses])
+
+
+@pytest.mark.parametrize("autopilot", [1, 5])
+@pytest.mark.parametrize("late_s", [0.0, 5.0, 30.0, -40.0])
+def test_a_gimbals_own_clock_moves_neither_the_track_nor_its_angles(tmp_path, late_s, autopilot):
+    heard = list(flight(autopilot=autopilot, gimbal_late_s=late_s, jitter_s=0.15))
+    (log,) = read_log(tlog(tmp_path / "a.tlog", heard))
+    assert not log.findings
+    track = [s for s in log.samples if s.has_position]
+    assert len(track) > 1100
+    assert [s.time_s - T0 - (s.lat_deg - 47.5) * 1e4 for s in track] == pytest.approx(
+        0.0 * np.arange(len(track)), abs=0.01
+    )
+    assert yaw_errors(log.timeline().at).max() < 1.0
+    live = LivePoses("v1")
+    for at, _, message in sorted(heard, key=lambda row: row[0]):
+        live.feed(message, at)
+    assert yaw_errors(live.at).max() < 1.0
+
+
+def test_a_gimbals_own_clock_is_followed_in_a_simulation_that_runs_fast(tmp_path):
+    (log,) = read_log(tlog(tmp_path / "a.tlog", flight(gimbal_late_s=30.0, pace=9.0)))
+    assert {f.code for f in log.findings} == {"tlog-pace"}
+    assert yaw_errors(log.timeline().at).max() < 1.0
+
+
+def test_a_gimbal_that_restarts_is_no_restart_of_the_vehicle(tmp_path):
+    first = [row for row in flight(gimbal_late_s=5.0) if row[0] < T0 + 60.0]
+    second = [row for row in flight(gimbal_late_s=155.0) if row[0] >= T0 + 60.0]
+    (log,) = read_log(tlog(tmp_path / "a.tlog", first + second))
+    assert not log.findings
+    assert yaw_errors(log.timeline().at).max() < 1.0
+
+
+@pytest.mark.parametrize("utc", [True, False])
+def test_a_companion_computer_does_not_set_the_vehicles_clock(tmp_path, utc):
+    """MAVROS sends SYSTEM_TIME with time_boot_ms 0."""
+    (log,) = read_log(tlog(tmp_path / "a.tlog", flight(mavros=True, utc=utc)))
+    assert not log.findings
+    track = [s for s in log.samples if s.has_position]
+    assert [s.time_s - T0 - (s.lat_deg - 47.5) * 1e4 for s in track] == pytest.approx(np.zeros(1200), abs=0.01)
+    yaws = [s.flight_yaw_deg for s in log.samples if s.flight_yaw_deg is not None]
+    assert yaws == pytest.approx([heading(i * 0.1) for i in range(1200)], abs=1e-3)
+
+
+def test_a_cameras_own_clock_dates_its_pictures(tmp_path):
+    heard = list(flight(camera_boot_s=20.0))
+    (log,) = read_log(tlog(tmp_path / "a.tlog", heard))
+    assert not log.findings
+    assert [e.time_s - T0 for e in log.events] == pytest.approx(np.arange(0.8, 120.0, 2.0), abs=0.15)
+    live = LivePoses("v1")
+    events = [live.feed(message, at) for at, _, message in heard]
+    assert [e.time_s - T0 for e in events if e is not None] == pytest.approx(np.arange(0.8, 120.0, 2.0), abs=0.15)
+
+
+def test_a_picture_reported_again_is_no_restart():
+    poses = MavlinkPoses()
+    poses.feed(mavlink.MAVLink_system_time_message(round(T0 * 1e6), 60_000))
+    report = mavlink.MAVLink_camera_image_captured_message(20_000, 0, 1, 0, 0, 0, 0, [math.nan] * 4, 3, 1, b"")
+    assert poses.feed(report).time_s == pytest.approx(T0 - 40.0)
+    assert poses.reboots == 0
+    assert poses.utc(60.0) == pytest.approx(T0)
