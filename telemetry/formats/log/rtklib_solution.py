@@ -1,0 +1,147 @@
+"""RTKLIB's solutions (.pos), also of Emlid: the receiver's track, or the exposures (`*_events.pos`).
+
+Comment lines begin with %; the last one that begins with a time scale (GPST, UTC, JST) names the columns: date and time
+or week and seconds of week; latitude, longitude (degrees, or degrees, minutes, seconds) and height, or x, y, z of the
+earth; quality, satellites, standard deviations. Source: RTKLIB manual 2.4.2, appendix B.1 (Solution Format).
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from telemetry.formats.log.log_data import NotALog
+from telemetry.samples.sample import Sample, checked
+from telemetry.samples.times import GPS_EPOCH_S, GPS_MINUS_UTC_S, WEEK_S, parse_time
+
+_SCALES: Final = {"GPST": GPS_MINUS_UTC_S, "UTC": 0.0, "JST": 9 * 3600.0}
+"""Seconds that a time scale is ahead of UTC."""
+_FIXED, _FLOAT = 1.0, 2.0
+_MAJOR_M, _FLATTENING = 6_378_137.0, 1.0 / 298.257223563
+"""The ellipsoid of WGS 84."""
+_LEAST_EPOCHS = 10
+_EVEN_S, _EVEN_SHARE = 0.005, 0.9
+"""Epochs of a receiver follow each other evenly to a millisecond, apart from missing ones; a camera that takes pictures
+every two seconds does so to some hundredths (chosen)."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Columns:
+    """What the header says.
+
+    Attributes:
+        ahead_s: time scale less UTC. words: number of words of a position.
+        position: latitude, longitude (degrees), height (metres) of these words as numbers.
+        deviations: number of the standard deviations that say something about the horizontal position.
+    """
+
+    ahead_s: float
+    words: int
+    position: Callable[[Sequence[float]], tuple[float, float, float]]
+    deviations: int = 2
+
+
+def read_solution(text: str) -> list[Sample]:
+    """The positions of a solution, in the order of the file; times are UTC.
+
+    Raises:
+        NotALog: it states no positions on the earth.
+    """
+    columns = _Columns(GPS_MINUS_UTC_S, 3, _degrees)
+    found = []
+    for line in text.splitlines():
+        if line.startswith("%"):
+            columns = _header(_words(line[1:])) or columns
+            continue
+        sample = _sample(_words(line), columns)
+        if sample is not None:
+            found.append(sample)
+    return found
+
+
+def is_track(stem: str, samples: Sequence[Sample]) -> bool:
+    """Whether positions are a receiver's track, not exposures.
+
+    Args:
+        stem: the file's name; RTKLIB ends those of exposures in `_events`.
+        samples: its positions.
+    """
+    if stem.lower().endswith("events") or len(samples) < _LEAST_EPOCHS:
+        return False
+    steps = np.diff(np.array([s.time_s for s in samples], dtype=np.float64))
+    usual = float(np.median(steps))
+    return usual > 0.0 and float(np.mean(np.abs(steps - usual * np.round(steps / usual)) < _EVEN_S)) >= _EVEN_SHARE
+
+
+def _words(line: str) -> list[str]:
+    return line.replace(",", " ").replace(";", " ").split()
+
+
+def _header(words: Sequence[str]) -> _Columns | None:
+    """The columns named by a comment line, None if it names none."""
+    if not words or words[0] not in _SCALES:
+        return None
+    names = " ".join(words[1:])
+    if "baseline" in names:
+        raise NotALog(
+            "the file states distances from a base station, not positions; write it again with latitude and longitude"
+        )
+    ahead_s = _SCALES[words[0]]
+    if "ecef" in names:
+        return _Columns(ahead_s, 3, _geocentric, deviations=3)
+    return _Columns(ahead_s, 7, _minutes) if "latitude(d'" in names else _Columns(ahead_s, 3, _degrees)
+
+
+def _sample(words: Sequence[str], columns: _Columns) -> Sample | None:
+    end = 2 + columns.words
+    if len(words) < end + 4:
+        return None
+    try:
+        numbers = [float(word) for word in words[2 : end + 2 + columns.deviations]]
+        time_s = _time(words) - columns.ahead_s
+        lat, lon, height = columns.position(numbers[: columns.words])
+    except ValueError:
+        return None
+    quality, _, *deviations = numbers[columns.words :]
+    spread = max(deviations)
+    sigma = spread if quality in (_FIXED, _FLOAT) and spread > 0.0 else None
+    sample = checked(Sample(time_s=time_s, lat_deg=lat, lon_deg=lon, altitude_m=height, sigma_m=sigma))
+    return sample if sample is not None and sample.has_position and sample.time_s is not None else None
+
+
+def _time(words: Sequence[str]) -> float:
+    """Seconds of the line's own scale, counted like UTC since 1970.
+
+    Raises:
+        ValueError: it is no time.
+    """
+    written = parse_time(" ".join(words[:2]))
+    return GPS_EPOCH_S + int(words[0]) * WEEK_S + float(words[1]) if written is None else written[0]
+
+
+def _degrees(numbers: Sequence[float]) -> tuple[float, float, float]:
+    lat, lon, height = numbers
+    return lat, lon, height
+
+
+def _minutes(numbers: Sequence[float]) -> tuple[float, float, float]:
+    """Of degrees, minutes and seconds; the sign stands before the degrees, also where they are 0."""
+    lat, lon = (
+        math.copysign(abs(degrees) + minutes / 60.0 + seconds / 3600.0, degrees)
+        for degrees, minutes, seconds in (numbers[:3], numbers[3:6])
+    )
+    return lat, lon, numbers[6]
+
+
+def _geocentric(numbers: Sequence[float]) -> tuple[float, float, float]:
+    """Of x, y, z in metres (Bowring 1976: exact to a micrometre at heights that are flown)."""
+    x, y, z = numbers
+    minor_m, out_m = _MAJOR_M * (1.0 - _FLATTENING), math.hypot(x, y)
+    squared, second = _FLATTENING * (2.0 - _FLATTENING), (_MAJOR_M / minor_m) ** 2 - 1.0
+    reduced = math.atan2(z * _MAJOR_M, out_m * minor_m)
+    lat = math.atan2(z + second * minor_m * math.sin(reduced) ** 3, out_m - squared * _MAJOR_M * math.cos(reduced) ** 3)
+    below_m = _MAJOR_M * math.sqrt(1.0 - squared * math.sin(lat) ** 2)
+    height = out_m * math.cos(lat) + z * math.sin(lat) - below_m
+    return math.degrees(lat), math.degrees(math.atan2(y, x)), height
