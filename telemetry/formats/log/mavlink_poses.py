@@ -173,7 +173,7 @@ class MavlinkPoses:
 
     def _mount(self, m: Any) -> Sample | None:
         yaw = m.yaw_absolute
-        if not math.isfinite(yaw):
+        if not math.isfinite(yaw) or yaw == 0.0:  # an extension, which reads as 0 where the sender does not fill it
             if self.heading_deg is None:
                 return None
             yaw = self.heading_deg + m.yaw

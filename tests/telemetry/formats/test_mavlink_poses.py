@@ -93,6 +93,20 @@ def test_a_gimbals_yaw_is_read_in_the_frame_its_flags_name(flags, own_yaw, expec
     assert live.latest.pitch_deg == pytest.approx(-80.0, abs=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("heading_deg", "own", "absolute", "expected"),
+    [(90.0, 10.0, 0.0, 100.0), (90.0, 10.0, math.nan, 100.0), (90.0, 10.0, 140.0, 140.0), (350.0, 10.0, 0.0, 0.0)],
+)
+def test_a_mounts_yaw_is_relative_where_the_absolute_one_is_not_filled(heading_deg, own, absolute, expected):
+    live = LivePoses("m", clock=lambda: 0.0)
+    live.feed(mavlink.MAVLink_mount_orientation_message(900, 0.0, -80.0, own, 0.0), 999.9)
+    assert live.latest.yaw_deg is None
+    live.feed(attitude(1000, yaw=heading_deg), 1000.0)
+    live.feed(mavlink.MAVLink_mount_orientation_message(1000, 0.0, -80.0, own, absolute), 1000.0)
+    assert live.latest.yaw_deg == pytest.approx(expected, abs=1e-3)
+    assert live.latest.pitch_deg == pytest.approx(-80.0, abs=1e-3)
+
+
 def test_a_camera_without_a_gimbal_is_fixed_under_the_airframe():
     sample = fixed_camera(Sample(flight_yaw_deg=30.0, flight_pitch_deg=5.0, flight_roll_deg=-3.0))
     assert (sample.yaw_deg, sample.pitch_deg, sample.roll_deg) == pytest.approx((30.0, -85.0, -3.0))
