@@ -28,21 +28,26 @@ _WANTED = frozenset(
     }
 )  # fmt: skip
 _EVENTS = frozenset({"camera_capture", "camera_trigger"})
+_RECEIVERS = ("sensor_gps", "vehicle_gps_position")
+"""Topics of which all instances count: the first of two receivers may have no fix."""
+_FIX_3D = 3
 
 
 def read_ulog(path: Path) -> FlightLog:
     """Read a ULog; a truncated one as far as it goes.
 
     Raises:
-        OSError: it cannot be read. NotALog: it is not a ULog.
+        OSError: it cannot be read. NotALog: it is not a ULog, or nothing in it can be dated.
     """
     with mapped(path) as data:
         if data[:7] != _MAGIC:
             raise NotALog("the file is not a ULog; check its name")
-        rows = _rows(data)
+        instances = _rows(data)
     log = FlightLog(path=path, kind="ULog", vehicle=path.stem)
-    fixes = rows.get("sensor_gps") or rows.get("vehicle_gps_position", [])
-    clock = _utc_minus_boot(fixes)
+    rows = {name: found for (name, instance), found in instances.items() if instance == 0}
+    receivers = [found for name in _RECEIVERS for (topic, _), found in sorted(instances.items()) if topic == name]
+    fixes = max(receivers, key=lambda found: sum(map(_has_fix, found)), default=[])
+    clock = _utc_minus_boot([row for found in receivers for row in found])
     homes = [r["alt"] for r in rows.get("home_position", []) if isinstance(r.get("alt"), float)]
     home = next((alt for alt in homes if math.isfinite(alt)), None)
     headings: list[tuple[float, float]] = []
@@ -69,7 +74,7 @@ def read_ulog(path: Path) -> FlightLog:
 
     def fix(row: Row) -> None:
         """A receiver's position: degrees and metres since PX4 1.14, 1e-7 degrees and millimetres before."""
-        if row.get("fix_type", 0) < 3:
+        if not _has_fix(row):
             return
         if "latitude_deg" in row:
             lat, lon, altitude = row["latitude_deg"], row["longitude_deg"], float(row["altitude_msl_m"])
@@ -87,14 +92,16 @@ def read_ulog(path: Path) -> FlightLog:
     each(rows.get("gimbal_device_attitude_status", []), lambda row: _gimbal(log, row, clock, headings))
     each(rows.get("camera_capture", []), lambda row: event(row, "camera_capture"))
     each(rows.get("camera_trigger", []), lambda row: event(row, "camera_trigger"))
+    if clock is None and rows and all(e.time_s is None for e in log.events):
+        raise NotALog("the log holds no UTC, since no receiver had a fix; use a log with a fix")
     return log
 
 
-def _rows(data: mmap.mmap) -> dict[str, list[Row]]:
-    """Data of the wanted topics, first instance of each."""
+def _rows(data: mmap.mmap) -> dict[tuple[str, int], list[Row]]:
+    """Data of the wanted topics by topic and instance: the first of each, all of receivers."""
     formats: dict[str, list[tuple[str, str, int]]] = {}
-    topics: dict[int, tuple[str, list[tuple[str, struct.Struct]]]] = {}
-    found: dict[str, list[Row]] = {}
+    topics: dict[int, tuple[tuple[str, int], list[tuple[str, struct.Struct]]]] = {}
+    found: dict[tuple[str, int], list[Row]] = {}
     at, size = 16, len(data)
     while at + 3 <= size:
         length, kind = struct.unpack_from("<HB", data, at)
@@ -108,14 +115,14 @@ def _rows(data: mmap.mmap) -> dict[str, list[Row]]:
         elif kind == ord("A") and length >= 3:
             multi, number = struct.unpack_from("<BH", body)
             name = body[3:].decode("ascii", "replace")
-            if multi == 0 and name in _WANTED and name in formats:
-                topics[number] = (name, _layout(name, formats))
+            if (multi == 0 or name in _RECEIVERS) and name in _WANTED and name in formats:
+                topics[number] = ((name, multi), _layout(name, formats))
         elif kind == ord("D") and length >= 2:
             topic = topics.get(int.from_bytes(body[:2], "little"))
             if topic is not None:
                 row = _row(body[2:], topic[1])
                 rows = found.setdefault(topic[0], [])
-                if row is not None and (topic[0] in _EVENTS or not rows or _is_later(row, rows[-1])):
+                if row is not None and (topic[0][0] in _EVENTS or not rows or _is_later(row, rows[-1])):
                     rows.append(row)
     return found
 
@@ -167,13 +174,20 @@ def _row(body: bytes, layout: list[tuple[str, struct.Struct]]) -> Row | None:
     return row if isinstance(row.get("timestamp"), int) else None
 
 
+def _has_fix(row: Row) -> bool:
+    kind = row.get("fix_type")
+    return isinstance(kind, int) and kind >= _FIX_3D
+
+
 def _utc_minus_boot(rows: list[Row]) -> float | None:
+    """UTC less time since boot in seconds; without a fix receivers tell the time of a clock that may never be set."""
     offsets = [
-        (row["time_utc_usec"] - int(row["timestamp"])) * 1e-6
+        (_has_fix(row), (row["time_utc_usec"] - int(row["timestamp"])) * 1e-6)
         for row in rows
         if isinstance(row.get("time_utc_usec"), int) and 10**15 < row["time_utc_usec"] < 10**16
     ]
-    return float(np.median(offsets)) if offsets else None
+    best = [offset for fixed, offset in offsets if fixed] or [offset for _, offset in offsets]
+    return float(np.median(best)) if best else None
 
 
 def _add(log: FlightLog, row: Row, clock: float | None, **values: Any) -> None:

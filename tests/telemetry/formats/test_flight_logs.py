@@ -136,6 +136,46 @@ def test_a_ulog_gives_track_and_events(tmp_path):
     assert track.flight_yaw_deg == pytest.approx(90.0, abs=1e-4)
 
 
+def receivers_ulog(path, instances):
+    """A track north and receivers: (topic, instance, (offset of their UTC in seconds, fix type, latitude))."""
+    out = bytearray(b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0))
+
+    def put(kind: str, body: bytes) -> None:
+        out.extend(struct.pack("<HB", len(body), ord(kind)) + body)
+
+    fields = "uint64_t timestamp;uint64_t time_utc_usec;double latitude_deg;double longitude_deg;double altitude_msl_m;"
+    for topic in ("sensor_gps", "vehicle_gps_position"):
+        put("F", f"{topic}:{fields}uint8_t fix_type;".encode())
+    for number, (topic, instance, _) in enumerate(instances):
+        put("A", struct.pack("<BH", instance, number) + topic.encode())
+    for i in range(50):
+        t = 1_000_000 + i * 200_000
+        for number, (_, _, (offset_s, fix, lat)) in enumerate(instances):
+            utc = 0 if offset_s is None else round(offset_s * 1e6) + t
+            put("D", struct.pack("<HQQdddB", number, t, utc, lat + i * 1e-6, 8.0, 450.0, fix))
+    path.write_bytes(out)
+    return path
+
+
+@pytest.mark.parametrize(
+    "instances",
+    [
+        [("sensor_gps", 0, (None, 0, 0.0)), ("sensor_gps", 1, (1.7e9, 3, 47.0))],
+        [("sensor_gps", 0, (None, 0, 0.0)), ("vehicle_gps_position", 0, (1.7e9, 3, 47.0))],
+        [("sensor_gps", 0, (1.4451e9, 1, 12.0)), ("sensor_gps", 1, (1.7e9, 3, 47.0))],
+    ],
+)
+def test_a_ulog_of_two_receivers_is_dated_and_placed_by_the_one_with_a_fix(tmp_path, instances):
+    (log,) = read_log(receivers_ulog(tmp_path / "a.ulg", instances))
+    sample = log.timeline().at(1_700_000_003.0)
+    assert (sample.lat_deg, sample.lon_deg) == pytest.approx((47.00001, 8.0), abs=1e-8)
+
+
+def test_a_ulog_without_utc_is_named(tmp_path):
+    with pytest.raises(NotALog, match="no UTC"):
+        read_log(receivers_ulog(tmp_path / "a.ulg", [("sensor_gps", 0, (None, 0, 0.0))]))
+
+
 @given(st.data())
 @settings(max_examples=40, deadline=None)
 def test_damaged_ulogs_are_survived(tmp_path_factory, data):
