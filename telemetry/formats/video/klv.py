@@ -93,6 +93,7 @@ def checksum(data: bytes) -> int:
     return (sum(data[::2]) * 256 + sum(data[1::2])) & 0xFFFF
 
 
+# Altitude and elevation (15, 25) are above mean sea level, ellipsoid heights (75, 78) are up to 100 m apart from them.
 # tag -> (name, bytes, signed, scale per unit, offset); a signed value of -2^(n-1) means "out of range".
 _ANGLE_16, _ANGLE_32, _LATITUDE_32 = 360.0 / 65535, 360.0 / 4294967294, 180.0 / 4294967294
 _ALTITUDE = 19900.0 / 65535
@@ -118,6 +119,7 @@ _NUMBERS: dict[int, tuple[str, int, bool, float, float]] = {
     52: ("sideslip", 2, True, 40.0 / 65534, 0.0),
     65: ("version", 1, False, 1.0, 0.0),
     75: ("sensor_ellipsoid_height", 2, False, _ALTITUDE, -900.0),
+    78: ("frame_center_ellipsoid_height", 2, False, _ALTITUDE, -900.0),
     90: ("platform_pitch_full", 4, True, _LATITUDE_32, 0.0),
     91: ("platform_roll_full", 4, True, _LATITUDE_32, 0.0),
 }
@@ -225,8 +227,10 @@ def _sample(values: dict[str, float | str]) -> Sample | None:
     name = values.get("tail_number") or values.get("platform")
     sample.vehicle = name if isinstance(name, str) else None
     elevation = _attitude(v, sample)
-    if sample.altitude_m is not None and "frame_center_elevation" in v:
-        height = sample.altitude_m - v["frame_center_elevation"]
+    if "sensor_altitude" in v and "frame_center_elevation" in v:
+        height = v["sensor_altitude"] - v["frame_center_elevation"]
+    elif "sensor_ellipsoid_height" in v and "frame_center_ellipsoid_height" in v:
+        height = v["sensor_ellipsoid_height"] - v["frame_center_ellipsoid_height"]
     elif "slant_range" in v and elevation is not None and elevation < -5.0:
         height = -v["slant_range"] * math.sin(math.radians(elevation))
     else:

@@ -64,6 +64,29 @@ def test_a_camera_that_looks_straight_down():
     assert sample.vehicle == "AF-101"
 
 
+SLANT_RANGE_110_M = round(110.0 / 5_000_000.0 * 4294967295).to_bytes(4, "big")
+
+
+@pytest.mark.parametrize(
+    ("heights", "expected"),
+    [
+        ({15: 600.0, 25: 480.0}, 120.0),
+        ({75: 648.0, 78: 528.0}, 120.0),
+        ({15: 600.0, 75: 648.0, 25: 480.0}, 120.0),
+        ({15: 600.0, 75: 648.0, 78: 528.0}, 120.0),
+        ({75: 648.0, 25: 480.0}, 110.0),  # the geoid lies between them: the slant range is left
+        ({15: 600.0, 78: 528.0}, 110.0),
+    ],
+)
+def test_a_height_is_the_difference_of_heights_over_one_surface(heights, expected):
+    """The sensor 120 m over ground at 480 m above sea level, the geoid 48 m over the ellipsoid."""
+    items = {tag: raw for tag, raw in NADIR.items() if tag not in (15, 25)}
+    items |= {21: SLANT_RANGE_110_M} | {tag: altitude(value) for tag, value in heights.items()}
+    (packet,) = klv.packets(local_set(dict(sorted(items.items()))))
+    assert packet.sample.height_m == pytest.approx(expected, abs=0.4)
+    assert packet.sample.height_is_ground
+
+
 def test_a_wrong_or_missing_checksum_is_refused_with_its_reason():
     (packet,) = klv.packets(local_set(NADIR, good=False))
     assert packet.sample is None
@@ -97,7 +120,7 @@ NAMES = {
     18: "relative_azimuth", 19: "relative_elevation", 20: "relative_roll", 21: "slant_range",
     22: "target_width", 23: "frame_center_latitude", 24: "frame_center_longitude",
     25: "frame_center_elevation", 75: "sensor_ellipsoid_height", 90: "platform_pitch_full",
-    91: "platform_roll_full",
+    78: "frame_center_ellipsoid_height", 91: "platform_roll_full",
 }  # fmt: skip
 
 
