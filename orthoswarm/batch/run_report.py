@@ -71,9 +71,11 @@ def _add_checkpoints(run: RunContext, state: RunState, report: dict[str, Any], g
     if table is None:
         return
     try:
-        report["checkpoints"] = evaluate_checkpoints(
+        accuracy = evaluate_checkpoints(
             run.out, table, run.options.pixel_scale, ground_z_m, control=state.control_points
-        ).figures()
+        )
+        report["checkpoints"] = accuracy.figures()
+        report["warnings"] += [f"check{finding}" for finding in accuracy.findings]
     except InputError as error:
         report["warnings"].append(f"the checkpoints could not be measured: {error}")
 

@@ -5,14 +5,15 @@ error. A point in photos of both gives one observation for each.
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.config import active
-from orthoswarm.evaluation.checkpoints import Checkpoint, intersection
+from orthoswarm.evaluation.checkpoints import Checkpoint
 from orthoswarm.evaluation.photo_names import photo_named
+from orthoswarm.evaluation.point_rays import Ray, RayPoint, intersect_rays
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import PlacedFrame, Terrain
@@ -29,6 +30,7 @@ class ControlObservation:
         placed: float64 (2,), east and north in the block. surveyed: float64 (2,), east and north by survey; same grid.
         sigma_m: of the difference, per axis: survey, pointing, and deformation of the block at that point.
         stated: whether the survey's sigma is known; False where it is assumed.
+        rays: how its marks meet; None for a place on the basemap.
     """
 
     name: str
@@ -36,6 +38,8 @@ class ControlObservation:
     surveyed: Array
     sigma_m: float
     stated: bool = True
+    _: KW_ONLY
+    rays: RayPoint | None = None
 
 
 def check_control(
@@ -79,16 +83,16 @@ def in_photos(
         photos = _photos(point, images)
         if not photos:
             continue
-        rays = [_ray(p, pixel) for p, pixel in photos]
+        rays = [_ray(p, pixel, config.receivers_local_sigma_m if not on_map else p.sigma_m) for p, pixel in photos]
         level = float(np.median([terrain.height(p.camera.nadir) for p, _ in photos]))
-        pixel_rad = config.pointing_sigma_px / float(np.median([p.camera.lens.focal_px for p, _ in photos]))
-        found = intersection(rays, level, config.height_sigma_m, pixel_rad)
-        found = intersection(rays, float(terrain.height(found)), config.height_sigma_m, pixel_rad)
+        place = intersect_rays(rays, level, config.height_sigma_m).place
+        met = intersect_rays(rays, float(terrain.height(place)), config.height_sigma_m)
         gsd = float(np.median([(p.camera.position[2] - level) / p.camera.lens.focal_px for p, _ in photos]))
         pointing = config.pointing_sigma_px * gsd / np.sqrt(len(photos))
         bent = float(np.median([p.sigma_m for p, _ in photos])) if on_map else config.receivers_local_sigma_m
-        sigma = float(np.linalg.norm([_survey_sigma(point), pointing, bent]))
-        out.append(ControlObservation(point.name, found, _in_grid(point.surveyed, grid), sigma, point.sigma_m > 0.0))
+        sigma = float(np.linalg.norm([_survey_sigma(point), pointing, bent, met.contradiction]))
+        surveyed, stated = _in_grid(point.surveyed, grid), point.sigma_m > 0.0
+        out.append(ControlObservation(point.name, met.place, surveyed, sigma, stated, rays=met))
     return out
 
 
@@ -121,12 +125,13 @@ def _photos(point: Checkpoint, images: dict[str, PlacedFrame]) -> list[tuple[Pla
     return out
 
 
-def _ray(placed: PlacedFrame, pixel: Array) -> tuple[Array, Array]:
-    """Camera position (3,) and unit direction (3,) of a pixel."""
+def _ray(placed: PlacedFrame, pixel: Array, camera_sigma_m: float) -> Ray:
+    """The ray of a pixel."""
     camera = placed.camera
     below = float(camera.position[2]) - 1.0
     away = np.array([*camera.to_ground(pixel, below), below]) - camera.position
-    return camera.position, away / np.linalg.norm(away)
+    pixel_rad = active().control.pointing_sigma_px / camera.lens.focal_px
+    return Ray(placed.frame.image, camera.position, away / np.linalg.norm(away), pixel_rad, camera_sigma_m)
 
 
 def _survey_sigma(point: Checkpoint) -> float:

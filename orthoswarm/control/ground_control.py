@@ -43,7 +43,8 @@ class GroundControl:
         if fit is None:
             return None
         similarity = fit.similarity
-        rms = float(np.sqrt((fit.residual**2).sum(axis=1).mean()))
+        miss = np.array([0.0 if o.rays is None else o.rays.miss_m for o in fit.used])
+        rms = float(np.sqrt(((fit.residual**2).sum(axis=1) + miss**2).mean()))
         return {
             "points": len(fit.used),
             "shift_m": {"east": float(similarity.values[0]), "north": float(similarity.values[1])},
@@ -52,7 +53,13 @@ class GroundControl:
             "sigma_m": float(similarity.sigma_m(similarity.middle)),
             "residual_rms_m": rms,
             "residuals": [
-                {"name": o.name, "east_m": float(r[0]), "north_m": float(r[1]), "sigma_m": o.sigma_m}
+                {
+                    "name": o.name,
+                    "east_m": float(r[0]),
+                    "north_m": float(r[1]),
+                    "sigma_m": o.sigma_m,
+                    "rays_miss_m": None if o.rays is None else o.rays.miss_m,
+                }
                 for o, r in zip(fit.used, fit.residual, strict=True)
             ],
             "left_out": [o.name for o in fit.left_out],
@@ -141,6 +148,8 @@ def _warnings(fits: dict[bool, ControlFit], placed: Sequence[PlacedFrame]) -> li
         ]
     said = []
     for fit in fits.values():
+        for o in (*fit.used, *fit.left_out):
+            said += [] if o.rays is None else [f"control {finding}" for finding in o.rays.findings(o.name)]
         for o in fit.left_out:
             away = fit.similarity.moved(o.placed) - o.surveyed
             said.append(

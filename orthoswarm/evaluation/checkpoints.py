@@ -23,7 +23,9 @@ from numpy.typing import NDArray
 from orthoswarm.config import active
 from orthoswarm.evaluation.independent_points import Surveyed, control_of_report, shared_points
 from orthoswarm.evaluation.photo_names import photo_named
+from orthoswarm.evaluation.point_rays import Ray, RayPoint, intersect_rays
 from orthoswarm.model.camera import Lens, focal_px
+from orthoswarm.model.earth import MEAN_RADIUS_M
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid, projection_of
 
@@ -31,6 +33,8 @@ Array = NDArray[np.float64]
 
 STANDARD_COUNT = 30
 """Checkpoints that a statement by the standard needs at least."""
+_SAME_PLACE_M = 0.02
+"""Lines of one point may round its coordinates differently."""
 _GRID = "+proj=longlat +datum=WGS84 +no_defs"
 
 
@@ -83,6 +87,9 @@ class CheckpointAccuracy:
         unused: names of the points that no mapped photo shows.
         how: `photos`, `orthoimage` or both.
         control: names of the points that were left out because they had placed the map.
+        findings: marks that contradict each other, in plain words.
+        miss_m: root mean square by which the rays of each point miss it, metres; None where it was measured on the
+            orthoimage.
     """
 
     names: list[str]
@@ -92,6 +99,8 @@ class CheckpointAccuracy:
     how: str
     _: KW_ONLY
     control: list[str] = field(default_factory=list)
+    findings: list[str] = field(default_factory=list)
+    miss_m: list[float | None] = field(default_factory=list)
 
     @property
     def rmse(self) -> tuple[float, float]:
@@ -130,8 +139,10 @@ class CheckpointAccuracy:
             "statement": self.statement(),
             "unused": self.unused,
             "control_left_out": self.control,
+            "findings": self.findings,
             "points": [
-                {"name": n, "east_m": float(e), "north_m": float(v)} for n, (e, v) in zip(self.names, self.error)
+                {"name": n, "east_m": float(e), "north_m": float(v), "rays_miss_m": miss}
+                for n, (e, v), miss in zip(self.names, self.error, self.miss_m)
             ],
         }
 
@@ -163,11 +174,13 @@ def evaluate_checkpoints(
     views = _Views.read(folder, ground_z_m) if any(p.marks for p in points) else None
     grid = LocalGrid(views.epsg if views else _epsg(points))
     names, errors, sigmas, unused, how = [], [], [], [], set()
+    findings: list[str] = []
+    misses: list[float | None] = []
     for point in points:
-        rays = views.rays(point.marks) if views else []
-        if rays:
-            assert views is not None
-            found = intersection(rays, views.ground_z_m)
+        met = views.point(point.marks) if views else None
+        if met is not None:
+            found = met.place
+            findings += met.findings(point.name)
             how.add("photos")
         elif point.on_map is not None:
             found = _placed(grid, point.on_map)
@@ -176,6 +189,7 @@ def evaluate_checkpoints(
             unused.append(point.name)
             continue
         names.append(point.name)
+        misses.append(None if met is None else met.miss_m)
         errors.append(found - _placed(grid, point.surveyed))
         sigmas.append(point.sigma_m)
     if not names:
@@ -184,7 +198,9 @@ def evaluate_checkpoints(
         )
     survey = float(np.sqrt(2.0 * np.mean(np.square(sigmas))))
     measured_in = " and ".join(sorted(how))
-    return CheckpointAccuracy(names, np.array(errors), survey, unused, measured_in, control=shared)
+    return CheckpointAccuracy(
+        names, np.array(errors), survey, unused, measured_in, control=shared, findings=findings, miss_m=misses
+    )
 
 
 def _control_of(folder: Path) -> Sequence[Surveyed]:
@@ -227,9 +243,9 @@ class _Scale:
 
 
 def _gcp_list(lines: Sequence[str], name: str, scale: _Scale) -> list[Checkpoint]:
-    """ODM's gcp_list.txt; lines with the same coordinates or name are one point."""
+    """ODM's gcp_list.txt; lines with the same coordinates, and name if there are names, are one point."""
     to_geographic = _transformer(lines[0].strip(), name)
-    points: dict[str, Checkpoint] = {}
+    points: list[Checkpoint] = []
     for number, line in enumerate(lines[1:], 2):
         words = line.split()
         try:
@@ -238,14 +254,14 @@ def _gcp_list(lines: Sequence[str], name: str, scale: _Scale) -> list[Checkpoint
         except (ValueError, IndexError):
             raise InputError(f"{name}, line {number}: expected 'east north height column row image [name]'") from None
         key = words[6] if len(words) > 6 else f"{words[0]} {words[1]}"
-        if key not in points:
-            points[key] = Checkpoint(key, np.array(to_geographic.transform(east, north)))
-        points[key].marks.append(scale.mark(image, column, row))
-    return list(points.values())
+        point = Checkpoint(key, np.array(to_geographic.transform(east, north)))
+        point.marks.append(scale.mark(image, column, row))
+        points.append(point)
+    return _merged(points)
 
 
 def _csv(lines: Sequence[str], name: str, scale: _Scale) -> list[Checkpoint]:
-    points: dict[str, Checkpoint] = {}
+    points: list[Checkpoint] = []
     for number, row in enumerate(csv.DictReader(lines, skipinitialspace=True), 2):
         cells = {(key or "").strip().lower(): (value or "").strip() for key, value in row.items() if key is not None}
         try:
@@ -255,11 +271,33 @@ def _csv(lines: Sequence[str], name: str, scale: _Scale) -> list[Checkpoint]:
                 f"{name}, line {number}: {_reason(error)}; columns are name, lat_deg, lon_deg (or east_m, north_m, "
                 "epsg), sigma_m, and image, column, row (or map_lat_deg, map_lon_deg)"
             ) from None
-        known = points.setdefault(point.name, point)
-        if known is not point:
-            known.marks += point.marks
-            known.on_map = point.on_map if known.on_map is None else known.on_map
-    return list(points.values())
+        points.append(point)
+    return _merged(points)
+
+
+def _merged(lines: Iterable[Checkpoint]) -> list[Checkpoint]:
+    """Points of the same name and place as one; those of one name at several places told apart by a number."""
+    places: dict[str, list[Checkpoint]] = {}
+    points: list[Checkpoint] = []
+    for line in lines:
+        same_name = places.setdefault(line.name, [])
+        known = next((p for p in same_name if _apart_m(p.surveyed, line.surveyed) <= _SAME_PLACE_M), None)
+        if known is None:
+            same_name.append(line)
+            points.append(line)
+        else:
+            known.marks += line.marks
+            known.on_map = line.on_map if known.on_map is None else known.on_map
+    for name, several in places.items():
+        for number, point in enumerate(several if len(several) > 1 else (), 1):
+            point.name = f"{name} ({number})"
+    return points
+
+
+def _apart_m(one: Array, other: Array) -> float:
+    """Metres between two places that are near each other, by longitude and latitude."""
+    east, north = np.radians(other - one) * MEAN_RADIUS_M
+    return math.hypot(float(east) * math.cos(math.radians(float(one[1]))), float(north))
 
 
 def _csv_row(cells: Mapping[str, str], name: str, scale: _Scale) -> Checkpoint:
@@ -349,16 +387,17 @@ class _Views:
             raise InputError(f"{folder} has no placed photos")
         return cls(placed, int(next(iter(placed.values()))["epsg"]), ground_z_m)
 
-    def rays(self, marks: Sequence[Mark]) -> list[tuple[Array, Array]]:
-        """Camera position (3,) and unit direction (3,) of each mark whose photo was mapped."""
+    def point(self, marks: Sequence[Mark]) -> RayPoint | None:
+        """Where the rays of marks meet; None if none of their photos was mapped."""
         found = ((self._row(mark.image), mark) for mark in marks)
-        return [self._ray(row, mark) for row, mark in found if row is not None]
+        rays = [self._ray(row, mark) for row, mark in found if row is not None]
+        return intersect_rays(rays, self.ground_z_m) if rays else None
 
     def _row(self, image: str) -> dict[str, Any] | None:
         name = photo_named(self.rows, image)
         return None if name is None else self.rows[name]
 
-    def _ray(self, row: Mapping[str, Any], mark: Mark) -> tuple[Array, Array]:
+    def _ray(self, row: Mapping[str, Any], mark: Mark) -> Ray:
         width, height = int(row["width"]), int(row["height"])
         mark.check_inside(width, height)
         focal = focal_px(math.radians(float(row["fov_deg"])), width)
@@ -371,30 +410,8 @@ class _Views:
         place = LocalGrid(self.epsg).to_grid(camera["lat_deg"], camera["lon_deg"])
         position = np.array([*place, float(camera["height_m"])])
         away = ground - position
-        return position, away / np.linalg.norm(away)
-
-
-def intersection(
-    rays: Sequence[tuple[Array, Array]],
-    ground_z_m: float,
-    height_sigma_m: float | None = None,
-    pixel_rad: float = 1e-3,
-) -> Array:
-    """East and north (2,) of the point nearest to all rays; its height is held by the ground where they do not hold it.
-
-    Every ray counts by its distance over the camera's range, so that a metre at 50 m height and two at 100 m are alike.
-
-    Args:
-        rays: camera position (3,) and unit direction (3,) of each. ground_z_m: level of the ground there, metres.
-        height_sigma_m: of the point's height over it, None: as configured. pixel_rad: sigma of a ray, radians.
-    """
-    height_sigma_m = active().evaluation.relief_sigma_m if height_sigma_m is None else height_sigma_m
-    normal, right = np.zeros((3, 3)), np.zeros(3)
-    for position, direction in rays:
-        distance = max(position[2] - ground_z_m, 1.0)
-        across = (np.eye(3) - np.outer(direction, direction)) / (pixel_rad * distance) ** 2
-        normal += across
-        right += across @ position
-    normal[2, 2] += 1.0 / height_sigma_m**2
-    right[2] += ground_z_m / height_sigma_m**2
-    return np.asarray(np.linalg.solve(normal, right)[:2])
+        # The sigma of photos that lie where receivers say has mostly what is common to all of them.
+        config = active().control
+        own = config.receivers_local_sigma_m if row["stage"] == "coarse" else row.get("sigma_m")
+        pixel_rad = config.pointing_sigma_px / focal
+        return Ray(row["image"], position, away / np.linalg.norm(away), pixel_rad, float(own or 0.0))

@@ -180,6 +180,22 @@ def test_photos_and_terrain_move_together():
     assert refinement.fine[0].placed[0].camera.nadir == pytest.approx(distorted(NADIRS[0]))
 
 
+def test_marks_that_miss_each_other_are_told_and_cost_certainty():
+    cameras, refinement = block()
+    point = max(surveyed_points(cameras), key=lambda p: len(p.marks))
+    right, last = point.marks[:-1], point.marks[-1]
+    assert len(right) > 1
+    wrong = Mark(last.image, last.column + (100.0 if last.column < 800 else -100.0), last.row)
+    _, clean = place_on_control(refinement, [replace(point, marks=right)], GRID, None)
+    assert not any("mark" in w for w in clean.warnings)
+    _, found = place_on_control(refinement, [replace(point, marks=[*right, wrong])], GRID, None)
+    assert found.document()["shift_m"] == pytest.approx(clean.document()["shift_m"], abs=0.01)
+    assert any(f"mark in {wrong.image} was left out" in w for w in found.warnings)
+    _, torn = place_on_control(refinement, [replace(point, marks=[right[0], wrong])], GRID, None)
+    assert any("contradict each other" in w for w in torn.warnings)
+    assert torn.document()["residual_rms_m"] > 0.5 and torn.document()["sigma_m"] > 1.0
+
+
 def test_photos_in_the_receivers_frame_are_moved_by_their_own_points():
     cameras, refinement = block("coarse")
     moved, did = place_on_control(refinement, surveyed_points(cameras), GRID, None)

@@ -148,3 +148,40 @@ def test_the_command_prints_the_contract(tmp_path, capsys):
 def test_real_control_points_are_read(real_data):
     points = read_checkpoints(real_data("sheffield_cross_800") / "gcp_file_4000px.txt", 0.2)
     assert len(points) == 5 and all(len(p.marks) == 5 for p in points)
+
+
+def test_points_of_one_name_at_several_places_are_several_points(tmp_path):
+    table = gcp_list(tmp_path / "gcp.txt")
+    lines = table.read_text().splitlines()
+    table.write_text("\n".join([lines[0], *(line.rsplit(" ", 1)[0] + " GCP" for line in lines[1:])]))
+    result = evaluate_checkpoints(product(tmp_path / "out"), table)
+    assert result.names == [f"GCP ({k})" for k in range(1, 7)]
+    assert np.abs(result.error).max() < 0.01 and result.findings == []
+    table = tmp_path / "points.csv"
+    table.write_text("name,lat_deg,lon_deg,image,column,row\n" + "".join(
+        f"P,{lat},11,DJI_{k:04d}.JPG,1,1\n" for k, lat in enumerate((48.0, 48.0, 48.001)))
+    )  # fmt: skip
+    assert [(p.name, len(p.marks)) for p in read_checkpoints(table)] == [("P (1)", 2), ("P (2)", 1)]
+
+
+def test_a_mark_that_the_others_contradict_is_left_out_and_told(tmp_path, capsys):
+    table = gcp_list(tmp_path / "gcp.txt")
+    lines = table.read_text().splitlines()
+    own = [i for i, line in enumerate(lines) if line.endswith("gcp0")]
+    assert len(own) > 2
+    words = lines[own[0]].split()
+    words[3] = str(float(words[3]) + (100.0 if float(words[3]) < 800 else -100.0))
+    lines[own[0]] = " ".join(words)
+    table.write_text("\n".join(lines))
+    out = product(tmp_path / "out")
+    result = evaluate_checkpoints(out, table)
+    assert np.abs(result.error).max() < 0.02
+    assert len(result.findings) == 1 and f"mark in {words[5]} was left out" in result.findings[0]
+
+    table.write_text(
+        "\n".join([lines[0], *(lines[i] for i in own[:2])])
+    )  # of two rays none is known to be the wrong one
+    result = evaluate_checkpoints(out, table)
+    assert "contradict each other" in result.findings[0] and result.miss_m[0] > 1.0
+    assert main(["evaluate", str(out), "--checkpoints", str(table)]) == 0
+    assert "contradict each other" in capsys.readouterr().out
