@@ -22,7 +22,7 @@ from orthoswarm.model.placement import PlacedFrame, Refinement, Solution
 from orthoswarm.mosaic.recorded_pose import hint_lone_photos
 from orthoswarm.raster.map_check import UnreadableMapError
 from orthoswarm.refine.flight.unsolved_pictures import place_by_neighbours, split_refinable
-from orthoswarm.refine.registration.map_offset import measure_map_offset
+from orthoswarm.refine.registration.map_offset import control_warning, measure_control_offset, measure_map_offset
 
 
 def refine(run: RunContext, state: RunState) -> Refinement | None:
@@ -71,10 +71,30 @@ def onto_ground(state: RunState, refinement: Refinement) -> Refinement:
     if state.control_points:
         gsd = None if state.basemap is None else state.basemap.native_gsd_m
         refinement, state.control = place_on_control(refinement, state.control_points, state.grid, gsd)
-        state.warnings += state.control.warnings
+        state.warnings += [*state.control.warnings, *_control_doubt(state, refinement)]
     if state.map_offset is not None and (state.control is None or state.control.on_map is None):
         state.warnings += state.map_offset.warning()  # control points on the map answer it
     return refinement
+
+
+def _control_doubt(state: RunState, moved: Refinement) -> list[str]:
+    """Compare control points with the receivers; points in a wrong datum agree with each other, and with nothing else.
+
+    Args:
+        state: the run; gets the offset. moved: all frames after the control.
+    """
+    assert state.control is not None
+    on_map = state.control.on_map
+    fit = on_map or state.control.by_receivers
+    if fit is None:
+        return []
+    placed = [p for s in moved.fine for p in s.placed if (p.stage == "fine") == (on_map is not None)]
+    sigma = float(fit.similarity.sigma_m(fit.similarity.middle))
+    state.control_offset = measure_control_offset(state.recorded.placed, placed, sigma)
+    if state.control_offset is None:
+        return []
+    shift = None if on_map is None else on_map.similarity.values[:2]
+    return control_warning(state.control_offset, state.map_offset, shift)
 
 
 def _refined(run: RunContext, frames: Sequence[Frame], state: RunState) -> Refinement:

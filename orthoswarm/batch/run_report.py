@@ -116,6 +116,7 @@ def _report(
         "basemap": address_of(run.options.basemap) if run.options.basemap and state.basemap else None,
         "map_offset_m": None if state.map_offset is None else state.map_offset.document(),
         "control_points": control_rows(state.control_points),
+        "control_offset_m": None if state.control_offset is None else state.control_offset.document(),
         "control": None if state.control is None else state.control.document(),
         "until": run.options.until,
         "config": {stage: dict(values) for stage, values in run.options.config.items()},

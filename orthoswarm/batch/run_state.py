@@ -126,6 +126,7 @@ class RunState:
         previews: small copies of the pictures, for the seams. pictures: those that are decoded, None to read the files.
         parts: what the real-time map shows of each picture, for the refined ones.
         undrawn: image -> why the real-time picture does not show it.
+        control_offset: offset between control points and receivers, None without control points.
         control_points: surveyed points to move the map onto. control: their result, None before or without them.
         map_offset: offset between map and receivers, None without a map.
         fault: error inside the refiner, None without one.
@@ -152,6 +153,7 @@ class RunState:
     control_points: list[Checkpoint] = field(default_factory=list)
     control: GroundControl | None = None
     map_offset: MapOffset | None = None
+    control_offset: MapOffset | None = None
     fault: str | None = None
 
     def read_rgb(self) -> Read:

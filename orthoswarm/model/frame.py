@@ -3,6 +3,9 @@
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 
+SURVEYED = "surveyed points"
+"""Source (`Frame.origin`) of positions that control points gave."""
+
 
 @dataclass(frozen=True, slots=True)
 class Fix:

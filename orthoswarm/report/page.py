@@ -297,7 +297,7 @@ def _verdict(report: Mapping[str, Any], placed: Sequence[PlacedFrame], shifts: M
             "text": f"Rough picture from recorded positions; expect errors of about {usual:.0f} m (one sigma an axis).",
         }
     if report.get("control"):
-        return _control_verdict(report["control"], _expected(sigma))
+        return _control_verdict(report["control"], _expected(sigma), report.get("control_offset_m"))
     if not fine:
         text = "Consistent in itself, but placed where the drones' receivers say, not on a map"
         return {"kind": "rough", "text": f"{text}; expect errors of about {usual:.1f} m (one sigma an axis)."}
@@ -337,8 +337,8 @@ def _expected(sigma_m: Sequence[float]) -> str:
     return text + ")"
 
 
-def _control_verdict(control: Mapping[str, Any], expected: str) -> dict[str, str]:
-    """The same for a map that surveyed points placed."""
+def _control_verdict(control: Mapping[str, Any], expected: str, offset: Mapping[str, Any] | None) -> dict[str, str]:
+    """The same for a map that surveyed points placed; `offset`: of these against the receivers."""
     count, shift = control["points"], control["shift_m"]
     points = "one surveyed point" if count == 1 else f"{count} surveyed points"
     text = (
@@ -347,6 +347,10 @@ def _control_verdict(control: Mapping[str, Any], expected: str) -> dict[str, str
     )
     if count > 1:
         text += f"; {control['residual_rms_m']:.2f} m (rms) are left at the points"
+    if offset is not None and offset["doubted"]:
+        away = math.hypot(offset["east"], offset["north"])
+        text += f". The points lie {away:.1f} m from where the receivers say, which are good to {offset['sigma']:.1f} m"
+        return {"kind": "doubt", "text": text + ": one of the two is wrong."}
     return {"kind": "rough" if control["left_out"] or count < 3 else "good", "text": text + "."}
 
 

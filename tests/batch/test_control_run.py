@@ -68,6 +68,8 @@ def test_control_points_move_a_map_that_lies_beside_its_place(flight, tmp_path, 
     assert report["map_offset_m"]["east"] == pytest.approx(offset["east"], abs=0.1)  # still the map's own
     assert report["against_map_m"] is None
     assert not any("--control FILE" in w for w in report["warnings"])
+    assert not any("from where the receivers say" in w for w in report["warnings"])
+    assert not report["control_offset_m"]["doubted"]
     page = (out / "report.html").read_text()
     assert "Placed on 3 surveyed points" in page and "4 checkpoints" in page
     with rasterio.open(out / "orthoimage.tif") as placed, rasterio.open(tmp_path / "followed/orthoimage.tif") as was:
@@ -105,6 +107,23 @@ def test_control_points_are_no_checkpoints(flight, tmp_path, capsys):
         assert main(["mosaic", str(flight / "photos"), "--out", str(out), *options]) == 2
         assert "keep some points out of --control" in capsys.readouterr().err
         assert not (out / "orthoimage.tif").exists()
+
+
+@pytest.mark.parametrize("map_given", [False, True])
+def test_control_points_in_another_datum_are_told(flight, tmp_path, capsys, map_given):
+    table = tmp_path / "datum.csv"
+    lines = (flight / "control.csv").read_text().splitlines()
+    words = [line.split(",") for line in lines[1:]]
+    table.write_text(
+        "\n".join([lines[0], *(",".join([w[0], w[1], f"{float(w[2]) + 0.0011:.9f}", *w[3:]]) for w in words)])
+    )
+    more = ("--basemap", flight / "map.tif") if map_given else ()
+    report = mosaic(flight, tmp_path / "out", "--control", table, *more)
+    assert report["control_offset_m"]["east"] == pytest.approx(83.0, abs=3.0)
+    said = [w for w in report["warnings"] if "the control points lie" in w]
+    assert len(said) == 1 and "datum" in said[0] and ("basemap, which agrees" in said[0]) == map_given
+    assert said[0] in capsys.readouterr().err
+    assert "one of the two is wrong" in (tmp_path / "out/report.html").read_text()
 
 
 def test_control_points_of_elsewhere_are_refused_before_the_work(flight, tmp_path, capsys):

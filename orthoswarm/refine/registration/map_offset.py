@@ -7,13 +7,13 @@ and place (ionosphere) does not become smaller with more vehicles.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.config import active
-from orthoswarm.model.frame import Frame
+from orthoswarm.model.frame import SURVEYED, Frame
 from orthoswarm.model.placement import PlacedFrame
 
 Array = NDArray[np.float64]
@@ -51,6 +51,10 @@ class MapOffset:
         """Whether the receivers' errors do not explain it."""
         return self.by_chance < active().registration.offset_probability
 
+    def explains(self, east: float, north: float) -> bool:
+        """Whether receivers' errors of this size would explain another offset, metres."""
+        return replace(self, east=east, north=north).by_chance >= active().registration.offset_probability
+
     def document(self) -> dict[str, float | int | bool]:
         """As JSON values: `east`, `north`, `sigma` in metres, `vehicles`, `doubted`."""
         return {
@@ -77,6 +81,28 @@ class MapOffset:
         ]
 
 
+def control_warning(control: MapOffset, on_map: MapOffset | None, shift_m: Array | None) -> list[str]:
+    """One sentence where neither the receivers' errors nor a map explain where control points lie, else none.
+
+    Args:
+        control: the frames that control points placed, against the receivers. on_map: the map against the receivers.
+        shift_m: float64 (2,), by which control points move what lies on the map; None without such photos.
+    """
+    if not control.doubted:
+        return []
+    agrees = ""
+    if on_map is not None and shift_m is not None:
+        if on_map.explains(*shift_m.tolist()):
+            return []  # map and points speak against the receivers
+        if not on_map.doubted:
+            agrees = f", and {np.hypot(*shift_m):.1f} m from the basemap, which agrees with the receivers"
+    return [
+        f"the control points lie {control.distance:.1f} m ({control.east:+.1f} east, {control.north:+.1f} north) from "
+        f"where the receivers say, which are good to {control.sigma:.1f} m (one sigma, {_count(control.vehicles)})"
+        f"{agrees}: check the datum, coordinate system and zone of the points; the orthoimage follows them"
+    ]
+
+
 def had_corrections(frames: Sequence[Frame]) -> bool:
     """Whether a vehicle's receiver states an accuracy that only corrections (RTK, PPK) give."""
     stated = [np.inf if f.fix.position_sigma_m is None else f.fix.position_sigma_m for f in frames]
@@ -89,13 +115,35 @@ def measure_map_offset(recorded: Sequence[PlacedFrame], refined: Sequence[Placed
     Args:
         recorded: the cameras as recorded. refined: the same frames after the refinement, in the same grid.
     """
+    on_map = [p for p in refined if p.stage == "fine" and not p.weak]
+    return _measured(recorded, on_map, min((p.sigma_m for p in refined if p.stage == "fine"), default=0.0))
+
+
+def measure_control_offset(
+    recorded: Sequence[PlacedFrame], placed: Sequence[PlacedFrame], found_sigma_m: float
+) -> MapOffset | None:
+    """The offset of frames that control points placed against the receivers; None without any.
+
+    Args:
+        recorded: the cameras as recorded. placed: the same frames after the control, in the same grid.
+        found_sigma_m: sigma of the control's shift, an axis, metres.
+    """
+    return _measured(recorded, [p for p in placed if not p.weak], found_sigma_m)
+
+
+def _measured(recorded: Sequence[PlacedFrame], refined: Sequence[PlacedFrame], found_m: float) -> MapOffset | None:
+    """Frames against their records; `found_m`: how well the place of the frames itself is known, metres."""
     config = active().registration
-    before = {(p.frame.vehicle, p.frame.image): p.camera.nadir for p in recorded}
+    before = {
+        (p.frame.vehicle, p.frame.image): p.camera.nadir
+        for p in recorded
+        if p.frame.origin.get("position") != SURVEYED  # which is no receiver's
+    }
     moved: dict[str, list[Array]] = {}
     stated: dict[str, list[float]] = {}
     for p in refined:
         was = before.get((p.frame.vehicle, p.frame.image))
-        if p.stage == "fine" and not p.weak and was is not None:
+        if was is not None:
             moved.setdefault(p.frame.vehicle, []).append(p.camera.nadir - was)
             stated.setdefault(p.frame.vehicle, []).append(p.frame.fix.position_sigma_m or np.inf)
     if not moved:
@@ -111,8 +159,7 @@ def measure_map_offset(recorded: Sequence[PlacedFrame], refined: Sequence[Placed
         sigmas.append(np.hypot(own, spread))
     offset, sigma = _together(np.array(means), np.array(sigmas))
     common = 0.0 if corrected else config.receiver_common_sigma_m
-    found = min(p.sigma_m for p in refined if p.stage == "fine")  # how well the place on the map itself is known
-    sigma = float(np.linalg.norm([sigma, common, found]))
+    sigma = float(np.linalg.norm([sigma, common, found_m]))
     return MapOffset(float(offset[0]), float(offset[1]), sigma, len(used), bool(corrected))
 
 

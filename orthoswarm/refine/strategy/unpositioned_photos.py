@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from orthoswarm.config import active
 from orthoswarm.evaluation.checkpoints import Checkpoint
 from orthoswarm.evaluation.photo_names import photo_named
-from orthoswarm.model.frame import Frame
+from orthoswarm.model.frame import SURVEYED, Frame
 from orthoswarm.model.geo import LocalGrid, area_epsg
 from orthoswarm.model.task_runner import Run
 from orthoswarm.refine.flight.sparse_start import read_photo_records
@@ -164,6 +164,6 @@ def _placed(photos: Sequence[Frame], network: FreeNetwork, *, grid: LocalGrid, o
             yaw_rad=yaw,
             position_sigma_m=float(np.hypot(network.sigma_m[k], leaning)),
         )
-        origin_of = {**frame.origin, "position": "surveyed points", "angles": "surveyed points"}
+        origin_of = {**frame.origin, "position": SURVEYED, "angles": SURVEYED}
         out.append(replace(frame, fix=fix, origin=origin_of))
     return out
