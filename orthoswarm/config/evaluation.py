@@ -15,6 +15,10 @@ class EvaluationConfig:
     same_name_m: float = 10.0
     """... and within this one if it has its name: tables in other systems differ by a metre or two (chosen)."""
 
+    least_picture_px: int = 200
+    """Side that pictures of the report have at least where a map's pixel is large, pixels (chosen: one of 640 m would
+    leave nothing to see)."""
+
     # Arrows of the report: blocks of the map found in the orthoimage
     block_px: int = 64
     """Side of a block, pixels (chosen; not measured)."""

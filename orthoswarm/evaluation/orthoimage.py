@@ -64,7 +64,7 @@ def evaluate_ortho(
     with _Pair(ortho, reference, mask, gsd_m) as pair:
         s = dataclasses.replace(settings or FieldSettings(), gsd_m=pair.gsd_m)
         thin = max(1, round(1.2 / s.gsd_m))
-        for strip in pair.strips(s):
+        for strip in _readable(pair.strips(s), f"{ortho} or {reference}"):
             args = (strip.ortho, strip.ortho_valid, strip.reference, strip.comparable)
             parts.append(displacement_field(*args, settings=s, offset=(strip.first_row, 0)))
             own_ortho.append(strip.own_ortho[::thin, ::thin])
@@ -74,6 +74,14 @@ def evaluate_ortho(
         raise InputError(f"{ortho.name} and {reference.name} do not overlap; check that both show the same place")
     step = max(1, round(s.step_m / s.gsd_m))
     return accuracy(Displacements.joined(parts), completeness(covered, ground, s.gsd_m * thin), float(step))
+
+
+def _readable(strips: "Iterator[_Strip]", names: str) -> "Iterator[_Strip]":
+    """Strips, and one sentence where a file is damaged."""
+    try:
+        yield from strips
+    except RasterioIOError:
+        raise InputError(f"{names} is damaged or cut short; copy or make it again") from None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

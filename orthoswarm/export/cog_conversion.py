@@ -45,8 +45,11 @@ def convert_cog(source: Path, path: Path, *, epsg: int | None = None, jpeg_quali
             with WarpedVRT(raster, crs=crs, resampling=rasterio.enums.Resampling.cubic, warp_mem_limit=64) as vrt:
                 _copy_warped(vrt, part, settings)
     except (CRSError, RasterioError) as error:
-        text = str(error).splitlines()[0]
-        raise InputError(f"{source.name} cannot be written as asked ({text}); check --epsg") from None
+        raise InputError(f"{source.name} cannot be written as asked ({_first_line(error)}); check --epsg") from None
+
+
+def _first_line(error: Exception) -> str:
+    return next(iter(str(error).splitlines()), type(error).__name__)
 
 
 def software() -> str:
@@ -61,6 +64,7 @@ def copy_dataset(dataset: Any, part: Path, **settings: Any) -> None:
         dataset: what is copied. part: the file. settings: driver and its creation options.
 
     Raises:
+        InputError: the dataset cannot be read to its end.
         OSError: the file cannot be written; GDAL does not say why.
     """
     import rasterio.shutil
@@ -68,8 +72,21 @@ def copy_dataset(dataset: Any, part: Path, **settings: Any) -> None:
 
     try:
         rasterio.shutil.copy(dataset, part, **settings)
-    except CPLE_BaseError as error:  # which is none of rasterio's own errors
-        raise OSError(0, str(error).splitlines()[0]) from None
+    except CPLE_BaseError as error:  # which is none of rasterio's own errors, and may be of either file
+        if not _is_whole(dataset):
+            raise InputError(f"{dataset.name} cannot be read ({_first_line(error)}); make the map again") from None
+        raise OSError(0, _first_line(error)) from None
+
+
+def _is_whole(dataset: Any) -> bool:
+    from rasterio.errors import RasterioError
+
+    try:
+        for _, window in dataset.block_windows(1):
+            dataset.read(window=window)
+    except RasterioError:
+        return False
+    return True
 
 
 def _copy_warped(vrt: Any, part: Path, settings: dict[str, Any]) -> None:

@@ -1,6 +1,7 @@
 """The surface model as a cloud-optimised GeoTIFF."""
 
 import tempfile
+import warnings
 from pathlib import Path
 from typing import Final
 
@@ -69,3 +70,17 @@ def write_surface(
             file.update_tags(**tags)
         with rasterio.open(plain) as file:
             copy_dataset(file, part, **_COG)
+
+
+def is_surface(path: Path) -> bool:
+    """Whether a file is a surface model that `write_surface` wrote."""
+    import rasterio
+    from rasterio.errors import RasterioError
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # a photo has no coordinate system
+            with rasterio.open(path) as file:
+                return "HEIGHTS_FROM" in file.tags()
+    except (RasterioError, OSError):
+        return False

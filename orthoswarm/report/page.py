@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm import __version__
+from orthoswarm.config import active
 from orthoswarm.export.catalog.tiled_raster import product_file
 from orthoswarm.export.product_files import iso_time, write_text
 from orthoswarm.model.bounding_box import BoundingBox
@@ -104,8 +105,10 @@ def write_page(
     }
     shifts = None
     if best is not None:
-        least = max(float(report["gsd_m"]), basemap.native_gsd_m if basemap else 0.0)
-        ortho = product_picture(best, view_grid(report["epsg"], product_bounds(best), 2000, least))
+        bounds = product_bounds(best)
+        coarsest = max(bounds.width, bounds.height) / active().evaluation.least_picture_px
+        least = max(float(report["gsd_m"]), min(basemap.native_gsd_m, coarsest) if basemap else 0.0)
+        ortho = product_picture(best, view_grid(report["epsg"], bounds, 2000, least))
         there = None if basemap is None else MapView.read(basemap, ortho.grid)
         if basemap is not None and there is not None and not report.get("control"):  # which moved it off the map
             shifts = shifts_against_map(best, ortho, there, basemap, least)

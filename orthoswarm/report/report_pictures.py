@@ -43,7 +43,7 @@ class Picture:
     def on(self, grid: GroundGrid) -> "Picture":
         """The same on another grid, as far as it reaches."""
         bands, seen = _regrid(np.ascontiguousarray(self.rgb.transpose(2, 0, 1)), self.seen, self.grid, grid)
-        return on_paper(np.ascontiguousarray(bands.transpose(1, 2, 0)), seen, grid)
+        return on_paper(bands.transpose(1, 2, 0).copy(), seen, grid)
 
 
 def _regrid(
@@ -101,7 +101,7 @@ def product_picture(path: Path, grid: GroundGrid) -> Picture:
             how = Resampling.average if scale > 1 else Resampling.bilinear
             shape, window = (4, r1 - r0, c1 - c0), Window(x0, y0, x1 - x0, y1 - y0)
             rgba[:, r0:r1, c0:c1] = source.read(window=window, out_shape=shape, resampling=how)
-    return on_paper(np.ascontiguousarray(rgba[:3].transpose(1, 2, 0)), rgba[3] > 127, grid)
+    return on_paper(rgba[:3].transpose(1, 2, 0).copy(), rgba[3] > 127, grid)
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +130,7 @@ class MapView:
 
 
 def on_paper(rgb: Bytes, seen: NDArray[np.bool_], grid: GroundGrid) -> Picture:
-    """A picture whose empty ground has the page's colour."""
+    """A picture whose empty ground has the page's colour; its array must be in order (OpenCV draws in no other)."""
     rgb[~seen] = PAPER
     return Picture(rgb, seen, grid)
 

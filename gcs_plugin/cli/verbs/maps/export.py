@@ -22,6 +22,8 @@ FORMATS = (
     "pack",
 )
 
+_WITHOUT_REPORT = frozenset({"mbtiles", "kmz", "gpkg", "cog", "pmtiles"})
+
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
@@ -62,6 +64,7 @@ def run(args: argparse.Namespace) -> int:
     import json
 
     from gcs_plugin.cli.progress import ProgressBars
+    from gcs_plugin.cli.written_files import require_no_file
     from orthoswarm.model.errors import InputError
 
     if not 1 <= args.quality <= 100:
@@ -69,6 +72,15 @@ def run(args: argparse.Namespace) -> int:
     if not args.map.is_dir():
         raise InputError(f"{args.map} is not a folder; name the output folder of `orthoswarm mosaic`")
     dest = args.dest or args.map / "export"
+    require_no_file("--dest", dest)
+    named_like_products = sorted({"cog", "gpkg", "places"}.intersection(args.to))
+    if named_like_products and (dest / "frames.jsonl").exists():
+        raise InputError(
+            f"--dest {dest} holds a map, of which {' and '.join(named_like_products)} would replace files; choose "
+            "another folder"
+        )
+    if not _WITHOUT_REPORT.issuperset(args.to):
+        _require_report(args.map / "report.json")
     made: dict[str, str] = {}
     notes: list[str] = []
     with ProgressBars() as bars:
@@ -81,6 +93,26 @@ def run(args: argparse.Namespace) -> int:
         for note in notes:
             print(f"note: {note}")
     return 0
+
+
+def _require_report(path: Path) -> None:
+    """Refuse a damaged report before the work; formats that need none accept that there is none.
+
+    Raises:
+        InputError: it is there and cannot be read.
+    """
+    import json
+
+    from orthoswarm.model.errors import InputError
+
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path} cannot be read ({error}); make the map again") from None
+    if not isinstance(document, dict):
+        raise InputError(f"{path} is not the report of a map; make the map again")
 
 
 Tell = Callable[[int, int], None]
@@ -147,7 +179,11 @@ def _cameras(kind: str, args: argparse.Namespace, dest: Path, tell: Tell, notes:
     lines = args.map / "frames.jsonl"
     if not lines.exists():
         raise InputError(f"{args.map} holds no frames.jsonl; make the map with `orthoswarm mosaic` first")
-    report = json.loads((args.map / "report.json").read_text(encoding="utf-8"))
+    try:
+        report = json.loads((args.map / "report.json").read_text(encoding="utf-8"))
+        rows = list(read_frames(lines))
+    except (OSError, ValueError) as error:
+        raise InputError(f"report.json or frames.jsonl of {args.map} cannot be read ({error}); make it again") from None
     root = args.images or (path_of(report["root"]) if report.get("root") else None)
 
     def find(row: Mapping[str, Any]) -> Path | None:
@@ -155,7 +191,7 @@ def _cameras(kind: str, args: argparse.Namespace, dest: Path, tell: Tell, notes:
         return path if path is not None and path.is_file() else None
 
     write = {"odm": write_odm, "colmap": write_colmap, "opensfm": write_opensfm}[kind]
-    gone = write(list(read_frames(lines)), find, dest / kind, progress=tell)
+    gone = write(rows, find, dest / kind, progress=tell)
     if gone:
         notes.append(f"{len(gone)} pictures are not where they were and were left out, the first is {gone[0]}")
     return dest / kind

@@ -249,11 +249,8 @@ def _check(args: argparse.Namespace) -> None:
             raise InputError("--tone map takes brightness and hue from a basemap; give one with --basemap")
         if args.no_gains or args.until != "fine":
             raise InputError("--tone map needs balanced, refined pictures; leave out --no-gains and --until")
-    if args.surface is not None:
-        if args.surface.suffix.lower() not in (".tif", ".tiff") or args.surface.is_dir():
-            raise InputError(f"--surface {args.surface} is not the name of a GeoTIFF; end it in .tif")
-        if args.until == "realtime" or args.refine != "swarm":
-            raise InputError("--surface needs the refined pictures; leave out --until realtime and --refine paper")
+    if args.control is not None and args.until == "realtime":
+        raise InputError("--control moves refined pictures; leave out --until realtime")
     if not args.pixel_scale > 0.0:
         raise InputError("--pixel-scale must be greater than 0; leave it out for points marked in these photos")
     files = (
@@ -265,6 +262,35 @@ def _check(args: argparse.Namespace) -> None:
     for flag, path in files:
         if path is not None and not exists(path):
             raise InputError(f"{flag} {address_of(path)} does not exist; check the path")
+    _check_written(args)
+
+
+def _check_written(args: argparse.Namespace) -> None:
+    """Refuse to write over an input, and to write two products into one file."""
+    from gcs_plugin.cli.written_files import refuse_product, refuse_replacing
+    from orthoswarm.batch.run_state import WRITTEN
+    from orthoswarm.model.errors import InputError
+
+    flags = ("basemap", "dem", "control", "checkpoints", "config")
+    read = {f"--{flag}": getattr(args, flag) for flag in flags}
+    read |= {f"--sei-layout {path}": path for path in args.sei_layout} | {f"INPUT {path}": path for path in args.inputs}
+    for name, path in read.items():
+        if path is not None:
+            refuse_product(name.split()[0], path, args.out, WRITTEN)
+    if args.surface is None:
+        return
+    if args.surface.suffix.lower() not in (".tif", ".tiff") or args.surface.is_dir():
+        raise InputError(f"--surface {args.surface} is not the name of a GeoTIFF; end it in .tif")
+    if args.until == "realtime" or args.refine != "swarm":
+        raise InputError("--surface needs the refined pictures; leave out --until realtime and --refine paper")
+    refuse_product("--surface", args.surface, args.out, WRITTEN)
+    refuse_replacing("--surface", args.surface, read)
+    folders = {path.resolve() for path in args.inputs if path.is_dir()}
+    if args.surface.exists() and not folders.isdisjoint(args.surface.resolve().parents):
+        from orthoswarm.export.surface_file import is_surface
+
+        if not is_surface(args.surface):
+            raise InputError(f"--surface {args.surface} would replace a file of INPUT; choose another name")
 
 
 def _tell(report: dict[str, object], out: Path) -> None:

@@ -104,6 +104,7 @@ def run(args: argparse.Namespace) -> int:
 
     from orthoswarm.twin.make import make_twin
 
+    _check(args)
     spec = _spec(args)
     bar = Progress(
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
@@ -123,6 +124,39 @@ def run(args: argparse.Namespace) -> int:
     else:
         print(f"{result.photos} photos of {result.vehicles} vehicles in {result.folder} ({result.made} made now)")
     return 0
+
+
+_LEAST = {
+    "every": 1, "rays": 1, "quality": 1, "columns": 1, "rows": 1, "photos": 2, "legs": 1, "width": 16, "height": 16,
+}  # fmt: skip
+_POSITIVE = ("map_gsd", "spacing_m", "leg_spacing_m", "height_m", "speed_m_s")
+
+
+def _check(args: argparse.Namespace) -> None:
+    """Refuse values of which no set can be made.
+
+    Raises:
+        InputError: one is out of range, or --out is a file.
+    """
+    from math import inf
+
+    from gcs_plugin.cli.written_files import require_no_file
+    from orthoswarm.model.errors import InputError
+
+    for name, least in _LEAST.items():
+        value = getattr(args, name)
+        if value is not None and value < least:
+            raise InputError(f"--{name} {value} is too few; give {least} or more")
+    if args.quality is not None and args.quality > 100:
+        raise InputError(f"--quality {args.quality} is out of range; give 1 to 100")
+    for name in _POSITIVE:
+        value = getattr(args, name)
+        if value is not None and not 0.0 < value < inf:
+            raise InputError(f"--{name.replace('_', '-')} {value:g} must be greater than zero")
+    lag = _pair(args.lag_s, "--lag-s")
+    if lag is not None and not -inf < lag[0] <= lag[1] < inf:
+        raise InputError(f"--lag-s {args.lag_s} is no range; give the lower number first")
+    require_no_file("--out", args.out)
 
 
 def _pair(text: str | None, flag: str) -> tuple[float, float] | None:

@@ -1,0 +1,71 @@
+"""Refusing to write over what was read, or over a product of another kind."""
+
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from orthoswarm.model.errors import InputError
+from orthoswarm.stores.addresses import address_of, is_stored
+
+
+def same_file(one: Path, other: Path) -> bool:
+    """Whether two paths are one file, which need not exist, by whatever links."""
+    if is_stored(one) or is_stored(other):
+        return one == other
+    try:
+        return os.path.samefile(one, other)
+    except OSError:
+        return os.path.normcase(os.path.realpath(one)) == os.path.normcase(os.path.realpath(other))
+
+
+def refuse_replacing(flag: str, target: Path, inputs: Mapping[str, Path | None]) -> None:
+    """Refuse to write a file over an input.
+
+    Args:
+        flag: that names the target. target: file to be written. inputs: name of each input -> its path, None without.
+
+    Raises:
+        InputError: they are the same file.
+    """
+    for name, path in inputs.items():
+        if path is not None and same_file(target, path):
+            raise InputError(f"{flag} {address_of(target)} would replace {name}; choose another name")
+
+
+def refuse_product(name: str, path: Path, out: Path, products: Iterable[str]) -> None:
+    """Refuse a file that is a product of the output folder, or lies in a folder that is one.
+
+    Raises:
+        InputError: it is one.
+    """
+    for product in products:
+        own = out / product
+        if any(same_file(p, own) for p in (path, path.parent, path.parent.parent)):
+            raise InputError(
+                f"{name} {address_of(path)} is the run's own {product}; choose another name or another --out"
+            )
+
+
+def require_folder_for(flag: str, target: Path) -> None:
+    """Refuse a file to be written where no file can be made, before the work.
+
+    Raises:
+        InputError: its folder does not exist or cannot be written, or it is a folder itself.
+    """
+    if target.is_dir():
+        raise InputError(f"{flag} {target} is a folder; name a file in it")
+    if not target.parent.is_dir():
+        raise InputError(f"{flag} {target}: there is no folder {target.parent}; make it first, or choose another")
+    if not os.access(target.parent, os.W_OK):
+        raise InputError(f"{flag} {target} cannot be written; choose another folder")
+
+
+def require_no_file(flag: str, folder: Path) -> None:
+    """Refuse a folder for products that is a file, or lies below one.
+
+    Raises:
+        InputError: it is.
+    """
+    blocked = next((p for p in (folder, *folder.parents) if p.exists() and not p.is_dir()), None)
+    if blocked is not None:
+        raise InputError(f"{flag} {folder}: {blocked} is a file; choose a folder")
