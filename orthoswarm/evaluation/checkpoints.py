@@ -4,9 +4,9 @@ A point is measured in the photos that show it (its rays are intersected) or on 
 survey are summed up as root mean squares, to which the survey's own error belongs. Two files are read:
 
 - ODM's gcp_list.txt: a line with the coordinate system, then `east north height column row image [name]`.
-- CSV with a header: `name`; `lat_deg`,`lon_deg`, or `east_m`,`north_m` with `epsg`; `sigma_m` (of the survey, an axis);
-  then either `image`,`column`,`row`, a line a photo, or `map_lat_deg`,`map_lon_deg` or `map_east_m`,`map_north_m`, the
-  place at which the orthoimage shows the point.
+- CSV with a header, separated by commas or semicolons: `name`; `lat_deg`,`lon_deg`, or `east_m`,`north_m` with `epsg`;
+  `sigma_m` (of the survey, an axis); then either `image`,`column`,`row`, a line a photo, or `map_lat_deg`,`map_lon_deg`
+  or `map_east_m`,`map_north_m`, the place at which the orthoimage shows the point.
 """
 
 import csv
@@ -226,7 +226,11 @@ def read_checkpoints(table: Path, pixel_scale: float = 1.0) -> list[Checkpoint]:
     if not lines:
         raise InputError(f"{table.name} holds no points")
     scaled = _Scale(pixel_scale)
-    points = _csv(lines, table.name, scaled) if "," in lines[0] else _gcp_list(lines, table.name, scaled)
+    separator = next((mark for mark in ";," if mark in lines[0]), None)
+    if separator is None:
+        points = _gcp_list(lines, table.name, scaled)
+    else:
+        points = _csv(lines, table.name, scaled, separator)
     if not points:
         raise InputError(f"{table.name} holds no points below its first line")
     return points
@@ -249,7 +253,8 @@ def _gcp_list(lines: Sequence[str], name: str, scale: _Scale) -> list[Checkpoint
     for number, line in enumerate(lines[1:], 2):
         words = line.split()
         try:
-            east, north, _, column, row = (_number(word) for word in words[:5])
+            east, north, column, row = (_number(words[i]) for i in (0, 1, 3, 4))
+            float(words[2])  # a height, which is not used; ODM writes NaN where there is none
             image = words[5]
         except (ValueError, IndexError):
             raise InputError(f"{name}, line {number}: expected 'east north height column row image [name]'") from None
@@ -260,9 +265,9 @@ def _gcp_list(lines: Sequence[str], name: str, scale: _Scale) -> list[Checkpoint
     return _merged(points)
 
 
-def _csv(lines: Sequence[str], name: str, scale: _Scale) -> list[Checkpoint]:
+def _csv(lines: Sequence[str], name: str, scale: _Scale, separator: str) -> list[Checkpoint]:
     points: list[Checkpoint] = []
-    for number, row in enumerate(csv.DictReader(lines, skipinitialspace=True), 2):
+    for number, row in enumerate(csv.DictReader(lines, skipinitialspace=True, delimiter=separator), 2):
         cells = {(key or "").strip().lower(): (value or "").strip() for key, value in row.items() if key is not None}
         try:
             point = _csv_row(cells, name, scale)
@@ -328,7 +333,10 @@ def _reason(error: Exception) -> str:
 
 
 def _number(text: str) -> float:
-    value = float(text)
+    try:
+        value = float(text)
+    except ValueError:  # a decimal comma, as spreadsheets in many countries write beside semicolons
+        value = float(text.replace(",", "."))
     if not math.isfinite(value):
         raise ValueError(f"'{text}' is not a number")
     return value

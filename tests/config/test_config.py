@@ -64,6 +64,8 @@ def test_a_file_overrides_defaults_and_workers_follow(tmp_path):
     assert active().records.theta_hat_deg == 55.0 and overridden() == {"records": {"theta_hat_deg": 55}}
     with Processes(3) as pool:
         assert set(pool.map(theta_hat, range(20))) == {55.0}
+    file.write_text("[records]\ntheta_hat_deg = 55\n", encoding="utf-8-sig")  # as Windows' Notepad writes it
+    assert read_overrides(file) == {"records": {"theta_hat_deg": 55}}
     override({})
     assert active() == Config()
 

@@ -127,6 +127,15 @@ def test_a_bad_table_is_one_sentence(tmp_path, text, said):
         evaluate_checkpoints(product(tmp_path / "out"), table)
 
 
+def test_tables_as_other_programs_write_them_are_read(tmp_path):
+    table = tmp_path / "points.txt"
+    table.write_text(f"EPSG:{EPSG}\n{EAST} {NORTH} NaN 10 10 a.jpg\n")
+    assert [p.marks[0].image for p in read_checkpoints(table)] == ["a.jpg"]
+    table.write_text("name;lat_deg;lon_deg;image;column;row\nP;48,5;11.25;a.jpg;10,5;4\n", "utf-8-sig")
+    (point,) = read_checkpoints(table)
+    assert point.surveyed.tolist() == [11.25, 48.5] and point.marks[0].column == pytest.approx(10.5)
+
+
 def test_a_name_that_two_photos_have_is_asked_about(tmp_path):
     out = product(tmp_path / "out")
     table = tmp_path / "gcp.txt"
