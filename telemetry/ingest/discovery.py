@@ -4,7 +4,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from functools import lru_cache
 from pathlib import Path
 
@@ -50,6 +50,7 @@ class Discovery:
         root: names are relative to it. folders: those with usable files.
         left_out: files with a picture's suffix that are not read -> reason.
         videos: the vehicle of each video, unless its metadata names another.
+        unreadable: folders that cannot be listed -> the system's reason.
         everywhere: tables and logs given by themselves or in folders without pictures and videos.
     """
 
@@ -58,6 +59,8 @@ class Discovery:
     left_out: list[tuple[Path, str]] = field(default_factory=list)
     videos: dict[Path, str] = field(default_factory=dict)
     everywhere: frozenset[Path] = frozenset()
+    _: KW_ONLY
+    unreadable: dict[Path, str] = field(default_factory=dict)
 
     def scope(self, path: Path) -> Path:
         """The folder whose pictures and videos (subfolders included) a table or log applies to."""
@@ -94,7 +97,7 @@ def discover(inputs: Sequence[Path], exclude: Sequence[Path] = ()) -> Discovery:
     geo.txt and CSV. Logs must be given, as those of other flights may be there.
 
     Raises:
-        InputError: no input, or one that does not exist.
+        InputError: no input, or one that does not exist or is a folder that cannot be listed.
     """
     if not inputs:
         raise InputError("no input was given; name a folder of photos or a video")
@@ -110,7 +113,11 @@ def discover(inputs: Sequence[Path], exclude: Sequence[Path] = ()) -> Discovery:
     seen: dict[str, Path] = {}
     left_out: dict[Path, str] = {}
     sorted_in: set[Path] = set()
-    inside = [(file, True) for path in absolute if path not in single for file in _walk(path, outside)]
+    unreadable: dict[Path, str] = {}
+    inside = [(file, True) for path in absolute if path not in single for file in _walk(path, outside, unreadable)]
+    for path in absolute:
+        if path in unreadable:
+            raise InputError(f"the folder {path} cannot be read ({unreadable[path]}); check its permissions")
     named = [path for path in absolute if path in single]
     files = [*inside, *((path, False) for path in named), *((path, True) for path in _with_side_files(named))]
     real_folder = lru_cache(maxsize=None)(os.path.realpath)
@@ -132,18 +139,27 @@ def discover(inputs: Sequence[Path], exclude: Sequence[Path] = ()) -> Discovery:
     _name_vehicles(ordered, root)
     pictures = [(file, why) for file, why in left_out.items() if file.suffix.lower() in PICTURE_SUFFIXES]
     left = [(file, why) for file, why in pictures if file not in sorted_in]
-    return Discovery(root, ordered, left, _video_vehicles(ordered, root), _far_from_pictures(tops, ordered))
+    if unreadable and not ordered and not left:
+        path, why = next(iter(unreadable.items()))
+        raise InputError(f"no picture was found, and the folder {path} cannot be read ({why}); check its permissions")
+    apart = _far_from_pictures(tops, ordered)
+    return Discovery(root, ordered, left, _video_vehicles(ordered, root), apart, unreadable=unreadable)
 
 
 def _by_name(path: Path) -> tuple[tuple[int, int, str], ...]:
     return natural_key(path.name)
 
 
-def _walk(top: Path, outside: set[str]) -> list[Path]:
+def _walk(top: Path, outside: set[str], unreadable: dict[Path, str]) -> list[Path]:
+    """All files below a folder; folders that cannot be listed are entered into `unreadable` with the reason."""
     if is_stored(top):
         return _stored(top, outside)
     found: list[Path] = []
-    for folder, below, files in os.walk(top):
+
+    def failed(error: OSError) -> None:
+        unreadable[Path(error.filename)] = error.strerror or str(error)
+
+    for folder, below, files in os.walk(top, onerror=failed):
         below[:] = sorted(
             name for name in below if not name.startswith(".") and os.path.join(folder, name) not in outside
         )

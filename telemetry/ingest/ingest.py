@@ -63,6 +63,9 @@ def survey(inputs: Sequence[Path], *, progress: Progress | None = None, options:
     found = discover([Path(path) for path in inputs], options.exclude)
     result = Survey(root=found.root, discovery=found)
     vehicles = {folder.path: folder.vehicle for folder in found.folders}
+    for path, why in found.unreadable.items():
+        text = f"the folder {found.name(path)} cannot be read ({why}); what it holds is left out: check its permissions"
+        result.findings.append(Finding("folder-unreadable", text))
     for path, why in found.left_out:
         result.rejected.append(Rejection(found.name(path), why, vehicles.get(path.parent, "")))
     tables = _tables(found, result)
