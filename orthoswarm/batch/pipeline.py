@@ -39,7 +39,7 @@ from orthoswarm.model.placement import PlacedFrame, Terrain
 from orthoswarm.mosaic.extent import partial_cover, placed_bounds
 from orthoswarm.mosaic.footprint import default_gsd
 from orthoswarm.mosaic.oblique import stray_warning, strays
-from orthoswarm.mosaic.recorded_pose import Recorded, area_grid, nothing_to_map, recorded_cameras
+from orthoswarm.mosaic.recorded_pose import Recorded, area_grid, in_one_area, nothing_to_map, recorded_cameras
 from orthoswarm.mosaic.seams.previews import PreviewFile
 from orthoswarm.raster.basemap import Basemap
 from orthoswarm.raster.grey_pictures import GreyPictures
@@ -117,6 +117,7 @@ def _load(run: RunContext, load: Load) -> RunState:
         ingest = load(run.progress)
     except OSError as error:  # pictures of videos are written
         raise disk_error(error, run.out) from None
+    ingest = in_one_area(ingest)
     if run.options.control is not None and ingest.unpositioned:
         ingest = with_control_positions(run, ingest)
     if not ingest.frames:

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 from orthoswarm.config import active
 from orthoswarm.model.camera import NADIR_PITCH_RAD, Camera, Lens, focal_px, rotation_from_angles
+from orthoswarm.model.earth import MEAN_RADIUS_M
+from orthoswarm.model.errors import InputError
 from orthoswarm.model.frame import Frame, Ingest, Rejection
 from orthoswarm.model.geo import LocalGrid, area_epsg
 from orthoswarm.model.placement import PlacedFrame
@@ -43,6 +45,41 @@ def area_grid(frames: Sequence[Frame]) -> LocalGrid:
         InputError: if the positions lie outside UTM.
     """
     return LocalGrid(area_epsg([f.fix.lat_deg for f in frames], [f.fix.lon_deg for f in frames]))
+
+
+def in_one_area(ingest: Ingest) -> Ingest:
+    """Inputs without the frames that lie on another continent than most, by `largest_area_m`; they are rejected.
+
+    Raises:
+        InputError: as many lie in one place as in another.
+    """
+    frames = ingest.frames
+    if len(frames) < 2:
+        return ingest
+    limit = active().records.largest_area_m
+    lat, lon = (np.radians([getattr(f.fix, name) for f in frames]) for name in ("lat_deg", "lon_deg"))
+    at = MEAN_RADIUS_M * np.column_stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
+    # Coarse cells first: many photos are compared with few places.
+    _, first, cell, count = np.unique(
+        np.floor(at / (0.1 * limit)), axis=0, return_index=True, return_inverse=True, return_counts=True
+    )
+    place = at[first]
+    around = np.array([count[np.linalg.norm(place - p, axis=1) <= limit].sum() for p in place])
+    best = int(np.argmax(around))
+    away = np.linalg.norm(at - place[best], axis=1)
+    far = away > limit
+    if not far.any():
+        return ingest
+    rival = int(around[np.unique(cell.ravel()[far])].max())
+    km = float(np.median(away[far])) / 1000
+    if rival >= around[best]:
+        raise InputError(
+            f"{rival} of {len(frames)} photos lie about {km:,.0f} km from {around[best]} others, and nothing tells which "
+            "are in the right place; correct the positions (a lost E or W, N or S, perhaps), or map the places one by one"
+        )
+    lost = [_far_from_others(frames[i], away[i] / 1000) for i in np.nonzero(far)[0].tolist()]
+    kept = [f for f, is_far in zip(frames, far.tolist(), strict=True) if not is_far]
+    return replace(ingest, frames=kept, rejected=[*ingest.rejected, *lost])
 
 
 def recorded_cameras(frames: Sequence[Frame], grid: LocalGrid, fov_rad: float | None = None) -> Recorded:
@@ -157,7 +194,11 @@ def _near(ground: Array) -> NDArray[np.bool_]:
 
 def _too_far(frame: Frame, ground: Array, i: int) -> Rejection:
     away = float(np.hypot(*(ground[i] - np.median(ground, axis=0)))) / 1000
-    where = f"{away:,.0f} km from the others" if np.isfinite(away) else "on the other side of the world"
+    return _far_from_others(frame, away)
+
+
+def _far_from_others(frame: Frame, away_km: float) -> Rejection:
+    where = f"{away_km:,.0f} km from the others" if np.isfinite(away_km) else "on the other side of the world"
     return Rejection(
         frame.image, f"its position is {where}; correct it or map it by itself", frame.vehicle, frame.time_s
     )

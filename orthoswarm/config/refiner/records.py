@@ -13,6 +13,9 @@ class RecordsConfig:
     """A position this far from the median of its set cannot be true: no small drone flies farther."""
     far_spreads: float = 10.0
     """... and so many times the median distance: a set may be larger than that (chosen; not measured)."""
+    largest_area_m: float = 100_000.0
+    """No position of a set lies farther than this from the place where most of them are, metres, however they spread: a
+    lost hemisphere (E or W, N or S) puts half of a flight on another continent (chosen: five times `far_m`)."""
     default_height_m: float = 80.0
     """Height above ground where no photo records one, metres, until pictures give the scale. Measured on two flights at
     90 m with positions only, with 60, 80 and 100 m: error of the map 0.147, 0.142, 0.145 m (95 %: 0.51, 0.51, 0.48),
