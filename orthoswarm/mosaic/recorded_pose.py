@@ -74,8 +74,9 @@ def in_one_area(ingest: Ingest) -> Ingest:
     km = float(np.median(away[far])) / 1000
     if rival >= around[best]:
         raise InputError(
-            f"{rival} of {len(frames)} photos lie about {km:,.0f} km from {around[best]} others, and nothing tells which "
-            "are in the right place; correct the positions (a lost E or W, N or S, perhaps), or map the places one by one"
+            f"{rival} of {len(frames)} photos lie about {km:,.0f} km from {around[best]} others, and nothing tells "
+            "which are in the right place; correct the positions (a lost E or W, N or S, perhaps), or map the places "
+            "one by one"
         )
     lost = [_far_from_others(frames[i], away[i] / 1000) for i in np.nonzero(far)[0].tolist()]
     kept = [f for f, is_far in zip(frames, far.tolist(), strict=True) if not is_far]

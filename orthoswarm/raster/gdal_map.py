@@ -18,6 +18,7 @@ from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.raster.map_check import UnreadableMapError, ends_early
 from orthoswarm.raster.resampling import resample
+from orthoswarm.stores.addresses import is_stored
 from orthoswarm.stores.local_copies import local_file
 
 Bytes = NDArray[np.uint8]
@@ -48,15 +49,13 @@ class RasterMap:
     """
 
     def __init__(self, path: Path, epsg: int, near: BoundingBox | None) -> None:
-        import rasterio
         from rasterio.errors import RasterioError
 
         self._error = RasterioError
         self._path = path
         self._epsg = epsg
         self._handles = threading.local()
-        with rasterio.Env(GDAL_DISABLE_READDIR_ON_OPEN="EMPTY_DIR"):
-            source = self._open()
+        source = self._open()
         self._crs = _crs_of(source, path)
         self._factors = [int(f) for f in source.overviews(1)] if source.count else []
         self._bands, self._alpha, self._palette = _band_roles(source)
@@ -82,8 +81,11 @@ class RasterMap:
                 # Bounds that cut a pixel move the whole map by up to half of one: GDAL takes them as the corner, and
                 # whole pixels from there.
                 options["USE_BOUNDS"] = "NO"
+            # Of a local map side files are looked for one by one (world file, .aux.xml, .msk, .ovr) without listing its
+            # folder, which may hold thousands of photos; asking a store for each of them would take seconds.
+            side_files = "EMPTY_DIR" if is_stored(self._path) else "TRUE"
             try:
-                with warnings.catch_warnings():
+                with warnings.catch_warnings(), rasterio.Env(GDAL_DISABLE_READDIR_ON_OPEN=side_files):
                     warnings.simplefilter("ignore", NotGeoreferencedWarning)  # reported as an error in plain words
                     handles[key] = rasterio.open(local_file(self._path), **options)
             except (RasterioIOError, OSError):
