@@ -20,6 +20,13 @@ class RasterConfig:
     """Side of these windows, pixels (chosen for its time)."""
 
     # Pictures
+    depth_full: float = 32768.0
+    """16-bit pictures whose upper values (`stretch_percent`) reach this use all bits: 256 of their levels become one.
+    Others, with 10 to 14 bits, are stretched like maps (chosen: half of the range)."""
+    depth_pictures: int = 9
+    """Pictures of a folder that tell the range of its 16-bit pictures (chosen for its time)."""
+    depth_values: int = 20_000
+    """About so many values of each of them (chosen for its time)."""
     grey_pictures_mb: float = 1500.0
     """Grey pictures at the refiner's working size that take no more than this together, megabytes, are kept on disk
     during a batch run (chosen for the disk). They come from the colours then: a grey level off by rounding, a few

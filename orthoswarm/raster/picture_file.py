@@ -1,14 +1,17 @@
 """Reading pictures: as stored in the file (EXIF rotation not applied), 8 bit, grey or RGB."""
 
 import io
+import os
 import struct
 from collections.abc import Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.stores.addresses import is_stored
 from orthoswarm.stores.local_copies import content
@@ -170,7 +173,46 @@ def _decode_other(path: Path, data: bytes, *, gray: bool) -> Bytes:
     import cv2
 
     flags = (cv2.IMREAD_GRAYSCALE if gray else cv2.IMREAD_COLOR) | cv2.IMREAD_IGNORE_ORIENTATION
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_ANYDEPTH) if data else None
+    if image is not None and image.dtype == np.uint16:
+        used = _used_range(path.parent, path.suffix.lower())
+        if used is not None:
+            low, high = used
+            scaled = (image.astype(np.float32) - np.float32(low)) * np.float32(255.0 / (high - low))
+            return np.asarray(np.clip(scaled + 0.5, 0, 255).astype(np.uint8))
+    if image is not None and image.dtype != np.uint8:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     if image is None:
         raise PictureError(f"{path.name} is not a readable picture; leave it out or copy it again")
     return np.asarray(image)
+
+
+@lru_cache(maxsize=256)
+def _used_range(folder: Path, suffix: str) -> tuple[float, float] | None:
+    """Values that become 0 and 255 in the 16-bit pictures of a folder; None where they use all 16 bits.
+
+    Thermal and multispectral cameras write 10 to 14 bits. The range comes from some pictures of the folder, the same
+    ones in every process, so that neighbouring pictures are alike. Of pictures in stores it is not looked for.
+    """
+    import cv2
+
+    if is_stored(folder):
+        return None
+    try:
+        names = sorted(name for name in os.listdir(folder) if Path(name).suffix.lower() == suffix)
+    except OSError:
+        return None
+    config = active().raster
+    values = []
+    for k in np.unique(np.linspace(0, len(names) - 1, config.depth_pictures).round().astype(int)) if names else ():
+        try:
+            data = _bytes(folder / names[k])
+        except PictureError:
+            continue
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+        if image is not None and image.dtype == np.uint16:
+            values.append(image.ravel()[:: max(1, image.size // config.depth_values)])
+    if not values:
+        return None
+    low, high = np.percentile(np.concatenate(values).astype(np.float64), config.stretch_percent)
+    return (float(low), float(max(high, low + 1.0))) if high < config.depth_full else None

@@ -1,0 +1,29 @@
+"""16-bit pictures of cameras with fewer bits are seen, and alike from picture to picture."""
+
+import cv2
+import numpy as np
+import pytest
+
+from orthoswarm.raster.picture_file import read_gray, read_rgb, read_rgba
+
+
+def ramp(low: float, high: float) -> np.ndarray:
+    return np.linspace(low, high, 64 * 48).reshape(48, 64).astype(np.uint16)
+
+
+@pytest.mark.parametrize("suffix", ["tif", "png"])
+def test_fourteen_bits_are_stretched_by_one_range_for_the_folder(tmp_path, suffix):
+    for k in range(4):
+        cv2.imwrite(str(tmp_path / f"{k}.{suffix}"), ramp(7200 + 100 * k, 7900 + 100 * k))
+    first, last = (read_gray(tmp_path / f"{k}.{suffix}").astype(float) for k in (0, 3))
+    assert first.min() == 0 and last.max() == 255 and first.max() > 150
+    level = 255.0 / 1000.0
+    assert np.median(last - first) == pytest.approx(300 * level, rel=0.1)  # the same value is the same grey
+    assert (
+        np.ptp(read_rgb(tmp_path / f"1.{suffix}")) > 150 and np.ptp(read_rgba(tmp_path / f"1.{suffix}")[..., :3]) > 150
+    )
+
+
+def test_all_sixteen_bits_are_divided(tmp_path):
+    cv2.imwrite(str(tmp_path / "full.tif"), ramp(0, 65535))
+    assert np.abs(read_gray(tmp_path / "full.tif").astype(float) - ramp(0, 65535) / 256.0).max() <= 1.0
