@@ -137,6 +137,12 @@ def _table_findings(path: Path, folder: Path, table: PoseTable, found: Discovery
     if table.useless:
         text = f"{plural(table.useless, 'line')} of {path.name} hold no valid position; they are not used"
         findings.append(Finding("table-lines", text))
+    if table.refused:
+        text = (
+            f"{plural(table.refused, 'cell')} of {path.name} cannot be read as the values that their titles name, "
+            f"'{table.first_refused}' first; they are not used"
+        )
+        findings.append(Finding("table-cells", text))
     pictures = [p for f in found.folders for p in f.pictures if p.is_relative_to(folder)]
     names = {name for p in pictures for name in names_of(p.relative_to(folder).as_posix())}
     absent = [name for name in table if name not in names]

@@ -11,18 +11,22 @@
 | WingtraHub and others | image, latitude, longitude | degrees | by value |
 | Pix4D, image geolocation | no header | latitude, longitude, altitude | yaw, pitch, roll; pitch 0 at nadir |
 
-Heights are absolute altitudes wherever the header does not say otherwise.
+Heights are absolute altitudes wherever the header does not say otherwise. How a cell may be written: `cell_values`. A
+cell that is not understood is left out and counted, and so is a line with more cells than the header has titles, since
+nothing tells which cell belongs to which title (47,5,8,25 with commas between the cells and in the numbers).
 """
 
 import csv
 import io
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from orthoswarm.model.errors import InputError
 from orthoswarm.raster.picture_file import PICTURE_SUFFIXES
+from telemetry.formats.table import cell_values
 from telemetry.formats.table.geo_txt import to_geographic
 from telemetry.formats.table.pose_row import PoseRow, PoseTable, pitch_by_value, read_text
 from telemetry.samples.rotations import camera_angles_from_opk_deg
@@ -49,10 +53,11 @@ _NAMES = {
     "fov_deg": "fov_deg",
     "time": "time time_s timestamp datetimeoriginal",
     "vehicle": "vehicle",
+    "lat_ref": "gpslatituderef latituderef lat_ref latitude_ref",
+    "lon_ref": "gpslongituderef longituderef lon_ref longitude_ref",
+    "altitude_ref": "gpsaltituderef altituderef alt_ref altitude_ref",
 }
 _COLUMNS = {name: key for key, names in _NAMES.items() for name in names.split()}
-_SEXAGESIMAL = re.compile(r"\s*([\d.]+)\s*deg\s*([\d.]+)'\s*([\d.]+)\"\s*([NSEW]?)")
-_NUMBER = re.compile(r"\s*([+-]?\d+(?:\.\d*)?(?:[eE][+-]?\d+)?)")
 _COORDINATE_SYSTEM = re.compile(r"#\s*CoordinateSystem:\s*(.+)", re.IGNORECASE)
 _PIX4D_COLUMNS = {
     3: "lat_deg lon_deg altitude_m",
@@ -60,6 +65,21 @@ _PIX4D_COLUMNS = {
     6: "lat_deg lon_deg altitude_m yaw_deg pitch_deg roll_deg",
     8: "lat_deg lon_deg altitude_m yaw_deg pitch_deg roll_deg sigma_m vertical",
 }
+
+
+@dataclass(frozen=True, slots=True)
+class _Layout:
+    """How the lines of a table are written.
+
+    Attributes:
+        separator: between cells; a blank stands for any number of blanks.
+        keys: field of each column, "" for one that is not used.
+        factors: metres or degrees in one unit of each field that is not in these.
+    """
+
+    separator: str
+    keys: Sequence[str]
+    factors: Mapping[str, float]
 
 
 def read_pose_csv(path: Path) -> PoseTable | None:
@@ -75,17 +95,17 @@ def read_pose_csv(path: Path) -> PoseTable | None:
         return None
     for at, line in enumerate(head[:5]):
         separator = _separator(line)
-        header = [_column(cell) for cell in _cells(line, separator)]
-        if "image" in header and ({"lat_deg", "lon_deg"} <= set(header) or {"x", "y"} <= set(header)):
-            return _read(path, at, _row_separator(head[at + 1 :], separator, header), header, line)
-    columns = _pix4d_header(head[0]) if head else None
-    if columns is not None:
-        return _read(path, -1, _separator(head[0]), columns, "")
-    return None
+        columns = [_column(cell) for cell in _cells(line, separator)]
+        keys = [key for key, _ in columns]
+        if "image" in keys and ({"lat_deg", "lon_deg"} <= set(keys) or {"x", "y"} <= set(keys)):
+            factors = {key: factor for key, factor in columns if factor != 1.0}
+            return _read(path, at, _Layout(_row_separator(head[at + 1 :], separator, keys), keys, factors), line)
+    known = _pix4d_columns(head[0]) if head else None
+    return None if known is None else _read(path, -1, _Layout(_separator(head[0]), known, {}), "")
 
 
 def _separator(line: str) -> str:
-    best = max(",;\t", key=line.count)
+    best = max(";\t,", key=line.count)  # a comma last: it may be the decimal mark of cells between semicolons
     return best if line.count(best) >= 2 else " "
 
 
@@ -93,26 +113,27 @@ def _row_separator(lines: Sequence[str], separator: str, header: Sequence[str]) 
     """What separates the cells of the rows: Metashape's OPK export has commas in its header and tabs below."""
     row = next((line for line in lines if line.strip() and not line.startswith("#")), "")
     own = _separator(row)
-    return own if len(_cells(row, separator)) < len(header) == len(_cells(row, own)) else separator
+    return own if own != "," and len(_cells(row, separator)) < len(header) == len(_cells(row, own)) else separator
 
 
 def _cells(line: str, separator: str) -> list[str]:
     return line.split() if separator == " " else next(csv.reader([line], delimiter=separator), [])
 
 
-def _column(cell: str) -> str:
-    """The field that a column's title names, "" if unknown; units, comment marks and capitals are ignored."""
-    text = re.sub(r"\[.*?\]|\(.*?\)", "", cell).strip().lstrip("#").strip().lower()
-    return _COLUMNS.get(re.sub(r"[\s_]+", "_", text).strip("_"), "")
+def _column(cell: str) -> tuple[str, float]:
+    """The field that a column's title names, "" if unknown, and its unit; comment marks and capitals are ignored."""
+    text, factor = cell_values.unit_of_title(cell.strip().lstrip("#"))
+    return _COLUMNS.get(re.sub(r"[\s_]+", "_", text.lower()).strip("_"), ""), factor
 
 
-def _pix4d_header(line: str) -> list[str] | None:
-    """Columns of a line `image.jpg,47.1,8.2,500 ...` without a header before it; None for any other line."""
-    cells = [cell.strip() for cell in line.split(_separator(line))]
+def _pix4d_columns(line: str) -> list[str] | None:
+    """Fields of a line `image.jpg,47.1,8.2,500 ...` without a header before it; None for any other line."""
+    separator = _separator(line)
+    cells = [cell.strip() for cell in line.split(separator)]
     if Path(cells[0]).suffix.lower() not in PICTURE_SUFFIXES:
         return None
     try:
-        numbers = [float(cell) for cell in cells[1:]]
+        numbers = [float(cell if separator == "," else cell.replace(",", ".")) for cell in cells[1:]]
     except ValueError:
         return None
     columns = _PIX4D_COLUMNS.get(len(numbers))
@@ -125,28 +146,35 @@ def _pix4d_header(line: str) -> list[str] | None:
     return ["image", *columns.split()]
 
 
-def _read(path: Path, header_at: int, separator: str, header: Sequence[str], title: str) -> PoseTable:
+def _read(path: Path, header_at: int, layout: _Layout, title: str) -> PoseTable:
     lines = read_text(path).splitlines()
     body = [line for line in lines[header_at + 1 :] if line.strip() and not line.startswith("#")]
-    commas = csv.reader(io.StringIO("\n".join(body)), delimiter=separator)
-    rows = (line.split() for line in body) if separator == " " else commas
+    commas = csv.reader(io.StringIO("\n".join(body)), delimiter=layout.separator)
+    rows = (_words(line, len(layout.keys)) for line in body) if layout.separator == " " else commas
     table = PoseTable()
     try:
         for cells in rows:
-            named = _row(header, cells)
-            if named is not None:
-                table[named[0]] = named[1]
+            _add_row(table, layout, cells)
     except csv.Error:  # an unterminated quoted cell: nothing after it can be separated
         pass
-    if "lat_deg" not in header:
+    unclear = table.useless
+    if "lat_deg" not in layout.keys:
         to_geographic(table, _projection(path, lines[: header_at + 1], table), path)
     for row in table.values():
         if row.lat_deg is None or row.lon_deg is None or not is_position(row.lat_deg, row.lon_deg):
             row.lat_deg = row.lon_deg = None
-    table.useless = sum(row.lat_deg is None for row in table.values())
-    if "lat_deg" not in title.lower() and "sourcefile" not in title.lower() and "omega" not in header:
+    table.useless = unclear + sum(row.lat_deg is None for row in table.values())
+    if "lat_deg" not in title.lower() and "sourcefile" not in title.lower() and "omega" not in layout.keys:
         pitch_by_value(table)
     return table
+
+
+def _words(line: str, most: int) -> list[str]:
+    """Cells between blanks; where there are more than titles, a first one with blanks ends with a picture's suffix."""
+    words = line.split()
+    ends = (i for i, word in enumerate(words) if Path(word).suffix.lower() in PICTURE_SUFFIXES)
+    first = next(ends, 0) + 1 if len(words) > most else 1
+    return [" ".join(words[:first]), *words[first:]]
 
 
 def _projection(path: Path, before: Sequence[str], table: PoseTable) -> str:
@@ -166,47 +194,59 @@ def _projection(path: Path, before: Sequence[str], table: PoseTable) -> str:
     )
 
 
-def _row(header: Sequence[str], cells: Sequence[str]) -> tuple[str, PoseRow] | None:
-    values = {key: cell.strip() for key, cell in zip(header, cells) if key and cell.strip()}
+def _add_row(table: PoseTable, layout: _Layout, cells: Sequence[str]) -> None:
+    """Put the values of one line into the table."""
+    values = {key: cell.strip() for key, cell in zip(layout.keys, cells) if key and cell.strip()}
     name = values.pop("image", "").replace("\\", "/").removeprefix("./")
     if not name:
-        return None
+        return
+    if any(cell.strip() for cell in cells[len(layout.keys) :]):
+        table.useless += 1
+        return
     vehicle = "".join(c for c in values.pop("vehicle", "") if c.isprintable()).strip()
     row = PoseRow(vehicle=vehicle[:64] or None)
-    row.time_s = _time(values.pop("time", ""))
-    numbers = {key: value for key, cell in values.items() if (value := _number(cell)) is not None}
+    values = {key: cell for key, cell in values.items() if not cell_values.is_absent(cell)}
+    # A comma is the decimal mark where it does not separate cells, and no number of the line is written with a point.
+    if layout.separator != "," and not any(map(_POINT.search, values.values())):
+        values = {key: _COMMA.sub(".", cell) for key, cell in values.items()}
+    numbers: dict[str, float] = {}
+    for key in filter(_VALUES.__contains__, values):
+        value = _with_ref(_VALUES[key](values[key], layout.factors.get(key, 1.0)), values, key)
+        if value is None:
+            table.refuse(values[key])
+        else:
+            numbers[key] = value
     if {"omega", "phi", "kappa"} <= numbers.keys():
         angles = camera_angles_from_opk_deg(numbers["omega"], numbers["phi"], numbers["kappa"])
         row.yaw_deg, row.pitch_deg, row.roll_deg = angles
     for key, value in numbers.items():
-        if key in ("x", "y"):
-            setattr(row, "lon_deg" if key == "x" else "lat_deg", value)
-        elif key in _FIELDS:
-            setattr(row, key, value)
+        if key not in ("omega", "phi", "kappa"):
+            setattr(row, {"x": "lon_deg", "y": "lat_deg", "time": "time_s"}.get(key, key), value)
     if row.sigma_m is not None and not 0.0 < row.sigma_m < 1000.0:
         row.sigma_m = None
-    return name.lower(), row
+    table[name.lower()] = row
 
 
-_FIELDS = frozenset(
-    {"lat_deg", "lon_deg", "altitude_m", "height_m", "yaw_deg", "pitch_deg", "roll_deg", "sigma_m", "fov_deg"}
-)
+def _with_ref(value: float | None, values: Mapping[str, str], key: str) -> float | None:
+    """A value with the sign that the column of its reference states; None where they contradict."""
+    if key == "lat_deg" and "lat_ref" in values:
+        return cell_values.in_hemisphere(value, values["lat_ref"], "NS")
+    if key == "lon_deg" and "lon_ref" in values:
+        return cell_values.in_hemisphere(value, values["lon_ref"], "EW")
+    if key == "altitude_m" and "altitude_ref" in values and value is not None:
+        below = cell_values.below_sea(values["altitude_ref"])
+        return None if below is None else -abs(value) if below else value
+    return value
 
 
-def _number(cell: str) -> float | None:
-    """A number, also with a unit after it ("512.3 m") or as ExifTool writes angles (47 deg 30' 0.00" N)."""
-    match = _SEXAGESIMAL.match(cell)
-    if match:
-        value = float(match[1]) + float(match[2]) / 60.0 + float(match[3]) / 3600.0
-        return -value if match[4] in ("S", "W") and match[4] else value
-    match = _NUMBER.match(cell)
-    value = float(match[1]) if match else math.nan
-    if cell.rstrip().endswith("Below Sea Level"):
-        value = -value
-    return value if math.isfinite(value) else None
+def _sigma(cell: str, factor: float) -> float | None:
+    """The largest of "0.02/0.05", accuracies in x and y."""
+    parts = [cell_values.length_m(part, factor) for part in cell.split("/")[:3]]
+    known = [part for part in parts if part is not None]
+    return max(known) if len(known) == len(parts) else None
 
 
-def _time(written: str) -> float | None:
+def _time(written: str, _factor: float) -> float | None:
     """Epoch seconds; None if it is not a time."""
     try:
         value = float(written)
@@ -214,6 +254,19 @@ def _time(written: str) -> float | None:
         parsed = parse_time(written)
         return None if parsed is None else parsed[0]
     return value if math.isfinite(value) and 0.0 < value < 7.3e9 else None
+
+
+_POINT, _COMMA = re.compile(r"\d\.\d"), re.compile(r"(?<=\d),(?=\d)")
+_VALUES: Mapping[str, Callable[[str, float], float | None]] = {
+    "lat_deg": lambda cell, factor: cell_values.coordinate_deg(cell, "NS", factor),
+    "lon_deg": lambda cell, factor: cell_values.coordinate_deg(cell, "EW", factor),
+    "x": lambda cell, _: cell_values.length_m(cell),  # in the unit of the projection, whatever the title says
+    "y": lambda cell, _: cell_values.length_m(cell),
+    **dict.fromkeys(("altitude_m", "height_m"), cell_values.length_m),
+    **dict.fromkeys(("yaw_deg", "pitch_deg", "roll_deg", "fov_deg", "omega", "phi", "kappa"), cell_values.angle_deg),
+    "sigma_m": _sigma,
+    "time": _time,
+}
 
 
 def names_pictures(path: Path) -> bool:

@@ -29,9 +29,17 @@ class PoseTable(dict[str, PoseRow]):
 
     Attributes:
         useless: number of lines that name a picture without a valid position.
+        refused: number of cells that were not understood; first_refused: the first of them.
     """
 
     useless: int = 0
+    refused: int = 0
+    first_refused: str = ""
+
+    def refuse(self, cell: str) -> None:
+        """Count a cell that is not understood."""
+        self.first_refused = self.first_refused or "".join(c for c in cell if c.isprintable())[:40]
+        self.refused += 1
 
 
 def lookup(table: PoseTable, relative: str) -> PoseRow | None:
