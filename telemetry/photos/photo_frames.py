@@ -11,7 +11,7 @@ from orthoswarm.config import active
 from orthoswarm.model.frame import Frame
 from telemetry.photos.attitude import check_legs, decide
 from telemetry.photos.maker_angles import Angles
-from telemetry.photos.photo_tags import PhotoTags
+from telemetry.photos.photo_tags import HEMISPHERE_UNKNOWN, PhotoTags
 from telemetry.samples.course import courses_deg, local_metres, straight_legs
 from telemetry.samples.findings import Finding, plural
 from telemetry.samples.sample import Sample
@@ -32,6 +32,13 @@ def frames_of(
     ground = local_metres([p.lat_deg or 0.0 for p in photos], [p.lon_deg or 0.0 for p in photos])
     course = courses_deg(ground)
     heights = _heights(photos, findings, vehicle)
+    unsigned = sum(p.origin.get("position", "").endswith(HEMISPHERE_UNKNOWN) for p in photos)
+    if unsigned:
+        text = (
+            f"the GPS tags of {plural(unsigned, 'photo')} do not say whether north or south, east or west "
+            "(GPSLatitudeRef, GPSLongitudeRef), and are taken as north and east; give a geo.txt if that is wrong"
+        )
+        findings.append(Finding("position-hemisphere", text, vehicle))
     chosen: dict[int, tuple[Angles, str]] = {}
     for model in sorted({p.model for p in photos}):
         index = [i for i, p in enumerate(photos) if p.model == model]

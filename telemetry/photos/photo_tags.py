@@ -25,6 +25,9 @@ from telemetry.samples.unreadable import Unreadable, read_or_reason
 Run = Callable[..., Iterator[Any]]
 """Maps a function over items, in order."""
 
+HEMISPHERE_UNKNOWN = "without hemisphere, taken as north and east"
+"""End of the origin of a position whose signs are not known."""
+
 _FULL_FRAME_DIAGONAL_MM = 43.2666
 _CHUNK = 64
 
@@ -153,11 +156,14 @@ def _position(photo: PhotoTags, tags: exif.Exif, found: xmp.Properties) -> None:
     position = exif.gps_position(tags.gps)
     source = "EXIF GPS"
     if position is None:
-        lat = xmp.number(found, *(f"{p}:{n}" for p in _POSITION_PREFIXES for n in ("GpsLatitude", "Latitude")))
-        lon_names = ("GpsLongitude", "GpsLongtitude", "Longitude")
-        lon = xmp.number(found, *(f"{p}:{n}" for p in _POSITION_PREFIXES for n in lon_names))
-        if lat is not None and lon is not None and is_position(lat, lon):
-            position, source = (lat, lon), "XMP position"
+        position, source = _xmp_position(found), "XMP position"
+    elif not all(signs := exif.gps_signs(tags.gps)):
+        other = _xmp_position(found)
+        if other is None:
+            source = f"EXIF GPS {HEMISPHERE_UNKNOWN}"
+        else:
+            lat, lon = (a if known else math.copysign(a, b) for a, b, known in zip(position, other, signs, strict=True))
+            position, source = (lat, lon), "EXIF GPS, hemisphere from XMP"
     if position is not None:
         photo.lat_deg, photo.lon_deg = position
         photo.origin["position"] = source
@@ -173,6 +179,13 @@ def _position(photo: PhotoTags, tags: exif.Exif, found: xmp.Properties) -> None:
         if stated is not None and 0.0 < stated < 1000.0:
             photo.position_sigma_m = stated
             photo.origin["position_sigma"] = "stated accuracy"
+
+
+def _xmp_position(found: xmp.Properties) -> tuple[float, float] | None:
+    lat = xmp.number(found, *(f"{p}:{n}" for p in _POSITION_PREFIXES for n in ("GpsLatitude", "Latitude")))
+    lon_names = ("GpsLongitude", "GpsLongtitude", "Longitude")
+    lon = xmp.number(found, *(f"{p}:{n}" for p in _POSITION_PREFIXES for n in lon_names))
+    return (lat, lon) if lat is not None and lon is not None and is_position(lat, lon) else None
 
 
 def _heights(photo: PhotoTags, tags: exif.Exif, found: xmp.Properties) -> None:

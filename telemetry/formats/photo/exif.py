@@ -1,7 +1,7 @@
 """EXIF without a library: the tags of a TIFF structure (JPEG APP1, PNG eXIf, WebP EXIF, a TIFF file itself).
 
 Own parser because it must take far less than a millisecond per photo and tolerate damaged files: every
-offset is checked, every count is bounded, and bad data never raises. Source: EXIF 2.32, TIFF 6.0.
+offset is checked, every count is bounded, and bad data never raises. Source: EXIF 2.32 and 3.0, TIFF 6.0.
 """
 
 import math
@@ -133,6 +133,15 @@ def gps_position(gps: Tags) -> tuple[float, float] | None:
     return (lat, lon) if is_position(lat, lon) else None
 
 
+def gps_signs(gps: Tags) -> tuple[bool, bool]:
+    """Whether a GPS directory states the hemisphere of its latitude, and of its longitude."""
+    lat, lon = _sexagesimal(gps.get(2)), _sexagesimal(gps.get(4))
+    return (
+        text(gps.get(1)).upper()[:1] in ("N", "S") or (lat is not None and lat < 0.0),
+        text(gps.get(3)).upper()[:1] in ("E", "W") or (lon is not None and lon < 0.0),
+    )
+
+
 def _sexagesimal(value: Value | None) -> float | None:
     if not isinstance(value, tuple) or not value or not math.isfinite(value[0]):
         return None
@@ -144,13 +153,17 @@ def _sexagesimal(value: Value | None) -> float | None:
 
 
 def gps_altitude(gps: Tags) -> float | None:
-    """Altitude in metres over the sea (as far as the camera knows), negative below it."""
+    """Altitude in metres, negative below the sea or the ellipsoid, whichever the camera counts from.
+
+    EXIF 3.0 has four references: 0 and 1 above and below the ellipsoid, 2 and 3 above and below the sea. Earlier
+    editions call the first two the sea's, so that they do not tell from what the camera counts.
+    """
     altitude = number(gps.get(6))
     if altitude is None:
         return None
     ref = gps.get(5)
-    below = (isinstance(ref, tuple) and bool(ref) and ref[0] == 1.0) or (isinstance(ref, bytes) and ref[:1] == b"\1")
-    return -abs(altitude) if below else altitude
+    code = ref[0] if isinstance(ref, tuple | bytes) and ref else 0
+    return -abs(altitude) if code in (1, 3) else altitude
 
 
 def gps_time(gps: Tags) -> float | None:

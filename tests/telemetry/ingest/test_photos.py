@@ -14,6 +14,7 @@ from PIL import Image
 from telemetry.formats.photo import exif, xmp
 from telemetry.formats.photo.makernotes import parse_dji
 from telemetry.formats.photo.picture_container import NotAPicture, read_container
+from telemetry.ingest.ingest import survey
 from telemetry.photos.photo_tags import read_photo
 from telemetry.samples.times import parse_offset, parse_time
 
@@ -197,6 +198,53 @@ def test_time_keeps_subseconds_and_takes_the_zone_where_it_is_known(tmp_path, kw
 def test_hemispheres(tmp_path, lat, lon):
     photo = read_photo(jpeg(tmp_path / "a.jpg", exif_bytes=gps_exif(lat, lon)))
     assert (photo.lat_deg, photo.lon_deg) == pytest.approx((lat, lon), abs=1e-8)
+
+
+def changed_gps(change, **kwargs) -> bytes:
+    """EXIF whose GPS directory (tag -> value) a function changes."""
+    tags = Image.Exif()
+    tags.load(gps_exif(**kwargs))
+    change(tags.get_ifd(0x8825))
+    return tags.tobytes()
+
+
+def without_refs(gps):
+    del gps[1], gps[3]
+
+
+SOUTH_WEST = (
+    b'<x:xmpmeta><rdf:Description drone-dji:GpsLatitude="-33.9" drone-dji:GpsLongitude="-70.6" '
+    b'drone-dji:RelativeAltitude="+80.1"/></x:xmpmeta>'
+)
+
+
+def test_a_gps_position_without_hemispheres_takes_them_from_the_xmp_of_its_photo(tmp_path):
+    unsigned = changed_gps(without_refs, lat=-33.9, lon=-70.6)
+    photo = read_photo(jpeg(tmp_path / "a.jpg", exif_bytes=unsigned, xmp_packet=SOUTH_WEST))
+    assert (photo.lat_deg, photo.lon_deg) == pytest.approx((-33.9, -70.6))
+    one = changed_gps(lambda gps: gps.pop(3), lat=33.9, lon=-70.6)
+    photo = read_photo(jpeg(tmp_path / "b.jpg", exif_bytes=one, xmp_packet=SOUTH_WEST))
+    assert (photo.lat_deg, photo.lon_deg) == pytest.approx((33.9, -70.6))
+
+
+def test_gps_positions_whose_hemispheres_nobody_states_are_reported(tmp_path):
+    jpeg(tmp_path / "a.jpg", exif_bytes=changed_gps(without_refs, lat=-33.9, lon=-70.6))
+    jpeg(tmp_path / "b.jpg", exif_bytes=gps_exif(33.9, 70.6))
+    (finding,) = [f for s in survey([tmp_path]).sources for f in s.findings if f.code == "position-hemisphere"]
+    assert "1 photo " in finding.message
+    assert not finding.note
+    (tmp_path / "geo.txt").write_text("EPSG:4326\na.jpg -70.6 -33.9\n")
+    assert not [f for s in survey([tmp_path]).sources for f in s.findings if f.code == "position-hemisphere"]
+
+
+@pytest.mark.parametrize(("ref", "sign"), [(0, 1.0), (1, -1.0), (2, 1.0), (3, -1.0), (None, 1.0)])
+def test_altitudes_below_the_sea_or_the_ellipsoid_are_negative(tmp_path, ref, sign):
+    def altitude(gps):
+        gps[6] = 12.5
+        if ref is not None:
+            gps[5] = bytes([ref])
+
+    assert read_photo(jpeg(tmp_path / "a.jpg", exif_bytes=changed_gps(altitude))).altitude_m == sign * 12.5
 
 
 def test_zero_zero_is_no_position(tmp_path):
