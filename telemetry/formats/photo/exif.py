@@ -179,7 +179,8 @@ def exposure_time(exif: Exif) -> tuple[float, str] | None:
     """Time of exposure: UTC epoch seconds, and the source of the time zone.
 
     The camera's clock has sub-seconds but often no zone, the GPS stamp a zone but whole seconds and a lag: where
-    both exist the stamp only determines the zone (to the quarter of an hour).
+    both exist the stamp only determines the zone (to the quarter of an hour), unless the clock differs from it by more
+    than two minutes or was never set (`_by_both`).
     """
     written = text(exif.exif.get(DATE_ORIGINAL)) or text(exif.main.get(DATE_TIME))
     local = parse_time(written)
@@ -195,9 +196,49 @@ def exposure_time(exif: Exif) -> tuple[float, str] | None:
     offset = parse_offset(text(exif.exif.get(OFFSET_ORIGINAL)) or text(exif.exif.get(OFFSET_TIME)))
     if offset is not None:
         return seconds - offset, "EXIF time with zone"
-    if stamp is not None:
-        quarters = round((seconds - stamp) / 900.0)
-        if abs(quarters) <= 60 and abs(seconds - stamp - 900.0 * quarters) < 120.0:
-            return seconds - 900.0 * quarters, "EXIF time, zone from GPS time"
-        return stamp, "EXIF GPS time"
-    return seconds, f"EXIF time {ZONE_UNKNOWN}"
+    exposed = None if stamp is None else _by_both(seconds, stamp)
+    return exposed or (seconds, f"EXIF time {ZONE_UNKNOWN}")
+
+
+_DAY_S, _QUARTER_S, _MOST_LAG_S = 86_400.0, 900.0, 120.0
+_WEST, _EAST = -11 * 4, 14 * 4
+"""The time zones in which people live, in quarters of an hour east of UTC."""
+_ROLLOVER_DAYS = 1024 * 7
+"""A receiver that counts weeks with ten bits is early by so much when they overflow (IS-GPS-200, 20.3.3.3.1.1)."""
+_YEAR_DAYS = 366
+
+
+def _by_both(clock: float, stamp: float) -> tuple[float, str] | None:
+    """UTC by the camera's clock and the receiver's stamp; None if nothing of the stamp can be believed.
+
+    The stamp's time of day comes from the satellites, but its date may be wrong. Where both differ by more than a time
+    zone, the days between them decide which of them is:
+
+    - one day: the stamp has the local date, or not yet the new day's. The clock is right, if its minutes are.
+    - The stamp is 1,024 weeks early, or a multiple: the receiver's week number rolled over. The same.
+    - The stamp is more than a year early, but not so: the receiver had no fix.
+    - Otherwise the clock was set wrongly, or never, as clocks start in a past year. The stamp is right.
+
+    Args:
+        clock: the camera's time as if it were UTC, epoch seconds.
+        stamp: GPSDateStamp and GPSTimeStamp, epoch seconds.
+    """
+    days = _days_early(clock - stamp)
+    if days > _YEAR_DAYS:
+        stamp += round(days / _ROLLOVER_DAYS) * _ROLLOVER_DAYS * _DAY_S
+        days = _days_early(clock - stamp)
+        if abs(days) > 1:
+            return None
+    if abs(days) <= 1:
+        zone = round((clock - stamp) / _QUARTER_S) * _QUARTER_S
+        if abs(clock - stamp - zone) < _MOST_LAG_S:
+            return clock - zone + days * _DAY_S, "EXIF time, zone from GPS time"
+    return stamp, "EXIF GPS time"
+
+
+def _days_early(apart: float) -> int:
+    """Days by which the stamp would have to be later for its difference from the clock, seconds, to be a time zone."""
+    if _WEST <= round(apart / _QUARTER_S) <= _EAST:
+        return 0
+    # 13 h and more share their time of day with -11 h and less: where the date does not tell, the zone of more people.
+    return math.ceil((apart - 13.0 * 3600.0 - _MOST_LAG_S) / _DAY_S)

@@ -3,6 +3,7 @@
 import io
 import math
 import struct
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
@@ -198,6 +199,58 @@ def test_time_keeps_subseconds_and_takes_the_zone_where_it_is_known(tmp_path, kw
 def test_hemispheres(tmp_path, lat, lon):
     photo = read_photo(jpeg(tmp_path / "a.jpg", exif_bytes=gps_exif(lat, lon)))
     assert (photo.lat_deg, photo.lon_deg) == pytest.approx((lat, lon), abs=1e-8)
+
+
+def written(utc: float) -> str:
+    return datetime.fromtimestamp(utc, UTC).strftime("%Y:%m:%d %H:%M:%S")
+
+
+def time_of(folder, clock: float, stamp: float, date_from: float | None = None) -> tuple[float, str]:
+    """Time and its origin of a photo with these times of its clock and receiver, and the date that the stamp names."""
+    of_day = (float(stamp % 86400.0 // 3600.0), float(stamp % 3600.0 // 60.0), stamp % 60.0)
+    date = written(stamp if date_from is None else date_from)[:10]
+    photo = read_photo(jpeg(folder / "a.jpg", exif_bytes=gps_exif(local=written(clock), gps_utc=(of_day, date))))
+    return photo.time_s, photo.origin["time"]
+
+
+WEEKS_1024_S = 1024 * 7 * 86400.0
+
+
+@given(
+    utc=st.integers(1_200_000_000, 1_900_000_000),
+    zone=st.integers(-40, 52),
+    lag=st.integers(-100, 100),
+    date=st.sampled_from(["right", "local", "a day late", "rolled over"]),
+)
+@settings(max_examples=100, deadline=None)
+def test_a_stamp_with_a_wrong_date_gives_the_zone_and_the_camera_the_date(tmp_path_factory, utc, zone, lag, date):
+    stamp, clock = float(utc - lag), utc + 900.0 * zone
+    dates = {"right": stamp, "local": clock, "a day late": stamp - 86400.0, "rolled over": stamp - WEEKS_1024_S}
+    if date in ("local", "a day late") and not -40 < zone < 52:
+        return  # the day before in Hawaii is today in Kiribati, tomorrow in New Zealand is today in Samoa
+    if date == "local" and clock // 86400 != (clock - lag) // 86400:
+        return
+    found, origin = time_of(tmp_path_factory.mktemp("t"), clock, stamp, dates[date])
+    assert (found, origin) == (utc + 0.25, "EXIF time, zone from GPS time")
+
+
+T0 = 1_715_000_000.0  # 2024-05-06
+
+
+@pytest.mark.parametrize("clock", [0.0, 946_684_800.0, 1_420_070_400.0, T0 - 40 * 86400.0, T0 + 300 * 86400.0])
+def test_a_clock_that_was_never_set_or_set_wrongly_gives_way_to_the_stamp(tmp_path, clock):
+    for minutes in range(0, 15, 3):  # whether or not the minutes agree by chance
+        assert time_of(tmp_path, clock + 60.0 * minutes + 7.0, T0) == (T0, "EXIF GPS time")
+
+
+def test_a_clock_whose_minutes_are_wrong_gives_way_to_the_stamp(tmp_path):
+    assert time_of(tmp_path, T0 + 7200.0 + 180.0, T0) == (T0, "EXIF GPS time")
+    assert time_of(tmp_path, T0 + 7200.0 + 180.0, T0, T0 - WEEKS_1024_S) == (T0, "EXIF GPS time")
+
+
+@pytest.mark.parametrize("date", [315_964_800.0, 946_684_800.0, 1_445_126_400.0])
+def test_the_stamp_of_a_receiver_without_a_fix_is_not_believed(tmp_path, date):
+    assert time_of(tmp_path, T0, T0, date) == (T0 + 0.25, "EXIF time without zone, taken as UTC")
 
 
 def changed_gps(change, **kwargs) -> bytes:
