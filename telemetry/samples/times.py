@@ -1,4 +1,4 @@
-"""Times: those written as text (EXIF, ISO 8601), and the scales of GPS and TAI."""
+"""Times: those written as text (EXIF, ISO 8601) or as numbers since 1970, and the scales of GPS and TAI."""
 
 import calendar
 import re
@@ -13,13 +13,18 @@ YEAR_2000_S = 946_684_800.0
 """2000-01-01 in epoch seconds: a clock that is earlier was never set."""
 
 _WRITTEN = re.compile(
-    r"\s*(\d{4})[:\-/](\d{1,2})[:\-/](\d{1,2})[T ]+(\d{1,2}):(\d{2})(?::(\d{2})(?:[.,](\d+))?)?\s*(Z|[+-]\d{2}:?\d{2})?"
+    r"\s*(\d{4})[:\-/](\d{1,2})[:\-/](\d{1,2})[T ]+(\d{1,2}):(\d{2})(?::(\d{2})(?:[.,](\d+))?)?\s*"
+    r"(Z|UTC|GMT|[+-]\d{2}(?::?\d{2})?)?\s*",
+    re.IGNORECASE,
 )
 
 
 def parse_time(value: str) -> tuple[float, bool] | None:
-    """Epoch seconds of an EXIF or ISO 8601 time and whether a zone was given; without one it is read as UTC."""
-    match = _WRITTEN.match(value)
+    """Epoch seconds of an EXIF or ISO 8601 time and whether a zone was given; without one it is read as UTC.
+
+    None if it is not such a time, or more than that: what follows may be a zone, or the other half of the day.
+    """
+    match = _WRITTEN.fullmatch(value)
     if match is None:
         return None
     year, month, day, hour, minute = (int(match[i]) for i in range(1, 6))
@@ -27,17 +32,27 @@ def parse_time(value: str) -> tuple[float, bool] | None:
     if not (1970 <= year < 2200 and 1 <= month <= 12 and 1 <= day <= 31 and hour < 25 and minute < 60 and second < 61):
         return None
     seconds = calendar.timegm((year, month, day, hour, minute, second, 0, 0, 0)) + float(f"0.{match[7] or 0}")
-    zone = parse_offset(match[8] or "")
-    return (seconds, False) if zone is None else (seconds - zone, True)
+    if match[8] is None:
+        return seconds, False
+    zone = parse_offset(match[8])
+    return None if zone is None else (seconds - zone, True)
 
 
 def parse_offset(value: str) -> float | None:
-    """Seconds east of UTC of "+02:00", "-0530" or "Z"; None for anything else."""
-    value = value.strip()
-    if value == "Z":
+    """Seconds east of UTC of "+02:00", "-0530", "+02" (ISO 8601: minutes may be left out) or "Z"; else None."""
+    value = value.strip().upper()
+    if value in ("Z", "UTC", "GMT"):
         return 0.0
-    match = re.fullmatch(r"([+-])(\d{2}):?(\d{2})", value)
-    if match is None or int(match[2]) > 14 or int(match[3]) > 59:
+    match = re.fullmatch(r"([+-])(\d{2})(?::?(\d{2}))?", value)
+    if match is None or int(match[2]) > 14 or int(match[3] or 0) > 59:
         return None
-    seconds = int(match[2]) * 3600.0 + int(match[3]) * 60.0
+    seconds = int(match[2]) * 3600.0 + int(match[3] or 0) * 60.0
     return -seconds if match[1] == "-" else seconds
+
+
+def epoch_seconds(value: float) -> float | None:
+    """Seconds since 1970 of a number of seconds, milliseconds, microseconds or nanoseconds; None beyond them.
+
+    The scale shows in the size: seconds reach 1e10 in the year 2286, which in milliseconds was in April 1970.
+    """
+    return next((float(value / scale) for scale in (1.0, 1e3, 1e6, 1e9) if abs(value) / scale < 1e10), None)

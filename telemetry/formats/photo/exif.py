@@ -29,6 +29,9 @@ DATE_ORIGINAL, OFFSET_TIME, OFFSET_ORIGINAL, SUBSEC, SUBSEC_ORIGINAL = 0x9003, 0
 MAKER_NOTE, FOCAL_MM, FOCAL_PLANE_X, FOCAL_PLANE_UNIT = 0x927C, 0x920A, 0xA20E, 0xA210
 PIXEL_X, FOCAL_35MM, DIGITAL_ZOOM = 0xA002, 0xA405, 0xA404
 
+_WRITTEN_CHARACTERS = 19
+"""Length of a time in EXIF, without the zero after it."""
+
 _LARGE_MAIN = frozenset({XMP})
 _LARGE_EXIF = frozenset({MAKER_NOTE})
 # Strips, tiles and colour maps can be megabytes and are not needed here.
@@ -171,7 +174,7 @@ def gps_time(gps: Tags) -> float | None:
     stamp = gps.get(7)
     if not isinstance(stamp, tuple) or len(stamp) < 3 or not all(map(math.isfinite, stamp[:3])):
         return None
-    day = parse_time(text(gps.get(29)) + " 00:00:00")
+    day = parse_time(text(gps.get(29))[:10] + " 00:00:00")
     return None if day is None else day[0] + stamp[0] * 3600.0 + stamp[1] * 60.0 + stamp[2]
 
 
@@ -183,7 +186,7 @@ def exposure_time(exif: Exif) -> tuple[float, str] | None:
     than two minutes or was never set (`_by_both`).
     """
     written = text(exif.exif.get(DATE_ORIGINAL)) or text(exif.main.get(DATE_TIME))
-    local = parse_time(written)
+    local = parse_time(written) or parse_time(written[:_WRITTEN_CHARACTERS])  # what follows is no part of it
     stamp = gps_time(exif.gps)
     if local is None:
         return None if stamp is None else (stamp, "EXIF GPS time")

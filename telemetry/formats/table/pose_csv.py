@@ -18,7 +18,6 @@ nothing tells which cell belongs to which title (47,5,8,25 with commas between t
 
 import csv
 import io
-import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -31,7 +30,7 @@ from telemetry.formats.table.geo_txt import to_geographic
 from telemetry.formats.table.pose_row import PoseRow, PoseTable, pitch_by_value, read_text
 from telemetry.samples.rotations import camera_angles_from_opk_deg
 from telemetry.samples.sample import is_position
-from telemetry.samples.times import parse_time
+from telemetry.samples.times import epoch_seconds, parse_time
 
 _HEAD_BYTES = 1 << 14
 _NAMES = {
@@ -206,6 +205,8 @@ def _add_row(table: PoseTable, layout: _Layout, cells: Sequence[str]) -> None:
     vehicle = "".join(c for c in values.pop("vehicle", "") if c.isprintable()).strip()
     row = PoseRow(vehicle=vehicle[:64] or None)
     values = {key: cell for key, cell in values.items() if not cell_values.is_absent(cell)}
+    if not values.get("time", "").strip("0:-/T. "):  # cameras without a clock write zeros
+        values.pop("time", None)
     # A comma is the decimal mark where it does not separate cells, and no number of the line is written with a point.
     if layout.separator != "," and not any(map(_POINT.search, values.values())):
         values = {key: _COMMA.sub(".", cell) for key, cell in values.items()}
@@ -249,11 +250,11 @@ def _sigma(cell: str, factor: float) -> float | None:
 def _time(written: str, _factor: float) -> float | None:
     """Epoch seconds; None if it is not a time."""
     try:
-        value = float(written)
+        value = epoch_seconds(float(written))
     except ValueError:
         parsed = parse_time(written)
-        return None if parsed is None else parsed[0]
-    return value if math.isfinite(value) and 0.0 < value < 7.3e9 else None
+        value = None if parsed is None else parsed[0]
+    return value if value is not None and 0.0 < value < 7.3e9 else None
 
 
 _POINT, _COMMA = re.compile(r"\d\.\d"), re.compile(r"(?<=\d),(?=\d)")

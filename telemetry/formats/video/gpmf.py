@@ -82,7 +82,7 @@ def _without_fix(entry: _Entry | None) -> bool:
 def _utc(entry: _Entry | None) -> float | None:
     """UTC of `yymmddhhmmss.sss`."""
     text = b"" if entry is None else entry.value[:16]
-    digits = text.decode("ascii", "replace")
+    digits = text.decode("ascii", "replace").rstrip("\0 ")
     parsed = parse_time(f"20{digits[0:2]}-{digits[2:4]}-{digits[4:6]} {digits[6:8]}:{digits[8:10]}:{digits[10:]}")
     return None if parsed is None else parsed[0]
 

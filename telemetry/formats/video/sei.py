@@ -35,6 +35,7 @@ from functools import cache
 
 from orthoswarm.model.earth import DEGREE_M
 from telemetry.samples.sample import Sample, checked
+from telemetry.samples.times import epoch_seconds, parse_time
 
 UUID = bytes.fromhex("0470547eac274f00856a5455b0eaf430")
 USER_DATA_UNREGISTERED = 5
@@ -308,8 +309,6 @@ def _decode_json(body: bytes) -> Sample | None:
 def _json_number(value: object, name: str) -> float | None:
     if isinstance(value, str):
         if name == "time_s":
-            from telemetry.samples.times import parse_time
-
             parsed = parse_time(value)
             if parsed is not None:
                 return parsed[0]
@@ -319,12 +318,7 @@ def _json_number(value: object, name: str) -> float | None:
             return None
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         return None
-    if name == "time_s":  # seconds, milliseconds, microseconds or nanoseconds since 1970
-        for scale in (1.0, 1e3, 1e6, 1e9):
-            if abs(value) / scale < 1e10:
-                return float(value / scale)
-        return None
-    return float(value)
+    return epoch_seconds(value) if name == "time_s" else float(value)
 
 
 _JSON = Decoder("SEI JSON", USER_DATA_UNREGISTERED, None, _decode_json)

@@ -196,3 +196,28 @@ def test_angles_are_read_with_their_unit(tmp_path):
 
 def test_the_larger_of_two_accuracies_counts(tmp_path):
     assert only_row(tmp_path, "image,lat,lon,accuracy_x/y\na.JPG,47.5,8.25,0.02/0.05\n").sigma_m == 0.05
+
+
+@pytest.mark.parametrize(
+    ("cell", "seconds"),
+    [
+        ("2024-05-06 12:00:00+02", 1714989600.0),
+        ("2024-05-06T12:00:00.5Z", 1714996800.5),
+        ("2024:05:06 12:00:00", 1714996800.0),
+        ("1714996800.25", 1714996800.25),
+        ("1714996800123", 1714996800.123),
+        ("1714996800123456", 1714996800.123456),
+        ("2024-05-06 12:00:00 CEST", None),
+        ("noon", None),
+    ],
+)
+def test_times_are_read_with_their_zone_and_in_any_unit_or_counted(tmp_path, cell, seconds):
+    found = table(tmp_path, f"image,lat_deg,lon_deg,time\na.JPG,47.5,8.25,{cell}\n")
+    assert found["a.jpg"].time_s == (None if seconds is None else pytest.approx(seconds, abs=1e-6))
+    assert (found["a.jpg"].lat_deg, found.refused) == (47.5, int(seconds is None))
+
+
+@pytest.mark.parametrize("cell", ["0", "0000:00:00 00:00:00"])
+def test_a_time_of_zeros_is_none(tmp_path, cell):
+    found = table(tmp_path, f"image,lat_deg,lon_deg,time\na.JPG,47.5,8.25,{cell}\n")
+    assert (found["a.jpg"].time_s, found.refused) == (None, 0)

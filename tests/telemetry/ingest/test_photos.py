@@ -17,7 +17,7 @@ from telemetry.formats.photo.makernotes import parse_dji
 from telemetry.formats.photo.picture_container import NotAPicture, read_container
 from telemetry.ingest.ingest import survey
 from telemetry.photos.photo_tags import read_photo
-from telemetry.samples.times import parse_offset, parse_time
+from telemetry.samples.times import epoch_seconds, parse_offset, parse_time
 
 DJI_ATTRIBUTES = b"""<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF><rdf:Description rdf:about="DJI"
  xmlns:drone-dji="http://www.dji.com/drone-dji/1.0/" drone-dji:RelativeAltitude="+120.40"
@@ -418,4 +418,22 @@ def test_time_formats():
     assert parse_time("2024-05-06T12:00:01.5+02:00") == (1714996801.5 - 7200, True)
     assert parse_time("2024:05:06 12:00:01") == (1714996801.0, False)
     assert parse_time("0000:00:00 00:00:00") is None
+    assert parse_time("2024-05-06 12:00:00-05") == (1714996800.0 + 5 * 3600, True)
+    assert parse_time("2024-05-06T12:00Z") == parse_time("2024-05-06 12:00:00 UTC") == (1714996800.0, True)
     assert parse_offset("-05:30") == -19800.0
+    assert parse_offset("+02") == 7200.0
+
+
+@pytest.mark.parametrize("rest", ["+2", "+2:00", "+99:00", "+02:0", " PM", " CEST", "[Europe/Berlin]", ":30", "x"])
+def test_a_time_with_a_rest_that_is_not_understood_is_none(rest):
+    assert parse_time(f"2024-05-06 12:00:01{rest}") is None
+
+
+def test_what_follows_a_time_in_exif_is_no_part_of_it(tmp_path):
+    photo = read_photo(jpeg(tmp_path / "a.jpg", exif_bytes=gps_exif(local="2024:05:06 12:00:01 DST")))
+    assert photo.time_s == 1714996801.25
+
+
+@given(st.floats(1e9, 7e9), st.sampled_from([1.0, 1e3, 1e6, 1e9]))
+def test_times_since_1970_are_read_in_any_unit(seconds, scale):
+    assert epoch_seconds(seconds * scale) == pytest.approx(seconds)
