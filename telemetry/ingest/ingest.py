@@ -15,7 +15,7 @@ from orthoswarm.model.errors import InputError
 from orthoswarm.model.frame import Ingest, Rejection
 from orthoswarm.stores.local_copies import local_file
 from telemetry.formats.table import geo_txt, pose_csv
-from telemetry.formats.table.pose_row import PoseTable, lookup, names_of
+from telemetry.formats.table.pose_row import PoseTable, leave_out_folder, lookup, names_of, take_base_names
 from telemetry.formats.video.sei import register
 from telemetry.formats.video.sei_layout import read_sei_layout
 from telemetry.ingest.discovery import Discovery, Folder, discover, natural_key
@@ -126,13 +126,16 @@ def _tables(found: Discovery, result: Survey) -> list[tuple[Path, str, PoseTable
                 where = found.scope(path)
                 tables.append((where, kind, table))
                 source = SourceInfo(path=found.name(path), kind=kind, counts=Counter(poses=len(table)))
-                source.findings += _table_findings(path, where, table, found)
+                below = (p for f in found.folders for p in f.pictures if p.is_relative_to(where))
+                pictures = [picture.relative_to(where).as_posix() for picture in below]
+                source.findings += _match_pictures(path, table, pictures)
+                source.findings += _table_findings(path, table, pictures)
                 result.sources.append(source)
     return sorted(tables, key=lambda entry: len(entry[0].parts))
 
 
-def _table_findings(path: Path, folder: Path, table: PoseTable, found: Discovery) -> list[Finding]:
-    """Findings on lines of a pose table that have no pose, or name missing pictures."""
+def _table_findings(path: Path, table: PoseTable, pictures: Sequence[str]) -> list[Finding]:
+    """Findings on lines of a pose table that have no pose, or name missing pictures (paths from the table's folder)."""
     findings = []
     if table.useless:
         text = f"{plural(table.useless, 'line')} of {path.name} hold no valid position; they are not used"
@@ -143,13 +146,30 @@ def _table_findings(path: Path, folder: Path, table: PoseTable, found: Discovery
             f"'{table.first_refused}' first; they are not used"
         )
         findings.append(Finding("table-cells", text))
-    pictures = [p for f in found.folders for p in f.pictures if p.is_relative_to(folder)]
-    names = {name for p in pictures for name in names_of(p.relative_to(folder).as_posix())}
+    names = {name for picture in pictures for name in names_of(picture)}
     absent = [name for name in table if name not in names]
     if absent:
         text = f"{plural(len(absent), 'line')} of {path.name} name pictures that are not here, {absent[0]} first"
         findings.append(Finding("table-pictures", text, note=len(absent) < len(table)))
     return findings
+
+
+def _match_pictures(path: Path, table: PoseTable, pictures: Sequence[str]) -> list[Finding]:
+    """Match lines to pictures where all paths are those of another place, and say so."""
+    if any(name in table for picture in pictures for name in names_of(picture)):
+        return []
+    left_out = leave_out_folder(table, pictures)
+    if left_out:
+        text = f"the paths in {path.name} begin with '{left_out}', which is not here; they are read without it"
+        return [Finding("table-folder", text, note=True)]
+    matched = take_base_names(table, pictures)
+    if not matched:
+        return []
+    text = (
+        f"the paths in {path.name} lead elsewhere; {plural(matched, 'line')} are matched by the file's name, which "
+        "only one picture has: check that they belong to these pictures"
+    )
+    return [Finding("table-base-names", text)]
 
 
 def _photo_folder(

@@ -14,7 +14,7 @@ from pathlib import Path
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import projection_of
 from orthoswarm.raster.picture_file import PICTURE_SUFFIXES
-from telemetry.formats.table.pose_row import PoseRow, PoseTable, pitch_by_value, read_text
+from telemetry.formats.table.pose_row import PoseRow, PoseTable, as_path, pitch_by_value, read_text
 from telemetry.samples.sample import is_position
 
 _MOST_NUMBERS = 8
@@ -64,7 +64,7 @@ def read_geo_txt(path: Path) -> PoseTable:
             row.yaw_deg = row.pitch_deg = row.roll_deg = None  # fillers before the accuracies
         if row.sigma_m is not None and not 0.0 < row.sigma_m < 1000.0:
             row.sigma_m = None
-        table[name.lower()] = row
+        table[as_path(name)] = row
     if not table:
         raise InputError(f"{path.name} has no line `name x y`; check its format (ODM geo.txt)")
     to_geographic(table, projection, path)

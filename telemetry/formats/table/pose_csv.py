@@ -27,7 +27,7 @@ from orthoswarm.model.errors import InputError
 from orthoswarm.raster.picture_file import PICTURE_SUFFIXES
 from telemetry.formats.table import cell_values
 from telemetry.formats.table.geo_txt import to_geographic
-from telemetry.formats.table.pose_row import PoseRow, PoseTable, pitch_by_value, read_text
+from telemetry.formats.table.pose_row import PoseRow, PoseTable, as_path, pitch_by_value, read_text
 from telemetry.samples.rotations import camera_angles_from_opk_deg
 from telemetry.samples.sample import is_position
 from telemetry.samples.times import epoch_seconds, parse_time
@@ -196,7 +196,7 @@ def _projection(path: Path, before: Sequence[str], table: PoseTable) -> str:
 def _add_row(table: PoseTable, layout: _Layout, cells: Sequence[str]) -> None:
     """Put the values of one line into the table."""
     values = {key: cell.strip() for key, cell in zip(layout.keys, cells) if key and cell.strip()}
-    name = values.pop("image", "").replace("\\", "/").removeprefix("./")
+    name = as_path(values.pop("image", ""))
     if not name:
         return
     if any(cell.strip() for cell in cells[len(layout.keys) :]):
@@ -225,7 +225,7 @@ def _add_row(table: PoseTable, layout: _Layout, cells: Sequence[str]) -> None:
             setattr(row, {"x": "lon_deg", "y": "lat_deg", "time": "time_s"}.get(key, key), value)
     if row.sigma_m is not None and not 0.0 < row.sigma_m < 1000.0:
         row.sigma_m = None
-    table[name.lower()] = row
+    table[name] = row
 
 
 def _with_ref(value: float | None, values: Mapping[str, str], key: str) -> float | None:

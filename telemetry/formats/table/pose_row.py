@@ -1,10 +1,16 @@
 """Poses of pictures from a table, in a common form."""
 
+from collections import Counter
+from collections.abc import Collection
 from dataclasses import dataclass
+from itertools import islice, takewhile
 from pathlib import Path
 
 from orthoswarm.model.errors import InputError
 from telemetry.samples.unreadable import MOST_TEXT_BYTES
+
+_MOST_FOLDERS = 64
+"""Folders of a path that may be left out: more are no path."""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -52,6 +58,64 @@ def names_of(relative: str) -> tuple[str, str, str]:
     path = relative.lower()
     name = path.rsplit("/", 1)[-1]
     return path, name, name.rsplit(".", 1)[0]
+
+
+def as_path(name: str) -> str:
+    """A picture's name or path as a table's key."""
+    return name.lower().replace("\\", "/").removeprefix("./")
+
+
+def leave_out_folder(table: PoseTable, pictures: Collection[str]) -> str:
+    """Rename rows whose paths begin elsewhere, on another machine or in a folder above, to those of the pictures here.
+
+    Args:
+        table: no name of which is a picture's. Changed where leaving out the first folders that all rows share makes
+            most of its paths those of pictures.
+        pictures: paths relative to the table's folder.
+
+    Returns:
+        the folders that were left out, with a slash at the end; "" if nothing matched.
+    """
+    known = {picture.lower() for picture in pictures}
+    known |= {names_of(picture)[2] for picture in pictures if "/" not in picture}
+    rows = [name.split("/") for name in table]
+    folders = islice(zip(*(row[:-1] for row in rows)), _MOST_FOLDERS)
+    shared = sum(1 for _ in takewhile(lambda names: len(set(names)) == 1, folders))
+    matches = {depth: sum("/".join(row[depth:]) in known for row in rows) for depth in range(1, shared + 1)}
+    depth = max(matches, key=matches.__getitem__, default=0)  # of several the first: the longest paths
+    if not matches.get(depth):
+        return ""
+    left_out = "/".join(rows[0][:depth]) + "/"
+    _rename(table, {name: name[len(left_out) :] for name in table})
+    return left_out
+
+
+def take_base_names(table: PoseTable, pictures: Collection[str]) -> int:
+    """Rename rows to the only picture of their file name, where no other row has it either.
+
+    Args:
+        table: no name of which is a picture's.
+        pictures: paths relative to the table's folder.
+
+    Returns:
+        the number of rows that were renamed.
+    """
+    places: dict[str, list[str]] = {}
+    for picture in pictures:
+        path, name, stem = names_of(picture)
+        for written in {name, stem}:
+            places.setdefault(written, []).append(path)
+    last = {name: name.rsplit("/", 1)[-1] for name in table}
+    rows = Counter(last.values())
+    unique = {name: places[base][0] for name, base in last.items() if rows[base] == len(places.get(base, ())) == 1}
+    _rename(table, unique)
+    return len(unique)
+
+
+def _rename(table: PoseTable, names: dict[str, str]) -> None:
+    rows = list(table.items())
+    table.clear()
+    table.update((names.get(name, name), row) for name, row in rows)
 
 
 def read_text(path: Path) -> str:
