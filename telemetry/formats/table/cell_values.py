@@ -94,7 +94,7 @@ def in_hemisphere(degrees: float | None, written: str, axis: str) -> float | Non
     """
     hemisphere = _plain(written).upper()
     letter = hemisphere[:1]
-    if degrees is None or hemisphere not in (letter, _WORDS.get(letter)) or letter not in axis:
+    if degrees is None or hemisphere not in (letter, _WORDS.get(letter)) or letter not in set(axis):
         return None
     if letter in "SW":
         return -abs(degrees)
