@@ -1,6 +1,7 @@
 """The ground below a plan, read from a height model."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -29,23 +30,33 @@ def read_ground(dem: Path, wanted: shapely.Geometry, grid: LocalGrid, starts: ND
     """
     points = np.concatenate([shapely.get_coordinates(wanted), starts])
     bounds = BoundingBox.around_points(points, active().raster.dem_margin_m)
-    found = HeightModel.open(dem, grid.epsg, bounds, np.empty((0, 3))).window(bounds, active().raster.dem_most_nodes)
+    most, beside_m = active().raster.dem_most_nodes, active().planning.beside_m
+    model = HeightModel.open(dem, grid.epsg, bounds, np.empty((0, 3)))
+    found = model.window(bounds, most)
     terrain = found.terrain
-    rows, columns = terrain.z.shape
-    east = terrain.west + terrain.step_m * np.arange(columns)
-    north = terrain.south + terrain.step_m * np.arange(rows)
-    nodes = np.stack(np.meshgrid(east, north), -1)
     # One step around the outline, too: a small area may lie between nodes.
-    within = shapely.contains_xy(wanted.buffer(terrain.step_m), nodes[..., 0], nodes[..., 1])
+    within = _nodes_in(wanted.buffer(terrain.step_m), terrain)
     hull = shapely.MultiPoint(points).convex_hull.buffer(terrain.step_m)
-    way = shapely.contains_xy(hull, nodes[..., 0], nodes[..., 1])
-    if not found.known[way | within].all():
+    if not found.known[within | _nodes_in(hull, terrain)].all():
         raise InputError(
             f"{dem} has no heights on a part of the area or of the ways to it; give a height model without holes there"
         )
-    z = terrain.z - np.float32(terrain.height(starts).min())
-    ground = Terrain(terrain.west, terrain.south, terrain.step_m, z)
-    return GroundBelow(ground, float(z[within].min()), float(z[within].max()), float(z[way].max()))
+    zero = np.float32(terrain.height(starts).min())
+    highest = model.highest(bounds, beside_m, active().planning.beside_steps, most)
+    highest = replace(highest, z=highest.z - zero)
+    way_m = float(highest.z[_nodes_in(hull, highest)].max())
+    z = terrain.z - zero
+    ground = replace(terrain, z=z)
+    return GroundBelow(ground, highest, float(z[within].min()), float(z[within].max()), way_m)
+
+
+def _nodes_in(outline: shapely.Geometry, terrain: Terrain) -> NDArray[np.bool_]:
+    """Which nodes (rows, columns) lie within an outline, grid metres."""
+    rows, columns = terrain.z.shape
+    east = terrain.west + terrain.step_m * np.arange(columns)
+    north = terrain.south + terrain.step_m * np.arange(rows)
+    shapely.prepare(outline)
+    return np.asarray(shapely.contains_xy(outline, *np.meshgrid(east, north)))
 
 
 def relief_notes(plan: Plan, ground: GroundBelow) -> list[str]:
@@ -63,7 +74,8 @@ def relief_notes(plan: Plan, ground: GroundBelow) -> list[str]:
     back = math.ceil(ground.way_m + active().planning.least_above_ground_m)
     return [
         f"the ground of the area lies {ground.low_m:.0f} to {ground.high_m:.0f} m over takeoff: {how}, "
-        f"{over.least_m:.0f} to {over.most_m:.0f} m above ground; side overlap {100 * over.side_overlap[0]:.0f} % or "
+        f"{over.least_m:.0f} to {over.most_m:.0f} m above ground, {over.way_least_m:.0f} m or more above the highest "
+        f"within {active().planning.beside_m:g} m; side overlap {100 * over.side_overlap[0]:.0f} % or "
         f"more on 95 % of the legs, forward overlap at least {100 * over.forward_overlap:.0f} %",
         f"a vehicle that turns home by itself flies straight back: set its return height (ArduPilot RTL_ALT, PX4 "
         f"RTL_RETURN_ALT) to {back} m or more",

@@ -14,6 +14,12 @@ class PlanningConfig:
     least_above_ground_m: float = 20.0
     """Least height of a flight over the highest ground below it, metres: trees, masts and errors of a height model
     (chosen)."""
+    beside_m: float = 10.0
+    """Ground up to so far beside a flight counts as ground below it, metres: 8 m by which receivers err (GPS SPS
+    Performance Standard 2020, 95 %) and 2 m by which a vehicle may pass a waypoint (ArduCopter's WPNAV_RADIUS)."""
+    beside_steps: float = 2.0
+    """The highest ground is read at so many steps within that distance at least, where the number of nodes allows it
+    (chosen: a coarser step would count ground that lies farther away)."""
     profile_finest_m: float = 1.0
     """Least distance of the places at which the ground below a flight is read, metres (chosen for its time)."""
     profile_coarsest_m: float = 10.0

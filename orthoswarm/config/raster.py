@@ -42,6 +42,11 @@ class RasterConfig:
     dem_finest_m: float = 2.0
     """Finest distance of the nodes on which a height model is read, metres: buildings that lean in it are averaged
     (chosen; not measured)."""
+    dem_mean_steps: float = 0.7
+    """Where its pixels are smaller than so many distances of nodes, a node has their mean (chosen) ..."""
+    dem_highest_steps: float = 1.5
+    """... or the highest of them where the highest ground is asked for: up to this also where pixels are hardly
+    larger, since between them a mast of one pixel would lose height (chosen)."""
     dem_margin_m: float = 50.0
     """A height model is read so far beyond the places that are asked for, metres (chosen: some of its nodes)."""
     dem_most_nodes: int = 4_000_000

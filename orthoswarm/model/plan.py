@@ -131,14 +131,15 @@ class Gap:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OverGround:
-    """How a plan lies over a height model, metres above the ground straight below.
+    """How a plan lies over a height model, metres above the ground straight below unless said otherwise.
 
     Attributes:
         follows: legs keep a constant height above the ground; else all legs lie at one height.
         by_vehicle: mission items are to state heights above the ground, which the vehicle keeps by a model of its own.
         nominal_m: height above the ground that was asked for.
         least_m: lowest point of the legs; most_m: highest.
-        way_least_m: lowest point of the flights but for takeoff and landing.
+        way_least_m: lowest point of the flights but for takeoff and landing, above the highest ground up to `beside_m`
+            from it.
         top_m: highest point of the flights, above their takeoff.
         side_overlap: of neighbouring lines: the 5th percentile along the legs, and the median.
         forward_overlap: of consecutive pictures at the lowest point of the legs.

@@ -23,11 +23,13 @@ class GroundBelow:
     """The ground below a plan, metres over the lowest takeoff.
 
     Attributes:
-        terrain: its heights. low_m: lowest ground of the area; high_m: highest.
-        way_m: highest ground of the area and of the ways to it.
+        terrain: its heights. highest: the highest ground up to `beside_m` from each place.
+        low_m: lowest ground of the area; high_m: highest.
+        way_m: highest ground of the area, of the ways to it, and beside them.
     """
 
     terrain: Terrain
+    highest: Terrain
     low_m: float
     high_m: float
     way_m: float
@@ -65,7 +67,7 @@ def plan_over_relief(
             "--altitude"
         )
     level_m = min(0.5 * (ground.low_m + ground.high_m) + above_m, ground.low_m + above_m + tolerance_m)
-    level_fits = level_m - max(ground.high_m, ground.way_m) >= kept_above_m
+    level_fits = level_m - ground.way_m >= kept_above_m
     flat = ground.high_m - ground.low_m <= 2.0 * tolerance_m
     if relief == "level" and not level_fits:
         raise InputError(
@@ -82,10 +84,16 @@ def plan_over_relief(
                 f"{kept_above_m:g} m that must be kept; give a larger --altitude"
             )
         kept_m = min(tolerance_m, active().planning.by_vehicle_m) if by_vehicle else tolerance_m
-        heights = GroundHeights(ground=ground.terrain, above_m=above_m, tolerance_m=kept_m, by_vehicle=by_vehicle)
+        heights = GroundHeights(
+            ground=ground.terrain,
+            highest=ground.highest,
+            above_m=above_m,
+            tolerance_m=kept_m,
+            by_vehicle=by_vehicle,
+        )
         plans.append(_closely_enough(make, lens, heights, least_m))
     if relief != "follow" and level_fits:
-        level = LevelHeights(level_m, ground.terrain, above_m)
+        level = LevelHeights(level_m, ground=ground.terrain, highest=ground.highest, nominal_m=above_m)
         plans.append(_closely_enough(make, lens, level, level_m - ground.high_m))
     return min(plans, key=lambda plan: (not _complete(plan), plan.makespan_s))
 

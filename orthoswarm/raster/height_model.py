@@ -23,6 +23,9 @@ _METRES = {"": 1.0, "m": 1.0, "metre": 1.0, "meter": 1.0, "metres": 1.0, "meters
            "ft": 0.3048, "foot": 0.3048, "feet": 0.3048, "us-ft": 0.3048006096012192,
            "us survey foot": 0.3048006096012192, "cm": 0.01, "dm": 0.1, "mm": 0.001}  # fmt: skip
 
+_BETWEEN_NODES = 1.5
+"""How far the nodes around a place and the node of a pixel are from them, together, in steps."""
+
 
 @dataclass(frozen=True, slots=True)
 class KnownGround:
@@ -86,6 +89,23 @@ class HeightModel:
         if len(at):
             _refuse_buried(path, below - zero, at[:, 2])
         return cls(Path(path).absolute(), epsg, zero, cover)
+
+    def highest(self, bounds: BoundingBox, within_m: float, steps: float, most_nodes: int) -> Terrain:
+        """The highest ground up to a distance from each place, over `zero_m`, in the area's CRS.
+
+        It is made of the DEM's highest pixels, where `window` has the mean of those about a node, and reaches up to
+        one and a half steps farther, so that what lies between nodes is not lost.
+
+        Args:
+            bounds: west, south, east, north. within_m: the distance. steps: nodes on it at least, where the DEM is
+                coarser, as far as there are not more than `most_nodes`.
+        """
+        z, west, south, step_m = _on_area(
+            self.path, self.epsg, bounds, None, most_nodes, highest_step_m=within_m / steps
+        )
+        known = np.isfinite(z)
+        z = _filled(z, known) if known.any() else np.zeros(z.shape)
+        return Terrain(west, south, step_m, _highest_within(z - self.zero_m, within_m / step_m + _BETWEEN_NODES))
 
     def window(self, bounds: BoundingBox, most_nodes: int | None = None) -> KnownGround:
         """Heights over `zero_m` in the area's CRS within bounds, a node every pixel of the DEM or at most so many.
@@ -191,9 +211,19 @@ def check_dem(path: Path, epsg: int, bounds: BoundingBox, cameras: ArrayLike) ->
 
 
 def _on_area(
-    path: Path, epsg: int, bounds: BoundingBox, step_m: float | None, most_nodes: int | None = None
+    path: Path,
+    epsg: int,
+    bounds: BoundingBox,
+    step_m: float | None,
+    most_nodes: int | None = None,
+    *,
+    highest_step_m: float | None = None,
 ) -> tuple[Array, float, float, float]:
-    """Heights in metres on nodes (rows go north), NaN where unknown, with west, south and step."""
+    """Heights in metres on nodes (rows go north), NaN where unknown, with west, south and step.
+
+    Nodes have the mean of the pixels about them; with `highest_step_m` the highest, and nodes are at most that far
+    apart where their number allows it.
+    """
     import rasterio
     from rasterio.enums import Resampling
     from rasterio.errors import NotGeoreferencedWarning, RasterioError
@@ -215,19 +245,19 @@ def _on_area(
             raise InputError(f"{name} is a picture ({dataset.count} bands of 8 bit), not heights; give a DEM by --dem")
         try:
             west, south, east, north = bounds
-            step = step_m or _own_step(dataset, epsg, bounds, most_nodes)
+            pixel = _pixel_m(dataset, epsg, bounds)
+            step = step_m or _own_step(min(pixel, highest_step_m or pixel), bounds, most_nodes)
             left, low = float(np.floor(west / step) * step), float(np.floor(south / step) * step)
             columns, rows = int(np.ceil((east - left) / step)) + 1, int(np.ceil((north - low) / step)) + 1
             # a pixel about every node: its centre is the node
             transform = rasterio.Affine(step, 0.0, left - 0.5 * step, 0.0, -step, low + (rows - 0.5) * step)
-            finer = _pixel_m(dataset, epsg, bounds) < 0.7 * step
             with WarpedVRT(
                 dataset,
                 crs=f"EPSG:{epsg}",
                 transform=transform,
                 width=columns,
                 height=rows,
-                resampling=Resampling.average if finer else Resampling.bilinear,
+                resampling=getattr(Resampling, _resampling(pixel / step, highest_step_m is not None)),
                 src_nodata=_nodata(dataset),
                 nodata=float("nan"),
                 dtype="float64",
@@ -263,12 +293,28 @@ def _pixel_m(dataset: Any, epsg: int, bounds: BoundingBox) -> float:
     return 100.0 / float(np.sqrt(area)) if np.isfinite(area) and area > 0 else 1.0
 
 
-def _own_step(dataset: Any, epsg: int, bounds: BoundingBox, most_nodes: int | None) -> float:
-    """Distance of nodes, metres: the DEM's own pixel within the configuration's limits and a number of nodes."""
+def _resampling(pixel_steps: float, highest: bool) -> str:
+    """GDAL's resampling of pixels whose side is so many steps of the nodes."""
+    if highest and pixel_steps < active().raster.dem_highest_steps:
+        return "max"
+    return "average" if pixel_steps < active().raster.dem_mean_steps else "bilinear"
+
+
+def _highest_within(z: Array, steps: float) -> NDArray[np.float32]:
+    """The highest of the nodes (rows, columns) up to so many steps away from each."""
+    import cv2
+
+    reach = np.arange(-int(steps), int(steps) + 1)
+    disc = (np.hypot(*np.meshgrid(reach, reach)) <= steps).astype(np.uint8)
+    return np.asarray(cv2.dilate(z.astype(np.float32), disc), np.float32)
+
+
+def _own_step(pixel_m: float, bounds: BoundingBox, most_nodes: int | None) -> float:
+    """Distance of nodes, metres: a pixel's side within the configuration's limits and a number of nodes."""
     config = active().raster
     nodes = config.dem_most_nodes if most_nodes is None else min(most_nodes, config.dem_most_nodes)
     spread = float(np.sqrt(bounds.width * bounds.height / nodes))
-    return float(max(config.dem_finest_m, round(_pixel_m(dataset, epsg, bounds), 1), spread))
+    return float(max(config.dem_finest_m, round(pixel_m, 1), spread))
 
 
 def _filled(z: Array, known: NDArray[np.bool_]) -> Array:

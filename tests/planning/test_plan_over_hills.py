@@ -22,11 +22,23 @@ def _hill(height_m: float, wide_m: float = 80.0) -> Height:
     return lambda e, n: 300.0 + height_m * np.exp(-((e - 200.0) ** 2 + (n - 200.0) ** 2) / wide_m**2)
 
 
-def _dem(path: Path, height: Height) -> Path:
-    at = np.arange(-300, 900, 5.0) + 2.5
+def _posts(height_m: float, apart_m: float = 20.0, side_m: float = 2.0) -> Height:
+    """Level ground with square posts in both directions between 100 and 200 m north and east."""
+
+    def height(east: np.ndarray, north: np.ndarray) -> np.ndarray:
+        post = (east % apart_m < side_m) & (north % apart_m < side_m)
+        for across in (east, north):
+            post &= (across >= 100.0) & (across < 200.0)
+        return 300.0 + height_m * post
+
+    return height
+
+
+def _dem(path: Path, height: Height, step_m: float = 5.0) -> Path:
+    at = np.arange(-300, 900, step_m) + 0.5 * step_m
     z = height(at[None, :], at[::-1, None]).astype(np.float32)
     size = {"width": len(at), "height": len(at), "count": 1, "dtype": "float32"}
-    transform = from_origin(CORNER[0] - 300.0, CORNER[1] + 900.0, 5.0, 5.0)
+    transform = from_origin(CORNER[0] - 300.0, CORNER[1] + 900.0, step_m, step_m)
     with rasterio.open(path, "w", driver="GTiff", crs=f"EPSG:{EPSG}", transform=transform, **size) as file:
         file.write(z, 1)
     return path
@@ -61,6 +73,49 @@ def _above_ground(folder: Path, height: Height) -> Iterator[tuple[float, float]]
         yield float(above.min()), float(above.max())
 
 
+def _least_beside(folder: Path, height: Height, beside_m: float) -> float:
+    """Least height of the missions over all ground up to a distance from them, sampled every metre."""
+    grid, found = FlownArea().grid, []
+    disc = [(e, n) for e in np.arange(-10.0, 10.5) for n in np.arange(-10.0, 10.5) if np.hypot(e, n) <= beside_m]
+    for feature in json.loads((folder / "all.geojson").read_text())["features"]:
+        if feature["geometry"]["type"] != "LineString":
+            continue
+        lon, lat, z = np.array(feature["geometry"]["coordinates"]).T
+        points = grid.to_grid(lat, lon)
+        along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+        at = np.arange(0.0, along[-1], 1.0)
+        east, north = (np.interp(at, along, points[:, axis]) - CORNER[axis] for axis in range(2))
+        top = np.max([height(east + e, north + n) for e, n in disc], axis=0) - 300.0
+        found.append(float((np.interp(at, along, z) - top).min()))
+    return min(found)
+
+
+def test_ground_beside_a_path_counts_as_ground_below_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Posts of 110 m, higher than the flight, of two pixels of the model: every line there passes some within 10 m."""
+    posts = _posts(110.0)
+    out = _planned(tmp_path, capsys, 80, "--dem", _dem(tmp_path / "dem.tif", posts, 1.0))
+    assert _least_beside(tmp_path / "p", posts, 9.0) > 19.9
+    assert out["over_ground"]["way_least_m"] == pytest.approx(20.0, abs=0.1)
+    assert out["over_ground"]["above_ground_m"][1] == pytest.approx(130.0, abs=0.1)
+    assert any("20 m or more above the highest within 10 m" in warning for warning in out["warnings"])
+    assert any("to 130 m or more" in warning for warning in out["warnings"])  # a return height
+
+
+def test_a_level_flight_counts_the_tops_between_the_nodes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A mast of one pixel of 1 m has a quarter of its height in the mean about a node."""
+    dem = _dem(tmp_path / "dem.tif", _posts(75.0, 50.0, 1.0), 1.0)
+    assert main(_arguments(tmp_path, 80, "--dem", dem, "--relief", "level")) == 2
+    assert "13 m above the highest ground" in capsys.readouterr().err
+
+
+def test_a_vehicle_that_keeps_its_height_itself_is_not_lifted_over_what_stands_beside(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    dem = _dem(tmp_path / "dem.tif", _posts(110.0), 1.0)
+    assert main(_arguments(tmp_path, 80, "--dem", dem, "--relief", "follow", "--terrain-items")) == 2
+    assert "highest ground within 10 m" in capsys.readouterr().err
+
+
 def test_legs_follow_the_ground_within_the_tolerance(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     hill = _hill(60.0)
     out = _planned(tmp_path, capsys, 80, "--dem", _dem(tmp_path / "dem.tif", hill), "--height-tolerance", 6)
@@ -68,7 +123,7 @@ def test_legs_follow_the_ground_within_the_tolerance(tmp_path: Path, capsys: pyt
     # The model is sampled every 5 m and bilinear between.
     assert all(low > 73.5 and high < 86.5 for low, high in _above_ground(tmp_path / "p", hill))
     assert out["over_ground"]["above_ground_m"] == pytest.approx([74.0, 86.0], abs=1.5)
-    assert out["over_ground"]["way_least_m"] >= 73.0
+    assert 60.0 < out["over_ground"]["way_least_m"] < 74.0  # 10 m beside it the ground is up to 6 m higher
 
 
 def test_an_area_that_is_flat_within_the_tolerance_is_flown_at_one_height(

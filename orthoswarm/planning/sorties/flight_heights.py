@@ -3,7 +3,8 @@
 Heights here are metres over one level for all vehicles: takeoff without a height model, the zero of the model with one.
 """
 
-from dataclasses import dataclass, field
+import math
+from dataclasses import KW_ONLY, dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,19 +17,28 @@ Array = NDArray[np.float64]
 _SAME_M = 0.01
 
 
+def profile_step_m(*grounds: Terrain) -> float:
+    """Distance of the places along a flight at which heights of the ground are read, metres."""
+    config = active().planning
+    return float(np.clip(0.5 * min(g.step_m for g in grounds), config.profile_finest_m, config.profile_coarsest_m))
+
+
 @dataclass(frozen=True)
 class LevelHeights:
     """All legs at one height.
 
     Attributes:
         z_m: height of the legs.
-        ground: heights of the ground, None where only the height above takeoff counts.
+        ground: heights of the ground, None where only the height above takeoff counts. highest: the highest ground
+            up to `beside_m` from each place.
         nominal_m: height above the ground that was asked for, None for z_m.
         follows: False, as heights do not follow the ground. by_vehicle: False, likewise.
     """
 
     z_m: float
+    _: KW_ONLY
     ground: Terrain | None = None
+    highest: Terrain | None = None
     nominal_m: float | None = None
     follows: bool = False
     by_vehicle: bool = False
@@ -55,14 +65,18 @@ class LevelHeights:
 class GroundHeights:
     """A constant height above the ground within a tolerance, on straight pieces as long as that allows.
 
+    Beside ground that is much higher a flight is higher than that: `least_above_ground_m` above it.
+
     Attributes:
-        ground: heights of the ground. above_m: height above it. tolerance_m: largest difference from it.
+        ground: heights of the ground. highest: the highest ground up to `beside_m` from each place.
+        above_m: height above the ground. tolerance_m: largest difference from it.
         follows: True, as heights follow the ground.
         by_vehicle: the vehicle itself keeps its height above the ground, so that points put in for their height are no
-            mission items.
+            mission items, and no ground beside it lifts it.
     """
 
     ground: Terrain
+    highest: Terrain
     above_m: float
     tolerance_m: float
     follows: bool = True
@@ -75,7 +89,24 @@ class GroundHeights:
 
     def at(self, place: Array, more_m: float) -> float:
         """Height of a flight over a place (2,), so many metres higher than legs."""
-        return self.ground_at(place) + self.above_m + more_m
+        return float(self._heights_at(place)[0]) + more_m
+
+    def _heights_at(self, places: Array) -> tuple[Array, Array, Array]:
+        """The height that is wanted of legs over places (..., 2), the lowest and the highest allowed, each (...,)."""
+        nominal = np.asarray(self.ground.height(places), np.float64) + self.above_m
+        low, high = nominal - self.tolerance_m, nominal + self.tolerance_m
+        if not self.by_vehicle:
+            # Also that of the next places to be read, so that the straight way to them keeps clear of a steep wall.
+            reach = math.sqrt(2.0) * self.step_m
+            around = places[..., None, :] + reach * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
+            floor = np.asarray(self.highest.height(around), np.float64).max(axis=-1)
+            low = np.maximum(low, floor + active().planning.least_above_ground_m)
+        return np.maximum(nominal, low), low, np.maximum(high, low)
+
+    @property
+    def step_m(self) -> float:
+        """Distance of the places at which the ground is read."""
+        return profile_step_m(self.ground, self.highest)
 
     def between(self, start: Array, end: Array, more_m: float) -> Array:
         """The way from `start` (3,) straight to `end` (2,), float64 (n, 3): points put in for the height, and the end.
@@ -91,13 +122,9 @@ class GroundHeights:
         length = float(np.hypot(*(end - start[:2])))
         if length < _SAME_M:
             return np.array([[*end, self.at(end, more_m)]])
-        step = float(
-            np.clip(0.5 * self.ground.step_m, active().planning.profile_finest_m, active().planning.profile_coarsest_m)
-        )
-        share = np.linspace(0.0, 1.0, int(np.ceil(length / step)) + 1)
+        share = np.linspace(0.0, 1.0, int(np.ceil(length / self.step_m)) + 1)
         places = start[:2] + share[:, None] * (end - start[:2])
-        wanted = np.asarray(self.ground.height(places), np.float64) + self.above_m + more_m
-        low, high = wanted - self.tolerance_m, wanted + self.tolerance_m
+        wanted, low, high = (heights + more_m for heights in self._heights_at(places))
         found, here, z = [], 0, float(start[2])
         while here < len(share) - 1:
             run = share[here + 1 :] - share[here]

@@ -12,7 +12,7 @@ from orthoswarm.model.errors import InputError
 from orthoswarm.model.placement import Terrain
 from orthoswarm.model.plan import OverGround
 from orthoswarm.planning.lines.line_spacing import Footprint
-from orthoswarm.planning.sorties.flight_heights import FlightHeights
+from orthoswarm.planning.sorties.flight_heights import FlightHeights, profile_step_m
 from orthoswarm.planning.sorties.flight_path import Flight
 
 Geometry = Any
@@ -38,11 +38,10 @@ def swaths(paths: Sequence[Array], ground: Terrain, foot: Footprint, foot_above_
     return [_swath(_sampled(path, ground), ground, foot, foot_above_m) for path in paths]
 
 
-def _sampled(path: Array, ground: Terrain) -> Array:
-    """A path (n, 3) with points at most half a node of the height model apart."""
+def _sampled(path: Array, *grounds: Terrain) -> Array:
+    """A path (n, 3) with points at most half a node of the height models apart."""
     along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path[:, :2], axis=0).T))])
-    step = float(np.clip(0.5 * ground.step_m, active().planning.profile_finest_m, active().planning.profile_coarsest_m))
-    at = np.union1d(np.linspace(0.0, along[-1], int(np.ceil(along[-1] / step)) + 1), along)
+    at = np.union1d(np.linspace(0.0, along[-1], int(np.ceil(along[-1] / profile_step_m(*grounds))) + 1), along)
     return np.stack([np.interp(at, along, path[:, axis]) for axis in range(3)], axis=1)
 
 
@@ -85,14 +84,14 @@ def over_ground(flights: Sequence[Flight], heights: FlightHeights, foot: Footpri
         flights: of all vehicles. heights: by which they were made, with a ground. foot, foot_above_m: see `swaths`.
 
     Raises:
-        InputError: a leg or a way is lower than 20 m above the ground.
+        InputError: a leg or a way is lower than `least_above_ground_m` above the ground, or above that beside it.
     """
-    ground = heights.ground
-    assert ground is not None
+    ground, highest = heights.ground, heights.highest
+    assert ground is not None and highest is not None
     on_legs, overlaps, on_ways = [], [], []
     for flight in flights:
-        cruise = _sampled(np.concatenate([[[*flight.home, flight.climb_m]], flight.points]), ground)
-        on_ways.append(cruise[:, 2] - np.asarray(ground.height(cruise[:, :2])))
+        cruise = _sampled(np.concatenate([[[*flight.home, flight.climb_m]], flight.points]), ground, highest)
+        on_ways.append(cruise[:, 2] - np.asarray(highest.height(cruise[:, :2])))
         for path in leg_paths(flight):
             points = _sampled(path, ground)
             on_legs.append(points[:, 2] - np.asarray(ground.height(points[:, :2])))
@@ -103,8 +102,9 @@ def over_ground(flights: Sequence[Flight], heights: FlightHeights, foot: Footpri
     least_above_m = active().planning.least_above_ground_m
     if least < least_above_m - 0.01:
         raise InputError(
-            f"the flight would be {least:.0f} m above the highest ground below it, and {least_above_m:g} m must "
-            f"be kept; give --altitude {np.ceil(heights.above_m + least_above_m - least):.0f} or more"
+            f"the flight would be {least:.0f} m above the highest ground within {active().planning.beside_m:g} m, "
+            f"and {least_above_m:g} m must be kept; give --altitude "
+            f"{np.ceil(heights.above_m + least_above_m - least):.0f} or more"
         )
     forward = 1.0 - foot.trigger_m / (foot.height_m * float(above.min()) / foot_above_m)
     top = max(float(flight.track()[:, 2].max()) - flight.home_z_m for flight in flights)

@@ -7,7 +7,7 @@ from rasterio.transform import from_origin
 
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError
-from orthoswarm.raster.height_model import check_dem, read_dem
+from orthoswarm.raster.height_model import HeightModel, check_dem, read_dem
 
 EPSG = 32632
 WEST, SOUTH = 500_000.0, 5_400_000.0
@@ -92,6 +92,33 @@ def test_a_fine_dem_is_averaged_and_a_coarse_one_interpolated(tmp_path):
     z, transform = utm_dem(gsd=20.0)
     coarse = read_dem(write(tmp_path / "c.tif", z, transform=transform), EPSG, BOUNDS, level_m=300.0, step_m=5.0)
     check(coarse, 300.0, 0.3)
+
+
+@pytest.mark.parametrize(("gsd", "side"), [(1.0, 1), (2.0, 1), (5.0, 1)])
+def test_the_highest_ground_is_that_of_single_pixels_within_a_distance(tmp_path, gsd, side):
+    z, transform = utm_dem(gsd=gsd)
+    level = np.full_like(z, 300.0)
+    row, column = (int(v) for v in (~transform * (WEST + 201.0, SOUTH + 151.0))[::-1])
+    level[row : row + side, column : column + side] = 375.0
+    model = HeightModel.open(write(tmp_path / "mast.tif", level, transform=transform), EPSG, BOUNDS, np.empty((0, 3)))
+    highest = model.highest(BOUNDS, 10.0, 2.0, 1_000_000)
+    middle = np.array(transform * (column + 0.5 * side, row + 0.5 * side))
+    turns = np.linspace(0.0, 2.0 * np.pi, 25)
+    ring = np.stack([np.cos(turns), np.sin(turns)], -1)
+    np.testing.assert_allclose(highest.height(middle + 10.0 * ring), 75.0, atol=0.01)
+    np.testing.assert_allclose(highest.height(middle + 30.0 * ring), 0.0, atol=0.01)
+    if gsd < 2.0:
+        assert model.window(BOUNDS).terrain.z.max() < 60.0  # the mean, as before
+
+
+def test_the_highest_ground_of_a_coarse_model_is_not_that_of_far_away(tmp_path):
+    east = WEST - 585.0 + 30.0 * np.arange(60)
+    z = np.tile((0.3 * (east - WEST)).astype(np.float32), (60, 1))
+    path = write(tmp_path / "slope.tif", z, transform=from_origin(WEST - 600.0, SOUTH + 900.0, 30.0, 30.0))
+    model = HeightModel.open(path, EPSG, BOUNDS, np.empty((0, 3)))
+    rise = model.highest(BOUNDS.grown(30.0), 10.0, 2.0, 1_000_000).height(probe())
+    rise -= model.window(BOUNDS.grown(30.0)).terrain.height(probe())
+    assert rise.min() > 2.9 and rise.max() < 5.3  # 3 m within 10 m
 
 
 @pytest.mark.parametrize("nodata", [-9999.0, None])
