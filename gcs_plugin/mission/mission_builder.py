@@ -17,6 +17,7 @@ from gcs_plugin.mission.items import (
     FRAME_GLOBAL,
     FRAME_MISSION,
     LAND,
+    LOITER_TIME,
     TAKEOFF,
     TRIGGER_DISTANCE,
     WAYPOINT,
@@ -26,7 +27,7 @@ from gcs_plugin.mission.items import (
 from orthoswarm.config import active
 from orthoswarm.model.errors import InputError
 
-_WITH_YAW: Final = frozenset({WAYPOINT, TAKEOFF, LAND})
+_WITH_YAW: Final = frozenset({WAYPOINT, TAKEOFF, LAND, LOITER_TIME})
 
 
 def build_mission(

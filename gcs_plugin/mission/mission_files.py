@@ -186,7 +186,11 @@ def _simple_item(item: MissionItem, number: int) -> dict[str, Any]:
 
 
 def waypoints_text(items: Sequence[MissionItem], home: tuple[float, float, float]) -> str:
-    """The text of a `.waypoints` file: "QGC WPL 110", twelve tab-separated columns, line 0 is home."""
+    """The text of a `.waypoints` file: "QGC WPL 110", twelve tab-separated columns, line 0 is home.
+
+    A parameter that PX4 is to choose is "nan", which QGroundControl (Qt's toDouble) and MAVProxy (Python's float) read
+    as such; a 0 would turn its nose north.
+    """
     first = MissionItem(
         command=NAV_WAYPOINT,
         frame=FRAME_GLOBAL,
@@ -197,7 +201,7 @@ def waypoints_text(items: Sequence[MissionItem], home: tuple[float, float, float
     )
     lines = ["QGC WPL 110"]
     for number, item in enumerate([first, *items]):
-        params = "\t".join(f"{0.0 if math.isnan(p) else p:.8g}" for p in item.params)
+        params = "\t".join(f"{p:.8g}" for p in item.params)
         position = f"{item.lat_deg:.8f}\t{item.lon_deg:.8f}\t{item.alt_m:.3f}"
         head = f"{number}\t{int(number == 0)}\t{item.frame}\t{item.command}"
         lines.append(f"{head}\t{params}\t{position}\t{int(item.autocontinue)}")

@@ -1,5 +1,6 @@
 import json
 import math
+from dataclasses import replace
 
 import jsonschema
 import pytest
@@ -147,6 +148,24 @@ def test_plan_files_fit_the_schema(autopilot, end):
     for item in mission["items"]:
         if item["command"] in (NAV_WAYPOINT, NAV_TAKEOFF, NAV_LAND):  # yaw 0 turns PX4 north
             assert item["params"][3] == (None if autopilot == "px4" else 0.0)
+
+
+@pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
+def test_a_waypoint_file_leaves_the_yaw_to_px4_as_the_plan_does(tmp_path, autopilot):
+    from pymavlink import mavwp  # by which MAVProxy reads such files
+
+    plan = small_plan()
+    sortie = plan.vehicles[0].sorties[0]
+    waits = replace(sortie.waypoints[0], wait_s=30.0)
+    plan = replace(plan, vehicles=(VehiclePlan(1, (replace(sortie, waypoints=(waits, *sortie.waypoints[1:])),)),))
+    texts = mission_files(plan, [autopilot])
+    (tmp_path / "v1.waypoints").write_text(texts["v1.waypoints"])
+    loader = mavwp.MAVWPLoader()
+    loader.load(str(tmp_path / "v1.waypoints"))
+    yaws = [item["params"][3] for item in json.loads(texts["v1.plan"])["mission"]["items"]]
+    read = [loader.wp(k).param4 for k in range(1, loader.count())]  # without home
+    assert [None if math.isnan(yaw) else yaw for yaw in read] == yaws
+    assert (None in yaws) == (autopilot == "px4")
 
 
 def test_the_trigger_follows_a_legs_first_waypoint_and_stops_at_its_last():

@@ -12,6 +12,7 @@ from gcs_plugin.mission import mission_files
 from gcs_plugin.mission.command_dialogues import unflyable
 from gcs_plugin.mission.items import (
     LAND,
+    LOITER_TIME,
     LOITER_UNLIM,
     RTL,
     TAKEOFF,
@@ -141,6 +142,13 @@ def test_a_file_of_either_kind_becomes_the_same_mission(tmp_path, autopilot, wri
     path.write_text(text)
     read, made = read_mission(path, autopilot), sortie_mission(plan, sortie, autopilot)
     assert repr(read.items) == repr(made.items)  # NaN equals NaN here
+
+
+@pytest.mark.parametrize("command", [WAYPOINT, TAKEOFF, LAND, LOITER_TIME])
+def test_a_yaw_of_0_is_none_for_px4(command):
+    item = mission_files.MissionItem(command=command, frame=3, lat_deg=47.4, lon_deg=8.5, alt_m=60.0)
+    assert math.isnan(build_mission(PX4, [item]).items[0].params[3])
+    assert build_mission(AP, [item]).items[1].params[3] == 0.0
 
 
 @BOTH
