@@ -1,5 +1,6 @@
 """The user's height model: a GeoTIFF of any CRS as terrain of the area, relative to the takeoff level."""
 
+import re
 import warnings
 from dataclasses import dataclass
 from functools import lru_cache
@@ -19,9 +20,18 @@ from orthoswarm.stores.local_copies import local_file
 
 Array = NDArray[np.float64]
 
-_METRES = {"": 1.0, "m": 1.0, "metre": 1.0, "meter": 1.0, "metres": 1.0, "meters": 1.0,
-           "ft": 0.3048, "foot": 0.3048, "feet": 0.3048, "us-ft": 0.3048006096012192,
-           "us survey foot": 0.3048006096012192, "cm": 0.01, "dm": 0.1, "mm": 0.001}  # fmt: skip
+_US_FOOT_M = 1200.0 / 3937.0
+_METRES = {
+    **dict.fromkeys(("", "m", "metre", "metres", "meter", "meters"), 1.0),
+    **dict.fromkeys(("ft", "foot", "feet", "international foot", "international feet"), 0.3048),
+    **dict.fromkeys(("us ft", "ft us", "ftus", "usft", "us foot", "us feet", "foot us", "feet us"), _US_FOOT_M),
+    **dict.fromkeys(("us survey foot", "us survey feet", "survey foot", "survey feet", "sft"), _US_FOOT_M),
+    **dict.fromkeys(("cm", "centimetre", "centimetres", "centimeter", "centimeters"), 0.01),
+    **dict.fromkeys(("dm", "decimetre", "decimetres", "decimeter", "decimeters"), 0.1),
+    **dict.fromkeys(("mm", "millimetre", "millimetres", "millimeter", "millimeters"), 0.001),
+    **dict.fromkeys(("km", "kilometre", "kilometres", "kilometer", "kilometers"), 1000.0),
+}
+"""Metres of a unit, spelt as GDAL, PROJ ("us-ft"), WKT ("US survey foot") and WKT of Esri ("Foot_US") do."""
 
 _BETWEEN_NODES = 1.5
 """How far the nodes around a place and the node of a pixel are from them, together, in steps."""
@@ -267,9 +277,24 @@ def _on_area(
         except RasterioError as error:
             raise InputError(f"{name} cannot be read as heights ({error}); check the file") from None
         z = z * float(dataset.scales[0] or 1.0) + float(dataset.offsets[0] or 0.0)
-        z *= _METRES.get(str(dataset.units[0] or "").strip().lower(), 1.0)
+        z *= _unit_m(str(dataset.units[0] or ""), name)
     z[~np.isfinite(z) | (z > 12000.0) | (z < -1000.0)] = np.nan  # impossible heights
     return np.ascontiguousarray(z[::-1]), left, low, step
+
+
+def _unit_m(unit: str, name: str) -> float:
+    """Metres of a height model's unit, in whichever case and with whatever between its words.
+
+    Raises:
+        InputError: it is not known.
+    """
+    words = re.findall("[a-z0-9]+", unit.lower().replace("u.s.", "us"))
+    metres = _METRES.get(" ".join(w for w in words if w != "intl")) if words or not unit.strip() else None
+    if metres is None:
+        raise InputError(
+            f"{name} has heights in '{unit.strip()}', which is no known unit; set it with gdal_edit.py -units m"
+        )
+    return metres
 
 
 def _nodata(dataset: Any) -> float | None:

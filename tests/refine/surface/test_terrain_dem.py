@@ -129,10 +129,19 @@ def test_gaps_are_filled_from_around(tmp_path, nodata):
     check(read_dem(path, EPSG, BOUNDS, level_m=300.0), 300.0, 3.0)
 
 
-def test_feet_become_metres(tmp_path):
+@pytest.mark.parametrize("unit", ["ft", "Foot_US", "foot_us", "ftUS", "us-ft", "US survey foot", "U.S. Survey Feet"])
+def test_feet_become_metres(tmp_path, unit):
     z, transform = utm_dem(factor=1 / 0.3048)
-    path = write(tmp_path / "feet.tif", z, transform=transform, unit="ft")
+    path = write(tmp_path / "feet.tif", z, transform=transform, unit=unit)
     check(read_dem(path, EPSG, BOUNDS, level_m=300.0), 300.0, 0.05)
+
+
+@pytest.mark.parametrize("unit", ["fathom", "yd", "%"])
+def test_an_unknown_unit_is_not_taken_for_metres(tmp_path, unit):
+    z, transform = utm_dem()
+    path = write(tmp_path / "dem.tif", z, transform=transform, unit=unit)
+    with pytest.raises(InputError, match=f"heights in '{unit}', which is no known unit"):
+        read_dem(path, EPSG, BOUNDS)
 
 
 def test_whole_numbers_are_read(tmp_path):
