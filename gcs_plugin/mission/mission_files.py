@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 from orthoswarm.model.earth import DEGREE_M
 from orthoswarm.model.errors import InputError
-from orthoswarm.model.plan import Plan, Sortie, Waypoint
+from orthoswarm.model.plan import Fence, Plan, Sortie, Waypoint
 
 Autopilot = Literal["ardupilot", "px4"]
 LatLon = tuple[float, float]
@@ -66,7 +66,7 @@ class Mission:
         home: latitude, longitude (degrees) and altitude (metres) of home, None if not in the file.
         surveys: outlines of survey items, each a ring of (latitude, longitude) in degrees.
         polylines: centre lines of corridor items, (latitude, longitude) in degrees.
-        no_fly: rings of exclusion fences, (latitude, longitude) in degrees.
+        no_fly: rings of exclusion fences, (latitude, longitude) in degrees. fences: all fences, of both kinds.
         speed_m_s: speed set in the file, or None.
     """
 
@@ -76,6 +76,7 @@ class Mission:
     polylines: tuple[tuple[LatLon, ...], ...] = ()
     no_fly: tuple[tuple[LatLon, ...], ...] = field(default=())
     speed_m_s: float | None = None
+    fences: tuple[Fence, ...] = ()
 
     def lines(self) -> tuple[tuple[LatLon, ...], ...]:
         """The lines to be photographed: the sections flown with the camera triggering by distance, if any, else all.
@@ -146,14 +147,21 @@ def sortie_items(plan: Plan, sortie: Sortie, autopilot: Autopilot) -> tuple[Miss
 
 
 def plan_text(
-    items: Sequence[MissionItem], home: tuple[float, float, float], autopilot: Autopilot, speed_m_s: float
+    items: Sequence[MissionItem],
+    home: tuple[float, float, float],
+    autopilot: Autopilot,
+    speed_m_s: float,
+    fences: Sequence[Fence] = (),
 ) -> str:
-    """The text of a QGroundControl `.plan`: file type "Plan", version 1, mission version 2, simple items only."""
+    """The text of a QGroundControl `.plan`: file type "Plan", version 1, mission version 2, simple items only.
+
+    QGroundControl sends the fence, too: an empty one replaces that of the vehicle.
+    """
     document = {
         "fileType": "Plan",
         "version": 1,
         "groundStation": "QGroundControl",
-        "geoFence": {"circles": [], "polygons": [], "version": 2},
+        "geoFence": _fence_document(fences),
         "rallyPoints": {"points": [], "version": 2},
         "mission": {
             "version": 2,
@@ -167,6 +175,27 @@ def plan_text(
         },
     }
     return json.dumps(document, indent=1, allow_nan=False) + "\n"
+
+
+def _fence_document(fences: Sequence[Fence]) -> dict[str, Any]:
+    """The `geoFence` of a QGroundControl plan, version 2."""
+    return {
+        "circles": [
+            {"circle": {"center": _rounded(f.points[0]), "radius": f.radius_m}, "inclusion": f.inclusion, "version": 1}
+            for f in fences
+            if f.radius_m is not None
+        ],
+        "polygons": [
+            {"inclusion": f.inclusion, "polygon": [_rounded(p) for p in f.points], "version": 1}
+            for f in fences
+            if f.radius_m is None
+        ],
+        "version": 2,
+    }
+
+
+def _rounded(point: LatLon) -> list[float]:
+    return [round(point[0], 8), round(point[1], 8)]
 
 
 def _simple_item(item: MissionItem, number: int) -> dict[str, Any]:
@@ -288,8 +317,11 @@ def _parse_plan(document: Mapping[str, Any]) -> Mission:
     for item in items:
         _check_item(item, "an item")
     fence = document.get("geoFence") or {}
-    no_fly = [_ring(p["polygon"]) for p in fence.get("polygons") or [] if not p.get("inclusion", True)]
-    no_fly += [_circle(c["circle"]) for c in fence.get("circles") or [] if not c.get("inclusion", True)]
+    fences = [
+        Fence(inclusion=bool(p.get("inclusion", True)), points=_ring(p["polygon"])) for p in fence.get("polygons") or []
+    ]
+    fences += [_read_circle(c["circle"], bool(c.get("inclusion", True))) for c in fence.get("circles") or []]
+    no_fly = [f.points if f.radius_m is None else _around(f) for f in fences if not f.inclusion]
     home = mission.get("plannedHomePosition")
     speed = mission.get("hoverSpeed") or mission.get("cruiseSpeed")
     return Mission(
@@ -299,6 +331,7 @@ def _parse_plan(document: Mapping[str, Any]) -> Mission:
         polylines=tuple(polylines),
         no_fly=tuple(no_fly),
         speed_m_s=float(speed) if speed else None,
+        fences=tuple(fences),
     )
 
 
@@ -337,9 +370,14 @@ def _ring(points: Iterable[Sequence[float]]) -> tuple[LatLon, ...]:
     return ring
 
 
-def _circle(circle: Mapping[str, Any]) -> tuple[LatLon, ...]:
+def _read_circle(circle: Mapping[str, Any], inclusion: bool) -> Fence:
+    return Fence(inclusion=inclusion, points=_ring([circle["center"]]), radius_m=float(circle["radius"]))
+
+
+def _around(circle: Fence) -> tuple[LatLon, ...]:
     """A circular fence as a 32-gon around it."""
-    (lat, lon), radius = circle["center"], float(circle["radius"]) / math.cos(math.pi / 32)
-    north, east = DEGREE_M, DEGREE_M * math.cos(math.radians(float(lat)))
+    assert circle.radius_m is not None
+    (lat, lon), radius = circle.points[0], circle.radius_m / math.cos(math.pi / 32)
+    north, east = DEGREE_M, DEGREE_M * math.cos(math.radians(lat))
     angles = [2.0 * math.pi * k / 32 for k in range(32)]
     return tuple((lat + radius * math.cos(a) / north, lon + radius * math.sin(a) / east) for a in angles)

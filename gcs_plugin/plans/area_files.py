@@ -11,6 +11,7 @@ from typing import Final
 from gcs_plugin.mission.mission_files import parse_mission
 from gcs_plugin.plans.vector_files import read_geopackage, read_zipped_shapefile
 from orthoswarm.model.errors import InputError
+from orthoswarm.model.plan import Fence
 from orthoswarm.planning.area.shape_files import Polygon, Ring, Shapes, parse_geojson, parse_kml, ring
 
 _KINDS: Final = {
@@ -55,6 +56,22 @@ def read_shapes(path: Path, name: str | None = None) -> tuple[Shapes, list[Ring]
     polygons = tuple(Polygon(ring(survey, name)) for survey in mission.surveys)
     lines = tuple(ring(line, name, 2) for line in (mission.polylines or mission.lines()))
     return Shapes(polygons, lines), [ring(zone, name) for zone in mission.no_fly]
+
+
+def read_fences(path: Path) -> tuple[Fence, ...]:
+    """The geofences of a QGroundControl `.plan`; files of other kinds have none.
+
+    Raises:
+        InputError: it cannot be read, or a polygon has fewer than three corners.
+    """
+    name = str(path)
+    if _kind(path, name) != "a mission":
+        return ()
+    fences = parse_mission(_text(path, name), name).fences
+    for fence in fences:
+        if fence.radius_m is None:
+            ring(fence.points, name)
+    return fences
 
 
 def _kind(path: Path, name: str) -> str:

@@ -31,7 +31,7 @@ def mission_files(plan: Plan, autopilots: Sequence[Autopilot]) -> dict[str, str]
             name = sortie_name(vehicle, index)
             home = (sortie.home_lat_deg, sortie.home_lon_deg, 0.0)
             items = sortie_items(plan, sortie, autopilot)
-            texts[f"{name}.plan"] = plan_text(items, home, autopilot, plan.speed_m_s)
+            texts[f"{name}.plan"] = plan_text(items, home, autopilot, plan.speed_m_s, plan.fences)
             texts[f"{name}.waypoints"] = waypoints_text(items, home)
     return texts
 

@@ -10,9 +10,10 @@ import numpy as np
 import shapely
 
 from gcs_plugin.mission.mission_files import Autopilot
-from gcs_plugin.plans.area_files import read_shapes
+from gcs_plugin.plans.area_files import read_fences, read_shapes
 from gcs_plugin.plans.gap_area import gap_area, read_gaps
 from gcs_plugin.plans.ground_below import read_ground, relief_notes
+from gcs_plugin.plans.plan_fence import refuse_outside, zone_fences
 from orthoswarm.config import active
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid, area_epsg
@@ -152,8 +153,20 @@ def make_plan(request: PlanRequest, progress: Callable[[str], None] = lambda _: 
         request: what to plan. progress: called with what is being done.
 
     Raises:
-        InputError: a file or a value is of no use.
+        InputError: a file or a value is of no use, or a flight would leave an inclusion fence.
     """
+    plan, area = _made(request, progress)
+    sources = [*request.no_fly] if request.gaps else [request.area, *request.no_fly]
+    fences = [fence for path in sources for fence in read_fences(path)]
+    refuse_outside(plan, fences, request.autopilots)
+    # Nearer to a zone a vehicle would break its fence by the errors of its receiver alone, and turn back or stop.
+    if area is not None and (request.clearance_m or 0.0) >= active().planning.beside_m:
+        fences += zone_fences(area, fences)
+    return replace(plan, fences=tuple(fences)), area
+
+
+def _made(request: PlanRequest, progress: Callable[[str], None]) -> tuple[Plan, Area | None]:
+    """The plan and its area, without fences; see `make_plan`."""
     options = request.flight_options()
     options.check()
     progress("area")

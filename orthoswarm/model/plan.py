@@ -157,6 +157,21 @@ class OverGround:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Fence:
+    """A geofence that goes with a plan.
+
+    Attributes:
+        inclusion: flights must stay inside it, else outside.
+        points: latitude and longitude in degrees of a polygon's corners, or of a circle's centre.
+        radius_m: of a circle, None for a polygon.
+    """
+
+    inclusion: bool
+    points: tuple[tuple[float, float], ...]
+    radius_m: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
     """Missions for a swarm over one area, or along given lines.
 
@@ -176,6 +191,7 @@ class Plan:
         separation: how vehicles are kept apart, in words.
         warnings: what the user should know.
         over_ground: how it lies over the height model, None without one.
+        fences: geofences that vehicles are to hold while they fly it.
     """
 
     method: str
@@ -193,6 +209,7 @@ class Plan:
     separation: str
     warnings: tuple[str, ...]
     over_ground: OverGround | None = None
+    fences: tuple[Fence, ...] = ()
 
     @property
     def makespan_s(self) -> float:
