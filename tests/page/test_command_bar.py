@@ -97,6 +97,8 @@ def test_keys_command_and_give_the_focus_back(browser):
         page.focus(".command[data-verb=pause]")
         page.keyboard.press("Enter")
         page.wait_for_timeout(400)
+        assert page.evaluate("document.activeElement.className") == "confirm-no"
+        page.keyboard.press("Tab")
         page.keyboard.press("Enter")
         page.wait_for_selector("[data-outcome=done]")
         assert page.evaluate("document.activeElement.dataset.verb") == "pause"
@@ -104,6 +106,38 @@ def test_keys_command_and_give_the_focus_back(browser):
         page.keyboard.press("Escape")
         page.wait_for_selector(".confirm", state="hidden")
         assert len(station.commands("pause")) == 1
+
+
+@pytest.mark.parametrize("key", ["Enter", "Space"])
+def test_a_key_that_is_held_down_lands_nobody(browser, key):
+    with standing(vehicle(1), vehicle(2)) as station, opened(browser, station.url) as page:
+        ok_for_all(station)
+        page.wait_for_selector(".tile >> nth=1")
+        page.focus(".command[data-verb=land]")
+        for _ in range(30):
+            page.keyboard.down(key)  # the first is a press, the others are its repeats
+            page.wait_for_timeout(50)
+        page.keyboard.up(key)
+        page.wait_for_selector(".confirm")
+        # the question was opened with a mouse while the key was down, and the focus is on the confirmation
+        page.click(".confirm-no")
+        page.keyboard.down(key)
+        page.click(".command[data-verb=land]")
+        page.focus(".confirm-yes")
+        page.wait_for_timeout(400)
+        for _ in range(5):
+            page.keyboard.down(key)
+        page.keyboard.up(key)
+        page.wait_for_timeout(300)
+        assert station.commands("land") == []
+        page.click(".confirm-no")
+        page.focus(".command[data-verb=land]")
+        page.keyboard.press(key)
+        page.wait_for_timeout(400)
+        page.keyboard.press("ArrowLeft")
+        page.keyboard.press(key)
+        page.wait_for_function("() => document.querySelectorAll('[data-outcome=done]').length == 2")
+        assert len(station.commands("land")) == 1
 
 
 @pytest.mark.parametrize(

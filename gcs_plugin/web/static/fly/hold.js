@@ -1,10 +1,21 @@
-// The confirmation of what moves vehicles: a mouse or a key presses once; a finger holds for one second.
+// The confirmation of what moves vehicles: a mouse or a key presses once; a finger holds for one second. The question opens
+// on Cancel, and a key that was down then confirms nothing until it was let go: holding Enter must not land the swarm.
 
 import { button, make, setHidden, setText } from "/static/core/dom.js";
 import { t } from "/static/core/strings.js";
 
 const HOLD_MS = 1000;
 const SETTLE_MS = 350; // a double press of the first button is not a confirmation
+
+const PRESSES = new Set(["Enter", "NumpadEnter", "Space"]);
+const down = new Set(); // keys that are held now
+
+document.addEventListener("keydown", (event) => {
+  down.add(event.code);
+  if (event.repeat && PRESSES.has(event.code) && event.target.closest?.("button")) event.preventDefault(); // a held key presses a button once
+}, true);
+document.addEventListener("keyup", (event) => down.delete(event.code), true);
+window.addEventListener("blur", () => down.clear());
 
 export function holdConfirm() {
   const question = make("p", { id: "confirm-question" });
@@ -16,6 +27,7 @@ export function holdConfirm() {
   let touch = false;
   let timer = null;
   let before = null;
+  let held = new Set(); // keys that were down when the question opened, and are since
   function close() {
     go = null;
     stop();
@@ -47,7 +59,15 @@ export function holdConfirm() {
     touch = false;
     if (!finger && performance.now() - opened > SETTLE_MS) confirm();
   });
-  box.addEventListener("keydown", (event) => { if (event.key === "Escape") close(); });
+  document.addEventListener("keyup", (event) => held.delete(event.code), true);
+  box.addEventListener("keydown", (event) => {
+    if (event.key === "Escape") close();
+    else if (PRESSES.has(event.code) && (event.repeat || held.has(event.code))) event.preventDefault();
+    else if (["Tab", "ArrowLeft", "ArrowRight"].includes(event.key)) {
+      event.preventDefault();
+      (document.activeElement === yes ? no : yes).focus();
+    }
+  });
   // Ask; work() runs once it is confirmed.
   const ask = (text, label, tone, work) => {
     setText(question, text);
@@ -55,9 +75,10 @@ export function holdConfirm() {
     yes.dataset.tone = tone;
     go = work;
     opened = performance.now();
+    held = new Set(down);
     before = document.activeElement;
     setHidden(box, false);
-    yes.focus();
+    no.focus();
   };
   return { box, ask };
 }
