@@ -1,8 +1,10 @@
 """Commands to vehicles over HTTP: each has an id and an outcome, and expires 5 s after it was issued.
 
-The client states the time of issue by the daemon's clock (`given_s`; heartbeats of the event stream carry that clock).
-Without it the time of issue is when the request was read, unless the daemon was suspended just before: the age of the
-request is then unknown, and it is not executed. A repeated id gets the same outcome; the command is not sent twice.
+The client states the time of issue by a clock of the daemon that nobody sets (`given_clock_s` with `run`), or by its
+wall clock (`given_s`); heartbeats of the event stream carry both. Without either the time of issue is when the request
+was read, unless the daemon was suspended just before: the age of the request is then unknown, and it is not executed.
+Pause, return and land are never refused because a clock runs ahead. A repeated id gets the same outcome; the command is
+not sent twice.
 """
 
 import asyncio
@@ -21,10 +23,11 @@ from gcs_plugin.config import COMMAND
 from gcs_plugin.daemon.daemon import Daemon
 from gcs_plugin.daemon.takeoffs import Takeoffs, names_of
 from gcs_plugin.daemon.vehicles import VehicleLinks
-from gcs_plugin.fleet.commands import VERBS, CommandResult, new_id
+from gcs_plugin.fleet.commands import URGENT, VERBS, CommandResult, new_id
 from gcs_plugin.mission.exchange import Verdict
 from gcs_plugin.web.answers import JsonAnswer, in_thread, json_body
-from gcs_plugin.web.standstill import Standstill
+from gcs_plugin.web.event_stream import RUN
+from gcs_plugin.web.standstill import Standstill, clock_with_sleep
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 
 Rows = list[dict[str, Any]]
@@ -32,6 +35,7 @@ Rows = list[dict[str, Any]]
 ALL: Final = "all"
 _ALL_VERBS: Final = ("pause", "resume", "rtl", "land")
 _AHEAD_S: Final = 2.0
+_BEATS: Final = {"given_s": "time", "given_clock_s": "clock_s"}
 _MOST_ID: Final = 200
 _REMEMBERED: Final = 1000  # commands, so that one that is sent twice is carried out once
 _THREADS: Final = 128  # commands under way
@@ -42,7 +46,7 @@ class Issue:
     """Id and time of issue of a command.
 
     Attributes:
-        id: from the client, or a new one. at: UTC epoch seconds by the daemon's clock.
+        id: from the client, or a new one. at: seconds of the daemon's clock that nobody sets.
     """
 
     id: str
@@ -51,7 +55,7 @@ class Issue:
     @property
     def age_s(self) -> float:
         """Seconds since then."""
-        return time.time() - self.at
+        return clock_with_sleep() - self.at
 
 
 class CommandRoutes:
@@ -73,8 +77,8 @@ class CommandRoutes:
     async def mission(self, vehicle: str, verb: str, request: Request) -> Response:
         """Send a command: `upload` ({"plan": id, "mission": "v1"}), `start`, `pause`, `resume`, `rtl`, `land`.
 
-        Body: `id` and `given_s` (epoch seconds by the daemon's clock). Answers once the outcome is known, with `id`,
-        `vehicle`, `command`, `outcome` (`done`, `refused`, `not_sent`, `unknown`) and `reason`. The vehicle `all`
+        Body: `id`, and `given_clock_s` with `run`, or `given_s` (see above). Answers once the outcome is known, with
+        `id`, `vehicle`, `command`, `outcome` (`done`, `refused`, `not_sent`, `unknown`) and `reason`. The vehicle `all`
         stands for all on the links (not for upload and start); its answer has `id` and `results`, a row a vehicle.
         """
         if verb not in (*VERBS, "upload"):
@@ -103,23 +107,27 @@ class CommandRoutes:
         return known[1]
 
     def _issue(self, body: Mapping[str, Any]) -> Issue:
-        number, at = body.get("id"), body.get("given_s")
+        number, run = body.get("id"), body.get("run")
         if number is None:
             number = new_id()
         if not isinstance(number, str) or not 0 < len(number) <= _MOST_ID:
             raise InputError(f"id is not a text of 1 to {_MOST_ID} characters; send one, or none for a new one")
-        if at is None:
-            return Issue(number, time.time() - self._standstill.length_s())
-        if isinstance(at, bool) or not isinstance(at, int | float) or not 0 <= at < 1e11 or not math.isfinite(at):
-            raise InputError("given_s is not a time; send epoch seconds by the daemon's clock (`time` of a heartbeat)")
-        return Issue(number, float(at))
+        now = clock_with_sleep()
+        steady, at = _seconds(body, "given_clock_s"), _seconds(body, "given_s")
+        if steady is not None and run == RUN:
+            return Issue(number, steady)
+        if at is not None:
+            return Issue(number, now - (time.time() - at))
+        if steady is not None:
+            return Issue(number, -math.inf)  # given to a run of the daemon that has ended
+        return Issue(number, now - self._standstill.length_s())
 
     def _carry_out(
         self, links: VehicleLinks, vehicle: str, verb: str, issue: Issue, body: dict[str, Any]
     ) -> Rows:  # fmt: skip
         """Execute a command and publish its outcome; runs in a thread."""
         names = _names(links) if vehicle == ALL else [vehicle]
-        late = _late(issue)
+        late = _late(issue, verb)
         if late is not None:
             rows = [CommandResult(issue.id, name, verb, Verdict.NOT_SENT, late).document() for name in names]
         elif verb == "upload":
@@ -198,18 +206,29 @@ def _begin(
     names: dict[str, str],
     override: Mapping[str, Collection[str]],
 ) -> dict[str, float]:
-    late = _late(issue)
+    late = _late(issue, "start")
     if late is not None:
         raise OrthoSwarmError(f"{late}; no vehicle was started")
     return takeoffs.begin(number, sortie, names, override)
 
 
-def _late(issue: Issue) -> str | None:
+def _seconds(body: Mapping[str, Any], key: str) -> float | None:
+    """A time in a request, None if it has none."""
+    at = body.get(key)
+    if at is None:
+        return None
+    if isinstance(at, bool) or not isinstance(at, int | float) or not 0 <= at < 1e11 or not math.isfinite(at):
+        raise InputError(f"{key} is not a time; send seconds by the daemon's clock (`{_BEATS[key]}` of a heartbeat)")
+    return float(at)
+
+
+def _late(issue: Issue, verb: str) -> str | None:
     """Why a command has expired or lies in the future, None if it is valid."""
     age = issue.age_s
     if age > COMMAND.fresh_s:
-        return f"it was given {age:.0f} s ago, too long to be executed now; look at the vehicle and give it again"
-    if age < -_AHEAD_S:
+        ago = f"{age:.0f} s ago" if math.isfinite(age) else "before the ground station was started again"
+        return f"it was given {ago}, too long to be executed now; look at the vehicle and give it again"
+    if age < -_AHEAD_S and verb not in URGENT:  # the clock was set; what ends a flight counts as given now
         return f"it was given {-age:.0f} s from now; take the time from the daemon's heartbeats and give it again"
     return None
 

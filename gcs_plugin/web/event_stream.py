@@ -1,36 +1,49 @@
-"""The event stream over a WebSocket: changes as they happen, and each second a heartbeat with the daemon's time."""
+"""The event stream over a WebSocket: changes as they happen, and each second a heartbeat with the daemon's clocks.
+
+The wall clock can be set while a page is open, which would make every command look as if it came from the future or the
+past. So heartbeats also carry a clock that nobody sets, and the run of the daemon in which it counts.
+"""
 
 import asyncio
 import contextlib
 import json
+import os
 import time
 from typing import Any, Final
 
 from fastapi import WebSocket, WebSocketDisconnect
 
 from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.web.standstill import clock_with_sleep
 from orthoswarm import __version__
 
 HEARTBEAT_S: Final = 1.0
+RUN: Final = os.urandom(6).hex()
+"""Names this run of the daemon: its clock means nothing to another."""
+
+
+def clocks() -> dict[str, Any]:
+    """What a client dates its commands with: `time` (UTC epoch seconds), `clock_s` (never set), `run`."""
+    return {"time": time.time(), "clock_s": clock_with_sleep(), "run": RUN}
 
 
 async def stream_events(socket: WebSocket, events: Events) -> None:
     """Send events as JSON texts, one per message, until the client disconnects.
 
-    `hello` comes first, `heartbeat` each second; both carry `time`, the daemon's clock in UTC epoch seconds.
+    `hello` comes first, `heartbeat` each second; both carry the values of `clocks`.
     """
     await socket.accept()
     subscription = events.subscribe()
     gone = asyncio.ensure_future(_until_gone(socket))
     news = asyncio.ensure_future(subscription.get())
     try:
-        await socket.send_text(_text({"type": "hello", "version": __version__, "time": time.time()}))
+        await socket.send_text(_text({"type": "hello", "version": __version__} | clocks()))
         due = time.monotonic() + HEARTBEAT_S
         while not gone.done():
             wait_s = max(0.0, due - time.monotonic())
             await asyncio.wait({news, gone}, timeout=wait_s, return_when=asyncio.FIRST_COMPLETED)
             if time.monotonic() >= due:
-                await socket.send_text(_text({"type": "heartbeat", "time": time.time()}))
+                await socket.send_text(_text({"type": "heartbeat"} | clocks()))
                 due = time.monotonic() + HEARTBEAT_S
             if news.done():
                 for event in news.result():

@@ -108,6 +108,26 @@ def test_keys_command_and_give_the_focus_back(browser):
         assert len(station.commands("pause")) == 1
 
 
+def test_commands_carry_the_stations_steady_clock_and_follow_a_wall_clock_that_was_set_back(browser):
+    with standing(vehicle(1)) as station, opened(browser, station.url) as page:
+        ok_for_all(station)
+        page.wait_for_selector(".tile")
+        page.evaluate("station.beats = false")
+        for shift in (0, -30, -30, -30):  # nothing was held up: the clock was set
+            page.evaluate(
+                "(s) => station.send({ type: 'heartbeat', time: 1e9 + s + performance.now() / 1000,"
+                " clock_s: 5000 + performance.now() / 1000, run: 'a' })",
+                shift,
+            )
+        page.click(".command[data-verb=land]")
+        confirm(page)
+        page.wait_for_selector("[data-outcome=done]")
+        body, now = station.commands("land")[0], page.evaluate("performance.now() / 1000")
+        assert body["run"] == "a"
+        assert body["given_clock_s"] - now == pytest.approx(5000, abs=5)
+        assert body["given_s"] - now == pytest.approx(1e9 - 30, abs=5)
+
+
 @pytest.mark.parametrize("key", ["Enter", "Space"])
 def test_a_key_that_is_held_down_lands_nobody(browser, key):
     with standing(vehicle(1), vehicle(2)) as station, opened(browser, station.url) as page:

@@ -38,12 +38,40 @@ def flying(tmp_path_factory):
 
 
 def test_a_command_that_was_given_too_long_ago_is_not_executed(flying):
-    for given, word in ((time.time() - 6.0, "ago"), (time.time() + 60.0, "from now")):
-        answer = flying.command("/api/missions/v1/rtl", {"id": f"late-{word}", "given_s": given})
+    for given, verb, word in ((time.time() - 6.0, "rtl", "ago"), (time.time() + 60.0, "resume", "from now")):
+        answer = flying.command(f"/api/missions/v1/{verb}", {"id": f"late-{word}", "given_s": given})
         assert answer.status_code == 200
         row = answer.json()
-        assert (row["id"], row["vehicle"], row["command"]) == (f"late-{word}", "v1", "rtl")
+        assert (row["id"], row["vehicle"], row["command"]) == (f"late-{word}", "v1", verb)
         assert row["outcome"] == "not_sent" and word in row["reason"]
+
+
+def heartbeat(flying):
+    from websockets.sync.client import connect
+
+    with connect(flying.url.replace("http", "ws") + "/api/events", origin=flying.url) as events:
+        return json.loads(events.recv(timeout=LIMIT_S))
+
+
+@pytest.mark.parametrize("verb", ["pause", "rtl", "land"])
+def test_a_clock_that_was_set_back_keeps_no_urgent_command_from_the_vehicles(flying, verb):
+    beat = heartbeat(flying)
+    ahead = {"given_s": time.time() + 30.0}  # as a page counts on that heard the clock before it was set
+    for body in (ahead, ahead | {"given_clock_s": beat["clock_s"], "run": beat["run"]}):
+        rows = flying.command(f"/api/missions/all/{verb}", body).json()["results"]
+        assert {row["outcome"] for row in rows} <= {"done", "refused"}
+
+
+def test_the_age_of_a_command_counts_by_the_clock_that_nobody_sets(flying):
+    beat = heartbeat(flying)
+    late = {"given_clock_s": beat["clock_s"] - 6.0, "run": beat["run"], "given_s": time.time()}
+    of_another_run = {"given_clock_s": beat["clock_s"], "run": "ended"}
+    for body in (late, of_another_run):
+        row = flying.command("/api/missions/v1/rtl", body).json()
+        assert row["outcome"] == "not_sent" and "give it again" in row["reason"]
+    fresh = {"given_clock_s": beat["clock_s"], "run": beat["run"], "given_s": time.time() - 60.0}
+    assert flying.command("/api/missions/v1/rtl", fresh).json()["outcome"] in ("done", "refused")
+    assert flying.command("/api/missions/v1/rtl", {"given_clock_s": "x"}).status_code == 422
 
 
 def test_a_command_in_time_reaches_the_vehicle_once(flying):

@@ -9,20 +9,34 @@ const RECONNECT_S = 8;
 const CHECK_MS = 500;
 
 let heardAt = performance.now();
-let offset_s = null; // the daemon's clock less performance.now()
 let socket = null;
 let wait = 500;
-
-// The daemon's time now (epoch seconds), null before its first heartbeat.
-export const daemonTime = () => (offset_s == null ? null : offset_s + performance.now() / 1000);
 export const connected = () => socket?.readyState === WebSocket.OPEN && state.link !== "lost";
 
-// A heartbeat that was held up on its way would set the clock back: only a large step back is the daemon's own.
+// Seconds of a clock of the daemon, less performance.now(). A heartbeat that was held up on its way would set the clock
+// back: it slips slowly. Three in a row that are far behind were not held up; the daemon's clock was set.
 const SLIP_S = 0.05;
-const STEP_S = 60;
-function setClock(offset) {
-  offset_s = offset_s == null || offset < offset_s - STEP_S ? offset : Math.max(offset, offset_s - SLIP_S);
+const FAR_S = 1;
+const STEP_BEATS = 3;
+const clock = () => ({ offset_s: null, behind: 0 });
+function setClock(held, time_s) {
+  const offset = time_s - heardAt / 1000;
+  held.behind = held.offset_s != null && offset < held.offset_s - FAR_S ? held.behind + 1 : 0;
+  held.offset_s = held.offset_s == null || held.behind >= STEP_BEATS ? offset : Math.max(offset, held.offset_s - SLIP_S);
 }
+const read = (held) => (held.offset_s == null ? null : held.offset_s + performance.now() / 1000);
+
+let wall = clock(); // epoch seconds: the daemon's machine may set it at any time
+let steady = clock(); // nobody sets it; it counts within one run of the daemon
+let run = null;
+function heardClocks(event) {
+  if (event.run !== run) { run = event.run ?? null; wall = clock(); steady = clock(); }
+  if (Number.isFinite(event.time)) setClock(wall, event.time);
+  if (Number.isFinite(event.clock_s)) setClock(steady, event.clock_s);
+}
+
+// When a command is given, by the daemon's clocks, for its age: without a time before the first heartbeat.
+export const given = () => (read(steady) == null ? { given_s: read(wall) } : { given_clock_s: read(steady), run, given_s: read(wall) });
 
 export function listen(heard) {
   const connect = () => {
@@ -36,7 +50,7 @@ export function listen(heard) {
       let event = null;
       try { event = JSON.parse(message.data); } catch { return; }
       if (!event || typeof event !== "object") return;
-      if (Number.isFinite(event.time) && (event.type === "heartbeat" || event.type === "hello")) setClock(event.time - heardAt / 1000);
+      if (event.type === "heartbeat" || event.type === "hello") heardClocks(event);
       if (event.type !== "heartbeat") heard(event.type === "hello" ? { type: "resync" } : event);
     };
     opened.onclose = () => {

@@ -2,7 +2,7 @@
 
 import { post } from "/static/core/api.js";
 import { changed, state } from "/static/core/store.js";
-import { connected, daemonTime } from "/static/core/stream.js";
+import { connected, given } from "/static/core/stream.js";
 import { t } from "/static/core/strings.js";
 
 const ANSWER_MS = { pause: 9_000, resume: 9_000, rtl: 9_000, land: 9_000, start: 60_000, upload: 190_000 };
@@ -36,8 +36,8 @@ function failed(entry, error, linked) {
   else end(entry, "unknown", t("outcome.silent", { name: entry.name }));
 }
 
-// The daemon does not carry out what it reads more than 5 s after `given_s`, by its own clock.
-const stamp = (id) => ({ id, given_s: daemonTime() });
+// The daemon does not carry out what it reads more than 5 s after it was given, by its own clock.
+const stamp = (id) => ({ id, ...given() });
 
 // One command to one vehicle; resolves to its entry once it has ended.
 export async function command(vehicle, verb, body = {}) {

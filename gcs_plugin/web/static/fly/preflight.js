@@ -7,7 +7,7 @@ import { dialogBox } from "/static/core/dialog.js";
 import { button, keyedList, make, setAttribute, setHidden, setText } from "/static/core/dom.js";
 import { notice } from "/static/core/notices.js";
 import { state } from "/static/core/store.js";
-import { daemonTime } from "/static/core/stream.js";
+import { given } from "/static/core/stream.js";
 import { t } from "/static/core/strings.js";
 import * as units from "/static/core/units.js";
 
@@ -126,7 +126,7 @@ async function start() {
   setText(status, t("preflight.starting"));
   try {
     const override = Object.fromEntries(Object.entries(allowed).map(([vehicle, items]) => [vehicle, [...items]]));
-    const answer = await post(`/api/plans/${plan.id}/start`, { sortie: 1, vehicles: names, override, given_s: daemonTime() });
+    const answer = await post(`/api/plans/${plan.id}/start`, { sortie: 1, vehicles: names, override, ...given() });
     dialog.close();
     const times = Object.entries(answer?.takeoffs_in_s ?? {}).map(([vehicle, s]) => t("preflight.takeoff", { name: nameOf(vehicle), time: units.clock(s) }));
     notice("done", t("preflight.started", { list: times.join(", ") }));
