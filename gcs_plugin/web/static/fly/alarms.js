@@ -1,4 +1,5 @@
-// Alarms by word, colour and sound: what needs a person now. A sound repeats until somebody has seen it.
+// Alarms by word, colour and sound: what needs a person now. A sound repeats until somebody has seen it; what was seen and
+// gets worse is an alarm again, and Seen is for what is on the screen.
 
 import { button, keyedList, make, setAttribute, setHidden, setText } from "/static/core/dom.js";
 import { settings } from "/static/core/settings.js";
@@ -28,15 +29,20 @@ function beep(level) {
   } catch { /* a browser without sound: word and colour stay */ }
 }
 
+const worse = (level, than) => level === "bad" && than !== "bad";
+
 function raise(key, level, text, vehicle) {
   const known = state.alarms.get(key);
-  if (known) {
-    known.text = text;
-    known.level = level;
-    return key;
+  if (!known) {
+    state.alarms.set(key, { key, level, text, vehicle, seen: false, shown: null });
+    beep(level);
+  } else {
+    if (worse(level, known.level)) {
+      Object.assign(known, { seen: false, shown: null });
+      beep(level);
+    }
+    Object.assign(known, { level, text });
   }
-  state.alarms.set(key, { key, level, text, vehicle, seen: false });
-  beep(level);
   return key;
 }
 
@@ -67,19 +73,31 @@ subscribe("vehicles tick commands alarms link", "alarms", () => {
   changed("alarm-list");
 });
 
+const rows = () => (innerWidth <= 700 || innerHeight <= 600 ? 3 : 5);
+const READ_MS = 300; // what came up just before the press was not read
+
 export function alarmList() {
   const list = make("ul", {});
-  const seen = button(t("alarm.seen"), () => { for (const alarm of state.alarms.values()) alarm.seen = true; changed("alarm-list"); }, { class: "small" });
+  let drawn = [];
+  const seen = button(t("alarm.seen"), () => {
+    for (const alarm of drawn) if (performance.now() - alarm.shown > READ_MS) alarm.seen = true;
+    changed("alarm-list");
+  }, { class: "small" });
   const title = make("b", {});
-  const box = make("section", { class: "alarms", "aria-label": t("alarm.title"), role: "alert", hidden: true }, make("div", { class: "row" }, title, seen), list);
+  const more = make("p", { class: "more" });
+  const box = make("section", { class: "alarms", "aria-label": t("alarm.title"), role: "alert", hidden: true }, make("div", { class: "row" }, title, seen), list, more);
   const draw = keyedList(list, (alarm) => make("li", {}, button("", () => alarm.vehicle && select(alarm.vehicle), { class: "alarm" })), (row, alarm) => {
     setText(row.firstChild, `${t(`alarm.${alarm.level}`)} ${alarm.text}`);
     setAttribute(row, "data-level", alarm.level);
   });
   subscribe("alarm-list", "list of alarms", () => {
     const fresh = [...state.alarms.values()].filter((alarm) => !alarm.seen).sort((a, b) => (a.level === "bad" ? 0 : 1) - (b.level === "bad" ? 0 : 1));
+    drawn = fresh.slice(0, rows());
+    for (const alarm of fresh) alarm.shown = drawn.includes(alarm) ? alarm.shown ?? performance.now() : null;
     setText(title, t("alarm.count", { n: fresh.length }));
-    draw(fresh.slice(0, 5).map((alarm) => [alarm.key, alarm]));
+    draw(drawn.map((alarm) => [alarm.key, alarm]));
+    setText(more, fresh.length > drawn.length ? t("alarm.more", { n: fresh.length - drawn.length }) : "");
+    setHidden(more, fresh.length === drawn.length);
     setHidden(box, fresh.length === 0);
   });
   setInterval(() => {
