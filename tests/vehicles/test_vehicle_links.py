@@ -215,6 +215,7 @@ def test_a_row_has_the_autopilots_words_and_home(open_links):
     row = links.rows()[0]
     assert any(said["text"] == "EKF3 IMU0 is using GPS" for said in row["texts"])
     assert row["home"] == pytest.approx([HOME[0], HOME[1]], abs=1e-5)
+    assert row["alt_m"] == pytest.approx(HOME[2], abs=5.0)  # above sea level, as aircraft say theirs
 
 
 def test_a_vehicle_that_acknowledged_a_pause_takes_another_mission_at_once(open_links, folder):  # noqa: F811

@@ -40,7 +40,9 @@ export const english = {
   "details.state": "State", "details.position": "Position", "details.height": "Height", "details.speed": "Speed", "details.battery": "Battery", "details.gps": "Positioning", "details.link": "Link", "details.home": "Home", "details.fence": "Geofence", "details.fence.unread": "not read yet", "details.fence.none": "none on the vehicle", "details.fence.read": "{inside} to stay in, {outside} to stay out of; read from the vehicle at {time}", "details.away": "{m} away", "details.silent": "No message yet.", "details.mission": "Mission", "details.pictures": "Pictures", "details.refined": "Refined",
   "details.start.air": "It is in the air: Resume lets it go on.", "details.armed": "armed", "details.disarmed": "disarmed", "details.left": "{time} min left", "details.satellites": "{n} {n|satellite|satellites}", "details.item": "item {item} of {items}",
   "details.counts": "{taken} taken, {frames} arrived, {fine} refined, {rejected} rejected", "details.refined_s": "{s} s after the mission ended",
-  "alarm.title": "Alarms", "alarm.seen": "Seen", "alarm.count": "{n} {n|alarm|alarms}", "alarm.more": "and {n} more", "alarm.bad": "DANGER", "alarm.warn": "WATCH",
+  "alarm.title": "Alarms", "alarm.seen": "Seen", "alarm.count": "{n} {n|alarm|alarms}", "alarm.more": "and {n} more", "alarm.said": "its autopilot says: {text}", "alarm.rebooted": "has restarted in the air", "alarm.aborted": "has ended its mission without completing it",
+  "aircraft.near": "{name}: aircraft {aircraft} is {metres} away and {height}", "aircraft.above": "{height} above it", "aircraft.below": "{height} below it", "aircraft.unknown": "at a height that is not known",
+  "alarm.bad": "DANGER", "alarm.warn": "WATCH",
 
   "preflight.title": "Before the start of {n} {n|vehicle|vehicles}", "preflight.about": "Vehicles arm and take off at these times after the start. A red item prevents the start; each can be allowed separately.",
   "preflight.fact": ": mission {mission}, {height} high, takes off at {at}, flies {time} min, {photos} {photos|picture|pictures}",

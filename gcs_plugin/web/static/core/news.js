@@ -5,7 +5,7 @@ import { guarded } from "/static/core/guard.js";
 import { changed, state } from "/static/core/store.js";
 import { t } from "/static/core/strings.js";
 import { aircraft, messages, MOST_TEXTS, ring, vehicle } from "/static/core/values.js";
-import { announce } from "/static/fly/alarms.js";
+import { announce, happened, near } from "/static/fly/alarms.js";
 import { heardCommand } from "/static/fly/commands.js";
 
 const HEALTH_MS = 5000;
@@ -56,7 +56,8 @@ const KINDS = {
   vehicle_event: (event) => {
     const row = state.vehicles.get(String(event.vehicle));
     if (row && event.said) { row.texts = [...row.texts, ...messages([{ text: event.said, time: event.time, severity: event.severity }])].slice(-MOST_TEXTS); changed("vehicles"); }
-    if (event.kind === "near" || event.kind === "apart") announce({ key: `near/${list(event.pair).join("/") || event.vehicle}`, text: event.text, vehicle: String(event.vehicle), active: event.kind === "near" });
+    if (event.kind === "near" || event.kind === "apart") near(list(event.pair).map(String), event.kind === "near", event);
+    else happened(event);
     if (event.kind === "behind" || event.kind === "caught_up") announce({ key: `behind/${event.vehicle}`, text: event.text, vehicle: String(event.vehicle), active: event.kind === "behind" });
     soon("/api/vehicles");
   },

@@ -4,8 +4,10 @@
 import { button, keyedList, make, setAttribute, setHidden, setText } from "/static/core/dom.js";
 import { settings } from "/static/core/settings.js";
 import { changed, select, state, subscribe } from "/static/core/store.js";
+import { given } from "/static/core/stream.js";
 import { t } from "/static/core/strings.js";
-import { need } from "/static/fly/need.js";
+import { inAir, need } from "/static/fly/need.js";
+import { aircraftNear } from "/static/fly/aircraft.js";
 
 const REPEAT_MS = 4000;
 let sound = null;
@@ -46,7 +48,7 @@ function raise(key, level, text, vehicle) {
   return key;
 }
 
-// Alarms that events raise by themselves (separation) stay as long as the daemon says.
+// Alarms that events raise by themselves stay as long as the daemon says.
 const announced = new Map();
 export function announce(event) {
   const key = `daemon/${event.key ?? event.kind ?? event.text}`;
@@ -55,16 +57,96 @@ export function announce(event) {
   changed("alarms");
 }
 
-subscribe("vehicles tick commands alarms link", "alarms", () => {
+// Vehicles that are too near each other. Events tell a pair at once; the `alarm` of the rows says what stands now, also to
+// a page that was opened later or missed an event.
+const ROWS_MS = 3000; // rows come each second
+const pairs = new Map();
+export function near(pair, active, event) {
+  const key = `near/${pair.join("/") || event.vehicle}`;
+  if (!active) pairs.delete(key);
+  else pairs.set(key, { pair, level: "bad", text: String(event.text), vehicle: String(event.vehicle), at: performance.now() });
+  changed("alarms");
+}
+
+function tooNear(now) {
+  const rows = (pair) => pair.map((id) => state.vehicles.get(id)).filter(Boolean);
+  for (const [key, { pair, at }] of pairs) {
+    const both = rows(pair);
+    if (both.length && now - at > ROWS_MS && both.every((row) => row.alarm === "" && row.at > at)) pairs.delete(key);
+  }
+  const found = [...pairs].map(([key, alarm]) => {
+    const [one, other] = rows(alarm.pair);
+    return [key, one?.alarm && one.alarm === other?.alarm ? { ...alarm, text: one.alarm } : alarm];
+  });
+  const told = new Set([...pairs.values()].flatMap((alarm) => alarm.pair));
+  const others = [...state.vehicles.values()].filter((row) => row.alarm && !told.has(row.id));
+  for (const text of new Set(others.map((row) => row.alarm))) { // both of a pair say the same
+    const ids = others.filter((row) => row.alarm === text).map((row) => row.id).sort();
+    found.push([`near/${ids.join("/")}`, { level: "bad", text, vehicle: ids[0] }]);
+  }
+  return found;
+}
+
+// What happened once stays until it was seen: what an autopilot says of severity 0 (emergency) to 3 (error), a restart in
+// the air, a mission that ended early. What it says of its own checks before arming is in the list before a start.
+const SEVERE = 3;
+const CHECKS = /^(PreArm|Arm|Preflight Fail): /i;
+const AGAIN_MS = 30_000; // the same words in a row are one alarm
+const OLD_S = 300; // before the page was opened
+const ROUND_S = 0.2; // rows give times in tenths, events in full
+const once = new Map();
+const heardTexts = new Map(); // vehicle -> time of the newest text that was looked at
+
+const clockText = (time_s) => (time_s == null ? "" : `${new Date(time_s * 1000).toTimeString().slice(0, 8)} `);
+
+function tell(vehicle, level, words, time_s) {
+  const key = `once/${vehicle}/${words}`;
+  const [known, now] = [once.get(key), performance.now()];
+  const name = state.vehicles.get(vehicle)?.name ?? vehicle;
+  if (known && state.alarms.get(key)?.seen && now - known.at > AGAIN_MS) state.alarms.delete(key);
+  once.set(key, { level, text: `${clockText(time_s)}${name}: ${words}`, vehicle, at: now });
+  changed("alarms");
+}
+
+function said(vehicle, message) {
+  if (message.severity > SEVERE || (CHECKS.test(message.text) && !state.vehicles.get(vehicle)?.armed)) return;
+  tell(vehicle, "bad", t("alarm.said", { text: message.text }), message.time);
+}
+
+export function happened(event) {
+  const vehicle = String(event.vehicle);
+  const row = state.vehicles.get(vehicle);
+  const time_s = Number.isFinite(event.time) ? event.time : null;
+  if (event.said) said(vehicle, { text: String(event.said), severity: event.severity ?? 6, time: time_s });
+  if (event.kind === "rebooted" && row && (row.armed || inAir(row))) tell(vehicle, "bad", t("alarm.rebooted"), time_s);
+  if (event.kind === "aborted") tell(vehicle, "warn", t("alarm.aborted"), time_s);
+}
+
+// What was said before the page was opened, or while it missed events.
+function earlier(row, now_s) {
+  if (now_s == null) return;
+  const since = heardTexts.get(row.id) ?? now_s - OLD_S;
+  for (const message of row.texts) if (message.time != null && message.time > since + ROUND_S && !heardNow(row.id, message)) said(row.id, message);
+  const newest = Math.max(since, ...row.texts.map((message) => message.time ?? 0));
+  heardTexts.set(row.id, newest);
+}
+const heardNow = (vehicle, message) => once.has(`once/${vehicle}/${t("alarm.said", { text: message.text })}`);
+
+subscribe("vehicles tick commands alarms link traffic", "alarms", () => {
   const now = performance.now();
   const standing = new Set();
   for (const row of state.vehicles.values()) {
     for (const item of need(row, now).why) {
-      if (item.level === "stale") continue;
+      if (item.level === "stale" || item.quiet) continue;
       standing.add(raise(`${row.id}/${item.key}`, item.level, `${row.name}: ${item.words}`, row.id));
     }
+    earlier(row, given().given_s);
   }
-  for (const [key, alarm] of announced) standing.add(raise(key, alarm.level, alarm.text, alarm.vehicle));
+  for (const [key, alarm] of [...announced, ...tooNear(now), ...aircraftNear()]) standing.add(raise(key, alarm.level, alarm.text, alarm.vehicle));
+  for (const [key, alarm] of once) {
+    if (state.alarms.get(key)?.seen && now - alarm.at > AGAIN_MS) once.delete(key);
+    else standing.add(raise(key, alarm.level, alarm.text, alarm.vehicle));
+  }
   if (state.link === "lost") standing.add(raise("daemon", "bad", t("link.banner.short")));
   for (const entry of state.commands) {
     if (entry.outcome === "unknown" || entry.outcome === "not_sent") standing.add(raise(entry.key, "bad", `${entry.name}: ${t(`verb.${entry.verb}`)} ${t(`outcome.${entry.outcome}`)}`, entry.vehicle));
