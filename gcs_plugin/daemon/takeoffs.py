@@ -73,6 +73,8 @@ class Takeoffs:
         sortie: int = 1,
         names: Mapping[str, str] | None = None,
         override: Mapping[str, Collection[str]] | None = None,
+        *,
+        wanted: Callable[[], bool] = lambda: True,
     ) -> dict[str, float]:
         """Start a plan's vehicles; returns vehicle -> seconds from now.
 
@@ -83,11 +85,12 @@ class Takeoffs:
             plan: its id. sortie: which flight of each vehicle, from 1.
             names: the plan's vehicle -> the daemon's, where they differ.
             override: names of red preflight items that do not stop the start, by the daemon's vehicle.
+            wanted: asked after the check, which takes seconds: whether they are still to start.
 
         Raises:
             InputError: there is no such plan or flight.
-            OrthoSwarmError: vehicles are not heard, a preflight item is red, or takeoffs are under way; none was
-                started.
+            OrthoSwarmError: vehicles are not heard, a preflight item is red, takeoffs are under way, or it is no longer
+                wanted; none was started.
         """
         starts = self._plans.starts(plan, sortie)
         with self._condition:
@@ -102,6 +105,8 @@ class Takeoffs:
             held = {s: self._links.fleet.vehicles[s].mission for s in delays}
             airspace = Airspace.of({s: mission for s, mission in held.items() if mission is not None})
             with self._condition:
+                if not wanted():
+                    raise OrthoSwarmError("the start was cancelled; no vehicle was started")
                 self._failed.clear()
                 self._names = {systems[vehicle]: whose[vehicle] for vehicle in starts}
                 self._schedule = TakeoffSchedule.of(delays, self._clock(), airspace)

@@ -11,7 +11,7 @@ import asyncio
 import math
 import time
 from collections import OrderedDict
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -33,6 +33,7 @@ from orthoswarm.model.errors import InputError, OrthoSwarmError
 Rows = list[dict[str, Any]]
 
 ALL: Final = "all"
+_PLAN: Final = "start of a plan"
 _ALL_VERBS: Final = ("pause", "resume", "rtl", "land")
 _AHEAD_S: Final = 2.0
 _BEATS: Final = {"given_s": "time", "given_clock_s": "clock_s"}
@@ -68,7 +69,8 @@ class CommandRoutes:
     def __init__(self, daemon: Daemon, standstill: Standstill) -> None:
         self._daemon, self._standstill = daemon, standstill
         self._threads = ThreadPoolExecutor(_THREADS, thread_name_prefix="commands")
-        self._known: OrderedDict[str, tuple[tuple[str, str], asyncio.Task[Rows]]] = OrderedDict()
+        self._known: OrderedDict[str, tuple[tuple[str, str], asyncio.Task[Any]]] = OrderedDict()
+        self._cancelled: OrderedDict[str, None] = OrderedDict()  # ids of starts
 
     def close(self) -> None:
         """Stop the threads."""
@@ -90,13 +92,16 @@ class CommandRoutes:
         task = self._known_task(issue.id, (vehicle, verb))
         if task is None:
             task = asyncio.ensure_future(in_thread(self._threads, self._carry_out, links, vehicle, verb, issue, body))
-            self._known[issue.id] = (vehicle, verb), task
-            while len(self._known) > _REMEMBERED:
-                self._known.popitem(last=False)
+            self._remember(issue.id, (vehicle, verb), task)
         rows = await asyncio.shield(task)
         return JsonAnswer({"id": issue.id, "results": rows} if vehicle == ALL else rows[0])
 
-    def _known_task(self, number: str, what: tuple[str, str]) -> "asyncio.Task[Rows] | None":
+    def _remember(self, number: str, what: tuple[str, str], task: "asyncio.Task[Any]") -> None:
+        self._known[number] = what, task
+        while len(self._known) > _REMEMBERED:
+            self._known.popitem(last=False)
+
+    def _known_task(self, number: str, what: tuple[str, str]) -> "asyncio.Task[Any] | None":
         known = self._known.get(number)
         if known is None:
             return None
@@ -176,15 +181,52 @@ class CommandRoutes:
 
         {"vehicles": {"v1": "alpha"}} says which vehicle flies which part where names differ, {"override": {"alpha":
         ["battery"]}} which red preflight items do not stop the start. A `pause`, `rtl` or `land` of a vehicle that
-        waits cancels its takeoff, a `start` starts it at once.
+        waits cancels its takeoff, a `start` starts it at once. A repeated id gets the same answer, so that a client to
+        which the answer was lost can ask again.
         """
         body = await json_body(request)
-        takeoffs, issue = self._takeoffs(), self._issue(body)
+        takeoffs, issue, what = self._takeoffs(), self._issue(body), (number, _PLAN)
         sortie, names = names_of(body)
-        override = _override(body, ALL)
-        begin = partial(_begin, takeoffs, issue, number, sortie=sortie, names=names, override=override)
-        seconds = await in_thread(self._threads, begin)
+        task = self._known_task(issue.id, what)
+        if task is None:
+            begin = partial(
+                _begin, takeoffs, issue, number,
+                sortie=sortie, names=names, override=_override(body, ALL),
+                wanted=lambda: issue.id not in self._cancelled,
+            )  # fmt: skip
+            task = asyncio.ensure_future(in_thread(self._threads, begin))
+            self._remember(issue.id, what, task)
+        seconds = await asyncio.shield(task)
         return JsonAnswer({"plan": number, "sortie": sortie, "takeoffs_in_s": seconds}, status_code=202)
+
+    async def cancel_start(self, number: str, request: Request) -> Response:
+        """Cancel a start by its `id`, also one that is still being checked or has not arrived yet.
+
+        Answers `results`: a row a vehicle as for a `pause`, which all its vehicles get if it had already begun; none
+        if no vehicle was started.
+        """
+        issue = self._issue(await json_body(request))
+        links = self._links()
+        self._cancelled[issue.id] = None
+        while len(self._cancelled) > _REMEMBERED:
+            self._cancelled.popitem(last=False)
+        known = self._known.get(issue.id)
+        rows: Rows = []
+        if known is not None and known[0] == (number, _PLAN):
+            try:
+                seconds = await asyncio.shield(known[1])
+            except OrthoSwarmError:
+                seconds = {}
+            if seconds:
+                pause = Issue(f"{issue.id}-cancelled", clock_with_sleep())
+                rows = await in_thread(self._threads, self._pause, links, list(seconds), pause)
+        return JsonAnswer({"plan": number, "results": rows})
+
+    def _pause(self, links: VehicleLinks, vehicles: list[str], issue: Issue) -> Rows:
+        rows = links.commands("pause", vehicles, command_id=issue.id)
+        for row in rows:
+            self._daemon.events.publish("command", **row)
+        return rows
 
     def _links(self) -> VehicleLinks:
         if self._daemon.links is None:
@@ -205,11 +247,12 @@ def _begin(
     sortie: int,
     names: dict[str, str],
     override: Mapping[str, Collection[str]],
+    wanted: Callable[[], bool],
 ) -> dict[str, float]:
     late = _late(issue, "start")
     if late is not None:
         raise OrthoSwarmError(f"{late}; no vehicle was started")
-    return takeoffs.begin(number, sortie, names, override)
+    return takeoffs.begin(number, sortie, names, override, wanted=wanted)
 
 
 def _seconds(body: Mapping[str, Any], key: str) -> float | None:

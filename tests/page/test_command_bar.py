@@ -1,5 +1,6 @@
 """Commands: always on the screen, confirmed once, and each ends visibly."""
 
+import contextlib
 import re
 import threading
 
@@ -307,6 +308,80 @@ def test_a_red_item_that_becomes_well_lets_the_start_go_without_a_press(browser)
             page.click("text=Check again")
             page.wait_for_selector(".checks input:visible >> nth=1")
             assert not boxes.nth(0).is_checked() and start.is_disabled()  # red again: it is asked again
+
+
+@contextlib.contextmanager
+def ready_to_start(browser, answer):
+    """The dialog before a start in which all is well; `answer` answers what follows."""
+    part = {"id": "v1", "time_s": 312, "photos": 40, "sorties": 1, "flights": [{"start_s": 0}]}
+    plan = {"id": "plan-1", "covered_share": 1.0, "makespan_s": 312, "spacing_m": 20, "vehicles": [part]}
+    shared = {"area": None, "settings": {}, "plan": "plan-1", "vehicles": {"v1": "v7"}, "version": 1}
+    checks = [{"vehicle": "v7", "state": "ok", "height_m": 80, "time_s": 312, "items": []}]
+    with standing(vehicle(7, name="Falcon")) as station:
+        station.gets |= {"/api/plan": shared, "/api/plans": [plan], "/api/plans/plan-1/map": {"features": []}}
+        station.answer = lambda method, path, body: (
+            (200, {"checks": checks}) if path.endswith("preflight") else answer(method, path, body)
+        )
+        with opened(browser, station.url) as page:
+            page.click("#tab-plan")
+            page.click("text=Check and start")
+            page.wait_for_function("() => !document.querySelector('.preflight .primary').disabled")
+            yield station, page
+
+
+@pytest.mark.parametrize("received", [True, False], ids=["received", "not received"])
+def test_a_start_whose_answer_is_lost_is_not_called_none(browser, received):
+    lost, reached = threading.Event(), threading.Event()
+
+    def answer(method, path, body):
+        if path.endswith("/start"):
+            reached.set()
+            lost.wait(30)
+            if received:
+                return 202, {"takeoffs_in_s": {"v7": 0}}
+            return 409, {"detail": "it was given 9 s ago, too long to be executed now; no vehicle was started"}
+        return 404, {}
+
+    with ready_to_start(browser, answer) as (station, page):
+        page.route("**/start", lambda route: route.abort("connectionreset"), times=1)
+        page.click(".preflight .primary")
+        page.wait_for_selector(".notice:has-text('It is not known whether the start was received: keep away')")
+        assert page.locator("dialog[open]").count() == 0  # the tiles can be seen
+        assert "No vehicle was started" not in page.inner_text("body")
+        assert reached.wait(60)
+        lost.set()
+        words = "Started: Falcon" if received else "No vehicle was started: it was given 9 s ago"
+        page.wait_for_selector(f".notice:has-text('{words}')")
+        assert page.locator(".notice:has-text('It is not known')").count() == 0
+        assert station.commands("start")[0]["id"]
+
+
+def test_cancel_during_a_start_takes_it_back_at_the_station(browser):
+    gate = threading.Event()
+    paused = [{"id": "x", "vehicle": "v7", "command": "pause", "outcome": "done", "reason": ""}]
+    results = [[], paused]
+
+    def answer(method, path, body):
+        if method == "DELETE":
+            return 200, {"results": results.pop(0)}
+        gate.wait(60)
+        return 202, {"takeoffs_in_s": {"v7": 0}}
+
+    with ready_to_start(browser, answer) as (station, page):
+        for leave, words in (
+            (lambda: page.click(".preflight >> text=Cancel the start"), "The start was cancelled: no vehicle"),
+            (lambda: page.keyboard.press("Escape"), "Pause was sent, Falcon: done"),
+        ):
+            page.click(".preflight .primary")
+            page.wait_for_selector(".preflight >> text=Starting")
+            page.focus(".preflight .row button:enabled")
+            leave()
+            page.wait_for_selector(f".notice:has-text('{words}')")
+            start, cancel = [body["id"] for method, path, body in station.heard if path.endswith("/start")][-2:]
+            assert start == cancel
+            page.click("text=Check and start")
+            page.wait_for_function("() => !document.querySelector('.preflight .primary').disabled")
+        gate.set()
 
 
 def test_on_a_phone_the_panel_can_be_made_taller_and_the_scale_is_free(browser):

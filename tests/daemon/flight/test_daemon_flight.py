@@ -3,6 +3,7 @@
 import json
 import sys
 
+import httpx
 import pytest
 
 from gcs_plugin.sim.multirotor import Airframe
@@ -34,6 +35,10 @@ def upload(served, vehicle, plan, mission=None):
     body = {"plan": plan, **({"mission": mission} if mission else {})}
     answer = served.command(f"/api/missions/{vehicle}/upload", body)
     assert answer.status_code == 200, answer.text
+
+
+def cancel(served, go, number):
+    return httpx.request("DELETE", served.url + go, json={"id": number}, headers=served.auth, timeout=60.0)
 
 
 def start(served, vehicle):
@@ -144,8 +149,12 @@ def test_a_plan_is_started_at_its_times_once_all_hold_it(flown):
     assert served.post(go, json={}).status_code == 401  # a command
     assert served.command(go, {"sortie": 7}).status_code == 422
     assert "alpha" in served.command(go, {"vehicles": {later: "alpha"}}).json()["detail"]
-    answer = served.command(go)
+    assert cancel(served, go, "never").json()["results"] == []
+    cancelled = served.command(go, {"id": "never"})  # the start comes after its cancellation
+    assert cancelled.status_code == 409 and "cancelled; no vehicle" in cancelled.json()["detail"]
+    answer = served.command(go, {"id": "once"})
     assert answer.status_code == 202, answer.text
+    assert served.command(go, {"id": "once"}).json() == answer.json()  # the first answer was lost on the way
     assert answer.json()["takeoffs_in_s"] == {
         v: pytest.approx(t - min(starts.values()), abs=0.1) for v, t in starts.items()
     }
@@ -157,3 +166,20 @@ def test_a_plan_is_started_at_its_times_once_all_hold_it(flown):
     served.until("/api/completions", lambda rows: len(rows) == 1)  # and the other one stays on the ground
     rows = {r["id"]: r for r in served.get("/api/vehicles").json()}
     assert rows[later]["takeoff"] is None and not rows[later]["armed"]
+
+
+def test_a_start_that_is_cancelled_after_it_has_begun_pauses_its_vehicles(flown):
+    served, _, _ = flown
+    served.until("/api/vehicles", lambda rows: sum(r.get("lat_deg") is not None for r in rows) == 2)
+    lat, lon = (float(v) for v in GRID.to_geographic([EAST - 90.0, NORTH - 90.0]))
+    body = {"area": square(130), "vehicles": 2, "altitude_m": 60, "fov_min_deg": 65, "speed_m_s": 8}
+    plan = served.command("/api/plans", body | {"starts": [[lat, lon], [lat, lon]]}).json()
+    for vehicle in ("v1", "v2"):
+        upload(served, vehicle, plan["id"])
+    go = f"/api/plans/{plan['id']}/start"
+    begun = served.command(go, {"id": "begun"}).json()["takeoffs_in_s"]
+    rows = cancel(served, go, "begun").json()["results"]
+    assert {row["vehicle"] for row in rows} == set(begun) and {row["command"] for row in rows} == {"pause"}
+    waits = max(begun, key=begun.get)
+    assert [row["outcome"] for row in rows if row["vehicle"] == waits] == ["done"]
+    served.until("/api/vehicles", lambda rows: not any(r["takeoff"] and r["takeoff"].get("in_s") for r in rows))

@@ -13,4 +13,5 @@ export function notice(level, text) {
   box.append(line);
   while (box.children.length > 4) box.firstChild.remove();
   if (level === "done") setTimeout(() => line.remove(), GOES_MS);
+  return line;
 }

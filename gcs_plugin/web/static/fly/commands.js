@@ -11,7 +11,7 @@ const OUTCOMES = new Set(["done", "refused", "not_sent", "unknown"]);
 const ALL = "all";
 
 let numbers = 0;
-const newId = () => `page-${Date.now().toString(36)}-${(++numbers).toString(36)}-${crypto.getRandomValues(new Uint32Array(1))[0].toString(36)}`;
+export const newId = () => `page-${Date.now().toString(36)}-${(++numbers).toString(36)}-${crypto.getRandomValues(new Uint32Array(1))[0].toString(36)}`;
 const nameOf = (id) => state.vehicles.get(id)?.name ?? id;
 
 function begin(id, verb, vehicle) {

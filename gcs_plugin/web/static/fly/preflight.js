@@ -2,7 +2,7 @@
 // item can be allowed by itself, never all at once. While something is red the check is repeated: a receiver gets its
 // fix, a filter settles.
 
-import { post } from "/static/core/api.js";
+import { post, request } from "/static/core/api.js";
 import { dialogBox } from "/static/core/dialog.js";
 import { button, keyedList, make, setAttribute, setHidden, setText } from "/static/core/dom.js";
 import { notice } from "/static/core/notices.js";
@@ -10,6 +10,7 @@ import { state } from "/static/core/store.js";
 import { given } from "/static/core/stream.js";
 import { t } from "/static/core/strings.js";
 import * as units from "/static/core/units.js";
+import { newId } from "/static/fly/commands.js";
 
 const CHECK_MS = 60_000;
 const REPEAT_MS = 5_000;
@@ -20,9 +21,15 @@ const facts = make("ul", { class: "starts" });
 const checks = make("div", { class: "checks" });
 const status = make("p", { role: "status" });
 const again = button(t("preflight.again"), () => check());
+const no = button(t("confirm.no"), () => leave());
 const go = button(t("preflight.start"), () => start(), { class: "primary" });
 const dialog = dialogBox({ class: "preflight", "aria-labelledby": "preflight-title" }, title, make("p", { class: "quiet" }, t("preflight.about")), facts, checks, status,
-  make("div", { class: "row wrap" }, again, button(t("confirm.no"), () => dialog.close()), go));
+  make("div", { class: "row wrap" }, again, no, go));
+dialog.box.addEventListener("keydown", (event) => {
+  if (event.key !== "Escape" || !begun) return;
+  event.stopImmediatePropagation();
+  leave();
+}, true);
 export const preflightDialog = () => dialog.box;
 
 let plan = null;
@@ -31,6 +38,7 @@ let rows = null;
 let allowed = {};
 let turn = 0; // a newer check or a start makes answers to older ones void
 let timer = 0;
+let begun = null; // the start that was asked for and has not been answered: its request
 
 export function openPreflight(chosen, vehicles) {
   plan = chosen;
@@ -119,19 +127,84 @@ function allow(vehicle, item, on) {
   refresh();
 }
 
+// Whether an error says that the station refused: anything else leaves open what it received.
+const isNo = (error) => error.kind === "http" && error.status < 500;
+const ASK_MS = 6_000; // longer than a command is fresh: asking starts nothing, whatever was done meanwhile
+const ASKED_MS = 120_000;
+
 async function start() {
   clearTimeout(timer);
   turn++;
   go.disabled = true;
+  again.disabled = true;
+  setText(no, t("preflight.stop"));
   setText(status, t("preflight.starting"));
+  const override = Object.fromEntries(Object.entries(allowed).map(([vehicle, items]) => [vehicle, [...items]]));
+  const mine = { path: `/api/plans/${plan.id}/start`, body: { sortie: 1, vehicles: names, override, id: newId(), ...given() } };
+  begun = mine;
   try {
-    const override = Object.fromEntries(Object.entries(allowed).map(([vehicle, items]) => [vehicle, [...items]]));
-    const answer = await post(`/api/plans/${plan.id}/start`, { sortie: 1, vehicles: names, override, ...given() });
-    dialog.close();
-    const times = Object.entries(answer?.takeoffs_in_s ?? {}).map(([vehicle, s]) => t("preflight.takeoff", { name: nameOf(vehicle), time: units.clock(s) }));
-    notice("done", t("preflight.started", { list: times.join(", ") }));
+    const answer = await post(mine.path, mine.body);
+    if (begun !== mine) return;
+    ended(true);
+    started(answer);
   } catch (error) {
-    setText(status, t("preflight.refused", { why: error.message }));
-    refresh();
+    if (begun !== mine) return;
+    ended(!isNo(error));
+    if (isNo(error)) {
+      setText(status, t("preflight.refused", { why: error.message }));
+      refresh();
+    } else ask(mine, notice("bad", t("preflight.unknown")));
   }
+}
+
+function ended(close) {
+  begun = null;
+  again.disabled = false;
+  setText(no, t("confirm.no"));
+  if (close) dialog.close(); // the tiles are under it
+}
+
+function started(answer) {
+  const times = Object.entries(answer?.takeoffs_in_s ?? {}).map(([vehicle, s]) => t("preflight.takeoff", { name: nameOf(vehicle), time: units.clock(s) }));
+  notice("done", t("preflight.started", { list: times.join(", ") }));
+}
+
+// The same request again tells what became of it: the station answers an id that it knows as before, and one that it does
+// not know comes too late to start anything.
+async function ask({ path, body }, doubt) {
+  if (body.given_clock_s == null && body.given_s == null) return; // without its time it would be taken for a new one
+  const end = performance.now() + ASKED_MS;
+  while (performance.now() < end) {
+    await new Promise((done) => setTimeout(done, ASK_MS));
+    try {
+      const answer = await post(path, body);
+      doubt.remove();
+      started(answer);
+      return;
+    } catch (error) {
+      if (!isNo(error)) continue;
+      doubt.remove();
+      notice("bad", t("preflight.refused", { why: error.message }));
+      return;
+    }
+  }
+}
+
+// Cancel: before the start it closes; during it the station takes the start back, and pauses what had begun.
+async function leave() {
+  if (!begun) { dialog.close(); return; }
+  const mine = begun;
+  begun = null;
+  setText(status, t("preflight.cancelling"));
+  no.disabled = true;
+  let word = null;
+  try {
+    const { results } = (await request("DELETE", mine.path, { id: mine.body.id })) ?? {};
+    word = results?.length ? ["bad", t("preflight.paused", { list: results.map((row) => `${nameOf(row.vehicle)}: ${t(`outcome.${row.outcome}`)}`).join(", ") })] : ["done", t("preflight.cancelled")];
+  } catch {
+    word = ["bad", t("preflight.unknown")];
+  }
+  no.disabled = false;
+  ended(true);
+  notice(...word);
 }
