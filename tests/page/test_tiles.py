@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from tests.kit.page_kit import SOCKET, opened, send, standing, vehicle
+from tests.kit.page_kit import DESK, PHONE, SOCKET, TABLET, opened, send, standing, vehicle
 
 UPDATES = """() => {
   let k = 0;
@@ -270,3 +270,49 @@ def test_one_vehicle_is_no_vehicles_and_no_height_is_minus_zero(browser):
         send(page, {"type": "vehicle"} | vehicle(2, height_m=-3.0))
         page.wait_for_selector("text=2 vehicles, 2 in the air")
         assert page.inner_text("li:nth-child(2) .tile .height") == "-3 m"
+
+
+def test_a_vehicle_that_is_lost_counts_as_where_it_was_heard_last(browser):
+    lost = {"state": "lost", "flight": {"state": "lost", "text": "lost"}, "silent_s": 60.0}
+    rows = [
+        vehicle(1, landed="in air", **lost),
+        vehicle(2, landed="on ground", armed=False, **lost),
+        vehicle(3, landed="", **lost),
+    ]
+    with standing(*rows) as station, opened(browser, station.url) as page:
+        page.wait_for_selector("text=3 vehicles, 2 in the air, 3 in danger")
+        assert page.locator(".tile .word").all_inner_texts() == [
+            "lost in the air",
+            "lost on the ground",
+            "lost in the air",
+        ]
+        for choice, names in (("air", ["v1", "v3"]), ("ground", ["v2"])):
+            page.select_option("select[aria-label='Which vehicles']", choice)
+            assert page.locator(".tile:visible b").all_inner_texts() == names
+
+
+def test_a_vehicle_that_is_armed_on_the_ground_says_so(browser):
+    ground = {"state": "on ground", "text": "on ground"}
+    rows = [vehicle(1, flight=ground, mode="GUIDED"), vehicle(2, flight=ground, armed=False)]
+    with standing(*rows) as station, opened(browser, station.url) as page:
+        page.wait_for_selector(".tile[data-level=warn]")
+        assert page.locator(".tile .word").all_inner_texts() == ["ARMED on ground", "on ground"]
+        assert page.locator(".tile .why").all_inner_texts() == ["armed: keep away", ""]
+        page.wait_for_selector("text=2 vehicles, 0 in the air, 0 in danger, 1 to watch")
+        page.wait_for_timeout(500)
+        assert page.locator(".alarms").is_hidden()  # each takeoff begins so
+
+
+@pytest.mark.parametrize("size", [DESK, TABLET, PHONE], ids=["desk", "tablet", "phone"])
+def test_alarms_leave_the_details_and_their_commands_free(browser, size):
+    rows = [vehicle(k, battery=0.05) for k in range(1, 9)]
+    with standing(*rows) as station, opened(browser, station.url, size) as page:
+        page.click(".tile >> nth=1")
+        page.wait_for_selector(".alarms")
+        page.wait_for_selector(".details h2")
+        free = """(name) => [...document.querySelectorAll(name)].filter((e) => e.checkVisibility()).every((e) => {
+          const { x, y, width, height } = e.getBoundingClientRect();
+          return [0.05, 0.5, 0.95].every((k) => e.contains(document.elementFromPoint(x + k * width, y + height / 2)));
+        })"""
+        for name in (".details h2", ".details .close", ".details [data-verb=pause]", ".alarms button"):
+            assert page.evaluate(free, name), name

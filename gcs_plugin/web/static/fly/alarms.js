@@ -155,7 +155,7 @@ subscribe("vehicles tick commands alarms link traffic", "alarms", () => {
   changed("alarm-list");
 });
 
-const rows = () => (innerWidth <= 700 || innerHeight <= 600 ? 3 : 5);
+const rows = () => (innerHeight <= 450 ? 2 : innerWidth <= 700 || innerHeight <= 600 ? 3 : 5); // what fits without scrolling
 const READ_MS = 300; // what came up just before the press was not read
 
 export function alarmList() {

@@ -12,8 +12,15 @@ const EMPTY = 0.12;
 const WEIGHT = { bad: 3, warn: 2, stale: 1, ok: 0 };
 
 const GROUND = new Set(["on ground", "complete"]);
-export const inAir = (row) => (row.flight.state ? !GROUND.has(row.flight.state) && row.flight.state !== "lost"
-  : row.linked && row.armed && row.flight.text !== "on ground");
+const offGround = (row) => row.armed && row.landed !== "on ground";
+// One that is lost counts as where it was heard last: it is in the air until somebody knows better.
+export const inAir = (row) => {
+  if (row.flight.state === "lost") return offGround(row);
+  return row.flight.state ? !GROUND.has(row.flight.state) : row.linked && row.armed && row.flight.text !== "on ground";
+};
+export const isLost = (row) => row.flight.state === "lost" || row.state === "lost";
+// Its propellers can turn any moment.
+export const armedOnGround = (row) => row.linked && row.armed && !inAir(row);
 
 export function need(row, now) {
   if (!row.linked) return { level: "ok", why: [], age_s: null, weight: 0, old: state.link !== "live" };
@@ -26,6 +33,7 @@ export function need(row, now) {
   if (row.battery != null && row.battery < EMPTY) add("bad", "battery", t("need.empty", { share: percent(row.battery) }));
   else if (row.battery != null && row.battery < LOW) add("warn", "battery", t("need.low", { share: percent(row.battery) }));
   if (row.gps_fix != null && row.gps_fix < 3) add(inAir(row) ? "bad" : "warn", "gps", t("need.gps"));
+  if (armedOnGround(row) && !isLost(row)) why.push({ level: "warn", key: "armed", words: t("need.armed"), quiet: true }); // at each takeoff: no alarm
   if (row.takeoff?.failed) add("warn", "takeoff", row.takeoff.failed);
   const level = why.reduce((worst, item) => (WEIGHT[item.level] > WEIGHT[worst] ? item.level : worst), "ok");
   return { level, why, age_s, weight: WEIGHT[level], old: age_s > STALE_S || state.link !== "live" };

@@ -8,7 +8,7 @@ import { select, state, subscribe } from "/static/core/store.js";
 import { t } from "/static/core/strings.js";
 import * as units from "/static/core/units.js";
 import { colourOf } from "/static/map/colours.js";
-import { inAir, need } from "/static/fly/need.js";
+import { armedOnGround, inAir, isLost, need } from "/static/fly/need.js";
 
 const FIX = ["", "", "2D", "3D", "DGPS", "RTK~", "RTK"];
 // What only a vehicle on a link can say.
@@ -43,6 +43,8 @@ function create(row) {
 
 export function wordOf(row) {
   if (!row.linked) return t("state.pictures");
+  if (isLost(row)) return t(inAir(row) ? "state.lost.air" : armedOnGround(row) ? "state.lost.armed" : "state.lost.ground");
+  if (armedOnGround(row)) return t("state.armed");
   if (row.takeoff?.in_s != null) return t("state.waiting", { time: units.clock(row.takeoff.in_s) });
   return row.flight.state ? row.flight.text : [row.flight.text, row.mode].filter(Boolean).join(", ") || t("state.unknown");
 }
