@@ -15,6 +15,7 @@ from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.items import Mission
 from gcs_plugin.plans.plan_request import AUTOPILOTS, ENDS, METHODS, RELIEFS, PlanRequest, make_plan
 from orthoswarm.model.errors import InputError
+from orthoswarm.planning.area.shape_files import parse_geojson
 
 _NAME: Final = re.compile(r"[0-9a-z][0-9a-z-]{0,63}\Z")
 _NUMBERS: Final = (
@@ -58,11 +59,7 @@ class Plans:
         area = body.get("area")
         if not isinstance(area, dict):
             raise InputError("area is missing; send a GeoJSON polygon")
-        zones = body.get("no_fly")
-        if not isinstance(zones, dict | None):
-            raise InputError("no_fly is not GeoJSON; send the polygons of the no-fly zones, or nothing")
-        has_zones = zones is not None and bool(zones.get("coordinates") or zones.get("features"))
-        return self._make("area.geojson", area, zones if has_zones else None, values)
+        return self._make("area.geojson", area, _zones(body.get("no_fly")), values)
 
     def autopilots_of(self, vehicles: Sequence[str]) -> list[str]:
         """The autopilots of vehicles; ArduPilot for those that were not heard."""
@@ -184,6 +181,33 @@ class Plans:
         if not isinstance(name, str) or not _NAME.match(name) or not (self.folder / name / "plan.json").is_file():
             raise InputError("there is no such plan; see /api/plans")
         return self.folder / name
+
+
+def _zones(no_fly: Any) -> Mapping[str, Any] | None:
+    """The no-fly zones of a request, None if it has none: any GeoJSON, of which nothing is left out without a word.
+
+    Raises:
+        InputError: it is not GeoJSON, or holds something that no vehicle could be kept out of.
+    """
+    if no_fly is None:
+        return None
+    if not isinstance(no_fly, dict):
+        raise InputError("no_fly is not GeoJSON; send the polygons of the no-fly zones, or nothing")
+    shapes = parse_geojson(json.dumps(no_fly), "no_fly")
+    geometries = [kind for kind, coordinates in _parts(no_fly) if coordinates != []]
+    if any(kind not in ("Polygon", "MultiPolygon") for kind in geometries):
+        raise InputError("no_fly holds a shape that is no polygon; draw each zone as a polygon")
+    return no_fly if shapes.polygons else None
+
+
+def _parts(document: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Kind and coordinates of each geometry of a GeoJSON document that was parsed before; None of an empty feature."""
+    for part in (*document.get("features", ()), *document.get("geometries", ())):
+        yield from _parts(part)
+    if "geometry" in document:
+        yield from [("nothing", None)] if document["geometry"] is None else _parts(document["geometry"])
+    if "coordinates" in document:
+        yield str(document["type"]), document["coordinates"]
 
 
 def _values(body: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,5 +1,7 @@
 """Plans as the page asks for them: for the autopilots that are on the links."""
 
+import json
+
 import pytest
 
 from gcs_plugin.daemon.web_plans import Plans
@@ -30,3 +32,46 @@ def test_other_autopilots_are_refused(autopilot, tmp_path):
     with pytest.raises(InputError, match="ardupilot, px4"):
         Plans(tmp_path).make(BODY | {"autopilot": autopilot})
     assert not list(tmp_path.iterdir())
+
+
+RING = on_globe([(80, 80), (120, 80), (120, 120), (80, 120)]).shell
+ZONE = {"type": "Polygon", "coordinates": [[[lon, lat] for lat, lon in [*RING, RING[0]]]]}
+
+
+@pytest.mark.parametrize(
+    "no_fly",
+    [
+        ZONE,
+        {"type": "MultiPolygon", "coordinates": [ZONE["coordinates"]]},
+        {"type": "Feature", "properties": {}, "geometry": ZONE},
+        {"type": "FeatureCollection", "features": [{"type": "Feature", "properties": {}, "geometry": ZONE}]},
+        {"type": "GeometryCollection", "geometries": [ZONE]},
+    ],
+    ids=lambda value: value["type"],
+)
+def test_no_fly_zones_of_any_geojson_are_kept(no_fly, tmp_path):
+    made = Plans(tmp_path).make(BODY | {"no_fly": no_fly})
+    assert json.loads((tmp_path / made["id"] / "no-fly.geojson").read_text()) == no_fly  # the planner reads this file
+
+
+@pytest.mark.parametrize(
+    "no_fly",
+    [
+        {"type": "Point", "coordinates": [8.5, 47.4]},
+        {"type": "Feature", "properties": {}, "geometry": None},
+        {"type": "GeometryCollection", "geometries": [ZONE, {"type": "Point", "coordinates": [8.5, 47.4]}]},
+        {"type": "Polygon", "coordinates": []},
+        {"polygons": [ZONE]},
+        [ZONE],
+    ],
+)
+def test_no_fly_zones_that_cannot_be_kept_are_refused(no_fly, tmp_path):
+    with pytest.raises(InputError, match="no_fly"):
+        Plans(tmp_path).make(BODY | {"no_fly": no_fly})
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("kind", [("MultiPolygon", "coordinates"), ("FeatureCollection", "features")])
+def test_no_zones_are_no_zones(kind, tmp_path):
+    made = Plans(tmp_path).make(BODY | {"no_fly": {"type": kind[0], kind[1]: []}})
+    assert not (tmp_path / made["id"] / "no-fly.geojson").exists()
