@@ -97,6 +97,92 @@ def test_files_bring_an_area_or_say_what_is_wrong(browser):
             assert corners(page) == count
 
 
+def made_plan(number="plan-1"):
+    part = {"id": "v1", "length_m": 900.0, "time_s": 312, "photos": 40, "sorties": 1, "flights": [{"start_s": 0}]}
+    return {"id": number, "covered_share": 1.0, "makespan_s": 312, "spacing_m": 20, "vehicles": [part]}
+
+
+def add_zone(page, *corners):
+    page.click("text=Add no-fly zone")
+    for x, y in corners:
+        page.mouse.click(x, y)
+        page.wait_for_timeout(350)
+    page.click("button:text-is('Done')")
+
+
+def test_a_zone_that_is_drawn_after_the_plan_stops_its_upload_and_start(browser):
+    older = "The plan is older than the drawing: make the plan again"
+
+    def answer(method, path, body):
+        if path == "/api/plan":
+            shared.update(body, version=shared["version"] + 1)
+            return 200, {"version": shared["version"]}
+        return (201, made_plan()) if path == "/api/plans" else (200, {"checks": []})
+
+    shared = {"area": None, "settings": {}, "plan": None, "vehicles": {}, "version": 1}
+    with standing(vehicle(7)) as station:
+        station.gets |= {"/api/plan": shared, "/api/plans": [made_plan()], "/api/plans/plan-1/map": {"features": []}}
+        station.answer = answer
+        with opened(browser, station.url) as page:
+            planning(page)
+            draw(page, (600, 250), (900, 250), (900, 550), (600, 550))
+            page.fill("[name=vehicles]", "1")
+            page.click("text=Make plan")
+            page.wait_for_selector(".plan-result")
+            page.wait_for_function("() => document.querySelector('.assignments select')")
+            page.select_option(".assignments select", "v7")
+            assert page.inner_text(".plan-result .wrong") == ""
+            add_zone(page, (700, 350), (800, 350), (750, 450))
+            page.wait_for_selector(f".plan-result .wrong:has-text('{older}')")
+            for press in ("Upload missions", "Check and start"):
+                page.click(f"text={press}")
+                page.wait_for_selector(f".notice:has-text('{older}')")
+                page.click(f".notice:has-text('{older}') button")
+            assert page.locator("dialog[open]").count() == 0
+            page.wait_for_timeout(1500)  # saved
+            with opened(browser, station.url) as second:  # a second page, or this one after a reload
+                second.click("#tab-plan")
+                second.wait_for_selector(f".plan-result .wrong:has-text('{older}')")
+            page.click("text=Undo")
+            page.click("text=Undo")
+            page.wait_for_function("() => document.querySelector('.plan-result .wrong').textContent === ''")
+            page.click("text=Check and start")
+            page.wait_for_selector("dialog[open]")
+            assert station.commands("upload") == []
+            # drawn on another page while the dialog is open
+            page.evaluate("import('/static/plan/area.js').then((a) => a.change((r) => r[0].push([8.5457, 47.398])))")
+            page.wait_for_timeout(300)
+            page.evaluate("document.querySelector('.preflight .primary').disabled = false")
+            page.click(".preflight .primary")
+            page.wait_for_selector(f".preflight >> text={older}")
+            assert station.commands("start") == []
+
+
+def test_an_area_file_keeps_the_zones_that_were_drawn_and_says_so(browser):
+    ring = [[8.544, 47.397], [8.547, 47.397], [8.547, 47.399], [8.544, 47.397]]
+    with standing(vehicle(1)) as station, opened(browser, station.url) as page:
+        station.answer = lambda *_: (200, {"polygons": [[ring]], "lines": [], "no_fly": []})
+        planning(page)
+        draw(page, (600, 250), (900, 250), (900, 550), (600, 550))
+        add_zone(page, (700, 350), (800, 350), (750, 450))
+        file = {"name": "b.geojson", "mimeType": "text/plain", "buffer": b"{}"}
+        page.set_input_files("input[type=file]", files=[file])
+        page.wait_for_selector(".notice:has-text('1 no-fly zone drawn before is kept')")
+        page.evaluate(HERE)
+        rings = page.evaluate("import('/static/plan/area.js').then((a) => a.area.rings.map((r) => r.length))")
+        assert rings == [3, 3]
+
+
+def test_the_height_counts_from_takeoff_unless_there_is_a_height_model(browser):
+    shared = {"area": None, "settings": {}, "plan": None, "vehicles": {}, "version": 1}
+    for dem, words in ((None, "Height above takeoff, m"), ("hills.tif", "Height above ground, m")):
+        with standing(vehicle(1)) as station:
+            station.gets["/api/plan"] = shared | {"dem": dem}
+            with opened(browser, station.url) as page:
+                page.click("#tab-plan")
+                page.wait_for_selector(f"label:has-text('{words}')")
+
+
 def test_a_field_out_of_range_names_its_range(browser):
     with standing(vehicle(1)) as station, opened(browser, station.url) as page:
         planning(page)

@@ -38,10 +38,13 @@ let rows = null;
 let allowed = {};
 let turn = 0; // a newer check or a start makes answers to older ones void
 let timer = 0;
+let wrong = () => "";
 let begun = null; // the start that was asked for and has not been answered: its request
 
-export function openPreflight(chosen, vehicles) {
+// problem: gives a sentence if the plan must not be flown any more, for example as its area was changed meanwhile.
+export function openPreflight(chosen, vehicles, problem = () => "") {
   plan = chosen;
+  wrong = problem;
   names = vehicles;
   allowed = {};
   setText(title, t("preflight.title", { n: plan.vehicles.length }));
@@ -133,6 +136,7 @@ const ASK_MS = 6_000; // longer than a command is fresh: asking starts nothing, 
 const ASKED_MS = 120_000;
 
 async function start() {
+  if (wrong()) { setText(status, wrong()); return; }
   clearTimeout(timer);
   turn++;
   go.disabled = true;

@@ -20,10 +20,13 @@ let noTerrain = null;
 let hasDem = false;
 let changed = () => {};
 
+// Without a height model heights count from where the vehicles take off, whatever the ground does.
+const nameOf = (key) => t(key === "altitude_m" && !hasDem ? "plan.altitude_m.takeoff" : `plan.${key}`, { unit: units.lengthUnit() });
+
 const number = (key) => {
   const [low, high, value, length] = NUMBERS[key];
   inputs[key] = make("input", { type: "number", name: key, min: length ? undefined : low, max: length ? undefined : high, step: "any", value, inputmode: "decimal", onchange: () => changed(), placeholder: value === "" ? t(`plan.${key}.none`) : undefined });
-  return labelled(t(`plan.${key}`, { unit: units.lengthUnit() }), inputs[key]);
+  return labelled(nameOf(key), inputs[key]);
 };
 
 const chosen = (key) => {
@@ -56,9 +59,8 @@ export function setDem(name) {
   hasDem = Boolean(name);
   setHidden(terrain, !hasDem);
   setHidden(noTerrain, hasDem);
+  setText(inputs.altitude_m.closest("label").firstChild, nameOf("altitude_m"));
 }
-
-const nameOf = (key) => t(`plan.${key}`, { unit: units.lengthUnit() });
 
 // The request's values in SI, or an error with the sentence that says what to change.
 export function planValues() {

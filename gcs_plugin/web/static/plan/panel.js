@@ -12,19 +12,21 @@ import * as area from "/static/plan/area.js";
 import * as editor from "/static/plan/editor.js";
 import { fillFields, followsTerrain, inFieldNames, planFields, planValues, rawValues, relabelFields, setDem } from "/static/plan/fields.js";
 import { acceptDrops, KINDS, readArea } from "/static/plan/import.js";
+import { drawnNow, madeOfNow, setMadeOf } from "/static/plan/outdated.js";
 import { planResult, showPlan } from "/static/plan/result.js";
 import { isSaving, loadShared, saveShared, whenChangedElsewhere } from "/static/plan/shared.js";
 import { boundsOf, fit } from "/static/map/map.js";
 
 let made = null;
 let names = {};
-function save() { saveShared({ area: area.area.rings.length ? area.polygon() : null, settings: rawValues(), plan: made?.id ?? null, vehicles: names }); }
+function save() { saveShared({ area: area.area.rings.length ? area.polygon() : null, settings: { ...rawValues(), made_of: madeOfNow() }, plan: made?.id ?? null, vehicles: names }); }
 
 export async function loadPlan() {
   if (isSaving()) return;
   const body = await loadShared();
   if (!body) return;
   const rings = (body.area?.coordinates ?? []).map((points) => ring(points).slice(0, -1)).filter((points) => points.length > 2);
+  setMadeOf(body.plan ? body.settings?.made_of : null);
   if (body.area || area.area.rings.length) area.replace(rings);
   fillFields(body.settings ?? {});
   setDem(body.dem);
@@ -52,8 +54,12 @@ export function planPanel() {
   async function read(dropped) {
     try {
       const rings = await readArea(dropped);
-      area.change((old) => old.splice(0, old.length, ...rings));
+      const given = new Set(rings.map((points) => JSON.stringify(points)));
+      const kept = area.area.rings.slice(1).filter((points) => points.length > 2 && !given.has(JSON.stringify(points)));
+      editor.stopDrawing();
+      area.change((old) => old.splice(0, old.length, ...rings, ...kept)); // a zone goes only if somebody deletes it
       fit(boundsOf(rings[0]));
+      if (kept.length) notice("warn", t("import.kept", { n: kept.length }));
       notice("done", t("import.done", { name: dropped.name, size: units.area(area.size_m2()) }));
     } catch (error) {
       notice("bad", error.message);
@@ -71,7 +77,9 @@ export function planPanel() {
       const heard = [...state.vehicles.values()].filter((row) => row.linked && row.position);
       if (followsTerrain() && !heard.length) throw new Error(t("plan.terrain.start"));
       if (heard.length >= body.vehicles || followsTerrain()) body.starts = heard.slice(0, body.vehicles).map((row) => [row.position[1], row.position[0]]);
+      const drawn = drawnNow();
       made = await post("/api/plans", body);
+      setMadeOf(drawn);
       names = Object.fromEntries(made.vehicles.map((row, k) => [row.id, heard.length >= made.vehicles.length ? heard[k].id : ""]));
       await showPlan(made, names, onNames);
       save();

@@ -10,6 +10,8 @@ import { command } from "/static/fly/commands.js";
 import { openPreflight } from "/static/fly/preflight.js";
 import { colourOf } from "/static/map/colours.js";
 import { show } from "/static/map/map.js";
+import { onArea } from "/static/plan/area.js";
+import { outdated } from "/static/plan/outdated.js";
 
 let plan = null;
 let names = {};
@@ -26,7 +28,7 @@ const wrong = make("p", { class: "wrong", role: "status" });
 
 export function planResult() {
   const upload = button(t("plan.upload"), uploadAll);
-  const start = button(t("plan.start"), () => assigned() && openPreflight(plan, names), { class: "primary" });
+  const start = button(t("plan.start"), () => assigned() && openPreflight(plan, names, problem), { class: "primary" });
   box.append(make("h2", {}, t("plan.result")), summary, warnings, list, wrong, make("div", { class: "row wrap" }, upload, start));
   return box;
 }
@@ -56,6 +58,7 @@ function paint() {
 }
 
 function problem() {
+  if (outdated()) return t("plan.outdated");
   const chosen = plan.vehicles.map((row) => names[row.id]);
   const twice = chosen.find((id, k) => id && chosen.indexOf(id) !== k);
   if (twice) return t("plan.twice", { name: nameOf(twice) });
@@ -95,3 +98,4 @@ export async function showPlan(made, assignment, onNames) {
 }
 
 subscribe("vehicles", "who flies what", redraw);
+onArea(redraw);
