@@ -54,6 +54,9 @@ class CommandConfig:
 
     fresh_s: float = 5.0
     """How long after it was given a command may still be sent, seconds; a later one could surprise whoever gave it."""
+    read_kept_s: float = 60.0
+    """A mission read so lately need not be read again for a start while nothing indicates a change, seconds: reading
+    eight missions over a radio of 57,600 baud takes up to a minute (chosen)."""
     takeoff_late_s: float = 5.0
     """A takeoff later than planned by more is late, seconds: arming and the start take up to three of themselves."""
 

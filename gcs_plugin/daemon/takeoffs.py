@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Collection, Mapping
 from typing import Any, Final
 
+from gcs_plugin.config import COMMAND
 from gcs_plugin.daemon.vehicles import VehicleLinks
 from gcs_plugin.daemon.web_plans import Plans
 from gcs_plugin.fleet.commands import Order
@@ -38,7 +39,10 @@ class Takeoffs:
         self._schedule = TakeoffSchedule.of({}, clock())
         self._names: dict[int, str] = {}
         self._failed: dict[str, str] = {}
-        self._checking = self._closed = False
+        self._checking: frozenset[int] = frozenset()
+        self._stops: dict[int, int] = {}
+        self._given_s: dict[int, float] = {}
+        self._closed = False
         links.cancel_takeoff, links.takeoffs = self.cancel, self.rows
 
     def preflight(
@@ -75,6 +79,7 @@ class Takeoffs:
         override: Mapping[str, Collection[str]] | None = None,
         *,
         wanted: Callable[[], bool] = lambda: True,
+        given_s: float | None = None,
     ) -> dict[str, float]:
         """Start a plan's vehicles; returns vehicle -> seconds from now.
 
@@ -86,42 +91,54 @@ class Takeoffs:
             names: the plan's vehicle -> the daemon's, where they differ.
             override: names of red preflight items that do not stop the start, by the daemon's vehicle.
             wanted: asked after the check, which takes seconds: whether they are still to start.
+            given_s: when it was given, on the clock; default now.
 
         Raises:
             InputError: there is no such plan or flight.
-            OrthoSwarmError: vehicles are not heard, a preflight item is red, takeoffs are under way, or it is no longer
+            OrthoSwarmError: vehicles are not heard, a preflight item is red, takeoffs are under way, one of the
+                vehicles was told to stop meanwhile, the check took so long that the start is too old, or it is no longer
                 wanted; none was started.
         """
+        given = self._clock() if given_s is None else min(given_s, self._clock())
         starts = self._plans.starts(plan, sortie)
+        whose = {vehicle: (names or {}).get(vehicle, vehicle) for vehicle in starts}
         with self._condition:
             if self._schedule.waiting or self._checking:
                 raise OrthoSwarmError("other takeoffs are under way; pause or rtl a waiting vehicle to cancel its own")
-            self._checking = True
+            systems = self._systems(whose)
+            self._checking, stops = frozenset(systems.values()), dict(self._links.fleet.stops)
         try:
-            whose = {vehicle: (names or {}).get(vehicle, vehicle) for vehicle in starts}
-            systems = self._ready(plan, sortie, names, override or {})
+            self._ready(plan, sortie, names, override or {})
             first = min(starts.values())
             delays = {systems[vehicle]: start_s - first for vehicle, start_s in starts.items()}
             held = {s: self._links.fleet.vehicles[s].mission for s in delays}
             airspace = Airspace.of({s: mission for s, mission in held.items() if mission is not None})
+            schedule = TakeoffSchedule.of(delays, self._clock(), airspace)
             with self._condition:
                 if not wanted():
                     raise OrthoSwarmError("the start was cancelled; no vehicle was started")
+                self._still_wanted(given, stops)
                 self._failed.clear()
+                self._stops, self._given_s = stops, {s: given for s, delay in delays.items() if delay <= 0.0}
                 self._names = {systems[vehicle]: whose[vehicle] for vehicle in starts}
-                self._schedule = TakeoffSchedule.of(delays, self._clock(), airspace)
+                self._schedule, self._checking = schedule, frozenset()
         finally:
-            self._checking = False
+            self._checking = frozenset()
         threading.Thread(target=self._run, name="takeoffs", daemon=True).start()
         return {whose[vehicle]: round(start_s - first, 1) for vehicle, start_s in starts.items()}
 
-    def cancel(self, vehicle: str) -> float | None:
-        """Cancel a waiting takeoff; returns the seconds until it, None if there was none."""
+    def cancel(self, vehicle: str) -> str:
+        """Cancel a takeoff that waits or is being checked; returns that in words, empty if there was none.
+
+        `Fleet.told_to_stop` comes before: by that `begin` finds after its check that the start is void.
+        """
         with self._condition:
+            if any(self._links.name_of(system) == vehicle for system in self._checking):
+                return "the start that was being checked is cancelled"
             system = next((s for s, name in self._names.items() if name == vehicle), None)
             due = None if system is None else self._schedule.waiting.pop(system, None)
             self._condition.notify_all()
-        return None if due is None else max(0.0, due - self._clock())
+        return "" if due is None else f"its takeoff in {max(0.0, due - self._clock()):.0f} s is cancelled"
 
     def rows(self) -> dict[str, dict[str, Any]]:
         """Vehicle -> `in_s` of a waiting takeoff, or `failed` with the reason."""
@@ -138,14 +155,46 @@ class Takeoffs:
             self._schedule.waiting.clear()
             self._condition.notify_all()
 
+    def _systems(self, whose: Mapping[str, str]) -> dict[str, int]:
+        """System ids of the plan's vehicles.
+
+        Raises:
+            OrthoSwarmError: one is not heard.
+        """
+        try:
+            return {vehicle: self._links.system_of(name) for vehicle, name in whose.items()}
+        except OrthoSwarmError as error:
+            raise OrthoSwarmError(f"{error}; no vehicle was started") from None
+
+    def _still_wanted(self, given_s: float, stops: Mapping[int, int]) -> None:
+        """Make sure that nobody told a vehicle to stop during the check, and that this did not take too long.
+
+        Raises:
+            OrthoSwarmError: the start is void.
+        """
+        told = [s for s in sorted(self._checking) if self._links.fleet.stops.get(s, 0) != stops.get(s, 0)]
+        if told:
+            who = ", ".join(self._links.name_of(system) for system in told)
+            raise OrthoSwarmError(f"{who} was told to stop during the check; no vehicle was started")
+        age_s = self._clock() - given_s
+        if age_s > COMMAND.fresh_s:
+            raise OrthoSwarmError(
+                f"the check took until {age_s:.0f} s after the start was given, so no vehicle was started; give it"
+                f" again (missions read within {COMMAND.read_kept_s:.0f} s are not read again)"
+            )
+
     def _ready(
         self,
         plan: str,
         sortie: int,
         names: Mapping[str, str] | None,
         override: Mapping[str, Collection[str]],
-    ) -> dict[str, int]:
-        """The plan's vehicles' system ids, once all have passed their check."""
+    ) -> None:
+        """Check the plan's vehicles.
+
+        Raises:
+            OrthoSwarmError: not all have passed.
+        """
         try:
             rows = self.preflight(plan, sortie, names)
         except InputError:
@@ -159,8 +208,6 @@ class Takeoffs:
             wrong += [f"{row['vehicle']}: {item['name']}: {item['reason']}" for item in red]
         if wrong:
             raise OrthoSwarmError(f"{'; '.join(wrong)}; no vehicle was started")
-        back = {name: vehicle for vehicle, name in (names or {}).items()}
-        return {back.get(row["vehicle"], row["vehicle"]): self._links.system_of(row["vehicle"]) for row in rows}
 
     def _run(self) -> None:
         """Start each at its time; ends with the last."""
@@ -180,7 +227,8 @@ class Takeoffs:
 
     def _start(self, vehicle: str, system: int) -> None:
         """Start one vehicle; if that fails, the waiting ones stay on the ground."""
-        order = Order(verb="start", system=system, given_s=self._clock())
+        given_s = self._given_s.get(system, self._clock())  # a later one is given by its planned time
+        order = Order(verb="start", system=system, given_s=given_s, stops=self._stops.get(system, 0))
         try:
             self._links.fleet.call(lambda: self._links.fleet.order(order))
             while order.outcome is None and not self._closed:

@@ -20,11 +20,10 @@ For the HTTP API and the page, all in JSON values:
   its command was given, so that a delayed one is not executed late.
 """
 
-import contextlib
 import logging
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
@@ -34,6 +33,7 @@ from gcs_plugin.daemon.airspace.traffic import Traffic
 from gcs_plugin.daemon.jobs.job_queue import Jobs
 from gcs_plugin.daemon.mission_journal import MissionJournal
 from gcs_plugin.daemon.settings import Settings
+from gcs_plugin.daemon.start_checks import StartChecks
 from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.fleet.commands import CommandResult
@@ -46,14 +46,12 @@ if TYPE_CHECKING:
     from gcs_plugin.fleet.fleet import Fleet
     from gcs_plugin.fleet.fleet_events import FleetEvent
     from gcs_plugin.fleet.vehicle_state import Vehicle
-    from gcs_plugin.mission.download import MissionDownload
     from gcs_plugin.mission.exchange import Exchange
     from gcs_plugin.mission.items import Mission
     from telemetry.live.live_poses import LivePoses
 
 _WATCH_S: Final = 0.5
 _SOON_S: Final = 5.0
-_READ_S: Final = 20.0
 _OUTCOME_S: Final = 60.0
 _TRAIL: Final = 600  # positions of a vehicle on the page
 _MOST_TEXTS: Final = 50  # of a vehicle on the page
@@ -81,7 +79,7 @@ class VehicleLinks:
         fleet: its vehicles and links.
         traffic: other aircraft that vehicles have heard of.
         latest: the rows of `rows`, at most half a second old.
-        cancel_takeoff: cancels a waiting takeoff; returns the seconds until it, or None.
+        cancel_takeoff: cancels a takeoff that waits or is being checked; returns what it did in words, or "".
         takeoffs: vehicle -> its takeoff that waits or failed, see `Takeoffs.rows`.
     """
 
@@ -104,12 +102,14 @@ class VehicleLinks:
         self._poses = Poses() if poses is None else poses
         self._stop = threading.Event()
         self.latest: list[dict[str, Any]] = []
-        self.cancel_takeoff: Callable[[str], float | None] = lambda _: None
+        self.cancel_takeoff: Callable[[str], str] = lambda _: ""
+        self._starting = Counter[int]()
         self.takeoffs: Callable[[], Mapping[str, dict[str, Any]]] = dict
         self.fleet: Fleet = Fleet(settings.links, key=find_key(), tlog=settings.workspace / "telemetry.tlog")
         self.fleet.on_event(self._event)
         self.fleet.subscribe(self._message)
         self._fences = Fences(self.fleet)
+        self._checks = StartChecks(self.fleet, self.name_of)
         self.traffic = Traffic()
         self.fleet.subscribe(self.traffic.heard, "ADSB_VEHICLE")
         self.fleet.subscribe(self.traffic.height, "GLOBAL_POSITION_INT")
@@ -212,8 +212,12 @@ class VehicleLinks:
             raise InputError(f"there is no command '{verb}'; choose {', '.join(VERBS)}")
         given, number = self.clock() if given_s is None else min(given_s, self.clock()), command_id or new_id()
         names = [self.name_of(s) for s in sorted(self.fleet.vehicles)] if vehicles is None else list(vehicles)
+        stops = dict(self.fleet.stops)
         rows, systems = self._without_command(verb, names, number, override or {})
-        orders = {name: Order(verb=verb, system=system, given_s=given, id=number) for name, system in systems.items()}
+        orders = {
+            name: Order(verb=verb, system=system, given_s=given, stops=stops.get(system, 0), id=number)
+            for name, system in systems.items()
+        }
         for order in orders.values():
             self.fleet.call(lambda o=order: self.fleet.order(o))  # type: ignore[misc]
         end = time.monotonic() + _OUTCOME_S
@@ -247,12 +251,15 @@ class VehicleLinks:
             except OrthoSwarmError as error:
                 end(name, Verdict.NOT_SENT, str(error))
                 continue
-            waited = self.cancel_takeoff(name) if verb in URGENT else None
-            if waited is not None and not self.fleet.vehicles[systems[name]].armed:
-                end(name, Verdict.DONE, f"{name} stays on the ground: its takeoff in {waited:.0f} s is cancelled")
-                del systems[name]
+            if verb in URGENT:
+                self.fleet.told_to_stop(systems[name])  # first of all: it makes void what is being checked now
+                checked = "its start is cancelled" if self._starting[systems[name]] else ""
+                cancelled = self.cancel_takeoff(name) or checked
+                if cancelled and not self.fleet.vehicles[systems[name]].armed:
+                    end(name, Verdict.DONE, f"{name} stays on the ground: {cancelled}")
+                    del systems[name]
         if verb == "start":
-            for row in self.preflight(list(systems)):
+            for row in self._checked(systems):
                 red = [
                     i for i in row["items"] if i["state"] == "red" and i["name"] not in override.get(row["vehicle"], ())
                 ]
@@ -261,6 +268,14 @@ class VehicleLinks:
                     end(row["vehicle"], Verdict.REFUSED, f"{row['vehicle']} was not started: {reason}")
                     del systems[row["vehicle"]]
         return rows, systems
+
+    def _checked(self, systems: Mapping[str, int]) -> list[dict[str, Any]]:
+        """The check of vehicles that are to start now; a command to stop that comes meanwhile finds them starting."""
+        self._starting.update(systems.values())
+        try:
+            return self.preflight(list(systems))
+        finally:
+            self._starting.subtract(systems.values())
 
     def preflight(
         self,
@@ -285,45 +300,11 @@ class VehicleLinks:
         Raises:
             OrthoSwarmError: a vehicle was not heard on any link.
         """
-        from gcs_plugin.config import LIMITS
-        from gcs_plugin.fleet.preflight import preflight_all
-
         names = [self.name_of(s) for s in sorted(self.fleet.vehicles)] if vehicles is None else list(vehicles)
         systems = {self.system_of(name): name for name in names}
-        stored = self._read_missions(systems)
         wanted = {s: missions[name] for s, name in systems.items() if missions and name in missions}
         times = {s: starts[name] for s, name in systems.items() if starts and name in starts}
-        checks = self.fleet.call(
-            lambda: preflight_all(
-                {s: self.fleet.vehicles[s] for s in systems},
-                wanted,
-                stored,
-                times,
-                time.monotonic(),
-                endurance_s=endurance_s or LIMITS.endurance_s,
-                legal_height_m=legal_height_m or LIMITS.legal_height_m,
-                name=self.name_of,
-            )
-        ).result(_READ_S)
-        return [check.document(systems[check.system]) for check in checks]
-
-    def _read_missions(self, systems: Collection[int]) -> "dict[int, Mission]":
-        """The missions stored in vehicles, of those that answer in time."""
-        from gcs_plugin.mission.items import Mission
-
-        reads: dict[int, MissionDownload] = {}
-
-        def begin(system: int) -> None:
-            with contextlib.suppress(OrthoSwarmError):  # lost or busy: reported by the check
-                reads[system] = self.fleet.download(system)
-
-        for begun in [self.fleet.call(lambda s=system: begin(s)) for system in systems]:  # type: ignore[misc]
-            begun.result(_SOON_S)
-        end = time.monotonic() + _READ_S
-        while any(read.outcome is None for read in reads.values()) and time.monotonic() < end:
-            time.sleep(0.02)
-        kinds = {s: self.fleet.vehicles[s].autopilot for s in reads}
-        return {s: Mission(kinds[s], tuple(read.items)) for s, read in reads.items() if read.items is not None}
+        return self._checks.check(systems, wanted, times, endurance_s=endurance_s, legal_height_m=legal_height_m)
 
     def command(self, begin: Callable[["Fleet"], "Exchange"], timeout_s: float = 180.0) -> str:
         """Run a dialogue with a vehicle to its end; returns the final text.

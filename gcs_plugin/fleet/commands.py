@@ -58,6 +58,7 @@ class Order:
     Attributes:
         verb: the command. system: the vehicle's system id.
         given_s: when it was given (the fleet's monotonic clock); it is not sent later than COMMAND.fresh_s after that.
+        stops: of a start, `Fleet.stops` (0 if none) when it was given: a pause, RTL or land since then makes it void.
         id: of the command.
         exchange: the dialogue with the vehicle, None if none was started.
     """
@@ -65,6 +66,7 @@ class Order:
     verb: Verb
     system: int
     given_s: float
+    stops: int | None = None
     id: str = field(default_factory=new_id)
     exchange: "Exchange | None" = None
     _ended: Outcome | None = None

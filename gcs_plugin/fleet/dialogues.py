@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from gcs_plugin.mission.command_dialogues import CheckMission, InOrder
+from gcs_plugin.mission.command_dialogues import BreakOff, CheckMission, InOrder, Start
 from gcs_plugin.mission.download import MissionDownload
 from gcs_plugin.mission.exchange import MISSION, NEVER, Verdict
 from gcs_plugin.mission.items import Mission
@@ -51,6 +51,10 @@ class Dialogues:
     def busy(self, system: int) -> bool:
         """True while a dialogue with this vehicle is active that somebody waits for."""
         return any(job.vehicle.system == system and not _in_background(job) for job in self.jobs)
+
+    def starting(self, system: int) -> bool:
+        """True while a start of this vehicle is under way, or is being broken off."""
+        return any(job.vehicle.system == system and isinstance(job, (Start, BreakOff)) for job in self.jobs)
 
     def end_background(self, system: int) -> None:
         """End what nobody waits for, in favour of what somebody asks for."""

@@ -5,6 +5,7 @@ vehicle could act on is sent without a request: the fleet by itself sends its he
 ground station, asks for streams and clocks, and asks a vehicle that would not arm for the reasons.
 """
 
+import itertools
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -50,6 +51,7 @@ class Fleet:
         own: our address.
         hub: the links. signed: whether it has a key.
         separation: watches the distances of vehicles in the air.
+        stops: number of the last command to pause, return or land, by system id; see `told_to_stop`.
     """
 
     def __init__(
@@ -99,6 +101,8 @@ class Fleet:
             wall=wall,
         )
         self.separation = self._reception.separation
+        self.stops: dict[int, int] = {}
+        self._stop_numbers = itertools.count(1)
         self._tick_at = 0.0
         self._thread: int | None = None
 
@@ -145,6 +149,11 @@ class Fleet:
         to a lost vehicle on every route on which it was heard.
         """
         now = self._clock()
+        if order.verb in URGENT:
+            self.told_to_stop(order.system)
+        elif order.stops is not None and order.stops != self.stops.get(order.system, 0):
+            text = f"vehicle {order.system} was told to stop after its '{order.verb}' was given, so that was not sent"
+            return order.end(text, Verdict.NOT_SENT)
         if now > order.expires_s:
             text = f"vehicle {order.system}: '{order.verb}' was given {now - order.given_s:.0f} s ago and was not sent"
             return order.end(f"{text}; give it again", Verdict.NOT_SENT)
@@ -156,6 +165,10 @@ class Fleet:
         exchange.expires = order.expires_s
         order.exchange = self.begin(exchange)
         return order
+
+    def told_to_stop(self, system: int) -> None:
+        """Make a start void that was given to a vehicle before now; from any thread."""
+        self.stops[system] = next(self._stop_numbers)
 
     def send(self, system: int, messages: Sequence[Message]) -> None:
         """Send messages without waiting for answers; in the polling thread. Nothing is sent to an unknown vehicle."""
@@ -275,10 +288,13 @@ class Fleet:
             return vehicle.pilot.start(in_air=vehicle.flying, armed=vehicle.armed, check=check)
         vehicle = self._known(system) if verb in URGENT else self.vehicle(system)
         sure = not vehicle.claimants and self._clock() - vehicle.heard < _SURE_S
-        if verb == "pause" and sure and not vehicle.armed:
+        starting = self._dialogues.starting(system)
+        if verb == "pause" and sure and not vehicle.armed and not starting:
             raise OrthoSwarmError(f"vehicle {system} is not armed, so there is nothing to pause")
         self._dialogues.make_way(system)
         self._pauses.pop(system, None)
+        if starting and verb in URGENT and not vehicle.flying:
+            return vehicle.pilot.break_off(verb)
         if verb == "pause":
             self._pauses[system] = (vehicle.pilot.pause(), self._clock())
             return self._pauses[system][0]

@@ -24,6 +24,8 @@ _REPEAT_S: Final = 0.5
 _AGAIN_S: Final = 1.0
 _ANSWER_S: Final = 1.0
 _FIRST_S: Final = 2.0  # silence after which the other way is tried
+_SETTLED_S: Final = 3.0  # commands of a start that was broken off have arrived or are lost by then
+_SHOWN_S: Final = 0.9  # two heartbeats
 _AIRBORNE_COMMANDS: Final = frozenset({TAKEOFF, int(dialect.MAV_CMD_NAV_VTOL_TAKEOFF)})
 
 
@@ -290,6 +292,76 @@ class InOrder(_Several):
 
 
 @dataclass(slots=True)
+class Start(InOrder):
+    """The steps of a start; it is broken off by `BreakOff` only."""
+
+
+@dataclass(slots=True)
+class BreakOff(Exchange):
+    """Ends a start whose commands may still be on their way: disarms, and changes the mode, again and again.
+
+    The disarming is not forced, so a vehicle that has left the ground refuses it and obeys the change of mode. An
+    acknowledgement may be that of the start, so it ends only when the vehicle's state shows it for `_SETTLED_S`.
+
+    Attributes:
+        modes: the autopilot's; mode: the one to end in. autopilot: its dialect.
+    """
+
+    autopilot: Autopilot = field(kw_only=True)
+    modes: Modes = field(kw_only=True)
+    mode: int = field(kw_only=True)
+    _began: float = field(default=0.0, init=False)
+    _sent: int = field(default=0, init=False)
+    _since: dict[str, float] = field(default_factory=dict, init=False)
+
+    def start(self, now: float) -> list[Message]:
+        """Send both."""
+        self._began = now
+        return self._send(now)
+
+    def feed(self, message: Message, now: float) -> list[Message]:
+        """Look at its state."""
+        if self.outcome is not None or message.get_type() != "HEARTBEAT":
+            return []
+        if message.autopilot == dialect.MAV_AUTOPILOT_INVALID:
+            return []
+        armed, name = message.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED, f"vehicle {self.vehicle.system}"
+        there = message.custom_mode == self.mode
+        shown = ("in air" if there else "") if armed else "on ground"
+        self._since = {shown: self._since.get(shown, now)}
+        if shown and now - self._began >= _SETTLED_S and now - self._since[shown] >= _SHOWN_S:
+            mode = self.modes.name(self.mode)
+            text = f"its start was broken off, it is in {mode}" if armed else "its start was broken off, it is disarmed"
+            self._end(True, f"{name}: {text}")
+        return []
+
+    def tick(self, now: float) -> list[Message]:
+        """Send both again, or give up."""
+        if self.outcome is not None or now < self.deadline:
+            return []
+        if now >= self.expires + _SETTLED_S:
+            name, verdict = f"vehicle {self.vehicle.system}", Verdict.UNKNOWN if self.delivered else Verdict.NOT_SENT
+            text = "does not show that its start is broken off; watch it, and be ready to use the radio control"
+            self._end(False, f"{name} {text}", verdict)
+            return []
+        if now > self.expires:
+            self.deadline = self.expires + _SETTLED_S  # it may still show
+            return []
+        return self._send(now)
+
+    def _send(self, now: float) -> list[Message]:
+        self.deadline = now + _REPEAT_S
+        again, self._sent, to = min(self._sent, 255), self._sent + 1, self.vehicle
+        mode = (*mode_params(self.autopilot, self.mode), *(0.0,) * 7)[:7]
+        return [
+            dialect.MAVLink_command_long_message(
+                to.system, to.component, dialect.MAV_CMD_COMPONENT_ARM_DISARM, again, *(0.0,) * 7
+            ),
+            dialect.MAVLink_command_long_message(to.system, to.component, dialect.MAV_CMD_DO_SET_MODE, again, *mode),
+        ]
+
+
+@dataclass(slots=True)
 class OrUndo(_Several):
     """A step, and a dialogue that undoes the previous one if the vehicle refuses this step; the refusal is the outcome.
 
@@ -380,7 +452,7 @@ class Pilot:
             go = OrUndo(self.vehicle, self.own, steps=[go, disarm], undone="it was disarmed again", left=left)
         flies = Confirm(self.vehicle, self.own, shown=self._flies, what="flies its mission")
         steps += [self.set_mode(self.modes.ready), arm, go, flies]
-        return InOrder(self.vehicle, self.own, steps=steps, done="flies its mission", carried=len(steps) - 2)
+        return Start(self.vehicle, self.own, steps=steps, done="flies its mission", carried=len(steps) - 2)
 
     def pause(self) -> Exchange:
         """Hold position. ArduPilot's own pause works between waypoints only, BRAKE everywhere."""
@@ -410,6 +482,11 @@ class Pilot:
         """Land where it is."""
         down = Command(self.vehicle, self.own, command=dialect.MAV_CMD_NAV_LAND, verb="land", patience_s=_FIRST_S)
         return Either(self.vehicle, self.own, steps=[down, self.set_mode(self.modes.land)])
+
+    def break_off(self, verb: str) -> BreakOff:
+        """End a start that is under way by `pause`, `rtl` or `land`; see `BreakOff`."""
+        mode = {"pause": self.modes.hold, "rtl": self.modes.rtl, "land": self.modes.land}[verb]
+        return BreakOff(self.vehicle, self.own, autopilot=self.autopilot, modes=self.modes, mode=mode)
 
     def _pause_continue(self, go_on: float, verb: str) -> Command:
         return Command(

@@ -252,7 +252,8 @@ def _begin(
     late = _late(issue, "start")
     if late is not None:
         raise OrthoSwarmError(f"{late}; no vehicle was started")
-    return takeoffs.begin(number, sortie, names, override, wanted=wanted)
+    began = VehicleLinks.clock() - max(0.0, issue.age_s)
+    return takeoffs.begin(number, sortie, names, override, wanted=wanted, given_s=began)
 
 
 def _seconds(body: Mapping[str, Any], key: str) -> float | None:

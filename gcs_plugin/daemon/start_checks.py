@@ -1,0 +1,98 @@
+"""The check before a start with what the daemon knows: missions are read from the vehicles for it.
+
+A mission that was read a moment ago is not read again as long as the vehicle's messages show no change of it. So a
+start can follow its check at once on a slow link too, where reading alone takes longer than a command stays valid.
+"""
+
+import contextlib
+import time
+from collections.abc import Callable, Collection, Mapping
+from typing import TYPE_CHECKING, Any, Final
+
+from gcs_plugin.config import COMMAND, LIMITS
+from orthoswarm.model.errors import OrthoSwarmError
+
+if TYPE_CHECKING:
+    from gcs_plugin.fleet.fleet import Fleet
+    from gcs_plugin.mission.download import MissionDownload
+    from gcs_plugin.mission.items import Mission
+
+_SOON_S: Final = 5.0
+_READ_S: Final = 20.0
+
+
+class StartChecks:
+    """Checks vehicles before their start.
+
+    Args:
+        fleet: the vehicles. name_of: id of a vehicle by its system id.
+    """
+
+    def __init__(self, fleet: "Fleet", name_of: Callable[[int], str]) -> None:
+        self._fleet, self._name_of = fleet, name_of
+        self._read: dict[int, tuple[float, Mission]] = {}
+
+    def check(
+        self,
+        systems: Mapping[int, str],
+        missions: "Mapping[int, Mission]",
+        starts: Mapping[int, float],
+        *,
+        endurance_s: float | None = None,
+        legal_height_m: float | None = None,
+    ) -> list[dict[str, Any]]:
+        """Check vehicles that are to start together; waits for their missions.
+
+        Args:
+            systems: their names by system id. missions: the plan's. starts: takeoffs in seconds after the first.
+            endurance_s, legal_height_m: as for `preflight_all`.
+
+        Returns:
+            A row per vehicle, see the top of `vehicles`.
+        """
+        from gcs_plugin.fleet.preflight import preflight_all
+
+        stored = self._missions(systems)
+        checks = self._fleet.call(
+            lambda: preflight_all(
+                {s: self._fleet.vehicles[s] for s in systems},
+                missions,
+                stored,
+                starts,
+                time.monotonic(),
+                endurance_s=endurance_s or LIMITS.endurance_s,
+                legal_height_m=legal_height_m or LIMITS.legal_height_m,
+                name=self._name_of,
+            )
+        ).result(_READ_S)
+        return [check.document(systems[check.system]) for check in checks]
+
+    def _missions(self, systems: Collection[int]) -> "dict[int, Mission]":
+        """The missions stored in vehicles, of those that answer in time."""
+        from gcs_plugin.mission.items import Mission
+
+        found = {s: mission for s in systems if (mission := self._known(s)) is not None}
+        reads: dict[int, MissionDownload] = {}
+
+        def begin(system: int) -> None:
+            with contextlib.suppress(OrthoSwarmError):  # lost or busy: reported by the check
+                reads[system] = self._fleet.download(system)
+
+        unread = [system for system in systems if system not in found]
+        for begun in [self._fleet.call(lambda s=system: begin(s)) for system in unread]:  # type: ignore[misc]
+            begun.result(_SOON_S)
+        end = time.monotonic() + _READ_S
+        while any(read.outcome is None for read in reads.values()) and time.monotonic() < end:
+            time.sleep(0.02)
+        for system, read in reads.items():
+            if read.items is not None:
+                found[system] = Mission(self._fleet.vehicles[system].autopilot, tuple(read.items))
+                self._read[system] = time.monotonic(), found[system]
+        return found
+
+    def _known(self, system: int) -> "Mission | None":
+        """Its mission, if it was read a moment ago and nothing indicates another one since."""
+        vehicle = self._fleet.vehicles[system]
+        at, mission = self._read.get(system, (0.0, None))
+        lately = mission is not None and time.monotonic() - at < COMMAND.read_kept_s
+        return mission if lately and vehicle.detector.knows and vehicle.mission == mission else None

@@ -1,0 +1,77 @@
+"""A plan's start in the daemon: what cancels it during its check and while vehicles wait, and what is looked at again."""
+
+import json
+import threading
+
+import pytest
+
+from gcs_plugin.daemon.takeoffs import Takeoffs
+from gcs_plugin.links.mavlink import Autopilot
+from gcs_plugin.sim.simulated_swarm import make_swarm
+from orthoswarm.model.errors import OrthoSwarmError
+from tests.vehicles.test_fleet_cli import HOME, folder  # noqa: F401
+from tests.vehicles.test_vehicle_links import PlanFolder, open_links, ready, upload_all, wait  # noqa: F401
+
+AP, PX4 = Autopilot.ARDUPILOT, Autopilot.PX4
+
+
+class SlowPlans(PlanFolder):
+    """Plans whose missions are read only when the test allows it: the check is under way until then."""
+
+    def __init__(self, path):
+        super().__init__(path)
+        self.asked, self.go_on = threading.Event(), threading.Event()
+
+    def mission(self, body, vehicle, autopilot):
+        self.asked.set()
+        assert self.go_on.wait(30.0)
+        return super().mission(body, vehicle, autopilot)
+
+
+def apart(folder, count, seconds):  # noqa: F811
+    """The plan with `count` vehicles that take off so many seconds after each other."""
+    document = json.loads((folder / "plan.json").read_text())
+    document["vehicles"] = document["vehicles"][:count]
+    for number, vehicle in enumerate(document["vehicles"]):
+        vehicle["flights"][0]["start_s"] = seconds * number
+    (folder / "plan.json").write_text(json.dumps(document))
+
+
+@pytest.mark.parametrize("verb", ["pause", "rtl", "land"])
+def test_a_command_to_stop_during_the_check_cancels_the_start(open_links, folder, verb):  # noqa: F811
+    apart(folder, 2, 2.0)
+    vehicles = make_swarm(2, home=HOME)
+    links = open_links(vehicles)
+    ready(links, 2)
+    upload_all(links, folder)
+    plans, said = SlowPlans(folder), []
+    takeoffs = Takeoffs(links, plans, lambda _: None)
+
+    def begin():
+        try:
+            said.append(takeoffs.begin("plan-1"))
+        except OrthoSwarmError as error:
+            said.append(str(error))
+
+    thread = threading.Thread(target=begin)
+    thread.start()
+    assert plans.asked.wait(30.0)
+    rows = links.commands(verb)
+    assert [row["outcome"] for row in rows] == ["done"] * 2 and "start" in rows[0]["reason"]
+    plans.go_on.set()
+    thread.join(30.0)
+    assert said == ["v1, v2 was told to stop during the check; no vehicle was started"]
+    assert takeoffs.rows() == {} and not any(v.flight.armed for v in vehicles)
+    takeoffs.close()
+
+
+def test_a_start_whose_check_took_long_is_not_carried_out_but_can_be_given_again(open_links, folder):  # noqa: F811
+    apart(folder, 2, 60.0)
+    links = open_links(make_swarm(2, home=HOME))
+    ready(links, 2)
+    upload_all(links, folder)
+    takeoffs = Takeoffs(links, PlanFolder(folder), lambda _: None)
+    with pytest.raises(OrthoSwarmError, match="no vehicle was started; give it again"):
+        takeoffs.begin("plan-1", given_s=links.clock() - 6.0)
+    assert takeoffs.begin("plan-1") == {"v1": 0.0, "v2": 60.0}
+    takeoffs.close()
