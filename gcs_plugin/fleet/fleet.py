@@ -6,6 +6,7 @@ ground station, asks for streams and clocks, and asks a vehicle that would not a
 """
 
 import itertools
+import math
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -17,6 +18,7 @@ from gcs_plugin.config import COMMAND
 from gcs_plugin.fleet.commands import URGENT, Order, Verb
 from gcs_plugin.fleet.dialogues import Dialogues
 from gcs_plugin.fleet.fleet_events import FleetEvent
+from gcs_plugin.fleet.flight_state import Word, flight_state
 from gcs_plugin.fleet.link_hub import Hub
 from gcs_plugin.fleet.message_rates import Rates, default_rates
 from gcs_plugin.fleet.reception import MESSAGE_IDS, Handler, Reception
@@ -89,6 +91,7 @@ class Fleet:
         self._clock = clock
         self._listeners: list[Callable[[FleetEvent], None]] = []
         self._pauses: dict[int, tuple[Exchange, float]] = {}
+        self._told_home: dict[int, float] = {}
         self._dialogues = Dialogues(self.vehicles, self.hub, clock, signed=self.signed)
         self._reception = Reception(
             self.vehicles,
@@ -291,8 +294,12 @@ class Fleet:
         starting = self._dialogues.starting(system)
         if verb == "pause" and sure and not vehicle.armed and not starting:
             raise OrthoSwarmError(f"vehicle {system} is not armed, so there is nothing to pause")
+        if verb == "resume":
+            self._may_resume(vehicle)
         self._dialogues.make_way(system)
         self._pauses.pop(system, None)
+        if verb in ("rtl", "land"):
+            self._told_home[system] = self._clock()
         if starting and verb in URGENT and not vehicle.flying:
             return vehicle.pilot.break_off(verb)
         if verb == "pause":
@@ -301,6 +308,22 @@ class Fleet:
         if verb == "resume":
             return vehicle.pilot.resume(in_mission_mode=vehicle.custom_mode == vehicle.modes.mission)
         return {"rtl": vehicle.pilot.rtl, "land": vehicle.pilot.land}[verb]()
+
+    def _may_resume(self, vehicle: Vehicle) -> None:
+        """Resuming must not pull a vehicle back that returns or lands, nor lift one from the ground.
+
+        Raises:
+            OrthoSwarmError: it is not within its mission.
+        """
+        state = flight_state(vehicle)
+        # A station that has just begun to listen does not know the mission's phase: then the mode of a pause counts.
+        held = vehicle.flying and vehicle.custom_mode == vehicle.modes.hold and vehicle.mission_seq > 0
+        within = held and state.word is Word.FLYING and vehicle.detector.phase is Phase.IDLE
+        if self._clock() - self._told_home.get(vehicle.system, -math.inf) < _PAUSE_SHOWS_S:  # its mode may be older
+            raise OrthoSwarmError(f"vehicle {vehicle.system} was told to return or land just now; it is not resumed")
+        # A pause shows some seconds after it was acknowledged: on a mission there is nothing to pull it out of.
+        if state.word not in (Word.PAUSED, Word.ON_MISSION) and not within:
+            raise OrthoSwarmError(f"vehicle {vehicle.system} is {state.word.value}, so there is no pause to end")
 
     def _was_just_paused(self, system: int) -> bool:
         """True between a vehicle's acknowledgement of a pause and the report of its mission's state that shows it."""

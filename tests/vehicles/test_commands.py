@@ -9,7 +9,7 @@ import pytest
 
 from gcs_plugin.fleet.commands import Order
 from gcs_plugin.fleet.fleet import Fleet
-from gcs_plugin.fleet.flight_state import Word, flight_state
+from gcs_plugin.fleet.flight_state import flight_state
 from gcs_plugin.fleet.link_hub import Hub
 from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.links.transports import TcpLink
@@ -140,38 +140,6 @@ def test_a_start_that_is_under_way_is_carried_through(make_world):
     world.finish(world.fleet.upload(1, mission(AP, END)))
     order = give(world, "start", 1, world.clock.now - 4.9)
     assert end_of(world, order).outcome is Verdict.DONE
-
-
-@BOTH
-@pytest.mark.parametrize("verb", ["pause", "rtl", "land"])
-@pytest.mark.parametrize("after_s", [0.1, 0.3, 0.7, 1.1, 1.5, 1.9, 2.5])
-def test_a_start_that_is_under_way_ends_with_a_command_to_stop(make_world, autopilot, verb, after_s):
-    """Its mode change, arming or MISSION_START may be on the way to the vehicle at that moment."""
-    world = make_world(SimVehicle(system=1, autopilot=autopilot), up=Faults(delay_s=(0.3, 0.3)))
-    world.meet()
-    assert world.finish(world.fleet.upload(1, mission(autopilot, END)))[0].ok
-    start = give(world, "start", 1)
-    world.wait(after_s)
-    result = end_of(world, give(world, verb, 1))
-    assert result.outcome is Verdict.DONE, result
-    world.wait(20.0)
-    flight, state = world.vehicles[1].flight, flight_state(world.fleet.vehicles[1])
-    assert start.outcome is not None
-    if verb == "pause" and start.outcome.ok:  # it flew before
-        assert flight.mode == flight.modes.hold or state.word is Word.PAUSED
-    else:
-        assert not flight.armed and state.word is not Word.ON_MISSION
-
-
-def test_a_start_that_was_given_before_a_command_to_stop_is_void(make_world):
-    world = make_world(SimVehicle(system=1, autopilot=AP))
-    world.meet()
-    assert world.finish(world.fleet.upload(1, mission(AP, END)))[0].ok
-    before = Order(verb="start", system=1, given_s=world.clock.now, stops=world.fleet.stops.get(1, 0))
-    end_of(world, give(world, "pause", 1))  # refused, as it stands on the ground, but meant
-    result = end_of(world, world.fleet.order(before))
-    assert result.outcome is Verdict.NOT_SENT and "told to stop" in result.reason
-    assert not world.vehicles[1].flight.armed
 
 
 # -- two links, two claimants -------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""A plan's start in the daemon: what cancels it during its check and while vehicles wait, and what is looked at again."""
+"""A plan's start in the daemon: what cancels it during its check and while vehicles wait, what is checked again."""
 
 import json
 import threading
