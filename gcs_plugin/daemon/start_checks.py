@@ -40,19 +40,21 @@ class StartChecks:
         *,
         endurance_s: float | None = None,
         legal_height_m: float | None = None,
+        reread: bool = True,
     ) -> list[dict[str, Any]]:
         """Check vehicles that are to start together; waits for their missions.
 
         Args:
             systems: their names by system id. missions: the plan's. starts: takeoffs in seconds after the first.
             endurance_s, legal_height_m: as for `preflight_all`.
+            reread: whether missions that are known and did not change are read all the same.
 
         Returns:
             A row per vehicle, see the top of `vehicles`.
         """
         from gcs_plugin.fleet.preflight import preflight_all
 
-        stored = self._missions(systems)
+        stored = self._missions(systems, reread=reread)
         checks = self._fleet.call(
             lambda: preflight_all(
                 {s: self._fleet.vehicles[s] for s in systems},
@@ -67,11 +69,11 @@ class StartChecks:
         ).result(_READ_S)
         return [check.document(systems[check.system]) for check in checks]
 
-    def _missions(self, systems: Collection[int]) -> "dict[int, Mission]":
+    def _missions(self, systems: Collection[int], *, reread: bool) -> "dict[int, Mission]":
         """The missions stored in vehicles, of those that answer in time."""
         from gcs_plugin.mission.items import Mission
 
-        found = {s: mission for s in systems if (mission := self._known(s)) is not None}
+        found = {s: mission for s in systems if (mission := self._known(s, reread=reread)) is not None}
         reads: dict[int, MissionDownload] = {}
 
         def begin(system: int) -> None:
@@ -90,9 +92,11 @@ class StartChecks:
                 self._read[system] = time.monotonic(), found[system]
         return found
 
-    def _known(self, system: int) -> "Mission | None":
-        """Its mission, if it was read a moment ago and nothing indicates another one since."""
+    def _known(self, system: int, *, reread: bool) -> "Mission | None":
+        """Its mission, if it was read a moment ago (`reread`: ever) and nothing indicates another one since."""
         vehicle = self._fleet.vehicles[system]
+        if not reread:
+            return vehicle.mission if vehicle.detector.knows else None
         at, mission = self._read.get(system, (0.0, None))
         lately = mission is not None and time.monotonic() - at < COMMAND.read_kept_s
         return mission if lately and vehicle.detector.knows and vehicle.mission == mission else None

@@ -16,7 +16,8 @@ from gcs_plugin.daemon.vehicles import VehicleLinks
 from gcs_plugin.daemon.web_plans import Plans
 from gcs_plugin.fleet.commands import Order
 from gcs_plugin.fleet.takeoff_schedule import TakeoffSchedule
-from gcs_plugin.mission.exchange import Outcome
+from gcs_plugin.mission.exchange import Outcome, Verdict
+from gcs_plugin.mission.items import Mission
 from gcs_plugin.mission.track import Airspace
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 
@@ -42,8 +43,12 @@ class Takeoffs:
         self._checking: frozenset[int] = frozenset()
         self._stops: dict[int, int] = {}
         self._given_s: dict[int, float] = {}
+        self._missions: dict[int, Mission] = {}
+        self._allowed: dict[str, Collection[str]] = {}
+        self._about_to: set[int] = set()
         self._closed = False
         links.cancel_takeoff, links.takeoffs = self.cancel, self.rows
+        links.fleet.takeoff_due = self._due
 
     def preflight(
         self, plan: str, sortie: int = 1, names: Mapping[str, str] | None = None, **limits: float | None
@@ -61,6 +66,12 @@ class Takeoffs:
             InputError: there is no such plan or flight.
             OrthoSwarmError: vehicles are not heard.
         """
+        return self._check(plan, sortie, names, limits)[0]
+
+    def _check(
+        self, plan: str, sortie: int, names: Mapping[str, str] | None, limits: Mapping[str, float | None]
+    ) -> tuple[list[dict[str, Any]], dict[str, Mission]]:
+        """The rows of `preflight`, and the plan's missions by vehicle."""
         starts = self._plans.starts(plan, sortie)
         whose = {vehicle: (names or {}).get(vehicle, vehicle) for vehicle in starts}
         missions = {}
@@ -69,7 +80,7 @@ class Takeoffs:
             mission = vehicle if sortie == 1 else f"{vehicle}-sortie{sortie}"
             missions[name] = self._plans.mission({"plan": plan, "mission": mission}, vehicle, known.autopilot)
         times = {whose[vehicle]: start_s for vehicle, start_s in starts.items()}
-        return self._links.preflight(list(whose.values()), missions, starts=times, **limits)
+        return self._links.preflight(list(whose.values()), missions, starts=times, **limits), missions
 
     def begin(
         self,
@@ -108,7 +119,7 @@ class Takeoffs:
             systems = self._systems(whose)
             self._checking, stops = frozenset(systems.values()), dict(self._links.fleet.stops)
         try:
-            self._ready(plan, sortie, names, override or {})
+            missions = self._ready(plan, sortie, names, override or {})
             first = min(starts.values())
             delays = {systems[vehicle]: start_s - first for vehicle, start_s in starts.items()}
             held = {s: self._links.fleet.vehicles[s].mission for s in delays}
@@ -121,6 +132,8 @@ class Takeoffs:
                 self._failed.clear()
                 self._stops, self._given_s = stops, {s: given for s, delay in delays.items() if delay <= 0.0}
                 self._names = {systems[vehicle]: whose[vehicle] for vehicle in starts}
+                self._missions = {system: missions[self._names[system]] for system in systems.values()}
+                self._allowed = dict(override or {})
                 self._schedule, self._checking = schedule, frozenset()
         finally:
             self._checking = frozenset()
@@ -136,6 +149,8 @@ class Takeoffs:
             if any(self._links.name_of(system) == vehicle for system in self._checking):
                 return "the start that was being checked is cancelled"
             system = next((s for s, name in self._names.items() if name == vehicle), None)
+            if system in self._about_to:
+                return "its start, which was due now, is cancelled"
             due = None if system is None else self._schedule.waiting.pop(system, None)
             self._condition.notify_all()
         return "" if due is None else f"its takeoff in {max(0.0, due - self._clock()):.0f} s is cancelled"
@@ -189,25 +204,26 @@ class Takeoffs:
         sortie: int,
         names: Mapping[str, str] | None,
         override: Mapping[str, Collection[str]],
-    ) -> None:
-        """Check the plan's vehicles.
+    ) -> dict[str, Mission]:
+        """Check the plan's vehicles; returns its missions by vehicle.
 
         Raises:
             OrthoSwarmError: not all have passed.
         """
         try:
-            rows = self.preflight(plan, sortie, names)
+            rows, missions = self._check(plan, sortie, names, {})
         except InputError:
             raise
         except OrthoSwarmError as error:
             raise OrthoSwarmError(f"{error}; no vehicle was started") from None
-        wrong = []
-        for row in rows:
-            allowed = override.get(row["vehicle"], ())
-            red = [i for i in row["items"] if i["state"] == "red" and i["name"] not in allowed]
-            wrong += [f"{row['vehicle']}: {item['name']}: {item['reason']}" for item in red]
+        wrong = [f"{row['vehicle']}: {text}" for row in rows for text in _red(row, override.get(row["vehicle"], ()))]
         if wrong:
             raise OrthoSwarmError(f"{'; '.join(wrong)}; no vehicle was started")
+        return missions
+
+    def _due(self, system: int) -> bool:
+        """Whether a vehicle's takeoff waits or is being checked. Without the lock: the fleet's thread never waits."""
+        return system in self._checking or system in self._schedule.waiting or system in self._about_to
 
     def _run(self) -> None:
         """Start each at its time; ends with the last."""
@@ -220,6 +236,7 @@ class Takeoffs:
                     self._condition.wait(due - self._clock())
                     continue
                 ready = self._schedule.due(self._clock())
+                self._about_to.update(ready)
                 if not ready:  # an earlier start is still undecided
                     self._condition.wait(_LOOK_S)
             for system in ready:
@@ -227,18 +244,41 @@ class Takeoffs:
 
     def _start(self, vehicle: str, system: int) -> None:
         """Start one vehicle; if that fails, the waiting ones stay on the ground."""
-        given_s = self._given_s.get(system, self._clock())  # a later one is given by its planned time
-        order = Order(verb="start", system=system, given_s=given_s, stops=self._stops.get(system, 0))
+        stops, given_s = self._stops.get(system, 0), self._given_s.get(system)
         try:
-            self._links.fleet.call(lambda: self._links.fleet.order(order))
+            red = self._red_now(vehicle, system)
+            # A later one is given by its planned time: it has just been checked again.
+            order = Order(verb="start", system=system, given_s=self._clock() if given_s is None else given_s)
+            order.stops = stops
+            if red:
+                order.end(f"{vehicle} was not started: {red}", Verdict.NOT_SENT)
+            else:
+                self._links.fleet.call(lambda: self._order(order))
             while order.outcome is None and not self._closed:
                 time.sleep(_LOOK_S)
-        except Exception as error:  # the links are being closed
+        except Exception as error:  # the links are being closed, or do not answer: nobody else takes off then
             if not self._closed:
                 _log.error("starting %s", vehicle, exc_info=error)
+                self._note(vehicle, system, Outcome(ok=False, text=f"{vehicle} could not be checked and started"))
             return
+        finally:
+            self._about_to.discard(system)
         if order.outcome is not None and not self._closed:
             self._note(vehicle, system, order.outcome)
+
+    def _order(self, order: Order) -> None:
+        """Send a start; in the fleet's thread, so that nobody finds it neither about to start nor under way."""
+        self._about_to.discard(order.system)
+        self._links.fleet.order(order)
+
+    def _red_now(self, vehicle: str, system: int) -> str:
+        """What is red of a vehicle whose time to take off has come, in words; its check may be minutes old.
+
+        Its distances to others are the schedule's.
+        """
+        mission = self._missions[system]
+        (row,) = self._links.preflight([vehicle], {vehicle: mission}, reread=False)
+        return "; ".join(_red(row, {*self._allowed.get(vehicle, ()), "separation"}))
 
     def _note(self, vehicle: str, system: int, outcome: Outcome) -> None:
         """Apply the outcome of one start to the waiting ones."""
@@ -255,6 +295,12 @@ class Takeoffs:
             self._condition.notify_all()
         for text in said:
             self._say(text)
+
+
+def _red(row: Mapping[str, Any], allowed: Collection[str]) -> list[str]:
+    """The red items of a vehicle's check that are not overridden, in words."""
+    red = [item for item in row["items"] if item["state"] == "red" and item["name"] not in allowed]
+    return [f"{item['name']}: {item['reason']}" for item in red]
 
 
 def names_of(body: Mapping[str, Any]) -> tuple[int, dict[str, str]]:

@@ -285,6 +285,7 @@ class VehicleLinks:
         starts: Mapping[str, float] | None = None,
         endurance_s: float | None = None,
         legal_height_m: float | None = None,
+        reread: bool = True,
     ) -> list[dict[str, Any]]:
         """Check vehicles before their start; their missions are read from them first.
 
@@ -293,6 +294,7 @@ class VehicleLinks:
             missions: the plan's mission of each, by vehicle; without it the vehicle's stored mission is flown.
             starts: takeoff of each in seconds after the first; default all at once.
             endurance_s: flight time of a full battery. legal_height_m: height that may be flown without asking.
+            reread: whether missions are read although they were read or written before and nothing changed them since.
 
         Returns:
             A row per vehicle, see the top of this module.
@@ -304,7 +306,9 @@ class VehicleLinks:
         systems = {self.system_of(name): name for name in names}
         wanted = {s: missions[name] for s, name in systems.items() if missions and name in missions}
         times = {s: starts[name] for s, name in systems.items() if starts and name in starts}
-        return self._checks.check(systems, wanted, times, endurance_s=endurance_s, legal_height_m=legal_height_m)
+        return self._checks.check(
+            systems, wanted, times, endurance_s=endurance_s, legal_height_m=legal_height_m, reread=reread
+        )
 
     def command(self, begin: Callable[["Fleet"], "Exchange"], timeout_s: float = 180.0) -> str:
         """Run a dialogue with a vehicle to its end; returns the final text.

@@ -53,6 +53,7 @@ class Fleet:
         own: our address.
         hub: the links. signed: whether it has a key.
         separation: watches the distances of vehicles in the air.
+        takeoff_due: whether a vehicle's takeoff waits or is being checked; it then takes no other mission.
         stops: number of the last command to pause, return or land, by system id; see `told_to_stop`.
     """
 
@@ -104,6 +105,7 @@ class Fleet:
             wall=wall,
         )
         self.separation = self._reception.separation
+        self.takeoff_due: Callable[[int], bool] = lambda _: False
         self.stops: dict[int, int] = {}
         self._stop_numbers = itertools.count(1)
         self._tick_at = 0.0
@@ -195,9 +197,11 @@ class Fleet:
         """Put a mission into a vehicle and read it back.
 
         Raises:
-            OrthoSwarmError: the vehicle is not there, is not a multirotor, is flying its mission, or is busy with
-                another upload or start.
+            OrthoSwarmError: the vehicle is not there, is not a multirotor, is flying its mission, is about to take
+                off, or is busy with another upload or start.
         """
+        if self.takeoff_due(system):
+            raise OrthoSwarmError(f"vehicle {system} waits for its takeoff with the mission it has; cancel that first")
         vehicle = self._flies_missions(system)
         if vehicle.detector.phase is Phase.ACTIVE and vehicle.armed and not self._was_just_paused(system):
             raise OrthoSwarmError(f"vehicle {system} is flying its mission; pause it or let it return first")

@@ -7,6 +7,7 @@ import pytest
 
 from gcs_plugin.daemon.takeoffs import Takeoffs
 from gcs_plugin.links.mavlink import Autopilot
+from gcs_plugin.mission.mission_builder import read_mission
 from gcs_plugin.sim.simulated_swarm import make_swarm
 from orthoswarm.model.errors import OrthoSwarmError
 from tests.vehicles.test_fleet_cli import HOME, folder  # noqa: F401
@@ -74,4 +75,36 @@ def test_a_start_whose_check_took_long_is_not_carried_out_but_can_be_given_again
     with pytest.raises(OrthoSwarmError, match="no vehicle was started; give it again"):
         takeoffs.begin("plan-1", given_s=links.clock() - 6.0)
     assert takeoffs.begin("plan-1") == {"v1": 0.0, "v2": 60.0}
+    takeoffs.close()
+
+
+def test_a_vehicle_whose_takeoff_waits_takes_no_other_mission(open_links, folder):  # noqa: F811
+    apart(folder, 2, 60.0)
+    links = open_links(make_swarm(2, home=HOME))
+    ready(links, 2)
+    upload_all(links, folder)
+    takeoffs = Takeoffs(links, PlanFolder(folder), lambda _: None)
+    takeoffs.begin("plan-1")
+    other = read_mission(folder / "v1.waypoints", links.fleet.vehicles[2].autopilot)
+    with pytest.raises(OrthoSwarmError, match=r"waits for its takeoff .* cancel that first"):
+        links.command(lambda fleet: fleet.upload(2, other))
+    assert links.commands("pause", ["v2"])[0]["outcome"] == "done"
+    links.command(lambda fleet: fleet.upload(2, other))
+    takeoffs.close()
+
+
+def test_what_has_become_red_until_the_takeoff_holds_the_vehicle_and_the_rest(open_links, folder):  # noqa: F811
+    apart(folder, 3, 4.0)
+    vehicles = make_swarm(3, home=HOME)
+    links = open_links(vehicles)
+    ready(links, 3)
+    upload_all(links, folder)
+    said = []
+    takeoffs = Takeoffs(links, PlanFolder(folder), said.append)
+    takeoffs.begin("plan-1")
+    vehicles[1].ready_s = 1e9  # its filter fails
+    wait(lambda: "failed" in takeoffs.rows().get("v3", {}), 40.0)
+    assert "v2 was not started: gps: no 3D fix" in takeoffs.rows()["v2"]["failed"]
+    assert any("v3 stay on the ground" in text for text in said)
+    assert not vehicles[1].flight.armed and not vehicles[2].flight.armed
     takeoffs.close()
