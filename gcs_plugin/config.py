@@ -30,6 +30,12 @@ class FlightLimits:
     """Flight time of a full battery, seconds (chosen: a small multicopter's)."""
     reserve_share: float = 0.2
     """Share of the battery that is to be left after landing (chosen: what pilots keep)."""
+    start_off_m: float = 15.0
+    """How far from its mission's takeoff a vehicle may stand, metres: as far as vehicles may be from a start that they
+    share in a plan (`planning.pad_distances` separation distances)."""
+    start_off_height_m: float = 15.0
+    """The same in height above the sea, where both are known, metres: receivers err by 5 m in height, global height
+    models by up to 10 m (SRTM, Copernicus: 90 % within 4 to 9 m)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

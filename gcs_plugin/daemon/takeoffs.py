@@ -51,13 +51,19 @@ class Takeoffs:
         links.fleet.takeoff_due = self._due
 
     def preflight(
-        self, plan: str, sortie: int = 1, names: Mapping[str, str] | None = None, **limits: float | None
+        self,
+        plan: str,
+        sortie: int = 1,
+        names: Mapping[str, str] | None = None,
+        *,
+        endurance_s: float | None = None,
+        legal_height_m: float | None = None,
     ) -> list[dict[str, Any]]:
         """Check a plan's vehicles before their start.
 
         Args:
             plan, sortie, names: as for `begin`.
-            limits: `endurance_s`, `legal_height_m`, as for `VehicleLinks.preflight`.
+            endurance_s, legal_height_m: as for `VehicleLinks.preflight`.
 
         Returns:
             A row per vehicle, as from `VehicleLinks.preflight`.
@@ -66,10 +72,16 @@ class Takeoffs:
             InputError: there is no such plan or flight.
             OrthoSwarmError: vehicles are not heard.
         """
-        return self._check(plan, sortie, names, limits)[0]
+        return self._check(plan, sortie, names, endurance_s=endurance_s, legal_height_m=legal_height_m)[0]
 
     def _check(
-        self, plan: str, sortie: int, names: Mapping[str, str] | None, limits: Mapping[str, float | None]
+        self,
+        plan: str,
+        sortie: int,
+        names: Mapping[str, str] | None,
+        *,
+        endurance_s: float | None = None,
+        legal_height_m: float | None = None,
     ) -> tuple[list[dict[str, Any]], dict[str, Mission]]:
         """The rows of `preflight`, and the plan's missions by vehicle."""
         starts = self._plans.starts(plan, sortie)
@@ -80,7 +92,10 @@ class Takeoffs:
             mission = vehicle if sortie == 1 else f"{vehicle}-sortie{sortie}"
             missions[name] = self._plans.mission({"plan": plan, "mission": mission}, vehicle, known.autopilot)
         times = {whose[vehicle]: start_s for vehicle, start_s in starts.items()}
-        return self._links.preflight(list(whose.values()), missions, starts=times, **limits), missions
+        rows = self._links.preflight(
+            list(whose.values()), missions, starts=times, endurance_s=endurance_s, legal_height_m=legal_height_m
+        )
+        return rows, missions
 
     def begin(
         self,
@@ -211,7 +226,7 @@ class Takeoffs:
             OrthoSwarmError: not all have passed.
         """
         try:
-            rows, missions = self._check(plan, sortie, names, {})
+            rows, missions = self._check(plan, sortie, names)
         except InputError:
             raise
         except OrthoSwarmError as error:

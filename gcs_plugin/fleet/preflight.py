@@ -14,7 +14,8 @@ from gcs_plugin.fleet.separation_watch import number_name
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.command_dialogues import unflyable
 from gcs_plugin.mission.comparison import difference
-from gcs_plugin.mission.track import Airspace, fastest_m_s, flight_seconds, highest_m
+from gcs_plugin.mission.items import FRAME_GLOBAL, PLAIN_FRAME
+from gcs_plugin.mission.track import Airspace, fastest_m_s, flight_seconds, highest_m, takeoff_place
 from orthoswarm.model.earth import distance_m
 
 if TYPE_CHECKING:
@@ -114,7 +115,7 @@ def preflight(vehicle: "Vehicle", wanted: Wanted, now: float) -> Check:
     """
     mission = wanted.mission or wanted.stored or vehicle.mission
     items = (
-        _link(vehicle, now), _gps(vehicle), _ekf(vehicle), _home(vehicle), _prearm(vehicle, now),
+        _link(vehicle, now), _gps(vehicle), _ekf(vehicle), _home(vehicle, mission, wanted), _prearm(vehicle, now),
         _battery(vehicle, mission, wanted.endurance_s), _mission(vehicle, wanted), _height(mission, wanted),
         _speed(vehicle, mission),
         Item("separation", Level.RED, wanted.near) if wanted.near else Item("separation", Level.OK, "keeps apart"),
@@ -208,7 +209,10 @@ def _ekf(vehicle: "Vehicle") -> Item:
     return Item("ekf", Level.OK, "position filter is running")
 
 
-def _home(vehicle: "Vehicle") -> Item:
+def _home(vehicle: "Vehicle", mission: "Mission | None", wanted: Wanted) -> Item:
+    off = _off_start(vehicle, mission, wanted) if mission is not None and not vehicle.flying else ""
+    if off:
+        return Item("home", Level.RED, f"{off}; plan from where it stands, or put it there")
     if vehicle.home is None:
         return Item("home", Level.WARNING, "not set yet; it is set when the vehicle arms")
     if vehicle.lat_deg is None or vehicle.lon_deg is None:
@@ -217,6 +221,24 @@ def _home(vehicle: "Vehicle") -> Item:
     if away > _HOME_M and not vehicle.flying:
         return Item("home", Level.WARNING, f"home is {away:.0f} m away from where it stands")
     return Item("home", Level.OK, "set")
+
+
+def _off_start(vehicle: "Vehicle", mission: "Mission", wanted: Wanted) -> str:
+    """How far a vehicle stands from where its mission takes off, in words; empty if it stands there."""
+    first = mission.items[0] if mission.first_seq and mission.items and wanted.mission is not None else None
+    place = takeoff_place(mission)
+    if place is None and first is not None and (first.x or first.y):  # a vehicle's own item 0 is its home
+        place = first.lat_deg, first.lon_deg
+    if place is not None and vehicle.lat_deg is not None and vehicle.lon_deg is not None:
+        away = distance_m(vehicle.lat_deg, vehicle.lon_deg, *place)
+        if away > LIMITS.start_off_m:
+            return f"it stands {away:.0f} m from where its mission takes off"
+    known = first is not None and first.z and PLAIN_FRAME.get(first.frame, first.frame) == FRAME_GLOBAL
+    if known and first is not None and vehicle.alt_m is not None:
+        above = vehicle.alt_m - first.z
+        if abs(above) > LIMITS.start_off_height_m:
+            return f"it stands {abs(above):.0f} m {'above' if above > 0 else 'below'} where its mission takes off"
+    return ""
 
 
 def _prearm(vehicle: "Vehicle", now: float) -> Item:

@@ -48,7 +48,7 @@ class Vehicle:
         heard: when it was heard last (the fleet's clock).
         lat_deg: latitude, None before the first position; lon_deg: longitude.
         reported: True once it has sent a position message, if only to say that it has no position.
-        height_m: above takeoff.
+        height_m: above takeoff. alt_m: above the sea, None before the first position.
         velocity_m_s: north, east, down. heading_rad: clockwise from north, None if it does not know.
         roll_rad: attitude of the airframe, with pitch_rad and yaw_rad.
         boot_utc_s: UTC epoch seconds of its start, from its SYSTEM_TIME; None before it knows the time.
@@ -60,6 +60,7 @@ class Vehicle:
         ekf_ok: whether its filter has an absolute position; None if not reported.
         prearm_ok: whether its pre-arm checks have passed; None if not reported.
         home: latitude and longitude of its home in degrees, None before it is set.
+        home_alt_m: altitude of its home above the sea, None before it is set.
         ask_why_at: when it may be asked again why it would not arm (the fleet's clock).
         pace: seconds of its clock in one of ours; 1 but for a simulation that runs fast or slow.
         launch: where it armed last, latitude and longitude in degrees.
@@ -84,6 +85,7 @@ class Vehicle:
     lon_deg: float | None = None
     reported: bool = False
     height_m: float = 0.0
+    alt_m: float | None = None
     velocity_m_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
     heading_rad: float | None = None
     roll_rad: float | None = None
@@ -107,6 +109,7 @@ class Vehicle:
     ekf_ok: bool | None = None
     prearm_ok: bool | None = None
     home: tuple[float, float] | None = None
+    home_alt_m: float | None = None
     launch: tuple[float, float] | None = None
     top_speed: tuple[str, float] | None = None
     ask_why_at: float = 0.0
@@ -238,6 +241,7 @@ class Vehicle:
         self.reported = True
         self.lat_deg, self.lon_deg = (m.lat / 1e7, m.lon / 1e7) if has_place(m) else (None, None)
         self.height_m = m.relative_alt / 1e3
+        self.alt_m = None if self.lat_deg is None else m.alt / 1e3
         self.velocity_m_s = (m.vx / 100.0, m.vy / 100.0, m.vz / 100.0)
         self.heading_rad = None if m.hdg == 65535 else math.radians(m.hdg / 100.0)
         self.time_boot_s = m.time_boot_ms / 1e3
@@ -275,7 +279,7 @@ class Vehicle:
         self.ekf_ok = m.flags & _EKF_NEEDED == _EKF_NEEDED and not m.flags & wrong
 
     def _home(self, m: Message) -> None:
-        self.home = (m.latitude / 1e7, m.longitude / 1e7)
+        self.home, self.home_alt_m = (m.latitude / 1e7, m.longitude / 1e7), m.altitude / 1e3
 
     def _parameter(self, m: Message) -> None:
         name, scale = str(m.param_id).strip("\x00"), SPEED_PARAMETERS[self.autopilot]

@@ -13,7 +13,17 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gcs_plugin.mission.items import CHANGE_SPEED, FRAME_GLOBAL, LAND, LOITER_TIME, PLAIN_FRAME, RTL, TAKEOFF, VTOL_LAND
+from gcs_plugin.mission.items import (
+    CHANGE_SPEED,
+    FRAME_GLOBAL,
+    LAND,
+    LOITER_TIME,
+    PLAIN_FRAME,
+    RTL,
+    TAKEOFF,
+    VTOL_LAND,
+    VTOL_TAKEOFF,
+)
 from orthoswarm.config import active
 from orthoswarm.config.autopilot import AutopilotConfig
 from orthoswarm.model.earth import DEGREE_M
@@ -272,11 +282,18 @@ def _near(a: Array, b: Array, distance_m: float) -> tuple[Ints, Ints]:
     return i[nearer], j[nearer]
 
 
+def takeoff_place(mission: "Mission") -> tuple[float, float] | None:
+    """The place that the takeoff of a mission states, degrees; None if it states none."""
+    for item in mission.items[mission.first_seq :]:
+        if item.command in (TAKEOFF, VTOL_TAKEOFF) and (item.x or item.y):
+            return item.lat_deg, item.lon_deg
+    return None
+
+
 def home_of(mission: "Mission") -> tuple[float, float] | None:
     """Where a mission takes off, degrees: its takeoff's place, ArduPilot's item 0, or the first waypoint."""
-    for item in mission.items[mission.first_seq :]:
-        if item.command == TAKEOFF and (item.x or item.y):
-            return item.lat_deg, item.lon_deg
+    if (place := takeoff_place(mission)) is not None:
+        return place
     if mission.first_seq and mission.items and (mission.items[0].x or mission.items[0].y):
         return mission.items[0].lat_deg, mission.items[0].lon_deg
     return next(((i.lat_deg, i.lon_deg) for i in mission.items if i.has_place and (i.x or i.y)), None)

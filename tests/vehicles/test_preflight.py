@@ -98,7 +98,8 @@ def test_each_item_turns_red_for_its_own_reason(make_world):
 
 
 def test_missions_that_cross_without_a_plan_are_red(make_world):
-    world = make_world(SimVehicle(system=1, autopilot=AP), SimVehicle(system=2, autopilot=AP))
+    second = SimVehicle(system=2, autopilot=AP, home=(*CHART.to_degrees(0.0, 80.0), 488.0))
+    world = make_world(SimVehicle(system=1, autopilot=AP), second)
     world.wait(8.0)
     missions = {1: line(AP, 40, 60), 2: line(AP, 40, 60, home_east=80.0)}
     checks = preflight_all(dict(world.fleet.vehicles), {}, missions, {}, world.clock.now)
