@@ -15,6 +15,7 @@ For the HTTP API and the page, all in JSON values:
   `paused`, `returning`, `landing`, `holding`, `flying`, `lost`, `complete`), `text` (`on mission 7/13`), `item` and
   `items`.
 - `alarm` in each row of `rows()`: what is wrong with where it flies, and what to do; empty if nothing is.
+- `behind` in each row of `rows()`: by how much it is behind its plan, in words; empty if it is not.
 - `fence` in each row of `rows()`: the geofence that the vehicle holds, see `Fences.of`.
 - `clock()` is the monotonic clock by which commands expire: a page that gets it from the event stream can state when
   its command was given, so that a delayed one is not executed late.
@@ -423,6 +424,7 @@ class VehicleLinks:
         record = self._record(vehicle.system)
         row = vehicle.summary(now) | {"id": record.id, "name": self._titles.get(record.id, "")}
         row["alarm"] = self.fleet.separation.text(vehicle.system, self.name_of)
+        row["behind"] = self.fleet.behind(vehicle.system)
         row["yaw_deg"], row["alt_m"] = row["heading_deg"], self.traffic.alt_m(vehicle.system)
         if vehicle.lat_deg is not None and vehicle.lon_deg is not None:
             point = (round(vehicle.lon_deg, 7), round(vehicle.lat_deg, 7))

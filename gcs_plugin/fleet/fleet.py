@@ -254,6 +254,10 @@ class Fleet:
         """State of each vehicle's mission, as JSON values by system id; for `remembered` after a restart."""
         return {system: vehicle.detector.state() for system, vehicle in self.vehicles.items()}
 
+    def behind(self, system: int) -> str:
+        """How far a vehicle is behind its plan, in words; empty if it is not."""
+        return self._reception.behind(system)
+
     def busy(self, system: int) -> bool:
         """True while a dialogue with a vehicle is under way."""
         return self._dialogues.busy(system)

@@ -282,8 +282,15 @@ class Reception:
         was = watched.behind
         watched.look(vehicle.time_boot_s, vehicle.lat_deg, vehicle.lon_deg, vehicle.height_m)
         if watched.behind and not was:
-            text = f"is {watched.late_s:.0f} s behind its plan, which keeps others apart for {watched.allowed_s:.0f} s"
-            self._event("behind", vehicle, f"{text}: watch its distances, and pause it before it comes near another")
+            self._event("behind", vehicle, self.behind(vehicle.system))
+
+    def behind(self, system: int) -> str:
+        """How far a vehicle is behind its plan, in words; empty if it is not."""
+        watched = self._lateness.get(system)
+        if watched is None or not watched.behind:
+            return ""
+        text = f"is {watched.late_s:.0f} s behind its plan, which keeps others apart for {watched.allowed_s:.0f} s"
+        return f"{text}: watch its distances, and pause it before it comes near another"
 
     def _compare_routes(self, vehicle: Vehicle, now: float) -> None:
         """Decide by the clocks whether one vehicle is on two links, or several vehicles share a system id."""

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
 from gcs_plugin.config import ALARM, HEARING
@@ -24,6 +24,7 @@ class Near:
         one: system id. other: system id of the one that should be paused.
         metres: horizontal distance. height_m: difference in height.
         ahead_s: in how many seconds, if both fly straight on; 0 for now.
+        silent: vehicles of the two that are not heard, so that it is not known whether they are still near.
     """
 
     one: int
@@ -31,6 +32,7 @@ class Near:
     metres: float
     height_m: float
     ahead_s: float = 0.0
+    silent: tuple[int, ...] = ()
 
     @property
     def pair(self) -> tuple[int, int]:
@@ -57,8 +59,13 @@ class SeparationWatch:
     alarms: dict[tuple[int, int], Near] = field(default_factory=dict)
 
     def look(self, vehicles: "Iterable[Vehicle]", now: float) -> tuple[list[Near], list[tuple[int, int]]]:
-        """Compare all pairs; returns new alarms, and the pairs whose alarm is over."""
-        flying = [v for v in vehicles if v.flying and v.lat_deg is not None and now - v.heard < HEARING.fresh_s]
+        """Compare all pairs; returns new or newly unknown alarms, and the pairs whose alarm is over.
+
+        The alarm of a pair stays while one of the two that flew is not heard: nobody knows that they are apart.
+        """
+        aloft = {v.system: v for v in vehicles if v.flying and v.lat_deg is not None}
+        silent = {s for s, v in aloft.items() if now - v.heard >= HEARING.fresh_s}
+        flying = [v for s, v in aloft.items() if s not in silent]
         found: dict[tuple[int, int], Near] = {}
         if len(flying) > 1:
             shrink = math.cos(math.radians(flying[0].lat_deg or 0.0))
@@ -67,11 +74,18 @@ class SeparationWatch:
                 for other, north2, east2, reach2, second in places[index + 1 :]:
                     if abs(north2 - north) >= reach + reach2 or abs(east2 - east) >= reach + reach2:
                         continue  # most pairs: they cannot meet
-                    apart = north2 - north, east2 - east, first.height_m - second.height_m
-                    met = self._meeting(apart, first, second, ALARM.over_share if (one, other) in self.alarms else 1.0)
+                    over = ALARM.over_share if (one, other) in self.alarms else 1.0
+                    meetings = [
+                        self._meeting((north2 - north, east2 - east, down), first, second, over)
+                        for down in _height_differences(first, second)
+                    ]
+                    met = min((meeting for meeting in meetings if meeting is not None), default=None)
                     if met is not None:
                         found[one, other] = Near(*_proposal(first, second), *met)
-        new = [near for pair, near in found.items() if pair not in self.alarms]
+        for pair, near in self.alarms.items():
+            if silent.intersection(pair) and aloft.keys() >= {*pair}:
+                found[pair] = replace(near, silent=tuple(sorted(silent.intersection(pair))))
+        new = [n for p, n in found.items() if p not in self.alarms or (n.silent and not self.alarms[p].silent)]
         ended = [pair for pair in self.alarms if pair not in found]
         self.alarms = found
         return new, ended
@@ -116,6 +130,12 @@ class SeparationWatch:
 def near_text(near: Near, watch: SeparationWatch, name: Callable[[int], str] = number_name) -> str:
     """An alarm in words; `name` gives the names of vehicles."""
     one, other = name(near.one), name(near.other)
+    if near.silent:
+        lost = " and ".join(name(system) for system in near.silent)
+        return (
+            f"{one} and {other} were {near.metres:.1f} m apart and {near.height_m:.1f} m in height; where they are now "
+            f"is not known, the link to {lost} is lost: pause {other}"
+        )
     when = f"will be in {near.ahead_s:.0f} s" if near.ahead_s >= 1.0 else "are"
     return (
         f"{one} and {other} {when} {near.metres:.1f} m apart and {near.height_m:.1f} m in height "
@@ -132,6 +152,17 @@ def _proposal(one: "Vehicle", other: "Vehicle") -> tuple[int, int]:
     """Which vehicle should be paused: the faster of the two, as it approaches the other."""
     fast, slow = sorted((one, other), key=lambda v: -math.hypot(*v.velocity_m_s[:2]))
     return slow.system, fast.system
+
+
+def _height_differences(one: "Vehicle", other: "Vehicle") -> list[float]:
+    """How much higher `one` is, metres: above the two takeoffs, and above the sea where both know it.
+
+    Either may be wrong: takeoffs may lie at different heights, and receivers err in height.
+    """
+    differences = [one.height_m - other.height_m]
+    if one.alt_m is not None and other.alt_m is not None:
+        differences.append(one.alt_m - other.alt_m)
+    return differences
 
 
 def _place(vehicle: "Vehicle", ahead_s: float) -> tuple[float, float]:
