@@ -30,6 +30,9 @@ class FlightLimits:
     """Flight time of a full battery, seconds (chosen: a small multicopter's)."""
     reserve_share: float = 0.2
     """Share of the battery that is to be left after landing (chosen: what pilots keep)."""
+    old_s: float = 15.0
+    """The state of battery or receiver that was reported longer ago is not that of now, seconds: both come once a
+    second, and are asked for again three seconds after they stop (chosen)."""
     start_off_m: float = 15.0
     """How far from its mission's takeoff a vehicle may stand, metres: as far as vehicles may be from a start that they
     share in a plan (`planning.pad_distances` separation distances)."""

@@ -19,6 +19,8 @@ _BACKOFF_S: Final = (3.0, 60.0)
 
 GLOBAL_POSITION_INT: Final = int(dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT)
 ATTITUDE: Final = int(dialect.MAVLINK_MSG_ID_ATTITUDE)
+GPS_RAW_INT: Final = int(dialect.MAVLINK_MSG_ID_GPS_RAW_INT)
+SYS_STATUS: Final = int(dialect.MAVLINK_MSG_ID_SYS_STATUS)
 # Each autopilot's message about its filter.
 _ARDUPILOT_ONLY: Final = int(dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT)
 _PX4_ONLY: Final = int(dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS)
@@ -30,7 +32,7 @@ class Rates:
 
     Attributes:
         wanted: requested until received.
-        optional: requested once; vehicles without a gimbal do not have its attitude.
+        optional: requested once, and again if they stop; vehicles without a gimbal do not have its attitude.
     """
 
     wanted: dict[int, float]
@@ -53,10 +55,10 @@ def default_rates() -> Rates:
             int(dialect.MAVLINK_MSG_ID_MISSION_CURRENT): 2.0,
             int(dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE): 1.0,
             int(dialect.MAVLINK_MSG_ID_SYSTEM_TIME): 1.0,
+            GPS_RAW_INT: 1.0,
+            SYS_STATUS: 1.0,
         },
         {
-            int(dialect.MAVLINK_MSG_ID_GPS_RAW_INT): 1.0,
-            int(dialect.MAVLINK_MSG_ID_SYS_STATUS): 1.0,
             int(dialect.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS): pose_hz,
             # Only from a rangefinder that states its limits: a height from a coarse terrain map is worse than none.
             int(dialect.MAVLINK_MSG_ID_DISTANCE_SENSOR): 2.0,
@@ -72,7 +74,7 @@ class _Stream:
     hz: float
     optional: bool
     count: int = 0
-    last: float = 0.0
+    last: float | None = None
     again_at: float = 0.0
     backoff_s: float = _BACKOFF_S[0]
 
@@ -106,8 +108,14 @@ class Streams:
     def start(self, now: float) -> list[Message]:
         """Request everything (again after a reboot, or when a vehicle is found again)."""
         wanted = {**self.rates.wanted, **self.rates.optional}
+        before = self._streams
         self._streams = {
-            kind: _Stream(hz=hz, optional=kind in self.rates.optional, again_at=now + _BACKOFF_S[0])
+            kind: _Stream(
+                hz=hz,
+                optional=kind in self.rates.optional,
+                again_at=now + _BACKOFF_S[0],
+                last=before[kind].last if kind in before else None,
+            )
             for kind, hz in wanted.items()
         }
         self.refused.clear()
@@ -120,6 +128,11 @@ class Streams:
         if stream is not None:
             stream.count += 1
             stream.last = now
+
+    def age_s(self, kind: int, now: float) -> float | None:
+        """Seconds since a message came last, None if it never has."""
+        stream = self._streams.get(kind)
+        return None if stream is None or stream.last is None else max(0.0, now - stream.last)
 
     def acknowledged(self, message: Message, now: float) -> list[Message]:
         """Process a COMMAND_ACK."""
@@ -169,9 +182,11 @@ class Streams:
         """Queue requests for messages that have stopped or whose rate another ground station has changed."""
         whole_window = now - self._window >= _WINDOW_S
         for kind, stream in self._streams.items():
-            if stream.optional or now < stream.again_at:
+            if (stream.optional and stream.last is None) or now < stream.again_at:
                 continue
-            stopped = now - stream.last > max(3.0, 4.0 / stream.hz)
+            stopped = stream.last is None or now - stream.last > max(3.0, 4.0 / stream.hz)
+            if stream.optional and not stopped:
+                continue  # at whatever rate it comes
             rate = stream.count / (now - self._window) if whole_window else stream.hz
             if stopped or not 0.4 * stream.hz <= rate <= 2.0 * stream.hz + 1.0:
                 self._queue.append(kind)

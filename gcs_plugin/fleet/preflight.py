@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from gcs_plugin.config import LIMITS
+from gcs_plugin.fleet.message_rates import GPS_RAW_INT, SYS_STATUS
 from gcs_plugin.fleet.separation_watch import number_name
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.command_dialogues import unflyable
@@ -115,8 +116,8 @@ def preflight(vehicle: "Vehicle", wanted: Wanted, now: float) -> Check:
     """
     mission = wanted.mission or wanted.stored or vehicle.mission
     items = (
-        _link(vehicle, now), _gps(vehicle), _ekf(vehicle), _home(vehicle, mission, wanted), _prearm(vehicle, now),
-        _battery(vehicle, mission, wanted.endurance_s), _mission(vehicle, wanted), _height(mission, wanted),
+        _link(vehicle, now), _gps(vehicle, now), _ekf(vehicle), _home(vehicle, mission, wanted), _prearm(vehicle, now),
+        _battery(vehicle, mission, wanted.endurance_s, now), _mission(vehicle, wanted), _height(mission, wanted),
         _speed(vehicle, mission),
         Item("separation", Level.RED, wanted.near) if wanted.near else Item("separation", Level.OK, "keeps apart"),
     )  # fmt: skip
@@ -189,8 +190,10 @@ def _link(vehicle: "Vehicle", now: float) -> Item:
     return Item("link", level, f"heard {age:.1f} s ago")
 
 
-def _gps(vehicle: "Vehicle") -> Item:
+def _gps(vehicle: "Vehicle", now: float) -> Item:
     count = vehicle.satellites
+    if (age_s := vehicle.streams.age_s(GPS_RAW_INT, now) or 0.0) > LIMITS.old_s:
+        return Item("gps", Level.RED, f"it has not reported its receiver's state for {age_s:.0f} s")
     if vehicle.gps_fix < 3:
         return Item("gps", Level.RED, f"no 3D fix ({count if count != _UNKNOWN_SATELLITES else 0} satellites)")
     if vehicle.lat_deg is None:
@@ -252,8 +255,10 @@ def _prearm(vehicle: "Vehicle", now: float) -> Item:
     return Item("pre-arm", Level.OK, "its own checks passed")
 
 
-def _battery(vehicle: "Vehicle", mission: "Mission | None", endurance_s: float) -> Item:
+def _battery(vehicle: "Vehicle", mission: "Mission | None", endurance_s: float, now: float) -> Item:
     left = vehicle.battery
+    if (age_s := vehicle.streams.age_s(SYS_STATUS, now) or 0.0) > LIMITS.old_s:
+        return Item("battery", Level.RED, f"it has not reported its battery for {age_s:.0f} s")
     if left is None:
         return Item("battery", Level.WARNING, "it does not report its battery")
     needed = flight_seconds(mission) / endurance_s if mission is not None else 0.0

@@ -5,8 +5,9 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Any, Final
 
+from gcs_plugin.config import HEARING
 from gcs_plugin.fleet.flight_state import flight_state
-from gcs_plugin.fleet.message_rates import Streams
+from gcs_plugin.fleet.message_rates import GPS_RAW_INT, SYS_STATUS, Streams
 from gcs_plugin.fleet.routes import Route, Routes
 from gcs_plugin.fleet.telemetry_check import has_place
 from gcs_plugin.links.mavlink import Autopilot, Message, dialect
@@ -192,7 +193,11 @@ class Vehicle:
             handler(self, message)
 
     def summary(self, now: float) -> dict[str, Any]:
-        """Its state as JSON values, for `fleet list --json` and the web map."""
+        """Its state as JSON values, for `fleet list --json` and the web map.
+
+        `battery_s` and `gps_s` are the whole seconds since when the battery's state and the receiver's (`gps_fix`,
+        `satellites`) have not been reported: 0 while they come, None if they never came.
+        """
         return {
             "id": self.id,
             "system": self.system,
@@ -212,6 +217,8 @@ class Vehicle:
             "heading_deg": None if self.heading_rad is None else round(math.degrees(self.heading_rad), 1),
             "speed_m_s": round(math.hypot(*self.velocity_m_s[:2]), 2),
             "battery": self.battery,
+            "battery_s": _old_s(self.streams.age_s(SYS_STATUS, now)),
+            "gps_s": _old_s(self.streams.age_s(GPS_RAW_INT, now)),
             "gps_fix": self.gps_fix,
             "satellites": self.satellites,
             "mission": {
@@ -291,6 +298,11 @@ class Vehicle:
         known = len(self._pictures)
         self._pictures.add((int(index), int(getattr(m, "time_usec", 0) or getattr(m, "time_utc", 0))))
         self.photos += len(self._pictures) - known
+
+
+def _old_s(age_s: float | None) -> int | None:
+    """The age of a value in whole seconds, 0 while it is renewed: rows change, and are sent, only if it matters."""
+    return None if age_s is None else 0 if age_s < HEARING.lost_s else int(age_s)
 
 
 _HANDLERS: Final = {
