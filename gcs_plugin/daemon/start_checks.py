@@ -14,6 +14,7 @@ from orthoswarm.model.errors import OrthoSwarmError
 
 if TYPE_CHECKING:
     from gcs_plugin.fleet.fleet import Fleet
+    from gcs_plugin.fleet.separation_check import Separation
     from gcs_plugin.mission.download import MissionDownload
     from gcs_plugin.mission.items import Mission
 
@@ -26,10 +27,13 @@ class StartChecks:
 
     Args:
         fleet: the vehicles. name_of: id of a vehicle by its system id.
+        waiting: vehicle -> its takeoff that waits or failed, see `Takeoffs.rows`.
     """
 
-    def __init__(self, fleet: "Fleet", name_of: Callable[[int], str]) -> None:
-        self._fleet, self._name_of = fleet, name_of
+    def __init__(
+        self, fleet: "Fleet", name_of: Callable[[int], str], waiting: Callable[[], Mapping[str, Mapping[str, Any]]]
+    ) -> None:
+        self._fleet, self._name_of, self._waiting = fleet, name_of, waiting
         self._read: dict[int, tuple[float, Mission]] = {}
 
     def check(
@@ -53,8 +57,13 @@ class StartChecks:
             A row per vehicle, see the top of `vehicles`.
         """
         from gcs_plugin.fleet.preflight import preflight_all
+        from gcs_plugin.fleet.separation_check import Separation
 
         stored = self._missions(systems, reread=reread)
+        separation = Separation()
+        if reread:  # it is a schedule's, otherwise
+            first = min(starts.values(), default=0.0)
+            separation = self._separation(systems, missions, stored, {s: at - first for s, at in starts.items()})
         checks = self._fleet.call(
             lambda: preflight_all(
                 {s: self._fleet.vehicles[s] for s in systems},
@@ -65,9 +74,32 @@ class StartChecks:
                 endurance_s=endurance_s or LIMITS.endurance_s,
                 legal_height_m=legal_height_m or LIMITS.legal_height_m,
                 name=self._name_of,
+                separation=separation,
             )
         ).result(_READ_S)
         return [check.document(systems[check.system]) for check in checks]
+
+    def _separation(
+        self,
+        systems: Collection[int],
+        missions: "Mapping[int, Mission]",
+        stored: "Mapping[int, Mission]",
+        starts: Mapping[int, float],
+    ) -> "Separation":
+        """How they keep apart from each other and from others, found in this thread: the links' must not wait."""
+        from gcs_plugin.fleet.separation_check import flights_of, others_of, separation_of
+
+        rows = self._waiting()
+        waits = {
+            s: rows[n]["in_s"] for s in list(self._fleet.vehicles) if "in_s" in rows.get(n := self._name_of(s), ())
+        }
+        flights = self._fleet.call(
+            lambda: (
+                others_of({s: v for s, v in self._fleet.vehicles.items() if s not in systems}, waits)
+                | flights_of({s: self._fleet.vehicles[s] for s in systems}, missions, stored, starts)
+            )
+        ).result(_READ_S)
+        return separation_of(flights, self._name_of)
 
     def _missions(self, systems: Collection[int], *, reread: bool) -> "dict[int, Mission]":
         """The missions stored in vehicles, of those that answer in time."""

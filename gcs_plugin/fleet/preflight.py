@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, Any, Final
 
 from gcs_plugin.config import LIMITS
 from gcs_plugin.fleet.message_rates import GPS_RAW_INT, SYS_STATUS
+from gcs_plugin.fleet.separation_check import Separation, flights_of, separation_of
 from gcs_plugin.fleet.separation_watch import number_name
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.command_dialogues import unflyable
 from gcs_plugin.mission.comparison import difference
 from gcs_plugin.mission.items import FRAME_GLOBAL, PLAIN_FRAME
-from gcs_plugin.mission.track import Airspace, fastest_m_s, flight_seconds, highest_m, takeoff_place
+from gcs_plugin.mission.track import fastest_m_s, flight_seconds, highest_m, takeoff_place
 from orthoswarm.model.earth import distance_m
 
 if TYPE_CHECKING:
@@ -99,6 +100,7 @@ class Wanted:
         endurance_s: flight time of a full battery.
         legal_height_m: height above takeoff that may be flown without asking.
         near: finding of the separation check about this vehicle, empty if none.
+        unexamined: why its separation from others could not be examined, empty if it was.
     """
 
     mission: "Mission | None" = None
@@ -106,6 +108,7 @@ class Wanted:
     endurance_s: float = LIMITS.endurance_s
     legal_height_m: float = LIMITS.legal_height_m
     near: str = ""
+    unexamined: str = ""
 
 
 def preflight(vehicle: "Vehicle", wanted: Wanted, now: float) -> Check:
@@ -119,7 +122,7 @@ def preflight(vehicle: "Vehicle", wanted: Wanted, now: float) -> Check:
         _link(vehicle, now), _gps(vehicle, now), _ekf(vehicle), _home(vehicle, mission, wanted), _prearm(vehicle, now),
         _battery(vehicle, mission, wanted.endurance_s, now), _mission(vehicle, wanted), _height(mission, wanted),
         _speed(vehicle, mission),
-        Item("separation", Level.RED, wanted.near) if wanted.near else Item("separation", Level.OK, "keeps apart"),
+        _separation(wanted),
     )  # fmt: skip
     return Check(vehicle.system, items)
 
@@ -134,6 +137,7 @@ def preflight_all(
     endurance_s: float = LIMITS.endurance_s,
     legal_height_m: float = LIMITS.legal_height_m,
     name: Callable[[int], str] = number_name,
+    separation: Separation | None = None,
 ) -> list[Check]:
     """Check vehicles that are to start together.
 
@@ -145,33 +149,21 @@ def preflight_all(
         now: the fleet's clock.
         endurance_s, legal_height_m: see Wanted.
         name: name of a vehicle by its system id.
+        separation: of them from each other and from others, where that was examined before.
     """
-    flown = {s: m for s, v in vehicles.items() if (m := missions.get(s) or stored.get(s) or v.mission) is not None}
-    near = conflict_texts(flown, starts, name) if set(flown) - set(missions) else {}
+    if separation is None:
+        separation = separation_of(flights_of(vehicles, missions, stored, starts), name)
     return [
         preflight(
             vehicle,
-            Wanted(missions.get(s), stored.get(s), endurance_s, legal_height_m, near.get(s, "")),
+            Wanted(
+                missions.get(s), stored.get(s), endurance_s, legal_height_m,
+                separation.near.get(s, ""), separation.unexamined.get(s, ""),
+            ),
             now,
         )
         for s, vehicle in sorted(vehicles.items())
-    ]
-
-
-def conflict_texts(
-    missions: "Mapping[int, Mission]", starts: Mapping[int, float], name: Callable[[int], str] = number_name
-) -> dict[int, str]:
-    """For vehicles whose missions come too close with these starts: the other vehicle, the time, the distance.
-
-    Missions of one plan with the plan's own starts are separated by construction and need no check.
-    """
-    found: dict[int, list[str]] = {}
-    for one, other, at, metres in Airspace.of(missions).conflicts({s: starts.get(s, 0.0) for s in missions}):
-        for mine, theirs in ((one, other), (other, one)):
-            found.setdefault(mine, []).append(f"{metres:.0f} m from {name(theirs)} after {at:.0f} s")
-    return {
-        s: f"comes within {', '.join(texts[:3])}; start them later, or plan them together" for s, texts in found.items()
-    }
+    ]  # fmt: skip
 
 
 def red_text(checks: Sequence[Check], overridden: Mapping[int, Iterable[str]]) -> dict[int, str]:
@@ -293,6 +285,14 @@ def _height(mission: "Mission | None", wanted: Wanted) -> Item:
         text = f"goes up to {top:.0f} m, above {wanted.legal_height_m:.0f} m; allow it if you may fly there"
         return Item("height", Level.RED, text)
     return Item("height", Level.OK, f"goes up to {top:.0f} m")
+
+
+def _separation(wanted: Wanted) -> Item:
+    if wanted.near:
+        return Item("separation", Level.RED, wanted.near)
+    if wanted.unexamined:
+        return Item("separation", Level.WARNING, f"not examined: {wanted.unexamined}")
+    return Item("separation", Level.OK, "keeps apart")
 
 
 def _speed(vehicle: "Vehicle", mission: "Mission | None") -> Item:

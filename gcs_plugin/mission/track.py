@@ -47,10 +47,22 @@ class Track:
     Attributes:
         places: float64 (n, 3), east and north of a common origin and height over takeoff, metres.
         autopilot: whose times these are.
+        level_m: altitude of its takeoff over a level that is common to all tracks, metres.
     """
 
     places: Array
     autopilot: AutopilotConfig = field(default_factory=lambda: active().ardupilot)
+    level_m: float = 0.0
+
+    def raised(self, level_m: float) -> "Track":
+        """The same from a takeoff that lies so much higher."""
+        return replace(self, level_m=level_m) if level_m else self
+
+    def elapsed_s(self, place: tuple[float, float, float]) -> float:
+        """The time at which it comes nearest to a place (east, north, height over takeoff; metres), seconds."""
+        if not len(self.places):
+            return 0.0
+        return STEP_S * float(np.argmin(np.linalg.norm(self.places - np.array(place), axis=1)))
 
     def pad(self, radius_m: float) -> NDArray[np.bool_]:
         """Samples near its start."""
@@ -182,10 +194,14 @@ class Airspace:
     _found: dict[tuple[int, int], "_Approaches"] = field(default_factory=dict, repr=False)
 
     @classmethod
-    def of(cls, missions: Mapping[int, "Mission"]) -> "Airspace":
-        """Of missions by system id."""
+    def of(cls, missions: Mapping[int, "Mission"], levels_m: Mapping[int, float] | None = None) -> "Airspace":
+        """Of missions by system id.
+
+        Args:
+            missions: the missions. levels_m: altitude of each takeoff over a common level, metres; default 0.
+        """
         origin = next((home for mission in missions.values() if (home := home_of(mission))), (0.0, 0.0))
-        tracks = {s: track_of(mission, origin) for s, mission in missions.items()}
+        tracks = {s: track_of(mission, origin).raised((levels_m or {}).get(s, 0.0)) for s, mission in missions.items()}
         slack_s = max((_autopilot_of(mission).schedule_slack_s for mission in missions.values()), default=0.0)
         return cls(tracks, slack_s=slack_s)
 
@@ -212,7 +228,8 @@ class Airspace:
         if known is None:
             a, b = self.tracks[one].places, self.tracks[other].places
             i, j = _near(a, b, self.distance_m) if len(a) and len(b) else (np.zeros(0, np.int64),) * 2
-            counted = np.abs(a[i, 2] - b[j, 2]) < self.height_m - _HAIR_M
+            higher = self.tracks[one].level_m - self.tracks[other].level_m
+            counted = np.abs(a[i, 2] - b[j, 2] + higher) < self.height_m - _HAIR_M
             i, j = i[counted], j[counted]
             at_start, start_slack_s = np.zeros(len(i), bool), np.zeros(len(i))
             if self._share_a_start(one, other):

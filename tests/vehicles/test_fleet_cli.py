@@ -63,7 +63,20 @@ def test_a_plan_is_uploaded_flown_and_watched_to_its_completion(swarm, folder, c
     code, uploaded = fleet(capsys, "upload", folder, "--link", swarm, "--json")
     assert code == 0 and all(v["ok"] for v in uploaded["vehicles"])
     assert [v["items"] for v in uploaded["vehicles"]] == [13, 12, 13]
-    code, flown = fleet(capsys, "start", "--plan", folder, "--watch", "--seconds", 60, "--link", swarm, "--json")
+    code, flown = fleet(
+        capsys,
+        "start",
+        "--override",
+        "separation",
+        "--plan",
+        folder,
+        "--watch",
+        "--seconds",
+        60,
+        "--link",
+        swarm,
+        "--json",
+    )
     assert code == 0 and flown["ended"]
     for vehicle in ("v1", "v2", "v3"):
         kinds = [e["kind"] for e in flown["events"] if e["vehicle"] == vehicle]
@@ -91,7 +104,7 @@ def test_nobody_is_started_while_one_vehicle_holds_another_mission_than_the_plan
     lines = (folder / "v2.waypoints").read_text().splitlines()
     other.write_text("\n".join(line.replace("\t60.000\t", "\t61.000\t") for line in lines))
     assert fleet(capsys, "upload", other, "--vehicle", "2", "--link", swarm)[0] == 0
-    code, said = fleet(capsys, "start", "--plan", folder, "--link", swarm, "--json")
+    code, said = fleet(capsys, "start", "--override", "separation", "--plan", folder, "--link", swarm, "--json")
     assert code == 1 and not any(v["ok"] for v in said["vehicles"])
     assert (
         "does not hold this plan's mission" in said["vehicles"][1]["text"]

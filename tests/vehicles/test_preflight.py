@@ -182,7 +182,7 @@ def test_all_wait_until_the_last_one_is_ready_and_say_for_what(folder, capsys): 
     swarm, link = swarm_of(vehicles)
     with swarm:
         assert fleet(capsys, "upload", folder, "--link", link)[0] == 0
-        code = main(["fleet", "start", "--plan", str(folder), "--link", link])
+        code = main(["fleet", "start", "--override", "separation", "--plan", str(folder), "--link", link])
         said = capsys.readouterr().out.splitlines()
         assert code == 0, said
         assert said[0].startswith("waiting: v2 ") and "pre-arm" in said[0]
@@ -199,7 +199,7 @@ def test_what_vehicles_wait_for_is_said_once_for_those_that_it_is_new_for(folder
     swarm, link = swarm_of(vehicles)
     with swarm:
         assert fleet(capsys, "upload", folder, "--link", link)[0] == 0
-        assert main(["fleet", "start", "--plan", str(folder), "--link", link]) == 0
+        assert main(["fleet", "start", "--override", "separation", "--plan", str(folder), "--link", link]) == 0
         lines = capsys.readouterr().out.splitlines()
     said = [line for line in lines if line.startswith(("waiting: ", "ready: "))]
     assert "ready: v1" in said
@@ -216,7 +216,9 @@ def test_nobody_takes_off_where_one_does_not_become_ready(folder, capsys):  # no
     swarm, link = swarm_of(vehicles)
     with swarm:
         assert fleet(capsys, "upload", folder, "--link", link)[0] == 0
-        code, said = fleet(capsys, "start", "--plan", folder, "--ready", 2, "--link", link, "--json")
+        code, said = fleet(
+            capsys, "start", "--override", "separation", "--plan", folder, "--ready", 2, "--link", link, "--json"
+        )
         assert code == 1
         assert [row["outcome"] for row in said["vehicles"]] == ["not_sent", "refused", "not_sent"]
         assert "pre-arm" in said["vehicles"][1]["text"]
@@ -229,7 +231,7 @@ def test_one_that_cannot_arm_at_its_time_holds_the_others(folder, capsys):  # no
     with swarm:
         assert fleet(capsys, "upload", folder, "--link", link)[0] == 0
         vehicles[1].arms = False  # nothing in its checks says so
-        code, said = fleet(capsys, "start", "--plan", folder, "--link", link, "--json")
+        code, said = fleet(capsys, "start", "--override", "separation", "--plan", folder, "--link", link, "--json")
         assert code == 1
         outcomes = [row["outcome"] for row in said["vehicles"]]
         assert outcomes == ["done", "refused", "not_sent"]

@@ -13,6 +13,7 @@ from orthoswarm.model.errors import OrthoSwarmError
 from tests.vehicles.test_fleet_cli import HOME, folder  # noqa: F401
 from tests.vehicles.test_vehicle_links import PlanFolder, open_links, ready, upload_all, wait  # noqa: F401
 
+ONE_PATH = {name: ["separation"] for name in ("v1", "v2", "v3")}  # all have one mission, some seconds apart
 AP, PX4 = Autopilot.ARDUPILOT, Autopilot.PX4
 
 
@@ -50,7 +51,7 @@ def test_a_command_to_stop_during_the_check_cancels_the_start(open_links, folder
 
     def begin():
         try:
-            said.append(takeoffs.begin("plan-1"))
+            said.append(takeoffs.begin("plan-1", override=ONE_PATH))
         except OrthoSwarmError as error:
             said.append(str(error))
 
@@ -101,7 +102,7 @@ def test_what_has_become_red_until_the_takeoff_holds_the_vehicle_and_the_rest(op
     upload_all(links, folder)
     said = []
     takeoffs = Takeoffs(links, PlanFolder(folder), said.append)
-    takeoffs.begin("plan-1")
+    takeoffs.begin("plan-1", override=ONE_PATH)
     vehicles[1].ready_s = 1e9  # its filter fails
     wait(lambda: "failed" in takeoffs.rows().get("v3", {}), 40.0)
     assert "v2 was not started: gps: no 3D fix" in takeoffs.rows()["v2"]["failed"]

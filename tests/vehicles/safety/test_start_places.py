@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import pytest
 
-from gcs_plugin.fleet.preflight import Level, Wanted, preflight
+from gcs_plugin.fleet.preflight import Level, Wanted, preflight, preflight_all
+from gcs_plugin.fleet.separation_check import flights_of, others_of, separation_of
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.items import FRAME_GLOBAL
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
@@ -46,3 +47,61 @@ def test_a_vehicle_that_stands_higher_than_its_mission_says_is_red(make_world):
         found = item(world, "home", Wanted(mission=planned))
         assert found.level is level, found
     assert "58 m above where its mission takes off" in found.reason
+
+
+# -- separation ---------------------------------------------------------------------------------------------------
+
+
+def two(make_world, *, above_m=0.0, heights=(30.0, 30.0)):
+    """Two vehicles that hold missions over one line; the second one stands 80 m east and `above_m` higher."""
+    homes = [(*CHART.to_degrees(0.0, east), 488.0 + up) for east, up in ((0.0, 0.0), (80.0, above_m))]
+    world = make_world(*(SimVehicle(system=s, home=home) for s, home in zip((1, 2), homes, strict=True)))
+    world.wait(8.0)
+    loaded = {s: line(AP, 40, 80, home_east=80.0 * (s - 1), north=40.0, height=heights[s - 1]) for s in (1, 2)}
+    assert all(o.ok for o in world.finish(*(world.fleet.upload(s, m) for s, m in loaded.items())))
+    return world, loaded
+
+
+def kept_apart(world, planned, starts=None):
+    checks = preflight_all(dict(world.fleet.vehicles), planned, {}, starts or {}, world.clock.now)
+    return [item.level for check in checks for item in check.items if item.name == "separation"]
+
+
+def test_a_plans_missions_are_examined_too(make_world):
+    world, loaded = two(make_world)
+    assert kept_apart(world, loaded) == [Level.RED] * 2
+    assert kept_apart(world, loaded, {2: 120.0}) == [Level.OK] * 2
+
+
+def test_the_levels_of_the_homes_count(make_world):
+    world, loaded = two(make_world, above_m=20.0, heights=(50.0, 30.0))
+    assert kept_apart(world, loaded) == [Level.RED] * 2
+    world, loaded = two(make_world, above_m=20.0)
+    assert kept_apart(world, loaded) == [Level.OK] * 2
+
+
+def test_a_single_start_keeps_apart_from_those_in_the_air_and_those_that_wait(make_world):
+    world, _ = two(make_world)
+
+    def found(waiting=None):
+        first, second = world.fleet.vehicles[1], world.fleet.vehicles[2]
+        flights = others_of({1: first}, waiting or {}) | flights_of({2: second}, {}, {}, {})
+        result = separation_of(flights)
+        assert 1 not in result.near and 1 not in result.unexamined
+        return result.near.get(2, ""), result.unexamined.get(2, "")
+
+    assert found() == ("", "")
+    assert "from v1" in found({1: 3.0})[0] and found({1: 300.0}) == ("", "")
+    assert world.finish(world.fleet.start(1))[0].ok
+    world.wait(8.0)
+    assert "from v1" in found()[0]
+    assert world.finish(world.fleet.pause(1))[0].ok
+    world.wait(4.0)
+    assert found()[0] == "" and "v1 flies or waits, and its way is not known" in found()[1]
+
+
+def test_what_was_not_examined_is_said(make_world):
+    loaded = line(AP, 10, 80)
+    world = standing(make_world, AP, loaded)
+    found = item(world, "separation", Wanted(unexamined="v3 flies, and its way is not known"))
+    assert found.level is Level.WARNING and found.reason.startswith("not examined: v3")

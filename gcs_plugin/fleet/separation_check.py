@@ -1,0 +1,143 @@
+"""Whether vehicles that are to start keep apart: from each other, from those in the air, from those that wait.
+
+All are followed on their missions from their takeoffs on by the planner's model, with the times of their autopilots and
+the levels of their homes (`Airspace`). What cannot be followed so is said: it was not examined.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from typing import TYPE_CHECKING, Final
+
+from gcs_plugin.config import LIMITS
+from gcs_plugin.fleet.flight_state import Word, flight_state
+from gcs_plugin.fleet.separation_watch import number_name
+from gcs_plugin.mission.track import STEP_S, Airspace, home_of, metres, track_of
+
+if TYPE_CHECKING:
+    from gcs_plugin.fleet.vehicle_state import Vehicle
+    from gcs_plugin.mission.items import Mission
+
+_PLANNED_SHARE: Final = 0.95
+"""Share of the distance that counts between missions of one plan, which was made with other samples."""
+
+
+@dataclass(frozen=True, slots=True)
+class Flight:
+    """What a vehicle flies.
+
+    Attributes:
+        mission: its mission, None if it is not known. start_s: takeoff, on a clock that all flights share.
+        alt_m: altitude of its home above the sea, None if that is not known.
+        planned: whether the mission is of the plan that is to be started.
+        examined: whether the vehicle is asked about; others are there only to be kept apart from.
+    """
+
+    mission: "Mission | None"
+    start_s: float
+    alt_m: float | None = None
+    planned: bool = False
+    examined: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Separation:
+    """Findings by system id, in words.
+
+    Attributes:
+        near: whom a vehicle comes too near. unexamined: what could not be examined.
+    """
+
+    near: Mapping[int, str] = field(default_factory=dict)
+    unexamined: Mapping[int, str] = field(default_factory=dict)
+
+
+def flights_of(
+    vehicles: "Mapping[int, Vehicle]",
+    missions: "Mapping[int, Mission]",
+    stored: "Mapping[int, Mission]",
+    starts: Mapping[int, float],
+) -> dict[int, Flight]:
+    """The flights of vehicles that are to start; arguments as for `preflight_all`."""
+    return {
+        s: Flight(missions.get(s) or stored.get(s) or v.mission, starts.get(s, 0.0), v.home_alt_m, s in missions)
+        for s, v in vehicles.items()
+    }
+
+
+def others_of(vehicles: "Mapping[int, Vehicle]", waiting: Mapping[int, float]) -> dict[int, Flight]:
+    """The flights of other vehicles: of those in the air, and of those whose takeoff waits.
+
+    Args:
+        vehicles: the others. waiting: seconds until the takeoff of those that wait.
+    """
+    found = {}
+    for s, vehicle in vehicles.items():
+        if s in waiting:
+            found[s] = Flight(vehicle.mission, waiting[s], vehicle.home_alt_m, examined=False)
+        elif vehicle.flying:
+            mission = vehicle.mission if flight_state(vehicle).word in (Word.ON_MISSION, Word.TAKING_OFF) else None
+            elapsed_s = 0.0 if mission is None else _elapsed_s(vehicle, mission)
+            found[s] = Flight(mission, -elapsed_s, vehicle.home_alt_m, examined=False)
+    return found
+
+
+def separation_of(flights: Mapping[int, Flight], name: Callable[[int], str] = number_name) -> Separation:
+    """Which vehicles come too near each other; takes a second or more for a large swarm.
+
+    Args:
+        flights: by system id. name: of a vehicle by its system id.
+    """
+    known = {s: flight for s, flight in flights.items() if flight.mission is not None}
+    found: dict[int, list[str]] = {}
+    for one, other, at, apart_m in _conflicts(tuple(sorted(known.items()))):
+        for mine, theirs in ((one, other), (other, one)):
+            if flights[mine].examined:
+                found.setdefault(mine, []).append(f"{apart_m:.0f} m from {name(theirs)} after {max(0.0, at):.0f} s")
+    near = {
+        s: f"comes within {', '.join(texts[:3])}; start them later, or plan them together" for s, texts in found.items()
+    }
+    lost = [s for s in sorted(flights) if s not in known and not flights[s].examined]
+    aloft = f"{', '.join(map(name, lost))} flies or waits, and its way is not known" if lost else ""
+    unexamined = {}
+    for s, flight in flights.items():
+        why = aloft if flight.mission is not None else "its mission is not known"
+        if flight.examined and why:
+            unexamined[s] = why
+    return Separation(near, unexamined)
+
+
+@lru_cache(maxsize=8)
+def _conflicts(flights: tuple[tuple[int, Flight], ...]) -> tuple[tuple[int, int, float, float], ...]:
+    """Both vehicles, the time and the distance; the same flights are asked about again and again before a start."""
+    about = dict(flights)
+    missions = {s: f.mission for s, f in flights if f.mission is not None}
+    airspace = Airspace.of(missions, _levels_m(about))
+    starts = {s: flight.start_s for s, flight in flights}
+    planned = replace(
+        airspace,
+        distance_m=_PLANNED_SHARE * airspace.distance_m,
+        slack_s=airspace.slack_s - STEP_S,
+        _found={},
+    )
+    in_plan = {s for s, flight in flights if flight.planned}
+    found = [row for row in airspace.conflicts(starts) if not {row[0], row[1]} <= in_plan]
+    found += planned.conflicts({s: start for s, start in starts.items() if s in in_plan})
+    return tuple(row for row in found if about[row[0]].examined or about[row[1]].examined)
+
+
+def _levels_m(flights: Mapping[int, Flight]) -> dict[int, float]:
+    """The homes' altitudes over the lowest; 0 for all where they are level within what receivers err by."""
+    known = {s: flight.alt_m for s, flight in flights.items() if flight.alt_m is not None}
+    lowest = min(known.values(), default=0.0)
+    levels = {s: alt_m - lowest for s, alt_m in known.items()}
+    return {s: level if level > LIMITS.level_m else 0.0 for s, level in levels.items()}
+
+
+def _elapsed_s(vehicle: "Vehicle", mission: "Mission") -> float:
+    """For how long a vehicle has been on its mission, from where it is."""
+    origin = home_of(mission)
+    if origin is None or vehicle.lat_deg is None or vehicle.lon_deg is None:
+        return 0.0
+    place = (*metres(vehicle.lat_deg, vehicle.lon_deg, origin), vehicle.height_m)
+    return track_of(mission, origin).elapsed_s(place)
