@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable, Collection, Mapping
 from typing import TYPE_CHECKING, Any
 
-from gcs_plugin.config import HEARING
+from gcs_plugin.config import HEARING, LIMITS
 from gcs_plugin.fleet.commands import Verb
 from gcs_plugin.fleet.fleet_events import FleetEvent
 from gcs_plugin.fleet.flight_state import Word, flight_state
@@ -117,15 +117,21 @@ class Backend(abc.ABC):
         stored: Mapping[int, Mission],
         starts: Mapping[int, float],
         legal_height_m: float,
+        *,
+        endurance_s: float | None = None,
     ) -> list[Check]:
         """Preflight check of vehicles with their present telemetry.
 
         Args:
             systems: the vehicles. missions: of the plan. stored: missions downloaded from the vehicles.
             starts: takeoffs in seconds after the first. legal_height_m: legal height limit, metres.
+            endurance_s: flight time of a full battery, None for the default.
         """
         vehicles = {s: self.vehicle(s) for s in systems}
-        return preflight_all(vehicles, missions, stored, starts, time.monotonic(), legal_height_m=legal_height_m)
+        return preflight_all(
+            vehicles, missions, stored, starts, time.monotonic(),
+            endurance_s=endurance_s or LIMITS.endurance_s, legal_height_m=legal_height_m,
+        )  # fmt: skip
 
     @abc.abstractmethod
     def command(

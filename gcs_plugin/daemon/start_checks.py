@@ -10,6 +10,7 @@ from collections.abc import Callable, Collection, Mapping
 from typing import TYPE_CHECKING, Any, Final
 
 from gcs_plugin.config import COMMAND, LIMITS
+from gcs_plugin.daemon.airspace.fences import Fences
 from orthoswarm.model.errors import OrthoSwarmError
 
 if TYPE_CHECKING:
@@ -26,14 +27,18 @@ class StartChecks:
     """Checks vehicles before their start.
 
     Args:
-        fleet: the vehicles. name_of: id of a vehicle by its system id.
+        fleet: the vehicles. fences: theirs. name_of: id of a vehicle by its system id.
         waiting: vehicle -> its takeoff that waits or failed, see `Takeoffs.rows`.
     """
 
     def __init__(
-        self, fleet: "Fleet", name_of: Callable[[int], str], waiting: Callable[[], Mapping[str, Mapping[str, Any]]]
+        self,
+        fleet: "Fleet",
+        fences: Fences,
+        name_of: Callable[[int], str],
+        waiting: Callable[[], Mapping[str, Mapping[str, Any]]],
     ) -> None:
-        self._fleet, self._name_of, self._waiting = fleet, name_of, waiting
+        self._fleet, self._fences, self._name_of, self._waiting = fleet, fences, name_of, waiting
         self._read: dict[int, tuple[float, Mission]] = {}
 
     def check(
@@ -75,6 +80,7 @@ class StartChecks:
                 legal_height_m=legal_height_m or LIMITS.legal_height_m,
                 name=self._name_of,
                 separation=separation,
+                zones=self._fences.zones(),
             )
         ).result(_READ_S)
         return [check.document(systems[check.system]) for check in checks]

@@ -44,6 +44,7 @@ class Takeoffs:
         self._stops: dict[int, int] = {}
         self._given_s: dict[int, float] = {}
         self._missions: dict[int, Mission] = {}
+        self._endurance_s: float | None = None
         self._allowed: dict[str, Collection[str]] = {}
         self._about_to: set[int] = set()
         self._closed = False
@@ -92,6 +93,7 @@ class Takeoffs:
             mission = vehicle if sortie == 1 else f"{vehicle}-sortie{sortie}"
             missions[name] = self._plans.mission({"plan": plan, "mission": mission}, vehicle, known.autopilot)
         times = {whose[vehicle]: start_s for vehicle, start_s in starts.items()}
+        endurance_s = endurance_s or self._plans.endurance_s(plan)
         rows = self._links.preflight(
             list(whose.values()), missions, starts=times, endurance_s=endurance_s, legal_height_m=legal_height_m
         )
@@ -147,6 +149,7 @@ class Takeoffs:
                 self._failed.clear()
                 self._stops, self._given_s = stops, {s: given for s, delay in delays.items() if delay <= 0.0}
                 self._names = {systems[vehicle]: whose[vehicle] for vehicle in starts}
+                self._endurance_s = self._plans.endurance_s(plan)
                 self._missions = {system: missions[self._names[system]] for system in systems.values()}
                 self._allowed = dict(override or {})
                 self._schedule, self._checking = schedule, frozenset()
@@ -292,7 +295,7 @@ class Takeoffs:
         Its distances to others are the schedule's.
         """
         mission = self._missions[system]
-        (row,) = self._links.preflight([vehicle], {vehicle: mission}, reread=False)
+        (row,) = self._links.preflight([vehicle], {vehicle: mission}, reread=False, endurance_s=self._endurance_s)
         return "; ".join(_red(row, {*self._allowed.get(vehicle, ()), "separation"}))
 
     def _note(self, vehicle: str, system: int, outcome: Outcome) -> None:

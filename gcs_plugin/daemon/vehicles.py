@@ -110,7 +110,7 @@ class VehicleLinks:
         self.fleet.on_event(self._event)
         self.fleet.subscribe(self._message)
         self._fences = Fences(self.fleet)
-        self._checks = StartChecks(self.fleet, self.name_of, lambda: self.takeoffs())
+        self._checks = StartChecks(self.fleet, self._fences, self.name_of, lambda: self.takeoffs())
         self.traffic = Traffic()
         self.fleet.subscribe(self.traffic.heard, "ADSB_VEHICLE")
         self.fleet.subscribe(self.traffic.height, "GLOBAL_POSITION_INT")

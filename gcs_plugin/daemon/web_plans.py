@@ -13,6 +13,7 @@ from typing import Any, Final
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.items import Mission
+from gcs_plugin.mission.plan_folder import plan_endurance_s
 from gcs_plugin.plans.plan_request import AUTOPILOTS, ENDS, METHODS, RELIEFS, PlanRequest, make_plan
 from orthoswarm.model.errors import InputError
 from orthoswarm.planning.area.shape_files import parse_geojson
@@ -166,6 +167,14 @@ class Plans:
             for vehicle, row in rows.items()
         }
 
+    def endurance_s(self, name: Any) -> float | None:
+        """Flight time of a full battery that a plan was made for, seconds; None if nobody said it.
+
+        Raises:
+            InputError: there is no such plan.
+        """
+        return plan_endurance_s(self._path(name))
+
     def newest_bounds(self) -> GeographicBounds | None:
         """South, west, north, east of the newest plan in degrees, None if there is none."""
         found = sorted(self.folder.glob("plan-*/all.geojson"))
@@ -280,7 +289,7 @@ def plan_into(request: PlanRequest) -> dict[str, Any]:
     from gcs_plugin.plans.plan_files import geojson, mission_files, report, write_folder
 
     plan, area = make_plan(request)
-    figures = report(plan, request.autopilots, request.fov_min_deg)
+    figures = report(plan, request.autopilots, request.fov_min_deg, request.endurance_min)
     files: dict[str, str | bytes] = dict(mission_files(plan, request.autopilots))
     files["all.geojson"] = geojson(plan, area)
     files["plan.json"] = json.dumps(figures, indent=1) + "\n"

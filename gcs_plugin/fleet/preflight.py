@@ -16,12 +16,14 @@ from gcs_plugin.fleet.separation_watch import number_name
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.command_dialogues import unflyable
 from gcs_plugin.mission.comparison import difference
+from gcs_plugin.mission.geofence import breach
 from gcs_plugin.mission.items import FRAME_GLOBAL, PLAIN_FRAME
 from gcs_plugin.mission.track import fastest_m_s, flight_seconds, highest_m, takeoff_place
 from orthoswarm.model.earth import distance_m
 
 if TYPE_CHECKING:
     from gcs_plugin.fleet.vehicle_state import Vehicle
+    from gcs_plugin.mission.geofence import Zone
     from gcs_plugin.mission.items import Mission
 
 ITEMS: Final = (
@@ -100,6 +102,7 @@ class Wanted:
         endurance_s: flight time of a full battery.
         legal_height_m: height above takeoff that may be flown without asking.
         near: finding of the separation check about this vehicle, empty if none.
+        zones: of the geofence that it holds, None if that has not been read.
         unexamined: why its separation from others could not be examined, empty if it was.
     """
 
@@ -109,6 +112,7 @@ class Wanted:
     legal_height_m: float = LIMITS.legal_height_m
     near: str = ""
     unexamined: str = ""
+    zones: "Sequence[Zone] | None" = None
 
 
 def preflight(vehicle: "Vehicle", wanted: Wanted, now: float) -> Check:
@@ -138,6 +142,7 @@ def preflight_all(
     legal_height_m: float = LIMITS.legal_height_m,
     name: Callable[[int], str] = number_name,
     separation: Separation | None = None,
+    zones: "Mapping[int, Sequence[Zone]] | None" = None,
 ) -> list[Check]:
     """Check vehicles that are to start together.
 
@@ -149,6 +154,7 @@ def preflight_all(
         now: the fleet's clock.
         endurance_s, legal_height_m: see Wanted.
         name: name of a vehicle by its system id.
+        zones: of the geofences that were read.
         separation: of them from each other and from others, where that was examined before.
     """
     if separation is None:
@@ -158,7 +164,7 @@ def preflight_all(
             vehicle,
             Wanted(
                 missions.get(s), stored.get(s), endurance_s, legal_height_m,
-                separation.near.get(s, ""), separation.unexamined.get(s, ""),
+                separation.near.get(s, ""), separation.unexamined.get(s, ""), (zones or {}).get(s),
             ),
             now,
         )
@@ -269,6 +275,8 @@ def _mission(vehicle: "Vehicle", wanted: Wanted) -> Item:
     wrong = unflyable(held.items, vehicle.autopilot, in_air=vehicle.flying)
     if wrong:
         return Item("mission", Level.RED, wrong)
+    if wanted.zones and (broken := breach(wanted.mission or held, wanted.zones)):
+        return Item("mission", Level.RED, f"{broken}; change the mission or the fence")
     if wanted.mission is not None:
         found = difference(wanted.mission, held.items)
         if found is not None:

@@ -2,10 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 from gcs_plugin.links.mavlink import dialect
 from gcs_plugin.mission.items import MissionItem
+
+if TYPE_CHECKING:
+    from gcs_plugin.mission.items import Mission
 
 FENCE: Final = int(dialect.MAV_MISSION_TYPE_FENCE)
 Kind = Literal["inclusion", "exclusion"]
@@ -38,6 +41,35 @@ class Zone:
         if self.radius_m is None:
             return {"kind": self.kind, "ring": [list(point) for point in self.points]}
         return {"kind": self.kind, "center": list(self.points[0]), "radius_m": self.radius_m}
+
+
+def breach(mission: "Mission", zones: "Sequence[Zone]") -> str:
+    """Where a mission leaves the zones it must stay inside of, or enters others, in words; empty if it keeps to them.
+
+    With several inclusion zones it must be in one of them: autopilots differ in whether they want it in all.
+    """
+    from shapely import LineString, Point, Polygon, union_all
+
+    from gcs_plugin.mission.track import flight_path, home_of, metres
+
+    origin = home_of(mission)
+    if origin is None or not zones:
+        return ""
+    points, _, _ = flight_path(mission, origin)
+    if len(points) < 2:
+        return ""
+    shapes = []
+    for zone in zones:
+        ring = [metres(lat, lon, origin) for lon, lat in zone.points]
+        shapes.append(Polygon(ring).buffer(0) if zone.radius_m is None else Point(ring[0]).buffer(zone.radius_m))
+    way = LineString(points[:, :2])
+    inside = [shape for zone, shape in zip(zones, shapes, strict=True) if zone.kind == "inclusion"]
+    if inside and (far := way.difference(union_all(inside))).length > 0.0:
+        return f"its mission leaves its geofence for {far.length:.0f} m"
+    outside = [shape for zone, shape in zip(zones, shapes, strict=True) if zone.kind == "exclusion"]
+    if outside and (within := way.intersection(union_all(outside))).length > 0.0:
+        return f"its mission flies {within.length:.0f} m through a zone that its geofence excludes"
+    return ""
 
 
 def zones_of(items: Sequence[MissionItem]) -> list[Zone]:

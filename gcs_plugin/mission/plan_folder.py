@@ -49,6 +49,15 @@ def read_plan_folder(folder: Path, sortie: int) -> dict[int, tuple[Path, float]]
     return flights
 
 
+def plan_endurance_s(folder: Path) -> float | None:
+    """Flight time of a full battery that a plan was made for, seconds; None if its report does not say it."""
+    try:
+        minutes = json.loads((folder / "plan.json").read_text(encoding="utf-8")).get("endurance_min")
+    except (OSError, ValueError, AttributeError):
+        return None
+    return 60.0 * minutes if isinstance(minutes, int | float) and minutes > 0 else None
+
+
 def number_in(path: Path) -> int | None:
     """The vehicle that a mission file is named after (v3.plan, v3-sortie1.waypoints), None for another name."""
     match = re.fullmatch(r"v(\d{1,3})(?:-sortie1)?", path.stem)

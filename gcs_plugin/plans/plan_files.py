@@ -40,8 +40,15 @@ def _autopilot(vehicle: VehiclePlan, autopilots: Sequence[Autopilot]) -> Autopil
     return autopilots[(vehicle.number - 1) % len(autopilots)]
 
 
-def report(plan: Plan, autopilots: Sequence[Autopilot], fov_min_deg: float) -> dict[str, Any]:
-    """The plan's figures as JSON: per vehicle and altogether."""
+def report(
+    plan: Plan, autopilots: Sequence[Autopilot], fov_min_deg: float, endurance_min: float | None = None
+) -> dict[str, Any]:
+    """The plan's figures as JSON: per vehicle and altogether.
+
+    Args:
+        plan: the plan. autopilots: of its vehicles, in turn. fov_min_deg: field of view that it was made for.
+        endurance_min: flight time of a full battery that it was made for, None if nobody said it.
+    """
     return {
         "fov_min_deg": fov_min_deg,
         "method": plan.method,
@@ -58,6 +65,7 @@ def report(plan: Plan, autopilots: Sequence[Autopilot], fov_min_deg: float) -> d
         "epsg": plan.epsg,
         "autopilot": autopilots[0] if len(set(autopilots)) == 1 else "mixed",
         "end": plan.end,
+        "endurance_min": endurance_min,
         "separation": plan.separation,
         "over_ground": None if plan.over_ground is None else _over_ground(plan.over_ground),
         "vehicles": [_vehicle(vehicle, _autopilot(vehicle, autopilots)) for vehicle in plan.vehicles],

@@ -14,6 +14,7 @@ from gcs_plugin.daemon.vehicles import VehicleLinks
 from gcs_plugin.fleet.separation_watch import Near, SeparationWatch
 from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.mission.mission_builder import read_mission
+from gcs_plugin.mission.plan_folder import plan_endurance_s
 from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 from tests.vehicles.test_fleet_cli import HOME, folder  # noqa: F401
@@ -38,6 +39,9 @@ class PlanFolder:
     def starts(self, name, sortie=1):
         document = json.loads((self.path / "plan.json").read_text())
         return {v["id"]: v["flights"][0]["start_s"] for v in document["vehicles"]}
+
+    def endurance_s(self, name):
+        return plan_endurance_s(self.path)
 
     def mission(self, body, vehicle, autopilot):
         return read_mission(self.path / f"{body['mission']}.waypoints", autopilot)

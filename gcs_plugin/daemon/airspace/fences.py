@@ -11,6 +11,7 @@ from orthoswarm.model.errors import OrthoSwarmError
 if TYPE_CHECKING:
     from gcs_plugin.fleet.fleet import Fleet
     from gcs_plugin.mission.download import MissionDownload
+    from gcs_plugin.mission.geofence import Zone
 
 _AT_ONCE: Final = 4  # fences that are read at a time, so that links stay free
 _AGAIN_S: Final = 60.0
@@ -22,12 +23,14 @@ class _Fence:
     """What is known of a vehicle's fence.
 
     Attributes:
-        read: under way. due: when to read (again), monotonic. document: for the vehicle's row, None until it was read.
+        read: under way. due: when to read (again), monotonic. document: for the vehicle's row.
+        zones: the same; both None until it was read.
     """
 
     due: float
     read: "MissionDownload | None" = None
     document: dict[str, Any] | None = None
+    zones: "tuple[Zone, ...] | None" = None
 
 
 class Fences:
@@ -50,7 +53,8 @@ class Fences:
             if fence.read is None or fence.read.outcome is None:
                 continue
             if fence.read.items is not None:
-                zones = [zone.document() for zone in zones_of(fence.read.items)]
+                fence.zones = tuple(zones_of(fence.read.items))
+                zones = [zone.document() for zone in fence.zones]
                 if fence.document is None or fence.document["zones"] != zones:
                     fence.document = {"zones": zones, "read_s": round(time.time(), 1)}
             fence.due = now + (_AGAIN_S if fence.read.outcome.ok else _FAILED_S)
@@ -63,6 +67,10 @@ class Fences:
                 with contextlib.suppress(OrthoSwarmError):  # lost, or busy with something else
                     fence.read = self._fleet.read_fence(system)
                     under_way += 1
+
+    def zones(self) -> "dict[int, tuple[Zone, ...]]":
+        """The zones of each vehicle whose fence has been read, by system id; from any thread."""
+        return {s: fence.zones for s, fence in list(self._fences.items()) if fence.zones is not None}
 
     def of(self, system: int) -> dict[str, Any] | None:
         """`zones` and `read_s` (epoch seconds since when they are known so), None until the vehicle has told."""

@@ -1,15 +1,22 @@
 """The check before a start: where vehicles stand, what else flies there, how long they can, and their fences."""
 
+import json
 from dataclasses import replace
 
 import pytest
 
+from gcs_plugin.daemon.takeoffs import Takeoffs
 from gcs_plugin.fleet.preflight import Level, Wanted, preflight, preflight_all
 from gcs_plugin.fleet.separation_check import flights_of, others_of, separation_of
 from gcs_plugin.links.mavlink import Autopilot
+from gcs_plugin.mission.geofence import Zone
 from gcs_plugin.mission.items import FRAME_GLOBAL
+from gcs_plugin.sim.simulated_swarm import make_swarm
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
+from tests.vehicles.test_fleet_cli import HOME as FOLDER_HOME
+from tests.vehicles.test_fleet_cli import folder  # noqa: F401
 from tests.vehicles.test_preflight import CHART, line
+from tests.vehicles.test_vehicle_links import PlanFolder, open_links, ready, upload_all  # noqa: F401
 
 AP, PX4 = Autopilot.ARDUPILOT, Autopilot.PX4
 BOTH = pytest.mark.parametrize("autopilot", [AP, PX4])
@@ -105,3 +112,34 @@ def test_what_was_not_examined_is_said(make_world):
     world = standing(make_world, AP, loaded)
     found = item(world, "separation", Wanted(unexamined="v3 flies, and its way is not known"))
     assert found.level is Level.WARNING and found.reason.startswith("not examined: v3")
+
+
+# -- endurance and fence ------------------------------------------------------------------------------------------
+
+
+def test_the_endurance_of_the_plan_counts(open_links, folder):  # noqa: F811
+    document = json.loads((folder / "plan.json").read_text())
+    document["vehicles"] = document["vehicles"][:1]
+    links = open_links(make_swarm(1, home=FOLDER_HOME))
+    ready(links, 1)
+    upload_all(links, folder)
+    takeoffs = Takeoffs(links, PlanFolder(folder), lambda _: None)
+    for endurance_min, state in ((None, "ok"), (1.0, "red")):
+        (folder / "plan.json").write_text(json.dumps(document | {"endurance_min": endurance_min}))
+        (row,) = takeoffs.preflight("plan-1")
+        assert {i["name"]: i["state"] for i in row["items"]}["battery"] == state, row
+    takeoffs.close()
+
+
+@pytest.mark.parametrize(
+    ("kind", "radius_m", "level"),
+    [("inclusion", 50.0, Level.RED), ("inclusion", 500.0, Level.OK), ("exclusion", 20.0, Level.RED)],
+)
+def test_a_mission_that_breaks_the_geofence_is_red(make_world, kind, radius_m, level):
+    loaded = line(AP, 10, 80)
+    world = standing(make_world, AP, loaded)
+    north = 0.0 if kind == "inclusion" else 60.0
+    lat, lon = CHART.to_degrees(north, 10.0)
+    zones = [Zone(kind, ((lon, lat),), radius_m)]
+    assert item(world, "mission", Wanted(zones=zones)).level is level
+    assert item(world, "mission").level is Level.OK

@@ -99,7 +99,7 @@ def run(args: argparse.Namespace) -> int:
     _say("files")
     from gcs_plugin.plans.plan_picture import draw
 
-    figures = report(plan, request.autopilots, request.fov_min_deg)
+    figures = report(plan, request.autopilots, request.fov_min_deg, request.endurance_min)
     files: dict[str, str | bytes] = dict(mission_files(plan, request.autopilots))
     files["all.geojson"] = geojson(plan, area)
     files["plan.json"] = json.dumps(figures, indent=1) + "\n"
