@@ -6,7 +6,7 @@ pre-arm checks, its filter) is included here, so that no vehicle takes off while
 
 import enum
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from gcs_plugin.config import LIMITS
@@ -111,6 +111,7 @@ class Wanted:
     endurance_s: float = LIMITS.endurance_s
     legal_height_m: float = LIMITS.legal_height_m
     near: str = ""
+    _: KW_ONLY
     unexamined: str = ""
     zones: "Sequence[Zone] | None" = None
 
@@ -164,7 +165,7 @@ def preflight_all(
             vehicle,
             Wanted(
                 missions.get(s), stored.get(s), endurance_s, legal_height_m,
-                separation.near.get(s, ""), separation.unexamined.get(s, ""), (zones or {}).get(s),
+                separation.near.get(s, ""), unexamined=separation.unexamined.get(s, ""), zones=(zones or {}).get(s),
             ),
             now,
         )

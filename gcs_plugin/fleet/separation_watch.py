@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
 from gcs_plugin.config import ALARM, HEARING
@@ -32,6 +32,7 @@ class Near:
     metres: float
     height_m: float
     ahead_s: float = 0.0
+    _: KW_ONLY
     silent: tuple[int, ...] = ()
 
     @property
