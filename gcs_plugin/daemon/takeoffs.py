@@ -124,8 +124,8 @@ class Takeoffs:
         Raises:
             InputError: there is no such plan or flight.
             OrthoSwarmError: vehicles are not heard, a preflight item is red, takeoffs are under way, one of the
-                vehicles was told to stop meanwhile, the check took so long that the start is too old, or it is no longer
-                wanted; none was started.
+                vehicles was told to stop meanwhile, the check took so long that the start is too old, or it is no
+                longer wanted; none was started.
         """
         given = self._clock() if given_s is None else min(given_s, self._clock())
         starts = self._plans.starts(plan, sortie)

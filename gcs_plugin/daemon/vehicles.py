@@ -113,7 +113,6 @@ class VehicleLinks:
         self._checks = StartChecks(self.fleet, self._fences, self.name_of, lambda: self.takeoffs())
         self.traffic = Traffic()
         self.fleet.subscribe(self.traffic.heard, "ADSB_VEHICLE")
-        self.fleet.subscribe(self.traffic.height, "GLOBAL_POSITION_INT")
         self._threads = [
             threading.Thread(target=self.fleet.run, args=(self._stop,), name="links", daemon=True),
             threading.Thread(target=self._watch, name="watch", daemon=True),
@@ -425,7 +424,7 @@ class VehicleLinks:
         row = vehicle.summary(now) | {"id": record.id, "name": self._titles.get(record.id, "")}
         row["alarm"] = self.fleet.separation.text(vehicle.system, self.name_of)
         row["behind"] = self.fleet.behind(vehicle.system)
-        row["yaw_deg"], row["alt_m"] = row["heading_deg"], self.traffic.alt_m(vehicle.system)
+        row["yaw_deg"] = row["heading_deg"]
         if vehicle.lat_deg is not None and vehicle.lon_deg is not None:
             point = (round(vehicle.lon_deg, 7), round(vehicle.lat_deg, 7))
             if not record.trail or record.trail[-1] != point:

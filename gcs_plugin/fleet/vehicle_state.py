@@ -214,6 +214,7 @@ class Vehicle:
             "lat_deg": self.lat_deg,
             "lon_deg": self.lon_deg,
             "height_m": round(self.height_m, 2),
+            "alt_m": None if self.alt_m is None else round(self.alt_m, 1),
             "heading_deg": None if self.heading_rad is None else round(math.degrees(self.heading_rad), 1),
             "speed_m_s": round(math.hypot(*self.velocity_m_s[:2]), 2),
             "battery": self.battery,

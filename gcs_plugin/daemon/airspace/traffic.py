@@ -15,11 +15,10 @@ _HEADING: Final = int(dialect.ADSB_FLAGS_VALID_HEADING)
 _VELOCITY: Final = int(dialect.ADSB_FLAGS_VALID_VELOCITY)
 _CALLSIGN: Final = int(dialect.ADSB_FLAGS_VALID_CALLSIGN)
 _DEGE7: Final = 1e-7
-_MILLI: Final = 1e-3
 
 
 class Traffic:
-    """The recently received aircraft, each once, from any vehicle, and how high the vehicles are; any thread.
+    """The recently received aircraft, each once, from any vehicle; any thread.
 
     Args:
         clock: monotonic seconds.
@@ -29,7 +28,6 @@ class Traffic:
         self._clock, self._lock = clock, threading.Lock()
         self._heard: dict[int, tuple[float, dict[str, Any]]] = {}
         self._published: list[dict[str, Any]] = []
-        self._alt_m: dict[int, float] = {}
 
     def heard(self, _vehicle: Any, message: Any, _utc: float) -> None:
         """Process an ADSB_VEHICLE; one without a valid position is ignored."""
@@ -49,14 +47,6 @@ class Traffic:
         }
         with self._lock:
             self._heard[number] = self._clock() - float(message.tslc), row
-
-    def height(self, vehicle: Any, message: Any, _utc: float) -> None:
-        """Process a GLOBAL_POSITION_INT: aircraft send heights above sea level, so a vehicle's is needed to compare."""
-        self._alt_m[vehicle.system] = round(message.alt * _MILLI, 1)
-
-    def alt_m(self, system: int) -> float | None:
-        """How high a vehicle is, metres above sea level, None if it has not said so."""
-        return self._alt_m.get(system)
 
     def rows(self) -> list[dict[str, Any]]:
         """A row per aircraft; unknown values are None.
