@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
-from gcs_plugin.config import ALARM, HEARING
+from gcs_plugin.config import ALARM, HEARING, LIMITS
 from orthoswarm.config import active
 from orthoswarm.model.earth import DEGREE_M, distance_m
 
@@ -156,13 +156,17 @@ def _proposal(one: "Vehicle", other: "Vehicle") -> tuple[int, int]:
 
 
 def _height_differences(one: "Vehicle", other: "Vehicle") -> list[float]:
-    """How much higher `one` is, metres: above the two takeoffs, and above the sea where both know it.
+    """How much higher `one` is, metres: above the two takeoffs, and above the sea where these seem to differ in height.
 
-    Either may be wrong: takeoffs may lie at different heights, and receivers err in height.
+    Heights above one takeoff are by barometer and good to a metre; altitudes err by several metres, more than lies
+    between the layers of a plan. So where both took off from the same level within that, altitudes would raise alarms
+    for nothing.
     """
     differences = [one.height_m - other.height_m]
     if one.alt_m is not None and other.alt_m is not None:
-        differences.append(one.alt_m - other.alt_m)
+        above_sea = one.alt_m - other.alt_m
+        if abs(above_sea - differences[0]) > LIMITS.level_m:
+            differences.append(above_sea)
     return differences
 
 

@@ -52,6 +52,14 @@ def test_vehicles_at_the_same_height_above_takeoffs_at_two_levels_are_an_alarm_t
     assert world.until(lambda: bool(near(world)), 60.0)
 
 
+@pytest.mark.parametrize("wrong_m", [-4.0, 4.0])
+def test_vehicles_in_two_layers_are_no_alarm_because_their_receivers_differ_in_height(make_world, wrong_m):
+    """They take off from one level; the second one's altitude is as wrong as receivers are."""
+    world = meeting(make_world, above_m=wrong_m, heights=(30.0, 35.0))
+    world.wait(60.0)
+    assert near(world) == []
+
+
 def test_an_alarm_does_not_end_because_a_link_is_lost(make_world):
     world = meeting(make_world)
     assert world.until(lambda: bool(near(world)), 60.0)
