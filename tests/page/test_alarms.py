@@ -81,6 +81,15 @@ def test_a_page_that_is_opened_while_two_are_too_near_raises_the_alarm(browser):
         page.wait_for_selector(".alarms:has-text('v1 and v3')")
 
 
+def test_a_vehicle_behind_its_plan_is_an_alarm_on_every_page_until_it_has_caught_up(browser):
+    late = "is 12 s behind its plan, which keeps others apart for 8 s: watch its distances"
+    with standing(vehicle(1, behind=late), vehicle(2)) as station, opened(browser, station.url) as page:
+        page.wait_for_selector(".alarms:has-text('12 s behind its plan')")
+        assert len(texts(page)) == 1
+        send(page, {"type": "vehicle", "id": "v1", "system": 1, "behind": ""})
+        page.wait_for_selector(".alarms", state="hidden")
+
+
 def test_an_alarm_of_a_pair_ends_with_the_rows_if_the_page_missed_the_event(browser):
     event = {"type": "vehicle_event", "kind": "near", "vehicle": "v1", "pair": ["v1", "v2"], "text": NEAR}
     with standing(vehicle(1, alarm=""), vehicle(2, alarm="")) as station, opened(browser, station.url) as page:

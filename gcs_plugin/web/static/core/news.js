@@ -58,7 +58,6 @@ const KINDS = {
     if (row && event.said) { row.texts = [...row.texts, ...messages([{ text: event.said, time: event.time, severity: event.severity }])].slice(-MOST_TEXTS); changed("vehicles"); }
     if (event.kind === "near" || event.kind === "apart") near(list(event.pair).map(String), event.kind === "near", event);
     else happened(event);
-    if (event.kind === "behind" || event.kind === "caught_up") announce({ key: `behind/${event.vehicle}`, text: event.text, vehicle: String(event.vehicle), active: event.kind === "behind" });
     soon("/api/vehicles");
   },
   frame: (event) => {

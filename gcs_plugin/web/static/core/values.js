@@ -47,7 +47,7 @@ export function vehicle(message, before, now, whole = false) {
   return {
     raw: row, id: text(row.id), name: text(row.name) || before?.name || text(row.id), system: number(row.system, 0, 255),
     linked: number(row.system, 0, 255) != null, state: text(row.state), mode: text(row.mode), armed: row.armed === true, landed: text(row.landed),
-    alarm: typeof row.alarm === "string" ? text(row.alarm, 300) : null, alt_m: number(row.alt_m, -5000, 60000),
+    alarm: typeof row.alarm === "string" ? text(row.alarm, 300) : null, behind: text(row.behind, 300), alt_m: number(row.alt_m, -5000, 60000),
     flight: flight(row), position: moved ?? before?.position ?? null, height_m: number(row.height_m, -5000, 50000),
     speed_m_s: number(row.speed_m_s, 0, 1000), heading_deg: number(row.heading_deg, -720, 720), battery,
     battery_left_s: number(row.battery_left_s, 0, 1e6), gps_fix: number(row.gps_fix, 0, 10), satellites: number(row.satellites, 0, 254),

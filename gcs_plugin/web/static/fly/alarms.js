@@ -140,6 +140,7 @@ subscribe("vehicles tick commands alarms link traffic", "alarms", () => {
       if (item.level === "stale" || item.quiet) continue;
       standing.add(raise(`${row.id}/${item.key}`, item.level, `${row.name}: ${item.words}`, row.id));
     }
+    if (row.behind) standing.add(raise(`behind/${row.id}`, "bad", `${row.name} ${row.behind}`, row.id));
     earlier(row, given().given_s);
   }
   for (const [key, alarm] of [...announced, ...tooNear(now), ...aircraftNear()]) standing.add(raise(key, alarm.level, alarm.text, alarm.vehicle));
