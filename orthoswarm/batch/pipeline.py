@@ -18,7 +18,6 @@ from orthoswarm.batch.run_state import (
     WRITTEN,
     Load,
     Options,
-    Progress,
     RunContext,
     RunState,
 )
@@ -36,6 +35,7 @@ from orthoswarm.export.catalog.tiled_raster import product_file
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import PlacedFrame, Terrain
+from orthoswarm.model.task_runner import Progress
 from orthoswarm.mosaic.extent import partial_cover, placed_bounds
 from orthoswarm.mosaic.footprint import default_gsd
 from orthoswarm.mosaic.oblique import stray_warning, strays

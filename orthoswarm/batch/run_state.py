@@ -19,6 +19,7 @@ from orthoswarm.export.catalog.tiled_raster import FOLDER, Tiles
 from orthoswarm.model.frame import Ingest, Rejection
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import PlacedFrame, Terrain
+from orthoswarm.model.task_runner import Progress
 from orthoswarm.mosaic.recorded_pose import Recorded
 from orthoswarm.mosaic.render_passes import Read
 from orthoswarm.mosaic.renderer import Blend
@@ -31,8 +32,6 @@ from orthoswarm.raster.picture_parts import PictureParts
 from orthoswarm.refine.registration.map_offset import MapOffset
 
 Bytes = NDArray[np.uint8]
-Progress = Callable[[str, int, int], None]
-"""Called with what is being done, how many are done, how many there are."""
 Load = Callable[[Progress], Ingest]
 
 REALTIME, COARSE, ORTHOIMAGE = "realtime.tif", "coarse.tif", "orthoimage.tif"

@@ -4,7 +4,7 @@ Legs are independent tasks (III.E). By Eq. 5 a run takes as long as its slowest 
 enough workers; `Refinement.equation_5` compares this with the time measured.
 """
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from time import perf_counter, process_time
@@ -15,15 +15,13 @@ from orthoswarm.config import active
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import Leg, LegState, MapWindow, PlacedFrame, Refinement, Solution, Stage
-from orthoswarm.model.task_runner import Run, serial
+from orthoswarm.model.task_runner import Progress, Run, serial
 from orthoswarm.paper.coarse_cameras import CoarseOptions, CoarseVehicle, coarse_vehicle
 from orthoswarm.paper.leg_cameras import carried_shift, fit_camera, pixel_grid
 from orthoswarm.paper.leg_patches import PatchFit, PatchOptions, PatchTask, match_patch
 from orthoswarm.refine.bundle.flight_records import Array
 from orthoswarm.refine.flight.solve_units import merge_units
 from orthoswarm.refine.flight.vehicle_refinement import UnitRefiner, unit_states, units_of_area
-
-Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True, slots=True)

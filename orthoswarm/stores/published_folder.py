@@ -7,7 +7,7 @@ belongs to it. An upload that was interrupted goes on with the files that are mi
 import json
 import os
 import shutil
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from concurrent.futures import ThreadPoolExecutor
 from hashlib import blake2b
 from pathlib import Path
@@ -15,12 +15,12 @@ from uuid import uuid4
 
 from orthoswarm.config import active
 from orthoswarm.model.errors import InputError, OrthoSwarmError
+from orthoswarm.model.task_runner import Progress
 from orthoswarm.stores.addresses import address_of
 from orthoswarm.stores.listing import list_folder
 from orthoswarm.stores.local_copies import cache_folder
 from orthoswarm.stores.requests import NotStoredError, StoreLostError, request
 
-Progress = Callable[[str, int, int], None]
 _LAST = "report.json"
 _RECORD = ".uploaded"
 

@@ -1,7 +1,7 @@
 """Make a data set: the map before the disaster, the photos after it, and the truth in its own folder."""
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from orthoswarm.model.camera import Camera, rotation_from_angles
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid
+from orthoswarm.model.task_runner import Progress
 from orthoswarm.twin.dataset_files import (
     after_disaster,
     photo_name,
@@ -29,7 +30,6 @@ from orthoswarm.twin.recorded_noise import Record, record
 from orthoswarm.twin.site import Site, disaster_zones
 from orthoswarm.twin.true_flight import Flight, fly, raised
 
-Progress = Callable[[str, int, int], None]
 SEA_LEVEL_M = 512.0
 """Absolute altitude of the takeoff point; far from 0, so that mixing up altitude and height shows at once."""
 GENERATOR = 3

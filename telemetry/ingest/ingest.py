@@ -13,6 +13,7 @@ from pathlib import Path
 
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.frame import Ingest, Rejection
+from orthoswarm.model.task_runner import Progress
 from orthoswarm.stores.local_copies import local_file
 from telemetry.formats.table import geo_txt, pose_csv
 from telemetry.formats.table.pose_row import PoseTable, leave_out_folder, lookup, names_of, take_base_names
@@ -22,7 +23,7 @@ from telemetry.ingest.discovery import Discovery, Folder, discover, natural_key
 from telemetry.ingest.log_ingest import LogSource, add_logs, read_logs
 from telemetry.ingest.photo_order import in_order
 from telemetry.ingest.side_files import read_control_points
-from telemetry.ingest.survey import LoadOptions, Progress, SourceInfo, Survey
+from telemetry.ingest.survey import LoadOptions, SourceInfo, Survey
 from telemetry.ingest.video_ingest import read_videos
 from telemetry.photos.flight_checks import flight_findings
 from telemetry.photos.maker_angles import Angles

@@ -13,9 +13,6 @@ from telemetry.ingest.discovery import Discovery, natural_key
 from telemetry.samples.findings import Finding
 from telemetry.samples.sample import Sample
 
-Progress = Callable[[str, int, int], None]
-"""Called with what is being done, how many are done, how many there are."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoadOptions:

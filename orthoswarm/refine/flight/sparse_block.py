@@ -10,7 +10,7 @@ from orthoswarm.config import active
 from orthoswarm.model.angles import wrap_rad
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
-from orthoswarm.model.task_runner import Run, serial
+from orthoswarm.model.task_runner import Progress, Run, serial
 from orthoswarm.refine.bundle import flight_records
 from orthoswarm.refine.bundle.adjustment import Adjustment
 from orthoswarm.refine.bundle.block_arrays import CX, CY, HEIGHT, WIDTH, F, Tracks
@@ -20,7 +20,7 @@ from orthoswarm.refine.flight.record_findings import height_findings
 from orthoswarm.refine.flight.relative_block import Flight
 from orthoswarm.refine.flight.sparse_adjustment import datum_prior, heights_above_ground, solve_sparse, trusted_heights
 from orthoswarm.refine.flight.sparse_start import SparseStart, read_photo_records, sparse_start
-from orthoswarm.refine.initial.pair_graph import Progress, ReadGray
+from orthoswarm.refine.initial.pair_graph import ReadGray
 from orthoswarm.refine.initial.planar_similarity import Array
 from orthoswarm.refine.initial.segments import photo_legs
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from orthoswarm.config import active
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
-from orthoswarm.model.task_runner import Run, serial
+from orthoswarm.model.task_runner import Progress, Run, serial
 from orthoswarm.refine.bundle.adjustment import Adjustment
 from orthoswarm.refine.bundle.block_arrays import WIDTH, Tracks
 from orthoswarm.refine.bundle.height_consistency import log_focal_sigmas
@@ -24,7 +24,7 @@ from orthoswarm.refine.flight.relative_block import Flight
 from orthoswarm.refine.flight.sparse_adjustment import datum_prior, solve_sparse, trusted_heights
 from orthoswarm.refine.flight.sparse_block import make_flight, open_sparse_flight
 from orthoswarm.refine.flight.sparse_start import SparseStart, read_photo_records, sparse_start
-from orthoswarm.refine.initial.pair_graph import Progress, ReadGray
+from orthoswarm.refine.initial.pair_graph import ReadGray
 from orthoswarm.refine.initial.planar_similarity import Array
 
 

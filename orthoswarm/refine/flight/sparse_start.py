@@ -12,7 +12,7 @@ import numpy as np
 from orthoswarm.config import active
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
-from orthoswarm.model.task_runner import Run, serial
+from orthoswarm.model.task_runner import Progress, Run, serial
 from orthoswarm.refine.bundle.block_arrays import HEIGHT, K1, WIDTH, CameraBlock, F, Tracks
 from orthoswarm.refine.features.pair_matching import Pair
 from orthoswarm.refine.features.sift_features import Features
@@ -20,7 +20,7 @@ from orthoswarm.refine.features.track_chaining import build_tracks, thin_tracks
 from orthoswarm.refine.flight.record_findings import findings, unplaced_reasons
 from orthoswarm.refine.initial.initial_orientation import InitialOrientation, find_initial_orientation
 from orthoswarm.refine.initial.lens_groups import lens_per_vehicle, split_unlike_lenses
-from orthoswarm.refine.initial.pair_graph import PairGraphBuilder, Progress, ReadGray, build_pair_graph
+from orthoswarm.refine.initial.pair_graph import PairGraphBuilder, ReadGray, build_pair_graph
 from orthoswarm.refine.initial.planar_similarity import Array, Flags, Ints, PhotoRecords
 from orthoswarm.refine.initial.relative_scale import focal_by_hint
 from orthoswarm.refine.initial.segments import split_segments

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from orthoswarm.config import active
 from orthoswarm.model.frame import Frame
-from orthoswarm.model.task_runner import Run, serial
+from orthoswarm.model.task_runner import Progress, Run, serial
 from orthoswarm.raster.picture_file import PictureError
 from orthoswarm.refine.features.pair_matching import Pair, consecutive, match_features, nearby
 from orthoswarm.refine.features.sift_features import Features, detect
@@ -22,7 +22,6 @@ from orthoswarm.refine.initial.planar_similarity import Ints, PhotoRecords
 
 Gray = NDArray[np.uint8]
 ReadGray = Callable[[Frame], Gray]
-Progress = Callable[[str, int, int], None]
 
 
 @dataclass(slots=True, kw_only=True)

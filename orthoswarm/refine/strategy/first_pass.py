@@ -10,10 +10,9 @@ from orthoswarm.model.errors import AdjustmentError
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import MapWindow
-from orthoswarm.model.task_runner import Run
+from orthoswarm.model.task_runner import Progress, Run
 from orthoswarm.refine.flight.relative_block import Flight
 from orthoswarm.refine.flight.sparse_joint import open_sparse_flights
-from orthoswarm.refine.initial.pair_graph import Progress
 from orthoswarm.refine.registration.block_state import Stopwatch, VehicleState
 from orthoswarm.refine.strategy.vehicle_passes import (
     Options,

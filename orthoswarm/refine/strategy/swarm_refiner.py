@@ -18,7 +18,7 @@ from orthoswarm.model.errors import AdjustmentError
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import MapWindow, Refinement, Solution, Terrain
-from orthoswarm.model.task_runner import Continued, Run, serial, whole
+from orthoswarm.model.task_runner import Continued, Progress, Run, serial, whole
 from orthoswarm.refine.flight.solve_units import merge_units
 from orthoswarm.refine.flight.unsolved_pictures import move_with_neighbours
 from orthoswarm.refine.flight.vehicle_refinement import UnitRefiner, unit_states, units_of_area, unrefined
@@ -42,7 +42,6 @@ from orthoswarm.refine.surface.vehicle_ground import ground_points
 __all__ = ["Options", "SwarmRefiner", "refine_alone", "states_of"]
 
 Array = NDArray[np.float64]
-Progress = Callable[[str, int, int], None]
 Task = Callable[..., VehicleState | Continued[VehicleState]]
 
 

@@ -5,7 +5,7 @@ where on the ground. What comes out is a recorded position and heading with a si
 refiner then adjusts these photos like all others.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +16,7 @@ from orthoswarm.evaluation.checkpoints import Checkpoint
 from orthoswarm.evaluation.photo_names import photo_named
 from orthoswarm.model.frame import SURVEYED, Frame
 from orthoswarm.model.geo import LocalGrid, area_epsg
-from orthoswarm.model.task_runner import Run
+from orthoswarm.model.task_runner import Progress, Run
 from orthoswarm.refine.flight.sparse_start import read_photo_records
 from orthoswarm.refine.initial.free_network import Anchors, FreeNetwork, solve_free_network
 from orthoswarm.refine.initial.initial_orientation import shape_of
@@ -26,7 +26,6 @@ from orthoswarm.refine.initial.relative_scale import focal_by_hint
 from orthoswarm.refine.initial.tilt_and_lens import Matches, level_pixels, similarities
 
 Array = NDArray[np.float64]
-Progress = Callable[[str, int, int], None]
 
 
 def place_unpositioned(
