@@ -98,7 +98,7 @@ def open_basemap(path: Path) -> Basemap | None:
     from rasterio.errors import RasterioError
     from rasterio.warp import transform_bounds
 
-    from orthoswarm.model.geo import utm_epsg
+    from orthoswarm.model.geo import area_epsg
 
     if path.is_dir():
         return None
@@ -109,6 +109,6 @@ def open_basemap(path: Path) -> Basemap | None:
             west, south, east, north = transform_bounds(raster.crs, 4326, *raster.bounds)
     except RasterioError as error:
         raise InputError(f"the basemap {path.name} cannot be read ({error}); check the file") from None
-    basemap = Basemap.open(path, utm_epsg(0.5 * (south + north), 0.5 * (west + east)))
+    basemap = Basemap.open(path, area_epsg([south, north], [west, east]))
     basemap.require_readable(basemap.bounds)  # check it now, not when the first vehicle completes
     return basemap

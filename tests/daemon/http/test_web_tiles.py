@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+import rasterio
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pyproj import Transformer
+from rasterio.transform import from_origin
 
 from gcs_plugin.daemon.jobs.kernel_warmup import made_up_ground, write_map
 from gcs_plugin.daemon.layers.layers import Area, Layer, successor
@@ -21,7 +23,7 @@ from gcs_plugin.daemon.store.workspace_lock import open_basemap
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError, OrthoSwarmError
-from orthoswarm.model.geo import GroundGrid
+from orthoswarm.model.geo import GroundGrid, LocalGrid
 from orthoswarm.mosaic.realtime import RealtimeMosaic
 from tests.kit.daemon_kit import camera_at, tile_over
 from tests.kit.mosaic_scene import EAST, NORTH, colour, picture_of
@@ -179,3 +181,15 @@ def test_a_basemap_that_is_cut_short_is_refused_before_anybody_flies(tmp_path):
     (tmp_path / "cut.tif").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(InputError, match=r"cut\.tif is cut short"):
         open_basemap(tmp_path / "cut.tif")
+
+
+def test_a_basemap_across_the_date_line_lies_in_a_zone_beside_it(tmp_path):
+    """Not in that of the mean of 179.998 and -179.998 degrees, on the other side of the world."""
+    values = np.random.default_rng(0).integers(0, 255, (3, 400, 400), dtype=np.uint8)
+    east, north = LocalGrid(32701).to_grid(-17.0, 180.0)
+    profile = {"driver": "GTiff", "width": 400, "height": 400, "count": 3, "dtype": "uint8", "crs": "EPSG:32701"}
+    with rasterio.open(
+        tmp_path / "map.tif", "w", **profile, transform=from_origin(east - 200.0, north + 200.0, 1, 1)
+    ) as file:
+        file.write(values)
+    assert open_basemap(tmp_path / "map.tif").epsg in (32701, 32760)
