@@ -12,6 +12,7 @@ survey are summed up as root mean squares, to which the survey's own error belon
 import csv
 import json
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
@@ -35,6 +36,7 @@ STANDARD_COUNT = 30
 """Checkpoints that a statement by the standard needs at least."""
 _SAME_PLACE_M = 0.02
 """Lines of one point may round its coordinates differently."""
+_DECIMAL_COMMA = re.compile(r"^([-+]?\d+),(\d+)$")
 _GRID = "+proj=longlat +datum=WGS84 +no_defs"
 
 
@@ -226,8 +228,8 @@ def read_checkpoints(table: Path, pixel_scale: float = 1.0) -> list[Checkpoint]:
     if not lines:
         raise InputError(f"{table.name} holds no points")
     scaled = _Scale(pixel_scale)
-    separator = next((mark for mark in ";," if mark in lines[0]), None)
-    if separator is None:
+    separator = max(";,", key=lines[0].count)
+    if separator not in lines[0]:
         points = _gcp_list(lines, table.name, scaled)
     else:
         points = _csv(lines, table.name, scaled, separator)
@@ -269,6 +271,8 @@ def _csv(lines: Sequence[str], name: str, scale: _Scale, separator: str) -> list
     points: list[Checkpoint] = []
     for number, row in enumerate(csv.DictReader(lines, skipinitialspace=True, delimiter=separator), 2):
         cells = {(key or "").strip().lower(): (value or "").strip() for key, value in row.items() if key is not None}
+        if separator == ";":  # spreadsheets in many countries write decimal commas then
+            cells = {key: _DECIMAL_COMMA.sub(r"\1.\2", value) for key, value in cells.items()}
         try:
             point = _csv_row(cells, name, scale)
         except (KeyError, ValueError) as error:
@@ -333,10 +337,7 @@ def _reason(error: Exception) -> str:
 
 
 def _number(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:  # a decimal comma, as spreadsheets in many countries write beside semicolons
-        value = float(text.replace(",", "."))
+    value = float(text)
     if not math.isfinite(value):
         raise ValueError(f"'{text}' is not a number")
     return value

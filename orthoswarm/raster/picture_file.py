@@ -2,6 +2,7 @@
 
 import io
 import os
+import re
 import struct
 from collections.abc import Sequence
 from functools import lru_cache
@@ -192,11 +193,13 @@ def _used_range(folder: Path, suffix: str) -> tuple[float, float] | None:
     """Values that become 0 and 255 in the 16-bit pictures of a folder; None where they use all 16 bits.
 
     Thermal and multispectral cameras write 10 to 14 bits. The range comes from some pictures of the folder, the same
-    ones in every process, so that neighbouring pictures are alike. Of pictures in stores it is not looked for.
+    ones in every process, so that neighbouring pictures are alike. It is not looked for in object storage, nor in the
+    folders of two hexadecimal digits over which the ground station spreads what comes: a range of these would change
+    with every picture.
     """
     import cv2
 
-    if is_stored(folder):
+    if is_stored(folder) or re.fullmatch("[0-9a-f]{2}", folder.name):
         return None
     try:
         names = sorted(name for name in os.listdir(folder) if Path(name).suffix.lower() == suffix)

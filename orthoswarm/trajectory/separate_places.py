@@ -9,29 +9,48 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
 
-def separate_places(lat_deg: Array, lon_deg: Array, gap_m: float) -> Ints:
+def separate_places(lat_deg: Array, lon_deg: Array, gap_m: float, gap_steps: float = 0.0) -> Ints:
     """Group of each place, int32 (N,), numbered in order of their first places.
 
-    Places less than `gap_m` apart are of one group, directly or through others.
+    Places less than a gap apart are of one group, directly or through others.
 
     Args:
         lat_deg, lon_deg: float64 (N,), in the order in which they were visited.
-        gap_m: distance in a straight line, metres.
+        gap_m: least gap in a straight line, metres. gap_steps: least gap in distances from a place to the nearest
+            other one, their median: high flights have few pictures far apart.
     """
     lat, lon = np.radians(lat_deg), np.radians(lon_deg)
     place = MEAN_RADIUS_M * np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=1)
-    step = np.linalg.norm(np.diff(place, axis=0), axis=1)
-    run = np.concatenate([[0], np.cumsum(step >= gap_m)]).astype(np.int32)[: len(place)]
-    if not len(run) or run[-1] == 0:
-        return run
+    if (np.linalg.norm(np.diff(place, axis=0), axis=1) < gap_m).all():
+        return np.zeros(len(place), np.int32)
     from scipy.spatial import cKDTree  # a tenth of a second that flights in one piece do without
 
-    trees = [cKDTree(place[run == k]) for k in range(int(run[-1]) + 1)]
-    group = np.arange(len(trees))
-    for k, tree in enumerate(trees):
-        for earlier in range(k):
-            nearest = np.min(tree.query(trees[earlier].data, distance_upper_bound=gap_m)[0])
-            if nearest < gap_m:
-                both = [group[earlier], group[k]]
-                group[np.isin(group, both)] = min(both)
-    return np.unique(group[run], return_inverse=True)[1].astype(np.int32)
+    if gap_steps:
+        nearest = np.asarray(cKDTree(place).query(place, k=2)[0])[:, 1]
+        gap_m = max(gap_m, gap_steps * float(np.median(nearest)))
+    label = _connected(place, gap_m)
+    _, first, number = np.unique(label, return_index=True, return_inverse=True)
+    return np.argsort(np.argsort(first)).astype(np.int32)[number]
+
+
+def _connected(place: Array, gap_m: float) -> Ints:
+    """A label of each place (N, 3): the same for those that are linked by steps shorter than the gap.
+
+    Places of one cell, whose diagonal is the gap, are linked; of two cells the nearest places decide.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
+    cells, cell = np.unique(np.floor(place * (np.sqrt(3.0) / gap_m)), axis=0, return_inverse=True)
+    order = np.argsort(cell.ravel(), kind="stable")
+    members = np.split(place[order], np.cumsum(np.bincount(cell.ravel()))[:-1])
+    trees = [cKDTree(own) for own in members]
+    # Places nearer than the gap lie at most two cells apart along each axis.
+    near = cKDTree(cells).query_pairs(2.0 * np.sqrt(3.0) + 1e-6, output_type="ndarray")
+    linked = [
+        (a, b) for a, b in near.tolist() if np.min(trees[a].query(members[b], distance_upper_bound=gap_m)[0]) < gap_m
+    ]
+    rows, columns = np.array(linked, np.intp).reshape(-1, 2).T
+    graph = coo_array((np.ones(len(rows), np.int8), (rows, columns)), shape=(len(cells), len(cells)))
+    return np.asarray(connected_components(graph, directed=False)[1], np.int32)[cell.ravel()]

@@ -134,6 +134,11 @@ def test_tables_as_other_programs_write_them_are_read(tmp_path):
     table.write_text("name;lat_deg;lon_deg;image;column;row\nP;48,5;11.25;a.jpg;10,5;4\n", "utf-8-sig")
     (point,) = read_checkpoints(table)
     assert point.surveyed.tolist() == [11.25, 48.5] and point.marks[0].column == pytest.approx(10.5)
+    table.write_text("name,lat_deg,lon_deg,image,column,row,note;x\nP,48.5,11.25,a.jpg,10,5,\n")
+    assert read_checkpoints(table)[0].surveyed.tolist() == [11.25, 48.5]
+    table.write_text('name,lat_deg,lon_deg,image,column,row\nP,48.5,11.25,a.jpg,"1,234",5\n')
+    with pytest.raises(InputError, match="line 2"):  # 1.234 or 1234
+        read_checkpoints(table)
 
 
 def test_a_name_that_two_photos_have_is_asked_about(tmp_path):

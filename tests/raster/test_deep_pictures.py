@@ -27,3 +27,15 @@ def test_fourteen_bits_are_stretched_by_one_range_for_the_folder(tmp_path, suffi
 def test_all_sixteen_bits_are_divided(tmp_path):
     cv2.imwrite(str(tmp_path / "full.tif"), ramp(0, 65535))
     assert np.abs(read_gray(tmp_path / "full.tif").astype(float) - ramp(0, 65535) / 256.0).max() <= 1.0
+
+
+def test_a_ground_stations_pictures_do_not_depend_on_what_else_has_come(tmp_path):
+    """It spreads them over folders by their digest: a range of these would differ from folder to folder."""
+    grey = []
+    for k, name in enumerate(("00", "ab", "f3")):
+        (tmp_path / name).mkdir()
+        cv2.imwrite(
+            str(tmp_path / name / f"{k}.png"), np.vstack([np.full((24, 64), 3200, np.uint16), ramp(0, 999 * k)])
+        )
+        grey.append(int(read_gray(tmp_path / name / f"{k}.png")[0, 0]))
+    assert set(grey) == {3200 // 256}

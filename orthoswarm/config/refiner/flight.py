@@ -18,7 +18,10 @@ class FlightConfig:
     """Fewer photos of another camera name but the same size stay with the vehicle's main camera (chosen)."""
     unit_gap_m: float = 500.0
     """Groups of photos at least so far apart are solved like different vehicles: they show no common ground, so what
-    places the one says nothing about the other (chosen: more than the footprint of a photo from 200 m)."""
+    places the one says nothing about the other (chosen: more than the footprint of a photo from 200 m) ..."""
+    unit_gap_steps: float = 10.0
+    """... and at least so many times the usual distance of a photo to the nearest one: of high flights lines are far
+    apart (chosen: with overlaps of 80 and 20 % lines are five times as far apart as photos)."""
     least_photos_of_kind: int = 3
     """Fewer photos of one camera and size are not refined but placed by their neighbours (chosen)."""
     hover_share: float = 0.05

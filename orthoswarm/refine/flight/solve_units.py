@@ -34,7 +34,7 @@ def _by_place(frames: list[Frame]) -> list[list[Frame]]:
     """Frames by the place where they were taken, groups of a few with the largest."""
     config = active().flight
     lat, lon = (np.array([getattr(f.fix, name) for f in frames], float) for name in ("lat_deg", "lon_deg"))
-    group = separate_places(lat, lon, config.unit_gap_m)
+    group = separate_places(lat, lon, config.unit_gap_m, config.unit_gap_steps)
     count = np.bincount(group)
     group[count[group] < config.own_unit_photos] = count.argmax()
     return [[f for f, k in zip(frames, group, strict=True) if k == number] for number in np.unique(group)]

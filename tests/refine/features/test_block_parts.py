@@ -112,6 +112,24 @@ def test_photos_of_another_place_are_a_unit_of_their_own():
     assert [f.image for f in other] == [f.image for f in away]
 
 
+def test_lines_of_a_high_flight_are_one_place():
+    """600 m from line to line, 300 m from photo to photo: they show common ground from 700 m."""
+    frames = [
+        frame(20 * k + i, lat_deg=48.0 + k * 600 / 111_200, lon_deg=11.0 + i * 300 / 74_500)
+        for k in range(10)
+        for i in range(20)
+    ]
+    (unit,) = split_units({"a": frames})
+    assert len(unit) == 200
+
+
+def test_two_places_visited_in_turn_are_two_units():
+    """Two drones of one model in one folder, photos sorted by time."""
+    frames = [frame(i, lat_deg=48.0 + 1e-5 * i + 0.02 * (i % 2)) for i in range(300)]
+    one, other = split_units({"a": frames})
+    assert [len(one), len(other)] == [150, 150]
+
+
 def test_a_few_photos_with_wrong_positions_stay_with_the_others():
     frames = [frame(i, **({"lat_deg": 48.3} if i in (7, 8, 30) else {})) for i in range(60)]
     (unit,) = split_units({"a": frames})
