@@ -30,9 +30,10 @@ class FlightLimits:
     """Flight time of a full battery, seconds (chosen: a small multicopter's)."""
     reserve_share: float = 0.2
     """Share of the battery that is to be left after landing (chosen: what pilots keep)."""
-    level_m: float = 6.0
-    """Homes whose altitudes differ by less count as level, metres: receivers err by about 5 m in height (u-blox M8:
-    2.5 m horizontally, twice that in height), and a plan's layers are 5 m apart."""
+    level_m: float = 12.0
+    """Takeoffs whose altitudes differ by less count as level, metres: receivers err by about 5 m in height (u-blox M8:
+    2.5 m horizontally, twice that in height), two of them by 7 m and now and then by 12 m. A plan's layers are 5 m
+    apart, so that such an error would be taken for a vehicle in another one's layer."""
     old_s: float = 15.0
     """The state of battery or receiver that was reported longer ago is not that of now, seconds: both come once a
     second, and are asked for again three seconds after they stop (chosen)."""

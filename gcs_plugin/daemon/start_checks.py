@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any, Final
 
 from gcs_plugin.config import COMMAND, LIMITS
 from gcs_plugin.daemon.airspace.fences import Fences
+from gcs_plugin.mission.items import Mission
 from orthoswarm.model.errors import OrthoSwarmError
 
 if TYPE_CHECKING:
     from gcs_plugin.fleet.fleet import Fleet
     from gcs_plugin.fleet.separation_check import Separation
     from gcs_plugin.mission.download import MissionDownload
-    from gcs_plugin.mission.items import Mission
 
 _SOON_S: Final = 5.0
 _READ_S: Final = 20.0
@@ -40,6 +40,7 @@ class StartChecks:
     ) -> None:
         self._fleet, self._fences, self._name_of, self._waiting = fleet, fences, name_of, waiting
         self._read: dict[int, tuple[float, Mission]] = {}
+        self._reading: dict[int, MissionDownload] = {}
 
     def check(
         self,
@@ -81,6 +82,7 @@ class StartChecks:
                 name=self._name_of,
                 separation=separation,
                 zones=self._fences.zones(),
+                reading=[s for s in systems if self._is_reading(s)],
             )
         ).result(_READ_S)
         return [check.document(systems[check.system]) for check in checks]
@@ -109,26 +111,37 @@ class StartChecks:
 
     def _missions(self, systems: Collection[int], *, reread: bool) -> "dict[int, Mission]":
         """The missions stored in vehicles, of those that answer in time."""
-        from gcs_plugin.mission.items import Mission
-
+        self._take_read()
         found = {s: mission for s in systems if (mission := self._known(s, reread=reread)) is not None}
-        reads: dict[int, MissionDownload] = {}
 
         def begin(system: int) -> None:
             with contextlib.suppress(OrthoSwarmError):  # lost or busy: reported by the check
-                reads[system] = self._fleet.download(system)
+                self._reading[system] = self._fleet.download(system)
 
         unread = [system for system in systems if system not in found]
-        for begun in [self._fleet.call(lambda s=system: begin(s)) for system in unread]:  # type: ignore[misc]
+        fresh = [system for system in unread if system not in self._reading]  # others go on from an earlier check
+        for begun in [self._fleet.call(lambda s=system: begin(s)) for system in fresh]:  # type: ignore[misc]
             begun.result(_SOON_S)
         end = time.monotonic() + _READ_S
-        while any(read.outcome is None for read in reads.values()) and time.monotonic() < end:
+        while any(self._is_reading(system) for system in unread) and time.monotonic() < end:
             time.sleep(0.02)
-        for system, read in reads.items():
+        self._take_read()
+        return found | {s: self._read[s][1] for s in unread if s in self._read and not self._is_reading(s)}
+
+    def _is_reading(self, system: int) -> bool:
+        read = self._reading.get(system)
+        return read is not None and read.outcome is None
+
+    def _take_read(self) -> None:
+        """Keep the missions whose reading has ended, also after the check that began it."""
+        for system, read in list(self._reading.items()):
+            if read.outcome is None:
+                continue
+            self._reading.pop(system, None)
+            self._read.pop(system, None)
             if read.items is not None:
-                found[system] = Mission(self._fleet.vehicles[system].autopilot, tuple(read.items))
-                self._read[system] = time.monotonic(), found[system]
-        return found
+                mission = Mission(self._fleet.vehicles[system].autopilot, tuple(read.items))
+                self._read[system] = time.monotonic(), mission
 
     def _known(self, system: int, *, reread: bool) -> "Mission | None":
         """Its mission, if it was read a moment ago (`reread`: ever) and nothing indicates another one since."""

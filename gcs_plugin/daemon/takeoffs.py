@@ -131,7 +131,7 @@ class Takeoffs:
         starts = self._plans.starts(plan, sortie)
         whose = {vehicle: (names or {}).get(vehicle, vehicle) for vehicle in starts}
         with self._condition:
-            if self._schedule.waiting or self._checking:
+            if self._schedule.waiting or self._checking or self._about_to:
                 raise OrthoSwarmError("other takeoffs are under way; pause or rtl a waiting vehicle to cancel its own")
             systems = self._systems(whose)
             self._checking, stops = frozenset(systems.values()), dict(self._links.fleet.stops)
@@ -140,8 +140,7 @@ class Takeoffs:
             first = min(starts.values())
             delays = {systems[vehicle]: start_s - first for vehicle, start_s in starts.items()}
             held = {s: self._links.fleet.vehicles[s].mission for s in delays}
-            airspace = Airspace.of({s: mission for s, mission in held.items() if mission is not None})
-            schedule = TakeoffSchedule.of(delays, self._clock(), airspace)
+            schedule = TakeoffSchedule.of(delays, self._clock())
             with self._condition:
                 if not wanted():
                     raise OrthoSwarmError("the start was cancelled; no vehicle was started")
@@ -156,18 +155,24 @@ class Takeoffs:
         finally:
             self._checking = frozenset()
         threading.Thread(target=self._run, name="takeoffs", daemon=True).start()
+        known = {s: mission for s, mission in held.items() if mission is not None}
+        threading.Thread(target=self._follow, args=(schedule, known, delays), daemon=True).start()
         return {whose[vehicle]: round(start_s - first, 1) for vehicle, start_s in starts.items()}
 
     def cancel(self, vehicle: str) -> str:
         """Cancel a takeoff that waits or is being checked; returns that in words, empty if there was none.
 
-        `Fleet.told_to_stop` comes before: by that `begin` finds after its check that the start is void.
+        `Fleet.told_to_stop` makes a start void that is being checked or about to be sent; it is told here again, since
+        a start whose check began after the first time would not see that.
         """
         with self._condition:
-            if any(self._links.name_of(system) == vehicle for system in self._checking):
+            system = next((s for s in self._checking if self._links.name_of(s) == vehicle), None)
+            if system is not None:
+                self._links.fleet.told_to_stop(system)
                 return "the start that was being checked is cancelled"
             system = next((s for s, name in self._names.items() if name == vehicle), None)
-            if system in self._about_to:
+            if system is not None and system in self._about_to:
+                self._links.fleet.told_to_stop(system)
                 return "its start, which was due now, is cancelled"
             due = None if system is None else self._schedule.waiting.pop(system, None)
             self._condition.notify_all()
@@ -242,6 +247,12 @@ class Takeoffs:
     def _due(self, system: int) -> bool:
         """Whether a vehicle's takeoff waits or is being checked. Without the lock: the fleet's thread never waits."""
         return system in self._checking or system in self._schedule.waiting or system in self._about_to
+
+    def _follow(self, schedule: TakeoffSchedule, missions: Mapping[int, Mission], delays: Mapping[int, float]) -> None:
+        """Give a schedule the airspace by which it moves takeoffs; beside it, as many vehicles take seconds."""
+        airspace = Airspace.of(missions).as_planned(delays)
+        with self._condition:
+            schedule.airspace = airspace
 
     def _run(self) -> None:
         """Start each at its time; ends with the last."""

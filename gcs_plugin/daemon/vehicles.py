@@ -9,8 +9,8 @@ For the HTTP API and the page, all in JSON values:
   `not_sent`, `unknown`), `reason`. Verbs are `start`, `pause`, `resume`, `rtl`, `land`; no vehicles named: all on the
   links at once.
 - `preflight(...)` gives a row a vehicle: `vehicle`, `state` and `items`, each with `name` (`link`, `gps`, `ekf`,
-  `home`, `pre-arm`, `battery`, `mission`, `height`, `speed`, `separation`), `state` (`ok`, `warning`, `red`) and
-  `reason`. A red item stops `start` unless it is overridden by its name.
+  `home`, `pre-arm`, `battery`, `mission`, `fence`, `height`, `speed`, `separation`), `state` (`ok`, `warning`, `red`)
+  and `reason`. A red item stops `start` unless it is overridden by its name.
 - `flight_state(vehicle)`, and `flight` in each row of `rows()`: `state` (`on ground`, `taking off`, `on mission`,
   `paused`, `returning`, `landing`, `holding`, `flying`, `lost`, `complete`), `text` (`on mission 7/13`), `item` and
   `items`.
@@ -254,8 +254,11 @@ class VehicleLinks:
             if verb in URGENT:
                 self.fleet.told_to_stop(systems[name])  # first of all: it makes void what is being checked now
                 checked = "its start is cancelled" if self._starting[systems[name]] else ""
+                if checked:
+                    self.fleet.told_to_stop(systems[name])  # again, for a check that began after the first time
                 cancelled = self.cancel_takeoff(name) or checked
-                if cancelled and not self.fleet.vehicles[systems[name]].armed:
+                under_way = self.fleet.vehicles[systems[name]].armed or self.fleet.starting(systems[name])
+                if cancelled and not under_way:
                     end(name, Verdict.DONE, f"{name} stays on the ground: {cancelled}")
                     del systems[name]
         if verb == "start":

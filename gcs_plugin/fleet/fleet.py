@@ -23,7 +23,7 @@ from gcs_plugin.fleet.link_hub import Hub
 from gcs_plugin.fleet.message_rates import Rates, default_rates
 from gcs_plugin.fleet.reception import MESSAGE_IDS, Handler, Reception
 from gcs_plugin.fleet.vehicle_state import Vehicle
-from gcs_plugin.links.mavlink import Message
+from gcs_plugin.links.mavlink import Autopilot, Message
 from gcs_plugin.links.packets import Packet
 from gcs_plugin.links.transports import Link
 from gcs_plugin.mission.completion import Phase
@@ -262,6 +262,10 @@ class Fleet:
         """True while a dialogue with a vehicle is under way."""
         return self._dialogues.busy(system)
 
+    def starting(self, system: int) -> bool:
+        """True while a vehicle's start is under way."""
+        return self._dialogues.starting(system)
+
     def _free(self, system: int) -> Vehicle:
         vehicle = self.vehicle(system)
         self._dialogues.end_background(system)
@@ -325,12 +329,13 @@ class Fleet:
         """
         state = flight_state(vehicle)
         # A station that has just begun to listen does not know the mission's phase: then the mode of a pause counts.
-        held = vehicle.flying and vehicle.custom_mode == vehicle.modes.hold and vehicle.mission_seq > 0
+        begun = vehicle.mission_seq >= (1 if vehicle.autopilot is Autopilot.ARDUPILOT else 0)  # its item 0 is its home
+        held = vehicle.flying and vehicle.custom_mode == vehicle.modes.hold and begun
         within = held and state.word is Word.FLYING and vehicle.detector.phase is Phase.IDLE
         if self._clock() - self._told_home.get(vehicle.system, -math.inf) < _PAUSE_SHOWS_S:  # its mode may be older
             raise OrthoSwarmError(f"vehicle {vehicle.system} was told to return or land just now; it is not resumed")
         # A pause shows some seconds after it was acknowledged: on a mission there is nothing to pull it out of.
-        if state.word not in (Word.PAUSED, Word.ON_MISSION) and not within:
+        if state.word not in (Word.PAUSED, Word.ON_MISSION, Word.TAKING_OFF) and not within:
             raise OrthoSwarmError(f"vehicle {vehicle.system} is {state.word.value}, so there is no pause to end")
 
     def _was_just_paused(self, system: int) -> bool:

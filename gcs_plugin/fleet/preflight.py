@@ -5,7 +5,7 @@ pre-arm checks, its filter) is included here, so that no vehicle takes off while
 """
 
 import enum
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from typing import TYPE_CHECKING, Any, Final
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from gcs_plugin.mission.items import Mission
 
 ITEMS: Final = (
-    "link", "gps", "ekf", "home", "pre-arm", "battery", "mission", "height", "speed", "separation",
+    "link", "gps", "ekf", "home", "pre-arm", "battery", "mission", "fence", "height", "speed", "separation",
 )  # fmt: skip
 _LINK_S: Final = (2.0, 5.0)
 _SATELLITES: Final = (6, 10)
@@ -104,6 +104,7 @@ class Wanted:
         near: finding of the separation check about this vehicle, empty if none.
         zones: of the geofence that it holds, None if that has not been read.
         unexamined: why its separation from others could not be examined, empty if it was.
+        reading: its mission is still being read from it.
     """
 
     mission: "Mission | None" = None
@@ -114,6 +115,7 @@ class Wanted:
     _: KW_ONLY
     unexamined: str = ""
     zones: "Sequence[Zone] | None" = None
+    reading: bool = False
 
 
 def preflight(vehicle: "Vehicle", wanted: Wanted, now: float) -> Check:
@@ -125,9 +127,8 @@ def preflight(vehicle: "Vehicle", wanted: Wanted, now: float) -> Check:
     mission = wanted.mission or wanted.stored or vehicle.mission
     items = (
         _link(vehicle, now), _gps(vehicle, now), _ekf(vehicle), _home(vehicle, mission, wanted), _prearm(vehicle, now),
-        _battery(vehicle, mission, wanted.endurance_s, now), _mission(vehicle, wanted), _height(mission, wanted),
-        _speed(vehicle, mission),
-        _separation(wanted),
+        _battery(vehicle, mission, wanted.endurance_s, now), _mission(vehicle, wanted), _fence(mission, wanted.zones),
+        _height(mission, wanted), _speed(vehicle, mission), _separation(wanted),
     )  # fmt: skip
     return Check(vehicle.system, items)
 
@@ -144,6 +145,7 @@ def preflight_all(
     name: Callable[[int], str] = number_name,
     separation: Separation | None = None,
     zones: "Mapping[int, Sequence[Zone]] | None" = None,
+    reading: Collection[int] = (),
 ) -> list[Check]:
     """Check vehicles that are to start together.
 
@@ -157,6 +159,7 @@ def preflight_all(
         name: name of a vehicle by its system id.
         zones: of the geofences that were read.
         separation: of them from each other and from others, where that was examined before.
+        reading: vehicles whose missions are still being read.
     """
     if separation is None:
         separation = separation_of(flights_of(vehicles, missions, stored, starts), name)
@@ -166,6 +169,7 @@ def preflight_all(
             Wanted(
                 missions.get(s), stored.get(s), endurance_s, legal_height_m,
                 separation.near.get(s, ""), unexamined=separation.unexamined.get(s, ""), zones=(zones or {}).get(s),
+                reading=s in reading,
             ),
             now,
         )
@@ -271,19 +275,28 @@ def _battery(vehicle: "Vehicle", mission: "Mission | None", endurance_s: float, 
 
 def _mission(vehicle: "Vehicle", wanted: Wanted) -> Item:
     held = wanted.stored or vehicle.mission
+    if wanted.reading:
+        return Item("mission", Level.RED, "its mission is still being read from it; wait")
     if held is None:
         return Item("mission", Level.RED, "its mission has not been read yet; upload it, or wait until it is read")
     wrong = unflyable(held.items, vehicle.autopilot, in_air=vehicle.flying)
     if wrong:
         return Item("mission", Level.RED, wrong)
-    if wanted.zones and (broken := breach(wanted.mission or held, wanted.zones)):
-        return Item("mission", Level.RED, f"{broken}; change the mission or the fence")
     if wanted.mission is not None:
         found = difference(wanted.mission, held.items)
         if found is not None:
             return Item("mission", Level.RED, f"it does not hold this plan's mission ({found.text}); upload the plan")
         return Item("mission", Level.OK, "holds this plan's mission")
     return Item("mission", Level.OK, f"holds a mission of {len(held)} items")
+
+
+def _fence(mission: "Mission | None", zones: "Sequence[Zone] | None") -> Item:
+    if not zones or mission is None:
+        return Item("fence", Level.OK, "its geofence was not read" if zones is None else "it has no geofence")
+    broken = breach(mission, zones)
+    if broken:
+        return Item("fence", Level.RED, f"{broken}; change the mission or the fence")
+    return Item("fence", Level.OK, "its mission keeps to its geofence")
 
 
 def _height(mission: "Mission | None", wanted: Wanted) -> Item:

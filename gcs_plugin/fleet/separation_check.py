@@ -9,7 +9,6 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Final
 
-from gcs_plugin.config import LIMITS
 from gcs_plugin.fleet.flight_state import Word, flight_state
 from gcs_plugin.fleet.separation_watch import number_name
 from gcs_plugin.mission.track import STEP_S, Airspace, home_of, metres, track_of
@@ -112,26 +111,15 @@ def _conflicts(flights: tuple[tuple[int, Flight], ...]) -> tuple[tuple[int, int,
     """Both vehicles, the time and the distance; the same flights are asked about again and again before a start."""
     about = dict(flights)
     missions = {s: f.mission for s, f in flights if f.mission is not None}
-    airspace = Airspace.of(missions, _levels_m(about))
+    levels = {s: flight.alt_m for s, flight in flights if flight.alt_m is not None}
     starts = {s: flight.start_s for s, flight in flights}
-    planned = replace(
-        airspace,
-        distance_m=_PLANNED_SHARE * airspace.distance_m,
-        slack_s=airspace.slack_s - STEP_S,
-        _found={},
-    )
     in_plan = {s for s, flight in flights if flight.planned}
-    found = [row for row in airspace.conflicts(starts) if not {row[0], row[1]} <= in_plan]
-    found += planned.conflicts({s: start for s, start in starts.items() if s in in_plan})
+    found = Airspace.of(missions, levels).conflicts(starts, but_among=in_plan)
+    # By what the plan's own autopilots are off schedule, as it was made.
+    plan = Airspace.of({s: mission for s, mission in missions.items() if s in in_plan}, levels)
+    plan = replace(plan, distance_m=_PLANNED_SHARE * plan.distance_m, slack_s=plan.slack_s - STEP_S, _found={})
+    found += plan.conflicts({s: start for s, start in starts.items() if s in in_plan})
     return tuple(row for row in found if about[row[0]].examined or about[row[1]].examined)
-
-
-def _levels_m(flights: Mapping[int, Flight]) -> dict[int, float]:
-    """The homes' altitudes over the lowest; 0 for all where they are level within what receivers err by."""
-    known = {s: flight.alt_m for s, flight in flights.items() if flight.alt_m is not None}
-    lowest = min(known.values(), default=0.0)
-    levels = {s: alt_m - lowest for s, alt_m in known.items()}
-    return {s: level if level > LIMITS.level_m else 0.0 for s, level in levels.items()}
 
 
 def _elapsed_s(vehicle: "Vehicle", mission: "Mission") -> float:

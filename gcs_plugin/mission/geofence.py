@@ -10,6 +10,8 @@ from gcs_plugin.mission.items import MissionItem
 if TYPE_CHECKING:
     from gcs_plugin.mission.items import Mission
 
+_ROUNDING_M: Final = 0.5
+"""A way along the edge of a zone may lie so far on the wrong side: places are rounded."""
 FENCE: Final = int(dialect.MAV_MISSION_TYPE_FENCE)
 Kind = Literal["inclusion", "exclusion"]
 _POLYGONS: Final[dict[int, Kind]] = {
@@ -64,10 +66,10 @@ def breach(mission: "Mission", zones: "Sequence[Zone]") -> str:
         shapes.append(Polygon(ring).buffer(0) if zone.radius_m is None else Point(ring[0]).buffer(zone.radius_m))
     way = LineString(points[:, :2])
     inside = [shape for zone, shape in zip(zones, shapes, strict=True) if zone.kind == "inclusion"]
-    if inside and (far := way.difference(union_all(inside))).length > 0.0:
+    if inside and (far := way.difference(union_all(inside).buffer(_ROUNDING_M))).length > 0.0:
         return f"its mission leaves its geofence for {far.length:.0f} m"
     outside = [shape for zone, shape in zip(zones, shapes, strict=True) if zone.kind == "exclusion"]
-    if outside and (within := way.intersection(union_all(outside))).length > 0.0:
+    if outside and (within := way.intersection(union_all(outside).buffer(-_ROUNDING_M))).length > 0.0:
         return f"its mission flies {within.length:.0f} m through a zone that its geofence excludes"
     return ""
 

@@ -92,7 +92,9 @@ def _wire(item: mission_files.MissionItem, autopilot: Autopilot) -> MissionItem:
 
 
 def _for(value: float, autopilot: Autopilot) -> float:
-    return 0.0 if autopilot is Autopilot.ARDUPILOT and math.isnan(value) else value
+    if not math.isnan(value):
+        return value
+    return 0.0 if autopilot is Autopilot.ARDUPILOT else math.nan  # one object: missions read twice are equal
 
 
 def _first_place(items: Sequence[MissionItem]) -> tuple[float, float, float] | None:

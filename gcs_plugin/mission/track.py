@@ -6,13 +6,14 @@ later, they are far enough from each other or at another height (orthoswarm.plan
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gcs_plugin.config import LIMITS
 from gcs_plugin.mission.items import (
     CHANGE_SPEED,
     FRAME_GLOBAL,
@@ -47,16 +48,19 @@ class Track:
     Attributes:
         places: float64 (n, 3), east and north of a common origin and height over takeoff, metres.
         autopilot: whose times these are.
-        level_m: altitude of its takeoff over a level that is common to all tracks, metres.
+        level_m: altitude of its takeoff above the sea, metres; None if that is not known.
     """
 
     places: Array
     autopilot: AutopilotConfig = field(default_factory=lambda: active().ardupilot)
-    level_m: float = 0.0
+    level_m: float | None = None
 
-    def raised(self, level_m: float) -> "Track":
-        """The same from a takeoff that lies so much higher."""
-        return replace(self, level_m=level_m) if level_m else self
+    def higher_m(self, other: "Track") -> float:
+        """How much higher it takes off than another one, metres; 0 where they may be level, by what receivers err."""
+        if self.level_m is None or other.level_m is None:
+            return 0.0
+        higher = self.level_m - other.level_m
+        return higher if abs(higher) > LIMITS.level_m else 0.0
 
     def elapsed_s(self, place: tuple[float, float, float]) -> float:
         """The time at which it comes nearest to a place (east, north, height over takeoff; metres), seconds."""
@@ -198,10 +202,11 @@ class Airspace:
         """Of missions by system id.
 
         Args:
-            missions: the missions. levels_m: altitude of each takeoff over a common level, metres; default 0.
+            missions: the missions. levels_m: altitudes of the takeoffs above the sea, metres, where they are known.
         """
         origin = next((home for mission in missions.values() if (home := home_of(mission))), (0.0, 0.0))
-        tracks = {s: track_of(mission, origin).raised((levels_m or {}).get(s, 0.0)) for s, mission in missions.items()}
+        levels = levels_m or {}
+        tracks = {s: replace(track_of(mission, origin), level_m=levels.get(s)) for s, mission in missions.items()}
         slack_s = max((_autopilot_of(mission).schedule_slack_s for mission in missions.values()), default=0.0)
         return cls(tracks, slack_s=slack_s)
 
@@ -228,7 +233,7 @@ class Airspace:
         if known is None:
             a, b = self.tracks[one].places, self.tracks[other].places
             i, j = _near(a, b, self.distance_m) if len(a) and len(b) else (np.zeros(0, np.int64),) * 2
-            higher = self.tracks[one].level_m - self.tracks[other].level_m
+            higher = self.tracks[one].higher_m(self.tracks[other])
             counted = np.abs(a[i, 2] - b[j, 2] + higher) < self.height_m - _HAIR_M
             i, j = i[counted], j[counted]
             at_start, start_slack_s = np.zeros(len(i), bool), np.zeros(len(i))
@@ -248,12 +253,20 @@ class Airspace:
         planned = replace(self, in_turn=True)
         return planned if not planned.conflicts(starts) else replace(self, in_turn=False)
 
-    def conflicts(self, starts: Mapping[int, float]) -> list[tuple[int, int, float, float]]:
-        """Pairs that come too close with these starts: both vehicles, time on the starts' clock, distance in metres."""
+    def conflicts(
+        self, starts: Mapping[int, float], *, but_among: Collection[int] = ()
+    ) -> list[tuple[int, int, float, float]]:
+        """Pairs that come too close with these starts: both vehicles, time on the starts' clock, distance in metres.
+
+        Args:
+            starts: takeoffs, seconds. but_among: pairs of these are left out.
+        """
         systems = sorted(set(starts) & set(self.tracks))
         found = []
         for index, one in enumerate(systems):
             for other in systems[index + 1 :]:
+                if one in but_among and other in but_among:
+                    continue
                 meeting = self.meeting(one, other, starts[other] - starts[one])
                 if meeting is not None:
                     found.append((one, other, starts[one] + meeting[0], meeting[1]))

@@ -15,6 +15,7 @@ from gcs_plugin.fleet.separation_watch import Near, SeparationWatch
 from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.mission.mission_builder import read_mission
 from gcs_plugin.mission.plan_folder import plan_endurance_s
+from gcs_plugin.sim.lossy_radio import NO_FAULTS, Faults
 from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 from tests.vehicles.test_fleet_cli import HOME, folder  # noqa: F401
@@ -51,8 +52,9 @@ class PlanFolder:
 def open_links(tmp_path):
     opened = []
 
-    def make(vehicles, *, key=None, speed=10.0, named=()):
-        swarm = SimSwarm(vehicles, "tcpin:127.0.0.1:0", speed=speed, key=key)
+    def make(vehicles, *, key=None, speed=10.0, named=(), delay_s=0.0):
+        slow = Faults(delay_s=(delay_s, delay_s)) if delay_s else NO_FAULTS
+        swarm = SimSwarm(vehicles, "tcpin:127.0.0.1:0", speed=speed, key=key, up=slow, down=slow)
         swarm.__enter__()
         opened.append(swarm)
         settings = Settings(workspace=tmp_path, links=tuple(swarm.addresses), vehicles=named)

@@ -5,6 +5,7 @@ import threading
 
 import pytest
 
+from gcs_plugin.daemon import start_checks
 from gcs_plugin.daemon.takeoffs import Takeoffs
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.mission_builder import read_mission
@@ -64,6 +65,61 @@ def test_a_command_to_stop_during_the_check_cancels_the_start(open_links, folder
     thread.join(30.0)
     assert said == ["v1, v2 was told to stop during the check; no vehicle was started"]
     assert takeoffs.rows() == {} and not any(v.flight.armed for v in vehicles)
+    takeoffs.close()
+
+
+def test_a_command_to_stop_counts_though_the_check_begins_at_that_moment(open_links, folder):  # noqa: F811
+    """The start copies the numbers of stops between the command's own count and its look at what is being checked."""
+    apart(folder, 1, 0.0)
+    vehicles = make_swarm(1, home=HOME)
+    links = open_links(vehicles)
+    ready(links, 1)
+    upload_all(links, folder)
+    plans, said = SlowPlans(folder), []
+    takeoffs = Takeoffs(links, plans, lambda _: None)
+    cancel = takeoffs.cancel
+
+    def begin():
+        try:
+            said.append(takeoffs.begin("plan-1", override=ONE_PATH))
+        except OrthoSwarmError as error:
+            said.append(str(error))
+
+    def late(vehicle):
+        thread.start()
+        assert plans.asked.wait(30.0)
+        return cancel(vehicle)
+
+    thread = threading.Thread(target=begin)
+    links.cancel_takeoff = late
+    (row,) = links.commands("pause")
+    assert row["outcome"] == "done" and "cancelled" in row["reason"]
+    plans.go_on.set()
+    thread.join(30.0)
+    assert said == ["v1 was told to stop during the check; no vehicle was started"]
+    assert not vehicles[0].flight.armed
+    takeoffs.close()
+
+
+def test_a_mission_that_takes_long_to_read_is_red_until_it_is_read(open_links, folder, monkeypatch):  # noqa: F811
+    """A check goes on with what an earlier one has begun to read; then a start finds the mission read."""
+    monkeypatch.setattr(start_checks, "_READ_S", 0.3)
+    apart(folder, 1, 0.0)
+    links = open_links(make_swarm(1, home=HOME), delay_s=0.3)
+    ready(links, 1)
+    upload_all(links, folder)
+    plans = PlanFolder(folder)
+    takeoffs = Takeoffs(links, plans, lambda _: None)
+
+    def reason():
+        (row,) = takeoffs.preflight("plan-1")
+        return next(i["reason"] for i in row["items"] if i["name"] == "mission")
+
+    assert "still being read" in reason()
+    with pytest.raises(OrthoSwarmError, match="still being read"):
+        takeoffs.begin("plan-1", override=ONE_PATH)
+    wait(lambda: reason() == "holds this plan's mission", 60.0)
+    assert takeoffs.begin("plan-1", override=ONE_PATH) == {"v1": 0.0}
     takeoffs.close()
 
 

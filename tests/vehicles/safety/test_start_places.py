@@ -141,5 +141,21 @@ def test_a_mission_that_breaks_the_geofence_is_red(make_world, kind, radius_m, l
     north = 0.0 if kind == "inclusion" else 60.0
     lat, lon = CHART.to_degrees(north, 10.0)
     zones = [Zone(kind, ((lon, lat),), radius_m)]
-    assert item(world, "mission", Wanted(zones=zones)).level is level
-    assert item(world, "mission").level is Level.OK
+    assert item(world, "fence", Wanted(zones=zones)).level is level
+    other = line(AP, 10, 90)  # whoever allows the fence does not allow another mission with it
+    assert item(world, "mission", Wanted(mission=other, zones=zones)).level is Level.RED
+    assert item(world, "fence").level is Level.OK and "not read" in item(world, "fence").reason
+
+
+def test_a_way_along_the_edge_of_a_fence_keeps_to_it(make_world):
+    world = standing(make_world, AP, line(AP, 10, 80))
+    corners = [CHART.to_degrees(north, east) for north, east in ((-10, 10), (200, 10), (200, 300), (-10, 300))]
+    ring = tuple((round(lon, 6), round(lat, 6)) for lat, lon in corners)
+    found = item(world, "fence", Wanted(zones=[Zone("exclusion", ring)]))
+    assert found.level is Level.OK, found.reason
+
+
+def test_a_check_is_red_while_the_mission_is_being_read(make_world):
+    world = standing(make_world, AP, line(AP, 10, 80))
+    found = item(world, "mission", Wanted(reading=True))
+    assert found.level is Level.RED and "still being read" in found.reason

@@ -70,6 +70,20 @@ def test_a_vehicle_that_returns_or_lands_is_not_resumed(make_world, autopilot, v
 
 
 @BOTH
+def test_a_vehicle_that_was_paused_in_its_climb_is_resumed(make_world, autopilot):
+    world = make_world(SimVehicle(system=1, autopilot=autopilot))
+    world.meet()
+    assert world.finish(world.fleet.upload(1, mission(autopilot, END)))[0].ok
+    start = give(world, "start", 1)
+    assert world.until(lambda: world.fleet.vehicles[1].height_m > 2.0, 60.0)
+    end_of(world, start)
+    assert world.fleet.vehicles[1].height_m < 20.0
+    assert end_of(world, give(world, "pause", 1)).outcome is Verdict.DONE
+    result = end_of(world, give(world, "resume", 1))
+    assert result.outcome is Verdict.DONE, result
+
+
+@BOTH
 @pytest.mark.parametrize("after_s", [0.0, 6.0])
 def test_a_paused_vehicle_is_resumed(make_world, autopilot, after_s):
     world = flying(make_world, autopilot)

@@ -19,9 +19,9 @@ const SLIP_S = 0.05;
 const FAR_S = 1;
 const STEP_BEATS = 3;
 const clock = () => ({ offset_s: null, behind: 0 });
-function setClock(held, time_s) {
+function setClock(held, time_s, maySteps = true) {
   const offset = time_s - heardAt / 1000;
-  held.behind = held.offset_s != null && offset < held.offset_s - FAR_S ? held.behind + 1 : 0;
+  held.behind = maySteps && held.offset_s != null && offset < held.offset_s - FAR_S ? held.behind + 1 : 0;
   held.offset_s = held.offset_s == null || held.behind >= STEP_BEATS ? offset : Math.max(offset, held.offset_s - SLIP_S);
 }
 const read = (held) => (held.offset_s == null ? null : held.offset_s + performance.now() / 1000);
@@ -32,7 +32,7 @@ let run = null;
 function heardClocks(event) {
   if (event.run !== run) { run = event.run ?? null; wall = clock(); steady = clock(); }
   if (Number.isFinite(event.time)) setClock(wall, event.time);
-  if (Number.isFinite(event.clock_s)) setClock(steady, event.clock_s);
+  if (Number.isFinite(event.clock_s)) setClock(steady, event.clock_s, false);
 }
 
 // When a command is given, by the daemon's clocks, for its age: without a time before the first heartbeat.
