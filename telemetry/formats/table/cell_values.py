@@ -80,23 +80,30 @@ def coordinate_deg(cell: str, axis: str, factor: float = 1.0) -> float | None:
         return written
     after, before = _AFTER.fullmatch(cell), _BEFORE.fullmatch(cell)
     if after is not None:
-        return in_hemisphere(_degrees(after[1], factor), after[2], axis)
-    return None if before is None else in_hemisphere(_degrees(before[2], factor), before[1], axis)
+        return _in_hemisphere(_degrees(after[1], factor), after[2], axis)
+    return None if before is None else _in_hemisphere(_degrees(before[2], factor), before[1], axis)
 
 
-def in_hemisphere(degrees: float | None, written: str, axis: str) -> float | None:
-    """Signed degrees of a coordinate whose hemisphere is written ("S", "South"); None where both contradict.
+def hemisphere_sign(written: str, axis: str) -> float | None:
+    """Sign of a coordinate whose hemisphere is written ("S", "South"); None if that is not understood.
 
     Args:
-        degrees: as written.
         written: the hemisphere.
         axis: "NS" or "EW".
     """
     hemisphere = _plain(written).upper()
     letter = hemisphere[:1]
-    if degrees is None or hemisphere not in (letter, _WORDS.get(letter)) or letter not in set(axis):
+    if hemisphere not in (letter, _WORDS.get(letter)) or letter not in set(axis):
         return None
-    if letter in "SW":
+    return -1.0 if letter in "SW" else 1.0
+
+
+def _in_hemisphere(degrees: float | None, written: str, axis: str) -> float | None:
+    """Signed degrees of a coordinate with its hemisphere in the same cell; None where both contradict."""
+    sign = hemisphere_sign(written, axis)
+    if degrees is None or sign is None:
+        return None
+    if sign < 0.0:
         return -abs(degrees)
     return degrees if degrees >= 0.0 else None
 
@@ -124,10 +131,11 @@ def below_sea(written: str) -> bool | None:
 
     EXIF 3.0: 0 and 1 are above and below the ellipsoid, 2 and 3 above and below the sea.
     """
-    if written in ("0", "1", "2", "3"):
-        return written in ("1", "3")
-    match = re.fullmatch(_SEA_LEVEL, written, re.IGNORECASE)
-    return None if match is None else match[1].lower() in _BELOW
+    number = re.fullmatch(r"([0-3])(?:\.0*)?", written)  # with a point where empty cells made a column of floats
+    if number is not None:
+        return number[1] in ("1", "3")
+    match = re.fullmatch(rf"{_SEA_LEVEL}|(above|below)", written, re.IGNORECASE)
+    return None if match is None else (match[1] or match[2]).lower() in _BELOW
 
 
 def angle_deg(cell: str, factor: float = 1.0) -> float | None:

@@ -12,8 +12,9 @@
 | Pix4D, image geolocation | no header | latitude, longitude, altitude | yaw, pitch, roll; pitch 0 at nadir |
 
 Heights are absolute altitudes wherever the header does not say otherwise. How a cell may be written: `cell_values`. A
-cell that is not understood is left out and counted, and so is a line with more cells than the header has titles, since
-nothing tells which cell belongs to which title (47,5,8,25 with commas between the cells and in the numbers).
+cell that is not understood is left out and counted. Cells beyond the header's titles are ignored, except where they
+show that cells stand under wrong titles: 47,5,8,25 with commas between the cells and in the numbers, 47 30 8 15 with
+blanks.
 """
 
 import csv
@@ -73,11 +74,20 @@ class _Layout:
     Attributes:
         separator: between cells; a blank stands for any number of blanks.
         keys: field of each column, "" for one that is not used.
-        factors: metres or degrees in one unit of each field that is not in these.
+        factors: metres or degrees in one unit of each column.
     """
 
     separator: str
     keys: Sequence[str]
+    factors: Sequence[float]
+
+
+@dataclass(frozen=True, slots=True)
+class _Line:
+    """What one line says of a picture: cells by field, and metres or degrees in one unit of each."""
+
+    name: str
+    cells: Mapping[str, str]
     factors: Mapping[str, float]
 
 
@@ -97,10 +107,10 @@ def read_pose_csv(path: Path) -> PoseTable | None:
         columns = [_column(cell) for cell in _cells(line, separator)]
         keys = [key for key, _ in columns]
         if "image" in keys and ({"lat_deg", "lon_deg"} <= set(keys) or {"x", "y"} <= set(keys)):
-            factors = {key: factor for key, factor in columns if factor != 1.0}
+            factors = [factor for _, factor in columns]
             return _read(path, at, _Layout(_row_separator(head[at + 1 :], separator, keys), keys, factors), line)
     known = _pix4d_columns(head[0]) if head else None
-    return None if known is None else _read(path, -1, _Layout(_separator(head[0]), known, {}), "")
+    return None if known is None else _read(path, -1, _Layout(_separator(head[0]), known, [1.0] * len(known)), "")
 
 
 def _separator(line: str) -> str:
@@ -150,12 +160,16 @@ def _read(path: Path, header_at: int, layout: _Layout, title: str) -> PoseTable:
     body = [line for line in lines[header_at + 1 :] if line.strip() and not line.startswith("#")]
     commas = csv.reader(io.StringIO("\n".join(body)), delimiter=layout.separator)
     rows = (_words(line, len(layout.keys)) for line in body) if layout.separator == " " else commas
-    table = PoseTable()
+    table, found = PoseTable(), []
     try:
         for cells in rows:
-            _add_row(table, layout, cells)
+            found.append(_line(table, layout, cells))
     except csv.Error:  # an unterminated quoted cell: nothing after it can be separated
         pass
+    named = [line for line in found if line is not None]
+    marks = layout.separator != "," and not any(map(_has_point, named))
+    for line in named:
+        _add_row(table, _with_points(line, marks, layout.separator))
     unclear = table.useless
     if "lat_deg" not in layout.keys:
         to_geographic(table, _projection(path, lines[: header_at + 1], table), path)
@@ -169,11 +183,22 @@ def _read(path: Path, header_at: int, layout: _Layout, title: str) -> PoseTable:
 
 
 def _words(line: str, most: int) -> list[str]:
-    """Cells between blanks; where there are more than titles, a first one with blanks ends with a picture's suffix."""
+    """Cells between blanks; where there are more than titles, those that hold blanks themselves are put together.
+
+    A first one with blanks ends with a picture's suffix; a date, a time and a zone are one.
+    """
     words = line.split()
+    if len(words) <= most:
+        return words
     ends = (i for i, word in enumerate(words) if Path(word).suffix.lower() in PICTURE_SUFFIXES)
-    first = next(ends, 0) + 1 if len(words) > most else 1
-    return [" ".join(words[:first]), *words[first:]]
+    first = next(ends, 0) + 1
+    words = [" ".join(words[:first]), *words[first:]]
+    for at in range(len(words) - 1):
+        if _DATE.fullmatch(words[at]) and _CLOCK.fullmatch(words[at + 1]) and len(words) > most:
+            zone = len(words) > most + 1 and at + 2 < len(words) and bool(_ZONE.fullmatch(words[at + 2]))
+            end = at + 2 + int(zone)
+            return [*words[:at], " ".join(words[at:end]), *words[end:]]
+    return words
 
 
 def _projection(path: Path, before: Sequence[str], table: PoseTable) -> str:
@@ -193,30 +218,71 @@ def _projection(path: Path, before: Sequence[str], table: PoseTable) -> str:
     )
 
 
-def _add_row(table: PoseTable, layout: _Layout, cells: Sequence[str]) -> None:
-    """Put the values of one line into the table."""
-    values = {key: cell.strip() for key, cell in zip(layout.keys, cells) if key and cell.strip()}
-    name = as_path(values.pop("image", ""))
+def _line(table: PoseTable, layout: _Layout, cells: Sequence[str]) -> _Line | None:
+    """The cells of a line by their fields; None, and counted where it names a picture, if it cannot be used.
+
+    Of two columns for one field that are both filled in, the one in metres or degrees is taken.
+    """
+    found: dict[str, str] = {}
+    factors: dict[str, float] = {}
+    for key, factor, cell in zip(layout.keys, layout.factors, map(str.strip, cells)):
+        empty = not cell or (key in _VALUES and cell_values.is_absent(cell))
+        if key and not empty and (key not in found or factor == 1.0 or factors[key] != 1.0):
+            found[key], factors[key] = cell, factor
+    name = as_path(found.pop("image", ""))
     if not name:
-        return
-    if any(cell.strip() for cell in cells[len(layout.keys) :]):
+        return None
+    if _is_shifted(layout.separator, found, cells[len(layout.keys) :]):
         table.useless += 1
-        return
+        return None
+    return _Line(name, found, factors)
+
+
+def _is_shifted(separator: str, found: Mapping[str, str], extra: Sequence[str]) -> bool:
+    """Whether a line's cells stand under wrong titles, by those that it has beyond the titles.
+
+    With commas, the decimal places of another cell become cells; with blanks, the minutes of whole degrees do.
+    """
+    more = any(_NUMBER.fullmatch(cell.strip()) for cell in extra)
+    if separator == " ":
+        return more and any(_WHOLE.fullmatch(found.get(key, "")) for key in ("lat_deg", "lon_deg"))
+    return more and separator == ","
+
+
+def _has_point(line: _Line) -> bool:
+    """Whether a number of a line has a decimal point; the point in 1.047,5 divides thousands."""
+    return any(_POINT.search(cell) and not _COMMA.search(cell) for key, cell in line.cells.items() if key in _NUMBERS)
+
+
+def _with_points(line: _Line, marks: bool, separator: str) -> _Line:
+    """A line with points for decimal commas.
+
+    Args:
+        line: as written. marks: the commas in the table's numbers are decimal marks. separator: between cells.
+    """
+    replaced = _NUMBERS if marks else frozenset()
+    if separator != ",":  # the comma before fractions of a second says nothing about other numbers
+        replaced = replaced | {"time"}
+    return _Line(
+        line.name, {k: _COMMA.sub(".", c) if k in replaced else c for k, c in line.cells.items()}, line.factors
+    )
+
+
+def _add_row(table: PoseTable, line: _Line) -> None:
+    """Put the values of one line into the table."""
+    values = dict(line.cells)
     vehicle = "".join(c for c in values.pop("vehicle", "") if c.isprintable()).strip()
     row = PoseRow(vehicle=vehicle[:64] or None)
     values = {key: cell for key, cell in values.items() if not cell_values.is_absent(cell)}
     if not values.get("time", "").strip("0:-/T. "):  # cameras without a clock write zeros
         values.pop("time", None)
-    # A comma is the decimal mark where it does not separate cells, and no number of the line is written with a point.
-    if layout.separator != "," and not any(map(_POINT.search, values.values())):
-        values = {key: _COMMA.sub(".", cell) for key, cell in values.items()}
     numbers: dict[str, float] = {}
     for key in filter(_VALUES.__contains__, values):
-        value = _with_ref(_VALUES[key](values[key], layout.factors.get(key, 1.0)), values, key)
+        value = _VALUES[key](values[key], line.factors[key])
         if value is None:
             table.refuse(values[key])
         else:
-            numbers[key] = value
+            numbers[key] = _with_ref(value, values, key, table)
     if {"omega", "phi", "kappa"} <= numbers.keys():
         angles = camera_angles_from_opk_deg(numbers["omega"], numbers["phi"], numbers["kappa"])
         row.yaw_deg, row.pitch_deg, row.roll_deg = angles
@@ -225,19 +291,30 @@ def _add_row(table: PoseTable, layout: _Layout, cells: Sequence[str]) -> None:
             setattr(row, {"x": "lon_deg", "y": "lat_deg", "time": "time_s"}.get(key, key), value)
     if row.sigma_m is not None and not 0.0 < row.sigma_m < 1000.0:
         row.sigma_m = None
-    table[name] = row
+    table[line.name] = row
 
 
-def _with_ref(value: float | None, values: Mapping[str, str], key: str) -> float | None:
-    """A value with the sign that the column of its reference states; None where they contradict."""
-    if key == "lat_deg" and "lat_ref" in values:
-        return cell_values.in_hemisphere(value, values["lat_ref"], "NS")
-    if key == "lon_deg" and "lon_ref" in values:
-        return cell_values.in_hemisphere(value, values["lon_ref"], "EW")
-    if key == "altitude_m" and "altitude_ref" in values and value is not None:
-        below = cell_values.below_sea(values["altitude_ref"])
-        return None if below is None else -abs(value) if below else value
-    return value
+def _with_ref(value: float, values: Mapping[str, str], key: str, table: PoseTable) -> float:
+    """A value with the sign that the column of its reference states.
+
+    A reference that is not understood counts as absent; beside a negative value, north and east do, too: some programs
+    write signed values beside a constant reference, none writes a sign that it does not mean. Both are counted.
+    """
+    ref_key, axis = _REFS.get(key, ("", ""))
+    if ref_key not in values:
+        return value
+    ref = values[ref_key]
+    if axis:
+        sign = cell_values.hemisphere_sign(ref, axis)
+    else:
+        below = cell_values.below_sea(ref)
+        sign = None if below is None else -1.0 if below else 1.0
+    if sign is None:
+        table.refuse(ref)
+        return value
+    if sign > 0.0 > value and axis:
+        table.refuse(f"{ref} beside {values[key]}")
+    return -abs(value) if sign < 0.0 else value
 
 
 def _sigma(cell: str, factor: float) -> float | None:
@@ -258,6 +335,9 @@ def _time(written: str, _factor: float) -> float | None:
 
 
 _POINT, _COMMA = re.compile(r"\d\.\d"), re.compile(r"(?<=\d),(?=\d)")
+_NUMBER, _WHOLE = re.compile(r"[+-]?\d[\d.]*(?:[eE][+-]?\d+)?\s*\D{0,3}"), re.compile(r"[+-]?\d{1,3}\s*°?")
+_DATE, _CLOCK = re.compile(r"\d{4}[:/-]\d{1,2}[:/-]\d{1,2}"), re.compile(r"\d{1,2}:\d{2}(?::\d{2}(?:[.,]\d+)?)?\S{0,6}")
+_ZONE = re.compile(r"Z|UTC|GMT|[+-]\d{2}(?::?\d{2})?", re.IGNORECASE)
 _VALUES: Mapping[str, Callable[[str, float], float | None]] = {
     "lat_deg": lambda cell, factor: cell_values.coordinate_deg(cell, "NS", factor),
     "lon_deg": lambda cell, factor: cell_values.coordinate_deg(cell, "EW", factor),
@@ -268,6 +348,9 @@ _VALUES: Mapping[str, Callable[[str, float], float | None]] = {
     "sigma_m": _sigma,
     "time": _time,
 }
+_NUMBERS = frozenset(_VALUES) - {"time"}
+_REFS = {"lat_deg": ("lat_ref", "NS"), "lon_deg": ("lon_ref", "EW"), "altitude_m": ("altitude_ref", "")}
+"""Column of a field's sign, and the letters of its axis."""
 
 
 def names_pictures(path: Path) -> bool:

@@ -128,7 +128,7 @@ def test_a_comma_beside_points_may_divide_thousands_and_is_not_guessed(tmp_path)
     assert (row.lat_deg, row.altitude_m, found.refused, found.first_refused) == (47.5, None, 1, "2,000")
 
 
-def test_a_line_with_more_cells_than_titles_is_left_out(tmp_path):
+def test_a_line_whose_numbers_the_separator_divides_is_left_out(tmp_path):
     found = table(tmp_path, "image,lat_deg,lon_deg\na.JPG,47,5,8,25\nb.JPG,47.5,8.25,,\n")
     assert list(found) == ["b.jpg"]
     assert found.useless == 1
@@ -147,9 +147,85 @@ def test_columns_with_the_hemispheres_are_read(tmp_path, south, west, sign):
     assert (row.lat_deg, row.lon_deg) == (33.912345, 70.651234)
     long = "S" * 65
     found = table(tmp_path, f"{header}\na.JPG,{long},33.912345,70.651234,East\n")
-    assert found.useless == 1
-    found = table(tmp_path, f"{header}\na.JPG,?,33.912345,70.651234,East\nb.JPG,North,-33.912345,70.651234,East\n")
-    assert found.useless == 2
+    assert (found["a.jpg"].lat_deg, found.refused) == (33.912345, 1)
+
+
+@pytest.mark.parametrize(
+    ("columns", "cells", "expected", "reported"),
+    [
+        ("GPSLatitude,GPSLatitudeRef", "47.5,Unknown ()", {"lat_deg": 47.5}, "Unknown ()"),
+        ("GPSLatitude,GPSLatitudeRef", "47.5,0", {"lat_deg": 47.5}, "0"),
+        ("GPSLatitude,GPSLatitudeRef", "47.5,E", {"lat_deg": 47.5}, "E"),
+        ("GPSLatitude,GPSLatitudeRef", "-47.5,N", {"lat_deg": -47.5}, "N beside -47.5"),
+        ("GPSLatitude,GPSAltitude,GPSAltitudeRef", "47.5,500,Unknown (5)", {"altitude_m": 500.0}, "Unknown (5)"),
+        ("GPSLatitude,GPSAltitude,GPSAltitudeRef", "47.5,500,0.0", {"altitude_m": 500.0}, ""),
+        ("GPSLatitude,GPSAltitude,GPSAltitudeRef", "47.5,12,1.0", {"altitude_m": -12.0}, ""),
+        ("GPSLatitude,GPSAltitude,GPSAltitudeRef", "47.5,500,Above", {"altitude_m": 500.0}, ""),
+        ("GPSLatitude,GPSAltitude,GPSAltitudeRef", "47.5,12,below", {"altitude_m": -12.0}, ""),
+    ],
+)
+def test_a_reference_that_is_not_understood_is_reported_and_the_value_kept(
+    tmp_path, columns, cells, expected, reported
+):
+    jpeg(tmp_path / "a.JPG")
+    found = table(tmp_path, f"SourceFile,GPSLongitude,{columns}\na.JPG,8.25,{cells}\n")
+    (row,) = found.values()
+    assert {name: getattr(row, name) for name in expected} == expected
+    assert (found.useless, found.refused, found.first_refused) == (0, int(bool(reported)), reported)
+    findings = {f.code: f.message for source in survey([tmp_path]).sources for f in source.findings}
+    assert (f"'{reported}'" in findings["table-cells"]) if reported else "table-cells" not in findings
+
+
+@pytest.mark.parametrize(
+    ("titles", "cells", "name", "value"),
+    [
+        ("alt_ft,alt_m", "1640,500", "altitude_m", 500.0),
+        ("alt_m,alt_ft", "500,1640", "altitude_m", 500.0),
+        ("altitude (ft),altitude (m)", "1640,500", "altitude_m", 500.0),
+        ("alt_m,alt_ft", "500,", "altitude_m", 500.0),
+        ("alt_m,alt_ft", ",1000", "altitude_m", 304.8),
+        ("alt_ft,alt_m", "1000,n/a", "altitude_m", 304.8),
+        ("yaw_rad,yaw_deg", "1.57,90", "yaw_deg", 90.0),
+    ],
+)
+def test_a_unit_belongs_to_its_column_and_metres_and_degrees_are_preferred(tmp_path, titles, cells, name, value):
+    row = only_row(tmp_path, f"image,lat,lon,{titles}\na.JPG,47.5,8.25,{cells}\n")
+    assert getattr(row, name) == pytest.approx(value)
+
+
+@pytest.mark.parametrize(
+    ("text", "altitude_m"),
+    [
+        ("image lat lon alt\na.JPG 47.5 8.25 500 # first\n", 500.0),
+        ("image lat lon alt\na.JPG 47.5 8.25 500 7\n", 500.0),
+        ("image\tlat\tlon\talt\na.JPG\t47.5\t8.25\t500\tgood\n", 500.0),
+        ("image;lat;lon;alt\na.JPG;47,5;8,25;500;3\n", 500.0),
+        ("image,lat,lon,alt\na.JPG,47.5,8.25,500,good\n", 500.0),
+    ],
+)
+def test_cells_beyond_the_titles_are_ignored(tmp_path, text, altitude_m):
+    row = only_row(tmp_path, text)
+    assert (row.lat_deg, row.lon_deg, row.altitude_m) == (47.5, 8.25, altitude_m)
+
+
+@pytest.mark.parametrize("zone", ["", "+02:00", " +0200", " Z"])
+def test_a_date_and_its_time_between_blanks_are_one_cell(tmp_path, zone):
+    shift = 7200.0 if "2" in zone else 0.0
+    for titles, cells in (("lat lon alt time", "47.5 8.25 500 {}"), ("time lat lon alt", "{} 47.5 8.25 500")):
+        row = only_row(tmp_path, f"image {titles}\na.JPG {cells.format('2024-05-01 10:00:00' + zone)}\n")
+        assert (row.lat_deg, row.altitude_m, row.time_s) == (47.5, 500.0, 1714557600.0 - shift)
+
+
+def test_only_the_tables_numbers_tell_whether_a_comma_is_their_decimal_mark(tmp_path):
+    text = "image;lat;lon;alt;time\na.jpg;47,5;8,25;500,3;2024-05-01 10:00:00.5\n"
+    row = only_row(tmp_path, text)
+    assert (row.lat_deg, row.lon_deg, row.altitude_m, row.time_s) == (47.5, 8.25, 500.3, 1714557600.5)
+    row = only_row(tmp_path, "image;lat;lon;alt;time\na.jpg;47.5;8.25;500.3;2024-05-01 10:00:00,5\n")
+    assert (row.lat_deg, row.time_s) == (47.5, 1714557600.5)
+    found = table(tmp_path, "image\tlat\tlon\talt\na.jpg\t47\t8\t1,500\nb.jpg\t47.5\t8.25\t1499.5\n")
+    assert (found["a.jpg"].altitude_m, found.first_refused) == (None, "1,500")
+    found = table(tmp_path, "image\tlat\tlon\talt\na.jpg\t47,5\t8,25\t1.047,5\n")
+    assert (found["a.jpg"].lat_deg, found["a.jpg"].altitude_m, found.refused) == (47.5, None, 1)
 
 
 @pytest.mark.parametrize(
