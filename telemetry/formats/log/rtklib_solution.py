@@ -24,7 +24,9 @@ _MAJOR_M, _FLATTENING = 6_378_137.0, 1.0 / 298.257223563
 _LEAST_EPOCHS = 10
 _EVEN_S, _EVEN_SHARE = 0.005, 0.9
 """Epochs of a receiver follow each other evenly to a millisecond, apart from missing ones; a camera that takes pictures
-every two seconds does so to some hundredths (chosen)."""
+every two seconds does so to some hundredths (chosen), or evenly, too, where its times were rounded."""
+_MOST_STEP_S = 1.0
+"""Receivers log one to twenty epochs a second; photos for a map are seldom taken that often."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,14 +67,16 @@ def is_track(stem: str, samples: Sequence[Sample]) -> bool:
     """Whether positions are a receiver's track, not exposures.
 
     Args:
-        stem: the file's name; RTKLIB ends those of exposures in `_events`.
+        stem: the file's name; RTKLIB ends those of exposures in `_events`, and people add to that.
         samples: its positions.
     """
-    if stem.lower().endswith("events") or len(samples) < _LEAST_EPOCHS:
+    if "event" in stem.lower() or len(samples) < _LEAST_EPOCHS:
         return False
     steps = np.diff(np.array([s.time_s for s in samples], dtype=np.float64))
     usual = float(np.median(steps))
-    return usual > 0.0 and float(np.mean(np.abs(steps - usual * np.round(steps / usual)) < _EVEN_S)) >= _EVEN_SHARE
+    if not 0.0 < usual <= _MOST_STEP_S + _EVEN_S:
+        return False
+    return float(np.mean(np.abs(steps - usual * np.round(steps / usual)) < _EVEN_S)) >= _EVEN_SHARE
 
 
 def _words(line: str) -> list[str]:

@@ -90,9 +90,18 @@ def test_a_receivers_track_is_read_by_the_photos_times_not_as_exposures(tmp_path
         assert frame.fix.position_sigma_m is None
 
 
-@pytest.mark.parametrize(("name", "jitter_s"), [("flight_events.pos", 0.0), ("flight.pos", 0.03)])
-def test_a_camera_that_takes_a_picture_every_two_seconds_makes_no_track(tmp_path, name, jitter_s):
-    times = UTC_S + np.arange(0.0, 80.0, 2.0) + jitter_s * np.random.default_rng(2).standard_normal(40)
+@pytest.mark.parametrize(
+    ("name", "step_s", "jitter_s"),
+    [
+        ("flight_events.pos", 1.0, 0.0),
+        ("flight_event.pos", 1.0, 0.0),
+        ("Flight_Events_fixed.pos", 1.0, 0.0),
+        ("flight.pos", 2.0, 0.0),
+        ("flight.pos", 2.0, 0.03),
+    ],
+)
+def test_a_camera_that_takes_pictures_at_an_interval_makes_no_track(tmp_path, name, step_s, jitter_s):
+    times = UTC_S + step_s * np.arange(40) + jitter_s * np.random.default_rng(2).standard_normal(40)
     (log,) = read_log(solution(tmp_path / name, [(t, "47.5 8.25 600.0") for t in times]))
     assert (len(log.events), log.samples) == (40, [])
 
