@@ -33,6 +33,10 @@ _METRES = {
 }
 """Metres of a unit, spelt as GDAL, PROJ ("us-ft"), WKT ("US survey foot") and WKT of Esri ("Foot_US") do."""
 
+_MOST_WORDS = max(len(unit.split()) for unit in _METRES)
+_NO_UNIT = frozenset({"unknown", "none", "unitless", "1"})
+"""Words of a unit that states none: metres, as where it is empty."""
+
 _BETWEEN_NODES = 1.5
 """How far the nodes around a place and the node of a pixel are from them, together, in steps."""
 
@@ -283,18 +287,32 @@ def _on_area(
 
 
 def _unit_m(unit: str, name: str) -> float:
-    """Metres of a height model's unit, in whichever case and with whatever between its words.
+    """Metres of a height model's unit, in whichever case, with whatever between its words and beside them.
+
+    Writers add the datum ("m (EGM96)", "metres above sea level"), or fill in that there is no unit.
 
     Raises:
-        InputError: it is not known.
+        InputError: no known unit is in it, or a number that makes it another one ("0.1 m").
     """
-    words = re.findall("[a-z0-9]+", unit.lower().replace("u.s.", "us"))
-    metres = _METRES.get(" ".join(w for w in words if w != "intl")) if words or not unit.strip() else None
+    words = [w for w in re.findall("[a-z0-9]+", unit.lower().replace("u.s.", "us")) if w != "intl"]
+    number = re.match(r"\s*([\d.,/]+)", unit)
+    scaled = number is not None and re.fullmatch(r"1(?:\.0*)?", number[1]) is None
+    metres = None if scaled or (unit.strip() and not words) else _unit_among(words)
     if metres is None:
         raise InputError(
             f"{name} has heights in '{unit.strip()}', which is no known unit; set it with gdal_edit.py -units m"
         )
     return metres
+
+
+def _unit_among(words: list[str]) -> float | None:
+    """Metres of the longest unit among words, feet before others; as metres count no unit and words for none."""
+    for count in range(min(len(words), _MOST_WORDS), 0, -1):
+        runs = [" ".join(words[at : at + count]) for at in range(len(words) - count + 1)]
+        known = [_METRES[run] for run in runs if run in _METRES]
+        if known:
+            return next((metres for metres in known if metres in (0.3048, _US_FOOT_M)), known[0])
+    return 1.0 if not words or _NO_UNIT & set(words) else None
 
 
 def _nodata(dataset: Any) -> float | None:

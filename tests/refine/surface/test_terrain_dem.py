@@ -136,7 +136,26 @@ def test_feet_become_metres(tmp_path, unit):
     check(read_dem(path, EPSG, BOUNDS, level_m=300.0), 300.0, 0.05)
 
 
-@pytest.mark.parametrize("unit", ["fathom", "yd", "%"])
+@pytest.mark.parametrize(
+    ("unit", "metres"),
+    [
+        *dict.fromkeys(
+            ("unknown", "none", "1", "m", "METERS", "meters above sea level", "m a.s.l.", "m (EGM96)", "1 m"), 1.0
+        ).items(),
+        *dict.fromkeys(("m NAVD88", "NAVD88 (m)", "metre (orthometric)", "meter(s)"), 1.0).items(),
+        ("feet above sea level", 0.3048),
+        ("NAVD88 (ft)", 0.3048),
+        ("NAVD88 height (US survey feet)", 1200 / 3937),
+        ("cm (EGM96)", 0.01),
+    ],
+)
+def test_a_unit_is_found_beside_what_else_is_written(tmp_path, unit, metres):
+    z, transform = utm_dem(factor=1 / metres)
+    path = write(tmp_path / "dem.tif", z, transform=transform, unit=unit)
+    check(read_dem(path, EPSG, BOUNDS, level_m=300.0), 300.0, 0.05)
+
+
+@pytest.mark.parametrize("unit", ["fathom", "yd", "%", "degrees", "0.1 m", "1.5 m", "1/10 m", "10 cm"])
 def test_an_unknown_unit_is_not_taken_for_metres(tmp_path, unit):
     z, transform = utm_dem()
     path = write(tmp_path / "dem.tif", z, transform=transform, unit=unit)
