@@ -2,8 +2,9 @@
 
 Used both for live links (`telemetry.live`) and for tlogs (`flight_logs`). Angles of a gimbal are interpreted in the
 frame that its flags name; without any gimbal message the camera is assumed fixed under the airframe, its picture's up
-towards the nose. All components of a vehicle may be fed: position, attitude and UTC are taken from the autopilot's,
-times of others are converted to its clock. Message fields: MAVLink common and ardupilotmega.
+towards the nose. All components of a vehicle may be fed: position, attitude and UTC are taken from the autopilot's
+(positions from another while it sends none), times of others are converted to its clock. Message fields: MAVLink common
+and ardupilotmega.
 """
 
 import math
@@ -37,9 +38,9 @@ TYPES = frozenset(
 )  # fmt: skip
 """Message types that say anything here."""
 
-_OF_AUTOPILOT = frozenset(
-    {"SYSTEM_TIME", "GLOBAL_POSITION_INT", "ATTITUDE", "ATTITUDE_QUATERNION", "HOME_POSITION", "GPS_RAW_INT"}
-)
+_TIMED = frozenset({"SYSTEM_TIME", "GLOBAL_POSITION_INT", "ATTITUDE", "ATTITUDE_QUATERNION"})
+"""Types by which autopilots tell their time since boot."""
+_OF_AUTOPILOT = _TIMED | {"HOME_POSITION", "GPS_RAW_INT"}
 """Types that count only from the autopilot: a gimbal's ATTITUDE is not the airframe's, and MAVROS sends SYSTEM_TIME."""
 _NO_AUTOPILOT = 8
 """MAV_AUTOPILOT_INVALID, which HEARTBEATs of everything but autopilots contain."""
@@ -111,8 +112,7 @@ class MavlinkPoses:
         handler = _HANDLERS.get(name)
         if handler is None:
             return None
-        positions = name == "GLOBAL_POSITION_INT"
-        if not self._clocks.is_autopilot(_sender(message), positions=positions) and name in _OF_AUTOPILOT:
+        if not self._counts(message, name):
             return None
         self._arrival_s = arrival_s
         result: Sample | CameraEvent | None = handler(self, message)
@@ -121,6 +121,17 @@ class MavlinkPoses:
                 result.time_s = self._clocks.boot_s
             return _checked(result)
         return result
+
+    def _counts(self, message: Any, name: str) -> bool:
+        """Whether a message's sender is one that its type is taken from."""
+        sender = _sender(message)
+        if name == "HEARTBEAT":
+            return True
+        positions = name == "GLOBAL_POSITION_INT" and is_position(message.lat * 1e-7, message.lon * 1e-7)
+        chosen = self._clocks.is_autopilot(sender, timed=name in _TIMED, positions=positions)
+        if name == "GLOBAL_POSITION_INT":
+            return chosen or self._clocks.places(sender)
+        return chosen or name not in _OF_AUTOPILOT or (name not in _TIMED and self._clocks.speaks_for_vehicle(sender))
 
     def utc(self, boot_s: float | None) -> float | None:
         """UTC of a time since boot, None while unknown."""
@@ -133,8 +144,8 @@ class MavlinkPoses:
         return self._clocks.heard(_sender(m), m.time_boot_ms * 1e-3, self._arrival_s)
 
     def _heartbeat(self, m: Any) -> None:
-        flies = m.autopilot != _NO_AUTOPILOT and m.type not in _NO_VEHICLES
-        self._clocks.is_autopilot(_sender(m), flies=flies)
+        if m.autopilot != _NO_AUTOPILOT and m.type not in _NO_VEHICLES:
+            self._clocks.flies(_sender(m))
 
     def _system_time(self, m: Any) -> None:
         utc_s, boot_s = m.time_unix_usec * 1e-6, self._boot(m)
@@ -240,7 +251,7 @@ class MavlinkPoses:
             boot_s = None if self.utc_minus_boot_s is None else seconds - self.utc_minus_boot_s
             time_s: float | None = seconds
         else:
-            boot_s = self._clocks.of(_sender(m), seconds, self._arrival_s)
+            boot_s = self._clocks.of(_sender(m), seconds, self._arrival_s, number=int(number), kind=m.get_type())
             time_s = self.utc(boot_s)
         return CameraEvent(time_s, boot_s, int(number), checked(sample) or Sample(), m.get_type())
 

@@ -331,3 +331,95 @@ def test_a_picture_reported_again_is_no_restart():
     assert poses.feed(report).time_s == pytest.approx(T0 - 40.0)
     assert poses.reboots == 0
     assert poses.utc(60.0) == pytest.approx(T0)
+
+
+def sent(at, component, message):
+    message.pack(mavlink.MAVLink(None, srcSystem=1, srcComponent=component))
+    return at, component, message
+
+
+def captured(number, own_s):
+    return mavlink.MAVLink_camera_image_captured_message(
+        round(own_s * 1000), 0, 1, 0, 0, 0, 0, [math.nan] * 4, number, 1, b""
+    )
+
+
+def times_of_pictures(path, heard):
+    """Seconds of the pictures in the order of their messages, by the log and by a link."""
+    (log,) = read_log(tlog(path, heard))
+    live = LivePoses("v1")
+    fed = [live.feed(message, at) for at, _, message in sorted(heard, key=lambda row: row[0])]
+    return [[e.time_s - T0 for e in events if e is not None] for events in (log.events, fed)]
+
+
+@pytest.mark.parametrize("attitudes", [False, True])
+@pytest.mark.parametrize("own_s", [100.0, 30.0])
+def test_pictures_that_are_sent_again_keep_their_times(tmp_path, own_s, attitudes):
+    """Numbers 12 to 17 are lost, and sent again within 0.1 s; the camera has the autopilot's clock, or its own."""
+    heard = [sent(T0 + 0.8 * k + 0.03, CAMERA, captured(k, own_s + 0.8 * k)) for k in range(70) if not 12 <= k < 18]
+    heard += [sent(T0 + 30.0 + 0.02 * (k - 12), CAMERA, captured(k, own_s + 0.8 * k)) for k in range(12, 18)]
+    if attitudes:  # sent at once, so that they tell the clock
+        own_ms = [round((own_s + t) * 1000) for t in range(60)]
+        heard += [sent(T0 + t, CAMERA, gimbal(ms, DOWN, 32)) for t, ms in enumerate(own_ms)]
+    log, live = times_of_pictures(tmp_path / "a.tlog", [*flight(), *heard])
+    assert log == pytest.approx(0.8 * np.arange(70), abs=0.15)
+    assert sorted(live) == pytest.approx(0.8 * np.arange(70), abs=0.15)
+
+
+def test_a_camera_whose_first_report_is_an_old_one_is_dated_by_the_next(tmp_path):
+    heard = [sent(T0 + 20.0, CAMERA, captured(3, 5.0))]
+    heard += [sent(T0 + t, CAMERA, captured(k, t + 1.0)) for k, t in enumerate(np.arange(21.0, 60.0, 2.0), 12)]
+    log, _ = times_of_pictures(tmp_path / "a.tlog", [*flight(), *heard])
+    assert log[1:] == pytest.approx(np.arange(21.0, 60.0, 2.0), abs=0.15)
+
+
+@pytest.mark.parametrize("first", [0, 40])
+def test_a_camera_that_restarts_is_dated_by_its_new_clock(tmp_path, first):
+    """Its numbers begin again, or go on; those before the restart were sent again once."""
+    heard = [sent(T0 + 2.0 * k, CAMERA, captured(k, 50.0 + 2.0 * k)) for k in range(30) if k != 7]
+    heard.append(sent(T0 + 59.5, CAMERA, captured(7, 64.0)))
+    heard += [sent(T0 + 70.0 + 2.0 * k, CAMERA, captured(first + k, 4.0 + 2.0 * k)) for k in range(20)]
+    log, live = times_of_pictures(tmp_path / "a.tlog", [*flight(), *heard])
+    expected = [*2.0 * np.arange(30), *(70.0 + 2.0 * np.arange(20))]
+    assert log == pytest.approx(expected, abs=0.15)
+    assert sorted(live) == pytest.approx(expected, abs=0.15)
+
+
+def heartbeat(kind=2, autopilot=3):
+    return mavlink.MAVLink_heartbeat_message(kind, autopilot, 0, 0, 0, 3)
+
+
+def without_heartbeats(component):
+    return [row for row in flight(autopilot=component) if row[2].get_type() != "HEARTBEAT"]
+
+
+OTHERS = {
+    "heartbeats of component 1": [*without_heartbeats(2), *(sent(T0 + t, 1, heartbeat()) for t in range(120))],
+    "one heartbeat of component 1": [*flight(autopilot=2), sent(T0 + 30.0, 1, heartbeat())],
+    "a rangefinder of component 1": [
+        *flight(autopilot=25), sent(T0 + 30.0, 1, mavlink.MAVLink_rangefinder_message(30.0, 0.0))
+    ],
+    "an attitude of component 1": [*flight(autopilot=25), sent(T0 + 30.0, 1, attitude(5000, yaw=77.0))],
+    "positions of another than the clock": [
+        *(row for row in flight() if row[2].get_type() != "GLOBAL_POSITION_INT"),
+        *(row for row in flight(autopilot=2) if row[2].get_type() == "GLOBAL_POSITION_INT"),
+    ],
+    "positions of a companion, too": [
+        *flight(), *(sent(T0 + t, COMPANION, position(1000 * t + 5000, 10.0)) for t in range(1, 120))
+    ],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", OTHERS)
+def test_messages_of_other_components_take_no_position_away(tmp_path, case):
+    (log,) = read_log(tlog(tmp_path / "a.tlog", OTHERS[case]))
+    track = [s for s in log.samples if s.has_position]
+    assert not log.findings
+    assert len(track) == 1200
+    assert [s.time_s - T0 - (s.lat_deg - 47.5) * 1e4 for s in track] == pytest.approx(np.zeros(1200), abs=0.01)
+    yaws = [s.flight_yaw_deg for s in log.samples if s.flight_yaw_deg is not None]
+    assert yaws == pytest.approx([heading(i * 0.1) for i in range(1200)], abs=1e-3)
+    live = LivePoses("v1")
+    for at, _, message in sorted(OTHERS[case], key=lambda row: row[0]):
+        live.feed(message, at)
+    assert live.at(T0 + 100.05).lat_deg == pytest.approx(47.5 + 0.010005, abs=2e-6)
