@@ -25,7 +25,7 @@ import logging
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
@@ -151,6 +151,13 @@ class VehicleLinks:
                 return system
         known = ", ".join(self.name_of(system) for system in sorted(self.fleet.vehicles)) or "none"
         raise OrthoSwarmError(f"{vehicle} is not on the links (heard: {known}); check links and system ids")
+
+    def standing(self, names: Sequence[str]) -> list[tuple[float, float]]:
+        """Where vehicles stand on the ground, latitude and longitude in degrees; empty unless that is known of all."""
+        known = {self.name_of(s): v for s, v in list(self.fleet.vehicles.items()) if not v.flying}
+        places = [(v.lat_deg, v.lon_deg) for name in names if (v := known.get(name)) is not None]
+        found = [(lat, lon) for lat, lon in places if lat is not None and lon is not None]
+        return found if len(found) == len(names) else []
 
     def autopilots(self) -> dict[str, str]:
         """The autopilot of each vehicle that was heard, by id."""
