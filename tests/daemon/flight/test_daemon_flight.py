@@ -176,9 +176,8 @@ def test_a_plan_is_started_at_its_times_once_all_hold_it(flown):
 def test_a_start_that_is_cancelled_after_it_has_begun_pauses_its_vehicles(flown):
     served, _, _ = flown
     served.until("/api/vehicles", lambda rows: sum(r.get("lat_deg") is not None for r in rows) == 2)
-    lat, lon = (float(v) for v in GRID.to_geographic([EAST - 90.0, NORTH - 90.0]))
     body = {"area": square(130), "vehicles": 2, "altitude_m": 60, "fov_min_deg": 65, "speed_m_s": 8}
-    plan = served.command("/api/plans", body | {"starts": [[lat, lon], [lat, lon]]}).json()
+    plan = served.command("/api/plans", body | {"starts": places(served)}).json()
     for vehicle in ("v1", "v2"):
         upload(served, vehicle, plan["id"])
     go = f"/api/plans/{plan['id']}/start"
