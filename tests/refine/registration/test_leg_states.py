@@ -13,7 +13,8 @@ def vehicle(ties, *, on_map=True, carried=False, residual_m=0.3, had_map=True):
     leg = np.repeat(np.arange(len(ties)), 3).astype(np.int32)
     camera = np.repeat(3 * np.arange(len(ties)), ties).astype(np.int32)
     residual = np.full((len(camera), 2), residual_m / np.sqrt(2))
-    flight = SimpleNamespace(leg=leg, adjustment=SimpleNamespace(tie_residual=residual))
+    frames = [SimpleNamespace(image=f"{k}.jpg") for k in range(len(leg))]
+    flight = SimpleNamespace(leg=leg, frames=frames, adjustment=SimpleNamespace(tie_residual=residual))
     return SimpleNamespace(
         vehicle="v", flight=flight, matches=SimpleNamespace(camera=camera), on_map=on_map, carried=carried,
         coarse_shift=None, had_map=had_map, sigma_m=np.full(len(leg), 0.2),
@@ -26,6 +27,10 @@ def states(*args, **options):
 
 def test_legs_with_ties_of_their_own_are_matched_and_carry_the_others():
     assert states([20, 0, 12]) == ["matched", "carried", "matched"]
+
+
+def test_a_leg_names_its_first_and_last_picture():
+    assert [leg.images for leg in leg_states(vehicle([20, 0]))] == [("0.jpg", "2.jpg"), ("3.jpg", "5.jpg")]
 
 
 def test_photos_that_only_together_have_enough_ties_are_matched():
