@@ -362,7 +362,7 @@ def _facts(report: Mapping[str, Any], placed: Sequence[PlacedFrame], shifts: Mov
     gsd = float(report["gsd_m"])
     days = _days(placed)
     facts = [
-        (f"EPSG:{report['epsg']}", crs_name(report["epsg"])),
+        (str(report["epsg"]), f"EPSG code: {crs_name(report['epsg'])}"),
         *([(days, "taken")] if days else []),
         (f"{frames['used']:,} of {frames['input']:,}", "pictures mapped"),
         (str(len(report["vehicles"])), "vehicle" if len(report["vehicles"]) == 1 else "vehicles"),

@@ -147,7 +147,7 @@ def test_the_page_stands_alone_and_has_its_pictures(mapped):
     assert "broken.jpg" in page and "Lies on the pre-disaster map" in page
     report, rows = mapped[1], rows_of(mapped[0])
     day = min(row["time"] for row in rows.values() if row["time"])[:10]
-    assert f"<b>EPSG:{report['epsg']}</b><span>WGS 84 / UTM zone" in page and f"<b>{day}</b><span>taken" in page
+    assert f"<b>{report['epsg']}</b><span>EPSG code: WGS 84 / UTM zone" in page and f"<b>{day}</b><span>taken" in page
     assert 'class="leg matched"' in page
 
 
