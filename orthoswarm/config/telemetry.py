@@ -107,6 +107,9 @@ class IngestConfig:
     """Ratio test of their matches (Lowe 2004)."""
     motion_most_turn_rad: float = 0.4
     """Two pictures that turn by more are not on one straight leg, radians (chosen)."""
+    contradiction_m: float = 500.0
+    """A table that puts a photo so far from its tags, or from another table, contradicts them, metres (chosen: more
+    than receivers err by; a wrong hemisphere, coordinate system or table does that)."""
     yaw_pairs_a_leg: int = 3
     """Pairs of pictures by which the recorded yaw of a leg is checked (chosen)."""
     yaw_least_step_m: float = 1.0

@@ -11,6 +11,8 @@ from contextlib import closing
 from itertools import islice
 from pathlib import Path
 
+from orthoswarm.config import active
+from orthoswarm.model.earth import distance_m
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.frame import Ingest, Rejection
 from orthoswarm.model.task_runner import Progress
@@ -187,7 +189,7 @@ def _photo_folder(
     at_root = folder.path == found.root
     source = SourceInfo(path=folder.path.name if at_root else found.name(folder.path), kind="photos")
     groups: dict[str, list[PhotoTags]] = {}
-    seen = 0
+    seen, moved_m = 0, list[float]()
     for path, photo in zip(folder.pictures, tags, strict=True):
         if photo is None:
             continue
@@ -196,8 +198,14 @@ def _photo_folder(
         if isinstance(photo, Unreadable):
             result.rejected.append(Rejection(name, str(photo), folder.vehicle))
             continue
-        vehicle = _merge_tables(photo, path, tables) or folder.vehicle
+        vehicle = _merge_tables(photo, path, tables, moved_m) or folder.vehicle
         groups.setdefault(vehicle, []).append(photo)
+    if moved_m:
+        text = (
+            f"tables put {plural(len(moved_m), 'picture')} up to {max(moved_m) / 1000:.1f} km from where its tags or "
+            "another table say; the last table by name counts: check it, or take it away"
+        )
+        source.findings.append(Finding("positions-contradict", text))
     for vehicle in sorted(groups, key=natural_key):
         photos = sorted(groups[vehicle], key=_photo_key)
         add_logs(photos, folder.path, vehicle, logs=logs, findings=source.findings, workers=workers)
@@ -242,8 +250,13 @@ def _photo_key(photo: PhotoTags) -> tuple[object, ...]:
     return (math.inf if photo.time_s is None else photo.time_s, natural_key(photo.path.name))
 
 
-def _merge_tables(photo: PhotoTags, path: Path, tables: Iterable[tuple[Path, str, PoseTable]]) -> str | None:
-    """Overwrite the photo's own tags by table values, field by field; returns the vehicle's name if a table has one."""
+def _merge_tables(
+    photo: PhotoTags, path: Path, tables: Iterable[tuple[Path, str, PoseTable]], moved_m: list[float]
+) -> str | None:
+    """Overwrite the photo's own tags by table values, field by field; returns the vehicle's name if a table has one.
+
+    How far a position contradicts the one before, if it does, is added to `moved_m`.
+    """
     vehicle = None
     for where, kind, table in tables:
         if not path.is_relative_to(where):
@@ -253,6 +266,10 @@ def _merge_tables(photo: PhotoTags, path: Path, tables: Iterable[tuple[Path, str
             continue
         vehicle = row.vehicle or vehicle
         if row.lat_deg is not None and row.lon_deg is not None:
+            if photo.lat_deg is not None and photo.lon_deg is not None:
+                away = distance_m(photo.lat_deg, photo.lon_deg, row.lat_deg, row.lon_deg)
+                if away > active().ingest.contradiction_m:
+                    moved_m.append(away)
             photo.lat_deg, photo.lon_deg = row.lat_deg, row.lon_deg
             photo.origin["position"] = kind
             photo.position_sigma_m = row.sigma_m if row.sigma_m is not None else photo.position_sigma_m

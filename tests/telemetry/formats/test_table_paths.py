@@ -65,3 +65,16 @@ def test_paths_in_a_geo_txt_are_matched_alike(tmp_path):
     (tmp_path / "geo.txt").write_text("EPSG:4326\nC:\\photos\\a.JPG 8.25 47.5\n")
     (frame,) = survey([tmp_path]).frames()
     assert frame.fix.lat_deg == 47.5
+
+
+@pytest.mark.parametrize("away_deg", [0.001, 0.01])
+def test_tables_that_contradict_each_other_are_told(tmp_path, away_deg):
+    """500 m are more than any receiver errs by; the last table by name counts."""
+    jpeg(tmp_path / "a.jpg")
+    for name, lat in (("a.csv", 47.5), ("b.csv", 47.5 + away_deg)):
+        (tmp_path / name).write_text(f"image,lat,lon,alt_m\na.jpg,{lat},8.25,500\n")
+    found = survey([tmp_path])
+    (frame,) = found.frames()
+    assert frame.fix.lat_deg == pytest.approx(47.5 + away_deg)
+    codes = [f.code for source in found.sources for f in source.findings]
+    assert codes.count("positions-contradict") == (1 if away_deg == 0.01 else 0)
