@@ -22,12 +22,12 @@ from gcs_plugin.fleet.message_rates import Rates, Streams
 from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.mavlink import Autopilot, Message
 from gcs_plugin.links.transports import parse_address
-from gcs_plugin.mission.command_dialogues import unflyable
 from gcs_plugin.mission.comparison import difference
 from gcs_plugin.mission.completion import CompletionDetector, Phase
 from gcs_plugin.mission.exchange import Address, Exchange, Outcome, Verdict
 from gcs_plugin.mission.flight_modes import modes_of, why_no_missions
 from gcs_plugin.mission.items import Mission, MissionItem
+from gcs_plugin.mission.mission_builder import unflyable
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 
 if TYPE_CHECKING:

@@ -23,6 +23,12 @@ _SOON_S: Final = 5.0
 _READ_S: Final = 20.0
 
 
+def red_items(row: Mapping[str, Any], allowed: Collection[str]) -> list[str]:
+    """The red items of a vehicle's row that are not allowed by name, in words."""
+    red = [item for item in row["items"] if item["state"] == "red" and item["name"] not in allowed]
+    return [f"{item['name']}: {item['reason']}" for item in red]
+
+
 class StartChecks:
     """Checks vehicles before their start.
 

@@ -12,6 +12,7 @@ from collections.abc import Callable, Collection, Mapping
 from typing import Any, Final
 
 from gcs_plugin.config import COMMAND
+from gcs_plugin.daemon.start_checks import red_items
 from gcs_plugin.daemon.vehicles import VehicleLinks
 from gcs_plugin.daemon.web_plans import Plans
 from gcs_plugin.fleet.commands import Order
@@ -141,6 +142,7 @@ class Takeoffs:
             delays = {systems[vehicle]: start_s - first for vehicle, start_s in starts.items()}
             held = {s: self._links.fleet.vehicles[s].mission for s in delays}
             schedule = TakeoffSchedule.of(delays, self._clock())
+            endurance_s = self._plans.endurance_s(plan)
             with self._condition:
                 if not wanted():
                     raise OrthoSwarmError("the start was cancelled; no vehicle was started")
@@ -148,7 +150,7 @@ class Takeoffs:
                 self._failed.clear()
                 self._stops, self._given_s = stops, {s: given for s, delay in delays.items() if delay <= 0.0}
                 self._names = {systems[vehicle]: whose[vehicle] for vehicle in starts}
-                self._endurance_s = self._plans.endurance_s(plan)
+                self._endurance_s = endurance_s
                 self._missions = {system: missions[self._names[system]] for system in systems.values()}
                 self._allowed = dict(override or {})
                 self._schedule, self._checking = schedule, frozenset()
@@ -239,7 +241,9 @@ class Takeoffs:
             raise
         except OrthoSwarmError as error:
             raise OrthoSwarmError(f"{error}; no vehicle was started") from None
-        wrong = [f"{row['vehicle']}: {text}" for row in rows for text in _red(row, override.get(row["vehicle"], ()))]
+        wrong = [
+            f"{row['vehicle']}: {text}" for row in rows for text in red_items(row, override.get(row["vehicle"], ()))
+        ]
         if wrong:
             raise OrthoSwarmError(f"{'; '.join(wrong)}; no vehicle was started")
         return missions
@@ -307,7 +311,7 @@ class Takeoffs:
         """
         mission = self._missions[system]
         (row,) = self._links.preflight([vehicle], {vehicle: mission}, reread=False, endurance_s=self._endurance_s)
-        return "; ".join(_red(row, {*self._allowed.get(vehicle, ()), "separation"}))
+        return "; ".join(red_items(row, {*self._allowed.get(vehicle, ()), "separation"}))
 
     def _note(self, vehicle: str, system: int, outcome: Outcome) -> None:
         """Apply the outcome of one start to the waiting ones."""
@@ -324,12 +328,6 @@ class Takeoffs:
             self._condition.notify_all()
         for text in said:
             self._say(text)
-
-
-def _red(row: Mapping[str, Any], allowed: Collection[str]) -> list[str]:
-    """The red items of a vehicle's check that are not overridden, in words."""
-    red = [item for item in row["items"] if item["state"] == "red" and item["name"] not in allowed]
-    return [f"{item['name']}: {item['reason']}" for item in red]
 
 
 def names_of(body: Mapping[str, Any]) -> tuple[int, dict[str, str]]:

@@ -34,7 +34,7 @@ from gcs_plugin.daemon.airspace.traffic import Traffic
 from gcs_plugin.daemon.jobs.job_queue import Jobs
 from gcs_plugin.daemon.mission_journal import MissionJournal
 from gcs_plugin.daemon.settings import Settings
-from gcs_plugin.daemon.start_checks import StartChecks
+from gcs_plugin.daemon.start_checks import StartChecks, red_items
 from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.fleet.commands import CommandResult
@@ -270,12 +270,9 @@ class VehicleLinks:
                     del systems[name]
         if verb == "start":
             for row in self._checked(systems):
-                red = [
-                    i for i in row["items"] if i["state"] == "red" and i["name"] not in override.get(row["vehicle"], ())
-                ]
+                red = red_items(row, override.get(row["vehicle"], ()))
                 if red:
-                    reason = "; ".join(f"{item['name']}: {item['reason']}" for item in red)
-                    end(row["vehicle"], Verdict.REFUSED, f"{row['vehicle']} was not started: {reason}")
+                    end(row["vehicle"], Verdict.REFUSED, f"{row['vehicle']} was not started: {'; '.join(red)}")
                     del systems[row["vehicle"]]
         return rows, systems
 

@@ -14,10 +14,10 @@ from gcs_plugin.fleet.message_rates import GPS_RAW_INT, SYS_STATUS
 from gcs_plugin.fleet.separation_check import Separation, flights_of, separation_of
 from gcs_plugin.fleet.separation_watch import number_name
 from gcs_plugin.links.mavlink import Autopilot
-from gcs_plugin.mission.command_dialogues import unflyable
 from gcs_plugin.mission.comparison import difference
 from gcs_plugin.mission.geofence import breach
 from gcs_plugin.mission.items import FRAME_GLOBAL, PLAIN_FRAME
+from gcs_plugin.mission.mission_builder import unflyable
 from gcs_plugin.mission.track import fastest_m_s, flight_seconds, highest_m, takeoff_place
 from orthoswarm.model.earth import distance_m
 

@@ -6,7 +6,7 @@ an autopilot that refuses MISSION_START has been armed already by then.
 """
 
 import abc
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -15,7 +15,8 @@ from gcs_plugin.links.mavlink import Autopilot, Message, dialect
 from gcs_plugin.mission.download import MissionDownload
 from gcs_plugin.mission.exchange import NEVER, Address, Exchange, Outcome, Verdict
 from gcs_plugin.mission.flight_modes import Modes, mode_params
-from gcs_plugin.mission.items import TAKEOFF, Mission, MissionItem
+from gcs_plugin.mission.items import Mission
+from gcs_plugin.mission.mission_builder import unflyable
 
 _ACCEPTED: Final = int(dialect.MAV_RESULT_ACCEPTED)
 _IN_PROGRESS: Final = int(dialect.MAV_RESULT_IN_PROGRESS)
@@ -26,7 +27,6 @@ _ANSWER_S: Final = 1.0
 _FIRST_S: Final = 2.0  # silence after which the other way is tried
 _SETTLED_S: Final = 3.0  # commands of a start that was broken off have arrived or are lost by then
 _SHOWN_S: Final = 0.9  # two heartbeats
-_AIRBORNE_COMMANDS: Final = frozenset({TAKEOFF, int(dialect.MAV_CMD_NAV_VTOL_TAKEOFF)})
 
 
 @dataclass(slots=True)
@@ -195,17 +195,6 @@ class CheckMission(Exchange):
         wrong = unflyable(reading.items, self.autopilot, in_air=self.in_air)
         self._end(not wrong, f"vehicle {self.vehicle.system} {wrong or 'has a mission that it can start'}")
         return messages
-
-
-def unflyable(items: Sequence[MissionItem], autopilot: Autopilot, *, in_air: bool) -> str:
-    """Why a stored mission cannot be started, in words; empty if it can."""
-    first = 1 if autopilot is Autopilot.ARDUPILOT else 0
-    flown = [item for item in items[first:] if item.is_nav]
-    if not flown:
-        return "has no mission; upload one first"
-    if not in_air and flown[0].command not in _AIRBORNE_COMMANDS:
-        return f"has a mission that begins with {flown[0].name} instead of a takeoff; upload one that takes off"
-    return ""
 
 
 @dataclass(slots=True)

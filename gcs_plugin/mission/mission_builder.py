@@ -20,6 +20,7 @@ from gcs_plugin.mission.items import (
     LOITER_TIME,
     TAKEOFF,
     TRIGGER_DISTANCE,
+    VTOL_TAKEOFF,
     WAYPOINT,
     Mission,
     MissionItem,
@@ -57,6 +58,17 @@ def build_mission(
     mission = Mission(autopilot, tuple(flown), name)
     _check(mission)
     return mission
+
+
+def unflyable(items: Sequence[MissionItem], autopilot: Autopilot, *, in_air: bool) -> str:
+    """Why a stored mission cannot be started, in words; empty if it can."""
+    first = 1 if autopilot is Autopilot.ARDUPILOT else 0
+    flown = [item for item in items[first:] if item.is_nav]
+    if not flown:
+        return "has no mission; upload one first"
+    if not in_air and flown[0].command not in (TAKEOFF, VTOL_TAKEOFF):
+        return f"has a mission that begins with {flown[0].name} instead of a takeoff; upload one that takes off"
+    return ""
 
 
 def read_mission(path: Path, autopilot: Autopilot) -> Mission:

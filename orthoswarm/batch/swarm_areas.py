@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.trajectory.near_paths import near_paths, reach_m
+from orthoswarm.trajectory.near_paths import NearPaths
 
 Array = NDArray[np.float64]
 
@@ -42,17 +42,11 @@ def divide(paths: Mapping[str, Array], most: int) -> list[Area]:
     parts = _halves(np.arange(len(names)), middle, count, most)
     if len(parts) == 1:
         return [Area(tuple(names), ())]
-    every = list(paths.values())
-    low, high = (np.array([end(path[:, :2], axis=0) for path in every]) for end in (np.min, np.max))
+    neighbours = NearPaths(list(paths.values()))
     areas = []
     for part in parts:
         own = set(part.tolist())
-        near = set[int]()
-        for k in part.tolist():
-            reach = reach_m(every[k])
-            meets = ((low < high[k] + reach) & (high > low[k] - reach)).all(1)  # thousands of vehicles are quick so
-            others = np.flatnonzero(meets).tolist()
-            near.update(others[j] for j in near_paths(every[k], [every[other] for other in others]))
+        near = {other for k in part.tolist() for other in neighbours.of(k)}
         areas.append(Area(tuple(names[k] for k in sorted(own)), tuple(names[k] for k in sorted(near - own))))
     return areas
 

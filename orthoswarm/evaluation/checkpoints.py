@@ -26,7 +26,7 @@ from orthoswarm.evaluation.independent_points import Surveyed, control_of_report
 from orthoswarm.evaluation.photo_names import photo_named
 from orthoswarm.evaluation.point_rays import Ray, RayPoint, intersect_rays
 from orthoswarm.model.camera import Lens, focal_px
-from orthoswarm.model.earth import MEAN_RADIUS_M
+from orthoswarm.model.earth import distance_m
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid, projection_of
 
@@ -290,7 +290,9 @@ def _merged(lines: Iterable[Checkpoint]) -> list[Checkpoint]:
     points: list[Checkpoint] = []
     for line in lines:
         same_name = places.setdefault(line.name, [])
-        known = next((p for p in same_name if _apart_m(p.surveyed, line.surveyed) <= _SAME_PLACE_M), None)
+        known = next(
+            (p for p in same_name if distance_m(*p.surveyed[::-1], *line.surveyed[::-1]) <= _SAME_PLACE_M), None
+        )
         if known is None:
             same_name.append(line)
             points.append(line)
@@ -301,12 +303,6 @@ def _merged(lines: Iterable[Checkpoint]) -> list[Checkpoint]:
         for number, point in enumerate(several if len(several) > 1 else (), 1):
             point.name = f"{name} ({number})"
     return points
-
-
-def _apart_m(one: Array, other: Array) -> float:
-    """Metres between two places that are near each other, by longitude and latitude."""
-    east, north = np.radians(other - one) * MEAN_RADIUS_M
-    return math.hypot(float(east) * math.cos(math.radians(float(one[1]))), float(north))
 
 
 def _csv_row(cells: Mapping[str, str], name: str, scale: _Scale) -> Checkpoint:

@@ -2,6 +2,9 @@
 
 import math
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
 MEAN_RADIUS_M = 6_371_008.8
 """Mean radius of the ellipsoid, (2 a + b) / 3 of GRS 80 (Moritz 2000, Journal of Geodesy 74)."""
 DEGREE_M = math.radians(MEAN_RADIUS_M)
@@ -18,3 +21,9 @@ def distance_m(lat1_deg: float, lon1_deg: float, lat2_deg: float, lon2_deg: floa
     half_lat, half_lon = 0.5 * (lat2 - lat1), 0.5 * math.radians(lon2_deg - lon1_deg)
     h = math.sin(half_lat) ** 2 + math.cos(lat1) * math.cos(lat2) * math.sin(half_lon) ** 2
     return 2.0 * MEAN_RADIUS_M * math.asin(math.sqrt(min(1.0, h)))
+
+
+def on_sphere(lat_deg: ArrayLike, lon_deg: ArrayLike) -> NDArray[np.float64]:
+    """Places as x, y, z from the Earth's middle, metres, float64 (N, 3), for straight distances anywhere."""
+    lat, lon = np.radians(np.asarray(lat_deg, np.float64)), np.radians(np.asarray(lon_deg, np.float64))
+    return MEAN_RADIUS_M * np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=-1)

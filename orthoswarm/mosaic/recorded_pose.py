@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from orthoswarm.config import active
 from orthoswarm.model.camera import NADIR_PITCH_RAD, Camera, Lens, focal_px, rotation_from_angles
-from orthoswarm.model.earth import MEAN_RADIUS_M
+from orthoswarm.model.earth import on_sphere
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.frame import Frame, Ingest, Rejection
 from orthoswarm.model.geo import LocalGrid, area_epsg
@@ -57,8 +57,7 @@ def in_one_area(ingest: Ingest) -> Ingest:
     if len(frames) < 2:
         return ingest
     limit = active().records.largest_area_m
-    lat, lon = (np.radians([getattr(f.fix, name) for f in frames]) for name in ("lat_deg", "lon_deg"))
-    at = MEAN_RADIUS_M * np.column_stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
+    at = on_sphere([f.fix.lat_deg for f in frames], [f.fix.lon_deg for f in frames])
     # Coarse cells first: many photos are compared with few places.
     _, first, cell, count = np.unique(
         np.floor(at / (0.1 * limit)), axis=0, return_index=True, return_inverse=True, return_counts=True

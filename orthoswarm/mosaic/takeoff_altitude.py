@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from orthoswarm.config import active
 from orthoswarm.model.placement import PlacedFrame
 from orthoswarm.model.robust import mad_sigma
-from orthoswarm.trajectory.near_paths import near_paths, reach_m
+from orthoswarm.trajectory.near_paths import NearPaths
 
 Array = NDArray[np.float64]
 _LEVELS_M = (-500.0, 9000.0)
@@ -108,16 +108,11 @@ def _blocks(paths: Mapping[str, Array]) -> list[list[str]]:
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    names, every = list(paths), list(paths.values())
+    names = list(paths)
     if not names:
         return []
-    low, high = (np.array([end(path[:, :2], axis=0) for path in every]) for end in (np.min, np.max))
-    edges: list[tuple[int, int]] = []
-    for k, path in enumerate(every):
-        reach = reach_m(path)
-        meets = ((low < high[k] + reach) & (high > low[k] - reach)).all(1)  # of thousands of vehicles few are near
-        others = np.flatnonzero(meets).tolist()
-        edges += [(k, others[j]) for j in near_paths(path, [every[other] for other in others])]
+    neighbours = NearPaths(list(paths.values()))
+    edges = [(k, other) for k in range(len(names)) for other in neighbours.of(k)]
     rows, columns = np.array(edges).reshape(-1, 2).T
     graph = coo_array((np.ones(len(rows), np.int8), (rows, columns)), shape=(len(names), len(names)))
     count, label = connected_components(graph, directed=False)

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.model.earth import MEAN_RADIUS_M
+from orthoswarm.model.earth import on_sphere
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
@@ -19,8 +19,7 @@ def separate_places(lat_deg: Array, lon_deg: Array, gap_m: float, gap_steps: flo
         gap_m: least gap in a straight line, metres. gap_steps: least gap in distances from a place to the nearest
             other one, their median: high flights have few pictures far apart.
     """
-    lat, lon = np.radians(lat_deg), np.radians(lon_deg)
-    place = MEAN_RADIUS_M * np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=1)
+    place = on_sphere(lat_deg, lon_deg)
     if (np.linalg.norm(np.diff(place, axis=0), axis=1) < gap_m).all():
         return np.zeros(len(place), np.int32)
     from scipy.spatial import cKDTree  # a tenth of a second that flights in one piece do without

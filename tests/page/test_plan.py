@@ -18,8 +18,8 @@ def planning(page):
     page.evaluate(HERE)
 
 
-def draw(page, *corners):
-    page.click("text=Draw area")
+def draw(page, *corners, what="Draw area"):
+    page.click(f"text={what}")
     for x, y in corners:
         page.mouse.click(x, y)
         page.wait_for_timeout(350)
@@ -102,14 +102,6 @@ def made_plan(number="plan-1"):
     return {"id": number, "covered_share": 1.0, "makespan_s": 312, "spacing_m": 20, "vehicles": [part]}
 
 
-def add_zone(page, *corners):
-    page.click("text=Add no-fly zone")
-    for x, y in corners:
-        page.mouse.click(x, y)
-        page.wait_for_timeout(350)
-    page.click("button:text-is('Done')")
-
-
 def test_a_zone_that_is_drawn_after_the_plan_stops_its_upload_and_start(browser):
     older = "The plan is older than the drawing: make the plan again"
 
@@ -132,7 +124,7 @@ def test_a_zone_that_is_drawn_after_the_plan_stops_its_upload_and_start(browser)
             page.wait_for_function("() => document.querySelector('.assignments select')")
             page.select_option(".assignments select", "v7")
             assert page.inner_text(".plan-result .wrong") == ""
-            add_zone(page, (700, 350), (800, 350), (750, 450))
+            draw(page, (700, 350), (800, 350), (750, 450), what="Add no-fly zone")
             page.wait_for_selector(f".plan-result .wrong:has-text('{older}')")
             for press in ("Upload missions", "Check and start"):
                 page.click(f"text={press}")
@@ -164,7 +156,7 @@ def test_an_area_file_keeps_the_zones_that_were_drawn_and_says_so(browser):
         station.answer = lambda *_: (200, {"polygons": [[ring]], "lines": [], "no_fly": []})
         planning(page)
         draw(page, (600, 250), (900, 250), (900, 550), (600, 550))
-        add_zone(page, (700, 350), (800, 350), (750, 450))
+        draw(page, (700, 350), (800, 350), (750, 450), what="Add no-fly zone")
         file = {"name": "b.geojson", "mimeType": "text/plain", "buffer": b"{}"}
         page.set_input_files("input[type=file]", files=[file])
         page.wait_for_selector(".notice:has-text('1 no-fly zone drawn before is kept')")

@@ -58,35 +58,36 @@ def _planned(tmp_path: Path, capsys: pytest.CaptureFixture[str], altitude: float
     return out
 
 
+def _sampled(feature: dict[str, Any]) -> tuple[Any, Any, Any]:
+    """A line of a written mission every metre: east and north from the corner, and height over takeoff, metres."""
+    lon, lat, z = np.array(feature["geometry"]["coordinates"]).T
+    points = FlownArea().grid.to_grid(lat, lon)
+    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+    at = np.arange(0.0, along[-1], 1.0)
+    east, north = (np.interp(at, along, points[:, axis]) - CORNER[axis] for axis in range(2))
+    return east, north, np.interp(at, along, z)
+
+
 def _above_ground(folder: Path, height: Height) -> Iterator[tuple[float, float]]:
     """Lowest and highest point above the ground of each leg, sampled every metre along the written missions."""
-    grid = FlownArea().grid
     for feature in json.loads((folder / "all.geojson").read_text())["features"]:
         if feature["properties"]["kind"] != "leg":
             continue
-        lon, lat, z = np.array(feature["geometry"]["coordinates"]).T
-        points = grid.to_grid(lat, lon)
-        along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
-        at = np.arange(0.0, along[-1], 1.0)
-        east, north = (np.interp(at, along, points[:, axis]) - CORNER[axis] for axis in range(2))
-        above = np.interp(at, along, z) - (height(east, north) - 300.0)
+        east, north, z = _sampled(feature)
+        above = z - (height(east, north) - 300.0)
         yield float(above.min()), float(above.max())
 
 
 def _least_beside(folder: Path, height: Height, beside_m: float) -> float:
     """Least height of the missions over all ground up to a distance from them, sampled every metre."""
-    grid, found = FlownArea().grid, []
+    found = []
     disc = [(e, n) for e in np.arange(-10.0, 10.5) for n in np.arange(-10.0, 10.5) if np.hypot(e, n) <= beside_m]
     for feature in json.loads((folder / "all.geojson").read_text())["features"]:
         if feature["geometry"]["type"] != "LineString":
             continue
-        lon, lat, z = np.array(feature["geometry"]["coordinates"]).T
-        points = grid.to_grid(lat, lon)
-        along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
-        at = np.arange(0.0, along[-1], 1.0)
-        east, north = (np.interp(at, along, points[:, axis]) - CORNER[axis] for axis in range(2))
+        east, north, z = _sampled(feature)
         top = np.max([height(east + e, north + n) for e, n in disc], axis=0) - 300.0
-        found.append(float((np.interp(at, along, z) - top).min()))
+        found.append(float((z - top).min()))
     return min(found)
 
 

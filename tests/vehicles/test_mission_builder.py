@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from gcs_plugin.links.mavlink import Autopilot, command_name, dialect
 from gcs_plugin.links.packets import Framer
 from gcs_plugin.mission import mission_files
-from gcs_plugin.mission.command_dialogues import unflyable
 from gcs_plugin.mission.items import (
     LAND,
     LOITER_TIME,
@@ -22,7 +21,7 @@ from gcs_plugin.mission.items import (
     Mission,
     MissionItem,
 )
-from gcs_plugin.mission.mission_builder import build_mission, read_mission
+from gcs_plugin.mission.mission_builder import build_mission, read_mission, unflyable
 from gcs_plugin.sim.mission_store import MissionStore
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.plan import Plan, Sortie, VehiclePlan, Waypoint

@@ -8,7 +8,8 @@ earth; quality, satellites, standard deviations. Source: RTKLIB manual 2.4.2, ap
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final
+from functools import cache
+from typing import Any, Final
 
 import numpy as np
 
@@ -19,8 +20,6 @@ from telemetry.samples.times import GPS_EPOCH_S, GPS_MINUS_UTC_S, WEEK_S, parse_
 _SCALES: Final = {"GPST": GPS_MINUS_UTC_S, "UTC": 0.0, "JST": 9 * 3600.0}
 """Seconds that a time scale is ahead of UTC."""
 _FIXED, _FLOAT = 1.0, 2.0
-_MAJOR_M, _FLATTENING = 6_378_137.0, 1.0 / 298.257223563
-"""The ellipsoid of WGS 84."""
 _LEAST_EPOCHS = 10
 _EVEN_S, _EVEN_SHARE = 0.005, 0.9
 """Epochs of a receiver follow each other evenly to a millisecond, apart from missing ones; a camera that takes pictures
@@ -140,12 +139,13 @@ def _minutes(numbers: Sequence[float]) -> tuple[float, float, float]:
 
 
 def _geocentric(numbers: Sequence[float]) -> tuple[float, float, float]:
-    """Of x, y, z in metres (Bowring 1976: exact to a micrometre at heights that are flown)."""
-    x, y, z = numbers
-    minor_m, out_m = _MAJOR_M * (1.0 - _FLATTENING), math.hypot(x, y)
-    squared, second = _FLATTENING * (2.0 - _FLATTENING), (_MAJOR_M / minor_m) ** 2 - 1.0
-    reduced = math.atan2(z * _MAJOR_M, out_m * minor_m)
-    lat = math.atan2(z + second * minor_m * math.sin(reduced) ** 3, out_m - squared * _MAJOR_M * math.cos(reduced) ** 3)
-    below_m = _MAJOR_M * math.sqrt(1.0 - squared * math.sin(lat) ** 2)
-    height = out_m * math.cos(lat) + z * math.sin(lat) - below_m
-    return math.degrees(lat), math.degrees(math.atan2(y, x)), height
+    """Of x, y, z in metres."""
+    lon, lat, height = _geodetic().transform(*numbers)
+    return float(lat), float(lon), float(height)
+
+
+@cache
+def _geodetic() -> Any:
+    import pyproj
+
+    return pyproj.Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)

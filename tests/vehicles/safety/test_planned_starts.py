@@ -31,6 +31,18 @@ class SlowPlans(PlanFolder):
         return super().mission(body, vehicle, autopilot)
 
 
+def beginning(takeoffs, said):
+    """A thread that gives a start; what it says is added to a list."""
+
+    def begin():
+        try:
+            said.append(takeoffs.begin("plan-1", override=ONE_PATH))
+        except OrthoSwarmError as error:
+            said.append(str(error))
+
+    return threading.Thread(target=begin)
+
+
 def apart(folder, count, seconds):  # noqa: F811
     """The plan with `count` vehicles that take off so many seconds after each other."""
     document = json.loads((folder / "plan.json").read_text())
@@ -50,13 +62,7 @@ def test_a_command_to_stop_during_the_check_cancels_the_start(open_links, folder
     plans, said = SlowPlans(folder), []
     takeoffs = Takeoffs(links, plans, lambda _: None)
 
-    def begin():
-        try:
-            said.append(takeoffs.begin("plan-1", override=ONE_PATH))
-        except OrthoSwarmError as error:
-            said.append(str(error))
-
-    thread = threading.Thread(target=begin)
+    thread = beginning(takeoffs, said)
     thread.start()
     assert plans.asked.wait(30.0)
     rows = links.commands(verb)
@@ -79,18 +85,12 @@ def test_a_command_to_stop_counts_though_the_check_begins_at_that_moment(open_li
     takeoffs = Takeoffs(links, plans, lambda _: None)
     cancel = takeoffs.cancel
 
-    def begin():
-        try:
-            said.append(takeoffs.begin("plan-1", override=ONE_PATH))
-        except OrthoSwarmError as error:
-            said.append(str(error))
-
     def late(vehicle):
         thread.start()
         assert plans.asked.wait(30.0)
         return cancel(vehicle)
 
-    thread = threading.Thread(target=begin)
+    thread = beginning(takeoffs, said)
     links.cancel_takeoff = late
     (row,) = links.commands("pause")
     assert row["outcome"] == "done" and "cancelled" in row["reason"]
