@@ -8,6 +8,19 @@ import { t } from "/static/core/strings.js";
 
 const FORMATS = ["pack", "cog", "gpkg", "mbtiles", "kmz", "odm", "pdf", "tak", "places", "pmtiles", "stac"];
 const CHOSEN = new Set(["pack"]);
+const CHANGES = new Set(["refine", "together", "tones", "coarse", "redraw"]); // jobs that change the map
+
+// The newest file of each kind: the daemon exports some by itself, and what a person asked for stays beside them.
+function newestFiles(jobs) {
+  const changedAt = Math.max(...jobs.filter((job) => CHANGES.has(job.kind) && job.state === "done").map((job) => Date.parse(job.ended) || 0), 0);
+  const newest = new Map();
+  for (const job of jobs.filter((row) => row.detail?.files).sort((a, b) => a.id - b.id)) {
+    const older = Date.parse(job.started) < changedAt;
+    for (const [kind, name] of Object.entries(job.detail.files)) newest.set(kind, { job, kind, name, older });
+  }
+  return [...newest];
+}
+const timeOfDay = (iso) => (Number.isFinite(Date.parse(iso)) ? new Date(iso).toTimeString().slice(0, 5) : "");
 
 export function exportPanel() {
   const boxes = FORMATS.map((key) => make("input", { type: "checkbox", name: key, checked: CHOSEN.has(key) }));
@@ -23,14 +36,12 @@ export function exportPanel() {
       notice("bad", t("export.refused", { why: error.message }));
     }
   };
-  const draw = keyedList(files, () => make("li", {}, make("a", { download: "" })), (row, [job, kind, name]) => {
+  const draw = keyedList(files, () => make("li", {}, make("a", { download: "" })), (row, { job, kind, name, older }) => {
     setAttribute(row.firstChild, "href", withToken(`/api/export/${job.id}/${encodeURIComponent(kind)}`));
-    setText(row.firstChild, `${FORMATS.includes(kind) ? t(`export.${kind}`) : kind}: ${name}`);
+    const text = `${FORMATS.includes(kind) ? t(`export.${kind}`) : kind}: ${name}`;
+    setText(row.firstChild, [text, timeOfDay(job.ended), older ? t("export.older") : ""].filter(Boolean).join(", "));
   });
-  subscribe("jobs", "exports", () => {
-    const made = [...state.jobs.values()].filter((job) => job.detail?.files).sort((a, b) => a.id - b.id).pop();
-    draw(made ? Object.entries(made.detail.files).map(([kind, name]) => [kind, [made, kind, name]]) : []);
-  });
+  subscribe("jobs", "exports", () => draw(newestFiles([...state.jobs.values()])));
   return make("section", {}, make("h2", {}, t("export.title")),
     make("form", { onsubmit: send }, ...FORMATS.map((key, k) => make("label", { class: "check" }, boxes[k], make("span", {}, t(`export.${key}`)))), make("button", { type: "submit" }, t("export.go"))), files);
 }

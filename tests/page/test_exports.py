@@ -1,0 +1,31 @@
+"""What was exported stays within reach, and says when the map has changed since."""
+
+from tests.kit.page_kit import opened, send, standing, vehicle
+
+T = "2026-05-28T20:{}:00Z"
+
+
+def job(number, kind, minute, files=None):
+    row = {"id": number, "kind": kind, "vehicle": None, "sortie": None, "state": "done", "progress": 1, "message": ""}
+    ended = row | {"created": T.format(minute), "started": T.format(minute), "ended": T.format(minute)}
+    return ended | {"attempts": 1, "detail": {} if files is None else {"files": files}}
+
+
+def test_a_pack_stays_when_the_daemon_exports_by_itself_and_says_that_it_is_older_than_the_map(browser):
+    with standing(vehicle(1)) as station:
+        station.gets["/api/jobs"] = [job(2, "export", 11, {"pack": "export/map.zip"}), job(1, "refine", 10)]
+        with opened(browser, station.url) as page:
+            page.click("#tab-map")
+            pack = page.locator(".files a:has-text('map.zip')")
+            pack.wait_for()
+            assert "older" not in pack.inner_text()
+            send(page, {"type": "job", **job(3, "refine", 12)})
+            send(page, {"type": "job", **job(4, "export", 13, {"cog": "orthoimage.tif", "gpkg": "footprints.gpkg"})})
+            page.wait_for_selector(".files a:has-text('orthoimage.tif')")
+            assert "/api/export/2/pack" in pack.get_attribute("href")
+            assert "older than the map" in pack.inner_text()
+            assert page.locator(".files a:has-text('older')").count() == 1
+            send(page, {"type": "job", **job(5, "export", 14, {"pack": "export/map.zip"})})
+            page.wait_for_selector(".files a[href*='/api/export/5/pack']")
+            assert page.locator(".files a").count() == 3
+            assert page.locator(".files a:has-text('older')").count() == 0
