@@ -5,16 +5,17 @@ import time
 from collections.abc import Callable, Collection, Mapping
 from typing import TYPE_CHECKING, Any
 
-from gcs_plugin.config import HEARING, LIMITS
+from gcs_plugin.config import HEARING
 from gcs_plugin.fleet.commands import Verb
 from gcs_plugin.fleet.fleet_events import FleetEvent
 from gcs_plugin.fleet.flight_state import Word, flight_state
 from gcs_plugin.fleet.preflight import Check, preflight_all
-from gcs_plugin.fleet.takeoff_schedule import TakeoffSchedule
+from gcs_plugin.fleet.separation.takeoff_schedule import TakeoffSchedule
 from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.exchange import Outcome, Verdict
 from gcs_plugin.mission.items import Mission
+from gcs_plugin.mission.plan_folder import NO_NEEDS, PlanNeeds
 
 if TYPE_CHECKING:
     from gcs_plugin.fleet.commands import Order
@@ -118,19 +119,19 @@ class Backend(abc.ABC):
         starts: Mapping[int, float],
         legal_height_m: float,
         *,
-        endurance_s: float | None = None,
+        needs: PlanNeeds = NO_NEEDS,
     ) -> list[Check]:
         """Preflight check of vehicles with their present telemetry.
 
         Args:
             systems: the vehicles. missions: of the plan. stored: missions downloaded from the vehicles.
             starts: takeoffs in seconds after the first. legal_height_m: legal height limit, metres.
-            endurance_s: flight time of a full battery, None for the default.
+            needs: of the plan.
         """
         vehicles = {s: self.vehicle(s) for s in systems}
         return preflight_all(
             vehicles, missions, stored, starts, time.monotonic(),
-            endurance_s=endurance_s or LIMITS.endurance_s, legal_height_m=legal_height_m,
+            needs=needs, legal_height_m=legal_height_m,
         )  # fmt: skip
 
     @abc.abstractmethod

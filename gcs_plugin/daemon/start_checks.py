@@ -9,14 +9,15 @@ import time
 from collections.abc import Callable, Collection, Mapping
 from typing import TYPE_CHECKING, Any, Final
 
-from gcs_plugin.config import COMMAND, LIMITS
+from gcs_plugin.config import COMMAND
 from gcs_plugin.daemon.airspace.fences import Fences
 from gcs_plugin.mission.items import Mission
+from gcs_plugin.mission.plan_folder import NO_NEEDS, PlanNeeds
 from orthoswarm.model.errors import OrthoSwarmError
 
 if TYPE_CHECKING:
     from gcs_plugin.fleet.fleet import Fleet
-    from gcs_plugin.fleet.separation_check import Separation
+    from gcs_plugin.fleet.separation.separation_check import Separation
     from gcs_plugin.mission.download import MissionDownload
 
 _SOON_S: Final = 5.0
@@ -54,22 +55,21 @@ class StartChecks:
         missions: "Mapping[int, Mission]",
         starts: Mapping[int, float],
         *,
-        endurance_s: float | None = None,
-        legal_height_m: float | None = None,
+        needs: PlanNeeds = NO_NEEDS,
         reread: bool = True,
     ) -> list[dict[str, Any]]:
         """Check vehicles that are to start together; waits for their missions.
 
         Args:
             systems: their names by system id. missions: the plan's. starts: takeoffs in seconds after the first.
-            endurance_s, legal_height_m: as for `preflight_all`.
+            needs: of the plan.
             reread: whether missions that are known and did not change are read all the same.
 
         Returns:
             A row per vehicle, see the top of `vehicles`.
         """
         from gcs_plugin.fleet.preflight import preflight_all
-        from gcs_plugin.fleet.separation_check import Separation
+        from gcs_plugin.fleet.separation.separation_check import Separation
 
         stored = self._missions(systems, reread=reread)
         separation = Separation()
@@ -83,8 +83,7 @@ class StartChecks:
                 stored,
                 starts,
                 time.monotonic(),
-                endurance_s=endurance_s or LIMITS.endurance_s,
-                legal_height_m=legal_height_m or LIMITS.legal_height_m,
+                needs=needs,
                 name=self._name_of,
                 separation=separation,
                 zones=self._fences.zones(),
@@ -101,7 +100,7 @@ class StartChecks:
         starts: Mapping[int, float],
     ) -> "Separation":
         """How they keep apart from each other and from others, found in this thread: the links' must not wait."""
-        from gcs_plugin.fleet.separation_check import flights_of, others_of, separation_of
+        from gcs_plugin.fleet.separation.separation_check import flights_of, others_of, separation_of
 
         rows = self._waiting()
         waits = {

@@ -16,9 +16,10 @@ from gcs_plugin.daemon.start_checks import red_items
 from gcs_plugin.daemon.vehicles import VehicleLinks
 from gcs_plugin.daemon.web_plans import Plans
 from gcs_plugin.fleet.commands import Order
-from gcs_plugin.fleet.takeoff_schedule import TakeoffSchedule
+from gcs_plugin.fleet.separation.takeoff_schedule import TakeoffSchedule
 from gcs_plugin.mission.exchange import Outcome, Verdict
 from gcs_plugin.mission.items import Mission
+from gcs_plugin.mission.plan_folder import NO_NEEDS
 from gcs_plugin.mission.track import Airspace
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 
@@ -45,7 +46,7 @@ class Takeoffs:
         self._stops: dict[int, int] = {}
         self._given_s: dict[int, float] = {}
         self._missions: dict[int, Mission] = {}
-        self._endurance_s: float | None = None
+        self._needs = NO_NEEDS
         self._allowed: dict[str, Collection[str]] = {}
         self._about_to: set[int] = set()
         self._closed = False
@@ -57,15 +58,11 @@ class Takeoffs:
         plan: str,
         sortie: int = 1,
         names: Mapping[str, str] | None = None,
-        *,
-        endurance_s: float | None = None,
-        legal_height_m: float | None = None,
     ) -> list[dict[str, Any]]:
         """Check a plan's vehicles before their start.
 
         Args:
             plan, sortie, names: as for `begin`.
-            endurance_s, legal_height_m: as for `VehicleLinks.preflight`.
 
         Returns:
             A row per vehicle, as from `VehicleLinks.preflight`.
@@ -74,16 +71,13 @@ class Takeoffs:
             InputError: there is no such plan or flight.
             OrthoSwarmError: vehicles are not heard.
         """
-        return self._check(plan, sortie, names, endurance_s=endurance_s, legal_height_m=legal_height_m)[0]
+        return self._check(plan, sortie, names)[0]
 
     def _check(
         self,
         plan: str,
         sortie: int,
         names: Mapping[str, str] | None,
-        *,
-        endurance_s: float | None = None,
-        legal_height_m: float | None = None,
     ) -> tuple[list[dict[str, Any]], dict[str, Mission]]:
         """The rows of `preflight`, and the plan's missions by vehicle."""
         starts = self._plans.starts(plan, sortie)
@@ -94,10 +88,7 @@ class Takeoffs:
             mission = vehicle if sortie == 1 else f"{vehicle}-sortie{sortie}"
             missions[name] = self._plans.mission({"plan": plan, "mission": mission}, vehicle, known.autopilot)
         times = {whose[vehicle]: start_s for vehicle, start_s in starts.items()}
-        endurance_s = endurance_s or self._plans.endurance_s(plan)
-        rows = self._links.preflight(
-            list(whose.values()), missions, starts=times, endurance_s=endurance_s, legal_height_m=legal_height_m
-        )
+        rows = self._links.preflight(list(whose.values()), missions, starts=times, needs=self._plans.needs(plan))
         return rows, missions
 
     def begin(
@@ -142,7 +133,7 @@ class Takeoffs:
             delays = {systems[vehicle]: start_s - first for vehicle, start_s in starts.items()}
             held = {s: self._links.fleet.vehicles[s].mission for s in delays}
             schedule = TakeoffSchedule.of(delays, self._clock())
-            endurance_s = self._plans.endurance_s(plan)
+            needs = self._plans.needs(plan)
             with self._condition:
                 if not wanted():
                     raise OrthoSwarmError("the start was cancelled; no vehicle was started")
@@ -150,7 +141,7 @@ class Takeoffs:
                 self._failed.clear()
                 self._stops, self._given_s = stops, {s: given for s, delay in delays.items() if delay <= 0.0}
                 self._names = {systems[vehicle]: whose[vehicle] for vehicle in starts}
-                self._endurance_s = endurance_s
+                self._needs = needs
                 self._missions = {system: missions[self._names[system]] for system in systems.values()}
                 self._allowed = dict(override or {})
                 self._schedule, self._checking = schedule, frozenset()
@@ -310,7 +301,7 @@ class Takeoffs:
         Its distances to others are the schedule's.
         """
         mission = self._missions[system]
-        (row,) = self._links.preflight([vehicle], {vehicle: mission}, reread=False, endurance_s=self._endurance_s)
+        (row,) = self._links.preflight([vehicle], {vehicle: mission}, reread=False, needs=self._needs)
         return "; ".join(red_items(row, {*self._allowed.get(vehicle, ()), "separation"}))
 
     def _note(self, vehicle: str, system: int, outcome: Outcome) -> None:

@@ -8,9 +8,9 @@ For the HTTP API and the page, all in JSON values:
 - `commands(verb, vehicles)` gives a row a vehicle: `id`, `vehicle`, `command`, `outcome` (`done`, `refused`,
   `not_sent`, `unknown`), `reason`. Verbs are `start`, `pause`, `resume`, `rtl`, `land`; no vehicles named: all on the
   links at once.
-- `preflight(...)` gives a row a vehicle: `vehicle`, `state` and `items`, each with `name` (`link`, `gps`, `ekf`,
-  `home`, `pre-arm`, `battery`, `mission`, `fence`, `height`, `speed`, `separation`), `state` (`ok`, `warning`, `red`)
-  and `reason`. A red item stops `start` unless it is overridden by its name.
+- `preflight(...)` gives a row a vehicle: `vehicle`, `state` and `items`, each with `name` (of
+  `fleet.preflight.ITEMS`), `state` (`ok`, `warning`, `red`) and `reason`. A red item stops `start` unless it is
+  overridden by its name.
 - `flight_state(vehicle)`, and `flight` in each row of `rows()`: `state` (`on ground`, `taking off`, `on mission`,
   `paused`, `returning`, `landing`, `holding`, `flying`, `lost`, `complete`), `text` (`on mission 7/13`), `item` and
   `items`.
@@ -38,8 +38,9 @@ from gcs_plugin.daemon.start_checks import StartChecks, red_items
 from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.fleet.commands import CommandResult
-from gcs_plugin.fleet.separation_watch import apart_text, near_text, number_name
+from gcs_plugin.fleet.separation.separation_watch import apart_text, near_text, number_name
 from gcs_plugin.mission.exchange import Verdict
+from gcs_plugin.mission.plan_folder import NO_NEEDS, PlanNeeds
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 from telemetry.live.live_poses import Poses
 
@@ -290,8 +291,7 @@ class VehicleLinks:
         missions: "Mapping[str, Mission] | None" = None,
         *,
         starts: Mapping[str, float] | None = None,
-        endurance_s: float | None = None,
-        legal_height_m: float | None = None,
+        needs: PlanNeeds = NO_NEEDS,
         reread: bool = True,
     ) -> list[dict[str, Any]]:
         """Check vehicles before their start; their missions are read from them first.
@@ -300,7 +300,7 @@ class VehicleLinks:
             vehicles: their ids; None for all on the links.
             missions: the plan's mission of each, by vehicle; without it the vehicle's stored mission is flown.
             starts: takeoff of each in seconds after the first; default all at once.
-            endurance_s: flight time of a full battery. legal_height_m: height that may be flown without asking.
+            needs: of the plan.
             reread: whether missions are read although they were read or written before and nothing changed them since.
 
         Returns:
@@ -313,9 +313,7 @@ class VehicleLinks:
         systems = {self.system_of(name): name for name in names}
         wanted = {s: missions[name] for s, name in systems.items() if missions and name in missions}
         times = {s: starts[name] for s, name in systems.items() if starts and name in starts}
-        return self._checks.check(
-            systems, wanted, times, endurance_s=endurance_s, legal_height_m=legal_height_m, reread=reread
-        )
+        return self._checks.check(systems, wanted, times, needs=needs, reread=reread)
 
     def command(self, begin: Callable[["Fleet"], "Exchange"], timeout_s: float = 180.0) -> str:
         """Run a dialogue with a vehicle to its end; returns the final text.

@@ -13,7 +13,7 @@ from typing import Any, Final
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.items import Mission
-from gcs_plugin.mission.plan_folder import plan_endurance_s
+from gcs_plugin.mission.plan_folder import PlanNeeds, plan_needs
 from gcs_plugin.plans.plan_request import AUTOPILOTS, ENDS, METHODS, RELIEFS, PlanRequest, make_plan
 from orthoswarm.model.errors import InputError
 from orthoswarm.planning.area.shape_files import parse_geojson
@@ -167,13 +167,13 @@ class Plans:
             for vehicle, row in rows.items()
         }
 
-    def endurance_s(self, name: Any) -> float | None:
-        """Flight time of a full battery that a plan was made for, seconds; None if nobody said it.
+    def needs(self, name: Any) -> PlanNeeds:
+        """What a plan relies on.
 
         Raises:
             InputError: there is no such plan.
         """
-        return plan_endurance_s(self._path(name))
+        return plan_needs(self._path(name))
 
     def newest_bounds(self) -> GeographicBounds | None:
         """South, west, north, east of the newest plan in degrees, None if there is none."""

@@ -215,8 +215,8 @@ class Fleet:
         return self.begin(MissionUpload(vehicle.address, self.own, mission=mission))
 
     def download(self, system: int) -> MissionDownload:
-        """Read the mission of a vehicle, and ask for what its speed is set by, which is compared with the mission's."""
-        self._dialogues.send(system, self._free(system).speed_questions())
+        """Read the mission of a vehicle, and ask for the settings that a check compares with it."""
+        self._dialogues.send(system, self._free(system).setting_questions())
         return self.begin(MissionDownload(self._free(system).address, self.own))
 
     def read_fence(self, system: int) -> MissionDownload:

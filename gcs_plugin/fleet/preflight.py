@@ -10,14 +10,16 @@ from dataclasses import KW_ONLY, dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from gcs_plugin.config import LIMITS
+from gcs_plugin.fleet.autopilot_settings import Setting
 from gcs_plugin.fleet.message_rates import GPS_RAW_INT, SYS_STATUS
-from gcs_plugin.fleet.separation_check import Separation, flights_of, separation_of
-from gcs_plugin.fleet.separation_watch import number_name
+from gcs_plugin.fleet.separation.separation_check import Separation, flights_of, separation_of
+from gcs_plugin.fleet.separation.separation_watch import number_name
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.comparison import difference
 from gcs_plugin.mission.geofence import breach
 from gcs_plugin.mission.items import FRAME_GLOBAL, PLAIN_FRAME
 from gcs_plugin.mission.mission_builder import unflyable
+from gcs_plugin.mission.plan_folder import NO_NEEDS, PlanNeeds
 from gcs_plugin.mission.track import fastest_m_s, flight_seconds, highest_m, takeoff_place
 from orthoswarm.model.earth import distance_m
 
@@ -27,7 +29,8 @@ if TYPE_CHECKING:
     from gcs_plugin.mission.items import Mission
 
 ITEMS: Final = (
-    "link", "gps", "ekf", "home", "pre-arm", "battery", "mission", "fence", "height", "speed", "separation",
+    "link", "gps", "ekf", "home", "pre-arm", "battery", "mission", "fence", "height", "return", "failsafe", "speed",
+    "separation",
 )  # fmt: skip
 _LINK_S: Final = (2.0, 5.0)
 _SATELLITES: Final = (6, 10)
@@ -99,7 +102,7 @@ class Wanted:
     Attributes:
         mission: the plan's mission of this vehicle, None to fly what it holds.
         stored: the mission just read from the vehicle, None to use the known one.
-        endurance_s: flight time of a full battery.
+        needs: what the plan relies on.
         legal_height_m: height above takeoff that may be flown without asking.
         near: finding of the separation check about this vehicle, empty if none.
         zones: of the geofence that it holds, None if that has not been read.
@@ -109,7 +112,7 @@ class Wanted:
 
     mission: "Mission | None" = None
     stored: "Mission | None" = None
-    endurance_s: float = LIMITS.endurance_s
+    needs: PlanNeeds = NO_NEEDS
     legal_height_m: float = LIMITS.legal_height_m
     near: str = ""
     _: KW_ONLY
@@ -127,8 +130,9 @@ def preflight(vehicle: "Vehicle", wanted: Wanted, now: float) -> Check:
     mission = wanted.mission or wanted.stored or vehicle.mission
     items = (
         _link(vehicle, now), _gps(vehicle, now), _ekf(vehicle), _home(vehicle, mission, wanted), _prearm(vehicle, now),
-        _battery(vehicle, mission, wanted.endurance_s, now), _mission(vehicle, wanted), _fence(mission, wanted.zones),
-        _height(mission, wanted), _speed(vehicle, mission), _separation(wanted),
+        _battery(vehicle, mission, wanted.needs.endurance_s or LIMITS.endurance_s, now), _mission(vehicle, wanted),
+        _fence(mission, wanted.zones), _height(mission, wanted), _return(vehicle, wanted.needs.return_height_m),
+        _failsafe(vehicle), _speed(vehicle, mission), _separation(wanted),
     )  # fmt: skip
     return Check(vehicle.system, items)
 
@@ -140,7 +144,7 @@ def preflight_all(
     starts: Mapping[int, float],
     now: float,
     *,
-    endurance_s: float = LIMITS.endurance_s,
+    needs: PlanNeeds = NO_NEEDS,
     legal_height_m: float = LIMITS.legal_height_m,
     name: Callable[[int], str] = number_name,
     separation: Separation | None = None,
@@ -155,7 +159,7 @@ def preflight_all(
         stored: what was read from the vehicles just now.
         starts: takeoffs in seconds after the first; default 0.
         now: the fleet's clock.
-        endurance_s, legal_height_m: see Wanted.
+        needs, legal_height_m: see Wanted.
         name: name of a vehicle by its system id.
         zones: of the geofences that were read.
         separation: of them from each other and from others, where that was examined before.
@@ -167,7 +171,7 @@ def preflight_all(
         preflight(
             vehicle,
             Wanted(
-                missions.get(s), stored.get(s), endurance_s, legal_height_m,
+                missions.get(s), stored.get(s), needs, legal_height_m,
                 separation.near.get(s, ""), unexamined=separation.unexamined.get(s, ""), zones=(zones or {}).get(s),
                 reading=s in reading,
             ),
@@ -309,6 +313,30 @@ def _height(mission: "Mission | None", wanted: Wanted) -> Item:
     return Item("height", Level.OK, f"goes up to {top:.0f} m")
 
 
+def _return(vehicle: "Vehicle", needed_m: float | None) -> Item:
+    found = vehicle.settings.get(Setting.RETURN_HEIGHT)
+    least = None if needed_m is None else f"the ground on its way needs {needed_m:.0f} m"
+    if found is None:
+        text = "it has not said at what height it flies home"
+        return Item("return", Level.OK, text) if least is None else Item("return", Level.WARNING, f"{text}; {least}")
+    text = f"flies home {found.value:g} m above home, or higher where it is higher ({found.name})"
+    if not found.value:
+        text = f"flies home at the height at which it is ({found.name} is 0)"
+    if needed_m is None or found.value >= needed_m:
+        return Item("return", Level.OK, text)
+    return Item("return", Level.RED, f"{text}, but {least}; set {found.name} to that")
+
+
+def _failsafe(vehicle: "Vehicle") -> Item:
+    low, alone = (vehicle.settings.get(s) for s in (Setting.LOW_BATTERY, Setting.NO_STATION))
+    text = "" if alone is None else f"; without a ground station it {alone.action or 'goes on'} ({alone.name})"
+    if low is None:
+        return Item("failsafe", Level.OK, f"it has not said what it does when its battery is low{text}")
+    if not low.action:
+        return Item("failsafe", Level.WARNING, f"it does nothing when its battery is low; set {low.name}{text}")
+    return Item("failsafe", Level.OK, f"when its battery is low it {low.action} ({low.name}){text}")
+
+
 def _separation(wanted: Wanted) -> Item:
     if wanted.near:
         return Item("separation", Level.RED, wanted.near)
@@ -321,9 +349,10 @@ def _speed(vehicle: "Vehicle", mission: "Mission | None") -> Item:
     asked = fastest_m_s(mission) if mission is not None else None
     if asked is None:
         return Item("speed", Level.OK, "its mission leaves the speed to it")
-    if vehicle.top_speed is None:
+    found = vehicle.settings.get(Setting.SPEED)
+    if found is None:
         return Item("speed", Level.OK, f"asks for {asked:g} m/s; the vehicle has not said what it is set to")
-    name, most = vehicle.top_speed
+    name, most = found.name, found.value
     if asked <= most + _SAME_M_S:
         return Item("speed", Level.OK, f"asks for {asked:g} m/s, {name} is {most:g} m/s")
     flies = f"flies at {most:g} m/s" if vehicle.autopilot is Autopilot.PX4 else "may not reach that"

@@ -13,7 +13,7 @@ from gcs_plugin.fleet.fleet_events import FleetEvent, Pair, mission_event
 from gcs_plugin.fleet.link_hub import Hub, Side
 from gcs_plugin.fleet.message_rates import Rates, Streams
 from gcs_plugin.fleet.routes import Route
-from gcs_plugin.fleet.separation_watch import SeparationWatch, apart_text, near_text
+from gcs_plugin.fleet.separation.separation_watch import SeparationWatch, apart_text, near_text
 from gcs_plugin.fleet.telemetry_check import has_place, possible
 from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.mavlink import Autopilot, Message, dialect, is_autopilot

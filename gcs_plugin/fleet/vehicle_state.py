@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from gcs_plugin.config import HEARING
+from gcs_plugin.fleet.autopilot_settings import Setting, SetTo, answer, questions
 from gcs_plugin.fleet.flight_state import flight_state
 from gcs_plugin.fleet.message_rates import GPS_RAW_INT, SYS_STATUS, Streams
 from gcs_plugin.fleet.routes import Route, Routes
@@ -24,13 +25,6 @@ _PREARM_S: Final = 45.0  # autopilots repeat what is wrong every 30 s
 _EKF_NEEDED: Final = int(dialect.EKF_ATTITUDE | dialect.EKF_POS_HORIZ_ABS | dialect.EKF_POS_VERT_ABS)
 _EKF_WRONG: Final = int(dialect.EKF_CONST_POS_MODE | dialect.EKF_UNINITIALIZED)
 _MISSION_PAUSED: Final = int(dialect.MISSION_STATE_PAUSED)
-SPEED_PARAMETERS: Final[dict[Autopilot, dict[str, float]]] = {
-    Autopilot.ARDUPILOT: {"WPNAV_SPEED": 0.01},
-    Autopilot.PX4: {"MPC_XY_VEL_MAX": 1.0},
-}
-"""What an autopilot's speed on missions is set by, and the factor to m/s. PX4 flies no faster than MPC_XY_VEL_MAX,
-whatever is asked for. ArduCopter tries to reach what is asked for, up to the lean of its ANGLE_MAX; its WPNAV_SPEED is
-what it has been set up for."""
 _STILL_M_S: Final = (0.6, 0.25)  # horizontally, vertically; slower than the last metres of a landing
 
 
@@ -65,7 +59,7 @@ class Vehicle:
         ask_why_at: when it may be asked again why it would not arm (the fleet's clock).
         pace: seconds of its clock in one of ours; 1 but for a simulation that runs fast or slow.
         launch: where it armed last, latitude and longitude in degrees.
-        top_speed: the parameter that it was asked for about its speed, and its value in m/s; None before it answers.
+        settings: what it is set to, as far as it has answered.
         paused_in_mission: MISSION_CURRENT says "paused", and a HEARTBEAT after it still shows the mission's mode. A
             change to RTL or hold suspends the mission as well, and its HEARTBEAT may come a second later.
     """
@@ -112,7 +106,7 @@ class Vehicle:
     home: tuple[float, float] | None = None
     home_alt_m: float | None = None
     launch: tuple[float, float] | None = None
-    top_speed: tuple[str, float] | None = None
+    settings: dict[Setting, SetTo] = field(default_factory=dict)
     ask_why_at: float = 0.0
     pace: float = 1.0
     texts: "deque[str]" = field(default_factory=lambda: deque(maxlen=50))
@@ -164,15 +158,9 @@ class Vehicle:
         """What it said lately about why it would not arm."""
         return [text for text, said in self._prearm.items() if now - said < _PREARM_S]
 
-    def speed_questions(self) -> list[Message]:
-        """Requests for the parameters of its speed, none once they are known."""
-        if self.top_speed is not None:
-            return []
-        to = self.address
-        return [
-            dialect.MAVLink_param_request_read_message(to.system, to.component, name.encode(), -1)
-            for name in SPEED_PARAMETERS[self.autopilot]
-        ]
+    def setting_questions(self) -> list[Message]:
+        """Requests for its settings that are not known yet."""
+        return questions(self.address, self.autopilot, self.settings)
 
     @property
     def pilot(self) -> Pilot:
@@ -290,9 +278,9 @@ class Vehicle:
         self.home, self.home_alt_m = (m.latitude / 1e7, m.longitude / 1e7), m.altitude / 1e3
 
     def _parameter(self, m: Message) -> None:
-        name, scale = str(m.param_id).strip("\x00"), SPEED_PARAMETERS[self.autopilot]
-        if name in scale and math.isfinite(m.param_value) and m.param_value > 0.0:
-            self.top_speed = name, scale[name] * float(m.param_value)
+        found = answer(m, self.autopilot)
+        if found is not None:
+            self.settings[found[0]] = found[1]
 
     def _photo(self, m: Message) -> None:
         index = m.img_idx if m.get_type() == "CAMERA_FEEDBACK" else m.image_index

@@ -2,7 +2,9 @@
 
 import json
 import re
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 from orthoswarm.model.errors import InputError
 
@@ -49,13 +51,35 @@ def read_plan_folder(folder: Path, sortie: int) -> dict[int, tuple[Path, float]]
     return flights
 
 
-def plan_endurance_s(folder: Path) -> float | None:
-    """Flight time of a full battery that a plan was made for, seconds; None if its report does not say it."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlanNeeds:
+    """What a plan relies on, as far as its report says it.
+
+    Attributes:
+        endurance_s: flight time of a full battery that it was made for; None if nobody said it.
+        return_height_m: above takeoff, from which a straight way home passes over the ground and what stands on it;
+            None for a plan that was made without a height model.
+    """
+
+    endurance_s: float | None = None
+    return_height_m: float | None = None
+
+
+NO_NEEDS: Final = PlanNeeds()
+"""Nothing is known of a plan, or nothing is planned."""
+
+
+def plan_needs(folder: Path) -> PlanNeeds:
+    """What the plan of a folder relies on; nothing is known where its report cannot be read."""
     try:
-        minutes = json.loads((folder / "plan.json").read_text(encoding="utf-8")).get("endurance_min")
+        document = json.loads((folder / "plan.json").read_text(encoding="utf-8"))
+        minutes, height_m = document.get("endurance_min"), (document.get("over_ground") or {}).get("return_height_m")
     except (OSError, ValueError, AttributeError):
-        return None
-    return 60.0 * minutes if isinstance(minutes, int | float) and minutes > 0 else None
+        return PlanNeeds()
+    return PlanNeeds(
+        endurance_s=60.0 * minutes if isinstance(minutes, int | float) and minutes > 0 else None,
+        return_height_m=float(height_m) if isinstance(height_m, int | float) else None,
+    )
 
 
 def number_in(path: Path) -> int | None:

@@ -59,6 +59,11 @@ def _nodes_in(outline: shapely.Geometry, terrain: Terrain) -> NDArray[np.bool_]:
     return np.asarray(shapely.contains_xy(outline, *np.meshgrid(east, north)))
 
 
+def return_height_m(ground: GroundBelow) -> float:
+    """Height above takeoff, whole metres, at which a straight way home passes over all ground and what stands on it."""
+    return float(math.ceil(ground.way_m + active().planning.least_above_ground_m))
+
+
 def relief_notes(plan: Plan, ground: GroundBelow) -> list[str]:
     """What to know about a plan over a height model, in words."""
     over = plan.over_ground
@@ -71,12 +76,11 @@ def relief_notes(plan: Plan, ground: GroundBelow) -> list[str]:
     )
     if over.by_vehicle:
         how += ", by the terrain data of the vehicles: the ground station must send it to them, or their card hold it"
-    back = math.ceil(ground.way_m + active().planning.least_above_ground_m)
     return [
         f"the ground of the area lies {ground.low_m:.0f} to {ground.high_m:.0f} m over takeoff: {how}, "
         f"{over.least_m:.0f} to {over.most_m:.0f} m above ground, {over.way_least_m:.0f} m or more above the highest "
         f"within {active().planning.beside_m:g} m; side overlap {100 * over.side_overlap[0]:.0f} % or "
         f"more on 95 % of the legs, forward overlap at least {100 * over.forward_overlap:.0f} %",
-        f"a vehicle that turns home by itself flies straight back: set its return height (ArduPilot RTL_ALT, PX4 "
-        f"RTL_RETURN_ALT) to {back} m or more",
+        f"a vehicle that turns home by itself flies straight back: set its return height (ArduPilot RTL_ALT, "
+        f"RTL_ALT_M from 4.7 on; PX4 RTL_RETURN_ALT) to {return_height_m(ground):.0f} m or more",
     ]

@@ -85,6 +85,7 @@ def _over_ground(over: OverGround) -> dict[str, Any]:
         "top_above_takeoff_m": round(over.top_m, 2),
         "side_overlap": [round(share, 4) for share in over.side_overlap],
         "forward_overlap": round(over.forward_overlap, 4),
+        "return_height_m": over.return_height_m,
     }
 
 

@@ -12,7 +12,7 @@ import shapely
 from gcs_plugin.mission.mission_files import Autopilot
 from gcs_plugin.plans.area_files import read_fences, read_shapes
 from gcs_plugin.plans.gap_area import gap_area, read_gaps
-from gcs_plugin.plans.ground_below import read_ground, relief_notes
+from gcs_plugin.plans.ground_below import read_ground, relief_notes, return_height_m
 from gcs_plugin.plans.plan_fence import refuse_outside, zone_fences
 from orthoswarm.config import active
 from orthoswarm.model.errors import InputError
@@ -249,6 +249,8 @@ def _over_ground(
         relief=request.relief,
         by_vehicle=by_vehicle,
     )
+    assert plan.over_ground is not None
+    plan = replace(plan, over_ground=replace(plan.over_ground, return_height_m=return_height_m(ground)))
     notes = relief_notes(plan, ground)
     if request.terrain_items and not by_vehicle:
         notes.append(f"{without[0]} has no items with heights above the ground: heights count from takeoff")

@@ -26,7 +26,7 @@ from gcs_plugin.sim.multirotor import STEP_S, Airframe, Chart, Motion, Pose
 from orthoswarm.model.angles import wrap_rad
 
 _LOITER_TIME: Final = int(dialect.MAV_CMD_NAV_LOITER_TIME)
-_RTL_HEIGHT_M: Final = 15.0
+RTL_HEIGHT_M: Final = 15.0
 _REACHED_M: Final = 1.5
 _FINAL_SINK_M_S, _FINAL_BELOW_M = 0.7, 5.0
 _OWN_TAKEOFF_S: Final = 0.7  # what the motion itself loses: by gathering speed in a takeoff,
@@ -413,7 +413,7 @@ class Flight:
     def _go_home(self) -> None:
         self._trigger_m = 0.0
         north, east = self.motion.seen
-        self.motion.go((north, east, max(self.motion.up, _RTL_HEIGHT_M)))
+        self.motion.go((north, east, max(self.motion.up, RTL_HEIGHT_M)))
         self._task, self._waited = Task.CLIMB_HOME, 0.0
 
     def _descend(self, north: float, east: float) -> None:

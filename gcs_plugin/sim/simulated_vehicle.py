@@ -6,6 +6,7 @@ as a ground station is there. Both answer commands and missions as measured (doc
 
 import heapq
 import math
+import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
@@ -16,7 +17,7 @@ from gcs_plugin.mission.exchange import Address
 from gcs_plugin.mission.flight_modes import modes_of
 from gcs_plugin.mission.items import FRAME_GLOBAL, WAYPOINT, MissionItem
 from gcs_plugin.sim.file_server import FileServer
-from gcs_plugin.sim.mission_flight import Exposure, Flight, Landed, State
+from gcs_plugin.sim.mission_flight import RTL_HEIGHT_M, Exposure, Flight, Landed, State
 from gcs_plugin.sim.mission_store import MissionStore
 from gcs_plugin.sim.multirotor import STEP_S, Airframe, Chart, Pose
 
@@ -176,13 +177,18 @@ class SimVehicle:
 
     def _parameter(self, name: str) -> list[Message]:
         """The value of a parameter; an autopilot does not answer about one that it has not."""
-        known = {"WPNAV_SPEED": 100.0 * _WPNAV_SPEED_M_S}
+        known: dict[str, float] = {
+            "WPNAV_SPEED": 100.0 * _WPNAV_SPEED_M_S, "RTL_ALT": 100.0 * RTL_HEIGHT_M, "FS_GCS_ENABLE": 0,
+        }  # fmt: skip
         if self.autopilot is Autopilot.PX4:
-            known = {"MPC_XY_VEL_MAX": self.airframe.top_m_s}
+            known = {"MPC_XY_VEL_MAX": self.airframe.top_m_s, "RTL_RETURN_ALT": RTL_HEIGHT_M, "NAV_DLL_ACT": 0}
         if name not in known:
             return []
-        real = int(dialect.MAV_PARAM_TYPE_REAL32)
-        return [dialect.MAVLink_param_value_message(name.encode(), known[name], real, len(known), 0)]
+        value, kind = known[name], int(dialect.MAV_PARAM_TYPE_REAL32)
+        if isinstance(value, int):
+            kind = int(dialect.MAV_PARAM_TYPE_INT32)
+            value = struct.unpack("<f", struct.pack("<i", value))[0] if self.autopilot is Autopilot.PX4 else value
+        return [dialect.MAVLink_param_value_message(name.encode(), value, kind, len(known), 0)]
 
     def _command(self, message: Message) -> int:
         flight, p1, p2, p3 = self.flight, message.param1, message.param2, message.param3

@@ -143,6 +143,7 @@ class OverGround:
         top_m: highest point of the flights, above their takeoff.
         side_overlap: of neighbouring lines: the 5th percentile along the legs, and the median.
         forward_overlap: of consecutive pictures at the lowest point of the legs.
+        return_height_m: above takeoff, at which a straight way home passes over all ground and what stands on it.
     """
 
     follows: bool
@@ -154,6 +155,7 @@ class OverGround:
     top_m: float
     side_overlap: tuple[float, float]
     forward_overlap: float
+    return_height_m: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

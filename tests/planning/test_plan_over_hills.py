@@ -12,6 +12,7 @@ from rasterio.transform import from_origin
 
 from gcs_plugin.cli.main import main
 from gcs_plugin.mission.mission_files import FRAME_TERRAIN, NAV_WAYPOINT, parse_mission
+from gcs_plugin.mission.plan_folder import plan_needs
 from tests.kit.flown_area import CORNER, EPSG, FlownArea
 
 Height = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -98,6 +99,8 @@ def test_ground_beside_a_path_counts_as_ground_below_it(tmp_path: Path, capsys: 
     assert _least_beside(tmp_path / "p", posts, 9.0) > 19.9
     assert out["over_ground"]["way_least_m"] == pytest.approx(20.0, abs=0.1)
     assert out["over_ground"]["above_ground_m"][1] == pytest.approx(130.0, abs=0.1)
+    assert out["over_ground"]["return_height_m"] == 130.0  # over the posts, which a straight way home may pass
+    assert plan_needs(tmp_path / "p").return_height_m == 130.0
     assert any("20 m or more above the highest within 10 m" in warning for warning in out["warnings"])
     assert any("to 130 m or more" in warning for warning in out["warnings"])  # a return height
 

@@ -8,9 +8,10 @@ import pytest
 
 from gcs_plugin.cli.main import main
 from gcs_plugin.fleet.preflight import ITEMS, Level, Wanted, preflight, preflight_all, red_text
-from gcs_plugin.fleet.takeoff_schedule import TakeoffSchedule
+from gcs_plugin.fleet.separation.takeoff_schedule import TakeoffSchedule
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.items import CHANGE_SPEED, LAND, RTL, TAKEOFF, WAYPOINT, Mission, MissionItem
+from gcs_plugin.mission.plan_folder import PlanNeeds
 from gcs_plugin.mission.track import Airspace, flight_seconds, highest_m
 from gcs_plugin.sim.lossy_radio import Faults
 from gcs_plugin.sim.multirotor import Chart
@@ -85,7 +86,7 @@ def test_each_item_turns_red_for_its_own_reason(make_world):
     assert red(Wanted(mission=line(AP, 10, 50))) == ["mission"]
     assert red(Wanted(legal_height_m=15.0)) == ["height"]
     assert red(Wanted(near="comes within 3 m of v2")) == ["separation"]
-    assert red(Wanted(endurance_s=20.0)) == ["battery"]
+    assert red(Wanted(needs=PlanNeeds(endurance_s=20.0))) == ["battery"]
     world.link.down.faults = Faults(loss=1.0)
     world.wait(6.0)
     assert red() == ["link"]

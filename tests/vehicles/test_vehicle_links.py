@@ -11,10 +11,10 @@ from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.daemon.takeoffs import Takeoffs
 from gcs_plugin.daemon.vehicles import VehicleLinks
-from gcs_plugin.fleet.separation_watch import Near, SeparationWatch
+from gcs_plugin.fleet.separation.separation_watch import Near, SeparationWatch
 from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.mission.mission_builder import read_mission
-from gcs_plugin.mission.plan_folder import plan_endurance_s
+from gcs_plugin.mission.plan_folder import plan_needs
 from gcs_plugin.sim.lossy_radio import NO_FAULTS, Faults
 from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
 from orthoswarm.model.errors import InputError, OrthoSwarmError
@@ -41,8 +41,8 @@ class PlanFolder:
         document = json.loads((self.path / "plan.json").read_text())
         return {v["id"]: v["flights"][0]["start_s"] for v in document["vehicles"]}
 
-    def endurance_s(self, name):
-        return plan_endurance_s(self.path)
+    def needs(self, name):
+        return plan_needs(self.path)
 
     def mission(self, body, vehicle, autopilot):
         return read_mission(self.path / f"{body['mission']}.waypoints", autopilot)

@@ -59,7 +59,7 @@ def test_a_speed_that_it_is_not_set_up_for_is_warned_about(make_world, autopilot
     warning = speed(most + 2.0)
     assert warning.level is Level.WARNING
     assert f"asked for {most + 2.0:g} m/s" in warning.reason and f"{name} is {most:g} m/s" in warning.reason
-    world.fleet.vehicles[1].top_speed = None  # one that does not answer
+    world.fleet.vehicles[1].settings.clear()  # one that does not answer
     assert "has not said" in next(
         i.reason for i in preflight(world.fleet.vehicles[1], Wanted(), world.clock.now).items if i.name == "speed"
     )

@@ -7,7 +7,7 @@ import pytest
 
 from gcs_plugin.daemon.takeoffs import Takeoffs
 from gcs_plugin.fleet.preflight import Level, Wanted, preflight, preflight_all
-from gcs_plugin.fleet.separation_check import flights_of, others_of, separation_of
+from gcs_plugin.fleet.separation.separation_check import flights_of, others_of, separation_of
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.geofence import Zone
 from gcs_plugin.mission.items import FRAME_GLOBAL

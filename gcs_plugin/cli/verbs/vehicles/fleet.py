@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gcs_plugin.config import LIMITS
-from gcs_plugin.mission.plan_folder import number_in, plan_endurance_s, read_plan_folder
+from gcs_plugin.mission.plan_folder import NO_NEEDS, number_in, plan_needs, read_plan_folder
 from orthoswarm.model.errors import InputError
 
 if TYPE_CHECKING:
@@ -175,19 +175,19 @@ class _Prepared:
         systems: requested vehicles, empty for all.
         files: mission file for each vehicle of an upload or of a started plan; `single`: a file for the only
             vehicle heard.
-        delays: seconds after the first takeoff for each vehicle of a plan. endurance_s: that it was made for.
+        delays: seconds after the first takeoff for each vehicle of a plan. needs: of the plan.
     """
 
     def __init__(self, args: argparse.Namespace, systems: list[int]) -> None:
         self.systems, self.files = systems, dict[int, Path]()
         self.single: Path | None = None
         self.delays: dict[int, float] = {}
-        self.endurance_s: float | None = None
+        self.needs = NO_NEEDS
         if args.action == "upload":
             self._missions(args.missions, args.sortie)
         if args.action in ("start", "check") and args.plan is not None:
             self._times(args.plan, args.sortie)
-            self.endurance_s = plan_endurance_s(args.plan)
+            self.needs = plan_needs(args.plan)
 
     def _missions(self, paths: Sequence[Path], sortie: int) -> None:
         named: dict[int, Path] = {}
@@ -355,7 +355,7 @@ def _ready(
     end = time.monotonic() + args.ready
     said: dict[int, str] = {}
     while True:
-        checks = backend.check(systems, missions, stored, starts, args.max_height, endurance_s=prepared.endurance_s)
+        checks = backend.check(systems, missions, stored, starts, args.max_height, needs=prepared.needs)
         red = red_text(checks, allowed)
         waits = all(item.name in _PASSING for check in checks for item in check.red(allowed.get(check.system, ())))
         if not red or not waits or time.monotonic() >= end:
@@ -419,7 +419,7 @@ def _check(backend: "Backend", args: argparse.Namespace, prepared: _Prepared, fo
     """Show the check of each vehicle; 0 if none has a red item."""
     systems = [s for s in prepared.systems or found if s in found]
     missions, stored, starts = _missions(backend, prepared, systems)
-    checks = backend.check(systems, missions, stored, starts, args.max_height, endurance_s=prepared.endurance_s)
+    checks = backend.check(systems, missions, stored, starts, args.max_height, needs=prepared.needs)
     if args.json:
         print(json.dumps({"vehicles": [check.document(f"v{check.system}") for check in checks]}))
     else:

@@ -10,7 +10,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Final
 
 from gcs_plugin.fleet.flight_state import Word, flight_state
-from gcs_plugin.fleet.separation_watch import number_name
+from gcs_plugin.fleet.separation.separation_watch import number_name
 from gcs_plugin.mission.track import STEP_S, Airspace, home_of, metres, track_of
 
 if TYPE_CHECKING:

@@ -1,0 +1,137 @@
+"""What autopilots are set to do by themselves is read, and compared with what the plan needs."""
+
+import json
+import re
+import struct
+from pathlib import Path
+
+import pytest
+
+from gcs_plugin.fleet.autopilot_settings import PARAMETERS, Setting, SetTo, answer
+from gcs_plugin.fleet.preflight import ITEMS, Level, Wanted, preflight
+from gcs_plugin.links.mavlink import Autopilot, dialect
+from gcs_plugin.mission.plan_folder import PlanNeeds, plan_needs
+from gcs_plugin.sim.simulated_vehicle import SimVehicle
+
+AP, PX4 = Autopilot.ARDUPILOT, Autopilot.PX4
+BOTH = pytest.mark.parametrize("autopilot", [AP, PX4])
+REAL, INT8, INT32 = (getattr(dialect, f"MAV_PARAM_TYPE_{name}") for name in ("REAL32", "INT8", "INT32"))
+
+
+def said(name, value, kind, autopilot):
+    message = dialect.MAVLink_param_value_message(name.encode(), value, kind, 100, 3)
+    packed = message.pack(dialect.MAVLink(None))
+    (heard,) = dialect.MAVLink(None).parse_buffer(packed)
+    return answer(heard, autopilot)
+
+
+def bytewise(value):
+    return struct.unpack("<f", struct.pack("<i", value))[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "kind", "autopilot", "setting", "si"),
+    [
+        ("WPNAV_SPEED", 1250.0, REAL, AP, Setting.SPEED, 12.5),
+        ("WP_SPD", 12.5, REAL, AP, Setting.SPEED, 12.5),  # ArduPilot 4.7
+        ("RTL_ALT", 3000.0, INT32, AP, Setting.RETURN_HEIGHT, 30.0),
+        ("RTL_ALT_M", 30.0, REAL, AP, Setting.RETURN_HEIGHT, 30.0),
+        ("RTL_ALT", 0.0, INT32, AP, Setting.RETURN_HEIGHT, 0.0),
+        ("BATT_FS_LOW_ACT", 2.0, INT8, AP, Setting.LOW_BATTERY, 2.0),
+        ("RTL_RETURN_ALT", 60.0, REAL, PX4, Setting.RETURN_HEIGHT, 60.0),
+        ("COM_LOW_BAT_ACT", bytewise(3), INT32, PX4, Setting.LOW_BATTERY, 3.0),
+        ("NAV_DLL_ACT", bytewise(2), INT32, PX4, Setting.NO_STATION, 2.0),
+    ],
+)
+def test_a_setting_is_read_in_its_unit(name, value, kind, autopilot, setting, si):
+    found = said(name, value, kind, autopilot)
+    assert found is not None and found[0] is setting and found[1].name == name
+    assert found[1].value == pytest.approx(si)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "kind", "autopilot"),
+    [
+        ("MPC_XY_VEL_MAX", 12.0, REAL, AP), ("WP_SPD", float("nan"), REAL, AP), ("WP_SPD", 0.0, REAL, AP),
+        ("RTL_ALT_M", -5.0, REAL, AP), ("COM_LOW_BAT_ACT", bytewise(-1), INT32, PX4), ("PILOT_SPD_UP", 2.5, REAL, AP),
+    ],
+)  # fmt: skip
+def test_other_parameters_and_values_without_a_meaning_are_not_taken(name, value, kind, autopilot):
+    assert said(name, value, kind, autopilot) is None
+
+
+def test_what_a_vehicle_does_is_in_words():
+    assert [SetTo("COM_LOW_BAT_ACT", value).action for value in (0.0, 2.0)] == ["", "lands"]
+    assert SetTo("BATT_FS_LOW_ACT", 42.0).action == "does what BATT_FS_LOW_ACT 42 says"
+
+
+def items_of(world, wanted):
+    check = preflight(world.fleet.vehicles[1], wanted, world.clock.now)
+    return {item.name: item for item in check.items}
+
+
+@BOTH
+def test_a_way_home_through_the_ground_is_red(make_world, autopilot):
+    world = make_world(SimVehicle(system=1, autopilot=autopilot))
+    world.meet()
+    vehicle, high = world.fleet.vehicles[1], Wanted(needs=PlanNeeds(return_height_m=40.0))
+    assert items_of(world, high)["return"].level is Level.WARNING  # it has not been asked yet
+    world.finish(world.fleet.download(1))
+    world.wait(1.0)
+    name = "RTL_ALT" if autopilot is AP else "RTL_RETURN_ALT"
+    found = items_of(world, high)["return"]
+    assert found.level is Level.RED and f"15 m above home, or higher where it is higher ({name})" in found.reason
+    assert "needs 40 m" in found.reason and f"set {name}" in found.reason
+    assert items_of(world, Wanted(needs=PlanNeeds(return_height_m=15.0)))["return"].level is Level.OK
+    assert items_of(world, Wanted())["return"].level is Level.OK
+    vehicle.settings[Setting.RETURN_HEIGHT] = SetTo(name, 0.0)
+    assert items_of(world, high)["return"].level is Level.RED  # from a valley it would fly straight into the hill
+
+
+@BOTH
+def test_a_vehicle_that_does_nothing_at_a_low_battery_is_warned_about(make_world, autopilot):
+    world = make_world(SimVehicle(system=1, autopilot=autopilot))
+    world.meet()
+    world.finish(world.fleet.download(1))
+    world.wait(1.0)
+    vehicle = world.fleet.vehicles[1]
+    name = "BATT_FS_LOW_ACT" if autopilot is AP else "COM_LOW_BAT_ACT"
+    found = items_of(world, Wanted())["failsafe"]  # the simulated one has no such parameter
+    assert (
+        found.level is Level.OK
+        and "has not said" in found.reason
+        and "without a ground station it goes on" in found.reason
+    )
+    vehicle.settings[Setting.LOW_BATTERY] = SetTo(name, 0.0)
+    assert items_of(world, Wanted())["failsafe"].level is Level.WARNING
+    vehicle.settings[Setting.LOW_BATTERY] = SetTo(name, 2.0)
+    assert items_of(world, Wanted())["failsafe"].level is Level.OK
+
+
+def test_each_autopilot_is_asked_for_every_setting_until_it_has_answered(make_world):
+    for parameters in PARAMETERS.values():
+        assert {parameter.setting for parameter in parameters} == set(Setting)
+    world = make_world(SimVehicle(system=1, autopilot=AP))
+    world.meet()
+    vehicle = world.fleet.vehicles[1]
+    assert len(vehicle.setting_questions()) == len(PARAMETERS[AP])
+    world.finish(world.fleet.download(1))
+    world.wait(1.0)
+    assert [m.param_id.rstrip("\x00") for m in vehicle.setting_questions()] == ["BATT_FS_LOW_ACT"]
+
+
+def test_a_plan_says_what_it_needs(tmp_path):
+    assert plan_needs(tmp_path) == PlanNeeds()
+    report = {"endurance_min": 18.0, "over_ground": {"return_height_m": 52.0}}
+    (tmp_path / "plan.json").write_text(json.dumps(report))
+    assert plan_needs(tmp_path) == PlanNeeds(endurance_s=1080.0, return_height_m=52.0)
+    (tmp_path / "plan.json").write_text(json.dumps({"endurance_min": None, "over_ground": None}))
+    assert plan_needs(tmp_path) == PlanNeeds()
+    (tmp_path / "plan.json").write_text("[]")
+    assert plan_needs(tmp_path) == PlanNeeds()
+
+
+def test_the_page_has_a_name_for_each_item():
+    root = Path(__file__).resolve().parents[3]
+    words = (root / "gcs_plugin/web/static/core/english.js").read_text(encoding="utf-8")
+    assert set(re.findall(r'"preflight\.item\.([a-z-]+)"', words)) == set(ITEMS)
