@@ -151,6 +151,7 @@ def test_the_ground_is_that_of_the_area_whose_cameras_are_nearest():
     assert merged_ground([west, None], nadirs).height(np.array([290.0, 100.0])) == 0.0
 
 
+@pytest.mark.slow
 def test_a_run_in_areas_has_all_products_and_its_pictures_lie_as_in_one(flight, mapped, tmp_path):
     scene, shots, folder = flight
     out, report = mapped

@@ -31,6 +31,7 @@ def mosaic(folder, photos, out, *more):
     return main([*arguments, *map(str, more)])
 
 
+@pytest.mark.slow
 def test_photos_that_recorded_nothing_are_placed_by_control_points(flight, tmp_path):
     out = tmp_path / "out"
     assert mosaic(flight, "bare", out, "--control", flight / "control.csv", "--checkpoints", flight / "check.csv") == 0
@@ -41,6 +42,7 @@ def test_photos_that_recorded_nothing_are_placed_by_control_points(flight, tmp_p
     assert not any("receivers say" in w for w in report["warnings"])  # none has a receiver
 
 
+@pytest.mark.slow
 def test_photos_with_positions_help_to_place_those_without(flight, tmp_path):
     """One point lies in photos of the other vehicle only: a single one could not place it alone."""
     lines = (flight / "control.csv").read_text().splitlines()

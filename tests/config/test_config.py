@@ -147,6 +147,7 @@ def states_of_legs(tmp_path, tmp_path_factory, name, text):
     return {leg["state"] for leg in report["legs"]}, report["config"]
 
 
+@pytest.mark.slow
 def test_an_override_of_the_registration_registers_otherwise(tmp_path, tmp_path_factory):
     """With a limit of evidence that nothing can pass the flight is not taken to lie on the map."""
     states, changed = states_of_legs(tmp_path, tmp_path_factory, "usual", "")

@@ -17,6 +17,7 @@ def tiny(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_true_poses_are_better_than_nothing_and_results_are_kept(tiny, tmp_path, capsys):
     out = tmp_path / "bench"
     command = ["bench", "accuracy", str(tiny), "--methods", "nothing,truth", "--workers", "1", "--out", str(out)]

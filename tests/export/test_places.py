@@ -145,6 +145,7 @@ def test_an_address_that_is_none_is_refused(text):
         TakAddress.parse(text)
 
 
+@pytest.mark.slow
 def test_the_feed_sends_vehicles_always_and_finds_when_they_are_new():
     places = [DRONE]
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:

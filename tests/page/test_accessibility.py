@@ -11,6 +11,7 @@ SMALL = """() => [...document.querySelectorAll("button, select, summary, input:n
   .filter(([, box]) => box.height < 43.5 || box.width < 43.5).map(([html]) => html)"""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [DESK, PHONE], ids=["desk", "phone"])
 @pytest.mark.parametrize("theme", ["dark", "sunlight"])
 def test_nothing_stands_in_the_way(browser, theme, size):

@@ -2,6 +2,8 @@
 
 import time
 
+import pytest
+
 from tests.kit.page_kit import opened, send, standing, vehicle
 
 SOUNDS = """() => {
@@ -90,6 +92,7 @@ def test_a_vehicle_behind_its_plan_is_an_alarm_on_every_page_until_it_has_caught
         page.wait_for_selector(".alarms", state="hidden")
 
 
+@pytest.mark.slow
 def test_an_alarm_of_a_pair_ends_with_the_rows_if_the_page_missed_the_event(browser):
     event = {"type": "vehicle_event", "kind": "near", "vehicle": "v1", "pair": ["v1", "v2"], "text": NEAR}
     with standing(vehicle(1, alarm=""), vehicle(2, alarm="")) as station, opened(browser, station.url) as page:

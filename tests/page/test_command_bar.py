@@ -177,6 +177,7 @@ def test_what_was_not_done_stays_on_the_screen_with_its_reason(browser, outcome,
         assert "Falcon" in page.inner_text(".outcomes")
 
 
+@pytest.mark.slow
 def test_a_station_that_never_answers_makes_the_outcome_unknown(browser):
     with standing(vehicle(1)) as station, opened(browser, station.url) as page:
         gate = threading.Event()
@@ -263,6 +264,7 @@ def test_red_items_stop_a_start_until_each_is_allowed(browser):
             assert station.commands("start")[0]["override"] == {"v7": ["battery", "gps"]}
 
 
+@pytest.mark.slow
 def test_a_red_item_that_becomes_well_lets_the_start_go_without_a_press(browser):
     """ArduCopter's position filter is ready 40 s after its start; the battery stays as it is."""
     part = {"id": "v1", "time_s": 312, "photos": 40, "sorties": 1, "flights": [{"start_s": 0}]}
@@ -329,6 +331,7 @@ def ready_to_start(browser, answer):
             yield station, page
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("received", [True, False], ids=["received", "not received"])
 def test_a_start_whose_answer_is_lost_is_not_called_none(browser, received):
     lost, reached = threading.Event(), threading.Event()

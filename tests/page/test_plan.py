@@ -2,6 +2,8 @@
 
 import json
 
+import pytest
+
 from gcs_plugin.web.areas import area_of
 from orthoswarm.model.errors import InputError
 from tests.kit.page_kit import opened, standing, vehicle
@@ -102,6 +104,7 @@ def made_plan(number="plan-1"):
     return {"id": number, "covered_share": 1.0, "makespan_s": 312, "spacing_m": 20, "vehicles": [part]}
 
 
+@pytest.mark.slow
 def test_a_zone_that_is_drawn_after_the_plan_stops_its_upload_and_start(browser):
     older = "The plan is older than the drawing: make the plan again"
 
@@ -150,6 +153,7 @@ def test_a_zone_that_is_drawn_after_the_plan_stops_its_upload_and_start(browser)
             assert station.commands("start") == []
 
 
+@pytest.mark.slow
 def test_an_area_file_keeps_the_zones_that_were_drawn_and_says_so(browser):
     ring = [[8.544, 47.397], [8.547, 47.397], [8.547, 47.399], [8.544, 47.397]]
     with standing(vehicle(1)) as station, opened(browser, station.url) as page:
@@ -225,6 +229,7 @@ def opened_groups(page):
         summary.click()
 
 
+@pytest.mark.slow
 def test_wind_wait_and_terrain_go_into_the_request_and_contradictions_are_said(browser):
     with standing(vehicle(1)) as station, opened(browser, station.url) as page:
         station.gets["/api/plan"] = {"version": 1, "dem": "hills.tif", "settings": {"relief": "level"}}

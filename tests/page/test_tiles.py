@@ -110,6 +110,7 @@ def test_a_name_stays_when_news_leave_it_out(browser):
             assert page.inner_text(".vehicle span") == "Falcon"
 
 
+@pytest.mark.slow
 def test_silence_is_shown_with_its_age_and_a_banner(browser):
     with standing(vehicle(1)) as station, opened(browser, station.url) as page:
         page.wait_for_selector(".tile[data-level=ok]")

@@ -252,6 +252,7 @@ class NoMap:
         return np.zeros(shape, np.float32), np.zeros(shape, bool)
 
 
+@pytest.mark.slow
 def test_a_vehicle_that_is_not_found_is_carried_by_its_neighbours(flight):
     scene, _, frames, path = flight
     refiner = PaperRefiner(scene.grid.epsg, local_origin(scene.grid, frames), OPTIONS)

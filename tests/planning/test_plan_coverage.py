@@ -356,6 +356,7 @@ def test_ways_around_zones_are_free_and_as_short_as_a_dense_search_finds(seed):
         assert length <= (first + last).min() + 1e-6
 
 
+@pytest.mark.slow
 def test_flights_that_the_first_cut_makes_too_long_are_cut_again_until_they_keep_the_endurance():
     """Between many zones turns and detours are most of a flight, and the cut knows them only roughly."""
 

@@ -68,6 +68,7 @@ def test_the_file_is_a_cog_that_says_what_its_heights_are(tmp_path):
         assert reduced.mask.any() and whole.min() <= reduced.min() < reduced.max() <= whole.max()  # gaps take no part
 
 
+@pytest.mark.slow
 def test_the_report_says_what_was_made(made):
     surface = json.loads((made / "report.json").read_text())["surface"]
     assert surface["file"].endswith("dsm.tif") and surface["known_ha"] > 3.0

@@ -177,6 +177,7 @@ def swarm_of(vehicles, speed=10.0):
     return SimSwarm(vehicles, f"udpout:127.0.0.1:{port}", speed=speed), f"udpin:127.0.0.1:{port}"
 
 
+@pytest.mark.slow
 def test_all_wait_until_the_last_one_is_ready_and_say_for_what(folder, capsys):  # noqa: F811
     vehicles = make_swarm(3, autopilots=(AP, PX4), home=HOME)
     vehicles[1].ready_s = 130.0
@@ -193,6 +194,7 @@ def test_all_wait_until_the_last_one_is_ready_and_say_for_what(folder, capsys): 
         assert swarm.now >= 130.0
 
 
+@pytest.mark.slow
 def test_what_vehicles_wait_for_is_said_once_for_those_that_it_is_new_for(folder, capsys):  # noqa: F811
     vehicles = make_swarm(3, autopilots=(AP,), home=HOME)
     for vehicle, ready_s in zip(vehicles, (50.0, 130.0, 130.0), strict=True):
@@ -211,6 +213,7 @@ def test_what_vehicles_wait_for_is_said_once_for_those_that_it_is_new_for(folder
         assert all(one != other for one, other in itertools.pairwise(mine)), said
 
 
+@pytest.mark.slow
 def test_nobody_takes_off_where_one_does_not_become_ready(folder, capsys):  # noqa: F811
     vehicles = make_swarm(3, autopilots=(AP, PX4), home=HOME)
     vehicles[1].ready_s = 1e9

@@ -134,6 +134,7 @@ def test_with_a_key_unsigned_vehicles_are_not_believed(open_links, monkeypatch):
     assert links.rows() == []
 
 
+@pytest.mark.slow
 def test_one_that_cannot_take_off_holds_the_others_and_it_is_said(open_links, folder):  # noqa: F811
     document = json.loads((folder / "plan.json").read_text())
     for number, vehicle in enumerate(document["vehicles"]):

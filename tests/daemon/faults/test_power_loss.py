@@ -204,6 +204,7 @@ def cut_on_a_copy(tmp_path, monkeypatch, seed, refine, count=12):
     return len(known), lost
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damaged", [False, True])
 def test_a_refined_layer_is_drawn_again_after_a_power_cut_or_when_its_canvas_is_damaged(tmp_path, damaged):
     workspace, shots = tmp_path / "w", line(6)
@@ -235,6 +236,7 @@ def refined_and_exported(rows):
     return {"refine", "export"} <= kinds and all(row["state"] == "done" for row in rows)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="watches what is synced through /proc")
 def test_a_power_cut_loses_no_acknowledged_picture(tmp_path, monkeypatch):
     print(cut_on_a_copy(tmp_path, monkeypatch, seed=int(time.time()), refine=False))
@@ -309,6 +311,7 @@ def cut_on_a_disk(disk, tmp_path, seed, refine, count=12):
     return len(known)
 
 
+@pytest.mark.slow
 def test_a_disk_that_lost_power_holds_what_was_acknowledged(disk, tmp_path):
     print(cut_on_a_disk(disk, tmp_path, seed=int(time.time()), refine=False))
 

@@ -75,6 +75,7 @@ def test_without_an_area_there_is_no_coverage(served: Served) -> None:
     assert served.get("/api/coverage/cells.png").status_code == 404
 
 
+@pytest.mark.slow
 def test_flown_legs_are_seen_and_others_planned_and_a_hole_is_told_with_its_cause(tmp_path: Path) -> None:
     with serving(tmp_path / "w") as served:
         plan, legs = _plan(served)

@@ -33,6 +33,7 @@ def test_state_is_told_in_lines(commands):
     assert commands.run(["web"])[0].startswith("http://127.0.0.1:")
 
 
+@pytest.mark.slow
 def test_the_workspace_gives_the_token(served):
     workspace = served.process.args[served.process.args.index("--workspace") + 1]
     commands = Commands(Client(served.url))

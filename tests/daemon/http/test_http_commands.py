@@ -93,6 +93,7 @@ def test_all_vehicles_are_commanded_at_once_with_an_outcome_each(flying, verb):
     assert flying.command("/api/missions/all/upload").status_code == 404
 
 
+@pytest.mark.slow
 def test_what_lay_in_a_frozen_daemons_socket_is_not_executed_after_the_thaw(flying):
     """SIGSTOP, an RTL without a time, SIGCONT: nobody can tell how old it is, so the vehicle never gets it."""
     pid = flying.process.pid
@@ -164,6 +165,7 @@ def put(served, body):
     return httpx.put(f"{served.url}/api/plan", json=body, headers=served.auth, timeout=LIMIT_S)
 
 
+@pytest.mark.slow
 def test_the_plan_is_the_same_for_a_second_page_and_after_a_restart(tmp_path):
     area = {"type": "Polygon", "coordinates": [[[0, 0], [1, 0], [1, 1], [0, 0]]]}
     with serving(tmp_path / "w") as served:
@@ -234,6 +236,7 @@ def half_sent(served, source="127.0.0.1"):
     return connection
 
 
+@pytest.mark.slow
 def test_half_sent_uploads_stop_neither_others_nor_their_own_sender(tmp_path):
     with serving(tmp_path / "w") as served:
         gone = [half_sent(served, "127.0.0.2") for _ in range(300)]

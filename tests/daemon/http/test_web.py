@@ -66,6 +66,7 @@ def test_the_map_appears_as_pictures_come(page):
     page.wait_for_selector(".jobs [data-state=done]")
 
 
+@pytest.mark.slow
 def test_an_area_is_drawn_and_planned(page):
     _, page = page
     page.click("#tab-plan")

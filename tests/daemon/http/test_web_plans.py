@@ -71,6 +71,7 @@ def test_no_fly_zones_that_cannot_be_kept_are_refused(no_fly, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [("MultiPolygon", "coordinates"), ("FeatureCollection", "features")])
 def test_no_zones_are_no_zones(kind, tmp_path):
     made = Plans(tmp_path).make(BODY | {"no_fly": {"type": kind[0], kind[1]: []}})

@@ -47,6 +47,7 @@ def test_a_first_picture_without_a_fix_does_not_anchor_the_map(tmp_path, pose):
         assert served.get("/tiles/realtime/{}/{}/{}.png".format(*tile_over(shots[2].camera))).content
 
 
+@pytest.mark.slow
 def test_most_pictures_anchor_the_map_and_none_is_lost(tmp_path):
     with serving(tmp_path / "w") as served:
         send_all(served, moved(line(2, "stray"), 10.0, 10.0))

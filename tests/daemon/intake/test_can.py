@@ -174,6 +174,7 @@ def errors(camera, frames):
     return np.array(metres), np.array(degrees)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("loss", "babble"), [(0.0, 0), (0.03, 100)], ids=["quiet", "loss and a babbling node"])
 def test_pictures_lie_where_the_receiver_on_the_bus_says(tmp_path, loss, babble):
     clock, camera = BusClock(), Camera()

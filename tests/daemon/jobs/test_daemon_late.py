@@ -36,6 +36,7 @@ def stages(daemon):
     return {row["image"]: row["stage"] for row in daemon.frames()}
 
 
+@pytest.mark.slow
 def test_a_few_late_pictures_are_laid_beside_the_others_and_many_refined_with_them(daemon, flight):
     frames, _ = flight
     late = [frames[k] for k in (5, 15, 16)]
@@ -95,6 +96,7 @@ def test_a_refinement_that_cannot_be_published_leaves_the_former_one(daemon, fli
     assert [path.name for path in files] == [row["path"]] and retired == []
 
 
+@pytest.mark.slow
 def test_late_pictures_are_remembered_over_a_restart(tmp_path, flight):
     frames, basemap = flight
     # each daemon ends before it notices the silence

@@ -52,6 +52,7 @@ def errors(found, frames):
     return np.array([np.hypot(*(p.camera.to_ground(middle) - true[p.frame.image])) for p in found.placed])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("daemon", [0.0], indirect=True)
 def test_the_first_is_solved_again_when_its_neighbour_was_refined(daemon, flights):
     frames, _ = flights
@@ -82,6 +83,7 @@ def test_the_first_is_solved_again_when_its_neighbour_was_refined(daemon, flight
     assert sorted(path.name for path in (daemon.settings.workspace / "solutions").glob("solution*.part")) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("daemon", [1e6], indirect=True)
 def test_what_lies_well_beside_its_neighbours_is_not_drawn_again(daemon, flights):
     frames, _ = flights

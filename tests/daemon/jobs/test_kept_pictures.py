@@ -3,6 +3,7 @@
 import time
 
 import numpy as np
+import pytest
 
 from gcs_plugin.daemon.daemon import Daemon
 from gcs_plugin.daemon.jobs.placed_sorties import sortie_frames
@@ -59,6 +60,7 @@ def test_a_sortie_is_followed_while_its_last_pictures_may_come(tmp_path, flight)
         assert kept(daemon) == []
 
 
+@pytest.mark.slow
 def test_a_vehicle_that_is_silent_before_it_completes_is_followed_then(tmp_path, flight):
     with Daemon(settings_of(tmp_path, flight, silent_s=0.5)) as daemon:
         post(daemon, flight[0])
@@ -90,6 +92,7 @@ def test_a_picture_that_comes_meanwhile_is_refined_with_the_others(tmp_path, fli
         assert found == alone
 
 
+@pytest.mark.slow
 def test_what_legs_left_is_not_needed_after_a_restart(tmp_path, flight):
     with Daemon(settings_of(tmp_path, flight, silent_s=0.5)) as daemon:
         post(daemon, flight[0][:20])

@@ -201,6 +201,7 @@ def layer_named(name):
     return lambda layers: not next(row for row in layers if row["name"] == name)["empty"]
 
 
+@pytest.mark.slow
 def test_legs_are_on_the_map_before_the_refinement_and_beside_it(tmp_path):
     ground = made_up_ground()
     write_map(ground, tmp_path / "map.tif")
@@ -258,6 +259,7 @@ def closeness_grows(workspace, ground):
     assert off[2] <= 1.05 * off[1]
 
 
+@pytest.mark.slow
 def test_pictures_that_do_not_hold_together_leave_the_real_time_map_alone(tmp_path):
     """Legs of pictures of nothing: the job ends with a note, the layer stays empty."""
     import io

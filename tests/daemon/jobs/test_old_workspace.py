@@ -21,6 +21,7 @@ def workspace(tmp_path):
     return settings, made_up_flight(ground, tmp_path, "v1")[:16]
 
 
+@pytest.mark.slow
 def test_solutions_of_another_version_are_made_again(workspace, caplog):
     settings, frames = workspace
     with Daemon(settings) as daemon:

@@ -98,6 +98,7 @@ def dark_and_bright(tmp_path):
     return flights, tmp_path / "map.tif"
 
 
+@pytest.mark.slow
 def test_the_daemon_draws_again_what_changes(tmp_path, dark_and_bright):
     flights, basemap = dark_and_bright
     settings = Settings(workspace=tmp_path / "w", basemap=basemap, coarse=False, redraw_px=1e6)

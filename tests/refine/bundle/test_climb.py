@@ -39,6 +39,7 @@ def climbing(frame, folder):
     return out
 
 
+@pytest.mark.slow
 def test_pictures_of_the_climb_do_not_cost_a_flight_its_scale(scene, tmp_path):
     vehicles, grid, basemap, truth = scene
     flown = vehicles["uav01"]

@@ -38,6 +38,7 @@ def opened(monkeypatch):
     return asked, breaks
 
 
+@pytest.mark.slow
 def test_photos_that_do_not_hold_together_with_others_are_matched_by_vehicle(scene, opened):
     vehicles, grid, basemap, truth = scene
     asked, breaks = opened

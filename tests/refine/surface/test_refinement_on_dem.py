@@ -63,6 +63,7 @@ def without(scene):
     return refine_all(vehicles, basemap, grid)
 
 
+@pytest.mark.slow
 def test_a_right_model_gives_the_ground_and_the_map_is_as_good(scene, without, tmp_path):
     vehicles, grid, basemap, _, (heights, _) = scene
     given = options(tmp_path, scene, heights)
@@ -89,6 +90,7 @@ def test_the_ground_is_known_before_the_map_is_used(scene, without):
         assert np.percentile(np.abs(off_ground(one, scene, ground)), 90) < 0.5 * flat
 
 
+@pytest.mark.slow
 def test_half_a_model_is_used_where_it_is(scene, without, tmp_path):
     vehicles, grid, basemap, _, (heights, _) = scene
     half = heights.copy()
