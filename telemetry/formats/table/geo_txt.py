@@ -14,7 +14,7 @@ from pathlib import Path
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import projection_of
 from orthoswarm.raster.picture_file import PICTURE_SUFFIXES
-from telemetry.formats.table.pose_row import PoseRow, PoseTable, as_path, pitch_by_value, read_text
+from telemetry.formats.table.pose_row import PoseRow, PoseTable, as_path, decoded, pitch_by_value, read_text
 from telemetry.samples.sample import is_position
 
 _MOST_NUMBERS = 8
@@ -26,7 +26,7 @@ def is_geo_txt(path: Path) -> bool:
         return False
     try:
         with path.open("rb") as handle:
-            first = handle.readline(512).decode("utf-8-sig", "replace").strip()
+            first = decoded(handle.read(512)).partition("\n")[0].strip()
     except OSError:
         return False
     return path.name.lower() == "geo.txt" or (path.name.lower().startswith("geo") and projection_of(first) is not None)

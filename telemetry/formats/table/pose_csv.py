@@ -28,7 +28,7 @@ from orthoswarm.model.errors import InputError
 from orthoswarm.raster.picture_file import PICTURE_SUFFIXES
 from telemetry.formats.table import cell_values
 from telemetry.formats.table.geo_txt import to_geographic
-from telemetry.formats.table.pose_row import PoseRow, PoseTable, as_path, pitch_by_value, read_text
+from telemetry.formats.table.pose_row import PoseRow, PoseTable, as_path, decoded, pitch_by_value, read_text
 from telemetry.samples.rotations import camera_angles_from_opk_deg
 from telemetry.samples.sample import is_position
 from telemetry.samples.times import epoch_seconds, parse_time
@@ -99,7 +99,7 @@ def read_pose_csv(path: Path) -> PoseTable | None:
     """
     try:
         with path.open("rb") as handle:  # most tables next to pictures are not tables of poses, and may be large
-            head = handle.read(_HEAD_BYTES).decode("utf-8-sig", "replace").replace("\0", "").splitlines()
+            head = decoded(handle.read(_HEAD_BYTES)).splitlines()
     except OSError:
         return None
     for at, line in enumerate(head[:5]):
@@ -357,7 +357,7 @@ def names_pictures(path: Path) -> bool:
     """Whether the first lines of a text name picture files, so that it is probably meant for them."""
     try:
         with path.open("rb") as handle:
-            words = re.split(r"[\s,;\"']+", handle.read(_HEAD_BYTES).decode("utf-8", "replace"))
+            words = re.split(r"[\s,;\"']+", decoded(handle.read(_HEAD_BYTES)))
     except OSError:
         return False
     return sum(Path(word).suffix.lower() in PICTURE_SUFFIXES for word in words[:2000] if "." in word) >= 1

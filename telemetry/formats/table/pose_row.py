@@ -1,5 +1,6 @@
 """Poses of pictures from a table, in a common form."""
 
+import codecs
 from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -118,6 +119,21 @@ def _rename(table: PoseTable, names: dict[str, str]) -> None:
     table.update((names.get(name, name), row) for name, row in rows)
 
 
+def decoded(data: bytes) -> str:
+    """Text of a table, or of its beginning.
+
+    It is UTF-8, UTF-16 with its mark (a spreadsheet's "Unicode text"), or else in Windows' Western code page, in which
+    names with umlauts and accents come.
+    """
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return data.decode("utf-16", "replace").replace("\0", "")
+    try:
+        text = codecs.getincrementaldecoder("utf-8-sig")().decode(data)  # a beginning may end within a letter
+    except UnicodeDecodeError:
+        text = data.decode("cp1252", "replace")
+    return text.replace("\0", "")
+
+
 def read_text(path: Path) -> str:
     """A table's text.
 
@@ -127,7 +143,7 @@ def read_text(path: Path) -> str:
     try:
         if path.stat().st_size > MOST_TEXT_BYTES:
             raise InputError(f"{path.name} is larger than {MOST_TEXT_BYTES >> 20} MB; split it")
-        return path.read_bytes().decode("utf-8-sig", "replace").replace("\0", "")
+        return decoded(path.read_bytes())
     except OSError as error:
         raise InputError(f"{path.name} cannot be read ({error.strerror}); check the file") from None
 

@@ -4,7 +4,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from telemetry.formats.table.geo_txt import is_geo_txt, read_geo_txt
 from telemetry.formats.table.pose_csv import read_pose_csv
+from telemetry.formats.table.pose_row import decoded
 from telemetry.ingest.ingest import survey
 from tests.telemetry.ingest.test_photos import jpeg
 
@@ -296,3 +298,22 @@ def test_times_are_read_with_their_zone_and_in_any_unit_or_counted(tmp_path, cel
 def test_a_time_of_zeros_is_none(tmp_path, cell):
     found = table(tmp_path, f"image,lat_deg,lon_deg,time\na.JPG,47.5,8.25,{cell}\n")
     assert (found["a.jpg"].time_s, found.refused) == (None, 0)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "cp1252"])
+def test_a_table_is_read_in_the_encodings_that_programs_write(tmp_path, encoding):
+    text = "image\tlat\tlon\talt\n" + "".join(f"Brücke_{k:02d}.jpg\t47.5\t8.5\t{500 + k}\n" for k in range(40))
+    (tmp_path / "poses.csv").write_bytes(text.encode(encoding))
+    assert {name: row.altitude_m for name, row in read_pose_csv(tmp_path / "poses.csv").items()} == {
+        f"brücke_{k:02d}.jpg": 500.0 + k for k in range(40)
+    }
+    (tmp_path / "geo.txt").write_bytes("EPSG:4326\nBrücke_01.jpg 8.5 47.5 500\n".encode(encoding))
+    assert is_geo_txt(tmp_path / "geo.txt")
+    (name,) = read_geo_txt(tmp_path / "geo.txt")
+    assert name == "brücke_01.jpg"
+
+
+@given(text=st.text(max_size=40), cut=st.integers(0, 200))
+def test_the_beginning_of_a_table_is_the_beginning_of_its_text(text, cut):
+    text = text.replace("\0", "").replace("\ufeff", "")
+    assert text.startswith(decoded(text.encode()[:cut]))
