@@ -75,6 +75,24 @@ class CommandConfig:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ReturnConfig:
+    """How an autopilot flies home where it has not said it: its factory settings."""
+
+    ardupilot_m_s: float = 10.0
+    """Speed, metres per second (WPNAV_SPEED, which RTL_SPEED 0 stands for)."""
+    px4_m_s: float = 5.0
+    """The same (MPC_XY_CRUISE)."""
+    ardupilot_m: float = 15.0
+    """Least height above home, metres (RTL_ALT)."""
+    px4_m: float = 60.0
+    """The same (RTL_RETURN_ALT)."""
+    look_s: float = 1.0
+    """Time between looks at vehicles that return in turn, seconds (chosen: they fly 10 m in it)."""
+    shows_s: float = 5.0
+    """So long after it was sent home a vehicle's heartbeats may show another mode, seconds (chosen: as a pause)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SortieConfig:
     """How many pictures a flight's steps take."""
 
@@ -88,4 +106,5 @@ HEARING: Final = HearingConfig()
 LIMITS: Final = FlightLimits()
 ALARM: Final = AlarmConfig()
 COMMAND: Final = CommandConfig()
+RETURN: Final = ReturnConfig()
 SORTIE: Final = SortieConfig()

@@ -27,9 +27,11 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
 from gcs_plugin.daemon.airspace.fences import Fences
+from gcs_plugin.daemon.airspace.returns import Returns
 from gcs_plugin.daemon.airspace.traffic import Traffic
 from gcs_plugin.daemon.jobs.job_queue import Jobs
 from gcs_plugin.daemon.mission_journal import MissionJournal
@@ -45,6 +47,7 @@ from orthoswarm.model.errors import InputError, OrthoSwarmError
 from telemetry.live.live_poses import Poses
 
 if TYPE_CHECKING:
+    from gcs_plugin.fleet.commands import Verb
     from gcs_plugin.fleet.fleet import Fleet
     from gcs_plugin.fleet.fleet_events import FleetEvent
     from gcs_plugin.fleet.vehicle_state import Vehicle
@@ -112,6 +115,7 @@ class VehicleLinks:
         self.fleet.subscribe(self._message)
         self._fences = Fences(self.fleet)
         self._checks = StartChecks(self.fleet, self._fences, self.name_of, lambda: self.takeoffs())
+        self._returns = Returns(self.fleet, self._give, lambda row: events.publish("command", **row), self.name_of)
         self.traffic = Traffic()
         self.fleet.subscribe(self.traffic.heard, "ADSB_VEHICLE")
         self._threads = [
@@ -127,6 +131,7 @@ class VehicleLinks:
     def close(self) -> None:
         """Close the links."""
         self._stop.set()
+        self._returns.close()
         for thread in self._threads:
             if thread.ident is not None:
                 thread.join(5.0)
@@ -165,14 +170,21 @@ class VehicleLinks:
         return {self.name_of(system): v.autopilot.value for system, v in list(self.fleet.vehicles.items())}
 
     def rows(self) -> list[dict[str, Any]]:
-        """All vehicles on the links as JSON values; `takeoff` of each is None where none waits or failed."""
+        """All vehicles on the links as JSON values.
+
+        `takeoff` of each is None where none waits or failed; `returns_after` names those that it waits for until it
+        returns, None where it does not wait.
+        """
 
         def collect() -> list[dict[str, Any]]:
             now = time.monotonic()
             return [self._row(vehicle, now) for _, vehicle in sorted(self.fleet.vehicles.items())]
 
-        takeoffs = self.takeoffs()
-        return [row | {"takeoff": takeoffs.get(row["id"])} for row in self.fleet.call(collect).result(5.0)]
+        takeoffs, returns = self.takeoffs(), self._returns.waits()
+        return [
+            row | {"takeoff": takeoffs.get(row["id"]), "returns_after": returns.get(row["id"])}
+            for row in self.fleet.call(collect).result(5.0)
+        ]
 
     @staticmethod
     def clock() -> float:
@@ -214,14 +226,31 @@ class VehicleLinks:
         Raises:
             InputError: there is no such command.
         """
-        from gcs_plugin.fleet.commands import VERBS, Order, new_id
+        from gcs_plugin.fleet.commands import VERBS, new_id
 
         if verb not in VERBS:
             raise InputError(f"there is no command '{verb}'; choose {', '.join(VERBS)}")
         given, number = self.clock() if given_s is None else min(given_s, self.clock()), command_id or new_id()
         names = [self.name_of(s) for s in sorted(self.fleet.vehicles)] if vehicles is None else list(vehicles)
+        for system in list(self.fleet.vehicles):
+            if self.name_of(system) in names:
+                self._returns.cancel(system)
+        return self._give(verb, names, given, number, override or {})
+
+    def _give(
+        self,
+        verb: "Verb",
+        names: Collection[str],
+        given: float | None = None,
+        number: str | None = None,
+        override: Mapping[str, Collection[str]] = MappingProxyType({}),
+    ) -> list[dict[str, Any]]:
+        """Give a command, see `commands`; `given` and `number`: default now, and a new one."""
+        from gcs_plugin.fleet.commands import Order, new_id
+
+        given, number = self.clock() if given is None else given, number or new_id()
         stops = dict(self.fleet.stops)
-        rows, systems = self._without_command(verb, names, number, override or {})
+        rows, systems = self._without_command(verb, names, number, override)
         orders = {
             name: Order(verb=verb, system=system, given_s=given, stops=stops.get(system, 0), id=number)
             for name, system in systems.items()
@@ -240,6 +269,19 @@ class VehicleLinks:
                 result = CommandResult(number, name, verb, Verdict.UNKNOWN, reason)
             rows[name] = result.document()
         return [rows[name] for name in names]
+
+    def return_in_turn(self, command_id: str | None = None) -> list[dict[str, Any]]:
+        """Return all vehicles on the links, those whose ways home come near each other one after the other.
+
+        Args:
+            command_id: id of the command; a new one by default.
+
+        Returns:
+            A row per vehicle, see the top of this module; one that holds until its turn comes has done as it was told.
+        """
+        from gcs_plugin.fleet.commands import new_id
+
+        return self._returns.begin({self.name_of(s): s for s in sorted(self.fleet.vehicles)}, command_id or new_id())
 
     def _without_command(
         self, verb: str, names: Collection[str], number: str, override: Mapping[str, Collection[str]]

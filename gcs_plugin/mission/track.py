@@ -232,7 +232,7 @@ class Airspace:
         known = self._found.get((one, other))
         if known is None:
             a, b = self.tracks[one].places, self.tracks[other].places
-            i, j = _near(a, b, self.distance_m) if len(a) and len(b) else (np.zeros(0, np.int64),) * 2
+            i, j = near_samples(a, b, self.distance_m) if len(a) and len(b) else (np.zeros(0, np.int64),) * 2
             higher = self.tracks[one].higher_m(self.tracks[other])
             counted = np.abs(a[i, 2] - b[j, 2] + higher) < self.height_m - _HAIR_M
             i, j = i[counted], j[counted]
@@ -298,7 +298,7 @@ class Airspace:
         return bool(len(a) and len(b) and np.hypot(*(a[0, :2] - b[0, :2])) < self._pad_m())
 
 
-def _near(a: Array, b: Array, distance_m: float) -> tuple[Ints, Ints]:
+def near_samples(a: Array, b: Array, distance_m: float) -> tuple[Ints, Ints]:
     """Pairs of samples (n, 3), (m, 3) in the air that are less than a horizontal distance apart: their numbers."""
     from scipy.spatial import cKDTree
 

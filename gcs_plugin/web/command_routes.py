@@ -20,6 +20,7 @@ from typing import Any, Final
 from fastapi import HTTPException, Request, Response
 
 from gcs_plugin.config import COMMAND
+from gcs_plugin.daemon.airspace.returns import VERB as RETURN_VERB
 from gcs_plugin.daemon.daemon import Daemon
 from gcs_plugin.daemon.takeoffs import Takeoffs, names_of
 from gcs_plugin.daemon.vehicles import VehicleLinks
@@ -34,7 +35,8 @@ Rows = list[dict[str, Any]]
 
 ALL: Final = "all"
 _PLAN: Final = "start of a plan"
-_ALL_VERBS: Final = ("pause", "resume", "rtl", "land")
+_ALL_VERBS: Final = ("pause", "resume", "rtl", "return", "land")
+_ENDS: Final = URGENT | {RETURN_VERB}
 _AHEAD_S: Final = 2.0
 _BEATS: Final = {"given_s": "time", "given_clock_s": "clock_s"}
 _MOST_ID: Final = 200
@@ -82,8 +84,10 @@ class CommandRoutes:
         Body: `id`, and `given_clock_s` with `run`, or `given_s` (see above). Answers once the outcome is known, with
         `id`, `vehicle`, `command`, `outcome` (`done`, `refused`, `not_sent`, `unknown`) and `reason`. The vehicle `all`
         stands for all on the links (not for upload and start); its answer has `id` and `results`, a row a vehicle.
+        `return` is for all only: those whose ways home come near each other return one after the other (`rtl` sends all
+        at once).
         """
-        if verb not in (*VERBS, "upload"):
+        if verb not in (*VERBS, "upload") and (vehicle, verb) != (ALL, RETURN_VERB):
             raise HTTPException(404, f"there is no such command; choose upload, {', '.join(VERBS)}")
         if vehicle == ALL and verb not in _ALL_VERBS:
             raise HTTPException(404, f"all vehicles at once can {', '.join(_ALL_VERBS)}; start a plan, or one vehicle")
@@ -135,6 +139,8 @@ class CommandRoutes:
         late = _late(issue, verb)
         if late is not None:
             rows = [CommandResult(issue.id, name, verb, Verdict.NOT_SENT, late).document() for name in names]
+        elif verb == RETURN_VERB:
+            rows = links.return_in_turn(command_id=issue.id)
         elif verb == "upload":
             rows = [self._upload(links, vehicle, issue, body)]
         else:
@@ -272,7 +278,7 @@ def _late(issue: Issue, verb: str) -> str | None:
     if age > COMMAND.fresh_s:
         ago = f"{age:.0f} s ago" if math.isfinite(age) else "before the ground station was started again"
         return f"it was given {ago}, too long to be executed now; look at the vehicle and give it again"
-    if age < -_AHEAD_S and verb not in URGENT:  # the clock was set; what ends a flight counts as given now
+    if age < -_AHEAD_S and verb not in _ENDS:  # the clock was set; what ends a flight counts as given now
         return f"it was given {-age:.0f} s from now; take the time from the daemon's heartbeats and give it again"
     return None
 

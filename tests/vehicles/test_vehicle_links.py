@@ -237,3 +237,29 @@ def test_a_vehicle_that_acknowledged_a_pause_takes_another_mission_at_once(open_
         upload_all(links, folder)
     assert [row["outcome"] for row in links.commands("pause")] == ["done"]
     upload_all(links, folder)
+
+
+@pytest.mark.slow
+def test_vehicles_of_one_start_return_in_turn_and_one_given_another_command_does_not(open_links, folder):  # noqa: F811
+    links = open_links(make_swarm(3, home=HOME, spacing_m=4.0))
+    ready(links, 3)
+    upload_all(links, folder)
+    override = {name: ["separation"] for name in ("v1", "v2", "v3")}
+    assert [r["outcome"] for r in links.commands("start", override=override)] == ["done"] * 3
+    wait(lambda: all(links.flight_state(f"v{n}")["state"] == "on mission" for n in (1, 2, 3)))
+    rows = links.return_in_turn("turn-1")
+    assert [(r["id"], r["vehicle"], r["command"], r["outcome"]) for r in rows] == [
+        ("turn-1", f"v{n}", "return", "done") for n in (1, 2, 3)
+    ]
+    waiting = {row["id"]: row["returns_after"] for row in links.rows() if row["returns_after"] is not None}
+    assert len(waiting) == 2  # all three fly one above the other's start
+    said = {row["vehicle"]: row["reason"] for row in rows}
+    assert all(f"{name} holds, and returns after" in said[name] for name in waiting)
+    second = max(waiting, key=lambda name: len(waiting[name]))
+    assert [r["outcome"] for r in links.commands("pause", [second])] == ["done"]
+    assert next(row for row in links.rows() if row["id"] == second)["returns_after"] is None
+    down = {"on ground", "complete"}
+    wait(lambda: all(links.flight_state(n)["state"] in down for n in {"v1", "v2", "v3"} - {second}), 60.0)
+    assert links.flight_state(second)["state"] == "paused"
+    assert next(row for row in links.return_in_turn() if row["vehicle"] == second)["outcome"] == "done"
+    wait(lambda: links.flight_state(second)["state"] in down, 60.0)

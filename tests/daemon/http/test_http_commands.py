@@ -53,7 +53,7 @@ def heartbeat(flying):
         return json.loads(events.recv(timeout=LIMIT_S))
 
 
-@pytest.mark.parametrize("verb", ["pause", "rtl", "land"])
+@pytest.mark.parametrize("verb", ["pause", "rtl", "return", "land"])
 def test_a_clock_that_was_set_back_keeps_no_urgent_command_from_the_vehicles(flying, verb):
     beat = heartbeat(flying)
     ahead = {"given_s": time.time() + 30.0}  # as a page counts on that heard the clock before it was set
@@ -84,13 +84,14 @@ def test_a_command_in_time_reaches_the_vehicle_once(flying):
     assert other.status_code == 409 and "once" in other.json()["detail"]
 
 
-@pytest.mark.parametrize("verb", ["pause", "rtl", "land"])
+@pytest.mark.parametrize("verb", ["pause", "rtl", "return", "land"])
 def test_all_vehicles_are_commanded_at_once_with_an_outcome_each(flying, verb):
     answer = flying.command(f"/api/missions/all/{verb}", {"given_s": time.time()}).json()
     assert [row["vehicle"] for row in answer["results"]] == ["v1", "v2"]
     assert {row["outcome"] for row in answer["results"]} <= {"done", "refused"}
     assert {row["id"] for row in answer["results"]} == {answer["id"]}
     assert flying.command("/api/missions/all/upload").status_code == 404
+    assert flying.command("/api/missions/v1/return").status_code == 404  # one vehicle has no turn
 
 
 @pytest.mark.slow

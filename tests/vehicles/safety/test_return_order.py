@@ -1,0 +1,191 @@
+"""Vehicles that return in turn keep apart on their ways home, and all of them come home."""
+
+import itertools
+import math
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gcs_plugin.fleet.autopilot_settings import Setting, SetTo
+from gcs_plugin.fleet.separation.return_order import ReturnOrder, aloft_of, apart
+from gcs_plugin.links.mavlink import Autopilot
+from gcs_plugin.mission.items import RTL, TAKEOFF, WAYPOINT, Mission, MissionItem
+from gcs_plugin.sim.multirotor import Airframe, Chart
+from gcs_plugin.sim.simulated_swarm import make_swarm
+
+AP, PX4 = Autopilot.ARDUPILOT, Autopilot.PX4
+HOME = (47.397742, 8.545594, 488.0)
+SPACING_M = 4.0
+
+
+def outward(autopilot, place, height):
+    """A mission that flies to a place (north, east of the first home) and back."""
+    chart = Chart(*HOME)
+    items = [MissionItem.at(WAYPOINT, *chart.to_degrees(0, 0), 0)] if autopilot is AP else []
+    items += [MissionItem.at(TAKEOFF, *chart.to_degrees(0, 0), height)]
+    items += [MissionItem.at(WAYPOINT, *chart.to_degrees(*place), height), MissionItem.do(RTL)]
+    return Mission(autopilot, tuple(items))
+
+
+def flown_out(make_world, places, *, autopilots=(AP,), height=30.0, seconds=45.0, spacing_m=SPACING_M):
+    """Vehicles of neighbouring starts on their ways to places, and their true positions as a function."""
+    swarm = make_swarm(
+        len(places), autopilots=autopilots, home=HOME, spacing_m=spacing_m, airframe=Airframe(climb_m_s=8.0)
+    )
+    world = make_world(*swarm)
+    world.meet()
+    fleet = world.fleet
+    world.until(lambda: all(v.prearm_ok and v.ekf_ok and v.home for v in fleet.vehicles.values()), 120.0)
+    uploads = [
+        fleet.upload(s, outward(fleet.vehicles[s].autopilot, p, height))
+        for s, p in zip(fleet.vehicles, places, strict=True)
+    ]
+    assert all(outcome.ok for outcome in world.finish(*uploads))
+    assert all(outcome.ok for outcome in world.finish(*(fleet.start(s) for s in fleet.vehicles)))
+    world.wait(seconds)
+    assert all(v.flying for v in fleet.vehicles.values())
+
+    def positions():
+        found = {}
+        for k, vehicle in enumerate(swarm):
+            motion = vehicle.flight.motion
+            if motion.up > 2.0:
+                found[vehicle.system] = (motion.north, motion.east + spacing_m * k, motion.up)
+        return found
+
+    return world, positions
+
+
+def nearest(positions):
+    """The least distance of two in the air that are less than 4 m apart in height."""
+    pairs = itertools.combinations(positions.values(), 2)
+    level = [math.dist(a[:2], b[:2]) for a, b in pairs if abs(a[2] - b[2]) < 4.0]
+    return min(level, default=math.inf)
+
+
+def come_home(world, positions, order=None, limit_s=900.0):
+    """Fly until all have landed; the least distance of two on the way."""
+    fleet, least, end = world.fleet, math.inf, world.clock.now + limit_s
+    if order is None:
+        world.finish(*(fleet.rtl(s) for s in fleet.vehicles))
+    else:
+        first = order.look(aloft_of(fleet.vehicles, world.clock.now))
+        world.finish(*(fleet.rtl(s) for s in first), *(fleet.pause(s) for s in order.waits))
+    while positions() and world.clock.now < end:
+        world.wait(1.0)
+        least = min(least, nearest(positions()))
+        if order is not None and order.waits:
+            for system in order.look(aloft_of(fleet.vehicles, world.clock.now)):
+                fleet.rtl(system)
+    assert not positions(), "not all have come home"
+    return least
+
+
+FAN = [(600, 240 * (k - 2)) for k in range(6)]
+
+
+@pytest.mark.parametrize("autopilots", [(AP,), (PX4,), (AP, PX4)], ids=["ardupilot", "px4", "mixed"])
+def test_those_of_neighbouring_starts_keep_apart_on_their_ways_home(make_world, autopilots):
+    world, positions = flown_out(make_world, FAN, autopilots=autopilots)
+    assert come_home(world, positions) < 8.0  # all at once: as near as their starts, and nearer where ways cross
+    world, positions = flown_out(make_world, FAN, autopilots=autopilots)
+    order = ReturnOrder(world.fleet.vehicles, world.clock)
+    assert come_home(world, positions, order) > 8.0
+    assert not order.waits
+
+
+def test_those_whose_ways_do_not_meet_return_at_once(make_world):
+    world, _ = flown_out(make_world, FAN[:3], spacing_m=80.0)
+    order = ReturnOrder(world.fleet.vehicles, world.clock)
+    assert sorted(order.look(aloft_of(world.fleet.vehicles, world.clock.now))) == [1, 2, 3]
+    assert not order.waits
+
+
+def test_known_return_heights_let_more_return_at_a_time(make_world):
+    world, _ = flown_out(make_world, FAN[:3])
+    vehicles = world.fleet.vehicles
+
+    def at_once(*heights):
+        for vehicle, height_m in zip(vehicles.values(), heights, strict=True):
+            vehicle.settings[Setting.RETURN_HEIGHT] = SetTo("RTL_ALT", height_m)
+        return len(ReturnOrder(vehicles, world.clock).look(aloft_of(vehicles, world.clock.now)))
+
+    # They come down at one place at one time all the same: one after the other, but for the lowest.
+    assert at_once(40.0, 40.0, 40.0) <= at_once(40.0, 80.0, 120.0)
+    assert at_once(40.0, 80.0, 120.0) >= 2
+
+
+def test_whoever_must_not_wait_returns_at_once(make_world):
+    world, _ = flown_out(make_world, FAN)
+    vehicles = world.fleet.vehicles
+    order = ReturnOrder(vehicles, world.clock)
+    order.look(aloft_of(vehicles, world.clock.now))
+    low, lost, unknown = sorted(order.waits)[:3]
+    vehicles[low].battery = 0.05
+    vehicles[lost].lost = True
+    vehicles[unknown].home = vehicles[unknown].launch = None
+    assert {low, lost, unknown} <= set(order.look(aloft_of(vehicles, world.clock.now)))
+    assert not {low, lost, unknown} & order.waits.keys()
+
+
+def test_one_that_was_given_another_command_waits_no_longer(make_world):
+    world, positions = flown_out(make_world, FAN)
+    order = ReturnOrder(world.fleet.vehicles, world.clock)
+    order.look(aloft_of(world.fleet.vehicles, world.clock.now))
+    held = sorted(order.waits)[-1]
+    assert order.drop(held) and not order.drop(held)
+    world.finish(*(world.fleet.pause(s) for s in (held, *order.waits)))
+    for _ in range(400):
+        for system in order.look(aloft_of(world.fleet.vehicles, world.clock.now)):
+            world.fleet.rtl(system)
+        world.wait(1.0)
+    assert set(positions()) == {held}
+
+
+def test_one_that_did_not_acknowledge_has_its_turn_again(make_world):
+    world, _ = flown_out(make_world, FAN[:2])
+    order = ReturnOrder(world.fleet.vehicles, world.clock)
+    (sent,) = order.look(aloft_of(world.fleet.vehicles, world.clock.now))
+    (held,) = order.waits
+    assert order.waits[held] == (sent,)
+    order.again(sent)
+    world.wait(1.0)
+    assert order.look(aloft_of(world.fleet.vehicles, world.clock.now)) == [sent]
+
+
+@settings(max_examples=60)
+@given(
+    places=st.lists(st.tuples(st.floats(-200, 200), st.floats(-200, 200), st.floats(5, 80)), min_size=1, max_size=7),
+    rtl_m=st.lists(st.floats(0, 80), min_size=7, max_size=7),
+)
+def test_whoever_sets_out_keeps_apart_from_those_that_fly_and_somebody_always_does(vehicle_at, places, rtl_m):
+    vehicles = {k + 1: vehicle_at(k + 1, place, rtl_m[k]) for k, place in enumerate(places)}
+    aloft = aloft_of(vehicles, 0.0)
+    order = ReturnOrder(vehicles, lambda: 0.0)
+    ready = order.look(aloft)
+    assert ready
+    assert set(ready) | order.waits.keys() == vehicles.keys() and not set(ready) & order.waits.keys()
+    if len(ready) > 1:
+        for one, other in itertools.combinations(ready, 2):
+            assert apart(aloft[one].way, aloft[other].way)
+
+
+@pytest.fixture(scope="module")
+def vehicle_at():
+    """Makes a vehicle in the air of the fleet's own kind: its place about the first home, its return height."""
+    from gcs_plugin.sim.memory_link import World
+
+    def make(system, place, rtl_m):
+        with World(make_swarm(1, home=HOME)) as world:
+            world.meet()
+            vehicle = world.fleet.vehicles[1]
+        chart = Chart(*HOME)
+        vehicle.address = vehicle.address.__class__(system, 1)
+        vehicle.home = chart.to_degrees(0.0, SPACING_M * system)
+        vehicle.lat_deg, vehicle.lon_deg = chart.to_degrees(*place[:2])
+        vehicle.height_m, vehicle.armed, vehicle.landed, vehicle.lost = place[2], True, "in air", False
+        vehicle.settings[Setting.RETURN_HEIGHT] = SetTo("RTL_ALT", rtl_m)
+        return vehicle
+
+    return make
