@@ -1,5 +1,6 @@
 """The geofence that a vehicle holds: zones out of the items of its fence list (MAV_MISSION_TYPE_FENCE)."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal
@@ -85,11 +86,11 @@ def zones_of(items: Sequence[MissionItem]) -> list[Zone]:
     while k < len(items):
         item = items[k]
         place = (item.lon_deg, item.lat_deg)
-        if item.command in _CIRCLES:
+        if item.command in _CIRCLES and math.isfinite(item.params[0]):
             zones.append(Zone(_CIRCLES[item.command], (place,), item.params[0]))
         elif item.command in _POLYGONS:
-            count = int(item.params[0])
-            row = [i for i in items[k : k + count] if i.command == item.command and int(i.params[0]) == count]
+            count = int(item.params[0]) if math.isfinite(item.params[0]) else 0
+            row = [i for i in items[k : k + count] if i.command == item.command and i.params[0] == item.params[0]]
             if count >= 3 and len(row) == count:
                 zones.append(Zone(_POLYGONS[item.command], tuple((i.lon_deg, i.lat_deg) for i in row)))
                 k += count

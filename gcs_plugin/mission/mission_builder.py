@@ -2,7 +2,8 @@
 
 ArduPilot's item 0 is home, which it overwrites: a list without it loses its takeoff. PX4's item 0 is flown: a list with
 home in front is refused at MISSION_START. ArduPilot refuses NaN in a parameter; PX4 reads a yaw of 0 as "turn north",
-so there it is NaN: nose along the path.
+so there it is NaN: nose along the path. A jump's target in files counts from home, as ArduPilot does; PX4's is one
+less.
 """
 
 import math
@@ -16,6 +17,7 @@ from gcs_plugin.mission import mission_files
 from gcs_plugin.mission.items import (
     FRAME_GLOBAL,
     FRAME_MISSION,
+    JUMP,
     LAND,
     LOITER_TIME,
     TAKEOFF,
@@ -96,6 +98,8 @@ def _wire(item: mission_files.MissionItem, autopilot: Autopilot) -> MissionItem:
     params = [_for(value, autopilot) for value in placed.params]
     if autopilot is Autopilot.PX4 and item.command in _WITH_YAW and not params[3]:
         params[3] = math.nan
+    if autopilot is Autopilot.PX4 and item.command == JUMP:
+        params[0] -= 1.0
     frame = FRAME_MISSION if not placed.has_place and placed.frame == FRAME_GLOBAL else placed.frame
     z = placed.z if math.isfinite(placed.z) else 0.0
     return replace(
@@ -125,5 +129,8 @@ def _check(mission: Mission) -> None:
         if item.has_place and not (abs(item.lat_deg) <= 90.0 and abs(item.lon_deg) <= 180.0):
             where = f"{item.lat_deg:g}, {item.lon_deg:g}"
             raise InputError(f"{name}: item {seq} ({item.name}) lies at {where}, which is not a place; correct it")
+        if item.command == JUMP and not mission.first_seq <= item.params[0] < len(mission):
+            target = item.params[0] + 1 - mission.first_seq
+            raise InputError(f"{name}: item {seq} jumps to item {target:g}, which it does not have; correct it")
         if not math.isfinite(item.z) or abs(item.z) >= 1e6:
             raise InputError(f"{name}: item {seq} ({item.name}) has the height {item.z:g} m; correct it")

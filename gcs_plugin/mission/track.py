@@ -6,7 +6,7 @@ later, they are far enough from each other or at another height (orthoswarm.plan
 """
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 from gcs_plugin.config import LIMITS
 from gcs_plugin.mission.items import (
     CHANGE_SPEED,
+    DELAY,
     FRAME_GLOBAL,
+    JUMP,
     LAND,
     LOITER_TIME,
     PLAIN_FRAME,
@@ -24,13 +26,14 @@ from gcs_plugin.mission.items import (
     TAKEOFF,
     VTOL_LAND,
     VTOL_TAKEOFF,
+    WAYPOINT,
 )
 from orthoswarm.config import active
 from orthoswarm.config.autopilot import AutopilotConfig
 from orthoswarm.model.earth import DEGREE_M
 
 if TYPE_CHECKING:
-    from gcs_plugin.mission.items import Mission
+    from gcs_plugin.mission.items import Mission, MissionItem
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -39,6 +42,8 @@ STEP_S: Final = 0.5
 """Time between the samples of a track, seconds."""
 _SPEED_M_S: Final = 5.0
 _HAIR_M: Final = 0.01
+_AGAIN: Final = 200
+"""So many items of a mission are followed that a jump has led back to: a jump may repeat them for ever."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,12 +96,15 @@ def flight_path(mission: "Mission", origin: tuple[float, float]) -> tuple[Array,
     base = _ground_m(mission)
     if home is not None:
         points.append((*metres(*home, origin), 0.0))
-    for item in mission.items[mission.first_seq :]:
+    for item in _flown(mission):
         if item.command == CHANGE_SPEED and item.params[1] > 0.0:
             speed = item.params[1]
         elif item.command == RTL and home is not None and points:
             top = points[-1][2]
             points += [(*metres(*home, origin), top), (*metres(*home, origin), 0.0)]
+        elif item.command == DELAY and item.params[0] > 0.0 and points:
+            points.append(points[-1])
+            waits[len(points) - 1] = item.params[0]
         elif item.is_nav and item.has_place:
             height = item.z - (base if PLAIN_FRAME.get(item.frame, item.frame) == FRAME_GLOBAL else 0.0)
             place = (item.lat_deg, item.lon_deg) if item.x or item.y else home
@@ -106,11 +114,28 @@ def flight_path(mission: "Mission", origin: tuple[float, float]) -> tuple[Array,
                 points.append((*metres(*place, origin), points[-1][2]))
                 height = 0.0
             points.append((*metres(*place, origin), height))
-            if item.command == LOITER_TIME:
+            if item.command == LOITER_TIME or (item.command == WAYPOINT and item.params[0] > 0.0):
                 points.append(points[-1])
                 waits[len(points) - 1] = item.params[0]
     before = np.array([waits.get(k, 0.0) for k in range(len(points))])
     return np.array(points, float).reshape(-1, 3), before, speed
+
+
+def _flown(mission: "Mission") -> "Iterator[MissionItem]":
+    """The items in the order in which they are flown, with jumps carried out."""
+    items, seq, jumped = mission.items, mission.first_seq, dict[int, int]()
+    for _ in range(len(items) + _AGAIN):
+        if seq >= len(items):
+            return
+        item = items[seq]
+        target, times = item.params[:2]
+        if item.command != JUMP:
+            yield item
+        elif 0 <= target < len(items) and (times < 0 or jumped.get(seq, 0) < times):
+            jumped[seq] = jumped.get(seq, 0) + 1
+            seq = int(target)
+            continue
+        seq += 1
 
 
 def track_of(mission: "Mission", origin: tuple[float, float]) -> Track:

@@ -1,6 +1,8 @@
 """Geofences: read from vehicles of both dialects, shown as zones, and never in the way of what an operator asks for."""
 
+import math
 import threading
+from dataclasses import replace
 
 import pytest
 
@@ -43,6 +45,12 @@ def test_zones_of_a_fence_list() -> None:
     assert [zone.document() for zone in zones_of([home, *FENCE])] == ZONES
     twice = zones_of([*polygon(OUTSIDE, TRIANGLE), *polygon(OUTSIDE, TRIANGLE)])  # neighbours of one kind
     assert len(twice) == 2
+
+
+@pytest.mark.parametrize("count", [math.nan, math.inf, -3.0])
+def test_a_fence_with_values_that_are_no_numbers_has_no_such_zone(count: float) -> None:
+    broken = [replace(item, params=(count, 0.0, 0.0, 0.0)) for item in polygon(INSIDE, SQUARE)]
+    assert zones_of([*broken, circle(47.0, 8.0, math.nan), *FENCE[-1:]]) == zones_of(FENCE[-1:])
 
 
 @pytest.mark.parametrize("items", [[], FENCE[:3], [*FENCE[:2], FENCE[4]], polygon(INSIDE, SQUARE[:2])])

@@ -10,6 +10,7 @@ from gcs_plugin.links.mavlink import Autopilot, command_name, dialect
 from gcs_plugin.links.packets import Framer
 from gcs_plugin.mission import mission_files
 from gcs_plugin.mission.items import (
+    JUMP,
     LAND,
     LOITER_TIME,
     LOITER_UNLIM,
@@ -22,6 +23,7 @@ from gcs_plugin.mission.items import (
     MissionItem,
 )
 from gcs_plugin.mission.mission_builder import build_mission, read_mission, unflyable
+from gcs_plugin.mission.track import flight_seconds
 from gcs_plugin.sim.mission_store import MissionStore
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.plan import Plan, Sortie, VehiclePlan, Waypoint
@@ -217,3 +219,41 @@ def test_an_altitude_where_nothing_flies_is_one_clear_sentence(written, tmp_path
     for autopilot in (AP, PX4):
         with pytest.raises(InputError, match=r"an item has the altitude \S+ m, where nothing flies"):
             read_mission(tmp_path / "high.plan", autopilot)
+
+
+def jumping(target, times=2.0, hold_s=0.0):
+    """Takeoff (1), two waypoints (2, 3), a jump, return."""
+    at = [47.397, 47.3979, 47.3988]
+    flown = [
+        mission_files.MissionItem(
+            command=command, frame=3, params=(hold, 0.0, 0.0, 0.0), lat_deg=lat, lon_deg=8.545, alt_m=20.0
+        )
+        for command, lat, hold in ((22, at[0], 0.0), (16, at[1], hold_s), (16, at[2], 0.0))
+    ]
+    return [
+        *flown,
+        mission_files.MissionItem(command=JUMP, params=(target, times, 0.0, 0.0)),
+        mission_files.MissionItem(command=RTL),
+    ]
+
+
+@BOTH
+def test_a_jump_leads_to_the_same_item_on_either_autopilot(autopilot):
+    mission = build_mission(autopilot, jumping(2.0))
+    (jump,) = [item for item in mission.items if item.command == JUMP]
+    assert mission.items[int(jump.params[0])].lat_deg == pytest.approx(47.3979)
+    for target in (0.0, 6.0, math.nan):
+        with pytest.raises(InputError, match="jumps to item"):
+            build_mission(autopilot, jumping(target))
+
+
+@BOTH
+def test_what_is_flown_again_and_waited_for_takes_its_time(autopilot):
+    def seconds(**options):
+        return flight_seconds(build_mission(autopilot, jumping(2.0, **options)))
+
+    once = seconds(times=0.0)
+    assert seconds(times=2.0) > seconds(times=1.0) + 30.0 > once + 60.0
+    assert seconds(times=-1.0) > 20.0 * once  # for ever
+    assert seconds(times=0.0, hold_s=25.0) == pytest.approx(once + 25.0, abs=3.0)
+    assert seconds(times=1.0, hold_s=25.0) == pytest.approx(seconds(times=1.0) + 50.0, abs=6.0)
