@@ -284,6 +284,10 @@ class MavsdkBackend(Backend):
             return Outcome(ok=False, text=f"vehicle {system} is not on the links; check links and system ids")
         if craft.vehicle.detector.phase is Phase.ACTIVE and craft.vehicle.armed:
             return Outcome(ok=False, text=f"vehicle {system} is flying its mission; pause it or let it return first")
+        in_auto = craft.vehicle.armed and craft.vehicle.custom_mode == craft.vehicle.modes.mission
+        if in_auto and craft.vehicle.autopilot is Autopilot.ARDUPILOT:
+            text = f"vehicle {system} is in its mission's mode and would fly items as they come; let it return first"
+            return Outcome(ok=False, text=text)
         if why := why_no_missions(craft.vehicle.kind):
             return Outcome(ok=False, text=f"vehicle {system} {why}")
         wrong = ""

@@ -7,7 +7,6 @@ for; no autopilot answers about a name that it does not have.
 import enum
 import math
 import struct
-from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Final
 
@@ -22,6 +21,7 @@ class Setting(enum.Enum):
     RETURN_HEIGHT = "least height of the way home above home, metres; 0 for the height at which the vehicle is"
     LOW_BATTERY = "action at a low battery"
     NO_STATION = "action where no ground station is heard"
+    NO_STATION_EXCEPT = "modes in which it does nothing of that, bits"
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,12 +41,14 @@ PARAMETERS: Final[dict[Autopilot, tuple[Parameter, ...]]] = {
         Parameter("RTL_ALT", Setting.RETURN_HEIGHT, 0.01),
         Parameter("BATT_FS_LOW_ACT", Setting.LOW_BATTERY),
         Parameter("FS_GCS_ENABLE", Setting.NO_STATION),
+        Parameter("FS_OPTIONS", Setting.NO_STATION_EXCEPT),
     ),
     Autopilot.PX4: (
         Parameter("MPC_XY_VEL_MAX", Setting.SPEED),
         Parameter("RTL_RETURN_ALT", Setting.RETURN_HEIGHT),
         Parameter("COM_LOW_BAT_ACT", Setting.LOW_BATTERY),
         Parameter("NAV_DLL_ACT", Setting.NO_STATION),
+        Parameter("COM_DLL_EXCEPT", Setting.NO_STATION_EXCEPT),
     ),
 }
 """PX4 flies no faster than MPC_XY_VEL_MAX, whatever is asked for. ArduCopter tries to reach what is asked for, up to
@@ -66,6 +68,8 @@ _ACTIONS: Final[dict[str, dict[int, str]]] = {
     "NAV_DLL_ACT": {0: "", 1: "holds", 2: "returns", 3: "lands", 5: "terminates its flight", 6: "disarms"},
 }  # fmt: skip
 """What a vehicle does by a parameter's value, empty for nothing (ArduCopter 4.7, PX4 1.16)."""
+_MISSION_BITS: Final = {"FS_OPTIONS": 1 << 1, "COM_DLL_EXCEPT": 1 << 0}
+"""The bit for a mission; FS_OPTIONS has others for other failsafes."""
 _INTEGERS: Final = {
     int(dialect.MAV_PARAM_TYPE_UINT8): "<B", int(dialect.MAV_PARAM_TYPE_INT8): "<b",
     int(dialect.MAV_PARAM_TYPE_UINT16): "<H", int(dialect.MAV_PARAM_TYPE_INT16): "<h",
@@ -86,13 +90,17 @@ class SetTo:
         known = _ACTIONS.get(self.name, {})
         return known.get(round(self.value), f"does what {self.name} {self.value:g} says")
 
+    @property
+    def spares_missions(self) -> bool:
+        """Whether, of NO_STATION_EXCEPT, a mission is one of these modes."""
+        return bool(int(self.value) & _MISSION_BITS.get(self.name, 0))
 
-def questions(address: Address, autopilot: Autopilot, known: Collection[Setting]) -> list[Message]:
-    """Requests for the settings that are not known yet."""
+
+def questions(address: Address, autopilot: Autopilot) -> list[Message]:
+    """Requests for the settings: all of them each time, since another station may have changed them."""
     return [
         dialect.MAVLink_param_request_read_message(address.system, address.component, parameter.name.encode(), -1)
         for parameter in PARAMETERS[autopilot]
-        if parameter.setting not in known
     ]
 
 

@@ -64,9 +64,10 @@ class Dialogues:
         self._reap()
 
     def make_way(self, system: int) -> None:
-        """End an active command for a newer one (an upload may continue)."""
+        """End an active command for a newer one (an upload may continue, unless it still changes the mode)."""
         for job in self.jobs:
-            if job.vehicle.system == system and not isinstance(job, (MissionUpload, MissionDownload)):
+            moves = not isinstance(job, (MissionUpload, MissionDownload)) or job.leaves_mode
+            if job.vehicle.system == system and moves:
                 job.cancel("another command came in between")
         self._reap()
 
@@ -146,7 +147,7 @@ class Dialogues:
         if vehicle is None:
             return
         if isinstance(job, MissionUpload) and job.outcome is not None and job.outcome.ok:
-            vehicle.mission, vehicle.mission_seq = job.mission, 0
+            vehicle.mission, vehicle.mission_seq, vehicle.unbegun = job.mission, 0, True
             vehicle.detector.uploaded(job.mission)
             return
         mission = None

@@ -212,7 +212,12 @@ class Fleet:
             )
         vehicle.mission = None
         vehicle.detector.uploaded(None)
-        return self.begin(MissionUpload(vehicle.address, self.own, mission=mission))
+        # In AUTO, even paused, ArduPilot flies the item that is stored under the current number: a new RTL at once.
+        in_auto = vehicle.autopilot is Autopilot.ARDUPILOT and vehicle.custom_mode == vehicle.modes.mission
+        leave = vehicle.pilot.set_mode(vehicle.modes.hold) if in_auto and vehicle.armed else None
+        if leave is not None:
+            leave.expires = self._clock() + COMMAND.fresh_s
+        return self.begin(MissionUpload(vehicle.address, self.own, mission=mission, leave=leave))
 
     def download(self, system: int) -> MissionDownload:
         """Read the mission of a vehicle, and ask for the settings that a check compares with it."""
@@ -327,6 +332,8 @@ class Fleet:
         Raises:
             OrthoSwarmError: it is not within its mission.
         """
+        if vehicle.unbegun:  # its autopilot would go on at the item at which it left the mission before
+            raise OrthoSwarmError(f"vehicle {vehicle.system} has not begun the mission that it was given; start it")
         state = flight_state(vehicle)
         # A station that has just begun to listen does not know the mission's phase: then the mode of a pause counts.
         begun = vehicle.mission_seq >= (1 if vehicle.autopilot is Autopilot.ARDUPILOT else 0)  # its item 0 is its home

@@ -329,7 +329,10 @@ def _return(vehicle: "Vehicle", needed_m: float | None) -> Item:
 
 def _failsafe(vehicle: "Vehicle") -> Item:
     low, alone = (vehicle.settings.get(s) for s in (Setting.LOW_BATTERY, Setting.NO_STATION))
+    spared = vehicle.settings.get(Setting.NO_STATION_EXCEPT)
     text = "" if alone is None else f"; without a ground station it {alone.action or 'goes on'} ({alone.name})"
+    if alone is not None and alone.action and spared is not None and spared.spares_missions:
+        text += f", but not on a mission ({spared.name})"
     if low is None:
         return Item("failsafe", Level.OK, f"it has not said what it does when its battery is low{text}")
     if not low.action:

@@ -219,13 +219,15 @@ class Reception:
             self._compare_routes(vehicle, now)
         elif verdict == "rebooted" and route is vehicle.route:
             self._event("rebooted", vehicle, "has restarted")
-            vehicle.mission = None
+            vehicle.mission, vehicle.unbegun = None, False
+            vehicle.settings.clear()  # it may have been set up anew
             self._mission_events(vehicle, vehicle.detector.rebooted())
             self._dialogues.send(vehicle.system, vehicle.streams.start(now))
             self._dialogues.rebooted(vehicle, now)
 
     def _mission_events(self, vehicle: Vehicle, events: Sequence[MissionEvent]) -> None:
         for event in events:
+            vehicle.unbegun &= event is not MissionEvent.STARTED
             kind, text = mission_event(event)
             self._event(kind, vehicle, text)
 

@@ -8,7 +8,7 @@ from typing import Any, Final
 from gcs_plugin.config import HEARING
 from gcs_plugin.fleet.autopilot_settings import Setting, SetTo, answer, questions
 from gcs_plugin.fleet.flight_state import flight_state
-from gcs_plugin.fleet.message_rates import GPS_RAW_INT, SYS_STATUS, Streams
+from gcs_plugin.fleet.message_rates import GLOBAL_POSITION_INT, GPS_RAW_INT, SYS_STATUS, Streams
 from gcs_plugin.fleet.routes import Route, Routes
 from gcs_plugin.fleet.telemetry_check import has_place
 from gcs_plugin.links.mavlink import Autopilot, Message, dialect
@@ -49,6 +49,7 @@ class Vehicle:
         boot_utc_s: UTC epoch seconds of its start, from its SYSTEM_TIME; None before it knows the time.
         time_boot_s: its own clock at the last position.
         mission: what it holds, where that was read or written in this session.
+        unbegun: it was given that mission here and has not begun it.
         photos: pictures that it has reported.
         received: packets; missed: packets lost according to its counters.
         impossible: number of messages with values out of range, which were dropped.
@@ -93,6 +94,7 @@ class Vehicle:
     gps_fix: int = 0
     satellites: int = 0
     mission: Mission | None = None
+    unbegun: bool = False
     mission_state: int = 0
     mission_seq: int = 0
     mission_total: int = 0
@@ -139,6 +141,10 @@ class Vehicle:
         """True if it is armed and, as far as is known, off the ground."""
         return self.armed and (self.in_air or (not self.landed and self.height_m > 1.5))
 
+    def place_age_s(self, now: float) -> float:
+        """Seconds since it reported where it is, or since it was heard, if that is longer ago."""
+        return max(now - self.heard, self.streams.age_s(GLOBAL_POSITION_INT, now) or 0.0)
+
     @property
     def route(self) -> Route | None:
         """The way that carries commands, None before it was heard."""
@@ -159,8 +165,8 @@ class Vehicle:
         return [text for text, said in self._prearm.items() if now - said < _PREARM_S]
 
     def setting_questions(self) -> list[Message]:
-        """Requests for its settings that are not known yet."""
-        return questions(self.address, self.autopilot, self.settings)
+        """Requests for its settings."""
+        return questions(self.address, self.autopilot)
 
     @property
     def pilot(self) -> Pilot:

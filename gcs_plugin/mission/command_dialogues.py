@@ -440,7 +440,12 @@ class Pilot:
             left = "it is still armed: disarm it with the radio control"
             go = OrUndo(self.vehicle, self.own, steps=[go, disarm], undone="it was disarmed again", left=left)
         flies = Confirm(self.vehicle, self.own, shown=self._flies, what="flies its mission")
-        steps += [self.set_mode(self.modes.ready), arm, go, flies]
+        steps.append(self.set_mode(self.modes.ready))
+        if in_air and self.autopilot is Autopilot.ARDUPILOT:
+            # Its MISSION_START goes on at the item at which it left a mission, be that another one; PX4's names item 0.
+            first = dialect.MAV_CMD_DO_SET_MISSION_CURRENT
+            steps.append(Command(self.vehicle, self.own, command=first, params=(0.0,), verb="begin its mission anew"))
+        steps += [arm, go, flies]
         return Start(self.vehicle, self.own, steps=steps, done="flies its mission", carried=len(steps) - 2)
 
     def pause(self) -> Exchange:
@@ -459,12 +464,9 @@ class Pilot:
     def rtl(self) -> Exchange:
         """Fly home and land."""
         home = Command(
-            self.vehicle,
-            self.own,
-            command=dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH,
-            verb="return to launch",
+            self.vehicle, self.own, command=dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH, verb="return to launch",
             patience_s=_FIRST_S,
-        )
+        )  # fmt: skip
         return Either(self.vehicle, self.own, steps=[home, self.set_mode(self.modes.rtl)])
 
     def land(self) -> Exchange:
@@ -479,13 +481,9 @@ class Pilot:
 
     def _pause_continue(self, go_on: float, verb: str) -> Command:
         return Command(
-            self.vehicle,
-            self.own,
-            command=dialect.MAV_CMD_DO_PAUSE_CONTINUE,
-            params=(go_on,),
-            verb=verb,
+            self.vehicle, self.own, command=dialect.MAV_CMD_DO_PAUSE_CONTINUE, params=(go_on,), verb=verb,
             patience_s=_FIRST_S,
-        )
+        )  # fmt: skip
 
     def _flies(self, message: Message) -> bool:
         return bool(

@@ -122,6 +122,11 @@ class Exchange(abc.ABC):
         return MISSION
 
     @property
+    def leaves_mode(self) -> bool:
+        """Whether a transfer of a mission is still changing the vehicle's mode."""
+        return False
+
+    @property
     def progress(self) -> float:
         """How far it is, 0 to 1."""
         return 0.0 if self.outcome is None else 1.0

@@ -41,6 +41,7 @@ _SAME_REQUEST_S: Final = 0.03
 class Stage(enum.Enum):
     """The state of an upload."""
 
+    LEAVE = "leaving the mission's mode"
     COUNT = "announced"
     ITEMS = "sending"
     PAUSE = "waiting"
@@ -57,6 +58,7 @@ class MissionUpload(Exchange):
         mission: what to upload.
         patience_s: silence after which it gives up.
         attempts: number of restarts (time-outs of the vehicle, reboots, a different stored mission).
+        leave: a change of mode before anything is sent, for a vehicle that would fly items as they arrive.
         stage: what it is doing.
         refusal: the vehicle's refusal in words, where the outcome is one.
     """
@@ -64,6 +66,7 @@ class MissionUpload(Exchange):
     mission: Mission = field(kw_only=True)
     patience_s: float = field(default=30.0, kw_only=True)
     attempts: int = field(default=12, kw_only=True)
+    leave: Exchange | None = field(default=None, kw_only=True)
     stage: Stage = field(default=Stage.PAUSE, init=False)
     refusal: Refusal | None = field(default=None, init=False)
     _begun: int = field(default=0, init=False)
@@ -87,10 +90,15 @@ class MissionUpload(Exchange):
         """Announce the mission."""
         self._heard_at = now
         self._trip.longest_s = 2.0 / max(1.0, self.pace)
+        if self.leave is not None:
+            self.stage = Stage.LEAVE
+            return self._follow(self.leave, self.leave.start(now), now)
         return self._announce(now)
 
     def feed(self, message: Message, now: float) -> list[Message]:
         """Process requests, acknowledgements and, while reading back, items."""
+        if self.stage is Stage.LEAVE and self.leave is not None and self.outcome is None:
+            return self._follow(self.leave, self.leave.feed(message, now), now)
         kind = self._mission_kind(message)
         if self.stage is Stage.CLEAR:
             if kind == "MISSION_ACK" and message.type == ACCEPTED:
@@ -108,6 +116,8 @@ class MissionUpload(Exchange):
         """Repeat, start again, or give up."""
         if self.outcome is not None or now < self.deadline:
             return []
+        if self.stage is Stage.LEAVE and self.leave is not None:
+            return self._follow(self.leave, self.leave.tick(now), now)
         if self.stage is Stage.CLEAR:
             return self._clear(now)
         if self._reading is not None:
@@ -134,6 +144,17 @@ class MissionUpload(Exchange):
         """Start again: a rebooted vehicle has dropped the upload, and perhaps stored half of it."""
         return [] if self.outcome is not None else self._announce(now)
 
+    def took(self) -> None:
+        """A link has accepted a message."""
+        self.delivered += 1
+        if self.stage is Stage.LEAVE and self.leave is not None:
+            self.leave.took()
+
+    @property
+    def leaves_mode(self) -> bool:
+        """See Exchange."""
+        return self.stage is Stage.LEAVE
+
     @property
     def progress(self) -> float:
         """Share of the work that is done; sending and reading back count half each."""
@@ -144,6 +165,19 @@ class MissionUpload(Exchange):
         return 0.5 * (self._served + 1) / max(1, len(self.mission))
 
     # --- sending ---
+
+    def _follow(self, leave: Exchange, messages: list[Message], now: float) -> list[Message]:
+        """Announce the mission once the vehicle has left its mission's mode."""
+        self.deadline, outcome = leave.deadline, leave.outcome
+        if outcome is None:
+            return messages
+        if outcome.ok:
+            return messages + self._announce(now)
+        self.stage = Stage.DONE
+        self._end(
+            False, f"{outcome.text}; it was sent no mission, since it would fly items as they come", outcome.failure
+        )
+        return messages
 
     def _count_message(self) -> Message:
         to = self.vehicle

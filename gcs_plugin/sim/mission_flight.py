@@ -192,7 +192,11 @@ class Flight:
             return "Mission start: not armed"
         self.armed, self.mode = True, self.modes.mission
         if self.state is not State.ACTIVE or self._task is Task.STAND:
-            self.seq, self.state, self._jumps = first, State.NOT_STARTED, {}
+            # ArduCopter goes on where it left a mission, though another one has been stored since (MIS_RESTART 0).
+            goes_on = self.autopilot is Autopilot.ARDUPILOT and self.state is not State.COMPLETE
+            if not (goes_on and first <= self.seq < len(self.store.items)):
+                self.seq, self._jumps = first, {}
+            self.state = State.NOT_STARTED
             self._enter_mission()
         return ""
 
@@ -209,9 +213,13 @@ class Flight:
         return True
 
     def set_current(self, seq: int) -> bool:
-        """Jump to an item."""
-        if not self._first <= seq < len(self.store.items):
+        """Jump to an item; ArduPilot's item 0 stands for the beginning."""
+        if not 0 <= seq < len(self.store.items):
             return False
+        if seq < self._first:
+            seq, self._jumps = self._first, {}
+        if self.state is State.COMPLETE:
+            self.state = State.NOT_STARTED
         self.seq = seq
         if self.state is State.ACTIVE:
             self._run_from(seq)

@@ -58,6 +58,8 @@ class SimVehicle:
             are sent first.
         files: what it serves over MAVLink FTP; None for one without.
         on_exposure: called at each picture.
+        withheld: ids of messages that it does not send, whatever it is asked for.
+        parameters: by name; integers are those that the autopilot keeps as such.
     """
 
     system: int
@@ -75,6 +77,8 @@ class SimVehicle:
     on_exposure: "Callable[[SimVehicle, Exposure], None] | None" = None
     flight: Flight = field(init=False)
     store: MissionStore = field(init=False)
+    withheld: set[int] = field(default_factory=set, init=False)
+    parameters: dict[str, float] = field(init=False)
     reboots: int = field(default=0, init=False)
     _now: float = field(default=0.0, init=False)
     _booted: float = field(default=0.0, init=False)
@@ -94,6 +98,12 @@ class SimVehicle:
         """Stand at home with an empty store."""
         if self.autopilot is Autopilot.PX4:
             self.airframe = replace(self.airframe, top_m_s=min(self.airframe.top_m_s, _PX4_TOP_M_S))
+        self.parameters = {
+            "WPNAV_SPEED": 100.0 * _WPNAV_SPEED_M_S, "RTL_ALT": 100.0 * RTL_HEIGHT_M, "FS_GCS_ENABLE": 0,
+        }  # fmt: skip
+        if self.autopilot is Autopilot.PX4:
+            top_m_s = self.airframe.top_m_s
+            self.parameters = {"MPC_XY_VEL_MAX": top_m_s, "RTL_RETURN_ALT": RTL_HEIGHT_M, "NAV_DLL_ACT": 0}
         home = MissionItem.at(WAYPOINT, *self.home, frame=FRAME_GLOBAL)
         items = [home] if self.autopilot is Autopilot.ARDUPILOT else []
         self.store = MissionStore(autopilot=self.autopilot, home=home, items=items)
@@ -177,11 +187,7 @@ class SimVehicle:
 
     def _parameter(self, name: str) -> list[Message]:
         """The value of a parameter; an autopilot does not answer about one that it has not."""
-        known: dict[str, float] = {
-            "WPNAV_SPEED": 100.0 * _WPNAV_SPEED_M_S, "RTL_ALT": 100.0 * RTL_HEIGHT_M, "FS_GCS_ENABLE": 0,
-        }  # fmt: skip
-        if self.autopilot is Autopilot.PX4:
-            known = {"MPC_XY_VEL_MAX": self.airframe.top_m_s, "RTL_RETURN_ALT": RTL_HEIGHT_M, "NAV_DLL_ACT": 0}
+        known = self.parameters
         if name not in known:
             return []
         value, kind = known[name], int(dialect.MAV_PARAM_TYPE_REAL32)
@@ -282,7 +288,7 @@ class SimVehicle:
             hz = self._rates.get(kind, 0.0)
             if hz > 0.0:
                 heapq.heappush(self._due, (max(at + 1.0 / hz, now - 1.0), kind))
-                message = _MAKERS[kind](self)
+                message = None if kind in self.withheld else _MAKERS[kind](self)
                 if message is not None and (kind == _HEARTBEAT or self._tx_room >= _bytes(message)):
                     self._spend([message], now)
                     messages.append(message)

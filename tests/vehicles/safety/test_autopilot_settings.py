@@ -108,16 +108,46 @@ def test_a_vehicle_that_does_nothing_at_a_low_battery_is_warned_about(make_world
     assert items_of(world, Wanted())["failsafe"].level is Level.OK
 
 
-def test_each_autopilot_is_asked_for_every_setting_until_it_has_answered(make_world):
+def test_each_autopilot_is_asked_for_every_setting_each_time_that_its_mission_is_read(make_world):
     for parameters in PARAMETERS.values():
         assert {parameter.setting for parameter in parameters} == set(Setting)
     world = make_world(SimVehicle(system=1, autopilot=AP))
     world.meet()
     vehicle = world.fleet.vehicles[1]
-    assert len(vehicle.setting_questions()) == len(PARAMETERS[AP])
+    for height_m in (30.0, 10.0):  # changed by another station in between
+        world.vehicles[1].parameters["RTL_ALT"] = 100.0 * height_m
+        world.finish(world.fleet.download(1))
+        world.wait(1.0)
+        assert vehicle.settings[Setting.RETURN_HEIGHT] == SetTo("RTL_ALT", height_m)
+
+
+def test_what_a_vehicle_was_set_to_before_its_restart_does_not_count(make_world):
+    world = make_world(SimVehicle(system=1, autopilot=AP))
+    world.meet()
+    world.finish(world.fleet.download(1))
+    world.wait(20.0)
+    vehicle, needs = world.fleet.vehicles[1], Wanted(needs=PlanNeeds(return_height_m=10.0))
+    assert items_of(world, needs)["return"].level is Level.OK
+    world.vehicles[1].parameters["RTL_ALT"] = 500.0
+    world.vehicles[1].reboot(world.clock.now)
+    assert world.until(lambda: any(event.kind == "rebooted" for event in world.events), 30.0)
+    assert not vehicle.settings and items_of(world, needs)["return"].level is Level.WARNING
     world.finish(world.fleet.download(1))
     world.wait(1.0)
-    assert [m.param_id.rstrip("\x00") for m in vehicle.setting_questions()] == ["BATT_FS_LOW_ACT"]
+    assert items_of(world, needs)["return"].level is Level.RED
+
+
+@BOTH
+def test_a_mission_that_goes_on_without_a_ground_station_is_said(make_world, autopilot):
+    world = make_world(SimVehicle(system=1, autopilot=autopilot))
+    world.meet()
+    names, bit = {AP: ("FS_GCS_ENABLE", "FS_OPTIONS"), PX4: ("NAV_DLL_ACT", "COM_DLL_EXCEPT")}[autopilot], 0
+    for bit, said in ((2 if autopilot is AP else 1, True), (16 if autopilot is AP else 2, False)):
+        world.vehicles[1].parameters |= {names[0]: 2, names[1]: bit}
+        world.finish(world.fleet.download(1))
+        world.wait(1.0)
+        reason = items_of(world, Wanted())["failsafe"].reason
+        assert "without a ground station it returns" in reason and (f"not on a mission ({names[1]})" in reason) is said
 
 
 def test_a_plan_says_what_it_needs(tmp_path):
