@@ -205,6 +205,8 @@ def _gps(vehicle: "Vehicle", now: float) -> Item:
         return Item("gps", Level.RED, f"no 3D fix ({count if count != _UNKNOWN_SATELLITES else 0} satellites)")
     if vehicle.lat_deg is None:
         return Item("gps", Level.RED, "it has not reported its position")
+    if (age_s := vehicle.place_age_s(now)) > LIMITS.old_s:
+        return Item("gps", Level.RED, f"it has not reported its position for {age_s:.0f} s")
     if count < _SATELLITES[0]:
         return Item("gps", Level.RED, f"{count} satellites, {_SATELLITES[0]} are needed")
     level = Level.OK if count >= _SATELLITES[1] else Level.WARNING

@@ -12,11 +12,11 @@ from gcs_plugin.fleet.dialogues import Dialogues
 from gcs_plugin.fleet.fleet_events import FleetEvent, Pair, mission_event
 from gcs_plugin.fleet.link_hub import Hub, Side
 from gcs_plugin.fleet.message_rates import Rates, Streams
-from gcs_plugin.fleet.routes import Route
+from gcs_plugin.fleet.routes import LongText, Route
 from gcs_plugin.fleet.separation.separation_watch import SeparationWatch, apart_text, near_text
 from gcs_plugin.fleet.telemetry_check import has_place, possible
 from gcs_plugin.fleet.vehicle_state import Vehicle
-from gcs_plugin.links.mavlink import Autopilot, Message, dialect, is_autopilot
+from gcs_plugin.links.mavlink import Autopilot, Message, dialect, is_vehicle
 from gcs_plugin.links.packets import Packet
 from gcs_plugin.links.transports import Peer
 from gcs_plugin.mission.completion import RELEVANT, CompletionDetector, MissionEvent, Phase
@@ -43,6 +43,7 @@ _POSITION: Final = MESSAGE_IDS["GLOBAL_POSITION_INT"]
 _SAME_TEXT_S: Final = 1.5
 _OVERTAKEN: Final = 64  # packets of its sender that a late one may be behind
 _PART: Final = 50  # characters of a STATUSTEXT
+_PARTS_S: Final = 1.5  # its parts are sent one after the other
 _PHOTOS: Final = frozenset({MESSAGE_IDS["CAMERA_FEEDBACK"], MESSAGE_IDS["CAMERA_IMAGE_CAPTURED"]})
 
 
@@ -67,9 +68,8 @@ class Reception:
     ) -> None:  # fmt: skip
         self._vehicles, self._hub, self._dialogues, self._own = vehicles, hub, dialogues, own
         self._rates, self._remembered, self._publish, self._wall = rates, dict(remembered), event, wall
-        self._counters: dict[tuple[Peer, int, int], int] = {}
+        self._counters: dict[tuple[Side, Peer, int, int], int] = {}
         self._said: dict[tuple[int, str], tuple[float, Route]] = {}
-        self._parts: dict[int, tuple[int, list[str]]] = {}
         self._lateness: dict[int, Lateness] = {}
         self.separation = SeparationWatch()
         self.handlers: dict[int, list[Handler]] = {}
@@ -90,12 +90,13 @@ class Reception:
             if vehicle is None:
                 return
         kind = packet.kind
-        late, lost = self._count(vehicle, peer, packet, now)
+        late, lost = self._count(vehicle, (side, peer, packet.system, packet.component), packet.seq, now)
         if not possible(packet.message):
             vehicle.impossible += 1
             return
-        vehicle.heard, vehicle.signs = now, vehicle.signs or packet.signed
+        vehicle.signs |= packet.signed
         if packet.component == vehicle.address.component:
+            vehicle.heard = now  # a camera or companion that is heard says nothing about it
             route = self._route(vehicle, side, peer, now)
             route.counted(lost)
             repeated = kind in _REPEATED and vehicle.routes.stale(route, now)
@@ -111,21 +112,20 @@ class Reception:
         for handler in self.handlers.get(kind, ()):
             handler(vehicle, packet.message, utc)
 
-    def _count(self, vehicle: Vehicle, peer: Peer, packet: Packet, now: float) -> tuple[bool, int]:
-        """Track a sender's packet counter: whether a packet was overtaken (or is a copy), and the number lost.
+    def _count(self, vehicle: Vehicle, counter: tuple[Side, Peer, int, int], seq: int, now: float) -> tuple[bool, int]:
+        """Track a sender's packet counter on a link: autopilots count the packets of each of their ports separately.
 
-        Returns True for an overtaken one, and the number of packets lost just before this one.
+        Returns True for an overtaken one (or a copy), and the number of packets lost just before this one.
         """
-        counter = (peer, packet.system, packet.component)
         last, lost = self._counters.get(counter), 0
         vehicle.received += 1
         if last is not None:
-            gap = (packet.seq - last - 1) & 0xFF
+            gap = (seq - last - 1) & 0xFF
             if gap >= 256 - _OVERTAKEN and now - vehicle.heard < 1.0:
                 return True, 0
             lost = gap if gap < 128 else 0
             vehicle.missed += lost
-        self._counters[counter] = packet.seq
+        self._counters[counter] = seq
         return False, lost
 
     def _route(self, vehicle: Vehicle, side: Side, peer: Peer, now: float) -> Route:
@@ -157,26 +157,31 @@ class Reception:
         if kind == _ACK:
             self._dialogues.send(vehicle.system, vehicle.streams.acknowledged(message, now))
         elif kind == _TEXT:
-            for text in self._joined(vehicle.system, message):
-                self._text(vehicle, route, text, int(message.severity), now)
+            self._text_part(vehicle, route, message, now)
         if kind in _DETECTED and not (kind in _REQUESTS and message.target_system == self._own.system):
             self._mission_events(vehicle, vehicle.detector.feed(message))
         self._dialogues.feed(vehicle, message, now)
 
-    def _joined(self, system: int, message: Message) -> list[str]:
-        """The texts completed by a message: a long text is sent in several parts of 50 characters with a common number.
+    def _text_part(self, vehicle: Vehicle, route: Route, message: Message, now: float) -> None:
+        """Process a STATUSTEXT: a long text is sent in parts of 50 characters with a common number.
 
-        If the last part was lost, the known parts are returned when the next text arrives.
+        Autopilots number the texts of each of their ports separately. A copy of a part changes nothing.
         """
-        number, text = int(message.id), str(message.text)
-        begun, parts = self._parts.pop(system, (number, []))
-        texts = [] if begun == number else ["".join(parts)]
-        received = [*parts, text] if begun == number else [text]
-        if number and len(text) >= _PART:
-            self._parts[system] = number, received
-        else:
-            texts.append("".join(received))
-        return [text.strip("\x00\t ") for text in texts]
+        number, part, text = int(message.id), int(message.chunk_seq), str(message.text)
+        last = route.text
+        if last is None or not number or last.number != number or last.parts.get(part, text) != text:
+            self._tell(vehicle, route, now)
+            last = route.text = LongText(number, int(message.severity), now)
+        last.parts.setdefault(part, text)
+        if not number or len(text) < _PART:
+            self._tell(vehicle, route, now)
+
+    def _tell(self, vehicle: Vehicle, route: Route, now: float) -> None:
+        """Pass on what has arrived of a text: all of it, or its last part is lost, or was as long as those before."""
+        text = route.text
+        if text is not None and not text.told:
+            text.told = True
+            self._text(vehicle, route, text.joined.strip("\x00\t "), text.severity, now)
 
     def _text(self, vehicle: Vehicle, route: Route, text: str, severity: int, now: float) -> None:
         """Pass a text on once, even if it arrives on two links."""
@@ -190,7 +195,7 @@ class Reception:
         self._event("text", vehicle, f"says: {text}", severity=severity)
 
     def _found(self, packet: Packet, now: float) -> Vehicle | None:
-        if packet.kind != _HEARTBEAT or not is_autopilot(packet.message):
+        if packet.kind != _HEARTBEAT or not is_vehicle(packet.message, packet.component):
             return None
         heartbeat, address = packet.message, Address(packet.system, packet.component)
         autopilot = Autopilot.of(heartbeat)
@@ -246,6 +251,9 @@ class Reception:
             self._watch_times(vehicle)
             self._dialogues.send(vehicle.system, vehicle.streams.tick(now))
             self._ask_why(vehicle, now)
+            for route in vehicle.routes.known.values():
+                if route.text is not None and now - route.text.begun > _PARTS_S:
+                    self._tell(vehicle, route, now)
             if now - vehicle.heard > HEARING.lost_s:
                 vehicle.lost = True
                 self._event("lost", vehicle, f"has been silent for {HEARING.lost_s:.0f} s")

@@ -49,6 +49,28 @@ class BootClock:
         return "mixed" if again else "rebooted"
 
 
+@dataclass(slots=True)
+class LongText:
+    """A text that an autopilot sends in several messages.
+
+    Attributes:
+        number: that its parts have in common, 0 for a text in one message.
+        severity: MAV_SEVERITY. begun: when the first part came (the fleet's clock).
+        parts: as far as they have arrived, by their place; told: it was passed on.
+    """
+
+    number: int
+    severity: int
+    begun: float
+    parts: dict[int, str] = field(default_factory=dict)
+    told: bool = False
+
+    @property
+    def joined(self) -> str:
+        """The text, with a mark for what was lost."""
+        return "".join(self.parts.get(k, "...") for k in range(max(self.parts, default=-1) + 1))
+
+
 @dataclass(slots=True, kw_only=True)
 class Route:
     """A route on which a vehicle is heard.
@@ -60,6 +82,7 @@ class Route:
         boot: the vehicle's start on that clock, from its own counter; None before the first position.
         boot_at: when that was computed; asked_at: when its clock was asked for.
         clock: watches the counter.
+        text: the autopilot's last text on it.
     """
 
     side: "Side"
@@ -70,6 +93,7 @@ class Route:
     boot_at: float = 0.0
     asked_at: float = 0.0
     clock: BootClock = field(default_factory=BootClock)
+    text: LongText | None = None
     _mark: tuple[float, float] | None = None
 
     def pace(self, time_boot_s: float, now: float) -> float | None:

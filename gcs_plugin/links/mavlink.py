@@ -19,7 +19,27 @@ Message = Any
 AUTOPILOT_COMPONENT: Final = 1
 BROADCAST: Final = 0
 
-__all__ = ["AUTOPILOT_COMPONENT", "BROADCAST", "Autopilot", "Message", "command_name", "dialect", "is_autopilot"]
+# What a system carries besides its autopilot, or on the ground. Some of these name an autopilot in their HEARTBEATs,
+# too: many programs on companion computers say "generic".
+_NO_VEHICLES: Final = frozenset(
+    int(getattr(dialect, f"MAV_TYPE_{name}"))
+    for name in (
+        "GCS", "ANTENNA_TRACKER", "ONBOARD_CONTROLLER", "GIMBAL", "ADSB", "CAMERA", "CHARGING_STATION", "FLARM",
+        "SERVO", "ODID", "BATTERY", "PARACHUTE", "LOG", "OSD", "IMU", "GPS", "WINCH",
+    )
+)  # fmt: skip
+_KNOWN: Final = frozenset({int(dialect.MAV_AUTOPILOT_ARDUPILOTMEGA), int(dialect.MAV_AUTOPILOT_PX4)})
+
+__all__ = [
+    "AUTOPILOT_COMPONENT",
+    "BROADCAST",
+    "Autopilot",
+    "Message",
+    "command_name",
+    "dialect",
+    "is_autopilot",
+    "is_vehicle",
+]
 
 
 class Autopilot(enum.Enum):
@@ -35,11 +55,17 @@ class Autopilot(enum.Enum):
 
 
 def is_autopilot(heartbeat: Message) -> bool:
-    """True for the HEARTBEAT of a flight controller; cameras, gimbals and ground stations send others."""
-    return bool(
-        heartbeat.autopilot != dialect.MAV_AUTOPILOT_INVALID
-        and heartbeat.type not in (dialect.MAV_TYPE_GCS, dialect.MAV_TYPE_GIMBAL, dialect.MAV_TYPE_CAMERA)
-    )
+    """True for the HEARTBEAT of a flight controller; cameras, companions and ground stations send others."""
+    return bool(heartbeat.autopilot != dialect.MAV_AUTOPILOT_INVALID and heartbeat.type not in _NO_VEHICLES)
+
+
+def is_vehicle(heartbeat: Message, component: int) -> bool:
+    """True if the sender of a HEARTBEAT, a component of its system, is that vehicle's autopilot.
+
+    Whoever is taken for it gets the commands. Another component than an autopilot's usual one must name one of the two
+    that are known here: with type and autopilot "generic" it may be anything.
+    """
+    return is_autopilot(heartbeat) and (component == AUTOPILOT_COMPONENT or heartbeat.autopilot in _KNOWN)
 
 
 def command_name(command: int) -> str:

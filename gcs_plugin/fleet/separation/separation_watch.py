@@ -24,7 +24,7 @@ class Near:
         one: system id. other: system id of the one that should be paused.
         metres: horizontal distance. height_m: difference in height.
         ahead_s: in how many seconds, if both fly straight on; 0 for now.
-        silent: vehicles of the two that are not heard, so that it is not known whether they are still near.
+        silent: vehicles of the two that do not report where they are, so that it is not known whether they are near.
     """
 
     one: int
@@ -62,10 +62,11 @@ class SeparationWatch:
     def look(self, vehicles: "Iterable[Vehicle]", now: float) -> tuple[list[Near], list[tuple[int, int]]]:
         """Compare all pairs; returns new or newly unknown alarms, and the pairs whose alarm is over.
 
-        The alarm of a pair stays while one of the two that flew is not heard: nobody knows that they are apart.
+        The alarm of a pair stays while one of the two that flew does not report its place (it is not heard, or its
+        filter has lost it): nobody knows that they are apart.
         """
-        aloft = {v.system: v for v in vehicles if v.flying and v.lat_deg is not None}
-        silent = {s for s, v in aloft.items() if now - v.heard >= HEARING.fresh_s}
+        aloft = {v.system: v for v in vehicles if v.flying}
+        silent = {s for s, v in aloft.items() if v.lat_deg is None or v.place_age_s(now) >= HEARING.fresh_s}
         flying = [v for s, v in aloft.items() if s not in silent]
         found: dict[tuple[int, int], Near] = {}
         if len(flying) > 1:
@@ -135,7 +136,7 @@ def near_text(near: Near, watch: SeparationWatch, name: Callable[[int], str] = n
         lost = " and ".join(name(system) for system in near.silent)
         return (
             f"{one} and {other} were {near.metres:.1f} m apart and {near.height_m:.1f} m in height; where they are now "
-            f"is not known, the link to {lost} is lost: pause {other}"
+            f"is not known, as {lost} last said so over {HEARING.fresh_s:.0f} s ago: pause {other}"
         )
     when = f"will be in {near.ahead_s:.0f} s" if near.ahead_s >= 1.0 else "are"
     return (

@@ -4,7 +4,8 @@ import math
 
 import pytest
 
-from gcs_plugin.fleet.preflight import Wanted, preflight
+from gcs_plugin.fleet.preflight import Level, Wanted, preflight
+from gcs_plugin.fleet.separation.separation_watch import SeparationWatch
 from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.mission.exchange import Address
 from gcs_plugin.sim.lossy_radio import Faults
@@ -67,7 +68,7 @@ def test_an_alarm_does_not_end_because_a_link_is_lost(make_world):
     world.link.down.faults = Faults(silent=((world.clock.now, world.clock.now + 9.0),))
     world.wait(8.0)
     since = [event for event in world.events[said:] if event.kind in ("near", "apart")]
-    assert [event.kind for event in since] == ["near"] and "the link to v1 and v2 is lost" in since[0].text
+    assert [event.kind for event in since] == ["near"] and "as v1 and v2 last said so" in since[0].text
     assert "not known" in world.fleet.separation.text(1) and "not known" in world.fleet.separation.text(2)
     assert world.until(lambda: world.events[-1].kind == "apart" or not world.fleet.separation.alarms, 240.0)
 
@@ -93,3 +94,24 @@ def test_battery_and_receiver_are_asked_for_again_and_have_an_age(make_world, au
     assert any(item.name == age.removesuffix("_s") and "has not reported" in item.reason for item in check.red())
     world.wait(30.0)
     assert vehicle.summary(world.clock.now)[age] == 0
+
+
+@BOTH
+def test_a_vehicle_that_no_longer_says_where_it_is_is_not_taken_to_be_where_it_was(make_world, autopilot):
+    world = make_world(SimVehicle(system=1, autopilot=autopilot), SimVehicle(system=2, autopilot=autopilot))
+    world.meet()
+    world.wait(3.0)
+    for vehicle in world.fleet.vehicles.values():  # side by side in the air
+        vehicle.armed, vehicle.landed, vehicle.height_m = True, "in air", 30.0
+    watch = SeparationWatch()
+    new, _ = watch.look(world.fleet.vehicles.values(), world.clock.now)
+    assert [near.silent for near in new] == [()]
+    world.vehicles[1].withheld = {int(dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT)}  # PX4 without a global position
+    world.wait(20.0)
+    for vehicle in world.fleet.vehicles.values():
+        vehicle.armed, vehicle.landed, vehicle.height_m = True, "in air", 30.0
+    new, ended = watch.look(world.fleet.vehicles.values(), world.clock.now)
+    assert [near.silent for near in new] == [(1,)] and not ended and not world.fleet.vehicles[1].lost
+    assert "where they are now is not known, as v1 last said so" in watch.text(2)
+    (gps,) = [i for i in preflight(world.fleet.vehicles[1], Wanted(), world.clock.now).items if i.name == "gps"]
+    assert gps.level is Level.RED and "not reported its position for" in gps.reason
