@@ -89,6 +89,8 @@ class IngestConfig:
     """Width at which they are compared, pixels (chosen)."""
     turning_longest_s: float = 600.0
     """Longest part of a video that is compared, seconds (chosen)."""
+    turning_margin: float = 0.1
+    """The turns of a video decide between two clocks, or two logs, if their correlations differ by more (chosen)."""
     nadir_within_deg: float = 45.0
     """A gimbal roll near 180 degrees is a turned yaw if the camera looks within this of nadir, degrees (chosen)."""
     outlying_position_m: float = 100.0
@@ -99,6 +101,9 @@ class IngestConfig:
     """Pitches below this are counted from the horizon, not from nadir, degrees: mapping cameras look down (chosen)."""
     least_height_m: float = 1.0
     """Recorded heights below this were never filled in, metres (chosen)."""
+    least_flown_height_m: float = 5.0
+    """A video whose heights reach this was recorded with heights: those near zero at its ends are true, metres
+    (chosen)."""
     most_height_m: float = 12_000.0
     """Recorded heights above this are not heights above ground, metres (chosen)."""
     motion_least_inliers: int = 25
@@ -126,5 +131,18 @@ class IngestConfig:
     """Candidates at most (chosen: memory)."""
     zoom_step: float = 0.03
     """Natural logarithm of the field of view's change from which on a video's lens counts as another (chosen)."""
+    restart_s: float = 1.0
+    """A stream whose decoding times go back by more than this starts its clock again, seconds: within a recording they
+    never do (chosen, above what containers round)."""
+    subtitle_restart_s: float = 5.0
+    """Subtitles whose times go back by more than this are those of another recording, seconds (chosen: blocks that are
+    out of order are neighbours)."""
+    subtitle_excess_s: float = 3.0
+    """Subtitles that end later than their video by more than this are of another length, seconds (chosen: the last
+    block of a second may go on for a second or two)."""
+    square_within: float = 0.01
+    """Pixels of a video whose width and height differ by no more than this share count as square (chosen)."""
+    most_aspect: float = 4.0
+    """A ratio of a pixel's sides beyond this is damage (chosen: anamorphic lenses have 2, DV has 16:11)."""
     held_at_ends_s: float = 1.0
     """Metadata with times of its own counts this long before its first and after its last value, seconds (chosen)."""

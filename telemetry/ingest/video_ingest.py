@@ -23,6 +23,8 @@ from telemetry.videos.picture_poses import Poses
 from telemetry.videos.video_file import VideoScan, scan
 
 NO_POSITION = "the video carries no position (SEI, KLV, djmd, subtitles); put an SRT next to it, or give its log, too"
+_WHY_NOT = ("log-ambiguous", "log-unused", "srt-length", "srt-no-position", "unreadable")
+"""Findings that say why a log or an SRT that is there gives no position, in this order."""
 
 
 def read_videos(
@@ -36,9 +38,11 @@ def read_videos(
 ) -> None:
     """Read the videos of a folder, each with the SRT of its name; SRT files without a video are only reported."""
     subtitle_files = {path.stem.lower(): path for path in folder.subtitles}
+    taken: set[Path | None] = set()
     for path in folder.videos:
         name = found.name(path)
-        subtitles = subtitle_files.pop(path.stem.lower(), None)
+        subtitles = subtitle_files.get(path.stem.lower())
+        taken.add(subtitles)
         copy = read_or_reason(local_file, path)
         scanned = copy if isinstance(copy, Unreadable) else read_or_reason(scan, copy)
         if isinstance(scanned, Unreadable):
@@ -58,8 +62,6 @@ def read_videos(
             matched = read_or_reason(add_log, poses, scanned, near)
             unmatched = [Finding("log-unused", f"no log could be matched with {name}: {matched}")]
             poses.findings += unmatched if isinstance(matched, Unreadable) else matched
-        if not poses.has_positions:
-            poses.findings.append(Finding("no-position", f"{name}: {NO_POSITION}"))
         if options.decode:
             _take(
                 path,
@@ -74,7 +76,7 @@ def read_videos(
             )
         else:
             _look(found.videos[path], scanned, poses, source)
-    for path in subtitle_files.values():
+    for path in (path for path in folder.subtitles if path not in taken):
         _lone_subtitles(path, found.name(path), result)
 
 
@@ -98,7 +100,8 @@ def _take(
 ) -> None:
     """Extract pictures and make frames of them."""
     if not poses.has_positions:
-        result.rejected.append(Rejection(name, NO_POSITION, vehicle, lacks_position=True))
+        source.findings += poses.findings
+        result.rejected.append(Rejection(name, _without_position(source.findings), vehicle, lacks_position=True))
         return
     try:
         extraction = extract(
@@ -123,9 +126,17 @@ def _take(
         source.shown[who] = len(photos)
 
 
+def _without_position(findings: Sequence[Finding]) -> str:
+    """Why a video has no position, one sentence."""
+    found = {finding.code: finding.message for finding in findings}
+    return next((f"it has no position: {found[code]}" for code in _WHY_NOT if code in found), NO_POSITION)
+
+
 def _look(vehicle: str, scanned: VideoScan, poses: Poses, source: SourceInfo) -> None:
     """Read only the metadata: the poses of all pictures, by vehicle."""
     source.findings += poses.findings
+    if not poses.has_positions:
+        source.findings.append(Finding("no-position", f"{source.path}: {_without_position(source.findings)}"))
     order = sorted(range(len(scanned.pictures)), key=lambda i: (scanned.pictures[i].video_s or 0.0, i))
     for index in order:
         pose = poses.of(index)

@@ -20,7 +20,7 @@ from telemetry.samples.timeline import Timeline
 from telemetry.videos.extraction import to_rgb
 from telemetry.videos.packet_loss import LiveDamage
 from telemetry.videos.picture_choice import Candidate, Picker
-from telemetry.videos.video_file import NotAVideo, open_video, parked
+from telemetry.videos.video_file import NotAVideo, open_video, parked, picture_stream
 
 _HELD_S = 0.5
 _KEPT_SAMPLES = 64
@@ -126,7 +126,7 @@ def _read(
     import av
     from av.codec.context import Flags
 
-    stream = container.streams.video[0]
+    stream = picture_stream(container)
     context = stream.codec_context
     context.flags |= int(Flags.copy_opaque) | int(Flags.output_corrupt)
     form = bitstream.StreamFormat.of(context.name, context.extradata)
@@ -171,6 +171,7 @@ def _read(
                     frame,
                     reading,
                     lost,
+                    aspect=float(stream.sample_aspect_ratio or 1),
                     klv_samples=klv_samples,
                     picker=picker,
                     number=next(numbers),
@@ -184,6 +185,7 @@ def _offer(
     reading: sei.Reading | None,
     lost: bool,
     *,
+    aspect: float,
     klv_samples: deque[Sample],
     picker: Picker | None,
     number: int,
@@ -206,7 +208,7 @@ def _offer(
         stated = None if one.sample is None else one.sample.time_s
         yield LivePicture(
             number=one.number,
-            rgb=to_rgb(one.frame),
+            rgb=to_rgb(one.frame, aspect),
             sample=one.sample,
             origin=one.origin,
             time_s=clock() if stated is None else stated,

@@ -19,6 +19,7 @@ class Sample:
         pitch_deg: -90 looks straight down. roll_deg: > 0 right side down.
         flight_yaw_deg: heading of the airframe; flight_pitch_deg, flight_roll_deg: its attitude.
         fov_deg: horizontal field of view.
+        zoom: focal length in a unit of the source, which is only comparable within one flight.
         sigma_m: one sigma of the horizontal position.
         vehicle: id of the vehicle.
         height_is_ground: whether height_m is above the ground below.
@@ -37,6 +38,7 @@ class Sample:
     flight_pitch_deg: float | None = None
     flight_roll_deg: float | None = None
     fov_deg: float | None = None
+    zoom: float | None = None
     sigma_m: float | None = None
     vehicle: str | None = None
     height_is_ground: bool = False
@@ -82,6 +84,8 @@ def checked(sample: Sample) -> Sample | None:
             setattr(sample, name, None)
     if sample.fov_deg is not None and not 0.1 < sample.fov_deg < 179.0:
         sample.fov_deg = None
+    if sample.zoom is not None and not sample.zoom > 0.0:
+        sample.zoom = None
     if sample.sigma_m is not None and not 0.0 < sample.sigma_m < 100_000.0:
         sample.sigma_m = None
     if sample.vehicle is not None:

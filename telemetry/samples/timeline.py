@@ -16,7 +16,7 @@ from telemetry.samples.sample import Sample
 Array = NDArray[np.float64]
 
 ANGLES = ("yaw_deg", "pitch_deg", "roll_deg", "flight_yaw_deg", "flight_pitch_deg", "flight_roll_deg")
-LINEAR = ("lat_deg", "height_m", "altitude_m", "fov_deg", "sigma_m")
+LINEAR = ("lat_deg", "height_m", "altitude_m", "fov_deg", "zoom", "sigma_m")
 _WRAPPED = (*ANGLES, "lon_deg")
 FIELDS = (*LINEAR, *_WRAPPED)
 GROUND = "ground_m"

@@ -17,10 +17,11 @@ from telemetry.samples.findings import Finding, plural
 from telemetry.samples.sample import Sample
 from telemetry.samples.times import ZONE_UNKNOWN
 from telemetry.videos.extraction_cache import CachedExtraction, CachedPicture, key_of, recall, remember
+from telemetry.videos.on_ground import on_ground
 from telemetry.videos.packet_loss import Damage, transport_gaps
 from telemetry.videos.picture_choice import Candidate, Picker
 from telemetry.videos.picture_poses import Pose, Poses
-from telemetry.videos.video_file import VideoScan, demux, open_video, parked, scan
+from telemetry.videos.video_file import VideoScan, demux, open_video, parked, picture_stream, scan, square_size
 
 JPEG_QUALITY = 95
 
@@ -55,6 +56,7 @@ class Extraction:
     findings: list[Finding] = field(default_factory=list)
     pictures: int = 0
     without_pose: int = 0
+    on_ground: int = 0
     damaged: int = 0
 
 
@@ -70,10 +72,11 @@ def decoded(
     import av
     from av.codec.context import Flags
 
-    by_time = {round(note.video_s, 6): i for i, note in enumerate(found.pictures) if note.video_s is not None}
+    times = [] if found.joints_s else [note.video_s for note in found.pictures]  # joined: not those of the packets
+    by_time = {round(t, 6): i for i, t in enumerate(times) if t is not None}
     rank = _presentation_rank(found)
     with open_video(found.path) as container:
-        stream = container.streams.video[0]
+        stream = picture_stream(container)
         start = stream.start_time or 0
         context = stream.codec_context
         context.thread_type = "AUTO"
@@ -156,7 +159,7 @@ def pictures(
     result = result if result is not None else Extraction()
     damaged, damage = [0], Damage()
     total = len(found.pictures)
-    placed_only = poses.has_positions
+    placed_only, grounded = poses.has_positions, on_ground(found, poses)
     for number, index, frame in decoded(found, damaged, damage):
         result.pictures += 1
         if progress is not None and number % 25 == 0:
@@ -167,6 +170,9 @@ def pictures(
         if placed_only and (pose is None or not pose.sample.has_position):
             result.without_pose += 1
             continue
+        if index in grounded:
+            result.on_ground += 1
+            continue
         video_s = number / (found.rate or 30.0)
         if index is not None and index < total and (own := found.pictures[index].video_s) is not None:
             video_s = own
@@ -176,36 +182,46 @@ def pictures(
                 number=number, frame=frame, sample=sample, video_s=video_s, origin=origin, packet=index, damaged=lost
             )
         ):
-            yield _picture(chosen)
+            yield _picture(chosen, found.aspect)
     for chosen in picker.flush():
-        yield _picture(chosen)
+        yield _picture(chosen, found.aspect)
     result.damaged = damaged[0]
     if progress is not None:
         progress(total, total)
 
 
-def _picture(chosen: Candidate) -> Picture:
+def _picture(chosen: Candidate, aspect: float) -> Picture:
     return Picture(
         number=chosen.number,
         sample=chosen.sample,
         origin=chosen.origin,
-        rgb=to_rgb(chosen.frame),
+        rgb=to_rgb(chosen.frame, aspect),
         video_s=chosen.video_s,
         packet=chosen.packet,
         damaged=chosen.damaged,
     )
 
 
-def to_rgb(frame: Any) -> NDArray[np.uint8]:
-    """A decoded frame's colours, uint8 (rows, columns, 3); unmarked pictures of 720 rows or more are BT.709."""
+def to_rgb(frame: Any, aspect: float = 1.0) -> NDArray[np.uint8]:
+    """A decoded frame's colours, uint8 (rows, columns, 3); unmarked pictures of 720 rows or more are BT.709.
+
+    Cameras have one focal length for both directions: pictures whose pixels are not square (`aspect`, width over
+    height) get more columns, or more rows.
+    """
     from av.video.reformatter import ColorRange, Colorspace
 
+    columns, rows = square_size(frame.width, frame.height, aspect)
     if frame.format.is_rgb:
-        return np.asarray(frame.to_ndarray(format="rgb24"))
+        return np.asarray(frame.reformat(width=columns, height=rows, format="rgb24").to_ndarray())
     source = Colorspace.ITU709 if frame.height >= 720 or int(frame.colorspace) == 1 else Colorspace.ITU601
     return np.asarray(
         frame.reformat(
-            format="rgb24", src_colorspace=source, dst_colorspace=source, dst_color_range=ColorRange.JPEG
+            width=columns,
+            height=rows,
+            format="rgb24",
+            src_colorspace=source,
+            dst_colorspace=source,
+            dst_color_range=ColorRange.JPEG,
         ).to_ndarray()
     )
 
@@ -254,9 +270,10 @@ def extract(
             rows, columns = picture.rgb.shape[:2]
             written.append(CachedPicture(picture.number, picture.packet, columns, rows, picture.damaged))
             write_jpeg(folder / written[-1].name, picture.rgb)
-        cached = CachedExtraction(written, result.pictures, result.without_pose, result.damaged)
+        cached = CachedExtraction(written, result.pictures, result.without_pose, result.on_ground, result.damaged)
         remember(folder, key, cached)
     result.pictures, result.without_pose, result.damaged = cached.seen, cached.without_pose, cached.damaged
+    result.on_ground = cached.on_ground
     lens = _LensKey(found)
     for one in cached.pictures:
         pose = None if one.packet is None else poses.of(one.packet)
@@ -273,6 +290,13 @@ def extract(
             )
         )
     result.findings += poses.findings
+    if len(lens.zooms) > 1:
+        text = (
+            f"the lens zooms during {path.name}, to {min(lens.zooms):.1f} to {max(lens.zooms):.1f} times its first "
+            "focal length: each focal length is adjusted as a camera of its own, but the real-time picture is drawn "
+            "with one"
+        )
+        result.findings.append(Finding("video-zoom", text))
     if result.without_pose:
         result.findings.append(
             Finding(
@@ -281,6 +305,12 @@ def extract(
                 "and are left out",
             )
         )
+    if result.on_ground:
+        text = (
+            f"{plural(result.on_ground, 'picture')} of {result.pictures} in {path.name} were taken on the ground, "
+            "before takeoff or after landing, and are left out"
+        )
+        result.findings.append(Finding("pictures-on-ground", text, note=True))
     return result
 
 
@@ -305,19 +335,28 @@ def write_jpeg(path: Path, rgb: NDArray[np.uint8], *, quality: int = JPEG_QUALIT
 
 
 class _LensKey:
-    """Names the lens of a picture; a zoom (change of the stated field of view) starts another."""
+    """Names the lens of a picture; a zoom (change of the field of view or focal length) starts another."""
 
     def __init__(self, found: VideoScan) -> None:
         self._base = f"video {found.width}x{found.height}"
         self._fov: float | None = None
+        self._first_zoom: float | None = None
+        self.zooms: set[float] = set()
 
     def of(self, sample: Sample | None) -> str:
+        step = active().ingest.zoom_step
         fov = None if sample is None else sample.fov_deg
         if fov is None:
-            return self._base
-        if self._fov is None or abs(math.log(fov / self._fov)) > active().ingest.zoom_step:
+            return self._base if sample is None or sample.zoom is None else self._zoomed(sample.zoom, step)
+        if self._fov is None or abs(math.log(fov / self._fov)) > step:
             self._fov = fov
         return f"{self._base} fov{self._fov:.1f}"
+
+    def _zoomed(self, zoom: float, step: float) -> str:
+        self._first_zoom = self._first_zoom or zoom
+        times = math.exp(step * round(math.log(zoom / self._first_zoom) / step))
+        self.zooms.add(times)
+        return self._base if times == 1.0 else f"{self._base} x{times:.2f}"
 
 
 def _photo(path: Path, picture: CachedPicture, pose: Pose | None, lens: _LensKey) -> PhotoTags:

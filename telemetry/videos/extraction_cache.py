@@ -11,7 +11,7 @@ from typing import Any
 from telemetry.videos.picture_poses import Poses
 
 _LIST = "pictures.json"
-_VERSION = 3
+_VERSION = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,12 +42,14 @@ class CachedExtraction:
 
     Attributes:
         pictures: the extracted ones. seen: number decoded. without_pose: number left out for lack of a position.
+        on_ground: number left out because they were taken on the ground.
         damaged: number that lost parts or could not be decoded.
     """
 
     pictures: Sequence[CachedPicture]
     seen: int
     without_pose: int
+    on_ground: int
     damaged: int
 
 
@@ -71,7 +73,9 @@ def recall(folder: Path, key: str) -> CachedExtraction | None:
         if document["key"] != key:
             return None
         pictures = [CachedPicture(*row) for row in document["pictures"]]
-        extraction = CachedExtraction(pictures, *(int(document[name]) for name in ("seen", "without_pose", "damaged")))
+        extraction = CachedExtraction(
+            pictures, *(int(document[name]) for name in ("seen", "without_pose", "on_ground", "damaged"))
+        )
         return extraction if all((folder / picture.name).stat().st_size for picture in pictures) else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
@@ -88,6 +92,7 @@ def remember(folder: Path, key: str, extraction: CachedExtraction) -> None:
         "pictures": [astuple(picture) for picture in extraction.pictures],
         "seen": extraction.seen,
         "without_pose": extraction.without_pose,
+        "on_ground": extraction.on_ground,
         "damaged": extraction.damaged,
     }
     temporary = folder / f"{_LIST}.part"

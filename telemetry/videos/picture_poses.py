@@ -17,7 +17,7 @@ from telemetry.formats.video import srt
 from telemetry.samples.findings import Finding, plural
 from telemetry.samples.sample import Sample
 from telemetry.samples.timeline import Timeline
-from telemetry.videos.video_file import VideoScan
+from telemetry.videos.video_file import VideoScan, square_size
 
 Array = NDArray[np.float64]
 
@@ -75,10 +75,15 @@ class Poses:
         self._trust_sei_times = True
         self._interpolated: list[tuple[str, list[Sample]]] = []
         self.findings: list[Finding] = []
-        cues = subtitles if subtitles is not None else found.cues
+        # A file beside the video counts before its own track, unless it is of some other kind.
+        cues = (
+            found.cues if subtitles is None or (found.cues.has_positions and not subtitles.has_positions) else subtitles
+        )
         self._add("KLV", self._klv_rows())
         self._add("GPMF", [(t, s) for t, s in found.gpmf_samples if s.has_position])
-        self._add("SRT", [(c.start_s, c.sample) for c in cues.cues if c.sample is not None and c.sample.has_position])
+        rows = [(c.start_s, c.sample) for c in cues.cues if c.sample is not None and c.sample.has_position]
+        self._add("SRT", rows, cues.joints_s)
+        self._note_file()
         self._note(cues)
 
     def of(self, index: int) -> Pose | None:
@@ -147,6 +152,13 @@ class Poses:
         self._interpolated.append((name, samples))
         return sum(sample.has_position for sample in samples)
 
+    @property
+    def clock_s(self) -> float | None:
+        """UTC of video time zero by the metadata, in which a zone may be missing; None if it has no times."""
+        poses = ((t, self.of(i)) for i, t in enumerate(self._times.tolist()) if t == t)
+        starts = [p.sample.time_s - t for t, p in poses if p is not None and p.sample.time_s is not None]
+        return float(np.median(starts)) if starts else None
+
     def track(self) -> tuple[Array, Array]:
         """Video times (N,) and positions (N, 2), latitude and longitude in degrees, of pictures that have one."""
         rows = [
@@ -171,15 +183,25 @@ class Poses:
         i = int(np.argmin(np.abs(self._djmd_times - t)))
         return self._djmd[i][1] if abs(self._djmd_times[i] - t) < 0.51 * self._interval else None
 
-    def _add(self, name: str, rows: list[tuple[float, Sample]]) -> None:
-        """Interpolate a source with times of its own at all pictures."""
+    def _add(self, name: str, rows: list[tuple[float, Sample]], joints_s: Sequence[float] = ()) -> None:
+        """Interpolate a source with times of its own at all pictures, but not from one recording to the next.
+
+        Args:
+            name: of the source.
+            rows: video times and samples.
+            joints_s: video times at which the source's next recording begins, besides the file's own.
+        """
         if not rows:
             return
-        dated = [(t, s.time_s) for t, s in rows if s.time_s is not None]
-        utc = Clock([t for t, _ in dated], [u for _, u in dated]).at(self._times)
-        samples = _held_timeline([replace(s, time_s=t) for t, s in rows]).at_all(self._times)
-        for sample, moment in zip(samples, utc.tolist(), strict=True):
-            sample.time_s = moment if moment == moment else None
+        joints = np.array(sorted({*self._scan.joints_s, *joints_s}))
+        part_of_row = np.searchsorted(joints, [t for t, _ in rows], side="right")
+        part_of_picture = np.searchsorted(joints, self._times, side="right")
+        samples = [Sample() for _ in range(len(self._times))]
+        for part in np.unique(part_of_row).tolist():
+            own = [rows[i] for i in np.flatnonzero(part_of_row == part).tolist()]
+            index = np.flatnonzero(part_of_picture == part)
+            for i, sample in zip(index.tolist(), _interpolated(own, self._times[index]), strict=True):
+                samples[i] = sample
         self._interpolated.append((name, samples))
 
     def _sei_clock(self) -> Clock:
@@ -241,6 +263,30 @@ class Poses:
                     )
                 )
 
+    def _note_file(self) -> None:
+        """Report what of the file is read otherwise than it looks."""
+        found, name = self._scan, self._scan.path.name
+        if found.joints_s:
+            text = (
+                f"the clock of {name} starts again {plural(len(found.joints_s), 'time')} (recordings joined, or "
+                "an encoder restarted); its parts are read one after the other"
+            )
+            self.findings.append(Finding("times-restart", text, note=True))
+        size = square_size(found.width, found.height, found.aspect)
+        if size != (found.width, found.height):
+            text = (
+                f"the pixels of {name} are not square ({found.aspect:.3f} as wide as high); its pictures are "
+                f"stretched from {found.width}x{found.height} to {size[0]}x{size[1]}"
+            )
+            self.findings.append(Finding("pixels-not-square", text, note=True))
+        if found.others:
+            others = ", ".join(f"{columns}x{rows}" for columns, rows in found.others)
+            text = (
+                f"{name} holds {1 + len(found.others)} videos; the one with most pixels ({found.width}x{found.height}) "
+                f"is mapped, {others} not: save them as files of their own to map them"
+            )
+            self.findings.append(Finding("video-streams", text))
+
     def _note(self, cues: srt.Subtitles) -> None:
         name = self._scan.path.name
         sizes: dict[str, list[int]] = {}
@@ -266,6 +312,25 @@ class Poses:
         self.findings += [
             Finding(code, text, note=code == "srt-tuple-order") for code, text in cues.notes.items() if cues.cues
         ]
+        ends = self._times[~np.isnan(self._times)]
+        last_s = max((cue.end_s for cue in cues.cues if cue.sample is not None), default=0.0)
+        if len(ends) and last_s > ends.max() + active().ingest.subtitle_excess_s and cues.has_positions:
+            text = (
+                f"the subtitles of {name} last {last_s:.0f} s, its pictures {ends.max() + self._interval:.0f} s: if "
+                "the video was cut or sped up, its pictures lie elsewhere; give the video as the camera wrote it, or "
+                "cut the subtitles like it"
+            )
+            self.findings.append(Finding("srt-length", text))
+
+
+def _interpolated(rows: list[tuple[float, Sample]], times: Array) -> list[Sample]:
+    """Samples with video times at other video times; their UTC goes on beyond them."""
+    dated = [(t, s.time_s) for t, s in rows if s.time_s is not None]
+    utc = Clock([t for t, _ in dated], [u for _, u in dated]).at(times)
+    samples = _held_timeline([replace(s, time_s=t) for t, s in rows]).at_all(times)
+    for sample, moment in zip(samples, utc.tolist(), strict=True):
+        sample.time_s = moment if moment == moment else None
+    return samples
 
 
 def _held_timeline(samples: list[Sample]) -> Timeline:

@@ -11,12 +11,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from orthoswarm.config import active
 from telemetry.formats.video import bitstream, djmd, gpmf, klv, sei, srt
 from telemetry.samples.sample import Sample
 from telemetry.samples.times import parse_time
 from telemetry.samples.unreadable import Unreadable
+from telemetry.videos.joined_times import JoinedTimes
 
 _MAX_PICTURES = 5_000_000
+_MOST_BOXES = 1000
 
 
 class NotAVideo(Unreadable):
@@ -51,6 +54,8 @@ class VideoScan:
         djmd_samples, gpmf_samples: video time and sample. cues: of a subtitle track.
         damaged: packets that could not be read.
         unknown_sei: (UUID, size) -> number of private SEI messages without a decoder.
+        joints_s: times at which the file's clock starts again (recordings joined); times continue over them.
+        aspect: width of a pixel over its height. others: width and height of other video streams.
     """
 
     path: Path
@@ -66,6 +71,9 @@ class VideoScan:
     cues: srt.Subtitles = field(default_factory=srt.Subtitles)
     damaged: int = 0
     unknown_sei: Counter[tuple[str, int]] = field(default_factory=Counter)
+    joints_s: list[float] = field(default_factory=list)
+    aspect: float = 1.0
+    others: list[tuple[int, int]] = field(default_factory=list)
 
     @property
     def sei_count(self) -> int:
@@ -86,16 +94,47 @@ def open_video(path: Path | str, **options: Any) -> Any:
     except (av.error.FFmpegError, OSError, ValueError) as error:
         if "://" in str(path):
             raise NotAVideo(f"the stream {path} cannot be opened ({_reason(error)}); check its address") from None
+        if _lacks_index(Path(path)):
+            raise NotAVideo(
+                "the video is cut off: its index, which cameras write last, is missing; copy it from the card again "
+                "or have it repaired with an intact video of the same camera"
+            ) from None
         raise NotAVideo(
             f"the file is not a video that can be read ({_reason(error)}); check it with a player or leave it out"
         ) from None
     if not container.streams.video:
         container.close()
         raise NotAVideo("the file holds no pictures; name a video")
-    if container.streams.video[0].codec_context is None:
+    if picture_stream(container).codec_context is None:
         container.close()
         raise NotAVideo("its pictures are coded in a way that is not known here; convert the video to H.264 or H.265")
     return container
+
+
+def picture_stream(container: Any) -> Any:
+    """The stream that is mapped: the one with most pixels, without cover pictures; the first of equals."""
+    return max(moving_streams(container), key=_pixels)
+
+
+def moving_streams(container: Any) -> list[Any]:
+    """The video streams of a file; cover pictures, which cameras store as a stream, count if there is nothing else."""
+    from av.stream import Disposition
+
+    streams = list(container.streams.video)
+    return [s for s in streams if not s.disposition & Disposition.attached_pic] or streams
+
+
+def _pixels(stream: Any) -> int:
+    context = stream.codec_context
+    return -1 if context is None else context.width * context.height
+
+
+def square_size(columns: int, rows: int, aspect: float) -> tuple[int, int]:
+    """Columns and rows of a picture once its pixels are square; none is lost."""
+    config = active().ingest
+    if abs(aspect - 1.0) <= config.square_within or not 1.0 / config.most_aspect <= aspect <= config.most_aspect:
+        return columns, rows
+    return (round(columns * aspect), rows) if aspect > 1.0 else (columns, round(rows / aspect))
 
 
 @contextmanager
@@ -112,6 +151,23 @@ def parked(context: Any) -> Iterator[None]:
         context.flush_buffers()
 
 
+def _lacks_index(path: Path) -> bool:
+    """Whether a file is an MP4 or MOV without the box `moov` (ISO/IEC 14496-12, 4.2: size, type, content)."""
+    kinds: list[bytes] = []
+    try:
+        with path.open("rb") as handle:
+            while len(kinds) < _MOST_BOXES and len(head := handle.read(16)) >= 8:
+                size = int.from_bytes(head[:4], "big")
+                size = int.from_bytes(head[8:16], "big") if size == 1 else size
+                kinds.append(head[4:8])
+                if size < 8:
+                    break
+                handle.seek(size - len(head), 1)
+    except (OSError, OverflowError, ValueError):
+        return False
+    return kinds[:1] == [b"ftyp"] and b"moov" not in kinds
+
+
 def _reason(error: Exception) -> str:
     return str(getattr(error, "strerror", None) or error).lower()
 
@@ -125,9 +181,12 @@ def scan(path: Path) -> VideoScan:
     if path.stat().st_size == 0:
         raise NotAVideo("the file is empty; copy it again")
     with open_video(path) as container:
-        stream = container.streams.video[0]
+        stream = picture_stream(container)
         context = stream.codec_context
         result = VideoScan(path=path, codec=context.name, width=context.width, height=context.height)
+        result.aspect = float(stream.sample_aspect_ratio or 1)
+        contexts = [s.codec_context for s in moving_streams(container) if s is not stream]
+        result.others = [(c.width, c.height) for c in contexts if c is not None]
         result.rate = float(stream.average_rate) if stream.average_rate else None
         created = parse_time(str(container.metadata.get("creation_time", "")))
         result.created_s = created[0] if created is not None else None
@@ -159,29 +218,48 @@ def demux(container: Any, streams: list[Any]) -> Iterator[Any]:
 def _scan_packets(container: Any, stream: Any, result: VideoScan) -> None:
     form = bitstream.StreamFormat.of(result.codec, stream.codec_context.extradata)
     wanted = [s for s in container.streams if s is stream or s.type in ("data", "subtitle")]
-    start = stream.start_time or 0
-    base = float(stream.start_time * stream.time_base) if stream.start_time is not None else 0.0
+    times = JoinedTimes(stream, 1.0 / (result.rate or 30.0))
     texts: list[tuple[float, float, str]] = []
     leftovers: dict[int, bytes] = {}
+    ahead: list[tuple[Any, int, float | None]] = []  # metadata of a part whose pictures have not begun
     for packet in demux(container, wanted):
         if packet.size == 0:
             continue
-        seconds = None if packet.pts is None else float(packet.pts * packet.time_base) - base
-        if packet.stream is stream:
+        part, seconds = times.place(packet)
+        if packet.stream is not stream:
+            ahead.append((packet, part, seconds))
+            if part >= times.parts:
+                continue
+        else:
             if len(result.pictures) >= _MAX_PICTURES:
                 break
-            seconds = None if packet.pts is None else float((packet.pts - start) * packet.time_base)
-            note = _note(bytes(packet), form, seconds, result.unknown_sei)
+            note = _note(bytes(packet), form, times.picture(part, seconds), result.unknown_sei)
             note.position = packet.pos
             result.pictures.append(note)
-        elif packet.stream.type == "subtitle":
-            if seconds is not None:
-                length = float((packet.duration or 0) * packet.time_base)
-                texts.append((seconds, seconds + length, _subtitle_text(bytes(packet))))
-        else:
-            _scan_data(packet, seconds, result, leftovers)
+        for other, its_part, moment in ahead:
+            _scan_metadata(other, times.metadata(its_part, moment), result, texts=texts, leftovers=leftovers)
+        ahead.clear()
+    for other, its_part, moment in ahead:
+        _scan_metadata(other, times.metadata(its_part, moment), result, texts=texts, leftovers=leftovers)
+    result.joints_s = times.joints_s
     if texts:
         result.cues = srt.parse_cues(texts)
+
+
+def _scan_metadata(
+    packet: Any,
+    seconds: float | None,
+    result: VideoScan,
+    *,
+    texts: list[tuple[float, float, str]],
+    leftovers: dict[int, bytes],
+) -> None:
+    """A packet of subtitles or data."""
+    if packet.stream.type == "data":
+        _scan_data(packet, seconds, result, leftovers)
+    elif seconds is not None:
+        length = float((packet.duration or 0) * packet.time_base)
+        texts.append((seconds, seconds + length, _subtitle_text(bytes(packet))))
 
 
 def _note(

@@ -12,7 +12,7 @@ from typing import Any
 from orthoswarm.model.errors import InputError
 from telemetry.formats.video import bitstream, sei
 from telemetry.samples.sample import Sample
-from telemetry.videos.video_file import NotAVideo, demux, open_video
+from telemetry.videos.video_file import NotAVideo, demux, open_video, picture_stream
 
 _RAW = frozenset({".h264", ".264", ".avc", ".h265", ".265", ".hevc"})
 
@@ -49,7 +49,7 @@ def add_sei(source: Path, target: Path, pose_of: PoseOf) -> int:
     temporary = target.with_name(f".{target.stem}.part{target.suffix}")
     try:
         with open_video(source) as reader:
-            stream = reader.streams.video[0]
+            stream = picture_stream(reader)
             form = bitstream.StreamFormat.of(stream.codec_context.name, stream.codec_context.extradata)
             if form is None:
                 raise InputError(f"{source.name} is neither H.264 nor H.265; SEI cannot be put into it")
@@ -72,7 +72,7 @@ def presentation_order(path: Path) -> list[int]:
         NotAVideo: it is not a video.
     """
     with open_video(path) as container:
-        stream = container.streams.video[0]
+        stream = picture_stream(container)
         times = [packet.pts for packet in demux(container, [stream]) if packet.size]
     if times and all(t is not None for t in times) and len(set(times)) == len(times):
         rank = {t: i for i, t in enumerate(sorted(times))}

@@ -123,7 +123,8 @@ _NUMBERS: dict[int, tuple[str, int, bool, float, float]] = {
     90: ("platform_pitch_full", 4, True, _LATITUDE_32, 0.0),
     91: ("platform_roll_full", 4, True, _LATITUDE_32, 0.0),
 }
-_TEXTS = {3: "mission", 4: "tail_number", 10: "platform"}
+_TEXTS = {3: "mission", 4: "tail_number", 10: "platform", 59: "call_sign"}
+# Item 10 is the model, which all vehicles of a fleet share: it names none of them.
 
 
 def _read_0601(packet_bytes: bytes, start: int) -> Packet:
@@ -224,7 +225,7 @@ def _sample(values: dict[str, float | str]) -> Sample | None:
     )
     if v.get("time_us"):
         sample.time_s = v["time_us"] * 1e-6
-    name = values.get("tail_number") or values.get("platform")
+    name = values.get("tail_number") or values.get("call_sign")
     sample.vehicle = name if isinstance(name, str) else None
     elevation = _attitude(v, sample)
     if "sensor_altitude" in v and "frame_center_elevation" in v:

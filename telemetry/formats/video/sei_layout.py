@@ -23,7 +23,7 @@ from orthoswarm.model.errors import InputError
 from telemetry.formats.video.sei import USER_DATA_UNREGISTERED, Decoder
 from telemetry.samples.sample import Sample
 
-_NUMBERS = frozenset(f.name for f in fields(Sample)) - {"vehicle", "height_is_ground", "number"}
+_NUMBERS = frozenset(f.name for f in fields(Sample)) - {"vehicle", "height_is_ground", "number", "zoom"}
 _FIELD = re.compile(r"(\w+)(?:\*([+-]?[\d.]+(?:e[+-]?\d+)?))?([+-][\d.]+)?", re.IGNORECASE)
 
 

@@ -20,7 +20,9 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 
+from orthoswarm.config import active
 from orthoswarm.model.earth import DEGREE_M
+from telemetry.samples.findings import plural
 from telemetry.samples.sample import Sample, checked
 from telemetry.samples.times import parse_time
 from telemetry.samples.unreadable import MOST_TEXT_BYTES
@@ -38,6 +40,10 @@ _BAROMETER = re.compile(rf"BAROMETER\s*(?::{_NUMBER}|\({_NUMBER}\s*M?\))", re.IG
 _GIMBAL = re.compile(rf"\bG\.PRY\s*\({_NUMBER}°?\s*,{_NUMBER}°?\s*,{_NUMBER}")
 _FLIGHT = re.compile(rf"\bF\.PRY\s*\({_NUMBER}°?\s*,{_NUMBER}°?\s*,{_NUMBER}")
 _DATE = re.compile(r"\d{4}[-./]\d{2}[-./]\d{2}[ T]\d{1,2}:\d{2}:\d{2}(?:[.,]\d{1,6}(?:[.,]\d{1,3})?)?")
+_COMMA_PAIR = re.compile(r"\b(?:latitude|longt?itude)\s*:\s*[+-]?\d+,\d", re.IGNORECASE)
+_COMMA_TUPLE = re.compile(r"\bGPS\s*\((?:\s*[+-]?\d+\s*,){3}\s*[+-]?\d", re.IGNORECASE)
+"""Four whole numbers where two or three numbers belong: two of them are decimals behind a comma."""
+_DECIMAL_COMMA = re.compile(r"(\d+),(\d+)")
 _COUNT = re.compile(r"\b(?:FrameCnt|SrtCnt)\s*:\s*(\d{1,9})")
 
 
@@ -57,11 +63,18 @@ class Subtitles:
     Attributes:
         cues: in order of the file. latitude_first: order of the GPS tuples, None where there are none.
         notes: irregularities by code, one sentence each.
+        joints_s: times at which the subtitles of another recording begin, where the file joins several.
     """
 
     cues: list[Cue] = field(default_factory=list)
     latitude_first: bool | None = None
     notes: dict[str, str] = field(default_factory=dict)
+    joints_s: list[float] = field(default_factory=list)
+
+    @property
+    def has_positions(self) -> bool:
+        """Whether any block has a position."""
+        return any(cue.sample is not None and cue.sample.has_position for cue in self.cues)
 
 
 @dataclass(slots=True)
@@ -117,11 +130,34 @@ def _undated_blocks(text: str) -> Iterator[_Raw]:
 
 
 def _read(blocks: list[_Raw]) -> Subtitles:
-    result = Subtitles(latitude_first=_latitude_first(blocks))
+    joints_s = _join(blocks)
+    if any(_COMMA_PAIR.search(block.text) or _COMMA_TUPLE.search(block.text) for block in blocks):
+        for block in blocks:
+            block.text = _DECIMAL_COMMA.sub(r"\1.\2", block.text)
+    result = Subtitles(latitude_first=_latitude_first(blocks), joints_s=joints_s)
     for block in blocks:
         result.cues.append(Cue(block.start_s, block.end_s, _sample(block.text, result.latitude_first)))
     _note_oddities(result, blocks)
     return result
+
+
+def _join(blocks: list[_Raw]) -> list[float]:
+    """Put the recordings that a file joins one after the other; returns where each but the first begins, seconds.
+
+    Each counts its times from zero. Blocks that are only out of order go back by less.
+    """
+    restart_s = active().ingest.subtitle_restart_s
+    joints_s: list[float] = []
+    shift_s = before_s = end_s = 0.0
+    for block in blocks:
+        if block.start_s < before_s - restart_s:
+            shift_s = end_s
+            joints_s.append(shift_s)
+        before_s = block.start_s
+        block.start_s += shift_s
+        block.end_s += shift_s
+        end_s = max(end_s, block.end_s)
+    return joints_s
 
 
 def _latitude_first(blocks: list[_Raw]) -> bool | None:
@@ -153,6 +189,8 @@ def _sample(text: str, latitude_first: bool | None) -> Sample | None:
     pairs = {name.lower(): float(value) for name, value in _PAIR.findall(text)}
     sample.lat_deg = pairs.get("latitude")
     sample.lon_deg = pairs.get("longitude", pairs.get("longtitude"))
+    if "focal_len" in pairs or "dzoom_ratio" in pairs:
+        sample.zoom = pairs.get("focal_len", 1.0) * pairs.get("dzoom_ratio", 1.0)
     sample.height_m = pairs.get("rel_alt")
     sample.altitude_m = pairs.get("abs_alt", pairs.get("altitude"))
     sample.yaw_deg, sample.pitch_deg, sample.roll_deg = (pairs.get(f"gb_{n}") for n in ("yaw", "pitch", "roll"))
@@ -216,5 +254,10 @@ def _note_oddities(result: Subtitles, blocks: list[_Raw]) -> None:
     starts = [cue.start_s for cue in result.cues]
     if any(later < earlier for earlier, later in pairwise(starts)):
         result.notes["time-backwards"] = "the times of the subtitles go backwards; they are put in order"
+    if result.joints_s:
+        result.notes["srt-joined"] = (
+            f"the times of the subtitles start again {plural(len(result.joints_s), 'time')}: the subtitles of "
+            "joined recordings, read one after the other; they fit only a video that joins the same recordings"
+        )
     if starts[0] > 60.0:
         result.notes["srt-late-start"] = f"the subtitles begin at {starts[0]:.0f} s, they are a part of a longer file"

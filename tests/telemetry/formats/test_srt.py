@@ -1,6 +1,7 @@
 """DJI subtitles in all layouts of the field, and djmd messages."""
 
 import math
+import re
 import struct
 
 import pytest
@@ -83,6 +84,39 @@ def test_oddities_are_named():
     notes = parse_srt(text).notes
     assert {"position-coarse", "srt-gaps", "time-backwards", "srt-no-attitude"} <= set(notes)
     assert "srt-empty" in parse_srt("no times in here").notes
+
+
+@pytest.mark.parametrize(
+    "written",
+    [
+        "[latitude: 47.469200] [longitude: 8.209000] [rel_alt: 45.600 abs_alt: 512.300]",
+        "GPS (8.2090, 47.4692, 18), D 49.21m, H 45.60m, H.S 2.44m/s, V.S 0.00m/s",
+        "GPS(47.4692,8.2090,0.0M) BAROMETER:45.6M",
+        "HOME(8.1000,47.4692) 2017.08.05 14:11:51\nGPS(8.2090,47.4692,16) BAROMETER:45.6",
+    ],
+)
+def test_a_decimal_comma_is_read_like_a_point(written):
+    point = parse_srt(block("2022-08-07 13:40:40,774,808\n" + written)).cues[0].sample
+    comma = parse_srt(block("2022-08-07 13:40:40,774,808\n" + re.sub(r"(\d)\.(\d+)(?!\.)\b", r"\1,\2", written)))
+    assert (point.lat_deg, point.lon_deg, point.height_m) == (47.4692, 8.209, 45.6)
+    for name in ("lat_deg", "lon_deg", "height_m", "altitude_m"):
+        assert getattr(comma.cues[0].sample, name) == getattr(point, name)
+
+
+@given(st.lists(st.integers(7, 60), min_size=1, max_size=4))
+@settings(max_examples=30, deadline=None)
+def test_subtitles_of_joined_recordings_follow_each_other(lengths):
+    """Each counts from zero; every block keeps its place in the order of the file."""
+    text, places = "", []
+    for part, seconds in enumerate(lengths):
+        for t in range(seconds):
+            places.append(47.0 + part + 0.001 * t)
+            text += f"{t}\n00:00:{t:02d},000 --> 00:00:{t:02d},999\n[latitude: {places[-1]:.4f}] [longitude: 8.25]\n\n"
+    found = parse_srt(text)
+    assert [cue.sample.lat_deg for cue in found.cues] == pytest.approx(places)
+    assert [cue.start_s for cue in found.cues] == pytest.approx(range(sum(lengths)), abs=0.01)
+    assert len(found.joints_s) == len(lengths) - 1
+    assert ("srt-joined" in found.notes) == (len(lengths) > 1)
 
 
 @given(st.text(max_size=400))
