@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from telemetry.samples.course import local_metres
 from telemetry.samples.timeline import Timeline
 
@@ -47,16 +48,18 @@ def offset_by_positions(times: Array, lat_lon: Array, timeline: Timeline, *, sea
         if times.max() - base + search_s < timeline.span[0] or times.min() - base - search_s > timeline.span[1]:
             continue
         for shift in np.arange(-search_s, search_s + 0.01, 1.0):
-            error = _distance(times - base - shift, lat_lon, timeline)
+            error = median_distance_m(times - base - shift, lat_lon, timeline)
             if error is not None and (best is None or error < best[0]):
                 best = error, base + float(shift)
     if best is None or best[0] > 50.0:
         return None
-    fine = [(_distance(times - best[1] - s, lat_lon, timeline), best[1] + s) for s in np.arange(-1.0, 1.01, 0.1)]
+    fine = [
+        (median_distance_m(times - best[1] - s, lat_lon, timeline), best[1] + s) for s in np.arange(-1.0, 1.01, 0.1)
+    ]
     return float(min((e, o) for e, o in fine if e is not None)[1])
 
 
-def _distance(times: Array, lat_lon: Array, timeline: Timeline) -> float | None:
+def median_distance_m(times: Array, lat_lon: Array, timeline: Timeline) -> float | None:
     """Median distance in metres between positions and a track; None if the track covers too few of them."""
     lat, lon = timeline.values("lat_deg", times), timeline.values("lon_deg", times)
     known = ~np.isnan(lat)
@@ -115,7 +118,7 @@ def offset_by_turning(
         return None
     correlation, offset = max(best)
     rivals = [c for c, o in best if abs(o - offset) > 3.0]
-    if correlation < 0.5 or (rivals and max(rivals) > correlation - 0.1):
+    if correlation < 0.5 or (rivals and max(rivals) > correlation - active().ingest.turning_margin):
         return None
     return offset, correlation
 
