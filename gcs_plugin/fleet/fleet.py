@@ -6,6 +6,7 @@ ground station, asks for streams and clocks, and asks a vehicle that would not a
 """
 
 import itertools
+import logging
 import math
 import threading
 import time
@@ -38,6 +39,7 @@ from orthoswarm.model.errors import OrthoSwarmError
 Result = TypeVar("Result")
 Dialogue = TypeVar("Dialogue", bound=Exchange)
 
+_log = logging.getLogger(__name__)
 _TICK_S: Final = 0.25
 _BATCH_S: Final = 0.04
 _FENCE_S: Final = 10.0
@@ -373,7 +375,10 @@ class Fleet:
         """Poll until `stop` is set. Input is read in small batches, which avoids most wake-ups."""
         self._thread = threading.get_ident()
         while not stop.is_set():
-            self.poll(0.5)
+            try:
+                self.poll(0.5)
+            except Exception:  # of a listener, or of one message: no fault may cut the vehicles off from commands
+                _log.exception("a fault while reading the links; they are read on")
             if not self._dialogues.jobs:
                 time.sleep(_BATCH_S)
         self._thread = None

@@ -263,3 +263,19 @@ def test_vehicles_of_one_start_return_in_turn_and_one_given_another_command_does
     assert links.flight_state(second)["state"] == "paused"
     assert next(row for row in links.return_in_turn() if row["vehicle"] == second)["outcome"] == "done"
     wait(lambda: links.flight_state(second)["state"] in down, 60.0)
+
+
+def test_a_fault_in_a_listener_cuts_no_vehicle_off_from_commands(open_links, caplog):
+    links = open_links(make_swarm(1, home=HOME))
+    ready(links, 1)
+    faults = []
+
+    def broken(vehicle, message, utc):
+        faults.append(vehicle.system)
+        raise KeyError("a fault of the program")
+
+    links.fleet.subscribe(broken, "HEARTBEAT")
+    wait(lambda: len(faults) > 2)
+    assert links.commands("rtl")[0]["outcome"] in ("done", "refused")
+    assert links.rows()[0]["silent_s"] < 5.0
+    assert any("a fault while reading the links" in record.message for record in caplog.records)
