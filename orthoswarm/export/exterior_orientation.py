@@ -71,14 +71,13 @@ def oriented_pictures(rows: Sequence[Row]) -> list[OrientedPicture]:
         raise InputError("the map's frames.jsonl does not hold the lenses; make the map again with this version")
     names = unique_names([str(row["image"]) for row in placed])
     found = []
-    for row in placed:
+    for row, name in zip(placed, names, strict=True):
         block = row["camera"]
         altitude = float(block.get("altitude_m", block["height_m"]))
-        image = str(row["image"])
         found.append(
             OrientedPicture(
-                name=names[image],
-                image=image,
+                name=name,
+                image=str(row["image"]),
                 row=row,
                 camera=camera_of(row),
                 lat_deg=float(block["lat_deg"]),

@@ -48,12 +48,11 @@ def write_odm(
     lines = ["EPSG:4326"]
     with atomic_write(folder) as part:
         (part / "images").mkdir(parents=True)
-        for done, row in enumerate(placed, 1):
+        for done, (row, name) in enumerate(zip(placed, names, strict=True), 1):
             file = find(row)
             if file is None:
                 gone.append(str(row["image"]))
             else:
-                name = names[str(row["image"])]
                 link_file(file, part / "images" / name)
                 lines.append(_line(name, row))
             if progress is not None:

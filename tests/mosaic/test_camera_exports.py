@@ -177,6 +177,18 @@ def test_opensfm_projects_ground_where_we_do(tmp_path):
         assert np.abs(np.stack([u, v], 1) - pixels).max() < 0.3
 
 
+@pytest.mark.parametrize("write", [write_odm, write_colmap, write_opensfm])
+def test_pictures_of_one_name_by_two_vehicles_are_both_exported_and_stay_as_they_were(tmp_path, write):
+    _, rows = flight(tmp_path)
+    rows = [row | {"image": "0001.jpg", "vehicle": vehicle} for vehicle, row in zip(("v1", "v2"), rows)]
+    files = {vehicle: tmp_path / f"{vehicle}.jpg" for vehicle in ("v1", "v2")}
+    for vehicle, file in files.items():
+        file.write_text(vehicle)
+    assert write(rows, lambda row: files[row["vehicle"]], tmp_path / "out") == []
+    assert {vehicle: file.read_text() for vehicle, file in files.items()} == {"v1": "v1", "v2": "v2"}
+    assert sorted(path.read_text() for path in (tmp_path / "out" / "images").iterdir()) == ["v1", "v2"]
+
+
 def test_a_map_without_lenses_is_refused(tmp_path):
     _, rows = flight(tmp_path)
     del rows[0]["camera"]["focal_px"]

@@ -10,6 +10,8 @@ import cv2
 import numpy as np
 import pytest
 import rasterio
+from hypothesis import given
+from hypothesis import strategies as st
 from PIL import Image
 from rasterio.warp import transform, transform_bounds
 
@@ -317,9 +319,16 @@ def test_odm_gets_pictures_and_positions(tmp_path):
 
 def test_names_for_odm_are_plain_and_different():
     names = unique_names(["a/1.jpg", "a_1.jpg", "b/1.jpg", "v.mp4#000001"])
-    assert len(set(names.values())) == 4
-    assert all("/" not in n and " " not in n and "#" not in n for n in names.values())
-    assert names["v.mp4#000001"].endswith(".jpg")
+    assert len(set(names)) == 4
+    assert all("/" not in n and " " not in n and "#" not in n for n in names)
+    assert names[-1].endswith(".jpg")
+
+
+@given(st.lists(st.text(st.sampled_from("ab_2./ x"), max_size=300), max_size=8))
+def test_each_picture_for_odm_has_a_name_of_its_own_that_a_disk_takes(images):
+    names = unique_names(images)
+    assert len({name.lower() for name in names}) == len(images)
+    assert all(len(name) < 200 for name in names)
 
 
 def test_a_fuller_lens_is_stated_in_the_simple_form():
