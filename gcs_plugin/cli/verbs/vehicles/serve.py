@@ -156,18 +156,21 @@ def serve(settings: "Settings", *, end_with_input: bool = False) -> int:
     from gcs_plugin.daemon.daemon import Daemon
     from gcs_plugin.daemon.intake.picture_sources import STREAM_THREAD
     from gcs_plugin.web.app import make_app
+    from gcs_plugin.web.connections import ConnectionLimits, Connections, bounded_protocol, open_files
     from gcs_plugin.web.guard import take_token
     from gcs_plugin.web.listener import open_listener
 
     logging.basicConfig(stream=sys.stderr, level=logging.INFO, format="%(levelname)s %(message)s")
     os.umask(0o077)  # pictures, plans and the token are readable by their owner only
+    limits = ConnectionLimits.of_files(open_files())
     listener = open_listener(settings.bind, settings.port)
     url = _url(settings, listener.getsockname()[1])
     with Daemon(settings) as daemon, listener:
         token = take_token(_token_file(settings))
         config = uvicorn.Config(
             make_app(daemon, token, settings.bind), log_level="warning", access_log=False, server_header=False,
-            timeout_graceful_shutdown=3, ws_max_size=1 << 16, lifespan="on", backlog=2048,
+            timeout_graceful_shutdown=3, ws_max_size=1 << 16, lifespan="on", backlog=limits.waiting,
+            http=bounded_protocol(Connections(limits)),
         )  # fmt: skip
         # a client may connect as soon as it reads the address, and waits until it is served
         listener.listen(config.backlog)
