@@ -12,6 +12,8 @@ from orthoswarm.model.errors import InputError
 
 FILE: Final = "orthoswarm.toml"
 PORT: Final = 8650
+NO_IDS: Final = frozenset({"all", ".", ".."})
+"""Ids that the address of a command cannot have: `all` means every vehicle, and browsers leave out the others."""
 
 TEMPLATE: Final = """\
 # What `orthoswarm serve` in this folder does. Flags on the command line win over this file.
@@ -137,6 +139,8 @@ class Settings:
             if len(set(values)) != len(values):
                 raise InputError(f"two vehicles in {FILE} have the same {what}; give each its own")
         for vehicle in self.vehicles:
+            if vehicle.id in NO_IDS:
+                raise InputError(f"a vehicle cannot have the id '{vehicle.id}'; give it another, for example v1")
             if vehicle.can:
                 check_bus(vehicle.can)
         return self

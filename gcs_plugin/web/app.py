@@ -294,7 +294,7 @@ def make_app(daemon: Daemon, token: str, bind: str = "127.0.0.1") -> Any:
     add("/api/plans/{number}/preflight", routes.commands.preflight, methods=["POST"])
     add("/api/plans/{number}/start", routes.commands.start_plan, methods=["POST"], status_code=202)
     add("/api/plans/{number}/start", routes.commands.cancel_start, methods=["DELETE"])
-    add("/api/missions/{vehicle}/{verb}", routes.commands.mission, methods=["POST"])
+    add("/api/missions/{vehicle:path}/{verb}", routes.commands.mission, methods=["POST"])
     add("/api/areas", read_area, methods=["POST"])
     add("/api/traffic", routes.traffic)
     add("/api/plan", routes.console_plan)

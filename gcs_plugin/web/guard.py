@@ -16,7 +16,8 @@ from orthoswarm.model.errors import InputError, OrthoSwarmError
 LOOPBACK: Final = frozenset({"127.0.0.1", "localhost", "::1"})
 _OPEN: Final = frozenset({"/healthz", "/", "/favicon.ico"})
 _OPEN_FOLDERS: Final = ("/static/",)
-_COMMANDS: Final = ("/api/missions", "/api/refine", "/api/export", "/api/plans", "/api/plan", "/api/finds")
+_WITHOUT_TOKEN: Final = frozenset({"/api/frames", "/api/areas"})
+"""What local programs may send without the token: pictures, and area files to be read."""
 _SAFE: Final = frozenset({"GET", "HEAD", "OPTIONS"})
 _HEADERS: Final = [
     (b"x-content-type-options", b"nosniff"),
@@ -98,7 +99,7 @@ class Guard:
         if not self.local and path not in _OPEN and not path.startswith(_OPEN_FOLDERS):
             return self._token_refusal(scope, headers, query=True)
         unsafe = scope["type"] == "http" and scope["method"] not in _SAFE
-        if unsafe and any(path == command or path.startswith(command + "/") for command in _COMMANDS):
+        if unsafe and path not in _WITHOUT_TOKEN:
             return self._token_refusal(scope, headers, query=False)
         return None
 

@@ -159,7 +159,7 @@ def test_pages_of_other_sites_are_refused(served):
 
 
 def test_commands_need_the_token(served):
-    for path in ("/api/refine", "/api/export", "/api/missions/v1/start"):
+    for path in ("/api/refine", "/api/export", "/api/missions/v1/start", "/api/coverage/flight", "/api/plans"):
         assert served.post(path, json={}).status_code == 401
         assert served.post(path, json={}, headers={"Authorization": "Bearer wrong"}).status_code == 401
         assert served.post(path + "?token=" + served.token, json={}).status_code == 401

@@ -5,6 +5,7 @@ import concurrent.futures
 import itertools
 import json
 import os
+import re
 import signal
 import socket
 import time
@@ -14,10 +15,12 @@ import httpx
 import pytest
 
 from gcs_plugin.daemon.intake.refused_pictures import RefusedPictures
+from gcs_plugin.daemon.settings import Settings, VehicleSettings
 from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
 from gcs_plugin.web.listener import open_listener
 from gcs_plugin.web.standstill import Standstill
 from gcs_plugin.web.uploads import UploadLimits, moving
+from orthoswarm.model.errors import InputError
 from tests.kit.daemon_kit import GRID, form, line, serving
 from tests.kit.mosaic_scene import EAST, NORTH
 
@@ -44,6 +47,17 @@ def test_a_command_that_was_given_too_long_ago_is_not_executed(flying):
         row = answer.json()
         assert (row["id"], row["vehicle"], row["command"]) == (f"late-{word}", "v1", verb)
         assert row["outcome"] == "not_sent" and word in row["reason"]
+
+
+def test_a_vehicle_whose_id_has_a_slash_gets_its_commands(flying):
+    row = flying.command("/api/missions/north%2F1/pause").json()
+    assert (row["vehicle"], row["command"], row["outcome"]) == ("north/1", "pause", "not_sent")
+
+
+@pytest.mark.parametrize("name", ["all", ".", ".."])
+def test_an_id_that_no_command_can_address_is_refused_at_the_start(tmp_path, name):
+    with pytest.raises(InputError, match=f"cannot have the id '{re.escape(name)}'"):
+        Settings(workspace=tmp_path, vehicles=(VehicleSettings(name),)).check()
 
 
 def heartbeat(flying):
