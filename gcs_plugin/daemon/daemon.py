@@ -281,8 +281,10 @@ class Daemon:
         """
         came = time.time()
         key = frame_key(pose.vehicle, pose.image)
-        known = self.journal.one("SELECT seq FROM frames WHERE key = ?", (key,))
+        known = self.journal.one("SELECT seq, path FROM frames WHERE key = ?", (key,))
         if known is not None:
+            if not self.store.holds(known["path"], data):
+                self.refused.note_name_taken(pose.vehicle, pose.image)
             return int(known["seq"]), False
         width, height, suffix = picture_size(data)
         pose = self._with_fix(pose)
@@ -488,10 +490,7 @@ class Daemon:
         """The present problems, in words."""
         components = (self.drawer.problem, self.drawer.overload, self.jobs.problem, self.tak.problem)
         found = [*components, *self.refused.problems()]
-        for source in self.sources:
-            if source.without_pose:
-                text = f"{source.without_pose} pictures of {source.vehicle} have no pose"
-                found.append(f"{text}; put the flight's log next to them")
+        found += [source.problem for source in self.sources]
         return [text for text in found if text]
 
     def _rejected(self, frame: Frame, reason: str, misplaced: bool) -> None:

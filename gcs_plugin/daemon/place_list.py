@@ -5,7 +5,7 @@ from datetime import datetime
 from typing import Any
 
 from gcs_plugin.daemon.jobs.solution_file import read_solution
-from gcs_plugin.daemon.jobs.workspace_products import ExportTask, placements
+from gcs_plugin.daemon.jobs.workspace_products import ExportTask, placements, writable
 from orthoswarm.export.tactical.places import Place
 from orthoswarm.export.tactical.seen_in import sightings
 from orthoswarm.model.geo import LocalGrid
@@ -22,10 +22,11 @@ def places_of(
         workspace: its name, which makes ids unique. finds: as ConsoleState gives them. vehicles: rows of
             /api/vehicles. now_s: UTC epoch seconds; a vehicle's place is as old as its last message.
     """
+    workspace = writable(workspace)
     found = [
         Place(
             uid=f"orthoswarm-{workspace}-find-{row['id']}", kind="find", name=_name(row), lat_deg=row["lat_deg"],
-            lon_deg=row["lon_deg"], sigma_m=row["sigma_m"], note=row["note"],
+            lon_deg=row["lon_deg"], sigma_m=row["sigma_m"], note=writable(row["note"]),
             time_s=datetime.fromisoformat(row["time"]).timestamp(), pictures=tuple(row.get("pictures", ())),
         )
         for row in finds
@@ -45,7 +46,8 @@ def places_of(
 
 
 def _name(find: Mapping[str, Any]) -> str:
-    return str(find["note"]).strip().splitlines()[0][:60] if str(find["note"]).strip() else f"Find {find['id']}"
+    note = writable(find["note"]).strip()
+    return note.splitlines()[0][:60] if note else f"Find {find['id']}"
 
 
 def pictures_at(task: ExportTask, lat_deg: float, lon_deg: float) -> list[dict[str, Any]]:

@@ -11,7 +11,10 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from gcs_plugin.daemon.place_list import places_of
 from gcs_plugin.daemon.tak_feed import TakFeed
 from orthoswarm.export.tactical.cursor_on_target import event, write_data_package
 from orthoswarm.export.tactical.place_files import write_csv, write_gpx, write_kml
@@ -64,6 +67,19 @@ def test_other_programs_read_the_same_places(tmp_path):
         rows = list(csv.DictReader(file))
     assert rows[0]["note"] == "'=2+3"  # no formula in a spreadsheet
     assert float(rows[0]["lat_deg"]) == FIND.lat_deg and rows[1]["sigma_m"] == ""
+
+
+@given(note=st.text(st.characters(), max_size=40), workspace=st.text(st.characters(), max_size=10))
+def test_a_note_of_any_text_hinders_no_export(tmp_path_factory, note, workspace):
+    row = {"id": 1, "lat_deg": 47.0, "lon_deg": 8.0, "sigma_m": None, "note": note, "time": "2026-05-28T20:26:40Z"}
+    (place,) = places_of(workspace, [row], [], 0.0)
+    folder = tmp_path_factory.mktemp("p")
+    for write, name in ((write_geojson, FILE), (write_kml, "p.kml"), (write_gpx, "p.gpx"), (write_csv, "p.csv")):
+        write([place], folder / name)
+    assert read_places(folder) == [place]
+    for name in ("p.kml", "p.gpx"):
+        ElementTree.parse(folder / name)
+    write_data_package([place], folder / "p.zip", "w")
 
 
 def test_a_changed_list_of_places_is_refused(tmp_path):

@@ -79,6 +79,12 @@ class Source:
         """Number of stream pictures dropped, or of files waiting, for lack of a pose."""
         return self._without_pose if self._reader is None else len(self._reader.poseless)
 
+    @property
+    def problem(self) -> str:
+        """What is wrong at present, in words; empty if nothing is."""
+        count = self.without_pose
+        return f"{count} pictures of {self.vehicle} have no pose; put the flight's log next to them" if count else ""
+
     def start(self) -> None:
         """Begin to read."""
         self._thread.start()

@@ -13,6 +13,7 @@ CAUSES: Final = {
     "pose": "the pose is wrong or missing",
     "picture": "the file is not a picture, or too large",
     "time": "the upload stood still",
+    "name": "another picture of the vehicle has the name",
     "place": "the picture's position cannot be on the map",
     "map": "the picture cannot be drawn",
 }
@@ -51,6 +52,11 @@ class RefusedPictures:
             count = 1 if before is None else before.count + 1
             self._by_cause[cause] = _Refusals(count, vehicle, image, reason, self._clock())
         self._publish("refused", cause=cause, count=count, vehicle=vehicle, image=image, reason=reason)
+
+    def note_name_taken(self, vehicle: str, image: str) -> None:
+        """Count a picture whose name another one of the vehicle has; the first one stays."""
+        text = f"{vehicle} sent another picture by a name that it used before"
+        self.note("name", f"{text}; have its camera or computer count on, and send it again", vehicle, image)
 
     @property
     def counts(self) -> dict[str, int]:

@@ -189,11 +189,13 @@ def placements(task: ExportTask, solutions: list[Solution]) -> tuple[list[Placed
 
 
 def _writable(frame: Frame) -> Frame:
-    """A frame whose names can be written in UTF-8 and by C libraries."""
-    image, vehicle = (
-        text.encode("utf-8", "backslashreplace").decode().replace("\0", "\\0") for text in (frame.image, frame.vehicle)
-    )
-    return replace(frame, image=image, vehicle=vehicle)
+    """A frame whose names are `writable`."""
+    return replace(frame, image=writable(frame.image), vehicle=writable(frame.vehicle))
+
+
+def writable(text: str) -> str:
+    """A text that can be written in UTF-8 and by C libraries: half characters and NUL as what stands for them."""
+    return text.encode("utf-8", "backslashreplace").decode().replace("\0", "\\0")
 
 
 def _stated(placed: list[PlacedFrame], solutions: list[Solution]) -> tuple[list[PlacedFrame], float]:

@@ -59,6 +59,14 @@ class PictureStore:
         """The file of a name returned by `put`."""
         return self.folder / name
 
+    def holds(self, name: str, data: bytes) -> bool:
+        """Whether a stored file has these bytes; True if it cannot be read, as nothing else is known then."""
+        path = self.path(name)
+        try:
+            return path.stat().st_size == len(data) and path.read_bytes() == data
+        except OSError:
+            return True
+
     def put(self, key: bytes, suffix: str, data: bytes) -> str:
         """Write a picture; when this returns, neither a crash nor a power cut loses it.
 

@@ -53,6 +53,18 @@ def test_a_repeated_picture_is_stored_once(served):
     assert len(served.get("/api/frames?vehicle=twice").json()) == 1
 
 
+def test_another_picture_by_a_known_name_is_told(served):
+    first, other = line(2, "restarted")
+    other.pose["image"] = first.pose["image"]
+    for _ in range(2):
+        assert served.send(first).status_code in (200, 201)
+    assert "restarted" not in served.get("/healthz").text
+    assert served.send(other).status_code == 200  # the first one stays
+    health = served.get("/healthz").json()
+    assert [(row["vehicle"], row["count"]) for row in health["refused"] if row["cause"] == "name"] == [("restarted", 1)]
+    assert any("restarted sent another picture by a name that it used before" in text for text in health["problems"])
+
+
 def test_the_same_picture_sent_many_times_at_once_is_stored_once(served):
     shot = line(1, "crowd")[0]
     with concurrent.futures.ThreadPoolExecutor(8) as pool:
