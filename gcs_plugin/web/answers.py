@@ -12,6 +12,7 @@ from starlette.exceptions import HTTPException as StarletteHTTPException
 from starlette.requests import ClientDisconnect
 
 from gcs_plugin.web.guard import TooLarge, bounded
+from orthoswarm.export.atomic_file import FULL
 from orthoswarm.model.errors import DiskFullError, InputError, OrthoSwarmError
 
 Result = TypeVar("Result")
@@ -44,6 +45,12 @@ def install_error_answers(app: FastAPI) -> None:
         assert isinstance(error, OrthoSwarmError)
         return JsonAnswer({"detail": str(error)}, status_code=status_of(error))
 
+    async def full(_: Request, error: Exception) -> Response:
+        assert isinstance(error, OSError)
+        if error.errno not in FULL:
+            raise error
+        return JsonAnswer({"detail": "the disk is full; free some space and send it again"}, status_code=507)
+
     async def timed_out(_: Request, error: Exception) -> Response:
         return JsonAnswer({"detail": "the links did not answer in time; try again"}, status_code=504)
 
@@ -57,6 +64,7 @@ def install_error_answers(app: FastAPI) -> None:
         return JsonAnswer({"detail": f"the address is not valid ({found}); see /docs"}, status_code=422)
 
     app.add_exception_handler(OrthoSwarmError, own)
+    app.add_exception_handler(OSError, full)
     app.add_exception_handler(TimeoutError, timed_out)
     app.add_exception_handler(StarletteHTTPException, http)
     app.add_exception_handler(RequestValidationError, invalid)

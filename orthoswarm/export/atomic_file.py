@@ -6,8 +6,12 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Final
 
 from orthoswarm.model.errors import DiskFullError, StorageError
+
+FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
+"""What the system says of a full disk, or of a used quota."""
 
 
 @contextmanager
@@ -35,7 +39,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
 
 def disk_error(error: OSError, path: Path) -> StorageError:
     """One clear sentence about a file that could not be written."""
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+    if error.errno in FULL:
         return DiskFullError(f"the disk is full, {path.name} was not written; free some space and run again")
     return StorageError(f"{path} cannot be written ({error.strerror or error}); choose another folder")
 

@@ -87,7 +87,7 @@ class Journal:
         """Open or make the journal.
 
         Raises:
-            OrthoSwarmError: the file cannot be opened or is not a journal.
+            OrthoSwarmError: the file cannot be opened, is not a journal, or is damaged.
         """
         self.path, self.commits = path, 0
         self._local = threading.local()
@@ -98,8 +98,16 @@ class Journal:
             self._writer = self._connect()
             self._writer.execute("PRAGMA journal_mode=WAL")
             self._writer.execute("PRAGMA synchronous=FULL")
+            found = self._writer.execute("PRAGMA quick_check(1)").fetchone()[0]
+            if found != "ok":  # a page written halfway, by a card or cable that failed
+                raise sqlite3.DatabaseError("database disk image is malformed")
             self._writer.executescript(_SCHEMA)
         except sqlite3.Error as error:
+            if getattr(error, "sqlite_errorcode", sqlite3.SQLITE_CORRUPT) == sqlite3.SQLITE_CORRUPT:
+                raise OrthoSwarmError(
+                    f"the journal {path} is damaged; rescue what is in it with `sqlite3 {path.name} .recover`,"
+                    " or choose another workspace and send the pictures again"
+                ) from None
             raise OrthoSwarmError(f"the journal {path} cannot be opened ({error}); choose another workspace") from None
         self._thread = threading.Thread(target=self._run, name="journal", daemon=True)
         self._thread.start()

@@ -1,5 +1,6 @@
 """The journal: commits together, undoes alone, holds any text."""
 
+import contextlib
 import sqlite3
 import threading
 
@@ -100,6 +101,22 @@ def test_a_file_that_is_no_journal_is_refused_in_words(tmp_path):
     (tmp_path / "journal.db").write_bytes(b"this is not a database at all, but long enough to be one" * 20)
     with pytest.raises(OrthoSwarmError, match="cannot be opened"):
         Journal(tmp_path / "journal.db")
+
+
+@pytest.mark.parametrize("table", ["frames", "jobs", "meta"])
+def test_a_damaged_journal_is_told_at_the_start(tmp_path, table):
+    path = tmp_path / "journal.db"
+    whole = Journal(path)
+    frame(whole, "v1", "a.jpg")
+    whole.close()
+    with contextlib.closing(sqlite3.connect(path)) as db:
+        (page,) = db.execute("SELECT rootpage FROM sqlite_master WHERE name = ?", (table,)).fetchone()
+        (size,) = db.execute("PRAGMA page_size").fetchone()
+    data = bytearray(path.read_bytes())
+    data[(page - 1) * size : page * size] = b"\xa5" * size
+    path.write_bytes(data)
+    with pytest.raises(OrthoSwarmError, match=r"is damaged; rescue .* \.recover"):
+        Journal(path)
 
 
 def test_packed_text_is_ascii():
