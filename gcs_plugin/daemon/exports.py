@@ -2,11 +2,13 @@
 
 import contextlib
 import math
+import shutil
+import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from gcs_plugin.daemon.jobs.job_queue import Job
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
@@ -18,8 +20,27 @@ from gcs_plugin.daemon.settings import Settings
 from gcs_plugin.daemon.store.console_state import ConsoleState
 from gcs_plugin.daemon.store.journal import Change, Journal, packed, unpacked
 from gcs_plugin.daemon.store.picture_store import PictureStore
+from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.export.tactical.places import Place
 from orthoswarm.model.errors import InputError
+
+_zipping: Final = threading.Lock()
+
+
+def zipped_folder(folder: Path) -> Path:
+    """The ZIP of an exported folder, beside it; made once, and again when the folder was exported again.
+
+    It is replaced as a whole: somebody may still be loading the last one down.
+
+    Raises:
+        StorageError: the disk is full or gone.
+    """
+    path = folder.with_suffix(".zip")
+    with _zipping:
+        if not path.is_file() or path.stat().st_mtime_ns <= folder.stat().st_mtime_ns:
+            with atomic_write(path) as part:
+                shutil.make_archive(str(part.with_suffix("")), "zip", folder)
+    return path
 
 
 class Exports:

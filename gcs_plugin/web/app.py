@@ -12,6 +12,7 @@ from starlette.responses import FileResponse
 from starlette.staticfiles import StaticFiles
 
 from gcs_plugin.daemon.daemon import Daemon
+from gcs_plugin.daemon.exports import zipped_folder
 from gcs_plugin.daemon.intake.posted_pose import parse_time
 from gcs_plugin.daemon.layers.web_tiles import TileAddress
 from gcs_plugin.daemon.metrics import prometheus
@@ -149,11 +150,7 @@ class Routes:
             raise HTTPException(404, "that job has made no such file; see /api/jobs")
         path: Path = self.daemon.settings.workspace / name
         if path.is_dir():
-            import shutil
-
-            zipped = path.with_suffix(".zip")
-            shutil.make_archive(str(path), "zip", path)
-            path = zipped
+            path = zipped_folder(path)
         if not path.is_file():
             raise HTTPException(404, "the file was removed; export again")
         return path
