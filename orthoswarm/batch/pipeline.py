@@ -3,6 +3,7 @@
 load -> real time (paper III.B) -> coarse and fine refinement, vehicle by vehicle (III.C, III.D) -> final pictures.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from orthoswarm.batch.run_state import (
     Options,
     RunContext,
     RunState,
+    is_written,
 )
 from orthoswarm.batch.split_legs import legs_as_vehicles
 from orthoswarm.batch.unpositioned import with_control_positions
@@ -48,11 +50,29 @@ from orthoswarm.raster.picture_parts import PictureParts
 from orthoswarm.stores.addresses import address_of
 from orthoswarm.stores.listing import exists
 
-__all__ = ["COARSE", "ORTHOIMAGE", "PRODUCTS", "REALTIME", "WRITTEN", "Load", "Options", "Progress", "run"]
+__all__ = [
+    "COARSE",
+    "ORTHOIMAGE",
+    "PRODUCTS",
+    "REALTIME",
+    "WRITTEN",
+    "Load",
+    "Options",
+    "Progress",
+    "is_written",
+    "run",
+]
 
 
 def run(
-    load: Load, out: Path, options: Options, workers: Workers, progress: Progress, *, drawers: Workers | None = None
+    load: Load,
+    out: Path,
+    options: Options,
+    workers: Workers,
+    progress: Progress,
+    *,
+    drawers: Workers | None = None,
+    publish: Callable[[], None] | None = None,
 ) -> dict[str, Any]:
     """Make all products of a set of inputs.
 
@@ -63,6 +83,8 @@ def run(
         workers: run the tasks; the products do not depend on their number.
         progress: called during long work.
         drawers: run the tasks that write into the output folder, where the workers do not see it; None: the workers.
+        publish: called when all products are there; the run is complete, and its results of use to no later one, only
+            after it.
 
     Returns:
         The content of report.json.
@@ -105,6 +127,8 @@ def run(
             else:
                 state.leave_out(state.undrawn, state.recorded.placed)
         report = run_report.write_products(context, state, placed, refinement)
+        if publish is not None:
+            publish()
         space.complete()
         if state.fault is not None:
             raise OrthoSwarmError(f"{state.fault}; {REALTIME} stands, but there is no orthoimage: report this fault")

@@ -15,7 +15,7 @@ from orthoswarm.compute.workers import Workers
 from orthoswarm.config import Overrides
 from orthoswarm.control.ground_control import GroundControl
 from orthoswarm.evaluation.checkpoints import Checkpoint
-from orthoswarm.export.catalog.tiled_raster import FOLDER, Tiles
+from orthoswarm.export.catalog.tiled_raster import FOLDER, Tiles, is_tile_or_collection
 from orthoswarm.model.frame import Ingest, Rejection
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import PlacedFrame, Terrain
@@ -50,6 +50,11 @@ PRODUCTS = (
 
 WRITTEN = (*PRODUCTS, *(name.replace(".tif", ".vrt") for name in (REALTIME, COARSE, ORTHOIMAGE)), FOLDER)
 """Files and folders that runs write, those of rasters in tiles among them."""
+
+
+def is_written(name: str) -> bool:
+    """Whether runs write a file of this name (path in the output folder)."""
+    return name in WRITTEN or is_tile_or_collection(name)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

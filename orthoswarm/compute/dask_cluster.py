@@ -26,6 +26,8 @@ from orthoswarm.config import active, overridden, override
 from orthoswarm.model.errors import InputError, RunInterruptedError
 from orthoswarm.model.task_runner import Continued, whole
 
+_SAMPLES = 100
+"""Paths that a worker is asked for, at most."""
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -59,7 +61,9 @@ class Cluster:
 
     Args:
         address: of the scheduler, for example tcp://192.168.1.10:8786.
-        shared: files and folders that every worker must see under the same path.
+        shared: files and folders that every worker must see under the same path, with what is in them.
+        written: a folder that every worker must write to under the same path; None for none.
+        begin: called in each worker before its first task.
         patience_s: how long to wait for a worker to come back when all are gone, and for a scheduler; None for the
             configuration's.
 
@@ -68,9 +72,18 @@ class Cluster:
             cannot read a shared path or that uses several BLAS threads.
     """
 
-    def __init__(self, address: str, shared: Sequence[Path] = (), patience_s: float | None = None) -> None:
+    def __init__(
+        self,
+        address: str,
+        shared: Sequence[Path] = (),
+        patience_s: float | None = None,
+        *,
+        written: Path | None = None,
+        begin: Callable[[], None] | None = None,
+    ) -> None:
         self._address = address
-        self._shared = [p.absolute() for p in shared]
+        self._shared = [str(seen) for path in shared for seen in _samples(path.absolute())]
+        self._written, self._begin = written and written.absolute(), begin
         self._client = _connect(address)
         self._patience_s = active().compute.cluster_patience_s if patience_s is None else patience_s
         self._cpu_s: dict[str, float] = {}
@@ -219,7 +232,9 @@ class Cluster:
         if not self._workers():
             at = self._address
             raise InputError(f"the cluster at {at} has no workers; start some with `dask worker {at}`")
-        for worker, found in self._client.run(_inspect, [str(p) for p in self._shared]).items():
+        with _marked(self._written) as marker:
+            every = self._client.run(_inspect, self._shared, marker, self._begin)
+        for worker, found in every.items():
             version, missing, process, cpu_s, alone = found
             if not alone:  # sums over several threads differ in their last digits, and threads compete for the cores
                 raise InputError(
@@ -232,7 +247,8 @@ class Cluster:
                 )
             if missing:
                 raise InputError(
-                    f"the worker {worker} does not see {missing[0]}; share it under the same path on all machines"
+                    f"the worker {worker} does not see {missing[0]}, or may not use it; share it under the same path "
+                    "on all machines"
                 )
             self._first_cpu_s.setdefault(process, cpu_s)
             self._cpu_s.setdefault(process, cpu_s)
@@ -271,9 +287,50 @@ def _work(payload: bytes) -> _Outcome:
     return _Outcome(value, raised, _process(), time.process_time(), peak_rss_mb())
 
 
-def _inspect(shared: list[str]) -> tuple[str, list[str], str, float, bool]:
+def _samples(path: Path) -> list[Path]:
+    """A path and, of a folder, the first file in each of its folders, up to so many.
+
+    The place of a folder that is not shared with a machine may be there, and empty.
+    """
+    found = [path]
+    for here, below, names in os.walk(path):
+        below.sort()
+        found += [Path(here, name) for name in sorted(names)[:1]]
+        if len(found) > _SAMPLES:
+            break
+    return found
+
+
+@contextlib.contextmanager
+def _marked(folder: Path | None) -> Iterator[str | None]:
+    """A new file in a folder, removed afterwards: whoever sees it sees the same folder.
+
+    Raises:
+        InputError: if it cannot be written.
+    """
+    if folder is None:
+        yield None
+        return
+    marker = folder / f".shared-{uuid4().hex}"
+    try:
+        marker.touch()
+    except OSError as error:
+        raise InputError(f"{folder} cannot be written ({error.strerror}); choose another folder") from None
+    try:
+        yield str(marker)
+    finally:
+        marker.unlink(missing_ok=True)
+
+
+def _inspect(
+    shared: list[str], marker: str | None, begin: Callable[[], None] | None
+) -> tuple[str, list[str], str, float, bool]:
     """Runs on a worker: version, unseen paths, who it is, CPU seconds so far, whether sums keep to one thread."""
+    if begin is not None:
+        begin()
     missing = [p for p in shared if not os.path.exists(p)]
+    if marker is not None and not (os.path.exists(marker) and os.access(os.path.dirname(marker), os.W_OK)):
+        missing.append(os.path.dirname(marker))
     return __version__, missing, _process(), time.process_time(), os.environ.get("OMP_NUM_THREADS") == "1"
 
 

@@ -11,8 +11,8 @@ class StoresConfig:
     """Disk space on each machine for copies of files from stores, megabytes; those used least recently go first
     (chosen: a flight of 500 photos of 12 megapixels takes 3 GB)."""
     cache_trust_s: float = 600.0
-    """A copy that was made or compared with its store no longer ago is used without asking, seconds (chosen: a request
-    takes some 20 ms, and a picture is read two to four times in a run)."""
+    """A copy that was made or compared with its store in this run, and no longer ago, is used without asking, seconds
+    (chosen: a request takes some 20 ms, and a picture is read two to four times in a run)."""
     held_s: float = 600.0
     """A copy used no longer ago is not removed, seconds: another process may be about to open it (chosen)."""
     attempts: int = 5
@@ -20,6 +20,11 @@ class StoresConfig:
     some seconds)."""
     first_wait_s: float = 0.5
     """Wait before the second attempt, seconds; each further wait is twice as long (chosen; usual for S3)."""
+    longest_wait_s: float = 10.0
+    """Longest wait between two attempts, seconds (chosen)."""
+    busy_s: float = 60.0
+    """So long a store may answer that it has too much to do (429, 502, 503, 504) before the run ends, seconds (chosen:
+    S3 takes some ten seconds to some minutes to spread a prefix that suddenly gets many requests)."""
     timeout_s: float = 30.0
     """Longest silence of a store within a request, seconds (chosen)."""
     connections: int = 16

@@ -23,6 +23,10 @@ class AnonymousError(PermissionError):
     """A request without credentials was refused."""
 
 
+class EndedLoginError(PermissionError):
+    """A request was refused for its credentials."""
+
+
 class GoogleFileSystem(GCSFileSystem):  # type: ignore[misc]
     """The file system of `gs://`: a failure is raised at once, and its type tells what it is.
 
@@ -62,5 +66,7 @@ async def _raise_refusal(response: ClientResponse) -> None:
     """Raise by type what gcsfs tells in a text alone; at the text "Forbidden" it tries what else may be allowed."""
     if response.status == 401 and "Authorization" not in response.request_info.headers:
         raise AnonymousError(f"Forbidden: {response.url.path}")
+    if response.status == 401:
+        raise EndedLoginError(f"Forbidden: {response.url.path}")
     if response.status == 403:
         raise PermissionError(f"Forbidden: {response.url.path}")

@@ -5,16 +5,19 @@ path), else by the links of its index page, as Apache, nginx and `python -m http
 """
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
 
+from orthoswarm.model.errors import InputError
 from orthoswarm.stores.addresses import address_of, is_stored
-from orthoswarm.stores.requests import NotStoredError, request
+from orthoswarm.stores.requests import NotStoredError, RefusedError, request
 
 MANIFEST = "files.txt"
+_SERVER_PARTS = 3
+"""Parts of the path of a server itself: root, scheme, host."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +40,7 @@ def known(path: Path) -> StoredFile | None:
     return _known.get(path)
 
 
-def remember(sizes: dict[Path, StoredFile]) -> None:
+def remember(sizes: Mapping[Path, StoredFile]) -> None:
     """Take over what a listing of another process has told."""
     _known.update(sizes)
 
@@ -60,7 +63,7 @@ def list_folder(folder: Path) -> list[Path]:
     """All files below a folder in a store, in the order of their paths; empty if there are none.
 
     Raises:
-        InputError and others: see `requests.request`.
+        OrthoSwarmError: see `requests.request`.
     """
     if folder.parts[1].startswith("http"):
         return sorted(_web_folder(folder))
@@ -73,24 +76,30 @@ def list_folder(folder: Path) -> list[Path]:
 
 
 def exists(path: Path) -> bool:
-    """Whether there is a file or folder, local or in a store."""
+    """Whether there is a file or folder, local or in a store.
+
+    Raises:
+        InputError: if its store refuses to tell. Else see `requests.request`.
+    """
     if not is_stored(path):
         return path.exists()
     if path.parts[1].startswith("http"):
         return is_file(path) or bool(list_folder(path))
     try:
         return request(path, lambda system, key: bool(system.exists(key)))
+    except RefusedError as error:
+        raise InputError(str(error)) from None
     except NotStoredError:
         return False
 
 
 def is_file(path: Path) -> bool:
-    """Whether a path is a file, local or in a store; an address without a suffix counts as a folder on the web."""
+    """Whether a path is a file, local or in a store; on the web a server, and a name without a suffix, is a folder."""
     if not is_stored(path):
         return path.is_file()
     if path in _known:
         return True
-    if path.parts[1].startswith("http") and not path.suffix:
+    if path.parts[1].startswith("http") and (not path.suffix or len(path.parts) <= _SERVER_PARTS):
         return False
     try:
         look_up(path)

@@ -8,15 +8,15 @@ import contextlib
 import os
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from hashlib import blake2b
 from pathlib import Path
 
 from orthoswarm.config import active
-from orthoswarm.model.errors import StorageError
+from orthoswarm.model.errors import RunInterruptedError, StorageError
 from orthoswarm.stores.addresses import address_of, is_stored
 from orthoswarm.stores.ahead import Ahead
-from orthoswarm.stores.listing import known, look_up
+from orthoswarm.stores.listing import StoredFile, known, look_up, remember
 from orthoswarm.stores.requests import StoreRequestError, request
 
 FOLDER_VARIABLE = "ORTHOSWARM_CACHE"
@@ -24,7 +24,29 @@ FOLDER_VARIABLE = "ORTHOSWARM_CACHE"
 _SLACK = 16  # the cache may exceed its size by a 16th for each process that writes to it
 _ABANDONED_S = 86_400.0
 _added = 0
+_trusted_from = 0.0
 _lock = threading.Lock()
+
+
+class CacheFullError(RunInterruptedError, StorageError):
+    """Copies cannot be written: all files are concerned, and not the one that came first."""
+
+
+def compare_from_now() -> None:
+    """Compare each copy with its store before this process uses it: a run begins, and files may have been replaced."""
+    global _trusted_from
+    _trusted_from = time.time()
+
+
+def expect(listed: Mapping[Path, StoredFile]) -> None:
+    """Take over what a listing has just told; copies of anything else are compared before any process uses them."""
+    remember(listed)
+    now = time.time()
+    for path, found in listed.items():
+        copy = _place(path)
+        with contextlib.suppress(OSError):
+            same = found.version and _version_of(copy) == f"{found.size} {found.version}"
+            os.utime(copy, (copy.stat().st_atime, now if same else 0.0))
 
 
 def cache_folder() -> Path:
@@ -36,8 +58,8 @@ def local_file(path: Path) -> Path:
     """A local file with the content of a file, under the same name; the path itself if it is local.
 
     Raises:
-        InputError, NotStoredError, StoreRequestError, StoreLostError: see `requests.request`.
-        StorageError: if the copy cannot be written.
+        NotStoredError, StoreRequestError, StoreLostError, StoreAccessError: see `requests.request`.
+        CacheFullError: if the copy cannot be written.
     """
     if not is_stored(path):
         return path
@@ -58,7 +80,7 @@ def _copied(path: Path) -> Path:
     now = time.time()
     with contextlib.suppress(FileNotFoundError):
         state = copy.stat()
-        trusted = now - state.st_mtime <= active().stores.cache_trust_s
+        trusted = state.st_mtime >= max(now - active().stores.cache_trust_s, _trusted_from)
         if trusted or _is_current(path, copy):  # times of the copy: of its last use, of its last comparison
             os.utime(copy, (now, state.st_mtime if trusted else now))
             return copy
@@ -123,11 +145,15 @@ def _place(path: Path) -> Path:
 def _is_current(path: Path, copy: Path) -> bool:
     """Whether the store still holds what was copied."""
     try:
-        version = Path(f"{copy}.version").read_text(encoding="utf-8")
+        version = _version_of(copy)
     except OSError:
         return False
     found = look_up(path)
     return version == f"{found.size} {found.version}" != "None "
+
+
+def _version_of(copy: Path) -> str:
+    return Path(f"{copy}.version").read_text(encoding="utf-8")
 
 
 def _fetch(path: Path, copy: Path) -> None:
@@ -146,11 +172,13 @@ def _fetch(path: Path, copy: Path) -> None:
             raise StoreRequestError(f"{address_of(path)} came with {size} of {found.size} bytes; upload it again")
         _put_in_place(part, copy, f"{found.size} {found.version}")
     except OSError as error:
-        raise StorageError(
-            f"{cache_folder()} cannot be written ({error.strerror}); set {FOLDER_VARIABLE} to a folder with room"
+        raise CacheFullError(
+            f"{cache_folder()} cannot be written ({error.strerror}); set {FOLDER_VARIABLE} to a folder with room and "
+            "run the same command again to go on"
         ) from None
     finally:
-        part.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            part.unlink()
     with _lock:
         _added += size
         full = _added * _SLACK > active().stores.cache_mb * 1e6

@@ -7,19 +7,19 @@ belongs to it. An upload that was interrupted goes on with the files that are mi
 import json
 import os
 import shutil
-from collections.abc import Collection
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from hashlib import blake2b
 from pathlib import Path
 from uuid import uuid4
 
 from orthoswarm.config import active
-from orthoswarm.model.errors import InputError, OrthoSwarmError
+from orthoswarm.model.errors import InputError, OrthoSwarmError, RunInterruptedError
 from orthoswarm.model.task_runner import Progress
 from orthoswarm.stores.addresses import address_of
 from orthoswarm.stores.listing import list_folder
 from orthoswarm.stores.local_copies import cache_folder
-from orthoswarm.stores.requests import NotStoredError, StoreLostError, request
+from orthoswarm.stores.requests import NotStoredError, request
 
 _LAST = "report.json"
 _RECORD = ".uploaded"
@@ -29,10 +29,10 @@ class PublishedFolder:
     """The local folder of a map that is to lie in a store.
 
     It is the same for each run to an address on this machine, so that an interrupted run goes on in it, and is removed
-    after the upload.
+    after the upload. Whoever publishes holds the local folder against other runs until that is over.
 
     Attributes:
-        address: where the map is to lie. local: the folder to write to.
+        address: where the map is to lie. local: the folder to write to, of the same name.
 
     Raises:
         InputError: if nothing can be written at the address.
@@ -41,19 +41,20 @@ class PublishedFolder:
 
     def __init__(self, address: Path) -> None:
         self.address = address
-        self.local = cache_folder() / "maps" / blake2b(address_of(address).encode(), digest_size=12).hexdigest()
+        place = blake2b(address_of(address).encode(), digest_size=12).hexdigest()
+        self.local = cache_folder() / "maps" / place / address.name
         _require_writable(address)
 
-    def publish(self, products: Collection[str], progress: Progress | None = None) -> None:
-        """Upload all files and remove the local folder.
+    def publish(self, written: Callable[[str], bool], progress: Progress | None = None) -> None:
+        """Upload all files and remove them here; hidden ones, of a run that is not complete yet, stay.
 
         Args:
-            products: names of files and folders that runs write; those of an earlier run that this one has not written
-                are removed from the store.
+            written: whether runs write files of such a name (path in the folder); those of an earlier run that this one
+                has not written are removed from the store.
             progress: called during the upload.
 
         Raises:
-            OrthoSwarmError: if a file cannot be uploaded; the local folder stays, and the next run uploads the rest.
+            OrthoSwarmError: if a file cannot be uploaded; the local files stay, and the next run uploads the rest.
         """
         names = sorted(_files(self.local), key=lambda name: (name == _LAST, name))
         sent = self._sent()
@@ -61,19 +62,47 @@ class PublishedFolder:
         if _LAST in there and _LAST not in sent:
             self._remove(_LAST)
         wanted = [name for name in names if sent.get(name) != self._state(name) or name not in there]
-        with ThreadPoolExecutor(active().stores.connections) as pool:
-            first = [name for name in wanted if name != _LAST]
-            for done, name in enumerate(pool.map(self._send, first), 1):
-                sent[name] = self._state(name)
-                self._record(sent)
-                if progress is not None:
-                    progress("uploading", done, len(wanted))
+        for done, name in enumerate(self._sending([name for name in wanted if name != _LAST]), 1):
+            sent[name] = self._state(name)
+            self._record(sent)
+            if progress is not None:
+                progress("uploading", done, len(wanted))
         for name in sorted(there - set(names)):
-            if name.partition("/")[0] in products and name != _LAST:
+            if written(name) and name != _LAST:
                 self._remove(name)
         if _LAST in wanted:
             self._send(_LAST)
-        shutil.rmtree(self.local, ignore_errors=True)
+        (self.local / _RECORD).unlink(missing_ok=True)
+        for entry in self.local.glob("[!.]*"):
+            if entry.is_dir():
+                shutil.rmtree(entry, ignore_errors=True)
+            else:
+                entry.unlink(missing_ok=True)
+
+    def folders(self) -> list[Path]:
+        """The folders to be removed when nothing is left in them, the innermost first."""
+        return [self.local, self.local.parent]
+
+    def _sending(self, names: Sequence[str]) -> Iterator[str]:
+        """Upload several files at once; yields the name of each that has arrived, also after one that fails.
+
+        Raises:
+            OrthoSwarmError: when those that were under way have ended, if a file cannot be uploaded.
+        """
+        failed: BaseException | None = None
+        with ThreadPoolExecutor(active().stores.connections) as pool:
+            sending = [pool.submit(self._send, name) for name in names]
+            for each in as_completed(sending):
+                if each.cancelled():
+                    continue
+                if (error := each.exception()) is None:
+                    yield each.result()
+                else:
+                    failed = failed or error
+                    for other in sending:
+                        other.cancel()
+        if failed is not None:
+            raise failed
 
     def _send(self, name: str) -> str:
         local, size = str(self.local / name), active().stores.part_mb << 20
@@ -119,7 +148,7 @@ def _require_writable(address: Path) -> None:
     try:
         request(probe, lambda system, key: system.pipe_file(key, b"orthoswarm"))
         request(probe, lambda system, key: system.rm_file(key))
-    except (InputError, StoreLostError):
+    except RunInterruptedError:
         raise
     except NotStoredError:
         raise InputError(f"{text} cannot be written: there is no such bucket, or it is refused; check --out") from None

@@ -2,9 +2,12 @@
 
     Exception
     └── OrthoSwarmError
-        ├── NotStoredError       there is no such file, or it may not be read: this file alone is concerned
+        ├── NotStoredError       there is no such file: this file alone is concerned
+        │   └── RefusedError     it may not be read or written, and perhaps is not there
         ├── StoreRequestError    a store refuses one request again and again: this file alone is concerned
-        └── StoreLostError       a store cannot be reached: the run ends, and goes on when started again
+        ├── StoreLostError       a store cannot be reached, or says that it has too much to do: the run ends, and goes
+        │                        on when started again
+        └── StoreAccessError     packages or credentials are missing or no longer valid: as above, exit code 2
 
 Credentials come from where the stores' own libraries look for them (environment, ~/.aws, ~/.config/gcloud, the
 machine's role), addresses of other servers from AWS_ENDPOINT_URL and STORAGE_EMULATOR_HOST.
@@ -14,14 +17,14 @@ import errno
 import os
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 from urllib.parse import quote
 
 from orthoswarm.config import active
 from orthoswarm.model.errors import InputError, OrthoSwarmError, RunInterruptedError
-from orthoswarm.stores.addresses import address_of
+from orthoswarm.stores.addresses import address_of, split_stored
 
 T = TypeVar("T")
 _PACKAGES = {"s3": "s3fs", "gs": "gcsfs", "http": "aiohttp", "https": "aiohttp"}
@@ -38,12 +41,22 @@ _NO_CREDENTIALS = (
     ("google.auth.exceptions", "DefaultCredentialsError"),
     ("orthoswarm.stores.google_store", "AnonymousError"),
 )
-_LOGGED_OUT = (("google.auth.exceptions", "RefreshError"),)
+_LOGGED_OUT = (("google.auth.exceptions", "RefreshError"), ("orthoswarm.stores.google_store", "EndedLoginError"))
+_LOGGED_OUT_CODES = frozenset(
+    {"ExpiredToken", "TokenRefreshRequired", "InvalidToken", "InvalidAccessKeyId", "SignatureDoesNotMatch"}
+    | {"RequestTimeTooSkewed", "400"}  # S3 answers a request without a body (HEAD) by this number alone
+)
+_BUSY = frozenset({429, 502, 503, 504})
+"""Statuses by which a store says that it, or what stands before it, cannot serve anybody now."""
 _file_systems: dict[tuple[str, int], Any] = {}
 
 
 class NotStoredError(OrthoSwarmError):
-    """There is no such file in the store, or it may not be read."""
+    """There is no such file in the store."""
+
+
+class RefusedError(NotStoredError):
+    """A file may not be read or written, and perhaps is not there: stores do not tell whom they refuse."""
 
 
 class StoreRequestError(OrthoSwarmError):
@@ -51,14 +64,18 @@ class StoreRequestError(OrthoSwarmError):
 
 
 class StoreLostError(RunInterruptedError):
-    """A store cannot be reached."""
+    """A store cannot be reached, or cannot serve anybody now."""
+
+
+class StoreAccessError(RunInterruptedError, InputError):
+    """Packages or credentials are missing, or no longer valid: no other file would be given, either."""
 
 
 def file_system(path: Path) -> Any:
     """The file system of fsspec for a path, one for each process.
 
     Raises:
-        InputError: if the packages for it are not installed.
+        StoreAccessError: if the packages for it are not installed.
     """
     scheme = path.parts[1].rstrip(":")
     key = (scheme, os.getpid())
@@ -69,7 +86,7 @@ def file_system(path: Path) -> Any:
 
 def key_of(path: Path) -> str:
     """What fsspec calls a path: bucket and key, or the whole address on the web, quoted."""
-    scheme, _, rest = address_of(path).partition("://")
+    scheme, rest = split_stored(path)
     return f"{scheme}://{quote(rest, safe='/:@')}" if scheme.startswith("http") else rest
 
 
@@ -80,19 +97,26 @@ def request(path: Path, what: Callable[[Any, str], T]) -> T:
         path: in a store. what: the request; may be repeated.
 
     Raises:
-        InputError: if packages or credentials are missing.
-        NotStoredError, StoreRequestError, StoreLostError: see above.
+        NotStoredError, StoreRequestError, StoreLostError, StoreAccessError: see above.
     """
     config, key = active().stores, key_of(path)
-    for attempt in range(1, config.attempts + 1):
+    began, attempt = time.monotonic(), 1
+    while True:
         try:
             return what(file_system(path), key)
         except Exception as error:  # each backend raises errors of its own library
             _raise_final(path, error)
-            if attempt == config.attempts:
+            status = _status(error)
+            if status in _BUSY:
+                if time.monotonic() - began > config.busy_s:
+                    raise StoreLostError(
+                        f"the store of {address_of(path)} has too much to do (status {status}) for "
+                        f"{config.busy_s:.0f} s; run the same command again later to go on"
+                    ) from None
+            elif attempt >= config.attempts:
                 _raise_spent(path, error, attempt)
-        time.sleep(config.first_wait_s * 2 ** (attempt - 1))
-    raise AssertionError("unreachable")
+        time.sleep(min(config.first_wait_s * 2 ** (attempt - 1), config.longest_wait_s))
+        attempt += 1
 
 
 def _connected(scheme: str) -> Any:
@@ -109,7 +133,7 @@ def _connected(scheme: str) -> Any:
         return system
     except ImportError:
         package = _PACKAGES[scheme]
-        raise InputError(f"{scheme}:// needs the package {package}; pip install orthoswarm[cloud]") from None
+        raise StoreAccessError(f"{scheme}:// needs the package {package}; pip install orthoswarm[cloud]") from None
 
 
 def _settings(scheme: str) -> dict[str, Any]:
@@ -133,13 +157,15 @@ def _raise_final(path: Path, error: Exception) -> None:
     if isinstance(error, FileNotFoundError):
         raise NotStoredError(f"{address} is not there; check the address") from None
     if _is(error, _NO_CREDENTIALS):
-        raise InputError(
+        raise StoreAccessError(
             f"there are no credentials for {address}; set them as for the store's own program (docs/cluster.md)"
         ) from None
-    if isinstance(error, PermissionError):
-        raise NotStoredError(f"{address} is refused by its store; give credentials that may use it") from None
+    if isinstance(error, PermissionError) and not _is_logged_out(error):
+        raise RefusedError(
+            f"{address} is refused by its store; check the address, or give credentials that may use it"
+        ) from None
     if isinstance(error, ImportError):
-        raise InputError(f"{address} needs a package ({error}); pip install orthoswarm[cloud]") from None
+        raise StoreAccessError(f"{address} needs a package ({error}); pip install orthoswarm[cloud]") from None
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS):
         raise error
     if isinstance(error, OrthoSwarmError):
@@ -148,23 +174,53 @@ def _raise_final(path: Path, error: Exception) -> None:
 
 def _raise_spent(path: Path, error: Exception, attempts: int) -> None:
     address = address_of(path)
+    if _is_logged_out(error):
+        raise StoreAccessError(
+            f"the login for {address} is no longer valid; log in again (docs/cluster.md) and run the same command again"
+        ) from None
     if isinstance(error, ConnectionError) or _is(error, _GONE):
         raise StoreLostError(
             f"the store of {address} cannot be reached; run the same command again to go on when it is back"
         ) from None
-    if _is(error, _LOGGED_OUT):
-        raise InputError(f"the login for {address} is no longer valid; log in again (docs/cluster.md)") from None
     raise StoreRequestError(f"{address} failed in {attempts} attempts ({_short(error)}); try again later") from None
+
+
+def _is_logged_out(error: BaseException | None) -> bool:
+    """Whether a store does not accept the credentials, whatever they are used for."""
+    if _is(error, _LOGGED_OUT):
+        return True
+    return any(_response(each).get("Error", {}).get("Code") in _LOGGED_OUT_CODES for each in _chain(error))
+
+
+def _status(error: BaseException) -> int | None:
+    """The HTTP status that an error of any of the libraries tells."""
+    for each in _chain(error):
+        told = _response(each).get("ResponseMetadata", {}).get("HTTPStatusCode")
+        for status in (told, getattr(each, "status", None), getattr(each, "code", None)):
+            if isinstance(status, int):
+                return status
+            if isinstance(status, str) and status.isdigit():
+                return int(status)
+    return None
+
+
+def _response(error: BaseException) -> dict[str, Any]:
+    """What S3 has answered, as botocore's errors have it."""
+    found = getattr(error, "response", None)
+    return found if isinstance(found, dict) else {}
+
+
+def _chain(error: BaseException | None) -> Iterator[BaseException]:
+    """An error and its causes."""
+    while error is not None:
+        yield error
+        error = error.__cause__
 
 
 def _is(error: BaseException | None, kinds: tuple[tuple[str, str], ...]) -> bool:
     """Whether an error or one of its causes is of a library's type; a library that was not imported raised nothing."""
     types = tuple(getattr(sys.modules[m], name, ()) for m, name in kinds if m in sys.modules)
-    while error is not None:
-        if isinstance(error, types):
-            return True
-        error = error.__cause__
-    return False
+    return any(isinstance(each, types) for each in _chain(error))
 
 
 def _short(error: BaseException) -> str:

@@ -171,8 +171,8 @@ def _stored(top: Path, outside: set[str]) -> list[Path]:
     """The files of a folder in a store in the order in which a local one is walked."""
 
     def hidden(path: Path) -> bool:
-        below = path.parent.relative_to(top).parts
-        return any(part.startswith(".") for part in below) or not outside.isdisjoint(map(str, path.parents))
+        folders = [folder for folder in path.parents if folder != top and folder.is_relative_to(top)]
+        return any(folder.name.startswith(".") or str(folder) in outside for folder in folders)
 
     files = [path for path in list_folder(top) if not hidden(path)]
     return sorted(files, key=lambda path: (path.parent.parts, natural_key(path.name)))

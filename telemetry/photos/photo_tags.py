@@ -13,7 +13,8 @@ from typing import Any
 
 from orthoswarm.config import active
 from orthoswarm.stores.addresses import is_stored
-from orthoswarm.stores.listing import StoredFile, known, remember
+from orthoswarm.stores.listing import StoredFile, known
+from orthoswarm.stores.local_copies import expect
 from telemetry.formats.photo import exif, xmp
 from telemetry.formats.photo.makernotes import parse_dji
 from telemetry.formats.photo.picture_container import Container, NotAPicture, read_container
@@ -128,7 +129,7 @@ def _chunk(paths: Sequence[Path]) -> _Chunk:
 def _read_chunk(chunk: _Chunk) -> list[PhotoTags | Unreadable | None]:
     if not any(map(is_stored, chunk.paths)):
         return [_tags_or_reason(path) for path in chunk.paths]
-    remember(chunk.stored)
+    expect(chunk.stored)
     with ThreadPoolExecutor(active().stores.connections) as pool:  # a request mostly waits for the network
         return list(pool.map(_tags_or_reason, chunk.paths))
 

@@ -3,6 +3,8 @@
 import gc
 import hashlib
 import os
+import shutil
+import subprocess
 import time
 import warnings
 from functools import partial
@@ -93,6 +95,25 @@ def test_a_path_that_workers_do_not_see_is_refused(loopback, tmp_path):
         pass
     with pytest.raises(InputError, match=r"does not see .*missing"):
         Cluster(loopback.address, [tmp_path / "missing"])
+
+
+@pytest.mark.parametrize("empty", ["photos", "out"])
+def test_a_worker_without_the_shared_folder_mounted_is_refused(tmp_path, empty):
+    for name in ("photos/a", "out", "nothing"):
+        (tmp_path / name).mkdir(parents=True)
+    (tmp_path / "photos" / "a" / "DJI_0001.JPG").write_bytes(b"a photo")
+    apart = ["unshare", "--map-root-user", "--mount", "sh", "-c", 'mount --bind "$0" "$1" && shift && exec "$@"']
+    apart += [str(tmp_path / "nothing"), str(tmp_path / empty)]
+    if shutil.which("unshare") is None or subprocess.run([*apart, "true"], capture_output=True).returncode:
+        pytest.skip("needs a system on which a process may have mounts of its own")
+    with Loopback(tmp_path) as one:
+        one.begin(1)
+        Cluster(one.address, [tmp_path / "photos"], written=tmp_path / "out").close()
+        one.worker(*apart)
+        one.wait_for_workers(2)
+        with pytest.raises(InputError, match=rf"does not see .*{empty}"):
+            Cluster(one.address, [tmp_path / "photos"], written=tmp_path / "out")
+    assert not list((tmp_path / "out").iterdir())
 
 
 def test_a_wrong_address_is_one_sentence(configure):

@@ -8,6 +8,7 @@ import sys
 import pytest
 
 from gcs_plugin.cli.main import main
+from orthoswarm.batch.pipeline import is_written
 from orthoswarm.config import active
 from orthoswarm.model.errors import InputError
 from orthoswarm.stores import requests
@@ -175,26 +176,28 @@ def test_an_upload_that_fails_goes_on_and_the_report_comes_last(bucket, store, t
     (out.local / ".work" / "key").write_text("")
     store.fault = lambda method, path: 500 if "b.tif" in path and method in UPLOADS else None
     with pytest.raises(StoreRequestError):
-        out.publish(["a.tif", "b.tif"])
+        out.publish(lambda name: True)
     assert [p.name for p in list_folder(address)] == ["a.tif"]
     store.fault, store.seen = (lambda method, path: None), []
-    PublishedFolder(address).publish(["a.tif", "b.tif"])
+    PublishedFolder(address).publish(lambda name: True)
     put = [path for method, path in store.seen if method in UPLOADS and "writable" not in path]
     assert [p.rpartition("/")[2] for p in put] == ["b.tif", "report.json"]
-    assert not out.local.exists() and len(list_folder(address)) == 3
+    assert [p.name for p in out.local.iterdir()] == [".work"] and len(list_folder(address)) == 3
 
 
 def test_products_of_an_earlier_run_are_removed_and_other_files_stay(bucket, tmp_path):
     address = path_of(bucket()) / "map"
-    first = ("a.tif", "b.tif", "notes.txt", "tiles/a/r0.tif", "tiles/b/r0.tif", "report.json")
-    for names in (first, ("a.tif", "tiles/a/r0.tif", "report.json")):
+    tiles = ("tiles/a/r000_c000.tif", "tiles/b/r000_c000.tif", "tiles/collection.json", "tiles/vehicles/uav01.json")
+    others = ("notes.txt", "tiles/12/2200/1343.png", "tiles/notes.txt", "tiles/vehicles/plan/a.json")
+    first = ("coarse.tif", "realtime.tif", *tiles, *others, "report.json")
+    for names in (first, ("realtime.tif", tiles[0], "report.json")):
         out = PublishedFolder(address)
         for name in names:
             (out.local / name).parent.mkdir(parents=True, exist_ok=True)
             (out.local / name).write_text(name)
-        out.publish(["a.tif", "b.tif", "tiles", "report.json"])
+        out.publish(is_written)
     left = [p.relative_to(address).as_posix() for p in list_folder(address)]
-    assert left == ["a.tif", "notes.txt", "report.json", "tiles/a/r0.tif"]
+    assert left == sorted(["realtime.tif", "report.json", tiles[0], *others])
 
 
 def test_a_large_file_goes_up_in_parts(bucket, store, tmp_path, configure):
@@ -206,7 +209,7 @@ def test_a_large_file_goes_up_in_parts(bucket, store, tmp_path, configure):
     (out.local / "a.tif").write_bytes(data)
     answers = iter([None, 503])
     store.fault = lambda method, path: next(answers, None) if store.kind.part in path else None
-    out.publish(["a.tif"])
+    out.publish(is_written)
     assert sum(store.kind.part in path for method, path in store.seen if method in UPLOADS) >= 4
     assert content(address / "a.tif") == data
 
@@ -278,7 +281,7 @@ def test_files_with_any_name_and_end_arrive_whole(bucket, store):
     requests.file_system(address).pipe_file(
         "/".join([*address.parts[2:], ""]), b""
     )  # as store's own pages make folders
-    out.publish([])
+    out.publish(is_written)
     assert {p.name: content(p) for p in list_folder(address)} == files
 
 

@@ -6,6 +6,8 @@ import threading
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from orthoswarm.stores.addresses import address_of, is_stored, path_of
 
@@ -77,3 +79,15 @@ def test_what_is_not_there_is_one_sentence(web):
 
     with pytest.raises(InputError, match=r"http://127\.0\.0\.1.*/nothing does not exist"):
         names(f"{web}/nothing")
+
+
+def test_an_address_of_a_browser_names_the_same_files(flight, web):
+    assert names(f"{web}/my%20flight/") == names(f"{web}/my flight")
+    assert names(f"{web}/my%20flight/a/DJI_0001.JPG") == ["DJI_0001.JPG"]
+    assert len(names(web)) == 5  # a server is a folder, whatever its name ends with
+
+
+@given(st.text(st.characters(blacklist_characters="/\\\0", blacklist_categories=("Cs",)), min_size=1))
+def test_any_name_on_the_web_has_an_address(name):
+    path = path_of("https://example.org/a") / name
+    assert name in (".", "..") or path_of(address_of(path)) == path

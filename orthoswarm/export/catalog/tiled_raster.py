@@ -27,6 +27,7 @@ COLLECTION = "collection.json"
 VEHICLES = "vehicles"
 Tiles = Literal["auto", "yes", "no"]
 _NAME = re.compile(r"r(\d+)_c(\d+)\.tif")
+_WRITTEN = re.compile(rf"{FOLDER}/({COLLECTION}|{VEHICLES}/[^/]+\.json|[^/]+/r\d+_c\d+\.(tif|json))")
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +36,11 @@ class RasterTile:
 
     name: str
     grid: GroundGrid
+
+
+def is_tile_or_collection(name: str) -> bool:
+    """Whether a path in a map's folder is that of a tile, of an item or of the collection; others are not ours."""
+    return _WRITTEN.fullmatch(name) is not None
 
 
 def in_tiles(wanted: Tiles, window: tuple[int, int, int, int]) -> bool:

@@ -33,14 +33,17 @@ class Loopback:
         self.wait(self.file.exists)
         self.port = int(self.address.rpartition(":")[2])
 
-    def start(self, what, *args):
-        command = [sys.executable, "-m", "dask", what, "--scheduler-file", str(self.file), *args]
+    def start(self, what, *args, within=()):
+        command = [*within, sys.executable, "-m", "dask", what, "--scheduler-file", str(self.file), *args]
         quiet = subprocess.DEVNULL
         self.processes.append(subprocess.Popen(command, env=self.environment, stdout=quiet, stderr=quiet))
         return self.processes[-1]
 
-    def worker(self):
-        return self.start("worker", "--host", "127.0.0.1", "--nthreads", "1", "--no-nanny", "--no-dashboard")
+    def worker(self, *within):
+        """Start one, within another command (of some words) if there is one."""
+        return self.start(
+            "worker", "--host", "127.0.0.1", "--nthreads", "1", "--no-nanny", "--no-dashboard", within=within
+        )
 
     @property
     def address(self):

@@ -91,7 +91,7 @@ def store_server(kind):
 
 
 class FaultyProxy:
-    """A proxy on loopback; `fault(method, path)` gives None, a status, or seconds to wait before the answer.
+    """A proxy on loopback; `fault(method, path)` gives None, a status (with a body), or seconds before the answer.
 
     Attributes:
         address: of the proxy. kind: of the store. seen: (method, path with query) of each request; small uploads to
@@ -118,7 +118,8 @@ class FaultyProxy:
                 if isinstance(fault, float):
                     time.sleep(fault)
                 elif fault is not None:
-                    return self.answer(fault, {}, b"")
+                    status, body = fault if isinstance(fault, tuple) else (fault, b"")
+                    return self.answer(status, {}, body)
                 headers = {k: v for k, v in self.headers.items() if k.lower() not in ("connection",)}
                 behind = http.client.HTTPConnection(target.removeprefix("http://"), timeout=60)
                 behind.request(self.command, self.path, body, headers)

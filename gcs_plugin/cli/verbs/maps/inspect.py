@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from orthoswarm.model.angles import wrap_deg
+from orthoswarm.stores.addresses import path_of
 
 if TYPE_CHECKING:
     from telemetry.ingest.ingest import Survey
@@ -17,7 +18,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "\n\nexample:\n  orthoswarm inspect photos flight.mp4 --picture tracks.png"
     )
     add = parser.add_argument
-    add("inputs", nargs="+", type=Path, metavar="INPUT", help="folders, photos, videos, logs")
+    add("inputs", nargs="+", type=path_of, metavar="INPUT", help="folders, photos, videos, logs, or their addresses")
     add(
         "--sei-layout", type=Path, action="append", default=[], metavar="FILE",
         help="TOML file that describes a private SEI message (docs/telemetry.md)",

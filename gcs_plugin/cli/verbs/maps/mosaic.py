@@ -45,14 +45,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="raster of ground heights, instead of terrain found from the pictures",
     )
     add(
-        "--surface", type=Path, metavar="FILE.tif",
+        "--surface", type=path_of, metavar="FILE.tif",
         help="also write a surface model there: height of ground, roofs and crowns, with its sigma",
     )  # fmt: skip
     add(
-        "--control", type=Path, metavar="FILE",
+        "--control", type=path_of, metavar="FILE",
         help="surveyed points that move the map onto the ground: ODM's gcp_list.txt, or a CSV (docs/usage.md)",
     )  # fmt: skip
-    add("--checkpoints", type=Path, metavar="FILE", help="surveyed points at which the map is measured, same formats")
+    add(
+        "--checkpoints", type=path_of, metavar="FILE", help="surveyed points at which the map is measured, same formats"
+    )
     add(
         "--pixel-scale", type=float, default=1.0, metavar="S",
         help="for points marked in larger copies of the photos: pixels of these to one of those, for example 0.2",
@@ -104,6 +106,7 @@ def run(args: argparse.Namespace) -> int:
     gc.set_threshold(100_000, 50, 50)
     import json
     import sys
+    from functools import partial
 
     import telemetry
     from gcs_plugin.cli.progress import ProgressBars
@@ -113,8 +116,10 @@ def run(args: argparse.Namespace) -> int:
     from orthoswarm.matchers.network_device import require_device
     from orthoswarm.model.errors import InputError
     from orthoswarm.stores.addresses import is_stored
+    from orthoswarm.stores.local_copies import compare_from_now
     from orthoswarm.stores.published_folder import PublishedFolder
 
+    compare_from_now()
     _check(args)
     options = _options(args)
 
@@ -143,13 +148,12 @@ def run(args: argparse.Namespace) -> int:
     drawers: Workers | None = None
     published = PublishedFolder(args.out) if is_stored(args.out) else None
     out = args.out if published is None else published.local
-    folders = missing(out)
+    folders = missing(out) if published is None else published.folders()
     try:
         pool, drawers = _pools(args, out)
         with ProgressBars() as progress:
-            report = pipeline.run(load, out, options, pool, progress, drawers=drawers)
-            if published is not None:
-                published.publish(pipeline.WRITTEN, progress)
+            publish = None if published is None else partial(published.publish, pipeline.is_written, progress)
+            report = pipeline.run(load, out, options, pool, progress, drawers=drawers, publish=publish)
     finally:
         for each in (pool, drawers):
             if each is not None:
@@ -211,15 +215,16 @@ def _pools(args: argparse.Namespace, out: Path) -> "tuple[Workers, Workers | Non
     if not args.cluster:
         return workers(args.workers), None
     from orthoswarm.compute.dask_cluster import Cluster
+    from orthoswarm.stores.local_copies import compare_from_now
 
     apart = all(map(is_stored, args.inputs))
     read = [p for p in (*args.inputs, args.basemap, args.dem) if p is not None and not is_stored(p)]
     if apart:
-        return Cluster(args.cluster, read), workers(args.workers)
+        return Cluster(args.cluster, read, begin=compare_from_now), workers(args.workers)
     if is_stored(args.out):
         raise InputError("with --cluster and photos in a folder, --out has to be a folder, too, that all workers see")
     out.mkdir(parents=True, exist_ok=True)  # the workers write there
-    return Cluster(args.cluster, [*read, out]), None
+    return Cluster(args.cluster, read, written=out, begin=compare_from_now), None
 
 
 def _refuse_videos(ingest: "Ingest") -> None:
@@ -233,6 +238,7 @@ def _refuse_videos(ingest: "Ingest") -> None:
 def _check(args: argparse.Namespace) -> None:
     """Refuse invalid values."""
     from orthoswarm.model.errors import InputError
+    from orthoswarm.stores.addresses import is_stored
     from orthoswarm.stores.listing import exists
 
     if args.gsd is not None and not 0.001 <= args.gsd <= 100.0:
@@ -253,6 +259,10 @@ def _check(args: argparse.Namespace) -> None:
         raise InputError("--control moves refined pictures; leave out --until realtime")
     if not args.pixel_scale > 0.0:
         raise InputError("--pixel-scale must be greater than 0; leave it out for points marked in these photos")
+    for flag in ("surface", "control", "checkpoints"):
+        path = getattr(args, flag)
+        if path is not None and is_stored(path):
+            raise InputError(f"--{flag} {address_of(path)} is an address; name a file on this machine")
     files = (
         ("--basemap", args.basemap),
         ("--dem", args.dem),
