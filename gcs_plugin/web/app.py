@@ -200,7 +200,7 @@ class Routes:
         return JsonAnswer(await self.work(self.daemon.console.finds))
 
     async def add_find(self, request: Request) -> Response:
-        """Mark a find: `lat_deg`, `lon_deg`, `sigma_m`, `note`."""
+        """Mark a find: `lat_deg`, `lon_deg`, `sigma_m`, `note`; `time` (ISO 8601) if it was marked before now."""
         body = await json_body(request)
         return JsonAnswer(await self.work(self.daemon.console.add_find, body), status_code=201)
 

@@ -59,7 +59,7 @@ def test_gaps_are_listed_and_flown_only_after_a_confirmation(browser):
             page.click("dialog[open] button:text-is('Plan')")
             assert "Enter how many minutes" in page.locator("dialog[open]").inner_text()
             assert _posts(station) == []
-            page.locator(".gap-vehicles input[type=number]").fill("12")
+            page.locator(".gap-vehicles input[inputmode=decimal]").fill("12")
             page.click("dialog[open] button:text-is('Plan')")
             page.wait_for_selector("text=a warning of the plan")
             assert _posts(station) == ["/api/coverage/flight"]

@@ -2,7 +2,7 @@
 
 import base64
 
-from tests.kit.page_kit import DESK, PHONE, ok_for_all, opened, send, standing, vehicle
+from tests.kit.page_kit import DESK, PHONE, TABLET, ok_for_all, opened, send, standing, vehicle
 from tests.page.test_command_bar import confirm
 
 PNG = base64.b64decode(
@@ -53,3 +53,51 @@ def test_the_ground_under_a_vehicle_can_be_marked(browser):
         box = page.locator("button.vehicle").bounding_box()
         with page.expect_request(lambda request: request.method == "POST" and request.url.endswith("/api/finds")):
             page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+
+
+FIND = {"id": 1, "lat_deg": 47.3977, "lon_deg": 8.5456, "sigma_m": 2.0, "note": "Roof", "time": "2026-05-28T20:26:40Z"}
+
+
+def test_a_find_says_how_far_off_it_may_be_or_that_this_is_not_known(browser):
+    with standing(vehicle(1)) as station:
+        station.gets["/api/finds"] = [FIND, FIND | {"id": 2, "sigma_m": None, "note": "Car"}]
+        with opened(browser, station.url) as page:
+            page.click("#tab-map")
+            page.wait_for_selector(".finds li:has-text('Roof') >> text=within 4.90 m (95 %)")
+            page.wait_for_selector(".finds li:has-text('Car') >> text=accuracy not known")
+
+
+def test_a_find_that_was_removed_can_be_put_back(browser):
+    with standing(vehicle(1)) as station:
+
+        def answer(method, path, body):
+            station.gets["/api/finds"] = [] if method == "DELETE" else [body | {"id": 2}]
+            return 200, None
+
+        station.gets["/api/finds"], station.answer = [FIND], answer
+        with opened(browser, station.url, TABLET) as page:
+            page.click("#tab-map")
+            page.click("[aria-label='Remove this find']")
+            page.wait_for_selector(".finds li", state="detached")
+            page.click("text=Put back")
+            page.wait_for_selector(".finds li:has-text('Roof')")
+            assert station.gets["/api/finds"] == [FIND | {"id": 2}]
+
+
+def test_a_find_that_could_not_be_saved_keeps_its_place(browser):
+    with standing(vehicle(1)) as station, opened(browser, station.url, TABLET) as page:
+        station.answer = lambda method, path, body: (201, body)
+        page.wait_for_selector(".vehicle")
+        page.click("#tab-map")
+        page.fill("input[aria-label='Note of the find']", "Person")
+        page.click("text=Mark on the map")
+        page.context.set_offline(True)
+        page.mouse.click(700, 300)
+        page.wait_for_selector("text=Person was not saved")
+        wanted = page.evaluate("orthoswarm.map.unproject([700 - 320, 300 - 52]).toArray()")
+        page.context.set_offline(False)
+        with page.expect_response(lambda response: response.request.method == "POST"):
+            page.click("text=Save again")
+        (_, _, saved) = station.heard[-1]
+        assert saved["note"] == "Person"
+        assert abs(saved["lon_deg"] - wanted[0]) < 1e-6 and abs(saved["lat_deg"] - wanted[1]) < 1e-6

@@ -3,6 +3,7 @@
 import threading
 import time
 from collections.abc import Callable, Mapping
+from datetime import datetime
 from typing import Any, Final
 
 from gcs_plugin.daemon.store.journal import Journal
@@ -71,7 +72,7 @@ class ConsoleState:
         row = {
             "lat_deg": _number(body, "lat_deg", 90.0), "lon_deg": _number(body, "lon_deg", 180.0),
             "sigma_m": None if body.get("sigma_m") is None else _number(body, "sigma_m", 1e6),
-            "note": body.get("note") or "", "time": iso_time(time.time()),
+            "note": body.get("note") or "", "time": _time_of(body),
         }  # fmt: skip
         if not isinstance(row["note"], str) or len(row["note"]) > _MOST_NOTE:
             raise InputError(f"note is not a text of at most {_MOST_NOTE} characters; send a shorter one")
@@ -94,6 +95,18 @@ class ConsoleState:
             self._journal.remember("finds", found | {"rows": rows})
         self._publish("finds")
         return True
+
+
+def _time_of(body: Mapping[str, Any]) -> str:
+    """When a find was marked: one that is put back after a deletion keeps its time (ISO 8601); else now."""
+    given, now = body.get("time"), time.time()
+    if not isinstance(given, str):
+        return iso_time(now)
+    try:
+        at = datetime.fromisoformat(given)
+        return iso_time(min(at.timestamp(), now) if at.tzinfo else now)
+    except (ValueError, OverflowError):
+        raise InputError("time is not a time in ISO 8601; send for example 2026-05-28T20:26:40Z, or none") from None
 
 
 def _number(body: Mapping[str, Any], key: str, largest: float) -> float:

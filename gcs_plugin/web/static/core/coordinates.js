@@ -21,6 +21,9 @@ function zoneOf(lat, lon) {
   return zone;
 }
 
+// Beyond the meridian of 180 degrees the map goes on counting.
+const wrapped = (lon) => (lon >= -180 && lon <= 180 ? lon : ((((lon + 180) % 360) + 360) % 360) - 180);
+
 // UTM of a position: { zone, band, east, north } in metres; null outside 80 S to 84 N.
 export function utm(lat, lon) {
   if (!(lat >= -80 && lat <= 84)) return null;
@@ -55,7 +58,8 @@ function dms(value, positive, negative) {
   return `${degrees}°${String(minutes).padStart(2, "0")}′${seconds.toFixed(1).padStart(4, "0")}″${value < 0 ? negative : positive}`;
 }
 
-export function positionText(lat, lon, form) {
+export function positionText(lat, away, form) {
+  const lon = wrapped(away);
   if (form === "dms") return `${dms(lat, "N", "S")} ${dms(lon, "E", "W")}`;
   if (form === "utm") {
     const grid = utm(lat, lon);

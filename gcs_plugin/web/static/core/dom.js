@@ -57,6 +57,9 @@ export function keyedList(box, create, update) {
 export const labelled = (text, control, hint) =>
   make("label", { class: "field" }, make("span", {}, text), control, hint ? make("small", {}, hint) : null);
 
+// A field for a number, read with numberOf of units.js. type=number drops the comma of "62,5" in most browsers.
+export const numberField = (attributes) => make("input", { type: "text", inputmode: "decimal", autocomplete: "off", ...attributes });
+
 export const button = (text, onclick, options = {}) =>
   make("button", { type: "button", onclick, ...options }, text);
 

@@ -17,9 +17,9 @@ export function linkStatus() {
 export function linkBanner() {
   const text = make("span", {});
   const banner = make("div", { class: "banner", role: "alert", hidden: true }, text);
-  subscribe("link", "banner", () => {
+  subscribe("link problems", "banner", () => {
     setHidden(banner, state.link !== "lost");
-    if (state.link === "lost") setText(text, t("link.banner", { age: ageText(Math.floor(state.silent_s)) }));
+    if (state.link === "lost") setText(text, state.problems.includes(t("app.token")) ? t("app.token") : t("link.banner", { age: ageText(Math.floor(state.silent_s)) }));
     setAttribute(document.documentElement, "data-link", state.link);
   });
   return banner;

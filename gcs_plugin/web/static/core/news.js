@@ -1,6 +1,7 @@
 // What comes in: everything once at the start and after each gap, then only what changes.
 
 import { get } from "/static/core/api.js";
+import { nowMs } from "/static/core/clock.js";
 import { guarded } from "/static/core/guard.js";
 import { changed, state } from "/static/core/store.js";
 import { t } from "/static/core/strings.js";
@@ -11,18 +12,29 @@ import { heardCommand } from "/static/fly/commands.js";
 const HEALTH_MS = 5000;
 const list = (value) => (Array.isArray(value) ? value : []);
 
-const takeVehicle = guarded("a vehicle", (message, whole) => {
+const takeVehicle = guarded("a vehicle", (message, whole, at = nowMs()) => {
   const id = message?.id == null ? "" : String(message.id);
   if (!id) return;
   if (!state.vehicles.has(id) && message.state === undefined) { soon("/api/vehicles"); return; } // only what has changed of one not known yet
-  state.vehicles.set(id, vehicle(message, state.vehicles.get(id), performance.now(), whole === true));
+  state.vehicles.set(id, vehicle(message, state.vehicles.get(id), at, whole === true));
   changed("vehicles");
 });
+
+// A list of vehicles may come late over a slow link: it is as old as its request, and what came meanwhile is newer.
+let meanwhile = [];
+function heardVehicle(message) {
+  if (reading.has("/api/vehicles")) meanwhile.push([message, nowMs()]);
+  takeVehicle(message);
+}
+function takeVehicles(rows, asked) {
+  list(rows).forEach((row) => takeVehicle(row, true, asked));
+  for (const [message, at] of meanwhile) takeVehicle(message, false, at);
+}
 const takeTraffic = (rows) => { state.traffic = list(rows).map(aircraft).filter((row) => row.id && row.position); changed("traffic"); };
 const takeJob = (job) => { if (job?.id != null) { state.jobs.set(job.id, job); changed("jobs"); } };
 
 const READS = {
-  "/api/vehicles": (rows) => list(rows).forEach((row) => takeVehicle(row, true)),
+  "/api/vehicles": takeVehicles,
   "/api/layers": (rows) => { state.layers = list(rows); changed("layers"); },
   "/api/jobs": (rows) => list(rows).forEach(takeJob),
   "/api/legs": (body) => { state.legs = list(body?.features); changed("legs"); },
@@ -32,14 +44,32 @@ const READS = {
   "/healthz": (body) => { state.problems = list(body?.problems).map(String); changed("problems"); },
 };
 
+// One request of each path at a time: on a slow link they would pile up, and an older answer could come last. After a gap
+// in the stream all are asked anew, and what was asked before it is not waited for.
+let era = 0;
+const reading = new Set();
+const again = new Set();
 async function read(path) {
+  if (reading.has(path)) { again.add(path); return; }
+  const [mine, asked] = [era, nowMs()];
+  reading.add(path);
+  if (path === "/api/vehicles") meanwhile = [];
   try {
-    guarded(path, READS[path])(await get(path));
+    const body = await get(path);
+    if (mine === era) guarded(path, READS[path])(body, asked);
   } catch (error) {
-    if (error.kind === "http") { state.problems = [error.status === 401 ? t("app.token") : `${path}: ${error.message}`]; changed("problems"); }
+    if (mine === era && error.kind === "http") { state.problems = [error.status === 401 ? t("app.token") : `${path}: ${error.message}`]; changed("problems"); }
+  } finally {
+    if (mine === era) reading.delete(path);
+    if (mine === era && again.delete(path)) soon(path);
   }
 }
-export const refresh = () => Promise.all(Object.keys(READS).map(read));
+export function refresh() {
+  era += 1;
+  reading.clear();
+  again.clear();
+  return Promise.all(Object.keys(READS).map(read));
+}
 
 // What is asked for again after an event, at most once in two seconds.
 const SOON_MS = 2000;
@@ -52,7 +82,8 @@ function soon(...paths) {
 
 const KINDS = {
   resync: () => { refresh(); changed("plan"); changed("finds-changed"); },
-  vehicle: takeVehicle,
+  refused: () => read("/api/vehicles"),
+  vehicle: heardVehicle,
   vehicle_event: (event) => {
     const row = state.vehicles.get(String(event.vehicle));
     if (row && event.said) { row.texts = [...row.texts, ...messages([{ text: event.said, time: event.time, severity: event.severity }])].slice(-MOST_TEXTS); changed("vehicles"); }

@@ -1,6 +1,7 @@
 // The daemon's event stream. A heartbeat comes each second: silence is shown, never hidden behind the last state.
 
 import { token } from "/static/core/api.js";
+import { nowMs } from "/static/core/clock.js";
 import { changed, state } from "/static/core/store.js";
 
 const LATE_S = 2;
@@ -8,7 +9,8 @@ export const LOST_S = 5;
 const RECONNECT_S = 8;
 const CHECK_MS = 500;
 
-let heardAt = performance.now();
+let heardAt = performance.now(); // for the clocks of commands
+let quietSince = nowMs(); // for what is shown
 let socket = null;
 let wait = 500;
 export const connected = () => socket?.readyState === WebSocket.OPEN && state.link !== "lost";
@@ -41,11 +43,13 @@ export const given = () => (read(steady) == null ? { given_s: read(wall) } : { g
 export function listen(heard) {
   const connect = () => {
     const query = token() ? `?token=${encodeURIComponent(token())}` : "";
+    let welcome = false;
     const opened = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/api/events${query}`);
     socket = opened;
-    opened.onopen = () => { wait = 500; };
+    opened.onopen = () => { wait = 500; welcome = true; };
     opened.onmessage = (message) => {
       heardAt = performance.now();
+      quietSince = nowMs();
       if (state.link !== "live") check();
       let event = null;
       try { event = JSON.parse(message.data); } catch { return; }
@@ -55,12 +59,13 @@ export function listen(heard) {
     };
     opened.onclose = () => {
       if (socket !== opened) return;
+      if (!welcome) heard({ type: "refused" }); // no link, or a wrong token: a request tells which
       setTimeout(connect, wait);
       wait = Math.min(4000, wait * 2);
     };
   };
   const check = () => {
-    const silent = (performance.now() - heardAt) / 1000;
+    const silent = (nowMs() - quietSince) / 1000;
     const link = silent < LATE_S ? "live" : silent < LOST_S ? "late" : "lost";
     if (link !== state.link || link !== "live") {
       state.link = link;
@@ -71,10 +76,11 @@ export function listen(heard) {
       const dead = socket;
       socket = null;
       dead.close();
-      heardAt = Math.min(heardAt, performance.now() - RECONNECT_S * 1000);
+      quietSince = Math.min(quietSince, nowMs() - RECONNECT_S * 1000);
       setTimeout(connect, 500);
     }
   };
   setInterval(check, CHECK_MS);
+  document.addEventListener("visibilitychange", check);
   connect();
 }

@@ -29,6 +29,13 @@ export function area(m2) {
   return m2 < 10_000 ? `${m2.toFixed(0)} m²` : `${(m2 / 10_000).toFixed(2)} ha`;
 }
 
+// A number as people type it, with a decimal point or comma; NaN for anything else. "1,000" is a thousand to some and one
+// to others: it is no number.
+export function numberOf(text) {
+  const words = text.trim();
+  return /^[-+]?(\d+([.,]\d*)?|[.,]\d+)$/.test(words) && !/^[-+]?[1-9]\d{0,2},\d{3}$/.test(words) ? Number(words.replace(",", ".")) : NaN;
+}
+
 // Input fields hold what the person reads; these turn it into metres and back.
 export const lengthUnit = () => (us() ? "ft" : "m");
 export const toMetres = (value) => (us() ? value * FOOT : value);

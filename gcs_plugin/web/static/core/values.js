@@ -12,7 +12,13 @@ export const position = (lon, lat) => {
   return x == null || y == null ? null : [x, y];
 };
 
-const points = (list) => (Array.isArray(list) ? list.map((p) => Array.isArray(p) && position(p[0], p[1])).filter(Boolean) : []);
+// Corners east or west of the meridian of 180 degrees go on counting (181), so that a ring stays in one piece.
+const corner = (lon, lat) => {
+  const turns = 360 * Math.round((number(lon, -540, 540) ?? 0) / 360);
+  const place = position(number(lon, -540, 540) == null ? null : lon - turns, lat);
+  return place && [lon, place[1]];
+};
+const points = (list) => (Array.isArray(list) ? list.map((p) => Array.isArray(p) && corner(p[0], p[1])).filter(Boolean) : []);
 export const ring = (list) => points(list);
 
 const object = (value) => (value && typeof value === "object" && !Array.isArray(value) ? value : {});
@@ -82,5 +88,5 @@ function extend(trail, point) {
   if (trail.length > TRAIL) trail.splice(0, trail.length - TRAIL);
 }
 
-// Seconds since a vehicle was heard, as of now (performance.now()); null for one that only sends pictures.
+// Seconds since a vehicle was heard, as of now (nowMs()); null for one that only sends pictures.
 export const age = (row, now) => (row.linked ? row.silent_s + (now - row.at) / 1000 : null);

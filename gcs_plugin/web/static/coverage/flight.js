@@ -4,7 +4,7 @@
 
 import { get, post } from "/static/core/api.js";
 import { dialogBox } from "/static/core/dialog.js";
-import { button, make, setHidden, setText } from "/static/core/dom.js";
+import { button, make, numberField, setHidden, setText } from "/static/core/dom.js";
 import { state } from "/static/core/store.js";
 import { t } from "/static/core/strings.js";
 import * as units from "/static/core/units.js";
@@ -46,7 +46,7 @@ export async function openGapFlight() {
     const vehicles = await get("/api/coverage/vehicles");
     rows = vehicles.map((row) => {
       const on = make("input", { type: "checkbox", checked: !row.busy, disabled: Boolean(row.busy) && !row.in_air, onchange: () => setPlan(null) });
-      const minutes = make("input", { type: "number", min: 1, max: 600, step: "any", value: row.minutes ?? "", inputmode: "decimal", "aria-label": t("gapflight.minutes", { name: nameOf(row.id) }), oninput: () => setPlan(null) });
+      const minutes = numberField({ value: row.minutes ?? "", "aria-label": t("gapflight.minutes", { name: nameOf(row.id) }), oninput: () => setPlan(null) });
       const left = t(row.minutes == null ? "gapflight.ask" : "gapflight.left", { battery: row.battery == null ? "?" : `${Math.round(100 * row.battery)} %` });
       const words = row.in_air ? `${t("gapflight.inair")} ${left}` : row.busy || left;
       list.append(make("li", {}, make("label", { class: "check" }, on, make("b", {}, nameOf(row.id))), make("small", {}, words), on.disabled ? null : minutes));
@@ -61,13 +61,13 @@ export async function openGapFlight() {
 async function makePlan() {
   setPlan(null);
   const chosen = rows.filter((row) => row.on.checked);
-  const asked = chosen.find((row) => !(Number(row.minutes.value) > 0));
+  const asked = chosen.find((row) => !(units.numberOf(row.minutes.value) > 0));
   if (asked) { setText(status, t("gapflight.unknown", { name: nameOf(asked.id) })); asked.minutes.focus(); return; }
   planButton.disabled = true;
   setText(status, t("plan.making"));
   try {
     const inAir = chosen.filter((row) => row.inAir).map((row) => row.id);
-    const wanted = { vehicles: Object.fromEntries(chosen.map((row) => [row.id, Number(row.minutes.value)])) };
+    const wanted = { vehicles: Object.fromEntries(chosen.map((row) => [row.id, units.numberOf(row.minutes.value)])) };
     const made = await post("/api/coverage/flight", inAir.length ? { ...wanted, in_air: inAir } : wanted, 120_000);
     setPlan({ ...made, inAir });
     setText(status, "");

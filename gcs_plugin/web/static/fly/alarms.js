@@ -1,6 +1,7 @@
 // Alarms by word, colour and sound: what needs a person now. A sound repeats until somebody has seen it; what was seen and
 // gets worse is an alarm again, and Seen is for what is on the screen.
 
+import { nowMs } from "/static/core/clock.js";
 import { button, keyedList, make, setAttribute, setHidden, setText } from "/static/core/dom.js";
 import { settings } from "/static/core/settings.js";
 import { changed, select, state, subscribe } from "/static/core/store.js";
@@ -13,9 +14,12 @@ const REPEAT_MS = 4000;
 let sound = null;
 let last = 0;
 
+// Browsers let a page sound only after a press on it; one that stays silent until then would stay silent for good.
+for (const kind of ["pointerup", "keydown"]) document.addEventListener(kind, () => { if (sound && sound.state !== "running") sound.resume?.(); }, true);
+
 function beep(level) {
-  if (!settings.sound || performance.now() - last < 700) return;
-  last = performance.now();
+  if (!settings.sound || nowMs() - last < 700) return;
+  last = nowMs();
   try {
     sound ??= new AudioContext();
     for (const [k, hertz] of (level === "bad" ? [880, 660, 880] : [660]).entries()) {
@@ -64,7 +68,7 @@ const pairs = new Map();
 export function near(pair, active, event) {
   const key = `near/${pair.join("/") || event.vehicle}`;
   if (!active) pairs.delete(key);
-  else pairs.set(key, { pair, level: "bad", text: String(event.text), vehicle: String(event.vehicle), at: performance.now() });
+  else pairs.set(key, { pair, level: "bad", text: String(event.text), vehicle: String(event.vehicle), at: nowMs() });
   changed("alarms");
 }
 
@@ -101,7 +105,7 @@ const clockText = (time_s) => (time_s == null ? "" : `${new Date(time_s * 1000).
 
 function tell(vehicle, level, words, time_s) {
   const key = `once/${vehicle}/${words}`;
-  const [known, now] = [once.get(key), performance.now()];
+  const [known, now] = [once.get(key), nowMs()];
   const name = state.vehicles.get(vehicle)?.name ?? vehicle;
   if (known && state.alarms.get(key)?.seen && now - known.at > AGAIN_MS) state.alarms.delete(key);
   once.set(key, { level, text: `${clockText(time_s)}${name}: ${words}`, vehicle, at: now });
@@ -133,7 +137,7 @@ function earlier(row, now_s) {
 const heardNow = (vehicle, message) => once.has(`once/${vehicle}/${t("alarm.said", { text: message.text })}`);
 
 subscribe("vehicles tick commands alarms link traffic", "alarms", () => {
-  const now = performance.now();
+  const now = nowMs();
   const standing = new Set();
   for (const row of state.vehicles.values()) {
     for (const item of need(row, now).why) {
@@ -163,7 +167,7 @@ export function alarmList() {
   const list = make("ul", {});
   let drawn = [];
   const seen = button(t("alarm.seen"), () => {
-    for (const alarm of drawn) if (performance.now() - alarm.shown > READ_MS) alarm.seen = true;
+    for (const alarm of drawn) if (nowMs() - alarm.shown > READ_MS) alarm.seen = true;
     changed("alarm-list");
   }, { class: "small" });
   const title = make("b", {});
@@ -176,7 +180,7 @@ export function alarmList() {
   subscribe("alarm-list", "list of alarms", () => {
     const fresh = [...state.alarms.values()].filter((alarm) => !alarm.seen).sort((a, b) => (a.level === "bad" ? 0 : 1) - (b.level === "bad" ? 0 : 1));
     drawn = fresh.slice(0, rows());
-    for (const alarm of fresh) alarm.shown = drawn.includes(alarm) ? alarm.shown ?? performance.now() : null;
+    for (const alarm of fresh) alarm.shown = drawn.includes(alarm) ? alarm.shown ?? nowMs() : null;
     setText(title, t("alarm.count", { n: fresh.length }));
     draw(drawn.map((alarm) => [alarm.key, alarm]));
     setText(more, fresh.length > drawn.length ? t("alarm.more", { n: fresh.length - drawn.length }) : "");

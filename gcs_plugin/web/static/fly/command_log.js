@@ -16,7 +16,7 @@ export function commandLog() {
     make("div", { class: "row" }, title, clear), list);
   const draw = keyedList(list, () => make("li", {}, make("b", {}), make("span", { class: "outcome" }), make("span", { class: "reason" })), (row, entry) => {
     const [name, outcome, reason] = row.children;
-    setText(name, `${entry.name}: ${t(`verb.${entry.verb}`)}`);
+    setText(name, `${entry.name}: ${t(`verb.${entry.verb}`)}${entry.elsewhere ? ` (${t("command.elsewhere")})` : ""}`);
     setText(outcome, t(`outcome.${entry.outcome}`));
     setText(reason, entry.outcome === "waiting" ? "" : entry.reason);
     setAttribute(row, "data-outcome", entry.outcome);

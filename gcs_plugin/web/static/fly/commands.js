@@ -76,7 +76,9 @@ export async function commandAll(verb) {
 export function heardCommand(event) {
   const key = `${event.id}/${event.vehicle}`;
   if (!event.vehicle || state.commands.some((entry) => entry.key === key)) return;
-  end(begin(String(event.id), String(event.command), String(event.vehicle)), event.outcome, event.reason);
+  const entry = begin(String(event.id), String(event.command), String(event.vehicle));
+  entry.elsewhere = true;
+  end(entry, event.outcome, event.reason);
 }
 
 export function forget(id) {

@@ -1,5 +1,6 @@
 // The selected vehicle: its figures in full, its commands, and what its autopilot says.
 
+import { nowMs } from "/static/core/clock.js";
 import { button, keyedList, make, setAttribute, setHidden, setText } from "/static/core/dom.js";
 import { onSettings, settings } from "/static/core/settings.js";
 import { changed, select, state, subscribe } from "/static/core/store.js";
@@ -46,7 +47,7 @@ export function detailsPanel() {
     const covered = settings.mode !== "fly" && settings.mode !== openedIn;
     setHidden(box, !row || covered);
     if (!row || covered) return;
-    const wanted = need(row, performance.now());
+    const wanted = need(row, nowMs());
     setText(name, row.name === row.id ? row.id : `${row.name} (${row.id})`);
     setText(why, wanted.why.map((item) => item.words).join("; "));
     for (const part of [linked, heading, messages]) setHidden(part, !row.linked);

@@ -1,10 +1,13 @@
 // The confirmation of what moves vehicles: a mouse or a key presses once; a finger holds for one second. The question opens
 // on Cancel, and a key that was down then confirms nothing until it was let go: holding Enter must not land the swarm.
+// A hold is of one finger, for one question, and counted in steps between which the page hears that the finger was lifted:
+// neither a second finger, nor a question that took the first one's place, nor a page that was busy makes a tap a hold.
 
 import { button, make, setHidden, setText } from "/static/core/dom.js";
 import { t } from "/static/core/strings.js";
 
-const HOLD_MS = 1000;
+const STEP_MS = 250;
+const STEPS = 4; // one second; the bar in layout.css fills in the same time
 const SETTLE_MS = 350; // a double press of the first button is not a confirmation
 
 const PRESSES = new Set(["Enter", "NumpadEnter", "Space"]);
@@ -26,6 +29,7 @@ export function holdConfirm() {
   let opened = 0;
   let touch = false;
   let timer = null;
+  const fingers = new Set(); // pointers on the button
   let before = null;
   let held = new Set(); // keys that were down when the question opened, and are since
   function close() {
@@ -45,19 +49,24 @@ export function holdConfirm() {
     timer = null;
     yes.classList.remove("holding");
   }
+  const hold = (left) => { timer = setTimeout(() => (left > 1 ? hold(left - 1) : confirm()), STEP_MS); };
   yes.addEventListener("pointerdown", (event) => {
     touch = event.pointerType === "touch" || event.pointerType === "pen";
     if (!touch) return;
+    stop();
+    fingers.add(event.pointerId);
     yes.setPointerCapture(event.pointerId);
+    if (fingers.size > 1) return;
     yes.classList.add("holding");
-    timer = setTimeout(confirm, HOLD_MS);
+    hold(STEPS);
   });
-  for (const kind of ["pointerup", "pointercancel"]) yes.addEventListener(kind, stop);
+  for (const kind of ["pointerup", "pointercancel"]) yes.addEventListener(kind, (event) => { fingers.delete(event.pointerId); stop(); });
+  document.addEventListener("visibilitychange", stop);
   yes.addEventListener("contextmenu", (event) => event.preventDefault());
   yes.addEventListener("click", (event) => {
-    const finger = touch && event.detail > 0;
+    const tapped = touch && event.detail > 0;
     touch = false;
-    if (!finger && performance.now() - opened > SETTLE_MS) confirm();
+    if (!tapped && performance.now() - opened > SETTLE_MS) confirm();
   });
   document.addEventListener("keyup", (event) => held.delete(event.code), true);
   box.addEventListener("keydown", (event) => {
@@ -70,6 +79,8 @@ export function holdConfirm() {
   });
   // Ask; work() runs once it is confirmed.
   const ask = (text, label, tone, work) => {
+    stop();
+    fingers.clear();
     setText(question, text);
     setText(yes.firstChild, label);
     yes.dataset.tone = tone;

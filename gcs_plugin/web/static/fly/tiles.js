@@ -1,6 +1,7 @@
 // The strip of vehicle tiles. A tile is made once, stays where it is, and changes in place: no press is lost, and the
 // keyboard's focus stays. The order changes only when the person asks for it.
 
+import { nowMs } from "/static/core/clock.js";
 import { button, choice, make, setAttribute, setHidden, setStyle, setText } from "/static/core/dom.js";
 import { guarded } from "/static/core/guard.js";
 import { setSetting, settings } from "/static/core/settings.js";
@@ -77,14 +78,14 @@ const matches = (row, now) => {
 };
 
 function refilter() {
-  const now = performance.now();
+  const now = nowMs();
   for (const [id, tile] of tiles) setHidden(tile.item, !matches(state.vehicles.get(id), now));
 }
 
 const byName = new Intl.Collator(undefined, { numeric: true });
 
 function order() {
-  const now = performance.now();
+  const now = nowMs();
   const rows = [...tiles.keys()].map((id) => state.vehicles.get(id));
   const weight = (row) => (settings.sort === "need" ? need(row, now).weight : 0);
   rows.sort((a, b) => weight(b) - weight(a) || byName.compare(a.name, b.name));
@@ -95,7 +96,7 @@ function order() {
 }
 
 subscribe("vehicles selected tick", "vehicle tiles", () => {
-  const now = performance.now();
+  const now = nowMs();
   const before = tiles.size;
   for (const row of state.vehicles.values()) guarded(`tile of ${row.id}`, update)(row, now);
   if (tiles.size !== before && !list.contains(document.activeElement)) order();

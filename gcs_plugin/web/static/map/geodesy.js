@@ -10,11 +10,14 @@ function scaleAt(lat) {
   return [(RAD * A * Math.cos(lat * RAD)) / Math.sqrt(w), (RAD * A * (1 - E2)) / w ** 1.5];
 }
 
+// A difference of longitudes the short way round.
+const acrossDeg = (deg) => deg - 360 * Math.round(deg / 360);
+
 export function lengthOf(points) {
   let sum = 0;
   for (let k = 1; k < points.length; k++) {
     const [x, y] = scaleAt((points[k][1] + points[k - 1][1]) / 2);
-    sum += Math.hypot((points[k][0] - points[k - 1][0]) * x, (points[k][1] - points[k - 1][1]) * y);
+    sum += Math.hypot(acrossDeg(points[k][0] - points[k - 1][0]) * x, (points[k][1] - points[k - 1][1]) * y);
   }
   return sum;
 }

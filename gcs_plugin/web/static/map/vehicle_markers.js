@@ -1,5 +1,6 @@
 // Vehicles on the map, with name and heading. Markers are moved in place; the map's canvas is not repainted for them.
 
+import { nowMs } from "/static/core/clock.js";
 import { setAttribute, setStyle, setText } from "/static/core/dom.js";
 import { guarded } from "/static/core/guard.js";
 import { select, state, subscribe } from "/static/core/store.js";
@@ -39,6 +40,6 @@ const place = (row, now) => {
 };
 
 subscribe("vehicles selected tick", "vehicles on the map", () => {
-  const now = performance.now();
+  const now = nowMs();
   for (const row of state.vehicles.values()) guarded(`${row.id} on the map`, place)(row, now);
 });

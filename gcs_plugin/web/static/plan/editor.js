@@ -39,7 +39,7 @@ export function setEditing(on) {
 
 map.on("click", guarded("drawing", (event) => {
   if (tool.active !== "draw") return;
-  change((rings) => rings[drawing].push([event.lngLat.lng, event.lngLat.lat]));
+  change((rings) => (rings[drawing] ??= []).push([event.lngLat.lng, event.lngLat.lat]));
 }));
 map.on("dblclick", () => { if (tool.active === "draw") stopDrawing(); });
 
@@ -64,7 +64,11 @@ function handle(ring, index, middle) {
     event.stopPropagation();
     if (middle) { change((rings) => rings[ring].splice(index + 1, 0, place)); focusOn(ring, index + 1); }
   });
-  element.addEventListener("dblclick", (event) => { event.stopPropagation(); if (!middle) removeCorner(ring, index); });
+  element.addEventListener("dblclick", (event) => {
+    event.stopPropagation();
+    if (isDrawing()) stopDrawing(); // the second tap that ends a drawing meets the corner of the first
+    else if (!middle) removeCorner(ring, index);
+  });
   element.addEventListener("keydown", (event) => { if (!middle) byKey(event, ring, index); });
   setAttribute(element, "data-at", `${ring}/${index}${middle ? "m" : ""}`);
   return marker;

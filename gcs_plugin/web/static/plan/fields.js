@@ -1,6 +1,6 @@
 // The fields of a plan: numbers with their limits and units, choices, and what only a station with a height model can do.
 
-import { choice, labelled, make, setHidden, setText } from "/static/core/dom.js";
+import { choice, labelled, make, numberField, setHidden, setText } from "/static/core/dom.js";
 import { settings } from "/static/core/settings.js";
 import { t } from "/static/core/strings.js";
 import * as units from "/static/core/units.js";
@@ -19,13 +19,15 @@ let terrain = null; // the section that needs a height model
 let noTerrain = null;
 let hasDem = false;
 let changed = () => {};
+let typedIn = null; // the field in which somebody is typing: values of another page do not come between the digits
 
 // Without a height model heights count from where the vehicles take off, whatever the ground does.
 const nameOf = (key) => t(key === "altitude_m" && !hasDem ? "plan.altitude_m.takeoff" : `plan.${key}`, { unit: units.lengthUnit() });
 
 const number = (key) => {
-  const [low, high, value, length] = NUMBERS[key];
-  inputs[key] = make("input", { type: "number", name: key, min: length ? undefined : low, max: length ? undefined : high, step: "any", value, inputmode: "decimal", onchange: () => changed(), placeholder: value === "" ? t(`plan.${key}.none`) : undefined });
+  const [, , value] = NUMBERS[key];
+  const input = numberField({ name: key, value, oninput: () => { typedIn = input; }, onblur: () => { typedIn = null; }, onchange: () => { typedIn = null; changed(); }, placeholder: value === "" ? t(`plan.${key}.none`) : undefined });
+  inputs[key] = input;
   return labelled(nameOf(key), inputs[key]);
 };
 
@@ -67,10 +69,10 @@ export function planValues() {
   const body = { end: inputs.end.value };
   for (const [key, [low, high, start, length]] of Object.entries(NUMBERS)) {
     if (key === "height_tolerance_m" && !hasDem) continue;
-    const { value: text, validity } = inputs[key];
-    if (text === "" && start === "" && !validity.badInput) continue;
-    const value = length ? units.toMetres(Number(text)) : Number(text);
-    if (text === "" || !(value >= low && value <= high)) {
+    const text = inputs[key].value.trim();
+    if (text === "" && start === "") continue;
+    const value = length ? units.toMetres(units.numberOf(text)) : units.numberOf(text);
+    if (!(value >= low && value <= high)) {
       const show = (limit) => (length ? Math.round(units.fromMetres(limit)) : limit);
       throw new Error(t("plan.range", { name: nameOf(key), low: show(low), high: show(high) }));
     }
@@ -90,16 +92,20 @@ const FLAGS = { "--altitude": "altitude_m", "--endurance": "endurance_min", "--f
 export const inFieldNames = (text) => text.replace(/--[a-z]+(-[a-z]+)*/g, (flag) => (FLAGS[flag] ? `"${nameOf(FLAGS[flag])}"` : flag));
 
 // What the fields hold, lengths in metres: so that a page with other units shows the same.
-export const rawValues = () => Object.fromEntries(Object.entries(inputs).map(([key, input]) => [key, input.type === "checkbox" ? input.checked
-  : NUMBERS[key]?.[3] && input.value !== "" ? units.toMetres(Number(input.value)) : input.value]));
+function raw(key, input) {
+  if (input.type === "checkbox") return input.checked;
+  const value = NUMBERS[key] ? units.numberOf(input.value) : NaN;
+  return Number.isFinite(value) ? (NUMBERS[key][3] ? units.toMetres(value) : String(value)) : input.value;
+}
+export const rawValues = () => Object.fromEntries(Object.entries(inputs).map(([key, input]) => [key, raw(key, input)]));
 
 export function fillFields(values) {
   for (const [key, value] of Object.entries(values)) {
     const input = inputs[key];
-    if (!input) continue;
+    if (!input || input === typedIn) continue;
     if (input.type === "checkbox") input.checked = value === true;
     else if (CHOICES[key]) { if (CHOICES[key].includes(value)) input.value = value; }
-    else input.value = NUMBERS[key][3] && value !== "" ? Number(units.fromMetres(Number(value)).toFixed(1)) : value;
+    else input.value = NUMBERS[key][3] && Number.isFinite(value) ? Number(units.fromMetres(value).toFixed(1)) : value ?? "";
   }
 }
 
@@ -108,8 +114,9 @@ export function relabelFields() {
   for (const [key, [, , , length]] of Object.entries(NUMBERS)) {
     if (!length) continue;
     const input = inputs[key];
-    if (input.value !== "") {
-      const metres = settings.units === "us" ? Number(input.value) : Number(input.value) * 0.3048;
+    const shown = units.numberOf(input.value);
+    if (Number.isFinite(shown)) {
+      const metres = settings.units === "us" ? shown : shown * 0.3048;
       input.value = Number(units.fromMetres(metres).toFixed(1));
     }
     setText(input.closest("label").firstChild, nameOf(key));

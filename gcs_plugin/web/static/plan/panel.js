@@ -27,10 +27,12 @@ export async function loadPlan() {
   if (!body) return;
   const rings = (body.area?.coordinates ?? []).map((points) => ring(points).slice(0, -1)).filter((points) => points.length > 2);
   setMadeOf(body.plan ? body.settings?.made_of : null);
-  if (body.area || area.area.rings.length) area.replace(rings);
+  if (!editor.isDrawing() && (body.area || area.area.rings.length)) area.replace(rings); // what is being drawn here stays
   fillFields(body.settings ?? {});
   setDem(body.dem);
+  const before = names;
   names = body.vehicles ?? {};
+  if (made && body.plan === made.id && JSON.stringify(before) !== JSON.stringify(names)) await showPlan(made, names, onNames);
   if (body.plan && body.plan !== made?.id) {
     const plan = (await get("/api/plans")).find((row) => row.id === body.plan);
     if (plan) { made = plan; await showPlan(plan, names, onNames); }

@@ -28,7 +28,7 @@ const wrong = make("p", { class: "wrong", role: "status" });
 
 export function planResult() {
   const upload = button(t("plan.upload"), uploadAll);
-  const start = button(t("plan.start"), () => assigned() && openPreflight(plan, names, problem), { class: "primary" });
+  const start = button(t("plan.start"), () => assigned() && openPreflight(plan, names, problemSince(plan, names)), { class: "primary" });
   box.append(make("h2", {}, t("plan.result")), summary, warnings, list, wrong, make("div", { class: "row wrap" }, upload, start));
   return box;
 }
@@ -66,6 +66,9 @@ function problem() {
   if (missing.length) return t("plan.missing", { parts: missing.map((row) => row.id).join(", ") });
   return "";
 }
+
+// What is wrong with a start that was prepared with a plan and an assignment, also if another page changed them meanwhile.
+const problemSince = (before, assignment) => () => problem() || (plan === before && names === assignment ? "" : t("plan.reassigned"));
 
 function assigned() {
   const text = problem();

@@ -5,6 +5,7 @@ import { notice } from "/static/core/notices.js";
 import { t } from "/static/core/strings.js";
 
 const SAVE_MS = 700;
+const RETRY_MS = 3000;
 let timer = null;
 let there = true; // whether this daemon keeps plans
 let version = null;
@@ -28,7 +29,8 @@ export async function loadShared() {
 
 export const isSaving = () => saving || timer != null;
 
-export function saveShared(body) {
+// A plan that could not be sent, as the network was away, is sent once it is back.
+export function saveShared(body, wait_ms = SAVE_MS) {
   if (!there) return;
   clearTimeout(timer);
   timer = setTimeout(async () => {
@@ -40,7 +42,8 @@ export function saveShared(body) {
       version = answer?.version ?? version;
     } catch (error) {
       if (error.status === 404) there = false;
-      else notice("warn", t("plan.unsaved", { why: error.message }));
+      else if (wait_ms === SAVE_MS) notice("warn", t("plan.unsaved", { why: error.message }));
+      if (error.kind !== "http" && timer == null) saveShared(body, RETRY_MS);
       outdated = error.status === 409;
     } finally {
       saving = false;
@@ -49,5 +52,5 @@ export function saveShared(body) {
       version = null;
       reload();
     }
-  }, SAVE_MS);
+  }, wait_ms);
 }

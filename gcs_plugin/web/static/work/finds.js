@@ -29,6 +29,30 @@ export async function loadFinds() {
   changed("finds");
 }
 
+const WITHIN_95 = 2.45; // sigmas an axis; the same of both axes
+const withinText = (sigma_m) => (sigma_m > 0 ? t("finds.within", { m: units.distance(WITHIN_95 * sigma_m) }) : t("finds.within.unknown"));
+
+// A find that could not be saved keeps its place: somebody may have looked long for it.
+async function save(find) {
+  try {
+    await post("/api/finds", find);
+    await loadFinds();
+  } catch (error) {
+    if (error.status === 404 || error.status === 405) notice("bad", t("finds.absent"));
+    else notice("bad", t("finds.failed", { note: find.note || t("finds.unnamed"), why: error.message }), [t("finds.retry"), () => save(find)]);
+  }
+}
+
+async function remove(row) {
+  try {
+    await request("DELETE", `/api/finds/${encodeURIComponent(row.id)}`);
+    notice("warn", t("finds.removed", { note: text(row.note) || t("finds.unnamed") }), [t("finds.restore"), () => save(row)]);
+    await loadFinds();
+  } catch (error) {
+    notice("bad", t("finds.stays", { why: error.message }));
+  }
+}
+
 export function findPanel() {
   const note = make("input", { type: "text", maxlength: 200, placeholder: t("finds.note"), "aria-label": t("finds.note") });
   const mark = button(t("finds.mark"), () => (tool.active === "find" ? stop() : begin()));
@@ -39,32 +63,20 @@ export function findPanel() {
   map.on("click", async (event) => {
     if (tool.active !== "find") return;
     stop();
-    const { lng, lat } = event.lngLat;
-    try {
-      await post("/api/finds", { lat_deg: lat, lon_deg: lng, sigma_m: sigmaAt(lng, lat), note: note.value.trim(), time: Date.now() / 1000 });
-      note.value = "";
-      await loadFinds();
-    } catch (error) {
-      notice("bad", error.status === 404 || error.status === 405 ? t("finds.absent") : t("finds.failed", { why: error.message }));
-    }
+    const { lng, lat } = event.lngLat.wrap();
+    const words = note.value.trim();
+    note.value = "";
+    await save({ lat_deg: lat, lon_deg: lng, sigma_m: sigmaAt(lng, lat), note: words });
   });
-  const remove = async (id) => {
-    try {
-      await request("DELETE", `/api/finds/${encodeURIComponent(id)}`);
-      await loadFinds();
-    } catch (error) {
-      notice("bad", t("finds.failed", { why: error.message }));
-    }
-  };
   const draw = keyedList(list, (row) => make("li", {}, button("", () => map.flyTo({ center: [row.lon_deg, row.lat_deg], zoom: Math.max(18, map.getZoom()), duration: 0 }), { class: "find" }),
-    button(t("finds.pictures"), () => showPictures(row), { class: "small" }), button("×", () => remove(row.id), { class: "close", "aria-label": t("finds.remove") })), (line, row) => {
-    setText(line.firstChild, `${text(row.note) || t("finds.unnamed")}: ${positionText(row.lat_deg, row.lon_deg, settings.coordinates)}${row.sigma_m == null ? "" : ` ± ${units.distance(row.sigma_m)}`}`);
+    button(t("finds.pictures"), () => showPictures(row), { class: "small" }), button("×", () => remove(row), { class: "close", "aria-label": t("finds.remove") })), (line, row) => {
+    setText(line.firstChild, `${text(row.note) || t("finds.unnamed")}: ${positionText(row.lat_deg, row.lon_deg, settings.coordinates)}; ${withinText(row.sigma_m)}`);
   });
   subscribe("finds ready", "finds", () => {
     draw(state.finds.map((row) => [row.id, row]));
     setText(about, absent ? t("finds.absent") : state.finds.length ? "" : t("finds.none"));
     setHidden(about, !about.textContent);
-    show("ellipses", state.finds.filter((row) => row.sigma_m > 0).map((row) => feature("Polygon", [circle([row.lon_deg, row.lat_deg], 2.45 * row.sigma_m)])));
+    show("ellipses", state.finds.filter((row) => row.sigma_m > 0).map((row) => feature("Polygon", [circle([row.lon_deg, row.lat_deg], WITHIN_95 * row.sigma_m)])));
     for (const [id, marker] of markers) if (!state.finds.some((row) => row.id === id)) { marker.remove(); markers.delete(id); }
     for (const row of state.finds) {
       if (markers.has(row.id)) continue;
