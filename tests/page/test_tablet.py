@@ -84,8 +84,8 @@ def test_a_decimal_comma_is_understood_and_never_dropped(browser, typed, height)
     with standing(vehicle(1)) as station, opened(browser, station.url, TABLET) as page:
         keep_plans(station)
         page.click("#tab-plan")
-        drawn = "import('/static/plan/area.js').then((m) => m.change((rings) => rings.push([[8, 47], [8.1, 47], [8, 47.1]])))"
-        page.evaluate(drawn)
+        corners = [[8, 47], [8.01, 47], [8, 47.01]]
+        page.evaluate("(c) => import('/static/plan/area.js').then((m) => m.change((rings) => rings.push(c)))", corners)
         page.fill("[name=altitude_m]", "")
         page.click("[name=altitude_m]")
         page.keyboard.type(typed)

@@ -97,7 +97,7 @@ class ConsoleState:
         return True
 
 
-def _time_of(body: Mapping[str, Any]) -> str:
+def _time_of(body: Mapping[str, Any]) -> str | None:
     """When a find was marked: one that is put back after a deletion keeps its time (ISO 8601); else now."""
     given, now = body.get("time"), time.time()
     if not isinstance(given, str):

@@ -193,6 +193,11 @@ def test_the_plan_is_the_same_for_a_second_page_and_after_a_restart(tmp_path):
         assert httpx.put(f"{served.url}/api/plan", json={}).status_code == 401
         find = served.command("/api/finds", {"lat_deg": 1.5, "lon_deg": 2, "sigma_m": 0.2, "note": "roof"}).json()
         served.command("/api/finds", {"lat_deg": 1.5, "lon_deg": 2})
+        old = {"lat_deg": 1.5, "lon_deg": 2, "time": "2026-05-28T20:26:40Z"}  # one that is put back
+        back = served.command("/api/finds", old).json()
+        assert back["time"].startswith("2026-05-28T20:26:40")
+        assert served.command("/api/finds", old | {"time": "yesterday"}).status_code == 422
+        httpx.delete(f"{served.url}/api/finds/{back['id']}", headers=served.auth)
         assert httpx.delete(f"{served.url}/api/finds/2", headers=served.auth).status_code == 204
         assert httpx.delete(f"{served.url}/api/finds/2", headers=served.auth).status_code == 404
     with serving(tmp_path / "w") as served:
