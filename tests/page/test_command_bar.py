@@ -415,3 +415,24 @@ def test_one_is_said_in_the_singular(browser):
         assert [text for text in texts if PLURAL.search(text)] == []
         page.click(".command[data-verb=pause]")
         assert page.inner_text("#confirm-question").startswith("Pause 1 vehicle where it is?")
+
+
+def test_vehicles_of_one_start_can_return_one_after_the_other(browser):
+    near = [vehicle(k, home=[47.3977, 8.5456 + 4e-5 * k], returns_after=["v1"] if k == 2 else None) for k in (1, 2)]
+    with standing(*near) as station, opened(browser, station.url) as page:
+        ok_for_all(station)
+        page.wait_for_selector(".tile .word:has-text('holds, returns after v1')")
+        page.click(".command[data-verb=rtl]")
+        assert "may meet there" in page.inner_text("#confirm-question")
+        page.wait_for_timeout(400)
+        page.keyboard.press("ArrowLeft")
+        assert page.inner_text("*:focus").startswith("One by one")
+        page.keyboard.press("Enter")
+        page.wait_for_function("() => document.querySelectorAll('[data-outcome=done]').length == 2")
+        assert [path for _, path, _ in station.heard] == ["/api/missions/all/return"]
+        page.click(".command[data-verb=land]")
+        assert not page.locator(".confirm-other").is_visible()  # landing has no order
+        page.keyboard.press("Escape")
+    with standing(vehicle(1)) as station, opened(browser, station.url) as page:
+        page.click(".command[data-verb=rtl]")
+        assert not page.locator(".confirm-other").is_visible()

@@ -131,7 +131,7 @@ class Returns:
     def _send_home(self, system: int, sending: set[int]) -> None:
         """Tell one vehicle to return; if it is there and does not acknowledge that, it has its turn again."""
         (row,) = self._command("rtl", [self._name_of(system)])
-        self._publish(row)
+        self._publish(row | {"by": VERB})
         if row["outcome"] != Verdict.DONE.value and not self._fleet.vehicles[system].lost:
             with self._lock:
                 self._again.add(system)

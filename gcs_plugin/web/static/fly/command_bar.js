@@ -6,8 +6,11 @@ import { t } from "/static/core/strings.js";
 import { command, commandAll } from "/static/fly/commands.js";
 import { commandLog } from "/static/fly/command_log.js";
 import { holdConfirm } from "/static/fly/hold.js";
+import { inAir } from "/static/fly/need.js";
 
 const TONES = { pause: "pause", resume: "go", rtl: "return", land: "land", start: "go" };
+const DEGREE_M = 111_320;
+const NEAR_M = 15; // what a plan takes for one start
 let confirm = null;
 
 export function commandBar() {
@@ -24,7 +27,18 @@ export function commandBar() {
 function askAll(verb) {
   const n = [...state.vehicles.values()].filter((row) => row.linked).length;
   const question = n ? t(`confirm.all.${verb}`, { n }) : t("confirm.none");
-  confirm.ask(question, t(`confirm.yes.${verb}`), TONES[verb], () => commandAll(verb));
+  const aloft = [...state.vehicles.values()].filter((row) => row.linked && inAir(row));
+  const inTurn = verb === "rtl" && aloft.length > 1;
+  const meet = inTurn && neighbours(aloft) ? ` ${t("confirm.meet")}` : "";
+  confirm.ask(question + meet, t(inTurn ? "confirm.yes.together" : `confirm.yes.${verb}`), TONES[verb], () => commandAll(verb),
+    inTurn ? { label: t("confirm.yes.return"), tone: TONES.rtl, work: () => commandAll("return") } : null);
+}
+
+// Whether two have their homes so near each other that they may meet there, on straight ways at one height.
+function neighbours(rows) {
+  const homes = rows.map((row) => row.home).filter(Boolean);
+  return homes.some(([lon, lat], k) => homes.slice(k + 1).some(([lon2, lat2]) =>
+    Math.hypot((lat2 - lat) * DEGREE_M, (lon2 - lon) * DEGREE_M * Math.cos(lat * Math.PI / 180)) < NEAR_M));
 }
 
 export function askOne(row, verb) {

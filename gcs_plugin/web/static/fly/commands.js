@@ -5,7 +5,7 @@ import { changed, state } from "/static/core/store.js";
 import { connected, given } from "/static/core/stream.js";
 import { t } from "/static/core/strings.js";
 
-const ANSWER_MS = { pause: 9_000, resume: 9_000, rtl: 9_000, land: 9_000, start: 60_000, upload: 190_000 };
+const ANSWER_MS = { pause: 9_000, resume: 9_000, rtl: 9_000, return: 20_000, land: 9_000, start: 60_000, upload: 190_000 };
 const MOST = 300;
 const OUTCOMES = new Set(["done", "refused", "not_sent", "unknown"]);
 const ALL = "all";
@@ -77,7 +77,7 @@ export function heardCommand(event) {
   const key = `${event.id}/${event.vehicle}`;
   if (!event.vehicle || state.commands.some((entry) => entry.key === key)) return;
   const entry = begin(String(event.id), String(event.command), String(event.vehicle));
-  entry.elsewhere = true;
+  entry.elsewhere = event.by == null; // the station sends some by itself
   end(entry, event.outcome, event.reason);
 }
 

@@ -20,71 +20,77 @@ document.addEventListener("keydown", (event) => {
 document.addEventListener("keyup", (event) => down.delete(event.code), true);
 window.addEventListener("blur", () => down.clear());
 
-export function holdConfirm() {
-  const question = make("p", { id: "confirm-question" });
-  const yes = make("button", { type: "button", class: "confirm-yes", "aria-describedby": "confirm-question" }, make("span", {}), make("i", { "aria-hidden": "true" }));
-  const no = button(t("confirm.no"), () => close(), { class: "confirm-no" });
-  const box = make("div", { class: "confirm", role: "alertdialog", "aria-labelledby": "confirm-question", hidden: true }, question, make("div", { class: "row" }, yes, no));
-  let go = null;
-  let opened = 0;
+// A button of the question: one press of a mouse or a key, or a hold of a finger, carries out what it offers.
+function choice(css, settled, carryOut) {
+  const element = make("button", { type: "button", class: css, "aria-describedby": "confirm-question" }, make("span", {}), make("i", { "aria-hidden": "true" }));
+  const fingers = new Set(); // pointers on the button
+  let work = null;
   let touch = false;
   let timer = null;
-  const fingers = new Set(); // pointers on the button
-  let before = null;
-  let held = new Set(); // keys that were down when the question opened, and are since
-  function close() {
-    go = null;
-    stop();
-    setHidden(box, true);
-    before?.focus?.();
-  }
-  function confirm() {
-    const work = go;
-    if (!work) return;
-    close();
-    work();
-  }
-  function stop() {
-    clearTimeout(timer);
-    timer = null;
-    yes.classList.remove("holding");
-  }
-  const hold = (left) => { timer = setTimeout(() => (left > 1 ? hold(left - 1) : confirm()), STEP_MS); };
-  yes.addEventListener("pointerdown", (event) => {
+  const stop = () => { clearTimeout(timer); timer = null; element.classList.remove("holding"); };
+  const go = () => { if (work) carryOut(work); };
+  const hold = (left) => { timer = setTimeout(() => (left > 1 ? hold(left - 1) : go()), STEP_MS); };
+  element.addEventListener("pointerdown", (event) => {
     touch = event.pointerType === "touch" || event.pointerType === "pen";
     if (!touch) return;
     stop();
     fingers.add(event.pointerId);
-    yes.setPointerCapture(event.pointerId);
+    element.setPointerCapture(event.pointerId);
     if (fingers.size > 1) return;
-    yes.classList.add("holding");
+    element.classList.add("holding");
     hold(STEPS);
   });
-  for (const kind of ["pointerup", "pointercancel"]) yes.addEventListener(kind, (event) => { fingers.delete(event.pointerId); stop(); });
+  for (const kind of ["pointerup", "pointercancel"]) element.addEventListener(kind, (event) => { fingers.delete(event.pointerId); stop(); });
   document.addEventListener("visibilitychange", stop);
-  yes.addEventListener("contextmenu", (event) => event.preventDefault());
-  yes.addEventListener("click", (event) => {
+  element.addEventListener("contextmenu", (event) => event.preventDefault());
+  element.addEventListener("click", (event) => {
     const tapped = touch && event.detail > 0;
     touch = false;
-    if (!tapped && performance.now() - opened > SETTLE_MS) confirm();
+    if (!tapped && settled()) go();
   });
+  // Offer something else: {label, tone, work}; nothing hides the button.
+  const offer = (what) => {
+    stop();
+    fingers.clear();
+    work = what?.work ?? null;
+    setHidden(element, !work);
+    setText(element.firstChild, what?.label ?? "");
+    element.dataset.tone = what?.tone ?? "";
+  };
+  return { element, stop, offer };
+}
+
+export function holdConfirm() {
+  let opened = 0;
+  let before = null;
+  let held = new Set(); // keys that were down when the question opened, and are since
+  const settled = () => performance.now() - opened > SETTLE_MS;
+  const carryOut = (work) => { close(); work(); };
+  const question = make("p", { id: "confirm-question" });
+  const [yes, other] = [choice("confirm-yes", settled, carryOut), choice("confirm-other", settled, carryOut)];
+  const no = button(t("confirm.no"), () => close(), { class: "confirm-no" });
+  const box = make("div", { class: "confirm", role: "alertdialog", "aria-labelledby": "confirm-question", hidden: true }, question, make("div", { class: "row wrap" }, yes.element, other.element, no));
+  function close() {
+    for (const one of [yes, other]) one.offer(null);
+    setHidden(box, true);
+    before?.focus?.();
+  }
   document.addEventListener("keyup", (event) => held.delete(event.code), true);
   box.addEventListener("keydown", (event) => {
     if (event.key === "Escape") close();
     else if (PRESSES.has(event.code) && (event.repeat || held.has(event.code))) event.preventDefault();
     else if (["Tab", "ArrowLeft", "ArrowRight"].includes(event.key)) {
       event.preventDefault();
-      (document.activeElement === yes ? no : yes).focus();
+      const all = [yes.element, other.element, no].filter((element) => !element.hidden);
+      const step = event.key === "ArrowLeft" || (event.key === "Tab" && event.shiftKey) ? all.length - 1 : 1;
+      all[(all.indexOf(document.activeElement) + step) % all.length].focus();
     }
   });
-  // Ask; work() runs once it is confirmed.
-  const ask = (text, label, tone, work) => {
-    stop();
-    fingers.clear();
+  // Ask; the work of what is chosen runs once it is confirmed. `also`: a second choice of the same kind.
+  const ask = (text, label, tone, work, also = null) => {
     setText(question, text);
-    setText(yes.firstChild, label);
-    yes.dataset.tone = tone;
-    go = work;
+    yes.offer({ label, tone, work });
+    other.offer(also);
     opened = performance.now();
     held = new Set(down);
     before = document.activeElement;

@@ -46,6 +46,7 @@ export function wordOf(row) {
   if (!row.linked) return t("state.pictures");
   if (isLost(row)) return t(inAir(row) ? "state.lost.air" : armedOnGround(row) ? "state.lost.armed" : "state.lost.ground");
   if (armedOnGround(row)) return t("state.armed");
+  if (row.returnsAfter) return t("state.returns", { after: row.returnsAfter.map((id) => state.vehicles.get(id)?.name ?? id).join(", ") || "–" });
   if (row.takeoff?.in_s != null) return t("state.waiting", { time: units.clock(row.takeoff.in_s) });
   return row.flight.state ? row.flight.text : [row.flight.text, row.mode].filter(Boolean).join(", ") || t("state.unknown");
 }
