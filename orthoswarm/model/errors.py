@@ -11,8 +11,11 @@
     │   ├── WorkerStoppedError         a worker process was killed
     │   ├── RunInterruptedError        a run cannot go on now; the same command goes on later
     │   │   ├── ClusterLostError       a cluster's scheduler or workers are gone    compute.dask_cluster
-    │   │   └── StoreLostError         a store cannot be reached        stores.requests
+    │   │   ├── StoreLostError         a store cannot be reached        stores.requests
+    │   │   ├── StoreAccessError       a store is refused (also an InputError)  stores.requests
+    │   │   └── CacheFullError         no room for copies (also a StorageError)     stores.local_copies
     │   ├── NotStoredError             a file is not in its store       stores.requests
+    │   │   └── RefusedError           one file may not be read or written      stores.requests
     │   ├── StoreRequestError          a store refuses one request      stores.requests
     │   ├── SolutionFileError          a refined sortie's file is damaged or old    gcs_plugin.daemon.jobs.solution_file
     │   ├── OutdatedError              the shared plan was changed by another user meanwhile  gcs_plugin.daemon.store
