@@ -86,6 +86,8 @@ class ReturnConfig:
     """Least height above home, metres (RTL_ALT)."""
     px4_m: float = 60.0
     """The same (RTL_RETURN_ALT)."""
+    cone: float = 3.0
+    """Near home they climb to so many times their distance at most (RTL_CONE_SLOPE; PX4 within RTL_MIN_DIST, 10 m)."""
     look_s: float = 1.0
     """Time between looks at vehicles that return in turn, seconds (chosen: they fly 10 m in it)."""
     shows_s: float = 5.0

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from gcs_plugin.config import COMMAND
 from gcs_plugin.daemon.airspace.fences import Fences
+from gcs_plugin.fleet.autopilot_settings import Setting
 from gcs_plugin.mission.items import Mission
 from gcs_plugin.mission.plan_folder import NO_NEEDS, PlanNeeds
 from orthoswarm.model.errors import OrthoSwarmError
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 
 _SOON_S: Final = 5.0
 _READ_S: Final = 20.0
+_ASKED, _ANSWER_S = 3, 0.7  # times, and seconds between them
 
 
 def red_items(row: Mapping[str, Any], allowed: Collection[str]) -> list[str]:
@@ -72,6 +74,8 @@ class StartChecks:
         from gcs_plugin.fleet.separation.separation_check import Separation
 
         stored = self._missions(systems, reread=reread)
+        if needs.return_height_m is not None:
+            self._ask_heights(systems)
         separation = Separation()
         if reread:  # it is a schedule's, otherwise
             first = min(starts.values(), default=0.0)
@@ -91,6 +95,17 @@ class StartChecks:
             )
         ).result(_READ_S)
         return [check.document(systems[check.system]) for check in checks]
+
+    def _ask_heights(self, systems: Collection[int]) -> None:
+        """Ask those again that have not said at what height they return: a lost packet must not let them start."""
+        for _ in range(_ASKED):
+            unknown = [s for s in systems if Setting.RETURN_HEIGHT not in self._fleet.vehicles[s].settings]
+            if not unknown:
+                return
+            for system in unknown:
+                questions = self._fleet.vehicles[system].setting_questions()
+                self._fleet.call(lambda s=system, q=questions: self._fleet.send(s, q)).result(_SOON_S)  # type: ignore[misc]
+            time.sleep(_ANSWER_S)
 
     def _separation(
         self,

@@ -79,10 +79,15 @@ _INTEGERS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class SetTo:
-    """A setting as a vehicle has it: the parameter's name, and its value in the unit of its `Setting`."""
+    """A setting as a vehicle has it: the parameter's name, its value in the unit of its `Setting`, and its scale."""
 
     name: str
     value: float
+    scale: float = 1.0
+
+    def native(self, value: float) -> float:
+        """A value in the unit of the parameter."""
+        return value / self.scale
 
     @property
     def action(self) -> str:
@@ -114,7 +119,7 @@ def answer(message: Message, autopilot: Autopilot) -> tuple[Setting, SetTo] | No
     least = 0.0 if parameter.setting is not Setting.SPEED else math.ulp(0.0)
     if not math.isfinite(value) or value < least:
         return None
-    return parameter.setting, SetTo(name, value)
+    return parameter.setting, SetTo(name, value, parameter.scale)
 
 
 def _value(message: Message, autopilot: Autopilot) -> float:

@@ -121,7 +121,7 @@ class Dialogues:
             vehicle = self._vehicles[job.vehicle.system]
             again = bool(getattr(message, "confirmation", 0))
             everywhere = again or vehicle.lost or bool(vehicle.claimants)
-            expires = max(job.expires, self._clock() + _ON_THE_WAY_S)
+            expires = max(job.message_expires, self._clock() + _ON_THE_WAY_S)
             if self.send(vehicle.system, [message], everywhere=everywhere, expires=expires):
                 job.took()
 
@@ -146,8 +146,10 @@ class Dialogues:
         vehicle = self._vehicles.get(job.vehicle.system)
         if vehicle is None:
             return
+        if isinstance(job, MissionUpload) and job.announced:  # from then on its old mission is no longer whole
+            vehicle.unbegun = True
         if isinstance(job, MissionUpload) and job.outcome is not None and job.outcome.ok:
-            vehicle.mission, vehicle.mission_seq, vehicle.unbegun = job.mission, 0, True
+            vehicle.mission, vehicle.mission_seq = job.mission, 0
             vehicle.detector.uploaded(job.mission)
             return
         mission = None

@@ -326,7 +326,7 @@ def _return(vehicle: "Vehicle", needed_m: float | None) -> Item:
         text = f"flies home at the height at which it is ({found.name} is 0)"
     if needed_m is None or found.value >= needed_m:
         return Item("return", Level.OK, text)
-    return Item("return", Level.RED, f"{text}, but {least}; set {found.name} to that")
+    return Item("return", Level.RED, f"{text}, but {least}; set {found.name} to {found.native(needed_m):.0f}")
 
 
 def _failsafe(vehicle: "Vehicle") -> Item:

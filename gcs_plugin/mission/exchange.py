@@ -122,6 +122,11 @@ class Exchange(abc.ABC):
         return MISSION
 
     @property
+    def message_expires(self) -> float:
+        """Time after which its present message may no longer be sent."""
+        return self.expires
+
+    @property
     def leaves_mode(self) -> bool:
         """Whether a transfer of a mission is still changing the vehicle's mode."""
         return False

@@ -42,8 +42,10 @@ STEP_S: Final = 0.5
 """Time between the samples of a track, seconds."""
 _SPEED_M_S: Final = 5.0
 _HAIR_M: Final = 0.01
-_AGAIN: Final = 200
-"""So many items of a mission are followed that a jump has led back to: a jump may repeat them for ever."""
+_FOREVER: Final = 200
+"""How often a jump without an end is followed: longer than any battery lasts."""
+_MOST_FLOWN: Final = 100_000
+"""So many items are followed at most: jumps within jumps multiply."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,14 +126,14 @@ def flight_path(mission: "Mission", origin: tuple[float, float]) -> tuple[Array,
 def _flown(mission: "Mission") -> "Iterator[MissionItem]":
     """The items in the order in which they are flown, with jumps carried out."""
     items, seq, jumped = mission.items, mission.first_seq, dict[int, int]()
-    for _ in range(len(items) + _AGAIN):
+    for _ in range(_MOST_FLOWN):
         if seq >= len(items):
             return
         item = items[seq]
         target, times = item.params[:2]
         if item.command != JUMP:
             yield item
-        elif 0 <= target < len(items) and (times < 0 or jumped.get(seq, 0) < times):
+        elif 0 <= target < len(items) and jumped.get(seq, 0) < (_FOREVER if times < 0 else times):
             jumped[seq] = jumped.get(seq, 0) + 1
             seq = int(target)
             continue

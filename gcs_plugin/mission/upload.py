@@ -151,6 +151,16 @@ class MissionUpload(Exchange):
             self.leave.took()
 
     @property
+    def announced(self) -> bool:
+        """Whether the vehicle was told of the mission, so that it may have dropped what it held."""
+        return self._begun > 0
+
+    @property
+    def message_expires(self) -> float:
+        """See Exchange: a change of mode expires, a mission does not."""
+        return self.leave.expires if self.leave is not None and self.leaves_mode else self.expires
+
+    @property
     def leaves_mode(self) -> bool:
         """See Exchange."""
         return self.stage is Stage.LEAVE

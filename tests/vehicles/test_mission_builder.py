@@ -257,3 +257,10 @@ def test_what_is_flown_again_and_waited_for_takes_its_time(autopilot):
     assert seconds(times=-1.0) > 20.0 * once  # for ever
     assert seconds(times=0.0, hold_s=25.0) == pytest.approx(once + 25.0, abs=3.0)
     assert seconds(times=1.0, hold_s=25.0) == pytest.approx(seconds(times=1.0) + 50.0, abs=6.0)
+
+
+def test_many_repeats_are_followed_to_the_end():
+    many = build_mission(Autopilot.ARDUPILOT, jumping(2.0, times=300.0))
+    few = build_mission(Autopilot.ARDUPILOT, jumping(2.0, times=100.0))
+    none = flight_seconds(build_mission(Autopilot.ARDUPILOT, jumping(2.0, times=0.0)))
+    assert flight_seconds(many) - none == pytest.approx(3.0 * (flight_seconds(few) - none), rel=0.01)

@@ -4,6 +4,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Collection, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, Final
 
 from gcs_plugin.config import RETURN
@@ -54,6 +55,10 @@ class Returns:
         Returns:
             A row a vehicle, as for a command. One that does not acknowledge that it is to hold is sent home.
         """
+        with self._lock:  # an earlier order ends; what others command from now on comes before this one
+            self._order, self._waits = None, {}
+            self._told_else.clear()
+            self._again.clear()
         self._fleet.call(self._ask).result(_ANSWER_S)
         aloft = self._aloft()
         going = {name for name, system in systems.items() if system in aloft and aloft[system].goes_home}
@@ -61,20 +66,25 @@ class Returns:
         order.look(aloft)
         held = [name for name, system in systems.items() if system in order.waits]
         home = [name for name in systems if name not in going and name not in held]
-        rows = self._told("rtl", home) | self._told("pause", held)
-        loose = [name for name in held if rows[name]["outcome"] != Verdict.DONE.value]
-        rows |= self._told("rtl", loose)
+        with ThreadPoolExecutor(2) as both:  # a lost vehicle among the one must not keep the others from holding
+            sent = [both.submit(self._told, *each, systems) for each in (("pause", held), ("rtl", home))]
+        rows = {name: row for told in sent for name, row in told.result().items()}
+        loose = [name for name in held if not _done(rows[name])]
+        rows |= self._told("rtl", loose, systems)
         for name in loose:
             order.drop(systems[name])
+        for name in (*loose, *home):
+            if systems[name] in aloft and not aloft[systems[name]].lost and not _done(rows[name]):
+                order.again(systems[name])
         for name in going:
             rows[name] = self._row(number, name, f"{name} returns or lands already")
         for name in set(held).difference(loose):
             after = ", ".join(map(self._name_of, order.waits.get(systems[name], ()))) or "others"
             rows[name] = self._row(number, name, f"{name} holds, and returns after {after}")
         with self._lock:
+            for system in self._told_else:
+                order.drop(system)
             self._order, self._waits = order, dict(order.waits)
-            self._told_else.clear()
-            self._again.clear()
         threading.Thread(target=self._run, args=(order,), name="returns", daemon=True).start()
         return [rows[name] | {"id": number, "command": VERB} for name in systems]
 
@@ -98,7 +108,7 @@ class Returns:
     def _run(self, order: ReturnOrder) -> None:
         """Send each home when its way is free; ends with the last, or when another order takes its place."""
         sending: set[int] = set()
-        while (order.waits or sending) and not self._stop.wait(RETURN.look_s):
+        while (not order.over or sending or self._again) and not self._stop.wait(RETURN.look_s):
             try:
                 aloft = self._aloft()
             except Exception as error:  # the links do not answer now: they are asked again
@@ -132,7 +142,7 @@ class Returns:
         """Tell one vehicle to return; if it is there and does not acknowledge that, it has its turn again."""
         (row,) = self._command("rtl", [self._name_of(system)])
         self._publish(row | {"by": VERB})
-        if row["outcome"] != Verdict.DONE.value and not self._fleet.vehicles[system].lost:
+        if not _done(row) and not self._fleet.vehicles[system].lost:
             with self._lock:
                 self._again.add(system)
         sending.discard(system)
@@ -147,9 +157,21 @@ class Returns:
         look = self._fleet.call(lambda: aloft_of(self._fleet.vehicles, time.monotonic()))
         return look.result(_ANSWER_S)
 
-    def _told(self, verb: "Verb", names: Collection[str]) -> dict[str, dict[str, Any]]:
-        return {row["vehicle"]: row for row in self._command(verb, names)} if names else {}
+    def _told(self, verb: "Verb", names: Collection[str], systems: Mapping[str, int]) -> dict[str, dict[str, Any]]:
+        """The rows of vehicles that are given a command, unless somebody has given them another one meanwhile."""
+        with self._lock:
+            free = [name for name in names if systems[name] not in self._told_else]
+        rows = {row["vehicle"]: row for row in self._command(verb, free)} if free else {}
+        for name in names:
+            if systems[name] in self._told_else:
+                text = f"{name} was given another command meanwhile"
+                rows[name] = CommandResult("", name, VERB, Verdict.DONE, text).document()
+        return rows
 
     @staticmethod
     def _row(number: str, name: str, text: str) -> dict[str, Any]:
         return CommandResult(number, name, VERB, Verdict.DONE, text).document()
+
+
+def _done(row: Mapping[str, Any]) -> bool:
+    return bool(row["outcome"] == Verdict.DONE.value)

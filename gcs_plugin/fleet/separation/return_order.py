@@ -61,18 +61,28 @@ class ReturnOrder:
         self.waits: dict[int, tuple[int, ...]] = dict.fromkeys(systems, ())
         self._clock = clock
         self._sent: dict[int, float] = {}
+        self._unheard: set[int] = set()
+
+    @property
+    def over(self) -> bool:
+        """Whether nobody waits, nor was sent home without being heard."""
+        return not self.waits and not self._unheard
 
     def look(self, aloft: Mapping[int, Aloft]) -> list[int]:
         """The vehicles that may return now; they no longer wait, nor do those that have landed or go home already.
 
         One whose way is not known returns at once: nothing is known that would be better for it. So does one whose
-        link is lost or whose battery must not wait. If nothing moves and no way is free, the one that the fewest
-        others stand in the way of sets out.
+        link is lost or whose battery must not wait; a lost one has its turn once more when it is heard and still holds.
+        Where some are in each other's way alone and nothing moves, the one that the fewest others stand in the way of
+        sets out.
 
         Args:
             aloft: all vehicles in the air, see `aloft_of`.
         """
-        waits = [s for s in self.waits if s in aloft and not aloft[s].goes_home]
+        self._unheard = {s for s in self._unheard if s in aloft and not aloft[s].goes_home}
+        heard = {s for s in self._unheard if not aloft[s].lost}
+        self._unheard -= heard
+        waits = [s for s in {**self.waits, **dict.fromkeys(heard)} if s in aloft and not aloft[s].goes_home]
         ready = [s for s in waits if aloft[s].way is None or aloft[s].lost or aloft[s].must_land]
         ways = {s: a.way for s, a in aloft.items() if a.way is not None}
         moving = {s for s in ways if self._goes_home(s, aloft[s])} | (ways.keys() & ready)
@@ -89,14 +99,18 @@ class ReturnOrder:
                 ready.append(system)
                 moving.add(system)
                 stay.discard(system)
-        if self.waits and not moving:
-            ready.append(min(self.waits, key=lambda s: (len(self.waits[s]), left.index(s))))
+        # In each other's way alone. One that is held by somebody, or flies a mission, is never flown into.
+        mutual = [s for s, others in self.waits.items() if self.waits.keys() >= set(others)]
+        if mutual and not moving:
+            ready.append(min(mutual, key=lambda s: (len(self.waits[s]), left.index(s))))
             del self.waits[ready[-1]]
         self._sent |= dict.fromkeys(ready, self._clock())
+        self._unheard |= {s for s in ready if aloft[s].lost}
         return ready
 
     def drop(self, system: int) -> bool:
         """Let a vehicle wait no longer, since it was given another command; returns whether it did."""
+        self._unheard.discard(system)
         return self.waits.pop(system, None) is not None
 
     def again(self, system: int) -> None:
@@ -125,13 +139,19 @@ def aloft_of(vehicles: "Mapping[int, Vehicle]", now: float) -> dict[int, Aloft]:
             place=Track(_point(v, origin), level_m=v.home_alt_m),
             way=way_home(v, origin),
             height_known=Setting.RETURN_HEIGHT in v.settings or flight_state(v).word is Word.LANDING,
-            goes_home=flight_state(v).word in _GOES_HOME,
+            goes_home=_goes_home(v),
             silent_s=now - v.heard,
             lost=v.lost,
             must_land=v.battery is not None and v.battery < 0.5 * LIMITS.reserve_share,
         )
         for s, v in known.items()
     }
+
+
+def _goes_home(vehicle: "Vehicle") -> bool:
+    """Whether its mode shows that it returns or lands. On a mission that is not known one that sinks may do neither."""
+    unknown = vehicle.mission is None and vehicle.custom_mode == vehicle.modes.mission
+    return not unknown and flight_state(vehicle).word in _GOES_HOME
 
 
 def way_home(vehicle: "Vehicle", origin: tuple[float, float]) -> Track | None:
@@ -152,7 +172,9 @@ def way_home(vehicle: "Vehicle", origin: tuple[float, float]) -> Track | None:
     )
     least_m = height.value if height is not None else RETURN.ardupilot_m if ardupilot else RETURN.px4_m
     here, there = metres(*place, origin), metres(*home, origin)
-    lands = flight_state(vehicle).word is Word.LANDING
+    away_m = math.hypot(there[0] - here[0], there[1] - here[1])
+    least_m = min(least_m, RETURN.cone * away_m)
+    lands = flight_state(vehicle).word is Word.LANDING and _goes_home(vehicle)
     if lands:  # where it is, or above its home already
         there, least_m = here, vehicle.height_m
     top = max(vehicle.height_m, least_m, active().planning.on_ground_m)

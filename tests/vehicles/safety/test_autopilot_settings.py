@@ -81,7 +81,8 @@ def test_a_way_home_through_the_ground_is_red(make_world, autopilot):
     name = "RTL_ALT" if autopilot is AP else "RTL_RETURN_ALT"
     found = items_of(world, high)["return"]
     assert found.level is Level.RED and f"15 m above home, or higher where it is higher ({name})" in found.reason
-    assert "needs 40 m" in found.reason and f"set {name}" in found.reason
+    native = "4000" if autopilot is AP else "40"  # RTL_ALT counts centimetres
+    assert "needs 40 m" in found.reason and f"set {name} to {native}" in found.reason
     assert items_of(world, Wanted(needs=PlanNeeds(return_height_m=15.0)))["return"].level is Level.OK
     assert items_of(world, Wanted())["return"].level is Level.OK
     vehicle.settings[Setting.RETURN_HEIGHT] = SetTo(name, 0.0)
@@ -118,7 +119,7 @@ def test_each_autopilot_is_asked_for_every_setting_each_time_that_its_mission_is
         world.vehicles[1].parameters["RTL_ALT"] = 100.0 * height_m
         world.finish(world.fleet.download(1))
         world.wait(1.0)
-        assert vehicle.settings[Setting.RETURN_HEIGHT] == SetTo("RTL_ALT", height_m)
+        assert vehicle.settings[Setting.RETURN_HEIGHT] == SetTo("RTL_ALT", height_m, 0.01)
 
 
 def test_what_a_vehicle_was_set_to_before_its_restart_does_not_count(make_world):

@@ -109,3 +109,27 @@ def test_a_vehicle_on_the_ground_is_started_as_before(make_world, autopilot):
     commands = [m.command for m in sent if m.get_type() == "COMMAND_LONG"]
     assert dialect.MAV_CMD_DO_SET_MISSION_CURRENT not in commands
     assert commands.index(dialect.MAV_CMD_COMPONENT_ARM_DISARM) < commands.index(dialect.MAV_CMD_MISSION_START)
+
+
+@pytest.mark.parametrize("broken", [False, True])
+def test_a_mission_that_is_being_stored_cannot_be_resumed(make_world, broken):
+    """ArduPilot drops its old mission as the new one is announced: what it holds then is a mixture."""
+    world = under_way(make_world, AP)
+    world.finish(world.fleet.pause(1))
+    upload = world.fleet.upload(1, mission(AP, END, legs=3))
+    assert world.until(lambda: upload.announced, 20.0)
+    if broken:
+        upload.cancel("another request came in between")
+        world.wait(1.0)
+    with pytest.raises(OrthoSwarmError, match="has not begun the mission"):
+        world.fleet.resume(1)
+
+
+def test_the_change_of_mode_before_an_upload_does_not_wait_for_a_link(make_world):
+    world = under_way(make_world, AP)
+    world.finish(world.fleet.pause(1))
+    world.wait(4.0)
+    upload = world.fleet.upload(1, mission(AP, END, legs=1))
+    assert upload.leaves_mode and upload.message_expires <= world.clock.now + 5.0
+    assert world.until(lambda: upload.announced, 20.0)
+    assert math.isinf(upload.message_expires)

@@ -154,6 +154,58 @@ def test_one_that_did_not_acknowledge_has_its_turn_again(make_world):
     assert order.look(aloft_of(world.fleet.vehicles, world.clock.now)) == [sent]
 
 
+def look(world, order):
+    return order.look(aloft_of(world.fleet.vehicles, world.clock.now))
+
+
+def test_nobody_is_sent_through_one_that_the_operator_holds(make_world):
+    world, positions = flown_out(make_world, [(600, 0), (600, 0)])
+    order = ReturnOrder(world.fleet.vehicles, world.clock)
+    (first,) = look(world, order)
+    (second,) = order.waits
+    world.finish(world.fleet.rtl(first), world.fleet.pause(second))
+    world.wait(10.0)
+    world.finish(world.fleet.pause(first))  # as the alarm of nearness proposes
+    order.drop(first)
+    for _ in range(120):
+        world.wait(1.0)
+        assert look(world, order) == []
+    assert order.waits[second] == (first,)
+    world.fleet.rtl(first)
+    for _ in range(240):
+        world.wait(1.0)
+        for system in look(world, order):
+            world.fleet.rtl(system)
+    assert not positions() and order.over
+
+
+def test_one_that_was_lost_has_its_turn_when_it_is_heard_again(make_world):
+    world, positions = flown_out(make_world, FAN[:2])
+    order = ReturnOrder(world.fleet.vehicles, world.clock)
+    (first,) = look(world, order)
+    (second,) = order.waits
+    world.finish(world.fleet.rtl(first), world.fleet.pause(second))
+    world.fleet.vehicles[second].lost = True
+    assert look(world, order) == [second] and not order.waits and not order.over  # told blindly, and not heard
+    world.fleet.vehicles[second].lost = False
+    look(world, order)
+    assert order.waits or order.over
+    for _ in range(300):
+        world.wait(1.0)
+        for system in look(world, order):
+            world.fleet.rtl(system)
+    assert not positions() and order.over
+
+
+def test_one_that_sinks_on_a_mission_that_is_not_known_is_not_taken_for_landing(make_world):
+    world, _ = flown_out(make_world, FAN[:1])
+    vehicle = world.fleet.vehicles[1]
+    vehicle.mission, vehicle.velocity_m_s = None, (0.0, 0.0, 2.0)
+    assert not aloft_of(world.fleet.vehicles, world.clock.now)[1].goes_home
+    vehicle.custom_mode = vehicle.modes.rtl
+    assert aloft_of(world.fleet.vehicles, world.clock.now)[1].goes_home
+
+
 @settings(max_examples=60)
 @given(
     places=st.lists(st.tuples(st.floats(-200, 200), st.floats(-200, 200), st.floats(5, 80)), min_size=1, max_size=7),
