@@ -241,7 +241,7 @@ def test_a_vehicle_that_acknowledged_a_pause_takes_another_mission_at_once(open_
 
 @pytest.mark.slow
 def test_vehicles_of_one_start_return_in_turn_and_one_given_another_command_does_not(open_links, folder):  # noqa: F811
-    links = open_links(make_swarm(3, home=HOME, spacing_m=4.0))
+    links = open_links(make_swarm(3, home=HOME, spacing_m=4.0), speed=5.0)
     ready(links, 3)
     upload_all(links, folder)
     override = {name: ["separation"] for name in ("v1", "v2", "v3")}
@@ -259,7 +259,7 @@ def test_vehicles_of_one_start_return_in_turn_and_one_given_another_command_does
     assert [r["outcome"] for r in links.commands("land", [second])] == ["done"]
     assert next(row for row in links.rows() if row["id"] == second)["returns_after"] is None
     down = {"on ground", "complete"}
-    wait(lambda: all(links.flight_state(n)["state"] in down for n in ("v1", "v2", "v3")), 60.0)
+    wait(lambda: all(links.flight_state(n)["state"] in down for n in ("v1", "v2", "v3")), 120.0)
     landed = links.fleet.vehicles[links.system_of(second)]
     assert landed.mode == "LAND"  # not sent home after it was told to land
 
