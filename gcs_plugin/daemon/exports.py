@@ -2,6 +2,7 @@
 
 import contextlib
 import math
+import os
 import shutil
 import threading
 import time
@@ -30,16 +31,19 @@ _zipping: Final = threading.Lock()
 def zipped_folder(folder: Path) -> Path:
     """The ZIP of an exported folder, beside it; made once, and again when the folder was exported again.
 
-    It is replaced as a whole: somebody may still be loading the last one down.
+    It has the time of the folder that it was made from. It is replaced as a whole: somebody may still be loading
+    the last one down.
 
     Raises:
         StorageError: the disk is full or gone.
     """
     path = folder.with_suffix(".zip")
     with _zipping:
-        if not path.is_file() or path.stat().st_mtime_ns <= folder.stat().st_mtime_ns:
+        began = folder.stat().st_mtime_ns
+        if not path.is_file() or path.stat().st_mtime_ns != began:
             with atomic_write(path) as part:
                 shutil.make_archive(str(part.with_suffix("")), "zip", folder)
+                os.utime(part, ns=(began, began))  # a folder that was exported again meanwhile has another time
     return path
 
 

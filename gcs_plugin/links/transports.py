@@ -358,7 +358,7 @@ class SerialLink(Link):
             return
         try:
             data = self._port.read(max(1, self._port.in_waiting))
-        except OSError as error:  # pyserial's own error is one
+        except (OSError, ValueError) as error:  # pyserial's own is an OSError; a ValueError: too many files are open
             self._lose(str(error), now)
             return
         if data:

@@ -137,6 +137,35 @@ def test_a_serial_line_goes_both_ways_and_comes_back_after_unplugging(loop):
     assert os_error and not link.greet()
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="pseudo terminals are POSIX")
+def test_a_serial_line_opened_behind_a_thousand_files_is_opened_again_when_there_are_fewer(loop):
+    """select() knows descriptors up to 1,023."""
+    pytest.importorskip("serial")
+    resource = pytest.importorskip("resource")
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if hard != resource.RLIM_INFINITY and hard < 1200:
+        pytest.skip("the system lets no process open so many files")
+    resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, 1200), hard))
+    master, slave = os.openpty()
+    files = []
+    try:
+        while not files or files[-1] < 1023:
+            files.append(os.open(os.devnull, os.O_RDONLY))
+        link = parse_link(f"serial:{os.ttyname(slave)}:57600")
+        line = loop(link)
+        os.write(master, b"lost")
+        assert line.until(lambda: link.problem != "") and not link.greet()
+        while files:
+            os.close(files.pop())
+        assert line.until(lambda: link.greet() and link.problem == "", 20.0)
+        os.write(master, b"heard\n")
+        assert line.until(lambda: b"heard" in b"".join(line.heard[link]))
+    finally:
+        for file in (*files, master, slave):
+            os.close(file)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
 @pytest.mark.parametrize(
     ("text", "kind"),
     [
