@@ -1,5 +1,9 @@
 """What was exported stays within reach, and says when the map has changed since."""
 
+from datetime import datetime, timedelta
+
+import pytest
+
 from tests.kit.page_kit import opened, send, standing, vehicle
 
 T = "2026-05-28T20:{}:00Z"
@@ -29,3 +33,20 @@ def test_a_pack_stays_when_the_daemon_exports_by_itself_and_says_that_it_is_olde
             page.wait_for_selector(".files a[href*='/api/export/5/pack']")
             assert page.locator(".files a").count() == 3
             assert page.locator(".files a:has-text('older')").count() == 0
+
+
+def test_a_file_of_another_day_says_which(browser):
+    now = datetime.now().astimezone()
+    if now + timedelta(minutes=5) > now.replace(hour=23, minute=59):
+        pytest.skip("midnight is near")
+    rows = []
+    for number, (kind, ended) in enumerate((("pack", now), ("cog", now - timedelta(days=1)))):
+        rows.append(job(number, "export", 11, {kind: f"{kind}.bin"}) | {"ended": ended.isoformat()})
+    with standing(vehicle(1)) as station:
+        station.gets["/api/jobs"] = rows
+        with opened(browser, station.url) as page:
+            page.click("#tab-map")
+            page.wait_for_selector(".files a:has-text('cog.bin')")
+            today, yesterday = (page.inner_text(f".files a:has-text('{name}.bin')") for name in ("pack", "cog"))
+    assert today.endswith(f"pack.bin, {now:%H:%M}")
+    assert yesterday.endswith(f"cog.bin, {now - timedelta(days=1):%Y-%m-%d %H:%M}")

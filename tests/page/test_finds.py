@@ -101,3 +101,19 @@ def test_a_find_that_could_not_be_saved_keeps_its_place(browser):
         (_, _, saved) = station.heard[-1]
         assert saved["note"] == "Person"
         assert abs(saved["lon_deg"] - wanted[0]) < 1e-6 and abs(saved["lat_deg"] - wanted[1]) < 1e-6
+
+
+def test_a_later_notice_is_seen_beside_those_that_wait_for_a_press(browser):
+    with standing(vehicle(1)) as station:
+        station.answer = lambda method, path, body: (200, None)
+        station.gets["/api/finds"] = [FIND | {"id": k, "note": f"Roof {k}"} for k in range(4)]
+        with opened(browser, station.url, TABLET) as page:
+            page.click("#tab-map")
+            page.wait_for_selector(".finds li >> nth=3")
+            for k in range(4):
+                page.locator(f".finds li:has-text('Roof {k}') [aria-label='Remove this find']").click()
+                page.wait_for_selector(f".notice:has-text('Roof {k}')")
+            page.click("#tab-plan")
+            page.click("text=Make plan")
+            page.wait_for_selector(".notice:has-text('area')")
+            assert page.locator(".notice").count() == 4

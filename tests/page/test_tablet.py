@@ -37,8 +37,10 @@ def keep_plans(station):
 
     def answer(method, path, body):
         if path == "/api/plan":
-            version = station.gets["/api/plan"]["version"] + 1
-            station.gets["/api/plan"] = body | {"version": version}
+            version = station.gets["/api/plan"]["version"]
+            if body.get("version", version) != version:
+                return 409, {"detail": f"the plan was changed elsewhere (version {version})"}
+            station.gets["/api/plan"] = body | {"version": version + 1}
             return 200, station.gets["/api/plan"]
         return 200, {}
 
@@ -147,6 +149,97 @@ def test_what_is_being_drawn_survives_another_page_and_the_next_taps_count(brows
             assert page.input_value("[name=altitude_m]") == "90"
 
 
+OUTLINE = [[8.544, 47.396], [8.547, 47.396], [8.547, 47.399], [8.544, 47.399], [8.544, 47.396]]
+ZONE = [[8.545, 47.397], [8.5455, 47.397], [8.5455, 47.3975], [8.545, 47.397]]
+ZONE_2 = [[8.546, 47.398], [8.5465, 47.398], [8.5465, 47.3985], [8.546, 47.398]]
+
+
+def polygon(*rings):
+    return {"type": "Polygon", "coordinates": list(rings)}
+
+
+def tap_all(page, *places):
+    for place in places:
+        page.mouse.click(*place)
+        page.wait_for_timeout(500)
+
+
+def stored_rings(station):
+    return station.gets["/api/plan"]["area"]["coordinates"]
+
+
+@pytest.mark.parametrize("what", ["Add corners", "Add no-fly zone"])
+def test_a_zone_of_another_page_stays_while_something_is_drawn_here(browser, what):
+    """GIVEN a page that is drawing WHEN another draws zones before and between its taps THEN everything is kept."""
+    with standing(vehicle(1)) as station:
+        keep_plans(station)
+        station.gets["/api/plan"] = EMPTY_PLAN | {"area": polygon(OUTLINE)}
+        with opened(browser, station.url, TABLET) as page:
+            page.wait_for_selector(".vehicle")
+            page.click("#tab-plan")
+            page.get_by_role("button", name=what).click()
+            change_elsewhere(station, page, area=polygon(OUTLINE, ZONE))
+            assert page.evaluate(RINGS)[:2] == [4, 3]  # before any tap
+            tap_all(page, (500, 200), (800, 200), (800, 450))
+            page.wait_for_timeout(1000)  # saved
+            before = stored_rings(station)
+            assert ZONE in before and len(before) == (2 if what == "Add corners" else 3)
+            change_elsewhere(station, page, area=polygon(before[0], ZONE_2, *before[1:]))
+            tap_all(page, (500, 450))
+            page.click("button:text-is('Done')")
+            page.wait_for_timeout(1000)
+            after = stored_rings(station)
+            assert ZONE in after and ZONE_2 in after and len(after) == len(before) + 1
+            drawn = after[0] if what == "Add corners" else next(r for r in after[1:] if r not in (ZONE, ZONE_2))
+            assert len(drawn) - 1 == (8 if what == "Add corners" else 4)
+            assert page.evaluate(RINGS) == [len(ring) - 1 for ring in after]
+
+
+def test_a_tap_while_the_change_of_another_page_is_loaded_does_not_undo_it(browser):
+    with standing(vehicle(1)) as station:
+        keep_plans(station)
+        station.gets["/api/plan"] = EMPTY_PLAN | {"area": polygon(OUTLINE)}
+        with opened(browser, station.url, TABLET) as page:
+            page.wait_for_selector(".vehicle")
+            page.click("#tab-plan")
+            page.get_by_role("button", name="Add corners").click()
+            held = []
+            page.route("**/api/plan", lambda r: held.append(r) if r.request.method == "GET" else r.continue_())
+            station.gets["/api/plan"] |= {"version": 51, "area": polygon(OUTLINE, ZONE)}
+            with page.expect_request("**/api/plan"):
+                send(page, {"type": "plan"})
+            page.mouse.click(800, 450)
+            page.wait_for_timeout(100)
+            held[0].fulfill(json=station.gets["/api/plan"])
+            page.unroute("**/api/plan")
+            page.wait_for_timeout(3000)
+            assert ZONE in stored_rings(station) and page.evaluate(RINGS) == [5, 3]
+            assert len(stored_rings(station)[0]) == 6
+
+
+def test_a_plan_is_outdated_by_the_zone_of_another_page_also_while_something_is_drawn(browser):
+    part = {"id": "v1", "length_m": 9, "time_s": 9, "photos": 1, "sorties": 1, "flights": []}
+    plan = {"id": "p1", "vehicles": [part], "covered_share": 1, "makespan_s": 9, "warnings": [], "spacing_m": 9}
+    drawn = "import('/static/plan/outdated.js').then((m) => m.drawnNow())"
+    older = ".plan-result .wrong:has-text('The plan is older than the drawing')"
+    with standing(vehicle(1)) as station:
+        keep_plans(station)
+        station.gets |= {"/api/plans": [plan], "/api/plans/p1/map": {"features": []}}
+        station.gets["/api/plan"] = EMPTY_PLAN | {"area": polygon(OUTLINE)}
+        with opened(browser, station.url, TABLET) as page:
+            page.click("#tab-plan")
+            page.get_by_role("button", name="Add corners").wait_for()
+            made_of = {"settings": {"made_of": page.evaluate(drawn)}, "plan": "p1", "vehicles": {"v1": "v1"}}
+            change_elsewhere(station, page, **made_of)
+            page.wait_for_selector(".assignments li")
+            assert page.locator(older).count() == 0
+            page.get_by_role("button", name="Add corners").click()
+            change_elsewhere(station, page, area=polygon(OUTLINE, ZONE))
+            page.wait_for_selector(older)
+            page.click("text=Check and start…")
+            assert page.locator("dialog[open]").count() == 0
+
+
 def test_a_double_tap_ends_a_drawing_with_that_corner(browser):
     with standing(vehicle(1)) as station, opened(browser, station.url, TABLET, has_touch=True) as page:
         page.wait_for_selector(".vehicle")
@@ -174,6 +267,35 @@ def test_what_was_drawn_without_a_network_is_saved_when_it_is_back(browser):
             with page.expect_response(lambda response: response.request.method == "PUT"):
                 pass
             assert station.gets["/api/plan"]["settings"]["altitude_m"] == 55
+
+
+@pytest.mark.parametrize("status", [409, 507, 401])
+def test_what_the_station_refuses_when_the_network_is_back_is_said(browser, status):
+    with standing(vehicle(1)) as station:
+        keep_plans(station)
+        with opened(browser, station.url, TABLET) as page:
+            page.click("#tab-plan")
+            page.context.set_offline(True)
+            page.fill("[name=altitude_m]", "55")
+            page.press("[name=altitude_m]", "Tab")
+            page.wait_for_selector("text=not shared with other pages")
+            station.answer = lambda method, path, body: (status, {"detail": "the station says no"})
+            page.context.set_offline(False)
+            page.wait_for_selector(".notice:has-text('not shared with other pages: the station says no')")
+
+
+def test_a_refused_picture_does_not_ask_for_all_vehicles(browser):
+    with standing(vehicle(1)) as station, opened(browser, station.url, TABLET) as page:
+        page.wait_for_selector(".link[data-link=live]")
+        page.wait_for_timeout(500)
+        asked = []
+        page.on("request", lambda request: asked.append(request.url))
+        for count in range(3):
+            send(
+                page, {"type": "refused", "cause": "pose", "count": count, "vehicle": "v1", "image": "a", "reason": ""}
+            )
+        page.wait_for_timeout(500)
+        assert [url for url in asked if url.endswith("/api/vehicles")] == []
 
 
 def test_a_list_that_comes_late_does_not_put_a_flying_vehicle_on_the_ground(browser):

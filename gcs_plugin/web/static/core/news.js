@@ -82,7 +82,7 @@ function soon(...paths) {
 
 const KINDS = {
   resync: () => { refresh(); changed("plan"); changed("finds-changed"); },
-  refused: () => read("/api/vehicles"),
+  unwelcome: () => read("/api/vehicles"),
   vehicle: heardVehicle,
   vehicle_event: (event) => {
     const row = state.vehicles.get(String(event.vehicle));

@@ -13,7 +13,7 @@ export function notice(level, text, action) {
   for (const old of box.children) if (!action && old.dataset.text === text) old.remove();
   const line = make("div", { class: "notice", dataset: { level, text, action: action ? "true" : "" } }, make("span", {}, text), action && button(action[0], () => { line.remove(); action[1](); }, { class: "small" }), button("×", () => line.remove(), { "aria-label": t("notice.dismiss") }));
   box.append(line);
-  while (box.children.length > MOST) ([...box.children].find((old) => !old.dataset.action) ?? box.firstChild).remove();
+  while (box.children.length > MOST) ([...box.children].slice(0, -1).find((old) => !old.dataset.action) ?? box.firstChild).remove();
   if (level === "done") setTimeout(() => line.remove(), GOES_MS);
   return line;
 }

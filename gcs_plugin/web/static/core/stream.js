@@ -59,7 +59,7 @@ export function listen(heard) {
     };
     opened.onclose = () => {
       if (socket !== opened) return;
-      if (!welcome) heard({ type: "refused" }); // no link, or a wrong token: a request tells which
+      if (!welcome) heard({ type: "unwelcome" }); // no link, or a wrong token: a request tells which
       setTimeout(connect, wait);
       wait = Math.min(4000, wait * 2);
     };

@@ -3,7 +3,7 @@
 import { make, setAttribute } from "/static/core/dom.js";
 import { guarded } from "/static/core/guard.js";
 import { t } from "/static/core/strings.js";
-import { area, change, onArea, preview, remember } from "/static/plan/area.js";
+import { area, change, onArea, preview, remember, replace } from "/static/plan/area.js";
 import { feature, map, maplibregl, show } from "/static/map/map.js";
 import { dropTool, takeTool, tool } from "/static/map/tools.js";
 
@@ -15,6 +15,22 @@ let drawing = -1; // the ring that taps add to
 let told = () => {};
 export const onDrawing = (work) => { told = work; };
 export const isDrawing = () => drawing >= 0;
+
+const same = (a, b) => JSON.stringify(a) === JSON.stringify(b);
+
+// Another page has changed the area: theirs counts, but for the ring that is being drawn here. kept: the rings that both
+// pages had before. Says whether theirs lacks something now.
+export function mergeDrawn(theirs, kept) {
+  const mine = area.rings[drawing] ?? [];
+  const at = drawing === 0 ? 0 : theirs.findIndex((ring, k) => k && same(ring, kept[drawing]));
+  let rings = [...theirs];
+  if (at > 0) rings[at] = mine;
+  else if (at < 0) rings = [...(theirs.length ? theirs : area.rings.slice(0, 1)), mine]; // no zone without an outline
+  else if (!same(mine, kept[0] ?? [])) rings = [mine, ...theirs.slice(1)];
+  drawing = at < 0 ? rings.length - 1 : at;
+  replace(rings);
+  return mine.length > 2 && !same(rings, theirs);
+}
 
 export function draw(ring) {
   takeTool("draw", stopDrawing);

@@ -14,20 +14,24 @@ import { fillFields, followsTerrain, inFieldNames, planFields, planValues, rawVa
 import { acceptDrops, KINDS, readArea } from "/static/plan/import.js";
 import { drawnNow, madeOfNow, setMadeOf } from "/static/plan/outdated.js";
 import { planResult, showPlan } from "/static/plan/result.js";
-import { isSaving, loadShared, saveShared, whenChangedElsewhere } from "/static/plan/shared.js";
+import { isSaving, keptArea, loadShared, saveShared, whenChangedElsewhere } from "/static/plan/shared.js";
 import { boundsOf, fit } from "/static/map/map.js";
 
 let made = null;
 let names = {};
-function save() { saveShared({ area: area.area.rings.length ? area.polygon() : null, settings: { ...rawValues(), made_of: madeOfNow() }, plan: made?.id ?? null, vehicles: names }); }
+function save() { saveShared(() => ({ area: area.area.rings.length ? area.polygon() : null, settings: { ...rawValues(), made_of: madeOfNow() }, plan: made?.id ?? null, vehicles: names })); }
+const ringsOf = (polygon) => (polygon?.coordinates ?? []).map((points) => ring(points).slice(0, -1)).filter((points) => points.length > 2);
 
 export async function loadPlan() {
   if (isSaving()) return;
+  const kept = ringsOf(keptArea());
   const body = await loadShared();
   if (!body) return;
-  const rings = (body.area?.coordinates ?? []).map((points) => ring(points).slice(0, -1)).filter((points) => points.length > 2);
+  const rings = ringsOf(body.area);
   setMadeOf(body.plan ? body.settings?.made_of : null);
-  if (!editor.isDrawing() && (body.area || area.area.rings.length)) area.replace(rings); // what is being drawn here stays
+  let unsaved = false;
+  if (editor.isDrawing()) unsaved = editor.mergeDrawn(rings, kept);
+  else if (body.area || area.area.rings.length) area.replace(rings);
   fillFields(body.settings ?? {});
   setDem(body.dem);
   const before = names;
@@ -37,6 +41,7 @@ export async function loadPlan() {
     const plan = (await get("/api/plans")).find((row) => row.id === body.plan);
     if (plan) { made = plan; await showPlan(plan, names, onNames); }
   }
+  if (unsaved) save();
 }
 
 whenChangedElsewhere(loadPlan);

@@ -9,17 +9,23 @@ const RETRY_MS = 3000;
 let timer = null;
 let there = true; // whether this daemon keeps plans
 let version = null;
+let kept = null; // the area of that version
 let saving = false;
 let reload = () => {};
 
 // Called when somebody else has changed the plan meanwhile: theirs stands, and is to be shown.
 export function whenChangedElsewhere(action) { reload = action; }
 
+export const keptArea = () => kept;
+
 export async function loadShared() {
+  const before = version;
   try {
     const body = await get("/api/plan");
     if (body?.version != null && body.version === version) return null;
+    if (before != null && (isSaving() || version !== before)) return null; // changed here meanwhile: the daemon says whose stands
     version = body?.version ?? null;
+    kept = body?.area ?? null;
     return body;
   } catch (error) {
     if (error.status === 404) there = false;
@@ -29,8 +35,8 @@ export async function loadShared() {
 
 export const isSaving = () => saving || timer != null;
 
-// A plan that could not be sent, as the network was away, is sent once it is back.
-export function saveShared(body, wait_ms = SAVE_MS) {
+// A plan that could not be sent, as the network was away, is sent once it is back. read gives the plan as it is then.
+export function saveShared(read, wait_ms = SAVE_MS) {
   if (!there) return;
   clearTimeout(timer);
   timer = setTimeout(async () => {
@@ -38,19 +44,18 @@ export function saveShared(body, wait_ms = SAVE_MS) {
     saving = true;
     let outdated = false;
     try {
+      const body = read();
       const answer = await request("PUT", "/api/plan", version == null ? body : { ...body, version });
       version = answer?.version ?? version;
+      kept = body.area;
     } catch (error) {
       if (error.status === 404) there = false;
-      else if (wait_ms === SAVE_MS) notice("warn", t("plan.unsaved", { why: error.message }));
-      if (error.kind !== "http" && timer == null) saveShared(body, RETRY_MS);
+      else if (wait_ms === SAVE_MS || error.kind === "http") notice("warn", t("plan.unsaved", { why: error.message }));
+      if (error.kind !== "http" && timer == null) saveShared(read, RETRY_MS);
       outdated = error.status === 409;
     } finally {
       saving = false;
     }
-    if (outdated) {
-      version = null;
-      reload();
-    }
+    if (outdated) reload(); // the version stays: without one, what is changed meanwhile would replace theirs
   }, wait_ms);
 }

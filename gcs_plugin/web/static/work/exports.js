@@ -8,6 +8,7 @@ import { t } from "/static/core/strings.js";
 
 const FORMATS = ["pack", "cog", "gpkg", "mbtiles", "kmz", "odm", "pdf", "tak", "places", "pmtiles", "stac"];
 const CHOSEN = new Set(["pack"]);
+const REDRAW_MS = 60_000; // after midnight, what was made today is from yesterday
 const CHANGES = new Set(["refine", "together", "tones", "coarse", "redraw"]); // jobs that change the map
 
 // The newest file of each kind: the daemon exports some by itself, and what a person asked for stays beside them.
@@ -20,7 +21,14 @@ function newestFiles(jobs) {
   }
   return [...newest];
 }
-const timeOfDay = (iso) => (Number.isFinite(Date.parse(iso)) ? new Date(iso).toTimeString().slice(0, 5) : "");
+// By this device's clock; with the date if it is not today.
+const local = (time_ms) => new Date(time_ms - new Date(time_ms).getTimezoneOffset() * 60_000).toISOString();
+function timeOfDay(iso) {
+  const time_ms = Date.parse(iso);
+  if (!Number.isFinite(time_ms)) return "";
+  const [day, time] = [local(time_ms).slice(0, 10), local(time_ms).slice(11, 16)];
+  return day === local(Date.now()).slice(0, 10) ? time : `${day} ${time}`;
+}
 
 export function exportPanel() {
   const boxes = FORMATS.map((key) => make("input", { type: "checkbox", name: key, checked: CHOSEN.has(key) }));
@@ -41,7 +49,9 @@ export function exportPanel() {
     const text = `${FORMATS.includes(kind) ? t(`export.${kind}`) : kind}: ${name}`;
     setText(row.firstChild, [text, timeOfDay(job.ended), older ? t("export.older") : ""].filter(Boolean).join(", "));
   });
-  subscribe("jobs", "exports", () => draw(newestFiles([...state.jobs.values()])));
+  const redraw = () => draw(newestFiles([...state.jobs.values()]));
+  subscribe("jobs", "exports", redraw);
+  setInterval(redraw, REDRAW_MS);
   return make("section", {}, make("h2", {}, t("export.title")),
     make("form", { onsubmit: send }, ...FORMATS.map((key, k) => make("label", { class: "check" }, boxes[k], make("span", {}, t(`export.${key}`)))), make("button", { type: "submit" }, t("export.go"))), files);
 }
