@@ -86,6 +86,9 @@ def _matches(poses: Poses, found: VideoScan, logs: Sequence[LogSource]) -> list[
         times, places = poses.track()
         clocks = {clock for clock in (found.created_s, poses.clock_s) if clock is not None}
         return [m for entry in logs if (m := _by_positions(times, places, clocks, entry)) is not None]
+    logs = [entry for entry in logs if any(sample.has_position for sample in entry.log.samples)]
+    if not logs:
+        return []
     margin = active().ingest.turning_margin
     times, rates = picture_rates(found)
     matches = []

@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -222,25 +223,29 @@ def _scan_packets(container: Any, stream: Any, result: VideoScan) -> None:
     texts: list[tuple[float, float, str]] = []
     leftovers: dict[int, bytes] = {}
     ahead: list[tuple[Any, int, float | None]] = []  # metadata of a part whose pictures have not begun
+    read = partial(_scan_metadata, result=result, texts=texts, leftovers=leftovers)
     for packet in demux(container, wanted):
         if packet.size == 0:
             continue
         part, seconds = times.place(packet)
         if packet.stream is not stream:
-            ahead.append((packet, part, seconds))
-            if part >= times.parts:
-                continue
-        else:
-            if len(result.pictures) >= _MAX_PICTURES:
-                break
-            note = _note(bytes(packet), form, times.picture(part, seconds), result.unknown_sei)
-            note.position = packet.pos
-            result.pictures.append(note)
-        for other, its_part, moment in ahead:
-            _scan_metadata(other, times.metadata(its_part, moment), result, texts=texts, leftovers=leftovers)
-        ahead.clear()
+            if part < times.parts:
+                read(packet, times.metadata(part, seconds))
+            else:
+                ahead.append((packet, part, seconds))
+            continue
+        if len(result.pictures) >= _MAX_PICTURES:
+            break
+        parts = times.parts
+        note = _note(bytes(packet), form, times.picture(part, seconds), result.unknown_sei)
+        note.position = packet.pos
+        result.pictures.append(note)
+        if times.parts > parts:
+            for other, its_part, moment in (each for each in ahead if each[1] < times.parts):
+                read(other, times.metadata(its_part, moment))
+            ahead = [each for each in ahead if each[1] >= times.parts]
     for other, its_part, moment in ahead:
-        _scan_metadata(other, times.metadata(its_part, moment), result, texts=texts, leftovers=leftovers)
+        read(other, times.metadata(its_part, moment))
     result.joints_s = times.joints_s
     if texts:
         result.cues = srt.parse_cues(texts)

@@ -144,20 +144,32 @@ def _read(blocks: list[_Raw]) -> Subtitles:
 def _join(blocks: list[_Raw]) -> list[float]:
     """Put the recordings that a file joins one after the other; returns where each but the first begins, seconds.
 
-    Each counts its times from zero. Blocks that are only out of order go back by less.
+    Each counts its times from zero. Blocks that are only out of order go back by less. A block with a damaged time
+    tells neither where a recording begins nor where it ends.
     """
     restart_s = active().ingest.subtitle_restart_s
+    starts_s = [block.start_s for block in blocks]
     joints_s: list[float] = []
     shift_s = before_s = end_s = 0.0
-    for block in blocks:
-        if block.start_s < before_s - restart_s:
-            shift_s = end_s
-            joints_s.append(shift_s)
-        before_s = block.start_s
+    for index, block in enumerate(blocks):
+        damaged = _stands_out(starts_s, index)
+        if not damaged:
+            if block.start_s < min(before_s - restart_s, restart_s):
+                shift_s = end_s
+                joints_s.append(shift_s)
+            before_s = block.start_s
         block.start_s += shift_s
         block.end_s += shift_s
-        end_s = max(end_s, block.end_s)
+        if not damaged:
+            end_s = max(end_s, block.end_s)
     return joints_s
+
+
+def _stands_out(values: list[float], index: int) -> bool:
+    """Whether the two values nearest to one in the list are closer to each other than to it."""
+    first = max(0, min(index - 1, len(values) - 3))
+    near = [values[i] for i in range(first, min(first + 3, len(values))) if i != index]
+    return len(near) == 2 and abs(near[0] - near[1]) < min(abs(values[index] - value) for value in near)
 
 
 def _latitude_first(blocks: list[_Raw]) -> bool | None:

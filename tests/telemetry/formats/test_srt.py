@@ -103,20 +103,47 @@ def test_a_decimal_comma_is_read_like_a_point(written):
         assert getattr(comma.cues[0].sample, name) == getattr(point, name)
 
 
+def counted(times):
+    """Subtitles with a block of a second at each of some times, and their latitudes."""
+    places = [47.0 + 0.001 * i for i in range(len(times))]
+    text = ""
+    for i, t in enumerate(times):
+        clock = f"{t // 3600:02d}:{t // 60 % 60:02d}:{t % 60:02d}"
+        text += f"{i}\n{clock},000 --> {clock},999\n[latitude: {places[i]:.4f}] [longitude: 8.25]\n\n"
+    return text, places
+
+
 @given(st.lists(st.integers(7, 60), min_size=1, max_size=4))
 @settings(max_examples=30, deadline=None)
 def test_subtitles_of_joined_recordings_follow_each_other(lengths):
     """Each counts from zero; every block keeps its place in the order of the file."""
-    text, places = "", []
-    for part, seconds in enumerate(lengths):
-        for t in range(seconds):
-            places.append(47.0 + part + 0.001 * t)
-            text += f"{t}\n00:00:{t:02d},000 --> 00:00:{t:02d},999\n[latitude: {places[-1]:.4f}] [longitude: 8.25]\n\n"
+    text, places = counted([t for seconds in lengths for t in range(seconds)])
     found = parse_srt(text)
     assert [cue.sample.lat_deg for cue in found.cues] == pytest.approx(places)
     assert [cue.start_s for cue in found.cues] == pytest.approx(range(sum(lengths)), abs=0.01)
     assert len(found.joints_s) == len(lengths) - 1
     assert ("srt-joined" in found.notes) == (len(lengths) > 1)
+
+
+@given(st.lists(st.integers(7, 60), min_size=1, max_size=3), st.data())
+@settings(max_examples=100, deadline=None)
+def test_one_damaged_time_leaves_all_other_blocks_where_they_are(lengths, data):
+    times = [t for seconds in lengths for t in range(seconds)]
+    # Where a recording ends is not known if its last block is damaged.
+    inside = [i for i, t in enumerate(times) if t >= 2 and 0 not in times[i + 1 : i + 3]]
+    damaged = data.draw(st.sampled_from([0, *inside]))
+    times[damaged] = data.draw(st.sampled_from([0, 1, 3]) | st.integers(0, 7200))
+    found = parse_srt(counted(times)[0])
+    starts = [cue.start_s for i, cue in enumerate(found.cues) if i != damaged]
+    assert starts == pytest.approx([i for i in range(len(times)) if i != damaged], abs=0.01)
+    assert len(found.joints_s) == len(lengths) - 1
+
+
+@pytest.mark.parametrize("damaged", [600, 0])
+def test_a_damaged_time_is_no_joint_of_recordings(damaged):
+    found = parse_srt(counted([*range(8), damaged, *range(9, 20)])[0])
+    assert [cue.start_s for cue in found.cues] == [*range(8), damaged, *range(9, 20)]
+    assert not found.joints_s and "time-backwards" in found.notes
 
 
 @given(st.text(max_size=400))

@@ -26,11 +26,14 @@ def klv_at(place, utc_s):
 
 @pytest.mark.parametrize("klv_every", [1, 4, 10])
 @pytest.mark.parametrize("count", [96, 101])
-def test_joined_recordings_keep_their_own_places_and_times(card, tmp_path, mapped, klv_every, count):
+@pytest.mark.parametrize("b_pictures", [0, 2])
+def test_joined_recordings_keep_their_own_places_and_times(card, tmp_path, mapped, klv_every, count, b_pictures):
     """Two transport streams in one file, both with times from zero, a kilometre and a day apart."""
     first, second = north(5.0), north(-5.0, 1000.0)
     parts = [
-        write_video(tmp_path / f"{name}.ts", count=count, klv=klv_at(place, utc_s), klv_every=klv_every)
+        write_video(
+            tmp_path / f"{name}.ts", count=count, klv=klv_at(place, utc_s), klv_every=klv_every, b_pictures=b_pictures
+        )
         for name, place, utc_s in (("a", first, 1.7e9), ("b", second, 1.7e9 + 86_400))
     ]
     (card / "ab.ts").write_bytes(b"".join(part.read_bytes() for part in parts))

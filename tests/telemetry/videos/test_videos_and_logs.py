@@ -1,6 +1,7 @@
 """Videos beside the logs of a whole swarm: the log of another vehicle is never taken."""
 
 import shutil
+import struct
 from datetime import UTC, datetime
 
 import numpy as np
@@ -60,6 +61,24 @@ def test_the_logs_of_autopilot_and_ground_station_are_no_rivals(card, real_data,
     span = flown(real_data, "copter_cam_rtl_1x.BIN").span
     write_video(card / "a.mp4", count=200, created=created(np.mean(span)))
     assert len(mapped(card).frames) >= 20
+
+
+def without_positions(source, path):
+    """Write what a device that knows no position sends, from a vehicle's tlog: attitudes and clocks."""
+    from pymavlink import mavutil
+
+    link = mavutil.mavlink_connection(str(source))
+    with path.open("wb") as file:
+        while (message := link.recv_match(type=["HEARTBEAT", "SYSTEM_TIME", "ATTITUDE"])) is not None:
+            file.write(struct.pack(">Q", round(message._timestamp * 1e6)) + bytes(message.get_msgbuf()))
+    link.close()
+
+
+def test_a_log_without_positions_is_no_rival(card, real_data, mapped):
+    shutil.copy(real_data("sitl_logs") / "swarm_v2.tlog", card)
+    without_positions(card / "swarm_v2.tlog", card / "gimbal.tlog")
+    write_video(card / "a.mp4", count=300, created=created(TAKEN_S))
+    assert len(mapped(card).frames) >= 25
 
 
 @pytest.mark.parametrize("zone_s", [0.0, 7200.0])

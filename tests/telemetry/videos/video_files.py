@@ -30,8 +30,12 @@ def write_video(
     created: str | None = None,
     klv: Callable[[float], bytes] | None = None,
     klv_every: int = 1,
+    b_pictures: int = 2,
 ) -> Path:
-    """A video with one H.264 stream of each size, and a KLV packet with every `klv_every`-th picture."""
+    """A video with one H.264 stream of each size, and a KLV packet with every `klv_every`-th picture.
+
+    `b_pictures`: how many in a row are coded by what precedes and what follows, and so stored out of order.
+    """
     import av
 
     with av.open(str(path), "w") as container:
@@ -41,7 +45,7 @@ def write_video(
         for size in sizes:
             stream = container.add_stream("libx264", rate=rate)
             stream.width, stream.height = size
-            stream.pix_fmt, stream.options = "yuv420p", {"g": "15", "bf": "2"}
+            stream.pix_fmt, stream.options = "yuv420p", {"g": "15", "bf": str(b_pictures)}
             if aspect is not None:
                 stream.codec_context.sample_aspect_ratio = aspect
             streams.append(stream)
