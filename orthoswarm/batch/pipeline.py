@@ -84,7 +84,7 @@ def run(
         progress: called during long work.
         drawers: run the tasks that write into the output folder, where the workers do not see it; None: the workers.
         publish: called when all products are there; the run is complete, and its results of use to no later one, only
-            after it.
+            after it. Not called if the refinement failed: a map of an earlier run is worth more.
 
     Returns:
         The content of report.json.
@@ -127,11 +127,14 @@ def run(
             else:
                 state.leave_out(state.undrawn, state.recorded.placed)
         report = run_report.write_products(context, state, placed, refinement)
-        if publish is not None:
+        if publish is not None and state.fault is None:
             publish()
         space.complete()
-        if state.fault is not None:
-            raise OrthoSwarmError(f"{state.fault}; {REALTIME} stands, but there is no orthoimage: report this fault")
+    if state.fault is not None:
+        stands = f"{REALTIME} stands, but there is no orthoimage"
+        if publish is not None:
+            stands = f"{out / REALTIME} stands, but there is no orthoimage, and nothing was uploaded"
+        raise OrthoSwarmError(f"{state.fault}; {stands}: report this fault")
     return report
 
 

@@ -56,6 +56,23 @@ class _Outcome:
     rss_mb: float
 
 
+_begun: set[str] = set()
+
+
+@dataclass(frozen=True, slots=True)
+class _Beginning:
+    """What a worker does before its first task of a run."""
+
+    run: str
+    begin: Callable[[], None]
+
+    def once(self) -> None:
+        """Runs on a worker."""
+        if self.run not in _begun:
+            self.begin()
+            _begun.add(self.run)
+
+
 class Cluster:
     """The workers of a Dask scheduler; each works on one item at a time.
 
@@ -63,7 +80,7 @@ class Cluster:
         address: of the scheduler, for example tcp://192.168.1.10:8786.
         shared: files and folders that every worker must see under the same path, with what is in them.
         written: a folder that every worker must write to under the same path; None for none.
-        begin: called in each worker before its first task.
+        begin: called in each worker before its first task, also in one that comes later.
         patience_s: how long to wait for a worker to come back when all are gone, and for a scheduler; None for the
             configuration's.
 
@@ -83,7 +100,8 @@ class Cluster:
     ) -> None:
         self._address = address
         self._shared = [str(seen) for path in shared for seen in _samples(path.absolute())]
-        self._written, self._begin = written and written.absolute(), begin
+        self._written = written and written.absolute()
+        self._begin = None if begin is None else _Beginning(uuid4().hex, begin)
         self._client = _connect(address)
         self._patience_s = active().compute.cluster_patience_s if patience_s is None else patience_s
         self._cpu_s: dict[str, float] = {}
@@ -145,7 +163,7 @@ class Cluster:
         return known
 
     def _submit(self, function: Callable[[Any], Any], item: Any) -> _Task:
-        payload = pickle.dumps((function, item, overridden()), pickle.HIGHEST_PROTOCOL)
+        payload = pickle.dumps((function, item, overridden(), self._begin), pickle.HIGHEST_PROTOCOL)
         return _Task(payload, self._sent(payload), self._client)
 
     def _sent(self, payload: bytes) -> Any:
@@ -233,7 +251,7 @@ class Cluster:
             at = self._address
             raise InputError(f"the cluster at {at} has no workers; start some with `dask worker {at}`")
         with _marked(self._written) as marker:
-            every = self._client.run(_inspect, self._shared, marker, self._begin)
+            every = self._client.run(_inspect, self._shared, marker)
         for worker, found in every.items():
             version, missing, process, cpu_s, alone = found
             if not alone:  # sums over several threads differ in their last digits, and threads compete for the cores
@@ -277,8 +295,10 @@ def _short(error: BaseException) -> str:
 def _work(payload: bytes) -> _Outcome:
     """Runs on a worker."""
     prepare_process()
-    function, item, config = pickle.loads(payload)
+    function, item, config, beginning = pickle.loads(payload)
     override(config)
+    if beginning is not None:
+        beginning.once()
     raised = False
     try:
         value = pickle.dumps(whole(function, item), pickle.HIGHEST_PROTOCOL)
@@ -322,12 +342,8 @@ def _marked(folder: Path | None) -> Iterator[str | None]:
         marker.unlink(missing_ok=True)
 
 
-def _inspect(
-    shared: list[str], marker: str | None, begin: Callable[[], None] | None
-) -> tuple[str, list[str], str, float, bool]:
+def _inspect(shared: list[str], marker: str | None) -> tuple[str, list[str], str, float, bool]:
     """Runs on a worker: version, unseen paths, who it is, CPU seconds so far, whether sums keep to one thread."""
-    if begin is not None:
-        begin()
     missing = [p for p in shared if not os.path.exists(p)]
     if marker is not None and not (os.path.exists(marker) and os.access(os.path.dirname(marker), os.W_OK)):
         missing.append(os.path.dirname(marker))

@@ -21,10 +21,11 @@ from orthoswarm.stores.requests import StoreRequestError, request
 
 FOLDER_VARIABLE = "ORTHOSWARM_CACHE"
 """Environment variable that names another folder for copies than the user's cache folder."""
+_COMPARE_VARIABLE = "ORTHOSWARM_COMPARE_FROM"
+"""Environment variable that tells the processes of a run when it began, epoch seconds."""
 _SLACK = 16  # the cache may exceed its size by a 16th for each process that writes to it
 _ABANDONED_S = 86_400.0
 _added = 0
-_trusted_from = 0.0
 _lock = threading.Lock()
 
 
@@ -33,9 +34,19 @@ class CacheFullError(RunInterruptedError, StorageError):
 
 
 def compare_from_now() -> None:
-    """Compare each copy with its store before this process uses it: a run begins, and files may have been replaced."""
-    global _trusted_from
-    _trusted_from = time.time()
+    """Compare each copy with its store before it is used: a run begins, and files may have been replaced.
+
+    It concerns this process and those that it starts from now on.
+    """
+    os.environ[_COMPARE_VARIABLE] = str(time.time())
+
+
+def _compared_from() -> float:
+    """When the run began that this process belongs to; 0 for none."""
+    try:
+        return float(os.environ.get(_COMPARE_VARIABLE, 0.0))
+    except ValueError:
+        return 0.0
 
 
 def expect(listed: Mapping[Path, StoredFile]) -> None:
@@ -80,7 +91,7 @@ def _copied(path: Path) -> Path:
     now = time.time()
     with contextlib.suppress(FileNotFoundError):
         state = copy.stat()
-        trusted = state.st_mtime >= max(now - active().stores.cache_trust_s, _trusted_from)
+        trusted = state.st_mtime >= max(now - active().stores.cache_trust_s, _compared_from())
         if trusted or _is_current(path, copy):  # times of the copy: of its last use, of its last comparison
             os.utime(copy, (now, state.st_mtime if trusted else now))
             return copy

@@ -7,8 +7,9 @@ belongs to it. An upload that was interrupted goes on with the files that are mi
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import closing
 from hashlib import blake2b
 from pathlib import Path
 from uuid import uuid4
@@ -62,11 +63,12 @@ class PublishedFolder:
         if _LAST in there and _LAST not in sent:
             self._remove(_LAST)
         wanted = [name for name in names if sent.get(name) != self._state(name) or name not in there]
-        for done, name in enumerate(self._sending([name for name in wanted if name != _LAST]), 1):
-            sent[name] = self._state(name)
-            self._record(sent)
-            if progress is not None:
-                progress("uploading", done, len(wanted))
+        with closing(self._sending([name for name in wanted if name != _LAST])) as arrived:
+            for done, name in enumerate(arrived, 1):
+                sent[name] = self._state(name)
+                self._record(sent)
+                if progress is not None:
+                    progress("uploading", done, len(wanted))
         for name in sorted(there - set(names)):
             if written(name) and name != _LAST:
                 self._remove(name)
@@ -83,24 +85,29 @@ class PublishedFolder:
         """The folders to be removed when nothing is left in them, the innermost first."""
         return [self.local, self.local.parent]
 
-    def _sending(self, names: Sequence[str]) -> Iterator[str]:
+    def _sending(self, names: Sequence[str]) -> Generator[str, None, None]:
         """Upload several files at once; yields the name of each that has arrived, also after one that fails.
+
+        Whoever leaves it early, as Ctrl-C does, waits for the files under way only.
 
         Raises:
             OrthoSwarmError: when those that were under way have ended, if a file cannot be uploaded.
         """
         failed: BaseException | None = None
         with ThreadPoolExecutor(active().stores.connections) as pool:
-            sending = [pool.submit(self._send, name) for name in names]
-            for each in as_completed(sending):
-                if each.cancelled():
-                    continue
-                if (error := each.exception()) is None:
-                    yield each.result()
-                else:
-                    failed = failed or error
-                    for other in sending:
-                        other.cancel()
+            try:
+                sending = [pool.submit(self._send, name) for name in names]
+                for each in as_completed(sending):
+                    if each.cancelled():
+                        continue
+                    if (error := each.exception()) is None:
+                        yield each.result()
+                    else:
+                        failed = failed or error
+                        for other in sending:
+                            other.cancel()
+            finally:
+                pool.shutdown(wait=False, cancel_futures=True)
         if failed is not None:
             raise failed
 

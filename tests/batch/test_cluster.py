@@ -165,6 +165,28 @@ def test_a_worker_that_dies_in_the_middle_loses_nothing(tmp_path):
                 list(cluster.map(die, [0]))
 
 
+def mark(folder):
+    """Notes that this worker has begun."""
+    with (folder / f"begun-{os.getpid()}").open("a") as file:
+        file.write("x")
+
+
+def has_begun(folder, _):
+    time.sleep(0.05)
+    return os.getpid(), (folder / f"begun-{os.getpid()}").exists()
+
+
+def test_every_worker_begins_before_its_first_task_also_one_that_comes_later(tmp_path):
+    with Loopback(tmp_path) as both:
+        both.begin(1)
+        with Cluster(both.address, begin=partial(mark, tmp_path)) as cluster:
+            both.worker()
+            both.wait_for_workers(2)
+            found = list(cluster.map(partial(has_begun, tmp_path), range(40)))
+    assert len({process for process, _ in found}) == 2 and all(begun for _, begun in found)
+    assert [path.read_text() for path in tmp_path.glob("begun-*")] == ["x", "x"]
+
+
 def slowly(folder, n):
     """Marks that it has begun and takes a moment."""
     (folder / f"begun-{n}").touch()

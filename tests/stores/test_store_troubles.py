@@ -1,16 +1,20 @@
 """What concerns a whole store is not taken for the fault of one photo; no old copy counts; no work is lost."""
 
 import json
+import signal
+import threading
 from uuid import uuid4
 
 import pytest
 
 from gcs_plugin.cli.main import main
+from orthoswarm.batch.refiners import REFINERS
 from orthoswarm.model.errors import RunInterruptedError
 from orthoswarm.stores import local_copies, requests
 from orthoswarm.stores.addresses import path_of
-from orthoswarm.stores.listing import list_folder
+from orthoswarm.stores.listing import list_folder, look_up
 from orthoswarm.stores.local_copies import CacheFullError, cache_folder, content
+from orthoswarm.stores.published_folder import PublishedFolder
 from orthoswarm.stores.requests import StoreAccessError, StoreLostError
 from tests.kit.scene import Scene, legs
 from tests.kit.servers.store_server import S3, FaultyProxy, store_server
@@ -156,6 +160,57 @@ def test_an_upload_that_fails_is_repeated_without_the_work_and_holds_the_folder(
     assert "drawing" not in capsys.readouterr().err
     assert json.loads(content(path_of(f"{out}/tiles/collection.json")))["id"] == "my-map"
     assert not list((cache_folder() / "maps").glob("*"))
+
+
+@pytest.mark.parametrize("where", ["while it waits", "while it tells how far it is"])
+def test_an_upload_that_is_interrupted_ends_after_the_files_under_way(store, photos, tmp_path, where):
+    out = PublishedFolder(path_of(f"{photos.rpartition('/')[0]}/map"))
+    out.local.mkdir(parents=True)
+    for number in range(200):
+        (out.local / f"{number:03d}.tif").write_text("")
+    store.seen = []
+
+    def fault(method, path):
+        if where == "while it waits" and method == "PUT" and path.endswith("/020.tif"):
+            signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
+        return 0.05
+
+    def told(*_):
+        if where != "while it waits":
+            raise KeyboardInterrupt
+
+    store.fault = fault
+    with pytest.raises(KeyboardInterrupt):
+        out.publish(lambda name: True, told)
+    sent = len([method for method, _ in store.seen if method == "PUT"])
+    assert 0 < sent < 100
+    store.fault = lambda method, path: None
+    out.publish(lambda name: True)
+    assert len(list_folder(out.address)) == 200
+
+
+def test_a_fault_in_the_refinement_leaves_the_published_map_as_it_is(store, photos, tmp_path, monkeypatch, capsys):
+    class Faulty:
+        """A refiner with a bug."""
+
+        def refine_batch(self, *_):
+            raise ZeroDivisionError("by a bug")
+
+    address = path_of(f"{photos.rpartition('/')[0]}/map")
+    command = ["mosaic", photos, "--out", f"{photos.rpartition('/')[0]}/map", "--gsd", "0.5", "--workers", "1"]
+    assert main(command) == 0
+    before = {path: look_up(path) for path in list_folder(address)}
+    assert address / "orthoimage.tif" in before
+    with monkeypatch.context() as patched:
+        patched.setitem(REFINERS, "swarm", lambda *_: Faulty())
+        assert main(command) == 1
+    (local,) = (cache_folder() / "maps").glob("*/map")
+    said = capsys.readouterr().err
+    assert f"{local / 'realtime.tif'} stands, but there is no orthoimage, and nothing was uploaded" in said
+    assert (local / "realtime.tif").exists() and (local / "report.html").exists()
+    assert {path: look_up(path) for path in list_folder(address)} == before
+    assert main(command) == 0
+    assert set(list_folder(address)) == set(before) and not local.exists()
 
 
 def test_a_refused_store_is_not_called_absent(store, photos, tmp_path, capsys):

@@ -3,13 +3,16 @@
 import functools
 import http.server
 import threading
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from orthoswarm.compute.workers import spawn_context
 from orthoswarm.stores.addresses import address_of, is_stored, path_of
+from orthoswarm.stores.local_copies import compare_from_now, content
 
 
 @pytest.mark.parametrize(
@@ -91,3 +94,15 @@ def test_an_address_of_a_browser_names_the_same_files(flight, web):
 def test_any_name_on_the_web_has_an_address(name):
     path = path_of("https://example.org/a") / name
     assert name in (".", "..") or path_of(address_of(path)) == path
+
+
+def test_worker_processes_of_a_run_take_no_old_copy_either(web, tmp_path, monkeypatch):
+    monkeypatch.setenv("ORTHOSWARM_COMPARE_FROM", "nonsense")  # which counts for nothing
+    path, file = path_of(f"{web}/a.jpg"), tmp_path / "www" / "a.jpg"
+    file.write_bytes(b"old")
+    assert content(path) == b"old"
+    file.write_bytes(b"another")
+    assert content(path) == b"old"  # was compared a moment ago
+    compare_from_now()
+    with ProcessPoolExecutor(1, mp_context=spawn_context()) as pool:
+        assert pool.submit(content, path).result() == b"another"
