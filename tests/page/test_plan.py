@@ -207,8 +207,11 @@ def test_a_plan_that_somebody_else_changed_meanwhile_is_theirs(browser):
     outline = {"type": "Polygon", "coordinates": [[[8.544, 47.397], [8.547, 47.397], [8.547, 47.399], [8.544, 47.397]]]}
     theirs = {"area": outline, "settings": {"altitude_m": 120}, "plan": None, "vehicles": {}, "version": 4}
     with standing(vehicle(1)) as station:
+        drawn = []
 
         def answer(method, path, body):
+            if not drawn:  # what is being drawn would stay
+                return 200, {"version": 3}
             station.gets["/api/plan"] = theirs
             return 409, {"detail": "the plan was changed elsewhere (version 4); load it and change it again"}
 
@@ -218,9 +221,11 @@ def test_a_plan_that_somebody_else_changed_meanwhile_is_theirs(browser):
             planning(page)
             page.wait_for_function("document.querySelector('[name=altitude_m]').value === '60'")
             draw(page, (600, 250), (900, 250), (900, 550), (600, 550))
+            drawn.append(True)
+            page.fill("[name=altitude_m]", "70")
             page.wait_for_selector(".notice:has-text('changed elsewhere')")
             page.wait_for_function("document.querySelector('[name=altitude_m]').value === '120'")
-            assert [body["version"] for _, path, body in station.heard if path == "/api/plan"] == [3]
+            assert {body["version"] for _, path, body in station.heard if path == "/api/plan"} == {3}
             assert corners(page) == 3
 
 
