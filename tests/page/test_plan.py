@@ -223,6 +223,7 @@ def test_a_plan_that_somebody_else_changed_meanwhile_is_theirs(browser):
             draw(page, (600, 250), (900, 250), (900, 550), (600, 550))
             drawn.append(True)
             page.fill("[name=altitude_m]", "70")
+            page.press("[name=altitude_m]", "Tab")
             page.wait_for_selector(".notice:has-text('changed elsewhere')")
             page.wait_for_function("document.querySelector('[name=altitude_m]').value === '120'")
             assert {body["version"] for _, path, body in station.heard if path == "/api/plan"} == {3}
