@@ -254,15 +254,19 @@ def test_a_double_tap_ends_a_drawing_with_that_corner(browser):
         assert page.evaluate(RINGS) == [4]
 
 
+def change_without_a_network(page):
+    page.click("#tab-plan")
+    page.context.set_offline(True)
+    page.fill("[name=altitude_m]", "55")
+    page.press("[name=altitude_m]", "Tab")
+    page.wait_for_selector("text=not shared with other pages")
+
+
 def test_what_was_drawn_without_a_network_is_saved_when_it_is_back(browser):
     with standing(vehicle(1)) as station:
         keep_plans(station)
         with opened(browser, station.url, TABLET) as page:
-            page.click("#tab-plan")
-            page.context.set_offline(True)
-            page.fill("[name=altitude_m]", "55")
-            page.press("[name=altitude_m]", "Tab")
-            page.wait_for_selector("text=not shared with other pages")
+            change_without_a_network(page)
             page.context.set_offline(False)
             with page.expect_response(lambda response: response.request.method == "PUT"):
                 pass
@@ -274,11 +278,7 @@ def test_what_the_station_refuses_when_the_network_is_back_is_said(browser, stat
     with standing(vehicle(1)) as station:
         keep_plans(station)
         with opened(browser, station.url, TABLET) as page:
-            page.click("#tab-plan")
-            page.context.set_offline(True)
-            page.fill("[name=altitude_m]", "55")
-            page.press("[name=altitude_m]", "Tab")
-            page.wait_for_selector("text=not shared with other pages")
+            change_without_a_network(page)
             station.answer = lambda method, path, body: (status, {"detail": "the station says no"})
             page.context.set_offline(False)
             page.wait_for_selector(".notice:has-text('not shared with other pages: the station says no')")

@@ -154,8 +154,7 @@ class Returns:
                 self._fleet.send(system, vehicle.setting_questions())
 
     def _aloft(self) -> dict[int, Aloft]:
-        look = self._fleet.call(lambda: aloft_of(self._fleet.vehicles, time.monotonic()))
-        return look.result(_ANSWER_S)
+        return self._fleet.call(lambda: aloft_of(self._fleet.vehicles, time.monotonic())).result(_ANSWER_S)
 
     def _told(self, verb: "Verb", names: Collection[str], systems: Mapping[str, int]) -> dict[str, dict[str, Any]]:
         """The rows of vehicles that are given a command, unless somebody has given them another one meanwhile."""
@@ -164,8 +163,7 @@ class Returns:
         rows = {row["vehicle"]: row for row in self._command(verb, free)} if free else {}
         for name in names:
             if systems[name] in self._told_else:
-                text = f"{name} was given another command meanwhile"
-                rows[name] = CommandResult("", name, VERB, Verdict.DONE, text).document()
+                rows[name] = self._row("", name, f"{name} was given another command meanwhile")
         return rows
 
     @staticmethod

@@ -82,6 +82,18 @@ def come_home(world, positions, order=None, limit_s=900.0):
     return least
 
 
+def look(world, order):
+    return order.look(aloft_of(world.fleet.vehicles, world.clock.now))
+
+
+def go_on(world, order, seconds):
+    """Send home those whose turn has come, once a second."""
+    for _ in range(seconds):
+        world.wait(1.0)
+        for system in look(world, order):
+            world.fleet.rtl(system)
+
+
 FAN = [(600, 240 * (k - 2)) for k in range(6)]
 
 
@@ -98,7 +110,7 @@ def test_those_of_neighbouring_starts_keep_apart_on_their_ways_home(make_world, 
 def test_those_whose_ways_do_not_meet_return_at_once(make_world):
     world, _ = flown_out(make_world, FAN[:3], spacing_m=80.0)
     order = ReturnOrder(world.fleet.vehicles, world.clock)
-    assert sorted(order.look(aloft_of(world.fleet.vehicles, world.clock.now))) == [1, 2, 3]
+    assert sorted(look(world, order)) == [1, 2, 3]
     assert not order.waits
 
 
@@ -132,30 +144,23 @@ def test_whoever_must_not_wait_returns_at_once(make_world):
 def test_one_that_was_given_another_command_waits_no_longer(make_world):
     world, positions = flown_out(make_world, FAN)
     order = ReturnOrder(world.fleet.vehicles, world.clock)
-    order.look(aloft_of(world.fleet.vehicles, world.clock.now))
+    look(world, order)
     held = sorted(order.waits)[-1]
     assert order.drop(held) and not order.drop(held)
     world.finish(*(world.fleet.pause(s) for s in (held, *order.waits)))
-    for _ in range(400):
-        for system in order.look(aloft_of(world.fleet.vehicles, world.clock.now)):
-            world.fleet.rtl(system)
-        world.wait(1.0)
+    go_on(world, order, 400)
     assert set(positions()) == {held}
 
 
 def test_one_that_did_not_acknowledge_has_its_turn_again(make_world):
     world, _ = flown_out(make_world, FAN[:2])
     order = ReturnOrder(world.fleet.vehicles, world.clock)
-    (sent,) = order.look(aloft_of(world.fleet.vehicles, world.clock.now))
+    (sent,) = look(world, order)
     (held,) = order.waits
     assert order.waits[held] == (sent,)
     order.again(sent)
     world.wait(1.0)
-    assert order.look(aloft_of(world.fleet.vehicles, world.clock.now)) == [sent]
-
-
-def look(world, order):
-    return order.look(aloft_of(world.fleet.vehicles, world.clock.now))
+    assert look(world, order) == [sent]
 
 
 def test_nobody_is_sent_through_one_that_the_operator_holds(make_world):
@@ -172,10 +177,7 @@ def test_nobody_is_sent_through_one_that_the_operator_holds(make_world):
         assert look(world, order) == []
     assert order.waits[second] == (first,)
     world.fleet.rtl(first)
-    for _ in range(240):
-        world.wait(1.0)
-        for system in look(world, order):
-            world.fleet.rtl(system)
+    go_on(world, order, 240)
     assert not positions() and order.over
 
 
@@ -190,10 +192,7 @@ def test_one_that_was_lost_has_its_turn_when_it_is_heard_again(make_world):
     world.fleet.vehicles[second].lost = False
     look(world, order)
     assert order.waits or order.over
-    for _ in range(300):
-        world.wait(1.0)
-        for system in look(world, order):
-            world.fleet.rtl(system)
+    go_on(world, order, 300)
     assert not positions() and order.over
 
 
