@@ -103,8 +103,7 @@ class StartChecks:
             if not unknown:
                 return
             for system in unknown:
-                questions = self._fleet.vehicles[system].setting_questions()
-                self._fleet.call(lambda s=system, q=questions: self._fleet.send(s, q)).result(_SOON_S)  # type: ignore[misc]
+                self._fleet.call(lambda s=system: self._fleet.ask_settings(s)).result(_SOON_S)  # type: ignore[misc]
             time.sleep(_ANSWER_S)
 
     def _separation(

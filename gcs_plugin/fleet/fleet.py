@@ -223,8 +223,13 @@ class Fleet:
 
     def download(self, system: int) -> MissionDownload:
         """Read the mission of a vehicle, and ask for the settings that a check compares with it."""
-        self._dialogues.send(system, self._free(system).setting_questions())
-        return self.begin(MissionDownload(self._free(system).address, self.own))
+        vehicle = self._free(system)
+        self.ask_settings(system)
+        return self.begin(MissionDownload(vehicle.address, self.own))
+
+    def ask_settings(self, system: int) -> None:
+        """Ask a vehicle for its settings; in the polling thread."""
+        self._dialogues.send(system, self.vehicles[system].setting_questions())
 
     def read_fence(self, system: int) -> MissionDownload:
         """Read the geofence of a vehicle; any other request to it ends this.

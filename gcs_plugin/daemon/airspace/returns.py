@@ -151,7 +151,7 @@ class Returns:
         """Ask for the heights at which they return, of those that have not said it: without them they wait longer."""
         for system, vehicle in self._fleet.vehicles.items():
             if vehicle.flying:
-                self._fleet.send(system, vehicle.setting_questions())
+                self._fleet.ask_settings(system)
 
     def _aloft(self) -> dict[int, Aloft]:
         return self._fleet.call(lambda: aloft_of(self._fleet.vehicles, time.monotonic())).result(_ANSWER_S)

@@ -23,8 +23,8 @@ class Station:
             future.set_result(work())
         return future
 
-    def send(self, system, messages):
-        self.world.fleet.send(system, messages)
+    def ask_settings(self, system):
+        self.world.fleet.ask_settings(system)
 
     def command(self, verb, names):
         self.heard.append((verb, tuple(sorted(names))))
