@@ -225,6 +225,19 @@ def warm_kernels(say: Callable[[str], None]) -> float:
     return time.perf_counter() - started
 
 
+def compile_cold_kernels(report: Callable[[str, int, int], None]) -> None:
+    """Compile the kernels if some are not compiled yet, so that what follows shows the speed of every later run.
+
+    Args:
+        report: called with the stage's name, the number of finished items and their total.
+    """
+    if all(warm for _, warm in kernel_modules()):
+        return
+    report("compiling, once", 0, 1)
+    warm_kernels(lambda _: None)
+    report("compiling, once", 1, 1)
+
+
 def _make_maps(folder: Path) -> None:
     """Map a dense flight, and a sparse one, whose pictures are matched in pairs instead of tracked."""
     import telemetry
@@ -262,14 +275,14 @@ def _make_plans(folder: Path) -> None:
 
 def _use_map(folder: Path) -> None:
     """Find what the pictures of the dense map cover, export it as tiles, and draw a picture as the daemon does."""
-    from contextlib import redirect_stdout
+    from contextlib import redirect_stderr, redirect_stdout
     from io import StringIO
 
     from gcs_plugin.cli.main import main
     from gcs_plugin.daemon.layers.realtime_layer import load_kernels
 
     dense, area = str(folder / "dense"), str(folder / "twin" / "plan.geojson")
-    with redirect_stdout(StringIO()):
+    with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
         main(["coverage", dense, "--area", area, "--out", str(folder / "coverage")])
         main(["export", dense, "--to", "mbtiles"])
     load_kernels(folder)

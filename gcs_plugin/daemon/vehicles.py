@@ -105,7 +105,7 @@ class VehicleLinks:
         self._names = {v.system: v.id for v in settings.vehicles if v.system is not None}
         self._records: dict[int, _VehicleRecord] = {}
         self._poses = Poses() if poses is None else poses
-        self._stop = threading.Event()
+        self._stop, self._silent = threading.Event(), threading.Event()
         self.latest: list[dict[str, Any]] = []
         self.cancel_takeoff: Callable[[str], str] = lambda _: ""
         self._starting = Counter[int]()
@@ -118,21 +118,21 @@ class VehicleLinks:
         self._returns = Returns(self.fleet, self._give, lambda row: events.publish("command", **row), self.name_of)
         self.traffic = Traffic()
         self.fleet.subscribe(self.traffic.heard, "ADSB_VEHICLE")
-        self._threads = [
-            threading.Thread(target=self.fleet.run, args=(self._stop,), name="links", daemon=True),
-            threading.Thread(target=self._watch, name="watch", daemon=True),
+        self._threads = [  # with what ends them: first the one that asks the links
+            (threading.Thread(target=self._watch, name="watch", daemon=True), self._stop),
+            (threading.Thread(target=self.fleet.run, args=(self._silent,), name="links", daemon=True), self._silent),
         ]
 
     def start(self) -> None:
         """Begin to listen."""
-        for thread in self._threads:
+        for thread, _ in self._threads:
             thread.start()
 
     def close(self) -> None:
         """Close the links."""
-        self._stop.set()
         self._returns.close()
-        for thread in self._threads:
+        for thread, ended in self._threads:
+            ended.set()
             if thread.ident is not None:
                 thread.join(5.0)
         self.fleet.close()

@@ -31,7 +31,13 @@ ReportProgress = Callable[[str, int, int], None]
 
 
 def run_demo(
-    setting: Setting, out: Path, report: ReportProgress, *, port: int = 0, opened: Callable[[str], None]
+    setting: Setting,
+    out: Path,
+    report: ReportProgress,
+    *,
+    port: int = 0,
+    opened: Callable[[str], None],
+    prepare: Callable[[ReportProgress], None],
 ) -> dict[str, Any]:
     """Run the demonstration and return the content of report.json.
 
@@ -41,6 +47,7 @@ def run_demo(
         report: called with a stage's name, the number of finished items and their total.
         port: of the web page.
         opened: called with the page's address.
+        prepare: called with `report` before the flight; makes the machine ready for it.
 
     Raises:
         InputError: the folder contains other files.
@@ -57,6 +64,7 @@ def run_demo(
         report("city", 0, 1)
         write_world(setting, out / "twin")
         report("city", 1, 1)
+        prepare(report)
         addresses = _receive_addresses(ours, process)
         with _daemon(setting, out, addresses) as daemon, Served(daemon, port) as served:
             opened(served.url)

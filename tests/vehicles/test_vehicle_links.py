@@ -1,6 +1,7 @@
 """The daemon's vehicles: commands to all at once, the check, signing, and takeoffs that hold each other."""
 
 import json
+import threading
 import time
 
 import pytest
@@ -278,3 +279,20 @@ def test_a_fault_in_a_listener_cuts_no_vehicle_off_from_commands(open_links, cap
     assert links.commands("rtl")[0]["outcome"] in ("done", "refused")
     assert links.rows()[0]["silent_s"] < 5.0
     assert any("a fault while reading the links" in record.message for record in caplog.records)
+
+
+def test_nobody_waits_for_links_that_have_ended(open_links, caplog):
+    links = open_links(make_swarm(1, home=HOME))
+    ready(links, 1)
+    looking, collect = threading.Event(), links.rows
+
+    def rows():
+        looking.set()
+        time.sleep(0.5)  # the links end meanwhile, if they do not wait for who asks them
+        return collect()
+
+    links.rows = rows
+    assert looking.wait(30.0)
+    links.close()
+    assert not {"watch", "links"} & {thread.name for thread in threading.enumerate()}
+    assert "watching vehicles" not in caplog.text

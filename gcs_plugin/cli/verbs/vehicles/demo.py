@@ -30,6 +30,7 @@ def run(args: argparse.Namespace) -> int:
     import json
     import sys
 
+    from gcs_plugin.cli.machine_check import compile_cold_kernels
     from gcs_plugin.cli.progress import ProgressBars
     from gcs_plugin.demo.demonstration import run_demo
     from gcs_plugin.demo.setting import Setting
@@ -49,7 +50,12 @@ def run(args: argparse.Namespace) -> int:
 
     with ProgressBars() as progress:
         report = run_demo(
-            Setting(args.vehicles, args.seed, args.speed), args.out, progress, port=args.port, opened=opened
+            Setting(args.vehicles, args.seed, args.speed),
+            args.out,
+            progress,
+            port=args.port,
+            opened=opened,
+            prepare=compile_cold_kernels,
         )
     accuracy = report["accuracy"]
     if args.json:
