@@ -3,6 +3,7 @@
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import settings
@@ -21,11 +22,20 @@ IN_REAL_TIME = {"vehicles", "daemon", "page", "cli"}
 """Rooms whose tests wait for vehicles, servers and browsers: never two of them at once (see the Makefile)."""
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Which tests stay in one process where there are several: files that share what they made, and real time."""
-    for item in items:
-        place = item.path.relative_to(ROOT / "tests")
-        item.add_marker(pytest.mark.xdist_group("real time" if place.parts[0] in IN_REAL_TIME else place.as_posix()))
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Which tests stay in one process where there are several: files that share what they made, and real time.
+
+    By place: marks of groups reach xdist 3.8 under pytest 9 no longer.
+    """
+    from xdist.scheduler import LoadScopeScheduling
+
+    class ByPlace(LoadScopeScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            file = nodeid.split("::")[0]
+            return "real time" if file.split("/")[1] in IN_REAL_TIME else file
+
+    return ByPlace(config, log) if config.getvalue("dist") == "loadgroup" else None
 
 
 def data_root() -> Path:
