@@ -86,7 +86,7 @@ def _senders(journal: Journal) -> Iterable[dict[str, Any]]:
         " FROM vehicles v LEFT JOIN frames f ON f.vehicle = v.id GROUP BY v.id ORDER BY v.rowid"
     )
     latest = journal.rows(
-        "SELECT seq, time, pose FROM frames WHERE seq IN (SELECT MAX(seq) FROM frames GROUP BY vehicle)"
+        "SELECT seq, time, arrived, pose FROM frames WHERE seq IN (SELECT MAX(seq) FROM frames GROUP BY vehicle)"
     )
     last = {row["seq"]: row for row in latest}
     for row in rows:
@@ -96,7 +96,9 @@ def _senders(journal: Journal) -> Iterable[dict[str, Any]]:
         if row["last"] in last:
             pose = json.loads(last[row["last"]]["pose"])
             document |= {key: pose.get(key) for key in ("lat_deg", "lon_deg", "height_m")}
-            document |= {"heading_deg": pose.get("yaw_deg"), "last_frame": iso_time(last[row["last"]]["time"])}
+            newest = last[row["last"]]
+            document |= {"heading_deg": pose.get("yaw_deg"), "last_frame": iso_time(newest["time"])}
+            document["last_arrived"] = iso_time(newest["arrived"])
         yield document
 
 

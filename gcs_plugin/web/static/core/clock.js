@@ -14,3 +14,11 @@ export function nowMs() {
   ahead_ms = ahead;
   return steady + slept_ms;
 }
+
+// By this device's clock; with the date if it is not today.
+const local = (time_ms) => new Date(time_ms - new Date(time_ms).getTimezoneOffset() * 60_000).toISOString();
+export function timeOfDay(time_ms) {
+  if (!Number.isFinite(time_ms)) return "";
+  const [day, time] = [local(time_ms).slice(0, 10), local(time_ms).slice(11, 16)];
+  return day === local(Date.now()).slice(0, 10) ? time : `${day} ${time}`;
+}

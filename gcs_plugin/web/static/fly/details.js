@@ -60,7 +60,7 @@ export function detailsPanel() {
       height: units.height(row.height_m), speed: units.speed(row.speed_m_s),
       battery: `${units.percent(row.battery)}${row.battery_left_s == null ? "" : `, ${t("details.left", { time: units.clock(row.battery_left_s) })}`}`,
       gps: row.satellites == null ? "–" : t("details.satellites", { n: row.satellites }),
-      link: row.linked ? `${row.link || "–"}, ${t("tile.heard", { age: units.ageText(Math.floor(wanted.age_s * 2) / 2) })}` : t("state.pictures"),
+      link: row.linked ? `${row.link || "–"}, ${t("tile.heard", { age: units.ageText(Math.floor(wanted.age_s * 2) / 2) })}` : t("details.unlinked"),
       home: row.home ? `${positionText(row.home[1], row.home[0], settings.coordinates)}${row.position ? `, ${t("details.away", { m: units.distance(lengthOf([row.home, row.position])) })}` : ""}` : "–",
       fence: fenceText(row.fence),
       mission: row.flight.items ? t("details.item", { item: row.flight.item, items: row.flight.items }) : "–",

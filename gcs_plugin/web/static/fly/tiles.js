@@ -1,7 +1,7 @@
 // The strip of vehicle tiles. A tile is made once, stays where it is, and changes in place: no press is lost, and the
 // keyboard's focus stays. The order changes only when the person asks for it.
 
-import { nowMs } from "/static/core/clock.js";
+import { nowMs, timeOfDay } from "/static/core/clock.js";
 import { button, choice, make, setAttribute, setHidden, setStyle, setText } from "/static/core/dom.js";
 import { guarded } from "/static/core/guard.js";
 import { setSetting, settings } from "/static/core/settings.js";
@@ -15,6 +15,7 @@ const FIX = ["", "", "2D", "3D", "DGPS", "RTK~", "RTK"];
 // What only a vehicle on a link can say.
 const OF_A_LINK = ["speed", "battery", "gps", "age"];
 const PARTS = ["height", "speed", "battery", "gps", "age", "pictures"];
+const SENDING_MS = 60_000; // a picture that came longer ago may be of an earlier flight
 const tiles = new Map();
 const list = make("ul", { class: "tiles", "aria-label": t("fly.vehicles") });
 const search = make("input", { type: "search", placeholder: t("fly.search"), "aria-label": t("fly.search"), oninput: refilter });
@@ -42,8 +43,14 @@ function create(row) {
   return tile;
 }
 
+// What is known of one that was not heard on a link since the station began.
+export function pictureWord(row) {
+  if (!row.cameAt) return t("state.pictures.none");
+  return Date.now() - row.cameAt > SENDING_MS ? t("state.pictures.last", { time: timeOfDay(row.cameAt) }) : t("state.pictures");
+}
+
 export function wordOf(row) {
-  if (!row.linked) return t("state.pictures");
+  if (!row.linked) return pictureWord(row);
   if (isLost(row)) return t(inAir(row) ? "state.lost.air" : armedOnGround(row) ? "state.lost.armed" : "state.lost.ground");
   if (armedOnGround(row)) return t("state.armed");
   if (row.returnsAfter) return t("state.returns", { after: row.returnsAfter.map((id) => state.vehicles.get(id)?.name ?? id).join(", ") || "–" });

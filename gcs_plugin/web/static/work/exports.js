@@ -1,6 +1,7 @@
 // Exports by what they are for.
 
 import { post, withToken } from "/static/core/api.js";
+import { timeOfDay } from "/static/core/clock.js";
 import { keyedList, make, setAttribute, setText } from "/static/core/dom.js";
 import { notice } from "/static/core/notices.js";
 import { state, subscribe } from "/static/core/store.js";
@@ -21,14 +22,6 @@ function newestFiles(jobs) {
   }
   return [...newest];
 }
-// By this device's clock; with the date if it is not today.
-const local = (time_ms) => new Date(time_ms - new Date(time_ms).getTimezoneOffset() * 60_000).toISOString();
-function timeOfDay(iso) {
-  const time_ms = Date.parse(iso);
-  if (!Number.isFinite(time_ms)) return "";
-  const [day, time] = [local(time_ms).slice(0, 10), local(time_ms).slice(11, 16)];
-  return day === local(Date.now()).slice(0, 10) ? time : `${day} ${time}`;
-}
 
 export function exportPanel() {
   const boxes = FORMATS.map((key) => make("input", { type: "checkbox", name: key, checked: CHOSEN.has(key) }));
@@ -47,7 +40,7 @@ export function exportPanel() {
   const draw = keyedList(files, () => make("li", {}, make("a", { download: "" })), (row, { job, kind, name, older }) => {
     setAttribute(row.firstChild, "href", withToken(`/api/export/${job.id}/${encodeURIComponent(kind)}`));
     const text = `${FORMATS.includes(kind) ? t(`export.${kind}`) : kind}: ${name}`;
-    setText(row.firstChild, [text, timeOfDay(job.ended), older ? t("export.older") : ""].filter(Boolean).join(", "));
+    setText(row.firstChild, [text, timeOfDay(Date.parse(job.ended)), older ? t("export.older") : ""].filter(Boolean).join(", "));
   });
   const redraw = () => draw(newestFiles([...state.jobs.values()]));
   subscribe("jobs", "exports", redraw);
