@@ -1,6 +1,7 @@
 """Plan mode: an area is drawn, changed, taken back and dropped; errors say what to change."""
 
 import json
+import time
 
 import pytest
 
@@ -60,6 +61,33 @@ def test_corners_are_drawn_inserted_moved_deleted_and_taken_back(browser):
         assert page.inner_text(".hint") != hint
         page.click("text=Undo")
         assert page.inner_text(".hint") == hint
+
+
+def test_a_zone_stays_a_zone_when_the_outline_loses_its_corners(browser):
+    """Another page that loads the plan must not take the no-fly zone for the area to fly over."""
+    outline = [[8.544, 47.397], [8.547, 47.397], [8.547, 47.399], [8.544, 47.397]]
+    zone = [[8.5450, 47.3975], [8.5460, 47.3975], [8.5460, 47.3980], [8.5450, 47.3980], [8.5450, 47.3975]]
+    plan = {"settings": {}, "plan": None, "vehicles": {}}
+    with standing(vehicle(1)) as station:
+        station.gets["/api/plan"] = plan | {"area": {"type": "Polygon", "coordinates": [outline, zone]}, "version": 3}
+        station.answer = lambda method, path, body: (200, {"version": 4})
+        with opened(browser, station.url) as page:
+            planning(page)
+            page.wait_for_function("document.querySelectorAll('.handle:not(.middle)').length === 7")
+            page.locator(".handle:not(.middle)").first.focus()
+            page.keyboard.press("Delete")
+            page.wait_for_function("document.querySelectorAll('.handle:not(.middle)').length === 6")
+            end = time.monotonic() + 60.0
+            while not station.heard and time.monotonic() < end:
+                page.wait_for_timeout(100)
+            saved = station.heard[-1][2]["area"]
+            assert [len(ring) for ring in saved["coordinates"]] == [3, 5]
+        station.gets["/api/plan"] = plan | {"area": saved, "version": 4}
+        with opened(browser, station.url) as page:
+            planning(page)
+            page.wait_for_function("document.querySelectorAll('.handle:not(.middle)').length === 6")
+            page.click("text=Make plan")
+            page.wait_for_selector(".notice:has-text('corner')")
 
 
 def test_an_outline_that_crosses_itself_says_what_to_change(browser):

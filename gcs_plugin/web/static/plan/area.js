@@ -53,7 +53,8 @@ export function replace(rings) {
   tell("loaded");
 }
 
-const closed = () => area.rings.filter((ring) => ring.length > 2).map((ring) => [...ring, ring[0]]);
+// The outline keeps its place however few corners it has: a no-fly zone in it would be read as the area to fly over.
+const closed = () => area.rings.filter((ring, k) => !k || ring.length > 2).map((ring) => (ring.length ? [...ring, ring[0]] : []));
 export const polygon = () => ({ type: "Polygon", coordinates: closed() });
 export const outline = () => ({ type: "Polygon", coordinates: closed().slice(0, 1) });
 export const zones = () => ({ type: "MultiPolygon", coordinates: closed().slice(1).map((ring) => [ring]) });

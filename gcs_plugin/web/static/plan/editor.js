@@ -11,6 +11,7 @@ const MOST_HANDLES = 150;
 const STEP_PX = 8;
 let handles = [];
 let editing = false;
+let dragged = false;
 let drawing = -1; // the ring that taps add to
 let told = () => {};
 export const onDrawing = (work) => { told = work; };
@@ -60,8 +61,9 @@ map.on("click", guarded("drawing", (event) => {
 map.on("dblclick", () => { if (tool.active === "draw") stopDrawing(); });
 
 const paint = () => {
-  const rings = area.rings.filter((ring) => ring.length > 1).map((ring) => [...ring, ring[0]]);
-  show("area", rings.length ? [feature("Polygon", rings)] : []);
+  const closed = (ring) => [...ring, ring[0]];
+  const [outline, zones] = [area.rings[0] ?? [], area.rings.slice(1).filter((ring) => ring.length > 1)];
+  show("area", outline.length > 1 ? [feature("Polygon", [outline, ...zones].map(closed))] : zones.map((ring) => feature("LineString", closed(ring))));
 };
 
 function handle(ring, index, middle) {
@@ -72,10 +74,11 @@ function handle(ring, index, middle) {
   let at = index;
   marker.on("dragstart", () => {
     remember();
+    dragged = true;
     if (middle) { at = index + 1; preview((rings) => rings[ring].splice(at, 0, place)); }
   });
   marker.on("drag", () => preview((rings) => { rings[ring][at] = marker.getLngLat().toArray(); }));
-  marker.on("dragend", () => handlesAgain({ ring, index: at }));
+  marker.on("dragend", () => { dragged = false; handlesAgain({ ring, index: at }); });
   element.addEventListener("click", (event) => {
     event.stopPropagation();
     if (middle) { change((rings) => rings[ring].splice(index + 1, 0, place)); focusOn(ring, index + 1); }
@@ -111,7 +114,8 @@ function byKey(event, ring, index) {
   focusOn(ring, index);
 }
 
-const focusOn = (ring, index) => handles.map((h) => h.getElement()).find((e) => e.dataset.at === `${ring}/${index}`)?.focus();
+const focusAt = (at) => handles.map((h) => h.getElement()).find((e) => e.dataset.at === at)?.focus();
+const focusOn = (ring, index) => focusAt(`${ring}/${index}`);
 
 function handlesAgain(focus) {
   for (const marker of handles) marker.remove();
@@ -129,4 +133,9 @@ function handlesAgain(focus) {
 }
 
 onArea((why) => { paint(); if (why !== "preview") handlesAgain(); });
-map.on("moveend", () => { if (editing && area.rings.some((ring) => ring.length > 40)) handlesAgain(); });
+map.on("moveend", () => { // other corners are in view now
+  if (!editing || dragged) return;
+  const at = document.activeElement?.dataset.at;
+  handlesAgain();
+  if (at) focusAt(at);
+});

@@ -20,7 +20,10 @@ import { boundsOf, fit } from "/static/map/map.js";
 let made = null;
 let names = {};
 function save() { saveShared(() => ({ area: area.area.rings.length ? area.polygon() : null, settings: { ...rawValues(), made_of: madeOfNow() }, plan: made?.id ?? null, vehicles: names })); }
-const ringsOf = (polygon) => (polygon?.coordinates ?? []).map((points) => ring(points).slice(0, -1)).filter((points) => points.length > 2);
+const ringsOf = (polygon) => {
+  const rings = (polygon?.coordinates ?? []).map((points) => ring(points).slice(0, -1)).filter((points, k) => !k || points.length > 2);
+  return rings.length > 1 || rings[0]?.length ? rings : [];
+};
 
 export async function loadPlan() {
   if (isSaving()) return;
