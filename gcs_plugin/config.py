@@ -88,10 +88,14 @@ class ReturnConfig:
     """The same (RTL_RETURN_ALT)."""
     cone: float = 3.0
     """Near home they climb to so many times their distance at most (RTL_CONE_SLOPE; PX4 within RTL_MIN_DIST, 10 m)."""
+    known_s: float = 3.0
+    """A command to return in turn waits so long at most for homes that are not known yet, seconds (chosen)."""
     look_s: float = 1.0
     """Time between looks at vehicles that return in turn, seconds (chosen: they fly 10 m in it)."""
     shows_s: float = 5.0
-    """So long after it was sent home a vehicle's heartbeats may show another mode, seconds (chosen: as a pause)."""
+    """So long after a command a vehicle's heartbeats may show another mode, seconds (chosen: as a pause)."""
+    left_m: float = 10.0
+    """One that held and is so far from there, metres, follows another command (chosen: the separation of plans)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -2,23 +2,22 @@
 
 import abc
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from gcs_plugin.config import HEARING
-from gcs_plugin.fleet.commands import Verb
+from gcs_plugin.fleet.commands import Order, Verb
 from gcs_plugin.fleet.fleet_events import FleetEvent
 from gcs_plugin.fleet.flight_state import Word, flight_state
 from gcs_plugin.fleet.preflight import Check, preflight_all
 from gcs_plugin.fleet.separation.takeoff_schedule import TakeoffSchedule
 from gcs_plugin.fleet.vehicle_state import Vehicle
-from gcs_plugin.links.mavlink import Autopilot
+from gcs_plugin.links.mavlink import Autopilot, Message
 from gcs_plugin.mission.exchange import Outcome, Verdict
 from gcs_plugin.mission.items import Mission
 from gcs_plugin.mission.plan_folder import NO_NEEDS, PlanNeeds
 
 if TYPE_CHECKING:
-    from gcs_plugin.fleet.commands import Order
     from gcs_plugin.mission.track import Airspace
 
 Report = Callable[[str, int, int], None]
@@ -135,9 +134,16 @@ class Backend(abc.ABC):
         )  # fmt: skip
 
     @abc.abstractmethod
+    def order(self, order: Order) -> Order:
+        """Give a command to a vehicle; its outcome is set some time later, during `pump`."""
+
+    @abc.abstractmethod
+    def send(self, system: int, messages: Sequence[Message]) -> None:
+        """Send messages to a vehicle without waiting for answers."""
+
     def command(
         self, verb: Verb, delays: Mapping[int, float], say: Say, airspace: "Airspace | None" = None
-    ) -> "dict[int, Order]":
+    ) -> dict[int, Order]:
         """Send a command to vehicles and wait for the outcome of each.
 
         A failed start cancels the takeoffs that are still due; a late one delays them.
@@ -148,6 +154,11 @@ class Backend(abc.ABC):
             say: called at once with each outcome and its consequences.
             airspace: the missions that are started, so that takeoffs that are still due can be delayed.
         """
+
+        def begin(system: int) -> Order:
+            return self.order(Order(verb=verb, system=system, given_s=time.monotonic()))
+
+        return command_all(delays, begin, self.pump, say, airspace)
 
     @abc.abstractmethod
     def pump(self, seconds: float) -> None:
@@ -178,11 +189,11 @@ def coming_home(vehicle: Vehicle) -> bool:
 
 def command_all(
     delays: Mapping[int, float],
-    begin: "Callable[[int], Order]",
+    begin: Callable[[int], Order],
     pump: Callable[[float], None],
     say: Say,
     airspace: "Airspace | None",
-) -> "dict[int, Order]":
+) -> dict[int, Order]:
     """Send one command to each vehicle at its time and wait for all outcomes; see `Backend.command`."""
     schedule = TakeoffSchedule.of(delays, time.monotonic(), airspace)
     orders: dict[int, Order] = {}

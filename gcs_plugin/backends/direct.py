@@ -1,24 +1,21 @@
 """The default backend: our own links and MAVLink protocols, with pymavlink for messages; for many vehicles."""
 
 import time
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from gcs_plugin.backends.backend import ENDED, Backend, Report, Say, coming_home, command_all
-from gcs_plugin.fleet.commands import Order, Verb
+from gcs_plugin.backends.backend import ENDED, Backend, Report, coming_home
+from gcs_plugin.fleet.commands import Order
 from gcs_plugin.fleet.fleet import Fleet
 from gcs_plugin.fleet.fleet_events import FleetEvent
 from gcs_plugin.fleet.vehicle_state import Vehicle
+from gcs_plugin.links.mavlink import Message
 from gcs_plugin.links.transports import Link
 from gcs_plugin.mission.completion import Phase
 from gcs_plugin.mission.download import MissionDownload
 from gcs_plugin.mission.exchange import Address, Exchange, Outcome
 from gcs_plugin.mission.items import Mission
 from orthoswarm.model.errors import OrthoSwarmError
-
-if TYPE_CHECKING:
-    from gcs_plugin.mission.track import Airspace
 
 
 class DirectBackend(Backend):
@@ -85,17 +82,13 @@ class DirectBackend(Backend):
                 found[system] = Mission(fleet.vehicles[system].autopilot, tuple(job.items))
         return found
 
-    def command(
-        self, verb: Verb, delays: Mapping[int, float], say: Say, airspace: "Airspace | None" = None
-    ) -> dict[int, Order]:
-        """All commands at their times."""
-        return command_all(
-            delays,
-            lambda s: self.fleet.order(Order(verb=verb, system=s, given_s=time.monotonic())),
-            self.pump,
-            say,
-            airspace,
-        )
+    def order(self, order: Order) -> Order:
+        """Give a command."""
+        return self.fleet.order(order)
+
+    def send(self, system: int, messages: Sequence[Message]) -> None:
+        """Send on the vehicle's best link."""
+        self.fleet.send(system, messages)
 
     def pump(self, seconds: float) -> None:
         """Poll the fleet."""

@@ -12,9 +12,9 @@ import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
-from gcs_plugin.backends.backend import ENDED, Backend, Report, Say, coming_home, command_all
+from gcs_plugin.backends.backend import ENDED, Backend, Report, coming_home
 from gcs_plugin.config import HEARING
 from gcs_plugin.fleet.commands import URGENT, Order, Verb
 from gcs_plugin.fleet.fleet_events import FleetEvent, mission_event
@@ -29,9 +29,6 @@ from gcs_plugin.mission.flight_modes import modes_of, why_no_missions
 from gcs_plugin.mission.items import Mission, MissionItem
 from gcs_plugin.mission.mission_builder import unflyable
 from orthoswarm.model.errors import InputError, OrthoSwarmError
-
-if TYPE_CHECKING:
-    from gcs_plugin.mission.track import Airspace
 
 _HEARD: Final = (
     "HEARTBEAT", "COMMAND_ACK", "MISSION_CURRENT", "MISSION_ITEM_REACHED", "EXTENDED_SYS_STATE", "STATUSTEXT",
@@ -139,20 +136,17 @@ class MavsdkBackend(Backend):
             report("read", len(found), len(systems))
         return found
 
-    def command(
-        self, verb: Verb, delays: Mapping[int, float], say: Say, airspace: "Airspace | None" = None
-    ) -> dict[int, Order]:
-        """All commands at their times."""
+    def order(self, order: Order) -> Order:
+        """Give a command."""
+        try:
+            order.exchange = self._begin(order.system, order.verb, order.expires_s)
+        except OrthoSwarmError as error:
+            return order.end(str(error), Verdict.REFUSED)
+        return order
 
-        def begin(system: int) -> Order:
-            order = Order(verb=verb, system=system, given_s=time.monotonic())
-            try:
-                order.exchange = self._begin(system, verb, order.expires_s)
-            except OrthoSwarmError as error:
-                return order.end(str(error), Verdict.REFUSED)
-            return order
-
-        return command_all(delays, begin, self.pump, say, airspace)
+    def send(self, system: int, messages: Sequence[Message]) -> None:
+        """Send through MAVSDK."""
+        self._send(self._craft(system), messages)
 
     def watch(self, systems: Collection[int], seconds: float, report: Callable[[FleetEvent], None]) -> bool:
         """Report events until all missions have ended and nobody flies home."""

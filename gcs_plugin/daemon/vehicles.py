@@ -31,7 +31,6 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
 from gcs_plugin.daemon.airspace.fences import Fences
-from gcs_plugin.daemon.airspace.returns import Returns
 from gcs_plugin.daemon.airspace.traffic import Traffic
 from gcs_plugin.daemon.jobs.job_queue import Jobs
 from gcs_plugin.daemon.mission_journal import MissionJournal
@@ -40,6 +39,7 @@ from gcs_plugin.daemon.start_checks import StartChecks, red_items
 from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.fleet.commands import CommandResult
+from gcs_plugin.fleet.separation.returns import Returns
 from gcs_plugin.fleet.separation.separation_watch import apart_text, near_text, number_name
 from gcs_plugin.mission.exchange import Verdict
 from gcs_plugin.mission.plan_folder import NO_NEEDS, PlanNeeds

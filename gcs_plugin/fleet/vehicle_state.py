@@ -168,6 +168,13 @@ class Vehicle:
         """Requests for its settings."""
         return questions(self.address, self.autopilot)
 
+    def home_question(self) -> Message:
+        """A request for where its home is, which it says every few seconds only."""
+        to, command = self.address, dialect.MAV_CMD_REQUEST_MESSAGE
+        return dialect.MAVLink_command_long_message(
+            to.system, to.component, command, 0, dialect.MAVLINK_MSG_ID_HOME_POSITION, 0, 0, 0, 0, 0, 0
+        )
+
     @property
     def pilot(self) -> Pilot:
         """Makes the commands for it."""

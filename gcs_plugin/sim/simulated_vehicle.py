@@ -182,8 +182,14 @@ class SimVehicle:
             result = self._command(message)
             texts = self._texts()
             ack = dialect.MAVLink_command_ack_message(message.command, result, 0, 0, sender.system, sender.component)
-            return [*texts, ack, *self._change()]
+            return [*texts, ack, *self._requested(message), *self._change()]
         return []
+
+    def _requested(self, message: Message) -> list[Message]:
+        """The message that a command asks for, if it has it."""
+        maker = _MAKERS.get(int(message.param1)) if message.command == dialect.MAV_CMD_REQUEST_MESSAGE else None
+        made = None if maker is None else maker(self)
+        return [] if made is None else [made]
 
     def _parameter(self, name: str) -> list[Message]:
         """The value of a parameter; an autopilot does not answer about one that it has not."""
@@ -205,6 +211,8 @@ class SimVehicle:
                     return _FAILED if self.autopilot is Autopilot.ARDUPILOT else _DENIED
                 self._stream(int(p1), 1e6 / p2 if p2 > 0 else 0.0)
                 return _OK
+            case dialect.MAV_CMD_REQUEST_MESSAGE:
+                return _OK if int(p1) in _MAKERS else _UNSUPPORTED
             case dialect.MAV_CMD_DO_SET_MODE:
                 px4 = self.autopilot is Autopilot.PX4
                 flight.set_mode((int(p2) << 16) | (int(p3) << 24) if px4 else int(p2))

@@ -20,11 +20,11 @@ from typing import Any, Final
 from fastapi import HTTPException, Request, Response
 
 from gcs_plugin.config import COMMAND
-from gcs_plugin.daemon.airspace.returns import VERB as RETURN_VERB
 from gcs_plugin.daemon.daemon import Daemon
 from gcs_plugin.daemon.takeoffs import Takeoffs, names_of
 from gcs_plugin.daemon.vehicles import VehicleLinks
 from gcs_plugin.fleet.commands import URGENT, VERBS, CommandResult, new_id
+from gcs_plugin.fleet.separation.returns import VERB as RETURN_VERB
 from gcs_plugin.mission.exchange import Verdict
 from gcs_plugin.web.answers import JsonAnswer, in_thread, json_body
 from gcs_plugin.web.event_stream import RUN

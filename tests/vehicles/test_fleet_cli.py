@@ -1,5 +1,6 @@
 """`orthoswarm fleet` and `orthoswarm sim` against simulated vehicles on loopback."""
 
+import builtins
 import json
 import subprocess
 import sys
@@ -11,6 +12,7 @@ from gcs_plugin.cli.verbs.vehicles.fleet import parse_systems
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission import mission_files
 from gcs_plugin.mission.plan_folder import read_plan_folder
+from gcs_plugin.sim.mission_flight import Landed
 from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
 from orthoswarm.model.errors import InputError
 from tests.kit.servers.ports import free_port
@@ -123,6 +125,65 @@ def test_one_vehicle_is_started_paused_resumed_and_brought_home(swarm, folder, c
         assert code == 0 and said["vehicles"][0]["ok"], said
     code, said = fleet(capsys, "start", "--vehicle", "2", "--link", swarm, "--json")
     assert code == 1 and "no mission" in said["vehicles"][0]["text"]
+
+
+@pytest.fixture
+def flying(request):
+    """Three simulated vehicles of one start that hold over one place; gives the link of a ground station."""
+    port, speed = free_port(), request.param
+    vehicles = make_swarm(3, home=HOME, spacing_m=4.0, ready_s=0.0)
+    for k, vehicle in enumerate(vehicles):
+        flight = vehicle.flight
+        flight.motion.north, flight.motion.east, flight.motion.up = 60.0, 20.0 * k, 25.0
+        flight.armed, flight.landed = True, Landed.IN_AIR
+        flight.set_mode(flight.modes.hold)
+    with SimSwarm(vehicles, f"udpout:127.0.0.1:{port}", speed=speed) as swarm:
+        yield swarm, f"udpin:127.0.0.1:{port}"
+
+
+@pytest.mark.parametrize("flying", [40.0], indirect=True)
+def test_vehicles_of_one_start_return_in_turn(flying, capsys):
+    swarm, link = flying
+    assert main(["fleet", "rtl", "--in-turn", "--link", link, "--json"]) == 0
+    captured = capsys.readouterr()
+    rows = json.loads(captured.out)["vehicles"]
+    assert [(row["id"], row["command"], row["outcome"]) for row in rows] == [
+        (f"v{n}", "rtl", "done") for n in (1, 2, 3)
+    ]
+    said = captured.err.splitlines()
+    assert sum("holds, and returns after vehicle" in line for line in said) == 2
+    modes = [vehicle.flight.modes.name(vehicle.flight.mode) for vehicle in swarm.vehicles.values()]
+    assert modes == ["RTL"] * 3
+
+
+@pytest.mark.parametrize("flying", [1.0], indirect=True)
+def test_whoever_waits_is_left_holding_by_ctrl_c_and_that_is_said(flying, capsys, monkeypatch):
+    swarm, link = flying
+    written = builtins.print
+
+    def interrupted(text="", **options):
+        written(text, **options)
+        if "returns after" in str(text):
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(builtins, "print", interrupted)
+    assert main(["fleet", "rtl", "--in-turn", "--link", link]) == 130
+    captured = capsys.readouterr()
+    assert captured.out.count("holds where it is and was not sent home") == 2
+    assert "run the same command again to go on" in captured.err
+    assert sorted(v.flight.modes.name(v.flight.mode) for v in swarm.vehicles.values()) == ["BRAKE", "BRAKE", "RTL"]
+
+
+@pytest.mark.parametrize("flying", [1.0], indirect=True)
+def test_turns_that_take_too_long_end_with_exit_code_one(flying, capsys):
+    _, link = flying
+    words = ("rtl", "--in-turn", "--seconds", 1, "--vehicle", "1,3,9", "--wait", 1, "--link", link)
+    code, said = fleet(capsys, *words, "--json")
+    assert code == 1
+    assert sorted(row["outcome"] for row in said["vehicles"]) == ["done", "not_sent", "not_sent"]  # 2 is told nothing
+    assert {row["text"] for row in said["vehicles"] if row["id"] == "v9"} == {
+        "vehicle 9 was not heard; check its link and system id"
+    }
 
 
 def test_a_refused_mission_is_explained_in_words_and_in_json(swarm, folder, capsys):

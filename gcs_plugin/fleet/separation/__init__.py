@@ -1,1 +1,1 @@
-"""Whether vehicles keep apart: before a start, in flight, and in the times of their takeoffs."""
+"""Whether vehicles keep apart: before a start, in flight, on their ways home, and in the times of their takeoffs."""

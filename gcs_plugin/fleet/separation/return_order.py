@@ -20,11 +20,27 @@ from gcs_plugin.fleet.flight_state import Word, flight_state
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.track import STEP_S, Array, Track, metres, near_samples
 from orthoswarm.config import active
+from orthoswarm.model.earth import distance_m
 
 if TYPE_CHECKING:
     from gcs_plugin.fleet.vehicle_state import Vehicle
 
 _GOES_HOME: Final = frozenset({Word.RETURNING, Word.LANDING})
+
+
+@dataclass(frozen=True, slots=True)
+class Hold:
+    """How a vehicle holds: its mode in words, and where, latitude and longitude in degrees (None: not known)."""
+
+    mode: str
+    place: tuple[float, float] | None
+
+    def left(self, now: "Hold") -> str:
+        """Why it holds no longer as now it is, in words; empty if it does."""
+        if now.mode != self.mode:
+            return f"its mode is {now.mode}"
+        away_m = 0.0 if self.place is None or now.place is None else distance_m(*self.place, *now.place)
+        return f"it has left the place where it held by {away_m:.0f} m" if away_m > RETURN.left_m else ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,7 +51,7 @@ class Aloft:
         place: where it is, one sample. way: from now on if it returns; None where that is not known.
         height_known: whether the height of its way is known: it has said at what height it returns, or comes down.
         goes_home: its mode shows that it returns or lands. silent_s: since when it has not been heard, seconds.
-        lost: its link is lost. must_land: its battery must not wait.
+        lost: its link is lost. must_land: its battery must not wait. hold: where and how it holds, if it does.
     """
 
     place: Track
@@ -45,6 +61,7 @@ class Aloft:
     silent_s: float
     lost: bool
     must_land: bool
+    hold: Hold
 
 
 class ReturnOrder:
@@ -52,6 +69,7 @@ class ReturnOrder:
 
     Attributes:
         waits: vehicles that hold until their way is free, and whom each waits for (nobody before the first look).
+        left: those that at the last look were found to follow another command, and what shows that, in words.
 
     Args:
         systems: the vehicles, all in the air. clock: monotonic seconds.
@@ -59,26 +77,37 @@ class ReturnOrder:
 
     def __init__(self, systems: Collection[int], clock: Callable[[], float] = time.monotonic) -> None:
         self.waits: dict[int, tuple[int, ...]] = dict.fromkeys(systems, ())
+        self.left: dict[int, str] = {}
         self._clock = clock
         self._sent: dict[int, float] = {}
         self._unheard: set[int] = set()
+        self._held: dict[int, tuple[float, Hold | None]] = {}
+
+    @property
+    def pending(self) -> set[int]:
+        """Those that wait, or were sent home without being heard."""
+        return self.waits.keys() | self._unheard
 
     @property
     def over(self) -> bool:
-        """Whether nobody waits, nor was sent home without being heard."""
-        return not self.waits and not self._unheard
+        """Whether there is nobody of those."""
+        return not self.pending
 
     def look(self, aloft: Mapping[int, Aloft]) -> list[int]:
         """The vehicles that may return now; they no longer wait, nor do those that have landed or go home already.
 
         One whose way is not known returns at once: nothing is known that would be better for it. So does one whose
         link is lost or whose battery must not wait; a lost one has its turn once more when it is heard and still holds.
+        One that no longer holds as it did follows another command, of a remote control or another station.
         Where some are in each other's way alone and nothing moves, the one that the fewest others stand in the way of
         sets out.
 
         Args:
             aloft: all vehicles in the air, see `aloft_of`.
         """
+        self.left = self._left(aloft)
+        for system in self.left:
+            self.drop(system)
         self._unheard = {s for s in self._unheard if s in aloft and not aloft[s].goes_home}
         heard = {s for s in self._unheard if not aloft[s].lost}
         self._unheard -= heard
@@ -106,7 +135,13 @@ class ReturnOrder:
             del self.waits[ready[-1]]
         self._sent |= dict.fromkeys(ready, self._clock())
         self._unheard |= {s for s in ready if aloft[s].lost}
+        for system in self._unheard:  # nobody knows what it does until it is heard
+            self._held.pop(system, None)
         return ready
+
+    def holds(self, system: int) -> None:
+        """A vehicle that waits has acknowledged that it holds."""
+        self._held[system] = self._clock(), None
 
     def drop(self, system: int) -> bool:
         """Let a vehicle wait no longer, since it was given another command; returns whether it did."""
@@ -117,6 +152,19 @@ class ReturnOrder:
         """A vehicle did not acknowledge that it returns: it has its turn once more."""
         self.waits[system] = ()
         self._sent.pop(system, None)
+
+    def _left(self, aloft: Mapping[int, Aloft]) -> dict[int, str]:
+        """Those that wait and do not hold any more as they did when that had begun to show: what shows it."""
+        found = {}
+        for system in self.waits.keys() & self._held.keys() & aloft.keys():
+            vehicle, (since, hold) = aloft[system], self._held[system]
+            if vehicle.lost or vehicle.goes_home or self._clock() - since < RETURN.shows_s:
+                continue
+            if hold is None:
+                self._held[system] = since, vehicle.hold
+            elif why := hold.left(vehicle.hold):
+                found[system] = why
+        return found
 
     def _goes_home(self, system: int, vehicle: Aloft) -> bool:
         """Whether it flies home: by its mode, by what it was just told, or, unheard, as long as that takes."""
@@ -143,6 +191,7 @@ def aloft_of(vehicles: "Mapping[int, Vehicle]", now: float) -> dict[int, Aloft]:
             silent_s=now - v.heard,
             lost=v.lost,
             must_land=v.battery is not None and v.battery < 0.5 * LIMITS.reserve_share,
+            hold=Hold(v.mode, _place(v)),
         )
         for s, v in known.items()
     }

@@ -72,6 +72,8 @@ def come_home(world, positions, order=None, limit_s=900.0):
     else:
         first = order.look(aloft_of(fleet.vehicles, world.clock.now))
         world.finish(*(fleet.rtl(s) for s in first), *(fleet.pause(s) for s in order.waits))
+        for system in order.waits:
+            order.holds(system)
     while positions() and world.clock.now < end:
         world.wait(1.0)
         least = min(least, nearest(positions()))
@@ -150,6 +152,25 @@ def test_one_that_was_given_another_command_waits_no_longer(make_world):
     world.finish(*(world.fleet.pause(s) for s in (held, *order.waits)))
     go_on(world, order, 400)
     assert set(positions()) == {held}
+
+
+@pytest.mark.parametrize(
+    ("autopilot", "shown"), [(AP, "has left the place where it held"), (PX4, "its mode is MISSION")]
+)
+def test_one_that_another_station_or_a_remote_control_commands_waits_no_longer(make_world, autopilot, shown):
+    world, _ = flown_out(make_world, FAN[:2], autopilots=(autopilot,))
+    order = ReturnOrder(world.fleet.vehicles, world.clock)
+    (first,) = look(world, order)
+    (held,) = order.waits
+    world.finish(world.fleet.rtl(first), world.fleet.pause(held))
+    order.holds(held)
+    for _ in range(8):
+        world.wait(1.0)
+        assert look(world, order) == [] and not order.left
+    world.finish(world.fleet.resume(held))
+    world.wait(4.0)
+    assert look(world, order) == [] and order.over
+    assert shown in order.left[held]
 
 
 def test_one_that_did_not_acknowledge_has_its_turn_again(make_world):

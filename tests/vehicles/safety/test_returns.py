@@ -6,7 +6,7 @@ from concurrent.futures import Future
 
 import pytest
 
-from gcs_plugin.daemon.airspace.returns import Returns
+from gcs_plugin.fleet.separation.returns import Returns
 from tests.vehicles.safety.test_return_order import FAN, flown_out
 
 
@@ -23,8 +23,8 @@ class Station:
             future.set_result(work())
         return future
 
-    def ask_settings(self, system):
-        self.world.fleet.ask_settings(system)
+    def send(self, system, messages):
+        self.world.fleet.send(system, messages)
 
     def command(self, verb, names):
         self.heard.append((verb, tuple(sorted(names))))
@@ -33,6 +33,13 @@ class Station:
 
     def told(self, verb):
         return {name for each, names in self.heard if each == verb for name in names}
+
+
+def until(done, limit_s=20.0):
+    end = time.monotonic() + limit_s
+    while not done() and time.monotonic() < end:
+        time.sleep(0.01)
+    assert done()
 
 
 @pytest.fixture
@@ -49,8 +56,8 @@ def test_those_that_hold_are_told_at_once_though_another_does_not_answer(station
     station.slow["rtl"] = 1.0
     begin = threading.Thread(target=station.returns.begin, args=(station.systems, "n"))
     begin.start()
-    time.sleep(0.5)
-    assert station.told("pause") and station.told("rtl")
+    until(lambda: station.told("pause") and station.told("rtl"))
+    assert begin.is_alive()  # one of those that return has not answered yet
     begin.join()
     assert station.told("pause").isdisjoint(station.told("rtl"))
     assert set(station.returns.waits()) == station.told("pause")
@@ -61,7 +68,7 @@ def test_what_others_command_meanwhile_stands(station):
     done = []
     begin = threading.Thread(target=lambda: done.append(station.returns.begin(station.systems, "n")))
     begin.start()
-    time.sleep(0.2)
+    until(lambda: station.told("pause"))
     held = sorted(station.told("pause"))
     for name in held:  # the operator lands all: their pauses end without success
         station.outcomes["pause", name] = "not_sent"
@@ -79,3 +86,29 @@ def test_one_that_does_not_acknowledge_its_return_has_its_turn_again(station):
     rows = station.returns.begin(station.systems, "n")
     assert {row["outcome"] for row in rows} == {"unknown", "done"}
     assert set(station.returns.waits()) == set(station.systems)
+
+
+def test_one_that_comes_home_by_itself_waits_no_longer_and_that_is_said(station):
+    station.returns.begin(station.systems, "n")
+    held = sorted(station.returns.waits())[0]
+    with station.lock:
+        station.world.vehicles[station.systems[held]].flight.set_mode(9)  # LAND, by its remote control
+        station.world.wait(5.0)
+    until(lambda: any(row["vehicle"] == held for row in station.published))
+    row = next(row for row in station.published if row["vehicle"] == held)
+    assert (row["outcome"], row["reason"]) == ("done", f"{held} returns or lands already")
+    assert held not in station.returns.waits() and held not in station.told("rtl")
+
+
+def test_a_home_that_is_not_known_yet_is_waited_for(station):
+    vehicles = station.vehicles
+    homes = {system: vehicle.home for system, vehicle in vehicles.items()}
+    for vehicle in vehicles.values():
+        vehicle.home = vehicle.launch = None
+    begin = threading.Thread(target=station.returns.begin, args=(station.systems, "n"))
+    begin.start()
+    with station.lock:  # they are asked, and answer
+        for system, home in homes.items():
+            vehicles[system].home = home
+    begin.join()
+    assert station.told("pause") and set(station.returns.waits()) == station.told("pause")

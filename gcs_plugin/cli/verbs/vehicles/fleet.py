@@ -9,129 +9,24 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gcs_plugin.config import LIMITS
+from gcs_plugin.cli.verbs.vehicles.fleet_arguments import DEFAULT_LINK, add_arguments
 from gcs_plugin.mission.plan_folder import NO_NEEDS, number_in, plan_needs, read_plan_folder
 from orthoswarm.model.errors import InputError
 
 if TYPE_CHECKING:
     from gcs_plugin.backends import Backend
+    from gcs_plugin.fleet.commands import Order
     from gcs_plugin.fleet.fleet_events import FleetEvent
     from gcs_plugin.mission.exchange import Outcome
     from gcs_plugin.mission.items import Mission
     from gcs_plugin.mission.track import Airspace
 
-_WAIT_S = 8.0
 _PASSING = frozenset({"link", "gps", "ekf", "home", "pre-arm"})  # red items that clear by waiting
-_DEFAULT_LINK = "udpin:0.0.0.0:14550"
-_VERBS = {
-    "list": "show the vehicles",
-    "upload": "put missions into vehicles and read them back",
-    "start": "let vehicles fly their missions from the beginning (mode, arm, start)",
-    "pause": "hold vehicles where they are",
-    "resume": "let vehicles go on with their missions",
-    "rtl": "let vehicles fly home and land",
-    "land": "let vehicles land where they are",
-    "check": "check vehicles before their start",
-    "watch": "follow missions until each has ended",
-}
-_EXAMPLES = {
-    "list": "orthoswarm fleet list --link udpin:0.0.0.0:14550",
-    "upload": (
-        "orthoswarm fleet upload missions --link udpin:0.0.0.0:14550     (a folder made by `orthoswarm plan`)\n"
-        "  orthoswarm fleet upload survey.plan --vehicle 3 --link tcp:127.0.0.1:5760"
-    ),
-    "start": (
-        "orthoswarm fleet start --plan missions --watch --link udpin:0.0.0.0:14550     (at the plan's times)\n"
-        "  orthoswarm fleet start --vehicle 3 --link tcp:127.0.0.1:5760"
-    ),
-    "pause": "orthoswarm fleet pause --vehicle 3 --link udpin:0.0.0.0:14550",
-    "resume": "orthoswarm fleet resume --vehicle 3 --link udpin:0.0.0.0:14550",
-    "rtl": "orthoswarm fleet rtl --link udpin:0.0.0.0:14550",
-    "land": "orthoswarm fleet land --vehicle 3 --link udpin:0.0.0.0:14550",
-    "check": "orthoswarm fleet check --plan missions --link udpin:0.0.0.0:14550",
-    "watch": "orthoswarm fleet watch --link udpin:0.0.0.0:14550 --seconds 1800",
-}
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    parser.epilog = (
-        "A link is udpin:HOST:PORT (listen), udpout:HOST:PORT, tcp:HOST:PORT, or serial:DEVICE:BAUD; give --link\n"
-        f"again for more; without one, {_DEFAULT_LINK}. Nothing moves a vehicle but start, resume, rtl\nand land.\n\n"
-        f"example:\n  {_EXAMPLES['list']}"
-    )
-    verbs = parser.add_subparsers(dest="action", required=True, metavar="VERB")
-    for name, text in _VERBS.items():
-        verb = verbs.add_parser(
-            name,
-            help=text,
-            description=text[0].upper() + text[1:] + ".",
-            epilog=f"example:\n  {_EXAMPLES[name]}",
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        )
-        _common(verb)
-        if name == "upload":
-            verb.add_argument(
-                "missions",
-                nargs="+",
-                type=Path,
-                metavar="MISSION",
-                help="folder of a plan, or .plan or .waypoints files",
-            )
-            verb.add_argument("--sortie", type=int, default=1, metavar="N", help="which flight of a plan (default 1)")
-        if name in ("start", "check"):
-            _start_arguments(verb)
-        if name == "start":
-            verb.add_argument("--watch", action="store_true", help="follow the missions until each has ended")
-            verb.add_argument(
-                "--ready", type=float, default=60.0, metavar="S",
-                help="wait at most this long until all vehicles' own checks pass (default 60)",
-            )  # fmt: skip
-            verb.add_argument(
-                "--override", action="append", default=[], metavar="ITEM",
-                help="start in spite of a red item of the check: battery, or v3:battery for one vehicle",
-            )  # fmt: skip
-        if name in ("start", "watch"):
-            verb.add_argument(
-                "--seconds", type=float, default=7200.0, metavar="S", help="follow at most this long (default 7200)"
-            )
-
-
-def _start_arguments(verb: argparse.ArgumentParser) -> None:
-    verb.add_argument("--plan", type=Path, metavar="DIR", help="folder of a plan: its vehicles, at its times")
-    verb.add_argument("--sortie", type=int, default=1, metavar="N", help="which flight of the plan (default 1)")
-    verb.add_argument(
-        "--max-height", type=float, default=LIMITS.legal_height_m, metavar="M",
-        help=f"height above takeoff that may be flown (default {LIMITS.legal_height_m:g}, the usual legal limit)",
-    )  # fmt: skip
-
-
-def _common(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add(
-        "--link",
-        action="append",
-        default=[],
-        metavar="URL",
-        help=f"link to vehicles, several allowed ({_DEFAULT_LINK})",
-    )
-    add("--vehicle", action="append", default=[], metavar="ID", help="system ids: 3, v3, or 1,2,5 (default: all heard)")
-    add("--wait", type=float, default=_WAIT_S, metavar="S", help=f"wait for vehicles at most this long ({_WAIT_S:g})")
-    add("--json", action="store_true", help="one JSON document on stdout")
-    add(
-        "--backend",
-        default="pymavlink",
-        choices=["pymavlink", "mavsdk"],
-        help="library for MAVLink (pymavlink)",
-    )
-    add("--tlog", type=Path, metavar="FILE", help="append all packets to a telemetry log")
-    add(
-        "--signing-key",
-        type=Path,
-        metavar="FILE",
-        help="key for signed MAVLink (or ORTHOSWARM_SIGNING_KEY_FILE, ORTHOSWARM_SIGNING_KEY)",
-    )
-    add("--gcs-system", type=int, default=255, metavar="ID", help="our own system id (255)")
+    add_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -153,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
     prepared = _Prepared(args, systems)
     backend = open_backend(
         args.backend,
-        args.link or [_DEFAULT_LINK],
+        args.link or [DEFAULT_LINK],
         own=Address(args.gcs_system, 190),
         key=find_key(args.signing_key),
         tlog=args.tlog,
@@ -162,6 +57,8 @@ def run(args: argparse.Namespace) -> int:
         found = backend.discover(args.wait, prepared.systems)
         if not found or (prepared.systems and not set(prepared.systems) & set(found)):
             return _nobody(backend, args, prepared.systems, found)
+        if args.action == "rtl" and args.in_turn:
+            return _return_in_turn(backend, args, prepared, found)
         actions = {"list": _list, "upload": _upload, "watch": _watch, "check": _check}
         return actions.get(args.action, _command)(backend, args, prepared, found)
     finally:
@@ -302,9 +199,6 @@ def _upload(backend: "Backend", args: argparse.Namespace, prepared: _Prepared, f
 
 
 def _command(backend: "Backend", args: argparse.Namespace, prepared: _Prepared, found: list[int]) -> int:
-    from gcs_plugin.fleet.commands import Order
-    from gcs_plugin.mission.exchange import Verdict
-
     systems = prepared.systems or found
     missing = [s for s in systems if s not in found]
     if missing and args.action == "start":
@@ -319,22 +213,48 @@ def _command(backend: "Backend", args: argparse.Namespace, prepared: _Prepared, 
         if isinstance(checked, dict):
             return _report(args, checked, {})
         airspace = checked
-    given_s = time.monotonic()
-    text = "was not heard; check its link and system id"
-    orders = {
-        s: Order(verb=args.action, system=s, given_s=given_s).end(f"vehicle {s} {text}", Verdict.NOT_SENT)
-        for s in missing
-    }
-    for order in orders.values():
-        _say(args, order.outcome.text if order.outcome else "")
+    orders = _unheard(args, missing)
     delays = {s: prepared.delays.get(s, 0.0) for s in heard}
     orders |= backend.command(args.action, delays, lambda line: _say(args, line), airspace)
     outcomes = {s: order.outcome for s, order in orders.items() if order.outcome is not None}
     followed = [s for s, outcome in outcomes.items() if outcome.ok]
     if args.action == "start" and args.watch and followed:
         return _follow(backend, args, followed, all(outcome.ok for outcome in outcomes.values()))
-    ids = {s: {"command": order.verb, "command_id": order.id} for s, order in orders.items()}
-    return _report(args, outcomes, ids, said=True)
+    return _report(args, outcomes, _ids(orders), said=True)
+
+
+def _return_in_turn(backend: "Backend", args: argparse.Namespace, prepared: _Prepared, found: list[int]) -> int:
+    """Send vehicles home in turn; those that wait when it is interrupted, or takes too long, hold."""
+    from gcs_plugin.backends.in_turn import InTurn
+
+    if prepared.systems:  # the others are kept apart from, too
+        found = backend.discover(args.wait)
+    systems = prepared.systems or found
+    orders = _unheard(args, [s for s in systems if s not in found])
+    turn = InTurn(backend, lambda line: _say(args, line))
+    try:
+        turn.run([s for s in systems if s in found], args.seconds)
+    finally:  # Ctrl-C ends the order: what it has come to is said all the same
+        outcomes = {s: order.outcome for s, order in orders.items() if order.outcome is not None} | turn.outcomes()
+        code = _report(args, outcomes, _ids(orders | turn.orders), said=True)
+    return code
+
+
+def _unheard(args: argparse.Namespace, systems: Sequence[int]) -> "dict[int, Order]":
+    """The command to vehicles that were not heard: said at once, and not sent."""
+    from gcs_plugin.fleet.commands import Order
+    from gcs_plugin.mission.exchange import Verdict
+
+    orders = {}
+    for s in systems:
+        text = f"vehicle {s} was not heard; check its link and system id"
+        orders[s] = Order(verb=args.action, system=s, given_s=time.monotonic()).end(text, Verdict.NOT_SENT)
+        _say(args, text)
+    return orders
+
+
+def _ids(orders: "Mapping[int, Order]") -> dict[int, dict[str, Any]]:
+    return {s: {"command": order.verb, "command_id": order.id} for s, order in orders.items()}
 
 
 def _say(args: argparse.Namespace, text: str) -> None:
@@ -486,7 +406,7 @@ def _with_bar(work: Any) -> Any:
 
 
 def _nobody(backend: "Backend", args: argparse.Namespace, wanted: list[int], found: list[int]) -> int:
-    links = ", ".join(args.link or [_DEFAULT_LINK])
+    links = ", ".join(args.link or [DEFAULT_LINK])
     heard = f"; heard: {', '.join(map(str, found))}" if found else ""
     who = f"vehicle {', '.join(map(str, wanted))}" if wanted else "no vehicle"
     text = f"{who} {'not ' if wanted else ''}heard on {links} in {args.wait:g} s{heard}; check links and system ids"

@@ -3,38 +3,56 @@
 import logging
 import threading
 import time
-from collections.abc import Callable, Collection, Mapping
-from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Callable, Collection, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar
 
 from gcs_plugin.config import RETURN
-from gcs_plugin.fleet.commands import CommandResult
+from gcs_plugin.fleet.commands import CommandResult, new_id
 from gcs_plugin.fleet.separation.return_order import Aloft, ReturnOrder, aloft_of
 from gcs_plugin.mission.exchange import Verdict
 
 if TYPE_CHECKING:
     from gcs_plugin.fleet.commands import Verb
-    from gcs_plugin.fleet.fleet import Fleet
+    from gcs_plugin.fleet.vehicle_state import Vehicle
+    from gcs_plugin.links.mavlink import Message
 
 VERB: Final = "return"
 _ANSWER_S: Final = 5.0
+_AGAIN_S: Final = 0.1
 _log = logging.getLogger(__name__)
 
+Result = TypeVar("Result")
 Rows = list[dict[str, Any]]
+
+
+class Station(Protocol):
+    """The vehicles as one thread hears them: `fleet.Fleet`, or what stands for it."""
+
+    @property
+    def vehicles(self) -> "Mapping[int, Vehicle]":
+        """By system id."""
+
+    def call(self, work: Callable[[], Result]) -> "Future[Result]":
+        """Run a function in that thread; from any thread."""
+
+    def send(self, system: int, messages: "Sequence[Message]") -> None:
+        """Send messages to a vehicle without waiting for answers; in that thread."""
 
 
 class Returns:
     """Vehicles that return in turn.
 
     Args:
-        fleet: the vehicles. command: gives a command (its verb) to vehicles by their ids, and returns a row for each
-            as `VehicleLinks.commands` does. publish: called with the row of each that is sent home later.
+        fleet: the vehicles. command: gives a command (its verb) to vehicles by their ids, waits for the outcomes and
+            returns a row for each (`CommandResult.document`). publish: called with the row of each that is sent home
+            later, or waits no longer for another reason than a command that is given here.
         name_of: id of a vehicle by its system id.
     """
 
     def __init__(
         self,
-        fleet: "Fleet",
+        fleet: Station,
         command: Callable[["Verb", Collection[str]], Rows],
         publish: Callable[[dict[str, Any]], None],
         name_of: Callable[[int], str],
@@ -45,6 +63,7 @@ class Returns:
         self._waits: dict[int, tuple[int, ...]] = {}
         self._told_else, self._again = set[int](), set[int]()
         self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
 
     def begin(self, systems: Mapping[str, int], number: str) -> Rows:
         """Return vehicles in turn; answers once each was told to return or to hold.
@@ -60,7 +79,7 @@ class Returns:
             self._told_else.clear()
             self._again.clear()
         self._fleet.call(self._ask).result(_ANSWER_S)
-        aloft = self._aloft()
+        aloft = self._known(systems.values())
         going = {name for name, system in systems.items() if system in aloft and aloft[system].goes_home}
         order = ReturnOrder([s for name, s in systems.items() if s in aloft and name not in going])
         order.look(aloft)
@@ -73,6 +92,8 @@ class Returns:
         rows |= self._told("rtl", loose, systems)
         for name in loose:
             order.drop(systems[name])
+        for system in order.waits:
+            order.holds(system)
         for name in (*loose, *home):
             if systems[name] in aloft and not aloft[systems[name]].lost and not _done(rows[name]):
                 order.again(systems[name])
@@ -85,7 +106,8 @@ class Returns:
             for system in self._told_else:
                 order.drop(system)
             self._order, self._waits = order, dict(order.waits)
-        threading.Thread(target=self._run, args=(order,), name="returns", daemon=True).start()
+        self._thread = threading.Thread(target=self._run, args=(order,), name="returns", daemon=True)
+        self._thread.start()
         return [rows[name] | {"id": number, "command": VERB} for name in systems]
 
     def cancel(self, system: int) -> None:
@@ -101,6 +123,11 @@ class Returns:
             known = dict(self._waits)
         return {self._name_of(s): [self._name_of(o) for o in others] for s, others in known.items()}
 
+    @property
+    def running(self) -> bool:
+        """Whether somebody waits still, or was told to return and has neither answered nor been heard."""
+        return self._thread is not None and self._thread.is_alive()
+
     def close(self) -> None:
         """Send nobody home any more: what waits is left holding."""
         self._stop.set()
@@ -112,6 +139,8 @@ class Returns:
             try:
                 aloft = self._aloft()
             except Exception as error:  # the links do not answer now: they are asked again
+                if self._stop.is_set():
+                    return
                 _log.warning("returning in turn: %s", str(error) or type(error).__name__)
                 continue
             free = self._free(order, aloft)
@@ -129,6 +158,7 @@ class Returns:
             self._again.clear()
             for system in self._told_else:
                 order.drop(system)
+        pending = order.pending
         free = order.look(aloft)
         with self._lock:
             if self._order is not order:
@@ -136,7 +166,19 @@ class Returns:
             for system in self._told_else:  # also those that were given another command during the look
                 order.drop(system)
             self._waits = dict(order.waits)
-            return [system for system in free if system not in self._told_else]
+            told_else = set(self._told_else)
+        for system in sorted(pending - order.pending - told_else - set(free)):
+            self._publish(self._no_longer(system, order, aloft).document() | {"by": VERB})
+        return [system for system in free if system not in told_else]
+
+    def _no_longer(self, system: int, order: ReturnOrder, aloft: Mapping[int, Aloft]) -> CommandResult:
+        """Why a vehicle waits no longer that was not sent home."""
+        name = self._name_of(system)
+        if system in order.left:
+            text = f"{name} follows another command ({order.left[system]}); it is not sent home in turn any more"
+            return CommandResult(new_id(), name, VERB, Verdict.NOT_SENT, text)
+        does = "returns or lands" if system in aloft else "is on the ground"
+        return CommandResult(new_id(), name, VERB, Verdict.DONE, f"{name} {does} already")
 
     def _send_home(self, system: int, sending: set[int]) -> None:
         """Tell one vehicle to return; if it is there and does not acknowledge that, it has its turn again."""
@@ -148,10 +190,23 @@ class Returns:
         sending.discard(system)
 
     def _ask(self) -> None:
-        """Ask for the heights at which they return, of those that have not said it: without them they wait longer."""
+        """Ask for the heights at which they return, without which they wait longer, and for homes not known yet."""
         for system, vehicle in self._fleet.vehicles.items():
             if vehicle.flying:
-                self._fleet.ask_settings(system)
+                home = [] if vehicle.home is not None else [vehicle.home_question()]
+                self._fleet.send(system, [*home, *vehicle.setting_questions()])
+
+    def _known(self, systems: Collection[int]) -> dict[int, Aloft]:
+        """The vehicles in the air, as soon as the ways home of these are known: one that has just been heard says it.
+
+        Whose way is not known then returns at once.
+        """
+        end = time.monotonic() + RETURN.known_s
+        while True:
+            aloft = self._aloft()
+            unknown = [s for s in systems if s in aloft and aloft[s].way is None and not aloft[s].lost]
+            if not unknown or time.monotonic() >= end or self._stop.wait(_AGAIN_S):
+                return aloft
 
     def _aloft(self) -> dict[int, Aloft]:
         return self._fleet.call(lambda: aloft_of(self._fleet.vehicles, time.monotonic())).result(_ANSWER_S)
