@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 _USAGE: Final = (
-    "usage: orthoswarm status|vehicles|plan|upload|start|pause|resume|rtl|land|refine|layers|export|web|connect"
+    "usage: orthoswarm status|vehicles|plan|upload|start|pause|resume|rtl|return|land|refine|layers|export|web|connect"
 )
 _TIMEOUT_S: Final = 240.0
 
@@ -86,10 +86,11 @@ class Commands:
         self.client = client
         self._plan = ""
         self._said: dict[str, str] = {}
+        self._waits: set[str] = set()
         self._verbs: dict[str, Callable[[list[str]], list[str]]] = {
             "status": self.status, "vehicles": self.vehicles, "plan": self.plan, "upload": self.upload,
             "start": self.start, "pause": self.command("pause"), "resume": self.command("resume"),
-            "rtl": self.command("rtl"), "land": self.command("land"),
+            "rtl": self.command("rtl"), "return": self.return_in_turn, "land": self.command("land"),
             "refine": self.refine, "layers": self.layers, "export": self.export, "web": self.web,
             "connect": self.connect,
         }  # fmt: skip
@@ -159,7 +160,7 @@ class Commands:
         return next((str(row["id"]) for row in rows if str(row.get("system")) == word), f"v{word}")
 
     def news(self) -> list[str]:
-        """What went wrong since the last call: takeoffs that failed or are held, vehicles too near each other."""
+        """What happened since the last call: takeoffs that failed or are held, vehicles too near each other, turns."""
         try:
             rows = self.client.ask("/api/vehicles")
         except RuntimeError:
@@ -170,6 +171,9 @@ class Commands:
         new = [f"{who.split()[0]}: {text}" if not who.startswith("alarm") else text for who, text in found.items()
                if text and who not in self._said]  # fmt: skip
         self._said = {who: text for who, text in found.items() if text}
+        waits = {str(row["id"]) for row in rows if row.get("returns_after") is not None}
+        new += [f"{name} waits no longer for its turn to return" for name in sorted(self._waits - waits)]
+        self._waits = waits
         return new
 
     def start(self, words: list[str]) -> list[str]:
@@ -190,6 +194,13 @@ class Commands:
             return [self.client.ask(f"/api/missions/{self._named(words[0])}/{verb}", {})["reason"]]
 
         return run
+
+    def return_in_turn(self, words: list[str]) -> list[str]:
+        """`return`: all vehicles, those whose ways home come near each other one after the other."""
+        if words:
+            return ["usage: orthoswarm return, for all vehicles in turn; rtl VEHICLE sends one home at once"]
+        rows = self.client.ask("/api/missions/all/return", {})["results"]
+        return [str(row["reason"]) for row in rows] or ["no vehicle is on the links"]
 
     def refine(self, words: list[str]) -> list[str]:
         """`refine [VEHICLE]`."""

@@ -21,7 +21,9 @@ from MAVProxy.modules.lib import mp_module
 from gcs_plugin.mavproxy.daemon_client import Client, Commands
 from gcs_plugin.mavproxy.packet_feed import Child, Feed
 
-_VERBS: Final = "<status|vehicles|plan|upload|start|pause|resume|rtl|land|refine|layers|export|web|connect|serve|feed>"
+_VERBS: Final = (
+    "<status|vehicles|plan|upload|start|pause|resume|rtl|return|land|refine|layers|export|web|connect|serve|feed>"
+)
 _START_ONE: Final = (
     "'orthoswarm serve WORKSPACE [--basemap MAP]' starts one and feeds it, 'orthoswarm connect URL TOKEN' takes another"
 )

@@ -12,7 +12,10 @@ class Answers:
 
     def ask(self, path, body=None):
         self.asked.append(path)
-        return self.rows if path == "/api/vehicles" else {"outcome": "done", "reason": "done"}
+        done = {"outcome": "done", "reason": "done"}
+        return (
+            self.rows if path == "/api/vehicles" else done | {"results": [{"reason": "v1 holds"}, {"reason": "done"}]}
+        )
 
 
 def test_a_vehicle_is_known_by_its_name_and_by_its_number_in_every_command():
@@ -22,6 +25,18 @@ def test_a_vehicle_is_known_by_its_name_and_by_its_number_in_every_command():
         for word, name in (("1", "v1"), ("v1", "v1"), ("2", "falcon"), ("falcon", "falcon"), ("9", "v9")):
             assert commands.run([verb, word, *(["plan-1"] if verb == "upload" else [])]) == ["done"]
             assert answers.asked[-1] == f"/api/missions/{name}/{verb}"
+
+
+def test_all_return_in_turn_and_it_is_said_whose_turn_has_come():
+    answers = Answers()
+    commands = Commands(answers)
+    assert commands.run(["return"]) == ["v1 holds", "done"] and answers.asked == ["/api/missions/all/return"]
+    assert "usage" in commands.run(["return", "v1"])[0]
+    answers.rows[0]["returns_after"] = ["falcon"]
+    assert commands.news() == []
+    answers.rows[0]["returns_after"] = None
+    assert commands.news() == ["v1 waits no longer for its turn to return"]
+    assert commands.news() == []
 
 
 def test_what_goes_wrong_is_said_once():
