@@ -110,8 +110,9 @@ class Daemon:
         self.refused = RefusedPictures(self.events.publish)
         self.console = ConsoleState(self.journal, self.events.publish)
         self.plans = Plans(
-            folder / "plans", settings.dem, lambda: {} if self.links is None else self.links.autopilots()
-        )
+            folder / "plans", settings.dem, lambda: {} if self.links is None else self.links.autopilots(),
+            standing=lambda: {} if self.links is None else self.links.standing(),
+        )  # fmt: skip
 
     def _open_drawing(self) -> None:
         """The map that grows in flight, and how well the area is seen."""

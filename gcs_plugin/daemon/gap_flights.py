@@ -79,9 +79,8 @@ class GapFlights:
             "fly_not_arrived": body.get("fly_not_arrived") is True,
             "autopilots": self._plans.autopilots_of(ordered),
         }  # fmt: skip
-        made = self._plans.make_gaps(self._coverage.gaps, self._coverage.no_fly, values)
+        made = self._plans.make_gaps(self._coverage.gaps, self._coverage.no_fly, values, notes)
         names = dict(zip([f"v{k}" for k in range(1, len(ordered) + 1)], ordered, strict=True))
-        made["warnings"] = [*notes, *made["warnings"]]
         return made | {"names": {row["id"]: names[row["id"]] for row in made["vehicles"]}}
 
     def _camera(self, vehicles: list[str], body: Mapping[str, Any]) -> tuple[float, float, list[str]]:

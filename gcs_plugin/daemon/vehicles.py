@@ -25,7 +25,7 @@ import logging
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
@@ -158,12 +158,13 @@ class VehicleLinks:
         known = ", ".join(self.name_of(system) for system in sorted(self.fleet.vehicles)) or "none"
         raise OrthoSwarmError(f"{vehicle} is not on the links (heard: {known}); check links and system ids")
 
-    def standing(self, names: Sequence[str]) -> list[tuple[float, float]]:
-        """Where vehicles stand on the ground, latitude and longitude in degrees; empty unless that is known of all."""
-        known = {self.name_of(s): v for s, v in list(self.fleet.vehicles.items()) if not v.flying}
-        places = [(v.lat_deg, v.lon_deg) for name in names if (v := known.get(name)) is not None]
-        found = [(lat, lon) for lat, lon in places if lat is not None and lon is not None]
-        return found if len(found) == len(names) else []
+    def standing(self) -> dict[str, tuple[float, float] | str]:
+        """Where vehicles stand on the ground, latitude and longitude in degrees, or why that is not known, by id."""
+        known: dict[str, tuple[float, float] | str] = {}
+        for system, v in list(self.fleet.vehicles.items()):
+            place = "no position yet" if v.lat_deg is None or v.lon_deg is None else (v.lat_deg, v.lon_deg)
+            known[self.name_of(system)] = "in the air" if v.flying else place
+        return known
 
     def autopilots(self) -> dict[str, str]:
         """The autopilot of each vehicle that was heard, by id."""

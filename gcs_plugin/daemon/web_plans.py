@@ -7,6 +7,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -30,6 +31,8 @@ _CHOICES: Final = {"method": METHODS, "end": ENDS, "relief": RELIEFS}
 
 GeographicBounds = tuple[float, float, float, float]
 """South, west, north, east in degrees."""
+Place = tuple[float, float]
+"""Latitude and longitude in degrees."""
 
 
 class Plans:
@@ -38,12 +41,17 @@ class Plans:
     Args:
         folder: of all plans. dem: height model that they follow, None for level ground.
         autopilots: of the vehicles on the links, by id; a plan is made for these unless its request names others.
+        standing: where these stand (latitude and longitude in degrees), or why that is not known, in words.
     """
 
     def __init__(
-        self, folder: Path, dem: Path | None = None, autopilots: Callable[[], Mapping[str, str]] = dict
+        self,
+        folder: Path,
+        dem: Path | None = None,
+        autopilots: Callable[[], Mapping[str, str]] = dict,
+        standing: Callable[[], Mapping[str, Place | str]] = dict,
     ) -> None:
-        self.folder, self.dem, self._autopilots = folder, dem, autopilots
+        self.folder, self.dem, self._autopilots, self._standing = folder, dem, autopilots, standing
         self._bounds: tuple[Path, GeographicBounds] | None = None
 
     def make(self, body: Mapping[str, Any]) -> dict[str, Any]:
@@ -54,35 +62,66 @@ class Plans:
         Raises:
             InputError: the area or a value is invalid.
         """
-        values = _values(body)
+        values, notes = _values(body), list[str]()
+        vehicles = [f"v{k}" for k in range(1, values["vehicles"] + 1)]
         if "autopilot" not in body:
-            values["autopilots"] = self.autopilots_of([f"v{k}" for k in range(1, values["vehicles"] + 1)])
+            values["autopilots"] = self.autopilots_of(vehicles)
+        if "starts" not in body:
+            values["starts"], notes = self._starts(vehicles)
         area = body.get("area")
         if not isinstance(area, dict):
             raise InputError("area is missing; send a GeoJSON polygon")
-        return self._make("area.geojson", area, _zones(body.get("no_fly")), values)
+        return self._make("area.geojson", area, _zones(body.get("no_fly")), values, notes)
 
     def autopilots_of(self, vehicles: Sequence[str]) -> list[str]:
         """The autopilots of vehicles; ArduPilot for those that were not heard."""
         known = self._autopilots()
         return [known.get(vehicle, "ardupilot") for vehicle in vehicles]
 
+    def _starts(self, vehicles: Sequence[str]) -> tuple[list[Place], list[str]]:
+        """Where vehicles stand; unless that is known of all of them none of that, and a warning that names the others.
+
+        Without vehicles on the links there is nothing to warn of: who flies the plan is not known.
+        """
+        known = self._standing()
+        places = [known.get(vehicle, "not on the links") for vehicle in vehicles] if known else []
+        unknown: dict[str, list[str]] = {}
+        for vehicle, place in zip(vehicles, places, strict=False):
+            if isinstance(place, str):
+                unknown.setdefault(place, []).append(vehicle)
+        if not unknown:
+            return [place for place in places if not isinstance(place, str)], []
+        who = "; ".join(f"{', '.join(names)}: {why}" for why, names in unknown.items())
+        return [], [
+            f"it is not known where all vehicles stand ({who}), so each takeoff lies where its first line begins; "
+            "one that stands elsewhere is not started: plan again when all of them stand there with a position"
+        ]
+
     def make_gaps(
-        self, gaps: Mapping[str, Any], no_fly: Mapping[str, Any] | None, values: Mapping[str, Any]
+        self,
+        gaps: Mapping[str, Any],
+        no_fly: Mapping[str, Any] | None,
+        values: Mapping[str, Any],
+        notes: Sequence[str] = (),
     ) -> dict[str, Any]:
         """Plan a flight over gaps; returns its figures with the plan's `id`.
 
         Args:
             gaps: GeoJSON as `orthoswarm coverage` writes it. no_fly: GeoJSON of zones, None if there are none.
-            values: further fields of the PlanRequest.
+            values: further fields of the PlanRequest. notes: to be added to the plan's warnings.
 
         Raises:
             InputError: there is nothing to fly, or a value is invalid.
         """
-        return self._make("gaps.geojson", gaps, no_fly, values)
+        return self._make("gaps.geojson", gaps, no_fly, values, notes)
 
     def _make(
-        self, name: str, area: Mapping[str, Any], zones: Mapping[str, Any] | None, values: Mapping[str, Any]
+        self,
+        name: str,
+        area: Mapping[str, Any],
+        zones: Mapping[str, Any] | None,
+        values: Mapping[str, Any],
+        notes: Sequence[str],
     ) -> dict[str, Any]:
         """Plan in a new folder, into which area and no-fly zones are written first."""
         plan = f"plan-{time.strftime('%Y%m%d-%H%M%S', time.gmtime())}-{time.time_ns() % 10**6:06d}"
@@ -95,9 +134,8 @@ class Plans:
                 no_fly = [path / _NO_FLY_FILE]
                 no_fly[0].write_text(json.dumps(zones), encoding="utf-8")
             with closing(WorkerPool(1)) as pool:
-                figures: dict[str, Any] = pool.run(
-                    plan_into, PlanRequest(area=path / name, no_fly=no_fly, dem=self.dem, **values)
-                )
+                request = PlanRequest(area=path / name, no_fly=no_fly, dem=self.dem, **values)
+                figures: dict[str, Any] = pool.run(partial(plan_into, notes=notes), request)
         except BaseException:
             shutil.rmtree(path, ignore_errors=True)
             raise
@@ -284,12 +322,13 @@ def _positions(document: Any) -> Iterator[tuple[float, float]]:
                 yield from _positions(part)
 
 
-def plan_into(request: PlanRequest) -> dict[str, Any]:
-    """Plan in a worker and write the plan's folder; returns the figures."""
+def plan_into(request: PlanRequest, notes: Sequence[str]) -> dict[str, Any]:
+    """Plan in a worker and write the plan's folder; returns the figures, with notes before the plan's warnings."""
     from gcs_plugin.plans.plan_files import geojson, mission_files, report, write_folder
 
     plan, area = make_plan(request)
     figures = report(plan, request.autopilots, request.fov_min_deg, request.endurance_min)
+    figures["warnings"] = [*notes, *figures["warnings"]]
     files: dict[str, str | bytes] = dict(mission_files(plan, request.autopilots))
     files["all.geojson"] = geojson(plan, area)
     files["plan.json"] = json.dumps(figures, indent=1) + "\n"

@@ -166,10 +166,6 @@ class Routes:
     async def plan(self, request: Request) -> Response:
         """Plan missions for {"area": GeoJSON, "vehicles": N, "altitude_m": M, "fov_min_deg": D, ...}."""
         body = await json_body(request)
-        links, count = self.daemon.links, body.get("vehicles")
-        heard = 0 if links is None else len(links.fleet.vehicles)
-        if "starts" not in body and links is not None and isinstance(count, int) and 0 < count <= heard:
-            body["starts"] = links.standing([f"v{k}" for k in range(1, count + 1)])
         return JsonAnswer(await self.work(self.daemon.plans.make, body), status_code=201)
 
     async def plans(self) -> Response:

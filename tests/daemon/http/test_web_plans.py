@@ -5,6 +5,7 @@ import json
 import pytest
 
 from gcs_plugin.daemon.web_plans import Plans
+from gcs_plugin.links.mavlink import Autopilot
 from orthoswarm.model.errors import InputError
 from tests.kit.plan_checks import on_globe
 
@@ -25,6 +26,32 @@ def test_a_plan_is_made_for_the_autopilots_on_the_links_unless_the_request_names
     plans = Plans(tmp_path, autopilots=lambda: {"v2": "px4", "v7": "px4"})
     figures = plans.make(BODY | asked)
     assert [vehicle["autopilot"] for vehicle in figures["vehicles"]] == made
+    assert figures["warnings"] == []
+
+
+STANDING = {"v1": SQUARE.shell[0], "v2": SQUARE.shell[1]}
+
+
+def test_a_plan_takes_off_where_its_vehicles_stand(tmp_path):
+    plans = Plans(tmp_path, standing=lambda: STANDING)
+    made = plans.make(BODY)
+    assert made["warnings"] == []
+    mission = plans.mission({"plan": made["id"]}, "v2", Autopilot.ARDUPILOT)
+    assert (mission.items[0].lat_deg, mission.items[0].lon_deg) == pytest.approx(STANDING["v2"], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("standing", "said"),
+    [
+        ({"v1": "in the air", "v2": "no position yet"}, "(v1: in the air; v2: no position yet)"),
+        ({"v1": SQUARE.shell[0]}, "(v2: not on the links)"),
+    ],
+)
+def test_a_plan_says_whose_place_is_not_known_and_that_takeoffs_lie_at_first_lines(standing, said, tmp_path):
+    plans = Plans(tmp_path, standing=lambda: standing)
+    (warning,) = plans.make(BODY)["warnings"]
+    assert said in warning and "where its first line begins" in warning and "plan again" in warning
+    assert plans.all()[0]["warnings"] == [warning]  # also for a page that is opened later
 
 
 @pytest.mark.parametrize("autopilot", ["betaflight", 4, [], ["px4", None]])
