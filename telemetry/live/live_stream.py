@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 from telemetry.formats.video import bitstream, klv, sei
 from telemetry.samples.sample import Sample
 from telemetry.samples.timeline import Timeline
+from telemetry.videos.display_turn import turn_of
 from telemetry.videos.extraction import to_rgb
 from telemetry.videos.packet_loss import LiveDamage
 from telemetry.videos.picture_choice import Candidate, Picker
-from telemetry.videos.video_file import NotAVideo, open_video, parked, picture_stream
+from telemetry.videos.video_file import NotAVideo, open_video, parked, picture_stream, square_size
 
 _HELD_S = 0.5
 _KEPT_SAMPLES = 64
@@ -202,13 +203,15 @@ def _offer(
                 (from_klv if sample is None else from_klv.merge(sample)),
                 " + ".join(filter(None, ("KLV", origin))),
             )
+    if sample is not None:
+        sample = turn_of(frame).sample(sample, *square_size(frame.width, frame.height, aspect))
     candidate = Candidate(number=number, frame=frame, sample=sample, video_s=seconds, origin=origin, damaged=lost)
     chosen = [candidate] if picker is None else picker.push(candidate)
     for one in chosen:
         stated = None if one.sample is None else one.sample.time_s
         yield LivePicture(
             number=one.number,
-            rgb=to_rgb(one.frame, aspect),
+            rgb=turn_of(one.frame).picture(to_rgb(one.frame, aspect)),
             sample=one.sample,
             origin=one.origin,
             time_s=clock() if stated is None else stated,

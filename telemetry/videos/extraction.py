@@ -182,20 +182,20 @@ def pictures(
                 number=number, frame=frame, sample=sample, video_s=video_s, origin=origin, packet=index, damaged=lost
             )
         ):
-            yield _picture(chosen, found.aspect)
+            yield _picture(chosen, found)
     for chosen in picker.flush():
-        yield _picture(chosen, found.aspect)
+        yield _picture(chosen, found)
     result.damaged = damaged[0]
     if progress is not None:
         progress(total, total)
 
 
-def _picture(chosen: Candidate, aspect: float) -> Picture:
+def _picture(chosen: Candidate, found: VideoScan) -> Picture:
     return Picture(
         number=chosen.number,
         sample=chosen.sample,
         origin=chosen.origin,
-        rgb=to_rgb(chosen.frame, aspect),
+        rgb=found.turn.picture(to_rgb(chosen.frame, found.aspect)),
         video_s=chosen.video_s,
         packet=chosen.packet,
         damaged=chosen.damaged,
@@ -206,7 +206,7 @@ def to_rgb(frame: Any, aspect: float = 1.0) -> NDArray[np.uint8]:
     """A decoded frame's colours, uint8 (rows, columns, 3); unmarked pictures of 720 rows or more are BT.709.
 
     Cameras have one focal length for both directions: pictures whose pixels are not square (`aspect`, width over
-    height) get more columns, or more rows.
+    height) get more columns, or more rows. They are not turned (`display_turn`).
     """
     from av.video.reformatter import ColorRange, Colorspace
 

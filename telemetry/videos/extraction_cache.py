@@ -11,7 +11,7 @@ from typing import Any
 from telemetry.videos.picture_poses import Poses
 
 _LIST = "pictures.json"
-_VERSION = 4
+_VERSION = 5
 
 
 @dataclass(frozen=True, slots=True)

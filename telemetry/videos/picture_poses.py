@@ -92,6 +92,7 @@ class Poses:
         parts: list[tuple[Sample, str]] = []
         own = note.sample
         if own is not None:
+            own = self._turned(own)
             if own.time_s is not None and not self._trust_sei_times:
                 own = replace(own, time_s=None)
             parts.append((own, " + ".join(note.decoders)))
@@ -204,6 +205,11 @@ class Poses:
                 samples[i] = sample
         self._interpolated.append((name, samples))
 
+    def _turned(self, sample: Sample) -> Sample:
+        """A pose from the stream of pictures itself, which describes them as coded, for the pictures as shown."""
+        found = self._scan
+        return found.turn.sample(sample, *square_size(found.width, found.height, found.aspect))
+
     def _sei_clock(self) -> Clock:
         pairs = [
             (n.video_s, n.sample.time_s)
@@ -215,7 +221,7 @@ class Poses:
     def _klv_rows(self) -> list[tuple[float, Sample]]:
         """KLV poses with video times: their own, else from UTC and the SEI times, else from their place in the file."""
         rows = [
-            (t, after, p.sample)
+            (t, after, self._turned(p.sample))
             for t, after, p in self._scan.klv_packets
             if p.sample is not None and p.sample.has_position
         ]
@@ -279,6 +285,14 @@ class Poses:
                 f"stretched from {found.width}x{found.height} to {size[0]}x{size[1]}"
             )
             self.findings.append(Finding("pixels-not-square", text, note=True))
+        if not found.turn.is_none:
+            turned = f"turned by {found.turn.clockwise_deg} degrees clockwise" if found.turn.clockwise_deg else ""
+            mirrored = "mirrored" if found.turn.is_mirrored else ""
+            text = (
+                f"the pictures of {name} are {' and '.join(filter(None, (mirrored, turned)))}, as the file tells "
+                "players to show them"
+            )
+            self.findings.append(Finding("pictures-turned", text, note=True))
         if found.others:
             others = ", ".join(f"{columns}x{rows}" for columns, rows in found.others)
             text = (

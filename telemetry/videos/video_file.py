@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +18,13 @@ from telemetry.formats.video import bitstream, djmd, gpmf, klv, sei, srt
 from telemetry.samples.sample import Sample
 from telemetry.samples.times import parse_time
 from telemetry.samples.unreadable import Unreadable
+from telemetry.videos.display_turn import AS_CODED, Turn, turn_of
 from telemetry.videos.joined_times import JoinedTimes
 
 _MAX_PICTURES = 5_000_000
 _MOST_BOXES = 1000
+_MOST_BEFORE_FIRST = 100
+"""Packets within which a picture is decoded, unless the file is damaged (decoders hold back up to 16, and a thread each)."""
 
 
 class NotAVideo(Unreadable):
@@ -57,6 +61,7 @@ class VideoScan:
         unknown_sei: (UUID, size) -> number of private SEI messages without a decoder.
         joints_s: times at which the file's clock starts again (recordings joined); times continue over them.
         aspect: width of a pixel over its height. others: width and height of other video streams.
+        turn: how a player turns the pictures.
     """
 
     path: Path
@@ -75,6 +80,7 @@ class VideoScan:
     joints_s: list[float] = field(default_factory=list)
     aspect: float = 1.0
     others: list[tuple[int, int]] = field(default_factory=list)
+    turn: Turn = AS_CODED
 
     @property
     def sei_count(self) -> int:
@@ -194,7 +200,24 @@ def scan(path: Path) -> VideoScan:
         _scan_packets(container, stream, result)
     if not result.pictures:
         raise NotAVideo("the file holds no pictures; it may be cut off")
+    result.turn = _turn(path)
     return result
+
+
+def _turn(path: Path) -> Turn:
+    """How the pictures are turned, by the first one that can be decoded: some containers tell it by nothing else."""
+    import av
+
+    with open_video(path) as container:
+        stream = picture_stream(container)
+        for packet in islice(demux(container, [stream]), _MOST_BEFORE_FIRST):
+            try:
+                frames = packet.decode()
+            except (av.error.FFmpegError, ValueError):
+                continue
+            if frames:
+                return turn_of(frames[0])
+    return AS_CODED
 
 
 def demux(container: Any, streams: list[Any]) -> Iterator[Any]:

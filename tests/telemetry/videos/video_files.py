@@ -1,5 +1,6 @@
 """Videos of plain pictures with what cameras write beside them: subtitles in DJI's form, KLV in a transport stream."""
 
+import struct
 from collections.abc import Callable
 from datetime import UTC, datetime
 from fractions import Fraction
@@ -31,10 +32,12 @@ def write_video(
     klv: Callable[[float], bytes] | None = None,
     klv_every: int = 1,
     b_pictures: int = 2,
+    shows: np.ndarray | None = None,
 ) -> Path:
     """A video with one H.264 stream of each size, and a KLV packet with every `klv_every`-th picture.
 
-    `b_pictures`: how many in a row are coded by what precedes and what follows, and so stored out of order.
+    `b_pictures`: how many in a row are coded by what precedes and what follows, and so stored out of order. `shows`:
+    grey values of all pictures; by default plain ones that grow brighter.
     """
     import av
 
@@ -52,8 +55,8 @@ def write_video(
         data = container.add_data_stream("klv") if klv else None
         for number in range(count):
             for stream in streams:
-                grey = np.full((stream.height, stream.width), 16 + number % 200, np.uint8)
-                frame = av.VideoFrame.from_ndarray(grey, format="gray").reformat(format="yuv420p")
+                plain = np.full((stream.height, stream.width), 16 + number % 200, np.uint8)
+                frame = av.VideoFrame.from_ndarray(plain if shows is None else shows, format="gray").reformat(format="yuv420p")
                 frame.pts = number
                 container.mux(stream.encode(frame))
             if data is not None and klv is not None and number % klv_every == 0:
@@ -89,3 +92,14 @@ def write_srt(
 
 def _cue(t: int) -> str:
     return f"{t // 3600:02d}:{t // 60 % 60:02d}:{t % 60:02d},000"
+
+
+def tell_players_to_turn(path: Path, clockwise_deg: int, *, mirrored: bool = False) -> None:
+    """Write the display matrix of an MP4 with one track as a camera would (ISO/IEC 14496-12, 8.3.2: box `tkhd`)."""
+    across, along = (round(65536 * f(np.radians(clockwise_deg))) for f in (np.cos, np.sin))
+    data = bytearray(path.read_bytes())
+    at = data.index(b"tkhd") + 4 + 40
+    assert struct.unpack_from(">9i", data, at)[::4] == (65536, 65536, 1 << 30)
+    flip = -1 if mirrored else 1
+    struct.pack_into(">9i", data, at, flip * across, along, 0, -flip * along, across, 0, 0, 0, 1 << 30)
+    path.write_bytes(data)
