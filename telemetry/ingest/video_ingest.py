@@ -23,7 +23,7 @@ from telemetry.videos.picture_poses import Poses
 from telemetry.videos.video_file import VideoScan, scan
 
 NO_POSITION = "the video carries no position (SEI, KLV, djmd, subtitles); put an SRT next to it, or give its log, too"
-_WHY_NOT = ("log-ambiguous", "log-unused", "srt-length", "srt-no-position", "unreadable")
+_WHY_NOT = ("rate-unknown", "log-ambiguous", "log-unused", "srt-length", "srt-no-position", "unreadable")
 """Findings that say why a log or an SRT that is there gives no position, in this order."""
 
 
@@ -58,7 +58,7 @@ def read_videos(
             result.rejected.append(Rejection(name, str(poses), found.videos[path]))
             continue
         near = [entry for entry in logs if folder.path.is_relative_to(entry.folder)]
-        if near and not (poses.has_positions and poses.has_angles):
+        if near and scanned.has_times and not (poses.has_positions and poses.has_angles):
             matched = read_or_reason(add_log, poses, scanned, near)
             unmatched = [Finding("log-unused", f"no log could be matched with {name}: {matched}")]
             poses.findings += unmatched if isinstance(matched, Unreadable) else matched

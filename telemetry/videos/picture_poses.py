@@ -285,6 +285,13 @@ class Poses:
                 f"stretched from {found.width}x{found.height} to {size[0]}x{size[1]}"
             )
             self.findings.append(Finding("pixels-not-square", text, note=True))
+        if not (found.has_times or any(n.sample is not None and n.sample.has_position for n in found.pictures)):
+            text = (
+                f"{name} is a raw stream that states no frame rate, so that no SRT and no log can be matched with its "
+                f"pictures; put it into an MP4 with its rate (ffmpeg -framerate 30 -i {name} -c copy "
+                f"{found.path.stem}.mp4)"
+            )
+            self.findings.append(Finding("rate-unknown", text))
         if not found.turn.is_none:
             turned = f"turned by {found.turn.clockwise_deg} degrees clockwise" if found.turn.clockwise_deg else ""
             mirrored = "mirrored" if found.turn.is_mirrored else ""

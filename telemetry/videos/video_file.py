@@ -23,6 +23,8 @@ from telemetry.videos.joined_times import JoinedTimes
 
 _MAX_PICTURES = 5_000_000
 _MOST_BOXES = 1000
+_RAW_FORMATS = frozenset({"h264", "hevc"})
+"""FFmpeg's names of streams without a container, which give no times to their pictures."""
 _MOST_BEFORE_FIRST = 100
 """Packets within which a picture is decoded, unless the file is damaged (decoders hold back up to 16, and a thread each)."""
 
@@ -81,6 +83,11 @@ class VideoScan:
     aspect: float = 1.0
     others: list[tuple[int, int]] = field(default_factory=list)
     turn: Turn = AS_CODED
+
+    @property
+    def has_times(self) -> bool:
+        """Whether it is known when in the video any picture is shown; not of raw streams that state no rate."""
+        return self.rate is not None or any(note.video_s is not None for note in self.pictures)
 
     @property
     def sei_count(self) -> int:
@@ -194,7 +201,7 @@ def scan(path: Path) -> VideoScan:
         result.aspect = float(stream.sample_aspect_ratio or 1)
         contexts = [s.codec_context for s in moving_streams(container) if s is not stream]
         result.others = [(c.width, c.height) for c in contexts if c is not None]
-        result.rate = float(stream.average_rate) if stream.average_rate else None
+        result.rate = _rate(container, stream)
         created = parse_time(str(container.metadata.get("creation_time", "")))
         result.created_s = created[0] if created is not None else None
         _scan_packets(container, stream, result)
@@ -202,6 +209,12 @@ def scan(path: Path) -> VideoScan:
         raise NotAVideo("the file holds no pictures; it may be cut off")
     result.turn = _turn(path)
     return result
+
+
+def _rate(container: Any, stream: Any) -> float | None:
+    """Pictures a second; of a raw stream those that its sequence parameters state, as FFmpeg assumes 25 if they don't."""
+    stated = stream.codec_context.framerate if container.format.name in _RAW_FORMATS else stream.average_rate
+    return float(stated) if stated else None
 
 
 def _turn(path: Path) -> Turn:

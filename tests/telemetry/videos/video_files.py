@@ -33,8 +33,9 @@ def write_video(
     klv_every: int = 1,
     b_pictures: int = 2,
     shows: np.ndarray | None = None,
+    codec: str = "libx264",
 ) -> Path:
-    """A video with one H.264 stream of each size, and a KLV packet with every `klv_every`-th picture.
+    """A video with one stream of each size, and a KLV packet with every `klv_every`-th picture.
 
     `b_pictures`: how many in a row are coded by what precedes and what follows, and so stored out of order. `shows`:
     grey values of all pictures; by default plain ones that grow brighter.
@@ -46,7 +47,7 @@ def write_video(
             container.metadata["creation_time"] = created
         streams = []
         for size in sizes:
-            stream = container.add_stream("libx264", rate=rate)
+            stream = container.add_stream(codec, rate=rate)
             stream.width, stream.height = size
             stream.pix_fmt, stream.options = "yuv420p", {"g": "15", "bf": str(b_pictures)}
             if aspect is not None:
