@@ -95,6 +95,15 @@ class IngestConfig:
     """A gimbal roll near 180 degrees is a turned yaw if the camera looks within this of nadir, degrees (chosen)."""
     outlying_position_m: float = 100.0
     """A photo farther than this from those before and after has a wrong position, metres (and 15 steps; chosen)."""
+    fastest_m_s: float = 128.6
+    """No aircraft that takes pictures flies faster over ground, m/s: 250 knots, the limit below 10,000 feet (14 CFR
+    91.117(a)); small drones may fly 44.7 m/s (14 CFR 107.51(a))."""
+    time_resolution_s: float = 1.0
+    """Times of positions may be off by this, seconds: many are written in whole seconds."""
+    wild_most_share: float = 0.1
+    """Positions that cannot be reached are wild up to this share of all; more are another flight (chosen)."""
+    wild_most_pieces: int = 2000
+    """A track that cannot be flown at more places than this has wrong times, not wild positions (chosen)."""
     low_share: float = 0.4
     """A few photos lower than this share of the usual height are reported: takeoff, landing, inspection (chosen)."""
     from_horizon_deg: float = -25.0

@@ -34,6 +34,7 @@ from telemetry.photos.photo_tags import PhotoTags, read_photos
 from telemetry.samples.findings import Finding, plural
 from telemetry.samples.times import ZONE_UNKNOWN
 from telemetry.samples.unreadable import Unreadable, read_or_reason
+from telemetry.samples.wild_fixes import wild_fixes
 
 __all__ = ["LoadOptions", "SourceInfo", "Survey", "load", "require_frames", "survey"]
 
@@ -211,6 +212,7 @@ def _photo_folder(
         add_logs(photos, folder.path, vehicle, logs=logs, findings=source.findings, workers=workers)
         photos = _with_position(_one_band(photos, vehicle, found, result), vehicle, found, result)
         photos = in_order(photos, vehicle, source.findings)
+        photos = _where_it_can_be(photos, vehicle, found, source, result)
         frames = frames_of(photos, vehicle, found.name, source.findings)
         source.frames += frames
         source.findings += flight_findings(photos, frames, vehicle)
@@ -244,6 +246,30 @@ def _with_position(photos: Sequence[PhotoTags], vehicle: str, found: Discovery, 
             result.rejected.append(Rejection(found.name(photo.path), reason, vehicle, photo.time_s, True))
             result.unpositioned.append(frame_without_position(photo, vehicle, found.name(photo.path)))
     return placed
+
+
+def _where_it_can_be(
+    photos: Sequence[PhotoTags], vehicle: str, found: Discovery, source: SourceInfo, result: Survey
+) -> list[PhotoTags]:
+    """Photos without those whose positions the aircraft cannot have reached; these are rejected like those without."""
+    wild = wild_fixes([p.time_s for p in photos], [(p.lat_deg or 0.0, p.lon_deg or 0.0) for p in photos])
+    if not wild.indices:
+        return list(photos)
+    text = (
+        f"{plural(len(wild.indices), 'picture')} lie up to {wild.distance} away from the pictures before and after "
+        f"({found.name(photos[wild.indices[0]].path)} first), farther than any aircraft flies in that time; their "
+        "positions are wrong, and they are left out"
+    )
+    source.findings.append(Finding("position-astray", text, vehicle))
+    for i in wild.indices:
+        photo, name = photos[i], found.name(photos[i].path)
+        reason = (
+            "its position is farther from those before and after than any aircraft flies in that time; put a geo.txt "
+            "with the right one next to it"
+        )
+        result.rejected.append(Rejection(name, reason, vehicle, photo.time_s, True))
+        result.unpositioned.append(frame_without_position(photo, vehicle, name))
+    return [photo for i, photo in enumerate(photos) if i not in set(wild.indices)]
 
 
 def _photo_key(photo: PhotoTags) -> tuple[object, ...]:

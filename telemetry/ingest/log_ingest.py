@@ -27,6 +27,7 @@ from telemetry.samples.findings import Finding, plural
 from telemetry.samples.sample import Sample
 from telemetry.samples.timeline import Timeline
 from telemetry.samples.unreadable import Unreadable, read_or_reason
+from telemetry.samples.wild_fixes import without_wild_fixes
 
 _BUS = "DroneCAN"
 
@@ -67,12 +68,24 @@ def read_logs(found: Discovery, result: Survey) -> list[LogSource]:
             source = SourceInfo(path=found.name(path), kind=vehicles[0].kind)
             result.sources.append(source)
             for log in vehicles:
-                source.findings += log.findings
+                source.findings += log.findings + _drop_wild_fixes(log)
                 source.tracks[log.vehicle] = [s for s in log.samples if s.has_position]
                 source.shown[log.vehicle] = 0
                 logs.append(LogSource(folder=found.scope(path), log=log, source=source, timeline=log.timeline()))
     _count_once(logs)
     return _with_buses(logs)
+
+
+def _drop_wild_fixes(log: FlightLog) -> list[Finding]:
+    """Take the wild fixes out of a log's track and exposures."""
+    log.samples, found = without_wild_fixes(log.samples, [s.time_s for s in log.samples], log.path.name)
+    exposures = [replace(event.sample, time_s=event.time_s) for event in log.events]
+    sound, more = without_wild_fixes(exposures, [s.time_s for s in exposures], f"the exposures of {log.path.name}")
+    log.events = [
+        event if sample.has_position == event.sample.has_position else replace(event, sample=sample)
+        for event, sample in zip(log.events, sound, strict=True)
+    ]
+    return found + more
 
 
 def _with_buses(logs: Sequence[LogSource]) -> list[LogSource]:

@@ -18,6 +18,7 @@ from telemetry.photos.photo_frames import frames_of
 from telemetry.samples.findings import Finding
 from telemetry.samples.sample import Sample
 from telemetry.samples.unreadable import Unreadable, read_or_reason, reason_of
+from telemetry.samples.wild_fixes import without_wild_fixes
 from telemetry.videos.extraction import extract
 from telemetry.videos.picture_poses import Poses
 from telemetry.videos.video_file import VideoScan, scan
@@ -165,5 +166,8 @@ def _lone_subtitles(path: Path, name: str, result: Survey) -> None:
     source.findings += [Finding(code, text, note=code == "srt-tuple-order") for code, text in cues.notes.items()]
     source.findings.append(Finding("no-video", f"{path.name} has no video of the same name next to it", note=True))
     source.counts["samples"] = len(cues.cues)
-    source.tracks[path.stem] = [cue.sample for cue in cues.cues if cue.sample is not None]
+    samples = [cue.sample for cue in cues.cues if cue.sample is not None]
+    times = [cue.start_s for cue in cues.cues if cue.sample is not None]
+    source.tracks[path.stem], wild = without_wild_fixes(samples, times, path.name)
+    source.findings += wild
     source.shown[path.stem] = 0

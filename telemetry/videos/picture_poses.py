@@ -17,6 +17,7 @@ from telemetry.formats.video import srt
 from telemetry.samples.findings import Finding, plural
 from telemetry.samples.sample import Sample
 from telemetry.samples.timeline import Timeline
+from telemetry.samples.wild_fixes import without_wild_fixes
 from telemetry.videos.video_file import VideoScan, square_size
 
 Array = NDArray[np.float64]
@@ -67,14 +68,15 @@ class Poses:
     def __init__(self, found: VideoScan, subtitles: srt.Subtitles | None = None) -> None:
         self._scan = found
         self._interval = 1.0 / found.rate if found.rate else 1.0 / 30.0
-        self._djmd = sorted(found.djmd_samples, key=lambda row: row[0])
+        self.findings: list[Finding] = []
+        self._djmd = self._sound("djmd", sorted(found.djmd_samples, key=lambda row: row[0]))
         self._djmd_times = np.array([row[0] for row in self._djmd])
         # Whole seconds: the largest difference belongs to a time at which the second had just begun.
         self._djmd_clock = max((s.time_s - t for t, s in self._djmd if s.time_s is not None), default=None)
         self._times = np.array([self._time(i) for i in range(len(found.pictures))], dtype=np.float64)
         self._trust_sei_times = True
         self._interpolated: list[tuple[str, list[Sample]]] = []
-        self.findings: list[Finding] = []
+        self._sei = self._sei_samples()
         # A file beside the video counts before its own track, unless it is of some other kind.
         cues = (
             found.cues if subtitles is None or (found.cues.has_positions and not subtitles.has_positions) else subtitles
@@ -90,9 +92,8 @@ class Poses:
         """Pose of the picture of a packet (its index in `VideoScan.pictures`); None if unknown."""
         note, t = self._scan.pictures[index], self._times[index]
         parts: list[tuple[Sample, str]] = []
-        own = note.sample
+        own = self._sei[index]
         if own is not None:
-            own = self._turned(own)
             if own.time_s is not None and not self._trust_sei_times:
                 own = replace(own, time_s=None)
             parts.append((own, " + ".join(note.decoders)))
@@ -122,7 +123,7 @@ class Poses:
         """Whether any source of this video has positions."""
         return (
             any(sample.has_position for _, samples in self._interpolated for sample in samples)
-            or any(note.sample is not None and note.sample.has_position for note in self._scan.pictures)
+            or any(sample is not None and sample.has_position for sample in self._sei)
             or any(sample.has_position for _, sample in self._djmd)
         )
 
@@ -199,11 +200,30 @@ class Poses:
         part_of_picture = np.searchsorted(joints, self._times, side="right")
         samples = [Sample() for _ in range(len(self._times))]
         for part in np.unique(part_of_row).tolist():
-            own = [rows[i] for i in np.flatnonzero(part_of_row == part).tolist()]
+            own = self._sound(name, [rows[i] for i in np.flatnonzero(part_of_row == part).tolist()])
             index = np.flatnonzero(part_of_picture == part)
             for i, sample in zip(index.tolist(), _interpolated(own, self._times[index]), strict=True):
                 samples[i] = sample
         self._interpolated.append((name, samples))
+
+    def _sei_samples(self) -> list[Sample | None]:
+        """The pose in each picture's own packet."""
+        samples = [None if note.sample is None else self._turned(note.sample) for note in self._scan.pictures]
+        part = np.searchsorted(np.array(self._scan.joints_s), self._times, side="right")
+        for k in np.unique(part).tolist():
+            index = [i for i in np.flatnonzero(part == k).tolist() if samples[i] is not None]
+            rows = self._sound("SEI", [(float(self._times[i]), sample) for i in index if (sample := samples[i])])
+            for i, (_, sample) in zip(index, rows, strict=True):
+                samples[i] = sample
+        return samples
+
+    def _sound(self, name: str, rows: list[tuple[float, Sample]]) -> list[tuple[float, Sample]]:
+        """Samples of one recording over video time, without positions that cannot be flown."""
+        samples, wild = without_wild_fixes(
+            [s for _, s in rows], [t if t == t else s.time_s for t, s in rows], f"{self._scan.path.name} ({name})"
+        )
+        self.findings += wild
+        return [(t, sample) for (t, _), sample in zip(rows, samples, strict=True)]
 
     def _turned(self, sample: Sample) -> Sample:
         """A pose from the stream of pictures itself, which describes them as coded, for the pictures as shown."""

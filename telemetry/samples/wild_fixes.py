@@ -1,0 +1,113 @@
+"""Wild fixes: positions that no aircraft can have reached from those before and after."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from orthoswarm.config import active
+from telemetry.samples.course import local_metres
+from telemetry.samples.findings import Finding, plural
+from telemetry.samples.sample import Sample
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class WildFixes:
+    """Indices of wild fixes in a track, in order of time, and how far the farthest lies from its neighbours, metres."""
+
+    indices: list[int]
+    away_m: float = 0.0
+
+    @property
+    def distance(self) -> str:
+        """`away_m` as text."""
+        return f"{self.away_m / 1000:.0f} km" if self.away_m > 10_000 else f"{self.away_m:.0f} m"
+
+
+def wild_fixes(times_s: Sequence[float | None], places: Sequence[tuple[float, float]]) -> WildFixes:
+    """The fixes that are not part of the longest track that can be flown.
+
+    The track is cut where the next fix is farther away than an aircraft flies in between (`fastest_m_s`); of the pieces
+    those are kept that can be flown one after the other and hold most fixes. If the others are more than a few, they
+    are no wild fixes but another flight, or the times are wrong: then there are none.
+
+    Args:
+        times_s: of the fixes, in one clock; what has none is not judged.
+        places: latitude and longitude in degrees.
+    """
+    config = active().ingest
+    timed = [i for i, t in enumerate(times_s) if t is not None and t == t]
+    order = sorted(timed, key=lambda i: times_s[i] or 0.0)
+    if len(order) < 3:
+        return WildFixes([])
+    times = np.array([times_s[i] for i in order], dtype=np.float64)
+    ground = local_metres([places[i][0] for i in order], [places[i][1] for i in order])
+    cuts = np.flatnonzero(~_flyable(times[:-1], ground[:-1], times[1:], ground[1:])) + 1
+    first = np.concatenate([[0], cuts])
+    last = np.concatenate([cuts, [len(order)]]) - 1
+    if not 1 < len(first) <= config.wild_most_pieces:
+        return WildFixes([])
+    kept = _longest_track(first, last, times, ground)
+    pieces = [np.arange(a, b + 1) for k, (a, b) in enumerate(zip(first, last, strict=True)) if k not in kept]
+    wild = np.concatenate(pieces)
+    if len(wild) > max(1.0, config.wild_most_share * len(order)):
+        return WildFixes([])
+    sound = np.setdiff1d(np.arange(len(order)), wild)
+    after = np.searchsorted(sound, wild).clip(0, len(sound) - 1)
+    near = np.minimum(
+        np.hypot(*(ground[wild] - ground[sound[after]]).T),
+        np.hypot(*(ground[wild] - ground[sound[(after - 1).clip(0)]]).T),
+    )
+    return WildFixes([order[i] for i in wild.tolist()], float(near.max()))
+
+
+def _flyable(t0: Array, a: Array, t1: Array, b: Array) -> NDArray[np.bool_]:
+    """Whether an aircraft can fly from places `a` (N, 2), metres, at times `t0` to places `b` at `t1`."""
+    config = active().ingest
+    reach = config.fastest_m_s * (t1 - t0 + config.time_resolution_s)
+    return np.asarray(np.hypot(b[..., 0] - a[..., 0], b[..., 1] - a[..., 1]) <= reach)
+
+
+def _longest_track(first: NDArray[np.int64], last: NDArray[np.int64], times: Array, ground: Array) -> set[int]:
+    """Pieces (from index `first` to `last`) that can be flown one after the other and hold most fixes together."""
+    best = (last - first + 1).astype(np.float64)
+    before = np.full(len(first), -1)
+    for k in range(1, len(first)):
+        ends = last[:k]
+        score = np.where(_flyable(times[ends], ground[ends], times[first[k]], ground[first[k]]), best[:k], 0.0)
+        i = int(np.argmax(score))
+        if score[i] > 0.0:
+            best[k] += score[i]
+            before[k] = i
+    kept, k = set(), int(np.argmax(best))
+    while k >= 0:
+        kept.add(k)
+        k = int(before[k])
+    return kept
+
+
+def without_wild_fixes(
+    samples: Sequence[Sample], times_s: Sequence[float | None], source: str
+) -> tuple[list[Sample], list[Finding]]:
+    """Samples whose wild fixes have no position any more, and a finding if there are any.
+
+    Args:
+        samples: of one flight.
+        times_s: of the samples, in one clock.
+        source: name of the file, for the message.
+    """
+    placed = [i for i, sample in enumerate(samples) if sample.has_position]
+    found = wild_fixes([times_s[i] for i in placed], [(samples[i].lat_deg or 0.0, samples[i].lon_deg or 0.0) for i in placed])
+    if not found.indices:
+        return list(samples), []
+    wild = {placed[i] for i in found.indices}
+    sound = [replace(s, lat_deg=None, lon_deg=None) if i in wild else s for i, s in enumerate(samples)]
+    text = (
+        f"{plural(len(wild), 'position')} of {source} {'lie' if len(wild) > 1 else 'lies'} up to {found.distance} away "
+        f"from those before and after, farther than any aircraft flies in that time "
+        f"({active().ingest.fastest_m_s:.0f} m/s); {'they are' if len(wild) > 1 else 'it is'} not used"
+    )
+    return sound, [Finding("wild-fix", text)]
