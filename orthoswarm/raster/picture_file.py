@@ -183,9 +183,22 @@ def _decode_other(path: Path, data: bytes, *, gray: bool) -> Bytes:
             return np.asarray(np.clip(scaled + 0.5, 0, 255).astype(np.uint8))
     if image is not None and image.dtype != np.uint8:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    if image is None and _holds_measurements(data):
+        raise PictureError(f"{path.name} holds 32-bit numbers, not colours; export it with 8 or 16 bits a pixel")
     if image is None:
         raise PictureError(f"{path.name} is not a readable picture; leave it out or copy it again")
     return np.asarray(image)
+
+
+def _holds_measurements(data: bytes) -> bool:
+    """Whether a picture's values are numbers of 32 bits, as temperatures in degrees are."""
+    from PIL import Image
+
+    try:
+        with Image.open(io.BytesIO(data)) as picture:
+            return picture.mode in ("F", "I")
+    except (OSError, ValueError, SyntaxError):
+        return False
 
 
 @lru_cache(maxsize=256)
