@@ -61,6 +61,13 @@ class PairingConfig:
     """Probability that the motion between two pictures is wrong although it looks right (chosen)."""
     same_exposure_share: float = 0.35
     """A photo nearer to an event than this share of the usual distance between events is that exposure (chosen)."""
+    jump_windows: int = 4
+    """Parts of a flight whose clocks are compared to find whether the camera's clock was set in between (chosen)."""
+    jump_least_photos: int = 6
+    """Photos of such a part at least (chosen: fewer fit by accident)."""
+    least_jump_s: float = 0.6
+    """Clocks of two parts that differ by more than this and the largest drift are two settings, seconds (chosen: more
+    than half of the whole seconds that many cameras write)."""
     most_tilt_deg: float = 60.0
     """Pictures that look farther from nadir than this tell nothing of the distance flown, degrees (chosen)."""
 
@@ -73,10 +80,16 @@ class IngestConfig:
     """A log belongs to photos if this share of the shorter of both is paired (chosen)."""
     log_same_exposure_s: float = 1.0
     """Exposures of two logs at most so far apart in time (and 3 m) are one exposure, seconds (chosen)."""
-    log_name_bonus: float = 0.05
-    """A log with the photos' folder in its name is preferred at a fit lower by so much (chosen)."""
+    log_same_fit: float = 0.05
+    """Two logs whose misfits to photos differ by no more than this fit equally well: a share of photos without event,
+    or of `event_far_m` (chosen)."""
     event_far_m: float = 60.0
     """Photos whose own position is farther than this from their camera event are reported, metres (chosen)."""
+    track_far_m: float = 10.0
+    """Photos nearer than this to a log's track at their times do not contradict it, metres (chosen: the errors of two
+    receivers, and the way flown in half a second)."""
+    track_far_times: float = 5.0
+    """Photos farther from it than so many times their median distance contradict it (chosen)."""
     bus_same_vehicle_m: float = 20.0
     """A CAN log belongs to the autopilot's log whose track is within this distance (median), metres (chosen)."""
     bus_least_common: int = 10

@@ -22,8 +22,9 @@ from telemetry.formats.table.pose_row import PoseTable, leave_out_folder, lookup
 from telemetry.formats.video.sei import register
 from telemetry.formats.video.sei_layout import read_sei_layout
 from telemetry.ingest.discovery import Discovery, Folder, discover, natural_key
-from telemetry.ingest.log_ingest import LogSource, add_logs, read_logs
-from telemetry.ingest.photo_order import in_order
+from telemetry.ingest.log_choice import LogSource
+from telemetry.ingest.log_ingest import add_logs, read_logs
+from telemetry.ingest.photo_order import clock_went_back, in_order
 from telemetry.ingest.side_files import read_control_points
 from telemetry.ingest.survey import LoadOptions, SourceInfo, Survey
 from telemetry.ingest.video_ingest import read_videos
@@ -210,7 +211,8 @@ def _photo_folder(
     for vehicle in sorted(groups, key=natural_key):
         photos = sorted(groups[vehicle], key=_photo_key)
         add_logs(photos, folder.path, vehicle, logs=logs, findings=source.findings, workers=workers)
-        photos = _with_position(_one_band(photos, vehicle, found, result), vehicle, found, result)
+        photos = _one_band(photos, vehicle, found, result)
+        photos = _with_position(photos, vehicle, found, result, _why_not_by_log(source.findings, vehicle))
         photos = in_order(photos, vehicle, source.findings)
         photos = _where_it_can_be(photos, vehicle, found, source, result)
         frames = frames_of(photos, vehicle, found.name, source.findings)
@@ -235,14 +237,23 @@ def _one_band(photos: Sequence[PhotoTags], vehicle: str, found: Discovery, resul
     return [photo for photo in photos if photo.band.lower() == mapped_band]
 
 
-def _with_position(photos: Sequence[PhotoTags], vehicle: str, found: Discovery, result: Survey) -> list[PhotoTags]:
-    """Keep photos with a position; the others are rejected, and listed for surveyed points to place them."""
+def _why_not_by_log(findings: Sequence[Finding], vehicle: str) -> str:
+    """Why a log that is there gives a vehicle's photos no position, one sentence; "" if nothing speaks against it."""
+    codes = ("log-ambiguous", "clock-unset", "clock-jump")
+    return next((f.message for f in findings if f.code in codes and f.vehicle == vehicle), "")
+
+
+def _with_position(
+    photos: Sequence[PhotoTags], vehicle: str, found: Discovery, result: Survey, why: str
+) -> list[PhotoTags]:
+    """Keep photos with a position; the others are rejected, with the reason, and listed for surveyed points."""
     placed = []
     for photo in photos:
         if photo.lat_deg is not None and photo.lon_deg is not None:
             placed.append(photo)
         else:
             reason = "the picture has no position; put a geo.txt next to it, or give its log as well"
+            reason = f"the picture has no position: {why}" if why else reason
             result.rejected.append(Rejection(found.name(photo.path), reason, vehicle, photo.time_s, True))
             result.unpositioned.append(frame_without_position(photo, vehicle, found.name(photo.path)))
     return placed
@@ -251,7 +262,12 @@ def _with_position(photos: Sequence[PhotoTags], vehicle: str, found: Discovery, 
 def _where_it_can_be(
     photos: Sequence[PhotoTags], vehicle: str, found: Discovery, source: SourceInfo, result: Survey
 ) -> list[PhotoTags]:
-    """Photos without those whose positions the aircraft cannot have reached; these are rejected like those without."""
+    """Photos without those whose positions the aircraft cannot have reached; these are rejected like those without.
+
+    Where the clock was set back, photos of two places seem to alternate, and nothing is known of speeds.
+    """
+    if clock_went_back(photos):
+        return list(photos)
     wild = wild_fixes([p.time_s for p in photos], [(p.lat_deg or 0.0, p.lon_deg or 0.0) for p in photos])
     if not wild.indices:
         return list(photos)

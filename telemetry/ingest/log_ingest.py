@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,37 +16,21 @@ from telemetry.formats.log.flight_logs import FlightLog, read_log
 from telemetry.formats.log.mavlink_poses import CameraEvent, fixed_camera
 from telemetry.ingest.can_positions import apart_m, bettered
 from telemetry.ingest.discovery import Discovery
+from telemetry.ingest.log_choice import LogMatch, LogSource, best_log
 from telemetry.ingest.pairing.event_pairing import Pairing, pair
 from telemetry.ingest.pairing.motion_chains import PictureMotion
 from telemetry.ingest.pairing.picture_evidence import picture_motion
 from telemetry.ingest.survey import SourceInfo, Survey
+from telemetry.ingest.track_poses import add_track, fill, is_named_like
 from telemetry.photos.flight_checks import number_of
 from telemetry.photos.photo_tags import PhotoTags
 from telemetry.samples.course import local_metres
 from telemetry.samples.findings import Finding, plural
 from telemetry.samples.sample import Sample
-from telemetry.samples.timeline import Timeline
 from telemetry.samples.unreadable import Unreadable, read_or_reason
 from telemetry.samples.wild_fixes import without_wild_fixes
 
 _BUS = "DroneCAN"
-
-
-@dataclass(slots=True, kw_only=True)
-class LogSource:
-    """A log, the folder that it applies to, whether it was used, and what in it comes from a CAN log."""
-
-    folder: Path
-    log: FlightLog
-    source: SourceInfo
-    timeline: Timeline
-    used: bool = False
-    better: str = ""
-
-    @property
-    def name(self) -> str:
-        """The file's name, and which values come from a CAN bus."""
-        return f"{self.log.path.name}, with {self.better}" if self.better else self.log.path.name
 
 
 def read_logs(found: Discovery, result: Survey) -> list[LogSource]:
@@ -171,39 +155,48 @@ def add_logs(
     near = [entry for entry in logs if folder.is_relative_to(entry.folder)]
     if not near or not photos or all(_is_complete(photo) for photo in photos):
         return
-    tried = []
+    pairings: dict[int, Pairing] = {}
+    matches = []
     for entry in near:
         pairing = _pair(photos, entry.log.events)
         if len(pairing.pairs) >= max(1.0, config.log_least_share * min(len(photos), len(entry.log.events))):
-            tried.append((_fit(photos, pairing, entry), _same_number(vehicle, entry.log), pairing, entry))
-    if not tried:
-        _use_timeline(photos, near, vehicle, findings)
+            pairings[id(entry)] = pairing
+            matches.append(
+                LogMatch(
+                    entry=entry,
+                    offset_s=pairing.offset_s or 0.0,
+                    how="by their camera events",
+                    rank=0,
+                    misfit=_misfit(photos, pairing, entry),
+                    margin=config.log_same_fit,
+                )
+            )
+    if not matches:
+        add_track(photos, near, vehicle, findings)
         return
-    tried.sort(key=lambda row: -(row[0] + config.log_name_bonus * row[1]))
-    fit, named, pairing, entry = tried[0]
-    if pairing.doubtful:
+    best = best_log(matches, f"the photos of {vehicle}", lambda log: is_named_like(vehicle, log.path.name, log.vehicle))
+    if isinstance(best, Finding):
+        findings.append(replace(best, vehicle=vehicle))
+        return
+    entry, pairing = best.entry, pairings[id(best.entry)]
+    if pairing.doubtful and not pairing.jumps:
         motion = picture_motion(photos, entry.log, entry.timeline, workers)
         pairing = _pair(photos, entry.log.events, motion) if motion is not None else pairing
     _use_events(photos, pairing, entry, vehicle, findings)
-    rivals = [other for rival, _, _, other in tried[1:] if rival > fit - config.log_name_bonus and not other.used]
-    if rivals and not named:
-        text = (
-            f"the photos fit {rivals[0].log.path.name} as well as {entry.log.path.name}, which is used; name only the "
-            "log of these photos"
-        )
-        findings.append(Finding("log-ambiguous", text, vehicle))
 
 
-def _fit(photos: Sequence[PhotoTags], pairing: Pairing, entry: LogSource) -> float:
-    """How well a log fits photos: 1 if each has its event, less for leftovers, residuals and repeated use."""
-    share = len(pairing.pairs) / max(len(photos), len(entry.log.events))
-    return share - 0.5 * (pairing.how != "time") - 0.6 * entry.used - 0.01 * math.log1p(pairing.residual_s)
+def _misfit(photos: Sequence[PhotoTags], pairing: Pairing, entry: LogSource) -> float:
+    """How badly a log fits photos: 0 if each has its event where it lies; leftovers, residuals and repeated use add."""
+    events = entry.log.events
+    share = len(pairing.pairs) / max(len(photos), len(events))
+    apart = [_photo_apart_m(photos[i], events[j].sample) for i, j in pairing.pairs if photos[i].lat_deg is not None]
+    away = float(np.median(apart)) / active().ingest.event_far_m if apart else 0.0
+    clock = 0.5 * (pairing.how != "time") + 0.01 * math.log1p(pairing.residual_s)
+    return 1.0 - share + clock + 0.6 * entry.used + away
 
 
-def _same_number(vehicle: str, log: FlightLog) -> bool:
-    """Whether vehicle and log are named by the same number (logs of a swarm are similar and can be confused)."""
-    number = number_of(vehicle)
-    return number is not None and number in (number_of(log.path.name), number_of(log.vehicle))
+def _photo_apart_m(photo: PhotoTags, pose: Sample) -> float:
+    return _apart_m(Sample(lat_deg=photo.lat_deg, lon_deg=photo.lon_deg), pose)
 
 
 def _is_complete(photo: PhotoTags) -> bool:
@@ -235,11 +228,9 @@ def _use_events(
         if not log.has_gimbal:
             pose = fixed_camera(pose)
         photo = photos[i]
-        if (
-            photo.lat_deg is not None
-            and _apart_m(Sample(lat_deg=photo.lat_deg, lon_deg=photo.lon_deg), pose) > config.event_far_m
-        ):
+        if _photo_apart_m(photo, pose) > config.event_far_m:
             far += 1
+            continue
         origin = f"{event.kind} ({entry.name})"
         if i in pairing.doubtful:
             spread = max((_apart_m(pose, log.events[k].sample) for k in pairing.doubtful[i]), default=0.0)
@@ -248,10 +239,10 @@ def _use_events(
             photo.ambiguous = True
         fill(photo, replace(pose, time_s=event.time_s), origin, gimbal=log.has_gimbal)
     findings += [replace(f, vehicle=vehicle) for f in _pairing_findings(photos, pairing, log)]
-    if far > 0.2 * len(pairing.pairs):
+    if far:
         text = (
-            f"{plural(far, 'photo')} lie more than {config.event_far_m:.0f} m from their camera events; the log may be "
-            "that of another flight"
+            f"{plural(far, 'photo')} lie more than {config.event_far_m:.0f} m from their camera events of "
+            f"{log.path.name} and get nothing from them; the log may be that of another flight"
         )
         findings.append(Finding("pairing-distance", text, vehicle))
 
@@ -261,12 +252,18 @@ def _pairing_findings(photos: Sequence[PhotoTags], pairing: Pairing, log: Flight
     how = {"time": "by time", "number": "by their numbers", "order": "by order alone"}[pairing.how]
     count = f"{len(pairing.pairs)} of {plural(len(photos), 'photo')}"
     text = f"{count} were paired with camera events of {log.path.name} {how}"
-    if pairing.offset_s is not None:
+    if pairing.offset_s is not None and not pairing.jumps:
         offset_s = round(pairing.offset_s, 1) + 0.0  # no "-0.0"
         text += f"; the camera's clock is {offset_s:+.1f} s off (median residual {pairing.residual_s:.2f} s)"
     if pairing.by_pictures:
         text += "; where the times leave several events, the pictures' motion decided"
     found = [Finding("paired", text, note=True)]
+    for first, jump_s in pairing.jumps:
+        text = (
+            f"the camera's clock was set by {jump_s:+.1f} s before {photos[first].path.name}; the photos before and "
+            f"after it are paired with {log.path.name} each by their own clock"
+        )
+        found.append(Finding("clock-set", text))
     if len(used_events) < len(log.events):
         first = next((j for j in range(len(log.events)) if j in used_events), 0)
         missing = len(log.events) - len(used_events)
@@ -289,65 +286,3 @@ def _pairing_findings(photos: Sequence[PhotoTags], pairing: Pairing, log: Flight
         text = f"{log.path.name} reports no gimbal: the camera counts as fixed under the airframe"
         found.append(Finding("fixed-camera", text, note=True))
     return found
-
-
-def fill(photo: PhotoTags, pose: Sample, origin: str, *, gimbal: bool) -> None:
-    """Fill a photo's missing fields from a pose; its time replaces the camera's clock."""
-    if photo.lat_deg is None and pose.has_position:
-        photo.lat_deg, photo.lon_deg = pose.lat_deg, pose.lon_deg
-        photo.position_sigma_m = pose.sigma_m
-        photo.origin["position"] = origin
-    if photo.height_m is None and pose.height_m is not None:
-        photo.height_m, photo.height_is_ground = pose.height_m, pose.height_is_ground
-        photo.origin["height"] = origin
-    if photo.altitude_m is None:
-        photo.altitude_m = pose.altitude_m
-    if photo.camera_deg[0] is None and pose.yaw_deg is not None:
-        photo.camera_deg = (pose.yaw_deg, pose.pitch_deg, pose.roll_deg)
-        photo.yaw_is_stated = True
-        photo.origin["angles"] = origin if gimbal else f"{origin}, camera fixed under the airframe"
-    if photo.flight_deg[0] is None and pose.flight_yaw_deg is not None:
-        photo.flight_deg = (pose.flight_yaw_deg, pose.flight_pitch_deg, pose.flight_roll_deg)
-        photo.origin["flight_yaw"] = origin
-    if pose.time_s is not None:
-        photo.time_s, photo.origin["time"] = pose.time_s, origin
-
-
-def _use_timeline(
-    photos: Sequence[PhotoTags], near: Sequence[LogSource], vehicle: str, findings: list[Finding]
-) -> None:
-    """Without camera events: poses at the photos' times, the clock corrected by positions or whole quarter hours."""
-    from telemetry.ingest.pairing.clock_offset import offset_by_positions, offset_by_zone
-
-    timed = [p for p in photos if p.time_s is not None]
-    if not timed:
-        return
-    times = np.array([p.time_s for p in timed], dtype=np.float64)
-    for entry in near:
-        placed = [p.lat_deg is not None for p in timed]
-        offset: float | None
-        if sum(placed) > 4:
-            known = [p for p in timed if p.lat_deg is not None]
-            offset = offset_by_positions(
-                np.array([p.time_s for p in known], dtype=np.float64),
-                np.array([[p.lat_deg, p.lon_deg] for p in known], dtype=np.float64),
-                entry.timeline,
-            )
-        else:
-            offset = offset_by_zone(times, entry.timeline)
-        if offset is None:
-            continue
-        count = 0
-        for photo, pose in zip(timed, entry.timeline.at_all(times - offset), strict=True):
-            if pose.has_position:
-                count += 1
-                pose = pose if entry.log.has_gimbal else fixed_camera(pose)
-                fill(photo, pose, f"track of {entry.name}", gimbal=entry.log.has_gimbal)
-        if count:
-            entry.used = True
-            text = (
-                f"{plural(count, 'photo')} got poses from the track of {entry.log.path.name} by time; the camera's "
-                f"clock is {offset:+.1f} s off"
-            )
-            findings.append(Finding("posed-by-time", text, vehicle, note=sum(placed) > 4))
-            return

@@ -1,6 +1,7 @@
 """The order of exposure of photos, even if the camera's clock was set in between."""
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -49,6 +50,20 @@ def in_order(photos: Sequence[PhotoTags], vehicle: str, findings: list[Finding])
     )
     findings.append(Finding("clock-jump", text, vehicle))
     return by_name
+
+
+def clock_went_back(photos: Sequence[PhotoTags]) -> bool:
+    """Whether the clock was set back between photos: runs of names, in order within, of which two share some time.
+
+    Runs one after the other are no sign of it: numbers begin anew after the last one.
+    """
+    ordered = sorted(photos, key=lambda p: natural_key(p.path.name))
+    times = np.array([p.time_s for p in ordered if p.time_s is not None], dtype=np.float64)
+    back = np.flatnonzero(np.diff(times) < -active().ingest.time_resolution_s) + 1
+    if not 0 < len(back) <= 3:  # more: names that are not in the order of exposure
+        return False
+    spans = sorted((run.min(), run.max()) for run in np.split(times, back))
+    return any(later[0] < earlier[1] for earlier, later in pairwise(spans))
 
 
 def _length_m(photos: Sequence[PhotoTags]) -> float:

@@ -11,7 +11,7 @@ from orthoswarm.model.task_runner import Progress
 from orthoswarm.stores.local_copies import local_file
 from telemetry.formats.video import srt
 from telemetry.ingest.discovery import Discovery, Folder
-from telemetry.ingest.log_ingest import LogSource
+from telemetry.ingest.log_choice import LogSource
 from telemetry.ingest.survey import LoadOptions, SourceInfo, Survey
 from telemetry.ingest.video_log_match import add_log
 from telemetry.photos.photo_frames import frames_of

@@ -1,14 +1,12 @@
 """Aligns a flight log with a video that has no poses of its own."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.config import active
-from telemetry.ingest.can_positions import apart_m
-from telemetry.ingest.log_ingest import LogSource
+from telemetry.ingest.log_choice import LogMatch, LogSource, best_log
 from telemetry.ingest.pairing.clock_offset import (
     median_distance_m,
     offset_by_positions,
@@ -24,23 +22,6 @@ Array = NDArray[np.float64]
 _BY_CREATION = "by the container's creation time"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Match:
-    """A log that fits a video.
-
-    Attributes:
-        entry: the log. offset_s: video time minus UTC. how: what the clock was found by.
-        rank: 0 for the strongest evidence. misfit: in it, smaller is better; differences up to `margin` decide nothing.
-    """
-
-    entry: LogSource
-    offset_s: float
-    how: str
-    rank: int
-    misfit: float
-    margin: float = 0.0
-
-
 def add_log(poses: Poses, found: VideoScan, logs: Sequence[LogSource]) -> list[Finding]:
     """Assign a video's pictures the poses of the log that fits it best.
 
@@ -53,19 +34,9 @@ def add_log(poses: Poses, found: VideoScan, logs: Sequence[LogSource]) -> list[F
     if not matches:
         what = "fits its positions" if poses.has_positions else "fits how its pictures turn, or its creation time"
         return [Finding("log-unused", f"no log beside {name} could be aligned with it: none {what}")]
-    best = min(matches, key=lambda match: (match.rank, match.misfit))
-    rivals = [m for m in matches if m.rank == best.rank and m.misfit <= best.misfit + best.margin]
-    rivals = [m for m in rivals if m is best or not _same_flight(m.entry, best.entry)]
-    if len(rivals) > 1:
-        named = [m for m in rivals if m.entry.log.path.stem.lower() == found.path.stem.lower()]
-        if len(named) != 1:
-            text = (
-                f"{rivals[0].entry.log.path.name} and {rivals[1].entry.log.path.name} fit {name} equally well "
-                f"({best.how}), so none is used: put each log into the folder of its vehicle's videos, or name it "
-                "like its video"
-            )
-            return [Finding("log-ambiguous", text)]
-        best = named[0]
+    best = best_log(matches, name, lambda log: log.path.stem.lower() == found.path.stem.lower())
+    if isinstance(best, Finding):
+        return [best]
     log = best.entry.log
     count = poses.add_track(f"track of {log.path.name}", best.entry.timeline, best.offset_s, has_gimbal=log.has_gimbal)
     if not count:
@@ -75,13 +46,7 @@ def add_log(poses: Poses, found: VideoScan, logs: Sequence[LogSource]) -> list[F
     return [Finding("posed-by-log", text, note=best.how != _BY_CREATION)]
 
 
-def _same_flight(a: LogSource, b: LogSource) -> bool:
-    """Whether two logs, of autopilot and ground station perhaps, record one vehicle's flight."""
-    distance = apart_m(a.log, b.log)
-    return distance is not None and distance <= active().ingest.bus_same_vehicle_m
-
-
-def _matches(poses: Poses, found: VideoScan, logs: Sequence[LogSource]) -> list[_Match]:
+def _matches(poses: Poses, found: VideoScan, logs: Sequence[LogSource]) -> list[LogMatch]:
     if poses.has_positions:
         times, places = poses.track()
         clocks = {clock for clock in (found.created_s, poses.clock_s) if clock is not None}
@@ -96,27 +61,29 @@ def _matches(poses: Poses, found: VideoScan, logs: Sequence[LogSource]) -> list[
         turning = offset_by_turning(times, rates, entry.timeline, search_s=_longest(entry))
         if turning is not None:
             how = f"by how its pictures turn (correlation {turning[1]:.2f})"
-            matches.append(_Match(entry=entry, offset_s=turning[0], how=how, rank=0, misfit=-turning[1], margin=margin))
+            matches.append(
+                LogMatch(entry=entry, offset_s=turning[0], how=how, rank=0, misfit=-turning[1], margin=margin)
+            )
         elif found.created_s is not None:
             length = len(found.pictures) / (found.rate or 30.0)
             zone = offset_by_zone(np.array([found.created_s, found.created_s + length]), entry.timeline)
             if zone is not None:
                 matches.append(
-                    _Match(entry=entry, offset_s=zone - found.created_s, how=_BY_CREATION, rank=1, misfit=abs(zone))
+                    LogMatch(entry=entry, offset_s=zone - found.created_s, how=_BY_CREATION, rank=1, misfit=abs(zone))
                 )
     return matches
 
 
-def _by_positions(times: Array, places: Array, clocks: set[float], entry: LogSource) -> _Match | None:
+def _by_positions(times: Array, places: Array, clocks: set[float], entry: LogSource) -> LogMatch | None:
     """The match under the clock (UTC of video time zero, in any zone) that brings the positions nearest to the log."""
-    best: _Match | None = None
+    best: LogMatch | None = None
     for clock in clocks:
         offset = offset_by_positions(times + clock, places, entry.timeline, search_s=60.0)
         if offset is None:
             continue
         apart = median_distance_m(times + clock - offset, places, entry.timeline)
         if apart is not None and (best is None or apart < best.misfit):
-            best = _Match(entry=entry, offset_s=offset - clock, how="by its own positions", rank=0, misfit=apart)
+            best = LogMatch(entry=entry, offset_s=offset - clock, how="by its own positions", rank=0, misfit=apart)
     return best
 
 

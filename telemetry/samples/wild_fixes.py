@@ -100,7 +100,9 @@ def without_wild_fixes(
         source: name of the file, for the message.
     """
     placed = [i for i, sample in enumerate(samples) if sample.has_position]
-    found = wild_fixes([times_s[i] for i in placed], [(samples[i].lat_deg or 0.0, samples[i].lon_deg or 0.0) for i in placed])
+    found = wild_fixes(
+        [times_s[i] for i in placed], [(samples[i].lat_deg or 0.0, samples[i].lon_deg or 0.0) for i in placed]
+    )
     if not found.indices:
         return list(samples), []
     wild = {placed[i] for i in found.indices}

@@ -26,7 +26,7 @@ _MOST_BOXES = 1000
 _RAW_FORMATS = frozenset({"h264", "hevc"})
 """FFmpeg's names of streams without a container, which give no times to their pictures."""
 _MOST_BEFORE_FIRST = 100
-"""Packets within which a picture is decoded, unless the file is damaged (decoders hold back up to 16, and a thread each)."""
+"""Packets within which a picture is decoded, unless the file is damaged (decoders hold back up to 16)."""
 
 
 class NotAVideo(Unreadable):
@@ -212,7 +212,7 @@ def scan(path: Path) -> VideoScan:
 
 
 def _rate(container: Any, stream: Any) -> float | None:
-    """Pictures a second; of a raw stream those that its sequence parameters state, as FFmpeg assumes 25 if they don't."""
+    """Pictures a second; of a raw stream what its sequence parameters state, without which FFmpeg assumes 25."""
     stated = stream.codec_context.framerate if container.format.name in _RAW_FORMATS else stream.average_rate
     return float(stated) if stated else None
 

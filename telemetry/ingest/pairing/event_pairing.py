@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.config import active
+from telemetry.ingest.pairing.clock_jumps import parts_between_jumps
 from telemetry.ingest.pairing.motion_chains import PictureMotion
 from telemetry.ingest.pairing.sequence_match import match_sequences
 
@@ -23,12 +24,13 @@ class Pairing:
     """Which photo belongs to which event.
 
     Attributes:
-        pairs: (photo, event) indices, both increasing.
+        pairs: (photo, event) indices, photos increasing.
         doubtful: photos whose pairing the times leave open -> possible events.
         offset_s: photo clock minus event clock, None if times were not used.
         residual_s: median distance of paired times after offset and drift.
         ambiguous: True if less than half of the pairs are decided. how: "time", "number" or "order".
         by_pictures: whether the pictures' motion was used, too.
+        jumps: for each time that the camera's clock was set, the first photo after it and by how many seconds.
     """
 
     pairs: list[tuple[int, int]] = field(default_factory=list)
@@ -38,6 +40,7 @@ class Pairing:
     ambiguous: bool = False
     how: str = "time"
     by_pictures: bool = False
+    jumps: list[tuple[int, float]] = field(default_factory=list)
 
 
 def pair(
@@ -68,10 +71,14 @@ def pair(
             if motion is not None:
                 motion = motion.subset(timed, dated)
             by_times = by_time(photos, events, motion)
+            if len(by_times.pairs) < len(photos):
+                numbers = [photo_numbers[i] for i in timed] if len(photo_numbers) else []
+                by_times = _by_parts(photos, events, numbers) or by_times
             by_times.pairs = [(timed[i], dated[j]) for i, j in by_times.pairs]
+            by_times.jumps = [(timed[i], jump_s) for i, jump_s in by_times.jumps]
             by_times.doubtful = {timed[i]: [dated[j] for j in at] for i, at in by_times.doubtful.items()}
             share = len(by_times.pairs) / min(len(photos), len(events))
-            if share >= 0.5 or (by_times.pairs and not by_times.ambiguous):
+            if by_times.jumps or share >= 0.5 or (by_times.pairs and not by_times.ambiguous):
                 return by_times
     other = _by_number(photo_numbers, event_numbers)
     if other is None:
@@ -123,6 +130,49 @@ def by_time(photos: Array, events: Array, motion: PictureMotion | None = None) -
         result.residual_s = float(np.median(np.abs(apart)))
     result.pairs.sort()
     return result
+
+
+def _by_parts(photos: Array, events: Array, numbers: Sequence[int | None]) -> Pairing | None:
+    """Pair by times where the camera's clock was set during the flight; None if it was not.
+
+    Args:
+        photos: (N,) by the camera's clock. events: (M,) by the vehicle's.
+        numbers: of the photos' names, in order of exposure; none if the photos are.
+    """
+    order = np.arange(len(photos))
+    known = [number for number in numbers if number is not None]
+    if len(known) == len(photos):
+        order = np.argsort(np.array(known), kind="stable")
+    by_event = np.argsort(events, kind="stable")
+    parts = parts_between_jumps(photos[order], events[by_event], _certain_offsets)
+    if len(parts) < 2:
+        return None
+    result, clocks, free = Pairing(offset_s=None), list[float](), 0
+    for part in parts:
+        own, theirs = order[part], by_event[free:]
+        found = by_time(photos[own], events[theirs]) if len(own) and len(theirs) else Pairing()
+        if found.offset_s is None or found.ambiguous:
+            continue
+        pairs = [(int(own[i]), int(theirs[j])) for i, j in found.pairs]
+        result.doubtful |= {int(own[i]): [int(theirs[j]) for j in at] for i, at in found.doubtful.items()}
+        result.pairs += pairs
+        clocks.append(float(np.median([photos[i] - events[j] for i, j in pairs])))
+        if len(clocks) > 1:
+            result.jumps.append((int(own[0]), clocks[-1] - clocks[-2]))
+        result.residual_s = max(result.residual_s, found.residual_s)
+        result.offset_s = found.offset_s
+        free += 1 + max(j for _, j in found.pairs)
+    result.pairs.sort()
+    return result if result.jumps else None
+
+
+def _certain_offsets(photos: Array, events: Array) -> Array | None:
+    """The offsets of the pairs of a part of a flight, if its times leave no doubt."""
+    found = by_time(photos, events) if np.ptp(photos) > 0.0 else Pairing()
+    sure = [(i, j) for i, j in found.pairs if i not in found.doubtful]
+    if len(sure) < max(active().pairing.jump_least_photos - 1, 0.5 * len(photos)):
+        return None
+    return np.array([photos[i] - events[j] for i, j in sure])
 
 
 def _by_number(photos: Sequence[int | None], events: Sequence[int | None]) -> Pairing | None:

@@ -44,7 +44,9 @@ def test_pictures_are_turned_as_players_show_them(card, mapped, clockwise_deg, m
     for frame in frames:
         assert (frame.width, frame.height) == (128, 96)
         assert np.abs(read_gray(frame.path).astype(float) - UPRIGHT).mean() < 6.0
-        assert math.degrees(frame.fix.yaw_rad) == pytest.approx(30.0)  # the gimbal's: of the picture that it holds level
+        assert math.degrees(frame.fix.yaw_rad) == pytest.approx(
+            30.0
+        )  # the gimbal's: of the picture that it holds level
     (source,) = survey([card], options=LoadOptions(decode=False)).sources
     assert ("pictures-turned" in {f.code for f in source.findings}) == (clockwise_deg != 0 or mirrored)
 

@@ -57,7 +57,9 @@ def write_video(
         for number in range(count):
             for stream in streams:
                 plain = np.full((stream.height, stream.width), 16 + number % 200, np.uint8)
-                frame = av.VideoFrame.from_ndarray(plain if shows is None else shows, format="gray").reformat(format="yuv420p")
+                frame = av.VideoFrame.from_ndarray(plain if shows is None else shows, format="gray").reformat(
+                    format="yuv420p"
+                )
                 frame.pts = number
                 container.mux(stream.encode(frame))
             if data is not None and klv is not None and number % klv_every == 0:

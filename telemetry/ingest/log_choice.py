@@ -1,0 +1,81 @@
+"""Which of several logs belongs to some pictures: the one that fits best, and none if several fit equally well."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from orthoswarm.config import active
+from telemetry.formats.log.flight_logs import FlightLog
+from telemetry.ingest.can_positions import apart_m
+from telemetry.ingest.survey import SourceInfo
+from telemetry.samples.findings import Finding
+from telemetry.samples.timeline import Timeline
+
+
+@dataclass(slots=True, kw_only=True)
+class LogSource:
+    """A log, the folder that it applies to, whether it was used, and what in it comes from a CAN log."""
+
+    folder: Path
+    log: FlightLog
+    source: SourceInfo
+    timeline: Timeline
+    used: bool = False
+    better: str = ""
+
+    @property
+    def name(self) -> str:
+        """The file's name, and which values come from a CAN bus."""
+        return f"{self.log.path.name}, with {self.better}" if self.better else self.log.path.name
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LogMatch:
+    """A log that fits some pictures.
+
+    Attributes:
+        entry: the log. offset_s: the pictures' clock minus UTC. how: what it fits by, for messages.
+        rank: 0 for the strongest evidence. misfit: in it, smaller is better; differences up to `margin` decide nothing.
+        by_positions: whether the misfit is a distance, metres.
+    """
+
+    entry: LogSource
+    offset_s: float
+    how: str
+    rank: int
+    misfit: float
+    margin: float = 0.0
+    by_positions: bool = False
+
+
+def best_log(matches: Sequence[LogMatch], what: str, is_named: Callable[[FlightLog], bool]) -> LogMatch | Finding:
+    """The match that fits best; where logs of several vehicles fit equally well, only one that is named like the input.
+
+    The vehicles of a swarm fly at the same time, so that a guess would put pictures elsewhere without a sign of it.
+
+    Args:
+        matches: at least one. what: the pictures, for messages ("a.mp4").
+        is_named: whether the name of a log says that it belongs to the pictures.
+
+    Returns:
+        The match, or a finding that says why there is none.
+    """
+    best = min(matches, key=lambda match: (match.rank, match.misfit))
+    rivals = [m for m in matches if m.rank == best.rank and m.misfit <= best.misfit + best.margin]
+    rivals = [m for m in rivals if m is best or not _same_flight(m.entry, best.entry)]
+    if len(rivals) < 2:
+        return best
+    named = [m for m in rivals if is_named(m.entry.log)]
+    if len(named) == 1:
+        return named[0]
+    text = (
+        f"{rivals[0].entry.log.path.name} and {rivals[1].entry.log.path.name} fit {what} equally well ({best.how}), "
+        f"so none is used: put each log into the folder of its vehicle's pictures, or name it like them"
+    )
+    return Finding("log-ambiguous", text)
+
+
+def _same_flight(a: LogSource, b: LogSource) -> bool:
+    """Whether two logs, of autopilot and ground station perhaps, record one vehicle's flight."""
+    distance = apart_m(a.log, b.log)
+    return distance is not None and distance <= active().ingest.bus_same_vehicle_m

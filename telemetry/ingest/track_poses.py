@@ -1,0 +1,160 @@
+"""Poses of photos from a log's track, at the photos' times: for logs without camera events."""
+
+from collections.abc import Sequence
+from pathlib import PurePath
+
+import numpy as np
+
+from orthoswarm.config import active
+from orthoswarm.model.earth import distance_m
+from telemetry.formats.log.mavlink_poses import fixed_camera
+from telemetry.ingest.log_choice import LogMatch, LogSource, best_log
+from telemetry.ingest.pairing.clock_offset import median_distance_m, offset_by_positions, offset_by_zone
+from telemetry.ingest.photo_order import clock_went_back
+from telemetry.photos.flight_checks import number_of
+from telemetry.photos.photo_tags import PhotoTags
+from telemetry.samples.findings import Finding, plural
+from telemetry.samples.sample import Sample
+from telemetry.samples.times import YEAR_2000_S
+
+_LEAST_PLACED = 5
+"""Photos with positions that it takes to find the camera's clock by them."""
+
+
+def is_named_like(vehicle: str, log_name: str, log_vehicle: str) -> bool:
+    """Whether vehicle and log have one name or number (logs of a swarm are similar and can be confused)."""
+    if PurePath(log_name).stem.lower() == PurePath(vehicle).name.lower():
+        return True
+    number = number_of(vehicle)
+    return number is not None and number in (number_of(log_name), number_of(log_vehicle))
+
+
+def add_track(photos: Sequence[PhotoTags], near: Sequence[LogSource], vehicle: str, findings: list[Finding]) -> None:
+    """Fill what photos lack from the track that fits them best, the camera's clock found by positions or its zone.
+
+    Photos whose own positions contradict the track at their times (the clock was set in between, or another flight
+    began) are matched by themselves, and get nothing where that is not possible.
+    """
+    timed = [p for p in photos if p.time_s is not None and p.time_s >= YEAR_2000_S]
+    early = sum(p.time_s is not None for p in photos) - len(timed)
+    if early:
+        text = f"{plural(early, 'photo')} were taken before the camera's clock was set; their times place them nowhere"
+        findings.append(Finding("clock-unset", text, vehicle))
+    while timed:
+        placed = [p for p in timed if p.lat_deg is not None]
+        by_positions = len(placed) >= _LEAST_PLACED
+        if not by_positions and clock_went_back(timed):
+            text = (
+                "the camera's clock was set back during the flight, so that times do not tell where its photos were "
+                "taken; give their positions (geo.txt) or a log with camera events"
+            )
+            findings.append(Finding("clock-jump", text, vehicle))
+            return
+        matches = _by_positions(placed, near) if by_positions else _by_zone(timed, near)
+        if not matches:
+            for part in _at_longest_pause(timed) if by_positions else ():
+                if sum(p.lat_deg is not None for p in part) >= _LEAST_PLACED:
+                    add_track(part, near, vehicle, findings)
+            return
+        best = best_log(
+            matches, f"the photos of {vehicle}", lambda log: is_named_like(vehicle, log.path.name, log.vehicle)
+        )
+        if isinstance(best, Finding):
+            findings.append(Finding(best.code, best.message, vehicle))
+            return
+        count, far = _fill_from(best, timed)
+        if count:
+            best.entry.used = True
+            text = (
+                f"{plural(count, 'photo')} got poses from the track of {best.entry.log.path.name} by time; the "
+                f"camera's clock is {best.offset_s:+.1f} s off"
+            )
+            findings.append(Finding("posed-by-time", text, vehicle, note=by_positions))
+        if far:
+            text = (
+                f"{plural(len(far), 'photo')} lie more than {_far_m(best):.0f} m from the track of "
+                f"{best.entry.log.path.name} at their times ({far[0].path.name} first) and get nothing from it there: "
+                "the camera's clock was set during the flight, or they are of another one"
+            )
+            findings.append(Finding("track-far", text, vehicle))
+        timed = far if count and len(far) >= _LEAST_PLACED else []
+
+
+def _at_longest_pause(photos: Sequence[PhotoTags]) -> list[Sequence[PhotoTags]]:
+    """Photos in order of time before and after their longest pause: two flights perhaps; none without a pause."""
+    steps = np.diff([p.time_s or 0.0 for p in photos])
+    longest = int(np.argmax(steps))
+    if steps[longest] <= active().ingest.clock_jump_s:
+        return []
+    return [photos[: longest + 1], photos[longest + 1 :]]
+
+
+def _by_positions(photos: Sequence[PhotoTags], near: Sequence[LogSource]) -> list[LogMatch]:
+    times = np.array([p.time_s for p in photos], dtype=np.float64)
+    places = np.array([[p.lat_deg, p.lon_deg] for p in photos], dtype=np.float64)
+    matches = []
+    for entry in near:
+        offset = offset_by_positions(times, places, entry.timeline)
+        apart = None if offset is None else median_distance_m(times - offset, places, entry.timeline)
+        if offset is not None and apart is not None:
+            how = "by their own positions"
+            matches.append(LogMatch(entry=entry, offset_s=offset, how=how, rank=0, misfit=apart, by_positions=True))
+    return matches
+
+
+def _by_zone(photos: Sequence[PhotoTags], near: Sequence[LogSource]) -> list[LogMatch]:
+    times = np.array([p.time_s for p in photos], dtype=np.float64)
+    zones = [(entry, offset_by_zone(times, entry.timeline)) for entry in near]
+    return [
+        LogMatch(entry=entry, offset_s=zone, how="by the time of the flight", rank=0, misfit=abs(zone))
+        for entry, zone in zones
+        if zone is not None and any(sample.has_position for sample in entry.log.samples)
+    ]
+
+
+def _far_m(match: LogMatch) -> float:
+    """Distance from the track from which on a photo's own position contradicts it, metres."""
+    config = active().ingest
+    usual_m = match.misfit if match.by_positions else config.event_far_m
+    return min(config.event_far_m, max(config.track_far_m, config.track_far_times * usual_m))
+
+
+def _fill_from(match: LogMatch, photos: Sequence[PhotoTags]) -> tuple[int, list[PhotoTags]]:
+    """Fill photos from a log's track: how many got a pose, and those whose own positions contradict it."""
+    log, far, count = match.entry.log, list[PhotoTags](), 0
+    limit_m = _far_m(match)
+    times = np.array([p.time_s for p in photos], dtype=np.float64)
+    for photo, pose in zip(photos, match.entry.timeline.at_all(times - match.offset_s), strict=True):
+        if pose.lat_deg is None or pose.lon_deg is None:
+            continue
+        if photo.lat_deg is not None and photo.lon_deg is not None:
+            apart = distance_m(photo.lat_deg, photo.lon_deg, pose.lat_deg, pose.lon_deg)
+            if apart > limit_m:
+                far.append(photo)
+                continue
+        count += 1
+        pose = pose if log.has_gimbal else fixed_camera(pose)
+        fill(photo, pose, f"track of {match.entry.name}", gimbal=log.has_gimbal)
+    return count, far
+
+
+def fill(photo: PhotoTags, pose: Sample, origin: str, *, gimbal: bool) -> None:
+    """Fill a photo's missing fields from a pose; its time replaces the camera's clock."""
+    if photo.lat_deg is None and pose.has_position:
+        photo.lat_deg, photo.lon_deg = pose.lat_deg, pose.lon_deg
+        photo.position_sigma_m = pose.sigma_m
+        photo.origin["position"] = origin
+    if photo.height_m is None and pose.height_m is not None:
+        photo.height_m, photo.height_is_ground = pose.height_m, pose.height_is_ground
+        photo.origin["height"] = origin
+    if photo.altitude_m is None:
+        photo.altitude_m = pose.altitude_m
+    if photo.camera_deg[0] is None and pose.yaw_deg is not None:
+        photo.camera_deg = (pose.yaw_deg, pose.pitch_deg, pose.roll_deg)
+        photo.yaw_is_stated = True
+        photo.origin["angles"] = origin if gimbal else f"{origin}, camera fixed under the airframe"
+    if photo.flight_deg[0] is None and pose.flight_yaw_deg is not None:
+        photo.flight_deg = (pose.flight_yaw_deg, pose.flight_pitch_deg, pose.flight_roll_deg)
+        photo.origin["flight_yaw"] = origin
+    if pose.time_s is not None:
+        photo.time_s, photo.origin["time"] = pose.time_s, origin

@@ -1,0 +1,125 @@
+"""Photos beside several logs, and cameras whose clock is set during the flight: never a wrong place without a sign."""
+
+from datetime import UTC, datetime
+
+import numpy as np
+import pytest
+
+from telemetry.ingest.ingest import load
+from telemetry.ingest.pairing.event_pairing import pair
+from tests.telemetry.formats.test_exposure_lists import UTC_S, solution
+from tests.telemetry.ingest.test_photos import gps_exif, jpeg
+
+METRE = 1.0 / 111_194.93
+TAKEN_S = np.cumsum([5.0, *[1.0, 1.7, 2.2] * 8])
+"""Seconds of a flight at which a photo was taken."""
+
+
+def place(t, metres_east=0.0):
+    """Where a vehicle is after so many seconds: to the north, then back beside its way, with 8 m/s."""
+    north = 8.0 * (t if t < 30.0 else 60.0 - t)
+    return 47.5 + north * METRE, 8.25 + (metres_east + (20.0 if t >= 30.0 else 0.0)) * METRE / np.cos(np.radians(47.5))
+
+
+def track(path, *, metres_east=0.0, later_s=0.0):
+    """A receiver's track, five positions a second."""
+    moments = np.arange(0.0, 60.0, 0.2)
+    rows = [(UTC_S + later_s + t, "{:.8f} {:.8f} 500.0".format(*place(t, metres_east))) for t in moments]
+    return solution(path, rows)
+
+
+def photos(folder, clock_s, *, metres_east=None):
+    """Photos by a camera whose clock shows `clock_s(i, utc)`; without positions unless `metres_east` says whose."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for i, t in enumerate(TAKEN_S):
+        moment = datetime.fromtimestamp(clock_s(i, UTC_S + t), UTC)
+        where = (0.0, 0.0) if metres_east is None else place(t, metres_east)
+        local, fraction = moment.strftime("%Y:%m:%d %H:%M:%S"), f"{moment.microsecond // 1000:03d}"
+        jpeg(folder / f"P_{i:03d}.JPG", exif_bytes=gps_exif(*where, local=local, subsec=fraction))
+
+
+def right(_, utc_s):
+    return utc_s
+
+
+def number(frame):
+    return int(frame.image[-7:-4])
+
+
+@pytest.mark.parametrize("own", ["a.pos", "b.pos"])
+def test_of_two_logs_the_one_along_the_photos_positions_is_taken(tmp_path, own):
+    photos(tmp_path / "card", lambda _, utc_s: utc_s + 4.0, metres_east=200.0)
+    for name in ("a.pos", "b.pos"):
+        track(tmp_path / "card" / name, metres_east=200.0 if name == own else 170.0)
+    frames = load([tmp_path]).frames
+    assert len(frames) == len(TAKEN_S)
+    for frame in frames:
+        assert own in frame.origin["time"]
+        assert frame.time_s - UTC_S == pytest.approx(TAKEN_S[number(frame)], abs=0.2)
+
+
+def test_logs_that_fit_equally_well_are_not_used_unless_one_is_named_like_the_photos(tmp_path):
+    for folder in ("card", "b"):
+        photos(tmp_path / folder, right)
+    track(tmp_path / "a.pos")
+    track(tmp_path / "b.pos", metres_east=200.0)
+    found = load([tmp_path])
+    assert len(found.frames) == len(found.rejected) == len(TAKEN_S)
+    assert all("b.pos" in frame.origin["position"] and frame.vehicle == "b" for frame in found.frames)
+    assert all("equally well" in rejection.reason for rejection in found.rejected)
+
+
+def test_the_log_of_the_photos_time_is_taken_and_not_the_first(tmp_path):
+    photos(tmp_path / "card", right)
+    track(tmp_path / "card" / "a.pos", metres_east=500.0, later_s=-3600.0)
+    track(tmp_path / "card" / "b.pos")
+    for frame in load([tmp_path]).frames:
+        assert "b.pos" in frame.origin["position"]
+
+
+@pytest.mark.parametrize("jump_s", [-15.0, 12.0, 3600.0])
+def test_photos_after_the_clock_was_set_are_found_by_their_positions(tmp_path, jump_s):
+    photos(tmp_path / "card", lambda i, utc_s: utc_s + jump_s * (i >= 14), metres_east=0.0)
+    track(tmp_path / "card" / "a.pos")
+    posed = [frame for frame in load([tmp_path]).frames if "a.pos" in frame.origin["time"]]
+    assert len(posed) >= 20
+    for frame in posed:
+        assert frame.time_s - UTC_S == pytest.approx(TAKEN_S[number(frame)], abs=1.5)
+
+
+def test_a_clock_that_was_set_back_places_no_photo(tmp_path):
+    photos(tmp_path / "card", lambda i, utc_s: utc_s - 4.0 * (i >= 10))
+    track(tmp_path / "card" / "a.pos")
+    found = load([tmp_path])
+    assert not found.frames
+    assert all("set back during the flight" in rejection.reason for rejection in found.rejected)
+
+
+def test_photos_before_the_clock_was_set_are_named_and_the_others_placed(tmp_path):
+    photos(tmp_path / "card", lambda i, utc_s: utc_s if i >= 4 else 315_964_800.0 + 2.0 * i)
+    track(tmp_path / "card" / "a.pos")
+    found = load([tmp_path])
+    assert len(found.frames) == len(TAKEN_S) - 4
+    for frame in found.frames:
+        assert frame.fix.lat_deg == pytest.approx(place(TAKEN_S[number(frame)])[0], abs=1e-6)
+    assert all("4 photos were taken before" in rejection.reason for rejection in found.rejected)
+
+
+@pytest.mark.parametrize(("first_after", "jump_s"), [(20, 3600.0), (30, -7.0), (20, 15.0), (30, None)])
+def test_camera_events_pair_with_photos_before_and_after_the_clock_was_set(first_after, jump_s):
+    rng = np.random.default_rng(3)
+    events = 1.7e9 + np.cumsum(rng.uniform(2.4, 3.9, 60))
+    clock = events + 3.3 + rng.normal(0.0, 0.02, 60)
+    if jump_s is None:  # it began in 1980
+        clock[:first_after] += 315_964_800.0 - clock[0]
+    else:
+        clock[first_after:] += jump_s
+    order = np.argsort(clock, kind="stable")
+    numbers = [] if first_after == 20 else [int(i) + 1 for i in order]
+    found = pair(clock[order].tolist(), events.tolist(), numbers)
+    wrong = [i for i, j in found.pairs if order[i] != j]
+    assert set(wrong) <= set(found.doubtful)
+    assert len(found.pairs) - len(wrong) >= 57
+    ((first, by_s),) = found.jumps
+    assert order[first] == pytest.approx(first_after, abs=1)
+    assert jump_s is None or by_s == pytest.approx(jump_s, abs=0.1)
