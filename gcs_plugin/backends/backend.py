@@ -79,6 +79,19 @@ class Backend(abc.ABC):
                 break
         return sorted(self.vehicles())
 
+    def hear_states(self, systems: Collection[int], wait_s: float) -> None:
+        """Wait until vehicles have reported what a check before a start looks at: what is not known is not wrong.
+
+        Args:
+            systems: the vehicles. wait_s: longest wait, seconds.
+        """
+        end = time.monotonic() + wait_s
+        while not all(self.vehicles()[s].streams.ready_to_check for s in systems):
+            left = end - time.monotonic()
+            if left <= 0.0:
+                return
+            self.pump(min(left, 0.1))
+
     def autopilot(self, system: int) -> Autopilot:
         """The type of a vehicle's autopilot."""
         return self.vehicle(system).autopilot

@@ -199,7 +199,7 @@ class MavsdkBackend(Backend):
                 autopilot=autopilot,
                 modes=modes_of(autopilot, int(system.vehicle_type())),
                 detector=CompletionDetector(autopilot=autopilot),
-                streams=Streams(vehicle=address, own=self._own, rates=_RATES),
+                streams=Streams(vehicle=address, own=self._own, rates=_RATES.of(autopilot)),
                 heard=time.monotonic(),
             )
             craft = _Craft(vehicle, system, MavlinkDirect(system), MissionRaw(system))

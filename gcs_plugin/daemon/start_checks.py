@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 _SOON_S: Final = 5.0
 _READ_S: Final = 20.0
+_CHECK_S: Final = 20.0
 _ASKED, _ANSWER_S = 3, 0.7  # times, and seconds between them
 
 
@@ -93,7 +94,7 @@ class StartChecks:
                 zones=self._fences.zones(),
                 reading=[s for s in systems if self._is_reading(s)],
             )
-        ).result(_READ_S)
+        ).result(_CHECK_S)
         return [check.document(systems[check.system]) for check in checks]
 
     def _ask_heights(self, systems: Collection[int]) -> None:
@@ -125,7 +126,7 @@ class StartChecks:
                 others_of({s: v for s, v in self._fleet.vehicles.items() if s not in systems}, waits)
                 | flights_of({s: self._fleet.vehicles[s] for s in systems}, missions, stored, starts)
             )
-        ).result(_READ_S)
+        ).result(_CHECK_S)
         return separation_of(flights, self._name_of)
 
     def _missions(self, systems: Collection[int], *, reread: bool) -> "dict[int, Mission]":

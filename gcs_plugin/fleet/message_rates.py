@@ -24,6 +24,8 @@ SYS_STATUS: Final = int(dialect.MAVLINK_MSG_ID_SYS_STATUS)
 # Each autopilot's message about its filter.
 _ARDUPILOT_ONLY: Final = int(dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT)
 _PX4_ONLY: Final = int(dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS)
+_CHECKED: Final = (GPS_RAW_INT, SYS_STATUS, _ARDUPILOT_ONLY, _PX4_ONLY)
+"""What a check before a start looks at."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,6 +135,12 @@ class Streams:
         """Seconds since a message came last, None if it never has."""
         stream = self._streams.get(kind)
         return None if stream is None or stream.last is None else max(0.0, now - stream.last)
+
+    @property
+    def ready_to_check(self) -> bool:
+        """True once each message that a check before a start looks at has come, or was refused."""
+        asked = {kind: self._streams[kind] for kind in _CHECKED if kind in self._streams}
+        return all(stream.last is not None or kind in self.refused for kind, stream in asked.items())
 
     def acknowledged(self, message: Message, now: float) -> list[Message]:
         """Process a COMMAND_ACK."""

@@ -34,6 +34,7 @@ _FIX_SHARE: Final = 0.25  # of the time until it can arm, after which it has a p
 _TX_BUFFER: Final = 300.0  # bytes
 _CHECKS_MISSION_S: Final = 1.0  # PX4 looks at a new mission for so long, and does not start it meanwhile
 _WHY_S: Final = 30.0
+_BATTERY_S: Final = 1800.0  # with its motors on; what stands on the ground uses hardly any of it
 _EKF: Final = int(dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT)
 _ESTIMATOR: Final = int(dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS)
 _WPNAV_SPEED_M_S, _PX4_TOP_M_S = 10.0, 12.0  # factory settings; ArduCopter flies faster if it is asked to and can
@@ -59,6 +60,7 @@ class SimVehicle:
         files: what it serves over MAVLink FTP; None for one without.
         on_exposure: called at each picture.
         withheld: ids of messages that it does not send, whatever it is asked for.
+        used_s: for how long its motors have used its battery, seconds.
         parameters: by name; integers are those that the autopilot keeps as such.
     """
 
@@ -80,6 +82,7 @@ class SimVehicle:
     withheld: set[int] = field(default_factory=set, init=False)
     parameters: dict[str, float] = field(init=False)
     reboots: int = field(default=0, init=False)
+    used_s: float = field(default=0.0, init=False)
     _now: float = field(default=0.0, init=False)
     _booted: float = field(default=0.0, init=False)
     _off_until: float = field(default=-1.0, init=False)
@@ -284,6 +287,7 @@ class SimVehicle:
         while self._stepped + STEP_S <= now + 1e-9:
             self._stepped += STEP_S
             self.flight.step(self._stepped - self._booted)
+            self.used_s += STEP_S if self.flight.armed else 0.0
             messages += self._happened()
         messages += self.store.tick(now)
         self._spend(messages, now)
@@ -440,7 +444,7 @@ class SimVehicle:
         )  # fmt: skip
 
     def _power(self) -> Message:
-        left = max(0, 100 - int((self._now - self._booted) / 18.0))
+        left = max(0, 100 - int(100.0 * self.used_s / _BATTERY_S))
         has = int(dialect.MAV_SYS_STATUS_PREARM_CHECK)
         said = 0 if self.autopilot is Autopilot.PX4 else has  # PX4 sets the bit of health only
         health = has if self._ready else 0

@@ -315,7 +315,7 @@ def test_a_bell_that_nobody_hears_does_not_block():
     hub = Hub([], GROUND_STATION, lambda *_: None)
     work = threading.Thread(target=lambda: [hub.post(lambda: None) for _ in range(20_000)], daemon=True)
     work.start()
-    work.join(20.0)
+    work.join(120.0)
     assert not work.is_alive()
     done = []
     hub.post(lambda: done.append(True))
@@ -334,14 +334,14 @@ def test_a_packet_that_waits_for_a_stalled_line_is_thrown_away_once_it_is_late()
         (stream,) = link._streams.values()
         stream.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
         stall = b"s" * 20_000
-        for key, events in selector.select(1.0):
+        for key, events in selector.select(60.0):
             list(link.receive(key.fileobj, events, 0.0))
         while len(stream.pending) <= len(stall):  # nothing more goes out, not even a byte
             assert link.send(stream, stall)
         soon = time.monotonic() + 0.05
         assert link.send(stream, b"RTL!", soon) and link.send(stream, b"later", math.inf)
         time.sleep(0.1)
-        other.settimeout(0.5)
+        other.settimeout(60.0)
         got = b""
         while not got.endswith(b"later"):
             for key, events in selector.select(0.05):

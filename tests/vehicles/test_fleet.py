@@ -349,7 +349,7 @@ def test_a_long_text_whose_end_is_lost_is_said_as_far_as_it_is_known(make_world)
 # --- real sockets ---
 
 
-def wait_for(done, limit_s=60.0):
+def wait_for(done, limit_s=200.0):
     end = time.monotonic() + limit_s
     while not done() and time.monotonic() < end:
         time.sleep(0.01)
@@ -378,12 +378,12 @@ def test_a_swarm_over_udp_is_flown_from_another_thread(tmp_path, together):
                 lambda s: fleet.upload(s, mission(fleet.vehicles[s].autopilot, END, legs=1)),
                 fleet.start,
             ):
-                jobs = [fleet.call(lambda s=s, act=act: act(s)).result(30.0) for s in (1, 2, 3)]
+                jobs = [fleet.call(lambda s=s, act=act: act(s)).result(120.0) for s in (1, 2, 3)]
                 assert wait_for(lambda jobs=jobs: all(job.outcome for job in jobs))
                 assert all(job.outcome.ok for job in jobs), [job.outcome for job in jobs]
-            assert wait_for(lambda: sum(e.kind == "complete" for e in events) == 3, 60.0)
+            assert wait_for(lambda: sum(e.kind == "complete" for e in events) == 3)
             with pytest.raises(OrthoSwarmError, match="not on the links"):
-                fleet.call(lambda: fleet.start(77)).result(30.0)
+                fleet.call(lambda: fleet.start(77)).result(120.0)
         finally:
             stop.set()
             thread.join()
@@ -393,8 +393,8 @@ def test_a_swarm_over_udp_is_flown_from_another_thread(tmp_path, together):
 
 def test_vehicles_that_serve_tcp_are_found():
     with SimSwarm(make_swarm(2, autopilots=(AP, PX4)), "tcpin:127.0.0.1:0") as swarm, Fleet(swarm.addresses) as fleet:
-        assert fleet.run_until(lambda: len(fleet.vehicles) == 2, 60.0)
-        assert fleet.run_until(lambda: all(v.lat_deg for v in fleet.vehicles.values()), 60.0)
+        assert fleet.run_until(lambda: len(fleet.vehicles) == 2, 200.0)
+        assert fleet.run_until(lambda: all(v.lat_deg for v in fleet.vehicles.values()), 200.0)
 
 
 def test_a_simulated_vehicle_can_be_silenced_and_restarted():
@@ -405,13 +405,13 @@ def test_a_simulated_vehicle_can_be_silenced_and_restarted():
     ):
         events = []
         fleet.on_event(events.append)
-        assert fleet.run_until(lambda: bool(fleet.vehicles) and fleet.vehicles[1].time_boot_s > 14.0, 60.0)
+        assert fleet.run_until(lambda: bool(fleet.vehicles) and fleet.vehicles[1].time_boot_s > 14.0, 200.0)
         swarm.reboot(1, 1.0)
-        assert fleet.run_until(lambda: "rebooted" in kinds(events), 60.0)
+        assert fleet.run_until(lambda: "rebooted" in kinds(events), 200.0)
         swarm.silence(1, 5.0)
         received = fleet.vehicles[1].received
         fleet.run_until(lambda: False, 0.2)
-        assert fleet.run_until(lambda: fleet.vehicles[1].received > received + 20, 60.0)
+        assert fleet.run_until(lambda: fleet.vehicles[1].received > received + 20, 200.0)
 
 
 def test_simulated_vehicles_need_a_sensible_address_and_number():

@@ -84,7 +84,7 @@ def test_an_upload_does_not_wait_for_a_fence_that_is_being_read(open_links, fold
         assert not links.fleet.busy(1)
         begun.set()
 
-    links.fleet.call(begin).result(5.0)
+    links.fleet.call(begin).result(60.0)
     assert begun.is_set()
     upload_all(links, folder)  # raises if the vehicle is busy
     assert links.fleet.vehicles[1].mission is not None

@@ -90,7 +90,7 @@ class MavProxy:
         except subprocess.TimeoutExpired:
             self.process.kill()
             self.process.wait(30)
-        self.reader.join(10)
+        self.reader.join(60)
 
 
 # Types what appears in a file, as MAVProxy's own console does with what appears on the keyboard.
@@ -183,14 +183,16 @@ def test_a_daemon_that_the_console_started_ends_with_it(tmp_path, how):
             proxy.close()
 
 
-def ended(url, limit_s=60.0):
+def ended(url, limit_s=120.0):
     """The daemon has ended with the module."""
     end = time.monotonic() + limit_s
     while time.monotonic() < end:
         try:
             httpx.get(f"{url}/healthz", trust_env=False)
-        except httpx.TransportError:
+        except httpx.ConnectError:
             return
+        except httpx.TransportError:  # it is busy, or just closes
+            pass
         time.sleep(0.2)
     raise AssertionError("the daemon still runs")
 
@@ -211,7 +213,7 @@ def test_the_daemons_words_go_to_the_vehicle_that_they_name():
 
     daemon = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     daemon.bind(("127.0.0.1", 0))
-    daemon.settimeout(10.0)
+    daemon.settimeout(60.0)
     masters = [Master(), Master()]
     state = types.SimpleNamespace(
         select_extra={}, vehicle_link_map={0: {(1, 1), (1, 100)}, 1: {(2, 1)}}, mav_master=masters
@@ -226,7 +228,7 @@ def test_the_daemons_words_go_to_the_vehicle_that_they_name():
     for target in (2, 0, 77):
         daemon.sendto(dialect.MAVLink_command_long_message(target, 1, 400, 0, 1, 0, 0, 0, 0, 0, 0).pack(ground), peer)
     ((fd, (read, args)),) = state.select_extra.items()
-    end = time.monotonic() + 10.0
+    end = time.monotonic() + 60.0
     while feed.up < 3 and time.monotonic() < end:
         read(args)
     targets = [[p.message.target_system for p in Framer().feed(m.sent)] for m in masters]

@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import threading
 from dataclasses import replace
 
 import pytest
@@ -9,7 +10,7 @@ import pytest
 from gcs_plugin.cli.main import main
 from gcs_plugin.fleet.preflight import ITEMS, Level, Wanted, preflight, preflight_all, red_text
 from gcs_plugin.fleet.separation.takeoff_schedule import TakeoffSchedule
-from gcs_plugin.links.mavlink import Autopilot
+from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.mission.items import CHANGE_SPEED, LAND, RTL, TAKEOFF, WAYPOINT, Mission, MissionItem
 from gcs_plugin.mission.plan_folder import PlanNeeds
 from gcs_plugin.mission.track import Airspace, flight_seconds, highest_m
@@ -180,10 +181,10 @@ def swarm_of(vehicles, speed=10.0):
 @pytest.mark.slow
 def test_all_wait_until_the_last_one_is_ready_and_say_for_what(folder, capsys):  # noqa: F811
     vehicles = make_swarm(3, autopilots=(AP, PX4), home=HOME)
-    vehicles[1].ready_s = 130.0
     swarm, link = swarm_of(vehicles)
     with swarm:
         assert fleet(capsys, "upload", folder, "--link", link)[0] == 0
+        vehicles[1].ready_s = ready_s = swarm.now + 130.0
         code = main(["fleet", "start", "--override", "separation", "--plan", str(folder), "--link", link])
         said = capsys.readouterr().out.splitlines()
         assert code == 0, said
@@ -191,17 +192,17 @@ def test_all_wait_until_the_last_one_is_ready_and_say_for_what(folder, capsys): 
         assert [text for text in said if "flies its mission" in text] == [
             f"vehicle {number} flies its mission" for number in (1, 2, 3)
         ]
-        assert swarm.now >= 130.0
+        assert swarm.now >= ready_s
 
 
 @pytest.mark.slow
 def test_what_vehicles_wait_for_is_said_once_for_those_that_it_is_new_for(folder, capsys):  # noqa: F811
     vehicles = make_swarm(3, autopilots=(AP,), home=HOME)
-    for vehicle, ready_s in zip(vehicles, (50.0, 130.0, 130.0), strict=True):
-        vehicle.ready_s = ready_s
     swarm, link = swarm_of(vehicles)
     with swarm:
         assert fleet(capsys, "upload", folder, "--link", link)[0] == 0
+        for vehicle, ready_s in zip(vehicles, (50.0, 130.0, 130.0), strict=True):
+            vehicle.ready_s = swarm.now + ready_s
         assert main(["fleet", "start", "--override", "separation", "--plan", str(folder), "--link", link]) == 0
         lines = capsys.readouterr().out.splitlines()
     said = [line for line in lines if line.startswith(("waiting: ", "ready: "))]
@@ -254,6 +255,23 @@ def test_a_height_above_the_legal_one_is_asked_about(folder, capsys):  # noqa: F
         assert fleet(capsys, "check", "--vehicle", 1, "--link", link)[0] == 1
         assert fleet(capsys, "check", "--vehicle", 1, "--max-height", 500, "--link", link)[0] == 0
         assert fleet(capsys, "start", "--vehicle", 1, "--max-height", 500, "--link", link)[0] == 0
+
+
+@pytest.mark.parametrize(("late", "passed"), [("GPS_RAW_INT", True), ("SYS_STATUS", False)])
+def test_what_a_vehicle_has_not_reported_yet_is_waited_for_before_the_check(folder, capsys, late, passed):  # noqa: F811
+    """Its receiver would be red, and its empty battery would not be."""
+    vehicles = make_swarm(1, home=HOME)
+    number = getattr(dialect, f"MAVLINK_MSG_ID_{late}")
+    vehicles[0].withheld.add(number)
+    vehicles[0].used_s = 0.0 if passed else 1e9
+    swarm, link = swarm_of(vehicles)
+    with swarm:
+        assert fleet(capsys, "upload", folder / "v1.plan", "--vehicle", 1, "--link", link)[0] == 0
+        said = threading.Timer(0.7, vehicles[0].withheld.discard, (number,))
+        said.start()
+        code, text = fleet(capsys, "check", "--vehicle", 1, "--wait", 60, "--link", link)
+        assert (code == 0) is passed, text
+        said.join()
 
 
 def test_a_speed_that_a_vehicle_may_not_reach_is_said_as_it_starts(folder, capsys):  # noqa: F811

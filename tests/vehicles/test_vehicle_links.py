@@ -1,6 +1,7 @@
 """The daemon's vehicles: commands to all at once, the check, signing, and takeoffs that hold each other."""
 
 import json
+import re
 import threading
 import time
 
@@ -70,7 +71,7 @@ def open_links(tmp_path):
         thing.close()
 
 
-def wait(done, limit_s=30.0):
+def wait(done, limit_s=120.0):
     end = time.monotonic() + limit_s
     while not done() and time.monotonic() < end:
         time.sleep(0.05)
@@ -83,7 +84,7 @@ def ready(links, count):
         return len(rows) == count and all(r["lat_deg"] and r["battery"] for r in rows)
 
     wait(known)
-    wait(lambda: all(v.ekf_ok and v.prearm_ok for v in links.fleet.vehicles.values()))
+    wait(lambda: all(v.ekf_ok and v.prearm_ok and v.gps_fix >= 3 for v in links.fleet.vehicles.values()))
 
 
 def upload_all(links, folder):  # noqa: F811
@@ -112,7 +113,7 @@ def test_all_are_commanded_at_once_with_an_outcome_each(open_links, folder):  # 
     wait(lambda: {links.flight_state(name)["state"] for name in ("v1", "v2", "v3")} <= home)
     assert [r["outcome"] for r in links.commands("land", ["v2"])] == ["done"]
     late = links.commands("rtl", ["v1"], given_s=links.clock() - 6.0)
-    assert late[0]["outcome"] == "not_sent" and "6 s ago" in late[0]["reason"]
+    assert late[0]["outcome"] == "not_sent" and re.search(r"was given \d+ s ago and was not sent", late[0]["reason"])
     assert links.commands("rtl", ["v9"])[0]["outcome"] == "not_sent"
     with pytest.raises(InputError, match="there is no command 'explode'"):
         links.commands("explode")
@@ -154,7 +155,7 @@ def test_one_that_cannot_take_off_holds_the_others_and_it_is_said(open_links, fo
     assert red == ["separation"] * 3
     vehicles[1].arms = False
     assert takeoffs.begin("plan-1", override=one_path) == {"v1": 0.0, "v2": 4.0, "v3": 8.0}
-    wait(lambda: "failed" in takeoffs.rows().get("v3", {}), 40.0)
+    wait(lambda: "failed" in takeoffs.rows().get("v3", {}))
     assert takeoffs.rows()["v3"]["failed"] == "held on the ground, because v2 did not take off"
     assert "Check frame class" in takeoffs.rows()["v2"]["failed"]
     assert any("v2 did not take off" in text and "v3 stay on the ground" in text for text in said)
@@ -216,20 +217,17 @@ def test_aircraft_are_known_until_nobody_hears_them():
 def test_a_row_has_the_autopilots_words_and_home(open_links):
     vehicles = make_swarm(1, home=HOME)
     links = open_links(vehicles)
-    end = time.monotonic() + 30.0
-    while not links.rows() and time.monotonic() < end:
-        time.sleep(0.1)
+    ready(links, 1)
     vehicles[0].flight.texts.append("EKF3 IMU0 is using GPS")
-    while not (links.rows() and links.rows()[0]["texts"] and links.rows()[0]["home"]) and time.monotonic() < end:
-        time.sleep(0.1)
+    wait(lambda: any(said["text"] == "EKF3 IMU0 is using GPS" for said in links.rows()[0]["texts"]))
+    wait(lambda: links.rows()[0]["home"])
     row = links.rows()[0]
-    assert any(said["text"] == "EKF3 IMU0 is using GPS" for said in row["texts"])
     assert row["home"] == pytest.approx([HOME[0], HOME[1]], abs=1e-5)
     assert row["alt_m"] == pytest.approx(HOME[2], abs=5.0)  # above sea level, as aircraft say theirs
 
 
 def test_a_vehicle_that_acknowledged_a_pause_takes_another_mission_at_once(open_links, folder):  # noqa: F811
-    links = open_links(make_swarm(1, autopilots=(AP,), home=HOME))
+    links = open_links(make_swarm(1, autopilots=(AP,), home=HOME), speed=5.0)  # its mission takes half a minute then
     ready(links, 1)
     upload_all(links, folder)
     assert [row["outcome"] for row in links.commands("start")] == ["done"]
@@ -252,15 +250,17 @@ def test_vehicles_of_one_start_return_in_turn_and_one_given_another_command_does
     assert [(r["id"], r["vehicle"], r["command"], r["outcome"]) for r in rows] == [
         ("turn-1", f"v{n}", "return", "done") for n in (1, 2, 3)
     ]
-    waiting = {row["id"]: row["returns_after"] for row in links.rows() if row["returns_after"] is not None}
-    assert len(waiting) == 2  # all three fly one above the other's start
     said = {row["vehicle"]: row["reason"] for row in rows}
-    assert all(f"{name} holds, and returns after" in said[name] for name in waiting)
-    second = max(waiting, key=lambda name: len(waiting[name]))
+    waiting = {name: said[name].partition(" holds, and returns after ")[2].split(", ") for name in said}
+    waiting = {name: others for name, others in waiting.items() if others != [""]}
+    assert len(waiting) == 2  # all three fly one above the other's start
+    second = max(waiting, key=lambda name: len(waiting[name]))  # it waits for both others: its turn comes last
+    row = next(row for row in links.rows() if row["id"] == second)
+    assert row["returns_after"] is not None
     assert [r["outcome"] for r in links.commands("land", [second])] == ["done"]
     assert next(row for row in links.rows() if row["id"] == second)["returns_after"] is None
     down = {"on ground", "complete"}
-    wait(lambda: all(links.flight_state(n)["state"] in down for n in ("v1", "v2", "v3")), 120.0)
+    wait(lambda: all(links.flight_state(n)["state"] in down for n in ("v1", "v2", "v3")), 240.0)
     landed = links.fleet.vehicles[links.system_of(second)]
     assert landed.mode == "LAND"  # not sent home after it was told to land
 

@@ -10,6 +10,7 @@ from gcs_plugin.daemon.takeoffs import Takeoffs
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.mission_builder import read_mission
 from gcs_plugin.sim.simulated_swarm import make_swarm
+from gcs_plugin.sim.simulated_vehicle import SimVehicle
 from orthoswarm.model.errors import OrthoSwarmError
 from tests.vehicles.test_fleet_cli import HOME, folder  # noqa: F401
 from tests.vehicles.test_vehicle_links import PlanFolder, open_links, ready, upload_all, wait  # noqa: F401
@@ -27,8 +28,18 @@ class SlowPlans(PlanFolder):
 
     def mission(self, body, vehicle, autopilot):
         self.asked.set()
-        assert self.go_on.wait(30.0)
+        assert self.go_on.wait(120.0)
         return super().mission(body, vehicle, autopilot)
+
+
+class SlowToRead(SimVehicle):
+    """A vehicle that sends no item of its mission while the test holds it."""
+
+    held = False
+
+    def handle(self, message, sender, now):
+        of_mission = message.get_type() == "MISSION_REQUEST_INT" and message.mission_type == 0
+        return [] if self.held and of_mission else super().handle(message, sender, now)
 
 
 def beginning(takeoffs, said):
@@ -64,11 +75,11 @@ def test_a_command_to_stop_during_the_check_cancels_the_start(open_links, folder
 
     thread = beginning(takeoffs, said)
     thread.start()
-    assert plans.asked.wait(30.0)
+    assert plans.asked.wait(120.0)
     rows = links.commands(verb)
     assert [row["outcome"] for row in rows] == ["done"] * 2 and "start" in rows[0]["reason"]
     plans.go_on.set()
-    thread.join(30.0)
+    thread.join(120.0)
     assert said == ["v1, v2 was told to stop during the check; no vehicle was started"]
     assert takeoffs.rows() == {} and not any(v.flight.armed for v in vehicles)
     takeoffs.close()
@@ -87,7 +98,7 @@ def test_a_command_to_stop_counts_though_the_check_begins_at_that_moment(open_li
 
     def late(vehicle):
         thread.start()
-        assert plans.asked.wait(30.0)
+        assert plans.asked.wait(120.0)
         return cancel(vehicle)
 
     thread = beginning(takeoffs, said)
@@ -95,7 +106,7 @@ def test_a_command_to_stop_counts_though_the_check_begins_at_that_moment(open_li
     (row,) = links.commands("pause")
     assert row["outcome"] == "done" and "cancelled" in row["reason"]
     plans.go_on.set()
-    thread.join(30.0)
+    thread.join(120.0)
     assert said == ["v1 was told to stop during the check; no vehicle was started"]
     assert not vehicles[0].flight.armed
     takeoffs.close()
@@ -105,9 +116,11 @@ def test_a_mission_that_takes_long_to_read_is_red_until_it_is_read(open_links, f
     """A check goes on with what an earlier one has begun to read; then a start finds the mission read."""
     monkeypatch.setattr(start_checks, "_READ_S", 0.3)
     apart(folder, 1, 0.0)
-    links = open_links(make_swarm(1, home=HOME), delay_s=0.3)
+    vehicle = SlowToRead(system=1, home=HOME)
+    links = open_links([vehicle])
     ready(links, 1)
     upload_all(links, folder)
+    vehicle.held = True
     plans = PlanFolder(folder)
     takeoffs = Takeoffs(links, plans, lambda _: None)
 
@@ -118,7 +131,8 @@ def test_a_mission_that_takes_long_to_read_is_red_until_it_is_read(open_links, f
     assert "still being read" in reason()
     with pytest.raises(OrthoSwarmError, match="still being read"):
         takeoffs.begin("plan-1", override=ONE_PATH)
-    wait(lambda: reason() == "holds this plan's mission", 60.0)
+    vehicle.held = False
+    wait(lambda: reason() == "holds this plan's mission")
     assert takeoffs.begin("plan-1", override=ONE_PATH) == {"v1": 0.0}
     takeoffs.close()
 
@@ -160,7 +174,7 @@ def test_what_has_become_red_until_the_takeoff_holds_the_vehicle_and_the_rest(op
     takeoffs = Takeoffs(links, PlanFolder(folder), said.append)
     takeoffs.begin("plan-1", override=ONE_PATH)
     vehicles[1].ready_s = 1e9  # its filter fails
-    wait(lambda: "failed" in takeoffs.rows().get("v3", {}), 40.0)
+    wait(lambda: "failed" in takeoffs.rows().get("v3", {}))
     assert "v2 was not started: gps: no 3D fix" in takeoffs.rows()["v2"]["failed"]
     assert any("v3 stay on the ground" in text for text in said)
     assert not vehicles[1].flight.armed and not vehicles[2].flight.armed

@@ -15,7 +15,11 @@ class Station:
 
     def __init__(self, world):
         self.world, self.fleet, self.heard, self.published = world, self, [], []
-        self.vehicles, self.outcomes, self.slow, self.lock = world.fleet.vehicles, {}, {}, threading.Lock()
+        self.vehicles, self.outcomes, self.lock = world.fleet.vehicles, {}, threading.Lock()
+        self.told_now = {verb: threading.Event() for verb in ("pause", "rtl")}
+        self.may_answer = {verb: threading.Event() for verb in ("pause", "rtl")}
+        for answered in self.may_answer.values():
+            answered.set()
 
     def call(self, work):
         future = Future()
@@ -28,14 +32,15 @@ class Station:
 
     def command(self, verb, names):
         self.heard.append((verb, tuple(sorted(names))))
-        time.sleep(self.slow.get(verb, 0.0))
+        self.told_now[verb].set()
+        assert self.may_answer[verb].wait(120.0)
         return [{"vehicle": n, "outcome": self.outcomes.get((verb, n), "done"), "reason": ""} for n in names]
 
     def told(self, verb):
         return {name for each, names in self.heard if each == verb for name in names}
 
 
-def until(done, limit_s=20.0):
+def until(done, limit_s=120.0):
     end = time.monotonic() + limit_s
     while not done() and time.monotonic() < end:
         time.sleep(0.01)
@@ -48,31 +53,32 @@ def station(make_world):
     made = Station(world)
     made.returns = Returns(made, made.command, made.published.append, lambda system: f"v{system}")
     made.systems = {f"v{system}": system for system in made.vehicles}
-    yield made
-    made.returns.close()
+    made.returns.close()  # nobody's turn comes afterwards: what `begin` does is looked at
+    return made
 
 
 def test_those_that_hold_are_told_at_once_though_another_does_not_answer(station):
-    station.slow["rtl"] = 1.0
+    station.may_answer["rtl"].clear()
     begin = threading.Thread(target=station.returns.begin, args=(station.systems, "n"))
     begin.start()
-    until(lambda: station.told("pause") and station.told("rtl"))
-    assert begin.is_alive()  # one of those that return has not answered yet
+    assert all(told.wait(120.0) for told in station.told_now.values())  # though nobody answers the one
+    station.may_answer["rtl"].set()
     begin.join()
     assert station.told("pause").isdisjoint(station.told("rtl"))
     assert set(station.returns.waits()) == station.told("pause")
 
 
 def test_what_others_command_meanwhile_stands(station):
-    station.slow["pause"] = 0.5
+    station.may_answer["pause"].clear()
     done = []
     begin = threading.Thread(target=lambda: done.append(station.returns.begin(station.systems, "n")))
     begin.start()
-    until(lambda: station.told("pause"))
+    assert station.told_now["pause"].wait(120.0)
     held = sorted(station.told("pause"))
     for name in held:  # the operator lands all: their pauses end without success
         station.outcomes["pause", name] = "not_sent"
         station.returns.cancel(station.systems[name])
+    station.may_answer["pause"].set()
     begin.join()
     assert not station.told("rtl") & set(held)
     assert station.returns.waits() == {}

@@ -272,6 +272,7 @@ def _ready(
 
     allowed = _overrides(args.override, systems, ITEMS)
     missions, stored, starts = _missions(backend, prepared, systems)
+    backend.hear_states(systems, args.wait)
     end = time.monotonic() + args.ready
     said: dict[int, str] = {}
     while True:
@@ -339,6 +340,7 @@ def _check(backend: "Backend", args: argparse.Namespace, prepared: _Prepared, fo
     """Show the check of each vehicle; 0 if none has a red item."""
     systems = [s for s in prepared.systems or found if s in found]
     missions, stored, starts = _missions(backend, prepared, systems)
+    backend.hear_states(systems, args.wait)
     checks = backend.check(systems, missions, stored, starts, args.max_height, needs=prepared.needs)
     if args.json:
         print(json.dumps({"vehicles": [check.document(f"v{check.system}") for check in checks]}))

@@ -75,11 +75,14 @@ def run(args: argparse.Namespace) -> int:
     print(f"{args.vehicles} simulated vehicles on {where}; end with Ctrl-C", file=sys.stderr)
     with swarm:
         finished = threading.Event()
-        while swarm.now < args.seconds and not finished.wait(0.05):
-            while events and swarm.now >= events[0][0]:
+        while True:
+            now = swarm.now
+            while events and events[0][0] <= min(now, args.seconds):  # also of the last look: it may come late
                 _, system, what, seconds = events.pop(0)
                 print(f"vehicle {system}: {what}", file=sys.stderr)
                 swarm.reboot(system) if what == "reboot" else swarm.silence(system, seconds)
+            if now >= args.seconds or finished.wait(0.05):
+                break
     return 0
 
 
