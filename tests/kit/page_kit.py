@@ -5,6 +5,7 @@ import json
 import mimetypes
 import shutil
 import threading
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -162,6 +163,19 @@ def opened(browser: Any, url: str, size: tuple[int, int] = DESK, *, fake: bool =
 def send(page: Any, event: dict[str, Any]) -> None:
     """An event on the stream."""
     page.evaluate("(event) => station.send(event)", event)
+
+
+def poll(page: Any, done: Callable[[], Any], limit_s: float = LIMIT_MS / 1000) -> None:
+    """Wait until something holds that the page does not show."""
+    end = time.monotonic() + limit_s
+    while not done():
+        assert time.monotonic() < end, "it did not come true"
+        page.wait_for_timeout(50)
+
+
+def saved(page: Any) -> None:
+    """Wait until what was drawn and filled in is with the station."""
+    poll(page, lambda: page.evaluate("import('/static/plan/shared.js').then((m) => !m.isSaving())"))
 
 
 def ok_for_all(station: Station, outcome: str = "done", reason: str = "") -> None:

@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from tests.kit.page_kit import DESK, PHONE, TABLET, ok_for_all, opened, send, standing, vehicle
+from tests.kit.page_kit import DESK, PHONE, TABLET, ok_for_all, opened, poll, send, standing, vehicle
 
 ALL = ("pause", "rtl", "land")
 PLURAL = re.compile(r"\b1 (vehicle|picture|satellite|corner|flight|leg|gap|job|item|alarm|polygon)s\b")
@@ -120,13 +120,15 @@ def test_commands_carry_the_stations_steady_clock_and_follow_a_wall_clock_that_w
                 " clock_s: 5000 + performance.now() / 1000, run: 'a' })",
                 shift,
             )
+        clock = "performance.now() / 1000"
+        before = page.evaluate(clock)
         page.click(".command[data-verb=land]")
         confirm(page)
         page.wait_for_selector("[data-outcome=done]")
-        body, now = station.commands("land")[0], page.evaluate("performance.now() / 1000")
+        body, now = station.commands("land")[0], page.evaluate(clock)
         assert body["run"] == "a"
-        assert body["given_clock_s"] - now == pytest.approx(5000, abs=5)
-        assert body["given_s"] - now == pytest.approx(1e9 - 30, abs=5)
+        assert before - 1 < body["given_clock_s"] - 5000 < now + 1
+        assert before - 1 < body["given_s"] - (1e9 - 30) < now + 1
 
 
 @pytest.mark.parametrize("key", ["Enter", "Space"])
@@ -367,7 +369,7 @@ def test_cancel_during_a_start_takes_it_back_at_the_station(browser):
     def answer(method, path, body):
         if method == "DELETE":
             return 200, {"results": results.pop(0)}
-        gate.wait(60)
+        gate.wait(240)
         return 202, {"takeoffs_in_s": {"v7": 0}}
 
     with ready_to_start(browser, answer) as (station, page):
@@ -378,10 +380,12 @@ def test_cancel_during_a_start_takes_it_back_at_the_station(browser):
             page.click(".preflight .primary")
             page.wait_for_selector(".preflight >> text=Starting")
             page.focus(".preflight .row button:enabled")
+            poll(page, lambda: station.commands("start"))  # the station has it
             leave()
             page.wait_for_selector(f".notice:has-text('{words}')")
-            start, cancel = [body["id"] for method, path, body in station.heard if path.endswith("/start")][-2:]
+            start, cancel = [body["id"] for method, path, body in station.heard if path.endswith("/start")]
             assert start == cancel
+            station.heard.clear()
             page.click("text=Check and start")
             page.wait_for_function("() => !document.querySelector('.preflight .primary').disabled")
         gate.set()

@@ -52,12 +52,12 @@ def test_gaps_are_listed_and_flown_only_after_a_confirmation(browser):
             assert "90.0 %" in words.inner_text() and "3 legs" in words.inner_text()
             assert "2 pictures not arrived (the first: event 7)" in words.inner_text()
             page.locator(".gaps button").click()
-            assert abs(page.evaluate("orthoswarm.map.getCenter().lng") - 8.5605) < 1e-3
+            page.wait_for_function("Math.abs(orthoswarm.map.getCenter().lng - 8.5605) < 1e-3")
             page.click("text=Fly the gaps…")
             page.wait_for_selector(".gap-vehicles li >> nth=1")
             assert page.locator(".gap-vehicles input[type=checkbox]").nth(1).is_disabled()
             page.click("dialog[open] button:text-is('Plan')")
-            assert "Enter how many minutes" in page.locator("dialog[open]").inner_text()
+            page.wait_for_selector("dialog[open] >> text=Enter how many minutes")
             assert _posts(station) == []
             page.locator(".gap-vehicles input[inputmode=decimal]").fill("12")
             page.click("dialog[open] button:text-is('Plan')")

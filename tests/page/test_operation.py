@@ -3,7 +3,6 @@
 import contextlib
 import json
 import re
-import time
 import zipfile
 
 import pytest
@@ -12,7 +11,7 @@ from gcs_plugin.sim.multirotor import Airframe
 from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
 from tests.kit.daemon_kit import GRID, serving
 from tests.kit.mosaic_scene import EAST, NORTH
-from tests.kit.page_kit import DESK, PHONE, TABLET, opened
+from tests.kit.page_kit import DESK, PHONE, TABLET, opened, poll
 from tests.kit.servers.ports import free_port
 from tests.kit.sim_cameras import Cameras, square
 from tests.page.test_command_bar import confirm
@@ -40,14 +39,6 @@ def until(page, count, condition):
         )
     except playwright.TimeoutError:
         pytest.fail(f"not {condition}: {page.evaluate(WORDS)}, {page.locator('.outcomes li').all_inner_texts()}")
-
-
-def poll_until(page, done, limit_s=600.0):
-    """Wait until something holds that the page does not show."""
-    end = time.monotonic() + limit_s
-    while not done():
-        assert time.monotonic() < end
-        page.wait_for_timeout(500)
 
 
 COUNT_DONE = """() => {
@@ -82,6 +73,7 @@ def test_from_an_area_to_the_pack(browser, tmp_path, size):
             cameras.served = served
             served.until("/api/vehicles", lambda rows: sum(r.get("lat_deg") is not None for r in rows) == 2)
             with opened(browser, f"{served.url}/#token={served.token}", size, fake=False) as page:
+                page.set_default_timeout(300_000)
                 operate(page, tmp_path, square(260), vehicles=2, altitude_m=60, fov_deg=65)
             cameras.over = True
 
@@ -171,12 +163,12 @@ def operate(page, folder, area, *, vehicles, altitude_m, fov_deg, way_home=False
     page.screenshot(path=folder / "6-find.png")
     accessible(page)
     page.click(".find-pictures button[aria-label=Close]")
-    poll_until(page, lambda: page.evaluate(REFINED) == vehicles)
+    poll(page, lambda: page.evaluate(REFINED) == vehicles, 600.0)
     if way_home:
         page.click("#tab-fly")
         until(page, vehicles, "t === 'complete' || t === 'on ground'")
         page.wait_for_timeout(LATE_MS)
-        poll_until(page, lambda: page.evaluate(IDLE))
+        poll(page, lambda: page.evaluate(IDLE), 600.0)
         page.click("#tab-map")
     page.click("#panel-map form button:text-is('Export')")
     link = page.locator(".files a:has-text('map.zip')")

@@ -7,7 +7,7 @@ from orthoswarm.export.sheets.pack import write_pack
 from orthoswarm.export.tactical.places import FILE, read_places, write_geojson
 from tests.export.test_date_line import make
 from tests.export.test_sheets import FIND, folder  # noqa: F401
-from tests.kit.page_kit import DESK, PHONE
+from tests.kit.page_kit import DESK, LIMIT_MS, PHONE
 
 
 def test_the_packs_page_shows_map_finds_and_files_from_a_folder(browser, folder, tmp_path):  # noqa: F811
@@ -18,6 +18,7 @@ def test_the_packs_page_shows_map_finds_and_files_from_a_folder(browser, folder,
     for size in (DESK, PHONE):
         context = browser.new_context(viewport={"width": size[0], "height": size[1]})
         page = context.new_page()
+        page.set_default_timeout(LIMIT_MS)
         errors, asked = [], []
         page.on("pageerror", lambda error, errors=errors: errors.append(str(error)))
         page.on("request", lambda request, asked=asked: asked.append(request.url))
@@ -46,6 +47,7 @@ def test_the_pack_says_which_pictures_are_not_refined(browser, folder, tmp_path)
     stac = json.loads((tmp_path / "out" / "flood-map" / "orthoimage.stac.json").read_text())
     assert "Not refined when this was written" in stac["properties"]["description"]
     page = browser.new_page()
+    page.set_default_timeout(LIMIT_MS)
     page.goto((tmp_path / "out" / "flood-map" / "index.html").as_uri())
     page.wait_for_function("document.getElementById('accuracy').textContent")
     assert "pictures 120 of v2" in page.inner_text("#accuracy") and "2 of 3 legs" in page.inner_text("#accuracy")
@@ -59,6 +61,7 @@ def test_the_page_shows_a_map_on_the_meridian_of_180_degrees_in_one_piece(browse
         archive.extractall(tmp_path / "out")
     context = browser.new_context(viewport={"width": DESK[0], "height": DESK[1]})
     page = context.new_page()
+    page.set_default_timeout(LIMIT_MS)
     page.goto((tmp_path / "out" / "map-map" / "index.html").as_uri())
     page.wait_for_function("() => [...document.querySelectorAll('#map img')].some((i) => i.naturalWidth === 256)")
     tiles = page.eval_on_selector_all(

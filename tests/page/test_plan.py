@@ -7,7 +7,7 @@ import pytest
 
 from gcs_plugin.web.areas import area_of
 from orthoswarm.model.errors import InputError
-from tests.kit.page_kit import opened, standing, vehicle
+from tests.kit.page_kit import opened, saved, standing, vehicle
 
 HERE = "orthoswarm.map.jumpTo({ center: [8.5456, 47.3977], zoom: 16 })"
 KML = """<kml xmlns="http://www.opengis.net/kml/2.2"><Placemark><Polygon><outerBoundaryIs><LinearRing><coordinates>
@@ -96,7 +96,7 @@ def test_an_outline_that_crosses_itself_says_what_to_change(browser):
         draw(page, (600, 250), (900, 550), (900, 250), (600, 550))
         assert "crosses itself: drag a corner" in page.inner_text(".hint")
         page.click("text=Make plan")
-        assert "crosses itself" in page.inner_text(".notices")
+        page.wait_for_selector(".notice:has-text('crosses itself')")
         assert [path for _, path, _ in station.heard if path == "/api/plans"] == []
 
 
@@ -162,7 +162,7 @@ def test_a_zone_that_is_drawn_after_the_plan_stops_its_upload_and_start(browser)
                 page.wait_for_selector(f".notice:has-text('{older}')")
                 page.click(f".notice:has-text('{older}') button")
             assert page.locator("dialog[open]").count() == 0
-            page.wait_for_timeout(1500)  # saved
+            saved(page)
             with opened(browser, station.url) as second:  # a second page, or this one after a reload
                 second.click("#tab-plan")
                 second.wait_for_selector(f".plan-result .wrong:has-text('{older}')")
@@ -213,7 +213,7 @@ def test_a_field_out_of_range_names_its_range(browser):
         draw(page, (600, 250), (900, 250), (900, 550))
         page.fill("[name=altitude_m]", "5000")
         page.click("text=Make plan")
-        assert "give a number from 5 to 1000" in page.inner_text(".notices")
+        page.wait_for_selector(".notice:has-text('give a number from 5 to 1000')")
 
 
 def test_units_and_coordinates_are_the_persons(browser):
@@ -249,6 +249,7 @@ def test_a_plan_that_somebody_else_changed_meanwhile_is_theirs(browser):
             planning(page)
             page.wait_for_function("document.querySelector('[name=altitude_m]').value === '60'")
             draw(page, (600, 250), (900, 250), (900, 550), (600, 550))
+            saved(page)
             drawn.append(True)
             page.fill("[name=altitude_m]", "70")
             page.press("[name=altitude_m]", "Tab")
@@ -292,7 +293,7 @@ def test_wind_wait_and_terrain_go_into_the_request_and_contradictions_are_said(b
             "terrain_items": True, "end": "land",
         }.items() <= body.items()  # fmt: skip
         assert len(body["starts"]) == 1
-        page.wait_for_timeout(1500)  # kept for other pages a moment after the last change
+        saved(page)  # kept for other pages a moment after the last change
         kept = [body["settings"] for method, path, body in station.heard if (method, path) == ("PUT", "/api/plan")][-1]
         assert (kept["wind_from_deg"], kept["terrain_items"], kept["relief"]) == ("270", True, "level")
 
@@ -302,8 +303,8 @@ def test_without_a_height_model_the_page_says_how_to_get_one(browser):
         planning(page)
         draw(page, (600, 250), (900, 250), (900, 550))
         opened_groups(page)
+        page.wait_for_selector("text=Start it with --dem FILE")
         assert not page.is_visible("[name=relief]")
-        assert page.is_visible("text=Start it with --dem FILE")
         page.click("text=Make plan")
         page.wait_for_selector(".notice")
         (body,) = [body for method, path, body in station.heard if method == "POST" and path == "/api/plans"]

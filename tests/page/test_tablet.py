@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from tests.kit.page_kit import PHONE, TABLET, ok_for_all, opened, send, standing, vehicle
+from tests.kit.page_kit import PHONE, TABLET, ok_for_all, opened, poll, saved, send, standing, vehicle
 
 GROUND = {"state": "on ground", "text": "on ground", "item": 0, "items": 0}
 RINGS = "import('/static/plan/area.js').then((m) => m.area.rings.map((ring) => ring.length))"
@@ -47,13 +47,27 @@ def keep_plans(station):
     station.answer = answer
 
 
-def change_elsewhere(station, page, **changes):
-    """Another page has changed the plan."""
+def announce_elsewhere(station, page, **changes):
+    """Another page has changed the plan; this one hears it."""
     now = station.gets["/api/plan"]
     station.gets["/api/plan"] = now | {"version": now["version"] + 50} | changes
-    with page.expect_response(lambda response: response.url.endswith("/api/plan")):
-        send(page, {"type": "plan"})
-    page.wait_for_timeout(300)
+    send(page, {"type": "plan"})
+
+
+def change_elsewhere(station, page, shown, **changes):
+    """Another page has changed the plan, after all of this one was saved; waits until it is so here (JavaScript)."""
+    saved(page)
+    announce_elsewhere(station, page, **changes)
+    poll(page, lambda: page.evaluate(shown))
+
+
+def field(name, value):
+    return f"document.querySelector('[name={name}]').value === '{value}'"
+
+
+def rings(*corners):
+    """Whether the first rings of the area have so many corners."""
+    return f"{RINGS}.then((rings) => `${{rings.slice(0, {len(corners)})}}` === '{','.join(map(str, corners))}')"
 
 
 def test_a_tap_of_two_fingers_is_no_hold(browser):
@@ -103,10 +117,9 @@ def test_another_page_does_not_write_between_the_digits_that_somebody_types(brow
         with opened(browser, station.url, TABLET) as page:
             page.click("#tab-plan")
             page.fill("[name=altitude_m]", "12")
-            change_elsewhere(station, page, settings={"altitude_m": 80, "vehicles": "4"})
+            change_elsewhere(station, page, field("vehicles", 4), settings={"altitude_m": 80, "vehicles": "4"})
             page.keyboard.type("0")
             assert page.input_value("[name=altitude_m]") == "120"
-            assert page.input_value("[name=vehicles]") == "4"
 
 
 def test_who_flies_what_follows_another_page(browser):
@@ -123,9 +136,8 @@ def test_who_flies_what_follows_another_page(browser):
             page.wait_for_selector(".assignments li >> nth=1")
             page.click("text=Check and start…")
             page.wait_for_selector("text=Start 2 vehicles")
-            change_elsewhere(station, page, vehicles={"v1": "v2", "v2": "v1"})
-            chosen = "[...document.querySelectorAll('.assignments select')].map((box) => box.value)"
-            assert page.evaluate(chosen) == ["v2", "v1"]
+            chosen = "[...document.querySelectorAll('.assignments select')].map((box) => box.value).join() === 'v2,v1'"
+            change_elsewhere(station, page, chosen, vehicles={"v1": "v2", "v2": "v1"})
             page.click("text=Start 2 vehicles")
             page.wait_for_selector("dialog[open] >> text=changed on another page")
             assert not any(path.endswith("/start") for _, path, _ in station.heard)
@@ -141,11 +153,9 @@ def test_what_is_being_drawn_survives_another_page_and_the_next_taps_count(brows
             for place in ((500, 200), (800, 200)):
                 page.mouse.click(*place)
                 page.wait_for_timeout(500)
-            page.wait_for_timeout(1000)  # saved
-            change_elsewhere(station, page, settings={"altitude_m": 90})
+            change_elsewhere(station, page, field("altitude_m", 90), settings={"altitude_m": 90})
             page.mouse.click(800, 450)
-            page.wait_for_timeout(200)
-            assert page.evaluate(RINGS) == [3]
+            poll(page, lambda: page.evaluate(rings(3)))
             assert page.input_value("[name=altitude_m]") == "90"
 
 
@@ -178,16 +188,16 @@ def test_a_zone_of_another_page_stays_while_something_is_drawn_here(browser, wha
             page.wait_for_selector(".vehicle")
             page.click("#tab-plan")
             page.get_by_role("button", name=what).click()
-            change_elsewhere(station, page, area=polygon(OUTLINE, ZONE))
-            assert page.evaluate(RINGS)[:2] == [4, 3]  # before any tap
+            change_elsewhere(station, page, rings(4, 3), area=polygon(OUTLINE, ZONE))  # before any tap
             tap_all(page, (500, 200), (800, 200), (800, 450))
-            page.wait_for_timeout(1000)  # saved
+            saved(page)
             before = stored_rings(station)
             assert ZONE in before and len(before) == (2 if what == "Add corners" else 3)
-            change_elsewhere(station, page, area=polygon(before[0], ZONE_2, *before[1:]))
+            zones = f"{RINGS}.then((rings) => rings.length === {len(before) + 1})"
+            change_elsewhere(station, page, zones, area=polygon(before[0], ZONE_2, *before[1:]))
             tap_all(page, (500, 450))
             page.click("button:text-is('Done')")
-            page.wait_for_timeout(1000)
+            saved(page)
             after = stored_rings(station)
             assert ZONE in after and ZONE_2 in after and len(after) == len(before) + 1
             drawn = after[0] if what == "Add corners" else next(r for r in after[1:] if r not in (ZONE, ZONE_2))
@@ -209,12 +219,32 @@ def test_a_tap_while_the_change_of_another_page_is_loaded_does_not_undo_it(brows
             with page.expect_request("**/api/plan"):
                 send(page, {"type": "plan"})
             page.mouse.click(800, 450)
-            page.wait_for_timeout(100)
+            poll(page, lambda: held)
             held[0].fulfill(json=station.gets["/api/plan"])
             page.unroute("**/api/plan")
-            page.wait_for_timeout(3000)
-            assert ZONE in stored_rings(station) and page.evaluate(RINGS) == [5, 3]
-            assert len(stored_rings(station)[0]) == 6
+            poll(page, lambda: page.evaluate(rings(5, 3)))
+            saved(page)
+            assert ZONE in stored_rings(station) and len(stored_rings(station)[0]) == 6
+
+
+def test_a_change_of_another_page_while_one_is_saved_here_is_shown_afterwards(browser):
+    """GIVEN a save that the station has taken WHEN another page changes the plan before its answer is here."""
+    with standing(vehicle(1)) as station:
+        keep_plans(station)
+        with opened(browser, station.url, TABLET) as page:
+            page.click("#tab-plan")
+            held = []
+            page.route(
+                "**/api/plan", lambda r: held.append((r, r.fetch())) if r.request.method == "PUT" else r.continue_()
+            )
+            page.fill("[name=altitude_m]", "55")
+            page.press("[name=altitude_m]", "Tab")
+            poll(page, lambda: held)
+            announce_elsewhere(station, page, settings={"altitude_m": 90})
+            page.wait_for_timeout(500)  # heard: events are gathered for a tenth of a second
+            (route, answer), *_ = held
+            route.fulfill(response=answer)
+            page.wait_for_function(field("altitude_m", 90))
 
 
 def test_a_plan_is_outdated_by_the_zone_of_another_page_also_while_something_is_drawn(browser):
@@ -230,11 +260,10 @@ def test_a_plan_is_outdated_by_the_zone_of_another_page_also_while_something_is_
             page.click("#tab-plan")
             page.get_by_role("button", name="Add corners").wait_for()
             made_of = {"settings": {"made_of": page.evaluate(drawn)}, "plan": "p1", "vehicles": {"v1": "v1"}}
-            change_elsewhere(station, page, **made_of)
-            page.wait_for_selector(".assignments li")
+            change_elsewhere(station, page, "document.querySelector('.assignments li')", **made_of)
             assert page.locator(older).count() == 0
             page.get_by_role("button", name="Add corners").click()
-            change_elsewhere(station, page, area=polygon(OUTLINE, ZONE))
+            change_elsewhere(station, page, rings(4, 3), area=polygon(OUTLINE, ZONE))
             page.wait_for_selector(older)
             page.click("text=Check and start…")
             assert page.locator("dialog[open]").count() == 0
@@ -268,9 +297,7 @@ def test_what_was_drawn_without_a_network_is_saved_when_it_is_back(browser):
         with opened(browser, station.url, TABLET) as page:
             change_without_a_network(page)
             page.context.set_offline(False)
-            with page.expect_response(lambda response: response.request.method == "PUT"):
-                pass
-            assert station.gets["/api/plan"]["settings"]["altitude_m"] == 55
+            poll(page, lambda: station.gets["/api/plan"]["settings"].get("altitude_m") == 55)
 
 
 @pytest.mark.parametrize("status", [409, 507, 401])
@@ -287,7 +314,7 @@ def test_what_the_station_refuses_when_the_network_is_back_is_said(browser, stat
 def test_a_refused_picture_does_not_ask_for_all_vehicles(browser):
     with standing(vehicle(1)) as station, opened(browser, station.url, TABLET) as page:
         page.wait_for_selector(".link[data-link=live]")
-        page.wait_for_timeout(500)
+        page.wait_for_load_state("networkidle")
         asked = []
         page.on("request", lambda request: asked.append(request.url))
         for count in range(3):
@@ -321,7 +348,7 @@ def test_after_a_sleep_nothing_old_is_shown_as_live(browser):
         page.wait_for_selector(".link[data-link=live]")
         page.route("**/api/vehicles", lambda route: route.abort())
         page.evaluate("station.beats = false; const now = Date.now; Date.now = () => now() + 600e3;")
-        page.wait_for_selector(".link[data-link=lost]", timeout=1500)
+        page.wait_for_selector(".link[data-link=lost]")
         page.wait_for_selector(".tile .age:has-text('10:0')")
 
 

@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from tests.kit.page_kit import DESK, PHONE, SOCKET, TABLET, opened, send, standing, vehicle
+from tests.kit.page_kit import DESK, LIMIT_MS, PHONE, SOCKET, TABLET, opened, send, standing, vehicle
 
 UPDATES = """() => {
   let k = 0;
@@ -184,6 +184,7 @@ def test_the_page_has_no_fault_of_its_own_when_parts_of_it_come_late(browser):
     with standing(vehicle(1)) as station:
         context = browser.new_context()
         page = context.new_page()
+        page.set_default_timeout(LIMIT_MS)
         page.route("**/fly/alarms.js", lambda route: (time.sleep(1.5), route.continue_()))
         page.add_init_script(SOCKET)
         page.goto(station.url)

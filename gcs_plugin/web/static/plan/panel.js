@@ -14,7 +14,7 @@ import { fillFields, followsTerrain, inFieldNames, planFields, planValues, rawVa
 import { acceptDrops, KINDS, readArea } from "/static/plan/import.js";
 import { drawnNow, madeOfNow, setMadeOf } from "/static/plan/outdated.js";
 import { planResult, showPlan } from "/static/plan/result.js";
-import { isSaving, keptArea, loadShared, saveShared, whenChangedElsewhere } from "/static/plan/shared.js";
+import { keptArea, loadShared, mayLoad, saveShared, whenChangedElsewhere } from "/static/plan/shared.js";
 import { boundsOf, fit } from "/static/map/map.js";
 
 let made = null;
@@ -26,7 +26,7 @@ const ringsOf = (polygon) => {
 };
 
 export async function loadPlan() {
-  if (isSaving()) return;
+  if (!mayLoad()) return;
   const kept = ringsOf(keptArea());
   const body = await loadShared();
   if (!body) return;

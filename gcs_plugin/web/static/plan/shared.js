@@ -11,6 +11,7 @@ let there = true; // whether this daemon keeps plans
 let version = null;
 let kept = null; // the area of that version
 let saving = false;
+let missed = false; // somebody else's change was announced during a save
 let reload = () => {};
 
 // Called when somebody else has changed the plan meanwhile: theirs stands, and is to be shown.
@@ -35,6 +36,12 @@ export async function loadShared() {
 
 export const isSaving = () => saving || timer != null;
 
+// Whether what was announced can be loaded now; otherwise it is once the save has ended.
+export function mayLoad() {
+  missed = isSaving();
+  return !missed;
+}
+
 // A plan that could not be sent, as the network was away, is sent once it is back. read gives the plan as it is then.
 export function saveShared(read, wait_ms = SAVE_MS) {
   if (!there) return;
@@ -56,6 +63,6 @@ export function saveShared(read, wait_ms = SAVE_MS) {
     } finally {
       saving = false;
     }
-    if (outdated) reload(); // the version stays: without one, what is changed meanwhile would replace theirs
+    if (outdated || (missed && timer == null)) reload(); // the version stays: without one, what is changed meanwhile would replace theirs
   }, wait_ms);
 }
