@@ -45,7 +45,18 @@ window.WebSocket = class {
   }
 };
 setInterval(() => { if (window.station.beats) window.station.send({ type: "heartbeat", time: now() }); }, 1000);
+// Vehicles that were heard are heard on: two seconds later the page would call them old, five seconds later lost.
+let heard = [];
+const ask = () => fetch("/kit/heard").then((answer) => answer.json()).then((ids) => { heard = ids; }, () => {});
+const shown = (id) => document.querySelector(`.tiles li[data-id="${id}"]`);
+setInterval(() => {
+  if (!window.station.beats) return;
+  for (const id of heard.filter(shown)) window.station.send({ type: "vehicle", id, silent_s: 0.1 });
+  ask();
+}, 500);
+ask();
 """
+HEARD_S = 1.0  # a row that is silent for longer stays so
 
 
 def vehicle(number: int, **more: Any) -> dict[str, Any]:
@@ -80,6 +91,12 @@ class Station:
         return [body for method, path, body in self.heard if method == "POST" and path.endswith(f"/{verb}")]
 
 
+def _heard(rows: list[Any]) -> list[str]:
+    """The ids of vehicles on links that are heard; rows may hold anything."""
+    known = [row for row in rows if isinstance(row, dict) and isinstance(row.get("id"), str) and row.get("system")]
+    return [row["id"] for row in known if 0.0 <= row.get("silent_s", -1.0) < HEARD_S]
+
+
 @contextlib.contextmanager
 def standing(*rows: dict[str, Any]) -> Iterator[Station]:
     """A station with vehicles, on a free port of this machine."""
@@ -95,6 +112,9 @@ def standing(*rows: dict[str, Any]) -> Iterator[Station]:
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
             path = self.path.split("?")[0]
+            if path == "/kit/heard":
+                self._send(200, json.dumps(_heard(station.gets["/api/vehicles"])).encode(), "application/json")
+                return
             if path in station.gets:
                 self._send(200, json.dumps(station.gets[path]).encode(), "application/json")
                 return

@@ -28,7 +28,7 @@ class Cameras:
 
     def all_posted(self):
         """Wait until the daemon has every picture; gives their number."""
-        end = time.monotonic() + 120.0
+        end = time.monotonic() + 240.0
         while self.posted < self.count:
             assert time.monotonic() < end, f"{self.posted} of {self.count} pictures were posted"
             time.sleep(0.05)

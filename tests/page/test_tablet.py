@@ -323,7 +323,8 @@ def test_what_the_station_refuses_when_the_network_is_back_is_said(browser, stat
 def test_a_refused_picture_does_not_ask_for_all_vehicles(browser):
     with standing(vehicle(1)) as station, opened(browser, station.url, TABLET) as page:
         page.wait_for_selector(".link[data-link=live]")
-        page.wait_for_load_state("networkidle")
+        page.wait_for_selector(".tile")
+        page.wait_for_timeout(500)
         asked = []
         page.on("request", lambda request: asked.append(request.url))
         for count in range(3):

@@ -192,7 +192,7 @@ def test_a_refused_mission_is_explained_in_words_and_in_json(swarm, folder, caps
 
 def test_mavsdk_flies_them_too(swarm, folder, capsys):
     pytest.importorskip("mavsdk")
-    both = ("--vehicle", "1,2", "--link", swarm, "--backend", "mavsdk", "--json")
+    both = ("--vehicle", "1,2", "--link", swarm, "--backend", "mavsdk", "--wait", "60", "--json")
     code, uploaded = fleet(capsys, "upload", folder, *both)
     assert code == 0 and all(v["ok"] for v in uploaded["vehicles"]), uploaded
     code, refused = fleet(capsys, "start", *both)
