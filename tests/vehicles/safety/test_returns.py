@@ -53,11 +53,12 @@ def station(make_world):
     made = Station(world)
     made.returns = Returns(made, made.command, made.published.append, lambda system: f"v{system}")
     made.systems = {f"v{system}": system for system in made.vehicles}
-    made.returns.close()  # nobody's turn comes afterwards: what `begin` does is looked at
-    return made
+    yield made
+    made.returns.close()
 
 
 def test_those_that_hold_are_told_at_once_though_another_does_not_answer(station):
+    station.returns.close()  # nobody's turn comes afterwards: what `begin` does is looked at
     station.may_answer["rtl"].clear()
     begin = threading.Thread(target=station.returns.begin, args=(station.systems, "n"))
     begin.start()
@@ -69,6 +70,7 @@ def test_those_that_hold_are_told_at_once_though_another_does_not_answer(station
 
 
 def test_what_others_command_meanwhile_stands(station):
+    station.returns.close()  # nobody's turn comes afterwards: what `begin` does is looked at
     station.may_answer["pause"].clear()
     done = []
     begin = threading.Thread(target=lambda: done.append(station.returns.begin(station.systems, "n")))
