@@ -204,9 +204,14 @@ class Drawer:
             self._condition.wait(1.0)
 
     def _tell_overload(self) -> None:
-        """Publish the number of frames put off (from the journal) when it has changed."""
-        now = time.monotonic()
-        if now - self._looked < self._look_s or not (self.put_off or len(self._queue) > _AT_ONCE or self._more):
+        """Publish the number of frames put off (from the journal) when it has changed.
+
+        It is looked up once in a while, and at the end of a jam, after which nothing else leads here.
+        """
+        now, left = time.monotonic(), len(self._queue) > 0 or self._more
+        if not (self.put_off or len(self._queue) > _AT_ONCE or self._more):
+            return
+        if left and now - self._looked < self._look_s:
             return
         self._looked = now
         query = "SELECT COUNT(*) AS n FROM frames WHERE drawn = 0 AND arrived < ?"
