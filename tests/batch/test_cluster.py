@@ -195,7 +195,7 @@ def slowly(folder, n):
 
 
 def test_a_scheduler_that_dies_and_comes_back_loses_nothing(tmp_path, configure):
-    configure({"compute": {"cluster_connect_s": 5.0, "cluster_poll_s": 0.2}})
+    configure({"compute": {"cluster_connect_s": 30.0, "cluster_poll_s": 0.2}})
     with Loopback(tmp_path) as both:
         both.begin(1)
         with Cluster(both.address, patience_s=120.0) as cluster:
@@ -211,10 +211,10 @@ def test_a_scheduler_that_dies_and_comes_back_loses_nothing(tmp_path, configure)
 
 
 def test_a_scheduler_that_stays_away_is_one_sentence(tmp_path, configure):
-    configure({"compute": {"cluster_connect_s": 0.5, "cluster_poll_s": 0.2}})
     with Loopback(tmp_path) as both:
         both.begin(1)
         with Cluster(both.address, patience_s=1.0) as cluster:
+            configure({"compute": {"cluster_connect_s": 0.5, "cluster_poll_s": 0.2}})  # once it is connected
             results = cluster.map(partial(slowly, tmp_path), range(40))
             next(results)
             both.close()

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.kit.daemon_kit import line, serving, start, stop
+from tests.kit.daemon_kit import exported, line, serving, start, stop
 
 MB = 1 << 20
 
@@ -147,7 +147,7 @@ def test_a_daemon_on_a_full_disk_refuses_pictures_and_takes_them_when_there_is_r
             assert served.send(shot).status_code == 201
         served.until("/api/frames", lambda rows: len(rows) == 12 and all(row["on_map"] for row in rows))
         assert served.command("/api/refine", {"vehicle": "v1"}).status_code == 202
-        jobs = served.until("/api/jobs", lambda rows: all(r["state"] in ("done", "failed") for r in rows))
+        jobs = served.until("/api/jobs", exported)
         assert [r for r in jobs if r["kind"] == "refine"][-1]["state"] == "done"
         assert [r for r in jobs if r["kind"] == "export"][-1]["state"] == "done"
         assert whole(disk / "w" / "realtime.tif")

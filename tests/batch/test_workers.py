@@ -213,7 +213,7 @@ def test_workers_end_with_a_parent_that_was_killed():
         assert parent.stdout is not None and parent.stdout.readline().split()
         parent.kill()
         # Workers hold the other end of this pipe: it ends with the last of them, and never if they wait on.
-        assert parent.communicate(timeout=60) == ("", None)
+        assert parent.communicate(timeout=240) == ("", None)
 
 
 def test_a_worker_does_not_inherit_the_path_that_opencv_is_imported_with():

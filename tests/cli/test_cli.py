@@ -4,7 +4,6 @@ import json
 import os
 import subprocess
 import sys
-import time
 
 import pytest
 
@@ -28,12 +27,14 @@ def test_help_imports_nothing_heavy(args):
 
 
 def test_help_answers_at_once():
-    def seconds():
-        started = time.perf_counter()
+    def cpu_s():
+        before = os.times()
         python("from gcs_plugin.cli.main import main; main(['--help'])")
-        return time.perf_counter() - started
+        after = os.times()
+        return after.children_user + after.children_system - before.children_user - before.children_system
 
-    assert min(seconds() for _ in range(3)) < 2.0  # the goal is 0.2 s on an idle machine
+    # The processor's time, since others may use the machine; the goal is 0.2 s.
+    assert min(cpu_s() for _ in range(3)) < 2.0
 
 
 WITHIN = {

@@ -65,7 +65,7 @@ def test_a_ctrl_c_at_the_terminal_ends_all_of_it_in_a_sentence(tmp_path):
     time.sleep(1.0)  # there is nothing to wait for: any moment of its start will do
     os.killpg(process.pid, signal.SIGINT)
     try:
-        _, said = process.communicate(timeout=60)
+        _, said = process.communicate(timeout=240)
     finally:
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)

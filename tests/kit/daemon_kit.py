@@ -27,7 +27,7 @@ FOV_DEG = 70.0
 SIZE = (160, 120)
 # One for all: each new client reads all certificates of the machine, which costs more than the daemon's answer.
 _CLIENT = httpx.Client(
-    timeout=120, verify=False, trust_env=False, limits=httpx.Limits(max_connections=None, max_keepalive_connections=0)
+    timeout=240, verify=False, trust_env=False, limits=httpx.Limits(max_connections=None, max_keepalive_connections=0)
 )
 
 
@@ -40,7 +40,7 @@ class StoppedWorkers:
     def run(self, function, task):
         self._target(task).write_bytes(b"half")
         self.began.set()
-        assert self.ends.wait(60)
+        assert self.ends.wait(300)
         raise OrthoSwarmError("a worker process was stopped from outside")
 
     def abandon(self):
@@ -121,9 +121,9 @@ class Served:
 
     def kill(self) -> None:
         self.process.send_signal(signal.SIGKILL)
-        self.process.wait(30)
+        self.process.wait(120)
 
-    def until(self, path: str, done, limit_s=180.0):
+    def until(self, path: str, done, limit_s=300.0):
         """Poll an address until something is so; gives its last JSON."""
         end = time.monotonic() + limit_s
         while True:
@@ -142,7 +142,7 @@ def end_with_us() -> None:
     ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG
 
 
-def start(workspace: Path, *arguments: str, port: int = 0, limit_s: float = 120.0) -> Served:
+def start(workspace: Path, *arguments: str, port: int = 0, limit_s: float = 240.0) -> Served:
     """Start `orthoswarm serve` and wait until it answers."""
     process = subprocess.Popen(
         [
@@ -200,10 +200,10 @@ def stop(served: Served) -> int:
     if served.process.poll() is None:
         served.process.send_signal(signal.SIGINT)
         try:
-            served.process.wait(60)
+            served.process.wait(120)
         except subprocess.TimeoutExpired:
             served.process.kill()
-            served.process.wait(30)
+            served.process.wait(120)
     return served.process.returncode
 
 

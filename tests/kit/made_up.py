@@ -11,7 +11,7 @@ from orthoswarm.model.geo import LocalGrid
 
 GRID = LocalGrid(32631)
 OFF_M = np.array([2.0, -2.2])
-LIMIT_S = 200.0
+LIMIT_S = 400.0
 
 
 def post(daemon, frames, off_m=OFF_M):

@@ -9,7 +9,7 @@ A, B, C = Path("/s3:/b/a"), Path("/s3:/b/b"), Path("/s3:/b/c")
 
 
 def test_announced_files_are_copied_at_the_same_time():
-    both = threading.Barrier(2, timeout=30)
+    both = threading.Barrier(2, timeout=240)
     ahead = Ahead(lambda path: both.wait())
     ahead.announce([A, B], threads=2)
     ahead.wait(A)
@@ -22,12 +22,12 @@ def test_a_file_that_is_being_copied_is_waited_for_and_a_later_one_is_left_to_th
 
     def copy(path):
         begun.set()
-        go.wait(30)
+        go.wait(240)
         copied.append(path)
 
     ahead = Ahead(copy)
     ahead.announce([A, B, C], threads=1)
-    assert begun.wait(30)
+    assert begun.wait(240)
     ahead.wait(B)  # returns at once: the caller copies it
     threading.Timer(0.05, go.set).start()
     ahead.wait(A)
@@ -45,5 +45,5 @@ def test_a_copy_that_fails_does_not_stop_the_others():
 
     ahead = Ahead(copy)
     ahead.announce([A, B], threads=1)
-    assert done.wait(30)
+    assert done.wait(240)
     ahead.wait(A)

@@ -56,7 +56,7 @@ def store(server, monkeypatch, tmp_path, configure):
     }.items():
         monkeypatch.setenv(name, value)
     requests._file_systems.clear()
-    configure({"stores": {"first_wait_s": 0.01, "timeout_s": 5.0}})
+    configure({"stores": {"first_wait_s": 0.01}})
     yield proxy
     proxy.close()
     requests._file_systems.clear()
@@ -129,9 +129,9 @@ def test_a_request_that_fails_now_and_then_is_repeated(bucket, store, site):
 
 def test_a_silent_store_is_given_up(bucket, store, site, configure):
     address = bucket(site)
-    configure({"stores": {"first_wait_s": 0.01, "timeout_s": 0.3, "attempts": 2}})
+    configure({"stores": {"first_wait_s": 0.01, "timeout_s": 1.0, "attempts": 2}})
     requests._file_systems.clear()
-    store.fault = lambda method, path: 3.0
+    store.fault = lambda method, path: 20.0
     with pytest.raises(StoreRequestError, match="in 2 attempts"):
         content(path_of(f"{address}/site/photos/a/DJI_0000.JPG"))
 

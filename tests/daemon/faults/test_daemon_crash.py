@@ -61,7 +61,8 @@ def kill_again_and_again(workspace, kills, seed, count=60):
     with serving(workspace) as served:
         check(served, workspace, acknowledged)
         jobs = served.until("/api/jobs", lambda jobs: all(job["state"] in ("done", "failed") for job in jobs))
-        refined = [job for job in jobs if job["kind"] == "refine"]
+        # One that was asked for and ended before the kill is followed by one of the pictures that came since then.
+        refined = [job for job in jobs if job["kind"] == "refine" and job["detail"].get("trigger") != "late"]
         assert len(refined) == asked, jobs  # not forgotten, and not done twice
         assert all(job["state"] == "done" or "pictures" in job["message"] for job in refined), jobs
         post_until_gone(served, shots, acknowledged, lock)
@@ -75,7 +76,7 @@ def test_nothing_acknowledged_is_lost_when_it_is_killed(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(3600)
+@pytest.mark.timeout(1800)
 def test_nothing_acknowledged_is_lost_over_many_kills(tmp_path):
     for seed in range(4):
         kill_again_and_again(tmp_path / f"w{seed}", kills=8, seed=seed)

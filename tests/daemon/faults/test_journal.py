@@ -60,7 +60,7 @@ def test_a_change_that_fails_is_undone_alone(journal):
         raise ValueError("no")
 
     gate = threading.Event()
-    first = journal.submit(lambda db: gate.wait(10))  # so that the others share a batch
+    first = journal.submit(lambda db: gate.wait(120))  # so that the others share a batch
     failing, good = journal.submit(bad), journal.submit(lambda db: db.execute("INSERT INTO meta VALUES ('b', '2')"))
     gate.set()
     first.result()

@@ -23,7 +23,7 @@ from gcs_plugin.daemon.web_plans import Plans
 from gcs_plugin.web.guard import take_token
 from orthoswarm.model.errors import InputError
 from tests.daemon.faults.test_daemon_crash import check, post_until_gone
-from tests.kit.daemon_kit import line, serving, start, stop, tile_over
+from tests.kit.daemon_kit import exported, line, serving, start, stop, tile_over
 from tests.kit.sim_cameras import square
 
 # Loaded by every interpreter of the daemon: notes what was synced, and how long it was then.
@@ -150,9 +150,8 @@ def goes_on(workspace, acknowledged, asked, shots):
             assert (folder / "v1.waypoints").read_text().count("\n") > 5
             assert "mission" in json.loads((folder / "v1.plan").read_text())
             assert not layers["coarse"]["empty"]  # drawn again by a job, if it had been drawn before
-            served.until("/api/jobs", lambda jobs: all(job["state"] in ("done", "failed") for job in jobs))
-            export = [job for job in served.get("/api/jobs").json() if job["kind"] == "export"]
-            assert export and export[-1]["state"] == "done", export
+            jobs = served.until("/api/jobs", exported)
+            assert [job["state"] for job in jobs if job["kind"] == "export"][-1] == "done", jobs
         assert served.get("/healthz").json()["problems"] == []
 
 
@@ -169,6 +168,7 @@ def fly_until(served, shots, acknowledged, *, lock, chance, refine):
         asked = 1
     else:
         post_until_gone(served, shots[:6], acknowledged, lock)
+        served.until("/api/frames", lambda rows: any(row["on_map"] for row in rows))  # something that is never synced
     poster = threading.Thread(target=post_until_gone, args=(served, shots, acknowledged, lock))
     poster.start()
     time.sleep(chance.uniform(0.0, 6.0 if refine else 1.5))

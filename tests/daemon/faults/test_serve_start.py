@@ -8,7 +8,7 @@ from tests.kit.daemon_kit import line, serving
 
 def show(workspace, *more):
     words = [sys.executable, "-m", "gcs_plugin.cli", "serve", "--workspace", str(workspace), "--show-token", *more]
-    return subprocess.run(words, capture_output=True, text=True, timeout=120)
+    return subprocess.run(words, capture_output=True, text=True, timeout=240)
 
 
 def test_the_link_with_the_token_is_printed_at_each_start_and_when_asked_for(tmp_path):

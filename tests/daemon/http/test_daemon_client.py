@@ -67,7 +67,7 @@ def mavproxy_state():
     )  # fmt: skip
 
 
-def said(module, capsys, text, limit_s=60.0):
+def said(module, capsys, text, limit_s=240.0):
     """Pass the time as MAVProxy does, until something was printed."""
     end, out = time.monotonic() + limit_s, ""
     while text not in out:

@@ -180,7 +180,7 @@ def test_commands_need_the_token(served):
 def test_no_path_leads_out_of_the_workspace(served):
     host, port = urlsplit(served.url).hostname, urlsplit(served.url).port
     for path in ("/static/../app.py", "/static/%2e%2e/app.py", "/tiles/..%2f..%2fjournal.db/1/1/1.png", "//etc/passwd"):
-        with socket.create_connection((host, port), timeout=30) as connection:
+        with socket.create_connection((host, port), timeout=120) as connection:
             connection.sendall(f"GET {path} HTTP/1.1\r\nHost: {host}:{port}\r\nConnection: close\r\n\r\n".encode())
             head = connection.makefile("rb").readline()
         assert b" 404 " in head or b" 403 " in head or b" 307 " in head, (path, head)
@@ -206,19 +206,20 @@ def test_a_huge_request_is_refused(served):
 def test_news_come_over_the_websocket(served):
     from websockets.sync.client import connect
 
-    with connect(served.url.replace("http", "ws") + "/api/events", origin=served.url) as events:
-        assert json.loads(events.recv(timeout=30))["type"] == "hello"
+    address = served.url.replace("http", "ws") + "/api/events"
+    with connect(address, origin=served.url, open_timeout=120) as events:
+        assert json.loads(events.recv(timeout=120))["type"] == "hello"
         served.send(line(1, "news", east=2000)[0])
         kinds = set()
         while not {"frame", "layer"} <= kinds:
-            event = json.loads(events.recv(timeout=60))
+            event = json.loads(events.recv(timeout=120))
             kinds.add(event["type"])
             if event["type"] == "frame" and event["vehicle"] == "news":
                 assert len(event["outline"]) == 4
     from websockets.exceptions import InvalidStatus, WebSocketException
 
     with pytest.raises((InvalidStatus, WebSocketException)):
-        connect(served.url.replace("http", "ws") + "/api/events", origin="https://evil.example").recv(timeout=30)
+        connect(address, origin="https://evil.example", open_timeout=120).recv(timeout=120)
 
 
 def test_a_second_daemon_does_not_take_a_living_ones_workspace(served, tmp_path):

@@ -24,7 +24,7 @@ from orthoswarm.model.errors import InputError
 from tests.kit.daemon_kit import GRID, form, line, serving
 from tests.kit.mosaic_scene import EAST, NORTH
 
-LIMIT_S = 60.0
+LIMIT_S = 120.0
 
 
 @pytest.fixture(scope="module")
@@ -60,30 +60,37 @@ def test_an_id_that_no_command_can_address_is_refused_at_the_start(tmp_path, nam
         Settings(workspace=tmp_path, vehicles=(VehicleSettings(name),)).check()
 
 
-def heartbeat(flying):
+def listening(flying):
     from websockets.sync.client import connect
 
-    with connect(flying.url.replace("http", "ws") + "/api/events", origin=flying.url) as events:
-        return json.loads(events.recv(timeout=LIMIT_S))
+    return connect(flying.url.replace("http", "ws") + "/api/events", origin=flying.url, open_timeout=LIMIT_S)
+
+
+def heartbeat(flying):
+    """The daemon's clock that nobody sets, as a page counts on from the heartbeat that it heard, and its run."""
+    with listening(flying) as events:
+        beat, heard = json.loads(events.recv(timeout=LIMIT_S)), time.monotonic()
+    return lambda: beat["clock_s"] + time.monotonic() - heard, beat["run"]
 
 
 @pytest.mark.parametrize("verb", ["pause", "rtl", "return", "land"])
 def test_a_clock_that_was_set_back_keeps_no_urgent_command_from_the_vehicles(flying, verb):
-    beat = heartbeat(flying)
-    ahead = {"given_s": time.time() + 30.0}  # as a page counts on that heard the clock before it was set
-    for body in (ahead, ahead | {"given_clock_s": beat["clock_s"], "run": beat["run"]}):
+    clock, run = heartbeat(flying)
+    for dated in (dict, lambda: {"given_clock_s": clock(), "run": run}):
+        # as a page counts on that heard the clock before it was set
+        body = {"given_s": time.time() + 30.0} | dated()
         rows = flying.command(f"/api/missions/all/{verb}", body).json()["results"]
         assert {row["outcome"] for row in rows} <= {"done", "refused"}
 
 
 def test_the_age_of_a_command_counts_by_the_clock_that_nobody_sets(flying):
-    beat = heartbeat(flying)
-    late = {"given_clock_s": beat["clock_s"] - 6.0, "run": beat["run"], "given_s": time.time()}
-    of_another_run = {"given_clock_s": beat["clock_s"], "run": "ended"}
+    clock, run = heartbeat(flying)
+    late = {"given_clock_s": clock() - 6.0, "run": run, "given_s": time.time()}
+    of_another_run = {"given_clock_s": clock(), "run": "ended"}
     for body in (late, of_another_run):
         row = flying.command("/api/missions/v1/rtl", body).json()
         assert row["outcome"] == "not_sent" and "give it again" in row["reason"]
-    fresh = {"given_clock_s": beat["clock_s"], "run": beat["run"], "given_s": time.time() - 60.0}
+    fresh = {"given_clock_s": clock(), "run": run, "given_s": time.time() - 60.0}
     assert flying.command("/api/missions/v1/rtl", fresh).json()["outcome"] in ("done", "refused")
     assert flying.command("/api/missions/v1/rtl", {"given_clock_s": "x"}).status_code == 422
 
@@ -147,11 +154,9 @@ def test_a_standstill_is_noticed_before_and_after_the_first_tick():
 
 
 def test_the_event_stream_has_a_heartbeat_with_the_daemons_time(flying):
-    from websockets.sync.client import connect
-
-    beats = []
-    with connect(flying.url.replace("http", "ws") + "/api/events", origin=flying.url) as events:
-        assert abs(json.loads(events.recv(timeout=LIMIT_S))["time"] - time.time()) < 5.0
+    beats, before = [], time.time()
+    with listening(flying) as events:
+        assert before - 0.1 < json.loads(events.recv(timeout=LIMIT_S))["time"] < time.time() + 0.1
         while len(beats) < 3:
             event = json.loads(events.recv(timeout=LIMIT_S))
             if event["type"] == "heartbeat":
@@ -161,11 +166,9 @@ def test_the_event_stream_has_a_heartbeat_with_the_daemons_time(flying):
 
 
 def test_each_vehicle_has_its_id_and_its_name_wherever_it_is_shown(flying):
-    from websockets.sync.client import connect
-
     assert {r["id"]: r["name"] for r in flying.get("/api/vehicles").json()} == {"v1": "Falcon", "v2": ""}
     named = {}
-    with connect(flying.url.replace("http", "ws") + "/api/events", origin=flying.url) as events:
+    with listening(flying) as events:
         while len(named) < 2:
             event = json.loads(events.recv(timeout=LIMIT_S))
             if event["type"] == "vehicle":
@@ -190,16 +193,18 @@ def test_the_plan_is_the_same_for_a_second_page_and_after_a_restart(tmp_path):
         late = put(served, {"area": None, "version": 0})
         assert late.status_code == 409 and "elsewhere" in late.json()["detail"]
         assert put(served, {"area": "here"}).status_code == 422
-        assert httpx.put(f"{served.url}/api/plan", json={}).status_code == 401
+        assert httpx.put(f"{served.url}/api/plan", json={}, timeout=LIMIT_S).status_code == 401
         find = served.command("/api/finds", {"lat_deg": 1.5, "lon_deg": 2, "sigma_m": 0.2, "note": "roof"}).json()
         served.command("/api/finds", {"lat_deg": 1.5, "lon_deg": 2})
         old = {"lat_deg": 1.5, "lon_deg": 2, "time": "2026-05-28T20:26:40Z"}  # one that is put back
         back = served.command("/api/finds", old).json()
         assert back["time"].startswith("2026-05-28T20:26:40")
         assert served.command("/api/finds", old | {"time": "yesterday"}).status_code == 422
-        httpx.delete(f"{served.url}/api/finds/{back['id']}", headers=served.auth)
-        assert httpx.delete(f"{served.url}/api/finds/2", headers=served.auth).status_code == 204
-        assert httpx.delete(f"{served.url}/api/finds/2", headers=served.auth).status_code == 404
+        removed = [
+            httpx.delete(f"{served.url}/api/finds/{number}", headers=served.auth, timeout=LIMIT_S).status_code
+            for number in (back["id"], 2, 2)
+        ]
+        assert removed == [204, 204, 404]
     with serving(tmp_path / "w") as served:
         plan = served.get("/api/plan").json()
         assert plan["area"] == area and plan["settings"] == {"altitude_m": 60} and plan["version"] == 1

@@ -106,7 +106,7 @@ def test_no_request_ends_in_500_and_memory_stays_flat(tmp_path):
     with SimSwarm(make_swarm(2, home=(lat, lon, 500.0)), "tcpin:127.0.0.1:0", speed=2.0) as swarm:
         links = [text for address in swarm.addresses for text in ("--link", address)]
         with serving(tmp_path / "w", *links) as served, contextlib.ExitStack() as at_end:
-            client = at_end.enter_context(httpx.Client(base_url=served.url, timeout=120, trust_env=False))
+            client = at_end.enter_context(httpx.Client(base_url=served.url, timeout=300, trust_env=False))
             routes = [
                 (method.upper(), path)
                 for path, methods in client.get("/openapi.json").json()["paths"].items()

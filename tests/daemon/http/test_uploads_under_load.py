@@ -28,7 +28,7 @@ def test_an_upload_does_not_wait_for_pictures_that_are_to_be_drawn(tmp_path: Pat
             transport = httpx.ASGITransport(make_app(daemon, "a-token-of-tests"))
             async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1") as client:
                 shot = Shot(pose_of(camera_at(), "new.jpg", "v2"), jpeg(camera_at()))
-                async with asyncio.timeout(20.0):
+                async with asyncio.timeout(120.0):
                     return (await client.post("/api/frames", **form(shot))).status_code
 
         assert asyncio.run(upload()) == 201

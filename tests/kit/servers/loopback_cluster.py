@@ -1,5 +1,6 @@
 """A Dask scheduler and workers on loopback, as processes of their own."""
 
+import contextlib
 import json
 import os
 import subprocess
@@ -30,7 +31,7 @@ class Loopback:
         """Start it, at the same address as before if there was one."""
         self.file.unlink(missing_ok=True)
         self.start("scheduler", "--host", "127.0.0.1", "--port", str(self.port), "--no-dashboard")
-        self.wait(self.file.exists)
+        self.wait(self.is_known)
         self.port = int(self.address.rpartition(":")[2])
 
     def start(self, what, *args, within=()):
@@ -49,7 +50,13 @@ class Loopback:
     def address(self):
         return json.loads(self.file.read_text())["address"]
 
-    def wait(self, ready, seconds=180):
+    def is_known(self):
+        """Whether the scheduler has said its address: its file is there before its content is."""
+        with contextlib.suppress(FileNotFoundError, ValueError):
+            return bool(self.address)
+        return False
+
+    def wait(self, ready, seconds=300):
         end = time.monotonic() + seconds
         while not ready():
             assert time.monotonic() < end, "the cluster did not start"
@@ -59,13 +66,13 @@ class Loopback:
         from distributed import Client
 
         with Client(self.address, set_as_default=False) as client:
-            client.wait_for_workers(count, timeout=180)
+            client.wait_for_workers(count, timeout=300)
 
     def close(self):
         for process in self.processes:
             process.kill()
         for process in self.processes:
-            process.wait(60)
+            process.wait(120)
 
     def __enter__(self):
         return self

@@ -76,10 +76,10 @@ def store_server(kind):
     server = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
         address = f"http://127.0.0.1:{port}"
-        end = time.monotonic() + 60
+        end = time.monotonic() + 240
         while True:
             try:
-                urllib.request.urlopen(f"{address}{kind.ready}", timeout=5).close()
+                urllib.request.urlopen(f"{address}{kind.ready}", timeout=30).close()
                 break
             except OSError:
                 assert server.poll() is None and time.monotonic() < end, f"the {kind.scheme} server did not start"
@@ -87,7 +87,7 @@ def store_server(kind):
         yield address
     finally:
         server.kill()
-        server.wait(60)
+        server.wait(120)
 
 
 class FaultyProxy:
@@ -121,7 +121,7 @@ class FaultyProxy:
                     status, body = fault if isinstance(fault, tuple) else (fault, b"")
                     return self.answer(status, {}, body)
                 headers = {k: v for k, v in self.headers.items() if k.lower() not in ("connection",)}
-                behind = http.client.HTTPConnection(target.removeprefix("http://"), timeout=60)
+                behind = http.client.HTTPConnection(target.removeprefix("http://"), timeout=240)
                 behind.request(self.command, self.path, body, headers)
                 answer = behind.getresponse()
                 self.answer(answer.status, answer.headers, answer.read())
