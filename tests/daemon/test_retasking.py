@@ -37,7 +37,7 @@ def test_legs_of_a_lost_vehicle_are_flown_by_one_that_is_in_the_air(flying):
     served, swarm = flying
     served.until("/api/vehicles", lambda rows: sum(r.get("lat_deg") is not None for r in rows) == 2)
     starts = [[r["lat_deg"], r["lon_deg"]] for r in sorted(served.get("/api/vehicles").json(), key=lambda r: r["id"])]
-    body = {"area": square(150), "vehicles": 2, "altitude_m": 60, "fov_min_deg": 65, "speed_m_s": 6, "starts": starts}
+    body = {"area": square(150), "vehicles": 2, "altitude_m": 60, "fov_min_deg": 65, "speed_m_s": 4, "starts": starts}
     first = served.command("/api/plans", body).json()
     swarm.vehicles[1].flight.misfires = range(LAST_PICTURE + 1, 10_000)  # what comes after its loss is lost with it
     for vehicle in ("v1", "v2"):

@@ -77,6 +77,8 @@ def test_without_an_area_there_is_no_coverage(served: Served) -> None:
 
 @pytest.mark.slow
 def test_flown_legs_are_seen_and_others_planned_and_a_hole_is_told_with_its_cause(tmp_path: Path) -> None:
+    (tmp_path / "w").mkdir()
+    (tmp_path / "w" / "orthoswarm.toml").write_text("coarse = false\n")  # recorded poses stay what counts
     with serving(tmp_path / "w") as served:
         plan, legs = _plan(served)
         before = served.until("/api/coverage", lambda c: c["plan"] == plan["id"])

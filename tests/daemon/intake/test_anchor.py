@@ -27,16 +27,14 @@ def send_all(served, shots):
 
 
 def drawn(served, vehicle, count):
-    return served.until(
-        f"/api/frames?vehicle={vehicle}", lambda rows: sum(row["on_map"] for row in rows) == count, limit_s=60
-    )
+    return served.until(f"/api/frames?vehicle={vehicle}", lambda rows: sum(row["on_map"] for row in rows) == count)
 
 
 @pytest.mark.parametrize("pose", [{"lat_deg": 0.0, "lon_deg": 0.0}, {"lat_deg": 52.0, "lon_deg": 13.0, "gps_fix": 1}])
 def test_a_first_picture_without_a_fix_does_not_anchor_the_map(tmp_path, pose):
     with serving(tmp_path / "w") as served:
         send_all(served, moved(line(1, "nofix"), **pose))
-        (row,) = served.until("/api/frames?vehicle=nofix", lambda rows: rows[0]["stage"] == "rejected", limit_s=60)
+        (row,) = served.until("/api/frames?vehicle=nofix", lambda rows: rows[0]["stage"] == "rejected")
         assert "fix" in row["reason"]
         assert row["lat_deg"] == pose["lat_deg"]  # what was posted stays
         shots = line(4)
@@ -54,7 +52,7 @@ def test_most_pictures_anchor_the_map_and_none_is_lost(tmp_path):
         drawn(served, "stray", 2)
         send_all(served, line(5))
         drawn(served, "v1", 5)  # those that came before the majority was clear, too
-        rows = served.until("/api/frames?vehicle=stray", lambda rows: all(r["reason"] for r in rows), limit_s=60)
+        rows = served.until("/api/frames?vehicle=stray", lambda rows: all(r["reason"] for r in rows))
         assert all("km from the others" in row["reason"] for row in rows)
     with serving(tmp_path / "w") as served:  # and so it is after a restart
         assert sum(row["on_map"] for row in served.get("/api/frames?vehicle=v1").json()) == 5
@@ -95,7 +93,7 @@ def test_the_newest_plan_says_where_the_map_lies(tmp_path):
         assert served.command("/api/plans", body).status_code == 201
         send_all(served, line(1))  # one against six, but where the plan is
         drawn(served, "v1", 1)
-        rows = served.until("/api/frames?vehicle=before", lambda rows: all(r["reason"] for r in rows), limit_s=60)
+        rows = served.until("/api/frames?vehicle=before", lambda rows: all(r["reason"] for r in rows))
         assert all("km from the newest plan" in row["reason"] for row in rows)
 
 

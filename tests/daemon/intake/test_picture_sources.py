@@ -53,8 +53,8 @@ def watched(tmp_path_factory):
         yield served, root
 
 
-def frames(served, vehicle, count, limit_s=120.0):
-    return served.until(f"/api/frames?vehicle={vehicle}", lambda rows: len(rows) >= count, limit_s)
+def frames(served, vehicle, count):
+    return served.until(f"/api/frames?vehicle={vehicle}", lambda rows: len(rows) >= count)
 
 
 def stored(root, vehicle, image):
@@ -75,12 +75,12 @@ def test_a_stream_without_pictures_is_told_once(tmp_path):
             "v1", where, take=lambda *_: (1, True), pose_at=lambda *_: None, notify=said.append, cache=tmp_path
         )
         source.start()
-        camera.settimeout(60.0)
+        camera.settimeout(120.0)
         for _ in range(3):
             camera.accept()[0].close()
         assert said == ["the pictures of v1: lost"]
         source.stop()
-    assert source.close(30.0)
+    assert source.close(120.0)
 
 
 def test_a_copy_that_stalls_is_taken_only_when_it_is_whole(watched):
@@ -172,9 +172,9 @@ def test_a_video_with_its_poses_is_taken_after_landing(watched, tmp_path):
         truth = by_time[round(datetime.fromisoformat(row["time"]).timestamp())]
         assert row["lat_deg"] == pytest.approx(truth["lat_deg"], abs=1e-6)
         assert row["height_m"] == pytest.approx(truth["height_m"], abs=0.1)
-    end = time.monotonic() + 10.0
-    while list((root / "w" / "videos").rglob("*.jpg")):  # kept among the pictures, not twice
-        assert time.monotonic() < end
+    end = time.monotonic() + 120.0
+    while any(name.endswith(".jpg") for _, _, names in os.walk(root / "w" / "videos") for name in names):
+        assert time.monotonic() < end, "pictures of the video are kept twice"
         time.sleep(0.05)
 
 
@@ -273,11 +273,12 @@ def test_a_card_read_after_landing_and_a_restart_gets_its_poses_from_the_link(tm
         fly(served, "v1", served.command("/api/plans", body).json()["id"])
         served.until("/api/completions", lambda rows: len(rows) == 1)
     assert len(recorder.shots) > 8
-    card.mkdir()
+    developed, pocket = list(recorder.developed()), tmp_path / "pocket"
+    pocket.mkdir()
+    for number, (_, time_s, _, data) in enumerate(developed):
+        (pocket / f"IMG_{number:04d}.jpg").write_bytes(timed(data, time_s))
     with serving(tmp_path / "w", "--source", f"v1={card}") as served:  # no link any more: only its log is left
-        developed = list(recorder.developed())
-        for number, (_, time_s, _, data) in enumerate(developed):
-            (card / f"IMG_{number:04d}.jpg").write_bytes(timed(data, time_s))
+        pocket.rename(card)  # whole at once, as a card comes
         rows = frames(served, "v1", len(developed))
         assert len(rows) == len(developed)
         for row, (pose, _, _, _) in zip(rows, developed, strict=True):

@@ -23,6 +23,14 @@ def daemon(tmp_path, flight):
         yield daemon
 
 
+def post_at_once(daemon, frames):
+    """Send frames without a silence between them, however busy the machine is."""
+    watch = daemon.leg_watch
+    silent_s, watch.silent_s = watch.silent_s, 3600.0
+    post(daemon, frames)
+    watch.silent_s = silent_s
+
+
 def after_all(daemon):
     """Wait until all pictures are refined; gives the refinements."""
     end = time.monotonic() + LIMIT_S
@@ -47,10 +55,9 @@ def test_a_few_late_pictures_are_laid_beside_the_others_and_many_refined_with_th
     assert refined.state == "done", refined.message
     assert refined.detail["frames"] == 17
     note = daemon.completions()
-    post(daemon, late)
-    beside = after_all(daemon)[1:]  # one job, or more where they came slowly
-    assert {(job.state, job.detail["trigger"]) for job in beside} == {("done", "late")}
-    assert sum(job.detail["beside"] for job in beside) == 3
+    post_at_once(daemon, late)
+    (beside,) = after_all(daemon)[1:]
+    assert (beside.state, beside.detail["trigger"], beside.detail["beside"]) == ("done", "late", 3)
     assert daemon.completions() == note  # what the completion led to stays as it was
     row = daemon.journal.one("SELECT path FROM solutions")
     placed = {
@@ -62,7 +69,7 @@ def test_a_few_late_pictures_are_laid_beside_the_others_and_many_refined_with_th
         assert np.hypot(*(one.camera.to_ground([119.5, 89.5]) - truth(frame))) < 0.5
         assert one.sigma_m < 1.5
         assert not one.weak
-    post(daemon, frames[20:])  # with the three they are more than a handful
+    post_at_once(daemon, frames[20:])  # with the three they are more than a handful
     again = after_all(daemon)[-1]
     assert again.state == "done", again.message
     assert "beside" not in again.detail
@@ -85,12 +92,9 @@ def test_a_refinement_that_cannot_be_published_leaves_the_former_one(daemon, fli
 
     monkeypatch.setattr(Publisher, "publish", full)
     monkeypatch.setattr(Publisher, "retire", lambda _, path: retired.append(path))
-    post(daemon, frames[14:])
-    end = time.monotonic() + LIMIT_S
-    while not (failed := [job for job in daemon.jobs.all() if job.state == "failed"]):
-        assert time.monotonic() < end
-        time.sleep(0.05)
-    assert "disk is full" in failed[0].message
+    post_at_once(daemon, frames[14:])
+    _, late = after_job(daemon, 2)
+    assert late.state == "failed" and "disk is full" in late.message
     row = daemon.journal.one("SELECT path FROM solutions")
     files = (daemon.settings.workspace / "solutions").glob("solution-*")
     assert [path.name for path in files] == [row["path"]] and retired == []
@@ -136,7 +140,7 @@ def test_silence_is_told_however_few_pictures_came():
     watch.start()
     for count in (1, 2):
         watch.add("v1", 1, 1e9 + count, 48.0, 11.0)
-        end = time.monotonic() + 30
+        end = time.monotonic() + 240
         while len(silent) < count:
             assert time.monotonic() < end
             time.sleep(0.01)

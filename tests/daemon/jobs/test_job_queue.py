@@ -14,7 +14,7 @@ from gcs_plugin.daemon.store.journal import Journal
 from orthoswarm.model.errors import DiskFullError, OrthoSwarmError, StorageError, WorkerStoppedError
 from orthoswarm.model.placement import Solution
 
-LIMIT_S = 60.0
+LIMIT_S = 240.0
 
 
 class FillingJournal(Journal):

@@ -142,7 +142,7 @@ def test_neighbours_wait_until_no_refinement_waits_or_runs(journal):
     going, order, beside = threading.Event(), [], []
 
     def refine(job, report):
-        assert going.wait(60)
+        assert going.wait(240)
         time.sleep(0.1)  # there is a thread that could take the other job
         order.append(job.kind)
         return lambda db: None
@@ -203,9 +203,9 @@ def test_a_refinement_that_begins_takes_its_process_and_it_is_done_later(journal
 
     thread = threading.Thread(target=run)
     thread.start()
-    assert workers.began.wait(60)
+    assert workers.began.wait(240)
     work.give_up()
-    thread.join(60)
+    thread.join(240)
     assert found == ["gave way"]
     assert not list(tmp_path.glob("*.pickle"))
     work.give_up()  # nothing runs: nothing happens

@@ -1,6 +1,9 @@
 """What the daemon keeps of pictures until their sortie is refined: used for the same result, then removed."""
 
+import contextlib
+import os
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,7 +27,18 @@ def settings_of(tmp_path, flight, **others):
 
 
 def kept(daemon):
-    return [path for path in (daemon.settings.workspace / "kept").rglob("*") if path.is_file()]
+    """The files that are kept; folders may be removed meanwhile, which ends a walk by `rglob` with an error."""
+    return [Path(at, name) for at, _, names in os.walk(daemon.settings.workspace / "kept") for name in names]
+
+
+def tracks(daemon):
+    return {path.name for path in kept(daemon) if path.suffix == ".tracks"}
+
+
+def size(path):
+    with contextlib.suppress(FileNotFoundError):  # it has its final name by now
+        return path.stat().st_size
+    return 0
 
 
 def until(true):
@@ -45,15 +59,22 @@ def solutions(daemon):
     return [{p.frame.image: (p.camera.position.tobytes(), p.sigma_m) for p in s.placed} for s in (found, alone)]
 
 
-def test_a_sortie_is_followed_while_its_last_pictures_may_come(tmp_path, flight):
+def test_a_sortie_is_followed_while_its_last_pictures_may_come(tmp_path, flight, monkeypatch):
+    dropped, drop = [], KeptPictures.drop
     with Daemon(settings_of(tmp_path, flight, coarse=False)) as daemon:
+
+        def noted_drop(*which):
+            dropped.append(tracks(daemon))
+            drop(*which)
+
+        monkeypatch.setattr(KeptPictures, "drop", noted_drop)
         post(daemon, flight[0])
         until(lambda: daemon.drawer.area is not None)  # the first picture begins the map
         complete(daemon)
-        until(lambda: [path for path in kept(daemon) if path.suffix == ".tracks"])
         (job,) = after_job(daemon, 1)
         assert job.state == "done", job.message
         assert job.detail["follow_cpu_s"] > 0.0
+        assert len(dropped[0]) == 1  # what was followed served the refinement
         found, alone = solutions(daemon)
         assert len(found) == 28
         assert found == alone
@@ -62,19 +83,21 @@ def test_a_sortie_is_followed_while_its_last_pictures_may_come(tmp_path, flight)
 
 @pytest.mark.slow
 def test_a_vehicle_that_is_silent_before_it_completes_is_followed_then(tmp_path, flight):
-    with Daemon(settings_of(tmp_path, flight, silent_s=0.5)) as daemon:
+    # longer than the daemon may take for one picture while it starts its processes: silent once
+    with Daemon(settings_of(tmp_path, flight, silent_s=3.0)) as daemon:
         post(daemon, flight[0])
         until(lambda: any(job.ended and "follow_cpu_s" in job.detail for job in daemon.jobs.all()))
-        (tracks,) = [path for path in kept(daemon) if path.suffix == ".tracks"]
+        followed = tracks(daemon)
+        assert len(followed) == 1
         seen = set()
         complete(daemon)
 
         def refined():
-            seen.update(path.name for path in kept(daemon) if path.suffix == ".tracks")
+            seen.update(tracks(daemon))
             return any(job.kind == "refine" and job.ended for job in daemon.jobs.all())
 
         until(refined)
-        assert seen <= {tracks.name}  # their refinement asks for the same, and makes no others
+        assert seen <= followed  # their refinement asks for the same, and makes no others
         found, alone = solutions(daemon)
         assert len(found) == 28
         assert found == alone
@@ -82,9 +105,16 @@ def test_a_vehicle_that_is_silent_before_it_completes_is_followed_then(tmp_path,
 
 def test_a_picture_that_comes_meanwhile_is_refined_with_the_others(tmp_path, flight):
     with Daemon(settings_of(tmp_path, flight, coarse=False)) as daemon:
+        last, stopped = [flight[0][27:]], daemon.refinement.stopped
+
+        def asked_while_it_waits_for_pictures():
+            if last:
+                post(daemon, last.pop())
+            return stopped()
+
+        daemon.refinement.stopped = asked_while_it_waits_for_pictures
         post(daemon, flight[0][:27])
         complete(daemon)
-        post(daemon, flight[0][27:])
         (job,) = after_job(daemon, 1)
         assert job.state == "done", job.message
         assert job.detail["frames"] == 28
@@ -96,7 +126,7 @@ def test_a_picture_that_comes_meanwhile_is_refined_with_the_others(tmp_path, fli
 def test_what_legs_left_is_not_needed_after_a_restart(tmp_path, flight):
     with Daemon(settings_of(tmp_path, flight, silent_s=0.5)) as daemon:
         post(daemon, flight[0][:20])
-        until(lambda: sum(path.stat().st_size for path in kept(daemon)) >= 14 * 240 * 180)
+        until(lambda: sum(map(size, kept(daemon))) >= 14 * 240 * 180)
     with Daemon(settings_of(tmp_path, flight, coarse=False)) as daemon:
         assert kept(daemon) == []
         post(daemon, flight[0][20:])

@@ -169,7 +169,7 @@ def test_it_gives_way_to_a_refinement_and_leaves_nothing_behind(tmp_path):
 
     thread = threading.Thread(target=run)
     thread.start()
-    assert workers.began.wait(60)
+    assert workers.began.wait(240)
     work.give_up()
-    thread.join(60)
+    thread.join(240)
     assert found == ["gave way"] and not list(tmp_path.glob("*.pickle"))
