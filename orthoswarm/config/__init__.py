@@ -5,6 +5,8 @@
     [features]
     corner_distance_px = 12
 
+A number outside its range (`ranges`) is refused.
+
 What is a definition and no choice (a layout of arrays, a unit) stays beside its code.
 """
 

@@ -14,15 +14,16 @@ from orthoswarm.config.coverage import CoverageConfig
 from orthoswarm.config.evaluation import EvaluationConfig
 from orthoswarm.config.matchers import MatchersConfig
 from orthoswarm.config.mosaic import MosaicConfig
-from orthoswarm.config.paper import PaperConfig
 from orthoswarm.config.planning import PlanningConfig
 from orthoswarm.config.radiometry import RadiometryConfig
+from orthoswarm.config.ranges import numbers_in, range_of, rises
 from orthoswarm.config.raster import RasterConfig
 from orthoswarm.config.refiner.bundle import BundleConfig
 from orthoswarm.config.refiner.features import FeaturesConfig
 from orthoswarm.config.refiner.flight import FlightConfig
 from orthoswarm.config.refiner.initial import InitialConfig
 from orthoswarm.config.refiner.late import LateConfig
+from orthoswarm.config.refiner.paper import PaperConfig
 from orthoswarm.config.refiner.records import RecordsConfig
 from orthoswarm.config.refiner.registration import RegistrationConfig
 from orthoswarm.config.refiner.strategy import StrategyConfig
@@ -86,7 +87,7 @@ def override(values: Overrides) -> None:
     """Put values in the place of defaults, in this process; an empty mapping restores the defaults.
 
     Raises:
-        InputError: a stage or field does not exist, or a value has another kind than the default.
+        InputError: a stage or field does not exist, or a value has another kind than the default or is out of range.
     """
     global _active, _overridden
     if values == _overridden:
@@ -130,25 +131,44 @@ def _names() -> tuple[str, ...]:
 
 
 def _checked(stage: str, name: str, value: Any) -> Any:
-    """A value of the kind that the default has; lists become tuples.
+    """A value of the kind that the default has, and in its range; lists become tuples.
 
     Raises:
-        InputError: it is of another kind, or there is no such field.
+        InputError: it is of another kind or out of range, or there is no such field.
     """
-    default_stage = getattr(_DEFAULT, stage)
-    known = [f.name for f in fields(default_stage)]
+    known = {f.name: f for f in fields(getattr(_DEFAULT, stage))}
     if name not in known:
         raise InputError(f"[{stage}] of the configuration has no '{name}'; it has: {', '.join(known)}")
-    default = getattr(default_stage, name)
-    if isinstance(value, list):
-        value = tuple(value)
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    fits = {
-        bool: isinstance(value, bool),
-        int: isinstance(value, int) and number,
-        float: number,
-        tuple: isinstance(value, tuple) and isinstance(default, tuple) and len(value) == len(default),
-    }.get(type(default), isinstance(value, type(default)))
-    if not fits:
-        raise InputError(f"[{stage}] {name} = {value!r} in the configuration is of another kind than {default!r}")
+    declared = known[name]
+    said = f"[{stage}] {name} = {value!r} in the configuration"
+    value = _tuples(value)
+    if not _alike(value, declared.default):
+        raise InputError(f"{said} is of another kind than {declared.default!r}")
+    allowed, numbers = range_of(declared), list(numbers_in(value))
+    if allowed is not None and not all(number in allowed for number in numbers):
+        each = "numbers" if isinstance(value, tuple) else "a number"
+        raise InputError(f"{said} is out of range; give {each} {allowed}")
+    if rises(declared) and numbers[0] > numbers[1]:
+        raise InputError(f"{said} is the wrong way round; give the smaller number first")
+    return _as_default(value, declared.default)
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(map(_tuples, value)) if isinstance(value, list | tuple) else value
+
+
+def _alike(value: Any, default: Any) -> bool:
+    """True if a value has the kind of the default; a whole number may stand for any other."""
+    if isinstance(default, tuple):
+        same = isinstance(value, tuple) and len(value) == len(default)
+        return same and all(map(_alike, value, default))
+    if isinstance(value, bool) or isinstance(default, bool):
+        return isinstance(value, bool) and isinstance(default, bool)
+    return isinstance(value, int | float if isinstance(default, float) else type(default))
+
+
+def _as_default(value: Any, default: Any) -> Any:
+    """A value with whole numbers made floats where the default is one."""
+    if isinstance(default, tuple):
+        return tuple(map(_as_default, value, default))
     return float(value) if isinstance(default, float) else value

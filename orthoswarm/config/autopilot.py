@@ -5,44 +5,46 @@ Measured in flights of both firmwares in simulation: 44 of ArduCopter 4.7 and 8 
 
 from dataclasses import dataclass
 
+from orthoswarm.config.ranges import above_zero, from_zero
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ArduPilotConfig:
     """ArduCopter."""
 
-    speed_share: float = 1.0
+    speed_share: float = above_zero(1.0)
     """Speed amid a long line, as a share of the one asked for (measured: 0.997 to 1.001 at 5 to 10 m/s)."""
     acceleration_m_s2: float = 1.2
     """Acceleration as it stops and sets off, metres per second squared (measured; its WPNAV_ACCEL is 2.5)."""
-    corner_m_s: float = 2.8
+    corner_m_s: float = from_zero(2.8)
     """Speed at which it passes corners (measured: a right angle takes 0.1 s at 3, 0.5 s at 5, 2.1 s at 8, 3.0 s at
     10 m/s; angles of 30 to 180 degrees follow from it within 1.3 s in ten turns)."""
-    takeoff_s: float = 2.6
+    takeoff_s: float = from_zero(2.6)
     """Seconds lost in the takeoff, against its rate of climb (measured: 2.3 to 2.9)."""
-    takeoff_below_s: float = 0.4
+    takeoff_below_s: float = from_zero(0.4)
     """Those of them that it loses in the first metres (measured: 0.4 to 0.5); the others at the top."""
-    takeoff_below_m: float = 2.0
+    takeoff_below_m: float = from_zero(2.0)
     """Height above home up to which it loses them, metres (measured)."""
-    set_off_s: float = 0.7
+    set_off_s: float = from_zero(0.7)
     """Seconds above its home until it accelerates towards the first point (measured: 0.6 to 1.1)."""
-    height_change_s: float = 1.4
+    height_change_s: float = from_zero(1.4)
     """Seconds lost in a climb or descent on one spot amid the flight (measured: 0.9 to 2.2)."""
-    home_wait_s: float = 12.0
+    home_wait_s: float = from_zero(12.0)
     """Seconds of slowing down and waiting above home before it descends (measured: 10 to 14; 5 are RTL_LOIT_TIME)."""
-    land_wait_s: float = 4.5
+    land_wait_s: float = from_zero(4.5)
     """The same where a mission ends with LAND (measured: 3.8 to 5.1)."""
     landing_m_s: float = 0.5
     """Rate of the last part of the descent, metres per second (its LAND_SPEED)."""
-    landing_below_m: float = 10.0
+    landing_below_m: float = from_zero(10.0)
     """Height above home at which that part begins, metres (its LAND_ALT_LOW)."""
-    schedule_slack_s: float = 10.0
+    schedule_slack_s: float = from_zero(10.0)
     """How much later than planned one vehicle may be than another while they stay separated, seconds: three times the
     greatest difference from these times in flight (measured: 2.4 on the way, 3.4 on the ground), for wind, loads and
     other settings."""
-    takeoff_slack_s: float = 3.5
+    takeoff_slack_s: float = from_zero(3.5)
     """The same around a start that vehicles share, as they take off (two differed by up to 3.0, as one took so long to
     arm). Three times as much, as above, at each takeoff and landing would hold a swarm of one start on the ground."""
-    landing_slack_s: float = 5.0
+    landing_slack_s: float = from_zero(5.0)
     """The same as they come home and land (two of one flight differed by up to 4.9)."""
     most_items: int = 650
     """Mission items that it stores, home among them (measured)."""
@@ -52,7 +54,7 @@ class ArduPilotConfig:
 class Px4Config:
     """PX4 multicopters."""
 
-    speed_share: float = 0.975
+    speed_share: float = above_zero(0.975)
     """Speed amid a long line, as a share of the one asked for (measured: 0.985 at 5, 0.966 at 8, 0.973 at 10 m/s; it
     takes half a minute to settle)."""
     acceleration_m_s2: float = 1.05
@@ -60,30 +62,30 @@ class Px4Config:
     4.0 s at 5, 5.0 s at 8, 6.0 s at 10 m/s beyond that)."""
     corner_m_s: float = 0.0
     """Speed at which it passes corners (it nearly stops)."""
-    takeoff_s: float = 5.5
+    takeoff_s: float = from_zero(5.5)
     """Seconds lost in the takeoff, against a rate of climb of 2.5 m/s (measured: 3.7 to 8.3)."""
-    takeoff_below_s: float = 5.5
+    takeoff_below_s: float = from_zero(5.5)
     """Those of them that it loses in the first metres: all (measured: 4.4 to 6.0)."""
-    takeoff_below_m: float = 10.0
+    takeoff_below_m: float = from_zero(10.0)
     """Height above home up to which it loses them, metres (measured: it climbs at 1.5 m/s up to there)."""
-    set_off_s: float = 2.0
+    set_off_s: float = from_zero(2.0)
     """Seconds above its home until it accelerates towards the first point (measured: 0.5 to 2.7)."""
-    height_change_s: float = 2.2
+    height_change_s: float = from_zero(2.2)
     """Seconds lost in a climb or descent on one spot amid the flight (measured: 1.1 to 3.7)."""
-    home_wait_s: float = 10.0
+    home_wait_s: float = from_zero(10.0)
     """Seconds of slowing down and waiting above home before it descends (measured: 7 to 12, once 16)."""
-    land_wait_s: float = 1.0
+    land_wait_s: float = from_zero(1.0)
     """The same where a mission ends with LAND (measured: -0.5 to 3.8)."""
     landing_m_s: float = 0.7
     """Rate of the last part of the descent, metres per second (its MPC_LAND_SPEED)."""
-    landing_below_m: float = 7.5
+    landing_below_m: float = from_zero(7.5)
     """Height above home at which that part begins, metres (between its MPC_LAND_ALT1 and MPC_LAND_ALT2)."""
-    schedule_slack_s: float = 20.0
+    schedule_slack_s: float = from_zero(20.0)
     """How much later than planned one vehicle may be than another while they stay separated, seconds: more than two
     vehicles differed in flight (measured: up to 7 late at 10 m/s, up to 12 at 5 m/s, up to 6 early)."""
-    takeoff_slack_s: float = 7.5
+    takeoff_slack_s: float = from_zero(7.5)
     """The same around a start that vehicles share, as they take off (two differed by up to 7.2)."""
-    landing_slack_s: float = 18.0
+    landing_slack_s: float = from_zero(18.0)
     """The same as they come home and land (two differed by up to 18)."""
     most_items: int = 1900
     """Mission items that it stores (the table of its dataman)."""

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from orthoswarm.config.ranges import from_zero
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ComputeConfig:
@@ -15,7 +17,7 @@ class ComputeConfig:
     idle_share: float = 0.1
     """Tasks that can be halved are, where processes would be idle for more than this share of the work, being too few
     (chosen: halves cost 5 % of CPU)."""
-    trim_after_s: float = 0.5
+    trim_after_s: float = from_zero(0.5)
     """After a task that took more CPU seconds unused memory goes back to the system (chosen)."""
     cluster_connect_s: float = 20.0
     """Time to reach a Dask scheduler, seconds (chosen)."""

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from orthoswarm.config.ranges import from_zero
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CoverageConfig:
@@ -14,9 +16,9 @@ class CoverageConfig:
     oblique_deg: float = 45.0
     """Ground that is seen farther from straight down is seen obliquely, degrees (chosen); from
     `mosaic.most_off_nadir_deg` on it is not seen at all."""
-    lens_sigmas: float = 2.0
+    lens_sigmas: float = from_zero(2.0)
     """Plans over gaps take the solved field of view less so many sigmas (chosen: 98 % of the lenses are wider)."""
-    smallest_gap_m2: float = 4.0
+    smallest_gap_m2: float = from_zero(4.0)
     """Smaller gaps are only counted, square metres (chosen)."""
 
     # Flaws of pictures, by comparison with those before and after
@@ -38,9 +40,9 @@ class CoverageConfig:
     """Usual steps between two pictures from which on one is missing (chosen)."""
     straight_deg: float = 20.0
     """Steps of one straight leg differ by less than this in direction, degrees (chosen)."""
-    most_missing: int = 400
+    most_missing: int = from_zero(400)
     """Most missing pictures that are made up in one hole (chosen for its time)."""
-    slack_s: float = 0.05
+    slack_s: float = from_zero(0.05)
     """Camera events this near in time to a picture are its own, seconds (chosen)."""
     match_share: float = 0.45
     """An event belongs to a picture within this share of the usual time between events (chosen: below a half)."""

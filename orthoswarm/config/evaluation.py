@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from orthoswarm.config.ranges import from_zero
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EvaluationConfig:
@@ -10,9 +12,9 @@ class EvaluationConfig:
     relief_sigma_m: float = 10.0
     """How far ground may lie off the mapped area's level where rays do not tell, one sigma, metres: holds the height of
     a point that one photo shows (chosen)."""
-    same_place_m: float = 0.05
+    same_place_m: float = from_zero(0.05)
     """A checkpoint within this distance of a control point is that point, metres (chosen: as surveys differ) ..."""
-    same_name_m: float = 10.0
+    same_name_m: float = from_zero(10.0)
     """... and within this one if it has its name: tables in other systems differ by a metre or two (chosen)."""
 
     least_picture_px: int = 200

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from orthoswarm.config.ranges import from_zero
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MatchersConfig:
@@ -64,14 +66,14 @@ class MatchersConfig:
     """Most keypoints a picture (chosen for cost)."""
     sift_ratio: float = 0.8
     """Ratio of the nearest to the second nearest descriptor (Lowe 2004)."""
-    sift_contrast: float = 0.02
+    sift_contrast: float = from_zero(0.02)
     """Contrast threshold: OpenCV's default is 0.04 (chosen; not measured)."""
 
     # Learned keypoints and RoMa
 
     learned_keypoints: int = 1024
     """Most keypoints a picture (chosen for cost)."""
-    learned_detection: float = 0.05
+    learned_detection: float = from_zero(0.05)
     """Detection threshold of XFeat (Potje et al., CVPR 2024)."""
     learned_least_keypoints: int = 4
     """Pictures with fewer keypoints are not matched (chosen)."""

@@ -7,6 +7,8 @@ and every ground pixel.
 
 from dataclasses import dataclass
 
+from orthoswarm.config.ranges import from_zero
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MosaicConfig:
@@ -60,32 +62,32 @@ class MosaicConfig:
     """Pictures more oblique than the best by this squared tangent are not candidates for a cell (chosen for its
     time)."""
 
-    obliqueness_cost: float = 15000.0
+    obliqueness_cost: float = from_zero(15000.0)
     """Cost of obliqueness, times the squared tangent of the view angle. Chosen by looking at four sets: with a third of
     it crowns lean over streets and masts lie down."""
-    haze_cost: float = 6000.0
+    haze_cost: float = from_zero(6000.0)
     """Cost of less local contrast than the clearest picture has on the same ground, times the logarithm of the ratio;
     chosen: half the contrast outweighs a view that is some 20 degrees more oblique."""
     haze_ignored_log: float = 0.3
     """Log ratios of contrast up to this cost nothing: parallax, shadows, noise; chosen."""
-    glare_cost: float = 3000.0
+    glare_cost: float = from_zero(3000.0)
     """Cost of ground that is burnt out (glints of water); chosen: as of a view at 25 degrees."""
     glare_level: int = 240
     """Grey levels from here on are taken for glints of water or burnt-out ground (chosen)."""
     glare_share: float = 0.05
     """A block of the preview with a larger share of glare says nothing about haze (chosen)."""
-    hidden_cost: float = 10000.0
+    hidden_cost: float = from_zero(10000.0)
     """Cost of a picture from which something taller hides the cell; chosen: as of a view at 39 degrees, more than
     `candidate_tan2` allows."""
     hidden_m: float = 1.0
     """What rises above the line of sight by less than this hides nothing, metres (chosen: about the error of heights
     beside walls)."""
-    blur_cost: float = 6000.0
+    blur_cost: float = from_zero(6000.0)
     """Cost of a picture that is less sharp than the median of those around, times the logarithm of the ratio; chosen
     like `haze_cost`."""
     blur_ignored_log: float = 0.25
     """Log ratios of sharpness up to this cost nothing; chosen: pictures of one scene taken well differ by less."""
-    seam_cost: float = 3.0
+    seam_cost: float = from_zero(3.0)
     """Cost of a seam where both pictures are alike: keeps seams short and few; chosen by looking at four sets."""
     difference_scale: float = 16.0
     """The squared difference of the two pictures, in levels, is divided by this: edges that do not meet (roofs, cars)
@@ -95,7 +97,7 @@ class MosaicConfig:
     show although its pictures differ everywhere; chosen."""
     difference_most: float = 80.0
     """Greatest cost of a difference, so that one roof edge does not decide alone; chosen."""
-    height_cost: float = 20.0
+    height_cost: float = from_zero(20.0)
     """Cost of a seam over what stands above the bare ground, a metre of its height; chosen."""
     height_most_m: float = 10.0
     """Greater heights cost no more, metres (chosen)."""

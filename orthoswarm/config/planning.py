@@ -5,6 +5,8 @@ Prices are shares of flying time or seconds; limits of a user's values are next 
 
 from dataclasses import dataclass
 
+from orthoswarm.config.ranges import above_zero, from_zero
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlanningConfig:
@@ -26,7 +28,7 @@ class PlanningConfig:
     """Greatest distance of them, metres (chosen: slopes of up to 45 degrees)."""
     edge_rounds: int = 12
     """Bisections by which the highest ground between two such places is found (chosen: to millimetres)."""
-    closer_share: float = 0.93
+    closer_share: float = above_zero(0.93)
     """Lines on slopes are laid for a lower flight, by this factor each round, until the ground is covered (chosen)."""
     closer_rounds: int = 4
     """Most such rounds (chosen for its time)."""
@@ -38,13 +40,13 @@ class PlanningConfig:
     """Share of an area from which on a plan covers it (chosen)."""
     target_share: float = 0.9996
     """Share up to which gaps of a plan are mended (chosen: above `complete_share` for errors of the flight)."""
-    repair_rounds: int = 5
+    repair_rounds: int = from_zero(5)
     """Most rounds of mending (chosen for its time)."""
     repair_places: int = 8
     """Places in the order of the legs at which a leg that mends a gap is tried, nearest first (chosen for its time)."""
-    crumb_m2: float = 0.5
+    crumb_m2: float = from_zero(0.5)
     """Smaller gaps are none, square metres: rounding of outlines (chosen)."""
-    line_crumb_m2: float = 0.05
+    line_crumb_m2: float = from_zero(0.05)
     """Smaller parts of an area get no line of their own, square metres (chosen)."""
     stretch_spacings: float = 5.0
     """A vehicle's share of a long leg is at least so many line spacings long, or turns outweigh it (chosen)."""
@@ -74,7 +76,7 @@ class PlanningConfig:
     """Longest edges, of the gap and of obstacles around it, along which legs for it are tried (chosen for its time)."""
     gap_shifts: int = 7
     """Places across a gap at which they are tried (chosen for its time)."""
-    gap_leg_price: float = 0.02
+    gap_leg_price: float = from_zero(0.02)
     """Price of a line spacing of flight, in shares of the gap (chosen)."""
     exact_cells: int = 8
     """So many cells are put in the shortest order exactly (0.02 s)."""
@@ -84,7 +86,7 @@ class PlanningConfig:
     """... and up to this number of cells the order is improved ..."""
     row_rounds: tuple[int, int] = (20, 2)
     """... in so many rounds at most, with more cells in so many (chosen for its time)."""
-    ordered_most_legs: int = 500
+    ordered_most_legs: int = from_zero(500)
     """Orders of more legs are not improved: cost grows with the square (chosen for its time)."""
     tries_if_few: int = 12
     """Directions that are tried where there are few lines, which are cheap to lay and hard to share (chosen)."""
@@ -94,7 +96,7 @@ class PlanningConfig:
     """Closer lines are tried, too, up to so many times their number, where they can be shared more evenly (chosen)."""
     hopeless: float = 1.08
     """Gaps are not filled for a direction whose path is so many times as long as the best (chosen)."""
-    detour_inside_m: float = 0.02
+    detour_inside_m: float = from_zero(0.02)
     """How far a detour may pass inside an obstacle, metres: its corners touch it (chosen: rounding)."""
     obstacle_tolerance: float = 0.1
     """Obstacles are simplified outwards by this share of the clearance (chosen) ..."""
@@ -108,7 +110,7 @@ class PlanningConfig:
     """The longest sortie over the mean up to which a division is fair (chosen)."""
     unfair_balance: float = 1.22
     """... and from which on it is priced steeply (chosen)."""
-    balance_prices: tuple[float, float] = (2.0, 6.0)
+    balance_prices: tuple[float, float] = from_zero((2.0, 6.0))
     """Prices of what the balance is above either, in shares of the longest sortie (chosen)."""
     fair_enough: float = 1.25
     """From here on the plan says that it is uneven (chosen)."""
@@ -127,7 +129,7 @@ class PlanningConfig:
     """Cosine of the angle up to which a vehicle comes straight into a leg and needs no run-in: 10 degrees (chosen)."""
     items_a_leg: int = 4
     """Mission items that a leg takes (two ends, camera on and off), to keep within an autopilot's limit."""
-    spare_items: int = 40
+    spare_items: int = from_zero(40)
     """Mission items kept for ways, takeoff and landing (chosen)."""
     least_leg_triggers: float = 4.0
     """Legs are not cut shorter than so many distances of pictures (chosen), if the endurance allows it."""
@@ -149,7 +151,7 @@ class PlanningConfig:
     """... then up to so many times more ..."""
     caps: int = 8
     """... so often, and at last without a limit (chosen)."""
-    cut_price: float = 0.25
+    cut_price: float = from_zero(0.25)
     """Price of a cut within a leg, in the unit of what is divided, so that legs stay whole where that costs little
     (chosen)."""
     leeway: float = 1.04
@@ -162,13 +164,13 @@ class PlanningConfig:
     """Least horizontal distance of vehicles, metres, if the user gives none (chosen: receivers err by 3 m) ..."""
     layer_m: float = 5.0
     """... or else their least difference in height, metres: that of the layers of ways out and home (chosen)."""
-    launch_s: float = 5.0
+    launch_s: float = from_zero(5.0)
     """Time between takeoffs, and between landings, at one start, seconds (chosen)."""
     step_s: float = 0.5
     """Time step in which flights are compared, seconds (chosen for its time)."""
     on_ground_m: float = 2.0
     """Up to this height over its takeoff a vehicle stands on the ground, metres (chosen)."""
-    layer_price_s: float = 3.0
+    layer_price_s: float = from_zero(3.0)
     """Price of each further height layer, in seconds of delay (chosen)."""
     pad_distances: float = 1.5
     """Radius about a start that vehicles share, in separation distances; in it they take off and land in turn

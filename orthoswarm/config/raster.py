@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from orthoswarm.config.ranges import from_zero
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RasterConfig:
@@ -34,7 +36,7 @@ class RasterConfig:
     picture_parts_mb: float = 2000.0
     """Parts of pictures that are kept on disk between two drawings of a batch run take no more than this together,
     megabytes (chosen for the disk); larger ones are decoded again."""
-    part_margin: float = 0.1
+    part_margin: float = from_zero(0.1)
     """What the real-time map shows of a picture is kept for the refined maps with a border of this share of the
     picture's longer side; what they need beyond it is decoded again (measured on 1,017 photos: 6 % are)."""
 
@@ -47,7 +49,7 @@ class RasterConfig:
     dem_highest_steps: float = 1.5
     """... or the highest of them where the highest ground is asked for: up to this also where pixels are hardly
     larger, since between them a mast of one pixel would lose height (chosen)."""
-    dem_margin_m: float = 50.0
+    dem_margin_m: float = from_zero(50.0)
     """A height model is read so far beyond the places that are asked for, metres (chosen: some of its nodes)."""
     dem_most_nodes: int = 4_000_000
     """Most nodes read from a height model as a whole (chosen for memory)."""

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from orthoswarm.config.ranges import from_zero
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StoresConfig:
@@ -10,15 +12,15 @@ class StoresConfig:
     cache_mb: float = 8000.0
     """Disk space on each machine for copies of files from stores, megabytes; those used least recently go first
     (chosen: a flight of 500 photos of 12 megapixels takes 3 GB)."""
-    cache_trust_s: float = 600.0
+    cache_trust_s: float = from_zero(600.0)
     """A copy that was made or compared with its store in this run, and no longer ago, is used without asking, seconds
     (chosen: a request takes some 20 ms, and a picture is read two to four times in a run)."""
-    held_s: float = 600.0
+    held_s: float = from_zero(600.0)
     """A copy used no longer ago is not removed, seconds: another process may be about to open it (chosen)."""
     attempts: int = 5
     """Attempts at a request that fails, the first one included (chosen: with the waits below a store may be away for
     some seconds)."""
-    first_wait_s: float = 0.5
+    first_wait_s: float = from_zero(0.5)
     """Wait before the second attempt, seconds; each further wait is twice as long (chosen; usual for S3)."""
     longest_wait_s: float = 10.0
     """Longest wait between two attempts, seconds (chosen)."""

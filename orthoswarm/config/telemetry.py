@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from orthoswarm.config.ranges import from_zero
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PairingConfig:
@@ -80,7 +82,7 @@ class IngestConfig:
     """A log belongs to photos if this share of the shorter of both is paired (chosen)."""
     log_same_exposure_s: float = 1.0
     """Exposures of two logs at most so far apart in time (and 3 m) are one exposure, seconds (chosen)."""
-    log_same_fit: float = 0.05
+    log_same_fit: float = from_zero(0.05)
     """Two logs whose misfits to photos differ by no more than this fit equally well: a share of photos without event,
     or of `event_far_m` (chosen)."""
     event_far_m: float = 60.0
@@ -166,5 +168,5 @@ class IngestConfig:
     """Pixels of a video whose width and height differ by no more than this share count as square (chosen)."""
     most_aspect: float = 4.0
     """A ratio of a pixel's sides beyond this is damage (chosen: anamorphic lenses have 2, DV has 16:11)."""
-    held_at_ends_s: float = 1.0
+    held_at_ends_s: float = from_zero(1.0)
     """Metadata with times of its own counts this long before its first and after its last value, seconds (chosen)."""

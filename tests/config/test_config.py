@@ -88,11 +88,72 @@ def test_what_is_wrong_with_a_file_is_said_and_changes_nothing(text, says, tmp_p
     assert active() == Config()
 
 
+@pytest.mark.parametrize(
+    ("stage", "line", "allowed"),
+    [
+        ("strategy", "area_pictures = 0", "a number of at least 1"),
+        ("compute", "pictures_per_task = -3", "a number of at least 1"),
+        ("compute", "pictures_per_task = 3000000000", "at most 2147483647"),
+        ("coverage", "cell_m = 0.0", "a number above 0"),
+        ("coverage", "cell_m = nan", "a number above 0"),
+        ("coverage", "cell_m = inf", "a number above 0"),
+        ("coverage", f"cell_m = 1{'0' * 400}", "a number above 0"),
+        ("coverage", "blurred_share = 1.2", "a number of at least 0 and at most 1"),
+        ("coverage", "oblique_deg = 400", "a number above 0 and at most 360"),
+        ("records", "usual_overlap = 1", "a number of at least 0 and below 1"),
+        ("initial", "default_fov_deg = 180", "a number above 0 and below 180"),
+        ("planning", "straight_cos = -1.1", "a number of at least -1 and at most 1"),
+        ("planning", "launch_s = -1", "a number of at least 0"),
+        ("ardupilot", "speed_share = 0", "a number above 0 and at most 1"),
+        ("records", "usual_heights_m = [50, -1]", "numbers above 0"),
+        ("records", "usual_heights_m = [150, 50]", "the smaller number first"),
+        ("raster", "stretch_percent = [1, 101]", "numbers above 0 and at most 100"),
+        ("radiometry", "neighbour_places = [[0.2, 0.5, -0.8], [0.3, 0.7]]", "numbers above 0"),
+        ("records", "usual_heights_m = [50, 'far']", "another kind"),
+        ("records", "usual_heights_m = [50]", "another kind"),
+    ],
+)
+def test_a_number_out_of_range_is_refused_and_the_range_said(stage, line, allowed, tmp_path):
+    file = tmp_path / "config.toml"
+    file.write_text(f"[{stage}]\n{line}\n")
+    with pytest.raises(InputError, match=f"{stage}.*{line.split()[0]} = .*{allowed}"):
+        read_overrides(file)
+    assert active() == Config()
+
+
+@pytest.mark.parametrize(
+    ("stage", "name", "value"),
+    [
+        ("planning", "launch_s", 0),  # "none of it", said of the field
+        ("coverage", "blurred_share", 0),
+        ("coverage", "blurred_share", 1),
+        ("registration", "oblique_sigma_share", 2.5),  # by its default a factor
+        ("ingest", "from_horizon_deg", -40.0),
+        ("matchers", "tile_search_px", (6, 10)),  # two rounds, no bounds
+        ("radiometry", "neighbour_places", ((0.1, 0.5, 0.9), (0.4, 0.6))),
+    ],
+)
+def test_a_number_at_the_end_of_its_range_is_taken(stage, name, value):
+    override({stage: {name: value}})
+    assert getattr(getattr(active(), stage), name) == value
+
+
+def test_every_default_is_in_its_own_range():
+    for stage in dataclasses.fields(Config):
+        default = getattr(Config(), stage.name)
+        override({stage.name: {f.name: getattr(default, f.name) for f in dataclasses.fields(default)}})
+        assert active() == Config()
+
+
 def test_mosaic_refuses_a_bad_configuration_before_it_begins(tmp_path, capsys):
     file = tmp_path / "config.toml"
-    file.write_text("[records]\nnothing = 1\n")
-    assert main(["mosaic", str(tmp_path), "--config", str(file), "--out", str(tmp_path / "out")]) == 2
-    assert "nothing" in capsys.readouterr().err and not (tmp_path / "out").exists()
+    for text, key in (
+        ("[records]\nnothing = 1\n", "nothing"),
+        ("[strategy]\narea_pictures = 0\n", "area_pictures = 0"),
+    ):
+        file.write_text(text)
+        assert main(["mosaic", str(tmp_path), "--config", str(file), "--out", str(tmp_path / "out")]) == 2
+        assert key in capsys.readouterr().err and not (tmp_path / "out").exists()
 
 
 def test_the_report_says_what_was_changed(tmp_path, tmp_path_factory):

@@ -1,1 +1,1 @@
-"""Thresholds of the refiner, one module a stage."""
+"""Thresholds of the refiners: of the default one one module a stage, of the paper's one for all."""
