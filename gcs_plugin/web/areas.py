@@ -1,18 +1,28 @@
-"""Reading an uploaded area file with the reader of the command line."""
+"""Reading an uploaded area file with the reader of the command line; a large one in a process of its own.
+
+Read here it would hold up all other requests: much of the work is done by calls that no other thread interrupts.
+"""
 
 import asyncio
+import json
 import tempfile
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path, PurePath
 from typing import Any, Final
 
 from fastapi import Query, Request, Response
 
+from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
 from gcs_plugin.plans.area_files import read_shapes
-from gcs_plugin.web.answers import JsonAnswer, body_of
+from gcs_plugin.web.answers import body_of, in_thread
 from orthoswarm.planning.area.shape_files import Ring
 
 MOST_BYTES: Final = 20_000_000
 _MOST_NAME: Final = 200  # characters
+_LARGE_BYTES: Final = 300_000
+"""Larger files take longer than a tenth of a second (chosen), less than the start of a process."""
+_ELSEWHERE: Final = ThreadPoolExecutor(1, thread_name_prefix="areas")  # one such process at a time
 
 
 async def read_area(
@@ -24,7 +34,22 @@ async def read_area(
     rings of [longitude, latitude], the outline first), `lines`, and `no_fly` (closed rings: exclusion fences).
     """
     data = await body_of(request, MOST_BYTES)
-    return JsonAnswer(await asyncio.to_thread(area_of, data, name[:_MOST_NAME]))
+    named = (data, name[:_MOST_NAME])
+    if len(data) <= _LARGE_BYTES:
+        answer = await asyncio.to_thread(_answer, named)
+    else:
+        answer = await in_thread(_ELSEWHERE, _answer_elsewhere, named)
+    return Response(answer, media_type="application/json")
+
+
+def _answer_elsewhere(named: tuple[bytes, str]) -> bytes:
+    with closing(WorkerPool(1)) as pool:
+        return pool.run(_answer, named)
+
+
+def _answer(named: tuple[bytes, str]) -> bytes:
+    """The JSON text for a file's content and name."""
+    return json.dumps(area_of(*named), separators=(",", ":"), allow_nan=False).encode("ascii")
 
 
 def area_of(data: bytes, name: str) -> dict[str, Any]:

@@ -12,6 +12,12 @@ from orthoswarm.config.ranges import above_zero, from_zero
 class PlanningConfig:
     """Planning: lines over an area, their order, sorties, and heights over ground."""
 
+    # Area
+    most_corners: int = 50_000
+    """Areas, zones and lines with more corners are refused. Whether an outline crosses itself can take the square of
+    their number: 13 s for a star of so many, four times that for one of twice as many (measured); a circle of so many
+    is planned in a minute."""
+
     # Heights over ground
     least_above_ground_m: float = 20.0
     """Least height of a flight over the highest ground below it, metres: trees, masts and errors of a height model

@@ -1,5 +1,6 @@
 """Areas from every kind of file that people have them in."""
 
+import asyncio
 import io
 import json
 import zipfile
@@ -8,9 +9,13 @@ import numpy as np
 import pyogrio
 import pytest
 import shapely
+from fastapi import Request
 
-from gcs_plugin.web.areas import area_of
+from gcs_plugin.web.areas import area_of, read_area
+from orthoswarm.config import active
 from orthoswarm.model.errors import InputError
+from orthoswarm.planning.area.area import make_area
+from orthoswarm.planning.area.shape_files import Polygon, parse_geojson
 
 RING = [[8.544, 47.397], [8.547, 47.397], [8.547, 47.399], [8.544, 47.399], [8.544, 47.397]]
 HOLE = [[8.545, 47.3975], [8.546, 47.3975], [8.546, 47.398], [8.545, 47.3975]]
@@ -99,3 +104,62 @@ def test_a_shapefile_without_its_coordinate_system_is_refused(tmp_path):
     parts = {p.name: p.read_bytes() for p in shape.parent.glob("area.*") if p.suffix != ".prj"}
     with pytest.raises(InputError, match="does not say its coordinate system"):
         area_of(zipped(**parts), "area.zip")
+
+
+def circle(corners, east_deg=0.0):
+    turn = np.linspace(0.0, 2.0 * np.pi, corners, endpoint=False)
+    points = np.column_stack([8.5 + east_deg + 0.01 * np.cos(turn), 47.4 + 0.01 * np.sin(turn)])
+    return json.dumps({"type": "Polygon", "coordinates": [[*points.tolist(), points[0].tolist()]]}).encode()
+
+
+def test_an_outline_with_too_many_corners_is_refused_before_it_is_compared_with_itself():
+    most = active().planning.most_corners
+    assert len(area_of(circle(most), "a.geojson")["polygons"][0][0]) == most + 1
+    with pytest.raises(InputError, match=rf"a.geojson has {most + 1} corners; simplify it to at most {most}"):
+        area_of(circle(most + 1), "a.geojson")
+
+
+def test_areas_and_zones_that_are_used_together_are_counted_together():
+    half = active().planning.most_corners // 2 + 1
+    one, other = (parse_geojson(circle(half, east)).polygons[0] for east in (0.0, 0.1))
+    assert make_area([one]).size_m2 > 0
+    with pytest.raises(InputError, match=r"the area with its no-fly zones has \d+ corners"):
+        make_area([one], [other.shell])
+
+
+def test_polygons_nested_in_polygons_are_read_once_each():
+    """Read again at every depth, this file of a megabyte would take half an hour."""
+    ring = b"<LinearRing><coordinates>8,47 9,47 9,48</coordinates></LinearRing>"
+    shape = b"<Polygon><outerBoundaryIs>" + ring + b"</outerBoundaryIs>"
+    assert len(area_of(b"<kml>" + shape * 10_000 + b"</Polygon>" * 10_000 + b"</kml>", "a.kml")["polygons"]) == 10_000
+
+
+def test_of_many_polygons_the_one_in_a_zone_is_named():
+    places = np.stack(np.meshgrid(np.arange(30), np.arange(30)), -1).reshape(-1, 2) * 0.001 + [47.4, 8.5]
+    corners = np.array([[0, 0], [0, 4e-4], [4e-4, 4e-4], [4e-4, 0]])
+    polygons = [Polygon(place + corners) for place in places]
+    assert make_area(polygons, [places[400] + 0.5 * corners]).ground.geom_type == "MultiPolygon"
+    with pytest.raises(InputError, match="polygon 401 lies inside a no-fly zone"):
+        make_area(polygons, [places[400] + 2.0 * corners - 2e-4])
+
+
+def posted(data):
+    """The answer to an area file that is posted."""
+
+    async def receive():
+        return {"type": "http.request", "body": data, "more_body": False}
+
+    scope = {"type": "http", "method": "POST", "path": "/api/areas", "query_string": b"", "headers": []}
+    return json.loads(asyncio.run(read_area(Request(scope, receive), "a.geojson")).body)
+
+
+def test_a_large_file_is_read_in_another_process_so_that_the_server_answers_others(monkeypatch):
+    def refuse(*_):
+        raise InputError("this process reads no file")
+
+    large = circle(20_000)
+    wanted = area_of(large, "a.geojson")
+    monkeypatch.setattr("gcs_plugin.web.areas.read_shapes", refuse)
+    assert posted(large) == wanted
+    with pytest.raises(InputError, match="this process"):
+        posted(circle(20))

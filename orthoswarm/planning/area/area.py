@@ -9,7 +9,7 @@ import shapely
 
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid, area_epsg
-from orthoswarm.planning.area.shape_files import Polygon, Ring
+from orthoswarm.planning.area.shape_files import Polygon, Ring, refuse_many_corners
 
 Geometry = Any  # shapely has no type information here
 
@@ -50,59 +50,82 @@ def make_area(polygons: Sequence[Polygon], no_fly: Iterable[Ring] = (), grid: Lo
     """
     if not polygons:
         raise InputError("no polygon was given; draw the area as a polygon")
+    zones = [Polygon(zone) for zone in no_fly]
+    refuse_many_corners([*polygons, *zones], "the area with its no-fly zones" if zones else "the area")
     if grid is None:
         shells = np.concatenate([p.shell for p in polygons])
         grid = LocalGrid(area_epsg(shells[:, 0], shells[:, 1]))
-    outlines, holes = [], []
-    for number, polygon in enumerate(polygons, start=1):
-        name = "the polygon" if len(polygons) == 1 else f"polygon {number}"
-        outline = shapely.Polygon(_to_grid(grid, polygon.shell), [_to_grid(grid, h) for h in polygon.holes])
-        _check(outline, grid, name)
-        outlines.append(shapely.Polygon(outline.exterior))
-        holes += [shapely.Polygon(r) for r in outline.interiors]
-    for zone in no_fly:
-        closed = shapely.Polygon(_to_grid(grid, zone))
-        _check(closed, grid, "a no-fly zone")
-        holes.append(closed)
-    forbidden = shapely.union_all(holes)
-    ground = shapely.union_all(outlines).difference(forbidden)
-    for number, outline in enumerate(outlines, start=1):
-        if outline.intersection(ground).area < _SMALLEST_M2:
-            raise InputError(
-                f"polygon {number} lies inside a no-fly zone, where nothing may fly; remove it or the hole around it"
-            )
+    single = len(polygons) == 1
+    names = ["the polygon" if single else f"polygon {number}" for number, _ in enumerate(polygons, start=1)]
+    closed = _in_grid([*polygons, *zones], grid)
+    for shape, polygon, name in zip(
+        [*polygons, *zones], closed, [*names, *["a no-fly zone"] * len(zones)], strict=True
+    ):
+        _check(polygon, shape.shell, grid, name)
+    outlines = [shapely.Polygon(polygon.exterior) for polygon in closed[: len(polygons)]]
+    holes = [shapely.Polygon(hole) for polygon in closed[: len(polygons)] for hole in polygon.interiors]
+    holes += closed[len(polygons) :]
+    ground, forbidden = shapely.union_all(outlines), shapely.union_all(holes)
+    if holes:
+        ground = ground.difference(forbidden)
+        _refuse_inside(outlines, forbidden)
     return Area(grid, _polygons_only(ground), _polygons_only(forbidden))
 
 
-def _to_grid(grid: LocalGrid, points: Ring) -> Ring:
-    return grid.to_grid(points[:, 0], points[:, 1])
+def _in_grid(shapes: Sequence[Polygon], grid: LocalGrid) -> list[Geometry]:
+    """Polygons in grid metres; all their points are transformed at once, since each call has its price."""
+    rings = [ring for shape in shapes for ring in (shape.shell, *shape.holes)]
+    points = np.concatenate(rings)
+    parts = iter(np.split(grid.to_grid(points[:, 0], points[:, 1]), np.cumsum([len(ring) for ring in rings])[:-1]))
+    return [shapely.Polygon(next(parts), [next(parts) for _ in shape.holes]) for shape in shapes]
 
 
-def _check(polygon: Geometry, grid: LocalGrid, name: str) -> None:
+def _refuse_inside(outlines: Sequence[Geometry], forbidden: Geometry) -> None:
+    """Refuse an outline of which no-fly zones leave nothing; each is compared with the zones near it only.
+
+    Raises:
+        InputError: there is such an outline.
+    """
+    zones = shapely.get_parts(forbidden)  # which do not overlap
+    outline, zone = shapely.STRtree(zones).query(outlines, predicate="intersects")
+    taken = shapely.area(shapely.intersection(np.asarray(outlines)[outline], zones[zone]))
+    left = shapely.area(outlines) - np.bincount(outline, taken, len(outlines))
+    for number in np.flatnonzero(left < _SMALLEST_M2) + 1:
+        raise InputError(
+            f"polygon {number} lies inside a no-fly zone, where nothing may fly; remove it or the hole around it"
+        )
+
+
+def _check(polygon: Geometry, shell: Ring, grid: LocalGrid, name: str) -> None:
+    """Refuse a polygon in grid metres that is none; `shell` is its outline in degrees.
+
+    Raises:
+        InputError: it says what is wrong.
+    """
     if not np.isfinite(shapely.get_coordinates(polygon)).all():
         raise InputError(f"{name} reaches too far for one UTM grid; plan a smaller area")
     outline = shapely.Polygon(polygon.exterior)
     hull = outline.convex_hull  # a crossing outline may have no net area, but its hull has
-    if min(hull.area, hull.area if not outline.is_valid else outline.area) < _SMALLEST_M2:
+    valid = bool(polygon.is_valid)  # asked once: of an outline that crosses itself it takes the square of its corners
+    if min(hull.area, outline.area if valid else hull.area) < _SMALLEST_M2:
         raise InputError(f"{name} has no area (less than {_SMALLEST_M2:g} square metre); draw a larger one")
-    if 2.0 * hull.area < _NARROWEST_M * hull.length or _is_line(grid, polygon):
+    if 2.0 * hull.area < _NARROWEST_M * hull.length or _is_line(shell):
         raise InputError(f"{name} has no area (its points lie on a line); draw it with some width")
-    if polygon.is_valid:
+    if valid:
         return
     reason, _, place = shapely.is_valid_reason(polygon).partition("[")
     where = ""
     if place:
         lat, lon = grid.to_geographic([float(v) for v in place.rstrip("]").split()[:2]])
         where = f" at {lat:.6f}, {lon:.6f}"
-    if outline.is_valid and not all(outline.covers(ring) for ring in polygon.interiors):
+    if polygon.interiors and outline.is_valid and not shapely.covers(outline, list(polygon.interiors)).all():
         raise InputError(f"{name} has a hole that is not inside it ({reason.lower()}{where}); move the hole inside")
     raise InputError(f"{name} crosses or touches itself{where} ({reason.lower()}); redraw its outline without crossing")
 
 
-def _is_line(grid: LocalGrid, polygon: Geometry) -> bool:
+def _is_line(shell: Ring) -> bool:
     """True for points on one parallel: in metres it bends, so that nothing would seem to have an area."""
-    lat_lon = grid.to_geographic(shapely.get_coordinates(polygon.exterior))
-    hull = shapely.MultiPoint(lat_lon).convex_hull
+    hull = shapely.MultiPoint(shell).convex_hull
     return bool(hull.area < 1e-7 * hull.length**2)
 
 

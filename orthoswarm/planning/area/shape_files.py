@@ -1,7 +1,7 @@
 """Polygons and lines out of GeoJSON and KML text, as latitudes and longitudes in degrees."""
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 from xml.etree import ElementTree
@@ -9,6 +9,7 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.config import active
 from orthoswarm.model.errors import InputError
 
 Ring = NDArray[np.float64]
@@ -70,6 +71,22 @@ def ring(points: Any, name: str, least: int = 3) -> Ring:
     return array
 
 
+def refuse_many_corners(shapes: Iterable[Polygon | Ring], name: str) -> None:
+    """Refuse shapes that would take forever: whether an outline crosses itself can take the square of its corners.
+
+    Args:
+        shapes: polygons and lines that are used together. name: how to call them in an error.
+
+    Raises:
+        InputError: they have more corners than the configuration allows.
+    """
+    most = active().planning.most_corners
+    rings = (ring for s in shapes for ring in ((s.shell, *s.holes) if isinstance(s, Polygon) else (s,)))
+    count = sum(map(len, rings))
+    if count > most:
+        raise InputError(f"{name} has {count} corners; simplify it to at most {most}, for example with QGIS's Simplify")
+
+
 def parse_geojson(text: str, name: str = "the GeoJSON file") -> Shapes:
     """Polygons and lines of a GeoJSON text (RFC 7946): geometries, features and collections, nested ones too.
 
@@ -98,6 +115,7 @@ def parse_geojson(text: str, name: str = "the GeoJSON file") -> Shapes:
                     lines.append(ring(_lat_lon(part), name, 2))
     except (TypeError, ValueError, KeyError, IndexError, AttributeError, RecursionError, OverflowError):
         raise InputError(f"{name} is GeoJSON with a broken geometry; export it again") from None
+    refuse_many_corners([*polygons, *lines], name)
     return Shapes(tuple(polygons), tuple(lines))
 
 
@@ -132,7 +150,8 @@ def parse_kml(text: str | bytes, name: str = "the KML file") -> Shapes:
         raise InputError(f"{name} is not valid XML ({error}); export it again") from None
     if _tag(root) not in ("kml", "Document", "Folder", "Placemark"):
         raise InputError(f"{name} is XML but no KML (its root is '{_tag(root)}'); export a polygon as KML")
-    polygons, lines = [], []
+    polygons: list[Polygon] = []
+    lines: list[Ring] = []
     for node in root.iter():
         if _tag(node) == "Polygon":
             outer = _coordinates(node, "outerBoundaryIs")
@@ -143,6 +162,7 @@ def parse_kml(text: str | bytes, name: str = "the KML file") -> Shapes:
             polygons.append(Polygon(shell, holes))
         elif _tag(node) == "LineString":
             lines += [ring(_numbers(c, name), name, 2) for c in _coordinates(node)]
+    refuse_many_corners([*polygons, *lines], name)
     return Shapes(tuple(polygons), tuple(lines))
 
 
@@ -150,9 +170,13 @@ def _tag(node: ElementTree.Element) -> str:
     return str(node.tag).rpartition("}")[2]
 
 
-def _coordinates(node: ElementTree.Element, below: str | None = None) -> list[str]:
-    parents = [node] if below is None else [n for n in node.iter() if _tag(n) == below]
-    return [n.text or "" for parent in parents for n in parent.iter() if _tag(n) == "coordinates"]
+def _coordinates(node: ElementTree.Element, boundary: str | None = None) -> list[str]:
+    """Texts of a line's coordinates, or of those of a polygon's boundaries.
+
+    Only children are looked at, as the standard has them: what is nested in itself would be read again at every depth.
+    """
+    rings = [node] if boundary is None else [r for b in node if _tag(b) == boundary for r in b]
+    return [n.text or "" for r in rings for n in r if _tag(n) == "coordinates"]
 
 
 def _numbers(text: str, name: str) -> list[tuple[float, float]]:
