@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 from gcs_plugin.daemon.store.event_bus import Events
-from gcs_plugin.daemon.store.journal import Change, Journal, packed, unpacked
+from gcs_plugin.daemon.store.journal import Change, Journal, newest_seq, packed, unpacked
 from orthoswarm.model.errors import OrthoSwarmError, StorageError, WorkerStoppedError
 
 _MOST_ATTEMPTS: Final = 3  # of a job whose worker stopped
@@ -249,10 +249,12 @@ class Jobs:
         return None
 
     def _do(self, job: Job) -> None:
+        if job.kind == "refine":
+            job.detail["newest_seq"] = newest_seq(self._journal)  # pictures that arrive later are late
         self._journal.write(
             lambda db: db.execute(
-                "UPDATE jobs SET state = 'running', started = ?, attempts = ?, message = '' WHERE id = ?",
-                (job.started, job.attempts, job.id),
+                "UPDATE jobs SET state = 'running', started = ?, attempts = ?, message = '', detail = ? WHERE id = ?",
+                (job.started, job.attempts, json.dumps(job.detail), job.id),
             )
         )
         self._publish(job)

@@ -19,7 +19,7 @@ from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
 from gcs_plugin.daemon.jobs.worker_tasks import FollowTask, SolveTask, SortieResult, follow, near, register_late, solve
 from gcs_plugin.daemon.layers.layers import new_name
 from gcs_plugin.daemon.layers.realtime_layer import Drawer
-from gcs_plugin.daemon.store.journal import Change, Journal, late_frames, packed
+from gcs_plugin.daemon.store.journal import Change, Journal, late_frames, newest_seq, packed
 from gcs_plugin.daemon.store.kept_pictures import KeptPictures
 from gcs_plugin.daemon.store.picture_store import PictureStore
 from orthoswarm.model.bounding_box import BoundingBox
@@ -116,7 +116,8 @@ class SortieRefinement:
             The row of the solution to which late pictures were registered (None: all were refined), the number of
             pictures, and their result.
         """
-        job.detail["refine_started_s"] = time.time()  # pictures that arrive later are late
+        job.detail["refine_started_s"] = time.time()
+        job.detail["newest_seq"] = newest_seq(self.journal)  # pictures that arrive later are late
         area = self.publisher.area()
         frames, thumbnails = sortie_frames(self.journal, self.store, str(job.vehicle), job.sortie)
         before = self._refined_before(job, len(frames))

@@ -282,14 +282,22 @@ class Drawn:
     quality: PictureQuality | None = None
 
 
+# Jobs of journals that an earlier version wrote have no `newest_seq`; their times stand in for it. Else times decide
+# nothing: a clock that was set back would hide what came since.
 _LATE: Final = """
 SELECT COUNT(*) AS late FROM frames WHERE vehicle = :vehicle AND sortie = :sortie AND reason IS NULL
-    AND arrived > COALESCE((SELECT MAX(COALESCE(json_extract(detail, '$.refine_started_s'), started)) FROM jobs
+    AND seq > COALESCE((SELECT MAX(COALESCE(json_extract(detail, '$.newest_seq'), (SELECT MAX(seq) FROM frames
+            WHERE arrived <= COALESCE(json_extract(jobs.detail, '$.refine_started_s'), jobs.started)))) FROM jobs
         WHERE kind = 'refine' AND vehicle = :vehicle AND sortie = :sortie AND id != :job), 0)
     AND (EXISTS (SELECT 1 FROM completions WHERE vehicle = :vehicle AND sortie = :sortie)
         OR EXISTS (SELECT 1 FROM jobs WHERE kind = 'refine' AND vehicle = :vehicle AND sortie = :sortie
             AND json_extract(detail, '$.trigger') = 'lost'))
 """
+
+
+def newest_seq(journal: Journal) -> int:
+    """The number of the newest frame of all, 0 without one; a refinement notes it as `newest_seq` when it begins."""
+    return int(journal.rows("SELECT COALESCE(MAX(seq), 0) AS newest FROM frames")[0]["newest"])
 
 
 def late_frames(journal: Journal, vehicle: str, sortie: int | None, job: int = 0) -> int:

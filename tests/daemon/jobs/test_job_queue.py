@@ -10,7 +10,7 @@ from gcs_plugin.daemon.jobs.job_queue import Jobs
 from gcs_plugin.daemon.jobs.solution_file import SolutionFile, SolutionFileError, is_readable, read_solution
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
 from gcs_plugin.daemon.store.event_bus import Events
-from gcs_plugin.daemon.store.journal import Journal
+from gcs_plugin.daemon.store.journal import Journal, add_frame, late_frames
 from orthoswarm.model.errors import DiskFullError, OrthoSwarmError, StorageError, WorkerStoppedError
 from orthoswarm.model.placement import Solution
 
@@ -236,3 +236,41 @@ def test_a_journal_on_a_full_disk_says_so_by_its_type(tmp_path):
     with pytest.raises(StorageError):
         journal.write(grow)
     journal.close()
+
+
+@pytest.mark.parametrize("set_s", [-86_400.0, 0.0, 86_400.0], ids=["back", "kept", "forward"])
+def test_what_is_late_does_not_depend_on_the_clock(journal, monkeypatch, set_s):
+    """A clock that is set during a mission neither hides pictures that came after a refinement nor counts others."""
+
+    def come(*images):
+        for image in images:
+            journal.write(add_frame(image.encode(), "v1", image, time_s=1e9, path=image, size=(640, 480), pose={}))
+
+    ended = []
+    jobs = Jobs(journal, Events(), {"refine": nothing}, slots=1)
+    jobs.on_end(lambda job: ended.append(job.id))
+    come("a", "b")
+    jobs.add("refine", "v1", 1, trigger="lost")
+    jobs.start()
+    until(lambda: ended)
+    assert late_frames(journal, "v1", 1) == 0
+    now = time.time()
+    monkeypatch.setattr(time, "time", lambda: now + set_s)
+    come("b", "c", "d")
+    assert late_frames(journal, "v1", 1) == 2
+    jobs.add("refine", "v1", 1, trigger="late")
+    until(lambda: len(ended) == 2)
+    assert late_frames(journal, "v1", 1) == 0
+    jobs.close()
+
+
+def test_pictures_that_were_late_for_an_earlier_version_are_late_still(journal):
+    """Its journal says only when a refinement began."""
+    for image, came_s in (("a", 10.0), ("b", 20.0), ("c", 30.0)):
+        journal.write(add_frame(image.encode(), "v1", image, time_s=1e9, path=image, size=(640, 480), pose={}))
+        journal.write(lambda db, s=came_s, i=image: db.execute("UPDATE frames SET arrived = ? WHERE path = ?", (s, i)))
+    job = Jobs(journal, Events(), {"refine": nothing}, slots=1).add(
+        "refine", "v1", 1, trigger="lost", refine_started_s=15.0
+    )
+    journal.write(lambda db: db.execute("UPDATE jobs SET state = 'done', started = 5.0 WHERE id = ?", (job.id,)))
+    assert late_frames(journal, "v1", 1) == 2
