@@ -7,6 +7,8 @@ import ssl
 import subprocess
 import threading
 import zipfile
+from dataclasses import replace
+from html.parser import HTMLParser
 from xml.etree import ElementTree
 
 import numpy as np
@@ -80,6 +82,46 @@ def test_a_note_of_any_text_hinders_no_export(tmp_path_factory, note, workspace)
     for name in ("p.kml", "p.gpx"):
         ElementTree.parse(folder / name)
     write_data_package([place], folder / "p.zip", "w")
+
+
+class Shown(HTMLParser):
+    """What a browser shows of HTML, and the tags in it."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.text, self.tags = "", []
+        self.feed(text)
+        self.close()
+
+    def handle_data(self, data):
+        self.text += data
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+
+
+@pytest.mark.parametrize(
+    "note",
+    [
+        "<script>alert(1)</script><img src=x onerror=alert(1)>",
+        "water < 1 m & rising; &lt;b&gt; stays",
+        "two\nlines",
+        "$[name] $[description]",
+    ],
+)
+def test_google_earth_shows_a_note_as_it_was_written(note, tmp_path):
+    """Descriptions and balloons of KML are HTML; what a user wrote is text in it."""
+    write_kml([replace(FIND, name=note, note=note, sigma_m=None, pictures=())], tmp_path / "p.kml")
+    kml = {"k": "http://www.opengis.net/kml/2.2"}
+    mark = ElementTree.parse(tmp_path / "p.kml").getroot().find(".//k:Placemark", kml)
+    assert mark.findtext("k:name", None, kml) == note  # plain text by the standard
+    lines = ["br"] * note.count("\n")
+    for path, wanted, tags in (
+        ("k:description", note, lines),
+        (".//k:BalloonStyle/k:text", f"{note}\n{note}", ["b", *lines, "br", *lines]),
+    ):
+        text = mark.findtext(path, None, kml)
+        assert (Shown(text).text, Shown(text).tags) == (wanted, tags) and "$[" not in text
 
 
 def test_a_changed_list_of_places_is_refused(tmp_path):

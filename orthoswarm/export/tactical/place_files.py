@@ -1,6 +1,7 @@
 """Places as KML (Google Earth), CSV (spreadsheets) and GPX (CalTopo, handheld receivers)."""
 
 import csv
+import html
 import io
 from collections.abc import Iterable
 from pathlib import Path
@@ -57,6 +58,9 @@ def write_gpx(places: Iterable[Place], path: Path) -> None:
 def write_kml(places: Iterable[Place], path: Path) -> None:
     """Write places as KML 2.2 placemarks (OGC 12-007r2).
 
+    Descriptions and balloons are HTML, in which Google Earth would run what a note holds; so texts are escaped as such.
+    A name is plain text, but the usual balloon repeats it as HTML: each place has its own.
+
     Raises:
         OrthoSwarmError: the disk is full.
     """
@@ -65,10 +69,18 @@ def write_kml(places: Iterable[Place], path: Path) -> None:
     _texts(document, {"name": "OrthoSwarm"})
     for place in places:
         mark = ElementTree.SubElement(document, "Placemark")
-        _texts(mark, {"name": place.name, "description": _words(place)})
+        name, words = _html(place.name), _html(_words(place))
+        _texts(mark, {"name": place.name, "description": words})
         _texts(ElementTree.SubElement(mark, "TimeStamp"), {"when": place.time})
+        balloon = ElementTree.SubElement(ElementTree.SubElement(mark, "Style"), "BalloonStyle")
+        _texts(balloon, {"text": f"<b>{name}</b><br>\n{words}"})
         _texts(ElementTree.SubElement(mark, "Point"), {"coordinates": f"{place.lon_deg:.7f},{place.lat_deg:.7f}"})
     _write(root, path)
+
+
+def _html(text: str) -> str:
+    """A text as HTML that shows it as it is; KML's own `$[...]`, which stands for another text, is escaped as well."""
+    return html.escape(text, quote=False).replace("$[", "&#36;[").replace("\n", "<br>\n")
 
 
 def _words(place: Place) -> str:
