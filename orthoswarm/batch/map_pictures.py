@@ -1,7 +1,7 @@
 """The rasters of a run: selection of the frames of each, and rendering as COGs."""
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -48,7 +48,7 @@ def refined_pictures(run: RunContext, state: RunState, refinement: Refinement | 
     for solution in refinement.fine:
         reasons = dict(solution.dropped)
         state.leave_out(reasons, state.recorded.placed)
-        state.warnings += [_named(solution.vehicle, w) for w in solution.warnings]
+    state.warnings += vehicles_warnings([(s.vehicle, w) for s in refinement.fine for w in s.warnings])
     on_map = any(p.stage == "fine" for s in refinement.fine for p in s.placed)
     with_map = state.basemap is not None and run.options.until == "fine"
     if with_map and not on_map:
@@ -240,6 +240,22 @@ def _shared_terrain(solutions: Sequence[Solution]) -> Terrain | None:
     return next((s.terrain for s in solutions if s.terrain is not None), None)
 
 
-def _named(vehicle: str, warning: str) -> str:
-    """A warning that begins with its vehicle's name."""
-    return warning if warning.startswith(vehicle) else f"{vehicle}: {warning}"
+def vehicles_warnings(said: Iterable[tuple[str, str]]) -> list[str]:
+    """Warnings with their vehicles' names before them; what is the same for several is told once for all.
+
+    Args:
+        said: vehicle and warning; one that begins with the vehicle's name is its own.
+    """
+    vehicles: dict[str, list[str]] = {}
+    for vehicle, warning in said:
+        vehicles.setdefault(warning, []).append("" if warning.startswith(vehicle) else vehicle)
+    told, most = [], active().flight.named_most
+    for warning, names in vehicles.items():
+        if not all(names):
+            told.append(warning)
+        elif len(names) == 1:
+            told.append(f"{names[0]}: {warning}")
+        else:
+            rest = f" and {len(names) - most} more" if len(names) > most else ""
+            told.append(f"{len(names)} vehicles ({', '.join(names[:most])}{rest}), of each: {warning}")
+    return told

@@ -6,6 +6,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from orthoswarm.batch.map_pictures import vehicles_warnings
 from orthoswarm.batch.workspace import Workspace, run_key
 from orthoswarm.compute.stage_times import Clock
 from orthoswarm.compute.workers import Usage
@@ -173,3 +174,20 @@ def test_a_file_is_no_output_folder(tmp_path):
     (tmp_path / "out").write_text("x")
     with pytest.raises(InputError, match="is a file"):
         Workspace(tmp_path / "out")
+
+
+def test_what_is_the_same_for_many_vehicles_is_told_once():
+    """Forty flights off the map: one sentence, with the first few and how many."""
+    off, own = "it lies where its receiver says", "v7: its clock is wrong"
+    said = [(f"v{k}", off) for k in range(1, 41)] + [
+        ("v7", own),
+        ("v8", "its lens is odd"),
+        ("v9", "two"),
+        ("v8", "two"),
+    ]
+    assert vehicles_warnings(said) == [
+        f"40 vehicles (v1, v2, v3 and 37 more), of each: {off}",
+        own,
+        "v8: its lens is odd",
+        "2 vehicles (v9, v8), of each: two",
+    ]
