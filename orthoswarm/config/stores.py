@@ -31,7 +31,7 @@ class StoresConfig:
     """Longest silence of a store within a request, seconds (chosen)."""
     connections: int = 16
     """Requests at once of a process that reads tags or uploads (chosen: a request mostly waits for the network)."""
-    whole_kb: int = 512
+    whole_kb: int = from_zero(512)
     """A picture file of no more kilobytes is fetched as a whole when its tags are read, since it is needed later anyhow
     (chosen: its transfer takes no longer than a second request)."""
     part_mb: int = 16

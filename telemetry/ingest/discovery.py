@@ -22,6 +22,7 @@ LOG_SUFFIXES = frozenset({".tlog", ".bin", ".ulg", ".pos", ".mrk"}) | CAN_LOGS
 _UNREAD_PICTURES = frozenset({".heic", ".heif", ".avif"})
 _SIDECARS = frozenset({".txt", ".csv"})
 _SUBTITLES = frozenset({".srt"})
+_ALREADY = "which is in the input already"
 
 
 @dataclass(slots=True, kw_only=True)
@@ -129,7 +130,8 @@ def discover(inputs: Sequence[Path], exclude: Sequence[Path] = ()) -> Discovery:
         real = os.path.realpath(file) if is_link else os.path.join(real_folder(str(file.parent)), file.name)
         first = seen.setdefault(real, file)
         if first != file:
-            left_out[file] = f"the same file as {first.name}, which is in the input already"
+            same = first.name == file.name
+            left_out[file] = _twice(first.parent, root) if same else f"the same file as {first.name}, {_ALREADY}"
         elif file not in sorted_in:
             sorted_in.add(file)
             _sort_in(file, folders, explicit=not walked)
@@ -144,6 +146,12 @@ def discover(inputs: Sequence[Path], exclude: Sequence[Path] = ()) -> Discovery:
         raise InputError(f"no picture was found, and the folder {path} cannot be read ({why}); check its permissions")
     apart = _far_from_pictures(tops, ordered)
     return Discovery(root, ordered, left, _video_vehicles(ordered, root), apart, unreadable=unreadable)
+
+
+def _twice(folder: Path, root: Path) -> str:
+    """Why a photo that is in a folder, too, is left out; without its name, so that it is said once for all of them."""
+    name = _text(_relative(str(folder), str(root)))
+    return f"the same photos are in {_text(root.name) if name == os.curdir else name}, {_ALREADY}"
 
 
 def _by_name(path: Path) -> tuple[tuple[int, int, str], ...]:

@@ -112,6 +112,20 @@ def test_a_missing_input_and_no_input_are_errors(tmp_path):
         require_frames(load([tmp_path]))
 
 
+@pytest.mark.parametrize("again", ["itself", "link"])
+def test_a_survey_that_is_given_twice_is_counted_once_and_that_is_said_once(tmp_path, again):
+    first = flight(tmp_path / "day1", [0.0], legs=4)
+    second = {"itself": first, "link": tmp_path / "day2"}[again]
+    if again == "link":
+        second.symlink_to(first, target_is_directory=True)
+    found = load([first, second])
+    assert len(found.frames) == 4 and len({frame.vehicle for frame in found.frames}) == 1
+    reasons = [rejection.reason for rejection in found.rejected]
+    if again == "link":
+        assert len(reasons) == 4
+        assert set(reasons) == {"the same photos are in day1, which is in the input already"}
+
+
 def test_an_excluded_folder_is_left_out(tmp_path):
     photo(tmp_path / "a.JPG")
     photo(tmp_path / "out" / "a.JPG")
