@@ -4,7 +4,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
-from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from gcs_plugin.backends.backend import Backend, Say
@@ -69,6 +69,7 @@ class InTurn:
                     self._say_waits()
             finally:
                 self._returns.close()
+                self._do_work()
                 with self._lock:
                     self._stop.set()
                 self._do_work()
@@ -114,12 +115,15 @@ class InTurn:
     def _command(self, verb: Verb, names: Collection[str]) -> list[dict[str, Any]]:
         """Give a command to vehicles and wait for the outcomes; in a thread of the returns."""
         given, orders = time.monotonic(), dict[str, Order]()
-        try:
-            for name in names:
-                system = self._systems[name]
-                orders[name] = self.call(lambda s=system: self._order(verb, s, given)).result()  # type: ignore[misc]
-        except CancelledError:
-            pass
+        begun = {
+            name: self.call(lambda s=self._systems[name]: self._order(verb, s, given))  # type: ignore[misc]
+            for name in names
+        }
+        for name, future in begun.items():
+            while not future.done() and not self._stop.wait(_STEP_S):  # Ctrl-C may cut off who does it
+                pass
+            if future.done() and not future.cancelled():
+                orders[name] = future.result()
         while any(order.outcome is None for order in orders.values()) and not self._stop.wait(_STEP_S):
             pass
         ended = [orders[name].result(name) if name in orders else None for name in names]
@@ -160,11 +164,13 @@ class InTurn:
     def _order(self, verb: Verb, system: int, given: float) -> Order:
         self._ended.pop(system, None)
         self._holding.discard(system)
-        self.orders[system] = self._backend.order(Order(verb=verb, system=system, given_s=given))
-        return self.orders[system]
+        order = self.orders[system] = Order(verb=verb, system=system, given_s=given)  # known before it is sent
+        return self._backend.order(order)
 
     def _heard(self, row: Mapping[str, Any], *, begins: bool = False) -> None:
-        """How a vehicle's command ended, or why it waits no longer."""
+        """How a vehicle's command ended, or why it waits no longer. At the end the orders say how it stands."""
+        if self._stop.is_set():
+            return
         system, verdict = self._systems[row["vehicle"]], Verdict(row["outcome"])
         self._ended[system] = Outcome(ok=verdict is Verdict.DONE, text=row["reason"], failure=verdict)
         order = self.orders.get(system)

@@ -283,8 +283,10 @@ def _use_map(folder: Path) -> None:
 
     dense, area = str(folder / "dense"), str(folder / "twin" / "plan.geojson")
     with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
-        main(["coverage", dense, "--area", area, "--out", str(folder / "coverage")])
-        main(["export", dense, "--to", "mbtiles"])
+        codes = [main(["coverage", dense, "--area", area, "--out", str(folder / "coverage")])]
+        codes += [main(["export", dense, "--to", "mbtiles"])]
+    if 130 in codes:
+        raise KeyboardInterrupt
     load_kernels(folder)
 
 

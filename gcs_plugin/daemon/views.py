@@ -1,6 +1,7 @@
 """The daemon's state for the API: frames, vehicles, legs and layers as JSON values."""
 
 import json
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -98,7 +99,7 @@ def _senders(journal: Journal) -> Iterable[dict[str, Any]]:
             document |= {key: pose.get(key) for key in ("lat_deg", "lon_deg", "height_m")}
             newest = last[row["last"]]
             document |= {"heading_deg": pose.get("yaw_deg"), "last_frame": iso_time(newest["time"])}
-            document["last_arrived"] = iso_time(newest["arrived"])
+            document["came_s"] = round(max(0.0, time.time() - newest["arrived"]), 1)
         yield document
 
 

@@ -143,7 +143,9 @@ class Commands:
         }  # fmt: skip
         figures = self.client.ask("/api/plans", body)
         self._plan = figures["id"]
-        return [f"{self._plan}: {100 * figures['covered_share']:.1f} % covered in {figures['makespan_s'] / 60:.1f} min"]
+        warned = [f"warning: {text}" for text in figures.get("warnings", [])]
+        covered, minutes = 100 * figures["covered_share"], figures["makespan_s"] / 60
+        return [f"{self._plan}: {covered:.1f} % covered in {minutes:.1f} min", *warned]
 
     def upload(self, words: list[str]) -> list[str]:
         """`upload VEHICLE [PLAN]`."""
@@ -172,7 +174,10 @@ class Commands:
                if text and who not in self._said]  # fmt: skip
         self._said = {who: text for who, text in found.items() if text}
         waits = {str(row["id"]) for row in rows if row.get("returns_after") is not None}
-        new += [f"{name} waits no longer for its turn to return" for name in sorted(self._waits - waits)]
+        new += [
+            f"{name} waits no longer: it is told to return, has landed, or follows another command; see 'vehicles'"
+            for name in sorted(self._waits - waits)
+        ]
         self._waits = waits
         return new
 

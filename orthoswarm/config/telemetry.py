@@ -117,8 +117,15 @@ class IngestConfig:
     """Times of positions may be off by this, seconds: many are written in whole seconds."""
     wild_most_share: float = 0.1
     """Positions that cannot be reached are wild up to this share of all; more are another flight (chosen)."""
-    wild_most_pieces: int = 2000
+    wild_most_pieces: int = 10_000
     """A track that cannot be flown at more places than this has wrong times, not wild positions (chosen)."""
+    longest_repeat_s: float = 30.0
+    """A receiver may repeat a fix for so long, during which it flies on, seconds (chosen)."""
+    far_share: float = 0.2
+    """Up to this share of photos far from their camera events have wrong positions; more are of another flight
+    (chosen)."""
+    most_zone_s: float = 54_000.0
+    """No time zone explains a larger offset of a camera's clock, seconds: 14 hours (IANA), and one for its error."""
     low_share: float = 0.4
     """A few photos lower than this share of the usual height are reported: takeoff, landing, inspection (chosen)."""
     from_horizon_deg: float = -25.0

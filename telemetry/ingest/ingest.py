@@ -24,7 +24,7 @@ from telemetry.formats.video.sei_layout import read_sei_layout
 from telemetry.ingest.discovery import Discovery, Folder, discover, natural_key
 from telemetry.ingest.log_choice import LogSource
 from telemetry.ingest.log_ingest import add_logs, read_logs
-from telemetry.ingest.photo_order import clock_went_back, in_order
+from telemetry.ingest.photo_order import SHIFTED, clock_went_back, in_order
 from telemetry.ingest.side_files import read_control_points
 from telemetry.ingest.survey import LoadOptions, SourceInfo, Survey
 from telemetry.ingest.video_ingest import read_videos
@@ -266,13 +266,13 @@ def _where_it_can_be(
 
     Where the clock was set back, photos of two places seem to alternate, and nothing is known of speeds.
     """
-    if clock_went_back(photos):
+    if clock_went_back(photos) or any(SHIFTED in p.origin.get("time", "") for p in photos):
         return list(photos)
     wild = wild_fixes([p.time_s for p in photos], [(p.lat_deg or 0.0, p.lon_deg or 0.0) for p in photos])
     if not wild.indices:
         return list(photos)
     text = (
-        f"{plural(len(wild.indices), 'picture')} lie up to {wild.distance} away from the pictures before and after "
+        f"{plural(len(wild.indices), 'picture')} up to {wild.distance} away from the pictures before and after "
         f"({found.name(photos[wild.indices[0]].path)} first), farther than any aircraft flies in that time; their "
         "positions are wrong, and they are left out"
     )

@@ -4,7 +4,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from orthoswarm.config import active
+from orthoswarm.model.earth import distance_m
 from telemetry.formats.log.flight_logs import FlightLog
 from telemetry.ingest.can_positions import apart_m
 from telemetry.ingest.survey import SourceInfo
@@ -78,4 +81,25 @@ def best_log(matches: Sequence[LogMatch], what: str, is_named: Callable[[FlightL
 def _same_flight(a: LogSource, b: LogSource) -> bool:
     """Whether two logs, of autopilot and ground station perhaps, record one vehicle's flight."""
     distance = apart_m(a.log, b.log)
+    distance = _exposures_apart_m(a.log, b.log) if distance is None else distance
     return distance is not None and distance <= active().ingest.bus_same_vehicle_m
+
+
+def _exposures_apart_m(a: FlightLog, b: FlightLog) -> float | None:
+    """Median distance of the exposures of the same moments, metres; None if less than half of one log's are in both."""
+    few, many = sorted((a.events, b.events), key=len)
+    times = np.array([event.time_s for event in many], dtype=np.float64)
+    apart = []
+    for event in few:
+        i = int(np.argmin(np.abs(times - (event.time_s or 0.0))))
+        own, other = event.sample, many[i].sample
+        if abs(times[i] - (event.time_s or 0.0)) > active().ingest.log_same_exposure_s:
+            continue
+        if (
+            own.lat_deg is not None
+            and own.lon_deg is not None
+            and other.lat_deg is not None
+            and other.lon_deg is not None
+        ):
+            apart.append(distance_m(own.lat_deg, own.lon_deg, other.lat_deg, other.lon_deg))
+    return float(np.median(apart)) if apart and len(apart) >= 0.5 * len(few) else None

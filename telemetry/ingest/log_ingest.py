@@ -192,7 +192,9 @@ def _misfit(photos: Sequence[PhotoTags], pairing: Pairing, entry: LogSource) -> 
     apart = [_photo_apart_m(photos[i], events[j].sample) for i, j in pairing.pairs if photos[i].lat_deg is not None]
     away = float(np.median(apart)) / active().ingest.event_far_m if apart else 0.0
     clock = 0.5 * (pairing.how != "time") + 0.01 * math.log1p(pairing.residual_s)
-    return 1.0 - share + clock + 0.6 * entry.used + away
+    # No zone explains more: another flight of the same mission.
+    other_day = 2.0 * active().ingest.log_same_fit * (abs(pairing.offset_s or 0.0) > active().ingest.most_zone_s)
+    return 1.0 - share + clock + other_day + 0.6 * entry.used + away
 
 
 def _photo_apart_m(photo: PhotoTags, pose: Sample) -> float:
@@ -220,7 +222,7 @@ def _use_events(
     config = active().ingest
     entry.used = True
     log = entry.log
-    far = 0
+    far = list[tuple[PhotoTags, float | None]]()
     for i, j in pairing.pairs:
         event = log.events[j]
         around = entry.timeline.at(event.time_s or 0.0)
@@ -229,7 +231,7 @@ def _use_events(
             pose = fixed_camera(pose)
         photo = photos[i]
         if _photo_apart_m(photo, pose) > config.event_far_m:
-            far += 1
+            far.append((photo, event.time_s))
             continue
         origin = f"{event.kind} ({entry.name})"
         if i in pairing.doubtful:
@@ -239,10 +241,13 @@ def _use_events(
             photo.ambiguous = True
         fill(photo, replace(pose, time_s=event.time_s), origin, gimbal=log.has_gimbal)
     findings += [replace(f, vehicle=vehicle) for f in _pairing_findings(photos, pairing, log)]
+    if len(far) <= config.far_share * len(pairing.pairs):  # the log is theirs, their positions are wrong
+        for photo, time_s in far:
+            photo.time_s, photo.origin["time"] = time_s, f"exposure ({entry.name})"
     if far:
         text = (
-            f"{plural(far, 'photo')} lie more than {config.event_far_m:.0f} m from their camera events of "
-            f"{log.path.name} and get nothing from them; the log may be that of another flight"
+            f"{plural(len(far), 'photo')} more than {config.event_far_m:.0f} m from the camera events of "
+            f"{log.path.name}, without a position from it; the log may be that of another flight"
         )
         findings.append(Finding("pairing-distance", text, vehicle))
 

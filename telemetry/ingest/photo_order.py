@@ -1,15 +1,21 @@
 """The order of exposure of photos, even if the camera's clock was set in between."""
 
+import re
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from orthoswarm.config import active
 from telemetry.ingest.discovery import natural_key
 from telemetry.photos.photo_tags import PhotoTags
 from telemetry.samples.course import local_metres
 from telemetry.samples.findings import Finding, plural
+
+SHIFTED: Final = "shifted after a jump"
+"""Said in the origin of a photo's time that was moved to follow the photos before it."""
 
 
 def in_order(photos: Sequence[PhotoTags], vehicle: str, findings: list[Finding]) -> list[PhotoTags]:
@@ -43,7 +49,7 @@ def in_order(photos: Sequence[PhotoTags], vehicle: str, findings: list[Finding])
     for photo, time_s in zip(by_name, times.tolist(), strict=True):
         if photo.time_s != time_s:
             photo.time_s = time_s
-            photo.origin["time"] = f"{photo.origin.get('time', 'camera clock')}, shifted after a jump"
+            photo.origin["time"] = f"{photo.origin.get('time', 'camera clock')}, {SHIFTED}"
     text = (
         f"the camera's clock jumped back {plural(len(back), 'time')} during the flight; the order of the file names is "
         "used, and times after a jump are shifted"
@@ -57,8 +63,14 @@ def clock_went_back(photos: Sequence[PhotoTags]) -> bool:
 
     Runs one after the other are no sign of it: numbers begin anew after the last one.
     """
-    ordered = sorted(photos, key=lambda p: natural_key(p.path.name))
-    times = np.array([p.time_s for p in ordered if p.time_s is not None], dtype=np.float64)
+    series: dict[str, list[float]] = {}  # by the names without their number: two cameras in one folder are two
+    for p in sorted(photos, key=lambda p: natural_key(p.path.name)):
+        if p.time_s is not None:
+            series.setdefault(re.sub(r"\d+\D*$", "", p.path.stem), []).append(p.time_s)
+    return any(_went_back(np.array(times)) for times in series.values())
+
+
+def _went_back(times: NDArray[np.float64]) -> bool:
     back = np.flatnonzero(np.diff(times) < -active().ingest.time_resolution_s) + 1
     if not 0 < len(back) <= 3:  # more: names that are not in the order of exposure
         return False

@@ -15,7 +15,7 @@ from telemetry.photos.flight_checks import number_of
 from telemetry.photos.photo_tags import PhotoTags
 from telemetry.samples.findings import Finding, plural
 from telemetry.samples.sample import Sample
-from telemetry.samples.times import YEAR_2000_S
+from telemetry.samples.times import YEAR_2000_S, ZONE_UNKNOWN
 
 _LEAST_PLACED = 5
 """Photos with positions that it takes to find the camera's clock by them."""
@@ -72,12 +72,15 @@ def add_track(photos: Sequence[PhotoTags], near: Sequence[LogSource], vehicle: s
             findings.append(Finding("posed-by-time", text, vehicle, note=by_positions))
         if far:
             text = (
-                f"{plural(len(far), 'photo')} lie more than {_far_m(best):.0f} m from the track of "
-                f"{best.entry.log.path.name} at their times ({far[0].path.name} first) and get nothing from it there: "
+                f"{plural(len(far), 'photo')} more than {_far_m(best):.0f} m from the track of "
+                f"{best.entry.log.path.name} at that time ({far[0].path.name} first), without a pose from it: "
                 "the camera's clock was set during the flight, or they are of another one"
             )
             findings.append(Finding("track-far", text, vehicle))
         timed = far if count and len(far) >= _LEAST_PLACED else []
+        for photo in far if count and not timed else ():  # their positions are wrong, their clock is that of the others
+            photo.time_s = (photo.time_s or 0.0) - best.offset_s
+            photo.origin["time"] = f"track of {best.entry.name}"
 
 
 def _at_longest_pause(photos: Sequence[PhotoTags]) -> list[Sequence[PhotoTags]]:
@@ -105,8 +108,11 @@ def _by_positions(photos: Sequence[PhotoTags], near: Sequence[LogSource]) -> lis
 def _by_zone(photos: Sequence[PhotoTags], near: Sequence[LogSource]) -> list[LogMatch]:
     times = np.array([p.time_s for p in photos], dtype=np.float64)
     zones = [(entry, offset_by_zone(times, entry.timeline)) for entry in near]
+    unknown = any(ZONE_UNKNOWN in p.origin.get("time", "") for p in photos)  # then no zone is likelier than another
     return [
-        LogMatch(entry=entry, offset_s=zone, how="by the time of the flight", rank=0, misfit=abs(zone))
+        LogMatch(
+            entry=entry, offset_s=zone, how="by the time of the flight", rank=0, misfit=0.0 if unknown else abs(zone)
+        )
         for entry, zone in zones
         if zone is not None and any(sample.has_position for sample in entry.log.samples)
     ]

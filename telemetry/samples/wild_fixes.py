@@ -50,7 +50,12 @@ def wild_fixes(times_s: Sequence[float | None], places: Sequence[tuple[float, fl
     last = np.concatenate([cuts, [len(order)]]) - 1
     if not 1 < len(first) <= config.wild_most_pieces:
         return WildFixes([])
-    kept = _longest_track(first, last, times, ground)
+    new = np.concatenate([[True], np.any(np.diff(ground, axis=0) != 0.0, axis=1)])
+    since = times[np.maximum.accumulate(np.where(new, np.arange(len(order)), 0))]  # a fix that is repeated may be old
+    since = np.maximum(since, times - config.longest_repeat_s)
+    kept = _longest_track(first, last, since, times, ground)
+    if len(kept) == len(first):
+        return WildFixes([])
     pieces = [np.arange(a, b + 1) for k, (a, b) in enumerate(zip(first, last, strict=True)) if k not in kept]
     wild = np.concatenate(pieces)
     if len(wild) > max(1.0, config.wild_most_share * len(order)):
@@ -71,13 +76,15 @@ def _flyable(t0: Array, a: Array, t1: Array, b: Array) -> NDArray[np.bool_]:
     return np.asarray(np.hypot(b[..., 0] - a[..., 0], b[..., 1] - a[..., 1]) <= reach)
 
 
-def _longest_track(first: NDArray[np.int64], last: NDArray[np.int64], times: Array, ground: Array) -> set[int]:
+def _longest_track(
+    first: NDArray[np.int64], last: NDArray[np.int64], since: Array, times: Array, ground: Array
+) -> set[int]:
     """Pieces (from index `first` to `last`) that can be flown one after the other and hold most fixes together."""
     best = (last - first + 1).astype(np.float64)
     before = np.full(len(first), -1)
     for k in range(1, len(first)):
         ends = last[:k]
-        score = np.where(_flyable(times[ends], ground[ends], times[first[k]], ground[first[k]]), best[:k], 0.0)
+        score = np.where(_flyable(since[ends], ground[ends], times[first[k]], ground[first[k]]), best[:k], 0.0)
         i = int(np.argmax(score))
         if score[i] > 0.0:
             best[k] += score[i]

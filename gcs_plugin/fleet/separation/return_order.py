@@ -18,6 +18,7 @@ from gcs_plugin.config import LIMITS, RETURN
 from gcs_plugin.fleet.autopilot_settings import Setting
 from gcs_plugin.fleet.flight_state import Word, flight_state
 from gcs_plugin.links.mavlink import Autopilot
+from gcs_plugin.mission.flight_modes import why_no_missions
 from gcs_plugin.mission.track import STEP_S, Array, Track, metres, near_samples
 from orthoswarm.config import active
 from orthoswarm.model.earth import distance_m
@@ -30,10 +31,17 @@ _GOES_HOME: Final = frozenset({Word.RETURNING, Word.LANDING})
 
 @dataclass(frozen=True, slots=True)
 class Hold:
-    """How a vehicle holds: its mode in words, and where, latitude and longitude in degrees (None: not known)."""
+    """How a vehicle holds.
+
+    Attributes:
+        mode: in words. place: latitude and longitude in degrees; None if it is not known, or if it circles.
+        paused: whether a pause leaves a vehicle in this mode. still: it no longer brakes.
+    """
 
     mode: str
     place: tuple[float, float] | None
+    paused: bool = True
+    still: bool = True
 
     def left(self, now: "Hold") -> str:
         """Why it holds no longer as now it is, in words; empty if it does."""
@@ -70,6 +78,7 @@ class ReturnOrder:
     Attributes:
         waits: vehicles that hold until their way is free, and whom each waits for (nobody before the first look).
         left: those that at the last look were found to follow another command, and what shows that, in words.
+        heard_again: those that were lost, were heard again by the last look, and wait: nothing has told them to hold.
 
     Args:
         systems: the vehicles, all in the air. clock: monotonic seconds.
@@ -78,6 +87,7 @@ class ReturnOrder:
     def __init__(self, systems: Collection[int], clock: Callable[[], float] = time.monotonic) -> None:
         self.waits: dict[int, tuple[int, ...]] = dict.fromkeys(systems, ())
         self.left: dict[int, str] = {}
+        self.heard_again: set[int] = set()
         self._clock = clock
         self._sent: dict[int, float] = {}
         self._unheard: set[int] = set()
@@ -120,7 +130,11 @@ class ReturnOrder:
         self.waits = {}
         for system in left:
             known = aloft[system].height_known
-            others = [o for o in moving if not apart(ways[system], ways[o], heights=known and aloft[o].height_known)]
+            others = [
+                o
+                for o in moving - {system}
+                if not apart(ways[system], ways[o], heights=known and aloft[o].height_known)
+            ]
             others += [o for o in stay if o != system and not apart(ways[system], aloft[o].place, heights=known)]
             if others:
                 self.waits[system] = tuple(sorted(others))
@@ -133,6 +147,7 @@ class ReturnOrder:
         if mutual and not moving:
             ready.append(min(mutual, key=lambda s: (len(self.waits[s]), left.index(s))))
             del self.waits[ready[-1]]
+        self.heard_again = heard & self.waits.keys()
         self._sent |= dict.fromkeys(ready, self._clock())
         self._unheard |= {s for s in ready if aloft[s].lost}
         for system in self._unheard:  # nobody knows what it does until it is heard
@@ -160,9 +175,10 @@ class ReturnOrder:
             vehicle, (since, hold) = aloft[system], self._held[system]
             if vehicle.lost or vehicle.goes_home or self._clock() - since < RETURN.shows_s:
                 continue
-            if hold is None:
-                self._held[system] = since, vehicle.hold
-            elif why := hold.left(vehicle.hold):
+            if hold is None and vehicle.hold.paused:
+                if vehicle.hold.still or self._clock() - since >= 3 * RETURN.shows_s:
+                    self._held[system] = since, vehicle.hold
+            elif why := hold.left(vehicle.hold) if hold is not None else f"its mode is {vehicle.hold.mode}":
                 found[system] = why
         return found
 
@@ -191,10 +207,17 @@ def aloft_of(vehicles: "Mapping[int, Vehicle]", now: float) -> dict[int, Aloft]:
             silent_s=now - v.heard,
             lost=v.lost,
             must_land=v.battery is not None and v.battery < 0.5 * LIMITS.reserve_share,
-            hold=Hold(v.mode, _place(v)),
+            hold=_hold(v),
         )
         for s, v in known.items()
     }
+
+
+def _hold(vehicle: "Vehicle") -> Hold:
+    """A pause leaves ArduPilot in AUTO or GUIDED, or in the mode that holds; one that cannot hover circles in that."""
+    modes, circles = vehicle.modes, bool(why_no_missions(vehicle.kind))
+    paused = vehicle.custom_mode in (modes.mission, modes.ready, modes.hold)
+    return Hold(vehicle.mode, None if circles else _place(vehicle), paused, circles or vehicle.still_s > 0.0)
 
 
 def _goes_home(vehicle: "Vehicle") -> bool:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 VERB: Final = "return"
 _ANSWER_S: Final = 5.0
 _AGAIN_S: Final = 0.1
+_ASK_S: Final = 0.5
 _log = logging.getLogger(__name__)
 
 Result = TypeVar("Result")
@@ -78,7 +79,6 @@ class Returns:
             self._order, self._waits = None, {}
             self._told_else.clear()
             self._again.clear()
-        self._fleet.call(self._ask).result(_ANSWER_S)
         aloft = self._known(systems.values())
         going = {name for name, system in systems.items() if system in aloft and aloft[system].goes_home}
         order = ReturnOrder([s for name, s in systems.items() if s in aloft and name not in going])
@@ -147,6 +147,9 @@ class Returns:
             if free is None:
                 return
             sending.update(free)
+            for system in order.heard_again:
+                hold = self._command, ("pause", [self._name_of(system)])
+                threading.Thread(target=hold[0], args=hold[1], daemon=True).start()
             for system in free:
                 threading.Thread(target=self._send_home, args=(system, sending), daemon=True).start()
 
@@ -182,12 +185,16 @@ class Returns:
 
     def _send_home(self, system: int, sending: set[int]) -> None:
         """Tell one vehicle to return; if it is there and does not acknowledge that, it has its turn again."""
-        (row,) = self._command("rtl", [self._name_of(system)])
-        self._publish(row | {"by": VERB})
-        if not _done(row) and not self._fleet.vehicles[system].lost:
-            with self._lock:
-                self._again.add(system)
-        sending.discard(system)
+        done = False
+        try:
+            (row,) = self._command("rtl", [self._name_of(system)])
+            done = _done(row)
+            self._publish(row | {"by": VERB})
+        finally:
+            if not done and not self._fleet.vehicles[system].lost:
+                with self._lock:
+                    self._again.add(system)
+            sending.discard(system)
 
     def _ask(self) -> None:
         """Ask for the heights at which they return, without which they wait longer, and for homes not known yet."""
@@ -201,12 +208,23 @@ class Returns:
 
         Whose way is not known then returns at once.
         """
-        end = time.monotonic() + RETURN.known_s
+        end, ask_at = time.monotonic() + RETURN.known_s, 0.0
         while True:
+            now = time.monotonic()
+            if now >= ask_at:  # a question or its answer may be lost
+                self._fleet.call(self._ask).result(_ANSWER_S)
+                ask_at = now + _ASK_S
             aloft = self._aloft()
-            unknown = [s for s in systems if s in aloft and aloft[s].way is None and not aloft[s].lost]
-            if not unknown or time.monotonic() >= end or self._stop.wait(_AGAIN_S):
+            unknown = [s for s in systems if self._unknown(s, aloft)]
+            if not unknown or now >= end or self._stop.wait(_AGAIN_S):
                 return aloft
+
+    def _unknown(self, system: int, aloft: Mapping[int, Aloft]) -> bool:
+        """Whether it is still to be heard whether a vehicle is in the air, or where its home is."""
+        vehicle = self._fleet.vehicles[system]
+        if system in aloft:
+            return aloft[system].way is None and not vehicle.lost
+        return vehicle.armed and not vehicle.lost and not (vehicle.reported and vehicle.landed)
 
     def _aloft(self) -> dict[int, Aloft]:
         return self._fleet.call(lambda: aloft_of(self._fleet.vehicles, time.monotonic())).result(_ANSWER_S)

@@ -30,9 +30,13 @@ def parts_between_jumps(photos: Array, events: Array, offsets: Matcher) -> list[
     if count < config.jump_windows * config.jump_least_photos:
         return [slice(0, count)]
     edges = np.linspace(0, count, config.jump_windows + 1).round().astype(int)
-    found = [offsets(photos[a:b], events) for a, b in pairwise(edges)]
-    clocks = [float(np.median(some)) for some in found if some is not None]
     allowed = config.most_drift * float(np.ptp(events)) + config.least_jump_s
+    parts = list(pairwise(edges.tolist()))
+    begin, end = (offsets(photos[a:b], events) for a, b in (parts[0], parts[-1]))
+    if begin is not None and end is not None and abs(float(np.median(end) - np.median(begin))) <= allowed:
+        return [slice(0, count)]  # a clock that was set stays so
+    found = [begin, *(offsets(photos[a:b], events) for a, b in parts[1:-1]), end]
+    clocks = [float(np.median(some)) for some in found if some is not None]
     starts = [0]
     for before, after in pairwise(clocks):
         if abs(after - before) > allowed:

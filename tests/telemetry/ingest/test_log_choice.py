@@ -7,7 +7,7 @@ import pytest
 
 from telemetry.ingest.ingest import load
 from telemetry.ingest.pairing.event_pairing import pair
-from tests.telemetry.formats.test_exposure_lists import UTC_S, solution
+from tests.telemetry.formats.test_exposure_lists import STEPS, UTC_S, solution, write_mrk, write_pos
 from tests.telemetry.ingest.test_photos import gps_exif, jpeg
 
 METRE = 1.0 / 111_194.93
@@ -28,14 +28,15 @@ def track(path, *, metres_east=0.0, later_s=0.0):
     return solution(path, rows)
 
 
-def photos(folder, clock_s, *, metres_east=None):
+def photos(folder, clock_s, *, metres_east=None, offset=None, prefix="P"):
     """Photos by a camera whose clock shows `clock_s(i, utc)`; without positions unless `metres_east` says whose."""
     folder.mkdir(parents=True, exist_ok=True)
     for i, t in enumerate(TAKEN_S):
         moment = datetime.fromtimestamp(clock_s(i, UTC_S + t), UTC)
         where = (0.0, 0.0) if metres_east is None else place(t, metres_east)
         local, fraction = moment.strftime("%Y:%m:%d %H:%M:%S"), f"{moment.microsecond // 1000:03d}"
-        jpeg(folder / f"P_{i:03d}.JPG", exif_bytes=gps_exif(*where, local=local, subsec=fraction))
+        name = f"{prefix}_{i:03d}.JPG"
+        jpeg(folder / name, exif_bytes=gps_exif(*where, local=local, subsec=fraction, offset=offset))
 
 
 def right(_, utc_s):
@@ -70,11 +71,28 @@ def test_logs_that_fit_equally_well_are_not_used_unless_one_is_named_like_the_ph
 
 
 def test_the_log_of_the_photos_time_is_taken_and_not_the_first(tmp_path):
+    photos(tmp_path / "card", right, offset="+00:00")
+    track(tmp_path / "card" / "a.pos", metres_east=500.0, later_s=-3600.0)
+    track(tmp_path / "card" / "b.pos")
+    frames = load([tmp_path]).frames
+    assert len(frames) == len(TAKEN_S)
+    for frame in frames:
+        assert "b.pos" in frame.origin["position"]
+
+
+def test_without_a_time_zone_none_of_two_flights_logs_is_likelier(tmp_path):
     photos(tmp_path / "card", right)
     track(tmp_path / "card" / "a.pos", metres_east=500.0, later_s=-3600.0)
     track(tmp_path / "card" / "b.pos")
-    for frame in load([tmp_path]).frames:
-        assert "b.pos" in frame.origin["position"]
+    found = load([tmp_path])
+    assert not found.frames and len(found.rejected) == len(TAKEN_S)
+
+
+def test_two_cameras_in_one_folder_are_both_placed(tmp_path):
+    for prefix in "AB":
+        photos(tmp_path / "card", right, prefix=prefix)
+    track(tmp_path / "card" / "a.pos")
+    assert len(load([tmp_path]).frames) == 2 * len(TAKEN_S)
 
 
 @pytest.mark.parametrize("jump_s", [-15.0, 12.0, 3600.0])
@@ -123,3 +141,13 @@ def test_camera_events_pair_with_photos_before_and_after_the_clock_was_set(first
     ((first, by_s),) = found.jumps
     assert order[first] == pytest.approx(first_after, abs=1)
     assert jump_s is None or by_s == pytest.approx(jump_s, abs=0.1)
+
+
+def test_a_list_of_exposures_and_the_ppk_solution_of_them_are_one_flights(tmp_path):
+    write_mrk(tmp_path / "flight_Timestamp.MRK")
+    write_pos(tmp_path / "flight_events.pos")
+    for i, t in enumerate(STEPS):
+        moment = datetime.fromtimestamp(UTC_S + t + 7200.0, UTC)  # the camera shows local time
+        local, fraction = moment.strftime("%Y:%m:%d %H:%M:%S"), f"{moment.microsecond // 1000:03d}"
+        jpeg(tmp_path / f"DJI_{i + 1:04d}.JPG", exif_bytes=gps_exif(0.0, 0.0, local=local, subsec=fraction))
+    assert len(load([tmp_path]).frames) == len(STEPS)

@@ -28,11 +28,12 @@ def outward(autopilot, place, height):
     return Mission(autopilot, tuple(items))
 
 
-def flown_out(make_world, places, *, autopilots=(AP,), height=30.0, seconds=45.0, spacing_m=SPACING_M):
+CRAFT = Airframe(climb_m_s=8.0)
+
+
+def flown_out(make_world, places, *, autopilots=(AP,), height=30.0, seconds=45.0, spacing_m=SPACING_M, airframe=CRAFT):
     """Vehicles of neighbouring starts on their ways to places, and their true positions as a function."""
-    swarm = make_swarm(
-        len(places), autopilots=autopilots, home=HOME, spacing_m=spacing_m, airframe=Airframe(climb_m_s=8.0)
-    )
+    swarm = make_swarm(len(places), autopilots=autopilots, home=HOME, spacing_m=spacing_m, airframe=airframe)
     world = make_world(*swarm)
     world.meet()
     fleet = world.fleet
@@ -171,6 +172,37 @@ def test_one_that_another_station_or_a_remote_control_commands_waits_no_longer(m
     world.wait(4.0)
     assert look(world, order) == [] and order.over
     assert shown in order.left[held]
+
+
+@pytest.mark.parametrize(("autopilot", "mode"), [(AP, 5), (PX4, 3 << 16)], ids=["LOITER", "POSCTL"])
+def test_a_pilot_who_takes_over_as_soon_as_it_holds_keeps_the_aircraft(make_world, autopilot, mode):
+    world, _ = flown_out(make_world, FAN[:2], autopilots=(autopilot,))
+    order = ReturnOrder(world.fleet.vehicles, world.clock)
+    (first,) = look(world, order)
+    (held,) = order.waits
+    world.finish(world.fleet.rtl(first), world.fleet.pause(held))
+    order.holds(held)
+    world.wait(1.0)
+    world.vehicles[held].flight.set_mode(mode)
+    for _ in range(8):
+        world.wait(1.0)
+        look(world, order)
+    assert held not in order.waits and order.over
+
+
+@pytest.mark.parametrize("accel_m_s2", [2.5, 1.0])
+def test_one_that_brakes_slowly_keeps_its_turn(make_world, accel_m_s2):
+    craft = Airframe(speed_m_s=12.0, climb_m_s=8.0, accel_m_s2=accel_m_s2)
+    world, _ = flown_out(make_world, FAN[:2], airframe=craft)
+    order = ReturnOrder(world.fleet.vehicles, world.clock)
+    (first,) = look(world, order)
+    (held,) = order.waits
+    world.finish(world.fleet.rtl(first), world.fleet.pause(held))
+    order.holds(held)
+    for _ in range(20):
+        world.wait(1.0)
+        look(world, order)
+        assert not order.left
 
 
 def test_one_that_did_not_acknowledge_has_its_turn_again(make_world):

@@ -45,8 +45,9 @@ function create(row) {
 
 // What is known of one that was not heard on a link since the station began.
 export function pictureWord(row) {
-  if (!row.cameAt) return t("state.pictures.none");
-  return Date.now() - row.cameAt > SENDING_MS ? t("state.pictures.last", { time: timeOfDay(row.cameAt) }) : t("state.pictures");
+  if (row.came_s == null) return t("state.pictures.none");
+  const ago_ms = 1000 * row.came_s + nowMs() - row.at;
+  return ago_ms > SENDING_MS ? t("state.pictures.last", { time: timeOfDay(Date.now() - ago_ms) }) : t("state.pictures");
 }
 
 export function wordOf(row) {

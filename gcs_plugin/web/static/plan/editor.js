@@ -118,6 +118,7 @@ const focusAt = (at) => handles.map((h) => h.getElement()).find((e) => e.dataset
 const focusOn = (ring, index) => focusAt(`${ring}/${index}`);
 
 function handlesAgain(focus) {
+  dragged = false; // a marker that is removed ends its drag
   for (const marker of handles) marker.remove();
   handles = [];
   if (!editing) return;

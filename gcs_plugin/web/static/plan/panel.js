@@ -8,6 +8,7 @@ import { state } from "/static/core/store.js";
 import { t } from "/static/core/strings.js";
 import * as units from "/static/core/units.js";
 import { ring } from "/static/core/values.js";
+import { inAir } from "/static/fly/need.js";
 import * as area from "/static/plan/area.js";
 import * as editor from "/static/plan/editor.js";
 import { fillFields, followsTerrain, inFieldNames, planFields, planValues, rawValues, relabelFields, setDem } from "/static/plan/fields.js";
@@ -86,7 +87,8 @@ export function planPanel() {
       const body = { ...planValues(), area: area.outline(), no_fly: area.zones() };
       const heard = [...state.vehicles.values()].filter((row) => row.linked && row.position);
       if (followsTerrain() && !heard.length) throw new Error(t("plan.terrain.start"));
-      if (heard.length >= body.vehicles || followsTerrain()) body.starts = heard.slice(0, body.vehicles).map((row) => [row.position[1], row.position[0]]);
+      const flies = heard.slice(0, body.vehicles).some(inAir); // it takes off elsewhere; the daemon warns
+      if ((heard.length >= body.vehicles && !flies) || followsTerrain()) body.starts = heard.slice(0, body.vehicles).map((row) => [row.position[1], row.position[0]]);
       const drawn = drawnNow();
       made = await post("/api/plans", body);
       setMadeOf(drawn);
