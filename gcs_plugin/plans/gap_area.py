@@ -1,7 +1,7 @@
 """The ground that a gap flight must see: gaps of a coverage, merged, grown by the margin of their cause."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -63,7 +63,7 @@ def read_gaps(path: Path) -> list[ReadGap]:
     gaps = []
     for feature in features:
         cause = known.get(str(((feature or {}).get("properties") or {}).get("cause")))
-        gaps += [ReadGap(polygon, cause) for polygon in parse_geojson(json.dumps(feature), str(path)).polygons]
+        gaps += [ReadGap(polygon, cause) for polygon in _polygons(feature, path)]
     if not gaps:
         raise InputError(f"{path} holds no polygon; give the gaps.geojson of a coverage")
     return gaps
@@ -119,3 +119,8 @@ def _grown(gap: ReadGap, grid: LocalGrid, foot: Footprint) -> Geometry:
     rings = [grid.to_grid(r[:, 0], r[:, 1]) for r in (gap.polygon.shell, *gap.polygon.holes)]
     margin = foot.width_m * (_USUAL_MARGIN if gap.cause is None else _MARGIN.get(gap.cause, _USUAL_MARGIN))
     return shapely.Polygon(rings[0], rings[1:]).buffer(0).buffer(margin).simplify(0.25 * margin)
+
+
+def _polygons(feature: Mapping[str, Any], path: Path) -> Sequence[Polygon]:
+    """The polygons of one feature. They are made of the steps of cells, and simplified later: any number of corners."""
+    return parse_geojson(json.dumps(feature), str(path), any_size=True).polygons

@@ -22,6 +22,7 @@ MOST_BYTES: Final = 20_000_000
 _MOST_NAME: Final = 200  # characters
 _LARGE_BYTES: Final = 300_000
 """Larger files take longer than a tenth of a second (chosen), less than the start of a process."""
+_ZIP: Final = b"PK\x03\x04"  # whose size says nothing of what is in it
 _ELSEWHERE: Final = ThreadPoolExecutor(1, thread_name_prefix="areas")  # one such process at a time
 
 
@@ -35,7 +36,7 @@ async def read_area(
     """
     data = await body_of(request, MOST_BYTES)
     named = (data, name[:_MOST_NAME])
-    if len(data) <= _LARGE_BYTES:
+    if len(data) <= _LARGE_BYTES and not data.startswith(_ZIP):
         answer = await asyncio.to_thread(_answer, named)
     else:
         answer = await in_thread(_ELSEWHERE, _answer_elsewhere, named)

@@ -68,7 +68,7 @@ class MosaicConfig:
     haze_cost: float = from_zero(6000.0)
     """Cost of less local contrast than the clearest picture has on the same ground, times the logarithm of the ratio;
     chosen: half the contrast outweighs a view that is some 20 degrees more oblique."""
-    haze_ignored_log: float = 0.3
+    haze_ignored_log: float = from_zero(0.3)
     """Log ratios of contrast up to this cost nothing: parallax, shadows, noise; chosen."""
     glare_cost: float = from_zero(3000.0)
     """Cost of ground that is burnt out (glints of water); chosen: as of a view at 25 degrees."""
@@ -85,7 +85,7 @@ class MosaicConfig:
     blur_cost: float = from_zero(6000.0)
     """Cost of a picture that is less sharp than the median of those around, times the logarithm of the ratio; chosen
     like `haze_cost`."""
-    blur_ignored_log: float = 0.25
+    blur_ignored_log: float = from_zero(0.25)
     """Log ratios of sharpness up to this cost nothing; chosen: pictures of one scene taken well differ by less."""
     seam_cost: float = from_zero(3.0)
     """Cost of a seam where both pictures are alike: keeps seams short and few; chosen by looking at four sets."""

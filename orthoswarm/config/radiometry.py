@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from orthoswarm.config.ranges import above_zero
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RadiometryConfig:
@@ -59,7 +61,7 @@ class RadiometryConfig:
     """A picture's own slopes; chosen by steps on even ground of three flights, other values changed with it."""
     curve_sigma: float = 0.06
     """A picture's own curvatures, x^2, xy, y^2; chosen with the slopes."""
-    hue_share: float = 0.35
+    hue_share: float = above_zero(0.35)
     """How much less than brightness hue may vary, but for a vehicle's white balance; chosen by looking at four sets."""
     redraw_tone: float = 0.015
     """Log factors of a flight's pictures, 95 %: if balancing all flights together changes them by more, it is drawn

@@ -61,11 +61,12 @@ def range_of(declared: "Field[Any]") -> Range | None:
         return None
     smallest, largest = min(numbers), max(numbers)
     unit = declared.name.rpartition("_")[2]
-    share = unit in _SHARES and largest <= 1.0  # with a larger default it is a factor
+    share = unit in _SHARES and largest < 1.0  # with a larger default it is a factor, and 1.0 may be exceeded
     whole = all(isinstance(number, int) for number in numbers)
-    lens = declared.name.endswith("fov_deg")
-    most = 180.0 if lens else 1.0 if share else _TOPS.get(unit, _LARGEST_WHOLE if whole else _LARGEST)
-    below = lens or (share and unit == "overlap")
+    lens, nadir = declared.name.endswith("fov_deg"), declared.name.endswith("nadir_deg")  # which looks at ground
+    most = _LARGEST_WHOLE if whole else _LARGEST
+    most = 180.0 if lens else 90.0 if nadir else 1.0 if share else _TOPS.get(unit, most)
+    below = lens or nadir or (share and unit == "overlap")
     if smallest < 0 or unit in ("cos", "cosine"):
         return Range(-most, most, below=below)
     above = not declared.metadata.get(_KEY, share or smallest == 0)
@@ -73,9 +74,9 @@ def range_of(declared: "Field[Any]") -> Range | None:
 
 
 def rises(declared: "Field[Any]") -> bool:
-    """True for a pair whose second number is the larger one: the bounds of something."""
+    """True for a pair whose second number is the larger one: the bounds of something (two prices are none)."""
     numbers = list(numbers_in(declared.default))
-    return len(numbers) == 2 and numbers[0] < numbers[1]
+    return len(numbers) == 2 and numbers[0] < numbers[1] and not declared.name.endswith("_prices")
 
 
 def numbers_in(value: Any) -> Iterator[int | float]:

@@ -13,7 +13,7 @@ class RasterConfig:
     collar_px: int = 15
     """Plain black or plain white squares of at least this side, pixels, in a map without a mask are its collar and no
     ground (chosen; not measured)."""
-    stretch_percent: tuple[float, float] = (0.5, 99.5)
+    stretch_percent: tuple[float, float] = from_zero((0.5, 99.5))
     """Percentiles of a map of more than 8 bits that become 0 and 255 (chosen; usual in GIS: 2 and 98, which clips
     roofs)."""
     check_side: int = 5
@@ -29,11 +29,11 @@ class RasterConfig:
     """Pictures of a folder that tell the range of its 16-bit pictures (chosen for its time)."""
     depth_values: int = 20_000
     """About so many values of each of them (chosen for its time)."""
-    grey_pictures_mb: float = 1500.0
+    grey_pictures_mb: float = from_zero(1500.0)
     """Grey pictures at the refiner's working size that take no more than this together, megabytes, are kept on disk
     during a batch run (chosen for the disk). They come from the colours then: a grey level off by rounding, a few
     where a colour is clipped."""
-    picture_parts_mb: float = 2000.0
+    picture_parts_mb: float = from_zero(2000.0)
     """Parts of pictures that are kept on disk between two drawings of a batch run take no more than this together,
     megabytes (chosen for the disk); larger ones are decoded again."""
     part_margin: float = from_zero(0.1)

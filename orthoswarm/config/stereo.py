@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from orthoswarm.config.ranges import from_zero
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StereoConfig:
@@ -31,9 +33,9 @@ class StereoConfig:
     and 1.76 m of their median error, ground as good with each."""
     smoothness: tuple[float, float] = (8.0, 32.0)
     """Penalty of a disparity that differs by one, and by more, times the block's area: OpenCV's recommendation."""
-    unique_percent: int = 10
+    unique_percent: int = from_zero(10)
     """The best match costs less than the second one by this much at least, percent: OpenCV's recommendation (5-15)."""
-    speckle_px: int = 60
+    speckle_px: int = from_zero(60)
     """Regions of alike disparity with fewer pixels are false matches: OpenCV's recommendation (50-200)."""
     disparity_sigma_px: float = 0.25
     """One sigma of a disparity, pixels: the 68 % above are 0.24 of it at a base of 0.25 and 0.22 at 0.7."""

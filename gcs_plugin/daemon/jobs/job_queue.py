@@ -341,7 +341,8 @@ def new_job(kind: str, vehicle: str | None, sortie: int | None, detail: dict[str
     def change(db: sqlite3.Connection) -> Job:
         db.row_factory = sqlite3.Row
         row = db.execute(
-            "SELECT * FROM jobs WHERE kind = ? AND vehicle IS ? AND sortie IS ? AND state = 'queued' AND detail = ?",
+            "SELECT * FROM jobs WHERE kind = ? AND vehicle IS ? AND sortie IS ? AND state = 'queued'"
+            " AND json_remove(detail, '$.newest_seq') = json(?)",
             (kind, name, sortie, text),
         ).fetchone()
         if row is None:

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from orthoswarm.config.ranges import from_zero
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StrategyConfig:
@@ -17,7 +19,7 @@ class StrategyConfig:
     flights and on 1,017 photos, and wrong tracks could carry the focal length away (docs/method.md)."""
     full_lens_steps: int = 4
     """Steps at the last scale more where all parameters of a lens are solved (chosen; not measured)."""
-    records_weighed_step: int = 3
+    records_weighed_step: int = from_zero(3)
     """After this step, counted from 0, records are weighted by their residuals, and the ground is fitted (chosen: the
     adjustment has nearly converged by then)."""
     first_steps: int = 2
@@ -84,7 +86,7 @@ class StrategyConfig:
     """How well a vehicle's place agrees in two areas that it was solved in, an axis, metres (chosen)."""
     leg_link_steps: int = 6
     """Steps of a flight without a map once its legs are linked to each other (chosen; not measured)."""
-    second_steps: int = 4
+    second_steps: int = from_zero(4)
     """Steps of the second pass without a map (chosen; not measured)."""
 
     # What the field of view's sigma takes in

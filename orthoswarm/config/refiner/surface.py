@@ -5,6 +5,8 @@ Lengths that scale with the flying height are stated for `reference_height_m` ab
 
 from dataclasses import dataclass
 
+from orthoswarm.config.ranges import from_zero
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SurfaceConfig:
@@ -74,7 +76,7 @@ class SurfaceConfig:
     hold_out_standard_errors: float = 0.5
     """The smoothest surface is taken whose error at points left out lies within so many standard errors of the best:
     the best itself is too rough on rubble, which is real but no ground."""
-    flat_relief_m: float = 0.5
+    flat_relief_m: float = from_zero(0.5)
     """Relief of this standard deviation or less is noise to the adjustment's height prior, metres: an unshrunk prior on
     flat ground follows each vehicle's own level."""
     tile_nodes: int = 40
@@ -101,7 +103,7 @@ class SurfaceConfig:
     drawn_hold_out_standard_errors: float = 1.0
     """As `hold_out_standard_errors`, of the surface for drawing: one as smooth as the points allow, so that rubble in
     the middle does not roughen the border."""
-    drawn_flat_relief_m: float = 0.15
+    drawn_flat_relief_m: float = from_zero(0.15)
     """As `flat_relief_m`, for drawing: there following noise costs less than missing relief."""
     drawn_on_map_sigma_floor_m: float = 0.15
     """As `point_sigma_floor_m`, where heights by the map are among the points (chosen with them: the 95 % of the map's

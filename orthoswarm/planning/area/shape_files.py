@@ -87,8 +87,12 @@ def refuse_many_corners(shapes: Iterable[Polygon | Ring], name: str) -> None:
         raise InputError(f"{name} has {count} corners; simplify it to at most {most}, for example with QGIS's Simplify")
 
 
-def parse_geojson(text: str, name: str = "the GeoJSON file") -> Shapes:
+def parse_geojson(text: str, name: str = "the GeoJSON file", *, any_size: bool = False) -> Shapes:
     """Polygons and lines of a GeoJSON text (RFC 7946): geometries, features and collections, nested ones too.
+
+    Args:
+        text: of the file. name: how to call it in an error.
+        any_size: also more corners than the configuration allows, for what is simplified before it is used.
 
     Raises:
         InputError: no JSON, no GeoJSON, or coordinates that are not longitude and latitude.
@@ -115,7 +119,8 @@ def parse_geojson(text: str, name: str = "the GeoJSON file") -> Shapes:
                     lines.append(ring(_lat_lon(part), name, 2))
     except (TypeError, ValueError, KeyError, IndexError, AttributeError, RecursionError, OverflowError):
         raise InputError(f"{name} is GeoJSON with a broken geometry; export it again") from None
-    refuse_many_corners([*polygons, *lines], name)
+    if not any_size:
+        refuse_many_corners([*polygons, *lines], name)
     return Shapes(tuple(polygons), tuple(lines))
 
 

@@ -274,3 +274,21 @@ def test_pictures_that_were_late_for_an_earlier_version_are_late_still(journal):
     )
     journal.write(lambda db: db.execute("UPDATE jobs SET state = 'done', started = 5.0 WHERE id = ?", (job.id,)))
     assert late_frames(journal, "v1", 1) == 2
+
+
+def test_a_refinement_that_was_interrupted_is_not_queued_beside_itself(journal):
+    begun, go_on = threading.Event(), threading.Event()
+
+    def wait(job, report):
+        begun.set()
+        assert go_on.wait(LIMIT_S)
+        return lambda db: None
+
+    jobs = Jobs(journal, Events(), {"refine": wait}, slots=1)
+    jobs.start()
+    first = jobs.add("refine", "v1", 1)
+    assert begun.wait(LIMIT_S)
+    journal.write(lambda db: db.execute("UPDATE jobs SET state = 'queued' WHERE id = ?", (first.id,)))  # a restart
+    assert jobs.add("refine", "v1", 1).id == first.id
+    go_on.set()
+    jobs.close()
