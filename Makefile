@@ -20,7 +20,7 @@ demo: $(STAMP)
 	@echo "The map: $(DEMO)/orthoimage.tif; how it was made: $(DEMO)/report.html"
 
 # Two processes: tests with vehicles, the daemon and the page one after the other in one, those that compute in both.
-# PYTEST="-n 2 --dist loadgroup -m 'not sitl'" runs the slow tests as well (half an hour).
+# PYTEST="-n 2 --dist loadgroup -m 'not sitl'" runs the slow tests as well (an hour).
 PYTEST ?= -n 2 --dist loadgroup
 test: check
 	@$(BIN)/python -m pytest $(PYTEST)
