@@ -40,8 +40,8 @@ class Hold:
 
     mode: str
     place: tuple[float, float] | None
-    paused: bool = True
-    still: bool = True
+    paused: bool
+    still: bool
 
     def left(self, now: "Hold") -> str:
         """Why it holds no longer as now it is, in words; empty if it does."""

@@ -148,8 +148,8 @@ class Returns:
                 return
             sending.update(free)
             for system in order.heard_again:
-                hold = self._command, ("pause", [self._name_of(system)])
-                threading.Thread(target=hold[0], args=hold[1], daemon=True).start()
+                args = "pause", [self._name_of(system)]
+                threading.Thread(target=self._command, args=args, daemon=True).start()
             for system in free:
                 threading.Thread(target=self._send_home, args=(system, sending), daemon=True).start()
 

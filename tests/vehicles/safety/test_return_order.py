@@ -97,6 +97,16 @@ def go_on(world, order, seconds):
             world.fleet.rtl(system)
 
 
+def one_waits_holding(world):
+    """Of two vehicles one returns and the other holds; gives their order and the one that holds."""
+    order = ReturnOrder(world.fleet.vehicles, world.clock)
+    (first,) = look(world, order)
+    (held,) = order.waits
+    world.finish(world.fleet.rtl(first), world.fleet.pause(held))
+    order.holds(held)
+    return order, held
+
+
 FAN = [(600, 240 * (k - 2)) for k in range(6)]
 
 
@@ -160,11 +170,7 @@ def test_one_that_was_given_another_command_waits_no_longer(make_world):
 )
 def test_one_that_another_station_or_a_remote_control_commands_waits_no_longer(make_world, autopilot, shown):
     world, _ = flown_out(make_world, FAN[:2], autopilots=(autopilot,))
-    order = ReturnOrder(world.fleet.vehicles, world.clock)
-    (first,) = look(world, order)
-    (held,) = order.waits
-    world.finish(world.fleet.rtl(first), world.fleet.pause(held))
-    order.holds(held)
+    order, held = one_waits_holding(world)
     for _ in range(8):
         world.wait(1.0)
         assert look(world, order) == [] and not order.left
@@ -177,11 +183,7 @@ def test_one_that_another_station_or_a_remote_control_commands_waits_no_longer(m
 @pytest.mark.parametrize(("autopilot", "mode"), [(AP, 5), (PX4, 3 << 16)], ids=["LOITER", "POSCTL"])
 def test_a_pilot_who_takes_over_as_soon_as_it_holds_keeps_the_aircraft(make_world, autopilot, mode):
     world, _ = flown_out(make_world, FAN[:2], autopilots=(autopilot,))
-    order = ReturnOrder(world.fleet.vehicles, world.clock)
-    (first,) = look(world, order)
-    (held,) = order.waits
-    world.finish(world.fleet.rtl(first), world.fleet.pause(held))
-    order.holds(held)
+    order, held = one_waits_holding(world)
     world.wait(1.0)
     world.vehicles[held].flight.set_mode(mode)
     for _ in range(8):
@@ -194,11 +196,7 @@ def test_a_pilot_who_takes_over_as_soon_as_it_holds_keeps_the_aircraft(make_worl
 def test_one_that_brakes_slowly_keeps_its_turn(make_world, accel_m_s2):
     craft = Airframe(speed_m_s=12.0, climb_m_s=8.0, accel_m_s2=accel_m_s2)
     world, _ = flown_out(make_world, FAN[:2], airframe=craft)
-    order = ReturnOrder(world.fleet.vehicles, world.clock)
-    (first,) = look(world, order)
-    (held,) = order.waits
-    world.finish(world.fleet.rtl(first), world.fleet.pause(held))
-    order.holds(held)
+    order, _ = one_waits_holding(world)
     for _ in range(20):
         world.wait(1.0)
         look(world, order)
