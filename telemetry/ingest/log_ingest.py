@@ -16,12 +16,12 @@ from telemetry.formats.log.flight_logs import FlightLog, read_log
 from telemetry.formats.log.mavlink_poses import CameraEvent, fixed_camera
 from telemetry.ingest.can_positions import apart_m, bettered
 from telemetry.ingest.discovery import Discovery
-from telemetry.ingest.log_choice import LogMatch, LogSource, best_log
+from telemetry.ingest.log_choice import LogMatch, LogSource
 from telemetry.ingest.pairing.event_pairing import Pairing, pair
 from telemetry.ingest.pairing.motion_chains import PictureMotion
 from telemetry.ingest.pairing.picture_evidence import picture_motion
 from telemetry.ingest.survey import SourceInfo, Survey
-from telemetry.ingest.track_poses import add_track, fill, is_named_like
+from telemetry.ingest.track_poses import add_track, best_log_of, fill
 from telemetry.photos.flight_checks import number_of
 from telemetry.photos.photo_tags import PhotoTags
 from telemetry.samples.course import local_metres
@@ -174,9 +174,9 @@ def add_logs(
     if not matches:
         add_track(photos, near, vehicle, findings)
         return
-    best = best_log(matches, f"the photos of {vehicle}", lambda log: is_named_like(vehicle, log.path.name, log.vehicle))
+    best = best_log_of(matches, vehicle)
     if isinstance(best, Finding):
-        findings.append(replace(best, vehicle=vehicle))
+        findings.append(best)
         return
     entry, pairing = best.entry, pairings[id(best.entry)]
     if pairing.doubtful and not pairing.jumps:

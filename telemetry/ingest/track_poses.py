@@ -1,6 +1,7 @@
 """Poses of photos from a log's track, at the photos' times: for logs without camera events."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import PurePath
 
 import numpy as np
@@ -21,7 +22,15 @@ _LEAST_PLACED = 5
 """Photos with positions that it takes to find the camera's clock by them."""
 
 
-def is_named_like(vehicle: str, log_name: str, log_vehicle: str) -> bool:
+def best_log_of(matches: Sequence[LogMatch], vehicle: str) -> LogMatch | Finding:
+    """The log that fits a vehicle's photos best, or a finding that says why there is none; see `best_log`."""
+    found = best_log(
+        matches, f"the photos of {vehicle}", lambda log: _is_named_like(vehicle, log.path.name, log.vehicle)
+    )
+    return replace(found, vehicle=vehicle) if isinstance(found, Finding) else found
+
+
+def _is_named_like(vehicle: str, log_name: str, log_vehicle: str) -> bool:
     """Whether vehicle and log have one name or number (logs of a swarm are similar and can be confused)."""
     if PurePath(log_name).stem.lower() == PurePath(vehicle).name.lower():
         return True
@@ -56,11 +65,9 @@ def add_track(photos: Sequence[PhotoTags], near: Sequence[LogSource], vehicle: s
                 if sum(p.lat_deg is not None for p in part) >= _LEAST_PLACED:
                     add_track(part, near, vehicle, findings)
             return
-        best = best_log(
-            matches, f"the photos of {vehicle}", lambda log: is_named_like(vehicle, log.path.name, log.vehicle)
-        )
+        best = best_log_of(matches, vehicle)
         if isinstance(best, Finding):
-            findings.append(Finding(best.code, best.message, vehicle))
+            findings.append(best)
             return
         count, far = _fill_from(best, timed)
         if count:
