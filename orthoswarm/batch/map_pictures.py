@@ -219,7 +219,7 @@ def _write(run: RunContext, canvas: Canvas, name: str) -> None:
 
 def _write_seamlines(run: RunContext, canvas: Canvas, placed: Sequence[PlacedFrame]) -> None:
     """Write which picture shows which ground."""
-    write_seamlines(run.out / SEAMLINES, canvas, [partial(describe_frame, p) for p in placed])
+    write_seamlines(run.out / SEAMLINES, canvas, [partial(describe_frame, p) for p in placed], run=run.drawers.map)
 
 
 def _copy_coarse(run: RunContext, state: RunState) -> None:
