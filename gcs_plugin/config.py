@@ -34,6 +34,11 @@ class FlightLimits:
     """Takeoffs whose altitudes differ by less count as level, metres: receivers err by about 5 m in height (u-blox M8:
     2.5 m horizontally, twice that in height), two of them by 7 m and now and then by 12 m. A plan's layers are 5 m
     apart, so that such an error would be taken for a vehicle in another one's layer."""
+    fence_margin_m: float = 2.0
+    """A mission that comes so near a limit of a geofence may be carried beyond it, metres: ArduCopter's factory setting
+    of FENCE_MARGIN, which counts where it is known."""
+    fence_px4_rise_m: float = 13.0
+    """The same for the height of a PX4, metres: it rises by so much as it brakes (measured, docs/vehicles.md)."""
     old_s: float = 15.0
     """The state of battery or receiver that was reported longer ago is not that of now, seconds: both come once a
     second, and are asked for again three seconds after they stop (chosen)."""

@@ -18,6 +18,7 @@ from gcs_plugin.mission.items import Mission
 from gcs_plugin.mission.plan_folder import NO_NEEDS, PlanNeeds
 
 if TYPE_CHECKING:
+    from gcs_plugin.mission.geofence import Zone
     from gcs_plugin.mission.track import Airspace
 
 Report = Callable[[str, int, int], None]
@@ -86,7 +87,7 @@ class Backend(abc.ABC):
             systems: the vehicles. wait_s: longest wait, seconds.
         """
         end = time.monotonic() + wait_s
-        while not all(self.vehicles()[s].streams.ready_to_check for s in systems):
+        while not all(self.vehicles()[s].ready_to_check for s in systems):
             left = end - time.monotonic()
             if left <= 0.0:
                 return
@@ -123,6 +124,15 @@ class Backend(abc.ABC):
             report: as for `upload`.
         """
 
+    @abc.abstractmethod
+    def zones(self, systems: Collection[int], report: Report) -> dict[int, "tuple[Zone, ...]"]:
+        """Download the zones of geofences; without those of vehicles that do not answer.
+
+        Args:
+            systems: system ids.
+            report: as for `upload`.
+        """
+
     def check(
         self,
         systems: Collection[int],
@@ -132,18 +142,19 @@ class Backend(abc.ABC):
         legal_height_m: float,
         *,
         needs: PlanNeeds = NO_NEEDS,
+        zones: "Mapping[int, tuple[Zone, ...]] | None" = None,
     ) -> list[Check]:
         """Preflight check of vehicles with their present telemetry.
 
         Args:
             systems: the vehicles. missions: of the plan. stored: missions downloaded from the vehicles.
             starts: takeoffs in seconds after the first. legal_height_m: legal height limit, metres.
-            needs: of the plan.
+            needs: of the plan. zones: of the geofences that were read.
         """
         vehicles = {s: self.vehicle(s) for s in systems}
         return preflight_all(
             vehicles, missions, stored, starts, time.monotonic(),
-            needs=needs, legal_height_m=legal_height_m,
+            needs=needs, legal_height_m=legal_height_m, zones=zones,
         )  # fmt: skip
 
     @abc.abstractmethod

@@ -14,6 +14,7 @@ from gcs_plugin.links.transports import Link
 from gcs_plugin.mission.completion import Phase
 from gcs_plugin.mission.download import MissionDownload
 from gcs_plugin.mission.exchange import Address, Exchange, Outcome
+from gcs_plugin.mission.geofence import Zone, zones_of
 from gcs_plugin.mission.items import Mission
 from orthoswarm.model.errors import OrthoSwarmError
 
@@ -81,6 +82,18 @@ class DirectBackend(Backend):
             if job.items is not None:
                 found[system] = Mission(fleet.vehicles[system].autopilot, tuple(job.items))
         return found
+
+    def zones(self, systems: Collection[int], report: Report) -> dict[int, tuple[Zone, ...]]:
+        """All downloads at the same time."""
+        jobs: dict[int, MissionDownload] = {}
+
+        def begin(system: int) -> Exchange:
+            jobs[system] = self.fleet.read_fence(system)
+            return jobs[system]
+
+        reads = {system: (lambda system=system: begin(system)) for system in systems}
+        self._run(reads, "read", report)
+        return {system: tuple(zones_of(job.items)) for system, job in jobs.items() if job.items is not None}
 
     def order(self, order: Order) -> Order:
         """Give a command."""

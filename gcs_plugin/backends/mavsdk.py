@@ -26,6 +26,7 @@ from gcs_plugin.mission.comparison import difference
 from gcs_plugin.mission.completion import CompletionDetector, Phase
 from gcs_plugin.mission.exchange import Address, Exchange, Outcome, Verdict
 from gcs_plugin.mission.flight_modes import modes_of, why_no_missions
+from gcs_plugin.mission.geofence import Zone, zones_of
 from gcs_plugin.mission.items import Mission, MissionItem
 from gcs_plugin.mission.mission_builder import unflyable
 from orthoswarm.model.errors import InputError, OrthoSwarmError
@@ -33,7 +34,7 @@ from orthoswarm.model.errors import InputError, OrthoSwarmError
 _HEARD: Final = (
     "HEARTBEAT", "COMMAND_ACK", "MISSION_CURRENT", "MISSION_ITEM_REACHED", "EXTENDED_SYS_STATE", "STATUSTEXT",
     "GLOBAL_POSITION_INT", "SYS_STATUS", "GPS_RAW_INT", "CAMERA_FEEDBACK", "CAMERA_IMAGE_CAPTURED",
-    "EKF_STATUS_REPORT", "ESTIMATOR_STATUS", "HOME_POSITION",
+    "EKF_STATUS_REPORT", "ESTIMATOR_STATUS", "HOME_POSITION", "PARAM_VALUE",
 )  # fmt: skip
 _RATES: Final = Rates({33: 2.0, 42: 2.0, 245: 1.0, 1: 1.0, 24: 1.0}, {193: 1.0, 230: 1.0, 242: 0.2})
 _ATTEMPTS: Final = 4  # uploads until what is stored agrees
@@ -132,8 +133,20 @@ class MavsdkBackend(Backend):
         """Downloads one after the other, since MAVSDK's calls block."""
         found: dict[int, Mission | None] = {}
         for system in systems:
-            found[system] = self._crafts[system].vehicle.mission = self._read(system)
+            craft = self._crafts[system]
+            self._send(craft, craft.vehicle.questions.ask(time.monotonic()))
+            found[system] = craft.vehicle.mission = self._read(system)
             report("read", len(found), len(systems))
+        return found
+
+    def zones(self, systems: Collection[int], report: Report) -> dict[int, tuple[Zone, ...]]:
+        """Downloads one after the other."""
+        found: dict[int, tuple[Zone, ...]] = {}
+        for count, system in enumerate(systems, 1):
+            items = _downloaded(self._crafts[system].raw.download_geofence)
+            if items is not None:
+                found[system] = tuple(zones_of(items))
+            report("read", count, len(systems))
         return found
 
     def order(self, order: Order) -> Order:
@@ -228,7 +241,7 @@ class MavsdkBackend(Backend):
             self._take(self._crafts[number], message, time.monotonic())
         now = time.monotonic()
         for craft in self._crafts.values():
-            self._send(craft, craft.vehicle.streams.tick(now))
+            self._send(craft, [*craft.vehicle.streams.tick(now), *craft.vehicle.questions.tick(now)])
             for job in list(craft.jobs):
                 if now >= job.deadline:
                     self._drive(craft, job, job.tick(now))
@@ -320,20 +333,9 @@ class MavsdkBackend(Backend):
 
     def _read(self, system: int) -> Mission | None:
         """The mission stored in a vehicle, None if the download fails."""
-        from mavsdk.plugins.mission_raw import MissionRawError
-
         craft = self._crafts[system]
-        try:
-            raw = craft.raw.download_mission()
-        except MissionRawError:
-            return None
-        items = [
-            MissionItem(
-                command=i.command, frame=i.frame, params=(i.param1, i.param2, i.param3, i.param4), x=i.x, y=i.y, z=i.z
-            )
-            for i in raw
-        ]
-        return Mission(craft.vehicle.autopilot, tuple(items))
+        items = _downloaded(craft.raw.download_mission)
+        return None if items is None else Mission(craft.vehicle.autopilot, items)
 
     def _begin(self, system: int, verb: Verb, expires: float) -> Exchange:
         craft = self._craft(system)
@@ -376,3 +378,19 @@ class MavsdkBackend(Backend):
             raise OrthoSwarmError(f"vehicle {vehicle.system} {wrong or 'did not send its mission'}")
         vehicle.detector.knows_mission(mission)
         return vehicle.pilot.start(in_air=in_air, armed=vehicle.armed, check=False)
+
+
+def _downloaded(download: Callable[[], Any]) -> tuple[MissionItem, ...] | None:
+    """The items of a list that MAVSDK downloads, None if that fails."""
+    from mavsdk.plugins.mission_raw import MissionRawError
+
+    try:
+        raw = download()
+    except MissionRawError:
+        return None
+    return tuple(
+        MissionItem(
+            command=i.command, frame=i.frame, params=(i.param1, i.param2, i.param3, i.param4), x=i.x, y=i.y, z=i.z
+        )
+        for i in raw
+    )

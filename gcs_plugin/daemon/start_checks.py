@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from gcs_plugin.config import COMMAND
 from gcs_plugin.daemon.airspace.fences import Fences
-from gcs_plugin.fleet.autopilot_settings import Setting
+from gcs_plugin.fleet.autopilot_settings import CHECKED
 from gcs_plugin.mission.items import Mission
 from gcs_plugin.mission.plan_folder import NO_NEEDS, PlanNeeds
 from orthoswarm.model.errors import OrthoSwarmError
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 _SOON_S: Final = 5.0
 _READ_S: Final = 20.0
 _CHECK_S: Final = 20.0
-_ASKED, _ANSWER_S = 3, 0.7  # times, and seconds between them
+_SETTINGS_S: Final = 5.0  # they are asked for thrice in less
 
 
 def red_items(row: Mapping[str, Any], allowed: Collection[str]) -> list[str]:
@@ -75,8 +75,8 @@ class StartChecks:
         from gcs_plugin.fleet.separation.separation_check import Separation
 
         stored = self._missions(systems, reread=reread)
-        if needs.return_height_m is not None:
-            self._ask_heights(systems)
+        if reread:
+            self._hear_settings(systems)
         separation = Separation()
         if reread:  # it is a schedule's, otherwise
             first = min(starts.values(), default=0.0)
@@ -97,15 +97,15 @@ class StartChecks:
         ).result(_CHECK_S)
         return [check.document(systems[check.system]) for check in checks]
 
-    def _ask_heights(self, systems: Collection[int]) -> None:
-        """Ask those again that have not said at what height they return: a lost packet must not let them start."""
-        for _ in range(_ASKED):
-            unknown = [s for s in systems if Setting.RETURN_HEIGHT not in self._fleet.vehicles[s].settings]
-            if not unknown:
-                return
-            for system in unknown:
+    def _hear_settings(self, systems: Collection[int]) -> None:
+        """Wait for the settings, asked for again where not told: a lost packet must not let a vehicle start."""
+        vehicles = {s: self._fleet.vehicles[s] for s in systems}
+        for system, vehicle in vehicles.items():
+            if not vehicle.lost and not vehicle.questions.waits_for(CHECKED) and vehicle.untold:
                 self._fleet.call(lambda s=system: self._fleet.ask_settings(s)).result(_SOON_S)  # type: ignore[misc]
-            time.sleep(_ANSWER_S)
+        end = time.monotonic() + _SETTINGS_S
+        while any(v.questions.waits_for(CHECKED) for v in vehicles.values() if not v.lost) and time.monotonic() < end:
+            time.sleep(0.02)
 
     def _separation(
         self,

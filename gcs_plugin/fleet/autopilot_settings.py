@@ -1,4 +1,4 @@
-"""Settings of an autopilot that the check before a start looks at: its speed, its way home, what it does by itself.
+"""Settings of an autopilot that a check before a start looks at: speed, way home, geofence, what it does by itself.
 
 ArduPilot 4.7 renamed some and gave them SI units (ardupilot.org, "Parameter Name Changes"), so both names are asked
 for; no autopilot answers about a name that it does not have.
@@ -7,7 +7,8 @@ for; no autopilot answers about a name that it does not have.
 import enum
 import math
 import struct
-from dataclasses import dataclass
+from collections.abc import Collection
+from dataclasses import dataclass, field
 from typing import Final
 
 from gcs_plugin.links.mavlink import Autopilot, Message, dialect
@@ -22,30 +23,52 @@ class Setting(enum.Enum):
     LOW_BATTERY = "action at a low battery"
     NO_STATION = "action where no ground station is heard"
     NO_STATION_EXCEPT = "modes in which it does nothing of that, bits"
+    FENCE = "whether it keeps a geofence"
+    FENCE_AUTO = "when it switches its geofence on by itself, 0 for never"
+    FENCE_KINDS = "limits that its geofence has, bits"
+    FENCE_ACTION = "action at its geofence"
+    FENCE_OPTIONS = "how its geofence's zones count, bits"
+    FENCE_RADIUS = "greatest distance from home, metres"
+    FENCE_TOP = "greatest height above home, metres"
+    FENCE_FLOOR = "least height above home, metres"
+    FENCE_MARGIN = "distance to be kept from its geofence, metres"
 
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """A parameter: its name, what it sets, and the factor to that unit."""
+    """A parameter: its name, what it sets, the factor to that unit, and the least value that has a meaning, in it."""
 
     name: str
     setting: Setting
     scale: float = 1.0
+    least: float = 0.0
 
 
+_SOME: Final = math.ulp(0.0)
 PARAMETERS: Final[dict[Autopilot, tuple[Parameter, ...]]] = {
     Autopilot.ARDUPILOT: (
-        Parameter("WP_SPD", Setting.SPEED),
-        Parameter("WPNAV_SPEED", Setting.SPEED, 0.01),
+        Parameter("FENCE_ENABLE", Setting.FENCE),
+        Parameter("FENCE_AUTOENABLE", Setting.FENCE_AUTO),
+        Parameter("FENCE_TYPE", Setting.FENCE_KINDS),
+        Parameter("FENCE_ACTION", Setting.FENCE_ACTION),
+        Parameter("FENCE_OPTIONS", Setting.FENCE_OPTIONS),
+        Parameter("FENCE_RADIUS", Setting.FENCE_RADIUS),
+        Parameter("FENCE_ALT_MAX", Setting.FENCE_TOP),
+        Parameter("FENCE_ALT_MIN", Setting.FENCE_FLOOR, least=-math.inf),
+        Parameter("FENCE_MARGIN", Setting.FENCE_MARGIN),
         Parameter("RTL_ALT_M", Setting.RETURN_HEIGHT),
         Parameter("RTL_ALT", Setting.RETURN_HEIGHT, 0.01),
+        Parameter("WP_SPD", Setting.SPEED, least=_SOME),
+        Parameter("WPNAV_SPEED", Setting.SPEED, 0.01, _SOME),
         Parameter("BATT_FS_LOW_ACT", Setting.LOW_BATTERY),
         Parameter("FS_GCS_ENABLE", Setting.NO_STATION),
         Parameter("FS_OPTIONS", Setting.NO_STATION_EXCEPT),
     ),
     Autopilot.PX4: (
-        Parameter("MPC_XY_VEL_MAX", Setting.SPEED),
+        Parameter("GF_MAX_HOR_DIST", Setting.FENCE_RADIUS),
+        Parameter("GF_MAX_VER_DIST", Setting.FENCE_TOP),
         Parameter("RTL_RETURN_ALT", Setting.RETURN_HEIGHT),
+        Parameter("MPC_XY_VEL_MAX", Setting.SPEED, least=_SOME),
         Parameter("COM_LOW_BAT_ACT", Setting.LOW_BATTERY),
         Parameter("NAV_DLL_ACT", Setting.NO_STATION),
         Parameter("COM_DLL_EXCEPT", Setting.NO_STATION_EXCEPT),
@@ -64,10 +87,19 @@ _ACTIONS: Final[dict[str, dict[int, str]]] = {
         4: "returns the way it came, or lands", 5: "lands", 6: "lands by its mission's landing, or returns",
         7: "brakes, or lands",
     },
+    "FENCE_ACTION": {
+        0: "", 1: "returns, or lands", 2: "lands", 3: "returns the way it came, or returns", 4: "brakes, or lands",
+        5: "returns the way it came, or lands",
+    },
     "COM_LOW_BAT_ACT": {0: "", 1: "returns", 2: "lands", 3: "returns when it is critical, lands when it is empty"},
     "NAV_DLL_ACT": {0: "", 1: "holds", 2: "returns", 3: "lands", 5: "terminates its flight", 6: "disarms"},
 }  # fmt: skip
 """What a vehicle does by a parameter's value, empty for nothing (ArduCopter 4.7, PX4 1.16)."""
+CHECKED: Final = frozenset({
+    Setting.RETURN_HEIGHT, Setting.FENCE, Setting.FENCE_KINDS, Setting.FENCE_ACTION, Setting.FENCE_RADIUS,
+    Setting.FENCE_TOP, Setting.SPEED,
+})  # fmt: skip
+"""What a check before a start waits for: what it compares with the mission, and all versions have."""
 _MISSION_BITS: Final = {"FS_OPTIONS": 1 << 1, "COM_DLL_EXCEPT": 1 << 0}
 """The bit for a mission; FS_OPTIONS has others for other failsafes."""
 _INTEGERS: Final = {
@@ -75,6 +107,8 @@ _INTEGERS: Final = {
     int(dialect.MAV_PARAM_TYPE_UINT16): "<H", int(dialect.MAV_PARAM_TYPE_INT16): "<h",
     int(dialect.MAV_PARAM_TYPE_UINT32): "<I", int(dialect.MAV_PARAM_TYPE_INT32): "<i",
 }  # fmt: skip
+_AT_ONCE, _PAUSE_S = 10, 0.25  # requests, and seconds until the next ones
+_ROUNDS, _ANSWER_S = 3, 0.7  # times that each is asked for, and seconds for the answers to the last ones
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,12 +135,61 @@ class SetTo:
         return bool(int(self.value) & _MISSION_BITS.get(self.name, 0))
 
 
-def questions(address: Address, autopilot: Autopilot) -> list[Message]:
-    """Requests for the settings: all of them each time, since another station may have changed them."""
-    return [
-        dialect.MAVLink_param_request_read_message(address.system, address.component, parameter.name.encode(), -1)
-        for parameter in PARAMETERS[autopilot]
-    ]
+@dataclass(slots=True)
+class Questions:
+    """Asks a vehicle for its settings: all of them each time, since another station may have changed them.
+
+    A few are asked for at a time, because ArduPilot drops those that it has no room for (20, GCS_Param.cpp). What has
+    not been answered is asked for again: a question or its answer may be lost. An autopilot says nothing about a name
+    that it does not have.
+
+    Args:
+        address: of the vehicle. autopilot: its dialect.
+    """
+
+    address: Address
+    autopilot: Autopilot
+    _open: dict[str, Setting] = field(default_factory=dict, init=False)
+    _queue: list[str] = field(default_factory=list, init=False)
+    _rounds: int = field(default=0, init=False)
+    _next: float = field(default=0.0, init=False)
+
+    def ask(self, now: float) -> list[Message]:
+        """Begin anew; returns the first requests, `tick` the others."""
+        self._open = {parameter.name: parameter.setting for parameter in PARAMETERS[self.autopilot]}
+        self._queue, self._rounds = list(self._open), _ROUNDS
+        return self._some(now)
+
+    def tick(self, now: float) -> list[Message]:
+        """The requests that are due."""
+        if not self._open or now < self._next:
+            return []
+        if not self._queue:
+            self._rounds -= 1
+            if not self._rounds:
+                self._open.clear()
+                return []
+            self._queue = list(self._open)
+        return self._some(now)
+
+    def answered(self, setting: Setting) -> None:
+        """A setting has been told."""
+        self._open = {name: asked for name, asked in self._open.items() if asked is not setting}
+        self._queue = [name for name in self._queue if name in self._open]
+
+    def waits_for(self, settings: Collection[Setting]) -> bool:
+        """Whether one of these has not been answered, or some setting not even been asked for yet."""
+        return (self._rounds == _ROUNDS and bool(self._queue)) or any(
+            asked in settings for asked in self._open.values()
+        )
+
+    def _some(self, now: float) -> list[Message]:
+        names, self._queue = self._queue[:_AT_ONCE], self._queue[_AT_ONCE:]
+        self._next = now + (_PAUSE_S if self._queue else _ANSWER_S)
+        to = self.address
+        return [
+            dialect.MAVLink_param_request_read_message(to.system, to.component, name.encode(), -1) for name in names
+        ]
 
 
 def answer(message: Message, autopilot: Autopilot) -> tuple[Setting, SetTo] | None:
@@ -116,8 +199,7 @@ def answer(message: Message, autopilot: Autopilot) -> tuple[Setting, SetTo] | No
     if parameter is None:
         return None
     value = parameter.scale * _value(message, autopilot)
-    least = 0.0 if parameter.setting is not Setting.SPEED else math.ulp(0.0)
-    if not math.isfinite(value) or value < least:
+    if not math.isfinite(value) or value < parameter.least:
         return None
     return parameter.setting, SetTo(name, value, parameter.scale)
 

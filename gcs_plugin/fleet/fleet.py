@@ -229,7 +229,7 @@ class Fleet:
 
     def ask_settings(self, system: int) -> None:
         """Ask a vehicle for its settings; in the polling thread."""
-        self._dialogues.send(system, self.vehicles[system].setting_questions())
+        self._dialogues.send(system, self.vehicles[system].questions.ask(self._clock()))
 
     def read_fence(self, system: int) -> MissionDownload:
         """Read the geofence of a vehicle; any other request to it ends this.

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from gcs_plugin.config import LIMITS
 from gcs_plugin.fleet.autopilot_settings import Setting
+from gcs_plugin.fleet.fence_limits import fence_findings, fence_limits, in_all_zones
 from gcs_plugin.fleet.message_rates import GPS_RAW_INT, SYS_STATUS
 from gcs_plugin.fleet.separation.separation_check import Separation, flights_of, separation_of
 from gcs_plugin.fleet.separation.separation_watch import number_name
@@ -131,8 +132,9 @@ def preflight(vehicle: "Vehicle", wanted: Wanted, now: float) -> Check:
     items = (
         _link(vehicle, now), _gps(vehicle, now), _ekf(vehicle), _home(vehicle, mission, wanted), _prearm(vehicle, now),
         _battery(vehicle, mission, wanted.needs.endurance_s or LIMITS.endurance_s, now), _mission(vehicle, wanted),
-        _fence(mission, wanted.zones), _height(mission, wanted), _return(vehicle, wanted.needs.return_height_m),
-        _failsafe(vehicle), _speed(vehicle, mission), _separation(wanted),
+        _fence(vehicle, mission, wanted.zones), _height(mission, wanted),
+        _return(vehicle, wanted.needs.return_height_m), _failsafe(vehicle), _speed(vehicle, mission),
+        _separation(wanted),
     )  # fmt: skip
     return Check(vehicle.system, items)
 
@@ -296,13 +298,24 @@ def _mission(vehicle: "Vehicle", wanted: Wanted) -> Item:
     return Item("mission", Level.OK, f"holds a mission of {len(held)} items")
 
 
-def _fence(mission: "Mission | None", zones: "Sequence[Zone] | None") -> Item:
-    if not zones or mission is None:
-        return Item("fence", Level.OK, "its geofence was not read" if zones is None else "it has no geofence")
-    broken = breach(mission, zones)
-    if broken:
-        return Item("fence", Level.RED, f"{broken}; change the mission or the fence")
-    return Item("fence", Level.OK, "its mission keeps to its geofence")
+def _fence(vehicle: "Vehicle", mission: "Mission | None", zones: "Sequence[Zone] | None") -> Item:
+    limits = fence_limits(vehicle)
+    if mission is None:
+        return Item("fence", Level.OK, "no mission to compare with its geofence")
+    why = breach(mission, zones, in_all=in_all_zones(vehicle)) if zones else ""
+    broken = f"{why}; change the mission or the fence" if why else ""
+    findings = [] if limits is None else fence_findings(vehicle, mission, limits)
+    beyond = [text for text in (broken, *(finding.text for finding in findings if finding.beyond)) if text]
+    if beyond:
+        return Item("fence", Level.RED, "; ".join(beyond))
+    if findings:
+        return Item("fence", Level.WARNING, "; ".join(finding.text for finding in findings))
+    if limits is None:
+        return Item("fence", Level.WARNING, "it has not said whether it keeps a geofence; look at its parameters")
+    if limits.unsaid:
+        return Item("fence", Level.WARNING, "it keeps a geofence but has not said all its limits; check again")
+    text = "its mission keeps to its geofence" if zones or limits.any else "it has no geofence"
+    return Item("fence", Level.OK, f"{text}; zones in it were not read" if zones is None else text)
 
 
 def _height(mission: "Mission | None", wanted: Wanted) -> Item:

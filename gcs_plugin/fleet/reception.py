@@ -249,7 +249,7 @@ class Reception:
             if vehicle.lost:
                 continue
             self._watch_times(vehicle)
-            self._dialogues.send(vehicle.system, vehicle.streams.tick(now))
+            self._dialogues.send(vehicle.system, [*vehicle.streams.tick(now), *vehicle.questions.tick(now)])
             self._ask_why(vehicle, now)
             for route in vehicle.routes.known.values():
                 if route.text is not None and now - route.text.begun > _PARTS_S:

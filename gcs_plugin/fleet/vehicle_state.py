@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from gcs_plugin.config import HEARING
-from gcs_plugin.fleet.autopilot_settings import Setting, SetTo, answer, questions
+from gcs_plugin.fleet.autopilot_settings import CHECKED, PARAMETERS, Questions, Setting, SetTo, answer
 from gcs_plugin.fleet.flight_state import flight_state
 from gcs_plugin.fleet.message_rates import GLOBAL_POSITION_INT, GPS_RAW_INT, SYS_STATUS, Streams
 from gcs_plugin.fleet.routes import Route, Routes
@@ -20,6 +20,7 @@ from gcs_plugin.mission.items import Mission
 
 _LANDED: Final = {0: "", 1: "on ground", 2: "in air", 3: "taking off", 4: "landing"}
 _PREARM: Final = int(dialect.MAV_SYS_STATUS_PREARM_CHECK)
+_GEOFENCE: Final = int(dialect.MAV_SYS_STATUS_GEOFENCE)
 _PREARM_S: Final = 45.0  # autopilots repeat what is wrong every 30 s
 # EKF_STATUS_FLAGS and ESTIMATOR_STATUS_FLAGS agree in these. PX4 sets CONST_POS_MODE whenever it stands still.
 _EKF_NEEDED: Final = int(dialect.EKF_ATTITUDE | dialect.EKF_POS_HORIZ_ABS | dialect.EKF_POS_VERT_ABS)
@@ -60,7 +61,8 @@ class Vehicle:
         ask_why_at: when it may be asked again why it would not arm (the fleet's clock).
         pace: seconds of its clock in one of ours; 1 but for a simulation that runs fast or slow.
         launch: where it armed last, latitude and longitude in degrees.
-        settings: what it is set to, as far as it has answered.
+        settings: what it is set to, as far as it has answered. questions: asks it for that.
+        fence_on: whether ArduPilot reports that it keeps a geofence now, by its parameters or a switch.
         paused_in_mission: MISSION_CURRENT says "paused", and a HEARTBEAT after it still shows the mission's mode. A
             change to RTL or hold suspends the mission as well, and its HEARTBEAT may come a second later.
     """
@@ -109,12 +111,18 @@ class Vehicle:
     home_alt_m: float | None = None
     launch: tuple[float, float] | None = None
     settings: dict[Setting, SetTo] = field(default_factory=dict)
+    questions: Questions = field(init=False)
+    fence_on: bool = False
     ask_why_at: float = 0.0
     pace: float = 1.0
     texts: "deque[str]" = field(default_factory=lambda: deque(maxlen=50))
     _prearm: dict[str, float] = field(default_factory=dict)
     _still_since: float | None = None
     _pictures: set[tuple[int, int]] = field(default_factory=set)
+
+    def __post_init__(self) -> None:
+        """Nothing is asked yet."""
+        self.questions = Questions(self.address, self.autopilot)
 
     @property
     def system(self) -> int:
@@ -160,13 +168,19 @@ class Vehicle:
         """For how many seconds of its own clock it has stood still."""
         return 0.0 if self._still_since is None else max(0.0, self.time_boot_s - self._still_since)
 
+    @property
+    def ready_to_check(self) -> bool:
+        """True once what a check before a start looks at was told, or was asked for in vain."""
+        return self.streams.ready_to_check and not self.questions.waits_for(CHECKED)
+
+    @property
+    def untold(self) -> bool:
+        """True if it has not told all settings that a check before a start waits for."""
+        return any(p.setting in CHECKED and p.setting not in self.settings for p in PARAMETERS[self.autopilot])
+
     def prearm_texts(self, now: float) -> list[str]:
         """What it said lately about why it would not arm."""
         return [text for text, said in self._prearm.items() if now - said < _PREARM_S]
-
-    def setting_questions(self) -> list[Message]:
-        """Requests for its settings."""
-        return questions(self.address, self.autopilot)
 
     def home_question(self) -> Message:
         """A request for where its home is, which it says every few seconds only."""
@@ -282,6 +296,7 @@ class Vehicle:
         self.battery = m.battery_remaining / 100.0 if 0 <= m.battery_remaining <= 100 else None
         known = self.autopilot is Autopilot.PX4 or m.onboard_control_sensors_enabled & _PREARM
         self.prearm_ok = bool(m.onboard_control_sensors_health & _PREARM) if known else None
+        self.fence_on = bool(m.onboard_control_sensors_enabled & _GEOFENCE) and self.autopilot is Autopilot.ARDUPILOT
 
     def _filter(self, m: Message) -> None:
         wrong = _EKF_WRONG if m.get_type() == "EKF_STATUS_REPORT" else 0
@@ -294,6 +309,7 @@ class Vehicle:
         found = answer(m, self.autopilot)
         if found is not None:
             self.settings[found[0]] = found[1]
+            self.questions.answered(found[0])
 
     def _photo(self, m: Message) -> None:
         index = m.img_idx if m.get_type() == "CAMERA_FEEDBACK" else m.image_index

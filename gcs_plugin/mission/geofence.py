@@ -46,12 +46,14 @@ class Zone:
         return {"kind": self.kind, "center": list(self.points[0]), "radius_m": self.radius_m}
 
 
-def breach(mission: "Mission", zones: "Sequence[Zone]") -> str:
+def breach(mission: "Mission", zones: "Sequence[Zone]", *, in_all: bool = False) -> str:
     """Where a mission leaves the zones it must stay inside of, or enters others, in words; empty if it keeps to them.
 
-    With several inclusion zones it must be in one of them: autopilots differ in whether they want it in all.
+    Args:
+        mission: the mission. zones: of the vehicle.
+        in_all: it must be in all inclusion zones, not just in any of them.
     """
-    from shapely import LineString, Point, Polygon, union_all
+    from shapely import LineString, Point, Polygon, intersection_all, union_all
 
     from gcs_plugin.mission.track import flight_path, home_of, metres
 
@@ -67,7 +69,8 @@ def breach(mission: "Mission", zones: "Sequence[Zone]") -> str:
         shapes.append(Polygon(ring).buffer(0) if zone.radius_m is None else Point(ring[0]).buffer(zone.radius_m))
     way = LineString(points[:, :2])
     inside = [shape for zone, shape in zip(zones, shapes, strict=True) if zone.kind == "inclusion"]
-    if inside and (far := way.difference(union_all(inside).buffer(_ROUNDING_M))).length > 0.0:
+    allowed = intersection_all(inside) if in_all else union_all(inside)
+    if inside and (far := way.difference(allowed.buffer(_ROUNDING_M))).length > 0.0:
         return f"its mission leaves its geofence for {far.length:.0f} m"
     outside = [shape for zone, shape in zip(zones, shapes, strict=True) if zone.kind == "exclusion"]
     if outside and (within := way.intersection(union_all(outside).buffer(-_ROUNDING_M))).length > 0.0:

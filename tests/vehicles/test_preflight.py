@@ -61,6 +61,7 @@ def test_a_vehicle_that_becomes_ready_turns_green_item_by_item(make_world, autop
     state, why = levels(world)
     assert (state["gps"], state["ekf"], state["pre-arm"]) == (Level.OK, Level.RED, Level.RED)
     world.finish(world.fleet.upload(1, mission(autopilot, MissionItem.do(RTL))))
+    world.finish(world.fleet.download(1))
     world.wait(42.0 - world.clock.now)
     state, why = levels(world)
     assert set(state.values()) == {Level.OK}, why
@@ -71,6 +72,7 @@ def test_each_item_turns_red_for_its_own_reason(make_world):
     world.meet()
     held = mission(AP, MissionItem.do(RTL))
     world.finish(world.fleet.upload(1, held))
+    world.finish(world.fleet.download(1))
     world.wait(6.0)
     vehicle = world.fleet.vehicles[1]
     assert set(levels(world)[0].values()) == {Level.OK}

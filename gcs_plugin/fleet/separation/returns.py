@@ -5,6 +5,7 @@ import threading
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar
 
 from gcs_plugin.config import RETURN
@@ -196,24 +197,25 @@ class Returns:
                     self._again.add(system)
             sending.discard(system)
 
-    def _ask(self) -> None:
-        """Ask for the heights at which they return, without which they wait longer, and for homes not known yet."""
+    def _ask(self, *, settings: bool) -> None:
+        """Ask for homes not known yet, and for how they return (`settings`), without which they wait longer."""
         for system, vehicle in self._fleet.vehicles.items():
             if vehicle.flying:
                 home = [] if vehicle.home is not None else [vehicle.home_question()]
-                self._fleet.send(system, [*home, *vehicle.setting_questions()])
+                asked = vehicle.questions.ask(time.monotonic()) if settings else []
+                self._fleet.send(system, [*home, *asked])
 
     def _known(self, systems: Collection[int]) -> dict[int, Aloft]:
         """The vehicles in the air, as soon as the ways home of these are known: one that has just been heard says it.
 
         Whose way is not known then returns at once.
         """
-        end, ask_at = time.monotonic() + RETURN.known_s, 0.0
+        end, ask_at, first = time.monotonic() + RETURN.known_s, 0.0, True
         while True:
             now = time.monotonic()
             if now >= ask_at:  # a question or its answer may be lost
-                self._fleet.call(self._ask).result(_ANSWER_S)
-                ask_at = now + _ASK_S
+                self._fleet.call(partial(self._ask, settings=first)).result(_ANSWER_S)
+                ask_at, first = now + _ASK_S, False
             aloft = self._aloft()
             unknown = [s for s in systems if self._unknown(s, aloft)]
             if not unknown or now >= end or self._stop.wait(_AGAIN_S):

@@ -110,8 +110,7 @@ def test_a_vehicle_that_does_nothing_at_a_low_battery_is_warned_about(make_world
 
 
 def test_each_autopilot_is_asked_for_every_setting_each_time_that_its_mission_is_read(make_world):
-    for parameters in PARAMETERS.values():
-        assert {parameter.setting for parameter in parameters} == set(Setting)
+    assert {parameter.setting for parameters in PARAMETERS.values() for parameter in parameters} == set(Setting)
     world = make_world(SimVehicle(system=1, autopilot=AP))
     world.meet()
     vehicle = world.fleet.vehicles[1]

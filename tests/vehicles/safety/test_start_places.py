@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 
 from gcs_plugin.daemon.takeoffs import Takeoffs
+from gcs_plugin.fleet.autopilot_settings import Setting, SetTo
 from gcs_plugin.fleet.preflight import Level, Wanted, preflight, preflight_all
 from gcs_plugin.fleet.separation.separation_check import flights_of, others_of, separation_of
 from gcs_plugin.links.mavlink import Autopilot
@@ -27,6 +28,8 @@ def standing(make_world, autopilot, loaded, north=0.0):
     world = make_world(SimVehicle(system=1, autopilot=autopilot, home=(*CHART.to_degrees(north, 0.0), 488.0)))
     world.wait(8.0)
     assert world.finish(world.fleet.upload(1, loaded))[0].ok
+    world.finish(world.fleet.download(1))  # asks for its settings, too
+    assert world.until(lambda: world.fleet.vehicles[1].ready_to_check, 30.0)
     return world
 
 
@@ -145,6 +148,17 @@ def test_a_mission_that_breaks_the_geofence_is_red(make_world, kind, radius_m, l
     other = line(AP, 10, 90)  # whoever allows the fence does not allow another mission with it
     assert item(world, "mission", Wanted(mission=other, zones=zones)).level is Level.RED
     assert item(world, "fence").level is Level.OK and "not read" in item(world, "fence").reason
+
+
+@BOTH
+def test_a_mission_within_one_of_two_inclusion_zones(make_world, autopilot):
+    """ArduPilot wants it in all, unless FENCE_OPTIONS says otherwise."""
+    world = standing(make_world, autopilot, line(autopilot, 10, 80))
+    (lat, lon), (beside, _) = CHART.to_degrees(0.0, 10.0), CHART.to_degrees(400.0, 10.0)
+    zones = [Zone("inclusion", ((lon, lat),), 300.0), Zone("inclusion", ((lon, beside),), 300.0)]
+    assert item(world, "fence", Wanted(zones=zones)).level is (Level.RED if autopilot is AP else Level.OK)
+    world.fleet.vehicles[1].settings[Setting.FENCE_OPTIONS] = SetTo("FENCE_OPTIONS", 2.0)
+    assert item(world, "fence", Wanted(zones=zones)).level is Level.OK
 
 
 def test_a_way_along_the_edge_of_a_fence_keeps_to_it(make_world):

@@ -272,11 +272,12 @@ def _ready(
 
     allowed = _overrides(args.override, systems, ITEMS)
     missions, stored, starts = _missions(backend, prepared, systems)
+    zones = _with_bar(lambda report: backend.zones(systems, report))
     backend.hear_states(systems, args.wait)
     end = time.monotonic() + args.ready
     said: dict[int, str] = {}
     while True:
-        checks = backend.check(systems, missions, stored, starts, args.max_height, needs=prepared.needs)
+        checks = backend.check(systems, missions, stored, starts, args.max_height, needs=prepared.needs, zones=zones)
         red = red_text(checks, allowed)
         waits = all(item.name in _PASSING for check in checks for item in check.red(allowed.get(check.system, ())))
         if not red or not waits or time.monotonic() >= end:
@@ -340,8 +341,9 @@ def _check(backend: "Backend", args: argparse.Namespace, prepared: _Prepared, fo
     """Show the check of each vehicle; 0 if none has a red item."""
     systems = [s for s in prepared.systems or found if s in found]
     missions, stored, starts = _missions(backend, prepared, systems)
+    zones = _with_bar(lambda report: backend.zones(systems, report))
     backend.hear_states(systems, args.wait)
-    checks = backend.check(systems, missions, stored, starts, args.max_height, needs=prepared.needs)
+    checks = backend.check(systems, missions, stored, starts, args.max_height, needs=prepared.needs, zones=zones)
     if args.json:
         print(json.dumps({"vehicles": [check.document(f"v{check.system}") for check in checks]}))
     else:
