@@ -7,6 +7,7 @@ import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,9 +75,11 @@ class Place:
         return heights(terrain, *self.corner(key), self.grid.gsd_m, self.tile_px)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Window:
-    """Where in a tile a frame won: rows row0 to row1, columns col0 to col1, and how many pixels."""
+class Window(NamedTuple):
+    """Where in a tile a frame won: rows row0 to row1, columns col0 to col1, and how many pixels.
+
+    A tuple, since tasks take thousands of them along, and a tuple is made and copied several times as fast.
+    """
 
     key: Key
     row0: int
