@@ -66,7 +66,7 @@ class PairingConfig:
     jump_windows: int = 4
     """Parts of a flight whose clocks are compared to find whether the camera's clock was set in between (chosen)."""
     jump_least_photos: int = 6
-    """Photos of such a part at least (chosen: fewer fit by accident)."""
+    """Photos of such a part at least, and photos that only its clock gives an event (chosen: fewer fit by accident)."""
     least_jump_s: float = 0.6
     """Clocks of two parts that differ by more than this and the largest drift are two settings, seconds (chosen: more
     than half of the whole seconds that many cameras write)."""

@@ -15,19 +15,19 @@ from telemetry.samples.timeline import Timeline
 Array = NDArray[np.float64]
 
 _QUARTER_S = 900.0
+_HALF_HOURS = (-9.5, -3.5, -2.5, 3.5, 4.5, 5.5, 5.75, 6.5, 8.75, 9.5, 10.5, 12.75, 13.75)
+ZONES_S = tuple(3600.0 * hours for hours in sorted([*range(-12, 15), *_HALF_HOURS]))
+"""Offsets of local times from UTC that are in use, seconds (IANA time zone database)."""
+_SPAN_MARGIN_S = 2.0
 
 
 def offset_by_zone(times: Array, timeline: Timeline) -> float | None:
-    """The zone (whole quarter hours) under which all photos fall into the flight; the smallest of several."""
+    """The time zone under which all photos fall into the flight; the smallest of several."""
     span = timeline.span
     if span is None:
         return None
-    first, last = span
-    fits = [
-        quarters * _QUARTER_S
-        for quarters in range(-56, 57)
-        if times.min() - quarters * _QUARTER_S >= first - 2.0 and times.max() - quarters * _QUARTER_S <= last + 2.0
-    ]
+    first, last = span[0] - _SPAN_MARGIN_S, span[1] + _SPAN_MARGIN_S
+    fits = [zone for zone in ZONES_S if times.min() - zone >= first and times.max() - zone <= last]
     return min(fits, key=abs) if fits else None
 
 

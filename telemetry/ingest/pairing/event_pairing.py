@@ -73,7 +73,9 @@ def pair(
             by_times = by_time(photos, events, motion)
             if len(by_times.pairs) < len(photos):
                 numbers = [photo_numbers[i] for i in timed] if len(photo_numbers) else []
-                by_times = _by_parts(photos, events, numbers) or by_times
+                by_parts = _by_parts(photos, events, numbers)
+                if by_parts is not None and _explains_more(by_parts, by_times):
+                    by_times = by_parts
             by_times.pairs = [(timed[i], dated[j]) for i, j in by_times.pairs]
             by_times.jumps = [(timed[i], jump_s) for i, jump_s in by_times.jumps]
             by_times.doubtful = {timed[i]: [dated[j] for j in at] for i, at in by_times.doubtful.items()}
@@ -164,6 +166,16 @@ def _by_parts(photos: Array, events: Array, numbers: Sequence[int | None]) -> Pa
         free += 1 + max(j for _, j in found.pairs)
     result.pairs.sort()
     return result if result.jumps else None
+
+
+def _explains_more(parts: Pairing, whole: Pairing) -> bool:
+    """Whether several clocks find events for photos that one clock leaves without any.
+
+    Photos that no log recorded lack events as well. A clock of their own would only take events from the photos that
+    these belong to: legs of one mission have one rhythm.
+    """
+    found, before = (sum(i not in pairing.doubtful for i, _ in pairing.pairs) for pairing in (parts, whole))
+    return found >= before + active().pairing.jump_least_photos
 
 
 def _certain_offsets(photos: Array, events: Array) -> Array | None:

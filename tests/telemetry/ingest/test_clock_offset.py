@@ -74,7 +74,14 @@ def test_the_clock_offset_is_found_from_positions_in_any_zone(flown):
 def test_the_zone_alone_is_found_where_nothing_else_is_known(flown):
     times = np.linspace(flown.span[0] + 70, flown.span[1] - 40, 40)
     assert offset_by_zone(times + 7200, flown) == 7200
+    assert offset_by_zone(times + 20700, flown) == 20700
     assert offset_by_zone(times + 86400 * 3, flown) is None
+
+
+def test_no_place_on_earth_explains_a_quarter_of_an_hour(flown):
+    """Photos of a flight without a log, a quarter of an hour before the one that has one."""
+    times = np.linspace(flown.span[0] + 70, flown.span[1] - 40, 40)
+    assert offset_by_zone(times - 900, flown) is None
 
 
 @pytest.mark.parametrize("offset", [-1.7e9, 15.0, 3600.0])

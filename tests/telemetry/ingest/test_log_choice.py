@@ -143,6 +143,18 @@ def test_camera_events_pair_with_photos_before_and_after_the_clock_was_set(first
     assert jump_s is None or by_s == pytest.approx(jump_s, abs=0.1)
 
 
+@pytest.mark.parametrize(("seed", "unlogged"), [(0, 24), (0, 12), (3, 12), (7, 12), (11, 12)])
+def test_photos_of_legs_that_no_log_recorded_take_no_events_of_later_legs(seed, unlogged):
+    """Eight equal legs, the log begins at the third or fifth: the first ones have the rhythm of those that follow."""
+    rng = np.random.default_rng(seed)
+    gaps = [gap for _ in range(8) for gap in [*(5.0 + rng.normal(0.0, 0.1, 5)), 8.0 + rng.normal(0.0, 1.0)]]
+    taken = 1.7e9 + np.cumsum(gaps)
+    photos = taken + 0.3 + rng.normal(0.0, 0.02, 48)
+    found = pair(photos.tolist(), taken[unlogged:].tolist(), list(range(48)))
+    assert found.pairs == [(i, i - unlogged) for i in range(unlogged, 48)]
+    assert not found.jumps
+
+
 def test_a_list_of_exposures_and_the_ppk_solution_of_them_are_one_flights(tmp_path):
     write_mrk(tmp_path / "flight_Timestamp.MRK")
     write_pos(tmp_path / "flight_events.pos")
