@@ -146,6 +146,7 @@ def rejection_row(rejection: Rejection, epsg: int | None) -> dict[str, Any]:
         "time": iso_time(rejection.time_s),
         "stage": "rejected",
         "reason": rejection.reason,
+        **({"detail": rejection.detail} if rejection.detail else {}),
         "epsg": epsg,
     }
 

@@ -81,6 +81,7 @@ class Rejection:
     Attributes:
         image: its name. reason: one clear sentence. vehicle, time_s: as far as known.
         lacks_position: True if only a position is missing, which a later log may provide.
+        detail: what is particular to this picture; the reason is the same for all that share it, so that it is counted.
     """
 
     image: str
@@ -88,6 +89,13 @@ class Rejection:
     vehicle: str = ""
     time_s: float | None = None
     lacks_position: bool = False
+    _: KW_ONLY
+    detail: str = ""
+
+    @property
+    def text(self) -> str:
+        """The reason with its detail."""
+        return f"{self.reason} ({self.detail})" if self.detail else self.reason
 
 
 @dataclass(frozen=True, slots=True)

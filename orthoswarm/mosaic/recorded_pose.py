@@ -199,9 +199,8 @@ def _too_far(frame: Frame, ground: Array, i: int) -> Rejection:
 
 def _far_from_others(frame: Frame, away_km: float) -> Rejection:
     where = f"{away_km:,.0f} km from the others" if np.isfinite(away_km) else "on the other side of the world"
-    return Rejection(
-        frame.image, f"its position is {where}; correct it or map it by itself", frame.vehicle, frame.time_s
-    )
+    reason = "its position is far from the others; correct it or map it by itself"
+    return Rejection(frame.image, reason, frame.vehicle, frame.time_s, detail=where)
 
 
 def nothing_to_map(ingest: Ingest) -> str:

@@ -411,7 +411,8 @@ def sample_pass(task: SampleTask) -> list[Sampled]:
             except RunInterruptedError:
                 raise
             except OrthoSwarmError as error:
-                results += [Sampled(shot.layer, shot.index, None, str(error)) for shot in shots]
+                reason = error.reason if isinstance(error, PictureError) else str(error)
+                results += [Sampled(shot.layer, shot.index, None, reason) for shot in shots]
                 continue
             for to in {shot.preview for shot in shots if shot.preview is not None}:
                 write_preview(*to, picture)
@@ -428,9 +429,10 @@ def sample_pass(task: SampleTask) -> list[Sampled]:
 def _read(read: Read, path: Path, size: Ints) -> Bytes:
     picture = read(path)
     if picture.shape[:2] != (size[1], size[0]):
-        raise PictureError(
-            f"{path.name} is {picture.shape[1]}x{picture.shape[0]} pixels and not {size[0]}x{size[1]} as it was; "
-            "do not change pictures while they are mapped"
+        raise PictureError.of(
+            path,
+            f"is {picture.shape[1]}x{picture.shape[0]} pixels and not {size[0]}x{size[1]} as it was; do not change "
+            "pictures while they are mapped",
         )
     return np.ascontiguousarray(picture[..., :3])
 

@@ -28,7 +28,21 @@ take 0.6 GB in colour. A file of some hundred kilobytes can hold a picture that 
 
 
 class PictureError(OrthoSwarmError):
-    """A picture cannot be decoded."""
+    """A picture cannot be decoded.
+
+    Attributes:
+        reason: the fault without the picture's name, the same for all pictures that have it.
+    """
+
+    def __init__(self, text: str, reason: str = "") -> None:
+        super().__init__(text)
+        self.reason = reason or text
+
+    @classmethod
+    def of(cls, path: Path, fault: str, detail: str = "") -> "PictureError":
+        """The error that a picture `fault` ("is not ...; what to do"); `detail` differs from picture to picture."""
+        what, separator, advice = fault.partition(";")
+        return cls(f"{path.name} {what}{detail and f' ({detail})'}{separator}{advice}", f"it {fault}")
 
 
 def reduction(width: int, height: int, longest: int) -> int:
@@ -107,7 +121,7 @@ def _decode_jpeg(path: Path, data: bytes, colors: str, *, fast_upsample: bool, f
             )
         )  # fmt: skip
     except ValueError as error:
-        raise PictureError(f"{path.name} is a damaged JPEG ({error}); copy it again from the camera") from None
+        raise PictureError.of(path, "is a damaged JPEG; copy it again from the camera", str(error)) from None
 
 
 def picture_size(data: bytes, formats: Sequence[str] | None = None) -> tuple[int, int, str]:
@@ -141,12 +155,12 @@ def _bytes(path: Path) -> bytes:
     if data[:2] == b"\xff\xd8":
         width, height = _jpeg_size(data)
         if width * height > MOST_PIXELS:
-            raise PictureError(f"{path.name} has {width} x {height} pixels, more than any camera; leave it out")
+            raise PictureError.of(path, f"has {width} x {height} pixels, more than any camera; leave it out")
         return data
     try:
         picture_size(data)
     except PictureError as error:
-        raise PictureError(str(error).replace("it ", f"{path.name} ", 1)) from None
+        raise PictureError.of(path, error.reason.removeprefix("it ")) from None
     return data
 
 
@@ -167,7 +181,7 @@ def _content(path: Path) -> bytes:
     except (NotStoredError, StoreRequestError) as error:
         raise PictureError(str(error)) from None
     except OSError as error:
-        raise PictureError(f"{path.name} cannot be read ({error.strerror}); check the file") from None
+        raise PictureError.of(path, f"cannot be read ({error.strerror}); check the file") from None
 
 
 def _decode_other(path: Path, data: bytes, *, gray: bool) -> Bytes:
@@ -184,9 +198,9 @@ def _decode_other(path: Path, data: bytes, *, gray: bool) -> Bytes:
     if image is not None and image.dtype != np.uint8:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     if image is None and _holds_measurements(data):
-        raise PictureError(f"{path.name} holds 32-bit numbers, not colours; export it with 8 or 16 bits a pixel")
+        raise PictureError.of(path, "holds 32-bit numbers, not colours; export it with 8 or 16 bits a pixel")
     if image is None:
-        raise PictureError(f"{path.name} is not a readable picture; leave it out or copy it again")
+        raise PictureError.of(path, "is not a readable picture; leave it out or copy it again")
     return np.asarray(image)
 
 

@@ -23,6 +23,7 @@ _UNREAD_PICTURES = frozenset({".heic", ".heif", ".avif"})
 _SIDECARS = frozenset({".txt", ".csv"})
 _SUBTITLES = frozenset({".srt"})
 _ALREADY = "which is in the input already"
+_OTHER_NAME = f"the same file as one of another name, {_ALREADY}"
 
 
 @dataclass(slots=True, kw_only=True)
@@ -49,7 +50,7 @@ class Discovery:
 
     Attributes:
         root: names are relative to it. folders: those with usable files.
-        left_out: files with a picture's suffix that are not read -> reason.
+        left_out: files with a picture's suffix that are not read, the reason (one for all that share it) and a detail.
         videos: the vehicle of each video, unless its metadata names another.
         unreadable: folders that cannot be listed -> the system's reason.
         everywhere: tables and logs given by themselves or in folders without pictures and videos.
@@ -57,7 +58,7 @@ class Discovery:
 
     root: Path
     folders: list[Folder]
-    left_out: list[tuple[Path, str]] = field(default_factory=list)
+    left_out: list[tuple[Path, str, str]] = field(default_factory=list)
     videos: dict[Path, str] = field(default_factory=dict)
     everywhere: frozenset[Path] = frozenset()
     _: KW_ONLY
@@ -112,7 +113,7 @@ def discover(inputs: Sequence[Path], exclude: Sequence[Path] = ()) -> Discovery:
     outside = {os.path.abspath(path) for path in exclude}
     folders: dict[Path, Folder] = {}
     seen: dict[str, Path] = {}
-    left_out: dict[Path, str] = {}
+    left_out: dict[Path, tuple[str, str]] = {}
     sorted_in: set[Path] = set()
     unreadable: dict[Path, str] = {}
     inside = [(file, True) for path in absolute if path not in single for file in _walk(path, outside, unreadable)]
@@ -125,13 +126,13 @@ def discover(inputs: Sequence[Path], exclude: Sequence[Path] = ()) -> Discovery:
     links = [(file.is_symlink(), file, walked) for file, walked in files]
     for is_link, file, walked in sorted(links, key=lambda entry: entry[0]):  # the file itself before links to it
         if walked and file.name.startswith("."):
-            left_out[file] = "a hidden file; rename it if it is a photo to be mapped"
+            left_out[file] = "a hidden file; rename it if it is a photo to be mapped", ""
             continue
         real = os.path.realpath(file) if is_link else os.path.join(real_folder(str(file.parent)), file.name)
         first = seen.setdefault(real, file)
         if first != file:
             same = first.name == file.name
-            left_out[file] = _twice(first.parent, root) if same else f"the same file as {first.name}, {_ALREADY}"
+            left_out[file] = (_twice(first.parent, root), "") if same else (_OTHER_NAME, first.name)
         elif file not in sorted_in:
             sorted_in.add(file)
             _sort_in(file, folders, explicit=not walked)
@@ -139,8 +140,8 @@ def discover(inputs: Sequence[Path], exclude: Sequence[Path] = ()) -> Discovery:
         folder.pictures.sort(key=_by_name)
     ordered = [folders[path] for path in sorted(folders, key=lambda p: natural_key(str(p)))]
     _name_vehicles(ordered, root)
-    pictures = [(file, why) for file, why in left_out.items() if file.suffix.lower() in PICTURE_SUFFIXES]
-    left = [(file, why) for file, why in pictures if file not in sorted_in]
+    pictures = [(file, *why) for file, why in left_out.items() if file.suffix.lower() in PICTURE_SUFFIXES]
+    left = [entry for entry in pictures if entry[0] not in sorted_in]
     if unreadable and not ordered and not left:
         path, why = next(iter(unreadable.items()))
         raise InputError(f"no picture was found, and the folder {path} cannot be read ({why}); check its permissions")

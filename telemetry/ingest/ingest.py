@@ -71,8 +71,8 @@ def survey(inputs: Sequence[Path], *, progress: Progress | None = None, options:
     for path, why in found.unreadable.items():
         text = f"the folder {found.name(path)} cannot be read ({why}); what it holds is left out: check its permissions"
         result.findings.append(Finding("folder-unreadable", text))
-    for path, why in found.left_out:
-        result.rejected.append(Rejection(found.name(path), why, vehicles.get(path.parent, "")))
+    for path, why, detail in found.left_out:
+        result.rejected.append(Rejection(found.name(path), why, vehicles.get(path.parent, ""), detail=detail))
     tables = _tables(found, result)
     logs = read_logs(found, result)
     total = sum(len(folder.pictures) for folder in found.folders)
@@ -212,7 +212,7 @@ def _photo_folder(
         photos = sorted(groups[vehicle], key=_photo_key)
         add_logs(photos, folder.path, vehicle, logs=logs, findings=source.findings, workers=workers)
         photos = _one_band(photos, vehicle, found, result)
-        photos = _with_position(photos, vehicle, found, result, _why_not_by_log(source.findings, vehicle))
+        photos = _with_position(photos, vehicle, found, result)
         photos = in_order(photos, vehicle, source.findings)
         photos = _where_it_can_be(photos, vehicle, found, source, result)
         frames = frames_of(photos, vehicle, found.name, source.findings)
@@ -237,25 +237,19 @@ def _one_band(photos: Sequence[PhotoTags], vehicle: str, found: Discovery, resul
     return [photo for photo in photos if photo.band.lower() == mapped_band]
 
 
-def _why_not_by_log(findings: Sequence[Finding], vehicle: str) -> str:
-    """Why a log that is there gives a vehicle's photos no position, one sentence; "" if nothing speaks against it."""
-    codes = ("log-ambiguous", "clock-unset", "clock-jump")
-    return next((f.message for f in findings if f.code in codes and f.vehicle == vehicle), "")
-
-
-def _with_position(
-    photos: Sequence[PhotoTags], vehicle: str, found: Discovery, result: Survey, why: str
-) -> list[PhotoTags]:
+def _with_position(photos: Sequence[PhotoTags], vehicle: str, found: Discovery, result: Survey) -> list[PhotoTags]:
     """Keep photos with a position; the others are rejected, with the reason, and listed for surveyed points."""
     placed = []
     for photo in photos:
         if photo.lat_deg is not None and photo.lon_deg is not None:
             placed.append(photo)
         else:
+            why, detail = photo.unplaced
             reason = "the picture has no position; put a geo.txt next to it, or give its log as well"
             reason = f"the picture has no position: {why}" if why else reason
-            result.rejected.append(Rejection(found.name(photo.path), reason, vehicle, photo.time_s, True))
-            result.unpositioned.append(frame_without_position(photo, vehicle, found.name(photo.path)))
+            name = found.name(photo.path)
+            result.rejected.append(Rejection(name, reason, vehicle, photo.time_s, True, detail=detail))
+            result.unpositioned.append(frame_without_position(photo, vehicle, name))
     return placed
 
 

@@ -21,7 +21,7 @@ from telemetry.ingest.pairing.event_pairing import Pairing, pair
 from telemetry.ingest.pairing.motion_chains import PictureMotion
 from telemetry.ingest.pairing.picture_evidence import picture_motion
 from telemetry.ingest.survey import SourceInfo, Survey
-from telemetry.ingest.track_poses import add_track, best_log_of, fill
+from telemetry.ingest.track_poses import add_track, best_log_of, explain, fill
 from telemetry.photos.flight_checks import number_of
 from telemetry.photos.photo_tags import PhotoTags
 from telemetry.samples.course import local_metres
@@ -31,6 +31,7 @@ from telemetry.samples.unreadable import Unreadable, read_or_reason
 from telemetry.samples.wild_fixes import without_wild_fixes
 
 _BUS = "DroneCAN"
+_NO_EVENT = "it has no camera event in the log; put a geo.txt next to it, or give the log of its flight"
 
 
 def read_logs(found: Discovery, result: Survey) -> list[LogSource]:
@@ -177,6 +178,7 @@ def add_logs(
     best = best_log_of(matches, vehicle)
     if isinstance(best, Finding):
         findings.append(best)
+        explain(photos, best.message)
         return
     entry, pairing = best.entry, pairings[id(best.entry)]
     if pairing.doubtful and not pairing.jumps:
@@ -223,6 +225,7 @@ def _use_events(
     entry.used = True
     log = entry.log
     far = list[tuple[PhotoTags, float | None]]()
+    explain(photos, _NO_EVENT, log.path.name)  # those that get a position below need no reason
     for i, j in pairing.pairs:
         event = log.events[j]
         around = entry.timeline.at(event.time_s or 0.0)

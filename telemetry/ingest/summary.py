@@ -33,7 +33,7 @@ def summarise(found: Survey, *, pictures: bool = True) -> dict[str, Any]:
     return {
         "root": str(found.root),
         "sources": sources,
-        "rejected": [{"image": r.image, "reason": r.reason} for r in found.rejected],
+        "rejected": [{"image": r.image, "reason": r.text} for r in found.rejected],
         "findings": [_plain(f) for f in found.findings],
     }
 

@@ -18,6 +18,11 @@ from telemetry.samples.findings import Finding, plural
 from telemetry.samples.sample import Sample
 from telemetry.samples.times import YEAR_2000_S, ZONE_UNKNOWN
 
+_NO_LOG_THEN = "no log that is here was recorded when it was taken; give the log of that flight, or a geo.txt"
+_NO_LOG_FITS = (
+    "no log that is here covers the times of these photos in any time zone; give the log of their flight, or a geo.txt"
+)
+_CLOCK_UNSET = "it was taken before the camera's clock was set, so that no log can place it; put a geo.txt next to it"
 _LEAST_PLACED = 5
 """Photos with positions that it takes to find the camera's clock by them."""
 
@@ -45,10 +50,11 @@ def add_track(photos: Sequence[PhotoTags], near: Sequence[LogSource], vehicle: s
     began) are matched by themselves, and get nothing where that is not possible.
     """
     timed = [p for p in photos if p.time_s is not None and p.time_s >= YEAR_2000_S]
-    early = sum(p.time_s is not None for p in photos) - len(timed)
+    early = [p for p in photos if p.time_s is not None and p.time_s < YEAR_2000_S]
     if early:
-        text = f"{plural(early, 'photo')} were taken before the camera's clock was set; their times place them nowhere"
+        text = f"{plural(len(early), 'photo')} from before the camera's clock was set: no log can place them by time"
         findings.append(Finding("clock-unset", text, vehicle))
+        explain(early, _CLOCK_UNSET)
     while timed:
         placed = [p for p in timed if p.lat_deg is not None]
         by_positions = len(placed) >= _LEAST_PLACED
@@ -58,9 +64,11 @@ def add_track(photos: Sequence[PhotoTags], near: Sequence[LogSource], vehicle: s
                 "taken; give their positions (geo.txt) or a log with camera events"
             )
             findings.append(Finding("clock-jump", text, vehicle))
+            explain(timed, text)
             return
         matches = _by_positions(placed, near) if by_positions else _by_zone(timed, near)
         if not matches:
+            explain(timed, _NO_LOG_FITS)
             for part in _at_longest_pause(timed) if by_positions else ():
                 if sum(p.lat_deg is not None for p in part) >= _LEAST_PLACED:
                     add_track(part, near, vehicle, findings)
@@ -68,6 +76,7 @@ def add_track(photos: Sequence[PhotoTags], near: Sequence[LogSource], vehicle: s
         best = best_log_of(matches, vehicle)
         if isinstance(best, Finding):
             findings.append(best)
+            explain(timed, best.message)
             return
         count, far = _fill_from(best, timed)
         if count:
@@ -139,6 +148,7 @@ def _fill_from(match: LogMatch, photos: Sequence[PhotoTags]) -> tuple[int, list[
     times = np.array([p.time_s for p in photos], dtype=np.float64)
     for photo, pose in zip(photos, match.entry.timeline.at_all(times - match.offset_s), strict=True):
         if pose.lat_deg is None or pose.lon_deg is None:
+            explain([photo], _NO_LOG_THEN, _not_in(match, photo))
             continue
         if photo.lat_deg is not None and photo.lon_deg is not None:
             apart = distance_m(photo.lat_deg, photo.lon_deg, pose.lat_deg, pose.lon_deg)
@@ -149,6 +159,23 @@ def _fill_from(match: LogMatch, photos: Sequence[PhotoTags]) -> tuple[int, list[
         pose = pose if log.has_gimbal else fixed_camera(pose)
         fill(photo, pose, f"track of {match.entry.name}", gimbal=log.has_gimbal)
     return count, far
+
+
+def explain(photos: Sequence[PhotoTags], why: str, detail: str = "") -> None:
+    """Say why no log gives photos a position."""
+    for photo in photos:
+        photo.unplaced = why, detail
+
+
+def _not_in(match: LogMatch, photo: PhotoTags) -> str:
+    """How a photo's time lies to a log that holds no position then."""
+    log, span = match.entry.log.path.name, match.entry.timeline.span
+    moment = (photo.time_s or 0.0) - match.offset_s
+    if span is None or span[0] <= moment <= span[1]:
+        return f"{log} has a gap there"
+    if moment < span[0]:
+        return f"{span[0] - moment:.0f} s before {log} begins"
+    return f"{moment - span[1]:.0f} s after {log} ends"
 
 
 def fill(photo: PhotoTags, pose: Sample, origin: str, *, gimbal: bool) -> None:

@@ -54,6 +54,7 @@ class PhotoTags:
         origin: field -> its source.
         damaged: True for a picture of a video that lost parts.
         ambiguous: True where it may belong to another camera event of a log.
+        unplaced: why the logs that are there give it no position (one for all with that reason), and a detail.
     """
 
     path: Path
@@ -78,6 +79,7 @@ class PhotoTags:
     origin: dict[str, str] = field(default_factory=dict)
     damaged: bool = False
     ambiguous: bool = False
+    unplaced: tuple[str, str] = ("", "")
 
 
 def read_photo(path: Path) -> PhotoTags | None:

@@ -81,6 +81,22 @@ def test_damaged_files_are_named_and_the_rest_is_mapped(scene, basemap, tmp_path
     assert np.median(errors(scene, rows, shots)) < 1.0
 
 
+def test_pictures_with_one_fault_are_counted_together(scene, tmp_path, mosaic):
+    shots = legs(count=2, photos=8)
+    shots[3] = replace(shots[3], recorded=(400_000.0, 0.0))
+    shots[11] = replace(shots[11], recorded=(0.0, -90_000.0))
+    files = scene.fly(tmp_path / "photos", shots)
+    for damaged in (files[5], files[9]):  # whole at first sight: the end is there, the middle is not
+        damaged.write_bytes(damaged.read_bytes()[:4000] + b"\xff\xd9")
+    (tmp_path / "photos" / "again_0.JPG").symlink_to(files[0])
+    (tmp_path / "photos" / "again_1.JPG").symlink_to(files[1])
+    code, rows, report, _ = mosaic(tmp_path / "photos", until="realtime")
+    assert code == 0
+    assert sorted(report["left_out"].values()) == [2, 2, 2]
+    assert any("damaged JPEG" in reason for reason in report["left_out"])
+    assert rows["again_1.JPG"]["detail"] == "DJI_0001.JPG"
+
+
 def test_photos_without_position_are_left_out_and_counted_by_reason(scene, basemap, tmp_path, mosaic, capsys):
     shots = legs(count=2, photos=8)
     shots[3] = replace(shots[3], tags="none")
@@ -246,7 +262,8 @@ def test_a_position_far_away_is_left_out(scene, basemap, tmp_path, mosaic):
     scene.fly(tmp_path / "photos", shots)
     code, rows, report, _ = mosaic(tmp_path / "photos", basemap=basemap)
     assert code == 0 and report["frames"]["used"] >= 14
-    assert "km from the others" in rows["DJI_0004.JPG"]["reason"]
+    assert "far from the others" in rows["DJI_0004.JPG"]["reason"]
+    assert rows["DJI_0004.JPG"]["detail"].endswith("km from the others")
     names = [n for n in rows if n not in ("DJI_0004.JPG", "DJI_0009.JPG")]
     assert np.median(errors(scene, rows, [shots[int(n[4:8])] for n in names], names)) < 1.5
 
@@ -341,7 +358,7 @@ def test_names_that_are_no_text_and_files_that_are_no_files(scene, tmp_path, mos
     assert code == 0 and set(rows) == expected
     reasons = {n: r["reason"] for n, r in rows.items() if r["stage"] == "rejected"}
     assert set(reasons) == expected & {"._DJI_0001.JPG", "copy.JPG", "gone.JPG", "pipe.JPG"}
-    assert "hidden" in reasons["._DJI_0001.JPG"] and "DJI_0000.JPG" in reasons["copy.JPG"]
+    assert "hidden" in reasons["._DJI_0001.JPG"] and rows["copy.JPG"]["detail"] == "DJI_0000.JPG"
 
 
 def test_a_height_model_that_is_none_is_refused_before_the_work(scene, tmp_path, mosaic):

@@ -95,7 +95,7 @@ def test_a_position_that_cannot_be_is_left_out():
     frames[4] = replace(frames[4], fix=replace(frames[4].fix, lat_deg=-80.0, lon_deg=120.0))
     made = recorded_cameras(frames, GRID)
     assert [r.image for r in made.rejected] == ["a/3.jpg", "a/4.jpg"] and len(made.placed) == 4
-    assert "90 km from the others" in made.rejected[0].reason
+    assert made.rejected[0].detail == "90 km from the others"
 
 
 def test_odd_pictures_follow_their_neighbours():

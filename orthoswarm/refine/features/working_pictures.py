@@ -100,7 +100,7 @@ class Pictures:
         try:
             picture = self._read(self._frames[i])
         except PictureError as error:
-            self.damaged[i] = str(error)
+            self.damaged[i] = error.reason
             return np.full(self.size[::-1], 127, np.uint8)
         frame = self._frames[i]
         factor = max(1, round(frame.width / picture.shape[1]))

@@ -110,7 +110,7 @@ def features_of(frame: Frame, *, read_gray: ReadGray, pixels: int) -> Features |
     try:
         gray = read_gray(frame)
     except PictureError as error:
-        return str(error)
+        return error.reason
     rows, columns = gray.shape
     if abs(columns * frame.height - rows * frame.width) > active().initial.header_size_share * columns * frame.height:
         return f"{frame.image} is {columns}x{rows}, not as its header says; copy it again"

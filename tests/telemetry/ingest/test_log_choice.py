@@ -120,7 +120,25 @@ def test_photos_before_the_clock_was_set_are_named_and_the_others_placed(tmp_pat
     assert len(found.frames) == len(TAKEN_S) - 4
     for frame in found.frames:
         assert frame.fix.lat_deg == pytest.approx(place(TAKEN_S[number(frame)])[0], abs=1e-6)
-    assert all("4 photos were taken before" in rejection.reason for rejection in found.rejected)
+    assert all("before the camera's clock was set" in rejection.reason for rejection in found.rejected)
+
+
+def test_photos_outside_a_log_are_not_said_to_have_an_unset_clock(tmp_path):
+    """Four photos from 1980 and six from after the log's end, without positions; the others have positions."""
+    clock = {**{i: 315_964_800.0 + 2.0 * i for i in range(4)}, **{i: UTC_S + 900.0 + 2.0 * i for i in range(19, 25)}}
+    photos(tmp_path / "card", lambda i, utc_s: clock.get(i, utc_s), metres_east=0.0)
+    for i in clock:
+        moment = datetime.fromtimestamp(clock[i], UTC)
+        exif = gps_exif(0.0, 0.0, local=moment.strftime("%Y:%m:%d %H:%M:%S"), subsec="0")
+        jpeg(tmp_path / "card" / f"P_{i:03d}.JPG", exif_bytes=exif)
+    track(tmp_path / "card" / "a.pos")
+    found = load([tmp_path])
+    assert len(found.frames) == len(TAKEN_S) - 10
+    unset = {int(r.image[-7:-4]) for r in found.rejected if "clock was set" in r.reason}
+    later = [r for r in found.rejected if int(r.image[-7:-4]) >= 19]
+    assert unset == {0, 1, 2, 3}
+    assert len(later) == 6 and len({r.reason for r in later}) == 1
+    assert all("no log" in r.reason and "s after a.pos ends" in r.detail for r in later)
 
 
 @pytest.mark.parametrize(("first_after", "jump_s"), [(20, 3600.0), (30, -7.0), (20, 15.0), (30, None)])

@@ -74,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
                 {"file": str(path), "image": frame.image, "vehicle": frame.vehicle, "time_s": frame.time_s}
                 for path, frame in zip(written, found.frames, strict=True)
             ],
-            "rejected": [{"image": r.image, "reason": r.reason} for r in found.rejected],
+            "rejected": [{"image": r.image, "reason": r.text} for r in found.rejected],
             "warnings": found.warnings,
         }
         json.dump(document, sys.stdout, indent=1, ensure_ascii=False)
@@ -83,7 +83,7 @@ def run(args: argparse.Namespace) -> int:
         for warning in found.warnings:
             print(f"! {warning}", file=sys.stderr)
         for rejection in found.rejected:
-            print(f"x {rejection.image}: {rejection.reason}", file=sys.stderr)
+            print(f"x {rejection.image}: {rejection.text}", file=sys.stderr)
         vehicles = len({frame.vehicle for frame in found.frames})
         print(f"{len(written)} pictures of {vehicles} vehicle(s) in {args.out}")
     return 0
