@@ -92,7 +92,11 @@ class ReturnConfig:
     px4_m: float = 60.0
     """The same (RTL_RETURN_ALT)."""
     cone: float = 3.0
-    """Near home they climb to so many times their distance at most (RTL_CONE_SLOPE; PX4 within RTL_MIN_DIST, 10 m)."""
+    """ArduCopter climbs to so many times its distance at most (RTL_CONE_SLOPE)."""
+    least_cone: float = 0.5
+    """A smaller RTL_CONE_SLOPE limits nothing (RTL_MIN_CONE_SLOPE, ArduCopter/config.h)."""
+    px4_near_m: float = 10.0
+    """PX4 climbs to its full height unless it is so near home, metres (RTL_MIN_DIST)."""
     known_s: float = 3.0
     """A command to return in turn waits so long at most for homes that are not known yet, seconds (chosen)."""
     look_s: float = 1.0

@@ -20,6 +20,11 @@ class Setting(enum.Enum):
 
     SPEED = "speed of missions, m/s"
     RETURN_HEIGHT = "least height of the way home above home, metres; 0 for the height at which the vehicle is"
+    RETURN_TYPE = "where to and how it returns; 0 for straight home, at a height above it"
+    RETURN_SPEED = "speed of the way home, m/s; 0 for the speed of missions"
+    RETURN_CLIMB = "how far it climbs at least before it flies home, metres"
+    RETURN_CONE = "to how many times its distance from home it climbs at most"
+    RALLY_POINTS = "number of places to which it may return instead of home"
     LOW_BATTERY = "action at a low battery"
     NO_STATION = "action where no ground station is heard"
     NO_STATION_EXCEPT = "modes in which it does nothing of that, bits"
@@ -47,6 +52,15 @@ class Parameter:
 _SOME: Final = math.ulp(0.0)
 PARAMETERS: Final[dict[Autopilot, tuple[Parameter, ...]]] = {
     Autopilot.ARDUPILOT: (
+        Parameter("RTL_ALT_M", Setting.RETURN_HEIGHT),
+        Parameter("RTL_ALT", Setting.RETURN_HEIGHT, 0.01),
+        Parameter("RTL_ALT_TYPE", Setting.RETURN_TYPE),
+        Parameter("RTL_SPEED_MS", Setting.RETURN_SPEED),
+        Parameter("RTL_SPEED", Setting.RETURN_SPEED, 0.01),
+        Parameter("RTL_CLIMB_MIN_M", Setting.RETURN_CLIMB),
+        Parameter("RTL_CLIMB_MIN", Setting.RETURN_CLIMB, 0.01),
+        Parameter("RTL_CONE_SLOPE", Setting.RETURN_CONE),
+        Parameter("RALLY_TOTAL", Setting.RALLY_POINTS),
         Parameter("FENCE_ENABLE", Setting.FENCE),
         Parameter("FENCE_AUTOENABLE", Setting.FENCE_AUTO),
         Parameter("FENCE_TYPE", Setting.FENCE_KINDS),
@@ -56,25 +70,27 @@ PARAMETERS: Final[dict[Autopilot, tuple[Parameter, ...]]] = {
         Parameter("FENCE_ALT_MAX", Setting.FENCE_TOP),
         Parameter("FENCE_ALT_MIN", Setting.FENCE_FLOOR, least=-math.inf),
         Parameter("FENCE_MARGIN", Setting.FENCE_MARGIN),
-        Parameter("RTL_ALT_M", Setting.RETURN_HEIGHT),
-        Parameter("RTL_ALT", Setting.RETURN_HEIGHT, 0.01),
-        Parameter("WP_SPD", Setting.SPEED, least=_SOME),
-        Parameter("WPNAV_SPEED", Setting.SPEED, 0.01, _SOME),
         Parameter("BATT_FS_LOW_ACT", Setting.LOW_BATTERY),
         Parameter("FS_GCS_ENABLE", Setting.NO_STATION),
         Parameter("FS_OPTIONS", Setting.NO_STATION_EXCEPT),
+        Parameter("WP_SPD", Setting.SPEED, least=_SOME),
+        Parameter("WPNAV_SPEED", Setting.SPEED, 0.01, _SOME),
     ),
     Autopilot.PX4: (
         Parameter("GF_MAX_HOR_DIST", Setting.FENCE_RADIUS),
         Parameter("GF_MAX_VER_DIST", Setting.FENCE_TOP),
         Parameter("RTL_RETURN_ALT", Setting.RETURN_HEIGHT),
-        Parameter("MPC_XY_VEL_MAX", Setting.SPEED, least=_SOME),
+        Parameter("RTL_TYPE", Setting.RETURN_TYPE),
+        Parameter("MPC_XY_CRUISE", Setting.RETURN_SPEED, least=_SOME),
         Parameter("COM_LOW_BAT_ACT", Setting.LOW_BATTERY),
         Parameter("NAV_DLL_ACT", Setting.NO_STATION),
         Parameter("COM_DLL_EXCEPT", Setting.NO_STATION_EXCEPT),
+        Parameter("MPC_XY_VEL_MAX", Setting.SPEED, least=_SOME),
     ),
 }
-"""PX4 flies no faster than MPC_XY_VEL_MAX, whatever is asked for. ArduCopter tries to reach what is asked for, up to
+"""They are asked for in this order; a check waits for the last one, so that most of the others have come by then.
+
+PX4 flies no faster than MPC_XY_VEL_MAX, whatever is asked for. ArduCopter tries to reach what is asked for, up to
 its greatest lean; its speed of missions is what it has been set up for."""
 
 _ACTIONS: Final[dict[str, dict[int, str]]] = {
@@ -96,10 +112,19 @@ _ACTIONS: Final[dict[str, dict[int, str]]] = {
 }  # fmt: skip
 """What a vehicle does by a parameter's value, empty for nothing (ArduCopter 4.7, PX4 1.16)."""
 CHECKED: Final = frozenset({
-    Setting.RETURN_HEIGHT, Setting.FENCE, Setting.FENCE_KINDS, Setting.FENCE_ACTION, Setting.FENCE_RADIUS,
-    Setting.FENCE_TOP, Setting.SPEED,
+    Setting.RETURN_HEIGHT, Setting.RETURN_TYPE, Setting.SPEED,
+    Setting.FENCE, Setting.FENCE_KINDS, Setting.FENCE_ACTION, Setting.FENCE_RADIUS, Setting.FENCE_TOP,
 })  # fmt: skip
 """What a check before a start waits for: what it compares with the mission, and all versions have."""
+_RETURNS: Final = {
+    1: "to its mission's landing or to a rally point, if it has one",
+    2: "along the way of its mission",
+    3: "to the nearest of home, its mission's landing and rally points",
+    4: "along the way of its mission, ahead or back",
+    5: "to a rally point",
+    6: "home, or to a rally point when its battery is low",
+}
+"""Where to a PX4 returns by RTL_TYPE (1.17), but for 0: straight home or to the nearest rally point."""
 _MISSION_BITS: Final = {"FS_OPTIONS": 1 << 1, "COM_DLL_EXCEPT": 1 << 0}
 """The bit for a mission; FS_OPTIONS has others for other failsafes."""
 _INTEGERS: Final = {
@@ -128,6 +153,16 @@ class SetTo:
         """What the vehicle does, in words; empty for nothing."""
         known = _ACTIONS.get(self.name, {})
         return known.get(round(self.value), f"does what {self.name} {self.value:g} says")
+
+    @property
+    def returns(self) -> str:
+        """How a vehicle returns by its RETURN_TYPE, in words; empty for straight home, at a height above it."""
+        kind = round(self.value)
+        if not kind or (self.name == "RTL_ALT_TYPE" and kind != 1):  # other values count as 0
+            return ""
+        if self.name == "RTL_ALT_TYPE":
+            return "at a height above the ground below it, where it knows that"
+        return _RETURNS.get(kind, f"as {self.name} {kind} says")
 
     @property
     def spares_missions(self) -> bool:

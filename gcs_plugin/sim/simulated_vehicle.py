@@ -103,13 +103,13 @@ class SimVehicle:
             self.airframe = replace(self.airframe, top_m_s=min(self.airframe.top_m_s, _PX4_TOP_M_S))
         self.parameters = {
             "WPNAV_SPEED": 100.0 * _WPNAV_SPEED_M_S, "RTL_ALT": 100.0 * RTL_HEIGHT_M, "FS_GCS_ENABLE": 0,
-            "FENCE_ENABLE": 0, "FENCE_TYPE": 7, "FENCE_ACTION": 1, "FENCE_RADIUS": 300.0, "FENCE_ALT_MAX": 100.0,
-            "FENCE_ALT_MIN": -10.0, "FENCE_MARGIN": 2.0,
+            "RTL_ALT_TYPE": 0, "FENCE_ENABLE": 0, "FENCE_TYPE": 7, "FENCE_ACTION": 1, "FENCE_RADIUS": 300.0,
+            "FENCE_ALT_MAX": 100.0, "FENCE_ALT_MIN": -10.0, "FENCE_MARGIN": 2.0,
         }  # fmt: skip
         if self.autopilot is Autopilot.PX4:
             top_m_s = self.airframe.top_m_s
             self.parameters = {
-                "MPC_XY_VEL_MAX": top_m_s, "RTL_RETURN_ALT": RTL_HEIGHT_M, "NAV_DLL_ACT": 0,
+                "MPC_XY_VEL_MAX": top_m_s, "RTL_RETURN_ALT": RTL_HEIGHT_M, "NAV_DLL_ACT": 0, "RTL_TYPE": 0,
                 "GF_MAX_HOR_DIST": 0.0, "GF_MAX_VER_DIST": 0.0,
             }  # fmt: skip
         home = MissionItem.at(WAYPOINT, *self.home, frame=FRAME_GLOBAL)

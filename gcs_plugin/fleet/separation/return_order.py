@@ -202,7 +202,7 @@ def aloft_of(vehicles: "Mapping[int, Vehicle]", now: float) -> dict[int, Aloft]:
         s: Aloft(
             place=Track(_point(v, origin), level_m=v.home_alt_m),
             way=way_home(v, origin),
-            height_known=Setting.RETURN_HEIGHT in v.settings or flight_state(v).word is Word.LANDING,
+            height_known=_height_known(v),
             goes_home=_goes_home(v),
             silent_s=now - v.heard,
             lost=v.lost,
@@ -237,23 +237,53 @@ def way_home(vehicle: "Vehicle", origin: tuple[float, float]) -> Track | None:
     home, place = vehicle.home or vehicle.launch, _place(vehicle)
     if home is None or place is None:
         return None
-    ardupilot = vehicle.autopilot is Autopilot.ARDUPILOT
-    speed, height = vehicle.settings.get(Setting.SPEED), vehicle.settings.get(Setting.RETURN_HEIGHT)
-    speed_m_s = (
-        speed.value if ardupilot and speed is not None else RETURN.ardupilot_m_s if ardupilot else RETURN.px4_m_s
-    )
-    least_m = height.value if height is not None else RETURN.ardupilot_m if ardupilot else RETURN.px4_m
     here, there = metres(*place, origin), metres(*home, origin)
-    away_m = math.hypot(there[0] - here[0], there[1] - here[1])
-    least_m = min(least_m, RETURN.cone * away_m)
+    least_m = return_height_m(vehicle, math.hypot(there[0] - here[0], there[1] - here[1]))
     lands = flight_state(vehicle).word is Word.LANDING and _goes_home(vehicle)
     if lands:  # where it is, or above its home already
         there, least_m = here, vehicle.height_m
     top = max(vehicle.height_m, least_m, active().planning.on_ground_m)
     points = np.array([(*here, vehicle.height_m), (*here, top), (*there, top), (*there, 0.0)])
     kept = np.linalg.norm(np.diff(points, axis=0, prepend=points[:1] - 1.0), axis=1) > 0.0
-    motion = Motion(speed_m_s=speed_m_s, autopilot=autopilot_config(vehicle.autopilot.value), lands=lands)
+    motion = Motion(
+        speed_m_s=_return_speed_m_s(vehicle), autopilot=autopilot_config(vehicle.autopilot.value), lands=lands
+    )
     return Track(motion.places(points[kept], None, STEP_S), motion.autopilot, vehicle.home_alt_m)
+
+
+def return_height_m(vehicle: "Vehicle", away_m: float) -> float:
+    """The height above home at which a vehicle flies home, from where it is (ArduCopter's mode_rtl.cpp, PX4's rtl.cpp).
+
+    Args:
+        vehicle: in the air. away_m: its distance from home.
+    """
+    said = vehicle.settings.get
+    height, climb, cone = said(Setting.RETURN_HEIGHT), said(Setting.RETURN_CLIMB), said(Setting.RETURN_CONE)
+    if vehicle.autopilot is not Autopilot.ARDUPILOT:
+        least_m = RETURN.px4_m if height is None else height.value
+        return max(vehicle.height_m, min(least_m, RETURN.cone * away_m) if away_m <= RETURN.px4_near_m else least_m)
+    least_m = RETURN.ardupilot_m if height is None else height.value
+    slope = RETURN.cone if cone is None else cone.value
+    climbed_m = vehicle.height_m + (0.0 if climb is None else climb.value)
+    limit_m = slope * away_m if slope >= RETURN.least_cone else math.inf
+    return max(climbed_m, min(least_m, limit_m))
+
+
+def _return_speed_m_s(vehicle: "Vehicle") -> float:
+    """The speed at which a vehicle flies home, metres per second."""
+    back, mission = vehicle.settings.get(Setting.RETURN_SPEED), vehicle.settings.get(Setting.SPEED)
+    if back is not None and back.value > 0.0:
+        return back.value
+    if vehicle.autopilot is Autopilot.PX4:
+        return RETURN.px4_m_s
+    return RETURN.ardupilot_m_s if mission is None else mission.value
+
+
+def _height_known(vehicle: "Vehicle") -> bool:
+    """Whether the height of its way is known: it has said at what height above home it returns, or comes down."""
+    how = vehicle.settings.get(Setting.RETURN_TYPE)
+    told = Setting.RETURN_HEIGHT in vehicle.settings and not (how is not None and how.returns)
+    return told or flight_state(vehicle).word is Word.LANDING
 
 
 def apart(one: Track, other: Track, *, heights: bool = True) -> bool:

@@ -36,6 +36,9 @@ def bytewise(value):
         ("WP_SPD", 12.5, REAL, AP, Setting.SPEED, 12.5),  # ArduPilot 4.7
         ("RTL_ALT", 3000.0, INT32, AP, Setting.RETURN_HEIGHT, 30.0),
         ("RTL_ALT_M", 30.0, REAL, AP, Setting.RETURN_HEIGHT, 30.0),
+        ("RTL_SPEED", 500.0, INT32, AP, Setting.RETURN_SPEED, 5.0),
+        ("RTL_SPEED_MS", 5.0, REAL, AP, Setting.RETURN_SPEED, 5.0),
+        ("FENCE_ALT_MIN", -10.0, REAL, AP, Setting.FENCE_FLOOR, -10.0),
         ("RTL_ALT", 0.0, INT32, AP, Setting.RETURN_HEIGHT, 0.0),
         ("BATT_FS_LOW_ACT", 2.0, INT8, AP, Setting.LOW_BATTERY, 2.0),
         ("RTL_RETURN_ALT", 60.0, REAL, PX4, Setting.RETURN_HEIGHT, 60.0),
@@ -87,6 +90,41 @@ def test_a_way_home_through_the_ground_is_red(make_world, autopilot):
     assert items_of(world, Wanted())["return"].level is Level.OK
     vehicle.settings[Setting.RETURN_HEIGHT] = SetTo(name, 0.0)
     assert items_of(world, high)["return"].level is Level.RED  # from a valley it would fly straight into the hill
+
+
+@pytest.mark.parametrize(
+    ("autopilot", "parameters", "words"),
+    [
+        (AP, {"RTL_ALT_TYPE": 1}, "at a height above the ground below it, where it knows that (RTL_ALT_TYPE is 1)"),
+        (AP, {"RALLY_TOTAL": 2}, "may return to one of its 2 rally points (RALLY_TOTAL)"),
+        (PX4, {"RTL_TYPE": 2}, "along the way of its mission (RTL_TYPE is 2)"),
+        (PX4, {"RTL_TYPE": 3}, "to the nearest of home, its mission's landing and rally points (RTL_TYPE is 3)"),
+        (PX4, {"RTL_TYPE": 9}, "returns as RTL_TYPE 9 says"),
+    ],
+)
+def test_a_way_home_that_is_not_straight_to_it_is_warned_about(make_world, autopilot, parameters, words):
+    world = make_world(SimVehicle(system=1, autopilot=autopilot))
+    world.vehicles[1].parameters |= parameters
+    world.meet()
+    world.finish(world.fleet.download(1))
+    assert world.until(lambda: world.fleet.vehicles[1].ready_to_check, 30.0)
+    for wanted in (Wanted(), Wanted(needs=PlanNeeds(return_height_m=10.0))):
+        found = items_of(world, wanted)["return"]
+        assert found.level is Level.WARNING and words in found.reason, found
+
+
+def test_a_fence_that_keeps_the_way_home_below_what_the_ground_needs_is_red(make_world):
+    world = make_world(SimVehicle(system=1))
+    world.vehicles[1].parameters |= {"RTL_ALT": 6000, "FENCE_ALT_MAX": 50.0}
+    world.meet()
+    needs = Wanted(needs=PlanNeeds(return_height_m=55.0))
+    for kept, level in ((0, Level.OK), (1, Level.RED)):
+        world.vehicles[1].parameters["FENCE_ENABLE"] = kept
+        world.finish(world.fleet.download(1))
+        assert world.until(lambda: world.fleet.vehicles[1].ready_to_check, 30.0)
+        found = items_of(world, needs)["return"]
+        assert found.level is level, found
+    assert "no higher than 48 m" in found.reason and "set FENCE_ALT_MAX to 57" in found.reason
 
 
 @BOTH

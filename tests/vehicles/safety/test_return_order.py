@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gcs_plugin.fleet.autopilot_settings import Setting, SetTo
-from gcs_plugin.fleet.separation.return_order import ReturnOrder, aloft_of, apart
+from gcs_plugin.fleet.separation.return_order import ReturnOrder, aloft_of, apart, return_height_m
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.items import RTL, TAKEOFF, WAYPOINT, Mission, MissionItem
 from gcs_plugin.sim.multirotor import Airframe, Chart
@@ -291,3 +291,50 @@ def vehicle_at():
         return vehicle
 
     return make
+
+
+# -- what is assumed of a way home ------------------------------------------------------------------------------------
+
+
+def aloft_at(make_world, autopilot, height_m, **settings):
+    """A vehicle in the air, a way off its home, with these settings (in the parameter's own units)."""
+    world, _ = flown_out(make_world, [(200.0, 0.0)], autopilots=(autopilot,), height=height_m)
+    vehicle = world.fleet.vehicles[1]
+    vehicle.settings |= {Setting[name]: SetTo(name, value) for name, value in settings.items()}
+    return world, vehicle
+
+
+@pytest.mark.parametrize(
+    ("autopilot", "away_m", "settings", "expected_m"),
+    [
+        (AP, 100.0, {"RETURN_HEIGHT": 40.0}, 40.0),
+        (AP, 10.0, {"RETURN_HEIGHT": 40.0}, 30.0),  # RTL_CONE_SLOPE is 3 if it is not told
+        (AP, 15.0, {"RETURN_HEIGHT": 40.0, "RETURN_CONE": 2.5}, 37.5),
+        (AP, 10.0, {"RETURN_HEIGHT": 40.0, "RETURN_CONE": 0.0}, 40.0),
+        (AP, 100.0, {"RETURN_HEIGHT": 15.0, "RETURN_CLIMB": 10.0}, 40.0),
+        (AP, 1.0, {"RETURN_HEIGHT": 15.0, "RETURN_CLIMB": 10.0}, 40.0),
+        (PX4, 15.0, {"RETURN_HEIGHT": 60.0}, 60.0),
+        (PX4, 15.0, {}, 60.0),
+    ],
+)
+def test_the_height_of_the_way_home_is_the_autopilots(make_world, autopilot, away_m, settings, expected_m):
+    _, vehicle = aloft_at(make_world, autopilot, 30.0)
+    vehicle.settings = {Setting[name]: SetTo(name, value) for name, value in settings.items()}
+    vehicle.height_m = 30.0
+    assert return_height_m(vehicle, away_m) == pytest.approx(expected_m)
+
+
+def test_a_way_home_takes_as_long_as_its_own_speed_does(make_world):
+    world, vehicle = aloft_at(make_world, AP, 30.0, SPEED=10.0, RETURN_SPEED=0.0)
+    fast = aloft_of(world.fleet.vehicles, world.clock.now)[1].way
+    vehicle.settings[Setting.RETURN_SPEED] = SetTo("RTL_SPEED_MS", 2.0)
+    slow = aloft_of(world.fleet.vehicles, world.clock.now)[1].way
+    assert fast is not None and slow is not None and len(slow.places) > 1.5 * len(fast.places)
+
+
+@pytest.mark.parametrize(("autopilot", "name"), [(AP, "RTL_ALT_TYPE"), (PX4, "RTL_TYPE")])
+def test_heights_do_not_keep_apart_a_vehicle_that_returns_in_another_way(make_world, autopilot, name):
+    world, vehicle = aloft_at(make_world, autopilot, 30.0, RETURN_HEIGHT=30.0)
+    for kind, known in ((0.0, True), (1.0, False)):
+        vehicle.settings[Setting.RETURN_TYPE] = SetTo(name, kind)
+        assert aloft_of(world.fleet.vehicles, world.clock.now)[1].height_known is known
