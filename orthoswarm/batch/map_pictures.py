@@ -17,6 +17,7 @@ from orthoswarm.export.cog import write_cog
 from orthoswarm.export.product_files import describe_frame
 from orthoswarm.export.seamlines import write_seamlines
 from orthoswarm.model.errors import OrthoSwarmError
+from orthoswarm.model.frame import last_time
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import PlacedFrame, Refinement, Solution, Terrain
 from orthoswarm.mosaic.extent import drawn_window, ground_level, placed_bounds
@@ -114,8 +115,8 @@ def _both(run: RunContext, state: RunState, coarse: _Map, fine: _Map) -> None:
             ]
             drawn = partial(run.progress, "drawing orthoimage")
             stats = render_layers(layers, read=state.read_rgb(), parts=state.parts, run=run.drawers.map, progress=drawn)
-            _write(run, first, COARSE)
-        _write(run, second, ORTHOIMAGE)
+            _write(run, first, COARSE, coarse[0])
+        _write(run, second, ORTHOIMAGE, fine[0])
         _write_seamlines(run, second, fine[0])
     run.space.clear_scratch()
     state.drawn = (stats[1].drawn_m2, stats[1].covered_share)
@@ -180,7 +181,7 @@ def draw(
                 run=run.drawers.map,
                 progress=drawn,
             )
-        _write(run, canvas, name)
+        _write(run, canvas, name, placed)
         if name == ORTHOIMAGE:
             _write_seamlines(run, canvas, placed)
     run.space.clear_scratch()
@@ -205,15 +206,16 @@ def _canvas(run: RunContext, name: str, placed: Sequence[PlacedFrame], terrain: 
     )
 
 
-def _write(run: RunContext, canvas: Canvas, name: str) -> None:
-    """Write a canvas as a COG, a large one in tiles."""
+def _write(run: RunContext, canvas: Canvas, name: str, placed: Sequence[PlacedFrame]) -> None:
+    """Write a canvas as a COG, a large one in tiles; its date is that of the last of these frames."""
+    last = last_time(p.frame for p in placed)
     written = partial(run.progress, f"writing {name}")
     window, threads = drawn_window(canvas), run.drawers.count
     if in_tiles(run.options.tiles, window):
         drawn = map(canvas.tile_bounds, canvas.changed_since(0))
-        write_tiled(canvas, run.out, name, window=window, drawn=drawn, progress=written, threads=threads)
+        write_tiled(canvas, run.out, name, window=window, drawn=drawn, progress=written, threads=threads, time_s=last)
         return
-    write_cog(canvas, run.out / name, window=window, progress=written, threads=threads)
+    write_cog(canvas, run.out / name, window=window, progress=written, threads=threads, time_s=last)
     remove_tiles(run.out, name)
 
 

@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import BinaryIO, Protocol
 
@@ -56,6 +57,7 @@ def write_cog(
     progress: Callable[[int, int], None] | None = None,
     threads: int = 2,
     classic_bytes: int = CLASSIC_BYTES,
+    time_s: float | None = None,
 ) -> None:
     """Write a source as a COG: RGBA uint8, deflate, tiles of 512, overviews by powers of two.
 
@@ -66,6 +68,7 @@ def write_cog(
         progress: called with tiles written and tiles in all.
         threads: how many tiles are compressed at once.
         classic_bytes: a file that may become larger is a BigTIFF.
+        time_s: UTC epoch seconds for the tag DateTime, None to leave it out.
 
     Raises:
         OrthoSwarmError: if the disk is full or the folder cannot be written.
@@ -74,7 +77,9 @@ def write_cog(
     row1, col1 = max(row1, row0 + 1), max(col1, col0 + 1)
     levels = _levels(row1 - row0, col1 - col0)
     with atomic_write(path) as part, part.open("w+b") as file:
-        tables = _write_directories(file, source.grid, (row0, col0), levels, _form_of(levels, classic_bytes))
+        tables = _write_directories(
+            file, source.grid, (row0, col0), levels=levels, form=_form_of(levels, classic_bytes), time_s=time_s
+        )
         done, total = 0, sum(level.tiles for level in levels)
         for level, table in reversed(list(zip(levels, tables, strict=True))):
             for i, data in enumerate(_compressed(source, (row0, col0), level, threads)):
@@ -195,8 +200,9 @@ def _form_of(levels: list[_Level], classic_bytes: int) -> _Form:
 
 
 def _write_directories(
-    file: BinaryIO, grid: GroundGrid, first: tuple[int, int], levels: list[_Level], form: "_Form"
-) -> list[_Table]:
+    file: BinaryIO, grid: GroundGrid, first: tuple[int, int], *, levels: list[_Level], form: "_Form",
+    time_s: float | None,
+) -> list[_Table]:  # fmt: skip
     """Write header and directories with room for the tile tables; the file is left at the first tile's offset."""
     ghost = b"GDAL_STRUCTURAL_METADATA_SIZE=%06d bytes\n" % len(_STRUCTURE) + _STRUCTURE
     ghost += bytes(-len(ghost) % 16)
@@ -206,6 +212,8 @@ def _write_directories(
     for i, level in enumerate(levels):
         table = _Table(level.tiles, form)
         tags = _tags(level, grid if i == 0 else None, first)
+        written = _date_time(time_s) if i == 0 else b""
+        tags |= {306: (_ASCII, written)} if written else {}
         block = _directory(at, tags, table, form, last=i == len(levels) - 1)
         file.write(block)
         at += len(block)
@@ -238,6 +246,14 @@ def _tags(level: _Level, grid: GroundGrid | None, first: tuple[int, int]) -> dic
         # GeoTIFF keys: projected, pixel is area, the CRS by its EPSG code, metres.
         tags[34735] = (_SHORT, [1, 1, 0, 4, 1024, 0, 1, 1, 1025, 0, 1, 1, 3072, 0, 1, grid.epsg, 3076, 0, 1, 9001])
     return tags
+
+
+def _date_time(time_s: float | None) -> bytes:
+    """The value of the tag DateTime, "YYYY:MM:DD HH:MM:SS" in UTC (TIFF knows no zone); empty if it is not known."""
+    try:
+        return b"" if time_s is None else datetime.fromtimestamp(time_s, UTC).strftime("%Y:%m:%d %H:%M:%S\0").encode()
+    except (OverflowError, ValueError, OSError):  # no date
+        return b""
 
 
 def _directory(

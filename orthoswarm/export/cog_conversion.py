@@ -8,6 +8,8 @@ from orthoswarm import __version__
 from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.model.errors import InputError
 
+_DATE = "TIFFTAG_DATETIME"
+
 
 def convert_cog(source: Path, path: Path, *, epsg: int | None = None, jpeg_quality: int | None = None) -> None:
     """Write a raster as a COG.
@@ -43,7 +45,7 @@ def convert_cog(source: Path, path: Path, *, epsg: int | None = None, jpeg_quali
                 copy_dataset(raster, part, **settings)
                 return
             with WarpedVRT(raster, crs=crs, resampling=rasterio.enums.Resampling.cubic, warp_mem_limit=64) as vrt:
-                _copy_warped(vrt, part, settings)
+                _copy_warped(vrt, part, settings, raster.tags().get(_DATE))
     except (CRSError, RasterioError) as error:
         raise InputError(f"{source.name} cannot be written as asked ({_first_line(error)}); check --epsg") from None
 
@@ -89,7 +91,7 @@ def _is_whole(dataset: Any) -> bool:
     return True
 
 
-def _copy_warped(vrt: Any, part: Path, settings: dict[str, Any]) -> None:
+def _copy_warped(vrt: Any, part: Path, settings: dict[str, Any], date: str | None) -> None:
     """Copy a warped raster, which has none of its source's tags, by way of a description that has."""
     import rasterio
 
@@ -97,6 +99,6 @@ def _copy_warped(vrt: Any, part: Path, settings: dict[str, Any]) -> None:
         described = Path(folder) / "warped.vrt"
         copy_dataset(vrt, described, driver="VRT")
         with rasterio.open(described, "r+") as file:
-            file.update_tags(TIFFTAG_SOFTWARE=software())
+            file.update_tags(TIFFTAG_SOFTWARE=software(), **({_DATE: date} if date else {}))
         with rasterio.open(described) as file:
             copy_dataset(file, part, **settings)

@@ -1,5 +1,6 @@
 """A frame: one picture with the recorded pose of its camera. Readers of telemetry yield frames."""
 
+from collections.abc import Iterable
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 
@@ -72,6 +73,11 @@ class Frame:
     def __deepcopy__(self, memo: dict[int, object]) -> "Frame":
         """Itself: nobody changes a frame."""
         return self
+
+
+def last_time(frames: Iterable[Frame]) -> float | None:
+    """Time of the last of some frames, UTC epoch seconds; None if no time is known."""
+    return max((frame.time_s for frame in frames if frame.time_s is not None), default=None)
 
 
 @dataclass(frozen=True, slots=True)

@@ -109,6 +109,15 @@ def test_pictures_are_cogs_of_drone_pixels(flight, mapped):
         assert set(np.unique(rgba[3])) <= {0, 255} and (rgba[:3, rgba[3] == 0] == 0).all()
 
 
+def test_each_picture_of_the_map_has_the_time_of_the_last_photo(mapped):
+    out = mapped[0]
+    rows = map(json.loads, (out / "frames.jsonl").read_text().splitlines())
+    last = max(row["time"] for row in rows if row["stage"] != "rejected")
+    for name in ("realtime.tif", "coarse.tif", "orthoimage.tif"):
+        with rasterio.open(out / name) as image:
+            assert image.tags()["TIFFTAG_DATETIME"] == last[:19].replace("-", ":").replace("T", " ")
+
+
 def test_the_orthoimage_shows_the_ground_where_it_is(flight, mapped):
     scene, _, _ = flight
     with rasterio.open(mapped[0] / "orthoimage.tif") as image:

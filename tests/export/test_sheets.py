@@ -16,6 +16,7 @@ from rasterio.warp import transform
 
 from gcs_plugin.cli.main import main
 from orthoswarm.export.reduced_raster import ReducedRaster
+from orthoswarm.export.sheets.forms import write_form
 from orthoswarm.export.sheets.geopdf import write_geopdf
 from orthoswarm.export.sheets.mgrs import mgrs, utm_zone
 from orthoswarm.export.sheets.stac_item import write_stac_item
@@ -109,6 +110,26 @@ def test_accuracy_is_stated_as_the_map_was_placed_and_checked(folder, monkeypatc
     )
     write_geopdf(folder / "orthoimage.tif", folder / "sheet.pdf", (), "Flood")
     assert words in " ".join(drawn)
+
+
+@pytest.mark.parametrize(("layer", "basemap", "own"), [
+    ("realtime", "m.tif", True), ("coarse", "m.tif", True), ("coarse", None, False), ("orthoimage", "m.tif", False),
+])  # fmt: skip
+def test_an_earlier_layer_does_not_quote_the_accuracy_of_the_last(folder, layer, basemap, own):
+    (folder / "report.json").write_text(json.dumps({"legs": [MATCHED], "basemap": basemap, "checkpoints": CHECKED}))
+    for name in ("coarse.tif", "realtime.tif"):
+        (folder / name).write_bytes((folder / "orthoimage.tif").read_bytes())
+    path = write_form("stac", folder / f"{layer}.tif", folder, ())
+    properties = json.loads(path.read_text())["properties"]
+    assert ("No accuracy is stated" in properties["description"]) == own
+    assert ("orthoswarm:sigma_median_m" in properties) == ("orthoswarm:rmse_h_m" in properties) == (not own)
+    pack = write_form("pack", folder / f"{layer}.tif", folder / "dest", ())
+    with zipfile.ZipFile(pack) as archive:
+        item = json.loads(archive.read("flood-map/orthoimage.stac.json"))
+        page = archive.read("flood-map/index.html").decode()
+    assert item["id"] == f"flood-{layer}"
+    assert ("No accuracy is stated" in item["properties"]["description"]) == own
+    assert ("No accuracy is stated" in page) == own
 
 
 def test_a_long_statement_stays_on_the_sheet(folder, monkeypatch):

@@ -238,6 +238,22 @@ def middle_of_pixel(overlay, place):
     return east, north
 
 
+@pytest.mark.parametrize("limit", [CLASSIC_BYTES, 0])
+def test_the_date_of_the_flight_stands_in_the_tags_and_nothing_else_changes(raster, tmp_path, limit):
+    write_cog(raster, tmp_path / "dated.tif", classic_bytes=limit, time_s=1_779_999_999.5)
+    write_cog(raster, tmp_path / "plain.tif", classic_bytes=limit)
+    convert_cog(tmp_path / "dated.tif", tmp_path / "copy.tif")
+    convert_cog(tmp_path / "dated.tif", tmp_path / "warped.tif", epsg=EPSG + 1)
+    for name in ("dated.tif", "copy.tif", "warped.tif"):
+        with rasterio.open(tmp_path / name) as image:
+            assert image.tags()["TIFFTAG_DATETIME"] == "2026:05:28 20:26:39"
+    with rasterio.open(tmp_path / "dated.tif") as dated, rasterio.open(tmp_path / "plain.tif") as plain:
+        assert "TIFFTAG_DATETIME" not in plain.tags()
+        assert dated.tags(ns="IMAGE_STRUCTURE") == plain.tags(ns="IMAGE_STRUCTURE")
+        assert dated.profile == plain.profile and dated.overviews(1) == plain.overviews(1)
+        np.testing.assert_array_equal(dated.read(), plain.read())
+
+
 def test_a_small_kmz_is_one_overlay(ortho, tmp_path):
     write_kmz(ortho, tmp_path / "m.kmz")
     (overlay,) = overlays(tmp_path / "m.kmz")

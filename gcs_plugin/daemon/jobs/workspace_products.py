@@ -17,7 +17,7 @@ from orthoswarm.export.sheets.forms import FORMS, write_form
 from orthoswarm.export.tactical import places as place_files
 from orthoswarm.export.tactical.places import Place
 from orthoswarm.model.errors import InputError
-from orthoswarm.model.frame import Frame, Rejection
+from orthoswarm.model.frame import Frame, Rejection, last_time
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import PlacedFrame, Solution
 from orthoswarm.raster.basemap import Basemap
@@ -70,12 +70,12 @@ def write_products(task: ExportTask) -> dict[str, str]:
     from orthoswarm.report.page import write_page
 
     out = task.workspace
-    made, area_ha = _pictures(task)
+    recorded = _recorded(task)
+    made, area_ha = _pictures(task, last_time(p.frame for p in recorded.placed))
     if not made:
         raise InputError("there is no map yet; wait for pictures")
     refined = [read_solution(path).solution for path in task.solutions]
     solutions = [*(read_solution(path).solution for path in task.coarse), *refined]
-    recorded = _recorded(task)
     placed, rejected = _placements(task, recorded, solutions)
     offset = measure_map_offset(recorded.placed, placed)
     placed, level = _stated(placed, solutions)
@@ -95,7 +95,7 @@ def write_products(task: ExportTask) -> dict[str, str]:
     return files
 
 
-def _pictures(task: ExportTask) -> tuple[list[str], float]:
+def _pictures(task: ExportTask, time_s: float | None) -> tuple[list[str], float]:
     """A COG for each layer, the best one last, and the ground that the first shows, hectares.
 
     orthoimage.tif is there as soon as anything was refined.
@@ -115,7 +115,9 @@ def _pictures(task: ExportTask) -> tuple[list[str], float]:
             if canvas.drawn[1] == 0:
                 continue
             area_ha = area_ha or _drawn_ha(canvas)
-            write_cog(_WithOverviews(canvas), task.workspace / file, window=drawn_window(canvas), threads=1)
+            write_cog(
+                _WithOverviews(canvas), task.workspace / file, window=drawn_window(canvas), threads=1, time_s=time_s
+            )
         made.append(file)
     if task.solutions and made[-1:] == ["coarse.tif"]:  # without a map the orthoimage is the coarse product
         with atomic_write(task.workspace / "orthoimage.tif") as part:

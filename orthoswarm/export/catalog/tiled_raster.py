@@ -86,7 +86,7 @@ def remove_collection(folder: Path) -> None:
 
 def write_tiled(
     source: Source, folder: Path, name: str, *, window: tuple[int, int, int, int], drawn: Iterable[BoundingBox],
-    progress: Callable[[int, int], None] | None = None, threads: int = 2,
+    progress: Callable[[int, int], None] | None = None, threads: int = 2, time_s: float | None = None,
 ) -> None:  # fmt: skip
     """Write a raster in tiles; tiles without content are left out.
 
@@ -95,6 +95,7 @@ def write_tiled(
         window: rows and columns (row0, row1, col0, col1) to write, the first ones multiples of 512.
         drawn: parts of the ground that have content, metres.
         progress: called with tiles written and tiles in all. threads: how many blocks are compressed at once.
+        time_s: UTC epoch seconds for the tag DateTime of the tiles, None to leave it out.
 
     Raises:
         OrthoSwarmError: if the disk is full or the folder cannot be written.
@@ -112,7 +113,7 @@ def write_tiled(
         for done, (r, c) in enumerate(sorted(filled), 1):
             top, left = row0 + r * side, col0 + c * side
             inside = (top, min(top + side, row1), left, min(left + side, col1))
-            write_cog(source, part / f"r{r:03d}_c{c:03d}.tif", window=inside, threads=threads)
+            write_cog(source, part / f"r{r:03d}_c{c:03d}.tif", window=inside, threads=threads, time_s=time_s)
             if progress is not None:
                 progress(done, len(filled))
     raster = replace(

@@ -87,7 +87,7 @@ def write_geopdf(cog: Path, path: Path, places: Sequence[Place] = (), title: str
                 rgba = vrt.read().transpose(1, 2, 0)
     except RasterioError as error:
         raise InputError(f"{cog} cannot be read ({error}); make the map again") from None
-    page = _page(frame, rgba, epsg, folder=cog.parent, places=places, title=title)
+    page = _page(frame, rgba, epsg, cog=cog, places=places, title=title)
     with atomic_write(path) as part:
         _save(page, frame, epsg, part, title)
 
@@ -128,7 +128,7 @@ def _frame(bounds: BoundingBox) -> _Frame:
     return best
 
 
-def _page(frame: _Frame, rgba: Any, epsg: int, *, folder: Path, places: Sequence[Place], title: str) -> Any:
+def _page(frame: _Frame, rgba: Any, epsg: int, *, cog: Path, places: Sequence[Place], title: str) -> Any:
     from PIL import Image, ImageDraw
 
     sheet = Image.new("RGB", frame.page, "white")
@@ -142,7 +142,7 @@ def _page(frame: _Frame, rgba: Any, epsg: int, *, folder: Path, places: Sequence
         east, north = (float(v) for v in grid.to_grid(place.lat_deg, place.lon_deg))
         _mark(draw, frame.pixel(east, north), place.name, frame)
     draw.rectangle(frame.box, outline=_INK, width=3)
-    _foot(draw, frame, grid, folder=folder, finds=len(finds), step=step, title=title)
+    _foot(draw, frame, grid, cog=cog, finds=len(finds), step=step, title=title)
     return sheet
 
 
@@ -180,9 +180,7 @@ def _mark(draw: "ImageDraw", at: tuple[float, float], name: str, frame: _Frame) 
         )
 
 
-def _foot(
-    draw: "ImageDraw", frame: _Frame, grid: LocalGrid, *, folder: Path, finds: int, step: float, title: str
-) -> None:
+def _foot(draw: "ImageDraw", frame: _Frame, grid: LocalGrid, *, cog: Path, finds: int, step: float, title: str) -> None:
     left, _, right, bottom = frame.box
     lat, lon = (float(v) for v in grid.to_geographic([frame.west, frame.north]))
     zone = utm_zone(grid.epsg)
@@ -191,13 +189,13 @@ def _foot(
         where = (
             f"MGRS {grid_zone(zone, lat)} {square(zone, frame.west, frame.north)}, UTM zone {zone} (EPSG:{grid.epsg})"
         )
-    first, last = picture_times(folder)
+    first, last = picture_times(cog.parent)
     taken = (
         "time of the pictures is not known"
         if first is None
         else f"pictures of {_minute(first)} to {_minute(last or first)} UTC"
     )
-    stated = stated_accuracy(folder)
+    stated = stated_accuracy(cog.parent, cog.stem)
     lines = [
         f"Scale 1:{frame.scale:,} on A3; grid lines every {step:g} m, WGS 84, {where}; up is grid north",
         f"Upper left corner {_degrees(lat, 'NS')}, {_degrees(lon, 'EW')}; {taken}",

@@ -79,7 +79,7 @@ def write_pack(
             lambda: write_gpx(places, folder / "places.gpx"),
             lambda: write_csv(places, folder / "places.csv"),
             lambda: _copy(cog, folder),
-            lambda: write_stac_item(folder / "orthoimage.tif", folder / "orthoimage.stac.json"),
+            lambda: write_stac_item(folder / "orthoimage.tif", folder / "orthoimage.stac.json", copy_of=cog),
         ]
         done = itertools.count(1)
         count = len(web) + len(others) + 1
@@ -93,8 +93,14 @@ def write_pack(
             for running in [pool.submit(run, web), pool.submit(run, others)]:
                 running.result()
         with closing(sqlite3.connect(tiles)) as database, atomic_write(path) as part:
-            _zip(database, folder, part, places=places, title=title, bounds=bounds[0])
+            about = {"bounds": bounds[0], "accuracy": _accuracy(cog)}
+            _zip(database, folder, part, places=places, title=title, about=about)
         tell(count, count)
+
+
+def _accuracy(cog: Path) -> str:
+    stated = stated_accuracy(cog.parent, cog.stem)
+    return "" if stated is None else stated.sentence
 
 
 def _draw_tiles(cog: Path, mbtiles: Path, kmz: Path) -> tuple[float, ...]:
@@ -116,17 +122,17 @@ def _copy(cog: Path, folder: Path) -> None:
 
 def _zip(
     database: sqlite3.Connection, folder: Path, path: Path, *, places: Sequence[Place], title: str,
-    bounds: Sequence[float],
+    about: dict[str, Any],
 ) -> None:  # fmt: skip
     top = f"{title}-map"
-    about = dict(database.execute("SELECT name, value FROM metadata"))
+    drawn = dict(database.execute("SELECT name, value FROM metadata"))
     files = [name for name in _PURPOSES if (folder / name).is_file()]
     names = []
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, data in _tiles(database):
             names.append(name)
             archive.writestr(f"{top}/tiles/{name}.webp", data, zipfile.ZIP_STORED)
-        document = _document(folder, about, names, files=files, places=places, title=title) | {"bounds": bounds}
+        document = _document(folder, drawn, names, files=files, places=places, title=title) | about
         page = _PAGE.read_text(encoding="utf-8").replace("/*PACK*/null", _script(document))
         archive.writestr(f"{top}/index.html", page)
         for name in files:
@@ -141,15 +147,13 @@ def _tiles(database: sqlite3.Connection) -> Iterator[tuple[str, bytes]]:
 
 
 def _document(
-    folder: Path, about: dict[str, str], tiles: list[str], *, files: list[str], places: Sequence[Place], title: str
+    folder: Path, drawn: dict[str, str], tiles: list[str], *, files: list[str], places: Sequence[Place], title: str
 ) -> dict[str, Any]:
     first, last = picture_times(folder)
-    stated = stated_accuracy(folder)
     return {
         "title": title,
         "about": "" if first is None or last is None else f"Pictures of {_minute(first)} to {_minute(last)} UTC.",
-        "accuracy": "" if stated is None else stated.sentence,
-        "minzoom": int(about["minzoom"]), "maxzoom": int(about["maxzoom"]), "tiles": tiles,
+        "minzoom": int(drawn["minzoom"]), "maxzoom": int(drawn["maxzoom"]), "tiles": tiles,
         "finds": [
             {"name": p.name, "lat": p.lat_deg, "lon": p.lon_deg, "sigma": p.sigma_m, "note": p.note}
             for p in places

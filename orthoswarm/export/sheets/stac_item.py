@@ -24,7 +24,7 @@ _COG: Final = "image/tiff; application=geotiff; profile=cloud-optimized"
 _COLOURS: Final = ("red", "green", "blue", "alpha")
 
 
-def write_stac_item(cog: Path, path: Path) -> None:
+def write_stac_item(cog: Path, path: Path, *, copy_of: Path | None = None) -> None:
     """Write the item of an orthoimage.
 
     Time is that of its pictures (`frames.jsonl` beside it), accuracy what `report.json` beside it states. A surface
@@ -32,6 +32,7 @@ def write_stac_item(cog: Path, path: Path) -> None:
 
     Args:
         cog: the orthoimage. path: the item, best in the same folder: it names the COG relatively to itself.
+        copy_of: the map's raster of which `cog` is a copy in another folder; its map gives name, time and accuracy.
 
     Raises:
         InputError: the COG cannot be read.
@@ -52,8 +53,8 @@ def write_stac_item(cog: Path, path: Path) -> None:
     except RasterioError as error:
         raise InputError(f"{cog} cannot be read ({error}); make the map again") from None
     item = raster_item(
-        grid, identifier=_identifier(cog), href=Path(os.path.relpath(cog, path.parent)).as_posix(),
-        title="Orthoimage", properties=_properties(cog), asset="orthoimage", bands=bands,
+        grid, identifier=_identifier(copy_of or cog), href=Path(os.path.relpath(cog, path.parent)).as_posix(),
+        title="Orthoimage", properties=_properties(copy_of or cog), asset="orthoimage", bands=bands,
     )  # fmt: skip
     item["assets"] |= surface_assets(cog.parent, path)
     with atomic_write(path) as part:
@@ -102,7 +103,7 @@ def _properties(cog: Path) -> dict[str, Any]:
         properties["datetime"] = made
     else:
         properties |= {"datetime": first, "start_datetime": first, "end_datetime": last}
-    stated = stated_accuracy(cog.parent)
+    stated = stated_accuracy(cog.parent, cog.stem)
     if stated is not None:
         properties["description"] = stated.sentence
         properties |= stated.values

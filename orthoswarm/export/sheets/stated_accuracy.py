@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from orthoswarm.export.catalog.tiled_raster import product_file
 from orthoswarm.export.product_files import read_frames
 
 
@@ -23,10 +24,18 @@ class StatedAccuracy:
     values: dict[str, float | int | str]
 
 
-def stated_accuracy(folder: Path) -> StatedAccuracy | None:
+_LAYERS = ("orthoimage", "coarse", "realtime")
+"""From the last stage to the first."""
+
+
+def stated_accuracy(folder: Path, layer: str = "") -> StatedAccuracy | None:
     """What placed a map, the sigma that its pictures state, and the errors at surveyed points where it was checked.
 
-    From `report.json`; sigma from `frames.jsonl`, or from the report's legs where that has none.
+    From `report.json`; sigma from `frames.jsonl`, or from the report's legs where that has none. Both describe the last
+    stage: of an earlier one it is only said how it was placed.
+
+    Args:
+        folder: of the map. layer: "orthoimage", "coarse" or "realtime"; "" for the last that is there.
 
     Returns:
         None if there is no report.
@@ -35,12 +44,29 @@ def stated_accuracy(folder: Path) -> StatedAccuracy | None:
     if not path.exists():
         return None
     report: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    if _is_earlier(folder, layer, report):
+        return _of_earlier(layer)
     placed_on, placing = _placed(report)
     sigma, of_sigma = _sigma(_sigmas(folder, report), placed_on)
     checked, of_check = _checked(report)
     parts = [_unrefined(report.get("unrefined", {})), placing, sigma, checked]
     values: dict[str, float | int | str] = {"orthoswarm:placed_on": placed_on, **of_sigma, **of_check}
     return StatedAccuracy(" ".join(part for part in parts if part), values)
+
+
+def _is_earlier(folder: Path, layer: str, report: Mapping[str, Any]) -> bool:
+    """Whether a layer is of an earlier stage than the one that the report describes."""
+    last = next((name for name in _LAYERS if product_file(folder, f"{name}.tif") is not None), layer)
+    copied = (last, layer) == ("orthoimage", "coarse") and report.get("basemap") is None
+    return layer in _LAYERS and layer != last and not copied
+
+
+def _of_earlier(layer: str) -> StatedAccuracy:
+    if layer == "realtime":
+        how, placed_on = "The quick picture, not refined: placed as the receivers recorded.", "receivers"
+    else:
+        how, placed_on = "The coarse picture, before the last refinement.", "map"
+    return StatedAccuracy(f"{how} No accuracy is stated for it.", {"orthoswarm:placed_on": placed_on})
 
 
 def _placed(report: Mapping[str, Any]) -> tuple[str, str]:
