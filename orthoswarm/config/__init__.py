@@ -1,6 +1,7 @@
 """Every threshold: one frozen dataclass a stage, each field with unit, meaning and source.
 
-`active()` gives the values in force. `orthoswarm mosaic --config FILE.toml` overrides them, a table a stage:
+`active()` gives the values in force. `--config FILE.toml` of `orthoswarm mosaic`, `plan` and `serve` overrides
+them, a table a stage:
 
     [features]
     corner_distance_px = 12

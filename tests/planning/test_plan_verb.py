@@ -51,6 +51,21 @@ def test_the_defaults_of_the_command_are_those_of_a_request(tmp_path):
     )  # fmt: skip
 
 
+def test_thresholds_of_a_file_are_used_and_stand_in_the_report(area, tmp_path, capsys):
+    config = tmp_path / "config.toml"
+    config.write_text("[planning]\nmost_corners = 6\n")
+    assert plan(area, "--vehicles", 2, *FLAGS, "--out", tmp_path / "out", "--config", config) == 2
+    assert "at most 6" in capsys.readouterr().err
+    config.write_text("[planning]\nclearance_m = 3\n")
+    assert plan(area, "--vehicles", 2, *FLAGS, "--out", tmp_path / "out", "--config", config, "--json") == 0
+    assert json.loads(capsys.readouterr().out)["config"] == {"planning": {"clearance_m": 3}}
+    assert plan(area, "--vehicles", 2, *FLAGS, "--out", tmp_path / "again", "--json") == 0
+    assert "config" not in json.loads(capsys.readouterr().out)
+    config.write_text("[planning]\nclearance = 3\n")
+    assert plan(area, "--vehicles", 2, *FLAGS, "--out", tmp_path / "none", "--config", config) == 2
+    assert "has no 'clearance'" in capsys.readouterr().err and not (tmp_path / "none").exists()
+
+
 @pytest.mark.parametrize("method", ["columns", "bcd", "tmstc"])
 def test_eight_vehicles_get_missions_a_report_and_a_picture(method, area, tmp_path, capsys):
     out = tmp_path / "out"

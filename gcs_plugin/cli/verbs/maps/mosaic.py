@@ -6,6 +6,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from gcs_plugin.cli.configuration import add_config, read_config
 from orthoswarm.stores.addresses import address_of, path_of
 
 if TYPE_CHECKING:
@@ -37,7 +38,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     add("--gsd", type=float, metavar="M", help="ground pixel of the products (default: the pictures' own)")
     add("--sei-layout", type=Path, action="append", default=[], metavar="FILE", help="layout of a maker's private SEI")
-    add("--config", type=Path, metavar="FILE.toml", help="thresholds of any stage other than their defaults")
+    add_config(parser)
     add(
         "--dem",
         type=path_of,
@@ -194,9 +195,7 @@ def _options(args: argparse.Namespace) -> "Options":
 
 def _overrides(args: argparse.Namespace) -> "Overrides":
     """What differs from the defaults: the file of --config, and flags over it."""
-    from orthoswarm.config import read_overrides
-
-    values = read_overrides(args.config) if args.config is not None else {}
+    values = read_config(args.config)
     if args.device is None:
         return values
     return {**values, "matchers": {**values.get("matchers", {}), "device": args.device}}

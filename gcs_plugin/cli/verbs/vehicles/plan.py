@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from gcs_plugin.cli.configuration import add_config, use_config
 from orthoswarm.model.errors import InputError
 
 if TYPE_CHECKING:
@@ -44,6 +45,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("--method", choices=["columns", "bcd", "tmstc"], default="bcd", help="how to lay lines (default bcd)")
     autopilot_help = "for mission format and flight times; again for vehicles in turn (default ardupilot)"
     add("--autopilot", action="append", choices=["ardupilot", "px4"], help=autopilot_help)
+    add_config(parser)
     add("--json", action="store_true", help="one JSON document on stdout")
     add("--dem", type=Path, metavar="FILE", help="height model; --altitude is then above the ground (needs --start)")
     relief_help = "with --dem: legs follow the ground, lie at one level, or whichever is done sooner (default auto)"
@@ -93,6 +95,7 @@ def run(args: argparse.Namespace) -> int:
     from gcs_plugin.plans.plan_files import check_folder, geojson, mission_files, report, write_folder
     from gcs_plugin.plans.plan_request import make_plan
 
+    changed = use_config(args.config)
     check_folder(args.out)
     request = _request(args)
     plan, area = make_plan(request, _say)
@@ -100,6 +103,8 @@ def run(args: argparse.Namespace) -> int:
     from gcs_plugin.plans.plan_picture import draw
 
     figures = report(plan, request.autopilots, request.fov_min_deg, request.endurance_min)
+    if changed:
+        figures["config"] = {stage: dict(values) for stage, values in changed.items()}
     files: dict[str, str | bytes] = dict(mission_files(plan, request.autopilots))
     files["all.geojson"] = geojson(plan, area)
     files["plan.json"] = json.dumps(figures, indent=1) + "\n"

@@ -5,6 +5,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from gcs_plugin.cli.configuration import add_config, use_config
+
 if TYPE_CHECKING:
     from gcs_plugin.daemon.settings import Settings
 
@@ -47,6 +49,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="pictures of a vehicle (stream or folder), or its CAN bus: can:socketcan:can0, can:mavlink",
     )
     add("--tak", action="append", default=[], metavar="URL", help="send vehicles and finds there: udp://239.2.3.1:6969")
+    add_config(parser)
     add("--show-token", action="store_true", help="print the page's link with the workspace's token and end")
     add(
         "--end-with-input",
@@ -81,6 +84,7 @@ def run(args: argparse.Namespace) -> int:
             return 0
     except OSError as error:
         raise disk_error(error, args.workspace) from None
+    use_config(args.config)
     settings = settings_of(args)
     return _show_token(settings) if args.show_token else serve(settings, end_with_input=args.end_with_input)
 
