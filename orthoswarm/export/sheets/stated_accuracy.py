@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from orthoswarm.export.catalog.tiled_raster import product_file
 from orthoswarm.export.product_files import read_frames
 
 
@@ -56,7 +55,8 @@ def stated_accuracy(folder: Path, layer: str = "") -> StatedAccuracy | None:
 
 def _is_earlier(folder: Path, layer: str, report: Mapping[str, Any]) -> bool:
     """Whether a layer is of an earlier stage than the one that the report describes."""
-    last = next((name for name in _LAYERS if product_file(folder, f"{name}.tif") is not None), layer)
+    there = (name for name in _LAYERS if any((folder / f"{name}.{kind}").exists() for kind in ("tif", "vrt")))
+    last = next(there, layer)
     copied = (last, layer) == ("orthoimage", "coarse") and report.get("basemap") is None
     return layer in _LAYERS and layer != last and not copied
 
