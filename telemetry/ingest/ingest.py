@@ -8,6 +8,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from contextlib import closing
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
@@ -35,7 +36,7 @@ from telemetry.photos.photo_tags import PhotoTags, read_photos
 from telemetry.samples.findings import Finding, plural
 from telemetry.samples.times import ZONE_UNKNOWN
 from telemetry.samples.unreadable import Unreadable, read_or_reason
-from telemetry.samples.wild_fixes import wild_fixes
+from telemetry.samples.wild_fixes import doubtful_finding, wild_fixes
 
 __all__ = ["LoadOptions", "SourceInfo", "Survey", "load", "require_frames", "survey"]
 
@@ -263,6 +264,8 @@ def _where_it_can_be(
     if clock_went_back(photos) or any(SHIFTED in p.origin.get("time", "") for p in photos):
         return list(photos)
     wild = wild_fixes([p.time_s for p in photos], [(p.lat_deg or 0.0, p.lon_deg or 0.0) for p in photos])
+    if wild.doubtful:
+        source.findings.append(replace(doubtful_finding(wild.doubtful, plural(len(photos), "photo")), vehicle=vehicle))
     if not wild.indices:
         return list(photos)
     text = (

@@ -16,10 +16,16 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class WildFixes:
-    """Indices of wild fixes in a track, in order of time, and how far the farthest lies from its neighbours, metres."""
+    """The fixes of a track that no aircraft can have reached.
+
+    Attributes:
+        indices: of the wild ones, in order of time. away_m: how far the farthest lies from its neighbours, metres.
+        doubtful: how many cannot be reached, where these are too many to be wild fixes.
+    """
 
     indices: list[int]
     away_m: float = 0.0
+    doubtful: int = 0
 
     @property
     def distance(self) -> str:
@@ -32,7 +38,7 @@ def wild_fixes(times_s: Sequence[float | None], places: Sequence[tuple[float, fl
 
     The track is cut where the next fix is farther away than an aircraft flies in between (`fastest_m_s`); of the pieces
     those are kept that can be flown one after the other and hold most fixes. If the others are more than a few, they
-    are no wild fixes but another flight, or the times are wrong: then there are none.
+    are no wild fixes but another flight, or the times are wrong: then there are none, and their number is `doubtful`.
 
     Args:
         times_s: of the fixes, in one clock; what has none is not judged.
@@ -48,7 +54,9 @@ def wild_fixes(times_s: Sequence[float | None], places: Sequence[tuple[float, fl
     cuts = np.flatnonzero(~_flyable(times[:-1], ground[:-1], times[1:], ground[1:])) + 1
     first = np.concatenate([[0], cuts])
     last = np.concatenate([cuts, [len(order)]]) - 1
-    if not 1 < len(first) <= config.wild_most_pieces:
+    if len(first) > config.wild_most_pieces:
+        return WildFixes([], doubtful=len(first) - 1)
+    if len(first) == 1:
         return WildFixes([])
     new = np.concatenate([[True], np.any(np.diff(ground, axis=0) != 0.0, axis=1)])
     since = times[np.maximum.accumulate(np.where(new, np.arange(len(order)), 0))]  # a fix that is repeated may be old
@@ -59,7 +67,7 @@ def wild_fixes(times_s: Sequence[float | None], places: Sequence[tuple[float, fl
     pieces = [np.arange(a, b + 1) for k, (a, b) in enumerate(zip(first, last, strict=True)) if k not in kept]
     wild = np.concatenate(pieces)
     if len(wild) > max(1.0, config.wild_most_share * len(order)):
-        return WildFixes([])
+        return WildFixes([], doubtful=len(wild))
     sound = np.setdiff1d(np.arange(len(order)), wild)
     after = np.searchsorted(sound, wild).clip(0, len(sound) - 1)
     near = np.minimum(
@@ -96,6 +104,16 @@ def _longest_track(
     return kept
 
 
+def doubtful_finding(count: int, of_what: str) -> Finding:
+    """The finding on positions that cannot be reached and are used all the same, being too many; see `wild_fixes`."""
+    text = (
+        f"{count} of {of_what} cannot be reached by any aircraft from those before and after "
+        f"({active().ingest.fastest_m_s:.0f} m/s); as so many are hardly wild, all are used: they are of several flights "
+        "or their times are wrong; check them, and read each flight by itself"
+    )
+    return Finding("positions-unreachable", text)
+
+
 def without_wild_fixes(
     samples: Sequence[Sample], times_s: Sequence[float | None], source: str
 ) -> tuple[list[Sample], list[Finding]]:
@@ -110,6 +128,8 @@ def without_wild_fixes(
     found = wild_fixes(
         [times_s[i] for i in placed], [(samples[i].lat_deg or 0.0, samples[i].lon_deg or 0.0) for i in placed]
     )
+    if found.doubtful:
+        return list(samples), [doubtful_finding(found.doubtful, f"{plural(len(placed), 'position')} of {source}")]
     if not found.indices:
         return list(samples), []
     wild = {placed[i] for i in found.indices}

@@ -101,6 +101,23 @@ def test_a_photo_with_a_wild_position_is_rejected_with_its_reason(tmp_path, by_t
     assert any("P_6.JPG first" in warning for warning in found.warnings)
 
 
+@pytest.mark.parametrize("kind", ["photos", "srt"])
+def test_more_wild_positions_than_are_left_out_are_told(card, tmp_path, kind):
+    """Three of twelve: no position is thrown away, but nobody has to find out by the map."""
+    if kind == "photos":
+        for i in range(12):
+            photo(card / f"P_{i}.JPG", 47.0 + 10.0 * i * METRE + AWAY_DEG * (i in (3, 6, 9)), 8.0, 2 * i)
+    else:
+        pytest.importorskip("av")
+        write_video(card / "a.mp4", count=120)
+        write_srt(card / "a.srt", seconds=12, lat=lambda t: north()(t) + AWAY_DEG * (t in (3, 6, 9)))
+    found = survey([card], options=LoadOptions(cache=tmp_path / "cache", every_s=0.5))
+    findings = [f for s in found.sources for f in s.findings if f.code == "positions-unreachable"]
+    assert len(findings) == 1 and not findings[0].note
+    assert "3 of 12 photos" in findings[0].message or "a.mp4 (SRT)" in findings[0].message
+    assert not found.rejected
+
+
 def test_photos_of_a_clock_that_was_set_back_are_not_wild(tmp_path):
     """For 50 s photos of two places 800 m apart seem to alternate, 9 % of all."""
     for i in range(300):
