@@ -8,6 +8,7 @@ import { t } from "/static/core/strings.js";
 import { aircraft, messages, MOST_TEXTS, ring, vehicle } from "/static/core/values.js";
 import { announce, happened, near } from "/static/fly/alarms.js";
 import { heardCommand } from "/static/fly/commands.js";
+import { inAir } from "/static/fly/need.js";
 
 const HEALTH_MS = 5000;
 const list = (value) => (Array.isArray(value) ? value : []);
@@ -20,23 +21,49 @@ const takeVehicle = guarded("a vehicle", (message, whole, at = nowMs()) => {
   changed("vehicles");
 });
 
-// A list of vehicles may come late over a slow link: it is as old as its request, and what came meanwhile is newer.
-let meanwhile = [];
-function heardVehicle(message) {
-  if (reading.has("/api/vehicles")) meanwhile.push([message, nowMs()]);
-  takeVehicle(message);
+// A list may come late over a slow link: it is as old as its request, and what came meanwhile is newer. What is in neither
+// is not known to the station (any more): it was started again.
+const meanwhile = { "/api/vehicles": [], "/api/jobs": [] };
+function heard(path, take) {
+  return (message) => {
+    if (reading.has(path)) meanwhile[path].push([message, nowMs()]);
+    take(message);
+  };
 }
+const others = (known, rows, path) => {
+  const named = new Set([...rows, ...meanwhile[path].map(([message]) => message)].map((row) => String(row?.id)));
+  return [...known.keys()].filter((id) => !named.has(String(id)));
+};
+
+// One that was in the air stays as it was heard last, until it is heard again: somebody has to look for it.
+const kept = (row) => row.linked && inAir(row);
 function takeVehicles(rows, asked) {
-  list(rows).forEach((row) => takeVehicle(row, true, asked));
-  for (const [message, at] of meanwhile) takeVehicle(message, false, at);
+  if (!Array.isArray(rows)) return;
+  const unheard = (id) => state.vehicles.has(id) && kept(state.vehicles.get(id));
+  const former = rows.filter((row) => row?.system == null && unheard(String(row?.id))).map((row) => String(row.id));
+  for (const id of [...others(state.vehicles, rows, "/api/vehicles"), ...former]) {
+    if (unheard(id)) state.vehicles.set(id, { ...state.vehicles.get(id), former: true });
+    else { state.vehicles.delete(id); state.outlines.delete(id); changed("outlines"); }
+  }
+  rows.filter((row) => !former.includes(String(row?.id))).forEach((row) => takeVehicle(row, true, asked));
+  for (const [message, at] of meanwhile["/api/vehicles"]) takeVehicle(message, false, at);
+  changed("vehicles");
+}
+function takeJobs(rows) {
+  if (!Array.isArray(rows)) return;
+  for (const id of others(state.jobs, rows, "/api/jobs")) state.jobs.delete(id);
+  for (const job of [...rows, ...meanwhile["/api/jobs"].map(([message]) => message)]) takeJob(job);
+  changed("jobs");
 }
 const takeTraffic = (rows) => { state.traffic = list(rows).map(aircraft).filter((row) => row.id && row.position); changed("traffic"); };
 const takeJob = (job) => { if (job?.id != null) { state.jobs.set(job.id, job); changed("jobs"); } };
 
+const heardJob = heard("/api/jobs", takeJob);
+
 const READS = {
   "/api/vehicles": takeVehicles,
   "/api/layers": (rows) => { state.layers = list(rows); changed("layers"); },
-  "/api/jobs": (rows) => list(rows).forEach(takeJob),
+  "/api/jobs": takeJobs,
   "/api/legs": (body) => { state.legs = list(body?.features); changed("legs"); },
   "/api/coverage": (body) => { state.coverage = body; changed("coverage"); },
   "/api/completions": (rows) => { state.completions = list(rows); changed("completions"); },
@@ -53,7 +80,7 @@ async function read(path) {
   if (reading.has(path)) { again.add(path); return; }
   const [mine, asked] = [era, nowMs()];
   reading.add(path);
-  if (path === "/api/vehicles") meanwhile = [];
+  if (meanwhile[path]) meanwhile[path] = [];
   try {
     const body = await get(path);
     if (mine === era) guarded(path, READS[path])(body, asked);
@@ -83,7 +110,7 @@ function soon(...paths) {
 const KINDS = {
   resync: () => { refresh(); changed("plan"); changed("finds-changed"); },
   unwelcome: () => read("/api/vehicles"),
-  vehicle: heardVehicle,
+  vehicle: heard("/api/vehicles", takeVehicle),
   vehicle_event: (event) => {
     const row = state.vehicles.get(String(event.vehicle));
     if (row && event.said) { row.texts = [...row.texts, ...messages([{ text: event.said, time: event.time, severity: event.severity }])].slice(-MOST_TEXTS); changed("vehicles"); }
@@ -98,7 +125,7 @@ const KINDS = {
   },
   traffic: (event) => takeTraffic(event.rows),
   layer: () => soon("/api/layers"),
-  job: (event) => { takeJob(event); if (event.state === "done" || event.state === "failed") soon("/api/legs", "/api/completions", "/api/vehicles", "/api/layers"); },
+  job: (event) => { heardJob(event); if (event.state === "done" || event.state === "failed") soon("/api/legs", "/api/completions", "/api/vehicles", "/api/layers"); },
   coverage: () => soon("/api/coverage"),
   requests: () => soon("/api/coverage"),
   completion: () => soon("/api/completions", "/api/vehicles"),

@@ -76,7 +76,7 @@ function tooNear(now) {
   const rows = (pair) => pair.map((id) => state.vehicles.get(id)).filter(Boolean);
   for (const [key, { pair, at }] of pairs) {
     const both = rows(pair);
-    if (both.length && now - at > ROWS_MS && both.every((row) => row.alarm === "" && row.at > at)) pairs.delete(key);
+    if (now - at > ROWS_MS && both.every((row) => row.alarm === "" && row.at > at)) pairs.delete(key);
   }
   const found = [...pairs].map(([key, alarm]) => {
     const [one, other] = rows(alarm.pair);

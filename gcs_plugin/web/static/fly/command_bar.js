@@ -6,7 +6,7 @@ import { t } from "/static/core/strings.js";
 import { command, commandAll } from "/static/fly/commands.js";
 import { commandLog } from "/static/fly/command_log.js";
 import { holdConfirm } from "/static/fly/hold.js";
-import { inAir } from "/static/fly/need.js";
+import { inAir, onLink } from "/static/fly/need.js";
 
 const TONES = { pause: "pause", resume: "go", rtl: "return", land: "land", start: "go" };
 const DEGREE_M = 111_320;
@@ -25,9 +25,9 @@ export function commandBar() {
 }
 
 function askAll(verb) {
-  const n = [...state.vehicles.values()].filter((row) => row.linked).length;
+  const n = [...state.vehicles.values()].filter(onLink).length;
   const question = n ? t(`confirm.all.${verb}`, { n }) : t("confirm.none");
-  const aloft = [...state.vehicles.values()].filter((row) => row.linked && inAir(row));
+  const aloft = [...state.vehicles.values()].filter((row) => onLink(row) && inAir(row));
   const inTurn = verb === "rtl" && aloft.length > 1;
   const meet = inTurn && neighbours(aloft) ? ` ${t("confirm.meet")}` : "";
   confirm.ask(question + meet, t(inTurn ? "confirm.yes.together" : `confirm.yes.${verb}`), TONES[verb], () => commandAll(verb),

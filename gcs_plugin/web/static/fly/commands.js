@@ -4,6 +4,7 @@ import { post } from "/static/core/api.js";
 import { changed, state } from "/static/core/store.js";
 import { connected, given } from "/static/core/stream.js";
 import { t } from "/static/core/strings.js";
+import { onLink } from "/static/fly/need.js";
 
 const ANSWER_MS = { pause: 9_000, resume: 9_000, rtl: 9_000, return: 20_000, land: 9_000, start: 60_000, upload: 190_000 };
 const MOST = 300;
@@ -55,7 +56,7 @@ export async function command(vehicle, verb, body = {}) {
 
 // One command to every vehicle on the links, at once, with an outcome for each.
 export async function commandAll(verb) {
-  const ids = [...state.vehicles.values()].filter((row) => row.linked).map((row) => row.id);
+  const ids = [...state.vehicles.values()].filter(onLink).map((row) => row.id);
   const id = newId();
   const entries = new Map(ids.map((vehicle) => [vehicle, begin(id, verb, vehicle)]));
   const linked = connected();

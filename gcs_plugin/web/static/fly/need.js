@@ -18,7 +18,9 @@ export const inAir = (row) => {
   if (row.flight.state === "lost") return offGround(row);
   return row.flight.state ? !GROUND.has(row.flight.state) : row.linked && row.armed && row.flight.text !== "on ground";
 };
-export const isLost = (row) => row.flight.state === "lost" || row.state === "lost";
+export const isLost = (row) => row.flight.state === "lost" || row.state === "lost" || row.former === true;
+// The station can send it commands.
+export const onLink = (row) => row.linked && !row.former;
 // Its propellers can turn any moment.
 export const armedOnGround = (row) => row.linked && row.armed && !inAir(row);
 
@@ -27,7 +29,8 @@ export function need(row, now) {
   const age_s = age(row, now);
   const why = [];
   const add = (level, key, words) => why.push({ level, key, words });
-  if (age_s > LOST_S || row.state === "lost") add("bad", "link", t("need.link", { age: ageText(age_s) }));
+  if (row.former) add(age_s > LOST_S ? "bad" : "stale", "link", t("need.former", { age: ageText(age_s) }));
+  else if (age_s > LOST_S || row.state === "lost") add("bad", "link", t("need.link", { age: ageText(age_s) }));
   else if (age_s > STALE_S || state.link !== "live") add("stale", "stale", t("need.stale", { age: ageText(age_s) }));
   if (row.state === "conflict") add("warn", "twins", t("need.twins"));
   if (row.battery != null && row.battery < EMPTY) add("bad", "battery", t("need.empty", { share: percent(row.battery) }));

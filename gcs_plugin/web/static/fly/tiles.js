@@ -107,6 +107,7 @@ function order() {
 subscribe("vehicles selected tick", "vehicle tiles", () => {
   const now = nowMs();
   const before = tiles.size;
+  for (const [id, tile] of tiles) if (!state.vehicles.has(id)) { tile.item.remove(); tiles.delete(id); }
   for (const row of state.vehicles.values()) guarded(`tile of ${row.id}`, update)(row, now);
   if (tiles.size !== before && !list.contains(document.activeElement)) order();
   setHidden(nothing, tiles.size > 0);

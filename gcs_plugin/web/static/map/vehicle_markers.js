@@ -41,5 +41,6 @@ const place = (row, now) => {
 
 subscribe("vehicles selected tick", "vehicles on the map", () => {
   const now = nowMs();
+  for (const [id, marker] of markers) if (!state.vehicles.has(id)) { marker.remove(); markers.delete(id); }
   for (const row of state.vehicles.values()) guarded(`${row.id} on the map`, place)(row, now);
 });

@@ -8,13 +8,13 @@ import { state } from "/static/core/store.js";
 import { t } from "/static/core/strings.js";
 import * as units from "/static/core/units.js";
 import { ring } from "/static/core/values.js";
-import { inAir } from "/static/fly/need.js";
+import { inAir, onLink } from "/static/fly/need.js";
 import * as area from "/static/plan/area.js";
 import * as editor from "/static/plan/editor.js";
 import { fillFields, followsTerrain, inFieldNames, planFields, planValues, rawValues, relabelFields, setDem } from "/static/plan/fields.js";
 import { acceptDrops, KINDS, readArea } from "/static/plan/import.js";
 import { drawnNow, madeOfNow, setMadeOf } from "/static/plan/outdated.js";
-import { planResult, showPlan } from "/static/plan/result.js";
+import { hidePlan, planResult, showPlan } from "/static/plan/result.js";
 import { keptArea, loadShared, mayLoad, saveShared, whenChangedElsewhere } from "/static/plan/shared.js";
 import { boundsOf, fit } from "/static/map/map.js";
 
@@ -41,9 +41,11 @@ export async function loadPlan() {
   const before = names;
   names = body.vehicles ?? {};
   if (made && body.plan === made.id && JSON.stringify(before) !== JSON.stringify(names)) await showPlan(made, names, onNames);
-  if (body.plan && body.plan !== made?.id) {
-    const plan = (await get("/api/plans")).find((row) => row.id === body.plan);
-    if (plan) { made = plan; await showPlan(plan, names, onNames); }
+  if ((body.plan ?? null) !== (made?.id ?? null)) {
+    const plan = body.plan ? (await get("/api/plans")).find((row) => row.id === body.plan) : null;
+    made = plan ?? null;
+    if (plan) await showPlan(plan, names, onNames);
+    else hidePlan();
   }
   if (unsaved) save();
 }
@@ -85,7 +87,7 @@ export function planPanel() {
     setText(go, t("plan.making"));
     try {
       const body = { ...planValues(), area: area.outline(), no_fly: area.zones() };
-      const heard = [...state.vehicles.values()].filter((row) => row.linked && row.position);
+      const heard = [...state.vehicles.values()].filter((row) => onLink(row) && row.position);
       if (followsTerrain() && !heard.length) throw new Error(t("plan.terrain.start"));
       const flies = heard.slice(0, body.vehicles).some(inAir); // it takes off elsewhere; the daemon warns
       if ((heard.length >= body.vehicles && !flies) || followsTerrain()) body.starts = heard.slice(0, body.vehicles).map((row) => [row.position[1], row.position[0]]);
@@ -93,8 +95,8 @@ export function planPanel() {
       made = await post("/api/plans", body);
       setMadeOf(drawn);
       names = Object.fromEntries(made.vehicles.map((row, k) => [row.id, heard.length >= made.vehicles.length ? heard[k].id : ""]));
-      await showPlan(made, names, onNames);
       save();
+      await showPlan(made, names, onNames);
     } catch (error) {
       notice("bad", t("plan.failed", { why: inFieldNames(error.message) }));
     } finally {

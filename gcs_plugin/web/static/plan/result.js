@@ -7,6 +7,7 @@ import { state, subscribe } from "/static/core/store.js";
 import { t } from "/static/core/strings.js";
 import * as units from "/static/core/units.js";
 import { command } from "/static/fly/commands.js";
+import { onLink } from "/static/fly/need.js";
 import { openPreflight } from "/static/fly/preflight.js";
 import { colourOf } from "/static/map/colours.js";
 import { show } from "/static/map/map.js";
@@ -18,7 +19,7 @@ let names = {};
 let changedNames = () => {};
 let picture = [];
 const nameOf = (id) => state.vehicles.get(id)?.name ?? id;
-const heard = () => [...state.vehicles.values()].filter((row) => row.linked);
+const heard = () => [...state.vehicles.values()].filter(onLink);
 
 const box = make("section", { class: "plan-result", hidden: true });
 const summary = make("p", {});
@@ -96,7 +97,17 @@ export async function showPlan(made, assignment, onNames) {
   warnings.replaceChildren(...(plan.warnings ?? []).map((text) => make("li", {}, text)));
   setHidden(box, false);
   redraw();
-  picture = ((await get(`/api/plans/${plan.id}/map`)).features ?? []).filter((feature) => feature.geometry?.type === "LineString");
+  const { features } = await get(`/api/plans/${made.id}/map`);
+  if (plan !== made) return;
+  picture = (features ?? []).filter((feature) => feature.geometry?.type === "LineString");
+  paint();
+}
+
+// The station has no plan now.
+export function hidePlan() {
+  plan = null;
+  picture = [];
+  setHidden(box, true);
   paint();
 }
 
