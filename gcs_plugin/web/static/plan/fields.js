@@ -99,6 +99,20 @@ function raw(key, input) {
 }
 export const rawValues = () => Object.fromEntries(Object.entries(inputs).map(([key, input]) => [key, raw(key, input)]));
 
+// The fields that hold something else than `before` (as of rawValues), each with what it held then. The same metres in
+// other units are the same: a field shows tenths.
+export function differences(before) {
+  const same = (key, value) => (NUMBERS[key]?.[3] && Number.isFinite(value) ? value.toFixed(1) : String(value));
+  const shown = (key, value) => {
+    if (value === "") return t("plan.empty");
+    if (CHOICES[key]) return t(`plan.${key}.${value}`);
+    if (typeof value === "boolean") return t(value ? "plan.on" : "plan.off");
+    return NUMBERS[key]?.[3] && Number.isFinite(value) ? Number(units.fromMetres(value).toFixed(1)) : value;
+  };
+  return Object.entries(rawValues()).filter(([key, value]) => before[key] !== undefined && same(key, value) !== same(key, before[key]))
+    .map(([key]) => t("plan.was", { name: nameOf(key), value: shown(key, before[key]) }));
+}
+
 export function fillFields(values) {
   for (const [key, value] of Object.entries(values)) {
     const input = inputs[key];

@@ -1,9 +1,13 @@
-// Whether the plan was made of the area that is drawn now: a zone that is drawn later is not in its lines.
+// Whether the plan was made of the area that is drawn now, and with the settings that the form has now.
 
+import { t } from "/static/core/strings.js";
 import { polygon } from "/static/plan/area.js";
+import { differences, rawValues } from "/static/plan/fields.js";
 
 const DIGITS = 7; // of a degree: a centimetre
-let madeOf = null; // null: not known, for example a flight over gaps
+// What the plan was made of; null: not known, for example a flight over gaps.
+let madeOf = null;
+let madeWith = null;
 
 // A short text that differs for other areas (FNV-1a); it is kept with the shared plan, so that a second page knows.
 export function drawnNow() {
@@ -12,6 +16,16 @@ export function drawnNow() {
   return hash.toString(16);
 }
 
-export const setMadeOf = (value) => { madeOf = typeof value === "string" ? value : null; };
-export const madeOfNow = () => madeOf;
-export const outdated = () => madeOf != null && madeOf !== drawnNow();
+export const nowMade = () => ({ made_of: drawnNow(), made_with: rawValues() });
+export const madeNow = () => ({ made_of: madeOf, made_with: madeWith });
+export function setMade(values) {
+  madeOf = typeof values?.made_of === "string" ? values.made_of : null;
+  madeWith = values?.made_with && typeof values.made_with === "object" ? values.made_with : null;
+}
+
+// Why the plan is not what area and form say; empty if it is.
+export function outdated() {
+  if (madeOf != null && madeOf !== drawnNow()) return t("plan.outdated");
+  const other = madeWith == null ? [] : differences(madeWith);
+  return other.length ? t("plan.reset", { list: other.join("; ") }) : "";
+}

@@ -13,14 +13,14 @@ import * as area from "/static/plan/area.js";
 import * as editor from "/static/plan/editor.js";
 import { fillFields, followsTerrain, inFieldNames, planFields, planValues, rawValues, relabelFields, setDem } from "/static/plan/fields.js";
 import { acceptDrops, KINDS, readArea } from "/static/plan/import.js";
-import { drawnNow, madeOfNow, setMadeOf } from "/static/plan/outdated.js";
-import { hidePlan, planResult, showPlan } from "/static/plan/result.js";
+import { madeNow, nowMade, setMade } from "/static/plan/outdated.js";
+import { hidePlan, planResult, redraw, showPlan } from "/static/plan/result.js";
 import { keptArea, loadShared, mayLoad, saveShared, whenChangedElsewhere } from "/static/plan/shared.js";
 import { boundsOf, fit } from "/static/map/map.js";
 
 let made = null;
 let names = {};
-function save() { saveShared(() => ({ area: area.area.rings.length ? area.polygon() : null, settings: { ...rawValues(), made_of: madeOfNow() }, plan: made?.id ?? null, vehicles: names })); }
+function save() { saveShared(() => ({ area: area.area.rings.length ? area.polygon() : null, settings: { ...rawValues(), ...madeNow() }, plan: made?.id ?? null, vehicles: names })); }
 const ringsOf = (polygon) => {
   const rings = (polygon?.coordinates ?? []).map((points) => ring(points).slice(0, -1)).filter((points, k) => !k || points.length > 2);
   return rings.length > 1 || rings[0]?.length ? rings : [];
@@ -32,7 +32,7 @@ export async function loadPlan() {
   const body = await loadShared();
   if (!body) return;
   const rings = ringsOf(body.area);
-  setMadeOf(body.plan ? body.settings?.made_of : null);
+  setMade(body.plan ? body.settings : null);
   let unsaved = false;
   if (editor.isDrawing()) unsaved = editor.mergeDrawn(rings, kept);
   else if (body.area || area.area.rings.length) area.replace(rings);
@@ -47,6 +47,7 @@ export async function loadPlan() {
     if (plan) await showPlan(plan, names, onNames);
     else hidePlan();
   }
+  redraw();
   if (unsaved) save();
 }
 
@@ -63,7 +64,7 @@ export function planPanel() {
   const file = make("input", { type: "file", accept: KINDS, class: "hidden-file", "aria-label": t("import.label"), onchange: () => { if (file.files[0]) read(file.files[0]); file.value = ""; } });
   const open = button(t("import.open"), () => file.click());
   const go = make("button", { type: "submit", class: "primary" }, t("plan.make"));
-  const form = make("form", { novalidate: true, onsubmit: submit }, ...planFields(save), go);
+  const form = make("form", { novalidate: true, onsubmit: submit, oninput: redraw, onchange: redraw }, ...planFields(save), go);
   async function read(dropped) {
     try {
       const rings = await readArea(dropped);
@@ -91,9 +92,9 @@ export function planPanel() {
       if (followsTerrain() && !heard.length) throw new Error(t("plan.terrain.start"));
       const flies = heard.slice(0, body.vehicles).some(inAir); // it takes off elsewhere; the daemon warns
       if ((heard.length >= body.vehicles && !flies) || followsTerrain()) body.starts = heard.slice(0, body.vehicles).map((row) => [row.position[1], row.position[0]]);
-      const drawn = drawnNow();
+      const now = nowMade();
       made = await post("/api/plans", body);
-      setMadeOf(drawn);
+      setMade(now);
       names = Object.fromEntries(made.vehicles.map((row, k) => [row.id, heard.length >= made.vehicles.length ? heard[k].id : ""]));
       save();
       await showPlan(made, names, onNames);

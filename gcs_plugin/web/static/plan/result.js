@@ -59,7 +59,8 @@ function paint() {
 }
 
 function problem() {
-  if (outdated()) return t("plan.outdated");
+  const older = outdated();
+  if (older) return older;
   const chosen = plan.vehicles.map((row) => names[row.id]);
   const twice = chosen.find((id, k) => id && chosen.indexOf(id) !== k);
   if (twice) return t("plan.twice", { name: nameOf(twice) });
@@ -77,7 +78,7 @@ function assigned() {
   return !text;
 }
 
-function redraw() {
+export function redraw() {
   if (!plan) return;
   draw(plan.vehicles.map((row) => [row.id, row]));
   setText(wrong, problem());
