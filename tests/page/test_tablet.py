@@ -236,12 +236,19 @@ def test_a_tap_while_the_change_of_another_page_is_loaded_does_not_undo_it(brows
             assert ZONE in stored_rings(station) and len(stored_rings(station)[0]) == 6
 
 
+# Counts the announcements that the page has dealt with: listeners run in the order in which they came.
+HEARD = """import('/static/core/store.js').then((m) =>
+  m.subscribe("plan", "a test", () => { window.heard = (window.heard ?? 0) + 1; }))"""
+
+
 def test_a_change_of_another_page_while_one_is_saved_here_is_shown_afterwards(browser):
     """GIVEN a save that the station has taken WHEN another page changes the plan before its answer is here."""
     with standing(vehicle(1)) as station:
         keep_plans(station)
         with opened(browser, station.url, TABLET) as page:
             page.click("#tab-plan")
+            page.evaluate(HEARD)
+            page.wait_for_function("window.heard > 0")
             held = []
             page.route(
                 "**/api/plan", lambda r: held.append((r, r.fetch())) if r.request.method == "PUT" else r.continue_()
@@ -249,8 +256,11 @@ def test_a_change_of_another_page_while_one_is_saved_here_is_shown_afterwards(br
             page.fill("[name=altitude_m]", "55")
             page.press("[name=altitude_m]", "Tab")
             poll(page, lambda: held)
+            before = page.evaluate("window.heard")
             announce_elsewhere(station, page, settings={"altitude_m": 90})
-            page.wait_for_timeout(500)  # heard: events are gathered for a tenth of a second
+            page.wait_for_function(f"window.heard > {before}")
+            assert page.evaluate("import('/static/plan/shared.js').then((m) => m.isSaving())")
+            assert page.input_value("[name=altitude_m]") == "55"  # it could not be loaded yet
             (route, answer), *_ = held
             route.fulfill(response=answer)
             page.wait_for_function(field("altitude_m", 90))
