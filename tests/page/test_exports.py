@@ -1,6 +1,6 @@
 """What was exported stays within reach, and says when the map has changed since."""
 
-from datetime import datetime, timedelta
+from datetime import UTC, datetime, timedelta
 
 import pytest
 
@@ -36,7 +36,7 @@ def test_a_pack_stays_when_the_daemon_exports_by_itself_and_says_that_it_is_olde
 
 
 def test_a_file_of_another_day_says_which(browser):
-    now = datetime.now().astimezone()
+    now = datetime.now(UTC)
     if now + timedelta(minutes=5) > now.replace(hour=23, minute=59):
         pytest.skip("midnight is near")
     rows = []
@@ -44,9 +44,9 @@ def test_a_file_of_another_day_says_which(browser):
         rows.append(job(number, "export", 11, {kind: f"{kind}.bin"}) | {"ended": ended.isoformat()})
     with standing(vehicle(1)) as station:
         station.gets["/api/jobs"] = rows
-        with opened(browser, station.url) as page:
+        with opened(browser, station.url, timezone_id="UTC") as page:
             page.click("#tab-map")
             page.wait_for_selector(".files a:has-text('cog.bin')")
             today, yesterday = (page.inner_text(f".files a:has-text('{name}.bin')") for name in ("pack", "cog"))
-    assert today.endswith(f"pack.bin, {now:%H:%M}")
-    assert yesterday.endswith(f"cog.bin, {now - timedelta(days=1):%Y-%m-%d %H:%M}")
+    assert today.endswith(f"pack.bin, {now:%H:%M} UTC")
+    assert yesterday.endswith(f"cog.bin, {now - timedelta(days=1):%Y-%m-%d %H:%M} UTC")

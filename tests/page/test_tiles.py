@@ -29,6 +29,9 @@ WILD = [
 ]  # fmt: skip
 
 
+FENCE = {"kind": "exclusion", "center": [8.5456, 47.3977], "radius_m": 20}
+
+
 def many():
     return [vehicle(k, name=f"Bird {k}") for k in range(1, 97)]
 
@@ -209,6 +212,24 @@ def test_the_details_show_home_and_what_the_autopilot_said_newest_first(browser)
         texts = page.locator(".messages li").all_inner_texts()
         assert texts[0].endswith("Mission: 3 WP") and texts[1].endswith("PreArm: GPS not healthy")
         assert "47.398000, 8.545600" in page.inner_text(".details dl") and "m away" in page.inner_text(".details dl")
+
+
+@pytest.mark.parametrize(
+    ("zone", "read", "said"),
+    [
+        ("UTC", "2026-05-28 20:26 UTC", "2026-05-28 20:27:01 UTC PreArm: no fix"),
+        ("Europe/Zurich", "2026-05-28 22:26 UTC+2", "2026-05-28 22:27:01 UTC+2 PreArm: no fix"),
+        ("Asia/Kathmandu", "2026-05-29 02:11 UTC+5:45", "2026-05-29 02:12:01 UTC+5:45 PreArm: no fix"),
+        ("America/St_Johns", "2026-05-28 17:56 UTC-2:30", "2026-05-28 17:57:01 UTC-2:30 PreArm: no fix"),
+    ],
+)
+def test_a_time_says_its_zone(browser, zone, read, said):
+    texts = [{"text": "PreArm: no fix", "time": 1_780_000_021.0, "severity": 4}]
+    row = vehicle(1, texts=texts, fence={"zones": [FENCE], "read_s": 1_780_000_000.0})
+    with standing(row) as station, opened(browser, station.url, timezone_id=zone) as page:
+        page.click(".tile")
+        page.wait_for_selector(f".details:has-text('read from the vehicle at {read}')")
+        assert page.locator(".messages li").all_inner_texts() == [said]
 
 
 def test_other_aircraft_are_on_the_map_while_they_are_heard(browser):

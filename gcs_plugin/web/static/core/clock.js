@@ -15,10 +15,16 @@ export function nowMs() {
   return steady + slept_ms;
 }
 
-// By this device's clock; with the date if it is not today.
-const local = (time_ms) => new Date(time_ms - new Date(time_ms).getTimezoneOffset() * 60_000).toISOString();
-export function timeOfDay(time_ms) {
-  if (!Number.isFinite(time_ms)) return "";
-  const [day, time] = [local(time_ms).slice(0, 10), local(time_ms).slice(11, 16)];
-  return day === local(Date.now()).slice(0, 10) ? time : `${day} ${time}`;
+// By this device's clock, with its zone: others write in their own, or in UTC. With the date if it is not today.
+const east_min = (time_ms) => -new Date(time_ms).getTimezoneOffset();
+const local = (time_ms) => new Date(time_ms + east_min(time_ms) * 60_000).toISOString();
+function zone(time_ms) {
+  const minutes = Math.abs(east_min(time_ms));
+  const part = minutes % 60 ? `:${String(minutes % 60).padStart(2, "0")}` : "";
+  return minutes ? `UTC${east_min(time_ms) < 0 ? "-" : "+"}${Math.floor(minutes / 60)}${part}` : "UTC";
+}
+export function timeOfDay(time_ms, { seconds = false } = {}) {
+  if (!Number.isFinite(time_ms) || Math.abs(time_ms) > 8e15) return ""; // no date is further away
+  const [day, time] = [local(time_ms).slice(0, 10), local(time_ms).slice(11, seconds ? 19 : 16)];
+  return `${day === local(Date.now()).slice(0, 10) ? "" : `${day} `}${time} ${zone(time_ms)}`;
 }

@@ -1,7 +1,7 @@
 // Alarms by word, colour and sound: what needs a person now. A sound repeats until somebody has seen it; what was seen and
 // gets worse is an alarm again, and Seen is for what is on the screen.
 
-import { nowMs } from "/static/core/clock.js";
+import { nowMs, timeOfDay } from "/static/core/clock.js";
 import { button, keyedList, make, setAttribute, setHidden, setText } from "/static/core/dom.js";
 import { settings } from "/static/core/settings.js";
 import { changed, select, state, subscribe } from "/static/core/store.js";
@@ -101,7 +101,7 @@ const ROUND_S = 0.2; // rows give times in tenths, events in full
 const once = new Map();
 const heardTexts = new Map(); // vehicle -> time of the newest text that was looked at
 
-const clockText = (time_s) => (time_s == null ? "" : `${new Date(time_s * 1000).toTimeString().slice(0, 8)} `);
+const clockText = (time_s) => (time_s == null ? "" : `${timeOfDay(time_s * 1000, { seconds: true })} `);
 
 function tell(vehicle, level, words, time_s) {
   const key = `once/${vehicle}/${words}`;

@@ -1,6 +1,6 @@
 // The selected vehicle: its figures in full, its commands, and what its autopilot says.
 
-import { nowMs } from "/static/core/clock.js";
+import { nowMs, timeOfDay } from "/static/core/clock.js";
 import { button, keyedList, make, setAttribute, setHidden, setText } from "/static/core/dom.js";
 import { onSettings, settings } from "/static/core/settings.js";
 import { changed, select, state, subscribe } from "/static/core/store.js";
@@ -29,7 +29,7 @@ export function detailsPanel() {
   const linked = make("div", { class: "verbs", role: "group", "aria-label": t("details.commands") }, ...["pause", "resume", "rtl", "land", "start"].map(verb));
   const start = linked.lastChild;
   const messages = make("ul", { class: "messages", "aria-label": t("details.messages"), tabindex: "0" });
-  const draw = keyedList(messages, () => make("li", {}), (row, message) => { setText(row, message.time == null ? message.text : `${new Date(message.time * 1000).toTimeString().slice(0, 8)} ${message.text}`); setAttribute(row, "data-severity", message.severity); });
+  const draw = keyedList(messages, () => make("li", {}), (row, message) => { setText(row, message.time == null ? message.text : `${timeOfDay(message.time * 1000, { seconds: true })} ${message.text}`); setAttribute(row, "data-severity", message.severity); });
   const silent = make("p", { class: "quiet" }, t("details.silent"));
   const heading = make("h3", {}, t("details.messages"));
   const box = make("aside", { class: "details", "aria-label": t("details.title"), hidden: true },
@@ -79,7 +79,7 @@ function fenceText(fence) {
   if (!fence) return t("details.fence.unread");
   if (!fence.zones.length) return t("details.fence.none");
   const inside = fence.zones.filter((zone) => zone.inside).length;
-  return t("details.fence.read", { inside, outside: fence.zones.length - inside, time: fence.read_s == null ? "–" : new Date(fence.read_s * 1000).toTimeString().slice(0, 5) });
+  return t("details.fence.read", { inside, outside: fence.zones.length - inside, time: fence.read_s == null ? "–" : timeOfDay(fence.read_s * 1000) });
 }
 
 function refinedText(vehicle) {
