@@ -116,6 +116,12 @@ class Route:
             return f"{name} from {self.peer[0]}:{self.peer[1]}"
         return f"{name} number {self.peer}" if isinstance(self.peer, int) else name
 
+    @property
+    def damaged(self) -> int:
+        """Number of packets with a wrong checksum from this sender, whichever vehicle behind it they are of."""
+        framer = self.side.framers.get(self.peer)
+        return 0 if framer is None else framer.bad_checksums
+
     def counted(self, lost: int) -> None:
         """Count a packet and the number lost before it."""
         for _ in range(min(lost, 20)):

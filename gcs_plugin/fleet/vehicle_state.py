@@ -211,7 +211,8 @@ class Vehicle:
         """Its state as JSON values, for `fleet list --json` and the web map.
 
         `battery_s` and `gps_s` are the whole seconds since when the battery's state and the receiver's (`gps_fix`,
-        `satellites`) have not been reported: 0 while they come, None if they never came.
+        `satellites`) have not been reported: 0 while they come, None if they never came. `faults` are those of its
+        stream: `lost_share` of its packets lately, `damaged` packets of its link, `impossible` messages, both dropped.
         """
         return {
             "id": self.id,
@@ -246,6 +247,11 @@ class Vehicle:
             "home": None if self.home is None else [round(self.home[0], 7), round(self.home[1], 7)],
             "received": self.received,
             "missed": self.missed,
+            "faults": {
+                "lost_share": round(self.route.loss, 2) if self.route else 0.0,
+                "damaged": self.route.damaged if self.route else 0,
+                "impossible": self.impossible,
+            },
         }
 
     # --- one method for each message ---

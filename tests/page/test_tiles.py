@@ -232,6 +232,19 @@ def test_a_time_says_its_zone(browser, zone, read, said):
         assert page.locator(".messages li").all_inner_texts() == [said]
 
 
+def test_the_faults_of_a_link_are_said_and_none_where_there_are_none(browser):
+    faults = {"lost_share": 0.12, "damaged": 1, "impossible": 3}
+    good = vehicle(2, faults=dict.fromkeys(faults, 0))
+    with standing(vehicle(1, faults=faults), good, vehicle(3)) as station, opened(browser, station.url) as page:
+        page.click(".tile >> nth=0")
+        page.wait_for_selector(".details dd:has-text('12 % of its packets lost lately; 1 packet damaged on its link')")
+        page.wait_for_selector(".details dd:has-text('3 messages with impossible values left out')")
+        for name in ("v2", "v3"):
+            page.click(f".tiles li[data-id={name}] .tile")
+            page.wait_for_selector(f".details h2:has-text('{name}')")
+            page.wait_for_selector(".details dt:has-text('Link faults')", state="hidden")
+
+
 def test_other_aircraft_are_on_the_map_while_they_are_heard(browser):
     row = {"id": "4b1803", "name": "SWR12", "lat_deg": 47.398, "lon_deg": 8.546, "alt_m": 900.0, "heading_deg": 90.0}
     with standing(vehicle(1)) as station, opened(browser, station.url) as page:

@@ -61,6 +61,22 @@ def test_a_vehicle_whose_autopilot_is_silent_is_lost_though_its_companion_is_hea
     assert "lost" in [event.kind for event in world.events]
 
 
+def test_the_faults_of_a_stream_are_counted_for_who_watches_its_link(make_world):
+    world = make_world(SimVehicle(system=1))
+    world.meet()
+    none = {"lost_share": 0.0, "damaged": 0, "impossible": 0}
+    assert world.fleet.vehicles[1].summary(world.clock.now)["faults"] == none
+    sender = dialect.MAVLink(None, 1, 1)
+    say(world, sender, dialect.MAVLink_global_position_int_message(1000, 950_000_000, 85_000_000, 0, 0, 0, 0, 0, 0))
+    damaged = bytearray(heartbeat(int(dialect.MAV_TYPE_QUADROTOR), ARDUPILOT).pack(sender))
+    damaged[-1] ^= 0xFF
+    for _ in range(2):
+        world.link.down.put((0, bytes(damaged)), world.clock.now)
+    world.wait(1.0)
+    faults = world.fleet.vehicles[1].summary(world.clock.now)["faults"]
+    assert (faults["damaged"], faults["impossible"]) == (2, 1)
+
+
 class TwoPorts:
     """One vehicle on two radios, each on a port of its own; the second one has its own packet counter."""
 

@@ -61,6 +61,7 @@ export function vehicle(message, before, now, whole = false) {
     came_s: number(row.came_s, 0), frames: { frames: count(frames.frames), fine: count(frames.fine), coarse: count(frames.coarse), rejected: count(frames.rejected) },
     sortie: count(row.sortie), phase: text(object(row.mission).phase), returnsAfter: Array.isArray(row.returns_after) ? row.returns_after.map(String) : null, takeoff: row.takeoff ? { in_s: number(row.takeoff.in_s), failed: text(row.takeoff.failed) } : null,
     texts: Array.isArray(message.texts) ? messages(message.texts) : (before?.texts ?? []), home: Array.isArray(row.home) ? position(row.home[1], row.home[0]) : null, trail, autopilot: text(row.autopilot), fence: fence(row.fence),
+    faults: { lost: number(object(row.faults).lost_share, 0, 1) ?? 0, damaged: count(object(row.faults).damaged), impossible: count(object(row.faults).impossible) },
   };
 }
 

@@ -16,7 +16,7 @@ import { refine } from "/static/work/jobs.js";
 
 // What only a vehicle on a link can say.
 const OF_A_LINK = ["speed", "battery", "gps", "home", "fence", "mission"];
-const FACTS = ["state", "position", "height", "speed", "battery", "gps", "link", "home", "fence", "mission", "pictures", "refined"];
+const FACTS = ["state", "position", "height", "speed", "battery", "gps", "link", "faults", "home", "fence", "mission", "pictures", "refined"];
 
 export function detailsPanel() {
   const name = make("h2", {});
@@ -61,6 +61,7 @@ export function detailsPanel() {
       battery: `${units.percent(row.battery)}${row.battery_left_s == null ? "" : `, ${t("details.left", { time: units.clock(row.battery_left_s) })}`}`,
       gps: row.satellites == null ? "–" : t("details.satellites", { n: row.satellites }),
       link: row.linked ? `${row.link || "–"}, ${t("tile.heard", { age: units.ageText(Math.floor(wanted.age_s * 2) / 2) })}` : t("details.unlinked"),
+      faults: faultsText(row.faults),
       home: row.home ? `${positionText(row.home[1], row.home[0], settings.coordinates)}${row.position ? `, ${t("details.away", { m: units.distance(lengthOf([row.home, row.position])) })}` : ""}` : "–",
       fence: fenceText(row.fence),
       mission: row.flight.items ? t("details.item", { item: row.flight.item, items: row.flight.items }) : "–",
@@ -68,12 +69,16 @@ export function detailsPanel() {
       refined: refinedText(row.id),
     };
     for (const key of FACTS) setText(cells[key], values[key]);
+    for (const cell of [terms.faults, cells.faults]) setHidden(cell, !row.linked || !values.faults);
     const said = row.texts.toReversed();
     setHidden(silent, said.length > 0 || !row.linked);
     draw(said.map((message, k) => [k, message]));
   });
   return box;
 }
+
+const faultsText = ({ lost, damaged, impossible }) => [lost && t("details.faults.lost", { share: units.percent(lost) }), damaged && t("details.faults.damaged", { n: damaged }),
+  impossible && t("details.faults.impossible", { n: impossible })].filter(Boolean).join("; ");
 
 function fenceText(fence) {
   if (!fence) return t("details.fence.unread");
