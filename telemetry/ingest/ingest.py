@@ -29,12 +29,11 @@ from telemetry.ingest.photo_order import SHIFTED, clock_went_back, in_order
 from telemetry.ingest.side_files import read_control_points
 from telemetry.ingest.survey import LoadOptions, SourceInfo, Survey
 from telemetry.ingest.video_ingest import read_videos
-from telemetry.photos.flight_checks import flight_findings
+from telemetry.photos.flight_checks import flight_findings, times_without_zone
 from telemetry.photos.maker_angles import Angles
 from telemetry.photos.photo_frames import frame_without_position, frames_of
 from telemetry.photos.photo_tags import PhotoTags, read_photos
 from telemetry.samples.findings import Finding, plural
-from telemetry.samples.times import ZONE_UNKNOWN
 from telemetry.samples.unreadable import Unreadable, read_or_reason
 from telemetry.samples.wild_fixes import doubtful_finding, wild_fixes
 
@@ -337,13 +336,7 @@ def _check_vehicles(result: Survey) -> None:
     """Findings over all sources."""
     if not result.sources and not result.rejected:
         result.findings.append(Finding("nothing", "no picture was found in the inputs"))
-    zoneless = sum(ZONE_UNKNOWN in frame.origin.get("time", "") for source in result.sources for frame in source.frames)
-    if zoneless:
-        text = (
-            f"times of {plural(zoneless, 'picture')} have no zone and are taken as UTC: where the clock showed local "
-            "time, all times of the products are off by its offset"
-        )
-        result.findings.append(Finding("time-without-zone", text))
+    result.findings += times_without_zone(frame for source in result.sources for frame in source.frames)
 
 
 def require_frames(ingest: Ingest) -> None:

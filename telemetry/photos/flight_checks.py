@@ -5,7 +5,7 @@ Nothing is changed here; most findings are notes, not errors.
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from orthoswarm.model.frame import Frame
 from telemetry.photos.photo_tags import PhotoTags
 from telemetry.samples.course import Straight, local_metres, straight_legs
 from telemetry.samples.findings import Finding, plural
+from telemetry.samples.times import ZONE_UNKNOWN
 
 Array = NDArray[np.float64]
 
@@ -38,6 +39,18 @@ def flight_findings(photos: Sequence[PhotoTags], frames: Sequence[Frame], vehicl
         _low(frames),
     ]
     return [Finding(f.code, f.message, vehicle, f.note) for f in found if f is not None]
+
+
+def times_without_zone(frames: Iterable[Frame]) -> list[Finding]:
+    """A finding on the frames, of all vehicles, whose times came without a zone; none if all have one."""
+    zoneless = sum(ZONE_UNKNOWN in frame.origin.get("time", "") for frame in frames)
+    if not zoneless:
+        return []
+    text = (
+        f"times of {plural(zoneless, 'picture')} have no zone and are taken as UTC: where the clock showed local "
+        "time, all times of the products are off by its offset"
+    )
+    return [Finding("time-without-zone", text)]
 
 
 def track_of(frames: Sequence[Frame]) -> Array:

@@ -111,6 +111,7 @@ class FolderReader:
         self._folder_state = FolderState(intake.cache, intake.vehicle, folder)
         self._tried: object = None
         self._told: frozenset[Path] = frozenset()
+        self._zone_told = False
         self._again_at, self._again_s = 0.0, _AGAIN_S[0]
         self._fresh_at: float | None = None
 
@@ -320,10 +321,21 @@ class FolderReader:
         import telemetry
 
         try:
-            return telemetry.load(paths, options=telemetry.LoadOptions(cache=self._intake.cache, workers=1))
+            found = telemetry.load(paths, options=telemetry.LoadOptions(cache=self._intake.cache, workers=1))
         except OrthoSwarmError as error:
             _log.warning("%s: %s", self._intake.vehicle, error)
             return None
+        self._tell_zone(found.frames)
+        return found
+
+    def _tell_zone(self, frames: "Sequence[Frame]") -> None:
+        """Tell the user once that times have no zone; the report counts them all."""
+        from telemetry.photos.flight_checks import times_without_zone
+
+        said = [] if self._zone_told else times_without_zone(frames)
+        self._zone_told |= bool(said)
+        for finding in said:
+            self._intake.notify(f"{self._intake.vehicle}: {finding}")
 
     def _tables(self, photos: Iterable[Path]) -> list[Path]:
         """Tables of poses (geo.txt, CSV) in the photos' folder or above it, within the watched folder."""

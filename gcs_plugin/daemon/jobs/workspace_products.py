@@ -80,7 +80,8 @@ def write_products(task: ExportTask) -> dict[str, str]:
     offset = measure_map_offset(recorded.placed, placed)
     placed, level = _stated(placed, solutions)
     write_frames(out, placed, rejected, LocalGrid(task.epsg), level)
-    report = _report(task, solutions, placed, rejected, level) | {"area_ha": area_ha, "until": "fine", "root": None}
+    report = _report(task, solutions, placed, rejected, level, assumed=recorded.warnings)
+    report |= {"area_ha": area_ha, "until": "fine", "root": None}
     report["unrefined"] = _unrefined(placed, refined)
     report["map_offset_m"] = None if offset is None else offset.document()
     report["warnings"] += [] if offset is None else offset.warning()
@@ -210,11 +211,14 @@ def _stated(placed: list[PlacedFrame], solutions: list[Solution]) -> tuple[list[
 
 
 def _report(
-    task: ExportTask, solutions: list[Solution], placed: list[PlacedFrame], rejected: list[Rejection], level: float
-) -> dict[str, Any]:
+    task: ExportTask, solutions: list[Solution], placed: list[PlacedFrame], rejected: list[Rejection], level: float,
+    *, assumed: Sequence[str],
+) -> dict[str, Any]:  # fmt: skip
+    """The report; `assumed` are sentences on what the pictures' poses lack."""
     from orthoswarm.export.product_files import leg_rows, vehicle_rows
+    from telemetry.photos.flight_checks import times_without_zone
 
-    warnings = [w for s in solutions for w in s.warnings]
+    warnings = [*map(str, times_without_zone(task.frames)), *assumed, *(w for s in solutions for w in s.warnings)]
     if task.basemap is None:
         warnings.append("there is no basemap: the orthoimage lies where the drones' receivers say")
     for stage in task.facts.get("stages", []):

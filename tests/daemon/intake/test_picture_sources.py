@@ -1,9 +1,11 @@
 """Pictures that arrive in a watched folder of a running daemon: half-written, renamed, in bursts, from cards."""
 
 import io
+import json
 import os
 import socket
 import time
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -19,7 +21,9 @@ from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.links.tlog_writer import TlogWriter, read_tlog
 from gcs_plugin.sim.multirotor import Airframe
 from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
+from telemetry import load
 from telemetry.samples.sample import Sample
+from telemetry.samples.times import ZONE_UNKNOWN
 from telemetry.write.sei_writer import add_sei
 from telemetry.write.tag_writer import with_pose
 from tests.daemon.flight.test_daemon_flight import fly
@@ -32,14 +36,14 @@ av = pytest.importorskip("av")
 VEHICLES = ("half", "renamed", "burst", "card", "video", "gps")
 
 
-def tagged(shot) -> bytes:
-    """The picture with its pose in EXIF and XMP."""
+def tagged(shot, **more) -> bytes:
+    """The picture with its pose in EXIF and XMP; more: fields of the frame."""
     pose = shot.pose
     values = {k: v for k, v in pose.items() if k not in ("vehicle", "image", "time")}
     frame = frame_of(
         values, image="x", path=Path("x"), vehicle="x", time_s=pose["time"], size=(shot.camera.lens.width, 120)
     )
-    return with_pose(shot.data, frame)
+    return with_pose(shot.data, replace(frame, **more))
 
 
 @pytest.fixture(scope="module")
@@ -51,6 +55,13 @@ def watched(tmp_path_factory):
     sources = [text for name in VEHICLES for text in ("--source", f"{name}={root / name}")]
     with serving(root / "w", *sources) as served:
         yield served, root
+
+
+def until(done, limit_s=300.0):
+    end = time.monotonic() + limit_s
+    while not done():
+        assert time.monotonic() < end
+        time.sleep(0.05)
 
 
 def frames(served, vehicle, count):
@@ -81,6 +92,40 @@ def test_a_stream_without_pictures_is_told_once(tmp_path):
         assert said == ["the pictures of v1: lost"]
         source.stop()
     assert source.close(120.0)
+
+
+def local_time(folder, count):
+    """Photos of a camera whose clock says no zone."""
+    folder.mkdir()
+    for number, shot in enumerate(line(count, "local")):
+        (folder / f"{number}.jpg").write_bytes(tagged(shot, origin={"time": f"EXIF time {ZONE_UNKNOWN}"}))
+    return folder
+
+
+def test_times_without_a_zone_are_told_once_a_folder(tmp_path):
+    said, taken = [], []
+    source = Source(
+        "v1", str(local_time(tmp_path / "card", 2)), pose_at=lambda *_: None, notify=said.append, cache=tmp_path,
+        take=lambda pose, _: (taken.append(pose), True),
+    )  # fmt: skip
+    source.start()
+    until(lambda: len(taken) == 2)
+    (tmp_path / "card" / "late.jpg").write_bytes((tmp_path / "card" / "0.jpg").read_bytes() + b"0")
+    until(lambda: len(taken) == 3)
+    source.stop()
+    assert source.close(120.0)
+    assert len(said) == 1 and said[0].startswith("v1: times of ") and "no zone and are taken as UTC" in said[0]
+
+
+def test_the_report_says_that_times_have_no_zone_as_a_batch_run_does(tmp_path):
+    folder = local_time(tmp_path / "card", 3)
+    with serving(tmp_path / "w", "--source", f"local={folder}") as served:
+        served.until("/api/frames", lambda rows: sum(row["on_map"] for row in rows) == 3)
+        number = served.command("/api/export", {"formats": ["gpkg"]}).json()["id"]
+        served.until("/api/jobs", lambda rows: any(r["id"] == number and r["state"] == "done" for r in rows))
+    warnings = json.loads((tmp_path / "w" / "report.json").read_text())["warnings"]
+    (found,) = [text for text in load([folder]).warnings if "zone" in text]
+    assert found in warnings and found.startswith("times of 3 pictures have no zone")
 
 
 def test_a_copy_that_stalls_is_taken_only_when_it_is_whole(watched):
