@@ -18,7 +18,7 @@ _log = logging.getLogger(__name__)
 
 
 class TakFeed:
-    """Sends all vehicles every two seconds, and all finds when one is new and every half minute.
+    """Sends all vehicles every two seconds, and all finds when one is new or changed and every half minute.
 
     Args:
         addresses: the receivers. places: returns the present finds and vehicles.
@@ -44,14 +44,14 @@ class TakFeed:
             sender.close()
 
     def _run(self, stop: threading.Event) -> None:
-        number, known = 0, set[str]()
+        number, known = 0, set[Place]()
         while not stop.wait(_EVERY_S):
             try:
                 places = self._places()
             except (OrthoSwarmError, TimeoutError) as error:
                 _log.warning("TAK: %s", error)
                 continue
-            finds = {place.uid for place in places if place.kind == "find"}
+            finds = {place for place in places if place.kind == "find"}
             everything = number % _FINDS_EVERY == 0 or not finds <= known
             number, known = number + 1, finds
             now = time.time()

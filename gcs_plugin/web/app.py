@@ -200,6 +200,14 @@ class Routes:
         body = await json_body(request)
         return JsonAnswer(await self.work(self.daemon.console.add_find, body), status_code=201)
 
+    async def change_find(self, number: int, request: Request) -> Response:
+        """Change a find's place and note; 409 if it has another `version` than the one that was changed."""
+        body = await json_body(request)
+        row = await self.work(self.daemon.console.change_find, number, body)
+        if row is None:
+            raise HTTPException(404, "there is no such find; see /api/finds")
+        return JsonAnswer(row)
+
     async def delete_find(self, number: int) -> Response:
         """Delete a find."""
         if not await self.work(self.daemon.console.delete_find, number):
@@ -297,6 +305,7 @@ def make_app(daemon: Daemon, token: str, bind: str = "127.0.0.1") -> Any:
     add("/api/finds/{number}/pictures", routes.find_pictures)
     add("/api/frames/{seq}/picture", routes.picture)
     add("/api/places", routes.places)
+    add("/api/finds/{number}", routes.change_find, methods=["PUT"])
     add("/api/finds/{number}", routes.delete_find, methods=["DELETE"], status_code=204)
     add("/tiles/{layer}/{z}/{x}/{y}.{suffix}", routes.tile, methods=["GET", "HEAD"])
     CoverageRoutes(daemon).install(app)

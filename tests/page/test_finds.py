@@ -67,6 +67,70 @@ def test_a_find_says_how_far_off_it_may_be_or_that_this_is_not_known(browser):
             page.wait_for_selector(".finds li:has-text('Car') >> text=accuracy not known")
 
 
+def keep_finds(station, *rows):
+    """The station keeps finds as the daemon does."""
+    station.gets["/api/finds"] = list(rows)
+
+    def answer(method, path, body):
+        now = {row["id"]: row for row in station.gets["/api/finds"]}
+        row = now.get(int(path.rsplit("/", 1)[1]))
+        if method != "PUT" or row is None:
+            return 404, {"detail": "there is no such find"}
+        if body["version"] != row["version"]:
+            return 409, {"detail": "the find was changed elsewhere"}
+        now[row["id"]] = body | {"id": row["id"], "version": row["version"] + 1}
+        station.gets["/api/finds"] = list(now.values())
+        return 200, now[row["id"]]
+
+    station.answer = answer
+
+
+def edit(page, name, words):
+    page.click(f".finds li:has-text('{name}') >> text=Edit")
+    page.fill(".find-edit input", words)
+
+
+def test_text_and_place_of_a_find_can_be_changed(browser):
+    with standing(vehicle(1)) as station:
+        keep_finds(station, FIND | {"version": 1}, FIND | {"id": 2, "note": "Car", "version": 1})
+        with opened(browser, station.url, TABLET) as page:
+            page.wait_for_selector(".vehicle")
+            page.click("#tab-map")
+            edit(page, "Roof", "Two persons")
+            page.click(".find-edit >> text=Move")
+            page.mouse.click(700, 300)
+            wanted = page.evaluate("orthoswarm.map.unproject([700 - 320, 300 - 52]).toArray()")
+            page.click(".find-edit >> text=Save")
+            page.wait_for_selector(".finds li:has-text('Two persons') >> text=accuracy not known")
+            page.wait_for_selector(".find-edit", state="detached")
+            page.wait_for_selector("[aria-label='Find: Two persons']")
+            changed, other = station.gets["/api/finds"]
+            assert (changed["id"], changed["time"], other["note"]) == (1, FIND["time"], "Car")
+            assert abs(changed["lon_deg"] - wanted[0]) < 1e-6 and abs(changed["lat_deg"] - wanted[1]) < 1e-6
+            edit(page, "Car", "Lorry")
+            page.click(".find-edit >> text=Cancel")
+            assert page.locator(".finds li:has-text('Car')").count() == 1 and station.gets["/api/finds"][1] == other
+
+
+def test_a_find_that_two_pages_change_keeps_both_until_somebody_decides(browser):
+    with standing(vehicle(1)) as station:
+        keep_finds(station, FIND | {"version": 1})
+        with opened(browser, station.url, TABLET) as page:
+            page.click("#tab-map")
+            edit(page, "Roof", "Mine")
+            station.gets["/api/finds"] = [FIND | {"note": "Theirs", "version": 2}]
+            page.click(".find-edit >> text=Save")
+            page.wait_for_selector(".notice:has-text('changed on another page')")
+            page.wait_for_selector(".finds li:has-text('Theirs')")
+            assert page.input_value(".find-edit input") == "Mine"
+            page.click(".find-edit >> text=Save")
+            page.wait_for_selector(".finds li:has-text('Mine')")
+            edit(page, "Mine", "Mine, too late")
+            station.gets["/api/finds"] = []
+            page.click(".find-edit >> text=Save")
+            page.wait_for_selector(".notice:has-text('Mine, too late was removed on another page') >> text=Put back")
+
+
 def test_a_find_that_was_removed_can_be_put_back(browser):
     with standing(vehicle(1)) as station:
 

@@ -16,7 +16,7 @@ _MOST_NOTE: Final = 10_000  # characters
 
 
 class OutdatedError(OrthoSwarmError):
-    """The plan was changed by another page meanwhile."""
+    """The plan or a find was changed by another page meanwhile."""
 
 
 class ConsoleState:
@@ -60,8 +60,12 @@ class ConsoleState:
         return plan
 
     def finds(self) -> list[dict[str, Any]]:
-        """The finds, oldest first: `id`, `lat_deg`, `lon_deg`, `sigma_m`, `note`, `time`."""
-        return list((self._journal.fact("finds") or {"rows": []})["rows"])
+        """The finds, oldest first: `id`, `lat_deg`, `lon_deg`, `sigma_m`, `note`, `time`, `version` from 1."""
+        return [{"version": 1, **row} for row in self._finds()["rows"]]
+
+    def _finds(self) -> dict[str, Any]:
+        found: dict[str, Any] = self._journal.fact("finds") or {"next": 1, "rows": []}
+        return found
 
     def add_find(self, body: Mapping[str, Any]) -> dict[str, Any]:
         """Add a find; returns it with its id.
@@ -69,15 +73,9 @@ class ConsoleState:
         Raises:
             InputError: a field is invalid, or there are too many finds.
         """
-        row = {
-            "lat_deg": _number(body, "lat_deg", 90.0), "lon_deg": _number(body, "lon_deg", 180.0),
-            "sigma_m": None if body.get("sigma_m") is None else _number(body, "sigma_m", 1e6),
-            "note": body.get("note") or "", "time": _time_of(body),
-        }  # fmt: skip
-        if not isinstance(row["note"], str) or len(row["note"]) > _MOST_NOTE:
-            raise InputError(f"note is not a text of at most {_MOST_NOTE} characters; send a shorter one")
+        row = _find(body) | {"time": _time_of(body), "version": 1}
         with self._lock:
-            found = self._journal.fact("finds") or {"next": 1, "rows": []}
+            found = self._finds()
             if len(found["rows"]) >= _MOST_FINDS:
                 raise InputError(f"there are {_MOST_FINDS} finds; delete some first")
             row = {"id": found["next"], **row}
@@ -85,16 +83,58 @@ class ConsoleState:
         self._publish("finds")
         return row
 
+    def change_find(self, number: int, body: Mapping[str, Any]) -> dict[str, Any] | None:
+        """Change a find's place and note, not its time; returns it with its new version, None if it does not exist.
+
+        Args:
+            number: its id. body: the fields of `add_find`; `version` is the version that was edited; without it any
+                version is replaced.
+
+        Raises:
+            InputError: a field is invalid.
+            OutdatedError: the find has another version now.
+        """
+        new, known = _find(body), body.get("version")
+        with self._lock:
+            rows = self.finds()
+            before = next((row for row in rows if row["id"] == number), None)
+            if before is None:
+                return None
+            if known is not None and known != before["version"]:
+                raise OutdatedError(
+                    f"the find was changed elsewhere (version {before['version']}); load it and change it again"
+                )
+            row = before | new | {"version": before["version"] + 1}
+            changed = [row if old is before else old for old in rows]
+            self._journal.remember("finds", self._finds() | {"rows": changed})
+        self._publish("finds")
+        return row
+
     def delete_find(self, number: int) -> bool:
         """Delete a find; False if it does not exist."""
         with self._lock:
-            found = self._journal.fact("finds") or {"next": 1, "rows": []}
+            found = self._finds()
             rows = [row for row in found["rows"] if row["id"] != number]
             if len(rows) == len(found["rows"]):
                 return False
             self._journal.remember("finds", found | {"rows": rows})
         self._publish("finds")
         return True
+
+
+def _find(body: Mapping[str, Any]) -> dict[str, Any]:
+    """Place and note of a find.
+
+    Raises:
+        InputError: a field is invalid.
+    """
+    note = body.get("note") or ""
+    if not isinstance(note, str) or len(note) > _MOST_NOTE:
+        raise InputError(f"note is not a text of at most {_MOST_NOTE} characters; send a shorter one")
+    return {
+        "lat_deg": _number(body, "lat_deg", 90.0), "lon_deg": _number(body, "lon_deg", 180.0),
+        "sigma_m": None if body.get("sigma_m") is None else _number(body, "sigma_m", 1e6), "note": note,
+    }  # fmt: skip
 
 
 def _time_of(body: Mapping[str, Any]) -> str | None:

@@ -211,6 +211,26 @@ def test_the_plan_is_the_same_for_a_second_page_and_after_a_restart(tmp_path):
         assert served.get("/api/finds").json() == [find]
 
 
+def test_a_find_is_changed_by_the_page_that_has_seen_its_last_change(tmp_path):
+    def change(number, **fields):
+        body = {"lat_deg": 1.5, "lon_deg": 2} | fields
+        return httpx.put(f"{served.url}/api/finds/{number}", json=body, headers=served.auth, timeout=LIMIT_S)
+
+    with serving(tmp_path / "w") as served:
+        first = served.command("/api/finds", {"lat_deg": 1.5, "lon_deg": 2, "note": "roof"}).json()
+        second = served.command("/api/finds", {"lat_deg": 1.5, "lon_deg": 2, "note": "car"}).json()
+        assert first["version"] == 1
+        changed = change(1, note="two persons", lat_deg=1.6, version=1)
+        assert changed.json() == first | {"note": "two persons", "lat_deg": 1.6, "version": 2}
+        late = change(1, note="a roof", version=1)
+        assert late.status_code == 409 and "elsewhere" in late.json()["detail"]
+        assert change(1, lat_deg=100, version=2).status_code == 422
+        assert change(9, note="x").status_code == 404
+        assert change(1, note="by a program").json()["version"] == 3
+        assert httpx.put(f"{served.url}/api/finds/1", json={}, timeout=LIMIT_S).status_code == 401
+        assert [row["note"] for row in served.get("/api/finds").json()] == ["by a program", second["note"]]
+
+
 # -- odd requests -----------------------------------------------------------------------------------------------------
 
 

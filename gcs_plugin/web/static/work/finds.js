@@ -1,7 +1,8 @@
 // Finds: places that somebody marks on the map, with a note and how far off they may be. The daemon keeps them.
 
 import { get, post, request } from "/static/core/api.js";
-import { button, keyedList, make, setHidden, setText } from "/static/core/dom.js";
+import { timeOfDay } from "/static/core/clock.js";
+import { button, keyedList, make, setAttribute, setHidden, setText } from "/static/core/dom.js";
 import { notice } from "/static/core/notices.js";
 import { settings } from "/static/core/settings.js";
 import { changed, state, subscribe } from "/static/core/store.js";
@@ -16,6 +17,7 @@ import { dropTool, takeTool, tool } from "/static/map/tools.js";
 import { picturesDialog } from "/static/work/find_pictures.js";
 
 const markers = new Map();
+const now = (row) => state.finds.find((find) => find.id === row.id) ?? row; // rows of the list stay while a find changes
 const { box: pictures, show: showPictures } = picturesDialog();
 document.body.append(pictures);
 let absent = false;
@@ -53,7 +55,59 @@ async function remove(row) {
   }
 }
 
+// One find at a time is changed here. The first page that saves a change wins; the other keeps what it has typed, sees
+// theirs in the list, and may save it over that.
+function editor() {
+  const note = make("input", { type: "text", maxlength: 200, "aria-label": t("finds.note") });
+  const move = button(t("finds.move"), () => (tool.active === "find-move" ? still() : (takeTool("find-move", still), setText(move, t("finds.tap")))));
+  const form = make("form", { class: "find-edit", onsubmit: store }, note, make("div", { class: "row wrap" }, move, button(t("confirm.no"), close), make("button", { type: "submit", class: "primary" }, t("finds.save"))));
+  let draft = null;
+  let place = null;
+  function still() { dropTool("find-move"); setText(move, t(place ? "finds.moved" : "finds.move")); }
+  function close() {
+    draft = place = null;
+    still();
+    form.remove();
+  }
+  function open(row, line) {
+    close();
+    draft = row;
+    note.value = text(row.note);
+    line.append(form);
+    note.focus();
+  }
+  map.on("click", (event) => {
+    if (tool.active !== "find-move") return;
+    const { lng, lat } = event.lngLat.wrap();
+    place = { lat_deg: lat, lon_deg: lng, sigma_m: sigmaAt(lng, lat) };
+    still();
+  });
+  async function store(event) {
+    event.preventDefault();
+    const { id, version, time, lat_deg, lon_deg, sigma_m } = draft;
+    const body = { lat_deg, lon_deg, sigma_m, ...place, note: note.value.trim(), time, version };
+    const name = body.note || t("finds.unnamed");
+    try {
+      await request("PUT", `/api/finds/${encodeURIComponent(id)}`, body);
+      close();
+      await loadFinds();
+    } catch (error) {
+      await loadFinds();
+      const theirs = state.finds.find((row) => row.id === id);
+      if (error.status === 409 && theirs && draft?.id === id) {
+        draft = theirs;
+        notice("bad", t("finds.elsewhere"));
+      } else if (error.status === 404 && !theirs) {
+        close();
+        notice("bad", t("finds.gone", { note: name }), [t("finds.restore"), () => save(body)]);
+      } else notice("bad", t("finds.failed", { note: name, why: error.message }));
+    }
+  }
+  return { open, form };
+}
+
 export function findPanel() {
+  const edit = editor();
   const note = make("input", { type: "text", maxlength: 200, placeholder: t("finds.note"), "aria-label": t("finds.note") });
   const mark = button(t("finds.mark"), () => (tool.active === "find" ? stop() : begin()));
   const list = make("ul", { class: "finds" });
@@ -68,9 +122,9 @@ export function findPanel() {
     note.value = "";
     await save({ lat_deg: lat, lon_deg: lng, sigma_m: sigmaAt(lng, lat), note: words });
   });
-  const draw = keyedList(list, (row) => make("li", {}, button("", () => map.flyTo({ center: [row.lon_deg, row.lat_deg], zoom: Math.max(18, map.getZoom()), duration: 0 }), { class: "find" }),
-    button(t("finds.pictures"), () => showPictures(row), { class: "small" }), button("×", () => remove(row), { class: "close", "aria-label": t("finds.remove") })), (line, row) => {
-    setText(line.firstChild, `${text(row.note) || t("finds.unnamed")}: ${positionText(row.lat_deg, row.lon_deg, settings.coordinates)}; ${withinText(row.sigma_m)}`);
+  const draw = keyedList(list, (row) => make("li", {}, button("", () => map.flyTo({ center: [now(row).lon_deg, now(row).lat_deg], zoom: Math.max(18, map.getZoom()), duration: 0 }), { class: "find" }),
+    button(t("finds.pictures"), () => showPictures(now(row)), { class: "small" }), button(t("finds.edit"), (event) => edit.open(now(row), event.target.closest("li")), { class: "small" }), button("×", () => remove(now(row)), { class: "close", "aria-label": t("finds.remove") })), (line, row) => {
+    setText(line.firstChild, [`${text(row.note) || t("finds.unnamed")}: ${positionText(row.lat_deg, row.lon_deg, settings.coordinates)}`, withinText(row.sigma_m), timeOfDay(Date.parse(row.time))].filter(Boolean).join("; "));
   });
   subscribe("finds ready", "finds", () => {
     draw(state.finds.map((row) => [row.id, row]));
@@ -79,9 +133,11 @@ export function findPanel() {
     show("ellipses", state.finds.filter((row) => row.sigma_m > 0).map((row) => feature("Polygon", [circle([row.lon_deg, row.lat_deg], WITHIN_95 * row.sigma_m)])));
     for (const [id, marker] of markers) if (!state.finds.some((row) => row.id === id)) { marker.remove(); markers.delete(id); }
     for (const row of state.finds) {
-      if (markers.has(row.id)) continue;
-      const element = make("button", { type: "button", class: "find-marker", "aria-label": t("finds.marker", { note: text(row.note) || t("finds.unnamed") }) }, "★");
-      markers.set(row.id, new maplibregl.Marker({ element }).setLngLat([row.lon_deg, row.lat_deg]).setPopup(new maplibregl.Popup({ offset: 18 }).setText(text(row.note) || t("finds.unnamed"))).addTo(map));
+      const [name, place] = [text(row.note) || t("finds.unnamed"), [row.lon_deg, row.lat_deg]];
+      const marker = markers.get(row.id) ?? new maplibregl.Marker({ element: make("button", { type: "button", class: "find-marker" }, "★") }).setLngLat(place).setPopup(new maplibregl.Popup({ offset: 18 })).addTo(map);
+      markers.set(row.id, marker.setLngLat(place));
+      marker.getPopup().setText(name);
+      setAttribute(marker.getElement(), "aria-label", t("finds.marker", { note: name }));
     }
   });
   return make("section", {}, make("h2", {}, t("finds.title")), make("div", { class: "row wrap" }, note, mark), about, list);
