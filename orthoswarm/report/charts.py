@@ -6,25 +6,26 @@ from typing import Any
 import numpy as np
 
 PALETTE = [
-    (33, 102, 172),
-    (217, 95, 2),
-    (27, 140, 100),
-    (166, 46, 130),
-    (120, 94, 30),
-    (90, 90, 200),
-    (200, 50, 50),
-    (0, 150, 170),
-    (110, 140, 20),
-    (80, 80, 80),
+    (0, 114, 178),
+    (213, 94, 0),
+    (86, 180, 233),
+    (204, 121, 167),
+    (0, 158, 115),
+    (136, 0, 238),
+    (85, 34, 0),
+    (51, 51, 68),
+    (187, 204, 119),
+    (221, 0, 68),
 ]
-"""Colours that stay apart on photographs and in print."""
+"""Colours that stay apart on photographs and in print: five of Okabe and Ito's, and others that differ from all before
+by at least 16 (CIE 1976), also as seen without red, green or blue cones (Machado and others 2009)."""
 
 _STAGE_COLOURS = {
-    "load": "#8a93a3",
-    "realtime": "#2166ac",
-    "coarse": "#1b8c64",
-    "fine": "#d95f02",
-    "final": "#a62e82",
+    "load": "#bbbbbb",
+    "realtime": "#0072b2",
+    "coarse": "#009e73",
+    "fine": "#e69f00",
+    "final": "#882255",
 }
 _WIDTH, _HEIGHT, _LEFT, _BASE = 640, 220, 46, 190
 
@@ -51,7 +52,7 @@ def fields_of_view(vehicles: Sequence[Mapping[str, Any]]) -> str | None:
     gap = (_WIDTH - _LEFT) / len(known)
     for i, (vehicle, value, wide) in enumerate(zip(known, fov, spread, strict=True)):
         x = _LEFT + (i + 0.5) * gap
-        colour = f"rgb{PALETTE[i % len(PALETTE)]}" if len(known) <= 16 else "rgb(33, 102, 172)"
+        colour = f"rgb{PALETTE[i % len(PALETTE)]}" if len(known) <= 16 else f"rgb{PALETTE[0]}"
         parts.append(
             f'<g stroke="{colour}" fill="{colour}"><line x1="{x:.1f}" x2="{x:.1f}" y1="{y(value - wide):.1f}" '
             f'y2="{y(value + wide):.1f}" stroke-width="2"/><circle cx="{x:.1f}" cy="{y(value):.1f}" r="3.5"/></g>'

@@ -50,7 +50,9 @@ _STAGES = (
 _FINE_M, _PART_PX = 1.2, 640
 _EDGE = (255, 214, 0)
 _ARROW = (208, 30, 60)
-_LEGS = {"matched": (0, 140, 90), "carried": (240, 150, 0), "failed": (208, 30, 60)}
+_LEGS = {"matched": (0, 158, 115), "carried": (230, 159, 0), "failed": (163, 32, 13)}
+_LEG_WIDTHS = {"matched": 2, "carried": 4, "failed": 7}
+"""Pixels: which is which can be seen without the colours."""
 _VEHICLES = charts.PALETTE
 
 
@@ -277,10 +279,13 @@ def _paths(reduced: Picture, placed: Sequence[PlacedFrame], report: Mapping[str,
         draw_lines(picture, [np.array([p.camera.nadir for p in own])], (150, 155, 165), 1)
     for leg in report["legs"]:
         own = by_vehicle.get(leg["vehicle"], [])[leg["first"] : leg["last"] + 1]
-        colour = _LEGS[leg["state"]] if _on_map(report) else _VEHICLES[0]
-        draw_lines(picture, [np.array([p.camera.nadir for p in own])] if own else [], colour, 3)
+        colour, width = (_LEGS[leg["state"]], _LEG_WIDTHS[leg["state"]]) if _on_map(report) else (_VEHICLES[0], 3)
+        draw_lines(picture, [np.array([p.camera.nadir for p in own])] if own else [], colour, width)
     scale_bar(picture)
-    text = "Green: matched to the map. Orange: carried by the others. Red: failed. Grey: turns."
+    text = (
+        "Green, thin: matched to the map. Orange, wider: carried by the others. Dark red, widest: failed. "
+        "Light grey: turns."
+    )
     if not _on_map(report):
         text = "Straight legs of the flights; grey: turns."
     return Figure("Legs", data_uri(picture.rgb), text)

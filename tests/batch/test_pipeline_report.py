@@ -13,9 +13,10 @@ from orthoswarm.compute.workers import Usage
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.frame import Fix, Frame
 from orthoswarm.model.geo import GroundGrid
-from orthoswarm.report.charts import fields_of_view, times
+from orthoswarm.report.charts import PALETTE, fields_of_view, times
 from orthoswarm.report.displacement_map import moved
 from orthoswarm.report.report_pictures import Picture, draw_arrows, draw_lines, fill_polygons, scale_bar, view_grid
+from tests.kit.looks.colour_vision import least_difference, rgb_of
 from tests.kit.scene import Scene
 
 GRID = GroundGrid(epsg=32632, west=465_000.0, north=5_250_000.0, gsd_m=0.5, width=900, height=700)
@@ -29,6 +30,13 @@ def test_the_chart_of_fields_of_view_is_sound_svg(count):
     assert len(circles) == count
     assert all(0 <= float(c.get("cy")) <= 220 and 0 <= float(c.get("cx")) <= 640 for c in circles)
     assert fields_of_view([{"id": "a", "fov_deg": 70.0, "fov_sigma_deg": None}]) is None
+
+
+def test_the_colours_of_charts_differ_for_those_who_do_not_see_all_colours():
+    assert least_difference(PALETTE) > 15
+    names = ("load", "realtime", "coarse", "fine", "final")
+    stages = [{"name": name, "wall_s": 1.0, "cpu_s": 1.0} for name in names]
+    assert least_difference([rgb_of(part["colour"]) for part in times(stages)["legend"]]) > 15
 
 
 def test_bars_add_up():

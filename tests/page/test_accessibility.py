@@ -2,6 +2,7 @@
 
 import pytest
 
+from tests.kit.looks.colour_vision import least_difference, rgb_of
 from tests.kit.page_kit import DESK, PHONE, TABLET, ok_for_all, opened, standing, vehicle
 
 axe = pytest.importorskip("axe_playwright_python.sync_playwright")
@@ -62,3 +63,31 @@ def test_every_field_of_a_plan_unfolded(browser, size, dem):
                 assert report.violations_count == 0, report.generate_report()
                 assert page.evaluate(SMALL) == []
             assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+
+
+COLOURS = """import('/static/map/colours.js').then((m) => [
+  [...Array(10).keys()].map((k) => m.colourOf(`other ${k}`)), Object.values(m.LEGS).map((leg) => leg.colour)])"""
+SIGNS = """[...new Set(orthoswarm.map.queryRenderedFeatures({ layers: ["legs-signs"] }).map((f) => f.properties.state))]
+  .sort().join()"""
+
+
+def leg(number, state):
+    line = [[8.5446 + 0.0008 * number, 47.3970], [8.5446 + 0.0008 * number, 47.3984]]
+    about = {"vehicle": "v1", "sortie": 1, "leg": number, "stage": "fine", "state": state, "sigma_m": 0.5}
+    return {"type": "Feature", "properties": about, "geometry": {"type": "LineString", "coordinates": line}}
+
+
+def test_legs_and_vehicles_are_told_apart_without_seeing_all_colours(browser):
+    states = ["carried", "failed", "matched"]
+    with standing() as station:
+        legs = [leg(number, state) for number, state in enumerate(states)]
+        station.gets["/api/legs"] = {"type": "FeatureCollection", "features": legs}
+        with opened(browser, station.url) as page:
+            page.evaluate("orthoswarm.map.jumpTo({ center: [8.5456, 47.3977], zoom: 17 })")
+            page.wait_for_function(f"{SIGNS} === '{','.join(states)}'")  # a sign on each, not the colour alone
+            page.click("#tab-map")
+            titles = [row.inner_text() for row in page.locator("p.leg b").all()]
+            assert [title.split()[0] for title in titles] == ["✓", "≈", "✕"]
+            vehicles, of_legs = page.evaluate(COLOURS)
+    assert least_difference([rgb_of(colour) for colour in vehicles]) > 15  # ten vehicles; it was 1
+    assert least_difference([rgb_of(colour) for colour in of_legs]) > 30

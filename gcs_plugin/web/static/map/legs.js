@@ -4,6 +4,7 @@ import { make, setText } from "/static/core/dom.js";
 import { state, subscribe } from "/static/core/store.js";
 import { t } from "/static/core/strings.js";
 import * as units from "/static/core/units.js";
+import { LEGS } from "/static/map/colours.js";
 import { map, maplibregl, show } from "/static/map/map.js";
 import { tool } from "/static/map/tools.js";
 
@@ -18,7 +19,7 @@ export function legPanel() {
   subscribe("legs ready", "legs", () => {
     const legs = state.legs.filter((leg) => leg?.geometry && leg.properties);
     show("legs", legs);
-    for (const [key, title] of lines) setText(title, t(`legs.${key}`, { n: legs.filter((leg) => leg.properties.state === key).length }));
+    for (const [key, title] of lines) setText(title, `${LEGS[key].sign} ${t(`legs.${key}`, { n: legs.filter((leg) => leg.properties.state === key).length })}`);
     const sigmas = legs.filter((leg) => leg.properties.state === "matched" && Number.isFinite(leg.properties.sigma_m)).map((leg) => leg.properties.sigma_m).sort((a, b) => a - b);
     setText(accuracy, sigmas.length ? t("legs.accuracy", { median: units.distance(sigmas[sigmas.length >> 1]), worst: units.distance(sigmas[Math.floor(0.95 * (sigmas.length - 1))]) }) : t("legs.none"));
   });

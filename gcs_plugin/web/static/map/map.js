@@ -3,6 +3,7 @@
 import * as maplibregl from "/static/vendor/maplibre-gl.mjs";
 import { tileRequest } from "/static/core/api.js";
 import { onSettings, settings } from "/static/core/settings.js";
+import { LEGS } from "/static/map/colours.js";
 
 maplibregl.setWorkerUrl("/static/vendor/maplibre-gl-worker.mjs");
 export { maplibregl };
@@ -10,9 +11,10 @@ export { maplibregl };
 export const EMPTY = { type: "FeatureCollection", features: [] };
 export const feature = (type, coordinates, properties = {}) => ({ type: "Feature", properties, geometry: { type, coordinates } });
 
-const STATE = ["match", ["get", "state"], "matched", "#2b8a3e", "carried", "#d9780a", "#c92a2a"];
+const STATE = ["match", ["get", "state"], "matched", LEGS.matched.colour, "carried", LEGS.carried.colour, LEGS.failed.colour];
 const COLOUR = ["coalesce", ["get", "colour"], "#16202a"];
-// id, type, paint, filter, source if it is not the id
+const SIGN = ["match", ["get", "state"], "matched", "leg-matched", "carried", "leg-carried", "leg-failed"];
+// id, type, paint, filter, source if it is not the id, layout
 const OVERLAYS = [
   ["footprints", "fill", { "fill-color": COLOUR, "fill-opacity": 0.12, "fill-outline-color": COLOUR }],
   ["trails-edge", "line", { "line-color": "#fff", "line-width": 4, "line-opacity": 0.45 }, null, "trails"],
@@ -20,6 +22,7 @@ const OVERLAYS = [
   ["legs", "line", { "line-color": "#fff", "line-width": 7, "line-opacity": 0.6 }],
   ["legs-refined", "line", { "line-color": STATE, "line-width": 4 }, ["==", ["get", "stage"], "fine"], "legs"],
   ["legs-flying", "line", { "line-color": STATE, "line-width": 4, "line-dasharray": [2, 1.2] }, ["!=", ["get", "stage"], "fine"], "legs"],
+  ["legs-signs", "symbol", {}, null, "legs", { "symbol-placement": "line-center", "icon-image": SIGN, "icon-rotation-alignment": "viewport", "icon-overlap": "never", "symbol-sort-key": ["match", ["get", "state"], "failed", 0, "carried", 1, 2] }],
   ["area", "fill", { "fill-color": "#1c64b0", "fill-opacity": 0.15 }],
   ["area-line", "line", { "line-color": "#fff", "line-width": 4 }, null, "area"],
   ["area-edge", "line", { "line-color": "#1c64b0", "line-width": 2.5 }, null, "area"],
@@ -36,7 +39,7 @@ const OVERLAYS = [
   ["measure-edge", "line", { "line-color": "#000", "line-width": 5, "line-opacity": 0.6 }, null, "measure"],
   ["measure-line", "line", { "line-color": "#ffd43b", "line-width": 3 }, null, "measure"],
 ];
-export const FLIGHT_LAYERS = ["footprints", "trails-edge", "trails", "legs", "legs-refined", "legs-flying", "homes", "fences", "fences-under", "fences-edge"];
+export const FLIGHT_LAYERS = ["footprints", "trails-edge", "trails", "legs", "legs-refined", "legs-flying", "legs-signs", "homes", "fences", "fences-under", "fences-edge"];
 export const FIRST_OVERLAY = OVERLAYS[0][0];
 
 // Where no layer has pixels: no glare at night.
@@ -54,13 +57,28 @@ onSettings((name) => { if (name === "theme") map.setPaintProperty("ground", "bac
 map.touchZoomRotate.disableRotation();
 map.keyboard.disableRotation();
 
+// A sign in a disc, drawn here: the map's own texts would need fonts from a server.
+function signPicture({ colour, sign }) {
+  const size = 44;
+  const pen = Object.assign(document.createElement("canvas"), { width: size, height: size }).getContext("2d");
+  pen.beginPath();
+  pen.arc(size / 2, size / 2, size / 2 - 2, 0, 2 * Math.PI);
+  Object.assign(pen, { fillStyle: "#fff", strokeStyle: colour, lineWidth: 4, font: "bold 30px system-ui, sans-serif", textAlign: "center", textBaseline: "middle" });
+  pen.fill();
+  pen.stroke();
+  pen.fillStyle = "#000";
+  pen.fillText(sign, size / 2, size / 2 + 1);
+  return pen.getImageData(0, 0, size, size);
+}
+
 let loaded = false;
 export const isReady = () => loaded;
 export const ready = new Promise((resolve) => {
   map.on("load", () => {
     for (const id of new Set(OVERLAYS.map(([name, , , , source]) => source || name))) map.addSource(id, { type: "geojson", data: EMPTY });
-    for (const [id, type, paint, filter, source] of OVERLAYS) {
-      map.addLayer({ id, type, source: source || id, paint, ...(filter ? { filter } : {}) });
+    for (const [key, leg] of Object.entries(LEGS)) map.addImage(`leg-${key}`, signPicture(leg), { pixelRatio: 2 });
+    for (const [id, type, paint, filter, source, layout] of OVERLAYS) {
+      map.addLayer({ id, type, source: source || id, paint, ...(filter ? { filter } : {}), ...(layout ? { layout } : {}) });
     }
     loaded = true;
     resolve();
