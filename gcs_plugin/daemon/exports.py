@@ -24,7 +24,10 @@ from gcs_plugin.daemon.store.picture_store import PictureStore
 from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.export.tactical.places import Place
 from orthoswarm.model.errors import InputError
+from orthoswarm.raster import picture_file
 
+_SHOWN: Final = (".jpg", ".webp", ".bmp")  # by all browsers
+_VIEW_QUALITY: Final = 90
 _zipping: Final = threading.Lock()
 
 
@@ -129,6 +132,19 @@ class Exports:
         if row is None or not self._store.path(row["path"]).is_file():
             raise InputError(f"there is no picture {seq}; see /api/frames")
         return self._store.path(row["path"])
+
+    def picture_view(self, seq: int) -> Path | bytes:
+        """The file of a picture, or a JPEG where browsers would show it black or not at all.
+
+        Raises:
+            InputError: there is no such picture. PictureError: it cannot be read.
+        """
+        path = self.picture(seq)
+        if path.suffix in _SHOWN or (path.suffix == ".png" and picture_file.deep_picture(path.read_bytes()) is None):
+            return path
+        import simplejpeg
+
+        return bytes(simplejpeg.encode_jpeg(picture_file.read_rgb(path), _VIEW_QUALITY, "RGB"))
 
     def _places(self, finds: list[dict[str, Any]]) -> list[Place]:
         return places_of(self._settings.workspace.resolve().name, finds, self._vehicles(), time.time())

@@ -222,6 +222,11 @@ class Routes:
         """A picture as received; `seq` is its number in /api/frames."""
         return FileResponse(await self.work(self.daemon.exports.picture, seq))
 
+    async def picture_view(self, seq: int) -> Response:
+        """A picture as browsers show it: other formats and 16 bits become a JPEG of the same size."""
+        shown = await self.work(self.daemon.exports.picture_view, seq)
+        return FileResponse(shown) if isinstance(shown, Path) else Response(shown, media_type="image/jpeg")
+
     async def places(self) -> Response:
         """Finds and vehicles as GeoJSON."""
         found = await self.work(self.daemon.exports.places)
@@ -304,6 +309,7 @@ def make_app(daemon: Daemon, token: str, bind: str = "127.0.0.1") -> Any:
     add("/api/finds", routes.add_find, methods=["POST"], status_code=201)
     add("/api/finds/{number}/pictures", routes.find_pictures)
     add("/api/frames/{seq}/picture", routes.picture)
+    add("/api/frames/{seq}/view", routes.picture_view)
     add("/api/places", routes.places)
     add("/api/finds/{number}", routes.change_find, methods=["PUT"])
     add("/api/finds/{number}", routes.delete_find, methods=["DELETE"], status_code=204)

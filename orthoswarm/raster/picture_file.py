@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from orthoswarm.config import active
 from orthoswarm.model.errors import OrthoSwarmError
+from orthoswarm.raster.kept_ranges import kept_range, limits
 from orthoswarm.stores.addresses import is_stored
 from orthoswarm.stores.local_copies import content
 from orthoswarm.stores.requests import NotStoredError, StoreRequestError
@@ -190,7 +191,8 @@ def _decode_other(path: Path, data: bytes, *, gray: bool) -> Bytes:
     flags = (cv2.IMREAD_GRAYSCALE if gray else cv2.IMREAD_COLOR) | cv2.IMREAD_IGNORE_ORIENTATION
     image = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_ANYDEPTH) if data else None
     if image is not None and image.dtype == np.uint16:
-        used = _used_range(path.parent, path.suffix.lower())
+        folder, suffix = path.parent, path.suffix.lower()
+        used = kept_range(folder.parent, image, suffix) if _is_spread(folder) else _used_range(folder, suffix)
         if used is not None:
             low, high = used
             scaled = (image.astype(np.float32) - np.float32(low)) * np.float32(255.0 / (high - low))
@@ -215,34 +217,43 @@ def _holds_measurements(data: bytes) -> bool:
         return False
 
 
+def _is_spread(folder: Path) -> bool:
+    """Whether it is one of the folders over which a ground station spreads what comes."""
+    return re.fullmatch("[0-9a-f]{2}", folder.name) is not None and not is_stored(folder)
+
+
+def deep_picture(data: bytes) -> NDArray[np.uint16] | None:
+    """The colours of a picture of 16 bits, uint16 (rows, columns, 3); None for any other file."""
+    import cv2
+
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
+    return np.asarray(image, np.uint16) if image is not None and image.dtype == np.uint16 else None
+
+
 @lru_cache(maxsize=256)
 def _used_range(folder: Path, suffix: str) -> tuple[float, float] | None:
     """Values that become 0 and 255 in the 16-bit pictures of a folder; None where they use all 16 bits.
 
     Thermal and multispectral cameras write 10 to 14 bits. The range comes from some pictures of the folder, the same
-    ones in every process, so that neighbouring pictures are alike. It is not looked for in object storage, nor in the
-    folders of two hexadecimal digits over which the ground station spreads what comes: a range of these would change
-    with every picture.
+    ones in every process, so that neighbouring pictures are alike. It is not looked for in object storage; for a ground
+    station's pictures see `kept_ranges`.
     """
-    import cv2
-
-    if is_stored(folder) or re.fullmatch("[0-9a-f]{2}", folder.name):
+    if is_stored(folder):
         return None
     try:
         names = sorted(name for name in os.listdir(folder) if Path(name).suffix.lower() == suffix)
     except OSError:
         return None
-    config = active().raster
-    values = []
-    for k in np.unique(np.linspace(0, len(names) - 1, config.depth_pictures).round().astype(int)) if names else ():
+    pictures = []
+    for k in (
+        np.unique(np.linspace(0, len(names) - 1, active().raster.depth_pictures).round().astype(int)) if names else ()
+    ):
         try:
             data = _bytes(folder / names[k])
         except PictureError:
             continue
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
-        if image is not None and image.dtype == np.uint16:
-            values.append(image.ravel()[:: max(1, image.size // config.depth_values)])
-    if not values:
-        return None
-    low, high = np.percentile(np.concatenate(values).astype(np.float64), config.stretch_percent)
-    return (float(low), float(max(high, low + 1.0))) if high < config.depth_full else None
+        image = deep_picture(data)
+        if image is not None:
+            pictures.append(image)
+    return limits(pictures) if pictures else None

@@ -26,7 +26,7 @@ def test_pictures_of_a_find_leave_commands_and_alarms_in_reach(browser):
             station.gets |= {"/api/finds": [find], "/api/finds/1/pictures": shown}
             with opened(browser, station.url, size) as page:
                 ok_for_all(station)
-                page.route("**/api/frames/5/picture*", lambda route: route.fulfill(body=PNG, content_type="image/png"))
+                page.route("**/api/frames/5/view*", lambda route: route.fulfill(body=PNG, content_type="image/png"))
                 page.click("#tab-map")
                 page.click(".finds >> text=Pictures")
                 page.wait_for_selector(".pictures figcaption:has-text('a.jpg of Falcon')")

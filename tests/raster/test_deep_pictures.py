@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
+from orthoswarm.raster.kept_ranges import grown
 from orthoswarm.raster.picture_file import read_gray, read_rgb, read_rgba
 
 
@@ -39,3 +40,15 @@ def test_a_ground_stations_pictures_do_not_depend_on_what_else_has_come(tmp_path
         )
         grey.append(int(read_gray(tmp_path / name / f"{k}.png")[0, 0]))
     assert set(grey) == {3200 // 256}
+
+
+def test_a_kept_range_grows_with_what_leaves_it_and_is_one_for_each_kind():
+    ranges = grown({}, ramp(300, 800), ".png")
+    low, high = ranges["64x48.png"]
+    assert 300 <= low < 320 and 780 < high <= 800
+    assert grown(ranges, ramp(350, 750), ".png") is None
+    more = grown(ranges, ramp(300, 1000), ".png")["64x48.png"]
+    assert more[0] == low and more[1] > 1000
+    both = grown(ranges, ramp(7000, 7900), ".tif")
+    assert both["64x48.png"] == (low, high) and both["64x48.tif"][0] >= 7000
+    assert grown(ranges, ramp(0, 65535), ".png")["64x48.png"] is None

@@ -4,12 +4,13 @@ import contextlib
 import hashlib
 import json
 import os
+import threading
 from pathlib import Path
 from typing import Final
 
-from orthoswarm.export.atomic_file import disk_error
+from orthoswarm.export.atomic_file import atomic_write, disk_error
 from orthoswarm.model.errors import InputError
-from orthoswarm.raster import picture_file
+from orthoswarm.raster import kept_ranges, picture_file
 
 MOST_PICTURE_BYTES: Final = 96_000_000
 """Larger files are refused, posted or read from a vehicle: twice the largest JPEG of a drone's camera (chosen)."""
@@ -45,6 +46,7 @@ class PictureStore:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
+        self._ranges = threading.Lock()
         try:
             folder.mkdir(parents=True, exist_ok=True)
             for number in range(256):
@@ -67,6 +69,19 @@ class PictureStore:
         except OSError:
             return True
 
+    def _note_range(self, data: bytes, suffix: str) -> None:
+        """Keep the values that 16-bit pictures use, before the first of them is there: without it they look black."""
+        if suffix not in (".png", ".tif"):
+            return
+        picture = picture_file.deep_picture(data)
+        if picture is None:
+            return
+        with self._ranges:
+            ranges = kept_ranges.grown(kept_ranges.read_ranges(self.folder), picture, suffix)
+            if ranges is not None:
+                with atomic_write(self.folder / kept_ranges.FILE) as part:
+                    part.write_text(json.dumps(ranges), encoding="ascii")
+
     def put(self, key: bytes, suffix: str, data: bytes) -> str:
         """Write a picture; when this returns, neither a crash nor a power cut loses it.
 
@@ -80,6 +95,7 @@ class PictureStore:
         name = f"{digits[:2]}/{digits}{suffix}"
         path = self.folder / name
         part = path.with_suffix(".part")
+        self._note_range(data, suffix)
         try:
             with part.open("wb") as file:
                 file.write(data)

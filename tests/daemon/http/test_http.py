@@ -3,8 +3,11 @@
 import concurrent.futures
 import json
 import socket
+from dataclasses import replace
 from urllib.parse import urlsplit
 
+import cv2
+import numpy as np
 import pytest
 
 from tests.kit.daemon_kit import Shot, camera_at, form, jpeg, line, pose_of, serving, tile_over
@@ -44,6 +47,39 @@ def test_the_map_grows_with_posted_pictures(served):
     again = served.get(address, headers={"If-None-Match": full.headers["etag"]})
     assert again.status_code == 304
     assert served.get(address.replace(".png", ".webp")).headers["content-type"] == "image/webp"
+
+
+def ten_bits(shot):
+    """The picture as a thermal camera writes it: values of 200 to 900 in 16 bits."""
+    grey = cv2.imdecode(np.frombuffer(shot.data, np.uint8), cv2.IMREAD_GRAYSCALE).astype(float)
+    deep = (200 + grey * 700 / 255).astype(np.uint16)
+    pose = shot.pose | {"image": shot.pose["image"].replace(".jpg", ".png")}
+    return replace(shot, pose=pose, data=cv2.imencode(".png", deep)[1].tobytes())
+
+
+def pixels(answer):
+    return cv2.imdecode(np.frombuffer(answer.content, np.uint8), cv2.IMREAD_UNCHANGED)
+
+
+def test_pictures_of_ten_bits_are_not_dark_on_the_map_and_in_the_view(served):
+    shots = [ten_bits(shot) for shot in line(3, "thermal", east=-600)]
+    for shot in shots:
+        assert served.send(shot).status_code == 201
+    rows = served.until("/api/frames?vehicle=thermal", lambda rows: all(row["on_map"] for row in rows))
+    tile = pixels(served.get("/tiles/realtime/{}/{}/{}.png".format(*tile_over(shots[1].camera))))
+    assert np.ptp(tile[tile[..., 3] > 0][:, :3]) > 150  # 700 of 65,536 levels are 3 of 256
+    view = served.get(f"/api/frames/{rows[0]['seq']}/view")
+    assert view.headers["content-type"] == "image/jpeg"
+    assert np.ptp(pixels(view)) > 150 and pixels(view).shape[:2] == (rows[0]["height"], rows[0]["width"])
+    assert served.get(f"/api/frames/{rows[0]['seq']}/picture").content == shots[0].data
+    assert served.get("/api/frames/999999/view").status_code == 422
+
+
+def test_a_picture_that_browsers_show_is_viewed_unchanged(served):
+    shot = line(1, "viewed")[0]
+    assert served.send(shot).status_code == 201
+    (row,) = served.get("/api/frames?vehicle=viewed").json()
+    assert served.get(f"/api/frames/{row['seq']}/view").content == shot.data
 
 
 def test_a_repeated_picture_is_stored_once(served):

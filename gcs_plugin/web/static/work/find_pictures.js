@@ -32,7 +32,7 @@ export function picturesDialog() {
 
 function figure(row) {
   const name = t("finds.pictures.one", { image: text(row.image), name: state.vehicles.get(row.vehicle)?.name ?? text(row.vehicle) });
-  const image = make("img", { src: withToken(`/api/frames/${row.seq}/picture`), alt: name, loading: "lazy" });
+  const image = make("img", { src: withToken(`/api/frames/${row.seq}/view`), alt: name, loading: "lazy" });
   const mark = make("i", {});
   image.addEventListener("load", () => { mark.style.left = `${(100 * row.column) / image.naturalWidth}%`; mark.style.top = `${(100 * row.row) / image.naturalHeight}%`; });
   return make("li", {}, make("figure", {}, make("a", { href: image.getAttribute("src"), target: "_blank", rel: "noopener" }, image, mark), make("figcaption", {}, name)));
