@@ -35,8 +35,9 @@ _HEARD: Final = (
     "HEARTBEAT", "COMMAND_ACK", "MISSION_CURRENT", "MISSION_ITEM_REACHED", "EXTENDED_SYS_STATE", "STATUSTEXT",
     "GLOBAL_POSITION_INT", "SYS_STATUS", "GPS_RAW_INT", "CAMERA_FEEDBACK", "CAMERA_IMAGE_CAPTURED",
     "EKF_STATUS_REPORT", "ESTIMATOR_STATUS", "HOME_POSITION", "PARAM_VALUE",
+    "BATTERY_STATUS",
 )  # fmt: skip
-_RATES: Final = Rates({33: 2.0, 42: 2.0, 245: 1.0, 1: 1.0, 24: 1.0}, {193: 1.0, 230: 1.0, 242: 0.2})
+_RATES: Final = Rates({33: 2.0, 42: 2.0, 245: 1.0, 1: 1.0, 24: 1.0}, {193: 1.0, 230: 1.0, 147: 1.0, 242: 0.2})
 _ATTEMPTS: Final = 4  # uploads until what is stored agrees
 
 

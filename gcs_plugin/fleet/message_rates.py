@@ -21,10 +21,13 @@ GLOBAL_POSITION_INT: Final = int(dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT)
 ATTITUDE: Final = int(dialect.MAVLINK_MSG_ID_ATTITUDE)
 GPS_RAW_INT: Final = int(dialect.MAVLINK_MSG_ID_GPS_RAW_INT)
 SYS_STATUS: Final = int(dialect.MAVLINK_MSG_ID_SYS_STATUS)
-# Each autopilot's message about its filter.
-_ARDUPILOT_ONLY: Final = int(dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT)
-_PX4_ONLY: Final = int(dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS)
-_CHECKED: Final = (GPS_RAW_INT, SYS_STATUS, _ARDUPILOT_ONLY, _PX4_ONLY)
+BATTERY_STATUS: Final = int(dialect.MAVLINK_MSG_ID_BATTERY_STATUS)
+_EKF: Final = int(dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT)
+_ESTIMATOR: Final = int(dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS)
+# Each autopilot's message about its filter. ArduPilot's SYS_STATUS shows its first battery, PX4's the emptiest one.
+_ARDUPILOT_ONLY: Final = frozenset({_EKF, BATTERY_STATUS})
+_PX4_ONLY: Final = frozenset({_ESTIMATOR})
+_CHECKED: Final = (GPS_RAW_INT, SYS_STATUS, BATTERY_STATUS, _EKF, _ESTIMATOR)
 """What a check before a start looks at."""
 
 
@@ -43,7 +46,7 @@ class Rates:
     def of(self, autopilot: Autopilot) -> "Rates":
         """Without what only the other autopilot has: ArduPilot says so in a text to all stations, at each request."""
         foreign = _PX4_ONLY if autopilot is Autopilot.ARDUPILOT else _ARDUPILOT_ONLY
-        wanted, optional = ({k: hz for k, hz in r.items() if k != foreign} for r in (self.wanted, self.optional))
+        wanted, optional = ({k: hz for k, hz in r.items() if k not in foreign} for r in (self.wanted, self.optional))
         return Rates(wanted, optional)
 
 
@@ -65,8 +68,9 @@ def default_rates() -> Rates:
             # Only from a rangefinder that states its limits: a height from a coarse terrain map is worse than none.
             int(dialect.MAVLINK_MSG_ID_DISTANCE_SENSOR): 2.0,
             int(dialect.MAVLINK_MSG_ID_HOME_POSITION): 0.2,
-            _ARDUPILOT_ONLY: 1.0,
-            _PX4_ONLY: 1.0,
+            _EKF: 1.0,
+            _ESTIMATOR: 1.0,
+            BATTERY_STATUS: 1.0,  # of one battery after the other
         },
     )
 

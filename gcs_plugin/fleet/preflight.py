@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 from gcs_plugin.config import LIMITS
 from gcs_plugin.fleet.autopilot_settings import Setting
 from gcs_plugin.fleet.fence_limits import fence_findings, fence_limits, in_all_zones
-from gcs_plugin.fleet.message_rates import GPS_RAW_INT, SYS_STATUS
+from gcs_plugin.fleet.message_rates import GPS_RAW_INT
 from gcs_plugin.fleet.separation.separation_check import Separation, flights_of, separation_of
 from gcs_plugin.fleet.separation.separation_watch import number_name
 from gcs_plugin.links.mavlink import Autopilot
@@ -268,12 +268,13 @@ def _prearm(vehicle: "Vehicle", now: float) -> Item:
 
 def _battery(vehicle: "Vehicle", mission: "Mission | None", endurance_s: float, now: float) -> Item:
     left = vehicle.battery
-    if (age_s := vehicle.streams.age_s(SYS_STATUS, now) or 0.0) > LIMITS.old_s:
+    if (age_s := vehicle.battery_age_s(now) or 0.0) > LIMITS.old_s:
         return Item("battery", Level.RED, f"it has not reported its battery for {age_s:.0f} s")
     if left is None:
         return Item("battery", Level.WARNING, "it does not report its battery")
     needed = flight_seconds(mission) / endurance_s if mission is not None else 0.0
-    text = f"{100 * left:.0f} % left, the mission needs about {100 * needed:.0f} %"
+    which = f" in its {vehicle.battery_name}" if vehicle.battery_name else ""
+    text = f"{100 * left:.0f} % left{which}, the mission needs about {100 * needed:.0f} %"
     if left < needed or left < 0.5 * LIMITS.reserve_share:
         return Item("battery", Level.RED, f"{text}; change the battery")
     if left < needed + LIMITS.reserve_share:

@@ -38,6 +38,7 @@ _STATES: Final = frozenset({_HEARTBEAT, MESSAGE_IDS["MISSION_CURRENT"], MESSAGE_
 _REPEATED: Final = frozenset({
     *_STATES, MESSAGE_IDS["GLOBAL_POSITION_INT"], MESSAGE_IDS["ATTITUDE"], MESSAGE_IDS["SYS_STATUS"],
     MESSAGE_IDS["GPS_RAW_INT"], MESSAGE_IDS["EKF_STATUS_REPORT"], MESSAGE_IDS["ESTIMATOR_STATUS"],
+    MESSAGE_IDS["BATTERY_STATUS"],
 })  # fmt: skip
 _POSITION: Final = MESSAGE_IDS["GLOBAL_POSITION_INT"]
 _SAME_TEXT_S: Final = 1.5
@@ -224,8 +225,7 @@ class Reception:
             self._compare_routes(vehicle, now)
         elif verdict == "rebooted" and route is vehicle.route:
             self._event("rebooted", vehicle, "has restarted")
-            vehicle.mission, vehicle.unbegun = None, False
-            vehicle.settings.clear()  # it may have been set up anew
+            vehicle.restarted()
             self._mission_events(vehicle, vehicle.detector.rebooted())
             self._dialogues.send(vehicle.system, vehicle.streams.start(now))
             self._dialogues.rebooted(vehicle, now)

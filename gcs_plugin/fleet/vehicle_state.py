@@ -8,7 +8,7 @@ from typing import Any, Final
 from gcs_plugin.config import HEARING
 from gcs_plugin.fleet.autopilot_settings import CHECKED, PARAMETERS, Questions, Setting, SetTo, answer
 from gcs_plugin.fleet.flight_state import flight_state
-from gcs_plugin.fleet.message_rates import GLOBAL_POSITION_INT, GPS_RAW_INT, SYS_STATUS, Streams
+from gcs_plugin.fleet.message_rates import BATTERY_STATUS, GLOBAL_POSITION_INT, GPS_RAW_INT, SYS_STATUS, Streams
 from gcs_plugin.fleet.routes import Route, Routes
 from gcs_plugin.fleet.telemetry_check import has_place
 from gcs_plugin.links.mavlink import Autopilot, Message, dialect
@@ -19,6 +19,7 @@ from gcs_plugin.mission.flight_modes import Modes, modes_of
 from gcs_plugin.mission.items import Mission
 
 _LANDED: Final = {0: "", 1: "on ground", 2: "in air", 3: "taking off", 4: "landing"}
+_FIRST: Final = 0
 _PREARM: Final = int(dialect.MAV_SYS_STATUS_PREARM_CHECK)
 _GEOFENCE: Final = int(dialect.MAV_SYS_STATUS_GEOFENCE)
 _PREARM_S: Final = 45.0  # autopilots repeat what is wrong every 30 s
@@ -49,6 +50,7 @@ class Vehicle:
         roll_rad: attitude of the airframe, with pitch_rad and yaw_rad.
         boot_utc_s: UTC epoch seconds of its start, from its SYSTEM_TIME; None before it knows the time.
         time_boot_s: its own clock at the last position.
+        battery: what is left in its emptiest battery, 0 to 1; None if not reported.
         mission: what it holds, where that was read or written in this session.
         unbegun: it was given that mission here and has not begun it.
         photos: pictures that it has reported.
@@ -118,6 +120,9 @@ class Vehicle:
     texts: "deque[str]" = field(default_factory=lambda: deque(maxlen=50))
     _prearm: dict[str, float] = field(default_factory=dict)
     _still_since: float | None = None
+    _batteries: dict[int, float | None] = field(default_factory=dict)
+    _told: set[int] = field(default_factory=set)
+    _all_batteries: bool = False
     _pictures: set[tuple[int, int]] = field(default_factory=set)
 
     def __post_init__(self) -> None:
@@ -169,9 +174,30 @@ class Vehicle:
         return 0.0 if self._still_since is None else max(0.0, self.time_boot_s - self._still_since)
 
     @property
+    def battery_name(self) -> str:
+        """The emptiest of several batteries, as ArduPilot counts them: "battery 2"; empty with one battery."""
+        known = {number: left for number, left in self._batteries.items() if left is not None}
+        return f"battery {min(known, key=known.__getitem__) + 1}" if len(known) > 1 else ""
+
+    def battery_age_s(self, now: float) -> float | None:
+        """Seconds since its batteries were reported, of several the longest time; None before that."""
+        others_s = self.streams.age_s(BATTERY_STATUS, now) if len(self._batteries) > 1 else None
+        ages = [age_s for age_s in (self.streams.age_s(SYS_STATUS, now), others_s) if age_s is not None]
+        return max(ages, default=None)
+
+    def restarted(self) -> None:
+        """Forget what it was set up with: it may have been set up anew, and with other batteries."""
+        self.mission, self.unbegun = None, False
+        self.settings.clear()
+        self._batteries.clear()
+        self._told.clear()
+        self._all_batteries = False
+
+    @property
     def ready_to_check(self) -> bool:
         """True once what a check before a start looks at was told, or was asked for in vain."""
-        return self.streams.ready_to_check and not self.questions.waits_for(CHECKED)
+        batteries = self._all_batteries or not self._told  # one that tells of none has none but SYS_STATUS's
+        return self.streams.ready_to_check and batteries and not self.questions.waits_for(CHECKED)
 
     @property
     def untold(self) -> bool:
@@ -234,7 +260,7 @@ class Vehicle:
             "heading_deg": None if self.heading_rad is None else round(math.degrees(self.heading_rad), 1),
             "speed_m_s": round(math.hypot(*self.velocity_m_s[:2]), 2),
             "battery": self.battery,
-            "battery_s": _old_s(self.streams.age_s(SYS_STATUS, now)),
+            "battery_s": _old_s(self.battery_age_s(now)),
             "gps_s": _old_s(self.streams.age_s(GPS_RAW_INT, now)),
             "gps_fix": self.gps_fix,
             "satellites": self.satellites,
@@ -299,10 +325,22 @@ class Vehicle:
         self.gps_fix, self.satellites = int(m.fix_type), int(m.satellites_visible)
 
     def _power(self, m: Message) -> None:
-        self.battery = m.battery_remaining / 100.0 if 0 <= m.battery_remaining <= 100 else None
+        self._left_in(_FIRST, m)
         known = self.autopilot is Autopilot.PX4 or m.onboard_control_sensors_enabled & _PREARM
         self.prearm_ok = bool(m.onboard_control_sensors_health & _PREARM) if known else None
         self.fence_on = bool(m.onboard_control_sensors_enabled & _GEOFENCE) and self.autopilot is Autopilot.ARDUPILOT
+
+    def _battery(self, m: Message) -> None:
+        """Of one of several; the first one's is in SYS_STATUS, too, and PX4's SYS_STATUS is of the emptiest one."""
+        if self.autopilot is not Autopilot.PX4:
+            self._all_batteries |= int(m.id) in self._told  # they are told one after the other
+            self._told.add(int(m.id))
+            if m.id != _FIRST:
+                self._left_in(int(m.id), m)
+
+    def _left_in(self, battery: int, m: Message) -> None:
+        self._batteries[battery] = m.battery_remaining / 100.0 if 0 <= m.battery_remaining <= 100 else None
+        self.battery = min((left for left in self._batteries.values() if left is not None), default=None)
 
     def _filter(self, m: Message) -> None:
         wrong = _EKF_WRONG if m.get_type() == "EKF_STATUS_REPORT" else 0
@@ -338,6 +376,7 @@ _HANDLERS: Final = {
     int(dialect.MAVLINK_MSG_ID_SYSTEM_TIME): Vehicle._system_time,
     int(dialect.MAVLINK_MSG_ID_GPS_RAW_INT): Vehicle._gps,
     int(dialect.MAVLINK_MSG_ID_SYS_STATUS): Vehicle._power,
+    BATTERY_STATUS: Vehicle._battery,
     int(dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT): Vehicle._filter,
     int(dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS): Vehicle._filter,
     int(dialect.MAVLINK_MSG_ID_HOME_POSITION): Vehicle._home,

@@ -79,6 +79,19 @@ class Pose:
     pitch_rad: float
     roll_rad: float
 
+    @property
+    def quaternion(self) -> tuple[float, float, float, float]:
+        """Rotation from north-east-down to the airframe, w first."""
+        cr, sr = math.cos(self.roll_rad / 2), math.sin(self.roll_rad / 2)
+        cp, sp = math.cos(self.pitch_rad / 2), math.sin(self.pitch_rad / 2)
+        cy, sy = math.cos(self.yaw_rad / 2), math.sin(self.yaw_rad / 2)
+        return (
+            cr * cp * cy + sr * sp * sy,
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+        )
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Airframe:

@@ -6,7 +6,6 @@ as a ground station is there. Both answer commands and missions as measured (doc
 
 import heapq
 import math
-import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
@@ -16,8 +15,9 @@ from gcs_plugin.links.mavlink import Autopilot, Message, dialect
 from gcs_plugin.mission.exchange import Address
 from gcs_plugin.mission.flight_modes import modes_of
 from gcs_plugin.mission.items import FRAME_GLOBAL, WAYPOINT, MissionItem
+from gcs_plugin.sim.factory_parameters import factory_parameters, parameter_answer
 from gcs_plugin.sim.file_server import FileServer
-from gcs_plugin.sim.mission_flight import RTL_HEIGHT_M, Exposure, Flight, Landed, State
+from gcs_plugin.sim.mission_flight import Exposure, Flight, Landed, State
 from gcs_plugin.sim.mission_store import MissionStore
 from gcs_plugin.sim.multirotor import STEP_S, Airframe, Chart, Pose
 
@@ -37,7 +37,8 @@ _WHY_S: Final = 30.0
 _BATTERY_S: Final = 1800.0  # with its motors on; what stands on the ground uses hardly any of it
 _EKF: Final = int(dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT)
 _ESTIMATOR: Final = int(dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS)
-_WPNAV_SPEED_M_S, _PX4_TOP_M_S = 10.0, 12.0  # factory settings; ArduCopter flies faster if it is asked to and can
+_BATTERY: Final = int(dialect.MAVLINK_MSG_ID_BATTERY_STATUS)
+_PX4_TOP_M_S: Final = 12.0  # factory setting
 _HOME: Final = (47.397742, 8.545594, 488.0)
 
 
@@ -61,6 +62,7 @@ class SimVehicle:
         on_exposure: called at each picture.
         withheld: ids of messages that it does not send, whatever it is asked for.
         used_s: for how long its motors have used its battery, seconds.
+        second_battery: what is left in a second one, 0 to 1; None for one without.
         parameters: by name; integers are those that the autopilot keeps as such.
     """
 
@@ -79,6 +81,7 @@ class SimVehicle:
     on_exposure: "Callable[[SimVehicle, Exposure], None] | None" = None
     flight: Flight = field(init=False)
     store: MissionStore = field(init=False)
+    second_battery: float | None = field(default=None, init=False)
     withheld: set[int] = field(default_factory=set, init=False)
     parameters: dict[str, float] = field(init=False)
     reboots: int = field(default=0, init=False)
@@ -94,6 +97,7 @@ class SimVehicle:
     _reported_state: tuple[bool, int] = field(default=(False, 0), init=False)
     _why_at: float = field(default=0.0, init=False)
     _long_texts: int = field(default=0, init=False)
+    _battery_id: int = field(default=0, init=False)
     _tx_room: float = field(default=_TX_BUFFER, init=False)
     _tx_at: float = field(default=0.0, init=False)
 
@@ -101,17 +105,7 @@ class SimVehicle:
         """Stand at home with an empty store."""
         if self.autopilot is Autopilot.PX4:
             self.airframe = replace(self.airframe, top_m_s=min(self.airframe.top_m_s, _PX4_TOP_M_S))
-        self.parameters = {
-            "WPNAV_SPEED": 100.0 * _WPNAV_SPEED_M_S, "RTL_ALT": 100.0 * RTL_HEIGHT_M, "FS_GCS_ENABLE": 0,
-            "RTL_ALT_TYPE": 0, "FENCE_ENABLE": 0, "FENCE_TYPE": 7, "FENCE_ACTION": 1, "FENCE_RADIUS": 300.0,
-            "FENCE_ALT_MAX": 100.0, "FENCE_ALT_MIN": -10.0, "FENCE_MARGIN": 2.0,
-        }  # fmt: skip
-        if self.autopilot is Autopilot.PX4:
-            top_m_s = self.airframe.top_m_s
-            self.parameters = {
-                "MPC_XY_VEL_MAX": top_m_s, "RTL_RETURN_ALT": RTL_HEIGHT_M, "NAV_DLL_ACT": 0, "RTL_TYPE": 0,
-                "GF_MAX_HOR_DIST": 0.0, "GF_MAX_VER_DIST": 0.0,
-            }  # fmt: skip
+        self.parameters = factory_parameters(self.autopilot, self.airframe.top_m_s)
         home = MissionItem.at(WAYPOINT, *self.home, frame=FRAME_GLOBAL)
         items = [home] if self.autopilot is Autopilot.ARDUPILOT else []
         self.store = MissionStore(autopilot=self.autopilot, home=home, items=items)
@@ -183,7 +177,7 @@ class SimVehicle:
             request = payload_of(message)
             return [] if request is None else [self.files.answer(request).message(sender.system, sender.component)]
         if kind == "PARAM_REQUEST_READ":
-            return self._parameter(str(message.param_id).strip("\x00"))
+            return parameter_answer(self.parameters, str(message.param_id).strip("\x00"), self.autopilot)
         if kind == "MISSION_SET_CURRENT":
             self.flight.set_current(int(message.seq))
         if kind in ("COMMAND_LONG", "COMMAND_INT"):
@@ -199,23 +193,12 @@ class SimVehicle:
         made = None if maker is None else maker(self)
         return [] if made is None else [made]
 
-    def _parameter(self, name: str) -> list[Message]:
-        """The value of a parameter; an autopilot does not answer about one that it has not."""
-        known = self.parameters
-        if name not in known:
-            return []
-        value, kind = known[name], int(dialect.MAV_PARAM_TYPE_REAL32)
-        if isinstance(value, int):
-            kind = int(dialect.MAV_PARAM_TYPE_INT32)
-            value = struct.unpack("<f", struct.pack("<i", value))[0] if self.autopilot is Autopilot.PX4 else value
-        return [dialect.MAVLink_param_value_message(name.encode(), value, kind, len(known), 0)]
-
     def _command(self, message: Message) -> int:
         flight, p1, p2, p3 = self.flight, message.param1, message.param2, message.param3
         match message.command:
             case dialect.MAV_CMD_SET_MESSAGE_INTERVAL:
-                foreign = _EKF if self.autopilot is Autopilot.PX4 else _ESTIMATOR
-                if int(p1) not in _MAKERS or int(p1) == foreign:
+                foreign = (_EKF, _BATTERY) if self.autopilot is Autopilot.PX4 else (_ESTIMATOR,)
+                if int(p1) not in _MAKERS or int(p1) in foreign:
                     return _FAILED if self.autopilot is Autopilot.ARDUPILOT else _DENIED
                 self._stream(int(p1), 1e6 / p2 if p2 > 0 else 0.0)
                 return _OK
@@ -385,7 +368,7 @@ class SimVehicle:
                 )
             ]
         boot_ms, index = int(exposure.time_s * 1e3), exposure.index
-        turn = _quaternion(pose.roll_rad, pose.pitch_rad, pose.yaw_rad)
+        turn = list(pose.quaternion)
         alt, rel = round(pose.alt_m * 1e3), round(pose.height_m * 1e3)
         return [
             dialect.MAVLink_camera_trigger_message(utc_us, index),
@@ -448,8 +431,22 @@ class SimVehicle:
             65535, 14,
         )  # fmt: skip
 
+    @property
+    def _left(self) -> int:
+        """Percent left in its first battery."""
+        return max(0, 100 - int(100.0 * self.used_s / _BATTERY_S))
+
+    def _battery(self) -> Message:
+        """One battery after the other, as ArduPilot does."""
+        left = self._left
+        self._battery_id = 1 - self._battery_id if self.second_battery is not None else 0
+        if self._battery_id and self.second_battery is not None:
+            left = round(100.0 * self.second_battery)
+        cells = [0xFFFF] * 10
+        return dialect.MAVLink_battery_status_message(self._battery_id, 0, 0, 0x7FFF, cells, -1, -1, -1, left)
+
     def _power(self) -> Message:
-        left = max(0, 100 - int(100.0 * self.used_s / _BATTERY_S))
+        left = self._left
         has = int(dialect.MAV_SYS_STATUS_PREARM_CHECK)
         said = 0 if self.autopilot is Autopilot.PX4 else has  # PX4 sets the bit of health only
         health = has if self._ready else 0
@@ -475,6 +472,7 @@ class SimVehicle:
 _MAKERS: Final[dict[int, Callable[[SimVehicle], Message | None]]] = {
     _EKF: SimVehicle._filter,
     _ESTIMATOR: SimVehicle._filter,
+    _BATTERY: SimVehicle._battery,
     _HEARTBEAT: SimVehicle._heartbeat,
     _POSITION: SimVehicle._position,
     _ATTITUDE: SimVehicle._attitude,
@@ -494,16 +492,3 @@ def _bytes(message: Message) -> int:
 def _severity(text: str) -> int:
     bad = text.startswith(("Arm:", "PreArm:", "Preflight", "Auto:", "No mission", "Mission start", "Takeoff waypoint"))
     return int(dialect.MAV_SEVERITY_CRITICAL if bad else dialect.MAV_SEVERITY_INFO)
-
-
-def _quaternion(roll: float, pitch: float, yaw: float) -> list[float]:
-    """Rotation from north-east-down to the airframe, w first."""
-    cr, sr = math.cos(roll / 2), math.sin(roll / 2)
-    cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
-    cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
-    return [
-        cr * cp * cy + sr * sp * sy,
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-    ]

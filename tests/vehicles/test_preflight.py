@@ -358,3 +358,46 @@ def test_neighbours_that_take_off_side_by_side_raise_no_alarm(make_world):
     world.finish(world.fleet.start(1), world.fleet.start(2))
     world.wait(60.0)
     assert not [e for e in world.events if e.kind == "near"]
+
+
+# -- several batteries ----------------------------------------------------------------------------------------------
+
+
+def test_the_emptiest_of_two_batteries_counts(make_world):
+    """ArduPilot's SYS_STATUS shows the first one only."""
+    world = make_world(SimVehicle(system=1, autopilot=AP))
+    world.vehicles[1].second_battery = 0.6
+    world.wait(8.0)
+    vehicle = world.fleet.vehicles[1]
+    assert vehicle.ready_to_check and vehicle.battery == pytest.approx(0.6)
+    world.vehicles[1].second_battery = 0.05
+    world.wait(6.0)
+    state, why = levels(world)
+    assert vehicle.summary(world.clock.now)["battery"] == pytest.approx(0.05)
+    assert state["battery"] is Level.RED and "5 % left in its battery 2" in why["battery"]
+    world.vehicles[1].withheld.add(int(dialect.MAVLINK_MSG_ID_BATTERY_STATUS))
+    world.wait(20.0)
+    assert "has not reported its battery for" in levels(world)[1]["battery"]  # SYS_STATUS still comes
+
+
+def test_a_check_waits_until_all_batteries_were_told(make_world):
+    world = make_world(SimVehicle(system=1, autopilot=AP))
+    world.vehicles[1].second_battery = 0.05
+    assert world.until(lambda: bool(world.fleet.vehicles) and world.fleet.vehicles[1].ready_to_check, 60.0)
+    assert world.fleet.vehicles[1].battery == pytest.approx(0.05)
+
+
+def test_one_battery_has_no_number(make_world):
+    world = make_world(SimVehicle(system=1, autopilot=AP))
+    world.wait(8.0)
+    assert world.fleet.vehicles[1].battery_name == "" and "% left, the mission" in levels(world)[1]["battery"]
+
+
+def test_batteries_are_forgotten_at_a_restart(make_world):
+    world = make_world(SimVehicle(system=1, autopilot=AP))
+    world.vehicles[1].second_battery = 0.05
+    world.wait(8.0)
+    world.vehicles[1].second_battery = None
+    world.vehicles[1].reboot(world.clock.now)
+    assert world.until(lambda: any(event.kind == "rebooted" for event in world.events), 30.0)
+    assert world.until(lambda: world.fleet.vehicles[1].battery == 1.0, 30.0)
