@@ -3,16 +3,18 @@
 import os
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 from orthoswarm.model.errors import InputError
 from orthoswarm.raster.picture_file import PICTURE_SUFFIXES
 from orthoswarm.stores.addresses import address_of, is_stored
 from orthoswarm.stores.listing import exists, is_file, list_folder
 from telemetry.formats.log.can_log import SUFFIXES as CAN_LOGS
+from telemetry.ingest.copied_photos import copies_among
 
 VIDEO_SUFFIXES = frozenset(
     {".mp4", ".mov", ".m4v", ".ts", ".m2ts", ".mts", ".mpg", ".mpeg", ".mkv", ".flv", ".avi"}
@@ -53,6 +55,7 @@ class Discovery:
         left_out: files with a picture's suffix that are not read, the reason (one for all that share it) and a detail.
         videos: the vehicle of each video, unless its metadata names another.
         unreadable: folders that cannot be listed -> the system's reason.
+        copies: photos that are left out as copies of another one.
         everywhere: tables and logs given by themselves or in folders without pictures and videos.
     """
 
@@ -63,6 +66,7 @@ class Discovery:
     everywhere: frozenset[Path] = frozenset()
     _: KW_ONLY
     unreadable: dict[Path, str] = field(default_factory=dict)
+    copies: dict[Path, Path] = field(default_factory=dict)
 
     def scope(self, path: Path) -> Path:
         """The folder whose pictures and videos (subfolders included) a table or log applies to."""
@@ -136,17 +140,40 @@ def discover(inputs: Sequence[Path], exclude: Sequence[Path] = ()) -> Discovery:
         elif file not in sorted_in:
             sorted_in.add(file)
             _sort_in(file, folders, explicit=not walked)
+    copies = copies_among(_originals_first(folders.values()))
+    for file, first in copies.items():
+        left_out[file] = _copied(first.parent, root), first.name if first.name != file.name else ""
     for folder in folders.values():
-        folder.pictures.sort(key=_by_name)
+        folder.pictures = sorted((path for path in folder.pictures if path not in copies), key=_by_name)
     ordered = [folders[path] for path in sorted(folders, key=lambda p: natural_key(str(p)))]
     _name_vehicles(ordered, root)
     pictures = [(file, *why) for file, why in left_out.items() if file.suffix.lower() in PICTURE_SUFFIXES]
-    left = [entry for entry in pictures if entry[0] not in sorted_in]
+    left = [entry for entry in pictures if entry[0] not in sorted_in or entry[0] in copies]
     if unreadable and not ordered and not left:
         path, why = next(iter(unreadable.items()))
         raise InputError(f"no picture was found, and the folder {path} cannot be read ({why}); check its permissions")
     apart = _far_from_pictures(tops, ordered)
-    return Discovery(root, ordered, left, _video_vehicles(ordered, root), apart, unreadable=unreadable)
+    return Discovery(root, ordered, left, _video_vehicles(ordered, root), apart, unreadable=unreadable, copies=copies)
+
+
+def _originals_first(folders: Iterable[Folder]) -> list[Path]:
+    """All pictures, likelier originals first: those of fuller folders, with tables or logs, and higher up."""
+
+    def fullest(folder: Folder) -> tuple[Any, ...]:
+        beside = len(folder.tables) + len(folder.logs)
+        return -len(folder.pictures), -beside, len(folder.path.parts), natural_key(str(folder.path))
+
+    return [
+        path
+        for folder in sorted(folders, key=fullest)
+        for path in sorted(folder.pictures, key=lambda path: (len(path.name), _by_name(path)))
+    ]
+
+
+def _copied(folder: Path, root: Path) -> str:
+    """Why a copy of a photo in a folder is left out; the same for all of them."""
+    name = _text(_relative(str(folder), str(root)))
+    return f"a copy of a photo in {_text(root.name) if name == os.curdir else name}, {_ALREADY}"
 
 
 def _twice(folder: Path, root: Path) -> str:

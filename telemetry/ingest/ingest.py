@@ -73,6 +73,7 @@ def survey(inputs: Sequence[Path], *, progress: Progress | None = None, options:
         result.findings.append(Finding("folder-unreadable", text))
     for path, why, detail in found.left_out:
         result.rejected.append(Rejection(found.name(path), why, vehicles.get(path.parent, ""), detail=detail))
+    result.findings += _copy_findings(found)
     tables = _tables(found, result)
     logs = read_logs(found, result)
     total = sum(len(folder.pictures) for folder in found.folders)
@@ -102,6 +103,23 @@ def survey(inputs: Sequence[Path], *, progress: Progress | None = None, options:
                 read_videos(folder, found, logs, options=options, progress=progress, result=result)
     _check_vehicles(result)
     return result
+
+
+def _copy_findings(found: Discovery) -> list[Finding]:
+    """One finding for each two folders of which one holds copies of the other's photos."""
+    counts = Counter((copy.parent, first.parent) for copy, first in found.copies.items())
+    findings = []
+    for (there, here), count in counts.items():
+        text = (
+            f"{count} photos in {_folder_name(found, there)} are copies of those in {_folder_name(found, here)} (the "
+            "same files); each picture is mapped once"
+        )
+        findings.append(Finding("copies", text))
+    return findings
+
+
+def _folder_name(found: Discovery, folder: Path) -> str:
+    return folder.name if folder == found.root else found.name(folder)
 
 
 def _tables(found: Discovery, result: Survey) -> list[tuple[Path, str, PoseTable]]:

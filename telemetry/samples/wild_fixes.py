@@ -108,8 +108,8 @@ def doubtful_finding(count: int, of_what: str) -> Finding:
     """The finding on positions that cannot be reached and are used all the same, being too many; see `wild_fixes`."""
     text = (
         f"{count} of {of_what} cannot be reached by any aircraft from those before and after "
-        f"({active().ingest.fastest_m_s:.0f} m/s); as so many are hardly wild, all are used: they are of several flights "
-        "or their times are wrong; check them, and read each flight by itself"
+        f"({active().ingest.fastest_m_s:.0f} m/s); so many are hardly wild, and all are used: they are of several "
+        "flights, or their times are wrong; check them, and read each flight by itself"
     )
     return Finding("positions-unreachable", text)
 

@@ -126,6 +126,33 @@ def test_a_survey_that_is_given_twice_is_counted_once_and_that_is_said_once(tmp_
         assert set(reasons) == {"the same photos are in day1, which is in the input already"}
 
 
+@pytest.mark.parametrize("renamed", [False, True])
+def test_a_backup_beside_the_photos_is_no_second_vehicle(tmp_path, renamed):
+    flight(tmp_path / "card" / "DCIM", [0.0], legs=6)
+    for number in range(1, 5):  # four of them, and one that is only there
+        original = tmp_path / "card" / "DCIM" / f"P_{number}.JPG"
+        copy = tmp_path / "card" / "Backup" / (f"old_{number}.JPG" if renamed else original.name)
+        copy.parent.mkdir(exist_ok=True)
+        copy.write_bytes(original.read_bytes())
+    photo(tmp_path / "card" / "Backup" / "X.JPG", second=50)
+    found = load([tmp_path / "card"])
+    assert sorted(f.image for f in found.frames) == ["Backup/X.JPG", *(f"DCIM/P_{i}.JPG" for i in range(6))]
+    assert {r.image.split("/")[0] for r in found.rejected} == {"Backup"} and len(found.rejected) == 4
+    assert {r.reason for r in found.rejected} == {"a copy of a photo in DCIM, which is in the input already"}
+    assert {r.detail for r in found.rejected} == ({f"P_{i}.JPG" for i in range(1, 5)} if renamed else {""})
+    assert any("4 photos in Backup are copies of those in DCIM" in warning for warning in found.warnings)
+
+
+def test_pictures_that_only_a_table_tells_apart_are_no_copies(tmp_path):
+    for folder in ("v1", "v2"):
+        (tmp_path / folder).mkdir()
+        rows = [f"{i}.jpg,{47.5 + 1e-4 * i},8.25" for i in range(5)]
+        (tmp_path / folder / "poses.csv").write_text("\n".join(["image,lat_deg,lon_deg", *rows]))
+        for i in range(5):
+            jpeg(tmp_path / folder / f"{i}.jpg")
+    assert len(load([tmp_path]).frames) == 10
+
+
 def test_an_excluded_folder_is_left_out(tmp_path):
     photo(tmp_path / "a.JPG")
     photo(tmp_path / "out" / "a.JPG")

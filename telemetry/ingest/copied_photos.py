@@ -1,0 +1,77 @@
+"""Copies of photos: the same files in a second folder, a backup beside the original perhaps, under any names.
+
+Each exposure is mapped once. A camera writes no two equal files: what has one size and one content in samples over the
+file, its tags among them, is one exposure. Pictures without a time and a position of their own are left alone, since
+nothing tells one from another (tables of poses may name pictures that look the same).
+"""
+
+import hashlib
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from orthoswarm.config import active
+from orthoswarm.stores.addresses import is_stored
+from telemetry.photos.photo_tags import read_photo
+from telemetry.samples.unreadable import Unreadable, read_or_reason
+
+_SAMPLE_BYTES, _SAMPLES = 16 << 10, 8
+
+
+def copies_among(photos: Sequence[Path]) -> dict[Path, Path]:
+    """The photos that are copies, with the one in another folder that each is a copy of.
+
+    Folders that have only one or two photos in common count as two. Only files that share their size with another are
+    opened. Files in stores are not compared.
+
+    Args:
+        photos: of all folders, the one to keep before its copies.
+    """
+    found: dict[Path, Path] = {}
+    for alike in _of_one_size(photos):
+        first_of: dict[bytes, Path] = {}
+        for path in alike:
+            digest = _digest(path)
+            if digest is None:
+                continue
+            first = first_of.setdefault(digest, path)
+            if first.parent != path.parent and _is_exposure(first):
+                found[path] = first
+    in_common: dict[tuple[Path, Path], set[Path]] = {}
+    for copy, first in found.items():
+        in_common.setdefault((copy.parent, first.parent), set()).add(first)
+    least = active().ingest.copied_least
+    return {copy: first for copy, first in found.items() if len(in_common[copy.parent, first.parent]) >= least}
+
+
+def _of_one_size(photos: Sequence[Path]) -> Iterator[list[Path]]:
+    by_size: dict[int, list[Path]] = {}
+    for path in photos:
+        if not is_stored(path):
+            try:
+                by_size.setdefault(os.stat(path).st_size, []).append(path)
+            except OSError:  # reading it says what is wrong
+                continue
+    return (alike for size, alike in by_size.items() if size and len(alike) > 1)
+
+
+def _digest(path: Path) -> bytes | None:
+    """A digest of the beginning, with the tags, and of samples up to the end; None if the file cannot be read."""
+    try:
+        if not path.is_file():  # reading a pipe would wait for ever
+            return None
+        with path.open("rb") as file:
+            size = os.fstat(file.fileno()).st_size
+            digest = hashlib.blake2b(digest_size=16)
+            for k in range(_SAMPLES + 1):
+                file.seek(max(0, size - _SAMPLE_BYTES) * k // _SAMPLES)
+                digest.update(file.read(_SAMPLE_BYTES))
+            return digest.digest()
+    except OSError:
+        return None
+
+
+def _is_exposure(path: Path) -> bool:
+    """Whether a photo's tags say when and where it was taken."""
+    tags = read_or_reason(read_photo, path)
+    return not (tags is None or isinstance(tags, Unreadable) or tags.time_s is None or tags.lat_deg is None)
