@@ -80,7 +80,8 @@ class StartChecks:
         separation = Separation()
         if reread:  # it is a schedule's, otherwise
             first = min(starts.values(), default=0.0)
-            separation = self._separation(systems, missions, stored, {s: at - first for s, at in starts.items()})
+            after_s = {s: at - first for s, at in starts.items()}
+            separation = self._separation(systems, missions, stored, after_s, needs=needs)
         checks = self._fleet.call(
             lambda: preflight_all(
                 {s: self._fleet.vehicles[s] for s in systems},
@@ -113,6 +114,8 @@ class StartChecks:
         missions: "Mapping[int, Mission]",
         stored: "Mapping[int, Mission]",
         starts: Mapping[int, float],
+        *,
+        needs: PlanNeeds,
     ) -> "Separation":
         """How they keep apart from each other and from others, found in this thread: the links' must not wait."""
         from gcs_plugin.fleet.separation.separation_check import flights_of, others_of, separation_of
@@ -127,7 +130,7 @@ class StartChecks:
                 | flights_of({s: self._fleet.vehicles[s] for s in systems}, missions, stored, starts)
             )
         ).result(_CHECK_S)
-        return separation_of(flights, self._name_of)
+        return separation_of(flights, self._name_of, needs.apart)
 
     def _missions(self, systems: Collection[int], *, reread: bool) -> "dict[int, Mission]":
         """The missions stored in vehicles, of those that answer in time."""

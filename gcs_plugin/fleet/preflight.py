@@ -22,6 +22,7 @@ from gcs_plugin.mission.items import FRAME_GLOBAL, PLAIN_FRAME
 from gcs_plugin.mission.mission_builder import unflyable
 from gcs_plugin.mission.plan_folder import NO_NEEDS, PlanNeeds
 from gcs_plugin.mission.track import fastest_m_s, flight_seconds, highest_m, takeoff_place
+from orthoswarm.config import active
 from orthoswarm.model.earth import distance_m
 
 if TYPE_CHECKING:
@@ -168,7 +169,7 @@ def preflight_all(
         reading: vehicles whose missions are still being read.
     """
     if separation is None:
-        separation = separation_of(flights_of(vehicles, missions, stored, starts), name)
+        separation = separation_of(flights_of(vehicles, missions, stored, starts), name, needs.apart)
     return [
         preflight(
             vehicle,
@@ -375,6 +376,10 @@ def _separation(wanted: Wanted) -> Item:
         return Item("separation", Level.RED, wanted.near)
     if wanted.unexamined:
         return Item("separation", Level.WARNING, f"not examined: {wanted.unexamined}")
+    apart, usual_m = wanted.needs.apart, active().planning.separation_m
+    if wanted.mission is not None and apart is not None and apart.distance_m < usual_m:
+        text = f"its plan keeps its vehicles only {apart.distance_m:g} m apart; alarms come below {usual_m:g} m"
+        return Item("separation", Level.WARNING, text)
     return Item("separation", Level.OK, "keeps apart")
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from orthoswarm.model.errors import InputError
+from orthoswarm.model.plan import Apart
 
 
 def read_plan_folder(folder: Path, sortie: int) -> dict[int, tuple[Path, float]]:
@@ -59,10 +60,12 @@ class PlanNeeds:
         endurance_s: flight time of a full battery that it was made for; None if nobody said it.
         return_height_m: above takeoff, from which a straight way home passes over the ground and what stands on it;
             None for a plan that was made without a height model.
+        apart: how far apart it keeps its vehicles; None where it does not say that.
     """
 
     endurance_s: float | None = None
     return_height_m: float | None = None
+    apart: Apart | None = None
 
 
 NO_NEEDS: Final = PlanNeeds()
@@ -74,11 +77,13 @@ def plan_needs(folder: Path) -> PlanNeeds:
     try:
         document = json.loads((folder / "plan.json").read_text(encoding="utf-8"))
         minutes, height_m = document.get("endurance_min"), (document.get("over_ground") or {}).get("return_height_m")
+        apart = [document.get("separation_m"), document.get("height_step_m")]
     except (OSError, ValueError, AttributeError):
         return PlanNeeds()
     return PlanNeeds(
         endurance_s=60.0 * minutes if isinstance(minutes, int | float) and minutes > 0 else None,
         return_height_m=float(height_m) if isinstance(height_m, int | float) else None,
+        apart=Apart(*map(float, apart)) if all(isinstance(m, int | float) and m > 0 for m in apart) else None,
     )
 
 

@@ -31,6 +31,7 @@ from gcs_plugin.mission.items import (
 from orthoswarm.config import active
 from orthoswarm.config.autopilot import AutopilotConfig
 from orthoswarm.model.earth import DEGREE_M
+from orthoswarm.model.plan import Apart
 
 if TYPE_CHECKING:
     from gcs_plugin.mission.items import Mission, MissionItem
@@ -225,17 +226,25 @@ class Airspace:
     _found: dict[tuple[int, int], "_Approaches"] = field(default_factory=dict, repr=False)
 
     @classmethod
-    def of(cls, missions: Mapping[int, "Mission"], levels_m: Mapping[int, float] | None = None) -> "Airspace":
+    def of(
+        cls,
+        missions: Mapping[int, "Mission"],
+        levels_m: Mapping[int, float] | None = None,
+        apart: Apart | None = None,
+    ) -> "Airspace":
         """Of missions by system id.
 
         Args:
             missions: the missions. levels_m: altitudes of the takeoffs above the sea, metres, where they are known.
+            apart: how far apart they are to be, None for the default of plans.
         """
         origin = next((home for mission in missions.values() if (home := home_of(mission))), (0.0, 0.0))
         levels = levels_m or {}
         tracks = {s: replace(track_of(mission, origin), level_m=levels.get(s)) for s, mission in missions.items()}
         slack_s = max((_autopilot_of(mission).schedule_slack_s for mission in missions.values()), default=0.0)
-        return cls(tracks, slack_s=slack_s)
+        if apart is None:
+            return cls(tracks, slack_s=slack_s)
+        return cls(tracks, distance_m=apart.distance_m, height_m=apart.height_m, slack_s=slack_s)
 
     def meeting(self, one: int, other: int, later_s: float) -> tuple[float, float] | None:
         """When (seconds after the first one's start) and how close two vehicles come if the other starts later.

@@ -67,6 +67,8 @@ def report(
         "end": plan.end,
         "endurance_min": endurance_min,
         "separation": plan.separation,
+        "separation_m": None if plan.apart is None else plan.apart.distance_m,
+        "height_step_m": None if plan.apart is None else plan.apart.height_m,
         "over_ground": None if plan.over_ground is None else _over_ground(plan.over_ground),
         "vehicles": [_vehicle(vehicle, _autopilot(vehicle, autopilots)) for vehicle in plan.vehicles],
         "gaps": [{"lat_deg": g.lat_deg, "lon_deg": g.lon_deg, "area_m2": g.area_m2} for g in plan.gaps],

@@ -6,7 +6,7 @@ become mission items of a dialect is the ground station's business.
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 End = Literal["rtl", "land", "hover"]
 
@@ -173,6 +173,13 @@ class Fence:
     radius_m: float | None = None
 
 
+class Apart(NamedTuple):
+    """How far apart vehicles are to be: so far horizontally, or so far in height, metres."""
+
+    distance_m: float
+    height_m: float
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
     """Missions for a swarm over one area, or along given lines.
@@ -194,6 +201,7 @@ class Plan:
         warnings: what the user should know.
         over_ground: how it lies over the height model, None without one.
         fences: geofences that vehicles are to hold while they fly it.
+        apart: how far apart vehicles are at any time, horizontally or in height; None where that is not known.
     """
 
     method: str
@@ -212,6 +220,7 @@ class Plan:
     warnings: tuple[str, ...]
     over_ground: OverGround | None = None
     fences: tuple[Fence, ...] = ()
+    apart: Apart | None = None
 
     @property
     def makespan_s(self) -> float:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from orthoswarm.config import active
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid, area_epsg
-from orthoswarm.model.plan import Gap, OverGround, Plan, Sortie, VehiclePlan, Waypoint
+from orthoswarm.model.plan import Apart, Gap, OverGround, Plan, Sortie, VehiclePlan, Waypoint
 from orthoswarm.planning.area.area import Area
 from orthoswarm.planning.area.shape_files import Ring
 from orthoswarm.planning.lines import planned_coverage
@@ -379,6 +379,7 @@ def _plan(
         separation=_separation_text(schedule, level_m, options.separation),
         warnings=tuple(warnings),
         over_ground=over.checked(schedule.slots),
+        apart=Apart(options.separation.distance_m, options.separation.height_m),
     )
 
 

@@ -16,6 +16,7 @@ from gcs_plugin.mission.track import STEP_S, Airspace, home_of, metres, track_of
 if TYPE_CHECKING:
     from gcs_plugin.fleet.vehicle_state import Vehicle
     from gcs_plugin.mission.items import Mission
+    from orthoswarm.model.plan import Apart
 
 _PLANNED_SHARE: Final = 0.95
 """Share of the distance that counts between missions of one plan, which was made with other samples."""
@@ -81,15 +82,18 @@ def others_of(vehicles: "Mapping[int, Vehicle]", waiting: Mapping[int, float]) -
     return found
 
 
-def separation_of(flights: Mapping[int, Flight], name: Callable[[int], str] = number_name) -> Separation:
+def separation_of(
+    flights: Mapping[int, Flight], name: Callable[[int], str] = number_name, apart: "Apart | None" = None
+) -> Separation:
     """Which vehicles come too near each other; takes a second or more for a large swarm.
 
     Args:
         flights: by system id. name: of a vehicle by its system id.
+        apart: how far apart the plan keeps its own vehicles, None for the default, which holds for all others.
     """
     known = {s: flight for s, flight in flights.items() if flight.mission is not None}
     found: dict[int, list[str]] = {}
-    for one, other, at, apart_m in _conflicts(tuple(sorted(known.items()))):
+    for one, other, at, apart_m in _conflicts(tuple(sorted(known.items())), apart):
         for mine, theirs in ((one, other), (other, one)):
             if flights[mine].examined:
                 found.setdefault(mine, []).append(f"{apart_m:.0f} m from {name(theirs)} after {max(0.0, at):.0f} s")
@@ -107,7 +111,9 @@ def separation_of(flights: Mapping[int, Flight], name: Callable[[int], str] = nu
 
 
 @lru_cache(maxsize=8)
-def _conflicts(flights: tuple[tuple[int, Flight], ...]) -> tuple[tuple[int, int, float, float], ...]:
+def _conflicts(
+    flights: tuple[tuple[int, Flight], ...], apart: "Apart | None"
+) -> tuple[tuple[int, int, float, float], ...]:
     """Both vehicles, the time and the distance; the same flights are asked about again and again before a start."""
     about = dict(flights)
     missions = {s: f.mission for s, f in flights if f.mission is not None}
@@ -115,8 +121,8 @@ def _conflicts(flights: tuple[tuple[int, Flight], ...]) -> tuple[tuple[int, int,
     starts = {s: flight.start_s for s, flight in flights}
     in_plan = {s for s, flight in flights if flight.planned}
     found = Airspace.of(missions, levels).conflicts(starts, but_among=in_plan)
-    # By what the plan's own autopilots are off schedule, as it was made.
-    plan = Airspace.of({s: mission for s, mission in missions.items() if s in in_plan}, levels)
+    # By what the plan's own autopilots are off schedule and as far apart as it was made for.
+    plan = Airspace.of({s: mission for s, mission in missions.items() if s in in_plan}, levels, apart)
     plan = replace(plan, distance_m=_PLANNED_SHARE * plan.distance_m, slack_s=plan.slack_s - STEP_S, _found={})
     found += plan.conflicts({s: start for s, start in starts.items() if s in in_plan})
     return tuple(row for row in found if about[row[0]].examined or about[row[1]].examined)

@@ -12,6 +12,7 @@ from gcs_plugin.fleet.preflight import ITEMS, Level, Wanted, preflight
 from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.mission.plan_folder import PlanNeeds, plan_needs
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
+from orthoswarm.model.plan import Apart
 
 AP, PX4 = Autopilot.ARDUPILOT, Autopilot.PX4
 BOTH = pytest.mark.parametrize("autopilot", [AP, PX4])
@@ -195,6 +196,13 @@ def test_a_plan_says_what_it_needs(tmp_path):
     assert plan_needs(tmp_path) == PlanNeeds(endurance_s=1080.0, return_height_m=52.0)
     (tmp_path / "plan.json").write_text(json.dumps({"endurance_min": None, "over_ground": None}))
     assert plan_needs(tmp_path) == PlanNeeds()
+    for report, apart in (
+        ({"separation_m": 4.0, "height_step_m": 5}, Apart(4.0, 5.0)),
+        ({"separation_m": None, "height_step_m": 5.0}, None),
+        ({"separation_m": -4.0, "height_step_m": 5.0}, None),
+    ):
+        (tmp_path / "plan.json").write_text(json.dumps(report))
+        assert plan_needs(tmp_path).apart == apart
     (tmp_path / "plan.json").write_text("[]")
     assert plan_needs(tmp_path) == PlanNeeds()
 

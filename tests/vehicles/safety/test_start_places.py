@@ -12,8 +12,10 @@ from gcs_plugin.fleet.separation.separation_check import flights_of, others_of, 
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.geofence import Zone
 from gcs_plugin.mission.items import FRAME_GLOBAL
+from gcs_plugin.mission.plan_folder import PlanNeeds
 from gcs_plugin.sim.simulated_swarm import make_swarm
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
+from orthoswarm.model.plan import Apart
 from tests.vehicles.test_fleet_cli import HOME as FOLDER_HOME
 from tests.vehicles.test_fleet_cli import folder  # noqa: F401
 from tests.vehicles.test_preflight import CHART, line
@@ -118,6 +120,27 @@ def test_what_was_not_examined_is_said(make_world):
 
 
 # -- endurance and fence ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("distance_m", "level"), [(4.0, Level.WARNING), (8.0, Level.RED), (None, Level.RED)])
+def test_vehicles_of_a_plan_are_to_keep_apart_as_it_was_made(make_world, distance_m, level):
+    homes = [(*CHART.to_degrees(0.0, east), 488.0) for east in (0.0, 80.0)]
+    world = make_world(*(SimVehicle(system=s, home=home) for s, home in zip((1, 2), homes, strict=True)))
+    world.wait(8.0)
+    loaded = {1: line(AP, 40, 80, north=40.0), 2: line(AP, 46, 80, home_east=80.0, north=40.0)}  # 6 m beside each other
+    needs = PlanNeeds(apart=None if distance_m is None else Apart(distance_m, 5.0))
+    vehicles = dict(world.fleet.vehicles)
+    found = [
+        item
+        for check in preflight_all(vehicles, loaded, {}, {}, world.clock.now, needs=needs)
+        for item in check.items
+        if item.name == "separation"
+    ]
+    assert [item.level for item in found] == [level] * 2, found
+    assert level is Level.RED or "only 4 m apart" in found[0].reason
+    # Who is not of the plan is kept as far away as ever.
+    stranger = preflight_all(vehicles, {1: loaded[1]}, {2: loaded[2]}, {}, world.clock.now, needs=needs)
+    assert any(item.name == "separation" and item.level is Level.RED for check in stranger for item in check.items)
 
 
 def test_the_endurance_of_the_plan_counts(open_links, folder):  # noqa: F811

@@ -299,7 +299,8 @@ def _ready(
         for item in check.items:
             if item.level is Level.WARNING and item.name not in _PASSING:
                 _say(args, f"warning: v{check.system} {item.name}: {item.reason}")
-    return Airspace.of({s: m for s in systems if (m := missions.get(s) or stored.get(s)) is not None})
+    flown = {s: m for s in systems if (m := missions.get(s) or stored.get(s)) is not None}
+    return Airspace.of(flown, apart=prepared.needs.apart)
 
 
 def _changes(before: Mapping[int, str], red: Mapping[int, str]) -> list[str]:
