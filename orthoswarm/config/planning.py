@@ -61,6 +61,12 @@ class PlanningConfig:
     tooth_spacings: float = 0.1
     """Outlines are simplified by so many line spacings before they are cut into cells: a ragged coast has a critical
     point at every tooth (chosen)."""
+    outline_corners: int = 2_000
+    """An area with more corners is given a coarser outline before lines are laid (chosen: outlines that are drawn or
+    simplified for a map have fewer, and 4,000 cost no second)."""
+    outline_spacings: float = 0.05
+    """That outline lies outside the drawn one by at most twice so many line spacings (chosen: a twentieth is finer than
+    vehicles and receivers place a line)."""
     edge_spacings: float = 0.1
     """Edges of an area whose directions are tried are those of its outline simplified by so many line spacings
     (chosen)."""

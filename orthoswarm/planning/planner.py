@@ -11,7 +11,7 @@ from orthoswarm.config import active
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid, area_epsg
 from orthoswarm.model.plan import Apart, Gap, OverGround, Plan, Sortie, VehiclePlan, Waypoint
-from orthoswarm.planning.area.area import Area
+from orthoswarm.planning.area.area import Area, coarser
 from orthoswarm.planning.area.shape_files import Ring
 from orthoswarm.planning.lines import planned_coverage
 from orthoswarm.planning.lines.candidates import METHODS, Method, candidates
@@ -136,7 +136,7 @@ def _best_work(
     area: Area, swarm: Swarm, foot: Footprint, *, method: Method, motion: Motion, router: Router, reach_m: float
 ) -> Work:
     """The fairest and shortest work among the method's candidates."""
-    field = Field(area.ground, router.obstacles)
+    field = Field(coarser(area, active().planning.outline_spacings * foot.spacing_m), router.obstacles)
     best: Work | None = None
     most = 0
     for candidate in candidates(

@@ -1,11 +1,14 @@
 import numpy as np
 import pytest
+import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from orthoswarm.model.errors import InputError
-from orthoswarm.planning.area.area import make_area
+from orthoswarm.planning.area.area import coarser, make_area
 from orthoswarm.planning.area.shape_files import Polygon, parse_geojson, parse_kml
+from orthoswarm.planning.lines.line_spacing import footprint
+from orthoswarm.planning.planner import plan_area
 from tests.kit.plan_checks import on_globe
 
 SQUARE = [[9.0, 47.0], [9.01, 47.0], [9.01, 47.01], [9.0, 47.01], [9.0, 47.0]]
@@ -154,3 +157,35 @@ def test_a_hole_outside_and_an_outline_that_crosses_itself_are_told_apart():
         make_area([on_globe([(0, 0), (600, 500), (600, 0), (0, 500)])])
     with pytest.raises(InputError, match="redraw its outline"):
         make_area([on_globe(square, [[(100, 100), (300, 300), (300, 100), (100, 300)]])])
+
+
+def ragged(count, seed=0):
+    """An area with a zone, whose outlines are ragged by half a metre: shell and hole in metres."""
+    rng = np.random.default_rng(seed)
+    angle = 2.0 * np.pi * np.arange(count) / count
+    radius = 300.0 + 60.0 * np.sin(3.0 * angle) + rng.normal(0.0, 0.5, count)
+    ring = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+    return ring, 0.25 * ring[:: max(1, count // 400)]
+
+
+def test_a_very_fine_outline_gets_coarser_but_never_smaller():
+    shell, hole = ragged(6000)
+    area = make_area([on_globe(shell, [hole])])
+    outline = coarser(area, 2.0)
+    assert shapely.get_num_coordinates(outline) < 0.2 * shapely.get_num_coordinates(area.ground)
+    assert shapely.difference(area.ground, outline).area < 1e-3
+    assert shapely.difference(outline, shapely.buffer(area.ground, 4.0)).area < 1e-3
+    assert shapely.intersection(outline, area.no_fly).area < 1e-3
+
+
+def test_the_outline_of_an_ordinary_area_stays_as_it_is():
+    shell, hole = ragged(1200)
+    area = make_area([on_globe(shell, [hole])])
+    assert coarser(area, 2.0) is area.ground
+
+
+def test_a_very_fine_outline_is_covered_as_it_was_drawn():
+    shell, hole = ragged(6000, seed=1)
+    area = make_area([on_globe(shell, [hole])])
+    plan = plan_area(area, 3, 60.0, footprint(60.0, np.radians(60.0)))
+    assert plan.covered_share >= 0.999 and plan.area_m2 == pytest.approx(area.size_m2)

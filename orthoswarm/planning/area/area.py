@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import shapely
 
+from orthoswarm.config import active
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid, area_epsg
 from orthoswarm.planning.area.shape_files import Polygon, Ring, refuse_many_corners
@@ -70,6 +71,21 @@ def make_area(polygons: Sequence[Polygon], no_fly: Iterable[Ring] = (), grid: Lo
         ground = ground.difference(forbidden)
         _refuse_inside(outlines, forbidden)
     return Area(grid, _polygons_only(ground), _polygons_only(forbidden))
+
+
+def coarser(area: Area, tolerance_m: float) -> Geometry:
+    """The ground with an outline no finer than lines need; no smaller than it is, and still without no-fly zones.
+
+    Args:
+        area: returned as it is where it has no more corners than usual. tolerance_m: the outline moves out by at most
+            twice as much.
+    """
+    if int(shapely.get_num_coordinates(area.ground)) <= active().planning.outline_corners:
+        return area.ground
+    grown = shapely.buffer(area.ground, tolerance_m, quad_segs=2)
+    # the grown outline lies at least cos(22.5 degrees) of the tolerance outside: it may come back by so much
+    outline = shapely.simplify(grown, 0.9 * tolerance_m)
+    return _polygons_only(outline.difference(area.no_fly))
 
 
 def _in_grid(shapes: Sequence[Polygon], grid: LocalGrid) -> list[Geometry]:
