@@ -79,7 +79,10 @@ def in_one_area(ingest: Ingest) -> Ingest:
         )
     lost = [_far_from_others(frames[i], away[i] / 1000) for i in np.nonzero(far)[0].tolist()]
     kept = [f for f, is_far in zip(frames, far.tolist(), strict=True) if not is_far]
-    return replace(ingest, frames=kept, rejected=[*ingest.rejected, *lost])
+    elsewhere = Counter(rejection.vehicle for rejection in lost)
+    named = ", ".join(f"{count} of {vehicle}" for vehicle, count in elsewhere.items())
+    text = f"pictures that lie about {km:,.0f} km from the others are left out, {named}: map each place by itself"
+    return replace(ingest, frames=kept, rejected=[*ingest.rejected, *lost], warnings=[*ingest.warnings, text])
 
 
 def recorded_cameras(frames: Sequence[Frame], grid: LocalGrid, fov_rad: float | None = None) -> Recorded:

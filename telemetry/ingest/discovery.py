@@ -157,10 +157,10 @@ def discover(inputs: Sequence[Path], exclude: Sequence[Path] = ()) -> Discovery:
 
 
 def _originals_first(folders: Iterable[Folder]) -> list[Path]:
-    """All pictures, likelier originals first: those of fuller folders, with tables or logs, and higher up."""
+    """All pictures, likelier originals first: those of fuller folders, with videos, tables or logs, and higher up."""
 
     def fullest(folder: Folder) -> tuple[Any, ...]:
-        beside = len(folder.tables) + len(folder.logs)
+        beside = sum(map(len, (folder.videos, folder.subtitles, folder.tables, folder.logs)))
         return -len(folder.pictures), -beside, len(folder.path.parts), natural_key(str(folder.path))
 
     return [

@@ -55,9 +55,16 @@ def load(inputs: Sequence[Path], *, progress: Progress | None = None, options: L
         InputError: an input does not exist or is of no known kind, or a SEI layout is wrong.
     """
     found = survey(inputs, progress=progress, options=options)
-    findings = [*found.findings, *(f for source in found.sources for f in source.findings)]
-    warnings = dict.fromkeys(str(finding) for finding in findings if not finding.note)
+    told = [str(finding) for finding in found.findings if not finding.note]
+    told += [_told(finding, source) for source in found.sources for finding in source.findings if not finding.note]
+    warnings = dict.fromkeys(told)
     return Ingest(found.frames(), found.rejected, list(warnings), found.unpositioned)
+
+
+def _told(finding: Finding, source: SourceInfo) -> str:
+    """A finding as a sentence that says what it is about, also where its source is not named above it."""
+    named = finding.vehicle or source.path.rsplit("/", 1)[-1] in finding.message
+    return str(finding) if named else f"{source.path}: {finding}"
 
 
 def survey(inputs: Sequence[Path], *, progress: Progress | None = None, options: LoadOptions | None = None) -> Survey:
@@ -101,8 +108,24 @@ def survey(inputs: Sequence[Path], *, progress: Progress | None = None, options:
                 )
             if folder.videos or folder.subtitles:
                 read_videos(folder, found, logs, options=options, progress=progress, result=result)
+    result.findings += _logs_apart(found, logs)
     _check_vehicles(result)
     return result
+
+
+def _logs_apart(found: Discovery, logs: Sequence[LogSource]) -> list[Finding]:
+    """A finding on the logs that apply to no picture, as there is none in their folder or below."""
+    places = [folder.path for folder in found.folders if folder.pictures or folder.videos]
+    apart = [log for log in logs if not any(place.is_relative_to(log.folder) for place in places)]
+    if not apart or not places:
+        return []
+    names = list(dict.fromkeys(log.source.path for log in apart))
+    more = f" and {len(names) - 3} more" if names[3:] else ""
+    text = (
+        f"no picture lies in the folder of {', '.join(names[:3])}{more} or below it, so that none gets poses from "
+        "there: put a log into the folder of its vehicle's pictures, or name it as an input of its own"
+    )
+    return [Finding("log-apart", text)]
 
 
 def _copy_findings(found: Discovery) -> list[Finding]:

@@ -33,7 +33,9 @@ def summarise(found: Survey, *, pictures: bool = True) -> dict[str, Any]:
     return {
         "root": str(found.root),
         "sources": sources,
-        "rejected": [{"image": r.image, "reason": r.text} for r in found.rejected],
+        "rejected": [
+            {"image": r.image, "reason": r.reason, **({"detail": r.detail} if r.detail else {})} for r in found.rejected
+        ],
         "findings": [_plain(f) for f in found.findings],
     }
 

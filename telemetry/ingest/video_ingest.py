@@ -138,6 +138,10 @@ def _look(vehicle: str, scanned: VideoScan, poses: Poses, source: SourceInfo) ->
     source.findings += poses.findings
     if not poses.has_positions:
         source.findings.append(Finding("no-position", f"{source.path}: {_without_position(source.findings)}"))
+    lost = sum((pose := poses.of(i)) is None or not pose.sample.has_position for i in range(len(scanned.pictures)))
+    if poses.has_positions and lost:
+        text = f"{lost} pictures of {len(scanned.pictures)} in {source.path} have no position and are not mapped"
+        source.findings.append(Finding("pictures-without-position", text))
     order = sorted(range(len(scanned.pictures)), key=lambda i: (scanned.pictures[i].video_s or 0.0, i))
     for index in order:
         pose = poses.of(index)

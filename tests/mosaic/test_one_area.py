@@ -24,6 +24,8 @@ def line(count: int, lat: float, lon: float) -> list[tuple[float, float]]:
 def test_the_smaller_group_is_left_out_and_told():
     found = in_one_area(ingest(*line(13, 47.4, 8.5), *line(12, 47.4, -8.5)))
     assert [f.image for f in found.frames] == [f"{k}.jpg" for k in range(13)]
+    (warning,) = found.warnings
+    assert "12 of a" in warning and "map each place by itself" in warning
     assert len(found.rejected) == 12 and "km from the others" in found.rejected[0].detail
 
 

@@ -195,3 +195,21 @@ def test_looking_at_a_video_takes_no_pictures(tmp_path):
     assert not cache.exists()
     assert document["sources"][0]["counts"]["sei"] == 8
     assert document["sources"][0]["vehicles"][0]["frames"] == 8
+
+
+def test_what_a_card_loses_is_named(tmp_path, real_data, capsys):
+    """A log in a folder of its own, and photos without a place in two folders: one line a reason."""
+    card = tmp_path / "card"
+    flight(card / "DCIM", [0.0])
+    for i in range(5):
+        jpeg(card / "DCIM" / f"X_{i}.JPG", exif_bytes=gps_exif(0.0, 0.0, local="1980:01:06 00:00:00", subsec="0"))
+    (card / "logs").mkdir()
+    (card / "logs" / "a.tlog").write_bytes((real_data("sitl_logs") / "swarm_v1.tlog").read_bytes())
+    found = load([card])
+    (apart,) = [warning for warning in found.warnings if "logs/a.tlog" in warning and "no picture" in warning]
+    assert "as an input of its own" in apart
+    assert not [w for w in load([card / "DCIM", card / "logs"]).warnings if "as an input of its own" in w]
+    assert main(["inspect", str(card)]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "DCIM/X_0.JPG, DCIM/X_1.JPG, DCIM/X_2.JPG and 2 more" in said
+    assert said.count("the picture has no position") == 1

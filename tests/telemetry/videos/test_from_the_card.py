@@ -170,3 +170,12 @@ def test_a_video_whose_camera_lost_power_says_what_is_missing(card, tmp_path, ma
     (rejection,) = mapped(card).rejected
     assert "index" in rejection.reason
     assert "card again" in rejection.reason
+
+
+def test_warnings_say_which_video_they_are_about(card, mapped):
+    write_video(card / "a.mp4", count=60)
+    write_srt(card / "a.srt", seconds=2)
+    warnings = mapped(card).warnings
+    (yaw,) = [warning for warning in warnings if "hold no yaw" in warning]
+    assert yaw.startswith("a.mp4: ")
+    assert any("pictures of 60 in a.mp4 have no position" in warning for warning in warnings)

@@ -10,6 +10,9 @@ from orthoswarm.stores.addresses import path_of
 if TYPE_CHECKING:
     from telemetry.ingest.ingest import Survey
 
+_NAMED = 3
+"""Pictures that are named for each reason why some cannot be used."""
+
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
@@ -68,7 +71,7 @@ def _tell(document: dict[str, Any]) -> None:
         console.print(f"\n[bold]{escape(one_line(source))}[/bold]")
         if source["vehicles"]:
             table = Table(
-                "vehicle",
+                Column("vehicle", overflow="fold"),
                 "pictures",
                 "legs",
                 "length",
@@ -92,10 +95,13 @@ def _tell(document: dict[str, Any]) -> None:
             console.print(f"  {mark} [bold]{finding['code']}[/bold] {escape(finding['message'])}")
     if document["rejected"]:
         console.print(f"\n[bold]{len(document['rejected'])} cannot be used[/bold]")
-        for rejection in document["rejected"][:20]:
-            console.print(f"  [red]x[/red] {escape(rejection['image'])}: {escape(rejection['reason'])}")
-        if len(document["rejected"]) > 20:
-            console.print(f"  and {len(document['rejected']) - 20} more (--json lists all)")
+        named: dict[str, list[str]] = {}
+        for rejection in document["rejected"]:
+            detail = f" ({rejection['detail']})" if "detail" in rejection else ""
+            named.setdefault(rejection["reason"], []).append(f"{rejection['image']}{detail}")
+        for reason, images in named.items():
+            rest = f" and {len(images) - _NAMED} more (--json lists all)" if len(images) > _NAMED else ""
+            console.print(f"  [red]x[/red] {escape(', '.join(images[:_NAMED]))}{rest}: {escape(reason)}")
     for finding in document["findings"]:
         console.print(f"[yellow]![/yellow] {escape(finding['message'])}")
 
