@@ -39,6 +39,16 @@ def planned(browser, **shared):
             yield station, page
 
 
+def test_a_plan_that_was_made_is_in_view(browser):
+    with planned(browser) as (_, page):
+        page.evaluate("document.querySelector('#panel-plan').scrollTop = 0")
+        page.wait_for_function("document.querySelector('.plan-result').getBoundingClientRect().bottom > innerHeight")
+        page.locator("#panel-plan form").evaluate("(form) => form.requestSubmit()")
+        box = "document.querySelector('.plan-result .primary').getBoundingClientRect()"
+        bar = "document.querySelector('.command-bar').getBoundingClientRect()"
+        page.wait_for_function(f"{box}.bottom <= {bar}.top + 1")
+
+
 def is_right(page):
     page.wait_for_function(f"document.querySelector('{WRONG}').textContent === ''")
 

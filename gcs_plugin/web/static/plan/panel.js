@@ -14,7 +14,7 @@ import * as editor from "/static/plan/editor.js";
 import { fillFields, followsTerrain, inFieldNames, planFields, planValues, rawValues, relabelFields, setDem } from "/static/plan/fields.js";
 import { acceptDrops, KINDS, readArea } from "/static/plan/import.js";
 import { madeNow, nowMade, setMade } from "/static/plan/outdated.js";
-import { hidePlan, planResult, redraw, showPlan } from "/static/plan/result.js";
+import { hidePlan, lookAtPlan, planResult, redraw, showPlan } from "/static/plan/result.js";
 import { keptArea, loadShared, mayLoad, saveShared, whenChangedElsewhere } from "/static/plan/shared.js";
 import { boundsOf, fit } from "/static/map/map.js";
 
@@ -98,6 +98,7 @@ export function planPanel() {
       names = Object.fromEntries(made.vehicles.map((row, k) => [row.id, heard.length >= made.vehicles.length ? heard[k].id : ""]));
       save();
       await showPlan(made, names, onNames);
+      lookAtPlan();
     } catch (error) {
       notice("bad", t("plan.failed", { why: inFieldNames(error.message) }));
     } finally {

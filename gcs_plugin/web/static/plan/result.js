@@ -104,6 +104,9 @@ export async function showPlan(made, assignment, onNames) {
   paint();
 }
 
+// To whoever has just made it: the form is longer than the panel.
+export const lookAtPlan = () => box.scrollIntoView({ block: "nearest" });
+
 // The station has no plan now.
 export function hidePlan() {
   plan = null;
