@@ -71,6 +71,17 @@ SIGNS = """[...new Set(orthoswarm.map.queryRenderedFeatures({ layers: ["legs-sig
   .sort().join()"""
 
 
+def test_a_vehicle_has_one_colour_on_all_pages(browser):
+    """GIVEN pages that hear of vehicles in other orders THEN their tiles have the same colours, all different."""
+    seen = []
+    for order in ((1, 2, 3), (3, 1, 2)):
+        with standing(*(vehicle(k) for k in order)) as station, opened(browser, station.url) as page:
+            page.wait_for_selector(".tile >> nth=2")
+            read = "[...document.querySelectorAll('.tiles li')].map((e) => [e.dataset.id, e.firstChild.style.cssText])"
+            seen.append(sorted(page.evaluate(read)))
+    assert seen[0] == seen[1] and len({colour for _, colour in seen[0]}) == 3
+
+
 def leg(number, state):
     line = [[8.5446 + 0.0008 * number, 47.3970], [8.5446 + 0.0008 * number, 47.3984]]
     about = {"vehicle": "v1", "sortie": 1, "leg": number, "stage": "fine", "state": state, "sigma_m": 0.5}
