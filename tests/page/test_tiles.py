@@ -299,6 +299,18 @@ def test_the_geofence_that_a_vehicle_holds_is_drawn_and_its_source_is_said(brows
         page.wait_for_function(f"() => JSON.stringify({drawn}) === '[true,false]'")
 
 
+@pytest.mark.parametrize("size", [DESK, TABLET, PHONE], ids=["desk", "tablet", "phone"])
+def test_what_a_tile_says_of_danger_covers_none_of_its_figures(browser, size):
+    row = vehicle(1, battery=0.1, battery_left_s=95, gps_fix=2, satellites=14, photos=120, frames={"frames": 118})
+    with standing(row) as station, opened(browser, station.url, size) as page:
+        why = page.locator(".tile .why:has-text('land now')").bounding_box()
+        for cell in page.locator(".tile .cell").all():
+            box = cell.bounding_box()
+            assert box["y"] + box["height"] <= why["y"] + 1, cell.inner_text()
+        cells = "[...document.querySelectorAll('.tile .cell')].filter((e) => e.scrollWidth > e.clientWidth)"
+        assert page.evaluate(f"{cells}.map((e) => e.innerText)") == []  # nothing is cut off
+
+
 def test_one_vehicle_is_no_vehicles_and_no_height_is_minus_zero(browser):
     with standing(vehicle(1, height_m=-0.02)) as station, opened(browser, station.url) as page:
         page.wait_for_selector("text=1 vehicle, 1 in the air")
