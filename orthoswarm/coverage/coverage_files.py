@@ -17,12 +17,12 @@ from orthoswarm.model.geo import GroundGrid, LocalGrid
 COLOURS = {
     State.OUTSIDE: (0, 0, 0, 0),
     State.PLANNED: (120, 150, 190, 90),
-    State.SEEN: (60, 160, 80, 110),
-    State.POOR: (245, 180, 40, 170),
-    State.MISSED: (215, 45, 45, 190),
+    State.SEEN: (0, 158, 115, 110),
+    State.POOR: (240, 228, 66, 170),
+    State.MISSED: (213, 94, 0, 190),
     State.EXCLUDED: (90, 90, 90, 150),
 }
-"""Red, green, blue, alpha of each state."""
+"""Red, green, blue, alpha of each state; those of ground that was flown over are Okabe and Ito's."""
 
 
 def write_cells(path: Path, cover: CoverageGrid) -> None:

@@ -2,6 +2,8 @@
 
 import pytest
 
+from orthoswarm.coverage.coverage_files import COLOURS as COLOURS_OF_CELLS
+from orthoswarm.coverage.coverage_grid import State
 from tests.kit.looks.colour_vision import least_difference, rgb_of
 from tests.kit.page_kit import DESK, PHONE, TABLET, ok_for_all, opened, standing, vehicle
 
@@ -69,6 +71,18 @@ COLOURS = """import('/static/map/colours.js').then((m) => [
   [...Array(10).keys()].map((k) => m.colourOf(`other ${k}`)), Object.values(m.LEGS).map((leg) => leg.colour)])"""
 SIGNS = """[...new Set(orthoswarm.map.queryRenderedFeatures({ layers: ["legs-signs"] }).map((f) => f.properties.state))]
   .sort().join()"""
+
+
+def test_cells_of_the_coverage_are_told_apart_and_are_those_of_its_legend(browser):
+    cells = [COLOURS_OF_CELLS[state][:3] for state in (State.SEEN, State.POOR, State.MISSED)]
+    assert least_difference(cells) > 30  # it was 19
+    read = """['seen', 'poor', 'missed'].map((state) => {
+      const swatch = document.body.appendChild(document.createElement('i'));
+      swatch.className = 'swatch';
+      swatch.dataset.state = state;
+      return getComputedStyle(swatch).backgroundColor; })"""
+    with standing() as station, opened(browser, station.url) as page:
+        assert page.evaluate(read) == [f"rgb{cell}" for cell in cells]
 
 
 def test_a_vehicle_has_one_colour_on_all_pages(browser):
