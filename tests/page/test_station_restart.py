@@ -7,6 +7,7 @@ import pytest
 from tests.kit.page_kit import TABLET, ok_for_all, opened, poll, send, standing, vehicle
 
 GROUND = {"armed": False, "flight": {"state": "on ground", "text": "on ground", "item": 0, "items": 0}}
+NEAR = "4.0 m from v9"
 JOB = {"id": 7, "kind": "refine", "vehicle": "v2", "sortie": 1, "state": "running", "progress": 0.5, "message": ""}
 PART = {"id": "v1", "length_m": 9, "time_s": 9, "photos": 1, "sorties": 1, "flights": []}
 PLAN = {"id": "p1", "vehicles": [PART], "covered_share": 1, "makespan_s": 9, "warnings": [], "spacing_m": 9}
@@ -17,11 +18,12 @@ SHARED = {"area": {"type": "Polygon", "coordinates": [OUTLINE]}, "settings": {},
 @contextlib.contextmanager
 def restarted(browser, *rows, **gets):
     """A page with vehicles 1 (in the air) and 2 and 3 (on the ground) after its station came back with other rows."""
-    with standing(vehicle(1), vehicle(2, **GROUND), vehicle(3, **GROUND)) as station:
+    with standing(vehicle(1, alarm=NEAR), vehicle(2, **GROUND), vehicle(3, **GROUND)) as station:
         station.gets |= {"/api/jobs": [JOB], "/api/plan": SHARED | {"version": 4}, "/api/plans": [PLAN]}
         station.gets["/api/plans/p1/map"] = {"features": []}
         with opened(browser, station.url, TABLET) as page:
             page.wait_for_selector(".tile >> nth=2")
+            page.wait_for_selector(f".alarms:has-text('{NEAR}')")
             page.wait_for_selector(".jobs li", state="attached")
             page.wait_for_selector(".plan-result .assignments li", state="attached")
             empty = {"area": None, "settings": {}, "plan": None, "vehicles": {}, "version": 0}
@@ -50,6 +52,7 @@ def test_one_in_the_air_stays_as_lost_until_it_is_heard_again(browser, sent):
         page.wait_for_selector(f"{tile} .why:has-text('not heard since the ground station was started again')")
         page.wait_for_selector(f"{tile} .tile[data-level=bad]")
         page.wait_for_selector(".alarms:has-text('v1: not heard since the ground station was started again')")
+        assert page.locator(f".alarms:has-text('{NEAR}')").count() == 0
         ok_for_all(station)
         page.click(".command[data-verb=rtl]")
         page.wait_for_selector(".confirm:has-text('Return 1 vehicle')")

@@ -42,7 +42,7 @@ function takeVehicles(rows, asked) {
   const unheard = (id) => state.vehicles.has(id) && kept(state.vehicles.get(id));
   const former = rows.filter((row) => row?.system == null && unheard(String(row?.id))).map((row) => String(row.id));
   for (const id of [...others(state.vehicles, rows, "/api/vehicles"), ...former]) {
-    if (unheard(id)) state.vehicles.set(id, { ...state.vehicles.get(id), former: true });
+    if (unheard(id)) state.vehicles.set(id, { ...state.vehicles.get(id), former: true, alarm: null, behind: "" }); // what it was warned of then may be over
     else { state.vehicles.delete(id); state.outlines.delete(id); changed("outlines"); }
   }
   rows.filter((row) => !former.includes(String(row?.id))).forEach((row) => takeVehicle(row, true, asked));
