@@ -28,6 +28,9 @@ MOST_PIXELS: Final = 200_000_000
 take 0.6 GB in colour. A file of some hundred kilobytes can hold a picture that takes many gigabytes."""
 
 
+_PNG: Final = b"\x89PNG\r\n\x1a\n"
+
+
 class PictureError(OrthoSwarmError):
     """A picture cannot be decoded.
 
@@ -226,6 +229,8 @@ def deep_picture(data: bytes) -> NDArray[np.uint16] | None:
     """The colours of a picture of 16 bits, uint16 (rows, columns, 3); None for any other file."""
     import cv2
 
+    if data[:8] == _PNG and data[24:25] != b"\x10":  # its header says so at once
+        return None
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
     return np.asarray(image, np.uint16) if image is not None and image.dtype == np.uint16 else None
