@@ -4,7 +4,7 @@ import contextlib
 
 import pytest
 
-from tests.kit.page_kit import TABLET, opened, saved, standing, vehicle
+from tests.kit.page_kit import TABLET, opened, poll, saved, standing, vehicle
 
 CORNERS = [[8.544, 47.397], [8.547, 47.397], [8.547, 47.399], [8.544, 47.399]]
 AREA = "(c) => import('/static/plan/area.js').then((m) => m.change((rings) => rings.push(c)))"
@@ -47,6 +47,21 @@ def test_a_plan_that_was_made_is_in_view(browser):
         box = "document.querySelector('.plan-result .primary').getBoundingClientRect()"
         bar = "document.querySelector('.command-bar').getBoundingClientRect()"
         page.wait_for_function(f"{box}.bottom <= {bar}.top + 1")
+
+
+def test_a_plan_may_take_minutes(browser):
+    with planned(browser) as (_, page):
+        held = []
+        page.route("**/api/plans", lambda route: held.append(route))
+        page.clock.install()
+        page.fill("[name=altitude_m]", "90")
+        page.click("text=Make plan")
+        poll(page, lambda: held)
+        page.clock.fast_forward("05:00")
+        page.wait_for_selector("button:text-is('Planning…')")
+        assert page.locator(".notice:has-text('No plan was made')").count() == 0
+        held[0].fulfill(json=PLAN, status=201)
+        is_right(page)
 
 
 def is_right(page):

@@ -18,6 +18,7 @@ import { hidePlan, lookAtPlan, planResult, redraw, showPlan } from "/static/plan
 import { keptArea, loadShared, mayLoad, saveShared, whenChangedElsewhere } from "/static/plan/shared.js";
 import { boundsOf, fit } from "/static/map/map.js";
 
+const PLANNING_MS = 600_000; // a large area for many vehicles, or the first plan of an installation, which compiles
 let made = null;
 let names = {};
 function save() { saveShared(() => ({ area: area.area.rings.length ? area.polygon() : null, settings: { ...rawValues(), ...madeNow() }, plan: made?.id ?? null, vehicles: names })); }
@@ -93,7 +94,7 @@ export function planPanel() {
       const flies = heard.slice(0, body.vehicles).some(inAir); // it takes off elsewhere; the daemon warns
       if ((heard.length >= body.vehicles && !flies) || followsTerrain()) body.starts = heard.slice(0, body.vehicles).map((row) => [row.position[1], row.position[0]]);
       const now = nowMade();
-      made = await post("/api/plans", body);
+      made = await post("/api/plans", body, PLANNING_MS);
       setMade(now);
       names = Object.fromEntries(made.vehicles.map((row, k) => [row.id, heard.length >= made.vehicles.length ? heard[k].id : ""]));
       save();
