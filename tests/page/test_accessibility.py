@@ -96,6 +96,16 @@ def test_a_vehicle_has_one_colour_on_all_pages(browser):
     assert seen[0] == seen[1] and len({colour for _, colour in seen[0]}) == 3
 
 
+def test_a_vehicle_in_danger_has_a_sign_on_the_map(browser):
+    rows = (vehicle(1, battery=0.05), vehicle(2, battery=0.2), vehicle(3))
+    with standing(*rows) as station, opened(browser, station.url) as page:
+        page.wait_for_selector("button.vehicle >> nth=2")
+        page.wait_for_selector("button.vehicle[data-level=bad]")
+        signs = """[...document.querySelectorAll('button.vehicle')].map((e) =>
+          [e.dataset.level, getComputedStyle(e.querySelector('span'), '::before').content])"""
+        assert sorted(page.evaluate(signs)) == [["bad", '"‼ "'], ["ok", "none"], ["warn", '"! "']]
+
+
 def leg(number, state):
     line = [[8.5446 + 0.0008 * number, 47.3970], [8.5446 + 0.0008 * number, 47.3984]]
     about = {"vehicle": "v1", "sortie": 1, "leg": number, "stage": "fine", "state": state, "sigma_m": 0.5}

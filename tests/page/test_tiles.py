@@ -202,7 +202,7 @@ def test_the_details_show_home_and_what_the_autopilot_said_newest_first(browser)
     said = [{"text": "PreArm: GPS not healthy", "severity": 2, "time": 1_780_000_000.0}]
     with standing(vehicle(1, home=[47.398, 8.5456], texts=said)) as station, opened(browser, station.url) as page:
         page.click(".tile")
-        page.wait_for_selector(".messages li[data-severity='2']")
+        page.wait_for_selector(".messages li[data-severity='2']:has-text('CRITICAL PreArm')")  # not its colour alone
         event = {"type": "vehicle_event", "vehicle": "v1", "kind": "text", "text": "vehicle 1 says: Mission: 3 WP",
                  "said": "Mission: 3 WP", "severity": 6, "time": 1_780_000_001.0}  # fmt: skip
         send(page, event)
@@ -217,10 +217,10 @@ def test_the_details_show_home_and_what_the_autopilot_said_newest_first(browser)
 @pytest.mark.parametrize(
     ("zone", "read", "said"),
     [
-        ("UTC", "2026-05-28 20:26 UTC", "2026-05-28 20:27:01 UTC PreArm: no fix"),
-        ("Europe/Zurich", "2026-05-28 22:26 UTC+2", "2026-05-28 22:27:01 UTC+2 PreArm: no fix"),
-        ("Asia/Kathmandu", "2026-05-29 02:11 UTC+5:45", "2026-05-29 02:12:01 UTC+5:45 PreArm: no fix"),
-        ("America/St_Johns", "2026-05-28 17:56 UTC-2:30", "2026-05-28 17:57:01 UTC-2:30 PreArm: no fix"),
+        ("UTC", "2026-05-28 20:26 UTC", "2026-05-28 20:27:01 UTC WARNING PreArm: no fix"),
+        ("Europe/Zurich", "2026-05-28 22:26 UTC+2", "2026-05-28 22:27:01 UTC+2 WARNING PreArm: no fix"),
+        ("Asia/Kathmandu", "2026-05-29 02:11 UTC+5:45", "2026-05-29 02:12:01 UTC+5:45 WARNING PreArm: no fix"),
+        ("America/St_Johns", "2026-05-28 17:56 UTC-2:30", "2026-05-28 17:57:01 UTC-2:30 WARNING PreArm: no fix"),
     ],
 )
 def test_a_time_says_its_zone(browser, zone, read, said):

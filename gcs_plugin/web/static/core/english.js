@@ -42,6 +42,7 @@ export const english = {
   "details.counts": "{taken} taken, {frames} arrived, {fine} refined, {rejected} rejected", "details.refined_s": "{s} s after the mission ended",
   "alarm.title": "Alarms", "alarm.seen": "Seen", "alarm.count": "{n} {n|alarm|alarms}", "alarm.more": "and {n} more", "alarm.said": "its autopilot says: {text}", "alarm.rebooted": "has restarted in the air", "alarm.aborted": "has ended its mission without completing it",
   "aircraft.near": "{name}: aircraft {aircraft} is {metres} away and {height}", "aircraft.above": "{height} above it", "aircraft.below": "{height} below it", "aircraft.unknown": "at a height that is not known",
+  "severity.0": "EMERGENCY", "severity.1": "ALERT", "severity.2": "CRITICAL", "severity.3": "ERROR", "severity.4": "WARNING",
   "alarm.bad": "DANGER", "alarm.warn": "WATCH",
 
   "preflight.title": "Before the start of {n} {n|vehicle|vehicles}", "preflight.about": "Vehicles arm and take off at these times after the start. A red item prevents the start; each can be allowed separately.",

@@ -18,6 +18,8 @@ import { refine } from "/static/work/jobs.js";
 const OF_A_LINK = ["speed", "battery", "gps", "home", "fence", "mission"];
 const FACTS = ["state", "position", "height", "speed", "battery", "gps", "link", "faults", "home", "fence", "mission", "pictures", "refined"];
 
+const WARNING = 4; // MAV_SEVERITY: graver ones are lower
+
 export function detailsPanel() {
   const name = make("h2", {});
   const why = make("p", { class: "why" });
@@ -29,7 +31,11 @@ export function detailsPanel() {
   const linked = make("div", { class: "verbs", role: "group", "aria-label": t("details.commands") }, ...["pause", "resume", "rtl", "land", "start"].map(verb));
   const start = linked.lastChild;
   const messages = make("ul", { class: "messages", "aria-label": t("details.messages"), tabindex: "0" });
-  const draw = keyedList(messages, () => make("li", {}), (row, message) => { setText(row, message.time == null ? message.text : `${timeOfDay(message.time * 1000, { seconds: true })} ${message.text}`); setAttribute(row, "data-severity", message.severity); });
+  const draw = keyedList(messages, () => make("li", {}), (row, message) => {
+    const when = message.time == null ? "" : timeOfDay(message.time * 1000, { seconds: true });
+    setText(row, [when, message.severity <= WARNING ? t(`severity.${message.severity}`) : "", message.text].filter(Boolean).join(" "));
+    setAttribute(row, "data-severity", message.severity);
+  });
   const silent = make("p", { class: "quiet" }, t("details.silent"));
   const heading = make("h3", {}, t("details.messages"));
   const box = make("aside", { class: "details", "aria-label": t("details.title"), hidden: true },
