@@ -65,7 +65,7 @@ def best_log(matches: Sequence[LogMatch], what: str, is_named: Callable[[FlightL
     """
     best = min(matches, key=lambda match: (match.rank, match.misfit))
     rivals = [m for m in matches if m.rank == best.rank and m.misfit <= best.misfit + best.margin]
-    rivals = [m for m in rivals if m is best or not _same_flight(m.entry, best.entry)]
+    rivals = [m for m in rivals if m is best or not same_flight(m.entry, best.entry)]
     if len(rivals) < 2:
         return best
     named = [m for m in rivals if is_named(m.entry.log)]
@@ -78,7 +78,7 @@ def best_log(matches: Sequence[LogMatch], what: str, is_named: Callable[[FlightL
     return Finding("log-ambiguous", text)
 
 
-def _same_flight(a: LogSource, b: LogSource) -> bool:
+def same_flight(a: LogSource, b: LogSource) -> bool:
     """Whether two logs, of autopilot and ground station perhaps, record one vehicle's flight."""
     distance = apart_m(a.log, b.log)
     distance = _exposures_apart_m(a.log, b.log) if distance is None else distance

@@ -16,10 +16,11 @@ from telemetry.formats.log.flight_logs import FlightLog, read_log
 from telemetry.formats.log.mavlink_poses import CameraEvent, fixed_camera
 from telemetry.ingest.can_positions import apart_m, bettered
 from telemetry.ingest.discovery import Discovery
-from telemetry.ingest.log_choice import LogMatch, LogSource
+from telemetry.ingest.log_choice import LogMatch, LogSource, same_flight
 from telemetry.ingest.pairing.event_pairing import Pairing, pair
 from telemetry.ingest.pairing.motion_chains import PictureMotion
 from telemetry.ingest.pairing.picture_evidence import picture_motion
+from telemetry.ingest.several_flights import logs_of_one_clock, nearest_span
 from telemetry.ingest.survey import SourceInfo, Survey
 from telemetry.ingest.track_poses import add_track, best_log_of, explain, fill
 from telemetry.photos.flight_checks import number_of
@@ -175,12 +176,46 @@ def add_logs(
     if not matches:
         add_track(photos, near, vehicle, findings)
         return
+    times = np.array([math.nan if photo.time_s is None else photo.time_s for photo in photos])
+    entries = {id(match.entry): match.entry for match in matches}
+    flights = logs_of_one_clock(pairings, times, lambda a, b: same_flight(entries[a], entries[b]))
+    if len(flights) > 1:
+        offsets = [pairings[key].offset_s or 0.0 for key in flights]
+        spans = [_event_span(entries[key].log, offset) for key, offset in zip(flights, offsets, strict=True)]
+        part_of = nearest_span(times, spans)
+        findings.append(_several_flights([entries[key] for key in flights], offsets[0], vehicle))
+        for number, key in enumerate(flights):
+            part = [photo for photo, own in zip(photos, part_of.tolist(), strict=True) if own == number]
+            _use_log(part, entries[key], _pair(part, entries[key].log.events), vehicle, findings, workers=workers)
+        return
     best = best_log_of(matches, vehicle)
     if isinstance(best, Finding):
         findings.append(best)
         explain(photos, best.message)
         return
-    entry, pairing = best.entry, pairings[id(best.entry)]
+    _use_log(photos, best.entry, pairings[id(best.entry)], vehicle, findings, workers=workers)
+
+
+def _event_span(log: FlightLog, offset_s: float) -> tuple[float, float]:
+    """First and last exposure of a log by the camera's clock."""
+    moments = [event.time_s for event in log.events if event.time_s is not None]
+    return min(moments) + offset_s, max(moments) + offset_s
+
+
+def _several_flights(entries: Sequence[LogSource], offset_s: float, vehicle: str) -> Finding:
+    names = ", ".join(entry.log.path.name for entry in entries)
+    text = (
+        f"the photos are of {len(entries)} flights: {names} find one camera clock for different photos "
+        f"({offset_s:+.1f} s off); each photo is paired with the log of its time"
+    )
+    return Finding("several-flights", text, vehicle)
+
+
+def _use_log(
+    photos: Sequence[PhotoTags], entry: LogSource, pairing: Pairing, vehicle: str, findings: list[Finding], *,
+    workers: int,
+) -> None:  # fmt: skip
+    """Assign photos the poses of a log's events; pictures are read where the times do not decide."""
     if pairing.doubtful and not pairing.jumps:
         motion = picture_motion(photos, entry.log, entry.timeline, workers)
         pairing = _pair(photos, entry.log.events, motion) if motion is not None else pairing

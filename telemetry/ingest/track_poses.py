@@ -12,6 +12,7 @@ from telemetry.formats.log.mavlink_poses import fixed_camera
 from telemetry.ingest.log_choice import LogMatch, LogSource, best_log
 from telemetry.ingest.pairing.clock_offset import median_distance_m, offset_by_positions, offset_by_zone
 from telemetry.ingest.photo_order import clock_went_back
+from telemetry.ingest.several_flights import nearest_span, zone_of_all
 from telemetry.photos.flight_checks import number_of
 from telemetry.photos.photo_tags import PhotoTags
 from telemetry.samples.findings import Finding, plural
@@ -67,6 +68,8 @@ def add_track(photos: Sequence[PhotoTags], near: Sequence[LogSource], vehicle: s
             explain(timed, text)
             return
         matches = _by_positions(placed, near) if by_positions else _by_zone(timed, near)
+        if not matches and not by_positions and _add_tracks(timed, near, vehicle, findings):
+            return
         if not matches:
             explain(timed, _NO_LOG_FITS)
             for part in _at_longest_pause(timed) if by_positions else ():
@@ -97,6 +100,31 @@ def add_track(photos: Sequence[PhotoTags], near: Sequence[LogSource], vehicle: s
         for photo in far if count and not timed else ():  # their positions are wrong, their clock is that of the others
             photo.time_s = (photo.time_s or 0.0) - best.offset_s
             photo.origin["time"] = f"track of {best.entry.name}"
+
+
+def _add_tracks(photos: Sequence[PhotoTags], near: Sequence[LogSource], vehicle: str, findings: list[Finding]) -> bool:
+    """Fill photos of several flights from the tracks of their logs; False if their times do not tell which is which."""
+    logs = [entry for entry in near if any(sample.has_position for sample in entry.log.samples)]
+    times = np.array([p.time_s for p in photos], dtype=np.float64)
+    known = all(ZONE_UNKNOWN not in p.origin.get("time", "") for p in photos)
+    zone = zone_of_all(times, [entry.timeline for entry in logs], zone_known=known)
+    if zone is None:
+        return False
+    own = nearest_span(times - zone, [span for entry in logs if (span := entry.timeline.span) is not None])
+    used, count = list[str](), 0
+    for number, entry in enumerate(logs):
+        part = [photo for photo, of in zip(photos, own.tolist(), strict=True) if of == number]
+        if part:
+            match = LogMatch(entry=entry, offset_s=zone, how="by the time of the flight", rank=0, misfit=0.0)
+            count += _fill_from(match, part)[0]
+            entry.used = True
+            used.append(entry.log.path.name)
+    text = (
+        f"{plural(count, 'photo')} of {len(used)} flights got poses from the tracks of {', '.join(used)} by time: in "
+        f"one time zone only ({zone / 3600.0:+g} h) each photo lies in the flight of a log; check their places"
+    )
+    findings.append(Finding("posed-by-time", text, vehicle))
+    return True
 
 
 def _at_longest_pause(photos: Sequence[PhotoTags]) -> list[Sequence[PhotoTags]]:

@@ -18,7 +18,8 @@ _QUARTER_S = 900.0
 _HALF_HOURS = (-9.5, -3.5, -2.5, 3.5, 4.5, 5.5, 5.75, 6.5, 8.75, 9.5, 10.5, 12.75, 13.75)
 ZONES_S = tuple(3600.0 * hours for hours in sorted([*range(-12, 15), *_HALF_HOURS]))
 """Offsets of local times from UTC that are in use, seconds (IANA time zone database)."""
-_SPAN_MARGIN_S = 2.0
+SPAN_MARGIN_S = 2.0
+"""Photos may lie so far outside a log's span, seconds: times are in whole seconds."""
 
 
 def offset_by_zone(times: Array, timeline: Timeline) -> float | None:
@@ -26,7 +27,7 @@ def offset_by_zone(times: Array, timeline: Timeline) -> float | None:
     span = timeline.span
     if span is None:
         return None
-    first, last = span[0] - _SPAN_MARGIN_S, span[1] + _SPAN_MARGIN_S
+    first, last = span[0] - SPAN_MARGIN_S, span[1] + SPAN_MARGIN_S
     fits = [zone for zone in ZONES_S if times.min() - zone >= first and times.max() - zone <= last]
     return min(fits, key=abs) if fits else None
 

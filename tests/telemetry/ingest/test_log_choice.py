@@ -88,6 +88,82 @@ def test_without_a_time_zone_none_of_two_flights_logs_is_likelier(tmp_path):
     assert not found.frames and len(found.rejected) == len(TAKEN_S)
 
 
+def two_flights(folder, hours, second_s=2400.0):
+    """Photos of two flights by one clock that is off by some hours; when each was taken, by name."""
+    photos(folder, lambda _, utc_s: utc_s + 3600.0 * hours)
+    photos(folder, lambda _, utc_s: utc_s + 3600.0 * hours + second_s, prefix="Q")
+    return {f"{prefix}_{i:03d}.JPG": (t, prefix) for prefix in "PQ" for i, t in enumerate(TAKEN_S)}
+
+
+@pytest.mark.parametrize("hours", [0.0, 2.0, 5.75])
+def test_photos_of_two_flights_beside_their_tracks_are_placed_where_one_zone_fits_all(tmp_path, hours):
+    taken = two_flights(tmp_path / "card", hours)
+    track(tmp_path / "card" / "a.pos")
+    track(tmp_path / "card" / "b.pos", metres_east=500.0, later_s=2400.0)
+    found = load([tmp_path])
+    assert len(found.frames) == 2 * len(TAKEN_S)
+    for frame in found.frames:
+        t, prefix = taken[frame.image.rsplit("/", 1)[-1]]
+        assert ("a.pos" if prefix == "P" else "b.pos") in frame.origin["position"]
+        assert frame.fix.lat_deg == pytest.approx(place(t)[0], abs=1e-6)
+    assert any("one time zone only" in warning for warning in found.warnings)
+
+
+@pytest.mark.parametrize("trap", ["beside another vehicle's", "in two zones", "one flight unlogged"])
+def test_photos_of_two_flights_get_no_place_without_evidence(tmp_path, trap):
+    two_flights(tmp_path / "card", 0.0, second_s=3600.0)
+    track(tmp_path / "card" / "a.pos")
+    if trap != "one flight unlogged":
+        track(tmp_path / "card" / "b.pos", metres_east=500.0, later_s=3600.0)
+    if trap == "in two zones":
+        track(tmp_path / "card" / "c.pos", metres_east=900.0, later_s=7200.0)
+    elif trap != "one flight unlogged":
+        track(tmp_path / "card" / "c.pos", metres_east=900.0, later_s=3600.0)
+    found = load([tmp_path])
+    assert not found.frames and len(found.rejected) == 2 * len(TAKEN_S)
+    assert all("no log that is here" in rejection.reason for rejection in found.rejected)
+
+
+def exposure_list(path, moments, east_m):
+    rows = [
+        f"47.5 {8.25 + (east_m + 8.0 * (t - moments[0])) * METRE / np.cos(np.radians(47.5)):.8f} 500" for t in moments
+    ]
+    return solution(path, list(zip(moments, rows, strict=True)))
+
+
+@pytest.mark.parametrize(("one_clock", "beside"), [(True, ""), (False, ""), (True, "the same"), (True, "another")])
+def test_photos_of_two_flights_are_paired_each_with_the_events_of_its_flight(tmp_path, one_clock, beside):
+    """Two lists of exposures whose clocks agree; where they do not, they may be of another vehicle.
+
+    Beside them lie second lists of the same flights, or those of another vehicle that took pictures at the same times.
+    """
+    rng = np.random.default_rng(7)
+    flights = [UTC_S + start + np.cumsum(rng.uniform(1.6, 3.1, 30)) for start in (0.0, 1500.0)]
+    (tmp_path / "card").mkdir()
+    for k, moments in enumerate(flights):
+        exposure_list(tmp_path / "card" / f"{'ab'[k]}_events.pos", moments, 300.0 * k)
+        if beside:
+            exposure_list(
+                tmp_path / "card" / f"{'xy'[k]}_events.pos", moments, 300.0 * k + 900.0 * (beside == "another")
+            )
+        for i, t in enumerate(moments):
+            shown = datetime.fromtimestamp(round(t + 7213.4 + (0.0 if one_clock else 40.0 * k), 2), UTC)
+            local, fraction = shown.strftime("%Y:%m:%d %H:%M:%S"), f"{shown.microsecond // 10_000:02d}"
+            jpeg(
+                tmp_path / "card" / f"P_{30 * k + i:03d}.JPG",
+                exif_bytes=gps_exif(0.0, 0.0, local=local, subsec=fraction),
+            )
+    found = load([tmp_path])
+    if not one_clock or beside == "another":
+        assert not found.frames and "equally well" in found.rejected[0].reason
+        return
+    assert len(found.frames) == 60 and any("photos are of 2 flights" in warning for warning in found.warnings)
+    for frame in found.frames:
+        k, i = divmod(number(frame), 30)
+        assert frame.time_s == pytest.approx(flights[k][i], abs=2e-3)
+        assert frame.origin["position"].split("(")[1][0] in ("ax", "by")[k]
+
+
 def test_two_cameras_in_one_folder_are_both_placed(tmp_path):
     for prefix in "AB":
         photos(tmp_path / "card", right, prefix=prefix)
