@@ -178,12 +178,17 @@ def add_logs(
         return
     times = np.array([math.nan if photo.time_s is None else photo.time_s for photo in photos])
     entries = {id(match.entry): match.entry for match in matches}
-    flights = logs_of_one_clock(pairings, times, lambda a, b: same_flight(entries[a], entries[b]))
+    flights = logs_of_one_clock(
+        pairings,
+        times,
+        pair_some=lambda key, some: _pair([photos[i] for i in some], entries[key].log.events),
+        same_flight=lambda a, b: same_flight(entries[a], entries[b]),
+    )
     if len(flights) > 1:
-        offsets = [pairings[key].offset_s or 0.0 for key in flights]
-        spans = [_event_span(entries[key].log, offset) for key, offset in zip(flights, offsets, strict=True)]
-        part_of = nearest_span(times, spans)
-        findings.append(_several_flights([entries[key] for key in flights], offsets[0], vehicle))
+        certain = next(pairings[key] for key in flights if not pairings[key].ambiguous)
+        offset_s = certain.offset_s or 0.0
+        part_of = nearest_span(times, [_event_span(entries[key].log, offset_s) for key in flights])
+        findings.append(_several_flights([entries[key] for key in flights], offset_s, vehicle))
         for number, key in enumerate(flights):
             part = [photo for photo, own in zip(photos, part_of.tolist(), strict=True) if own == number]
             _use_log(part, entries[key], _pair(part, entries[key].log.events), vehicle, findings, workers=workers)

@@ -19,34 +19,52 @@ Array = NDArray[np.float64]
 
 
 def logs_of_one_clock(
-    pairings: Mapping[int, Pairing], times: Array, same_flight: Callable[[int, int], bool]
+    pairings: Mapping[int, Pairing],
+    times: Array,
+    *,
+    pair_some: Callable[[int, Sequence[int]], Pairing],
+    same_flight: Callable[[int, int], bool],
 ) -> list[int]:
     """The logs that find one clock for different photos; fewer than two if that is not certain.
+
+    A log of a mission that was flown twice fits the photos of both flights: it is asked again about those that no other
+    log has.
 
     Args:
         pairings: of all photos with the events of each log, by the log's key.
         times: (N,) of the photos by the camera, NaN where unknown.
+        pair_some: pairs some photos with the events of a log.
         same_flight: whether two logs record one flight, by autopilot and ground station perhaps.
 
     Returns:
         Keys in order of time.
     """
     config = active().ingest
-    sure = {
-        key: [i for i, _ in pairing.pairs if i not in pairing.doubtful]
-        for key, pairing in pairings.items()
-        if pairing.how == "time" and pairing.offset_s is not None and not pairing.ambiguous and not pairing.jumps
-    }
-    sure = {key: photos for key, photos in sure.items() if len(photos) >= active().pairing.jump_least_photos}
+    sure = {key: photos for key, pairing in pairings.items() if (photos := _sure(pairing))}
     groups = [_joined(key, sure, pairings, times) for key in sure]
     best = max(groups, key=lambda keys: sum(len(sure[key]) for key in keys), default=[])
+    for key in [key for key in pairings if best and key not in best]:
+        taken = {i for own in best for i in sure[own]}
+        rest = [i for i in range(len(times)) if i not in taken]
+        again = pair_some(key, rest) if len(rest) > 1 else Pairing()
+        found = {**sure, key: [rest[i] for i in _sure(again)]}
+        if found[key] and _same_clock(best[0], key, found, {**pairings, key: again}, times):
+            sure, best = found, [*best, key]
     for key in pairings.keys() - set(best):  # another vehicle's log that fits the same photos
-        photos = {i for i, _ in pairings[key].pairs}
+        fitting = {i for i, _ in pairings[key].pairs}
         for own in best:
-            common = len(photos.intersection(sure[own]))
+            common = len(fitting.intersection(sure[own]))
             if common >= config.log_least_share * len(sure[own]) and not same_flight(key, own):
                 return []
     return sorted(best, key=lambda key: float(np.median(times[sure[key]])))
+
+
+def _sure(pairing: Pairing) -> list[int]:
+    """The photos whose events are certain; none if they are few, or if more than one clock fits."""
+    if pairing.how != "time" or pairing.offset_s is None or pairing.ambiguous or pairing.jumps:
+        return []
+    photos = [i for i, _ in pairing.pairs if i not in pairing.doubtful]
+    return photos if len(photos) >= active().pairing.jump_least_photos else []
 
 
 def _joined(first: int, sure: Mapping[int, Sequence[int]], pairings: Mapping[int, Pairing], times: Array) -> list[int]:

@@ -216,3 +216,21 @@ def test_a_log_that_contradicts_the_pictures_does_not_decide_anything():
         np.cumsum(rng.uniform(0.0, 8.0, len(flown.events))), lambda some: rng.uniform(1.0, 20.0, len(some) - 1)
     )
     assert scored(flown, motion).wrong_unmarked == 0
+
+
+def test_a_mission_that_was_flown_twice_is_paired_flight_by_flight(real_data, tmp_path):
+    """The second log alone fits the photos of both flights; only the clock of the first tells which are its own."""
+    poses = {}
+    for name, later in (("swarm_v1.tlog", 0), ("copter_cam_rtl_1x.BIN", 100)):
+        source = real_data("sitl_logs") / name
+        (log,) = read_log(source)
+        photos_of(log.events, tmp_path / "part", offset_s=3612.3)
+        (tmp_path / "card").mkdir(exist_ok=True)
+        for n, event in enumerate(log.events):
+            poses[f"DSC{n + later:05d}.JPG"] = event.sample
+            (tmp_path / "part" / f"DSC{n:05d}.JPG").rename(tmp_path / "card" / f"DSC{n + later:05d}.JPG")
+        (tmp_path / "card" / name).write_bytes(source.read_bytes())
+    frames = load([tmp_path / "card"]).frames
+    assert len(frames) == len(poses)
+    for frame in frames:
+        assert frame.fix.lat_deg == pytest.approx(poses[frame.image].lat_deg, abs=1e-9) and not frame.ambiguous
