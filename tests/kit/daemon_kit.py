@@ -134,6 +134,26 @@ class Served:
                 raise AssertionError(f"{path} is still {value}; jobs {self.get('/api/jobs').text}")
             time.sleep(0.1)
 
+    def take_off(self, vehicle: str, limit_s: float = 400.0) -> None:
+        """Start a vehicle's mission, again until its autopilot lets it: its own checks may take minutes.
+
+        One whose start was not answered in time may fly all the same. Its battery may be empty, as simulated ones get.
+        """
+        answers = []
+
+        def flies(rows: list[dict]) -> bool:
+            row = next((r for r in rows if r["id"] == vehicle), {})
+            if row.get("armed") and row.get("mission", {}).get("phase") == "active":
+                return True
+            time.sleep(1.0)
+            answers.append(self.command(f"/api/missions/{vehicle}/start", {"override": ["battery"]}).json())
+            return answers[-1]["outcome"] == "done"
+
+        try:
+            self.until("/api/vehicles", flies, limit_s)
+        except AssertionError:
+            raise AssertionError(f"{vehicle} does not start: {answers[-1:]}") from None
+
 
 def end_with_us() -> None:
     """A test run that is killed leaves no daemon behind."""

@@ -119,7 +119,7 @@ def charge(address):
     try:
         site = Site(place)
         site.charge()
-        full = site.vehicle.autopilot is not AP or place.until(lambda: (site.vehicle.battery or 0.0) > 0.95, 20.0)
+        full = site.vehicle.autopilot is not AP or place.until(lambda: (site.vehicle.battery or 0.0) > 0.95, 120.0)
         assert full, site.vehicle.battery
     finally:
         place.close()
@@ -269,11 +269,11 @@ def test_a_flown_mission_completes_exactly_once(make_site, ending):
 def test_loiter_unlimited_and_the_operators_rtl_are_no_completion(make_site):
     site = make_site()
     site.fly(*last_items(site, "loiter"))
-    site.place.until(lambda: site.vehicle.mission_seq >= site.vehicle.detector.final_seq, 200.0)
+    assert site.place.until(lambda: site.vehicle.mission_seq >= site.vehicle.detector.final_seq, 300.0)
     site.place.until(lambda: False, 20.0)
     assert site.kinds() == ["started"]
     site.home()
-    site.place.until(lambda: "aborted" in site.kinds(), 20.0)
+    assert site.place.until(lambda: "aborted" in site.kinds(), 120.0)
     assert "complete" not in site.kinds() and site.kinds()[-1] == "aborted"
 
 
@@ -290,11 +290,14 @@ def test_pause_and_resume(make_site):
     site = make_site()
     site.fly(MissionItem(command=RTL))
     site.follow(lambda: flight_state(site.vehicle).word.value == "on mission", 100.0)
-    site.place.until(lambda: site.vehicle.mission_seq >= site.vehicle.detector.final_seq - 4, 100.0)
+    assert site.place.until(lambda: site.vehicle.mission_seq >= site.vehicle.detector.final_seq - 4, 200.0)
     assert site.finish(site.fleet.pause(site.system)).ok
-    site.place.until(lambda: False, 12.0)
-    assert flight_state(site.vehicle).word.value == "paused"
-    assert math.hypot(*site.vehicle.velocity_m_s[:2]) < 0.5
+    site.place.until(lambda: False, 12.0)  # long enough for a pause that does not last to end
+    words = site.follow(
+        lambda: flight_state(site.vehicle).word.value == "paused" and math.hypot(*site.vehicle.velocity_m_s[:2]) < 0.5,
+        60.0,
+    )
+    assert words == ["paused"]
     assert site.finish(site.fleet.resume(site.system)).ok
     assert site.place.until(lambda: "complete" in site.kinds(), 300.0)
     assert site.kinds().count("complete") == 1
@@ -304,12 +307,15 @@ def test_streams_come_at_the_rates_asked_for(make_site):
     site = make_site()
     counts = {"GLOBAL_POSITION_INT": 0, "ATTITUDE": 0}
     site.fleet.subscribe(lambda v, m, utc: counts.__setitem__(m.get_type(), counts[m.get_type()] + 1), *counts)
-    site.place.until(lambda: False, 3.0)
-    before, clock = dict(counts), site.vehicle.time_boot_s
-    site.place.until(lambda: False, 10.0)
-    seconds = site.vehicle.time_boot_s - clock  # the vehicle's, which may run fast
-    for name in counts:
-        assert (counts[name] - before[name]) / seconds == pytest.approx(10.0, rel=0.15)
+    rates = []
+    for _ in range(12):  # they are asked for anew where they come at another rate
+        before, clock = dict(counts), site.vehicle.time_boot_s
+        site.place.until(lambda: False, 10.0)
+        seconds = site.vehicle.time_boot_s - clock  # the vehicle's, which may run fast
+        rates.append({name: (counts[name] - before[name]) / seconds for name in counts})
+        if all(rate == pytest.approx(10.0, rel=0.15) for rate in rates[-1].values()):
+            return
+    pytest.fail(f"{rates}")
 
 
 def test_an_upload_through_thirty_percent_loss_both_ways(make_site):
@@ -337,9 +343,18 @@ def test_a_mission_that_is_refused_names_the_item_and_leaves_no_success(make_sit
 
 def test_a_vehicle_without_a_mission_is_not_armed_by_start(make_site):
     site = make_site()
-    site.fleet._dialogues.send(site.system, [dialect.MAVLink_mission_clear_all_message(site.system, 1, 0)])
-    site.place.until(lambda: False, 3.0)
+
+    def emptied():
+        site.fleet._dialogues.send(site.system, [dialect.MAVLink_mission_clear_all_message(site.system, 1, 0)])
+        site.place.until(lambda: False, 3.0)
+        read = site.fleet.download(site.system)
+        site.finish(read)
+        return read.items is not None and len(read.items) <= (1 if site.vehicle.autopilot is AP else 0)
+
+    assert any(emptied() for _ in range(10))  # the message may be lost
     site.vehicle.mission = None
     outcome = site.finish(site.fleet.start(site.system))
     assert not outcome.ok and "no mission" in outcome.text
     assert not site.vehicle.armed
+    # In the mode of missions ArduPilot is not ready to arm without one: the next test would wait in vain.
+    assert site.finish(site.fleet.upload(site.system, site.mission(MissionItem(command=RTL)))).ok

@@ -180,18 +180,7 @@ def fly(served, name, pace):
     upload = {"plan": plan.json()["id"], "mission": plan.json()["vehicles"][0]["id"]}
     answer = served.command(f"/api/missions/{name}/upload", upload)
     assert answer.status_code == 200, answer.text
-    answers = []
-
-    def started(_):
-        """Its own checks may take a while; the battery of a simulation that has flown all day is empty."""
-        time.sleep(1.0)
-        answers.append(served.command(f"/api/missions/{name}/start", {"override": ["battery"]}).json())
-        return answers[-1]["outcome"] == "done"
-
-    try:
-        served.until("/healthz", started, limit_s=120.0)
-    except AssertionError:
-        pytest.fail(f"it does not start: {answers[-1]}")
+    served.take_off(name)
 
     def refined(rows):
         pace(next(r for r in served.get("/api/vehicles").json() if r["id"] == name)["pictures"]["taken"])
