@@ -13,6 +13,7 @@ import pytest
 
 from gcs_plugin.fleet.fleet import Fleet
 from gcs_plugin.fleet.flight_state import flight_state
+from gcs_plugin.fleet.preflight import Level
 from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.mission.exchange import Address
 from gcs_plugin.mission.items import RTL
@@ -113,6 +114,26 @@ def test_a_geofence_breach_ends_the_mission_without_completing_it(site, paramete
     parameters.set(**fence)
     words = ended_by_itself(site, began)
     assert "returning" in words
+
+
+def test_a_mission_beyond_the_geofence_is_red_before_it_is_flown(site, parameters):
+    def found():
+        site.finish(site.fleet.download(site.system))  # asks for the parameters, too
+        assert site.place.until(lambda: site.vehicle.ready_to_check, 60.0)
+        return next(item for item in site.check().items if item.name == "fence")
+
+    assert site.finish(site.fleet.upload(site.system, site.mission(MissionItem(command=RTL)))).ok
+    assert found().level is Level.OK
+    fences = per_autopilot(
+        site,
+        ap=[{"FENCE_TYPE": 2, "FENCE_RADIUS": 30, "FENCE_ENABLE": 1}, {"FENCE_TYPE": 1, "FENCE_ALT_MAX": 10}],
+        px4=[{"GF_MAX_HOR_DIST": 30}, {"GF_MAX_HOR_DIST": 0, "GF_MAX_VER_DIST": 10}],
+    )
+    for fence, words in zip(fences, ("m from home", "goes up to 15 m"), strict=True):
+        parameters.set(**fence)
+        item = found()
+        assert item.level is Level.RED and words in item.reason, item
+        print(item.reason)
 
 
 def test_a_battery_failsafe_ends_the_mission_without_completing_it(site, parameters):
