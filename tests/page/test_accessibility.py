@@ -96,6 +96,24 @@ def test_a_vehicle_has_one_colour_on_all_pages(browser):
     assert seen[0] == seen[1] and len({colour for _, colour in seen[0]}) == 3
 
 
+def test_legs_without_a_basemap_are_not_called_failed(browser):
+    layer = {"name": "realtime", "version": 1, "empty": True, "bounds": None, "tiles": "/none", "maxzoom": 22}
+    legs = {"type": "FeatureCollection", "features": [leg(0, "failed"), leg(1, "carried")]}
+    for layers, words, shown in (
+        ([layer], "This station has no basemap", ""),
+        ([layer | {"name": "basemap"}, layer], "No leg was found on the basemap", "carried,failed"),
+    ):
+        with standing() as station:
+            station.gets |= {"/api/legs": legs, "/api/layers": layers}
+            with opened(browser, station.url) as page:
+                page.evaluate("orthoswarm.map.jumpTo({ center: [8.5456, 47.3977], zoom: 17 })")
+                page.click("#tab-map")
+                page.wait_for_selector(f"#panel-map:has-text('{words}')")
+                page.wait_for_function("orthoswarm.map.queryRenderedFeatures({ layers: ['legs-refined'] }).length > 1")
+                page.wait_for_function(f"{SIGNS} === '{shown}'")
+                assert page.locator("p.leg:visible").count() == (3 if shown else 0)
+
+
 def test_a_vehicle_in_danger_has_a_sign_on_the_map(browser):
     rows = (vehicle(1, battery=0.05), vehicle(2, battery=0.2), vehicle(3))
     with standing(*rows) as station, opened(browser, station.url) as page:

@@ -16,5 +16,5 @@ export const coverageWords = {
   "gapflight.plan": "Plan", "gapflight.confirm": "Upload, then check and start…", "gapflight.minutes": "Minutes that {name} can fly", "gapflight.left": "battery {battery}; minutes by what its flight has cost",
   "gapflight.ask": "battery {battery}; how many minutes it can fly is not known: enter them", "gapflight.unknown": "Enter how many minutes {name} can fly.", "gapflight.nobody": "No vehicle is on the links.",
   "gapflight.inair": "In the air: tick it to pause it and give it these legs in place of its mission.", "gapflight.pauses": "{name} is in the air: it is paused before it gets the new mission, and flies on when you start it.",
-  "gapflight.failed": "Not planned: {why}", "gapflight.uploading": "Uploading…", "gapflight.refused": "Not uploaded: {list}", "gapflight.part": "{name}: {length}, over {time} min after the start, {photos} {photos|picture|pictures}, {sorties} {sorties|flight|flights}",
+  "gapflight.failed": "Not planned: {why}", "gapflight.uploading": "Uploading…", "gapflight.refused": "Not uploaded: {list}", "gapflight.part": "{name}: {length}, ends {time} min after the start, {photos} {photos|picture|pictures}, {sorties} {sorties|flight|flights}",
 };

@@ -20,6 +20,8 @@ function placeOf(vehicle) {
 // How well a leg lies on the map. A sign stands with each: at least 36 lies between the colours, seen in the same ways.
 export const LEGS = { matched: { colour: "#009e73", sign: "✓" }, carried: { colour: "#e69f00", sign: "≈" }, failed: { colour: "#a3200d", sign: "✕" } };
 
+export const FREE_LEG = "#56606b"; // where there is no map to lie on
+
 export const colourOf = (vehicle) => {
   const key = String(vehicle);
   if (!taken.has(key)) taken.set(key, placeOf(key));

@@ -1,6 +1,6 @@
 // How well the map holds each leg, in words with what they mean; a tap on a leg tells its figures.
 
-import { make, setText } from "/static/core/dom.js";
+import { make, setHidden, setText } from "/static/core/dom.js";
 import { state, subscribe } from "/static/core/store.js";
 import { t } from "/static/core/strings.js";
 import * as units from "/static/core/units.js";
@@ -11,17 +11,22 @@ import { tool } from "/static/map/tools.js";
 const STATES = ["matched", "carried", "failed"];
 const nameOf = (id) => state.vehicles.get(id)?.name ?? id;
 
+// Without a basemap no leg can be found on it, which is no failure of theirs.
+const withoutMap = () => state.layers.length > 0 && !state.layers.some((layer) => layer.name === "basemap");
+
 export function legPanel() {
   const lines = STATES.map((key) => [key, make("b", {}), make("small", {}, t(`legs.${key}.about`))]);
   const accuracy = make("p", {});
   const box = make("section", {}, make("h2", {}, t("legs.title")), accuracy,
     ...lines.map(([key, title, about]) => make("p", { class: "leg", dataset: { state: key } }, make("i", { "aria-hidden": "true" }), title, about)), make("p", { class: "quiet" }, t("legs.dashed")));
-  subscribe("legs ready", "legs", () => {
+  subscribe("legs layers ready", "legs", () => {
     const legs = state.legs.filter((leg) => leg?.geometry && leg.properties);
-    show("legs", legs);
+    const free = withoutMap();
+    show("legs", free ? legs.map((leg) => ({ ...leg, properties: { ...leg.properties, state: "free" } })) : legs);
+    for (const [, title] of lines) setHidden(title.parentNode, free);
     for (const [key, title] of lines) setText(title, `${LEGS[key].sign} ${t(`legs.${key}`, { n: legs.filter((leg) => leg.properties.state === key).length })}`);
     const sigmas = legs.filter((leg) => leg.properties.state === "matched" && Number.isFinite(leg.properties.sigma_m)).map((leg) => leg.properties.sigma_m).sort((a, b) => a - b);
-    setText(accuracy, sigmas.length ? t("legs.accuracy", { median: units.distance(sigmas[sigmas.length >> 1]), worst: units.distance(sigmas[Math.floor(0.95 * (sigmas.length - 1))]) }) : t("legs.none"));
+    setText(accuracy, sigmas.length ? t("legs.accuracy", { median: units.distance(sigmas[sigmas.length >> 1]), worst: units.distance(sigmas[Math.floor(0.95 * (sigmas.length - 1))]) }) : t(free ? "legs.free" : legs.length ? "legs.unmatched" : "legs.none"));
   });
   return box;
 }

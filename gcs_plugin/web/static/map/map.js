@@ -3,7 +3,7 @@
 import * as maplibregl from "/static/vendor/maplibre-gl.mjs";
 import { tileRequest } from "/static/core/api.js";
 import { onSettings, settings } from "/static/core/settings.js";
-import { LEGS } from "/static/map/colours.js";
+import { FREE_LEG, LEGS } from "/static/map/colours.js";
 
 maplibregl.setWorkerUrl("/static/vendor/maplibre-gl-worker.mjs");
 export { maplibregl };
@@ -11,9 +11,9 @@ export { maplibregl };
 export const EMPTY = { type: "FeatureCollection", features: [] };
 export const feature = (type, coordinates, properties = {}) => ({ type: "Feature", properties, geometry: { type, coordinates } });
 
-const STATE = ["match", ["get", "state"], "matched", LEGS.matched.colour, "carried", LEGS.carried.colour, LEGS.failed.colour];
+const STATE = ["match", ["get", "state"], "matched", LEGS.matched.colour, "carried", LEGS.carried.colour, "failed", LEGS.failed.colour, FREE_LEG];
 const COLOUR = ["coalesce", ["get", "colour"], "#16202a"];
-const SIGN = ["match", ["get", "state"], "matched", "leg-matched", "carried", "leg-carried", "leg-failed"];
+const SIGN = ["match", ["get", "state"], "matched", "leg-matched", "carried", "leg-carried", "failed", "leg-failed", ""];
 // id, type, paint, filter, source if it is not the id, layout
 const OVERLAYS = [
   ["footprints", "fill", { "fill-color": COLOUR, "fill-opacity": 0.12, "fill-outline-color": COLOUR }],
