@@ -32,6 +32,10 @@ from telemetry.samples.unreadable import Unreadable, read_or_reason
 from telemetry.samples.wild_fixes import without_wild_fixes
 
 _BUS = "DroneCAN"
+_SEVERAL_WAYS = (
+    "photos fit the camera events of the log in more than one way, and in some of them it has none; put a geo.txt next "
+    "to it, or give the logs of all flights"
+)
 _NO_EVENT = "it has no camera event in the log; put a geo.txt next to it, or give the log of its flight"
 
 
@@ -266,7 +270,10 @@ def _use_events(
     log = entry.log
     far = list[tuple[PhotoTags, float | None]]()
     explain(photos, _NO_EVENT, log.path.name)  # those that get a position below need no reason
+    explain([photos[i] for i in pairing.open], _SEVERAL_WAYS, log.path.name)
     for i, j in pairing.pairs:
+        if i in pairing.open:
+            continue
         event = log.events[j]
         around = entry.timeline.at(event.time_s or 0.0)
         pose = event.sample.merge(around)
@@ -298,7 +305,7 @@ def _use_events(
 def _pairing_findings(photos: Sequence[PhotoTags], pairing: Pairing, log: FlightLog) -> list[Finding]:
     used_photos, used_events = {i for i, _ in pairing.pairs}, {j for _, j in pairing.pairs}
     how = {"time": "by time", "number": "by their numbers", "order": "by order alone"}[pairing.how]
-    count = f"{len(pairing.pairs)} of {plural(len(photos), 'photo')}"
+    count = f"{len(pairing.pairs) - len(pairing.open)} of {plural(len(photos), 'photo')}"
     text = f"{count} were paired with camera events of {log.path.name} {how}"
     if pairing.offset_s is not None and not pairing.jumps:
         offset_s = round(pairing.offset_s, 1) + 0.0  # no "-0.0"
@@ -321,7 +328,13 @@ def _pairing_findings(photos: Sequence[PhotoTags], pairing: Pairing, log: Flight
     if len(used_photos) < len(photos):
         text = f"{plural(len(photos) - len(used_photos), 'photo')} have no camera event in {log.path.name}"
         found.append(Finding("photos-extra", text))
-    if pairing.ambiguous:
+    if pairing.open:
+        text = (
+            f"{plural(len(pairing.open), 'photo')} fit the camera events of {log.path.name} in more than one way, and "
+            "in some of them have none, so that they get no place from it; give the logs of all flights, or a geo.txt"
+        )
+        found.append(Finding("pairing-open", text))
+    elif pairing.ambiguous:
         text = f"photos fit the camera events of {log.path.name} in more than one way; check the map for a shift"
         found.append(Finding("pairing-ambiguous", text))
     elif pairing.doubtful:

@@ -22,6 +22,7 @@ class SequenceMatch:
         offset_s: photo time minus event time in the middle of the events. drift: rate of the photo's clock minus one.
         resolution_s: of the photo's clock. jitter_s: of the trigger, one sigma.
         by_pictures: whether the pictures were asked, too.
+        other_clock: probability that the clocks differ by another offset, some intervals away.
     """
 
     events: Indices
@@ -32,6 +33,7 @@ class SequenceMatch:
     resolution_s: float
     jitter_s: float
     by_pictures: bool = False
+    other_clock: float = 0.0
 
     def pairs(self) -> list[tuple[int, int, float]]:
         """The alignment with the most expected matches: photo, event (both increasing) and probability.
@@ -55,6 +57,11 @@ class SequenceMatch:
             i, event, probability, node = nodes[node]
             pairs.append((i, int(self.events[event]), probability))
         return pairs[::-1]
+
+    def may_have_none(self, photo: int) -> bool:
+        """Whether another clock, under which a photo has no event, is possible: then its event is no likely place."""
+        least = active().pairing.least_probability
+        return bool(self.other_clock > least and self.probability[photo].sum() < 1.0 - least)
 
     def alternatives(self, photo: int) -> list[int]:
         """Events that a photo may belong to."""

@@ -26,6 +26,7 @@ class Pairing:
     Attributes:
         pairs: (photo, event) indices, photos increasing.
         doubtful: photos whose pairing the times leave open -> possible events.
+        open: photos that have an event by the likeliest clock, and none by another one that is possible, too.
         offset_s: photo clock minus event clock, None if times were not used.
         residual_s: median distance of paired times after offset and drift.
         ambiguous: True if less than half of the pairs are decided. how: "time", "number" or "order".
@@ -35,6 +36,7 @@ class Pairing:
 
     pairs: list[tuple[int, int]] = field(default_factory=list)
     doubtful: dict[int, list[int]] = field(default_factory=dict)
+    open: set[int] = field(default_factory=set)
     offset_s: float | None = None
     residual_s: float = 0.0
     ambiguous: bool = False
@@ -78,6 +80,7 @@ def pair(
                     by_times = by_parts
             by_times.pairs = [(timed[i], dated[j]) for i, j in by_times.pairs]
             by_times.jumps = [(timed[i], jump_s) for i, jump_s in by_times.jumps]
+            by_times.open = {timed[i] for i in by_times.open}
             by_times.doubtful = {timed[i]: [dated[j] for j in at] for i, at in by_times.doubtful.items()}
             share = len(by_times.pairs) / min(len(photos), len(events))
             if by_times.jumps or share >= 0.5 or (by_times.pairs and not by_times.ambiguous):
@@ -125,6 +128,8 @@ def by_time(photos: Array, events: Array, motion: PictureMotion | None = None) -
         result.pairs.append((photo, event))
         if probability < active().pairing.certain or result.ambiguous:
             result.doubtful[photo] = [int(order_e[k]) for k in found.alternatives(i)]
+        if found.may_have_none(i):
+            result.open.add(photo)
     if pairs:
         own, theirs = photos[order_p][[i for i, _, _ in pairs]], events[order_e][[j for _, j, _ in pairs]]
         middle = 0.5 * (float(events.min()) + float(events.max()))

@@ -62,7 +62,7 @@ def match_sequences(photos: Array, events: Array, motion: PictureMotion | None =
 
 def _alignment(model: SequenceModel, windows: list[Clock], single: Indices) -> SequenceMatch:
     """The match, with probabilities of existing events only; its offset is between the model's own origins."""
-    first, probability, offset, drift = _probabilities(model, windows)
+    first, probability, offset, drift, other_clock = _probabilities(model, windows)
     inside = np.clip(first, 0, len(single))
     shifted = np.zeros_like(probability)
     for i, (lo, at) in enumerate(zip(first.tolist(), inside.tolist(), strict=True)):
@@ -78,6 +78,7 @@ def _alignment(model: SequenceModel, windows: list[Clock], single: Indices) -> S
         resolution_s=model.resolution_s,
         jitter_s=model.jitter_s,
         by_pictures=asked,
+        other_clock=other_clock,
     )
 
 
@@ -259,8 +260,11 @@ def _normalised(model: SequenceModel, grid: ClockGrid) -> float:
     return float(forward(model, grid).evidence.max() - weights)
 
 
-def _probabilities(model: SequenceModel, windows: list[Clock]) -> tuple[Indices, Array, float, float]:
-    """(N,) first event and (N, B) probabilities of each photo's events; the most likely offset and drift."""
+def _probabilities(model: SequenceModel, windows: list[Clock]) -> tuple[Indices, Array, float, float, float]:
+    """(N,) first event and (N, B) probabilities of each photo's events; the most likely offset and drift.
+
+    The last value is the probability of an offset that is some intervals away from that one.
+    """
     scored = []
     for number, centre in enumerate(windows):
         grid = _window(model, centre)
@@ -280,10 +284,13 @@ def _probabilities(model: SequenceModel, windows: list[Clock]) -> tuple[Indices,
             parts.append((some.band(model)[0], posterior(model, some, float(total))))
     best, values = max(scored, key=lambda row: float(row[1].max()))
     at = int(np.argmax(values))
+    far = active().pairing.other_clock_intervals * float(np.median(np.diff(model.e)))
+    away = [values[np.abs(grid.offset - best.offset[at]) > far] for grid, values in scored]
+    other_clock = float(np.exp(np.logaddexp.reduce(np.concatenate([*away, [-np.inf]])) - total))
     first = np.min([lo for lo, _ in parts], axis=0)
     width = max(int((lo + part.shape[1] - first).max()) for lo, part in parts)
     joined = np.zeros((len(model.p), width))
     for lo, part in parts:
         for i, shift in enumerate((lo - first).tolist()):
             joined[i, shift : shift + part.shape[1]] += part[i]
-    return first, joined, float(best.offset[at]), float(best.drift[at])
+    return first, joined, float(best.offset[at]), float(best.drift[at]), other_clock

@@ -234,3 +234,19 @@ def test_a_mission_that_was_flown_twice_is_paired_flight_by_flight(real_data, tm
     assert len(frames) == len(poses)
     for frame in frames:
         assert frame.fix.lat_deg == pytest.approx(poses[frame.image].lat_deg, abs=1e-9) and not frame.ambiguous
+
+
+def test_photos_that_fit_a_log_in_two_ways_and_in_one_have_no_event_get_no_place(real_data, tmp_path):
+    """A mission flown twice, the second log alone: its events may be those of either flight, at other legs, too."""
+    for name, later in (("swarm_v1.tlog", 0), ("copter_cam_rtl_1x.BIN", 100)):
+        (log,) = read_log(real_data("sitl_logs") / name)
+        photos_of(log.events, tmp_path / "part", offset_s=3612.3)
+        (tmp_path / "card").mkdir(exist_ok=True)
+        for n in range(len(log.events)):
+            (tmp_path / "part" / f"DSC{n:05d}.JPG").rename(tmp_path / "card" / f"DSC{n + later:05d}.JPG")
+    source = real_data("sitl_logs") / "copter_cam_rtl_1x.BIN"
+    (tmp_path / "card" / source.name).write_bytes(source.read_bytes())
+    found = load([tmp_path / "card"])
+    assert all(frame.ambiguous and frame.fix.position_sigma_m > 30.0 for frame in found.frames)
+    assert sum("in more than one way" in rejection.reason for rejection in found.rejected) >= 14
+    assert any("in more than one way" in warning for warning in found.warnings)
