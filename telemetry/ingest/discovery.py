@@ -14,6 +14,7 @@ from orthoswarm.raster.picture_file import PICTURE_SUFFIXES
 from orthoswarm.stores.addresses import address_of, is_stored
 from orthoswarm.stores.listing import exists, is_file, list_folder
 from telemetry.formats.log.can_log import SUFFIXES as CAN_LOGS
+from telemetry.formats.table.pose_csv import names_pictures
 from telemetry.ingest.copied_photos import copies_among
 
 VIDEO_SUFFIXES = frozenset(
@@ -157,15 +158,16 @@ def discover(inputs: Sequence[Path], exclude: Sequence[Path] = ()) -> Discovery:
 
 
 def _originals_first(folders: Iterable[Folder]) -> list[Path]:
-    """All pictures, likelier originals first: those of fuller folders, with videos, tables or logs, and higher up."""
+    """All pictures, those to keep first: of folders whose poses apply only there, of fuller ones, and higher up."""
 
-    def fullest(folder: Folder) -> tuple[Any, ...]:
+    def foremost(folder: Folder) -> tuple[Any, ...]:
+        posed = bool(folder.logs) or any(not is_stored(path) and names_pictures(path) for path in folder.tables)
         beside = sum(map(len, (folder.videos, folder.subtitles, folder.tables, folder.logs)))
-        return -len(folder.pictures), -beside, len(folder.path.parts), natural_key(str(folder.path))
+        return not posed, -len(folder.pictures), -beside, len(folder.path.parts), natural_key(str(folder.path))
 
     return [
         path
-        for folder in sorted(folders, key=fullest)
+        for folder in sorted(folders, key=foremost)
         for path in sorted(folder.pictures, key=lambda path: (len(path.name), _by_name(path)))
     ]
 

@@ -143,6 +143,22 @@ def test_a_backup_beside_the_photos_is_no_second_vehicle(tmp_path, renamed):
     assert any("4 photos in Backup are copies of those in DCIM" in warning for warning in found.warnings)
 
 
+def test_of_copies_those_beside_their_poses_are_kept(tmp_path):
+    flight(tmp_path / "day" / "ppk", [0.0], legs=4)
+    photos = sorted((tmp_path / "day" / "ppk").glob("*.JPG"))
+    rows = [f"{path.name} 465000.0 {5260000 + 8 * i}.0 512.0" for i, path in enumerate(photos)]
+    (tmp_path / "day" / "ppk" / "geo.txt").write_text("\n".join(["EPSG:32632", *rows]))
+    photo(tmp_path / "day" / "raw" / "X.JPG", second=50)  # more photos, but no table
+    for path in photos:
+        (tmp_path / "day" / "raw" / path.name).write_bytes(path.read_bytes())
+    (tmp_path / "day" / "raw" / "notes.txt").write_text("wind from the west\n")
+    found = load([tmp_path / "day"])
+    assert {f.image: f.origin["position"] for f in found.frames} == {
+        **{f"ppk/{path.name}": "geo.txt" for path in photos},
+        "raw/X.JPG": "EXIF GPS",
+    }
+
+
 def test_pictures_that_only_a_table_tells_apart_are_no_copies(tmp_path):
     for folder in ("v1", "v2"):
         (tmp_path / folder).mkdir()
