@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, Final
 
 from gcs_plugin.config import COMMAND
 from gcs_plugin.daemon.airspace.fences import Fences
-from gcs_plugin.fleet.autopilot_settings import CHECKED
 from gcs_plugin.mission.items import Mission
 from gcs_plugin.mission.plan_folder import NO_NEEDS, PlanNeeds
 from orthoswarm.model.errors import OrthoSwarmError
@@ -101,11 +100,11 @@ class StartChecks:
     def _hear_settings(self, systems: Collection[int]) -> None:
         """Wait for the settings, asked for again where not told: a lost packet must not let a vehicle start."""
         vehicles = {s: self._fleet.vehicles[s] for s in systems}
-        for system, vehicle in vehicles.items():
-            if not vehicle.lost and not vehicle.questions.waits_for(CHECKED) and vehicle.untold:
-                self._fleet.call(lambda s=system: self._fleet.ask_settings(s)).result(_SOON_S)  # type: ignore[misc]
+        again = [s for s, v in vehicles.items() if not v.lost and not v.answers_settings and v.untold]
+        for asked in [self._fleet.call(lambda s=system: self._fleet.ask_settings(s)) for system in again]:  # type: ignore[misc]
+            asked.result(_SOON_S)
         end = time.monotonic() + _SETTINGS_S
-        while any(v.questions.waits_for(CHECKED) for v in vehicles.values() if not v.lost) and time.monotonic() < end:
+        while any(v.answers_settings for v in vehicles.values() if not v.lost) and time.monotonic() < end:
             time.sleep(0.02)
 
     def _separation(

@@ -115,7 +115,9 @@ CHECKED: Final = frozenset({
     Setting.RETURN_HEIGHT, Setting.RETURN_TYPE, Setting.SPEED,
     Setting.FENCE, Setting.FENCE_KINDS, Setting.FENCE_ACTION, Setting.FENCE_RADIUS, Setting.FENCE_TOP,
 })  # fmt: skip
-"""What a check before a start waits for: what it compares with the mission, and all versions have."""
+"""What a check before a start waits for: what it compares with the mission."""
+NEWER: Final = frozenset({Setting.RETURN_TYPE})
+"""What of that older versions do not have."""
 _RETURNS: Final = {
     1: "to its mission's landing or to a rally point, if it has one",
     2: "along the way of its mission",
@@ -180,10 +182,14 @@ class Questions:
 
     Args:
         address: of the vehicle. autopilot: its dialect.
+
+    Attributes:
+        asked: it has been asked for them.
     """
 
     address: Address
     autopilot: Autopilot
+    asked: bool = field(default=False, init=False)
     _open: dict[str, Setting] = field(default_factory=dict, init=False)
     _queue: list[str] = field(default_factory=list, init=False)
     _rounds: int = field(default=0, init=False)
@@ -191,6 +197,7 @@ class Questions:
 
     def ask(self, now: float) -> list[Message]:
         """Begin anew; returns the first requests, `tick` the others."""
+        self.asked = True
         self._open = {parameter.name: parameter.setting for parameter in PARAMETERS[self.autopilot]}
         self._queue, self._rounds = list(self._open), _ROUNDS
         return self._some(now)

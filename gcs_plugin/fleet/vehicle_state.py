@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from gcs_plugin.config import HEARING
-from gcs_plugin.fleet.autopilot_settings import CHECKED, PARAMETERS, Questions, Setting, SetTo, answer
+from gcs_plugin.fleet.autopilot_settings import CHECKED, NEWER, PARAMETERS, Questions, Setting, SetTo, answer
 from gcs_plugin.fleet.flight_state import flight_state
 from gcs_plugin.fleet.message_rates import BATTERY_STATUS, GLOBAL_POSITION_INT, GPS_RAW_INT, SYS_STATUS, Streams
 from gcs_plugin.fleet.routes import Route, Routes
@@ -189,6 +189,7 @@ class Vehicle:
         """Forget what it was set up with: it may have been set up anew, and with other batteries."""
         self.mission, self.unbegun = None, False
         self.settings.clear()
+        self.questions.asked = False
         self._batteries.clear()
         self._told.clear()
         self._all_batteries = False
@@ -197,12 +198,24 @@ class Vehicle:
     def ready_to_check(self) -> bool:
         """True once what a check before a start looks at was told, or was asked for in vain."""
         batteries = self._all_batteries or not self._told  # one that tells of none has none but SYS_STATUS's
-        return self.streams.ready_to_check and batteries and not self.questions.waits_for(CHECKED)
+        return self.streams.ready_to_check and batteries and not self.answers_settings
+
+    @property
+    def answers_settings(self) -> bool:
+        """True while a setting that a check before a start looks at has been asked for and may still be told."""
+        return self.questions.waits_for(CHECKED)
 
     @property
     def untold(self) -> bool:
-        """True if it has not told all settings that a check before a start waits for."""
-        return any(p.setting in CHECKED and p.setting not in self.settings for p in PARAMETERS[self.autopilot])
+        """True if a check before a start asks it once more for settings that it waits for.
+
+        Not for what older versions do not have, and not if it has been asked and has answered nothing: each start would
+        wait for these in vain, until the command is too old.
+        """
+        if not self.settings:
+            return not self.questions.asked
+        have = {p.setting for p in PARAMETERS[self.autopilot]} & CHECKED - NEWER
+        return not have <= self.settings.keys()
 
     def prearm_texts(self, now: float) -> list[str]:
         """What it said lately about why it would not arm."""

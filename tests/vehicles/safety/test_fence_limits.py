@@ -9,6 +9,7 @@ from gcs_plugin.daemon.takeoffs import Takeoffs
 from gcs_plugin.fleet.preflight import Level, Wanted, preflight
 from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.mission.items import FRAME_TERRAIN, RTL, TAKEOFF, WAYPOINT, Mission, MissionItem
+from gcs_plugin.mission.mission_builder import read_mission
 from gcs_plugin.sim.lossy_radio import Faults
 from gcs_plugin.sim.multirotor import Chart
 from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
@@ -189,3 +190,19 @@ def test_the_daemons_check_is_red_too(open_links, folder):  # noqa: F811
         (row,) = takeoffs.preflight("plan-1")
         assert {i["name"]: i["state"] for i in row["items"]}["fence"] == state, row
     takeoffs.close()
+
+
+@pytest.mark.parametrize("missing", [("RTL_ALT_TYPE",), None])
+def test_a_start_does_not_wait_for_what_is_never_told(open_links, folder, monkeypatch, missing):  # noqa: F811
+    """One that is too old for a parameter, or that answers about none: its command would be too old by then."""
+    (vehicle,) = vehicles = make_swarm(1, home=HOME)
+    for name in missing or list(vehicle.parameters):
+        del vehicle.parameters[name]
+    links = open_links(vehicles)
+    ready(links, 1)
+    links.command(lambda fleet: fleet.upload(1, read_mission(folder / "v1.waypoints", AP)))
+    asked, ask = [], links.fleet.ask_settings
+    monkeypatch.setattr(links.fleet, "ask_settings", lambda system: (asked.append(system), ask(system)))
+    for _ in range(3):
+        links.preflight(["v1"])
+        assert asked == [1]
