@@ -20,7 +20,7 @@ from telemetry.ingest.log_choice import LogMatch, LogSource, same_flight
 from telemetry.ingest.pairing.event_pairing import Pairing, pair
 from telemetry.ingest.pairing.motion_chains import PictureMotion
 from telemetry.ingest.pairing.picture_evidence import picture_motion
-from telemetry.ingest.several_flights import logs_of_one_clock, nearest_span
+from telemetry.ingest.several_flights import logs_of_one_clock, nearest_span, of_one_vehicle
 from telemetry.ingest.survey import SourceInfo, Survey
 from telemetry.ingest.track_poses import add_track, best_log_of, explain, fill
 from telemetry.photos.flight_checks import number_of
@@ -188,7 +188,7 @@ def add_logs(
         pair_some=lambda key, some: _pair([photos[i] for i in some], entries[key].log.events),
         same_flight=lambda a, b: same_flight(entries[a], entries[b]),
     )
-    if len(flights) > 1:
+    if len(flights) > 1 and of_one_vehicle(entries[key].log for key in flights):
         certain = next(pairings[key] for key in flights if not pairings[key].ambiguous)
         offset_s = certain.offset_s or 0.0
         part_of = nearest_span(times, [_event_span(entries[key].log, offset_s) for key in flights])

@@ -2,20 +2,27 @@
 
 A camera's clock is one for all flights of a day. Camera events tell it by each log alone, so that logs which find the
 same clock for different photos are of one camera. Tracks tell it by the time zone in which every photo lies in some
-log. Nothing else decides: logs that find different clocks may be those of other vehicles.
+log. Nothing else decides: logs that find different clocks may be those of other vehicles, and logs of vehicles with
+different system ids are.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.config import active
+from telemetry.formats.log.log_data import FlightLog
 from telemetry.ingest.pairing.clock_offset import SPAN_MARGIN_S, ZONES_S
 from telemetry.ingest.pairing.event_pairing import Pairing
 from telemetry.samples.timeline import Timeline
 
 Array = NDArray[np.float64]
+
+
+def of_one_vehicle(logs: Iterable[FlightLog]) -> bool:
+    """Whether logs may be of one vehicle: what a ground station recorded names it by its system id."""
+    return len({log.vehicle for log in logs if log.kind == "tlog"}) < 2
 
 
 def logs_of_one_clock(

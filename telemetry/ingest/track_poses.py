@@ -12,7 +12,7 @@ from telemetry.formats.log.mavlink_poses import fixed_camera
 from telemetry.ingest.log_choice import LogMatch, LogSource, best_log
 from telemetry.ingest.pairing.clock_offset import median_distance_m, offset_by_positions, offset_by_zone
 from telemetry.ingest.photo_order import clock_went_back
-from telemetry.ingest.several_flights import nearest_span, zone_of_all
+from telemetry.ingest.several_flights import nearest_span, of_one_vehicle, zone_of_all
 from telemetry.photos.flight_checks import number_of
 from telemetry.photos.photo_tags import PhotoTags
 from telemetry.samples.findings import Finding, plural
@@ -111,6 +111,8 @@ def _add_tracks(photos: Sequence[PhotoTags], near: Sequence[LogSource], vehicle:
     if zone is None:
         return False
     own = nearest_span(times - zone, [span for entry in logs if (span := entry.timeline.span) is not None])
+    if not of_one_vehicle(logs[number].log for number in set(own.tolist())):
+        return False
     used, count = list[str](), 0
     for number, entry in enumerate(logs):
         part = [photo for photo, of in zip(photos, own.tolist(), strict=True) if of == number]

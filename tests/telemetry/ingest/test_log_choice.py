@@ -1,10 +1,13 @@
 """Photos beside several logs, and cameras whose clock is set during the flight: never a wrong place without a sign."""
 
+from dataclasses import replace
 from datetime import UTC, datetime
 
 import numpy as np
 import pytest
 
+from telemetry.formats.log.flight_logs import read_log
+from telemetry.ingest import log_ingest
 from telemetry.ingest.ingest import load
 from telemetry.ingest.pairing.event_pairing import pair
 from tests.telemetry.formats.test_exposure_lists import STEPS, UTC_S, solution, write_mrk, write_pos
@@ -122,6 +125,27 @@ def test_photos_of_two_flights_get_no_place_without_evidence(tmp_path, trap):
     found = load([tmp_path])
     assert not found.frames and len(found.rejected) == 2 * len(TAKEN_S)
     assert all("no log that is here" in rejection.reason for rejection in found.rejected)
+
+
+@pytest.mark.parametrize("by", ["tracks", "events"])
+@pytest.mark.parametrize("systems", [(1, 1), (1, 2)])
+def test_photos_of_one_vehicle_take_no_places_from_two(tmp_path, monkeypatch, systems, by):
+    """Where one flight's log is missing, another vehicle that flew at the same time may have one."""
+
+    def read(path):
+        return [
+            replace(log, kind="tlog", vehicle=f"sysid{systems['ab'.index(path.name[0])]}") for log in read_log(path)
+        ]
+
+    monkeypatch.setattr(log_ingest, "read_log", read)
+    two_flights(tmp_path / "card", 0.0)
+    for name, later_s, east_m in (("a", 0.0, 0.0), ("b", 2400.0, 500.0)):
+        if by == "tracks":
+            track(tmp_path / f"{name}.pos", metres_east=east_m, later_s=later_s)
+        else:
+            exposure_list(tmp_path / f"{name}_events.pos", UTC_S + later_s + TAKEN_S, east_m)
+    used = [frame.origin["position"] for frame in load([tmp_path]).frames]
+    assert len(used) == 2 * len(TAKEN_S) and len(set(used)) == 2 if systems == (1, 1) else not used
 
 
 def exposure_list(path, moments, east_m):
