@@ -127,6 +127,8 @@ _RETURNS: Final = {
     6: "home, or to a rally point when its battery is low",
 }
 """Where to a PX4 returns by RTL_TYPE (1.17), but for 0: straight home or to the nearest rally point."""
+_ALONG: Final = frozenset({2, 4})
+"""Those that go along the mission's way, back to home if it has no landing."""
 _MISSION_BITS: Final = {"FS_OPTIONS": 1 << 1, "COM_DLL_EXCEPT": 1 << 0}
 """The bit for a mission; FS_OPTIONS has others for other failsafes."""
 _INTEGERS: Final = {
@@ -165,6 +167,11 @@ class SetTo:
         if self.name == "RTL_ALT_TYPE":
             return "at a height above the ground below it, where it knows that"
         return _RETURNS.get(kind, f"as {self.name} {kind} says")
+
+    @property
+    def may_fly_straight(self) -> bool:
+        """Whether, of RETURN_TYPE, a vehicle may fly straight home at its RETURN_HEIGHT all the same."""
+        return self.name == "RTL_ALT_TYPE" or round(self.value) not in _ALONG
 
     @property
     def spares_missions(self) -> bool:

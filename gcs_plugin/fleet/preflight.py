@@ -26,6 +26,7 @@ from orthoswarm.config import active
 from orthoswarm.model.earth import distance_m
 
 if TYPE_CHECKING:
+    from gcs_plugin.fleet.autopilot_settings import SetTo
     from gcs_plugin.fleet.vehicle_state import Vehicle
     from gcs_plugin.mission.geofence import Zone
     from gcs_plugin.mission.items import Mission
@@ -333,29 +334,44 @@ def _height(mission: "Mission | None", wanted: Wanted) -> Item:
 def _return(vehicle: "Vehicle", needed_m: float | None) -> Item:
     found, how = vehicle.settings.get(Setting.RETURN_HEIGHT), vehicle.settings.get(Setting.RETURN_TYPE)
     least = None if needed_m is None else f"the ground on its way needs {needed_m:.0f} m"
-    if how is not None and how.returns:
-        text = f"it returns {how.returns} ({how.name} is {how.value:g}), which plans and a return in turn do not know"
+    other = "" if how is None or not how.returns else f"it returns {how.returns} ({how.name} is {how.value:g})"
+    low = _too_low(vehicle, needed_m) if needed_m is not None and (how is None or how.may_fly_straight) else ""
+    if low:
+        return Item("return", Level.RED, f"{other}, and otherwise it {low}" if other else low)
+    if how is not None and other:
         also = "" if least is None else f"; {least} above home"
-        return Item("return", Level.WARNING, f"{text}{also}; set {how.name} to 0")
+        text = f"{other}, which plans and a return in turn do not know{also}; set {how.name} to 0"
+        return Item("return", Level.WARNING, text)
     if found is None:
         text = "it has not said at what height it flies home"
         return Item("return", Level.OK, text) if least is None else Item("return", Level.WARNING, f"{text}; {least}")
-    text = f"flies home {found.value:g} m above home, or higher where it is higher ({found.name})"
-    if not found.value:
-        text = f"flies home at the height at which it is ({found.name} is 0)"
-    if needed_m is not None and found.value < needed_m:
-        return Item("return", Level.RED, f"{text}, but {least}; set {found.name} to {found.native(needed_m):.0f}")
-    limits = fence_limits(vehicle) if vehicle.autopilot is Autopilot.ARDUPILOT else None
-    if needed_m is not None and limits is not None and limits.top is not None:  # its way home stays below that
-        below_m = limits.top.value - limits.margin_m
-        if below_m < needed_m:
-            text = f"flies home no higher than {below_m:g} m, below its geofence's top ({limits.top.name}), but {least}"
-            return Item("return", Level.RED, f"{text}; set {limits.top.name} to {needed_m + limits.margin_m:.0f}")
     rally = vehicle.settings.get(Setting.RALLY_POINTS)
     if rally is not None and rally.value > 0.0:
         text = f"it may return to one of its {rally.value:.0f} rally points ({rally.name}) instead of home"
         return Item("return", Level.WARNING, f"{text}, which plans and a return in turn do not know; remove them")
-    return Item("return", Level.OK, text)
+    return Item("return", Level.OK, _way_home(found))
+
+
+def _way_home(height: "SetTo") -> str:
+    """At what height a vehicle flies home, in words."""
+    if not height.value:
+        return f"flies home at the height at which it is ({height.name} is 0)"
+    return f"flies home {height.value:g} m above home, or higher where it is higher ({height.name})"
+
+
+def _too_low(vehicle: "Vehicle", needed_m: float) -> str:
+    """Why a straight way home is lower than the ground needs, in words; empty if it is not, or not known to be."""
+    found, least = vehicle.settings.get(Setting.RETURN_HEIGHT), f"the ground on its way needs {needed_m:.0f} m"
+    if found is not None and found.value < needed_m:
+        return f"{_way_home(found)}, but {least}; set {found.name} to {found.native(needed_m):.0f}"
+    limits = fence_limits(vehicle) if vehicle.autopilot is Autopilot.ARDUPILOT else None
+    if found is None or limits is None or limits.top is None:
+        return ""
+    below_m = limits.top.value - limits.margin_m  # its way home stays below that
+    if below_m >= needed_m:
+        return ""
+    text = f"flies home no higher than {below_m:g} m, below its geofence's top ({limits.top.name}), but {least}"
+    return f"{text}; set {limits.top.name} to {needed_m + limits.margin_m:.0f}"
 
 
 def _failsafe(vehicle: "Vehicle") -> Item:

@@ -114,6 +114,24 @@ def test_a_way_home_that_is_not_straight_to_it_is_warned_about(make_world, autop
         assert found.level is Level.WARNING and words in found.reason, found
 
 
+@pytest.mark.parametrize(
+    ("autopilot", "parameters", "level"),
+    [
+        (AP, {"RTL_ALT_TYPE": 1, "RTL_ALT": 1500}, Level.RED),  # above home where it does not know the ground
+        (PX4, {"RTL_TYPE": 1, "RTL_RETURN_ALT": 30.0}, Level.RED),  # straight home, for want of a landing
+        (PX4, {"RTL_TYPE": 2, "RTL_RETURN_ALT": 30.0}, Level.WARNING),  # back along its mission
+    ],
+)
+def test_a_way_home_that_may_be_straight_is_not_too_low(make_world, autopilot, parameters, level):
+    world = make_world(SimVehicle(system=1, autopilot=autopilot))
+    world.vehicles[1].parameters |= parameters
+    world.meet()
+    world.finish(world.fleet.download(1))
+    assert world.until(lambda: world.fleet.vehicles[1].ready_to_check, 30.0)
+    found = items_of(world, Wanted(needs=PlanNeeds(return_height_m=60.0)))["return"]
+    assert found.level is level and "TYPE is" in found.reason and "needs 60 m" in found.reason, found
+
+
 def test_a_fence_that_keeps_the_way_home_below_what_the_ground_needs_is_red(make_world):
     world = make_world(SimVehicle(system=1))
     world.vehicles[1].parameters |= {"RTL_ALT": 6000, "FENCE_ALT_MAX": 50.0}
