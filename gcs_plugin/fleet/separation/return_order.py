@@ -16,6 +16,7 @@ import numpy as np
 
 from gcs_plugin.config import LIMITS, RETURN
 from gcs_plugin.fleet.autopilot_settings import Setting
+from gcs_plugin.fleet.fence_limits import fence_limits
 from gcs_plugin.fleet.flight_state import Word, flight_state
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.flight_modes import why_no_missions
@@ -283,6 +284,9 @@ def _height_known(vehicle: "Vehicle") -> bool:
     """Whether the height of its way is known: it has said at what height above home it returns, or comes down."""
     how = vehicle.settings.get(Setting.RETURN_TYPE)
     told = Setting.RETURN_HEIGHT in vehicle.settings and not (how is not None and how.returns)
+    limits = fence_limits(vehicle) if vehicle.autopilot is Autopilot.ARDUPILOT else None
+    if limits is not None and limits.top is not None:  # its way home stays below that, if it keeps its fence then
+        told &= return_height_m(vehicle, math.inf) <= limits.top.value - limits.margin_m
     return told or flight_state(vehicle).word is Word.LANDING
 
 

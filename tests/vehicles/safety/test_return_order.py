@@ -338,3 +338,12 @@ def test_heights_do_not_keep_apart_a_vehicle_that_returns_in_another_way(make_wo
     for kind, known in ((0.0, True), (1.0, False)):
         vehicle.settings[Setting.RETURN_TYPE] = SetTo(name, kind)
         assert aloft_of(world.fleet.vehicles, world.clock.now)[1].height_known is known
+
+
+@pytest.mark.parametrize(("enabled", "top_m", "known"), [(1.0, 60.0, False), (1.0, 100.0, True), (0.0, 60.0, True)])
+def test_heights_do_not_keep_apart_a_vehicle_whose_fence_keeps_its_way_lower(make_world, enabled, top_m, known):
+    """Two with RTL_ALT 70 and 80 would both fly home at 58 m."""
+    world, vehicle = aloft_at(make_world, AP, 30.0, RETURN_HEIGHT=80.0, FENCE=enabled, FENCE_KINDS=7.0, FENCE_TOP=top_m)
+    assert aloft_of(world.fleet.vehicles, world.clock.now)[1].height_known is known
+    vehicle.settings[Setting.RETURN_HEIGHT] = SetTo("RTL_ALT_M", 15.0)
+    assert aloft_of(world.fleet.vehicles, world.clock.now)[1].height_known
