@@ -203,7 +203,9 @@ class Vehicle:
     @property
     def answers_settings(self) -> bool:
         """True while a setting that a check before a start looks at has been asked for and may still be told."""
-        return self.questions.waits_for(CHECKED)
+        fence = self.settings.get(Setting.FENCE)
+        off = fence is not None and not fence.value and not self.fence_on  # unless it switches it on as it arms
+        return self.questions.waits_for(CHECKED | {Setting.FENCE_AUTO} if off else CHECKED)
 
     @property
     def untold(self) -> bool:

@@ -23,8 +23,8 @@ def factory_parameters(autopilot: Autopilot, top_m_s: float) -> dict[str, float]
             "GF_MAX_HOR_DIST": 0.0, "GF_MAX_VER_DIST": 0.0,
         }  # fmt: skip
     return {
-        "WPNAV_SPEED": 100.0 * _WPNAV_SPEED_M_S, "RTL_ALT": 100.0 * RTL_HEIGHT_M, "RTL_ALT_TYPE": 0,
-        "FS_GCS_ENABLE": 0, "FENCE_ENABLE": 0, "FENCE_TYPE": 7, "FENCE_ACTION": 1, "FENCE_RADIUS": 300.0,
+        "WPNAV_SPEED": 100.0 * _WPNAV_SPEED_M_S, "RTL_ALT": 100.0 * RTL_HEIGHT_M, "RTL_ALT_TYPE": 0, "FS_GCS_ENABLE": 0,
+        "FENCE_ENABLE": 0, "FENCE_AUTOENABLE": 0, "FENCE_TYPE": 7, "FENCE_ACTION": 1, "FENCE_RADIUS": 300.0,
         "FENCE_ALT_MAX": 100.0, "FENCE_ALT_MIN": -10.0, "FENCE_MARGIN": 2.0,
     }  # fmt: skip
 

@@ -6,6 +6,7 @@ import re
 import pytest
 
 from gcs_plugin.daemon.takeoffs import Takeoffs
+from gcs_plugin.fleet.autopilot_settings import Setting
 from gcs_plugin.fleet.preflight import Level, Wanted, preflight
 from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.mission.items import FRAME_TERRAIN, RTL, TAKEOFF, WAYPOINT, Mission, MissionItem
@@ -135,6 +136,23 @@ def test_the_fence_is_asked_for_until_it_is_told(make_world, autopilot):
     lossy = Faults(loss=0.2, seed=3)
     item = fence_of(make_world, autopilot, flight(autopilot), kept | {NAMES[autopilot][0]: 100.0}, up=lossy, down=lossy)
     assert item.level is Level.RED
+
+
+def test_a_fence_is_held_to_be_off_only_once_it_is_known_when_it_is_switched_on(make_world):
+    """FENCE_AUTOENABLE, or the question, may be lost where all else is told."""
+    world = make_world(SimVehicle(system=1))
+    del world.vehicles[1].parameters["FENCE_AUTOENABLE"]
+    world.vehicles[1].parameters["FENCE_RADIUS"] = 100.0
+    world.meet()
+    world.wait(8.0)
+    world.finish(world.fleet.upload(1, flight(AP)))
+    world.finish(world.fleet.download(1))
+    vehicle = world.fleet.vehicles[1]
+    assert world.until(lambda: {Setting.FENCE, Setting.SPEED} <= vehicle.settings.keys(), 2.0)
+    world.vehicles[1].parameters["FENCE_AUTOENABLE"] = 3
+    assert world.until(lambda: vehicle.ready_to_check, 30.0)
+    items = {item.name: item for item in preflight(vehicle, Wanted(), world.clock.now).items}
+    assert items["fence"].level is Level.RED, items["fence"].reason
 
 
 def test_a_vehicle_that_does_not_tell_is_warned_about(make_world):
