@@ -195,7 +195,7 @@ def _decode_other(path: Path, data: bytes, *, gray: bool) -> Bytes:
     image = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_ANYDEPTH) if data else None
     if image is not None and image.dtype == np.uint16:
         folder, suffix = path.parent, path.suffix.lower()
-        used = kept_range(folder.parent, image, suffix) if _is_spread(folder) else _used_range(folder, suffix)
+        used = kept_range(folder.parent, image, suffix) if _is_spread(path) else _used_range(folder, suffix)
         if used is not None:
             low, high = used
             scaled = (image.astype(np.float32) - np.float32(low)) * np.float32(255.0 / (high - low))
@@ -220,9 +220,10 @@ def _holds_measurements(data: bytes) -> bool:
         return False
 
 
-def _is_spread(folder: Path) -> bool:
-    """Whether it is one of the folders over which a ground station spreads what comes."""
-    return re.fullmatch("[0-9a-f]{2}", folder.name) is not None and not is_stored(folder)
+def _is_spread(path: Path) -> bool:
+    """Whether a ground station has spread it over folders of two digits of its name, which are no flights."""
+    digits = re.fullmatch("([0-9a-f]{2})[0-9a-f]{62}", path.stem)
+    return digits is not None and digits[1] == path.parent.name and not is_stored(path)
 
 
 def deep_picture(data: bytes) -> NDArray[np.uint16] | None:

@@ -12,8 +12,10 @@ def ramp(low: float, high: float) -> np.ndarray:
     return np.linspace(low, high, 64 * 48).reshape(48, 64).astype(np.uint16)
 
 
-@pytest.mark.parametrize("suffix", ["tif", "png"])
-def test_fourteen_bits_are_stretched_by_one_range_for_the_folder(tmp_path, suffix):
+@pytest.mark.parametrize(("suffix", "name"), [("tif", "flight"), ("png", "flight"), ("tif", "01")])
+def test_fourteen_bits_are_stretched_by_one_range_for_the_folder(tmp_path, suffix, name):
+    tmp_path = tmp_path / name
+    tmp_path.mkdir()
     for k in range(4):
         cv2.imwrite(str(tmp_path / f"{k}.{suffix}"), ramp(7200 + 100 * k, 7900 + 100 * k))
     first, last = (read_gray(tmp_path / f"{k}.{suffix}").astype(float) for k in (0, 3))
@@ -35,10 +37,9 @@ def test_a_ground_stations_pictures_do_not_depend_on_what_else_has_come(tmp_path
     grey = []
     for k, name in enumerate(("00", "ab", "f3")):
         (tmp_path / name).mkdir()
-        cv2.imwrite(
-            str(tmp_path / name / f"{k}.png"), np.vstack([np.full((24, 64), 3200, np.uint16), ramp(0, 999 * k)])
-        )
-        grey.append(int(read_gray(tmp_path / name / f"{k}.png")[0, 0]))
+        path = tmp_path / name / f"{name}{k:062x}.png"
+        cv2.imwrite(str(path), np.vstack([np.full((24, 64), 3200, np.uint16), ramp(0, 999 * k)]))
+        grey.append(int(read_gray(path)[0, 0]))
     assert set(grey) == {3200 // 256}
 
 
