@@ -1,6 +1,8 @@
 """Poses between samples, and the offset between the clocks of a camera and a vehicle."""
 
 import math
+from datetime import UTC, datetime
+from zoneinfo import ZoneInfo, available_timezones
 
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ from hypothesis import strategies as st
 
 from telemetry.formats.log.flight_logs import read_log
 from telemetry.ingest.ingest import LoadOptions, load
-from telemetry.ingest.pairing.clock_offset import offset_by_positions, offset_by_turning, offset_by_zone
+from telemetry.ingest.pairing.clock_offset import ZONES_S, offset_by_positions, offset_by_turning, offset_by_zone
 from telemetry.samples.sample import Sample
 from telemetry.samples.timeline import Timeline
 
@@ -76,6 +78,15 @@ def test_the_zone_alone_is_found_where_nothing_else_is_known(flown):
     assert offset_by_zone(times + 7200, flown) == 7200
     assert offset_by_zone(times + 20700, flown) == 20700
     assert offset_by_zone(times + 86400 * 3, flown) is None
+
+
+def test_the_zones_are_those_of_all_places_since_2010():
+    names = available_timezones()
+    if not names:
+        pytest.skip("no time zone database")
+    days = [datetime(year, month, 15, tzinfo=UTC) for year in range(2010, 2027) for month in (1, 4, 7, 10)]
+    offsets = {day.astimezone(ZoneInfo(name)).utcoffset().total_seconds() for name in names for day in days}
+    assert offsets <= set(ZONES_S)
 
 
 def test_no_place_on_earth_explains_a_quarter_of_an_hour(flown):
