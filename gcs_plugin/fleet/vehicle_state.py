@@ -20,6 +20,7 @@ from gcs_plugin.mission.items import Mission
 
 _LANDED: Final = {0: "", 1: "on ground", 2: "in air", 3: "taking off", 4: "landing"}
 _FIRST: Final = 0
+_SURE_TIMES: Final = 3  # that a battery was told before, where packets are lost: then the others were, too (chosen)
 _PREARM: Final = int(dialect.MAV_SYS_STATUS_PREARM_CHECK)
 _GEOFENCE: Final = int(dialect.MAV_SYS_STATUS_GEOFENCE)
 _PREARM_S: Final = 45.0  # autopilots repeat what is wrong every 30 s
@@ -121,7 +122,7 @@ class Vehicle:
     _prearm: dict[str, float] = field(default_factory=dict)
     _still_since: float | None = None
     _batteries: dict[int, float | None] = field(default_factory=dict)
-    _told: set[int] = field(default_factory=set)
+    _told: dict[int, tuple[int, int]] = field(default_factory=dict)
     _all_batteries: bool = False
     _pictures: set[tuple[int, int]] = field(default_factory=set)
 
@@ -348,8 +349,10 @@ class Vehicle:
     def _battery(self, m: Message) -> None:
         """Of one of several; the first one's is in SYS_STATUS, too, and PX4's SYS_STATUS is of the emptiest one."""
         if self.autopilot is not Autopilot.PX4:
-            self._all_batteries |= int(m.id) in self._told  # they are told one after the other
-            self._told.add(int(m.id))
+            times, missed = self._told.get(int(m.id), (0, 0))
+            # They are told one after the other: between two of one come all others, unless a packet was lost.
+            self._all_batteries |= times > 0 and (missed == self.missed or times >= _SURE_TIMES)
+            self._told[int(m.id)] = times + 1, self.missed
             if m.id != _FIRST:
                 self._left_in(int(m.id), m)
 

@@ -387,6 +387,21 @@ def test_a_check_waits_until_all_batteries_were_told(make_world):
     assert world.fleet.vehicles[1].battery == pytest.approx(0.05)
 
 
+def test_a_battery_whose_first_message_was_lost_is_waited_for(make_world):
+    """Two messages of the first one are no proof that there is no other where packets were lost between them."""
+    world = make_world(SimVehicle(system=1, autopilot=AP))
+    told, battery = dialect.MAVLINK_MSG_ID_BATTERY_STATUS, 0.05
+    world.vehicles[1].withheld.add(int(told))
+    world.wait(8.0)
+    vehicle = world.fleet.vehicles[1]
+    for number, left, lost in ((0, 90, 0), (0, 90, 1), (1, round(100 * battery), 0), (0, 90, 0)):
+        assert not vehicle.ready_to_check
+        vehicle.missed += lost
+        vehicle.streams.seen(int(told), world.clock.now)
+        vehicle.update(dialect.MAVLink_battery_status_message(number, 0, 0, 0x7FFF, [0xFFFF] * 10, -1, -1, -1, left))
+    assert vehicle.ready_to_check and vehicle.battery == pytest.approx(battery)
+
+
 def test_one_battery_has_no_number(make_world):
     world = make_world(SimVehicle(system=1, autopilot=AP))
     world.wait(8.0)
