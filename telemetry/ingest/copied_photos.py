@@ -22,21 +22,17 @@ def copies_among(photos: Sequence[Path]) -> dict[Path, Path]:
     """The photos that are copies, with the one in another folder that each is a copy of.
 
     Folders that have only one or two photos in common count as two. Only files that share their size with another are
-    opened. Files in stores are not compared.
+    opened, and only those that begin like another are read beyond: raw pictures are all of one size, and each sample
+    is a seek on a disk. Files in stores are not compared.
 
     Args:
         photos: of all folders, the one to keep before its copies.
     """
     found: dict[Path, Path] = {}
-    for alike in _of_one_size(photos):
-        first_of: dict[bytes, Path] = {}
-        for path in alike:
-            digest = _digest(path)
-            if digest is None:
-                continue
-            first = first_of.setdefault(digest, path)
-            if first.parent != path.parent and _is_exposure(first):
-                found[path] = first
+    for of_one_size in _of_one_size(photos):
+        for of_one_beginning in _alike(of_one_size, 0):
+            for first, *others in _alike(of_one_beginning, _SAMPLES):
+                found |= {path: first for path in others if first.parent != path.parent and _is_exposure(first)}
     in_common: dict[tuple[Path, Path], set[Path]] = {}
     for copy, first in found.items():
         in_common.setdefault((copy.parent, first.parent), set()).add(first)
@@ -55,7 +51,17 @@ def _of_one_size(photos: Sequence[Path]) -> Iterator[list[Path]]:
     return (alike for size, alike in by_size.items() if size and len(alike) > 1)
 
 
-def _digest(path: Path) -> bytes | None:
+def _alike(photos: Sequence[Path], samples: int) -> list[list[Path]]:
+    """Two and more of these that have one digest, in their order."""
+    by_digest: dict[bytes, list[Path]] = {}
+    for path in photos:
+        digest = _digest(path, samples)
+        if digest is not None:
+            by_digest.setdefault(digest, []).append(path)
+    return [alike for alike in by_digest.values() if len(alike) > 1]
+
+
+def _digest(path: Path, samples: int) -> bytes | None:
     """A digest of the beginning, with the tags, and of samples up to the end; None if the file cannot be read."""
     try:
         if not path.is_file():  # reading a pipe would wait for ever
@@ -63,8 +69,8 @@ def _digest(path: Path) -> bytes | None:
         with path.open("rb") as file:
             size = os.fstat(file.fileno()).st_size
             digest = hashlib.blake2b(digest_size=16)
-            for k in range(_SAMPLES + 1):
-                file.seek(max(0, size - _SAMPLE_BYTES) * k // _SAMPLES)
+            for k in range(samples + 1):
+                file.seek(max(0, size - _SAMPLE_BYTES) * k // max(1, samples))
                 digest.update(file.read(_SAMPLE_BYTES))
             return digest.digest()
     except OSError:

@@ -8,6 +8,7 @@ import pytest
 
 import telemetry
 from orthoswarm.model.errors import InputError
+from telemetry.ingest import copied_photos
 from telemetry.ingest.ingest import LoadOptions, load, require_frames, survey
 from tests.telemetry.ingest.test_photos import gps_exif, jpeg
 
@@ -141,6 +142,17 @@ def test_a_backup_beside_the_photos_is_no_second_vehicle(tmp_path, renamed):
     assert {r.reason for r in found.rejected} == {"a copy of a photo in DCIM, which is in the input already"}
     assert {r.detail for r in found.rejected} == ({f"P_{i}.JPG" for i in range(1, 5)} if renamed else {""})
     assert any("4 photos in Backup are copies of those in DCIM" in warning for warning in found.warnings)
+
+
+def test_photos_of_one_size_are_read_beyond_their_beginnings_only_if_these_are_alike(tmp_path, monkeypatch):
+    asked, digest = [], copied_photos._digest
+    monkeypatch.setattr(copied_photos, "_digest", lambda path, samples: asked.append(samples) or digest(path, samples))
+    for folder in ("v1", "v2"):
+        for i in range(8):  # the first four begin alike
+            path = photo(tmp_path / folder / f"{i}.JPG", second=i + 10 * (folder == "v2" and i >= 4))
+            path.write_bytes(path.read_bytes() + bytes(300_000) + folder.encode())
+    assert not copied_photos.copies_among(sorted(tmp_path.rglob("*.JPG")))
+    assert sorted(set(asked)) == [0, copied_photos._SAMPLES] and asked.count(copied_photos._SAMPLES) == 8
 
 
 def test_of_copies_those_beside_their_poses_are_kept(tmp_path):
