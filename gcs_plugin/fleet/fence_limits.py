@@ -16,7 +16,7 @@ from gcs_plugin.config import LIMITS
 from gcs_plugin.fleet.autopilot_settings import Setting
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.items import FRAME_TERRAIN, LAND, PLAIN_FRAME, RTL, VTOL_LAND
-from gcs_plugin.mission.track import flight_path, home_of
+from gcs_plugin.mission.track import flight_path, heights_m, home_of
 
 if TYPE_CHECKING:
     from gcs_plugin.fleet.autopilot_settings import SetTo
@@ -127,11 +127,11 @@ def _findings(vehicle: "Vehicle", mission: "Mission", limits: FenceLimits, point
             yield Finding(text, beyond=False)
     if limits.floor is not None:
         low_m, been_above = math.inf, False
-        for item in mission.items[mission.first_seq :]:
-            if not item.is_nav or not item.has_place or item.command in (RTL, LAND, VTOL_LAND):
+        for item, height_m in heights_m(mission):
+            if item.command in (RTL, LAND, VTOL_LAND):
                 continue
-            been_above |= item.z >= limits.floor.value + margin_m
-            low_m = min(low_m, item.z if been_above else math.inf)
+            been_above |= height_m >= limits.floor.value + margin_m
+            low_m = min(low_m, height_m if been_above else math.inf)
         if low_m <= limits.floor.value:
             text = f"its mission goes down to {low_m:.0f} m, but its geofence begins at {limits.floor.value:g} m"
             text += f" ({limits.floor.name})" + (f", {limits.does}" if limits.does else ", which it reports")

@@ -176,15 +176,19 @@ def fastest_m_s(mission: "Mission") -> float | None:
     return max(speeds, default=None)
 
 
-def highest_m(mission: "Mission") -> float | None:
-    """The greatest height above takeoff in a mission, None if it contains none."""
+def heights_m(mission: "Mission") -> "list[tuple[MissionItem, float]]":
+    """The items of a mission that have a place, each with its height above takeoff, metres."""
     base = _ground_m(mission)
-    heights = [
-        item.z - (base if PLAIN_FRAME.get(item.frame, item.frame) == FRAME_GLOBAL else 0.0)
+    return [
+        (item, item.z - (base if PLAIN_FRAME.get(item.frame, item.frame) == FRAME_GLOBAL else 0.0))
         for item in mission.items[mission.first_seq :]
         if item.is_nav and item.has_place
     ]
-    return max(heights, default=None)
+
+
+def highest_m(mission: "Mission") -> float | None:
+    """The greatest height above takeoff in a mission, None if it contains none."""
+    return max((height for _, height in heights_m(mission)), default=None)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 
 import pytest
 
@@ -9,7 +10,7 @@ from gcs_plugin.daemon.takeoffs import Takeoffs
 from gcs_plugin.fleet.autopilot_settings import Setting
 from gcs_plugin.fleet.preflight import Level, Wanted, preflight
 from gcs_plugin.links.mavlink import Autopilot, dialect
-from gcs_plugin.mission.items import FRAME_TERRAIN, RTL, TAKEOFF, WAYPOINT, Mission, MissionItem
+from gcs_plugin.mission.items import FRAME_GLOBAL, FRAME_TERRAIN, RTL, TAKEOFF, WAYPOINT, Mission, MissionItem
 from gcs_plugin.mission.mission_builder import read_mission
 from gcs_plugin.sim.lossy_radio import Faults
 from gcs_plugin.sim.multirotor import Chart
@@ -116,6 +117,11 @@ def test_a_mission_that_sinks_to_the_floor_of_a_fence_is_red(make_world):
     assert (
         item.level is Level.RED and "goes down to 25 m, but its geofence begins at 30 m (FENCE_ALT_MIN)" in item.reason
     )
+    home, *above_sea = flight(AP, heights=(538.0, 513.0), frame=FRAME_GLOBAL).items
+    takeoff = MissionItem.at(TAKEOFF, *CHART.to_degrees(0.0, 0.0), 538.0, frame=FRAME_GLOBAL)
+    above_sea = Mission(AP, (replace(home, z=488.0, frame=FRAME_GLOBAL), takeoff, *above_sea[1:]))
+    item = fence_of(make_world, AP, above_sea, floor)
+    assert item.level is Level.RED and "goes down to 25 m" in item.reason
     assert fence_of(make_world, AP, low, floor).level is Level.OK  # it never was above it
     assert fence_of(make_world, AP, sinks, floor | {"FENCE_ALT_MIN": -10.0}).level is Level.OK
 
