@@ -392,9 +392,11 @@ def _separation(wanted: Wanted) -> Item:
         return Item("separation", Level.RED, wanted.near)
     if wanted.unexamined:
         return Item("separation", Level.WARNING, f"not examined: {wanted.unexamined}")
-    apart, usual_m = wanted.needs.apart, active().planning.separation_m
-    if wanted.mission is not None and apart is not None and apart.distance_m < usual_m:
-        text = f"its plan keeps its vehicles only {apart.distance_m:g} m apart; alarms come below {usual_m:g} m"
+    apart, usual = wanted.needs.apart, active().planning
+    less = apart is not None and (apart.distance_m < usual.separation_m or apart.height_m < usual.layer_m)
+    if wanted.mission is not None and apart is not None and less:
+        text = f"its plan keeps its vehicles only {apart.distance_m:g} m apart, or {apart.height_m:g} m in height"
+        text += f"; alarms come below {usual.separation_m:g} m and {usual.layer_m:g} m"
         return Item("separation", Level.WARNING, text)
     return Item("separation", Level.OK, "keeps apart")
 

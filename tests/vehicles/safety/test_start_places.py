@@ -138,6 +138,10 @@ def test_vehicles_of_a_plan_are_to_keep_apart_as_it_was_made(make_world, distanc
     ]
     assert [item.level for item in found] == [level] * 2, found
     assert level is Level.RED or "only 4 m apart" in found[0].reason
+    flat = PlanNeeds(apart=Apart(10.0, 2.0))  # another way to be nearer than alarms allow
+    far = preflight_all({1: vehicles[1]}, {1: loaded[1]}, {}, {}, world.clock.now, needs=flat)
+    (item,) = [item for item in far[0].items if item.name == "separation"]
+    assert item.level is Level.WARNING and "or 2 m in height" in item.reason
     # Who is not of the plan is kept as far away as ever.
     stranger = preflight_all(vehicles, {1: loaded[1]}, {2: loaded[2]}, {}, world.clock.now, needs=needs)
     assert any(item.name == "separation" and item.level is Level.RED for check in stranger for item in check.items)
