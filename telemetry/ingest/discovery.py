@@ -3,7 +3,7 @@
 import os
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -157,11 +157,12 @@ def discover(inputs: Sequence[Path], exclude: Sequence[Path] = ()) -> Discovery:
     return Discovery(root, ordered, left, _video_vehicles(ordered, root), apart, unreadable=unreadable, copies=copies)
 
 
-def _originals_first(folders: Iterable[Folder]) -> list[Path]:
+def _originals_first(folders: Collection[Folder]) -> list[Path]:
     """All pictures, those to keep first: of folders whose poses apply only there, of fuller ones, and higher up."""
+    poses = {folder.path for folder in folders if folder.logs or any(map(_is_for_pictures, folder.tables))}
 
     def foremost(folder: Folder) -> tuple[Any, ...]:
-        posed = bool(folder.logs) or any(not is_stored(path) and names_pictures(path) for path in folder.tables)
+        posed = not poses.isdisjoint((folder.path, *folder.path.parents))
         beside = sum(map(len, (folder.videos, folder.subtitles, folder.tables, folder.logs)))
         return not posed, -len(folder.pictures), -beside, len(folder.path.parts), natural_key(str(folder.path))
 
@@ -170,6 +171,10 @@ def _originals_first(folders: Iterable[Folder]) -> list[Path]:
         for folder in sorted(folders, key=foremost)
         for path in sorted(folder.pictures, key=lambda path: (len(path.name), _by_name(path)))
     ]
+
+
+def _is_for_pictures(table: Path) -> bool:
+    return not is_stored(table) and names_pictures(table)
 
 
 def _copied(folder: Path, root: Path) -> str:

@@ -155,9 +155,10 @@ def test_photos_of_one_size_are_read_beyond_their_beginnings_only_if_these_are_a
     assert sorted(set(asked)) == [0, copied_photos._SAMPLES] and asked.count(copied_photos._SAMPLES) == 8
 
 
-def test_of_copies_those_beside_their_poses_are_kept(tmp_path):
-    flight(tmp_path / "day" / "ppk", [0.0], legs=4)
-    photos = sorted((tmp_path / "day" / "ppk").glob("*.JPG"))
+@pytest.mark.parametrize("below", ["", "DCIM/"])
+def test_of_copies_those_beside_their_poses_are_kept(tmp_path, below):
+    flight(tmp_path / "day" / "ppk" / below, [0.0], legs=4)
+    photos = sorted((tmp_path / "day" / "ppk" / below).glob("*.JPG"))
     rows = [f"{path.name} 465000.0 {5260000 + 8 * i}.0 512.0" for i, path in enumerate(photos)]
     (tmp_path / "day" / "ppk" / "geo.txt").write_text("\n".join(["EPSG:32632", *rows]))
     photo(tmp_path / "day" / "raw" / "X.JPG", second=50)  # more photos, but no table
@@ -166,7 +167,7 @@ def test_of_copies_those_beside_their_poses_are_kept(tmp_path):
     (tmp_path / "day" / "raw" / "notes.txt").write_text("wind from the west\n")
     found = load([tmp_path / "day"])
     assert {f.image: f.origin["position"] for f in found.frames} == {
-        **{f"ppk/{path.name}": "geo.txt" for path in photos},
+        **{f"ppk/{below}{path.name}": "geo.txt" for path in photos},
         "raw/X.JPG": "EXIF GPS",
     }
 
