@@ -20,6 +20,7 @@ from orthoswarm.export.sheets.forms import write_form
 from orthoswarm.export.sheets.geopdf import write_geopdf
 from orthoswarm.export.sheets.mgrs import mgrs, utm_zone
 from orthoswarm.export.sheets.stac_item import write_stac_item
+from orthoswarm.export.sheets.stated_accuracy import stated_accuracy
 from orthoswarm.export.surface_file import write_surface
 from orthoswarm.export.tactical.places import FILE, Place, write_geojson
 from orthoswarm.export.tiles.mbtiles import write_mbtiles
@@ -130,6 +131,12 @@ def test_an_earlier_layer_does_not_quote_the_accuracy_of_the_last(folder, layer,
     assert item["id"] == f"flood-{layer}"
     assert ("No accuracy is stated" in item["properties"]["description"]) == own
     assert ("No accuracy is stated" in page) == own
+
+
+@pytest.mark.parametrize(("leg", "placed_on"), [(MATCHED, "map"), (FAILED, "receivers")])
+def test_a_coarse_layer_is_placed_on_the_map_only_where_legs_were_found_there(folder, leg, placed_on):
+    (folder / "report.json").write_text(json.dumps({"legs": [leg], "basemap": "m.tif"}))
+    assert stated_accuracy(folder, "coarse").values == {"orthoswarm:placed_on": placed_on}
 
 
 def test_a_long_statement_stays_on_the_sheet(folder, monkeypatch):

@@ -44,7 +44,7 @@ def stated_accuracy(folder: Path, layer: str = "") -> StatedAccuracy | None:
         return None
     report: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     if _is_earlier(folder, layer, report):
-        return _of_earlier(layer)
+        return _of_earlier(layer, _matched(report))
     placed_on, placing = _placed(report)
     sigma, of_sigma = _sigma(_sigmas(folder, report), placed_on)
     checked, of_check = _checked(report)
@@ -61,19 +61,23 @@ def _is_earlier(folder: Path, layer: str, report: Mapping[str, Any]) -> bool:
     return layer in _LAYERS and layer != last and not copied
 
 
-def _of_earlier(layer: str) -> StatedAccuracy:
+def _of_earlier(layer: str, matched: int) -> StatedAccuracy:
     if layer == "realtime":
         how, placed_on = "The quick picture, not refined: placed as the receivers recorded.", "receivers"
     else:
-        how, placed_on = "The coarse picture, before the last refinement.", "map"
+        how, placed_on = "The coarse picture, before the last refinement.", "map" if matched else "receivers"
     return StatedAccuracy(f"{how} No accuracy is stated for it.", {"orthoswarm:placed_on": placed_on})
+
+
+def _matched(report: Mapping[str, Any]) -> int:
+    """How many legs were found on the map."""
+    return sum(leg.get("state") == "matched" for leg in report.get("legs", []))
 
 
 def _placed(report: Mapping[str, Any]) -> tuple[str, str]:
     """What placed the map: a word, and a sentence."""
-    legs: list[Mapping[str, Any]] = report.get("legs", [])
-    matched = sum(leg.get("state") == "matched" for leg in legs)
-    on_map = f"{matched} of {len(legs)} legs were found on the map"
+    matched = _matched(report)
+    on_map = f"{matched} of {len(report.get('legs', []))} legs were found on the map"
     control = report.get("control")
     if control:
         count = int(control["points"])
