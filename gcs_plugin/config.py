@@ -39,6 +39,9 @@ class FlightLimits:
     of FENCE_MARGIN, which counts where it is known."""
     fence_px4_rise_m: float = 13.0
     """The same for the height of a PX4, metres: it rises by so much as it brakes (measured, docs/vehicles.md)."""
+    lossy_share: float = 0.05
+    """A link that loses more of its packets may lose three questions or their answers: (2 * 0.05) ** 3, one in a
+    thousand times."""
     old_s: float = 15.0
     """The state of battery or receiver that was reported longer ago is not that of now, seconds: both come once a
     second, and are asked for again three seconds after they stop (chosen)."""

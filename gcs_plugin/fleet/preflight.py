@@ -317,8 +317,17 @@ def _fence(vehicle: "Vehicle", mission: "Mission | None", zones: "Sequence[Zone]
         return Item("fence", Level.WARNING, "it has not said whether it keeps a geofence; look at its parameters")
     if limits.unsaid:
         return Item("fence", Level.WARNING, "it keeps a geofence but has not said all its limits; check again")
+    lossy = vehicle.route is not None and vehicle.route.loss > LIMITS.lossy_share
+    if lossy and not limits.any and not limits.unsaid and _may_switch_fence_on(vehicle):
+        text = "its geofence is off; whether it switches that on as it arms may have been lost on its link"
+        return Item("fence", Level.WARNING, f"{text}; look at FENCE_AUTOENABLE")
     text = "its mission keeps to its geofence" if zones or limits.any else "it has no geofence"
     return Item("fence", Level.OK, f"{text}; zones in it were not read" if zones is None else text)
+
+
+def _may_switch_fence_on(vehicle: "Vehicle") -> bool:
+    """Whether ArduPilot has not said when it switches its geofence on; older versions do not say it."""
+    return vehicle.autopilot is Autopilot.ARDUPILOT and Setting.FENCE_AUTO not in vehicle.settings
 
 
 def _height(mission: "Mission | None", wanted: Wanted) -> Item:

@@ -161,6 +161,25 @@ def test_a_fence_is_held_to_be_off_only_once_it_is_known_when_it_is_switched_on(
     assert items["fence"].level is Level.RED, items["fence"].reason
 
 
+@pytest.mark.parametrize(("loss", "level"), [(0.0, Level.OK), (0.2, Level.WARNING)])
+def test_a_link_that_loses_packets_leaves_it_open_when_a_fence_is_switched_on(make_world, loss, level):
+    """Older versions do not have FENCE_AUTOENABLE; on a link that loses packets that looks the same."""
+    world = make_world(SimVehicle(system=1), up=Faults(loss=loss, seed=5), down=Faults(loss=loss, seed=6))
+    del world.vehicles[1].parameters["FENCE_AUTOENABLE"]
+    world.meet()
+    world.wait(20.0)
+    world.finish(world.fleet.upload(1, flight(AP)))
+    vehicle = world.fleet.vehicles[1]
+    for _ in range(10):
+        world.finish(world.fleet.download(1))
+        assert world.until(lambda: vehicle.ready_to_check, 60.0)
+        if not vehicle.untold:
+            break
+    items = {item.name: item for item in preflight(vehicle, Wanted(), world.clock.now).items}
+    assert items["fence"].level is level, items["fence"].reason
+    assert level is Level.OK or "FENCE_AUTOENABLE" in items["fence"].reason
+
+
 def test_a_vehicle_that_does_not_tell_is_warned_about(make_world):
     world = make_world(SimVehicle(system=1))
     world.vehicles[1].parameters.clear()
