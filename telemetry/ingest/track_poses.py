@@ -10,7 +10,12 @@ from orthoswarm.config import active
 from orthoswarm.model.earth import distance_m
 from telemetry.formats.log.mavlink_poses import fixed_camera
 from telemetry.ingest.log_choice import LogMatch, LogSource, best_log
-from telemetry.ingest.pairing.clock_offset import median_distance_m, offset_by_positions, offset_by_zone
+from telemetry.ingest.pairing.clock_offset import (
+    median_distance_m,
+    offset_by_positions,
+    offset_by_zone,
+    zones_of_flight,
+)
 from telemetry.ingest.photo_order import clock_went_back
 from telemetry.ingest.several_flights import nearest_span, of_one_vehicle, zone_of_all
 from telemetry.photos.flight_checks import number_of
@@ -81,6 +86,7 @@ def add_track(photos: Sequence[PhotoTags], near: Sequence[LogSource], vehicle: s
             findings.append(best)
             explain(timed, best.message)
             return
+        also = [] if by_positions else _other_zones(timed, best)
         count, far = _fill_from(best, timed)
         if count:
             best.entry.used = True
@@ -88,6 +94,8 @@ def add_track(photos: Sequence[PhotoTags], near: Sequence[LogSource], vehicle: s
                 f"{plural(count, 'photo')} got poses from the track of {best.entry.log.path.name} by time; the "
                 f"camera's clock is {best.offset_s:+.1f} s off"
             )
+            if also:
+                text += f"; time zones of {', '.join(also)} from that fit as well: check their places"
             findings.append(Finding("posed-by-time", text, vehicle, note=by_positions))
         if far:
             text = (
@@ -153,8 +161,11 @@ def _by_positions(photos: Sequence[PhotoTags], near: Sequence[LogSource]) -> lis
 
 def _by_zone(photos: Sequence[PhotoTags], near: Sequence[LogSource]) -> list[LogMatch]:
     times = np.array([p.time_s for p in photos], dtype=np.float64)
-    zones = [(entry, offset_by_zone(times, entry.timeline)) for entry in near]
-    unknown = any(ZONE_UNKNOWN in p.origin.get("time", "") for p in photos)  # then no zone is likelier than another
+    unknown = _is_zone_unknown(photos)  # then no zone is likelier than another
+    if unknown:
+        zones = [(entry, next(iter(zones_of_flight(times, entry.timeline)), None)) for entry in near]
+    else:
+        zones = [(entry, offset_by_zone(times, entry.timeline)) for entry in near]
     return [
         LogMatch(
             entry=entry, offset_s=zone, how="by the time of the flight", rank=0, misfit=0.0 if unknown else abs(zone)
@@ -162,6 +173,19 @@ def _by_zone(photos: Sequence[PhotoTags], near: Sequence[LogSource]) -> list[Log
         for entry, zone in zones
         if zone is not None and any(sample.has_position for sample in entry.log.samples)
     ]
+
+
+def _is_zone_unknown(photos: Sequence[PhotoTags]) -> bool:
+    return any(ZONE_UNKNOWN in p.origin.get("time", "") for p in photos)
+
+
+def _other_zones(photos: Sequence[PhotoTags], match: LogMatch) -> list[str]:
+    """Offsets in hours, from that of a match, of further zones under which photos lie in the log's flights."""
+    if not _is_zone_unknown(photos):
+        return []
+    times = np.array([p.time_s for p in photos], dtype=np.float64)
+    zones = zones_of_flight(times, match.entry.timeline)
+    return [f"{(zone - match.offset_s) / 3600.0:+g} h" for zone in zones if zone != match.offset_s]
 
 
 def _far_m(match: LogMatch) -> float:

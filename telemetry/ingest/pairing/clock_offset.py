@@ -20,16 +20,45 @@ ZONES_S = tuple(3600.0 * hours for hours in sorted([*range(-12, 15), *_HALF_HOUR
 """Offsets of local times from UTC that were in use anywhere from 2010 on, seconds (IANA time zone database)."""
 SPAN_MARGIN_S = 2.0
 """Photos may lie so far outside a log's span, seconds: times are in whole seconds."""
+_MOVED_M = 2.0
+"""A vehicle moved that is farther away at the next photo, metres (chosen: receivers at rest wander less)."""
+_LEAST_MOVED = 0.8
+"""Zones under which a vehicle moved less often, by this share of the most, are not the photos' (chosen)."""
 
 
 def offset_by_zone(times: Array, timeline: Timeline) -> float | None:
-    """The time zone under which all photos fall into the flight; the smallest of several."""
+    """The time zone under which all photos fall into the log; the smallest of several."""
+    return next(iter(_fitting_zones(times, timeline)), None)
+
+
+def zones_of_flight(times: Array, timeline: Timeline) -> list[float]:
+    """The time zones, smallest first, under which all photos fall into the log, and into its flights.
+
+    A log may last for hours: under a wrong zone photos lie where the vehicle stood before or after its flight. So of
+    several zones those count under which it moved between most photos.
+    """
+    zones = _fitting_zones(times, timeline)
+    moved = [_moved_share(np.sort(times) - zone, timeline) for zone in zones]
+    return [zone for zone, share in zip(zones, moved, strict=True) if share >= _LEAST_MOVED * max(moved)]
+
+
+def _fitting_zones(times: Array, timeline: Timeline) -> list[float]:
     span = timeline.span
     if span is None:
-        return None
+        return []
     first, last = span[0] - SPAN_MARGIN_S, span[1] + SPAN_MARGIN_S
-    fits = [zone for zone in ZONES_S if times.min() - zone >= first and times.max() - zone <= last]
-    return min(fits, key=abs) if fits else None
+    fits = (zone for zone in ZONES_S if times.min() - zone >= first and times.max() - zone <= last)
+    return sorted(fits, key=abs)
+
+
+def _moved_share(times: Array, timeline: Timeline) -> float:
+    """Share of photos between which and the one before a vehicle moved."""
+    lat, lon = timeline.values("lat_deg", times), timeline.values("lon_deg", times)
+    known = ~np.isnan(lat)
+    if known.sum() < 2:
+        return 0.0
+    steps = np.hypot(*np.diff(local_metres(lat[known], lon[known]), axis=0).T)
+    return float((steps > _MOVED_M).sum()) / len(times)
 
 
 def offset_by_positions(times: Array, lat_lon: Array, timeline: Timeline, *, search_s: float = 30.0) -> float | None:

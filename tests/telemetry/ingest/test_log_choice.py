@@ -91,6 +91,22 @@ def test_without_a_time_zone_none_of_two_flights_logs_is_likelier(tmp_path):
     assert not found.frames and len(found.rejected) == len(TAKEN_S)
 
 
+@pytest.mark.parametrize("again", [False, True])
+def test_a_log_of_hours_places_photos_in_its_flight_and_names_other_zones_that_fit(tmp_path, again):
+    """The vehicle waits for an hour before its flight and after it, or flies again; the clock shows local time."""
+    photos(tmp_path / "card", lambda _, utc_s: utc_s + 3600.0)
+    moments = np.arange(-3700.0, 7400.0)
+    flown = np.clip(moments - 3600.0 * (again & (moments >= 1800.0)), 0.0, 60.0)
+    rows = [(UTC_S + m, "{:.8f} {:.8f} 500.0".format(*place(f))) for m, f in zip(moments, flown, strict=True)]
+    solution(tmp_path / "card" / "a.pos", rows)
+    found = load([tmp_path])
+    (said,) = [warning for warning in found.warnings if "by time" in warning]
+    assert ("fit as well" in said) == again
+    if not again:
+        for frame in found.frames:
+            assert frame.time_s - UTC_S == pytest.approx(TAKEN_S[number(frame)], abs=1e-3)
+
+
 def two_flights(folder, hours, second_s=2400.0):
     """Photos of two flights by one clock that is off by some hours; when each was taken, by name."""
     photos(folder, lambda _, utc_s: utc_s + 3600.0 * hours)
