@@ -14,9 +14,9 @@ class PairingConfig:
     benchmarks.accuracy.photo_pairing finds no wrong pairing without a mark at it)."""
     least_probability: float = 0.02
     """Events that a photo has with less probability are not listed as its alternatives (chosen)."""
-    other_clock_intervals: float = 3.0
-    """Two clocks that differ by more usual intervals between exposures are two ways to pair a flight, not one of which
-    the neighbouring event is uncertain (chosen)."""
+    other_clock_intervals: float = 10.0
+    """Two clocks that differ by more usual intervals between exposures are two ways to pair a flight (chosen: an even
+    rhythm fits some intervals off, too, which the sigma covers; other legs and flights are tens of intervals away)."""
     same_exposure_s: float = 0.12
     """Camera events closer than this are one exposure that was recorded twice, seconds; at most 0.35 of the usual
     interval (CAMERA_TRIGGER and CAMERA_IMAGE_CAPTURED of one exposure are up to 0.1 s apart)."""
