@@ -167,7 +167,8 @@ def _correlation_peaks(model: SequenceModel) -> Iterator[Clock]:
         lag = int(np.argmax(best))
         if not np.isfinite(best[lag]) or best[lag] < 0.25:
             return
-        signed = lag if lag < size // 2 else lag - size
+        # Around the end are lags of events before the first photo; the photos may last far longer than the events.
+        signed = lag if lag * bin_s <= float(np.ptp(p)) + 2.0 else lag - size
         drift = float(drift_at[lag])
         yield float(p[0]) + signed * bin_s - (1.0 + drift) * float(e[0]), drift
         best[np.arange(lag - apart, lag + apart + 1) % size] = -np.inf

@@ -250,3 +250,16 @@ def test_photos_that_fit_a_log_in_two_ways_and_in_one_have_no_event_get_no_place
     assert all(frame.ambiguous and frame.fix.position_sigma_m > 30.0 for frame in found.frames)
     assert sum("in more than one way" in rejection.reason for rejection in found.rejected) >= 14
     assert any("in more than one way" in warning for warning in found.warnings)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_photos_of_three_flights_are_paired_with_the_log_of_each(seed):
+    """A log lasts a minute, the photos an hour: the last flight begins far after the first photo."""
+    rng = np.random.default_rng(seed)
+    flights = [1.7e9 + 1500.0 * k + np.cumsum(rng.uniform(1.6, 3.1, 30)) for k in range(3)]
+    photos = np.round(np.concatenate(flights) + 7213.4, 2)
+    for k, events in enumerate(flights):
+        found = pair(photos.tolist(), events.tolist())
+        assert found.pairs == [(30 * k + i, i) for i in range(30)] and not found.doubtful
+        back = pair(events.tolist(), photos.tolist())  # and the other way: the log has all flights
+        assert back.pairs == [(i, 30 * k + i) for i in range(30)]
