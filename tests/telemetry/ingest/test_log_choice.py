@@ -143,10 +143,8 @@ def test_photos_of_two_flights_get_no_place_without_evidence(tmp_path, trap):
     assert all("no log that is here" in rejection.reason for rejection in found.rejected)
 
 
-@pytest.mark.parametrize("by", ["tracks", "events"])
-@pytest.mark.parametrize("systems", [(1, 1), (1, 2)])
-def test_photos_of_one_vehicle_take_no_places_from_two(tmp_path, monkeypatch, systems, by):
-    """Where one flight's log is missing, another vehicle that flew at the same time may have one."""
+def as_tlogs(monkeypatch, systems):
+    """Read logs a and b as a ground station's, of these vehicles."""
 
     def read(path):
         return [
@@ -154,12 +152,15 @@ def test_photos_of_one_vehicle_take_no_places_from_two(tmp_path, monkeypatch, sy
         ]
 
     monkeypatch.setattr(log_ingest, "read_log", read)
+
+
+@pytest.mark.parametrize("systems", [(1, 1), (1, 2)])
+def test_photos_of_one_vehicle_take_no_places_from_two(tmp_path, monkeypatch, systems):
+    """Where one flight's log is missing, another vehicle that flew at the same time may have one."""
+    as_tlogs(monkeypatch, systems)
     two_flights(tmp_path / "card", 0.0)
-    for name, later_s, east_m in (("a", 0.0, 0.0), ("b", 2400.0, 500.0)):
-        if by == "tracks":
-            track(tmp_path / f"{name}.pos", metres_east=east_m, later_s=later_s)
-        else:
-            exposure_list(tmp_path / f"{name}_events.pos", UTC_S + later_s + TAKEN_S, east_m)
+    track(tmp_path / "a.pos")
+    track(tmp_path / "b.pos", metres_east=500.0, later_s=2400.0)
     used = [frame.origin["position"] for frame in load([tmp_path]).frames]
     assert len(used) == 2 * len(TAKEN_S) and len(set(used)) == 2 if systems == (1, 1) else not used
 
@@ -171,8 +172,20 @@ def exposure_list(path, moments, east_m):
     return solution(path, list(zip(moments, rows, strict=True)))
 
 
-@pytest.mark.parametrize(("one_clock", "beside"), [(True, ""), (False, ""), (True, "the same"), (True, "another")])
-def test_photos_of_two_flights_are_paired_each_with_the_events_of_its_flight(tmp_path, one_clock, beside):
+@pytest.mark.parametrize(
+    ("one_clock", "beside", "systems"),
+    [
+        (True, "", None),
+        (True, "", (1, 1)),
+        (True, "", (1, 2)),
+        (False, "", None),
+        (True, "the same", None),
+        (True, "another", None),
+    ],
+)
+def test_photos_of_two_flights_are_paired_each_with_the_events_of_its_flight(
+    tmp_path, monkeypatch, one_clock, beside, systems
+):
     """Two lists of exposures whose clocks agree; where they do not, they may be of another vehicle.
 
     Beside them lie second lists of the same flights, or those of another vehicle that took pictures at the same times.
@@ -193,8 +206,10 @@ def test_photos_of_two_flights_are_paired_each_with_the_events_of_its_flight(tmp
                 tmp_path / "card" / f"P_{30 * k + i:03d}.JPG",
                 exif_bytes=gps_exif(0.0, 0.0, local=local, subsec=fraction),
             )
+    if systems is not None:
+        as_tlogs(monkeypatch, systems)
     found = load([tmp_path])
-    if not one_clock or beside == "another":
+    if not one_clock or beside == "another" or systems == (1, 2):
         assert not found.frames and "equally well" in found.rejected[0].reason
         return
     assert len(found.frames) == 60 and any("photos are of 2 flights" in warning for warning in found.warnings)
