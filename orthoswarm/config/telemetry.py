@@ -82,7 +82,7 @@ class IngestConfig:
     """Tags, logs and videos: what belongs together, what cannot be right, which pictures of a video are used."""
 
     copied_least: int = 3
-    """Two folders with so many photos in common are one and its copy (chosen)."""
+    """Two folders with so many photos in common may be one and its copy (chosen)."""
     log_least_share: float = 0.5
     """A log belongs to photos if this share of the shorter of both is paired (chosen)."""
     log_same_exposure_s: float = 1.0

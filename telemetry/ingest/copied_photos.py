@@ -1,8 +1,8 @@
 """Copies of photos: the same files in a second folder, a backup beside the original perhaps, under any names.
 
-Each exposure is mapped once. A camera writes no two equal files: what has one size and one content in samples over the
-file, its tags among them, is one exposure. Pictures without a time and a position of their own are left alone, since
-nothing tells one from another (tables of poses may name pictures that look the same).
+They are told and not left out: a folder is a vehicle, whatever it holds. A camera writes no two equal files: what has
+one size and one content in samples over the file, its tags among them, is one exposure. Pictures without a time and a
+position of their own are not compared, since tables of poses may name pictures that look the same.
 """
 
 import hashlib
@@ -19,14 +19,14 @@ _SAMPLE_BYTES, _SAMPLES = 16 << 10, 8
 
 
 def copies_among(photos: Sequence[Path]) -> dict[Path, Path]:
-    """The photos that are copies, with the one in another folder that each is a copy of.
+    """Photos that are the same files as earlier ones in another folder, with these.
 
     Folders that have only one or two photos in common count as two. Only files that share their size with another are
     opened, and only those that begin like another are read beyond: raw pictures are all of one size, and each sample
     is a seek on a disk. Files in stores are not compared.
 
     Args:
-        photos: of all folders, the one to keep before its copies.
+        photos: of all folders.
     """
     found: dict[Path, Path] = {}
     for of_one_size in _of_one_size(photos):

@@ -3,18 +3,16 @@
 import os
 import re
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 from orthoswarm.model.errors import InputError
 from orthoswarm.raster.picture_file import PICTURE_SUFFIXES
 from orthoswarm.stores.addresses import address_of, is_stored
 from orthoswarm.stores.listing import exists, is_file, list_folder
 from telemetry.formats.log.can_log import SUFFIXES as CAN_LOGS
-from telemetry.formats.table.pose_csv import names_pictures
 from telemetry.ingest.copied_photos import copies_among
 
 VIDEO_SUFFIXES = frozenset(
@@ -56,7 +54,7 @@ class Discovery:
         left_out: files with a picture's suffix that are not read, the reason (one for all that share it) and a detail.
         videos: the vehicle of each video, unless its metadata names another.
         unreadable: folders that cannot be listed -> the system's reason.
-        copies: photos that are left out as copies of another one.
+        copies: photos that are the same files as photos in another folder, with these.
         everywhere: tables and logs given by themselves or in folders without pictures and videos.
     """
 
@@ -141,46 +139,18 @@ def discover(inputs: Sequence[Path], exclude: Sequence[Path] = ()) -> Discovery:
         elif file not in sorted_in:
             sorted_in.add(file)
             _sort_in(file, folders, explicit=not walked)
-    copies = copies_among(_originals_first(folders.values()))
-    for file, first in copies.items():
-        left_out[file] = _copied(first.parent, root), first.name if first.name != file.name else ""
     for folder in folders.values():
-        folder.pictures = sorted((path for path in folder.pictures if path not in copies), key=_by_name)
+        folder.pictures.sort(key=_by_name)
     ordered = [folders[path] for path in sorted(folders, key=lambda p: natural_key(str(p)))]
+    copies = copies_among([path for folder in ordered for path in folder.pictures])
     _name_vehicles(ordered, root)
     pictures = [(file, *why) for file, why in left_out.items() if file.suffix.lower() in PICTURE_SUFFIXES]
-    left = [entry for entry in pictures if entry[0] not in sorted_in or entry[0] in copies]
+    left = [entry for entry in pictures if entry[0] not in sorted_in]
     if unreadable and not ordered and not left:
         path, why = next(iter(unreadable.items()))
         raise InputError(f"no picture was found, and the folder {path} cannot be read ({why}); check its permissions")
     apart = _far_from_pictures(tops, ordered)
     return Discovery(root, ordered, left, _video_vehicles(ordered, root), apart, unreadable=unreadable, copies=copies)
-
-
-def _originals_first(folders: Collection[Folder]) -> list[Path]:
-    """All pictures, those to keep first: of folders whose poses apply only there, of fuller ones, and higher up."""
-    poses = {folder.path for folder in folders if folder.logs or any(map(_is_for_pictures, folder.tables))}
-
-    def foremost(folder: Folder) -> tuple[Any, ...]:
-        posed = not poses.isdisjoint((folder.path, *folder.path.parents))
-        beside = sum(map(len, (folder.videos, folder.subtitles, folder.tables, folder.logs)))
-        return not posed, -len(folder.pictures), -beside, len(folder.path.parts), natural_key(str(folder.path))
-
-    return [
-        path
-        for folder in sorted(folders, key=foremost)
-        for path in sorted(folder.pictures, key=lambda path: (len(path.name), _by_name(path)))
-    ]
-
-
-def _is_for_pictures(table: Path) -> bool:
-    return not is_stored(table) and names_pictures(table)
-
-
-def _copied(folder: Path, root: Path) -> str:
-    """Why a copy of a photo in a folder is left out; the same for all of them."""
-    name = _text(_relative(str(folder), str(root)))
-    return f"a copy of a photo in {_text(root.name) if name == os.curdir else name}, {_ALREADY}"
 
 
 def _twice(folder: Path, root: Path) -> str:

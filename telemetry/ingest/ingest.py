@@ -134,8 +134,8 @@ def _copy_findings(found: Discovery) -> list[Finding]:
     findings = []
     for (there, here), count in counts.items():
         text = (
-            f"{count} photos in {_folder_name(found, there)} are copies of those in {_folder_name(found, here)} (the "
-            "same files); each picture is mapped once"
+            f"{count} photos in {_folder_name(found, there)} are the same files as photos in "
+            f"{_folder_name(found, here)}; both are used, as two vehicles: leave one folder out if it is a backup"
         )
         findings.append(Finding("copies", text))
     return findings

@@ -128,7 +128,7 @@ def test_a_survey_that_is_given_twice_is_counted_once_and_that_is_said_once(tmp_
 
 
 @pytest.mark.parametrize("renamed", [False, True])
-def test_a_backup_beside_the_photos_is_no_second_vehicle(tmp_path, renamed):
+def test_a_backup_beside_the_photos_is_told_and_kept(tmp_path, renamed):
     flight(tmp_path / "card" / "DCIM", [0.0], legs=6)
     for number in range(1, 5):  # four of them, and one that is only there
         original = tmp_path / "card" / "DCIM" / f"P_{number}.JPG"
@@ -137,11 +137,10 @@ def test_a_backup_beside_the_photos_is_no_second_vehicle(tmp_path, renamed):
         copy.write_bytes(original.read_bytes())
     photo(tmp_path / "card" / "Backup" / "X.JPG", second=50)
     found = load([tmp_path / "card"])
-    assert sorted(f.image for f in found.frames) == ["Backup/X.JPG", *(f"DCIM/P_{i}.JPG" for i in range(6))]
-    assert {r.image.split("/")[0] for r in found.rejected} == {"Backup"} and len(found.rejected) == 4
-    assert {r.reason for r in found.rejected} == {"a copy of a photo in DCIM, which is in the input already"}
-    assert {r.detail for r in found.rejected} == ({f"P_{i}.JPG" for i in range(1, 5)} if renamed else {""})
-    assert any("4 photos in Backup are copies of those in DCIM" in warning for warning in found.warnings)
+    assert len(found.frames) == 6 + 4 + 1 and not found.rejected
+    assert {f.vehicle for f in found.frames} == {"DCIM", "Backup"}
+    (warning,) = (w for w in found.warnings if "the same files" in w)
+    assert "4 photos in DCIM are the same files as photos in Backup" in warning and "leave one folder out" in warning
 
 
 def test_photos_of_one_size_are_read_beyond_their_beginnings_only_if_these_are_alike(tmp_path, monkeypatch):
@@ -155,23 +154,6 @@ def test_photos_of_one_size_are_read_beyond_their_beginnings_only_if_these_are_a
     assert sorted(set(asked)) == [0, copied_photos._SAMPLES] and asked.count(copied_photos._SAMPLES) == 8
 
 
-@pytest.mark.parametrize("below", ["", "DCIM/"])
-def test_of_copies_those_beside_their_poses_are_kept(tmp_path, below):
-    flight(tmp_path / "day" / "ppk" / below, [0.0], legs=4)
-    photos = sorted((tmp_path / "day" / "ppk" / below).glob("*.JPG"))
-    rows = [f"{path.name} 465000.0 {5260000 + 8 * i}.0 512.0" for i, path in enumerate(photos)]
-    (tmp_path / "day" / "ppk" / "geo.txt").write_text("\n".join(["EPSG:32632", *rows]))
-    photo(tmp_path / "day" / "raw" / "X.JPG", second=50)  # more photos, but no table
-    for path in photos:
-        (tmp_path / "day" / "raw" / path.name).write_bytes(path.read_bytes())
-    (tmp_path / "day" / "raw" / "notes.txt").write_text("wind from the west\n")
-    found = load([tmp_path / "day"])
-    assert {f.image: f.origin["position"] for f in found.frames} == {
-        **{f"ppk/{below}{path.name}": "geo.txt" for path in photos},
-        "raw/X.JPG": "EXIF GPS",
-    }
-
-
 def test_pictures_that_only_a_table_tells_apart_are_no_copies(tmp_path):
     for folder in ("v1", "v2"):
         (tmp_path / folder).mkdir()
@@ -179,7 +161,8 @@ def test_pictures_that_only_a_table_tells_apart_are_no_copies(tmp_path):
         (tmp_path / folder / "poses.csv").write_text("\n".join(["image,lat_deg,lon_deg", *rows]))
         for i in range(5):
             jpeg(tmp_path / folder / f"{i}.jpg")
-    assert len(load([tmp_path]).frames) == 10
+    found = load([tmp_path])
+    assert len(found.frames) == 10 and not any("the same files" in warning for warning in found.warnings)
 
 
 def test_an_excluded_folder_is_left_out(tmp_path):
