@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 from gcs_plugin.backends.backend import ENDED, Backend, Report, coming_home
@@ -15,7 +16,7 @@ from gcs_plugin.mission.completion import Phase
 from gcs_plugin.mission.download import MissionDownload
 from gcs_plugin.mission.exchange import Address, Exchange, Outcome
 from gcs_plugin.mission.geofence import Zone, zones_of
-from gcs_plugin.mission.items import Mission
+from gcs_plugin.mission.items import Mission, MissionItem
 from orthoswarm.model.errors import OrthoSwarmError
 
 
@@ -69,31 +70,26 @@ class DirectBackend(Backend):
 
     def stored(self, systems: Collection[int], report: Report) -> dict[int, Mission | None]:
         """All downloads at the same time."""
-        fleet, jobs = self.fleet, dict[int, MissionDownload]()
-
-        def begin(system: int) -> Exchange:
-            jobs[system] = fleet.download(system)
-            return jobs[system]
-
-        reads = {system: (lambda system=system: begin(system)) for system in systems}
-        self._run(reads, "read", report)
-        found: dict[int, Mission | None] = dict.fromkeys(systems)
-        for system, job in jobs.items():
-            if job.items is not None:
-                found[system] = Mission(fleet.vehicles[system].autopilot, tuple(job.items))
-        return found
+        items = self._downloaded(self.fleet.download, systems, report)
+        return {s: Mission(self.fleet.vehicles[s].autopilot, items[s]) if s in items else None for s in systems}
 
     def zones(self, systems: Collection[int], report: Report) -> dict[int, tuple[Zone, ...]]:
         """All downloads at the same time."""
+        found = self._downloaded(self.fleet.read_fence, systems, report)
+        return {system: tuple(zones_of(items)) for system, items in found.items()}
+
+    def _downloaded(
+        self, download: Callable[[int], MissionDownload], systems: Collection[int], report: Report
+    ) -> dict[int, tuple[MissionItem, ...]]:
+        """The lists that vehicles give, without those that do not."""
         jobs: dict[int, MissionDownload] = {}
 
         def begin(system: int) -> Exchange:
-            jobs[system] = self.fleet.read_fence(system)
+            jobs[system] = download(system)
             return jobs[system]
 
-        reads = {system: (lambda system=system: begin(system)) for system in systems}
-        self._run(reads, "read", report)
-        return {system: tuple(zones_of(job.items)) for system, job in jobs.items() if job.items is not None}
+        self._run({system: partial(begin, system) for system in systems}, "read", report)
+        return {system: tuple(job.items) for system, job in jobs.items() if job.items is not None}
 
     def order(self, order: Order) -> Order:
         """Give a command."""

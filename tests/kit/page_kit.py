@@ -193,6 +193,15 @@ def poll(page: Any, done: Callable[[], Any], limit_s: float = LIMIT_MS / 1000) -
         page.wait_for_timeout(50)
 
 
+def refused(page: Any, words: str) -> None:
+    """Neither upload nor start of the shown plan goes on: each press is answered by a notice with these words."""
+    for press in ("Upload missions", "Check and start"):
+        page.click(f"text={press}")
+        page.wait_for_selector(f".notice:has-text('{words}')")
+        page.click(f".notice:has-text('{words}') button")
+    assert page.locator("dialog[open]").count() == 0
+
+
 def saved(page: Any) -> None:
     """Wait until what was drawn and filled in is with the station."""
     poll(page, lambda: page.evaluate("import('/static/plan/shared.js').then((m) => !m.isSaving())"))

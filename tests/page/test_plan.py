@@ -7,7 +7,7 @@ import pytest
 
 from gcs_plugin.web.areas import area_of
 from orthoswarm.model.errors import InputError
-from tests.kit.page_kit import opened, saved, standing, vehicle
+from tests.kit.page_kit import opened, refused, saved, standing, vehicle
 
 HERE = "orthoswarm.map.jumpTo({ center: [8.5456, 47.3977], zoom: 16 })"
 KML = """<kml xmlns="http://www.opengis.net/kml/2.2"><Placemark><Polygon><outerBoundaryIs><LinearRing><coordinates>
@@ -157,11 +157,7 @@ def test_a_zone_that_is_drawn_after_the_plan_stops_its_upload_and_start(browser)
             assert page.inner_text(".plan-result .wrong") == ""
             draw(page, (700, 350), (800, 350), (750, 450), what="Add no-fly zone")
             page.wait_for_selector(f".plan-result .wrong:has-text('{older}')")
-            for press in ("Upload missions", "Check and start"):
-                page.click(f"text={press}")
-                page.wait_for_selector(f".notice:has-text('{older}')")
-                page.click(f".notice:has-text('{older}') button")
-            assert page.locator("dialog[open]").count() == 0
+            refused(page, older)
             saved(page)
             with opened(browser, station.url) as second:  # a second page, or this one after a reload
                 second.click("#tab-plan")

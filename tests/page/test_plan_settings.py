@@ -4,7 +4,7 @@ import contextlib
 
 import pytest
 
-from tests.kit.page_kit import TABLET, opened, poll, saved, standing, vehicle
+from tests.kit.page_kit import TABLET, opened, poll, refused, saved, standing, vehicle
 
 CORNERS = [[8.544, 47.397], [8.547, 47.397], [8.547, 47.399], [8.544, 47.399]]
 AREA = "(c) => import('/static/plan/area.js').then((m) => m.change((rings) => rings.push(c)))"
@@ -83,11 +83,7 @@ def test_a_setting_that_is_changed_after_the_plan_stops_its_upload_and_start(bro
         before = page.input_value(f"[name={name}]")
         page.fill(f"[name={name}]", typed)  # typed, not left yet
         page.wait_for_selector(f"{WRONG}:has-text('{OLDER} ({words})')")
-        for press in ("Upload missions", "Check and start"):
-            page.click(f"text={press}")
-            page.wait_for_selector(f".notice:has-text('{OLDER}')")
-            page.click(f".notice:has-text('{OLDER}') button")
-        assert page.locator("dialog[open]").count() == 0
+        refused(page, OLDER)
         assert station.commands("upload") == []
         saved(page)
         with opened(browser, station.url, TABLET) as second:

@@ -93,6 +93,16 @@ def test_a_way_home_through_the_ground_is_red(make_world, autopilot):
     assert items_of(world, high)["return"].level is Level.RED  # from a valley it would fly straight into the hill
 
 
+def set_up(make_world, autopilot, parameters):
+    """A world with a vehicle that has these parameters, and has told them."""
+    world = make_world(SimVehicle(system=1, autopilot=autopilot))
+    world.vehicles[1].parameters |= parameters
+    world.meet()
+    world.finish(world.fleet.download(1))
+    assert world.until(lambda: world.fleet.vehicles[1].ready_to_check, 30.0)
+    return world
+
+
 @pytest.mark.parametrize(
     ("autopilot", "parameters", "words"),
     [
@@ -104,11 +114,7 @@ def test_a_way_home_through_the_ground_is_red(make_world, autopilot):
     ],
 )
 def test_a_way_home_that_is_not_straight_to_it_is_warned_about(make_world, autopilot, parameters, words):
-    world = make_world(SimVehicle(system=1, autopilot=autopilot))
-    world.vehicles[1].parameters |= parameters
-    world.meet()
-    world.finish(world.fleet.download(1))
-    assert world.until(lambda: world.fleet.vehicles[1].ready_to_check, 30.0)
+    world = set_up(make_world, autopilot, parameters)
     for wanted in (Wanted(), Wanted(needs=PlanNeeds(return_height_m=10.0))):
         found = items_of(world, wanted)["return"]
         assert found.level is Level.WARNING and words in found.reason, found
@@ -123,11 +129,7 @@ def test_a_way_home_that_is_not_straight_to_it_is_warned_about(make_world, autop
     ],
 )
 def test_a_way_home_that_may_be_straight_is_not_too_low(make_world, autopilot, parameters, level):
-    world = make_world(SimVehicle(system=1, autopilot=autopilot))
-    world.vehicles[1].parameters |= parameters
-    world.meet()
-    world.finish(world.fleet.download(1))
-    assert world.until(lambda: world.fleet.vehicles[1].ready_to_check, 30.0)
+    world = set_up(make_world, autopilot, parameters)
     found = items_of(world, Wanted(needs=PlanNeeds(return_height_m=60.0)))["return"]
     assert found.level is level and "TYPE is" in found.reason and "needs 60 m" in found.reason, found
 
