@@ -19,6 +19,7 @@ from gcs_plugin.mission.plan_folder import NO_NEEDS, PlanNeeds
 
 if TYPE_CHECKING:
     from gcs_plugin.mission.geofence import Zone
+    from gcs_plugin.mission.start_dialogue import Standing
     from gcs_plugin.mission.track import Airspace
 
 Report = Callable[[str, int, int], None]
@@ -166,7 +167,15 @@ class Backend(abc.ABC):
         """Send messages to a vehicle without waiting for answers."""
 
     def command(
-        self, verb: Verb, delays: Mapping[int, float], say: Say, airspace: "Airspace | None" = None
+        self,
+        verb: Verb,
+        delays: Mapping[int, float],
+        say: Say,
+        airspace: "Airspace | None" = None,
+        *,
+        standing: "Mapping[int, Standing] | None" = None,
+        missions: "Mapping[int, Mission] | None" = None,
+        pump: Callable[[float], None] | None = None,
     ) -> dict[int, Order]:
         """Send a command to vehicles and wait for the outcome of each.
 
@@ -177,12 +186,16 @@ class Backend(abc.ABC):
             delays: seconds from now for each system id.
             say: called at once with each outcome and its consequences.
             airspace: the missions that are started, so that takeoffs that are still due can be delayed.
+            standing, missions: of a start, what the vehicles were when it was given, and what was checked.
+            pump: processes messages meanwhile; default `self.pump`.
         """
 
         def begin(system: int) -> Order:
-            return self.order(Order(verb=verb, system=system, given_s=time.monotonic()))
+            then, mission = (standing or {}).get(system), (missions or {}).get(system)
+            order = Order(verb=verb, system=system, given_s=time.monotonic(), standing=then, mission=mission)
+            return self.order(order)
 
-        return command_all(delays, begin, self.pump, say, airspace)
+        return command_all(delays, begin, pump or self.pump, say, airspace)
 
     @abc.abstractmethod
     def pump(self, seconds: float) -> None:
@@ -235,7 +248,8 @@ def command_all(
             if order.verb != "start":
                 continue
             if outcome.ok:
-                for text in schedule.started(system, time.monotonic(), "vehicle {}".format):
+                now = time.monotonic()
+                for text in schedule.started(system, now, "vehicle {}".format, order.begun_s):
                     say(text)
                 continue
             for cancelled in schedule.failed(system):

@@ -105,7 +105,6 @@ class DirectBackend(Backend):
 
     def watch(self, systems: Collection[int], seconds: float, report: Callable[[FleetEvent], None]) -> bool:
         """Poll and report events until all missions have ended and nobody flies home."""
-        self._download_unknown(systems)
         end, reported = time.monotonic() + seconds, 0
         while True:
             for event in self.events[reported:]:
@@ -124,17 +123,6 @@ class DirectBackend(Backend):
     def close(self) -> None:
         """Close the fleet."""
         self.fleet.close()
-
-    def _download_unknown(self, systems: Collection[int]) -> None:
-        """Download unknown missions: whether one ends with RTL or LAND decides how its end is detected."""
-        fleet = self.fleet
-        jobs: list[Exchange] = []
-        for system in systems or list(fleet.vehicles):
-            vehicle = fleet.vehicles.get(system)
-            idle = vehicle is not None and not vehicle.lost and not fleet.busy(system) and not vehicle.claimants
-            if vehicle is not None and idle and vehicle.mission_total and not vehicle.detector.knows:
-                jobs.append(fleet.download(system))
-        fleet.run_until(lambda: all(job.outcome is not None for job in jobs), 20.0)
 
     def _run(
         self,

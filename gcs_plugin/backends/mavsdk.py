@@ -18,6 +18,7 @@ from gcs_plugin.backends.backend import ENDED, Backend, Report, coming_home
 from gcs_plugin.config import HEARING
 from gcs_plugin.fleet.commands import URGENT, Order, Verb
 from gcs_plugin.fleet.fleet_events import FleetEvent, mission_event
+from gcs_plugin.fleet.going_on import continued, resumed
 from gcs_plugin.fleet.message_rates import Rates, Streams
 from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.mavlink import Autopilot, Message
@@ -28,7 +29,7 @@ from gcs_plugin.mission.exchange import Address, Exchange, Outcome, Verdict
 from gcs_plugin.mission.flight_modes import modes_of, why_no_missions
 from gcs_plugin.mission.geofence import Zone, zones_of
 from gcs_plugin.mission.items import Mission, MissionItem
-from gcs_plugin.mission.mission_builder import unflyable
+from gcs_plugin.mission.start_dialogue import Expected, start_mission
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 
 _HEARD: Final = (
@@ -153,7 +154,7 @@ class MavsdkBackend(Backend):
     def order(self, order: Order) -> Order:
         """Give a command."""
         try:
-            order.exchange = self._begin(order.system, order.verb, order.expires_s)
+            order.exchange = self._begin(order)
         except OrthoSwarmError as error:
             return order.end(str(error), Verdict.REFUSED)
         return order
@@ -263,7 +264,7 @@ class MavsdkBackend(Backend):
         if message.get_type() == "COMMAND_ACK":
             self._send(craft, vehicle.streams.acknowledged(message, now))
         for event in vehicle.detector.feed(message):
-            kind, text = mission_event(event)
+            kind, text = mission_event(event, craft.vehicle)
             self._event(kind, vehicle.system, text)
         for job in list(craft.jobs):
             if job.outcome is None:
@@ -338,15 +339,15 @@ class MavsdkBackend(Backend):
         items = _downloaded(craft.raw.download_mission)
         return None if items is None else Mission(craft.vehicle.autopilot, items)
 
-    def _begin(self, system: int, verb: Verb, expires: float) -> Exchange:
-        craft = self._craft(system)
+    def _begin(self, order: Order) -> Exchange:
+        craft = self._craft(order.system)
         vehicle = craft.vehicle
-        if vehicle.lost and verb not in URGENT:
-            raise OrthoSwarmError(f"vehicle {system} is lost; wait until it is heard again")
+        if vehicle.lost and order.verb not in URGENT:
+            raise OrthoSwarmError(f"vehicle {order.system} is lost; wait until it is heard again")
         for job in craft.jobs:
             job.cancel("another command came in between")
-        job = self._dialogue(craft, verb)
-        job.expires = expires
+        job = self._start(vehicle, order) if order.verb == "start" else self._dialogue(vehicle, order.verb)
+        job.expires = order.expires_s
         craft.jobs.append(job)
         self._drive(craft, job, job.start(time.monotonic()))
         return job
@@ -356,29 +357,33 @@ class MavsdkBackend(Backend):
         for _ in messages:
             job.took()
 
-    def _dialogue(self, craft: _Craft, verb: Verb) -> Exchange:
-        vehicle = craft.vehicle
+    def _dialogue(self, vehicle: Vehicle, verb: Verb) -> Exchange:
         if verb == "pause":
             if not vehicle.armed and not vehicle.lost:
                 raise OrthoSwarmError(f"vehicle {vehicle.system} is not armed, so there is nothing to pause")
-            return vehicle.pilot.pause()
+            return vehicle.pilot.pause(held=vehicle.custom_mode == vehicle.modes.hold)
         if verb == "resume":
-            return vehicle.pilot.resume(in_mission_mode=vehicle.custom_mode == vehicle.modes.mission)
-        if verb == "rtl":
-            return vehicle.pilot.rtl()
-        if verb == "land":
-            return vehicle.pilot.land()
+            return resumed(vehicle)
+        if verb == "continue":
+            return continued(vehicle)
+        return vehicle.pilot.rtl() if verb == "rtl" else vehicle.pilot.land()
+
+    def _start(self, vehicle: Vehicle, order: Order) -> Exchange:
+        name = f"vehicle {vehicle.system}"
         if vehicle.detector.phase is Phase.ACTIVE and vehicle.armed:
-            raise OrthoSwarmError(f"vehicle {vehicle.system} is flying its mission already")
+            raise OrthoSwarmError(f"{name} is flying its mission already")
         if why := why_no_missions(vehicle.kind):
-            raise OrthoSwarmError(f"vehicle {vehicle.system} {why}")
-        mission = vehicle.mission or self._read(vehicle.system)
-        in_air = vehicle.in_air and vehicle.armed
-        wrong = unflyable(mission.items if mission else (), vehicle.autopilot, in_air=in_air)
+            raise OrthoSwarmError(f"{name} {why}")
+        then = order.standing or vehicle.standing
+        if why := vehicle.changed_since(then):
+            raise OrthoSwarmError(f"{name} {why} since its start was given, so it was not started")
+        expected = Expected(autopilot=vehicle.autopilot, in_air=vehicle.flying, mission=order.mission)
+        mission = self._read(vehicle.system)
+        wrong = "did not send its mission" if mission is None else expected.wrong(mission)
         if mission is None or wrong:
-            raise OrthoSwarmError(f"vehicle {vehicle.system} {wrong or 'did not send its mission'}")
+            raise OrthoSwarmError(f"{name} {wrong}")
         vehicle.detector.knows_mission(mission)
-        return vehicle.pilot.start(in_air=in_air, armed=vehicle.armed, check=False)
+        return start_mission(vehicle.pilot, then, expected, reads=False)
 
 
 def _downloaded(download: Callable[[], Any]) -> tuple[MissionItem, ...] | None:

@@ -36,7 +36,7 @@ from gcs_plugin.daemon.jobs.publisher import Publisher
 from gcs_plugin.daemon.jobs.sortie_refinement import SortieRefinement
 from gcs_plugin.daemon.jobs.tone_balance import ToneBalance
 from gcs_plugin.daemon.jobs.worker_pool import LAST, WorkerPool
-from gcs_plugin.daemon.jobs.workspace_products import FORMATS, facts_of
+from gcs_plugin.daemon.jobs.workspace_products import FORMATS, PRODUCTS, facts_of
 from gcs_plugin.daemon.layers.anchor import Anchor
 from gcs_plugin.daemon.layers.layers import NAMES, Area, Layer
 from gcs_plugin.daemon.layers.realtime_layer import Drawer
@@ -53,6 +53,7 @@ from gcs_plugin.daemon.tak_feed import TakFeed
 from gcs_plugin.daemon.takeoffs import Takeoffs
 from gcs_plugin.daemon.vehicles import VehicleLinks
 from gcs_plugin.daemon.web_plans import Plans
+from gcs_plugin.fleet.fleet_problems import fleet_problems
 from orthoswarm.compute.workers import peak_rss_mb, prepare_process
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.frame import Frame
@@ -443,14 +444,14 @@ class Daemon:
         self.coarse.give_up(None, layer)
 
     def _after_job(self, job: Job) -> None:
-        """Record the result of a completion; export the products once nothing is left to refine."""
+        """Record the result of a completion; export the products again once nothing is left to refine."""
         if job.kind == "refine":
             self._note_refined(job)
             self.jobs.wake()
         elif job.kind not in ("together", "tones", "redraw") and (job.kind != "coarse" or "after" not in job.detail):
             return
         if not self.jobs.open("refine", "together", "tones", "coarse", "redraw"):
-            self.jobs.add("export", formats=["cog", "gpkg"])
+            self.jobs.add("export", formats=list(PRODUCTS), after="all")
 
     def _note_refined(self, job: Job) -> None:
         if job.state != "done" or job.vehicle is None or "published_s" not in job.detail or "beside" in job.detail:
@@ -489,10 +490,9 @@ class Daemon:
 
     def problems(self) -> list[str]:
         """The present problems, in words."""
-        components = (self.drawer.problem, self.drawer.overload, self.jobs.problem, self.tak.problem)
-        found = [*components, *self.refused.problems()]
-        found += [source.problem for source in self.sources]
-        return [text for text in found if text]
+        own = (self.drawer.problem, self.drawer.overload, self.jobs.problem, self.tak.problem)
+        linked = [] if self.links is None else fleet_problems(self.links.fleet, self.links.name_of)
+        return [text for text in (*own, *linked, *self.refused.problems(), *(s.problem for s in self.sources)) if text]
 
     def _rejected(self, frame: Frame, reason: str, misplaced: bool) -> None:
         """Report a stored picture that cannot be on the map."""

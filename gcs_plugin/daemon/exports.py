@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from gcs_plugin.daemon.jobs.job_queue import Job
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
-from gcs_plugin.daemon.jobs.workspace_products import ExportTask, write_products
+from gcs_plugin.daemon.jobs.workspace_products import PRODUCTS, ExportTask, write_products
 from gcs_plugin.daemon.layers.journal_frames import frame_of_row
 from gcs_plugin.daemon.layers.layers import Area, Layer
 from gcs_plugin.daemon.place_list import pictures_at, places_of
@@ -77,9 +77,10 @@ class Exports:
         self._settings, self._journal, self._store = settings, journal, store
         self._layers, self._console, self._workers = layers, console, workers
         self._area, self._vehicles, self._facts, self._cells = area, vehicles, facts, cells
+        self._written: tuple[dict[str, int], dict[str, str]] = ({}, {})  # the layers' versions, and the files of them
 
     def write(self, job: Job, report: Callable[[float, str], None]) -> Change:
-        """The handler of an `export` job.
+        """The handler of an `export` job; one that nobody asked for writes only what has changed since the last one.
 
         Raises:
             InputError: there is no map yet.
@@ -88,6 +89,10 @@ class Exports:
         area = self._area()
         if area is None:
             raise InputError("there is no map yet; wait for pictures")
+        versions = {name: layer.version for name, layer in self._layers.items()}
+        if "after" in job.detail and versions == self._written[0]:
+            job.detail["note"], job.detail["files"] = "the last one has everything", self._written[1]
+            return lambda db: None
         with contextlib.ExitStack() as held:  # a replaced generation stays while it is read
             canvases = {name: held.enter_context(layer.reading()) for name, layer in self._layers.items()}
             folders = {name: canvas.path for name, canvas in canvases.items() if canvas is not None}
@@ -98,7 +103,8 @@ class Exports:
             ]
             places = tuple(self._places(shown))
             task = replace(task, facts=self._facts(), places=places, cells=self._cells())
-            job.detail["files"] = self._workers.run(write_products, task)
+            job.detail["files"] = files = self._workers.run(write_products, task)
+            self._written = versions, {name: files[name] for name in PRODUCTS}
         return lambda db: None
 
     def places(self) -> list[Place]:

@@ -4,7 +4,6 @@ A mission that was read a moment ago is not read again as long as the vehicle's 
 start can follow its check at once on a slow link too, where reading alone takes longer than a command stays valid.
 """
 
-import contextlib
 import time
 from collections.abc import Callable, Collection, Mapping
 from typing import TYPE_CHECKING, Any, Final
@@ -13,12 +12,10 @@ from gcs_plugin.config import COMMAND
 from gcs_plugin.daemon.airspace.fences import Fences
 from gcs_plugin.mission.items import Mission
 from gcs_plugin.mission.plan_folder import NO_NEEDS, PlanNeeds
-from orthoswarm.model.errors import OrthoSwarmError
 
 if TYPE_CHECKING:
     from gcs_plugin.fleet.fleet import Fleet
     from gcs_plugin.fleet.separation.separation_check import Separation
-    from gcs_plugin.mission.download import MissionDownload
 
 _SOON_S: Final = 5.0
 _READ_S: Final = 20.0
@@ -48,8 +45,6 @@ class StartChecks:
         waiting: Callable[[], Mapping[str, Mapping[str, Any]]],
     ) -> None:
         self._fleet, self._fences, self._name_of, self._waiting = fleet, fences, name_of, waiting
-        self._read: dict[int, tuple[float, Mission]] = {}
-        self._reading: dict[int, MissionDownload] = {}
 
     def check(
         self,
@@ -92,7 +87,7 @@ class StartChecks:
                 name=self._name_of,
                 separation=separation,
                 zones=self._fences.zones(),
-                reading=[s for s in systems if self._is_reading(s)],
+                reading=[s for s in systems if self._fleet.reads(s)],
             )
         ).result(_CHECK_S)
         return [check.document(systems[check.system]) for check in checks]
@@ -132,44 +127,11 @@ class StartChecks:
         return separation_of(flights, self._name_of, needs.apart)
 
     def _missions(self, systems: Collection[int], *, reread: bool) -> "dict[int, Mission]":
-        """The missions stored in vehicles, of those that answer in time."""
-        self._take_read()
-        found = {s: mission for s in systems if (mission := self._known(s, reread=reread)) is not None}
-
-        def begin(system: int) -> None:
-            with contextlib.suppress(OrthoSwarmError):  # lost or busy: reported by the check
-                self._reading[system] = self._fleet.download(system)
-
-        unread = [system for system in systems if system not in found]
-        fresh = [system for system in unread if system not in self._reading]  # others go on from an earlier check
-        for begun in [self._fleet.call(lambda s=system: begin(s)) for system in fresh]:  # type: ignore[misc]
+        """The missions that vehicles hold, read again where that was long ago; of those that answer in time."""
+        vehicles, now = {s: self._fleet.vehicles[s] for s in systems}, time.monotonic()
+        old = [s for s, v in vehicles.items() if v.mission is None or now - v.read_s > COMMAND.read_kept_s]
+        for begun in [self._fleet.call(lambda s=s: self._fleet.read_mission(s)) for s in old if reread]:  # type: ignore[misc]
             begun.result(_SOON_S)
-        end = time.monotonic() + _READ_S
-        while any(self._is_reading(system) for system in unread) and time.monotonic() < end:
+        while any(self._fleet.reads(s) for s in old) and time.monotonic() < now + _READ_S:
             time.sleep(0.02)
-        self._take_read()
-        return found | {s: self._read[s][1] for s in unread if s in self._read and not self._is_reading(s)}
-
-    def _is_reading(self, system: int) -> bool:
-        read = self._reading.get(system)
-        return read is not None and read.outcome is None
-
-    def _take_read(self) -> None:
-        """Keep the missions whose reading has ended, also after the check that began it."""
-        for system, read in list(self._reading.items()):
-            if read.outcome is None:
-                continue
-            self._reading.pop(system, None)
-            self._read.pop(system, None)
-            if read.items is not None:
-                mission = Mission(self._fleet.vehicles[system].autopilot, tuple(read.items))
-                self._read[system] = time.monotonic(), mission
-
-    def _known(self, system: int, *, reread: bool) -> "Mission | None":
-        """Its mission, if it was read a moment ago (`reread`: ever) and nothing indicates another one since."""
-        vehicle = self._fleet.vehicles[system]
-        if not reread:
-            return vehicle.mission if vehicle.detector.knows else None
-        at, mission = self._read.get(system, (0.0, None))
-        lately = mission is not None and time.monotonic() - at < COMMAND.read_kept_s
-        return mission if lately and vehicle.detector.knows and vehicle.mission == mission else None
+        return {s: v.mission for s, v in vehicles.items() if v.mission is not None and not self._fleet.reads(s)}

@@ -20,6 +20,7 @@ from gcs_plugin.fleet.separation.takeoff_schedule import TakeoffSchedule
 from gcs_plugin.mission.exchange import Outcome, Verdict
 from gcs_plugin.mission.items import Mission
 from gcs_plugin.mission.plan_folder import NO_NEEDS
+from gcs_plugin.mission.start_dialogue import Standing
 from gcs_plugin.mission.track import Airspace
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 
@@ -45,6 +46,7 @@ class Takeoffs:
         self._checking: frozenset[int] = frozenset()
         self._stops: dict[int, int] = {}
         self._given_s: dict[int, float] = {}
+        self._standing: dict[int, Standing] = {}
         self._missions: dict[int, Mission] = {}
         self._needs = NO_NEEDS
         self._allowed: dict[str, Collection[str]] = {}
@@ -127,6 +129,7 @@ class Takeoffs:
                 raise OrthoSwarmError("other takeoffs are under way; pause or rtl a waiting vehicle to cancel its own")
             systems = self._systems(whose)
             self._checking, stops = frozenset(systems.values()), dict(self._links.fleet.stops)
+            standing = {s: self._links.fleet.vehicles[s].standing for s in systems.values()}
         try:
             missions = self._ready(plan, sortie, names, override or {})
             first = min(starts.values())
@@ -139,6 +142,7 @@ class Takeoffs:
                     raise OrthoSwarmError("the start was cancelled; no vehicle was started")
                 self._still_wanted(given, stops)
                 self._failed.clear()
+                self._standing = standing
                 self._stops, self._given_s = stops, {s: given for s, delay in delays.items() if delay <= 0.0}
                 self._names = {systems[vehicle]: whose[vehicle] for vehicle in starts}
                 self._needs = needs
@@ -273,7 +277,7 @@ class Takeoffs:
             red = self._red_now(vehicle, system)
             # A later one is given by its planned time: it has just been checked again.
             order = Order(verb="start", system=system, given_s=self._clock() if given_s is None else given_s)
-            order.stops = stops
+            order.stops, order.standing, order.mission = stops, self._standing[system], self._missions[system]
             if red:
                 order.end(f"{vehicle} was not started: {red}", Verdict.NOT_SENT)
             else:
@@ -288,7 +292,7 @@ class Takeoffs:
         finally:
             self._about_to.discard(system)
         if order.outcome is not None and not self._closed:
-            self._note(vehicle, system, order.outcome)
+            self._note(vehicle, system, order.outcome, order.begun_s)
 
     def _order(self, order: Order) -> None:
         """Send a start; in the fleet's thread, so that nobody finds it neither about to start nor under way."""
@@ -304,11 +308,11 @@ class Takeoffs:
         (row,) = self._links.preflight([vehicle], {vehicle: mission}, reread=False, needs=self._needs)
         return "; ".join(red_items(row, {*self._allowed.get(vehicle, ()), "separation"}))
 
-    def _note(self, vehicle: str, system: int, outcome: Outcome) -> None:
+    def _note(self, vehicle: str, system: int, outcome: Outcome, begun_s: float | None = None) -> None:
         """Apply the outcome of one start to the waiting ones."""
         with self._condition:
             if outcome.ok:
-                said = self._schedule.started(system, self._clock(), self._names.__getitem__)
+                said = self._schedule.started(system, self._clock(), self._names.__getitem__, begun_s)
             else:
                 self._failed[vehicle] = outcome.text
                 held = [self._names[waiter] for waiter in self._schedule.failed(system)]

@@ -6,15 +6,14 @@ A fleet is polled by one thread. State that must survive a restart is written to
 For the HTTP API and the page, all in JSON values:
 
 - `commands(verb, vehicles)` gives a row a vehicle: `id`, `vehicle`, `command`, `outcome` (`done`, `refused`,
-  `not_sent`, `unknown`), `reason`. Verbs are `start`, `pause`, `resume`, `rtl`, `land`; no vehicles named: all on the
-  links at once.
+  `not_sent`, `unknown`), `reason`. Verbs are those of `fleet.commands`; no vehicles named: all on the links at once.
 - `preflight(...)` gives a row a vehicle: `vehicle`, `state` and `items`, each with `name` (of
   `fleet.preflight.ITEMS`), `state` (`ok`, `warning`, `red`) and `reason`. A red item stops `start` unless it is
   overridden by its name.
 - `flight_state(vehicle)`, and `flight` in each row of `rows()`: `state` (`on ground`, `taking off`, `on mission`,
-  `paused`, `returning`, `landing`, `holding`, `flying`, `lost`, `complete`), `text` (`on mission 7/13`), `item` and
-  `items`.
-- `alarm` in each row of `rows()`: what is wrong with where it flies, and what to do; empty if nothing is.
+  `paused`, `returning`, `landing`, `holding`, `flying`, `descending`, `lost`, `complete`), `text` (`on mission 7/13`),
+  `item` and `items`.
+- `alarm` in each row of `rows()`: what is wrong with how and where it flies, and what to do; empty if nothing is.
 - `behind` in each row of `rows()`: by how much it is behind its plan, in words; empty if it is not.
 - `fence` in each row of `rows()`: the geofence that the vehicle holds, see `Fences.of`.
 - `clock()` is the monotonic clock by which commands expire: a page that gets it from the event stream can state when
@@ -61,6 +60,7 @@ _OUTCOME_S: Final = 60.0
 _TRAIL: Final = 600  # positions of a vehicle on the page
 _MOST_TEXTS: Final = 50  # of a vehicle on the page
 _COMPLETE_EVERY: Final = 20  # looks after which all rows are sent, not only changed ones
+_FAULT: Final = 4  # MAV_SEVERITY_WARNING
 _REPLACED: Final = "dropped: the vehicle is complete, its refinement takes its place"
 _log = logging.getLogger(__name__)
 
@@ -215,7 +215,7 @@ class VehicleLinks:
         """Give a command to vehicles, to all at once, and wait for the outcome of each.
 
         Args:
-            verb: `start`, `pause`, `resume`, `rtl` or `land`.
+            verb: one of `fleet.commands.VERBS`.
             vehicles: their ids; None for all on the links.
             given_s: when it was given (`clock`); default now. It is not sent later than 5 s after that.
             command_id: id of the command; a new one by default.
@@ -250,12 +250,16 @@ class VehicleLinks:
         from gcs_plugin.fleet.commands import Order, new_id
 
         given, number = self.clock() if given is None else given, number or new_id()
-        stops = dict(self.fleet.stops)
+        stops, fleet = dict(self.fleet.stops), self.fleet.vehicles
+        standing = {s: v.standing for s, v in list(fleet.items())}
         rows, systems = self._without_command(verb, names, number, override)
         orders = {
-            name: Order(verb=verb, system=system, given_s=given, stops=stops.get(system, 0), id=number)
-            for name, system in systems.items()
-        }
+            name: Order(
+                verb=verb, system=s, given_s=given, stops=stops.get(s, 0), id=number, standing=standing.get(s),
+                mission=fleet[s].mission if verb == "start" else None,
+            )
+            for name, s in systems.items()
+        }  # fmt: skip
         for order in orders.values():
             self.fleet.call(lambda o=order: self.fleet.order(o))  # type: ignore[misc]
         end = time.monotonic() + _OUTCOME_S
@@ -289,6 +293,7 @@ class VehicleLinks:
     ) -> tuple[dict[str, dict[str, Any]], dict[str, int]]:
         """The rows of vehicles that need no command, and the system ids of the others."""
         from gcs_plugin.fleet.commands import URGENT
+        from gcs_plugin.fleet.preflight import CONTINUED, ITEMS
 
         rows: dict[str, dict[str, Any]] = {}
         systems: dict[str, int] = {}
@@ -312,11 +317,13 @@ class VehicleLinks:
                 if cancelled and not under_way:
                     end(name, Verdict.DONE, f"{name} stays on the ground: {cancelled}")
                     del systems[name]
-        if verb == "start":
+        if verb in ("start", "continue"):
+            free = () if verb == "start" else set(ITEMS) - CONTINUED
             for row in self._checked(systems):
-                red = red_items(row, override.get(row["vehicle"], ()))
+                red = red_items(row, {*override.get(row["vehicle"], ()), *free})
                 if red:
-                    end(row["vehicle"], Verdict.REFUSED, f"{row['vehicle']} was not started: {'; '.join(red)}")
+                    was = "started" if verb == "start" else "sent on with its mission"
+                    end(row["vehicle"], Verdict.REFUSED, f"{row['vehicle']} was not {was}: {'; '.join(red)}")
                     del systems[row["vehicle"]]
         return rows, systems
 
@@ -410,8 +417,9 @@ class VehicleLinks:
             said = {"text": vehicle.texts[-1], "severity": event.severity, "time": round(event.time_s, 1)}
             record.texts.append(said)
             about |= {"said": said["text"], "severity": said["severity"]}
-        else:
-            _log.info("%s", text)
+        grave = event.kind == "danger" or event.severity <= _FAULT
+        if grave or event.kind != "text":
+            _log.log(logging.WARNING if grave else logging.INFO, "%s", text)
         self._events.publish("vehicle_event", **about)
 
     def _words(self, event: "FleetEvent") -> str:
@@ -470,7 +478,8 @@ class VehicleLinks:
     def _row(self, vehicle: "Vehicle", now: float) -> dict[str, Any]:
         record = self._record(vehicle.system)
         row = vehicle.summary(now) | {"id": record.id, "name": self._titles.get(record.id, "")}
-        row["alarm"] = self.fleet.separation.text(vehicle.system, self.name_of)
+        near = self.fleet.separation.text(vehicle.system, self.name_of)
+        row["alarm"] = "; ".join(text for text in (near, vehicle.danger and f"{record.id} {vehicle.danger}") if text)
         row["behind"] = self.fleet.behind(vehicle.system)
         row["yaw_deg"] = row["heading_deg"]
         if vehicle.lat_deg is not None and vehicle.lon_deg is not None:

@@ -10,9 +10,12 @@ from gcs_plugin.mission.exchange import Outcome, Verdict
 
 if TYPE_CHECKING:
     from gcs_plugin.mission.exchange import Exchange
+    from gcs_plugin.mission.items import Mission
+    from gcs_plugin.mission.start_dialogue import Standing
 
-Verb = Literal["start", "pause", "resume", "rtl", "land"]
-VERBS: Final[tuple[Verb, ...]] = ("start", "pause", "resume", "rtl", "land")
+Verb = Literal["start", "pause", "resume", "continue", "rtl", "land"]
+VERBS: Final[tuple[Verb, ...]] = ("start", "pause", "resume", "continue", "rtl", "land")
+"""`resume` ends a pause, whatever was paused; `continue` goes on with a mission that was left, for a return, too."""
 URGENT: Final[frozenset[str]] = frozenset({"pause", "rtl", "land"})
 """Commands that bring a flight to its end: no doubt about identity or link ever blocks them."""
 
@@ -31,7 +34,7 @@ class CommandResult:
     Attributes:
         id: of the command; a command to several vehicles has one id.
         vehicle: its name: v1, or as the operator calls it.
-        command: `start`, `pause`, `resume`, `rtl`, `land`, or `upload`.
+        command: one of VERBS, or `upload`.
         outcome: DONE: the vehicle acknowledged it. REFUSED: it or the station said no. NOT_SENT: nothing left the
             station. UNKNOWN: it was sent but not answered.
         reason: one sentence; if not done, the reason and what to do.
@@ -59,6 +62,8 @@ class Order:
         verb: the command. system: the vehicle's system id.
         given_s: when it was given (the fleet's monotonic clock); it is not sent later than COMMAND.fresh_s after that.
         stops: of a start, `Fleet.stops` (0 if none) when it was given: a pause, RTL or land since then makes it void.
+        standing: of a start, what the vehicle was when it was given; it is not started if that has changed since.
+        mission: of a start, the mission that was checked; it is not started with another one.
         id: of the command.
         exchange: the dialogue with the vehicle, None if none was started.
     """
@@ -67,6 +72,8 @@ class Order:
     system: int
     given_s: float
     stops: int | None = None
+    standing: "Standing | None" = None
+    mission: "Mission | None" = None
     id: str = field(default_factory=new_id)
     exchange: "Exchange | None" = None
     _ended: Outcome | None = None
@@ -75,6 +82,12 @@ class Order:
     def expires_s(self) -> float:
         """Time after which it may not be sent."""
         return self.given_s + COMMAND.fresh_s
+
+    @property
+    def begun_s(self) -> float | None:
+        """Of a start: when the vehicle was first seen on its mission (the fleet's clock), before it had climbed."""
+        takes_off = getattr(self.exchange, "takes_off", None)
+        return None if takes_off is None else takes_off.begun_s
 
     @property
     def outcome(self) -> Outcome | None:

@@ -4,10 +4,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from gcs_plugin.mission.command_dialogues import BreakOff, CheckMission, InOrder, Start
 from gcs_plugin.mission.download import MissionDownload
 from gcs_plugin.mission.exchange import MISSION, NEVER, Verdict
 from gcs_plugin.mission.items import Mission
+from gcs_plugin.mission.start_dialogue import BreakOff, Start
 from gcs_plugin.mission.upload import MissionUpload
 
 if TYPE_CHECKING:
@@ -51,6 +51,17 @@ class Dialogues:
     def busy(self, system: int) -> bool:
         """True while a dialogue with this vehicle is active that somebody waits for."""
         return any(job.vehicle.system == system and not _in_background(job) for job in self.jobs)
+
+    def talks(self, system: int) -> bool:
+        """True while any dialogue with this vehicle is active."""
+        return any(job.vehicle.system == system for job in self.jobs)
+
+    def reads(self, system: int) -> bool:
+        """True while this vehicle's mission is being read."""
+        return any(
+            job.vehicle.system == system and isinstance(job, MissionDownload) and job.list_type == MISSION
+            for job in self.jobs
+        )
 
     def starting(self, system: int) -> bool:
         """True while a start of this vehicle is under way, or is being broken off."""
@@ -150,14 +161,21 @@ class Dialogues:
             vehicle.unbegun = True
         if isinstance(job, MissionUpload) and job.outcome is not None and job.outcome.ok:
             vehicle.mission, vehicle.mission_seq = job.mission, 0
+            vehicle.mission_was_read(self._clock())
             vehicle.detector.uploaded(job.mission)
             return
         mission = None
+        if job.outcome is not None and not job.outcome.ok and _in_background(job):
+            vehicle.read_at = min(vehicle.read_at, self._clock() + _ON_THE_WAY_S)  # something else came in between
         if isinstance(job, MissionDownload) and job.list_type == MISSION and job.items is not None:
             mission = Mission(vehicle.autopilot, tuple(job.items))
-        elif isinstance(job, InOrder) and isinstance(job.steps[0], CheckMission):
-            mission = job.steps[0].mission
-        if mission is not None and (vehicle.mission != mission or not vehicle.detector.knows):
+        elif isinstance(job, Start):
+            mission = job.arm.mission
+        if mission is None:
+            return
+        if job.outcome is not None and isinstance(job, MissionDownload):
+            vehicle.mission_was_read(self._clock())
+        if vehicle.mission != mission or not vehicle.detector.knows:
             vehicle.mission = mission
             vehicle.detector.knows_mission(mission)
 

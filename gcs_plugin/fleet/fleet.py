@@ -19,7 +19,7 @@ from gcs_plugin.config import COMMAND
 from gcs_plugin.fleet.commands import URGENT, Order, Verb
 from gcs_plugin.fleet.dialogues import Dialogues
 from gcs_plugin.fleet.fleet_events import FleetEvent
-from gcs_plugin.fleet.flight_state import Word, flight_state
+from gcs_plugin.fleet.going_on import continued, resumed
 from gcs_plugin.fleet.link_hub import Hub
 from gcs_plugin.fleet.message_rates import Rates, default_rates
 from gcs_plugin.fleet.reception import MESSAGE_IDS, Handler, Reception
@@ -28,11 +28,12 @@ from gcs_plugin.links.mavlink import Autopilot, Message
 from gcs_plugin.links.packets import Packet
 from gcs_plugin.links.transports import Link
 from gcs_plugin.mission.completion import Phase
-from gcs_plugin.mission.download import MissionDownload
-from gcs_plugin.mission.exchange import GROUND_STATION, Address, Exchange, Verdict
+from gcs_plugin.mission.download import AT_ONCE, MissionDownload
+from gcs_plugin.mission.exchange import GROUND_STATION, MISSION, Address, Exchange, Verdict
 from gcs_plugin.mission.flight_modes import why_no_missions
 from gcs_plugin.mission.geofence import FENCE
 from gcs_plugin.mission.items import Mission
+from gcs_plugin.mission.start_dialogue import Expected, break_off, start_mission
 from gcs_plugin.mission.upload import MissionUpload
 from orthoswarm.model.errors import OrthoSwarmError
 
@@ -42,7 +43,8 @@ Dialogue = TypeVar("Dialogue", bound=Exchange)
 _log = logging.getLogger(__name__)
 _TICK_S: Final = 0.25
 _BATCH_S: Final = 0.04
-_FENCE_S: Final = 10.0
+_READ_S: Final = 10.0  # silence after which a list that nobody waits for is read later
+_READS: Final = 4  # missions that are read at once while nobody waits for them: a radio has other things to carry
 _PAUSE_SHOWS_S: Final = 5.0
 _SURE_S: Final = 2.5  # an older state of a vehicle does not override a command that ends its flight
 
@@ -165,7 +167,7 @@ class Fleet:
             text = f"vehicle {order.system}: '{order.verb}' was given {now - order.given_s:.0f} s ago and was not sent"
             return order.end(f"{text}; give it again", Verdict.NOT_SENT)
         try:
-            exchange = self._dialogue(order.verb, order.system)
+            exchange = self._start(order) if order.verb == "start" else self._dialogue(order.verb, order.system)
         except OrthoSwarmError as error:
             silent = order.system not in self.vehicles or self.vehicles[order.system].lost
             return order.end(str(error), Verdict.NOT_SENT if silent else Verdict.REFUSED)
@@ -225,7 +227,7 @@ class Fleet:
         """Read the mission of a vehicle, and ask for the settings that a check compares with it."""
         vehicle = self._free(system)
         self.ask_settings(system)
-        return self.begin(MissionDownload(vehicle.address, self.own))
+        return self.begin(MissionDownload(vehicle.address, self.own, window=AT_ONCE[vehicle.autopilot]))
 
     def ask_settings(self, system: int) -> None:
         """Ask a vehicle for its settings; in the polling thread."""
@@ -237,21 +239,42 @@ class Fleet:
         Raises:
             OrthoSwarmError: the vehicle is not there, or busy.
         """
+        vehicle = self.vehicle(system)
+        if self._dialogues.talks(system):
+            raise OrthoSwarmError(f"vehicle {system} is busy with another request; wait until that has ended")
+        return self._read(vehicle, FENCE)
+
+    def read_mission(self, system: int) -> None:
+        """Read what a vehicle holds, and its settings, if it can be asked now; any other request to it ends this."""
+        vehicle = self.vehicles[system]
+        self.ask_settings(system)
+        if not (vehicle.lost or vehicle.claimants or self._dialogues.talks(system)):
+            vehicle.read_at = self._clock() + _READ_S
+            self._read(vehicle)
+
+    def reads(self, system: int) -> bool:
+        """True while a vehicle's mission is being read."""
+        return self._dialogues.reads(system)
+
+    def _read(self, vehicle: Vehicle, list_type: int = MISSION) -> MissionDownload:
+        window = AT_ONCE[vehicle.autopilot]
         job = MissionDownload(
-            self._free(system).address, self.own, patience_s=_FENCE_S, list_type=FENCE, background=True
+            vehicle.address, self.own, patience_s=_READ_S, list_type=list_type, background=True, window=window
         )
         return self.begin(job)
 
     def start(self, system: int) -> Exchange:
-        """Start a vehicle's mission from the beginning: check, mode, arm, MISSION_START."""
-        return self._now("start", system)
+        """Start a vehicle's mission from the beginning, see `mission.start_dialogue`."""
+        exchange = self._start(Order(verb="start", system=system, given_s=self._clock()))
+        exchange.expires = self._clock() + COMMAND.fresh_s
+        return self.begin(exchange)
 
     def pause(self, system: int) -> Exchange:
         """Make a vehicle hold its position."""
         return self._now("pause", system)
 
     def resume(self, system: int) -> Exchange:
-        """Make a vehicle continue its mission."""
+        """Make a vehicle continue what was paused: its mission, or its way home."""
         return self._now("resume", system)
 
     def rtl(self, system: int) -> Exchange:
@@ -307,50 +330,51 @@ class Fleet:
         Raises:
             OrthoSwarmError: it cannot be given.
         """
-        if verb == "start":
-            vehicle = self._flies_missions(system)
-            if vehicle.detector.phase is Phase.ACTIVE and vehicle.armed:
-                raise OrthoSwarmError(f"vehicle {system} is flying its mission already")
-            check = vehicle.mission is None or not vehicle.detector.knows
-            return vehicle.pilot.start(in_air=vehicle.flying, armed=vehicle.armed, check=check)
         vehicle = self._known(system) if verb in URGENT else self.vehicle(system)
         sure = not vehicle.claimants and self._clock() - vehicle.heard < _SURE_S
         starting = self._dialogues.starting(system)
         if verb == "pause" and sure and not vehicle.armed and not starting:
             raise OrthoSwarmError(f"vehicle {system} is not armed, so there is nothing to pause")
-        if verb == "resume":
-            self._may_resume(vehicle)
+        goes_on = None if verb not in ("resume", "continue") else self._goes_on(vehicle, verb)
         self._dialogues.make_way(system)
         self._pauses.pop(system, None)
         if verb in ("rtl", "land"):
             self._told_home[system] = self._clock()
         if starting and verb in URGENT and not vehicle.flying:
-            return vehicle.pilot.break_off(verb)
+            return break_off(vehicle.pilot, verb)
         if verb == "pause":
-            self._pauses[system] = (vehicle.pilot.pause(), self._clock())
+            self._pauses[system] = (vehicle.pilot.pause(held=vehicle.custom_mode == vehicle.modes.hold), self._clock())
             return self._pauses[system][0]
-        if verb == "resume":
-            return vehicle.pilot.resume(in_mission_mode=vehicle.custom_mode == vehicle.modes.mission)
-        return {"rtl": vehicle.pilot.rtl, "land": vehicle.pilot.land}[verb]()
+        return goes_on or {"rtl": vehicle.pilot.rtl, "land": vehicle.pilot.land}[verb]()
 
-    def _may_resume(self, vehicle: Vehicle) -> None:
-        """Resuming must not pull a vehicle back that returns or lands, nor lift one from the ground.
+    def _goes_on(self, vehicle: Vehicle, verb: Verb) -> Exchange:
+        """See `going_on`.
 
         Raises:
-            OrthoSwarmError: it is not within its mission.
+            OrthoSwarmError: there is nothing to go on with.
         """
-        if vehicle.unbegun:  # its autopilot would go on at the item at which it left the mission before
-            raise OrthoSwarmError(f"vehicle {vehicle.system} has not begun the mission that it was given; start it")
-        state = flight_state(vehicle)
-        # A station that has just begun to listen does not know the mission's phase: then the mode of a pause counts.
-        begun = vehicle.mission_seq >= (1 if vehicle.autopilot is Autopilot.ARDUPILOT else 0)  # its item 0 is its home
-        held = vehicle.flying and vehicle.custom_mode == vehicle.modes.hold and begun
-        within = held and state.word is Word.FLYING and vehicle.detector.phase is Phase.IDLE
-        if self._clock() - self._told_home.get(vehicle.system, -math.inf) < _PAUSE_SHOWS_S:  # its mode may be older
+        told_s = self._clock() - self._told_home.get(vehicle.system, -math.inf)
+        if verb == "resume" and told_s < _PAUSE_SHOWS_S:  # its mode may be older
             raise OrthoSwarmError(f"vehicle {vehicle.system} was told to return or land just now; it is not resumed")
-        # A pause shows some seconds after it was acknowledged: on a mission there is nothing to pull it out of.
-        if state.word not in (Word.PAUSED, Word.ON_MISSION, Word.TAKING_OFF) and not within:
-            raise OrthoSwarmError(f"vehicle {vehicle.system} is {state.word.value}, so there is no pause to end")
+        return resumed(vehicle) if verb == "resume" else continued(vehicle)
+
+    def _start(self, order: Order) -> Exchange:
+        """The dialogue of a start.
+
+        Raises:
+            OrthoSwarmError: the vehicle cannot be started, or is not what it was when the start was given.
+        """
+        vehicle = self._flies_missions(order.system)
+        if vehicle.detector.phase is Phase.ACTIVE and vehicle.armed:
+            raise OrthoSwarmError(f"vehicle {order.system} is flying its mission already")
+        then = order.standing or vehicle.standing
+        if why := vehicle.changed_since(then):
+            raise OrthoSwarmError(f"vehicle {order.system} {why} since its start was given, so it was not started")
+        known = vehicle.mission if vehicle.detector.knows else None
+        mission = order.mission or known
+        held_id = vehicle.held_id if known is not None and (order.mission is None or order.mission == known) else 0
+        expected = Expected(autopilot=vehicle.autopilot, in_air=vehicle.flying, mission=mission, known_id=held_id)
+        return start_mission(vehicle.pilot, then, expected)
 
     def _was_just_paused(self, system: int) -> bool:
         """True between a vehicle's acknowledgement of a pause and the report of its mission's state that shows it."""
@@ -375,6 +399,19 @@ class Fleet:
         if now >= self._tick_at:
             self._tick_at = now + _TICK_S
             self._reception.tick(now)
+            self._read_missions(now)
+
+    def _read_missions(self, now: float) -> None:
+        """Read what vehicles hold where that is not known or may have changed, while nothing else asks them."""
+        room = _READS - sum(isinstance(job, MissionDownload) and job.background for job in self._dialogues.jobs)
+        for system, vehicle in self.vehicles.items():
+            if room <= 0:
+                return
+            idle = not (vehicle.lost or vehicle.claimants or self._dialogues.talks(system))
+            if not idle or not vehicle.mission_total or now < vehicle.read_at:
+                continue
+            vehicle.read_at, room = now + _READ_S, room - 1
+            self._read(vehicle)
 
     def run(self, stop: threading.Event) -> None:
         """Poll until `stop` is set. Input is read in small batches, which avoids most wake-ups."""

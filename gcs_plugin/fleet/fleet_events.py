@@ -1,16 +1,18 @@
 """What happens to the vehicles of a fleet, as values and in words."""
 
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from gcs_plugin.mission.completion import MissionEvent
+from gcs_plugin.mission.flight_modes import HOLDS
+
+if TYPE_CHECKING:
+    from gcs_plugin.fleet.vehicle_state import Vehicle
 
 _WORDS: Final = {
     MissionEvent.STARTED: "has started its mission",
-    MissionEvent.SUSPENDED: "has left its mission",
     MissionEvent.RESUMED: "goes on with its mission",
     MissionEvent.COMPLETE: "has completed its mission",
-    MissionEvent.ABORTED: "has ended its mission without completing it",
 }
 
 Pair = tuple[int, int]
@@ -24,8 +26,8 @@ class FleetEvent:
     Attributes:
         kind: `found`, `lost`, `regained`, `rebooted`, `link` (commands go another way), `conflict` (several vehicles
             with one system id), `single` (no longer), `near` (too near another vehicle), `apart` (no longer), `behind`
-            (later on its mission than plans allow for), `caught_up` (no longer: it has ended), `text`, or a mission's
-            `started`, `suspended`, `resumed`, `complete`, `aborted`.
+            (later on its mission than plans allow for), `caught_up` (no longer), `danger` (`Vehicle.danger`), `safe`
+            (no longer), `text`, or a mission's `started`, `suspended`, `resumed`, `complete`, `aborted`.
         system: system id.
         time_s: UTC epoch seconds.
         text: one sentence.
@@ -41,6 +43,20 @@ class FleetEvent:
     severity: int = 6
 
 
-def mission_event(event: MissionEvent) -> tuple[str, str]:
-    """Kind and words of what has happened to a mission."""
+def mission_event(event: MissionEvent, vehicle: "Vehicle") -> tuple[str, str]:
+    """Kind and words of what has happened to a vehicle's mission."""
+    if event is MissionEvent.ABORTED:
+        flown = vehicle.detector.flown
+        return event.value, f"has ended its mission: {flown.text if flown else 'it was not completed'}"
+    if event is MissionEvent.SUSPENDED:
+        return event.value, _left(vehicle)
     return event.value, _WORDS[event]
+
+
+def _left(vehicle: "Vehicle") -> str:
+    """Why a vehicle is off its mission, as far as its mode tells; that may come a second later than its mission's."""
+    if vehicle.failsafe:
+        return "has left its mission in a failsafe"
+    if vehicle.custom_mode == vehicle.modes.mission:
+        return "has interrupted its mission"
+    return f"has {'paused' if vehicle.mode in HOLDS else 'left'} its mission and is in {vehicle.mode}"

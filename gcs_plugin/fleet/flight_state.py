@@ -1,4 +1,8 @@
-"""The flight state of a vehicle in one word, from its mode, speed, height and mission, for both autopilots."""
+"""The flight state of a vehicle in one word, from its motion, mode and mission, for both autopilots.
+
+A mode alone says nothing: in LOITER or GUIDED a vehicle stands still, is flown by someone else, or sinks because a
+remote control's throttle is low. So a word that means standing still is said only of one that does.
+"""
 
 import enum
 import math
@@ -7,24 +11,22 @@ from typing import Any, Final, Protocol
 
 from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.mission.completion import CompletionDetector, Phase
-from gcs_plugin.mission.flight_modes import Modes
+from gcs_plugin.mission.flight_modes import HOLDS, LANDS, RETURNS, Modes
 from gcs_plugin.mission.items import DELAY, LAND, LOITER_UNLIM, RTL, TAKEOFF, VTOL_LAND, WAYPOINT, Mission
 
 STILL_S: Final = 2.5
 """How long a vehicle stands still on its way before that counts as a pause: longer than a turn's stop."""
-_STILL_UNKNOWN_S: Final = 8.0
-"""The same where its mission is not known: an item may let it wait, and PX4 hovers for some seconds before it lands."""
 _SINKS_M_S: Final = 0.3
 _SLOW_M_S: Final = 1.0
-_LOW_M: Final = 1.5
-_RETURNS: Final = frozenset({"RTL", "SMART_RTL", "AUTO_RTL", "QRTL"})
-_LANDS: Final = frozenset({"LAND", "QLAND"})
-_HOLDS: Final = frozenset({"HOLD", "BRAKE", "LOITER", "POSHOLD", "GUIDED", "QHOVER", "QLOITER"})
+_SINKING_S: Final = 1.0
+"""How long a vehicle sinks where it should not until that is said: gusts and braking move it for less."""
+_BRAKES_S: Final = 5.0
+"""One that was just put into its mode to hold is still slowing down for so long at most: from 15 m/s at 3 m/s2."""
 _TIMED: Final = frozenset({DELAY, LOITER_UNLIM, int(dialect.MAV_CMD_NAV_LOITER_TIME)})
 
 
 class Word(enum.Enum):
-    """Flight states. FLYING: in the air without a mission; HOLDING: in the air after its mission's end."""
+    """Flight states. FLYING: moved without its mission; HOLDING: still, without one; DESCENDING: unordered."""
 
     ON_GROUND = "on ground"
     TAKING_OFF = "taking off"
@@ -33,6 +35,7 @@ class Word(enum.Enum):
     RETURNING = "returning"
     LANDING = "landing"
     HOLDING = "holding"
+    DESCENDING = "descending"
     FLYING = "flying"
     LOST = "lost"
     COMPLETE = "complete"
@@ -45,15 +48,20 @@ class FlightState:
     Attributes:
         word: the state.
         item: the current mission item, from 1. items: their number; both 0 if unknown.
+        mode: the flight mode that it moves in without its mission; of a pause, the one that it interrupted if that was
+            not the mission.
     """
 
     word: Word
     item: int = 0
     items: int = 0
+    mode: str = ""
 
     @property
     def text(self) -> str:
         """For people: `on mission 7/13`."""
+        if self.mode:
+            return f"{self.word.value} in {self.mode}"
         counted = self.word in (Word.ON_MISSION, Word.PAUSED) and self.items
         return f"{self.word.value} {self.item}/{self.items}" if counted else self.word.value
 
@@ -76,8 +84,15 @@ class Observed(Protocol):
     landed: str
     mission: Mission | None
     mission_seq: int
+    mission_state: int
     mission_total: int
     paused_in_mission: bool
+    way: int | None
+    failsafe: bool
+
+    @property
+    def severe_text(self) -> str:
+        """The last text in which its autopilot reported a fault in this flight, empty if none."""
 
     @property
     def mode(self) -> str:
@@ -91,12 +106,36 @@ class Observed(Protocol):
     def still_s(self) -> float:
         """For how long it has been stationary, seconds."""
 
+    @property
+    def in_mode_s(self) -> float:
+        """For how long it has been in its mode, seconds."""
+
+    @property
+    def sinks_s(self) -> float:
+        """For how long it has been sinking, seconds."""
+
 
 def flight_state(vehicle: Observed) -> FlightState:
     """The flight state of a vehicle, as far as its messages show."""
     items = vehicle.mission_total
     first = 0 if vehicle.autopilot is Autopilot.ARDUPILOT else 1
-    return FlightState(_word(vehicle), min(vehicle.mission_seq + first, items), items)
+    word = _word(vehicle)
+    mode = vehicle.mode if word in (Word.FLYING, Word.DESCENDING) else ""
+    if word is Word.PAUSED and vehicle.way not in (None, vehicle.modes.mission):
+        mode = vehicle.modes.name(vehicle.way or 0)
+    return FlightState(word, min(vehicle.mission_seq + first, items), items, mode)
+
+
+def danger_of(vehicle: Observed) -> str:
+    """What endangers a vehicle in the air by itself, and what to do, in words; empty if nothing does."""
+    if vehicle.lost or not vehicle.flying:
+        return ""
+    if _word(vehicle) is Word.DESCENDING:
+        return f"sinks in {vehicle.mode} though nobody ordered it to land: take it over, or send it home"
+    if vehicle.failsafe:
+        said = f" ({vehicle.severe_text})" if vehicle.severe_text else ""
+        return f"is in a failsafe{said}, in {vehicle.mode}: let it return, or take it over"
+    return f"says: {vehicle.severe_text}" if vehicle.severe_text else ""
 
 
 def _word(vehicle: Observed) -> Word:
@@ -106,39 +145,44 @@ def _word(vehicle: Observed) -> Word:
         done = vehicle.detector.phase is Phase.COMPLETE and not vehicle.armed
         return Word.COMPLETE if done else Word.ON_GROUND
     mode = vehicle.mode
-    if mode in _LANDS:
+    if mode in LANDS:
         return Word.LANDING
-    if mode in _RETURNS:
+    if mode in RETURNS:
         return Word.LANDING if _comes_down(vehicle) else Word.RETURNING
     if mode == "TAKEOFF":
         return Word.TAKING_OFF
     if vehicle.custom_mode == vehicle.modes.mission:
         return _on_mission(vehicle)
-    if vehicle.detector.phase is Phase.COMPLETE:
-        return Word.HOLDING
-    if mode in _HOLDS and vehicle.detector.phase is Phase.SUSPENDED:
-        return Word.PAUSED
-    if mode in _HOLDS and vehicle.detector.phase is Phase.ACTIVE:
-        return Word.ON_MISSION  # it pauses, resumes or ends: PX4's mode and mission state arrive up to a second apart
-    return Word.FLYING
+    if vehicle.sinks_s >= _SINKING_S:
+        return Word.DESCENDING
+    brakes = vehicle.custom_mode == vehicle.modes.hold and vehicle.in_mode_s < _BRAKES_S
+    if mode not in HOLDS or (math.hypot(*vehicle.velocity_m_s[:2]) > _SLOW_M_S and not brakes):
+        return Word.FLYING
+    return Word.PAUSED if _interrupted(vehicle) else Word.HOLDING
+
+
+def _interrupted(vehicle: Observed) -> bool:
+    """Whether one that holds was under way: on a return, or between the ends of its mission."""
+    if vehicle.detector.phase in (Phase.SUSPENDED, Phase.ACTIVE):
+        return True
+    if vehicle.way is not None:
+        return vehicle.modes.name(vehicle.way) in RETURNS | LANDS
+    begun = vehicle.mission_seq >= 1 or vehicle.mission_state == dialect.MISSION_STATE_PAUSED  # ArduPilot: by its item
+    return begun and vehicle.custom_mode == vehicle.modes.hold and vehicle.detector.phase is Phase.IDLE
 
 
 def _on_mission(vehicle: Observed) -> Word:
     command, waits = _item(vehicle)
     if command == RTL:
         return Word.LANDING if _comes_down(vehicle) else Word.RETURNING
-    if command in (LAND, VTOL_LAND) and _comes_down(vehicle):
-        return Word.LANDING
-    if command is None and _comes_down(vehicle) and vehicle.landed != "taking off":
+    if vehicle.landed == "landing" or (command in (LAND, VTOL_LAND) and _comes_down(vehicle)):
         return Word.LANDING
     if vehicle.detector.phase is Phase.COMPLETE:
         return Word.LANDING if _comes_down(vehicle) else Word.HOLDING
     if command == TAKEOFF or vehicle.landed == "taking off":
         return Word.TAKING_OFF
-    still_s = _STILL_UNKNOWN_S if command is None else STILL_S
-    if vehicle.paused_in_mission or (vehicle.still_s >= still_s and not waits):
-        return Word.PAUSED
-    return Word.ON_MISSION
+    still = command is not None and vehicle.still_s >= STILL_S and not waits
+    return Word.PAUSED if vehicle.paused_in_mission or still else Word.ON_MISSION
 
 
 def _item(vehicle: Observed) -> tuple[int | None, bool]:

@@ -35,6 +35,8 @@ ITEMS: Final = (
     "link", "gps", "ekf", "home", "pre-arm", "battery", "mission", "fence", "height", "return", "failsafe", "speed",
     "separation",
 )  # fmt: skip
+CONTINUED: Final = frozenset({"link", "gps", "ekf", "battery", "mission", "fence", "failsafe"})
+"""Those that count before a vehicle in the air goes on with a mission that it has left."""
 _LINK_S: Final = (2.0, 5.0)
 _SATELLITES: Final = (6, 10)
 _HOME_M: Final = 50.0
@@ -275,6 +277,8 @@ def _battery(vehicle: "Vehicle", mission: "Mission | None", endurance_s: float, 
     if left is None:
         return Item("battery", Level.WARNING, "it does not report its battery")
     needed = flight_seconds(mission) / endurance_s if mission is not None else 0.0
+    if vehicle.flying and (flown := vehicle.detector.flown) is not None and flown.places:
+        needed *= 1.0 - len(flown.reached & flown.places.keys()) / len(flown.places)
     which = f" in its {vehicle.battery_name}" if vehicle.battery_name else ""
     text = f"{100 * left:.0f} % left{which}, the mission needs about {100 * needed:.0f} %"
     if left < needed or left < 0.5 * LIMITS.reserve_share:
@@ -386,6 +390,8 @@ def _too_low(vehicle: "Vehicle", needed_m: float) -> str:
 def _failsafe(vehicle: "Vehicle") -> Item:
     low, alone = (vehicle.settings.get(s) for s in (Setting.LOW_BATTERY, Setting.NO_STATION))
     spared = vehicle.settings.get(Setting.NO_STATION_EXCEPT)
+    if vehicle.flying and vehicle.failsafe:
+        return Item("failsafe", Level.RED, f"it is in a failsafe ({vehicle.severe_text or 'it does not say why'})")
     text = "" if alone is None else f"; without a ground station it {alone.action or 'goes on'} ({alone.name})"
     if alone is not None and alone.action and spared is not None and spared.spares_missions:
         text += f", but not on a mission ({spared.name})"

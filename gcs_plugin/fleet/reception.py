@@ -10,6 +10,7 @@ from typing import Any, Final
 from gcs_plugin.config import HEARING
 from gcs_plugin.fleet.dialogues import Dialogues
 from gcs_plugin.fleet.fleet_events import FleetEvent, Pair, mission_event
+from gcs_plugin.fleet.flight_state import danger_of
 from gcs_plugin.fleet.link_hub import Hub, Side
 from gcs_plugin.fleet.message_rates import Rates, Streams
 from gcs_plugin.fleet.routes import LongText, Route
@@ -161,6 +162,8 @@ class Reception:
             self._text_part(vehicle, route, message, now)
         if kind in _DETECTED and not (kind in _REQUESTS and message.target_system == self._own.system):
             self._mission_events(vehicle, vehicle.detector.feed(message))
+            if vehicle.mission is not None and not vehicle.detector.knows:  # somebody stores another one
+                vehicle.mission, vehicle.read_at = None, 0.0
         self._dialogues.feed(vehicle, message, now)
 
     def _text_part(self, vehicle: Vehicle, route: Route, message: Message, now: float) -> None:
@@ -192,7 +195,7 @@ class Reception:
             return
         if len(self._said) > 1000:
             self._said.clear()
-        vehicle.says(text, now)
+        vehicle.says(text, now, severity)
         self._event("text", vehicle, f"says: {text}", severity=severity)
 
     def _found(self, packet: Packet, now: float) -> Vehicle | None:
@@ -233,7 +236,8 @@ class Reception:
     def _mission_events(self, vehicle: Vehicle, events: Sequence[MissionEvent]) -> None:
         for event in events:
             vehicle.unbegun &= event is not MissionEvent.STARTED
-            kind, text = mission_event(event)
+            vehicle.read_at = 0.0
+            kind, text = mission_event(event, vehicle)
             self._event(kind, vehicle, text)
 
     def _event(self, kind: str, vehicle: Vehicle, text: str, pair: Pair | None = None, severity: int = 6) -> None:
@@ -249,6 +253,7 @@ class Reception:
             if vehicle.lost:
                 continue
             self._watch_times(vehicle)
+            self._watch_danger(vehicle)
             self._dialogues.send(vehicle.system, [*vehicle.streams.tick(now), *vehicle.questions.tick(now)])
             self._ask_why(vehicle, now)
             for route in vehicle.routes.known.values():
@@ -276,6 +281,14 @@ class Reception:
         for pair in ended:
             self._event("apart", self._vehicles[pair[1]], apart_text(pair), pair)
 
+    def _watch_danger(self, vehicle: Vehicle) -> None:
+        """Tell once that a vehicle is in a failsafe, or sinks though nobody ordered it."""
+        was, vehicle.danger = vehicle.danger, danger_of(vehicle)
+        if vehicle.danger and vehicle.danger != was:
+            self._event("danger", vehicle, vehicle.danger)
+        elif was and not vehicle.danger:
+            self._event("safe", vehicle, "is out of the danger that was told")
+
     def _watch_times(self, vehicle: Vehicle) -> None:
         """Compare a vehicle on its mission with the times of its plan."""
         watched, mission, phase = self._lateness.get(vehicle.system), vehicle.mission, vehicle.detector.phase
@@ -293,6 +306,8 @@ class Reception:
         watched.look(vehicle.time_boot_s, vehicle.lat_deg, vehicle.lon_deg, vehicle.height_m)
         if watched.behind and not was:
             self._event("behind", vehicle, self.behind(vehicle.system))
+        elif was and not watched.behind:
+            self._event("caught_up", vehicle, "is no longer behind its plan")
 
     def behind(self, system: int) -> str:
         """How far a vehicle is behind its plan, in words; empty if it is not."""

@@ -15,8 +15,10 @@ from gcs_plugin.links.mavlink import Autopilot, Message, dialect
 from gcs_plugin.mission.command_dialogues import Pilot
 from gcs_plugin.mission.completion import CompletionDetector
 from gcs_plugin.mission.exchange import Address
-from gcs_plugin.mission.flight_modes import Modes, modes_of
+from gcs_plugin.mission.flight_modes import HOLDS, Modes, modes_of
 from gcs_plugin.mission.items import Mission
+from gcs_plugin.mission.start_dialogue import MOVED_M, Standing, mission_id, others_command
+from orthoswarm.model.earth import distance_m
 
 _LANDED: Final = {0: "", 1: "on ground", 2: "in air", 3: "taking off", 4: "landing"}
 _FIRST: Final = 0
@@ -28,6 +30,11 @@ _PREARM_S: Final = 45.0  # autopilots repeat what is wrong every 30 s
 _EKF_NEEDED: Final = int(dialect.EKF_ATTITUDE | dialect.EKF_POS_HORIZ_ABS | dialect.EKF_POS_VERT_ABS)
 _EKF_WRONG: Final = int(dialect.EKF_CONST_POS_MODE | dialect.EKF_UNINITIALIZED)
 _MISSION_PAUSED: Final = int(dialect.MISSION_STATE_PAUSED)
+_CRITICAL: Final = frozenset({int(dialect.MAV_STATE_CRITICAL), int(dialect.MAV_STATE_EMERGENCY)})
+_INFO, _FAULT = int(dialect.MAV_SEVERITY_INFO), int(dialect.MAV_SEVERITY_WARNING)
+_SEVERE_S: Final = 30.0  # so often autopilots repeat what is still wrong
+_READ_AGAIN_S: Final = 60.0  # ArduPilot does not say that another station has stored a mission of as many items
+_SINKS_M_S: Final = 0.5  # faster than one that holds its height moves, slower than any descent
 _STILL_M_S: Final = (0.6, 0.25)  # horizontally, vertically; slower than the last metres of a landing
 
 
@@ -53,6 +60,12 @@ class Vehicle:
         time_boot_s: its own clock at the last position.
         battery: what is left in its emptiest battery, 0 to 1; None if not reported.
         mission: what it holds, where that was read or written in this session.
+        held_id: the vehicle's own checksum of it; 0 for an ArduPilot, which tells none. mission_id: the one told last.
+        read_s: when its mission was read last; read_at: when it is to be read again (the fleet's clock).
+        touched: how often its mode or arming has changed, or it has obeyed another station.
+        way: the mode in which it was last under way in this flight, not held; None on the ground, or not known.
+        danger: what endangers it by itself, in words; empty if nothing does.
+        failsafe: whether it reports one (MAV_STATE_CRITICAL, MAV_STATE_EMERGENCY).
         unbegun: it was given that mission here and has not begun it.
         photos: pictures that it has reported.
         received: packets; missed: packets lost according to its counters.
@@ -99,6 +112,14 @@ class Vehicle:
     gps_fix: int = 0
     satellites: int = 0
     mission: Mission | None = None
+    held_id: int = 0
+    mission_id: int = 0
+    read_s: float = -math.inf
+    read_at: float = 0.0
+    touched: int = 0
+    way: int | None = None
+    danger: str = ""
+    failsafe: bool = False
     unbegun: bool = False
     mission_state: int = 0
     mission_seq: int = 0
@@ -121,6 +142,9 @@ class Vehicle:
     texts: "deque[str]" = field(default_factory=lambda: deque(maxlen=50))
     _prearm: dict[str, float] = field(default_factory=dict)
     _still_since: float | None = None
+    _sinks_since: float | None = None
+    _mode_since: float = 0.0
+    _severe: tuple[str, float] = ("", -math.inf)
     _batteries: dict[int, float | None] = field(default_factory=dict)
     _told: dict[int, tuple[int, int]] = field(default_factory=dict)
     _all_batteries: bool = False
@@ -175,6 +199,39 @@ class Vehicle:
         return 0.0 if self._still_since is None else max(0.0, self.time_boot_s - self._still_since)
 
     @property
+    def in_mode_s(self) -> float:
+        """For how many seconds of its own clock it has been in its mode."""
+        return max(0.0, self.time_boot_s - self._mode_since)
+
+    @property
+    def sinks_s(self) -> float:
+        """For how many seconds of its own clock it has been sinking."""
+        return 0.0 if self._sinks_since is None else max(0.0, self.time_boot_s - self._sinks_since)
+
+    @property
+    def standing(self) -> Standing:
+        """What a start that is given now relies on."""
+        placed = not self.flying and self.lat_deg is not None and self.lon_deg is not None
+        place = (self.lat_deg or 0.0, self.lon_deg or 0.0) if placed else None
+        return Standing(mode=self.custom_mode, armed=self.armed, place=place, touched=self.touched)
+
+    def changed_since(self, then: Standing) -> str:
+        """What has changed since a start was given, in words; empty if nothing has."""
+        if self.custom_mode != then.mode:
+            return f"was put into {self.mode}"
+        if self.armed != then.armed:
+            return "was armed" if self.armed else "was disarmed"
+        if self.touched != then.touched:
+            return "was commanded by someone else"
+        here = self.standing.place
+        away = 0.0 if here is None or then.place is None else distance_m(*here, *then.place)
+        return f"was moved by {away:.0f} m" if away > MOVED_M else ""
+
+    def mission_was_read(self, now: float) -> None:
+        """Its mission was just read from it, or written and read back."""
+        self.held_id, self.read_s, self.read_at = self.mission_id, now, now + _READ_AGAIN_S
+
+    @property
     def battery_name(self) -> str:
         """The emptiest of several batteries, as ArduPilot counts them: "battery 2"; empty with one battery."""
         known = {number: left for number, left in self._batteries.items() if left is not None}
@@ -188,7 +245,8 @@ class Vehicle:
 
     def restarted(self) -> None:
         """Forget what it was set up with: it may have been set up anew, and with other batteries."""
-        self.mission, self.unbegun = None, False
+        self.mission, self.unbegun, self.read_at, self.way = None, False, 0.0, None
+        self.touched += 1
         self.settings.clear()
         self.questions.asked = False
         self._batteries.clear()
@@ -236,9 +294,17 @@ class Vehicle:
         """Makes the commands for it."""
         return Pilot(self.address, self.streams.own, self.autopilot, self.modes)
 
-    def says(self, text: str, now: float) -> None:
-        """Process a text of its autopilot."""
+    @property
+    def severe_text(self) -> str:
+        """The last text by which its autopilot reported a fault in the air, for some seconds of its own clock."""
+        text, said_s = self._severe
+        return text if self.flying and 0.0 <= self.time_boot_s - said_s < _SEVERE_S else ""
+
+    def says(self, text: str, now: float, severity: int = _INFO) -> None:
+        """Process a text of its autopilot, of a MAV_SEVERITY."""
         self.texts.append(text)
+        if severity <= _FAULT:
+            self._severe = text, self.time_boot_s
         if text.startswith(("PreArm", "Arm:", "Preflight")):
             self._prearm.pop(text, None)
             self._prearm[text] = now
@@ -302,7 +368,15 @@ class Vehicle:
         was, self.armed = self.armed, bool(m.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
         if self.armed and not was and self.lat_deg is not None and self.lon_deg is not None and not self.in_air:
             self.launch = self.lat_deg, self.lon_deg
-        self.custom_mode = int(m.custom_mode)
+        changed = self.armed != was or self.custom_mode != int(m.custom_mode)
+        self.touched += changed
+        self.custom_mode, self.failsafe = int(m.custom_mode), int(m.system_status) in _CRITICAL
+        if changed:
+            self.read_at, self._mode_since = 0.0, self.time_boot_s
+        if not self.armed:
+            self.way = None
+        elif self.mode not in HOLDS:
+            self.way = self.custom_mode
         if m.type != self.kind:
             self.kind = int(m.type)
             self.modes = modes_of(self.autopilot, self.kind)
@@ -316,6 +390,10 @@ class Vehicle:
         self.velocity_m_s = (m.vx / 100.0, m.vy / 100.0, m.vz / 100.0)
         self.heading_rad = None if m.hdg == 65535 else math.radians(m.hdg / 100.0)
         self.time_boot_s = m.time_boot_ms / 1e3
+        if self.velocity_m_s[2] < _SINKS_M_S:
+            self._sinks_since = None
+        elif self._sinks_since is None or self._sinks_since > self.time_boot_s:
+            self._sinks_since = self.time_boot_s
         if math.hypot(*self.velocity_m_s[:2]) > _STILL_M_S[0] or abs(self.velocity_m_s[2]) > _STILL_M_S[1]:
             self._still_since = None
         elif self._still_since is None or self._still_since > self.time_boot_s:
@@ -327,8 +405,14 @@ class Vehicle:
     def _mission_current(self, m: Message) -> None:
         self.mission_seq, self.mission_state = int(m.seq), int(m.mission_state)
         self.paused_in_mission &= self.mission_state == _MISSION_PAUSED
+        last, self.mission_id = self.mission_id, mission_id(m)
+        if self.mission_id != last:
+            self.read_at = 0.0
         if 0 < m.total < 0xFFFF:
             self.mission_total = int(m.total)
+
+    def _acknowledged(self, m: Message) -> None:
+        self.touched += others_command(m, self.streams.own)
 
     def _extended(self, m: Message) -> None:
         self.landed = _LANDED.get(int(m.landed_state), "")
@@ -390,6 +474,7 @@ _HANDLERS: Final = {
     int(dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT): Vehicle._position,
     int(dialect.MAVLINK_MSG_ID_ATTITUDE): Vehicle._attitude,
     int(dialect.MAVLINK_MSG_ID_MISSION_CURRENT): Vehicle._mission_current,
+    int(dialect.MAVLINK_MSG_ID_COMMAND_ACK): Vehicle._acknowledged,
     int(dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE): Vehicle._extended,
     int(dialect.MAVLINK_MSG_ID_SYSTEM_TIME): Vehicle._system_time,
     int(dialect.MAVLINK_MSG_ID_GPS_RAW_INT): Vehicle._gps,

@@ -65,6 +65,7 @@ def _make(packet: Packet, kind: Any, size: int, order: Any) -> Message:
     if len(payload) < size:  # trailing zeros are not sent
         payload += bytes(size - len(payload))
     message = kind(*order(kind.unpacker.unpack(payload)))
+    message._payload = raw[start : start + raw[1]]  # with fields that this version of the dialect does not know
     header = message.get_header()
     header.mlen, header.seq, header.srcSystem, header.srcComponent = raw[1], packet.seq, packet.system, packet.component
     return message

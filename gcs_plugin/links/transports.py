@@ -7,16 +7,17 @@ TCP a connection, with a serial line there is one. The owner of the selector dec
 import abc
 import contextlib
 import errno
+import os
 import re
 import selectors
 import socket
 import sys
-import time
-from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import partial
 from typing import Any, Final
 
+from gcs_plugin.links.outgoing import Pending, Stream
 from orthoswarm.model.errors import InputError
 
 # A sender: an address, a connection, the other end of a line. Hashable, otherwise opaque.
@@ -31,45 +32,6 @@ _BACKLOG: Final = 1 << 16  # bytes that a slow receiver may be behind
 _RETRY_S: Final = 2.0
 _AGAIN: Final = (errno.EAGAIN, errno.EWOULDBLOCK)
 EXAMPLES: Final = "udpin:0.0.0.0:14550, udpout:192.168.1.7:14550, tcp:127.0.0.1:5760 or serial:/dev/ttyUSB0:57600"
-
-
-@dataclass(slots=True)
-class _Pending:
-    """Packets waiting to be sent. An expired one is dropped unless it was partly sent."""
-
-    _packets: deque[tuple[bytes, float]] = field(default_factory=deque)
-    _begun: int = 0
-    _size: int = 0
-
-    def __len__(self) -> int:
-        return self._size
-
-    def put(self, data: bytes, expires: float) -> None:
-        """Add a packet."""
-        self._packets.append((data, expires))
-        self._size += len(data)
-
-    def bytes(self) -> bytes:
-        """The bytes to send now."""
-        now, begun = time.monotonic(), self._begun
-        first = [self._packets[0]] if begun else []
-        rest = self._packets if not begun else list(self._packets)[1:]
-        self._packets = deque([*first, *(p for p in rest if p[1] >= now)])
-        self._size = sum(len(data) for data, _ in self._packets) - begun
-        return b"".join(data for data, _ in self._packets)[begun:]
-
-    def sent(self, count: int) -> None:
-        """Remove the bytes that were sent."""
-        self._size -= count
-        count += self._begun
-        while self._packets and count >= len(self._packets[0][0]):
-            count -= len(self._packets.popleft()[0])
-        self._begun = count
-
-    def clear(self) -> None:
-        """Forget all."""
-        self._packets.clear()
-        self._begun = self._size = 0
 
 
 class Link(abc.ABC):
@@ -186,22 +148,13 @@ class UdpLink(Link):
         self._socket.close()
 
 
-@dataclass(slots=True, eq=False)
-class _Stream:
-    """One TCP connection and its output queue."""
-
-    socket: socket.socket
-    connected: bool
-    pending: "_Pending" = field(default_factory=lambda: _Pending())
-
-
 class TcpLink(Link):
     """TCP: connects to a server, again after every loss, or serves any number of connections."""
 
     def __init__(self, name: str, host: str, port: int, *, serves: bool = False) -> None:
         super().__init__(name)
         self._address, self._serves = (host, port), serves
-        self._streams: dict[socket.socket, _Stream] = {}
+        self._streams: dict[socket.socket, Stream] = {}
         self._server: socket.socket | None = None
         self._retry_at = 0.0
         if serves:
@@ -225,7 +178,10 @@ class TcpLink(Link):
             self._connect(now)
 
     def tick(self, now: float) -> None:
-        """Connect again."""
+        """Connect again, and send what is left over."""
+        for stream in list(self._streams.values()):
+            if stream.connected:
+                self._flush(stream, now)
         if self._server is None and not self._streams and now >= self._retry_at:
             self._connect(now)
 
@@ -239,7 +195,7 @@ class TcpLink(Link):
         stream = self._streams.get(source)
         if stream is None:
             return
-        if events & selectors.EVENT_WRITE and not self._flush(stream, now):
+        if (events & selectors.EVENT_WRITE or stream.pending) and not self._flush(stream, now):
             return
         if events & selectors.EVENT_READ:
             try:
@@ -255,7 +211,7 @@ class TcpLink(Link):
 
     def send(self, peer: Peer, data: bytes, expires: float = NEVER) -> bool:
         """Queue for a connection."""
-        if not isinstance(peer, _Stream) or peer.socket not in self._streams or len(peer.pending) > _BACKLOG:
+        if not isinstance(peer, Stream) or peer.socket not in self._streams or len(peer.pending) > _BACKLOG:
             self.dropped += 1
             return False
         peer.pending.put(data, expires)
@@ -293,13 +249,11 @@ class TcpLink(Link):
         self._add(connection, connected=False)
 
     def _add(self, connection: socket.socket, *, connected: bool) -> None:
-        connection.setblocking(False)
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._streams[connection] = _Stream(connection, connected)
+        self._streams[connection] = Stream(connection, connected)
         wanted = selectors.EVENT_READ if connected else selectors.EVENT_READ | selectors.EVENT_WRITE
         self._selector.register(connection, wanted, self)
 
-    def _flush(self, stream: _Stream, now: float) -> bool:
+    def _flush(self, stream: Stream, now: float) -> bool:
         """Send what is pending; False if the connection is gone."""
         if not stream.connected:
             code = stream.socket.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
@@ -308,21 +262,18 @@ class TcpLink(Link):
                 return False
             stream.connected, self.problem = True, ""
         try:
-            if stream.pending and (data := stream.pending.bytes()):
-                stream.pending.sent(stream.socket.send(data))
+            more = stream.flush()
         except OSError as error:
-            if error.errno not in _AGAIN:
-                self._drop(stream, error.strerror or str(error), now)
-                return False
-        wanted = selectors.EVENT_READ | (selectors.EVENT_WRITE if stream.pending else 0)
-        self._selector.modify(stream.socket, wanted, self)
+            self._drop(stream, error.strerror or str(error), now)
+            return False
+        self._selector.modify(stream.socket, selectors.EVENT_READ | (selectors.EVENT_WRITE if more else 0), self)
         return True
 
-    def _drop(self, stream: _Stream, why: str, now: float) -> None:
+    def _drop(self, stream: Stream, why: str, now: float) -> None:
         self._streams.pop(stream.socket, None)
         with contextlib.suppress(KeyError, ValueError):
             self._selector.unregister(stream.socket)
-        stream.socket.close()
+        stream.close()
         self._retry_at = now + _RETRY_S
         if not self._serves:
             self.problem = why
@@ -337,7 +288,7 @@ class SerialLink(Link):
         super().__init__(name)
         self._device, self._baud = device, baud
         self._port: Any = None
-        self._pending = _Pending()
+        self._pending = Pending()
         self._retry_at = 0.0
 
     def open(self, selector: selectors.BaseSelector, now: float) -> None:
@@ -406,7 +357,9 @@ class SerialLink(Link):
 
         try:
             if data := self._pending.bytes():
-                self._pending.sent(self._port.write(data) or 0)
+                # Not by the port's own `write`, which tries for ever where the system's buffer is full.
+                put = self._port.write if sys.platform == "win32" else partial(os.write, self._port.fileno())
+                self._pending.sent(put(data) or 0)
         except serial.SerialTimeoutException:
             return  # its buffer is full: what is left over goes at the next tick
         except OSError as error:

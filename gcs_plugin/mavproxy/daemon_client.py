@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any, Final
 
 _USAGE: Final = (
-    "usage: orthoswarm status|vehicles|plan|upload|start|pause|resume|rtl|return|land|refine|layers|export|web|connect"
+    "usage: orthoswarm status|vehicles|plan|upload|start|pause|resume|continue|rtl|return|land|refine|layers|export|"
+    "web|connect"
 )
 _TIMEOUT_S: Final = 240.0
 
@@ -90,7 +91,8 @@ class Commands:
         self._verbs: dict[str, Callable[[list[str]], list[str]]] = {
             "status": self.status, "vehicles": self.vehicles, "plan": self.plan, "upload": self.upload,
             "start": self.start, "pause": self.command("pause"), "resume": self.command("resume"),
-            "rtl": self.command("rtl"), "return": self.return_in_turn, "land": self.command("land"),
+            "continue": self.command("continue"), "rtl": self.command("rtl"), "return": self.return_in_turn,
+            "land": self.command("land"),
             "refine": self.refine, "layers": self.layers, "export": self.export, "web": self.web,
             "connect": self.connect,
         }  # fmt: skip

@@ -8,6 +8,7 @@ what was measured). The rules here follow from it:
 - ArduCopter never sends 5 for a mission that ends with LAND: there, disarming while LAND is current counts.
 - State 3 while disarmed is ArduCopter standing in AUTO after a flight, not a flight.
 - Leaving the mission (state 2 or 4) suspends it; disarming a suspended mission ends it without completing it.
+- A mission of which places were not reached (`flown_items`), or that was replaced meanwhile, has ended, not completed.
 - For firmware without `mission_state`, its mode and MISSION_ITEM_REACHED of the last NAV item are used.
 
 The clock plays no part, so a simulation at any speed and a log read afterwards give the same events.
@@ -19,6 +20,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from gcs_plugin.links.mavlink import Autopilot, Message, dialect, is_autopilot
+from gcs_plugin.mission.flown_items import FlownItems
 from gcs_plugin.mission.items import Ending, Mission, ending_of, final_nav
 
 
@@ -45,7 +47,7 @@ class MissionEvent(enum.Enum):
 # The message types that the detector uses; others are ignored.
 RELEVANT: Final = frozenset({
     "HEARTBEAT", "MISSION_CURRENT", "MISSION_ITEM_REACHED", "EXTENDED_SYS_STATE", "STATUSTEXT",
-    "MISSION_COUNT", "MISSION_ITEM_INT", "MISSION_REQUEST", "MISSION_REQUEST_INT",
+    "MISSION_COUNT", "MISSION_ITEM_INT", "MISSION_REQUEST", "MISSION_REQUEST_INT", "GLOBAL_POSITION_INT",
 })  # fmt: skip
 
 _ACTIVE, _COMPLETE, _PAUSED = 3, 5, 4
@@ -55,6 +57,8 @@ _PX4_AUTO_MISSION = (4 << 16) | (4 << 24)
 # Number of MISSION_CURRENT with "active" after disarming before the flight counts as aborted:
 # the heartbeat and the 10 Hz stream cross each other on the way.
 _PATIENCE = 3
+# Number of messages without a position after which a mission's end is judged without one.
+_JUDGING = 40
 
 
 @dataclasses.dataclass(slots=True, kw_only=True)
@@ -67,6 +71,7 @@ class CompletionDetector:
         seq: the current item as last reported, None before.
         total: reported number of items, without ArduPilot's home; None if not reported.
         armed: None before the first heartbeat.
+        flown: what it has reached of the mission that it flies or flew; None where the mission is not known.
     """
 
     autopilot: Autopilot
@@ -74,6 +79,7 @@ class CompletionDetector:
     seq: int | None = None
     total: int | None = None
     armed: bool | None = None
+    flown: FlownItems | None = None
     _commands: list[int | None] | None = None
     _mission_mode: bool = False
     _has_state: bool | None = None
@@ -93,10 +99,14 @@ class CompletionDetector:
     _new_total_under_way: bool = False
     _learned: dict[int, int] = dataclasses.field(default_factory=dict)
     _learned_count: int = 0
+    _joined: bool = False
+    _judging: int = 0
+    _untold: list[MissionEvent] = dataclasses.field(default_factory=list)
 
     def uploaded(self, mission: Mission | None) -> None:
         """A new mission was stored in the vehicle (None: unknown); earlier states no longer count."""
         self._commands = None if mission is None else [item.command for item in mission.items]
+        self.flown = None if mission is None else FlownItems.of(mission)
         self._learned.clear()
         self._learned_count = 0
         self.total = None if mission is None else len(mission) - self._first_seq
@@ -104,8 +114,15 @@ class CompletionDetector:
         self._restart(hot=bool(self.armed))
 
     def knows_mission(self, mission: Mission) -> None:
-        """Set the mission stored in the vehicle, which has not changed."""
-        self._commands = [item.command for item in mission.items]
+        """Set the mission stored in the vehicle; if it is another one than the vehicle began, that has ended."""
+        flown, commands = FlownItems.of(mission), list[int | None](item.command for item in mission.items)
+        if self.flown is None or self.flown.places != flown.places or self._commands not in (None, commands):
+            if self.flown is not None:
+                self._replaced()
+            self.flown = flown
+            if self.seq is not None and self.phase is not Phase.IDLE:
+                self.flown.current(self.seq)
+        self._commands = commands
         self.total, self._new_total = len(mission) - self._first_seq, None
 
     @property
@@ -123,8 +140,28 @@ class CompletionDetector:
         self.phase = Phase.ABORTED
         return [MissionEvent.ABORTED]
 
+    def _replaced(self) -> None:
+        """Another mission was stored: one under way has ended, which is told with the next message."""
+        if self.phase in (Phase.ACTIVE, Phase.SUSPENDED):
+            self._untold.append(MissionEvent.ABORTED)
+            self._restart(hot=bool(self.armed))
+
     def feed(self, message: Message) -> list[MissionEvent]:
         """Process one message; returns the mission's events, mostly none."""
+        untold, self._untold = self._untold, []
+        if message.get_type() == "GLOBAL_POSITION_INT":
+            return untold + self._position(message)
+        if self._judging:  # its end was heard; whether that completes the mission, its next position tells
+            self._judging -= 1
+            return untold + (self._complete() if not self._judging else [])
+        return untold + self._events_of(message)
+
+    def _position(self, message: Message) -> list[MissionEvent]:
+        if self.flown is not None and self.phase is Phase.ACTIVE and (message.lat or message.lon):
+            self.flown.position(message.time_boot_ms / 1e3, message.lat / 1e7, message.lon / 1e7)
+        return self._complete() if self._judging else []
+
+    def _events_of(self, message: Message) -> list[MissionEvent]:
         match message.get_type():
             case "HEARTBEAT":
                 return self._heartbeat(message) if is_autopilot(message) else []
@@ -143,6 +180,7 @@ class CompletionDetector:
                 self._learn(message)
             case "MISSION_REQUEST" | "MISSION_REQUEST_INT":  # some ground station is uploading
                 if message.mission_type == dialect.MAV_MISSION_TYPE_MISSION:
+                    self._replaced()
                     self.uploaded(None)
         return []
 
@@ -165,6 +203,8 @@ class CompletionDetector:
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         values["autopilot"], values["phase"] = self.autopilot.value, self.phase.value
         values["_learned"] = [[seq, command] for seq, command in self._learned.items()]
+        values["flown"] = None if self.flown is None else self.flown.state()
+        values["_untold"] = [event.value for event in self._untold]
         return values
 
     @classmethod
@@ -173,6 +213,9 @@ class CompletionDetector:
         restored = dict(values)
         restored["autopilot"], restored["phase"] = Autopilot(values["autopilot"]), Phase(values["phase"])
         restored["_learned"] = {int(seq): int(command) for seq, command in values["_learned"]}
+        flown = values.get("flown")
+        restored["flown"] = None if flown is None else FlownItems.from_state(flown)
+        restored["_untold"] = [MissionEvent(event) for event in values.get("_untold", ())]
         return cls(**restored)
 
     @property
@@ -197,6 +240,15 @@ class CompletionDetector:
         return [event]
 
     def _complete(self) -> list[MissionEvent]:
+        if self.flown is not None and not self.flown.all_reached:
+            first, self._judging = not self._judging, 0
+            self.flown.ended()
+            if first and not self.flown.all_reached:  # it may have flown them unheard
+                self._judging, self.phase = _JUDGING, Phase.ACTIVE
+                return []
+            if not self.flown.all_reached:
+                return self._abort()
+        self._judging = 0
         return self._end(Phase.COMPLETE, MissionEvent.COMPLETE)
 
     def _abort(self) -> list[MissionEvent]:
@@ -209,6 +261,7 @@ class CompletionDetector:
         mode = int(message.custom_mode)
         self._mission_mode = mode == (_ARDUCOPTER_AUTO if self.autopilot is Autopilot.ARDUPILOT else _PX4_AUTO_MISSION)
         events: list[MissionEvent] = []
+        self._joined = self.armed and (self._joined or was is None)
         self._beats = self._beats + 1 if self.armed else 0
         if self._beats == 2:  # armed again; a single heartbeat may be a late one of the flight before
             if self._waiting:  # how that ended was never heard
@@ -241,6 +294,8 @@ class CompletionDetector:
         self._follow_total(int(getattr(message, "total", 0)))
         state, seq = int(getattr(message, "mission_state", 0)), int(message.seq)
         was_final = self._at_final
+        if self.flown is not None and seq != self.seq and self.phase in (Phase.ACTIVE, Phase.SUSPENDED):
+            self.flown.current(seq)
         self.seq = seq
         if was_final and not self._at_final and self.phase is Phase.ACTIVE:
             self._dropped, self._armed_since_drop = True, 0
@@ -282,6 +337,11 @@ class CompletionDetector:
             return []
         self._restart(hot=False)
         self.phase = Phase.ACTIVE
+        if self.flown is not None:
+            self.flown = FlownItems(self.flown.places, self.flown.lines)
+            if not self._joined:  # else it may have flown a part before it was heard
+                self.flown.current(self._first_seq)
+            self.flown.current(self.seq or 0)
         return [MissionEvent.STARTED]
 
     def _still_waiting(self, state: int) -> list[MissionEvent]:
@@ -299,6 +359,8 @@ class CompletionDetector:
         if self.phase not in (Phase.ACTIVE, Phase.SUSPENDED):
             return []
         self._reached = max(self._reached, seq)
+        if self.flown is not None:
+            self.flown.reached.add(seq)
         final = self.final_seq
         done = self._has_state is False and self.phase is Phase.ACTIVE and final is not None and seq >= final
         return self._complete() if done and self.ending is not Ending.NEVER else []
@@ -331,6 +393,7 @@ class CompletionDetector:
             self._commands = None
             self.total, self._new_total = total, None
             if self._new_total_under_way:  # else what has started meanwhile is the new mission
+                self._replaced()
                 self._restart(hot=bool(self.armed))
 
     def _learn(self, message: Message) -> None:

@@ -1,14 +1,18 @@
 """Reading the mission, or the geofence, out of a vehicle: REQUEST_LIST, COUNT, REQUEST_INT and ITEM_INT in turn."""
 
+import itertools
 from dataclasses import dataclass, field
 from typing import Final
 
-from gcs_plugin.links.mavlink import Message, dialect
+from gcs_plugin.links.mavlink import Autopilot, Message, dialect
 from gcs_plugin.mission.exchange import MISSION, Exchange, RoundTrip, Verdict
 from gcs_plugin.mission.items import MissionItem
 from gcs_plugin.mission.refusal import ACCEPTED, DENIED, UNSUPPORTED
 
+AT_ONCE: Final = {Autopilot.ARDUPILOT: 8, Autopilot.PX4: 1}
+"""Items that are asked for at once: PX4 hands out one after the other only."""
 _BUSY_S: Final = 1.0
+_SOON_S: Final = 0.5  # a start is void after 5 s
 _FORGOTTEN: Final = 9
 """Unanswered requests for one item after which the reading begins anew: PX4 forgets a transfer (and the acknowledgement
 that says so may be lost), and then ignores requests for items silently. With 30 % loss each way one in 400 items meets
@@ -17,22 +21,26 @@ so many by chance."""
 
 @dataclass(slots=True)
 class MissionDownload(Exchange):
-    """Asks for one item at a time (PX4 hands them out in order only) and asks again until it has them all.
+    """Asks for a few items at a time (PX4 hands them out one by one, in order) and again until it has them all.
 
     Attributes:
-        patience_s: silence after which it gives up.
+        patience_s: silence after which it gives up. urgent: whether it asks again sooner, as somebody waits to arm.
         list_type: MAV_MISSION_TYPE of the list: the mission, or the geofence.
         background: nobody waits for it; any other request to the vehicle ends it.
+        window: how many items are asked for at once: a slow link costs a round trip a window; 1 for PX4.
         items: the stored list, None until it is complete.
     """
 
     patience_s: float = 30.0
     list_type: int = MISSION
     background: bool = False
+    window: int = 1
+    urgent: bool = False
     items: list[MissionItem] | None = field(default=None, init=False)
     _count: int | None = field(default=None, init=False)
     _got: dict[int, MissionItem] = field(default_factory=dict, init=False)
     _trip: RoundTrip = field(default_factory=RoundTrip, init=False)
+    _under_way: set[int] = field(default_factory=set, init=False)
     _asked_at: float = field(default=0.0, init=False)
     _asked_again: bool = field(default=False, init=False)
     _unanswered: int = field(default=0, init=False)
@@ -43,7 +51,7 @@ class MissionDownload(Exchange):
     def start(self, now: float) -> list[Message]:
         """Request the list."""
         self._heard_at = now
-        self._trip.longest_s = 2.0 / max(1.0, self.pace)
+        self._trip.longest_s = (_SOON_S if self.urgent else 2.0) / max(1.0, self.pace)
         self._trip.wait_s = min(self._trip.wait_s, self._trip.longest_s)
         return self._restart(now)
 
@@ -106,9 +114,14 @@ class MissionDownload(Exchange):
         self.deadline = now + self._trip.wait_s
         to = self.vehicle
         if self._count is None or self._asks_list:
+            self._under_way.clear()
             return [dialect.MAVLink_mission_request_list_message(to.system, to.component, self.list_type)]
-        seq = next(seq for seq in range(self._count) if seq not in self._got)
-        return [dialect.MAVLink_mission_request_int_message(to.system, to.component, seq, self.list_type)]
+        if again:
+            self._under_way.clear()
+        missing = (seq for seq in range(self._count) if seq not in self._got and seq not in self._under_way)
+        wanted = list(itertools.islice(missing, max(0, self.window - len(self._under_way))))
+        self._under_way.update(wanted)
+        return [dialect.MAVLink_mission_request_int_message(to.system, to.component, s, self.list_type) for s in wanted]
 
     def _heard(self, now: float) -> None:
         self._heard_at, self._unanswered = now, 0
@@ -129,6 +142,7 @@ class MissionDownload(Exchange):
             return []
         self._heard(now)
         self._got[seq] = MissionItem.of(message)
+        self._under_way.discard(seq)
         return self._ask(now, again=False) if len(self._got) < self._count else self._finish()
 
     def _finish(self) -> list[Message]:

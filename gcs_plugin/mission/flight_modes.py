@@ -5,6 +5,11 @@ from typing import Final
 
 from gcs_plugin.links.mavlink import Autopilot, dialect
 
+HOLDS: Final = frozenset({"HOLD", "BRAKE", "LOITER", "POSHOLD", "GUIDED", "QHOVER", "QLOITER"})
+"""Modes in which a vehicle stays where it is, unless a pilot or another station moves it."""
+RETURNS: Final = frozenset({"RTL", "SMART_RTL", "AUTO_RTL", "QRTL"})
+LANDS: Final = frozenset({"LAND", "QLAND"})
+
 
 def _px4(main: int, sub: int = 0) -> int:
     return (main << 16) | (sub << 24)

@@ -20,6 +20,10 @@ _AHEAD_S: Final = 30.0
 """How far ahead of the place where it was last its next place is looked for, seconds of its plan."""
 _OFF_M: Final = 15.0
 """A vehicle that is farther from its way is not on it: it was paused, sent elsewhere, or blown off."""
+_STANDS_S: Final = 3.0
+"""Longer in one place a plan stands still; at the slowest of a turn it takes less for `_AS_NEAR_M` either way."""
+_STILL_BEHIND: Final = 0.5
+"""One that is behind is so until it is late by less than this share of what is allowed: words must not come and go."""
 _AS_NEAR_M: Final = 1.0
 """Places so much farther than the nearest one count as well: where it stands still, many moments have one place."""
 
@@ -30,8 +34,9 @@ class Lateness:
 
     Attributes:
         mission: what is flown.
-        late_s: how far it was behind at the last look, seconds of its own clock; negative: ahead.
-        behind: True once it was later than plans allow for: where it stands still, it is not known how late it is.
+        late_s: how far it is behind, seconds of its own clock; negative: ahead. Where its plan stands still, too, that
+            is only known to be more than something, so what was known before stays.
+        behind: True while it is later than plans allow for.
     """
 
     mission: "Mission"
@@ -77,5 +82,8 @@ class Lateness:
             first = max(far[far < nearest], default=-1) + 1
             last = min(far[far > nearest], default=len(away)) - 1
             self._at += int(np.clip(round(flown_s / STEP_S) - self._at, first, last))
-        self.late_s = flown_s - STEP_S * self._at
-        self.behind |= self.late_s > self.allowed_s
+            late_s = flown_s - STEP_S * self._at
+            self.late_s = max(self.late_s, late_s) if (last - first) * STEP_S > _STANDS_S else late_s
+        else:
+            self.late_s = flown_s - STEP_S * self._at
+        self.behind = self.late_s > self.allowed_s * (_STILL_BEHIND if self.behind else 1.0)

@@ -1,6 +1,5 @@
 """A simulated vehicle's flight of its mission: items, camera, and the end as its autopilot does it."""
 
-import enum
 import math
 from collections.abc import Collection
 from dataclasses import dataclass, field
@@ -21,8 +20,10 @@ from gcs_plugin.mission.items import (
     VTOL_LAND,
     MissionItem,
 )
+from gcs_plugin.sim.flight_values import Exposure as Exposure
+from gcs_plugin.sim.flight_values import Landed, State, Task
 from gcs_plugin.sim.mission_store import MissionStore
-from gcs_plugin.sim.multirotor import STEP_S, Airframe, Chart, Motion, Pose
+from gcs_plugin.sim.multirotor import STEP_S, Airframe, Chart, Motion
 from orthoswarm.model.angles import wrap_rad
 
 _LOITER_TIME: Final = int(dialect.MAV_CMD_NAV_LOITER_TIME)
@@ -31,54 +32,10 @@ _REACHED_M: Final = 1.5
 _FINAL_SINK_M_S, _FINAL_BELOW_M = 0.7, 5.0
 _OWN_TAKEOFF_S: Final = 0.7  # what the motion itself loses: by gathering speed in a takeoff,
 _OWN_STOP_S: Final = 1.0  # and by slowing down above home
-
-
-class Landed(enum.IntEnum):
-    """MAV_LANDED_STATE."""
-
-    ON_GROUND = 1
-    IN_AIR = 2
-    TAKEOFF = 3
-    LANDING = 4
-
-
-class State(enum.IntEnum):
-    """MISSION_STATE."""
-
-    NONE = 1
-    NOT_STARTED = 2
-    ACTIVE = 3
-    PAUSED = 4
-    COMPLETE = 5
-
-
-class Task(enum.Enum):
-    """The vehicle's present task."""
-
-    STAND = "stand"
-    HOLD = "hold"
-    ITEM = "item"
-    CLIMB_HOME = "climb home"
-    GO_HOME = "go home"
-    DESCEND = "descend"
-
-
-@dataclass(frozen=True, slots=True)
-class Exposure:
-    """A picture that the vehicle has taken.
-
-    Attributes:
-        index: counts from 0.
-        time_s: seconds since boot.
-        pose: the vehicle's true pose.
-        lat_deg: latitude by its receiver; lon_deg: longitude.
-    """
-
-    index: int
-    time_s: float
-    pose: Pose
-    lat_deg: float
-    lon_deg: float
+_LIFTED_M: Final = 0.3  # one that is lower when it leaves its mission, or stops landing, stands
+_STICKS_S: Final = 5.0  # one that is steered flies to where it would be then
+_IDLE_S: Final = {Autopilot.ARDUPILOT: 10.0, Autopilot.PX4: 2.0}
+"""Landed by its sticks, it disarms after so long: factory settings of DISARM_DELAY and COM_DISARM_LAND."""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -90,7 +47,7 @@ class Flight:
         store: the mission.
         motion: its position and velocity.
         mode: custom mode number.
-        armed: motors on.
+        armed: motors on. failsafe: it reports one; until it is disarmed.
         seq: current item; state: MISSION_STATE.
         landed: MAV_LANDED_STATE.
         reached: items reached since the last look; texts: texts since then; exposures: all pictures.
@@ -103,6 +60,7 @@ class Flight:
     motion: Motion
     mode: int = 0
     armed: bool = False
+    failsafe: bool = False
     seq: int = 0
     state: State = State.NONE
     landed: Landed = Landed.ON_GROUND
@@ -121,6 +79,8 @@ class Flight:
     _ends_mission: bool = False
     _reached_any: bool = False
     _generation: int = 0
+    _steered: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    _cruise_m_s: float | None = None
 
     @classmethod
     def make(
@@ -152,16 +112,19 @@ class Flight:
         """Motors off, and what that does to the mission."""
         if not self.armed:
             return
-        self.armed, self._task, self.landed = False, Task.STAND, Landed.ON_GROUND
-        self.motion.still()
+        self.armed = self.failsafe = False
+        self._stand()
         self._trigger_m = 0.0
         if self.state is State.COMPLETE or self.autopilot is Autopilot.ARDUPILOT:
             self.seq = 0
 
-    def set_mode(self, mode: int) -> None:
-        """Change the mode; leaving the mission's mode suspends the mission."""
+    def set_mode(self, mode: int, *, anew: bool = False) -> None:
+        """Change the mode; leaving the mission's mode suspends the mission. A PX4 in HOLD goes on with it if not anew."""
+        if mode == self.mode == self.modes.hold and self.autopilot is Autopilot.PX4 and not anew:
+            return
         was, self.mode = self.mode, mode
         modes = self.modes
+        self._let_go()
         if mode == modes.mission:
             if self.armed and self.state is not State.COMPLETE:
                 self._enter_mission()
@@ -171,7 +134,9 @@ class Flight:
         self.paused = False
         if not self.armed or self.landed is Landed.ON_GROUND:
             return
-        if mode == modes.rtl:
+        if self.motion.up < _LIFTED_M:
+            self._settle()
+        elif mode == modes.rtl:
             self._ends_mission = False
             self._go_home()
         elif mode == modes.land:
@@ -191,6 +156,7 @@ class Flight:
         if self.autopilot is Autopilot.ARDUPILOT and not self.armed:
             return "Mission start: not armed"
         self.armed, self.mode = True, self.modes.mission
+        self._let_go()
         if self.state is not State.ACTIVE or self._task is Task.STAND:
             # ArduCopter goes on where it left a mission, though another one has been stored since (MIS_RESTART 0).
             goes_on = self.autopilot is Autopilot.ARDUPILOT and self.state is not State.COMPLETE
@@ -225,6 +191,24 @@ class Flight:
             self._run_from(seq)
         return True
 
+    def steer(self, north_m_s: float, east_m_s: float, up_m_s: float) -> None:
+        """Be moved by sticks, or by another station, until the mode changes; down to the ground, too."""
+        if not self.armed or self.landed is Landed.ON_GROUND:
+            return
+        self._let_go()
+        self._task, self.landed = Task.STEERED, Landed.IN_AIR
+        self._steered, self._cruise_m_s = (north_m_s, east_m_s, up_m_s), self.motion.speed
+        self.motion.speed = math.hypot(north_m_s, east_m_s)
+
+    def fail_safe(self, text: str) -> None:
+        """Its battery is low: it says so and flies home, or takes its motors off where it stands."""
+        self.texts.append(text)
+        self.failsafe = self.armed
+        if self.landed is Landed.ON_GROUND:
+            self.disarm()
+        else:
+            self.set_mode(self.modes.rtl)
+
     # --- time ---
 
     def step(self, time_s: float) -> None:
@@ -250,6 +234,10 @@ class Flight:
                     self._descend(0.0, 0.0)
             case Task.DESCEND:
                 self._touch_down()
+            case Task.STEERED:
+                self._follow_sticks()
+            case Task.STAND if self._waited > 0.0:
+                self._idle()
         if self._trigger_m > 0.0 and self.landed is Landed.IN_AIR:
             self._photograph()
 
@@ -312,6 +300,10 @@ class Flight:
         return None
 
     def _begin(self, item: MissionItem) -> None:
+        lifts = item.command == TAKEOFF or (self.autopilot is Autopilot.PX4 and item.command not in (RTL, LAND))
+        if self.landed is Landed.ON_GROUND and not lifts:  # ArduCopter wants a takeoff
+            self._task = Task.STAND
+            return
         self.texts.append(f"Mission: {self.seq} {item.name}")
         if item.command == RTL:
             if self.autopilot is Autopilot.PX4:
@@ -323,7 +315,7 @@ class Flight:
             self._aim(item)
             self._ends_mission = True
         else:
-            if item.command == TAKEOFF and self.landed is Landed.ON_GROUND:
+            if self.landed is Landed.ON_GROUND:
                 self.landed = Landed.TAKEOFF
             self._aim(item)
 
@@ -449,6 +441,38 @@ class Flight:
             self.seq, self.state = 1, State.ACTIVE  # measured: back at the first item, still "active"
         elif state is not State.COMPLETE:
             self.state = State.NOT_STARTED
+
+    # --- by hand ---
+
+    def _let_go(self) -> None:
+        """The sticks, or another station, move it no longer, and it lands no longer."""
+        if self._cruise_m_s is not None:
+            self.motion.speed, self._cruise_m_s = self._cruise_m_s, None
+        if self.landed is Landed.LANDING:
+            self.landed = Landed.IN_AIR
+
+    def _follow_sticks(self) -> None:
+        motion, (vn, ve, vu) = self.motion, self._steered
+        north, east = motion.seen
+        motion.go((north + _STICKS_S * vn, east + _STICKS_S * ve, motion.up + vu))
+        if vu < 0.0 and motion.up <= 0.05:
+            self._let_go()
+            self._settle()
+
+    def _settle(self) -> None:
+        """Stand on the ground with its motors on, for a while."""
+        self._stand()
+        self._waited = STEP_S
+
+    def _stand(self) -> None:
+        self._task, self.landed, self._waited = Task.STAND, Landed.ON_GROUND, 0.0
+        self.motion.still()
+
+    def _idle(self) -> None:
+        self._waited += STEP_S
+        if self._waited > _IDLE_S[self.autopilot]:
+            self.texts.append("Disarming motors")
+            self.disarm()
 
     # --- the camera ---
 

@@ -25,6 +25,7 @@ _ECCENTRICITY2: Final = 6.69437999014e-3  # of WGS 84
 STEP_S: Final = 0.05
 _FILTER_S: Final = 3.0
 _LOOK_AHEAD_S: Final = 0.8
+_LIFT_M_S2: Final = 1.5  # greatest change of its rate of climb
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,7 +189,8 @@ class Motion:
         """Brake to a stop with the largest acceleration."""
         north, east = self.seen
         after_s = math.hypot(self.vn, self.ve) / (2.0 * self.airframe.accel_m_s2) + 0.7
-        self.go((north + self.vn * after_s, east + self.ve * after_s, self.up))
+        up = max(0.0, self.up + self.vu * abs(self.vu) / (2.0 * _LIFT_M_S2))
+        self.go((north + self.vn * after_s, east + self.ve * after_s, up))
 
     def still(self) -> None:
         """Stand on the ground."""
@@ -277,7 +279,7 @@ class Motion:
         self.ve += dt * self._ae
         rise = target[2] - self.up
         wanted_up = max(-frame.sink_m_s, min(frame.climb_m_s, self.climb_m_s, 1.0 * rise))
-        self.vu += max(-1.5 * dt, min(1.5 * dt, wanted_up - self.vu))
+        self.vu += max(-_LIFT_M_S2 * dt, min(_LIFT_M_S2 * dt, wanted_up - self.vu))
         self.north += dt * self.vn
         self.east += dt * self.ve
         self.up += dt * self.vu

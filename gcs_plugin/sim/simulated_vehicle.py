@@ -6,6 +6,7 @@ as a ground station is there. Both answer commands and missions as measured (doc
 
 import heapq
 import math
+import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
@@ -17,9 +18,11 @@ from gcs_plugin.mission.flight_modes import modes_of
 from gcs_plugin.mission.items import FRAME_GLOBAL, WAYPOINT, MissionItem
 from gcs_plugin.sim.factory_parameters import factory_parameters, parameter_answer
 from gcs_plugin.sim.file_server import FileServer
-from gcs_plugin.sim.mission_flight import Exposure, Flight, Landed, State
+from gcs_plugin.sim.flight_values import Exposure, Landed, State
+from gcs_plugin.sim.mission_flight import Flight
 from gcs_plugin.sim.mission_store import MissionStore
 from gcs_plugin.sim.multirotor import STEP_S, Airframe, Chart, Pose
+from gcs_plugin.sim.sent_messages import MissionCurrent, bytes_of, severity_of
 
 _OK, _REJECTED, _DENIED, _UNSUPPORTED, _FAILED = (
     int(dialect.MAV_RESULT_ACCEPTED), int(dialect.MAV_RESULT_TEMPORARILY_REJECTED), int(dialect.MAV_RESULT_DENIED),
@@ -38,6 +41,7 @@ _BATTERY_S: Final = 1800.0  # with its motors on; what stands on the ground uses
 _EKF: Final = int(dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT)
 _ESTIMATOR: Final = int(dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS)
 _BATTERY: Final = int(dialect.MAVLINK_MSG_ID_BATTERY_STATUS)
+_LEFT_GROUND_M: Final = 0.2
 _PX4_TOP_M_S: Final = 12.0  # factory setting
 _HOME: Final = (47.397742, 8.545594, 488.0)
 
@@ -227,6 +231,9 @@ class SimVehicle:
                 if self.autopilot is Autopilot.PX4:
                     return _UNSUPPORTED
                 return _OK if flight.pause(go_on=bool(p1)) else _FAILED
+            case dialect.MAV_CMD_DO_REPOSITION if self.autopilot is Autopilot.PX4 and math.isnan(message.param5):
+                flight.set_mode(flight.modes.hold, anew=True)
+                return _OK
             case dialect.MAV_CMD_DO_SET_MISSION_CURRENT:
                 return _OK if flight.set_current(int(p1)) else _DENIED
         return _UNSUPPORTED
@@ -239,6 +246,8 @@ class SimVehicle:
 
     def _arm(self, wanted: bool) -> int:
         if not wanted:
+            if self.flight.motion.up > _LEFT_GROUND_M:  # not in the air, unless it is forced
+                return _FAILED if self.autopilot is Autopilot.ARDUPILOT else _REJECTED
             self.flight.disarm()
             return _OK
         if not self._ready:
@@ -289,7 +298,7 @@ class SimVehicle:
             if hz > 0.0:
                 heapq.heappush(self._due, (max(at + 1.0 / hz, now - 1.0), kind))
                 message = None if kind in self.withheld else _MAKERS[kind](self)
-                if message is not None and (kind == _HEARTBEAT or self._tx_room >= _bytes(message)):
+                if message is not None and (kind == _HEARTBEAT or self._tx_room >= bytes_of(message)):
                     self._spend([message], now)
                     messages.append(message)
         return messages
@@ -298,7 +307,7 @@ class SimVehicle:
         """Charge messages to the radio's capacity."""
         if self.tx_bytes_s < math.inf:
             self._tx_room = min(_TX_BUFFER, self._tx_room + self.tx_bytes_s * (now - self._tx_at))
-            self._tx_room -= sum(_bytes(message) for message in messages)
+            self._tx_room -= sum(bytes_of(message) for message in messages)
             self._tx_at = now
 
     def _stream(self, kind: int, hz: float) -> None:
@@ -329,7 +338,7 @@ class SimVehicle:
 
     def _text_parts(self, text: str) -> list[Message]:
         """A text in messages of 50 characters; several have a number in common."""
-        data, severity = text.encode(), _severity(text)
+        data, severity = text.encode(), severity_of(text)
         if len(data) <= 50:
             return [dialect.MAVLink_statustext_message(severity, data)]
         self._long_texts = self._long_texts % 0xFFFF + 1
@@ -388,6 +397,7 @@ class SimVehicle:
         )
         base = 81 | (dialect.MAV_MODE_FLAG_SAFETY_ARMED if flight.armed else 0)
         status = dialect.MAV_STATE_STANDBY if flight.landed is Landed.ON_GROUND else dialect.MAV_STATE_ACTIVE
+        status = dialect.MAV_STATE_CRITICAL if flight.failsafe else status
         return dialect.MAVLink_heartbeat_message(self.kind, kind, base, flight.mode, status, 3)
 
     def _position(self) -> Message | None:
@@ -412,7 +422,10 @@ class SimVehicle:
         flight, count = self.flight, len(self.store.items)
         total = count - 1 if self.autopilot is Autopilot.ARDUPILOT else count
         mode = 1 if flight.mode == flight.modes.mission else 2
-        return dialect.MAVLink_mission_current_message(flight.seq, max(0, total), int(flight.state), mode)
+        message = MissionCurrent(flight.seq, max(0, total), int(flight.state), mode)
+        if self.autopilot is Autopilot.PX4 and count:
+            message.mission_id = zlib.crc32(repr(self.store.items).encode())
+        return message
 
     def _extended(self) -> Message:
         return dialect.MAVLink_extended_sys_state_message(0, int(self.flight.landed))
@@ -483,12 +496,3 @@ _MAKERS: Final[dict[int, Callable[[SimVehicle], Message | None]]] = {
     int(dialect.MAVLINK_MSG_ID_SYS_STATUS): SimVehicle._power,
     int(dialect.MAVLINK_MSG_ID_HOME_POSITION): SimVehicle._home,
 }
-
-
-def _bytes(message: Message) -> int:
-    return int(message.unpacker.size) + 12  # MAVLink 2's frame, unsigned
-
-
-def _severity(text: str) -> int:
-    bad = text.startswith(("Arm:", "PreArm:", "Preflight", "Auto:", "No mission", "Mission start", "Takeoff waypoint"))
-    return int(dialect.MAV_SEVERITY_CRITICAL if bad else dialect.MAV_SEVERITY_INFO)

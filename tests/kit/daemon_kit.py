@@ -237,9 +237,11 @@ def serving(workspace: Path, *arguments: str, port: int = 0):
 
 
 def exported(jobs: list[dict]) -> bool:
-    """Whether products were written, and nothing else is to be done."""
-    wrote = any(job["kind"] == "export" and job["state"] == "done" for job in jobs)
-    return wrote and all(job["state"] in ("done", "failed") for job in jobs)
+    """Whether products were written last of all, and nothing else is to be done."""
+    others = [job["ended"] for job in jobs if job["kind"] != "export" and job["state"] in ("done", "failed")]
+    wrote = [job["started"] for job in jobs if job["kind"] == "export" and job["state"] == "done"]
+    over = all(job["state"] in ("done", "failed") for job in jobs)
+    return over and bool(wrote) and max(wrote) >= max(others, default="")
 
 
 def tile_over(camera: Camera, zoom=19) -> tuple[int, int, int]:

@@ -17,6 +17,7 @@ from gcs_plugin.mission.exchange import GROUND_STATION, Verdict
 from gcs_plugin.mission.items import TAKEOFF, MissionItem
 from gcs_plugin.sim.lossy_radio import Faults
 from gcs_plugin.sim.memory_link import SimLink, VirtualClock
+from gcs_plugin.sim.mission_flight import Flight
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
 from orthoswarm.model.errors import OrthoSwarmError
 from tests.vehicles.test_fleet import END, kinds, sent_by
@@ -63,15 +64,27 @@ def test_an_acknowledged_command_is_done(make_world, autopilot, verb):
 
 
 @BOTH
-def test_a_start_that_is_refused_after_arming_leaves_no_motor_running(make_world, autopilot):
+def test_a_start_that_is_refused_after_arming_leaves_no_motor_running(make_world, autopilot, monkeypatch):
+    world = make_world(SimVehicle(system=1, autopilot=autopilot))
+    world.meet()
+    assert world.finish(world.fleet.upload(1, mission(autopilot, END)))[0].ok
+    monkeypatch.setattr(Flight, "start_mission", lambda _: "Auto: Missing Takeoff Cmd")
+    result = end_of(world, give(world, "start", 1))
+    assert result.outcome is Verdict.REFUSED and result.reason.endswith("it was disarmed again")
+    assert "akeoff" in result.reason and not world.vehicles[1].flight.armed
+
+
+@BOTH
+def test_a_mission_without_a_takeoff_is_refused_before_arming(make_world, autopilot):
     world = make_world(SimVehicle(system=1, autopilot=autopilot))
     world.meet()
     good = mission(autopilot, END)
     no_takeoff = type(good)(autopilot, tuple(item for item in good.items if item.command != TAKEOFF))
     assert world.finish(world.fleet.upload(1, no_takeoff))[0].ok
+    sent = sent_by(world)
     result = end_of(world, give(world, "start", 1))
-    assert result.outcome is Verdict.REFUSED and result.reason.endswith("it was disarmed again")
-    assert "akeoff" in result.reason and not world.vehicles[1].flight.armed
+    assert result.outcome is Verdict.REFUSED and "instead of a takeoff" in result.reason
+    assert dialect.MAV_CMD_COMPONENT_ARM_DISARM not in [getattr(m, "command", 0) for m in sent]
 
 
 @BOTH
@@ -138,7 +151,7 @@ def test_a_start_that_is_under_way_is_carried_through(make_world):
     world = make_world(SimVehicle(system=1, autopilot=AP))
     world.meet()
     world.finish(world.fleet.upload(1, mission(AP, END)))
-    order = give(world, "start", 1, world.clock.now - 4.9)
+    order = give(world, "start", 1, world.clock.now - 4.0)
     assert end_of(world, order).outcome is Verdict.DONE
 
 

@@ -235,10 +235,11 @@ def test_a_mission_replaced_by_another_ground_station_is_forgotten():
     detector.uploaded(mission(AP, *BODIES["rtl"]))
     run(detector, [heartbeat(True), current(2, ACTIVE, 4)])
     request = dialect.MAVLink_mission_request_message(254, 190, 0, 0)
-    assert run(detector, [request, current(0, COMPLETE, 7), current(0, COMPLETE, 7)]) == []
+    assert run(detector, [request, current(0, COMPLETE, 7), current(0, COMPLETE, 7)]) == [MissionEvent.ABORTED]
     detector.uploaded(mission(AP, *BODIES["rtl"]))
     run(detector, [heartbeat(True), current(2, ACTIVE, 4), current(2, ACTIVE, 4)])
-    assert run(detector, [current(0, 2, 7), current(0, 2, 7), current(0, COMPLETE, 7)]) == [MissionEvent.SUSPENDED]
+    other = [current(0, 2, 7), current(0, 2, 7), current(0, COMPLETE, 7)]
+    assert run(detector, other) == [MissionEvent.SUSPENDED, MissionEvent.ABORTED]
     assert detector.phase is Phase.IDLE
 
 
@@ -318,7 +319,7 @@ def test_a_mission_of_another_station_that_starts_at_once_starts_once(lead):
     assert run(detector, [*before, *started]) == [MissionEvent.STARTED]
     assert detector.total == 11
     other = [current(1, ACTIVE, 7)] * 4  # a mission that another station stores in flight is another one
-    assert run(detector, other) == [MissionEvent.STARTED] and detector.total == 7
+    assert run(detector, other) == [MissionEvent.ABORTED, MissionEvent.STARTED] and detector.total == 7
 
 
 @pytest.mark.parametrize("log", ["copter_cam_rtl_1x", "swarm_v1", "swarm_v2", "swarm_v3"])

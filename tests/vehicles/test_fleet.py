@@ -132,7 +132,8 @@ def test_a_whole_flight_over_a_link_that_loses_thirty_percent(make_world, autopi
         world.until(lambda w=world: 1 in w.fleet.vehicles, 30.0)
         world.wait(5.0)
         assert world.finish(world.fleet.upload(1, mission(autopilot, END)))[0].ok
-        assert world.finish(world.fleet.start(1))[0].ok
+        tries = (world.finish(world.fleet.start(1))[0] for _ in range(3))  # what cannot be read in time is not started
+        assert any(outcome.ok for outcome in tries)
         world.until(lambda w=world: "complete" in w.kinds(1), 300.0)
         world.wait(90.0)
         assert world.kinds(1).count("complete") == 1

@@ -5,6 +5,8 @@ import json
 import re
 import subprocess
 import sys
+import threading
+import time
 
 import pytest
 
@@ -79,6 +81,36 @@ def test_a_plan_is_uploaded_flown_and_watched_to_its_completion(swarm, folder, c
     assert all(v["photos"] > 10 for v in flown["vehicles"])
 
 
+def test_events_are_told_while_others_wait_and_a_return_from_elsewhere_is_heard(folder, capsys):
+    """Two terminals: one starts a plan, the other sends all home while the second vehicle waits for its takeoff."""
+    document = json.loads((folder / "plan.json").read_text())
+    for number, vehicle in enumerate(document["vehicles"]):
+        vehicle["flights"][0]["start_s"] = 6.0 * number
+    (folder / "plan.json").write_text(json.dumps({"vehicles": document["vehicles"][:2]}))
+    port = free_port()
+    vehicles = make_swarm(2, home=HOME)
+    with SimSwarm(vehicles, f"udpout:127.0.0.1:{port}", speed=4.0):
+        link = f"udpin:127.0.0.1:{port}"
+        assert fleet(capsys, "upload", folder, "--vehicle", "1,2", "--link", link)[0] == 0
+
+        def elsewhere():
+            while vehicles[0].flight.motion.up < 3.0:
+                time.sleep(0.02)
+            for vehicle in vehicles:
+                vehicle.flight.set_mode(vehicle.flight.modes.rtl)
+
+        other = threading.Thread(target=elsewhere, daemon=True)
+        other.start()
+        words = ["--plan", folder, "--override", "separation", "--watch", "--seconds", LONG_S, "--link", link]
+        code, said = fleet(capsys, "start", *words)
+        other.join(60.0)
+    lines = said.splitlines()
+    stays = next(k for k, line in enumerate(lines) if "vehicle 2 was put into RTL since its start was given" in line)
+    assert code == 1 and not vehicles[1].flight.armed
+    assert any("vehicle 1 has started its mission" in line for line in lines[:stays]), lines
+    assert any("vehicle 1 has left its mission and is in RTL" in line for line in lines[:stays]), lines
+
+
 def test_a_px4_is_watched_until_it_has_come_home(folder, capsys):
     """Its mission is complete when the way home begins, tens of metres up."""
     port = free_port()
@@ -114,7 +146,7 @@ def test_one_vehicle_is_started_paused_resumed_and_brought_home(swarm, folder, c
     assert code == 0 and "vehicle 3 flies its mission" in text
     for action in ("pause", "resume", "rtl"):
         code, said = fleet(capsys, action, "--vehicle", "3", "--link", swarm, "--json")
-        assert code == 0 and said["vehicles"][0]["ok"], said
+        assert code == 0 and said["vehicles"][0]["ok"], str(said)
     code, said = fleet(capsys, "start", "--vehicle", "2", "--link", swarm, "--json")
     assert code == 1 and "no mission" in said["vehicles"][0]["text"]
 

@@ -1,7 +1,9 @@
 """Links and packets: every kind of link on loopback, streams in pieces, signatures, telemetry logs."""
 
+import contextlib
 import os
 import selectors
+import socket
 import sys
 import time
 
@@ -9,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gcs_plugin.links import outgoing
 from gcs_plugin.links.mavlink import dialect
 from gcs_plugin.links.packets import Framer, checksum
 from gcs_plugin.links.signing import Signing, find_key, key_from, signing_time
@@ -28,6 +31,10 @@ def messages(count=5, version1=False):
         result.append(message.pack(packer, force_mavlink1=version1))
         packer.seq += 1
     return result
+
+
+def passed(moment):
+    return lambda: time.monotonic() > moment
 
 
 class Loop:
@@ -116,6 +123,130 @@ def test_a_tcp_link_without_a_server_says_so_and_goes_on_trying(loop):
     assert client.dropped == 1
 
 
+# --- a TCP connection whose other side does not take what is sent ---
+
+
+class Peer:
+    """The other end of a TCP link: it takes little, and reads only when it is told to."""
+
+    def __init__(self, loop, serves):
+        self.server = None
+        if not serves:
+            self.server = socket.create_server(("127.0.0.1", 0))
+            self.server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1)  # what a connection has from the beginning
+        port = 0 if serves else self.server.getsockname()[1]
+        self.link = TcpLink("link", "127.0.0.1", port, serves=serves)
+        self.loop = loop(self.link)
+        self.connect()
+
+    def connect(self):
+        """A connection, and how the link names it."""
+        if self.server is None:
+            self.socket = socket.socket()
+            self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1)
+            self.socket.connect(("127.0.0.1", self.link.port))
+        else:
+            self.link._retry_at = 0.0
+            self.socket = self.accepted()
+        self.socket.setblocking(False)
+        self.came = b""
+        assert self.loop.until(self.link.greet)
+        (self.name,) = self.link.greet()
+
+    def accepted(self):
+        self.server.setblocking(False)
+        found = []
+
+        def look():
+            with contextlib.suppress(BlockingIOError):
+                found.append(self.server.accept()[0])
+            return found
+
+        assert self.loop.until(look)
+        return found[0]
+
+    def fill(self):
+        """Send until something is not acknowledged, though the system would take more."""
+
+        def stuck():
+            return self.name._waits_s() > 0.05 or not (
+                outgoing._unacknowledged(self.name.socket) or self.link.send(self.name, b"." * 500)
+            )
+
+        assert self.loop.until(stuck) and outgoing._unacknowledged(self.name.socket)
+
+    def read(self):
+        """All that has come on this connection, which may be broken."""
+        with contextlib.suppress(BlockingIOError, ConnectionResetError):
+            while part := self.socket.recv(65536):
+                self.came += part
+        return self.came
+
+    def close(self):
+        self.socket.close()
+        if self.server is not None:
+            self.server.close()
+
+
+@pytest.fixture(params=["connects", "serves"])
+def peer(request, loop, monkeypatch):
+    if sys.platform != "linux":
+        pytest.skip("only Linux says what was acknowledged")
+    monkeypatch.setattr(outgoing, "_STALLED_S", 60.0)  # in tests that are not about it, however slow the machine is
+    monkeypatch.setitem(outgoing._OPTIONS, "TCP_USER_TIMEOUT", 60_000)
+    made = Peer(loop, serves=request.param == "serves")
+    yield made
+    made.close()
+
+
+def test_a_command_does_not_wait_in_the_system_and_is_not_sent_late(peer, monkeypatch):
+    monkeypatch.setattr(outgoing, "_HELD_S", 0.05)
+    peer.fill()
+    expires = time.monotonic() + 0.2
+    assert all(peer.link.send(peer.name, b"pause", expires) for _ in range(10))
+    assert peer.loop.until(passed(expires))
+    peer.read()
+    assert peer.link.send(peer.name, b"resume", time.monotonic() + 60.0)
+    assert peer.loop.until(lambda: b"resume" in peer.read())  # it goes on where it was
+    assert b"pause" not in peer.came and peer.link.greet() == [peer.name]
+
+
+def test_a_command_that_the_system_took_is_discarded_with_the_connection_when_it_expires(peer, monkeypatch):
+    peer.fill()
+    monkeypatch.setattr(outgoing, "_HELD_S", 60.0)
+    expires = time.monotonic() + 0.2
+    assert peer.link.send(peer.name, b"pause", expires)
+    assert peer.loop.until(lambda: not peer.link.greet())
+    assert time.monotonic() > expires
+    assert b"pause" not in peer.read()
+    assert not peer.link.send(peer.name, b"pause") and peer.link.dropped == 1
+
+
+def test_a_stalled_connection_is_reset_and_a_new_one_works(peer, monkeypatch):
+    monkeypatch.setattr(outgoing, "_HELD_S", 0.05)
+    monkeypatch.setattr(outgoing, "_STALLED_S", 0.2)
+    peer.fill()
+    assert peer.link.send(peer.name, b"the last of the old ones")
+    assert peer.loop.until(lambda: not peer.link.greet())
+    assert peer.link.problem == ("" if peer.server is None else "the other side takes nothing")
+    assert b"old" not in peer.read()
+    peer.socket.close()
+    peer.connect()
+    assert peer.link.send(peer.name, b"the first of the new ones") and peer.link.problem == ""
+    assert peer.loop.until(lambda: peer.read() == b"the first of the new ones")
+
+
+def test_a_silent_side_that_takes_everything_gets_its_commands(peer, monkeypatch):
+    """A bridge to a radio says nothing while no vehicle is heard."""
+    monkeypatch.setattr(outgoing, "_HELD_S", 0.1)
+    for number in range(3):
+        begun = time.monotonic()
+        assert peer.link.send(peer.name, b"rtl %d;" % number, begun + 60.0)
+        assert peer.loop.until(lambda n=number: peer.read().endswith(b"rtl %d;" % n))
+        assert peer.loop.until(passed(begun + 0.2))
+    assert peer.link.greet() == [peer.name]
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="pseudo terminals are POSIX")
 def test_a_serial_line_goes_both_ways_and_comes_back_after_unplugging(loop):
     pytest.importorskip("serial")
@@ -134,6 +265,41 @@ def test_a_serial_line_goes_both_ways_and_comes_back_after_unplugging(loop):
     os.close(slave)
     os_error = line.until(lambda: link.problem != "")
     assert os_error and not link.greet()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="pseudo terminals are POSIX")
+@pytest.mark.timeout(60)
+def test_a_serial_line_that_takes_nothing_holds_up_nobody_and_its_commands_are_not_sent_late(loop):
+    pytest.importorskip("serial")
+    master, slave = os.openpty()
+    link = parse_link(f"serial:{os.ttyname(slave)}:57600")
+    line = loop(link)
+    import tty
+
+    tty.setraw(slave)
+
+    def full():
+        """The system's buffer is, and stays so."""
+        waits = len(link._pending) or (link.send(link.greet()[0], b"." * 1000) and len(link._pending))
+        return waits and not line.until(lambda: len(link._pending) < waits, 0.2)
+
+    assert line.until(full)
+    expires = time.monotonic() + 0.1
+    assert link.send(link.greet()[0], b"pause", expires) and line.until(passed(expires))
+    came = b""
+    os.set_blocking(master, False)
+
+    def resumed():
+        nonlocal came
+        with contextlib.suppress(BlockingIOError):
+            came += os.read(master, 65536)
+        return came.endswith(b"resume")
+
+    assert not resumed()
+    assert link.send(link.greet()[0], b"resume") and line.until(resumed)
+    assert b"pause" not in came
+    os.close(master)
+    os.close(slave)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="pseudo terminals are POSIX")

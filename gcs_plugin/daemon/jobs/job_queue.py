@@ -25,6 +25,8 @@ _MOST_LISTED: Final = 1000  # finished jobs
 _BACKGROUND: Final = frozenset({"coarse", "together", "tones", "redraw", "export"})
 _IN_FLIGHT: Final = "(kind = 'coarse' AND json_extract(detail, '$.after') IS NULL)"
 """A coarse map of a vehicle that still flies, as SQL; one with `after` completes the layer after a refinement."""
+_FIRST: Final = "(kind = 'export' AND json_extract(detail, '$.after') IS 'refine')"
+"""What a refinement has changed is written before anything else is done in the background, as SQL."""
 _PREEMPTED: Final = frozenset({"coarse", "together", "tones"})
 _AFTER_REFINEMENT: Final = _PREEMPTED | {"export"}
 """An export that was asked for during a refinement holds its result."""
@@ -234,7 +236,7 @@ class Jobs:
 
     def _next(self, background: bool) -> Job | None:
         """Take the next background job, or the next refinement; the jobs of a vehicle run one after the other."""
-        rows = self._journal.rows(f"SELECT * FROM jobs WHERE state = 'queued' ORDER BY {_IN_FLIGHT}, id")
+        rows = self._journal.rows(f"SELECT * FROM jobs WHERE state = 'queued' ORDER BY NOT {_FIRST}, {_IN_FLIGHT}, id")
         busy = {_lane(job) for job in self._running.values()}
         refining = any(kind == "refine" for kind, _ in busy) or any(row["kind"] == "refine" for row in rows)
         for row in rows:

@@ -17,6 +17,7 @@ from gcs_plugin.daemon.jobs.placed_sorties import detail_of, others_near, refine
 from gcs_plugin.daemon.jobs.publisher import Publisher
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
 from gcs_plugin.daemon.jobs.worker_tasks import FollowTask, SolveTask, SortieResult, follow, near, register_late, solve
+from gcs_plugin.daemon.jobs.workspace_products import PRODUCTS
 from gcs_plugin.daemon.layers.layers import new_name
 from gcs_plugin.daemon.layers.realtime_layer import Drawer
 from gcs_plugin.daemon.store.journal import Change, Journal, late_frames, newest_seq, packed
@@ -217,6 +218,7 @@ class SortieRefinement:
             if before is None:
                 then += together_jobs(self.journal, job, solved.bounds)
         then.append(new_job("tones", None, None, {}))
+        then.append(new_job("export", None, None, {"formats": list(PRODUCTS), "after": "refine"}))
 
         def change(db: sqlite3.Connection) -> None:
             stands(db)

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from orthoswarm.mosaic.recorded_pose import Recorded
 
 FORMATS: Final = ("cog", "mbtiles", "kmz", "gpkg", "odm", *FORMS)
+PRODUCTS: Final = ("cog", "gpkg")
+"""The formats that are written without being asked for."""
 _FILES: Final = {"realtime": "realtime.tif", "coarse": "coarse.tif", "fine": "orthoimage.tif"}
 
 

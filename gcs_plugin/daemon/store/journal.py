@@ -52,6 +52,11 @@ CREATE TABLE IF NOT EXISTS exposures (
 CREATE TABLE IF NOT EXISTS completions (
     id INTEGER PRIMARY KEY AUTOINCREMENT, vehicle TEXT NOT NULL, sortie INTEGER NOT NULL, detail TEXT NOT NULL);
 """
+_WROTE_REFINED: Final = """
+SELECT NOT EXISTS (SELECT 1 FROM jobs WHERE kind = 'refine' AND state IN ('queued', 'running')) AND EXISTS (
+    SELECT 1 FROM jobs WHERE kind = 'export' AND state = 'done' AND started >= (
+        SELECT max(ended) FROM jobs WHERE kind = 'refine' AND state = 'done'))
+"""
 _BATCH: Final = 256  # changes in one transaction
 _BUSY_S: Final = 30.0
 
@@ -304,6 +309,17 @@ def late_frames(journal: Journal, vehicle: str, sortie: int | None, job: int = 0
     """Number of frames of a sortie that its last refinement (other than the job's) did not use; 0 while it is flown."""
     row = journal.rows(_LATE, {"vehicle": packed(vehicle), "sortie": sortie, "job": job})[0]
     return int(row["late"])
+
+
+def wrote_refined(folder: Path) -> bool:
+    """Whether the products were written after all refinements; true of a folder that is no workspace. Any process."""
+    path = (folder / "journal.db").resolve()
+    if not path.exists():
+        return True
+    uri = f"{path.as_uri()}?mode=ro"
+    with contextlib.suppress(sqlite3.Error), contextlib.closing(sqlite3.connect(uri, uri=True, timeout=_BUSY_S)) as db:
+        return bool(db.execute(_WROTE_REFINED).fetchone()[0])
+    return False  # its daemon is only just making it
 
 
 def frames_drawn(results: Iterable[Drawn]) -> Change:

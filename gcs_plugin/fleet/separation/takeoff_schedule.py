@@ -52,16 +52,18 @@ class TakeoffSchedule:
         """When the next one starts, None if none waits."""
         return min(self.waiting.values(), default=None)
 
-    def started(self, system: int, now: float, name: Callable[[int], str]) -> list[str]:
-        """A vehicle flies its mission; returns the changes for others, in words.
+    def started(self, system: int, now: float, name: Callable[[int], str], begun: float | None = None) -> list[str]:
+        """A vehicle has taken off; returns the changes for others, in words.
 
         Args:
-            system: its id. now: when, on the caller's clock. name: of a vehicle, from its system id.
+            system: its id. now: the time, on the caller's clock. name: of a vehicle, from its system id.
+            begun: when it began its mission, which is earlier, by its climb; default now.
         """
+        begun = now if begun is None else begun
         self._undecided.pop(system, None)
-        planned = self._planned.get(system, now)
-        late = now - planned
-        self.flown[system] = now if late > COMMAND.takeoff_late_s else planned
+        planned = self._planned.get(system, begun)
+        late = begun - planned
+        self.flown[system] = begun if late > COMMAND.takeoff_late_s else planned
         if late <= COMMAND.takeoff_late_s:
             return []
         said = [f"{name(system)} took off {late:.0f} s late"]

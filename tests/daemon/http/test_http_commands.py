@@ -23,6 +23,7 @@ from gcs_plugin.web.uploads import UploadLimits, moving
 from orthoswarm.model.errors import InputError
 from tests.kit.daemon_kit import GRID, form, line, serving
 from tests.kit.mosaic_scene import EAST, NORTH
+from tests.kit.servers.ports import free_port
 
 LIMIT_S = 120.0
 
@@ -324,6 +325,22 @@ def test_refused_pictures_are_in_health_and_metrics(tmp_path):
         metrics = served.get("/metrics").text
         assert 'orthoswarm_pictures_refused_total{cause="picture"} 1' in metrics
         assert 'orthoswarm_pictures_refused_total{cause="disk"} 0' in metrics
+
+
+def test_a_broken_link_and_two_vehicles_of_one_system_id_are_in_health(tmp_path):
+    lat, lon = (float(v) for v in GRID.to_geographic([EAST, NORTH]))
+    port = free_port()
+    (tmp_path / "w").mkdir()
+    (tmp_path / "w" / "orthoswarm.toml").write_text('[[vehicle]]\nid = "north"\nsystem = 1\n')
+    with SimSwarm(make_swarm(1, home=(lat, lon, 500.0)), "tcpin:127.0.0.1:0") as first:
+        links = (first.addresses[0], f"tcp:127.0.0.1:{port}")
+        with serving(tmp_path / "w", "--link", links[0], "--link", links[1]) as served:
+            broken = f"{links[1]}: no connection (ECONNREFUSED)"
+            served.until("/healthz", lambda health: health["problems"] == [broken] and first.now > 5.0)
+            with SimSwarm(make_swarm(1, home=(lat, lon, 500.0)), f"tcpin:127.0.0.1:{port}"):  # its clock is behind
+                shared = served.until("/healthz", lambda health: health["problems"] not in ([], [broken]))["problems"]
+    assert len(shared) == 1 and shared[0].startswith("several vehicles use the system id of north: ")
+    assert all(link in shared[0] for link in links)
 
 
 def test_old_refusals_are_counted_but_no_news():

@@ -113,6 +113,12 @@ class Real:
         return self.fleet.run_until(done, limit_s)
 
 
+def further_link(address):
+    """Another link of the same autopilot: ArduPilot's SERIAL1, PX4's for ground stations."""
+    kind, host, port = address.split(":")
+    return f"tcp:{host}:{int(port) + 2}" if kind == "tcp" else f"{kind}:{host}:14550"
+
+
 def charge(address):
     """Fill the battery of an ArduPilot, which does not fill by itself in simulation, for a test that needs it full."""
     place = Real(address)

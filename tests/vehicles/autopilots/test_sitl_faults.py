@@ -20,7 +20,7 @@ from gcs_plugin.mission.items import RTL
 from gcs_plugin.mission.mission_files import MissionItem
 from gcs_plugin.sim.lossy_radio import Faults
 from tests.kit.daemon_kit import start, stop
-from tests.vehicles.autopilots.test_fleet_scenarios import ADDRESSES, REAL, Real, Site
+from tests.vehicles.autopilots.test_fleet_scenarios import ADDRESSES, REAL, Real, Site, further_link
 from tests.vehicles.autopilots.test_twin_camera import small_area
 
 pytestmark = pytest.mark.sitl
@@ -160,6 +160,49 @@ def test_the_loss_of_gps_ends_the_mission_without_completing_it(site, parameters
     assert site.place.until(site.ready, 240.0)
 
 
+@pytest.mark.parametrize(
+    ("fault", "parameters_of_it"),
+    [
+        ("remote control lost", {"FS_THR_ENABLE": 1, "SIM_RC_FAIL": 1}),
+        ("receiver jumps by 110 m", {"SIM_GPS1_GLTCH_X": 0.001}),
+    ],
+)
+def test_what_fails_on_the_way_is_told_and_is_no_completion(site, parameters, fault, parameters_of_it):
+    if site.vehicle.autopilot is PX4:
+        pytest.skip("the simulation inside PX4 has neither")
+    on_mission(site)
+    began, dangers = time.monotonic(), []
+    parameters.set(**parameters_of_it)
+    assert site.place.until(lambda: bool(site.vehicle.danger), 60.0)
+    dangers.append(site.vehicle.danger)
+    site.place.until(lambda: False, 3.0)
+    parameters.restore()
+    words = site.follow(lambda: not site.vehicle.armed, 300.0)
+    print(f"{fault}: {dangers}, {words}, {site.kinds()} after {time.monotonic() - began:.0f} s")
+    assert site.kinds().count("complete") + site.kinds().count("aborted") == 1
+
+
+@pytest.mark.parametrize("address", REAL)
+def test_a_flight_is_started_paused_and_completed_through_twenty_percent_loss(address):
+    place = Real(address, [Faults(loss=0.2, seed=seed) for seed in (1, 2)])
+    try:
+        site = Site(place)
+        assert site.finish(site.fleet.upload(site.system, site.mission(MissionItem(command=RTL), legs=4))).ok
+        began, tries = time.monotonic(), []
+        while not tries or not (tries[-1].ok or len(tries) > 3):
+            tries.append(site.finish(site.fleet.start(site.system)))
+        assert tries[-1].ok, tries
+        print(f"climbed {time.monotonic() - began:.1f} s after the command, {len(tries)} tries")
+        site.follow(lambda: flight_state(site.vehicle).word.value == "on mission", 60.0)
+        assert site.finish(site.fleet.pause(site.system)).ok
+        site.follow(lambda: flight_state(site.vehicle).word.value == "paused", 30.0)
+        assert site.finish(site.fleet.resume(site.system)).ok
+        assert place.until(lambda: "complete" in site.kinds() and not site.vehicle.armed, 300.0), site.kinds()
+        assert site.kinds().count("complete") == 1 and "aborted" not in site.kinds()
+    finally:
+        place.close()
+
+
 def test_a_mission_is_flown_in_wind_of_twelve_metres_a_second(site, parameters):
     if site.vehicle.autopilot is PX4:
         pytest.skip("the simulation inside PX4 has no wind")
@@ -275,12 +318,6 @@ def begin(served):
     assert served.command(f"/api/missions/{row['id']}/upload", upload).status_code == 200
     served.take_off(row["id"])
     return row["id"]
-
-
-def further_link(address):
-    """Another link of the same autopilot: ArduPilot's SERIAL1, PX4's for ground stations."""
-    kind, host, port = address.split(":")
-    return f"tcp:{host}:{int(port) + 2}" if kind == "tcp" else f"{kind}:{host}:14550"
 
 
 @pytest.mark.parametrize("address", REAL)

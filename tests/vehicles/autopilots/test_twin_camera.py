@@ -80,21 +80,20 @@ PLACES = [
 ]
 
 
-class CameraProcess:
-    """`orthoswarm twin camera` as a process."""
+class Followed:
+    """A process that runs for long, and what it says meanwhile on one of its outputs."""
 
-    def __init__(self, *arguments):
+    def __init__(self, words, stderr=subprocess.STDOUT, **options):
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "gcs_plugin.cli", "twin", "camera", "--json", *arguments],
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=end_with_us,
-        )  # fmt: skip
+            words, stdout=subprocess.PIPE, stderr=stderr, text=True, preexec_fn=end_with_us, **options
+        )
         self.said: list[str] = []
         self.told = threading.Condition()
         self.reader = threading.Thread(target=self.read, daemon=True)
         self.reader.start()
 
     def read(self):
-        with self.process.stderr as stream:
+        with self.process.stderr or self.process.stdout as stream:
             for text in stream:
                 with self.told:
                     self.said.append(text)
@@ -110,16 +109,24 @@ class CameraProcess:
         assert match, "".join(self.said)
         return match
 
-    def end(self):
-        self.process.send_signal(signal.SIGINT)
-        out = self.process.stdout.read()
-        return self.process.wait(30), json.loads(out) if out else {}
-
     def close(self):
         self.process.kill()
         self.process.wait(30)
         self.reader.join(10.0)
         self.process.stdout.close()
+
+
+class CameraProcess(Followed):
+    """`orthoswarm twin camera` as a process."""
+
+    def __init__(self, *arguments):
+        words = [sys.executable, "-m", "gcs_plugin.cli", "twin", "camera", "--json", *arguments]
+        super().__init__(words, subprocess.PIPE)
+
+    def end(self):
+        self.process.send_signal(signal.SIGINT)
+        out = self.process.stdout.read()
+        return self.process.wait(30), json.loads(out) if out else {}
 
 
 @pytest.fixture(params=PLACES)

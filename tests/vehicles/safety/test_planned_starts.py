@@ -1,7 +1,9 @@
 """A plan's start in the daemon: what cancels it during its check and while vehicles wait, what is checked again."""
 
 import json
+import math
 import threading
+from dataclasses import replace
 
 import pytest
 
@@ -120,7 +122,8 @@ def test_a_mission_that_takes_long_to_read_is_red_until_it_is_read(open_links, f
     links = open_links([vehicle])
     ready(links, 1)
     upload_all(links, folder)
-    vehicle.held = True
+    wait(lambda: not links.fleet.reads(1))
+    links.fleet.vehicles[1].read_s, vehicle.held = -math.inf, True  # it was read long ago
     plans = PlanFolder(folder)
     takeoffs = Takeoffs(links, plans, lambda _: None)
 
@@ -178,4 +181,51 @@ def test_what_has_become_red_until_the_takeoff_holds_the_vehicle_and_the_rest(op
     assert "v2 was not started: gps: no 3D fix" in takeoffs.rows()["v2"]["failed"]
     assert any("v3 stay on the ground" in text for text in said)
     assert not vehicles[1].flight.armed and not vehicles[2].flight.armed
+    takeoffs.close()
+
+
+def plan_of_two(open_links, folder, seconds):  # noqa: F811
+    """Two vehicles that take off so many seconds after each other, and the plan's start."""
+    apart(folder, 2, seconds)
+    vehicles = make_swarm(2, home=HOME)
+    links = open_links(vehicles, speed=4.0)
+    ready(links, 2)
+    upload_all(links, folder)
+    said = []
+    takeoffs = Takeoffs(links, PlanFolder(folder), said.append)
+    assert set(takeoffs.begin("plan-1", override=ONE_PATH)) == {"v1", "v2"}
+    return vehicles, links, takeoffs, said
+
+
+def test_a_waiting_vehicle_that_somebody_else_returns_stays_on_the_ground(open_links, folder):  # noqa: F811
+    vehicles, _, takeoffs, said = plan_of_two(open_links, folder, 6.0)
+    wait(lambda: vehicles[0].flight.motion.up > 4.0)
+    for vehicle in vehicles:  # by another station: ours hears of it by the vehicles' messages only
+        vehicle.flight.set_mode(vehicle.flight.modes.rtl)
+    wait(lambda: "failed" in takeoffs.rows().get("v2", {}))
+    assert "was put into RTL since its start was given" in takeoffs.rows()["v2"]["failed"]
+    wait(lambda: not vehicles[0].flight.armed)
+    assert not vehicles[1].flight.armed and any("v2 did not take off" in text for text in said)
+    takeoffs.close()
+
+
+def test_nobody_follows_one_that_does_not_leave_the_ground(open_links, folder):  # noqa: F811
+    vehicles, _, takeoffs, _ = plan_of_two(open_links, folder, 1.0)
+    first = vehicles[0].flight
+    wait(lambda: first.armed and first.mode == first.modes.mission)
+    first.set_mode(first.modes.rtl)
+    first.motion.still()  # it is still on the ground
+    wait(lambda: "failed" in takeoffs.rows().get("v2", {}))
+    assert "because v1 did not take off" in takeoffs.rows()["v2"]["failed"]
+    assert not vehicles[1].flight.armed
+    takeoffs.close()
+
+
+def test_a_mission_that_somebody_replaces_while_a_takeoff_waits_is_not_flown(open_links, folder):  # noqa: F811
+    vehicles, _, takeoffs, _ = plan_of_two(open_links, folder, 4.0)
+    store = vehicles[1].store
+    store.items = [*store.items[:3], *(replace(item, z=item.z + 9.0) for item in store.items[3:])]
+    store.generation += 1
+    wait(lambda: "failed" in takeoffs.rows().get("v2", {}))
+    assert "mission" in takeoffs.rows()["v2"]["failed"] and not vehicles[1].flight.armed
     takeoffs.close()

@@ -104,9 +104,9 @@ def test_a_single_start_keeps_apart_from_those_in_the_air_and_those_that_wait(ma
 
     assert found() == ("", "")
     assert "from v1" in found({1: 3.0})[0] and found({1: 300.0}) == ("", "")
-    assert world.finish(world.fleet.start(1))[0].ok
-    world.wait(8.0)
-    assert "from v1" in found()[0]
+    world.fleet.start(1)
+    assert world.until(lambda: world.fleet.vehicles[1].height_m > 2.0, 60.0)
+    assert world.until(lambda: "from v1" in found()[0], 10.0)
     assert world.finish(world.fleet.pause(1))[0].ok
     world.wait(4.0)
     assert found()[0] == "" and "v1 flies or waits, and its way is not known" in found()[1]

@@ -2,11 +2,16 @@
 
 import argparse
 import json
+import sys
+import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
     from orthoswarm.evaluation.displacement import Accuracy
+
+_WAIT_S: Final = 600.0  # of a refinement and its files on a busy machine
+_LOOK_S: Final = 0.5
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -43,6 +48,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("--gsd", type=float, metavar="M", help="pixel at which both are compared (default 0.3, or what they have)")
     add("--search", type=float, default=8.0, metavar="M", help="largest displacement that is looked for (default 8)")
     add("--field", type=Path, metavar="FIELD.csv", help="write the field of displacements")
+    add(
+        "--wait", type=float, nargs="?", const=_WAIT_S, metavar="SECONDS",
+        help="wait until the orthoimage is there, and that of a daemon has all that is refined (at most SECONDS, 600)",
+    )  # fmt: skip
     add("--json", action="store_true", help="one JSON document on stdout")
 
 
@@ -64,6 +73,10 @@ def run(args: argparse.Namespace) -> int:
         read = ("ortho", "reference", "checkpoints", "poses", "truth")
         refuse_replacing("--field", args.field, {name: getattr(args, name) for name in read})
         require_folder_for("--field", args.field)
+    if args.wait is not None and not args.wait >= 0.0:
+        raise InputError("--wait must be 0 or more seconds")
+    if args.wait is not None:
+        _wait(args)
     figures: dict[str, Any] = {}
     if args.reference is not None:
         figures |= _against_reference(args)
@@ -76,6 +89,28 @@ def run(args: argparse.Namespace) -> int:
     else:
         _print(figures)
     return 0
+
+
+def _wait(args: argparse.Namespace) -> None:
+    """Wait until the orthoimage is there and, in a daemon's workspace, was written after the last refinement.
+
+    Raises:
+        OrthoSwarmError: that takes longer. InputError: there is nothing to wait for, or to measure it against.
+    """
+    from gcs_plugin.daemon.store.journal import wrote_refined
+    from orthoswarm.export.catalog.tiled_raster import product_file
+    from orthoswarm.model.errors import InputError, OrthoSwarmError
+
+    ortho = args.ortho / "orthoimage.tif" if args.ortho.is_dir() or not args.ortho.suffix else args.ortho
+    for path in (ortho.parent, args.reference, args.checkpoints, args.truth):
+        if path is not None and not path.exists():
+            raise InputError(f"{path} does not exist; nothing was waited for")
+    end, what = time.monotonic() + args.wait, f"until {ortho} is there and has all that is refined"
+    print(f"waiting {what}", file=sys.stderr, flush=True)
+    while product_file(ortho.parent, ortho.name) is None or not wrote_refined(ortho.parent):
+        if time.monotonic() >= end:
+            raise OrthoSwarmError(f"waited {args.wait:g} s {what}; see on the daemon's page what it does")
+        time.sleep(_LOOK_S)
 
 
 def _against_reference(args: argparse.Namespace) -> dict[str, Any]:

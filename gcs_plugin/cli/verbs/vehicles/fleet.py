@@ -1,4 +1,4 @@
-"""`orthoswarm fleet`: the vehicles on the links: list, upload missions, check, start, pause, resume, RTL, land."""
+"""`orthoswarm fleet`: the vehicles on the links: list, upload, check, start, pause, resume, continue, RTL, land."""
 
 import argparse
 import json
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from gcs_plugin.fleet.fleet_events import FleetEvent
     from gcs_plugin.mission.exchange import Outcome
     from gcs_plugin.mission.items import Mission
-    from gcs_plugin.mission.track import Airspace
 
+_STEP_S = 0.05
 _PASSING = frozenset({"link", "gps", "ekf", "home", "pre-arm"})  # red items that clear by waiting
 
 
@@ -32,6 +32,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Open the links, run the action, close them."""
     from gcs_plugin.backends import open_backend
+    from gcs_plugin.fleet.commands import URGENT
     from gcs_plugin.links.signing import find_key
     from gcs_plugin.mission.exchange import Address
 
@@ -54,6 +55,8 @@ def run(args: argparse.Namespace) -> int:
         tlog=args.tlog,
     )
     try:
+        if args.action in URGENT and not systems and not getattr(args, "in_turn", False):
+            return _as_they_are_heard(backend, args)
         found = backend.discover(args.wait, prepared.systems)
         if not found or (prepared.systems and not set(prepared.systems) & set(found)):
             return _nobody(backend, args, prepared.systems, found)
@@ -199,6 +202,8 @@ def _upload(backend: "Backend", args: argparse.Namespace, prepared: _Prepared, f
 
 
 def _command(backend: "Backend", args: argparse.Namespace, prepared: _Prepared, found: list[int]) -> int:
+    from gcs_plugin.mission.track import Airspace
+
     systems = prepared.systems or found
     missing = [s for s in systems if s not in found]
     if missing and args.action == "start":
@@ -207,19 +212,56 @@ def _command(backend: "Backend", args: argparse.Namespace, prepared: _Prepared, 
             f"vehicle {names} was not heard, so no vehicle was started; check its link, or leave it out with --vehicle"
         )
     heard = [s for s in systems if s in found]
-    airspace = None
-    if args.action == "start":
-        checked = _ready(backend, args, prepared, heard)
-        if isinstance(checked, dict):
-            return _report(args, checked, {})
-        airspace = checked
-    orders = _unheard(args, missing)
-    delays = {s: prepared.delays.get(s, 0.0) for s in heard}
-    orders |= backend.command(args.action, delays, lambda line: _say(args, line), airspace)
+    standing = {s: backend.vehicle(s).standing for s in heard}  # before the checks: nothing may change during them
+    if args.action == "resume":  # where one was held on its mission tells what was paused
+        _with_bar(lambda report: backend.stored([s for s in heard if backend.vehicle(s).mission is None], report))
+    airspace, flown = None, dict[int, "Mission"]()
+    if args.action in ("start", "continue"):
+        flown, refused = _ready(backend, args, prepared, heard)
+        if refused:
+            return _report(args, refused, {})
+        airspace = Airspace.of(flown, apart=prepared.needs.apart) if args.action == "start" else None
+    orders, told = _unheard(args, missing), list(backend.events)
+    watches = args.action == "start" and args.watch
+
+    def pump(seconds: float) -> None:
+        backend.pump(seconds)
+        if watches:
+            _tell(args, backend.events[len(told) :], heard, told)
+
+    orders |= backend.command(
+        args.action, {s: prepared.delays.get(s, 0.0) for s in heard}, lambda line: _say(args, line), airspace,
+        standing=standing, missions=flown, pump=pump,
+    )  # fmt: skip
     outcomes = {s: order.outcome for s, order in orders.items() if order.outcome is not None}
     followed = [s for s, outcome in outcomes.items() if outcome.ok]
-    if args.action == "start" and args.watch and followed:
-        return _follow(backend, args, followed, all(outcome.ok for outcome in outcomes.values()))
+    if watches and followed:
+        return _follow(backend, args, followed, all(outcome.ok for outcome in outcomes.values()), told)
+    return _report(args, outcomes, _ids(orders), said=True)
+
+
+def _as_they_are_heard(backend: "Backend", args: argparse.Namespace) -> int:
+    """Pause, return or land all: each is told at once as it is heard, nobody waits until all were found."""
+    from gcs_plugin.config import HEARING
+    from gcs_plugin.fleet.commands import Order
+
+    orders, said = dict[int, Order](), set[int]()
+    last = time.monotonic()
+    while True:
+        backend.look()
+        backend.pump(_STEP_S)
+        now = time.monotonic()
+        for system in [s for s in backend.vehicles() if s not in orders]:
+            orders[system], last = backend.order(Order(verb=args.action, system=system, given_s=now)), now
+        for system in [s for s, order in orders.items() if order.outcome is not None and s not in said]:
+            said.add(system)
+            outcome = orders[system].outcome
+            _say(args, outcome.text if outcome is not None else "")
+        if len(said) == len(orders) and now - last > (HEARING.all_found_s if orders else args.wait):
+            break
+    if not orders:
+        return _nobody(backend, args, [], [])
+    outcomes = {s: order.outcome for s, order in orders.items() if order.outcome is not None}
     return _report(args, outcomes, _ids(orders), said=True)
 
 
@@ -264,13 +306,14 @@ def _say(args: argparse.Namespace, text: str) -> None:
 
 def _ready(
     backend: "Backend", args: argparse.Namespace, prepared: _Prepared, systems: list[int]
-) -> "Airspace | dict[int, Outcome]":
-    """Wait until all vehicles have passed their check; returns their missions, or why none was started."""
-    from gcs_plugin.fleet.preflight import ITEMS, Level, red_text
+) -> "tuple[dict[int, Mission], dict[int, Outcome]]":
+    """Wait until all vehicles have passed their check; returns their missions, and why none was sent on."""
+    from gcs_plugin.fleet.preflight import CONTINUED, ITEMS, Level, red_text
     from gcs_plugin.mission.exchange import Outcome, Verdict
-    from gcs_plugin.mission.track import Airspace
 
     allowed = _overrides(args.override, systems, ITEMS)
+    if args.action == "continue":
+        allowed = {s: items | (set(ITEMS) - CONTINUED) for s, items in allowed.items()}
     missions, stored, starts = _missions(backend, prepared, systems)
     zones = _with_bar(lambda report: backend.zones(systems, report))
     backend.hear_states(systems, args.wait)
@@ -287,20 +330,17 @@ def _ready(
         said = red
         backend.pump(0.5)
     if red:
-        others = "was not started, because others are not ready"
-        return {
-            s: Outcome(
-                ok=False, text=f"vehicle {s} {'was not started: ' + red[s] if s in red else others}", failure=failure
-            )
-            for s in systems
-            for failure in (Verdict.REFUSED if s in red else Verdict.NOT_SENT,)
-        }
+        not_sent = "was not started" if args.action == "start" else "was not sent on"
+        refused = {}
+        for s in systems:
+            why, failure = (red[s], Verdict.REFUSED) if s in red else ("others are not ready", Verdict.NOT_SENT)
+            refused[s] = Outcome(ok=False, text=f"vehicle {s} {not_sent}: {why}", failure=failure)
+        return {}, refused
     for check in checks:
         for item in check.items:
             if item.level is Level.WARNING and item.name not in _PASSING:
                 _say(args, f"warning: v{check.system} {item.name}: {item.reason}")
-    flown = {s: m for s in systems if (m := missions.get(s) or stored.get(s)) is not None}
-    return Airspace.of(flown, apart=prepared.needs.apart)
+    return {s: m for s in systems if (m := missions.get(s) or stored.get(s)) is not None}, {}
 
 
 def _changes(before: Mapping[int, str], red: Mapping[int, str]) -> list[str]:
@@ -355,17 +395,29 @@ def _check(backend: "Backend", args: argparse.Namespace, prepared: _Prepared, fo
 
 
 def _watch(backend: "Backend", args: argparse.Namespace, prepared: _Prepared, found: list[int]) -> int:
-    return _follow(backend, args, prepared.systems or found, True)
+    return _follow(backend, args, prepared.systems or found, True, [])
 
 
-def _follow(backend: "Backend", args: argparse.Namespace, systems: list[int], good: bool) -> int:
-    """Print events until all missions have ended; with --json all at once at the end."""
-    reported: list[FleetEvent] = []
+def _tell(
+    args: argparse.Namespace, events: "Sequence[FleetEvent]", systems: Sequence[int], told: "list[FleetEvent]"
+) -> None:
+    """Print new events of vehicles, with --json nothing; all have been told then."""
+    for event in events:
+        if event.system in systems and not args.json:
+            print(event.text, flush=True)
+    told += events
+
+
+def _follow(
+    backend: "Backend", args: argparse.Namespace, systems: list[int], good: bool, told: "list[FleetEvent]"
+) -> int:
+    """Print events until all missions have ended, without those that were told; with --json all at once at the end."""
+    reported, known = list["FleetEvent"](), {id(event) for event in told}
     print(f"following {', '.join(f'v{s}' for s in systems)}; Ctrl-C ends it, not the flights", file=sys.stderr)
 
     def tell(event: "FleetEvent") -> None:
         reported.append(event)
-        if not args.json:
+        if not args.json and id(event) not in known:
             print(event.text, flush=True)
 
     ended = backend.watch(systems, args.seconds, tell)

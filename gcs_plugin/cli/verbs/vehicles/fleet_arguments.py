@@ -14,7 +14,8 @@ _VERBS = {
     "upload": "put missions into vehicles and read them back",
     "start": "let vehicles fly their missions from the beginning (mode, arm, start)",
     "pause": "hold vehicles where they are",
-    "resume": "let vehicles go on with their missions",
+    "resume": "let paused vehicles go on with what they did: their missions, or their ways home",
+    "continue": "let vehicles in the air go on with missions that they broke off; checks battery, fence and failsafes",
     "rtl": "let vehicles fly home and land",
     "land": "let vehicles land where they are",
     "check": "check vehicles before their start",
@@ -32,6 +33,7 @@ _EXAMPLES = {
     ),
     "pause": "orthoswarm fleet pause --vehicle 3 --link udpin:0.0.0.0:14550",
     "resume": "orthoswarm fleet resume --vehicle 3 --link udpin:0.0.0.0:14550",
+    "continue": "orthoswarm fleet continue --vehicle 3 --link udpin:0.0.0.0:14550",
     "rtl": (
         "orthoswarm fleet rtl --link udpin:0.0.0.0:14550     (all at once)\n"
         "  orthoswarm fleet rtl --in-turn --link udpin:0.0.0.0:14550     (so that they do not meet on their ways)"
@@ -46,7 +48,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add them to the parser of the verb."""
     parser.epilog = (
         "A link is udpin:HOST:PORT (listen), udpout:HOST:PORT, tcp:HOST:PORT, or serial:DEVICE:BAUD; give --link\n"
-        f"again for more; without one, {DEFAULT_LINK}. Nothing moves a vehicle but start, resume, rtl\nand land.\n\n"
+        f"again for more; without one, {DEFAULT_LINK}. Nothing moves a vehicle but start, resume, continue,\n"
+        "rtl and land.\n\n"
         f"example:\n  {_EXAMPLES['list']}"
     )
     verbs = parser.add_subparsers(dest="action", required=True, metavar="VERB")
@@ -76,10 +79,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                 "--ready", type=float, default=60.0, metavar="S",
                 help="wait at most this long until all vehicles' own checks pass (default 60)",
             )  # fmt: skip
+        if name in ("start", "continue"):
             verb.add_argument(
                 "--override", action="append", default=[], metavar="ITEM",
-                help="start in spite of a red item of the check: battery, or v3:battery for one vehicle",
+                help="do it in spite of a red item of the check: battery, or v3:battery for one vehicle",
             )  # fmt: skip
+        if name == "continue":
+            verb.set_defaults(ready=0.0, max_height=LIMITS.legal_height_m, plan=None)
         if name == "rtl":
             verb.add_argument(
                 "--in-turn", action="store_true",

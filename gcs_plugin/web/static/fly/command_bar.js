@@ -8,7 +8,7 @@ import { commandLog } from "/static/fly/command_log.js";
 import { holdConfirm } from "/static/fly/hold.js";
 import { inAir, onLink } from "/static/fly/need.js";
 
-const TONES = { pause: "pause", resume: "go", rtl: "return", land: "land", start: "go" };
+const TONES = { pause: "pause", resume: "go", continue: "go", rtl: "return", land: "land", start: "go" };
 const DEGREE_M = 111_320;
 const NEAR_M = 15; // what a plan takes for one start
 let confirm = null;

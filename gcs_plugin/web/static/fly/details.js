@@ -28,7 +28,7 @@ export function detailsPanel() {
   const facts = make("dl", {}, ...FACTS.flatMap((key) => [terms[key], cells[key]]));
   const chosen = () => state.vehicles.get(state.selected);
   const verb = (key) => make("button", { type: "button", dataset: { verb: key }, onclick: () => chosen() && askOne(chosen(), key) }, t(`verb.${key}`));
-  const linked = make("div", { class: "verbs", role: "group", "aria-label": t("details.commands") }, ...["pause", "resume", "rtl", "land", "start"].map(verb));
+  const linked = make("div", { class: "verbs", role: "group", "aria-label": t("details.commands") }, ...["pause", "resume", "rtl", "land", "continue", "start"].map(verb));
   const start = linked.lastChild;
   const messages = make("ul", { class: "messages", "aria-label": t("details.messages"), tabindex: "0" });
   const draw = keyedList(messages, () => make("li", {}), (row, message) => {
