@@ -9,6 +9,7 @@ from gcs_plugin.backends.backend import ENDED, Backend, Report, coming_home
 from gcs_plugin.fleet.commands import Order
 from gcs_plugin.fleet.fleet import Fleet
 from gcs_plugin.fleet.fleet_events import FleetEvent
+from gcs_plugin.fleet.separation.separation_watch import number_name
 from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.mavlink import Message
 from gcs_plugin.links.transports import Link
@@ -50,18 +51,8 @@ class DirectBackend(Backend):
         return vehicle.reported and bool(vehicle.landed)
 
     def problems(self) -> list[str]:
-        """Broken links, rejected packets, signing and shared system ids."""
-        hub = self.fleet.hub
-        problems = [f"{side.link.name}: {side.link.problem}" for side in hub.sides if side.link.problem]
-        if hub.rejected:
-            problems.append(f"{hub.rejected} packets had no valid signature; check the signing key")
-        signing = [v for v in self.fleet.vehicles.values() if v.signs and not self.fleet.signed]
-        problems += [
-            f"{v.id} signs its messages and ignores unsigned ones; give its key with --signing-key" for v in signing
-        ]
-        shared = [v for v in self.fleet.vehicles.values() if v.claimants]
-        problems += [f"several vehicles use the system id of {v.id}: {', '.join(v.claimants)}" for v in shared]
-        return problems
+        """See `Fleet.problems`."""
+        return self.fleet.problems(number_name)
 
     def upload(self, missions: Mapping[int, Mission], report: Report) -> dict[int, Outcome]:
         """All uploads at the same time."""

@@ -53,7 +53,6 @@ from gcs_plugin.daemon.tak_feed import TakFeed
 from gcs_plugin.daemon.takeoffs import Takeoffs
 from gcs_plugin.daemon.vehicles import VehicleLinks
 from gcs_plugin.daemon.web_plans import Plans
-from gcs_plugin.fleet.fleet_problems import fleet_problems
 from orthoswarm.compute.workers import peak_rss_mb, prepare_process
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.frame import Frame
@@ -491,7 +490,7 @@ class Daemon:
     def problems(self) -> list[str]:
         """The present problems, in words."""
         own = (self.drawer.problem, self.drawer.overload, self.jobs.problem, self.tak.problem)
-        linked = [] if self.links is None else fleet_problems(self.links.fleet, self.links.name_of)
+        linked = [] if self.links is None else self.links.fleet.problems(self.links.name_of)
         return [text for text in (*own, *linked, *self.refused.problems(), *(s.problem for s in self.sources)) if text]
 
     def _rejected(self, frame: Frame, reason: str, misplaced: bool) -> None:

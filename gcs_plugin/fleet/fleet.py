@@ -289,6 +289,21 @@ class Fleet:
         """State of each vehicle's mission, as JSON values by system id; for `remembered` after a restart."""
         return {system: vehicle.detector.state() for system, vehicle in self.vehicles.items()}
 
+    def problems(self, name_of: Callable[[int], str]) -> list[str]:
+        """Broken links, rejected packets, vehicles that sign and those that share a system id; from any thread.
+
+        Args:
+            name_of: the id of a vehicle by its system id.
+        """
+        hub, vehicles = self.hub, list(self.vehicles.values())
+        problems = [f"{side.link.name}: {side.link.problem}" for side in hub.sides if side.link.problem]
+        if hub.rejected:
+            problems.append(f"{hub.rejected} packets had no valid signature; check the signing key")
+        signs = "signs its messages and ignores unsigned ones; give its key in ORTHOSWARM_SIGNING_KEY_FILE"
+        problems += [f"{name_of(v.system)} {signs}" for v in vehicles if v.signs and not self.signed]
+        shared = [(v.system, ", ".join(v.claimants)) for v in vehicles if v.claimants]
+        return problems + [f"several vehicles use the system id of {name_of(system)}: {who}" for system, who in shared]
+
     def behind(self, system: int) -> str:
         """How far a vehicle is behind its plan, in words; empty if it is not."""
         return self._reception.behind(system)

@@ -242,8 +242,8 @@ class Pilot:
     def pause(self, *, held: bool = False) -> Exchange:
         """Hold position. ArduPilot's own pause works between waypoints only, BRAKE everywhere.
 
-        A PX4 that is in HOLD already (`held`) may be under way to where another station has sent it, which HOLD does not
-        end: it is sent to where it is.
+        A PX4 that is in HOLD already (`held`) may be under way to where another station has sent it. HOLD does not end
+        that: it is sent to where it is.
         """
         ways: list[Exchange] = [self.set_mode(self.modes.hold)]
         if held and self.autopilot is Autopilot.PX4:

@@ -119,7 +119,7 @@ class Flight:
             self.seq = 0
 
     def set_mode(self, mode: int, *, anew: bool = False) -> None:
-        """Change the mode; leaving the mission's mode suspends the mission. A PX4 in HOLD goes on with it if not anew."""
+        """Change the mode; leaving the mission's mode suspends the mission. PX4's HOLD goes on with what it does."""
         if mode == self.mode == self.modes.hold and self.autopilot is Autopilot.PX4 and not anew:
             return
         was, self.mode = self.mode, mode
@@ -186,7 +186,7 @@ class Flight:
             seq, self._jumps = self._first, {}
         if self.state is State.COMPLETE:
             self.state = State.NOT_STARTED
-        self.seq = seq
+        self.seq, self.paused = seq, False
         if self.state is State.ACTIVE:
             self._run_from(seq)
         return True

@@ -99,7 +99,7 @@ def place(name):
     """A path of the environment."""
     if not os.environ.get(name):
         pytest.skip(f"{name} names no autopilot")
-    return os.environ[name]
+    return str(Path(os.environ[name]).resolve())
 
 
 def on_this_machine(command, places):

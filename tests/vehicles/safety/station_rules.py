@@ -27,8 +27,10 @@ class Heard:
     places: list = field(default_factory=list)  # (time, latitude, longitude)
     checksum: tuple = (-math.inf, 0)
     obeys_other: list = field(default_factory=list)  # (time, command)
-    counted: tuple = (-math.inf, 0)
-    items: dict = field(default_factory=dict)  # seq -> (time, item)
+    count: int = 0
+    items: dict = field(default_factory=dict)  # seq -> item
+    asked: float | None = None  # for its mission
+    read: tuple = (-math.inf, -math.inf, ())  # begun, ended, items
     seq: int | None = None
     counts: dict = field(default_factory=dict)
 
@@ -92,16 +94,23 @@ class Rules:
         elif kind == "COMMAND_ACK" and message.target_system == OTHER.system and message.result == 0:
             heard.obeys_other.append((now, int(message.command)))
         elif kind == "MISSION_COUNT" and message.target_system == GROUND_STATION.system and message.mission_type == 0:
-            heard.counted, heard.items = (now, int(message.count)), {}
+            heard.count = int(message.count)
         elif kind in ("MISSION_ITEM_INT", "MISSION_ITEM") and message.target_system == GROUND_STATION.system:
-            heard.items.setdefault(int(message.seq), (now, MissionItem.of(message)))
+            heard.items[int(message.seq)] = MissionItem.of(message)
 
     # --- rules 1, 2 and 5: what leaves the station ---
 
     def _sent(self, peer, data, expires=math.inf):
         for packet in Framer().feed(data):
-            if packet.message.get_type() == "COMMAND_LONG":
-                self._command(self.field.vehicles[peer], packet.message)
+            message, heard = packet.message, self.heard[self.field.vehicles[peer].system]
+            match message.get_type():
+                case "COMMAND_LONG":
+                    self._command(self.field.vehicles[peer], message)
+                case "MISSION_REQUEST_LIST" if heard.asked is None and message.mission_type == 0:
+                    heard.asked = self.field.now
+                case "MISSION_ACK" if message.mission_type == 0:  # it has read all
+                    heard.read = heard.asked, self.field.now, [heard.items[seq] for seq in range(heard.count)]
+                    heard.asked = None
         return self._put(peer, data, expires)
 
     def _command(self, vehicle, message):
@@ -147,16 +156,15 @@ class Rules:
         heard, now, delay = self.heard[vehicle.system], self.field.now, self.field.delay_s
         if given.mission is None:
             return
-        begun, count = heard.counted
-        items = [heard.items[seq] for seq in range(count) if seq in heard.items]
-        read = len(items) == count and max((at for at, _ in items), default=begun) >= now - LOOK_S
-        if read:
-            wrong = difference(given.mission, [item for _, item in items])
-            if wrong is not None:
-                self._breaks(1, f"{what}, it was read to hold another mission: {wrong.text}")
-        checked = now - heard.checksum[0] <= LOOK_S and heard.checksum[1] != 0 and vehicle.autopilot is not AP
+        begun, ended, items = heard.read
+        read = ended >= now - LOOK_S
+        wrong = difference(given.mission, items) if read else None
+        if wrong is not None:
+            self._breaks(1, f"{what}, it was read to hold another mission: {wrong.text}")
+        checked = now - heard.checksum[0] <= LOOK_S and heard.checksum[1] != 0
         if not read and not checked:
             self._breaks(1, f"{what}, its mission was not read in the last second")
+            return
         since = (begun if read else heard.checksum[0]) - 2 * delay - 0.05
         held = vehicle.held_since(since)
         same = any(difference(given.mission, list(items)) is None for items in held)
@@ -165,9 +173,11 @@ class Rules:
             self._breaks(1, f"{what}, it held another mission all the time since {now - since:.2f} s ago")
 
     def _evidence(self, vehicle, stop):
-        """When a stop was told to the station: by a heartbeat in its mode, or the vehicle's answer to the other one."""
+        """When a stop was told to the station: by a change of mode, or by the vehicle's answer to the other one."""
         heard = self.heard[vehicle.system]
-        shown = [at for at, mode, _ in heard.beats if at > stop.at and mode == stop.mode != stop.was]
+        changes = [(b[0], b[1]) for a, b in zip(heard.beats, heard.beats[1:]) if a[1] != b[1]]
+        sent = stop.at + self.field.delay_s
+        shown = [at for at, mode in changes if at >= sent and mode == stop.mode != stop.was]
         shown += [at for at, command in heard.obeys_other if at >= stop.at and command == stop.command]
         return min(shown, default=math.inf)
 
