@@ -390,8 +390,9 @@ def _too_low(vehicle: "Vehicle", needed_m: float) -> str:
 def _failsafe(vehicle: "Vehicle") -> Item:
     low, alone = (vehicle.settings.get(s) for s in (Setting.LOW_BATTERY, Setting.NO_STATION))
     spared = vehicle.settings.get(Setting.NO_STATION_EXCEPT)
-    if vehicle.flying and vehicle.failsafe:
-        return Item("failsafe", Level.RED, f"it is in a failsafe ({vehicle.severe_text or 'it does not say why'})")
+    if vehicle.flying and vehicle.had_failsafe:
+        text = f"it is in a failsafe, or was in one in this flight ({vehicle.severe_text or 'it says no more why'})"
+        return Item("failsafe", Level.RED, text)
     text = "" if alone is None else f"; without a ground station it {alone.action or 'goes on'} ({alone.name})"
     if alone is not None and alone.action and spared is not None and spared.spares_missions:
         text += f", but not on a mission ({spared.name})"

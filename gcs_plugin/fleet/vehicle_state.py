@@ -65,7 +65,7 @@ class Vehicle:
         touched: how often its mode or arming has changed, or it has obeyed another station.
         way: the mode in which it was last under way in this flight, not held; None on the ground, or not known.
         danger: what endangers it by itself, in words; empty if nothing does.
-        failsafe: whether it reports one (MAV_STATE_CRITICAL, MAV_STATE_EMERGENCY).
+        failsafe: whether it reports one (MAV_STATE_CRITICAL, MAV_STATE_EMERGENCY). had_failsafe: in this flight, ever.
         unbegun: it was given that mission here and has not begun it.
         photos: pictures that it has reported.
         received: packets; missed: packets lost according to its counters.
@@ -120,6 +120,7 @@ class Vehicle:
     way: int | None = None
     danger: str = ""
     failsafe: bool = False
+    had_failsafe: bool = False
     unbegun: bool = False
     mission_state: int = 0
     mission_seq: int = 0
@@ -373,6 +374,7 @@ class Vehicle:
         self.custom_mode, self.failsafe = int(m.custom_mode), int(m.system_status) in _CRITICAL
         if changed:
             self.read_at, self._mode_since = 0.0, self.time_boot_s
+        self.had_failsafe = self.armed and (self.had_failsafe or self.failsafe)
         if not self.armed:
             self.way = None
         elif self.mode not in HOLDS:

@@ -41,6 +41,11 @@ class Beside:
         ]
         return ack.result == dialect.MAV_RESULT_ACCEPTED
 
+    def jump(self, seq):
+        to = self.site.vehicle.address
+        message = dialect.MAVLink_mission_set_current_message(to.system, to.component, seq)
+        self.sim.handle(message, OTHER, self.site.place.world.clock.now)
+
     def store(self, mission):
         self.sim.store.items, self.sim.store.generation = list(mission.items), self.sim.store.generation + 1
 
@@ -87,36 +92,40 @@ class Apart(Beside):
         self.site.place.until(lambda: job.outcome is not None, 15.0)
         return job.outcome is not None and job.outcome.ok
 
+    def jump(self, seq):
+        to = self.site.vehicle.address
+        self.fleet.send(self.site.system, [dialect.MAVLink_mission_set_current_message(to.system, to.component, seq)])
+
     def store(self, mission):
         job = self.fleet.upload(self.site.system, mission)
         assert self.site.place.until(lambda: job.outcome is not None, 60.0) and job.outcome.ok, job.outcome
 
     def moves(self):
         assert self.mode("ready")
-        lat, lon = self.site.chart.to_degrees(400.0, 0.0)
-        to, alt = self.site.vehicle.address, self.site.vehicle.alt_m
+        self._reposition(*self.site.chart.to_degrees(400.0, 0.0), 0.0)
+
+    def _reposition(self, lat, lon, lower_m):
+        copter, vehicle = self.site.vehicle.autopilot is AP, self.site.vehicle
+        to, up = vehicle.address, vehicle.height_m - lower_m if copter else vehicle.alt_m - lower_m
         go = dialect.MAVLink_command_int_message(
-            to.system, to.component, 6, dialect.MAV_CMD_DO_REPOSITION, 0, 0, -1, 1, 0, math.nan,
-            round(lat * 1e7), round(lon * 1e7), 15.0 if self.site.vehicle.autopilot is AP else alt,
+            to.system, to.component, 6 if copter else 5, dialect.MAV_CMD_DO_REPOSITION, 0, 0, -1, 1, 0, math.nan,
+            round(lat * 1e7), round(lon * 1e7), up,
         )  # fmt: skip
-        if self.site.vehicle.autopilot is PX4:
-            go.frame = 5
         self.fleet.send(self.site.system, [go])
 
     def sinks(self):
-        """A joystick in place of a remote control, throttle at the bottom; its autopilot wants it before the mode."""
+        """A joystick in place of a remote control, throttle at the bottom; PX4 flies by none here and is sent down."""
+        if self.site.vehicle.autopilot is PX4:
+            self._reposition(self.site.vehicle.lat_deg, self.site.vehicle.lon_deg, 30.0)
+            return
         self._sticks()
         self.site.place.during = self._sticks
-        assert self.send(dialect.MAV_CMD_DO_SET_MODE, *mode_params(self.site.vehicle.autopilot, self.manual))
+        assert self.send(dialect.MAV_CMD_DO_SET_MODE, *mode_params(AP, self.manual))
 
     def _sticks(self):
-        to = self.site.vehicle.address
-        if self.site.vehicle.autopilot is AP:
-            values = (1500, 1500, 1200, 1500, 0, 0, 0, 0)
-            message = dialect.MAVLink_rc_channels_override_message(to.system, to.component, *values)
-        else:
-            message = dialect.MAVLink_manual_control_message(to.system, 0, 0, 200, 0, 0)
-        self.fleet.send(self.site.system, [message])
+        to, values = self.site.vehicle.address, (1500, 1500, 1200, 1500, 0, 0, 0, 0)
+        sticks = dialect.MAVLink_rc_channels_override_message(to.system, to.component, *values)
+        self.fleet.send(self.site.system, [sticks])
 
     def failsafe(self):
         from tests.vehicles.autopilots.test_sitl_faults import Parameters
@@ -295,7 +304,7 @@ def test_a_paused_return_is_resumed_as_a_return(pair, who):
     assert site.place.until(lambda: word(site) is Word.PAUSED, 20.0), flight_state(site.vehicle)
     assert "RTL" in flight_state(site.vehicle).text
     if who == "failsafe":
-        assert site.vehicle.failsafe and "failsafe" in danger_of(site.vehicle)
+        assert "ailsafe" in danger_of(site.vehicle) and site.vehicle.had_failsafe, danger_of(site.vehicle)
         print(danger_of(site.vehicle))
     site.place.until(lambda: False, 3.0)
     assert site.finish(site.fleet.resume(site.system)).ok
@@ -364,7 +373,7 @@ def test_a_last_item_that_another_station_makes_current_completes_nothing(pair):
     site, other = pair
     flying(site, legs=4)
     final = site.vehicle.detector.final_seq
-    assert other.send(dialect.MAV_CMD_DO_SET_MISSION_CURRENT, float(final))
+    other.jump(final)
     site.follow(lambda: not site.vehicle.armed, 200.0)
     assert site.place.until(lambda: "aborted" in site.kinds(), 20.0), site.kinds()
     assert "complete" not in site.kinds()
