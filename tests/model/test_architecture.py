@@ -62,8 +62,8 @@ def test_every_room_has_its_row(package):
     assert not silent, "give these a sentence in docs/architecture.md"
 
 
-def test_the_pages_stay_two():
-    assert len(TEXT.splitlines()) <= 140
+def test_the_pages_stay_three():
+    assert len(TEXT.splitlines()) <= 180
 
 
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
