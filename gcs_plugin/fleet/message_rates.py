@@ -44,7 +44,10 @@ class Rates:
     optional: dict[int, float] = field(default_factory=dict)
 
     def of(self, autopilot: Autopilot) -> "Rates":
-        """Without what only the other autopilot has: ArduPilot says so in a text to all stations, at each request."""
+        """The rates of the messages that an autopilot has.
+
+        ArduPilot answers a request for a message that it does not have with a text to all stations.
+        """
         foreign = _PX4_ONLY if autopilot is Autopilot.ARDUPILOT else _ARDUPILOT_ONLY
         wanted, optional = ({k: hz for k, hz in r.items() if k not in foreign} for r in (self.wanted, self.optional))
         return Rates(wanted, optional)

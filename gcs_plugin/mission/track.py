@@ -64,7 +64,7 @@ class Track:
     level_m: float | None = None
 
     def higher_m(self, other: "Track") -> float:
-        """How much higher it takes off than another one, metres; 0 where they may be level, by what receivers err."""
+        """How much higher its takeoff lies than another one's, metres; 0 within the error of receivers."""
         if self.level_m is None or other.level_m is None:
             return 0.0
         higher = self.level_m - other.level_m

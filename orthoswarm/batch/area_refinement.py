@@ -32,8 +32,10 @@ class _Solved:
     """What is kept of an area.
 
     Attributes:
-        own: its refinement, without its halo. places: vehicle -> float64 (N, 3), some camera positions in its frame, of
-            all its vehicles and those of its halo. failure: why none of them could be refined; empty if some were.
+        own: refinement of the area's own vehicles, without those of its halo.
+        places: vehicle -> float64 (N, 3), some of its camera positions as this area solved them; of the vehicles of the
+            halo, too, by which the area is tied to its neighbours.
+        failure: why no vehicle could be refined; empty if some were.
     """
 
     own: Refinement

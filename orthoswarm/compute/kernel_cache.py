@@ -48,7 +48,7 @@ def compiled_in(function: Function) -> bytes:
 
 @cache
 def _of_another_file(function: Function) -> bytes:
-    """The same, computed once: a file that another one imports from is complete."""
+    """`compiled_in` of a function of another file, computed once: a file that is imported from is loaded completely."""
     return compiled_in(function)
 
 

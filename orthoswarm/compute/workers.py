@@ -209,7 +209,10 @@ class Processes:
         source: Iterator[Item],
         ahead: int,
     ) -> None:
-        """Give the other processes work: what is to be continued if one is free, and items so that one more waits."""
+        """Submit work to the other processes: first continuations of tasks, if a process is free, then new items.
+
+        One item more than there are other processes is under way, so that none has to wait for its next one.
+        """
 
         def busy() -> int:
             return sum(not place.future.done() for place in queue)

@@ -32,7 +32,7 @@ class ArduPilotConfig:
     home_wait_s: float = from_zero(12.0)
     """Seconds of slowing down and waiting above home before it descends (measured: 10 to 14; 5 are RTL_LOIT_TIME)."""
     land_wait_s: float = from_zero(4.5)
-    """The same where a mission ends with LAND (measured: 3.8 to 5.1)."""
+    """Seconds of slowing down and waiting before it descends where a mission ends with LAND (measured: 3.8 to 5.1)."""
     landing_m_s: float = 0.5
     """Rate of the last part of the descent, metres per second (its LAND_SPEED)."""
     landing_below_m: float = from_zero(10.0)
@@ -42,10 +42,12 @@ class ArduPilotConfig:
     greatest difference from these times in flight (measured: 2.4 on the way, 3.4 on the ground), for wind, loads and
     other settings."""
     takeoff_slack_s: float = from_zero(3.5)
-    """The same around a start that vehicles share, as they take off (two differed by up to 3.0, as one took so long to
-    arm). Three times as much, as above, at each takeoff and landing would hold a swarm of one start on the ground."""
+    """How much later than planned one vehicle may be than another as they take off from a start that they share,
+    seconds (two differed by up to 3.0, as one took so long to arm). Three times as much, as above, at each takeoff and
+    landing would hold a swarm of one start on the ground."""
     landing_slack_s: float = from_zero(5.0)
-    """The same as they come home and land (two of one flight differed by up to 4.9)."""
+    """How much later than planned one may be than another as they come home and land, seconds (two of one flight
+    differed by up to 4.9)."""
     most_items: int = 650
     """Mission items that it stores, home among them (measured)."""
 
@@ -75,7 +77,7 @@ class Px4Config:
     home_wait_s: float = from_zero(10.0)
     """Seconds of slowing down and waiting above home before it descends (measured: 7 to 12, once 16)."""
     land_wait_s: float = from_zero(1.0)
-    """The same where a mission ends with LAND (measured: -0.5 to 3.8)."""
+    """Seconds of slowing down and waiting before it descends where a mission ends with LAND (measured: -0.5 to 3.8)."""
     landing_m_s: float = 0.7
     """Rate of the last part of the descent, metres per second (its MPC_LAND_SPEED)."""
     landing_below_m: float = from_zero(7.5)
@@ -84,9 +86,11 @@ class Px4Config:
     """How much later than planned one vehicle may be than another while they stay separated, seconds: more than two
     vehicles differed in flight (measured: up to 7 late at 10 m/s, up to 12 at 5 m/s, up to 6 early)."""
     takeoff_slack_s: float = from_zero(7.5)
-    """The same around a start that vehicles share, as they take off (two differed by up to 7.2)."""
+    """How much later than planned one vehicle may be than another as they take off from a start that they share,
+    seconds (two differed by up to 7.2)."""
     landing_slack_s: float = from_zero(18.0)
-    """The same as they come home and land (two differed by up to 18)."""
+    """How much later than planned one may be than another as they come home and land, seconds (two differed by up to
+    18)."""
     most_items: int = 1900
     """Mission items that it stores (the table of its dataman)."""
 

@@ -91,7 +91,7 @@ class MatchersConfig:
     agreement_px: float = 3.0
     """A tile agrees with a homography within this distance, pixels of the patch (chosen)."""
     coarse_agreement_px: float = 6.0
-    """The same for the first homography, from the matcher's own matches (chosen)."""
+    """A tile agrees with the first homography, of the matcher's own matches, within this distance, pixels (chosen)."""
     tile_search_px: tuple[int, int] = (10, 6)
     """Search radius of tiles about the homography so far in each round, pixels (chosen; not measured)."""
     least_tiles: int = 12

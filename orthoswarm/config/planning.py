@@ -77,7 +77,7 @@ class PlanningConfig:
     same_direction_deg: float = 1.0
     """Directions nearer to each other than this are tried once, degrees (chosen)."""
     same_grid_rad: float = 0.02
-    """The same for the grid of the spanning tree, radians (chosen)."""
+    """Directions of the spanning tree's grid nearer to each other than this are tried once, radians (chosen)."""
     ranked_spacings: float = 0.05
     """Outlines are simplified by so many line spacings before directions are ranked (chosen for its time)."""
     shortest_m: float = 0.01

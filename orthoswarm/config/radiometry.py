@@ -32,7 +32,7 @@ class RadiometryConfig:
     dark_level: float = 8.0
     """Thumbnail levels from 0 to here are partly clipped and say nothing about a gain (chosen)."""
     bright_level: float = 247.0
-    """The same for levels from here to 255 (chosen)."""
+    """Thumbnail levels from here to 255 are partly clipped and say nothing about a gain (chosen)."""
     beside_seam: float = 0.35
     """How far beside a seam, towards each picture's nadir, colours are compared as well: a share of the way to the
     nadir (chosen; not measured)."""

@@ -44,7 +44,7 @@ class StereoConfig:
     tallest_m: float = 60.0
     """Search range above the terrain, metres (chosen: a tower block)."""
     tallest_heights: float = 0.45
-    """The same as a share of the camera's height above the ground; the lower of both counts (chosen)."""
+    """Search range above the terrain as a share of the camera's height above it; the lower of both counts (chosen)."""
     wide_px: int = 128
     """Pairs with a search range of more disparities are matched at half size first, to find those that occur (chosen:
     for fewer the time saved is less than what it takes) ..."""

@@ -17,5 +17,5 @@ def mad_sigma(deviation: ArrayLike) -> float:
 
 
 def mad_sigmas(deviation: ArrayLike) -> Array:
-    """The same of each column of deviations (N, K): float64 (K,)."""
+    """Robust sigma (`mad_sigma`) of each column of deviations (N, K): float64 (K,)."""
     return np.asarray(MAD_TO_SIGMA * np.median(np.abs(deviation), axis=0), np.float64)

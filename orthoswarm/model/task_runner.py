@@ -11,10 +11,10 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True, slots=True)
 class Continued(Generic[T]):
-    """What a task returns whose second half may run elsewhere: its result is that of `function(item)`.
+    """The first half of a task returns this; the second half, `function(item)`, may run in another process.
 
-    Few long tasks leave processes idle at the end (three flights take two processes as long as four); halves do so for
-    half as long.
+    Its result is the task's. Few long tasks leave processes idle at the end (two processes take as long for three
+    flights as for four); with halved tasks they are idle for half as long.
     """
 
     function: "Callable[[Any], T | Continued[T]]"

@@ -47,11 +47,11 @@ class Place:
     grid: GroundGrid
 
     def store(self) -> TileStore:
-        """The tiles, mapped in small number: tasks walk from tile to tile."""
+        """The tiles; only a few are mapped into memory at a time, since a task goes from tile to tile."""
         return self._store(self.folder)
 
     def other_pictures(self) -> TileStore:
-        """Beside them tiles of what the other picture shows near each seam."""
+        """Tiles of the second picture's pixels near each seam, in a folder beside the others."""
         return self._store(self.folder / "seams")
 
     def _store(self, folder: Path) -> TileStore:

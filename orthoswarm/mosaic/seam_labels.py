@@ -82,7 +82,7 @@ def _claim(best, label, r0, r1, c0, c1, mark, x, y, gsd):  # type: ignore[no-unt
 
 @in_place_kernel
 def _contest(best, label, r0, r1, c0, c1, mark, position, rotation, lens, lattice, flat, gsd, tan2):  # type: ignore[no-untyped-def]
-    """The same for a frame that sees part of the block: pixel by pixel where it would be nearer."""
+    """Give a frame that sees part of a block the pixels to which it is nearer; gives the block's greatest distance."""
     worst = np.float32(0.0)
     limit = np.float32(tan2)
     step = np.float32(gsd)

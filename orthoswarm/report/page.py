@@ -346,7 +346,7 @@ def _expected(sigma_m: Sequence[float]) -> str:
 
 
 def _control_verdict(control: Mapping[str, Any], expected: str, offset: Mapping[str, Any] | None) -> dict[str, str]:
-    """The same for a map that surveyed points placed; `offset`: of these against the receivers."""
+    """The verdict on a map that surveyed points placed; `offset`: of these against the receivers."""
     count, shift = control["points"], control["shift_m"]
     points = "one surveyed point" if count == 1 else f"{count} surveyed points"
     text = (

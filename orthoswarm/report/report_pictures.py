@@ -41,7 +41,7 @@ class Picture:
         return Picture(self.rgb.copy(), self.seen, self.grid)
 
     def on(self, grid: GroundGrid) -> "Picture":
-        """The same on another grid, as far as it reaches."""
+        """Resampled to another grid, as far as it reaches."""
         bands, seen = _regrid(np.ascontiguousarray(self.rgb.transpose(2, 0, 1)), self.seen, self.grid, grid)
         return on_paper(bands.transpose(1, 2, 0).copy(), seen, grid)
 
@@ -120,7 +120,7 @@ class MapView:
         return cls(np.clip(gray + 0.5, 0, 255).astype(np.uint8), valid, full).on(grid)
 
     def on(self, grid: GroundGrid) -> "MapView":
-        """The same on another grid, as far as it reaches."""
+        """Resampled to another grid, as far as it reaches."""
         gray, valid = _regrid(self.gray[None], self.valid, self.grid, grid)
         return MapView(gray[0], valid, grid)
 

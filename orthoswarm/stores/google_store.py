@@ -1,8 +1,9 @@
-"""Google Cloud Storage through gcsfs, without what gcsfs does beside the requests that it is asked for.
+"""Google Cloud Storage through gcsfs, with gcsfs's own retries and lookups switched off.
 
-It repeats a request that fails up to five times in half a minute and prints each failure, though `requests.request`
-counts the attempts; it looks a file up before it fetches it; and its default file system first asks for the class of a
-bucket, over gRPC, which takes a minute where nobody answers. Buckets of the class Rapid cannot be used without that.
+By itself gcsfs repeats a failed request up to five times in half a minute and prints each failure, though
+`requests.request` counts the attempts here; it looks up each file before it fetches it; and its default file system
+first asks over gRPC for the class of a bucket, which takes a minute where nobody answers. Since that question is left
+out, buckets of the class Rapid cannot be used.
 """
 
 import inspect

@@ -62,8 +62,8 @@ def test_every_room_has_its_row(package):
     assert not silent, "give these a sentence in docs/architecture.md"
 
 
-def test_the_pages_stay_two():
-    assert len(TEXT.splitlines()) <= 140
+def test_the_pages_stay_three():
+    assert len(TEXT.splitlines()) <= 180
 
 
 DOCUMENTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -91,7 +91,7 @@ def test_documents_name_what_exists(path):
 
 
 QUOTED = re.findall(
-    r"Here, `([^`]+)`:\n\n```python\n(.*?)```", (ROOT / "docs" / "style.md").read_text(encoding="utf-8"), re.S
+    r"In `([^`]+)`:\n\n```python\n(.*?)```", (ROOT / "docs" / "style.md").read_text(encoding="utf-8"), re.S
 )
 
 
@@ -105,5 +105,5 @@ def test_quoted_code_is_what_stands_in_the_file(path, quote):
         at = found + len(part)
 
 
-def test_five_kinds_of_code_are_quoted():
-    assert len(QUOTED) == 5
+def test_all_code_of_the_style_is_quoted_from_a_file():
+    assert len(QUOTED) == (ROOT / "docs" / "style.md").read_text(encoding="utf-8").count("```python") > 0

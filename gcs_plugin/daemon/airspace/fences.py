@@ -73,6 +73,6 @@ class Fences:
         return {s: fence.zones for s, fence in list(self._fences.items()) if fence.zones is not None}
 
     def of(self, system: int) -> dict[str, Any] | None:
-        """`zones` and `read_s` (epoch seconds since when they are known so), None until the vehicle has told."""
+        """A vehicle's geofence: `zones`, and `read_s`, when they were first read (epoch seconds); None before that."""
         fence = self._fences.get(system)
         return None if fence is None else fence.document

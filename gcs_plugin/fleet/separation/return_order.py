@@ -165,12 +165,12 @@ class ReturnOrder:
         return self.waits.pop(system, None) is not None
 
     def again(self, system: int) -> None:
-        """A vehicle did not acknowledge that it returns: it has its turn once more."""
+        """Put a vehicle that did not acknowledge its return command back among those that wait."""
         self.waits[system] = ()
         self._sent.pop(system, None)
 
     def _left(self, aloft: Mapping[int, Aloft]) -> dict[int, str]:
-        """Those that wait and do not hold any more as they did when that had begun to show: what shows it."""
+        """Waiting vehicles that have left the mode or the place in which they held: system id -> which, in words."""
         found = {}
         for system in self.waits.keys() & self._held.keys() & aloft.keys():
             vehicle, (since, hold) = aloft[system], self._held[system]
@@ -281,7 +281,7 @@ def _return_speed_m_s(vehicle: "Vehicle") -> float:
 
 
 def _height_known(vehicle: "Vehicle") -> bool:
-    """Whether the height of its way is known: it has said at what height above home it returns, or comes down."""
+    """Whether the height of its way home is known: it has told its return height, or it is landing."""
     how = vehicle.settings.get(Setting.RETURN_TYPE)
     told = Setting.RETURN_HEIGHT in vehicle.settings and not (how is not None and how.returns)
     limits = fence_limits(vehicle) if vehicle.autopilot is Autopilot.ARDUPILOT else None
@@ -291,10 +291,10 @@ def _height_known(vehicle: "Vehicle") -> bool:
 
 
 def apart(one: Track, other: Track, *, heights: bool = True) -> bool:
-    """Whether two keep the distance or the height of a plan, also if one is late by what landings differ.
+    """Whether two vehicles keep a plan's distance or height, also if one is late by the slack of a landing.
 
-    A track of one place is a vehicle that stays there; the end of another one is on the ground. `heights`: they are
-    known, so that they count.
+    A track of one place is a vehicle that holds there; any other track ends on the ground. heights: whether heights are
+    known; if not, only the horizontal distance counts.
     """
     if not len(one.places) or not len(other.places):
         return True

@@ -61,7 +61,8 @@ class FeaturesConfig:
     klt_mismatch: float = 0.75
     """Largest mean square error of a window from picture to picture, as a share of its variance (chosen)."""
     klt_anchor_mismatch: float = 0.4
-    """The same against the first observation: stricter, or tracks would creep (chosen; not measured)."""
+    """Largest mean square error of a window against its first observation, as a share of its variance: stricter than
+    from picture to picture, or tracks would creep (chosen; not measured)."""
     klt_noise_variance: float = 4.0
     """Noise of the picture that is added to both, grey values squared (chosen; not measured)."""
 
@@ -141,7 +142,7 @@ class FeaturesConfig:
     """Pixels of the reduced picture on which features are found, whatever its shape (measured on four real flights: 31
     to 53 ms a photo)."""
     sift_fine_pixels: int = 640 * 480
-    """The same for photos that matched too few others (measured likewise)."""
+    """Pixels of the reduced picture for photos that matched too few others (measured likewise)."""
     sift_contrast: float = 0.02
     """Contrast threshold of SIFT (Lowe 2004: 0.03); lower, because ground is of little contrast (chosen on four real
     flights)."""

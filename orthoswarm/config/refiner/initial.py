@@ -14,7 +14,7 @@ class InitialConfig:
     pair_reach_share: float = 0.68
     """Photos nearer than this share of the footprint's diagonal may overlap (chosen on four real flights)."""
     weak_reach_share: float = 0.8
-    """The same for photos with few matches (chosen; not measured)."""
+    """Photos with few matches are tried with others within this share of the diagonal (chosen; not measured)."""
     pairs_first: int = 3
     """Neighbours that each photo tries first, before the tilt is known (chosen; not measured)."""
     pairs_usual: int = 6
@@ -138,7 +138,8 @@ class InitialConfig:
     relative_height_sigma: float = 0.03
     """Relative sigma of a recorded height within its segment (chosen; not measured)."""
     relative_level_sigma: float = 0.15
-    """The same of a photo without one: about as level as its segment (chosen; not measured)."""
+    """Relative sigma of the height of a photo without a recorded one: about as level as its segment (chosen; not
+    measured)."""
     height_known_share: float = 0.5
     """Share of a segment's photos that must record a height (chosen; not measured)."""
     height_least_m: float = 2.0
@@ -164,7 +165,7 @@ class InitialConfig:
     link_sigma: float = 0.15
     """Relative sigma of a segment's ground scale about its lens's (chosen; not measured)."""
     link_height_sigma: float = 0.03
-    """The same where recorded heights scale it (chosen; not measured)."""
+    """Relative sigma of a segment's ground scale where recorded heights scale it (chosen; not measured)."""
     lens_scale_sigma: float = 0.5
     """Relative sigma of a lens's ground scale (chosen; not measured)."""
 

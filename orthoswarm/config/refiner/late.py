@@ -38,7 +38,7 @@ class LateConfig:
     """Sigma of the start's position, an axis, metres: loose, it holds only what the points do not determine
     (chosen)."""
     attitude_sigma_rad: float = 0.05
-    """The same of its attitude, radians: 3 degrees (chosen)."""
+    """Sigma of the start's attitude, radians: 3 degrees, loose like that of the position (chosen)."""
     corner_height_m: float = 0.5
     """How far corners stand above the terrain that they are taken to lie on, all alike, metres (measured: 0.1 to
     0.5)."""

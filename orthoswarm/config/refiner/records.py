@@ -39,7 +39,8 @@ class RecordsConfig:
     """Error of the ground point at a photo's centre through its recorded attitude, as a share of the height: 1.7
     degrees (chosen; not measured)."""
     untagged_tilt_sigma: float = 0.1
-    """The same without a recorded attitude: 6 degrees of sway about straight down (chosen; not measured)."""
+    """Error of the ground point at the centre of a photo without a recorded attitude, as a share of the height: 6
+    degrees of sway about straight down (chosen; not measured)."""
     pause_s: float = 60.0
     """Photos farther apart in time do not follow each other: the vehicle did something else between (chosen)."""
 

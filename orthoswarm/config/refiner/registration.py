@@ -14,7 +14,7 @@ class RegistrationConfig:
     strip_pictures: int = 25
     """Pictures of a strip in which corners are followed (chosen; not measured)."""
     strip_pictures_sparse: int = 3
-    """The same of photos that are matched in pairs: some hundred metres of ground (chosen; not measured)."""
+    """Pictures of a strip of photos that are matched in pairs: some hundred metres of ground (chosen; not measured)."""
     strip_across_px: float = 150.0
     """Width of a picture in a strip, pixels (chosen for cost)."""
     strip_gsd_m: tuple[float, float] = (0.2, 2.5)
@@ -100,15 +100,15 @@ class RegistrationConfig:
     first_tie_reach_m: float = 14.0
     """How far a tie point is searched on the map after the coarse registration, to each side; chosen, not measured."""
     tie_reach_m: float = 5.0
-    """The same once the flight lies on the map (chosen; not measured)."""
+    """How far a tie point is searched once the flight lies on the map, metres to each side (chosen; not measured)."""
     first_tie_cell_m: float = 50.0
     """One tie point a leg in each cell of this size, metres, after the coarse registration (chosen for cost)."""
     first_tie_cell_sparse_m: float = 25.0
-    """The same for photos that are matched in pairs."""
+    """`first_tie_cell_m` of photos that are matched in pairs (chosen for cost)."""
     tie_cell_m: float = 30.0
-    """The same once the flight lies on the map (chosen for cost)."""
+    """One tie point a leg in each cell of this size, metres, once the flight lies on the map (chosen for cost)."""
     tie_cell_sparse_m: float = 15.0
-    """The same for photos that are matched in pairs."""
+    """`tie_cell_m` of photos that are matched in pairs (chosen for cost)."""
     map_window_share: float = 0.7
     """Least share of a patch's search window that the map covers (chosen; not measured)."""
     patch_share: float = 0.85
@@ -159,7 +159,7 @@ class RegistrationConfig:
     mode_scales_m: tuple[float, float, float, float, float] = (0.5, 0.5, 0.35, 0.25, 0.25)
     """Scales of the reweighted means that refine it, metres (chosen; not measured)."""
     line_scales_m: tuple[float, float, float, float, float, float] = (4.0, 2.0, 1.0, 0.7, 0.5, 0.5)
-    """The same for the line of shifts along a leg (chosen; not measured)."""
+    """Scales of the reweighted fits of the line of shifts along a leg, metres (chosen; not measured)."""
     line_fewest: int = 6
     """Fewest tie points of a leg that must agree on such a line (chosen) ..."""
     line_least_share: float = 0.6
@@ -171,7 +171,7 @@ class RegistrationConfig:
     first_tie_scales: tuple[float, float, float, float] = (36.0, 9.0, 6.0, 6.0)
     """Robust scales of the first tie points in its steps (chosen; not measured)."""
     tie_scales: tuple[float, float] = (9.0, 6.0)
-    """The same of the next ones, in the first step and in all others (chosen; not measured)."""
+    """Robust scales of later tie points, in the first step and in all others (chosen; not measured)."""
     second_steps: int = 3
     """Steps with the second tie points (chosen)."""
     renewed_steps: int = 4

@@ -96,8 +96,8 @@ class StrategyConfig:
     """Sigma of the focal length of followed pictures without a height, a share: relief and tilt tell it (15 flights:
     2.5 % rms)."""
     one_way_fov_sigma_deg: float = 5.0
-    """The same for photos on one straight line, degrees: tilt, height and lens cannot be separated (11 such legs of a
-    suburb: 5.6 rms)."""
+    """Sigma of the field of view of photos on one straight line, degrees: tilt, height and lens cannot be separated (11
+    such legs of a suburb: 5.6 rms)."""
     decentred_share: float = 0.02
     """What tangential distortion, which is not modelled, does to the focal length of a strong lens, a share (measured:
     1.6 %)."""
@@ -126,16 +126,18 @@ class StrategyConfig:
     """Sigma of a receiver's drift over one straight run, metres: tilt and drift cannot be separated there. Without
     this prior single legs were up to 12 m off on the map or not found; with it 2 to 4 m (simulated flights)."""
     held_drift_bend_m: float = 0.3
-    """The same for the second difference of the drift's knots, metres (measured together)."""
+    """Sigma of the second difference of the drift's knots over that run, metres (measured together)."""
     held_lag_s: float = 0.2
-    """The same for the delay of positions behind the shutter, seconds (measured together)."""
+    """Sigma of the delay of positions behind the shutter over that run, seconds (measured together)."""
     one_way_sigma_share: float = 0.025
     """Error of a leg's coarse placement on the map as a share of the height (simulated flights: 2 to 4 m)."""
     many_ways_sigma_share: float = 0.014
-    """The same from two legs in opposite directions on (simulated flights: 0.5 to 2 m)."""
+    """Error of the coarse placement with two or more legs in opposite directions, a share of the height (simulated
+    flights: 0.5 to 2 m)."""
     odd_focal_change: float = 0.2
     """A placement whose focal length left its start by more than this, as a logarithm, is not shown (chosen)."""
     odd_height_change: float = 0.2
-    """The same for the height (chosen; not measured)."""
+    """A placement whose height changed by more than this, as a logarithm, is not shown (chosen; not measured)."""
     odd_turn_deg: float = 12.0
-    """The same for the attitude where tilt was recorded, degrees (chosen; not measured)."""
+    """A placement whose attitude turned by more than this where tilt was recorded, degrees, is not shown (chosen; not
+    measured)."""

@@ -278,7 +278,7 @@ class _Drawing:
         return reduce_rgba(rgba, 2)
 
     def _of_block(self, x: int, y: int) -> Generator[Quad, None, Bytes | None]:
-        """The same, of a tile of the zoom that is warped."""
+        """The quads of a tile of the zoom that is warped, and of all below it; returns the tile itself."""
         rgba = self._warped(x, y)
         self._done += 1
         if self._progress is not None:

@@ -65,11 +65,11 @@ class Field:
     obstacles: Geometry
 
     def turned(self, frame: Turned) -> "Field":
-        """The same in a turned frame."""
+        """Ground and obstacles in a turned frame."""
         return Field(frame.turn(self.ground), frame.turn(self.obstacles))
 
     def swapped(self) -> "Field":
-        """The same with x and y exchanged."""
+        """Ground and obstacles with x and y exchanged."""
         return Field(shapely.transform(self.ground, _swap), shapely.transform(self.obstacles, _swap))
 
 

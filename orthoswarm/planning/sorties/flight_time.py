@@ -69,7 +69,7 @@ class Motion:
         return np.asarray(self.stop_s * np.sin(0.5 * angle_rad) * slowed**2)
 
     def without_turns(self) -> "Motion":
-        """The same vehicle, if turns took no time."""
+        """The motion of this vehicle if turns took no time."""
         return replace(self, autopilot=replace(self.autopilot, acceleration_m_s2=math.inf))
 
     @property

@@ -87,7 +87,10 @@ def _subtract_block(band, row, column, left, right):  # type: ignore[no-untyped-
 
 @in_place_kernel
 def _subtract_own_block(band, row, left, right, both):  # type: ignore[no-untyped-def]
-    """The same on the diagonal; both: the transposed product, too, of another observation by the same camera."""
+    """Subtract left (6, 3) times the transpose of right (6, 3) from a block on the diagonal of a lower band.
+
+    both: subtract the transposed product, too, for another observation by the same camera.
+    """
     for a in range(6):
         for q in range(6):
             value = left[a, 0] * right[q, 0] + left[a, 1] * right[q, 1] + left[a, 2] * right[q, 2]

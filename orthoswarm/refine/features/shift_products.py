@@ -147,7 +147,7 @@ def add_products(template, window, score):  # type: ignore[no-untyped-def]
 
 @in_place_kernel
 def add_wanted_products(template, window, score, wanted):  # type: ignore[no-untyped-def]
-    """The same, only for the blocks of ROWS x LANES shifts that are wanted: bool (rows / ROWS, columns / LANES)."""
+    """`add_products` for the wanted blocks of ROWS x LANES shifts alone: bool (rows / ROWS, columns / LANES)."""
     channels, lines, n = template.shape
     rows, columns = score.shape
     step, blocks = window.shape[2], columns // LANES

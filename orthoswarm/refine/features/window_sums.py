@@ -1,7 +1,8 @@
-"""Sums over the windows of the flow, in vector registers: one lane a column of the window.
+"""Sums over the windows of the Lucas-Kanade tracker in vector registers: one lane for each column of the window.
 
-A compiled loop adds one number after the other, since another order rounds differently from run to run; here the order
-is fixed and sixteen columns are added at once (see `shift_products` for why this is written in LLVM's terms).
+The compiler does not reorder the additions of a loop, since that changes rounding, so it adds one number after the
+other. Here sixteen columns are added at once, in an order that is always the same (see `shift_products` for why this is
+written in LLVM's terms).
 """
 
 from collections.abc import Sequence
@@ -16,7 +17,7 @@ SIZE = 15
 WIDE = SIZE + 2
 """Side of a template: the window and the pixels around it, for its gradients."""
 LANES = 16
-"""Columns that are added at once, the last one for nothing."""
+"""Columns that are added at once: those of a window and one that is not used."""
 
 _FLOAT, _INT = ir.FloatType(), ir.IntType(32)
 _VECTOR = ir.VectorType(_FLOAT, LANES)

@@ -311,7 +311,7 @@ def first_ties(flight: Flight, surface: GroundModel, ground: LoadedMap) -> MapMa
 
 
 def small_ties(flight: Flight, surface: GroundModel, ground: LoadedMap, half_m: float) -> MapMatches:
-    """The same with small patches that touch each other: more evidence where few large ones fit; too noisy for ties."""
+    """Matches of small patches that touch each other: more evidence where few large ones fit, too noisy as ties."""
     reach = active().registration.first_tie_reach_m
     return clear_matches(tie_matches(flight, surface, ground, cell_m=2.0 * half_m, reach_m=reach, half_m=half_m))
 

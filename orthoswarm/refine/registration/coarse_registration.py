@@ -21,8 +21,8 @@ class CoarseFit:
 
     Attributes:
         correction: float64 (N, 2), metres to add to each camera. matches: all windows found. inlier: bool for each.
-        confidence: share of the windows that agree; where only all together were found, how far the second peak of
-            their sum is below the first.
+        confidence: share of the windows that agree. If only the sum of their correlations has a peak: 1 minus the ratio
+            of its second peak to the first.
     """
 
     correction: Array

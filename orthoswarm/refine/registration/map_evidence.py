@@ -47,7 +47,7 @@ def agreement_probability(agree: int, count: int, within_m: float, reach_m: floa
 
 
 def _group(shift: Array, along: Array, reach_m: float, tolerances: tuple[float, ...]) -> float:
-    """The same for one group: lines through two of its ties, or where all are at one place shifts of one."""
+    """The evidence of one group by its best line through two ties, or by one tie's shift if all are at one place."""
     count = len(shift)
     if np.ptp(along) > 0:
         i, j = np.triu_indices(count, 1)

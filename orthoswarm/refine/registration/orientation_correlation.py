@@ -272,7 +272,7 @@ def stacked(strips: Sequence[Strip]) -> tuple[Array, float, float] | None:
 
 
 def by_learning(strip: Strip) -> Found | None:
-    """The same by learned matching, some seconds a strip: the second opinion where edges find no agreement."""
+    """Where a strip lies on the map by learned matching, some seconds a strip: for strips whose edges do not agree."""
     from orthoswarm.matchers.second_opinion import second_opinion
 
     shift = second_opinion(strip.gray, strip.valid, strip.ground, known=strip.known, reach=strip.reach)

@@ -50,7 +50,7 @@ def with_tall_surfaces(
 
 
 def _finer(ground: Terrain, parts: int) -> Terrain:
-    """The same ground with each step subdivided."""
+    """A ground with its nodes closer: each step divided into so many parts."""
     rows, columns = ((n - 1) * parts + 1 for n in ground.z.shape)
     step = ground.step_m / parts
     east, north = ground.west + step * np.arange(columns), ground.south + step * np.arange(rows)
