@@ -15,9 +15,9 @@ from gcs_plugin.fleet.link_hub import Hub, Side
 from gcs_plugin.fleet.message_rates import Rates, Streams
 from gcs_plugin.fleet.routes import LongText, Route
 from gcs_plugin.fleet.separation.separation_watch import SeparationWatch, apart_text, near_text
-from gcs_plugin.fleet.telemetry_check import has_place, possible
+from gcs_plugin.fleet.telemetry_check import possible
 from gcs_plugin.fleet.vehicle_state import Vehicle
-from gcs_plugin.links.mavlink import Autopilot, Message, dialect, is_vehicle
+from gcs_plugin.links.mavlink import Autopilot, Message, dialect, has_place, is_vehicle
 from gcs_plugin.links.packets import Packet
 from gcs_plugin.links.transports import Peer
 from gcs_plugin.mission.completion import RELEVANT, CompletionDetector, MissionEvent, Phase

@@ -16,11 +16,6 @@ def possible(message: Message) -> bool:
     return check is None or check(message)
 
 
-def has_place(message: Message) -> bool:
-    """True for a position; autopilots say latitude 0 and longitude 0 until they know where they are."""
-    return bool(message.lat or message.lon)
-
-
 def _degrees(lat: float, lon: float) -> bool:
     return -90.0 <= lat <= 90.0 and -180.0 <= lon <= 180.0
 

@@ -10,8 +10,7 @@ from gcs_plugin.fleet.autopilot_settings import CHECKED, NEWER, PARAMETERS, Ques
 from gcs_plugin.fleet.flight_state import flight_state
 from gcs_plugin.fleet.message_rates import BATTERY_STATUS, GLOBAL_POSITION_INT, GPS_RAW_INT, SYS_STATUS, Streams
 from gcs_plugin.fleet.routes import Route, Routes
-from gcs_plugin.fleet.telemetry_check import has_place
-from gcs_plugin.links.mavlink import Autopilot, Message, dialect
+from gcs_plugin.links.mavlink import Autopilot, Message, dialect, has_place
 from gcs_plugin.mission.command_dialogues import Pilot
 from gcs_plugin.mission.completion import CompletionDetector
 from gcs_plugin.mission.exchange import Address

@@ -37,6 +37,7 @@ __all__ = [
     "Message",
     "command_name",
     "dialect",
+    "has_place",
     "is_autopilot",
     "is_vehicle",
 ]
@@ -57,6 +58,11 @@ class Autopilot(enum.Enum):
 def is_autopilot(heartbeat: Message) -> bool:
     """True for the HEARTBEAT of a flight controller; cameras, companions and ground stations send others."""
     return bool(heartbeat.autopilot != dialect.MAV_AUTOPILOT_INVALID and heartbeat.type not in _NO_VEHICLES)
+
+
+def has_place(position: Message) -> bool:
+    """True for a position; autopilots say latitude 0 and longitude 0 until they know where they are."""
+    return bool(position.lat or position.lon)
 
 
 def is_vehicle(heartbeat: Message, component: int) -> bool:

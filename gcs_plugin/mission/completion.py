@@ -19,7 +19,7 @@ import enum
 from collections.abc import Mapping
 from typing import Any, Final
 
-from gcs_plugin.links.mavlink import Autopilot, Message, dialect, is_autopilot
+from gcs_plugin.links.mavlink import Autopilot, Message, dialect, has_place, is_autopilot
 from gcs_plugin.mission.flown_items import FlownItems
 from gcs_plugin.mission.items import Ending, Mission, ending_of, final_nav
 
@@ -157,7 +157,7 @@ class CompletionDetector:
         return untold + self._events_of(message)
 
     def _position(self, message: Message) -> list[MissionEvent]:
-        if self.flown is not None and self.phase is Phase.ACTIVE and (message.lat or message.lon):
+        if self.flown is not None and self.phase is Phase.ACTIVE and has_place(message):
             self.flown.position(message.time_boot_ms / 1e3, message.lat / 1e7, message.lon / 1e7)
         return self._complete() if self._judging else []
 

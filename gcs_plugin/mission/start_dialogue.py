@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from typing import Final
 
 from gcs_plugin.config import COMMAND
-from gcs_plugin.links.mavlink import Autopilot, Message, dialect, is_autopilot
+from gcs_plugin.links.mavlink import Autopilot, Message, dialect, has_place, is_autopilot
 from gcs_plugin.mission.command_dialogues import Command, InOrder, Pilot, Several
 from gcs_plugin.mission.comparison import difference
 from gcs_plugin.mission.download import AT_ONCE, MissionDownload
@@ -138,7 +138,7 @@ class LastLook(Exchange):
         kind = message.get_type()
         if kind == "HEARTBEAT" and is_autopilot(message):
             self._state(int(message.custom_mode), bool(message.base_mode & ARMED), now)
-        elif kind == "GLOBAL_POSITION_INT" and self.place is not None:
+        elif kind == "GLOBAL_POSITION_INT" and self.place is not None and has_place(message):
             away = distance_m(message.lat / 1e7, message.lon / 1e7, *self.place)
             if away > MOVED_M:
                 self._stays(f"was moved by {away:.0f} m since its start was given")
@@ -244,10 +244,14 @@ class Guarded(Exchange):
         """Hand a message on; its acknowledgement may be lost, and its state tells all the same."""
         if self.outcome is not None:
             return []
-        shown = self._ordered and message.get_type() == "HEARTBEAT" and is_autopilot(message)
-        if shown and (message.custom_mode, bool(message.base_mode & ARMED)) == self.obeyed:
-            self._end(True, f"vehicle {self.vehicle.system}: {self.order.verb} accepted")
-            return []
+        if self._ordered and message.get_type() == "HEARTBEAT" and is_autopilot(message):
+            mode, name = int(message.custom_mode), f"vehicle {self.vehicle.system}"
+            if (mode, bool(message.base_mode & ARMED)) == self.obeyed:
+                self._end(True, f"{name}: {self.order.verb} accepted")
+                return []
+            if mode not in (self.look.mode, self.look.was, self.obeyed[0]):
+                self._end(False, f"{name} was put into {self.look.modes.name(mode)} meanwhile, so it was not started")
+                return []
         return self._follow(self._step.feed(message, now), now)
 
     def tick(self, now: float) -> list[Message]:
@@ -272,8 +276,7 @@ class Guarded(Exchange):
                 if not outcome.ok:
                     self._end(False, outcome.text, outcome.verdict)
                     return messages
-                order = replace(self.order)
-                messages, self._ordered = messages + self._next(order, now), True
+                messages, self._ordered = messages + self._next(replace(self.order), now), True
             elif outcome.ok or now + FRESH_S >= self.expires:
                 self._end(outcome.ok, outcome.text, outcome.verdict)
                 return messages
