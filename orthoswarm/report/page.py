@@ -215,6 +215,8 @@ def _edge_crops(best: Path, ortho: Picture, there: MapView, basemap: Basemap) ->
     overview = view_grid(epsg, there.grid.bounds, 400)
     seen = ortho.on(overview).seen.astype(np.float32)
     size = max(3, int(side * gsd / overview.gsd_m))
+    if size > 2 * max(seen.shape):  # a map of huge pixels: no such part lies in it, and summing over it takes minutes
+        return []
     edges = map_edges(there.on(overview)).astype(np.float32) * seen
     full = cv2.boxFilter(seen, -1, (size, size), borderType=cv2.BORDER_CONSTANT) > 0.9
     score = cv2.boxFilter(edges, -1, (size, size), borderType=cv2.BORDER_CONSTANT) * full
