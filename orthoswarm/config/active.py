@@ -22,7 +22,6 @@ from orthoswarm.config.refiner.bundle import BundleConfig
 from orthoswarm.config.refiner.features import FeaturesConfig
 from orthoswarm.config.refiner.flight import FlightConfig
 from orthoswarm.config.refiner.initial import InitialConfig
-from orthoswarm.config.refiner.late import LateConfig
 from orthoswarm.config.refiner.paper import PaperConfig
 from orthoswarm.config.refiner.records import RecordsConfig
 from orthoswarm.config.refiner.registration import RegistrationConfig
@@ -48,7 +47,6 @@ class Config:
     flight: FlightConfig = field(default_factory=FlightConfig)
     surface: SurfaceConfig = field(default_factory=SurfaceConfig)
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
-    late: LateConfig = field(default_factory=LateConfig)
     strategy: StrategyConfig = field(default_factory=StrategyConfig)
     ingest: IngestConfig = field(default_factory=IngestConfig)
     pairing: PairingConfig = field(default_factory=PairingConfig)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Final
 
 import numpy as np
 
@@ -11,6 +12,8 @@ from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.placement import MapWindow, PlacedFrame, Solution, Terrain
 from orthoswarm.mosaic.footprint import footprint_boxes
+
+FLAT_RELIEF_M: Final = 0.5  # relief of this standard deviation or less is noise to the adjustment's height prior
 
 
 def placed_bounds(placed: Sequence[PlacedFrame], low: float, high: float) -> BoundingBox:
@@ -60,7 +63,7 @@ def from_takeoff(
         return placed, level
     config = active().mosaic
     ground = terrain.bare_ground().height(np.array([p.camera.nadir for p in placed]))
-    relief = float(np.sqrt(max(0.0, ground.var() - active().surface.flat_relief_m ** 2)))  # less is the surface's noise
+    relief = float(np.sqrt(max(0.0, ground.var() - FLAT_RELIEF_M**2)))  # less is the surface's noise
     recorded = [p.camera.position[2] - p.frame.fix.height_m for p in placed if p.frame.fix.height_m is not None]
     zeros = [(level, config.ground_level_sigma_m**2 + relief**2)]
     if recorded:

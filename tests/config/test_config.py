@@ -132,7 +132,6 @@ def test_a_number_out_of_range_is_refused_and_the_range_said(stage, line, allowe
         ("ardupilot", "speed_share", 1.001),
         ("coverage", "blurred_share", 0),
         ("coverage", "blurred_share", 1),
-        ("registration", "oblique_sigma_share", 2.5),  # by its default a factor
         ("ingest", "from_horizon_deg", -40.0),
         ("matchers", "tile_search_px", (6, 10)),  # two rounds, no bounds
         ("radiometry", "neighbour_places", ((0.1, 0.5, 0.9), (0.4, 0.6))),

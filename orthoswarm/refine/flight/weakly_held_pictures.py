@@ -1,5 +1,7 @@
 """Pictures with too few observations (water, haze, blur), which are placed between their neighbours."""
 
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -7,6 +9,8 @@ from orthoswarm.config import active
 from orthoswarm.refine.flight.relative_block import Flight
 
 Array = NDArray[np.float64]
+
+_SPARSE_FEWEST_OBSERVATIONS: Final = 12  # photos matched in pairs with fewer observations are weakly determined
 
 
 def observations_per_camera(flight: Flight) -> NDArray[np.int64]:
@@ -19,7 +23,7 @@ def observations_per_camera(flight: Flight) -> NDArray[np.int64]:
 
 def weakly_held(flight: Flight) -> NDArray[np.bool_]:
     """Whether too few observations hold a camera: bool (N,)."""
-    fewest = active().registration.sparse_fewest_observations if flight.sparse else active().flight.held_observations
+    fewest = _SPARSE_FEWEST_OBSERVATIONS if flight.sparse else active().flight.held_observations
     return np.asarray(observations_per_camera(flight) < fewest)
 
 

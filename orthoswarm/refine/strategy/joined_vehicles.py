@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import replace
 from functools import partial
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from orthoswarm.config import active
 from orthoswarm.model.placement import MapWindow
 from orthoswarm.model.plane_similarity import Similarity
 from orthoswarm.model.task_runner import Run
+from orthoswarm.refine.bundle.covariance import RECEIVER_COMMON_SIGMA_M
 from orthoswarm.refine.registration.block_state import VehicleState, lies_on_map
 from orthoswarm.refine.registration.coarse_map import is_coarse, shift_on_coarse_map
 from orthoswarm.refine.registration.map_offset import had_corrections
@@ -26,6 +28,9 @@ from orthoswarm.refine.surface.vehicle_ground import fit_surface
 Array = NDArray[np.float64]
 Block = list[int]
 Join = Callable[[tuple[VehicleState, list[VehicleState]]], VehicleState]
+
+_DATUM_SHIFT_SIGMA_M: Final = 100.0  # what is known of the shift of such a block before its receivers are asked
+_DATUM_ROUNDS: Final = 5  # rounds of reweighting, so that a receiver that is far off counts little
 
 
 def join_unmapped(
@@ -97,13 +102,13 @@ def _back_to_receivers(out: list[VehicleState], block: Block) -> None:
     now, alone = (np.array([o[i] for o in own]) for i in (0, 1))
     weight = np.array([1.0 / o[3] ** 2 for o in own])
     level_sigma = config.strategy.takeoff_level_sigma_m / max(float(np.median(now[:, 2])), 1.0)
-    shift_sigma = config.registration.datum_shift_sigma_m
+    shift_sigma = _DATUM_SHIFT_SIGMA_M
     turn = float(np.average([o[2] for o in own], weights=weight))
     prior = np.array([0.0, 0.0, turn, float(np.mean(alone[:, 2] / now[:, 2])) - 1.0])
     prior_sigma = np.array([shift_sigma, shift_sigma, 1.0 / np.sqrt(weight.sum()), level_sigma])
-    common = config.registration.receiver_common_sigma_m
+    common = RECEIVER_COMMON_SIGMA_M
     sigma_m, counts = np.array([out[k].receiver_sigma_m for k in block]), np.ones(len(block))
-    for _ in range(config.registration.datum_rounds):
+    for _ in range(_DATUM_ROUNDS):
         similarity = Similarity.between(
             now[:, :2],
             alone[:, :2],

@@ -21,7 +21,13 @@ from orthoswarm.refine.bundle.covariance import (
 from orthoswarm.refine.bundle.map_distortion import map_distortion_variance
 from orthoswarm.refine.flight.relative_block import Flight
 from orthoswarm.refine.flight.weakly_held_pictures import interpolate_weak
-from orthoswarm.refine.registration.absolute_orientation import load_map, map_gsd, reorient_on_map, working_gsd
+from orthoswarm.refine.registration.absolute_orientation import (
+    TIE_SCALES,
+    load_map,
+    map_gsd,
+    reorient_on_map,
+    working_gsd,
+)
 from orthoswarm.refine.registration.block_state import Stopwatch, VehicleState, lies_on_map
 from orthoswarm.refine.registration.map_heights import map_heights
 from orthoswarm.refine.registration.map_windows import LoadedMap
@@ -96,7 +102,7 @@ def _own_errors(state: VehicleState, others: Sequence[VehicleState], ground: Loa
     floor = config.sigma_floor_m
     if ground is not None:
         floor = common_map_sigma(adj.tie_residual, state.ties.sigma_m, ground.gsd_m)
-    track_c, tie_c = config.track_robust_c, active().registration.tie_scales[1]
+    track_c, tie_c = config.track_robust_c, TIE_SCALES[1]
     stated = stated_errors(adj, track_c, state.surface.height_prior(adj.points), ties=ties, tie_c=tie_c, floor_m=floor)
     level_deg = level_sigma_deg(flight, state.surface)
     state.fov_sigma_deg = float(np.hypot(stated.fov_sigma_deg, level_deg))

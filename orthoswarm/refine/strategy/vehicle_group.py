@@ -1,6 +1,7 @@
 """What vehicles of an area share: which are neighbours, the lean of the map, one terrain."""
 
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,8 @@ from orthoswarm.refine.surface.vehicle_ground import ground_points
 from orthoswarm.trajectory.near_paths import near_paths
 
 Array = NDArray[np.float64]
+
+_DRAWN_NODES: Final = 4_000_000  # most nodes of a surface that pictures are drawn on (memory)
 
 
 def neighbours_of(state: VehicleState, states: Sequence[VehicleState]) -> list[VehicleState]:
@@ -73,7 +76,7 @@ def common_terrain(
     lift = float(np.median([s.surface.ground_offset_m for s in states]))
     fit, off = None, 0.0
     how = FitSettings.for_drawing(on_map=any(s.on_map for s in states))
-    drawn_nodes = active().surface.drawn_nodes
+    drawn_nodes = _DRAWN_NODES
     if dem is not None:
         fit, off = fit_over_dem(dem, points, sigma, bounds, settings=how, most_nodes=drawn_nodes)
     drawn = (fit or fit_terrain(points, sigma, bounds, settings=how)).rendering(lift)
@@ -123,7 +126,7 @@ def coarse_terrain(states: Sequence[VehicleState]) -> Terrain | None:
     path = np.concatenate(paths)
     reach = active().strategy.terrain_reach_heights * float(np.median(path[:, 2]))
     low, high = path[:, :2].min(0) - reach, path[:, :2].max(0) + reach
-    step = max(min(steps), float(np.sqrt(np.prod(high - low) / active().surface.drawn_nodes)))
+    step = max(min(steps), float(np.sqrt(np.prod(high - low) / _DRAWN_NODES)))
     columns, rows = (np.ceil((high - low) / step).astype(int) + 1).tolist()
     nodes = np.stack(np.meshgrid(low[0] + step * np.arange(columns), low[1] + step * np.arange(rows)), -1)
     vehicle = np.repeat(np.arange(len(states)), [len(p) for p in paths])
