@@ -10,7 +10,7 @@ from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.placement import MapWindow
 from orthoswarm.model.robust import mad_sigma
-from orthoswarm.refine.bundle.adjustment import Adjustment, MapTies
+from orthoswarm.refine.bundle.adjustment import TRACK_ROBUST_C, Adjustment, MapTies
 from orthoswarm.refine.bundle.block_arrays import Tracks
 from orthoswarm.refine.bundle.observation_selection import one_per_cell
 from orthoswarm.refine.flight.relative_block import Flight
@@ -400,7 +400,7 @@ def reorient_on_map(
 def _step(flight: Flight, surface: GroundModel, ties: MapTies, tie_scale: float) -> None:
     """One Gauss-Newton step with tie points, heights held near the ground."""
     prior = surface.height_prior(flight.adjustment.points)
-    flight.adjustment.step(active().bundle.track_robust_c, prior, ties, tie_scale)
+    flight.adjustment.step(TRACK_ROBUST_C, prior, ties, tie_scale)
 
 
 def _second_round(
