@@ -11,7 +11,6 @@ from orthoswarm.config.autopilot import ArduPilotConfig, Px4Config
 from orthoswarm.config.compute import ComputeConfig
 from orthoswarm.config.control import ControlConfig
 from orthoswarm.config.coverage import CoverageConfig
-from orthoswarm.config.evaluation import EvaluationConfig
 from orthoswarm.config.matchers import MatchersConfig
 from orthoswarm.config.mosaic import MosaicConfig
 from orthoswarm.config.planning import PlanningConfig
@@ -29,7 +28,7 @@ from orthoswarm.config.refiner.strategy import StrategyConfig
 from orthoswarm.config.refiner.surface import SurfaceConfig
 from orthoswarm.config.stereo import StereoConfig
 from orthoswarm.config.stores import StoresConfig
-from orthoswarm.config.telemetry import IngestConfig, PairingConfig
+from orthoswarm.config.telemetry import IngestConfig
 from orthoswarm.model.errors import InputError
 
 Overrides = Mapping[str, Mapping[str, Any]]
@@ -49,7 +48,6 @@ class Config:
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
     strategy: StrategyConfig = field(default_factory=StrategyConfig)
     ingest: IngestConfig = field(default_factory=IngestConfig)
-    pairing: PairingConfig = field(default_factory=PairingConfig)
     mosaic: MosaicConfig = field(default_factory=MosaicConfig)
     radiometry: RadiometryConfig = field(default_factory=RadiometryConfig)
     raster: RasterConfig = field(default_factory=RasterConfig)
@@ -58,7 +56,6 @@ class Config:
     ardupilot: ArduPilotConfig = field(default_factory=ArduPilotConfig)
     px4: Px4Config = field(default_factory=Px4Config)
     coverage: CoverageConfig = field(default_factory=CoverageConfig)
-    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     control: ControlConfig = field(default_factory=ControlConfig)
     matchers: MatchersConfig = field(default_factory=MatchersConfig)
     paper: PaperConfig = field(default_factory=PaperConfig)

@@ -10,6 +10,7 @@ from orthoswarm.config import active
 from orthoswarm.matchers import Matches, map_matcher
 from orthoswarm.matchers.matcher import Floats, Mask
 from orthoswarm.matchers.patch_registration import Registration, apply, register
+from orthoswarm.matchers.second_opinion import LEAST_TILES, TRUSTED_SHARE
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import MapWindow
@@ -90,7 +91,7 @@ class PatchOptions:
 def match_patch(task: PatchTask, *, basemap: MapWindow, origin: Array, options: PatchOptions) -> PatchFit:
     """Register one leg on the map."""
     began, clock = process_time(), perf_counter()
-    config, trust = active().paper, active().matchers
+    config = active().paper
     pictures = Pictures(task.frames, lambda f: read_gray(f.path), 10_000, cache_mb=8.0)
     centre = task.cameras.position[:, :2].mean(axis=0)
     gsd = patch_gsd(task.cameras, basemap.native_gsd_m)
@@ -110,7 +111,7 @@ def match_patch(task: PatchTask, *, basemap: MapWindow, origin: Array, options: 
             consistent = HeightFilter(task.cameras, own, there)
             matcher = map_matcher(options.matcher)
             found = register(patch, valid, window, known=known, reach=reach, matcher=matcher, keep=consistent)
-            if found is not None and found.share >= trust.trusted_share and len(found.matches) >= trust.least_tiles:
+            if found is not None and found.share >= TRUSTED_SHARE and len(found.matches) >= LEAST_TILES:
                 homography = in_metres(found.homography, own, there, centre)
                 break
     return PatchFit(
@@ -193,7 +194,7 @@ class HeightFilter:
         height = np.maximum(self.cameras.position[nearest, 2], 1.0)
         leaning = rho > _ROOF_DISTANCE_SHARE * height
         apparent = (residual * lever).sum(1) / np.maximum(rho, 1e-6) * height / np.maximum(rho, 1e-6)
-        if leaning.sum() < active().matchers.least_tiles:
+        if leaning.sum() < LEAST_TILES:
             return np.ones(len(matches), bool)
         usual = float(np.median(apparent[leaning]))
         spread = mad_sigma(apparent[leaning] - usual)

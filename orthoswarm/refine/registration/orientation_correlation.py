@@ -21,7 +21,7 @@ Complex = NDArray[np.complex64]
 
 _STRIP_MOST_PX: Final = 4_000_000  # larger strips are not correlated (memory)
 _STRIP_FARTHEST_HEIGHTS: Final = 4.0
-"""a picture that looks farther than so many flying heights and the next field is left out: horizon."""
+"""A picture that looks farther than so many flying heights and the next field is left out: horizon."""
 _STRIP_FARTHEST_M: Final = 50.0  # ... and this
 STRIP_MAP_SHARE: Final = 0.1  # least share of a strip's search area that the map covers
 _STRIP_BLUR_PX: Final = 0.7  # sigma of the blur before the gradients
