@@ -240,7 +240,7 @@ class Processes:
             return failed
 
     def fit(self, pixels: int) -> None:
-        """Work in this process alone from now on where pictures have too few pixels for others, see `alone_mpx`."""
+        """Work in this process alone from now on where pictures have too few pixels for others, see `_ALONE_MPX`."""
         if pixels <= _ALONE_MPX * 1e6:
             self.count = 1
 

@@ -12,13 +12,10 @@ from orthoswarm.config.ranges import from_zero
 class PlanningConfig:
     """Planning: lines over an area, their order, sorties, and heights over ground."""
 
-    # Area
     most_corners: int = 50_000
     """Areas, zones and lines with more corners are refused. Whether an outline crosses itself can take the square of
     their number: 13 s for a star of so many, four times that for one of twice as many (measured); a circle of so many
     is planned in a minute."""
-
-    # Heights over ground
     least_above_ground_m: float = 20.0
     """Least height of a flight over the highest ground below it, metres: trees, masts and errors of a height model
     (chosen)."""
@@ -27,22 +24,17 @@ class PlanningConfig:
     Performance Standard 2020, 95 %) and 2 m by which a vehicle may pass a waypoint (ArduCopter's WPNAV_RADIUS)."""
     by_vehicle_m: float = 1.0
     """How near a vehicle that follows the terrain by itself is taken to keep its height, metres (chosen)."""
-
-    # Lines
     complete_share: float = 0.999
     """Share of an area from which on a plan covers it (chosen)."""
     target_share: float = 0.9996
     """Share up to which gaps of a plan are mended (chosen: above `complete_share` for errors of the flight)."""
-
-    # Sorties
     clearance_m: float = 1.0
-    """Distance that is kept from no-fly zones where none is asked for, metres (chosen), but at most ..."""
+    """Distance that is kept from no-fly zones where none is asked for, metres (chosen); an eighth of a picture's
+    width if that is less."""
     quickest_s: float = 0.5
     """A warning says that cameras seldom release at shorter intervals, seconds (chosen)."""
     endurance_spare: float = 1.05
     """Where an endurance is too short, so many times what the farthest line needs is asked for (chosen)."""
-
-    # Deconfliction
     separation_m: float = 10.0
     """Least horizontal distance of vehicles, metres, if the user gives none (chosen: receivers err by 3 m) ..."""
     layer_m: float = 5.0

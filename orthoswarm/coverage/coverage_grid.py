@@ -79,7 +79,7 @@ class Cells:
         """Cells of at most `cell_m` (None: as configured) over shapely (Multi)Polygons in the grid of `epsg`.
 
         Raises:
-            InputError: the area is empty, or would have more than `most_cells` of the configuration.
+            InputError: the area is empty, or would have more than `_MOST_CELLS`.
         """
         from rasterio.features import rasterize
 

@@ -121,7 +121,7 @@ def estimate_fields(
         threads: that share the work; the result does not depend on them.
 
     Returns:
-        image -> field for every frame; factors lie within `greatest_factor` and its inverse.
+        image -> field for every frame; factors lie within `GREATEST_FACTOR` and its inverse.
     """
     held = held or {}
     known = [i for i, f in enumerate(frames) if f.frame.image in thumbnails]

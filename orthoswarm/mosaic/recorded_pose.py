@@ -54,7 +54,7 @@ def area_grid(frames: Sequence[Frame]) -> LocalGrid:
 
 
 def in_one_area(ingest: Ingest) -> Ingest:
-    """Inputs without the frames that lie on another continent than most, by `largest_area_m`; they are rejected.
+    """Inputs without the frames that lie on another continent than most, by `_LARGEST_AREA_M`; they are rejected.
 
     Raises:
         InputError: as many lie in one place as in another.

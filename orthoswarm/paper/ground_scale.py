@@ -109,7 +109,7 @@ class ScaleTask:
 
 
 def choose_pairs(along: Array, height: Array, tilt: Array, members: NDArray[np.integer], count: int) -> list[ScaleTask]:
-    """Up to `count` pairs, evenly spread over a leg, with a distance near `scale_pair_heights` flying heights.
+    """Up to `count` pairs, evenly spread over a leg, with a distance near `_SCALE_PAIR_HEIGHTS` flying heights.
 
     Args:
         along: float64 (n,), distance along the line of the leg's frames, in flying order.

@@ -132,7 +132,7 @@ class HeightModel:
         """Heights over `zero_m` in the area's CRS within bounds, a node every pixel of the DEM or at most so many.
 
         Args:
-            bounds: west, south, east, north. most_nodes: None takes `dem_window_nodes` of the configuration.
+            bounds: west, south, east, north. most_nodes: None takes `_DEM_WINDOW_NODES`.
         """
         return _window_over(self, bounds, most_nodes or _DEM_WINDOW_NODES)
 

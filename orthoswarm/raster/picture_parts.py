@@ -95,7 +95,7 @@ class PictureParts:
         return Part(record[head:].reshape(rows, columns, 3), (left, top))
 
     def keep(self, path: Path, picture: Bytes, drawn: Box) -> None:
-        """Keep what was drawn of a picture and `part_margin` around it, unless some of it is kept already.
+        """Keep what was drawn of a picture and `_PART_MARGIN` around it, unless some of it is kept already.
 
         Args:
             path: its file. picture: uint8 (rows, columns, 3), all of it. drawn: lies in it.

@@ -127,7 +127,7 @@ def merge_heights(
         count: (N,).
 
     Returns:
-        Height, sigma (both NaN where fewer than `stereo.least_pairs` agree) and number of agreeing pairs. The sigma is
+        Height, sigma (both NaN where fewer than `_LEAST_PAIRS` agree) and number of agreeing pairs. The sigma is
         that of the mean of pairs that are partly independent, enlarged where they scatter more than they state.
     """
     z, s = np.asarray(height_m, np.float64), np.asarray(sigma_m, np.float64)

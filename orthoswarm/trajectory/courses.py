@@ -16,7 +16,7 @@ _CORNER_DEG: Final = 50.0  # a change of course above this is a corner between t
 def course(ground: Array) -> Array:
     """Grid azimuth of flight at each of a vehicle's positions (N, 2), radians; at a corner that of the leg it ends.
 
-    Steps under `moved_m` have no direction and take that of the nearest step that has; 0 where nothing moved.
+    Steps under `MOVED_M` have no direction and take that of the nearest step that has; 0 where nothing moved.
     """
     corner_rad = np.radians(_CORNER_DEG)
     n = len(ground)

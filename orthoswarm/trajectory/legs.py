@@ -27,7 +27,7 @@ def split_legs(position: Array, time_s: Array | None = None) -> Ints:
 
     Args:
         position: float64 (N, 2) or (N, 3), smoothed or recorded positions in flying order, metres.
-        time_s: float64 (N,) or None; a longer gap than `pause_s` of the configuration ends a leg.
+        time_s: float64 (N,) or None; a longer gap than `PAUSE_S` ends a leg.
     """
     config = active().records
     reach, turn_rad = config.leg_reach, float(np.radians(_LEG_TURN_DEG))

@@ -73,9 +73,9 @@ def test_a_file_overrides_defaults_and_workers_follow(tmp_path):
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("[nothing]\na = 1\n", "no stage 'nothing'"),
+        ("[nothing]\na = 1\n", r"no settings \[nothing\]"),
         ("records = 3\n", "write it as a table"),
-        ("[records]\nnothing = 1\n", "no 'nothing'"),
+        ("[records]\nnothing = 1\n", "no setting records.nothing"),
         ("[records]\ntheta_hat_deg = 'wide'\n", "another kind"),
         ("[records\n", "not a TOML file"),
     ],

@@ -52,7 +52,7 @@ def balance_tones(task: ToneTask) -> tuple[list[float], int, float]:
 
     Returns:
         For each sortie, by how much its pictures' log factors change (95 %); a new file is written if by more than
-        `redraw_tone` of the configuration. The number of pictures; CPU seconds used.
+        `_REDRAW_TONE`. The number of pictures; CPU seconds used.
     """
     began = time.process_time()
     sorties = [read_solution(path) for path in task.solutions]

@@ -59,7 +59,7 @@ class CellSize:
 
 
 def cell_size(picture_px: float, tile_px: int, map_px: int) -> CellSize:
-    """Cells for a map: about `level_cells` of the configuration across a picture.
+    """Cells for a map: about `_LEVEL_CELLS` across a picture.
 
     Args:
         picture_px: width of a picture, pixels of the map. tile_px: side of the tiles. map_px: pixels of the map.

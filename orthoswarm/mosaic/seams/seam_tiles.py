@@ -33,7 +33,7 @@ class SeamCells:
     Attributes:
         previews: file of the pictures' previews. rows: int32 (N,), the candidates' records there.
         tone: float32 (N, 6), factors of their brightness, see cell_candidates.
-        cell_px: side of a cell. terrain: the ground of the tile and `border_px` around it.
+        cell_px: side of a cell. terrain: the ground of the tile and `BORDER_PX` around it.
     """
 
     previews: Path
@@ -44,7 +44,7 @@ class SeamCells:
 
 
 def cell_size_px(picture_width: int, picture_gsd_m: float, gsd_m: float) -> int:
-    """Side of the cells, pixels of the map (within `cell_px` of the configuration): about a pixel of the previews.
+    """Side of the cells, pixels of the map (within `_CELL_PX`): about a pixel of the previews.
 
     Args:
         picture_width: columns of the pictures. picture_gsd_m: their ground pixel at nadir. gsd_m: the map's.

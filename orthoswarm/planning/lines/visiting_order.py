@@ -110,7 +110,7 @@ def shorten(legs: Array, router: Router, depot: Array | None = None) -> Array:
         depot: float64 (2,) where the row begins and ends; None leaves both ends open.
 
     Returns:
-        float64 (n, 2, 2). Rows of more than `ordered_most_legs` legs come back as they are.
+        float64 (n, 2, 2). Rows of more than `_ORDERED_MOST_LEGS` legs come back as they are.
     """
     n = len(legs)
     if n < 2 or n > _ORDERED_MOST_LEGS:

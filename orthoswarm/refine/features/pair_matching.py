@@ -53,7 +53,7 @@ def match_features(one: Features, two: Features) -> Ints:
     """Rows of matching features in two photos, int32 (n, 2); (0, 2) without a match.
 
     Mutual nearest neighbours that pass the ratio test, then a similarity by RANSAC, then the fundamental matrix by
-    MAGSAC (Barath et al. 2020). Fewer than `match_least` inliers count as no match.
+    MAGSAC (Barath et al. 2020). Fewer than `_MATCH_LEAST` inliers count as no match.
     """
     none = np.zeros((0, 2), np.int32)
     candidates = mutual_nearest(_unit(one), _unit(two))

@@ -90,7 +90,7 @@ def detect(gray: Bytes, width: int, height: int, working_pixels: int | None = No
         working_pixels: number of pixels of the reduced working picture (None: as configured).
 
     Returns:
-        At most `sift_kept` features, the strongest of each cell first.
+        At most `_SIFT_KEPT` features, the strongest of each cell first.
     """
     import cv2
 

@@ -18,7 +18,7 @@ _TRACK_PER_CELL: Final = 2  # observations in a cell of a photo from which on fu
 
 
 def build_tracks(features: Sequence[Features], pairs: Sequence[Pair]) -> Tracks:
-    """Tie points through all photos, each observed 2 to `track_longest` times.
+    """Tie points through all photos, each observed 2 to `_TRACK_LONGEST` times.
 
     The strongest pair is joined first; a join that would put two points of one photo into a track is refused, so that
     one wrong match cannot merge two places.

@@ -65,7 +65,7 @@ class Pictures:
         return picture
 
     def small(self, i: int) -> Gray:
-        """Picture i reduced to `small_width_px` columns."""
+        """Picture i reduced to `_SMALL_WIDTH_PX` columns."""
         if i not in self._small:
             self.gray(i)
         return self._small[i]

@@ -90,7 +90,7 @@ class PhotoRecords:
     def tag_level(self) -> Array:
         """Rotations camera to level camera by the tilt tags, float64 (N, 3, 3); the identity where there are none.
 
-        Tilts beyond `tag_tilt_limit_deg` are ignored: such a picture could not be matched anyway.
+        Tilts beyond `_TAG_TILT_LIMIT_DEG` are ignored: such a picture could not be matched anyway.
         """
         pitch = np.where(np.isfinite(self.pitch), self.pitch, NADIR_PITCH_RAD)
         roll = np.where(np.isfinite(self.roll), self.roll, 0.0)

@@ -80,7 +80,7 @@ def place_unpositioned(
 def candidate_pairs(without: int, count: int) -> Ints:
     """Pairs to try, int32 (n, 2), of photos of which the first `without` have no position.
 
-    All pairs with a photo without position, as nothing tells which overlap; beyond `free_most_pairs` those nearest in
+    All pairs with a photo without position, as nothing tells which overlap; beyond `_FREE_MOST_PAIRS` those nearest in
     order.
     """
     first, second = np.triu_indices(count, 1)

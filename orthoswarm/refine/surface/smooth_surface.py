@@ -47,7 +47,7 @@ _TILE_OVERLAP_NODES: Final = 8  # nodes by which tiles overlap on each side
 _TILE_KAPPA_VOTES: Final = 4
 """So many of the fullest tiles ask for a smoothness, and the median is taken for all (its cost)."""
 _DRAWN_HOLD_OUT_STANDARD_ERRORS: Final = 1.0  # as `_HOLD_OUT_STANDARD_ERRORS`, of the surface for drawing
-_DRAWN_FLAT_RELIEF_M: Final = 0.15  # as `flat_relief_m`, for drawing
+_DRAWN_FLAT_RELIEF_M: Final = 0.15  # as `FLAT_RELIEF_M`, for drawing
 _DRAWN_ON_MAP_SIGMA_FLOOR_M: Final = 0.15
 """As `_POINT_SIGMA_FLOOR_M`, where heights by the map are among the points (chosen with them: the 95 % of the map's
 error fell by a quarter on flat ground, by half on relief)."""
