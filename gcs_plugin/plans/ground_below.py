@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import shapely
@@ -15,7 +16,11 @@ from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import Terrain
 from orthoswarm.model.plan import Plan
 from orthoswarm.planning.relief_plan import GroundBelow
-from orthoswarm.raster.height_model import HeightModel
+from orthoswarm.raster.height_model import DEM_MOST_NODES, HeightModel
+
+_BESIDE_STEPS: Final = 2.0
+"""The highest ground is read at so many steps within that distance at least, where the number of nodes allows it."""
+DEM_MARGIN_M: Final = 50.0  # a height model is read so far beyond the places that are asked for (some of its nodes)
 
 
 def read_ground(dem: Path, wanted: shapely.Geometry, grid: LocalGrid, starts: NDArray[np.float64]) -> GroundBelow:
@@ -29,8 +34,8 @@ def read_ground(dem: Path, wanted: shapely.Geometry, grid: LocalGrid, starts: ND
         InputError: the model cannot be read, or has no heights there.
     """
     points = np.concatenate([shapely.get_coordinates(wanted), starts])
-    bounds = BoundingBox.around_points(points, active().raster.dem_margin_m)
-    most, beside_m = active().raster.dem_most_nodes, active().planning.beside_m
+    bounds = BoundingBox.around_points(points, DEM_MARGIN_M)
+    most, beside_m = DEM_MOST_NODES, active().planning.beside_m
     model = HeightModel.open(dem, grid.epsg, bounds, np.empty((0, 3)))
     found = model.window(bounds, most)
     terrain = found.terrain
@@ -42,7 +47,7 @@ def read_ground(dem: Path, wanted: shapely.Geometry, grid: LocalGrid, starts: ND
             f"{dem} has no heights on a part of the area or of the ways to it; give a height model without holes there"
         )
     zero = np.float32(terrain.height(starts).min())
-    highest = model.highest(bounds, beside_m, active().planning.beside_steps, most)
+    highest = model.highest(bounds, beside_m, _BESIDE_STEPS, most)
     highest = replace(highest, z=highest.z - zero)
     way_m = float(highest.z[_nodes_in(hull, highest)].max())
     z = terrain.z - zero

@@ -27,6 +27,7 @@ from orthoswarm.mosaic.radiometry import NO_MAP_TONE, estimate_fields, tone_warn
 from orthoswarm.mosaic.realtime import mosaic
 from orthoswarm.mosaic.renderer import Layer, RenderStats, Seams, render, render_layers
 from orthoswarm.raster.height_model import read_dem
+from orthoswarm.refine.flight.record_findings import NAMED_MOST
 
 _Map = tuple[Sequence[PlacedFrame], Terrain | None]
 """Frames and the ground under them: what a map is drawn from."""
@@ -251,7 +252,7 @@ def vehicles_warnings(said: Iterable[tuple[str, str]]) -> list[str]:
     vehicles: dict[str, list[str]] = {}
     for vehicle, warning in said:
         vehicles.setdefault(warning, []).append("" if warning.startswith(vehicle) else vehicle)
-    told, most = [], active().flight.named_most
+    told, most = [], NAMED_MOST
     for warning, names in vehicles.items():
         if not all(names):
             told.append(warning)

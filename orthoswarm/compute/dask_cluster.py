@@ -17,7 +17,7 @@ from concurrent.futures import CancelledError
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 from uuid import uuid4
 
 from orthoswarm import __version__
@@ -30,6 +30,8 @@ _SAMPLES = 100
 """Paths that a worker is asked for, at most."""
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+
+_CLUSTER_QUEUE_PER_WORKER: Final = 3  # items sent to a cluster for each worker, so that none waits for the network
 
 
 class ClusterLostError(RunInterruptedError):
@@ -124,7 +126,7 @@ class Cluster:
         queue: deque[_Task] = deque()
         try:
             while True:
-                wanted = active().compute.cluster_queue_per_worker * self.count
+                wanted = _CLUSTER_QUEUE_PER_WORKER * self.count
                 while len(queue) < wanted:
                     for item in source:
                         queue.append(self._submit(function, item))

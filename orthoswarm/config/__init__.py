@@ -1,14 +1,14 @@
-"""Every threshold: one frozen dataclass a stage, each field with unit, meaning and source.
+"""What a user may set: one frozen dataclass a stage, each field with unit, meaning and source.
 
 `active()` gives the values in force. `--config FILE.toml` of `orthoswarm mosaic`, `plan` and `serve` overrides
 them, a table a stage:
 
     [features]
-    corner_distance_px = 12
+    cell_px = 60
 
 A number outside its range (`ranges`) is refused.
 
-What is a definition and no choice (a layout of arrays, a unit) stays beside its code.
+All other thresholds are constants beside their use.
 """
 
 from orthoswarm.config.active import Config, Overrides, active, overridden, override, read_overrides

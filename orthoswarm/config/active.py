@@ -9,28 +9,30 @@ from typing import Any
 
 from orthoswarm.config.autopilot import ArduPilotConfig, Px4Config
 from orthoswarm.config.compute import ComputeConfig
-from orthoswarm.config.control import ControlConfig
-from orthoswarm.config.coverage import CoverageConfig
-from orthoswarm.config.evaluation import EvaluationConfig
-from orthoswarm.config.matchers import MatchersConfig
-from orthoswarm.config.mosaic import MosaicConfig
+from orthoswarm.config.mapping import (
+    ControlConfig,
+    CoverageConfig,
+    IngestConfig,
+    MatchersConfig,
+    MosaicConfig,
+    RadiometryConfig,
+    RasterConfig,
+    StereoConfig,
+)
 from orthoswarm.config.planning import PlanningConfig
-from orthoswarm.config.radiometry import RadiometryConfig
 from orthoswarm.config.ranges import numbers_in, range_of, rises
-from orthoswarm.config.raster import RasterConfig
-from orthoswarm.config.refiner.bundle import BundleConfig
-from orthoswarm.config.refiner.features import FeaturesConfig
-from orthoswarm.config.refiner.flight import FlightConfig
-from orthoswarm.config.refiner.initial import InitialConfig
-from orthoswarm.config.refiner.late import LateConfig
-from orthoswarm.config.refiner.paper import PaperConfig
-from orthoswarm.config.refiner.records import RecordsConfig
-from orthoswarm.config.refiner.registration import RegistrationConfig
-from orthoswarm.config.refiner.strategy import StrategyConfig
-from orthoswarm.config.refiner.surface import SurfaceConfig
-from orthoswarm.config.stereo import StereoConfig
+from orthoswarm.config.refiner import (
+    BundleConfig,
+    FeaturesConfig,
+    FlightConfig,
+    InitialConfig,
+    PaperConfig,
+    RecordsConfig,
+    RegistrationConfig,
+    StrategyConfig,
+    SurfaceConfig,
+)
 from orthoswarm.config.stores import StoresConfig
-from orthoswarm.config.telemetry import IngestConfig, PairingConfig
 from orthoswarm.model.errors import InputError
 
 Overrides = Mapping[str, Mapping[str, Any]]
@@ -48,10 +50,8 @@ class Config:
     flight: FlightConfig = field(default_factory=FlightConfig)
     surface: SurfaceConfig = field(default_factory=SurfaceConfig)
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
-    late: LateConfig = field(default_factory=LateConfig)
     strategy: StrategyConfig = field(default_factory=StrategyConfig)
     ingest: IngestConfig = field(default_factory=IngestConfig)
-    pairing: PairingConfig = field(default_factory=PairingConfig)
     mosaic: MosaicConfig = field(default_factory=MosaicConfig)
     radiometry: RadiometryConfig = field(default_factory=RadiometryConfig)
     raster: RasterConfig = field(default_factory=RasterConfig)
@@ -60,7 +60,6 @@ class Config:
     ardupilot: ArduPilotConfig = field(default_factory=ArduPilotConfig)
     px4: Px4Config = field(default_factory=Px4Config)
     coverage: CoverageConfig = field(default_factory=CoverageConfig)
-    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     control: ControlConfig = field(default_factory=ControlConfig)
     matchers: MatchersConfig = field(default_factory=MatchersConfig)
     paper: PaperConfig = field(default_factory=PaperConfig)
@@ -95,7 +94,7 @@ def override(values: Overrides) -> None:
     stages: dict[str, Any] = {}
     for stage, changes in values.items():
         if stage not in _names():
-            raise InputError(f"the configuration has no stage '{stage}'; choose one of: {', '.join(_names())}")
+            raise InputError(f"there are no settings [{stage}]; remove them; there are: {', '.join(_names())}")
         if not isinstance(changes, Mapping):
             raise InputError(f"'{stage}' in the configuration is a value; write it as a table: [{stage}]")
         default = getattr(_DEFAULT, stage)
@@ -138,7 +137,7 @@ def _checked(stage: str, name: str, value: Any) -> Any:
     """
     known = {f.name: f for f in fields(getattr(_DEFAULT, stage))}
     if name not in known:
-        raise InputError(f"[{stage}] of the configuration has no '{name}'; it has: {', '.join(known)}")
+        raise InputError(f"there is no setting {stage}.{name}; remove it; [{stage}] has: {', '.join(known)}")
     declared = known[name]
     said = f"[{stage}] {name} = {value!r} in the configuration"
     value = _tuples(value)

@@ -2,27 +2,13 @@
 
 from dataclasses import dataclass
 
-from orthoswarm.config.ranges import from_zero
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ComputeConfig:
     """Workers and memory. These change how long a run takes, never its products."""
 
-    alone_mpx: float = 20.0
-    """Pictures of no more megapixels together are mapped in one process where the user names no number of workers: each
-    other process takes 1.1 to 2 s to start, 65 photos of 640 x 480 pixels 5 s (measured on two cores)."""
-    queue_per_process: int = 4
-    """Items begun or done ahead of the one that is waited for, for each process (chosen; bounds memory)."""
-    idle_share: float = 0.1
-    """Tasks that can be halved are, where processes would be idle for more than this share of the work, being too few
-    (chosen: halves cost 5 % of CPU)."""
-    trim_after_s: float = from_zero(0.5)
-    """After a task that took more CPU seconds unused memory goes back to the system (chosen)."""
     cluster_connect_s: float = 20.0
     """Time to reach a Dask scheduler, seconds (chosen)."""
-    cluster_queue_per_worker: int = 3
-    """Items sent to a cluster for each worker, so that none waits for the network (chosen)."""
     cluster_poll_s: float = 1.0
     """How often the cluster's workers are counted while a result is awaited, seconds (chosen)."""
     cluster_patience_s: float = 120.0
@@ -43,5 +29,3 @@ class ComputeConfig:
     """Places whose colours are compared at once (chosen for memory)."""
     fields_at_once: int = 2048
     """Pictures whose factors of colour are evaluated at once, 15 kB each (chosen for memory)."""
-    map_pixels_at_once: int = 8_000_000
-    """Pixels of a map read at once (chosen for memory)."""

@@ -1,11 +1,10 @@
 """Which numbers a threshold may be: from the unit at the end of its name and its default, or declared beside it.
 
 A share lies between 0 and 1, an angle within a full turn, a field of view below 180 degrees; lengths, times, sizes and
-counts are above 0, and what has a negative default may have either sign. 0 is allowed only where the default is 0 or
-the field says so (`from_zero`): most thresholds divide by something, or count what there must be one of.
+counts are above 0. 0 is allowed only where the default is 0 or the field says so (`from_zero`): most thresholds divide
+by something, or count what there must be one of.
 """
 
-import math
 import sys
 from collections.abc import Iterator
 from dataclasses import Field, dataclass, field
@@ -14,8 +13,8 @@ from typing import Any, Final, TypeVar
 Value = TypeVar("Value", int, float, tuple[float, float])
 
 _KEY: Final = "zero is allowed"
-_SHARES: Final = ("share", "overlap", "confidence", "probability")
-_TOPS: Final = {"cos": 1.0, "cosine": 1.0, "percent": 100.0, "deg": 360.0, "rad": 2.0 * math.pi}
+_SHARES: Final = ("share", "overlap")
+_TOPS: Final = {"percent": 100.0, "deg": 360.0}
 _LARGEST: Final = sys.float_info.max
 _LARGEST_WHOLE: Final = 2**31 - 1
 """Compiled code and OpenCV count with 32 bits."""
@@ -36,12 +35,12 @@ class Range:
 
     def __str__(self) -> str:
         """What is allowed, to follow "a number"."""
-        parts = [] if self.least == -_LARGEST else [f"{'above' if self.above else 'of at least'} {self.least:g}"]
+        parts = [f"{'above' if self.above else 'of at least'} {self.least:g}"]
         if self.most == _LARGEST_WHOLE:
             parts.append(f"at most {_LARGEST_WHOLE}")
         elif self.most != _LARGEST:
             parts.append(f"{'below' if self.below else 'at most'} {self.most:g}")
-        return " and ".join(parts) or "that is finite"
+        return " and ".join(parts)
 
 
 def from_zero(default: Value) -> Value:
@@ -67,16 +66,14 @@ def range_of(declared: "Field[Any]") -> Range | None:
     most = _LARGEST_WHOLE if whole else _LARGEST
     most = 180.0 if lens else 90.0 if nadir else 1.0 if share else _TOPS.get(unit, most)
     below = lens or nadir or (share and unit == "overlap")
-    if smallest < 0 or unit in ("cos", "cosine"):
-        return Range(-most, most, below=below)
     above = not declared.metadata.get(_KEY, share or smallest == 0)
     return Range(1, most, below=below) if above and whole else Range(0, most, above, below)
 
 
 def rises(declared: "Field[Any]") -> bool:
-    """True for a pair whose second number is the larger one: the bounds of something (two prices are none)."""
+    """True for a pair whose second number is the larger one: the bounds of something."""
     numbers = list(numbers_in(declared.default))
-    return len(numbers) == 2 and numbers[0] < numbers[1] and not declared.name.endswith("_prices")
+    return len(numbers) == 2 and numbers[0] < numbers[1]
 
 
 def numbers_in(value: Any) -> Iterator[int | float]:

@@ -7,16 +7,22 @@ holds stays where it is in the plane. (Ackermann, Ebner, Klein 1970: independent
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.model.plane_similarity import Similarity, design
 
 Array = NDArray[np.float64]
 _HELD = 1e-6
 """Sigma of what does not move, metres (or radians)."""
+
+_AREA_SHIFT_SIGMA_M: Final = 1.0
+"""How well an area's receivers tell its place, an axis, and its level; over its extent the same of its turn and scale:
+some 30 of them, 2 m each, and what they have in common (areas that no map holds are moved onto each other within
+it)."""
+_AREA_TIE_SIGMA_M: Final = 0.3  # how well a vehicle's place agrees in two areas that it was solved in, an axis
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,9 +56,9 @@ def adjust_areas(nadirs: Sequence[Array], held: Sequence[bool], ties: Sequence[A
     Returns:
         For each area its move.
     """
-    c, count = active().strategy, len(nadirs)
+    count = len(nadirs)
     middles = [own.mean(0) for own in nadirs]
-    shift = c.area_shift_sigma_m
+    shift = _AREA_SHIFT_SIGMA_M
     radius = [max(float(np.sqrt(own.var(0).sum())), 1.0) for own in nadirs]
     prior = np.array(
         [[_HELD] * 4 if on_map else [shift, shift, shift / r, shift / r] for on_map, r in zip(held, radius)]
@@ -65,12 +71,12 @@ def adjust_areas(nadirs: Sequence[Array], held: Sequence[bool], ties: Sequence[A
         for k, sign, place in ((tie.one, 1.0, tie.place[0]), (tie.other, -1.0, tie.place[1])):
             a[:, :, 4 * k : 4 * k + 4] = sign * design(place[:, :2] - middles[k])
         apart = tie.place[1] - tie.place[0]
-        weight = 1.0 / (points * c.area_tie_sigma_m**2)
+        weight = 1.0 / (points * _AREA_TIE_SIGMA_M**2)
         normal += weight * np.einsum("nij,nik->jk", a, a)
         right += weight * np.einsum("nij,ni->j", a, apart[:, :2])
         pair = np.array([tie.one, tie.other])
-        level[np.ix_(pair, pair)] += np.array([[1.0, -1.0], [-1.0, 1.0]]) / c.area_tie_sigma_m**2
-        rise[pair] += np.array([1.0, -1.0]) * float(np.median(apart[:, 2])) / c.area_tie_sigma_m**2
+        level[np.ix_(pair, pair)] += np.array([[1.0, -1.0], [-1.0, 1.0]]) / _AREA_TIE_SIGMA_M**2
+        rise[pair] += np.array([1.0, -1.0]) * float(np.median(apart[:, 2])) / _AREA_TIE_SIGMA_M**2
     covariance = np.linalg.inv(normal)
     values, up = (covariance @ right).reshape(count, 4), np.linalg.solve(level, rise)
     return [

@@ -6,12 +6,13 @@ error. A point in photos of both gives one observation for each.
 
 from collections.abc import Iterable, Sequence
 from dataclasses import KW_ONLY, dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.config import active
-from orthoswarm.evaluation.checkpoints import Checkpoint
+from orthoswarm.evaluation.checkpoints import RECEIVERS_LOCAL_SIGMA_M, Checkpoint
 from orthoswarm.evaluation.photo_names import photo_named
 from orthoswarm.evaluation.point_rays import Ray, RayPoint, intersect_rays
 from orthoswarm.model.errors import InputError
@@ -19,6 +20,9 @@ from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import PlacedFrame, Terrain
 
 Array = NDArray[np.float64]
+
+_HEIGHT_SIGMA_M: Final = 2.0  # sigma of a point's height over the solved terrain below it
+FARTHEST_M: Final = 1000.0  # control points farther from every photo than this belong elsewhere
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +64,7 @@ def check_control(
     nadirs = np.array([p.camera.nadir for p in recorded])
     for point in seen:
         away = float(np.hypot(*(nadirs - _in_grid(point.surveyed, grid)).T).min())
-        if away > active().control.farthest_m:
+        if away > FARTHEST_M:
             raise InputError(
                 f"control point {point.name} lies {away / 1000:,.0f} km from the nearest photo; check its coordinates "
                 "and their coordinate system"
@@ -83,13 +87,13 @@ def in_photos(
         photos = _photos(point, images)
         if not photos:
             continue
-        rays = [_ray(p, pixel, config.receivers_local_sigma_m if not on_map else p.sigma_m) for p, pixel in photos]
+        rays = [_ray(p, pixel, RECEIVERS_LOCAL_SIGMA_M if not on_map else p.sigma_m) for p, pixel in photos]
         level = float(np.median([terrain.height(p.camera.nadir) for p, _ in photos]))
-        place = intersect_rays(rays, level, config.height_sigma_m).place
-        met = intersect_rays(rays, float(terrain.height(place)), config.height_sigma_m)
+        place = intersect_rays(rays, level, _HEIGHT_SIGMA_M).place
+        met = intersect_rays(rays, float(terrain.height(place)), _HEIGHT_SIGMA_M)
         gsd = float(np.median([(p.camera.position[2] - level) / p.camera.lens.focal_px for p, _ in photos]))
         pointing = config.pointing_sigma_px * gsd / np.sqrt(len(photos))
-        bent = float(np.median([p.sigma_m for p, _ in photos])) if on_map else config.receivers_local_sigma_m
+        bent = float(np.median([p.sigma_m for p, _ in photos])) if on_map else RECEIVERS_LOCAL_SIGMA_M
         sigma = float(np.linalg.norm([_survey_sigma(point), pointing, bent, met.contradiction]))
         surveyed, stated = _in_grid(point.surveyed, grid), point.sigma_m > 0.0
         out.append(ControlObservation(point.name, met.place, surveyed, sigma, stated, rays=met))

@@ -6,17 +6,21 @@ shift the block, and more of them turn and scale it.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
-from orthoswarm.control.control_observations import ControlObservation
+from orthoswarm.control.control_observations import FARTHEST_M, ControlObservation
+from orthoswarm.evaluation.point_rays import MISTAKE_PROBABILITY
 from orthoswarm.model.plane_similarity import Similarity
 
 Array = NDArray[np.float64]
 _HALVINGS = 20
 """Of a bracket of a kilometre, to a millimetre."""
+
+_SCATTER_FEWEST: Final = 5  # fewest points without a stated sigma whose scatter is estimated
+_SHIFT_SIGMA_M: Final = 100.0  # what is known of the shift before the control points: nothing, so that they decide it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,9 +56,9 @@ def fit_similarity(observations: Sequence[ControlObservation], nadirs: Array, bo
     """
     middle = np.asarray(nadirs.mean(axis=0))
     radius = max(float(np.sqrt(((nadirs - middle) ** 2).sum(axis=1).mean())), 1.0)
-    shift = active().control.shift_sigma_m
+    shift = _SHIFT_SIGMA_M
     prior_sigma = np.array([shift, shift, border_m / radius, border_m / radius])
-    limit = -2.0 * np.log(active().control.mistake_probability)
+    limit = -2.0 * np.log(MISTAKE_PROBABILITY)
     used, left_out, scatter_m = list(observations), [], np.inf
     while True:
         scatter_m = min(_scatter(used, middle, prior_sigma, scatter_m), scatter_m)
@@ -78,14 +82,14 @@ def _scatter(used: Sequence[ControlObservation], middle: Array, prior_sigma: Arr
     With too few points that of before stays; 0 where none was found.
     """
     unstated = np.array([not o.stated for o in used])
-    if unstated.sum() < active().control.scatter_fewest:
+    if unstated.sum() < _SCATTER_FEWEST:
         return before_m if np.isfinite(before_m) else 0.0
 
     def too_small(scatter_m: float) -> bool:
         chi2 = _left_out_chi2(_widened(used, scatter_m), middle, prior_sigma)
         return bool(np.median(chi2[unstated]) > 2.0 * np.log(2.0))
 
-    low, high = 0.0, active().control.farthest_m
+    low, high = 0.0, FARTHEST_M
     if not too_small(low):
         return 0.0
     for _ in range(_HALVINGS):

@@ -7,6 +7,7 @@ without a camera event: the camera was not triggered.
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,10 @@ from orthoswarm.coverage.missing_pictures import Cause, Exposure, MissingPicture
 from orthoswarm.coverage.view import View
 
 Array = NDArray[np.float64]
+
+_MATCH_SHARE: Final = 0.45  # a picture's event is within this share of the usual time between them (below a half)
+_LEAST_MATCHED: Final = 0.5  # share of a vehicle's pictures that must have an event: else its clocks disagree
+_BORROWED_LENS: Final = 0.6  # confidence in what a vehicle has seen of which no picture has arrived
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +77,7 @@ def missing_by_events(
             found += missing_pictures(row, files)
             continue
         without = _without_picture(own, np.array([*(v.time_s for v in timed), *(e.time_s for e in files)], float))
-        if len(own) - len(without) < active().coverage.least_matched * len(timed):
+        if len(own) - len(without) < _LEAST_MATCHED * len(timed):
             warnings.append(f"the camera events of {vehicle} do not match the times of its pictures and are not used")
             found += missing_pictures(row, files)
             continue
@@ -101,14 +106,14 @@ def _none_arrived(vehicle: str, events: Sequence[CameraEvent], views: Sequence[V
         near = views[int(np.hypot(*(places - event.position[:2]).T).argmin())]
         place = np.array([*event.position[:2], near.position[2]])
         view = replace(near.moved_to(place, f"event {event.number}", event.time_s), vehicle=vehicle)
-        found.append(MissingPicture(view, "", Cause.NOT_ARRIVED, active().coverage.borrowed_lens))
+        found.append(MissingPicture(view, "", Cause.NOT_ARRIVED, _BORROWED_LENS))
     return found
 
 
 def _without_picture(events: Sequence[CameraEvent], times: Array) -> list[CameraEvent]:
     """Events without a picture; each picture is assigned to its nearest event."""
     at = np.array([e.time_s for e in events])
-    slack = active().coverage.match_share * float(np.median(np.diff(at)))
+    slack = _MATCH_SHARE * float(np.median(np.diff(at)))
     nearest = np.abs(at[None, :] - times[:, None]).argmin(1)
     matched = {int(k) for k, t in zip(nearest, times, strict=True) if abs(at[k] - t) <= slack}
     return [event for k, event in enumerate(events) if k not in matched]

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import lru_cache
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,8 @@ Geometry = Any
 Due = bool | NDArray[np.bool_]
 
 _ROWS_AT_ONCE = 64
+
+_MOST_CELLS: Final = 60_000_000  # areas with more cells are refused, or need larger ones (memory)
 
 
 class State(IntEnum):
@@ -77,7 +79,7 @@ class Cells:
         """Cells of at most `cell_m` (None: as configured) over shapely (Multi)Polygons in the grid of `epsg`.
 
         Raises:
-            InputError: the area is empty, or would have more than `most_cells` of the configuration.
+            InputError: the area is empty, or would have more than `_MOST_CELLS`.
         """
         from rasterio.features import rasterize
 
@@ -85,8 +87,8 @@ class Cells:
             raise InputError("the area is empty; draw it as a polygon with some ground")
         config, bounds = active().coverage, BoundingBox(*ground.bounds)
         cell_m = config.cell_m if cell_m is None else cell_m
-        if bounds.width * bounds.height > config.most_cells * cell_m * cell_m:
-            side = math.ceil(math.sqrt(bounds.width * bounds.height / config.most_cells) * 10) / 10
+        if bounds.width * bounds.height > _MOST_CELLS * cell_m * cell_m:
+            side = math.ceil(math.sqrt(bounds.width * bounds.height / _MOST_CELLS) * 10) / 10
             raise InputError(f"the area has too many cells of {cell_m:g} m; use --cell {side:g} or a smaller area")
         grid = GroundGrid.around(epsg, bounds, cell_m)
 

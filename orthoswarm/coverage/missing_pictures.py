@@ -5,11 +5,16 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Final
 
 import numpy as np
 
-from orthoswarm.config import active
 from orthoswarm.coverage.view import View
+
+_HOLE_STEPS: Final = 1.6  # usual steps between two pictures from which on one is missing
+_STRAIGHT_DEG: Final = 20.0  # steps of one straight leg differ by less than this in direction
+_MOST_MISSING: Final = 400  # most missing pictures that are made up in one hole (for its time)
+_SLACK_S: Final = 0.05  # camera events this near in time to a picture are its own
 
 
 class Cause(StrEnum):
@@ -90,11 +95,11 @@ def _holes(row: Sequence[View], lost: Sequence[Exposure]) -> list[MissingPicture
     usual = float(np.median(moving))
     heading = way / np.maximum(step, 1e-9)[:, None]
     found = []
-    for i in np.flatnonzero(step > active().coverage.hole_steps * usual).tolist():
+    for i in np.flatnonzero(step > _HOLE_STEPS * usual).tolist():
         near = [k for k in (i - 1, i + 1) if 0 <= k < len(step) and step[k] > 0.2]
-        if not any(float(heading[k] @ heading[i]) > np.cos(np.radians(active().coverage.straight_deg)) for k in near):
+        if not any(float(heading[k] @ heading[i]) > np.cos(np.radians(_STRAIGHT_DEG)) for k in near):
             continue
-        count = min(active().coverage.most_missing, max(1, round(step[i] / usual) - 1))
+        count = min(_MOST_MISSING, max(1, round(step[i] / usual) - 1))
         cause, confidence, names = _why(row[i], row[i + 1], count, lost)
         for k in range(count):
             share = (k + 1) / (count + 1)
@@ -107,7 +112,7 @@ def _holes(row: Sequence[View], lost: Sequence[Exposure]) -> list[MissingPicture
 def _why(before: View, after: View, count: int, lost: Sequence[Exposure]) -> tuple[Cause, float, list[str]]:
     """Cause of a hole, its confidence (0 to 1), and names of its pictures where they are known."""
     if before.time_s is not None and after.time_s is not None:
-        times = (before.time_s + active().coverage.slack_s, after.time_s - active().coverage.slack_s)
+        times = (before.time_s + _SLACK_S, after.time_s - _SLACK_S)
         within = [e for e in lost if times[0] < e.time_s < times[1]]
         files = [e.image for e in within if e.image]
         if within:

@@ -1,6 +1,7 @@
 """Which pictures are blurred, damaged or without contrast, by comparison with their neighbours in flight."""
 
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,6 +9,12 @@ from numpy.typing import NDArray
 from orthoswarm.config import active
 from orthoswarm.coverage.view import Flaw
 from orthoswarm.raster.picture_quality import PictureQuality
+
+NEIGHBOURS: Final = 15  # pictures before and after with whose median one is compared
+_FAINT_SHARE: Final = 0.25  # haze: less than this share of their contrast ...
+_LEAST_CONTRAST: Final = 4.0  # ... or less than this ...
+_SATURATED_SHARE: Final = 0.5  # ... or more than this share of the pixels saturated
+_FLAT_SHARE: Final = 0.10  # damaged: this share of the blocks more than usual is of one single value
 
 
 def picture_flaws(qualities: Sequence[PictureQuality | None]) -> list[Flaw]:
@@ -29,16 +36,13 @@ def picture_flaws(qualities: Sequence[PictureQuality | None]) -> list[Flaw]:
     for k, i in enumerate(measured):
         if sharp[k] < config.blurred_share * usual_sharp[k]:
             flaws[i] |= Flaw.BLURRED
-        if (
-            contrast[k] < max(config.least_contrast, config.faint_share * usual_contrast[k])
-            or bright[k] > config.saturated_share
-        ):
+        if contrast[k] < max(_LEAST_CONTRAST, _FAINT_SHARE * usual_contrast[k]) or bright[k] > _SATURATED_SHARE:
             flaws[i] |= Flaw.HAZE
-        if flat[k] > usual_flat[k] + config.flat_share:
+        if flat[k] > usual_flat[k] + _FLAT_SHARE:
             flaws[i] |= Flaw.DAMAGED
     return flaws
 
 
 def _running_median(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    n = active().coverage.neighbours
+    n = NEIGHBOURS
     return np.array([np.median(values[max(0, i - n) : i + n + 1]) for i in range(len(values))])

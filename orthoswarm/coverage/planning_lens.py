@@ -8,13 +8,16 @@ gives a wrong footprint; the solved footprint at the recorded height is right in
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.coverage.view import View
 from orthoswarm.model.robust import mad_sigma
+
+_LENS_SIGMAS: Final = 2.0
+"""Plans over gaps take the solved field of view less so many sigmas (98 % of the lenses are wider)."""
 
 
 def planning_fov_rad(
@@ -67,7 +70,7 @@ def _effective(views: Sequence[View], ground_z_m: float, heights_over_level_grou
     else:
         middle = float(np.median(half_width))
         sigma = middle * float(np.median([v.focal_sigma for v in views]))
-    return 2.0 * math.atan(max(middle - active().coverage.lens_sigmas * sigma, 0.0))
+    return 2.0 * math.atan(max(middle - _LENS_SIGMAS * sigma, 0.0))
 
 
 def _above_ground_m(view: View, ground_z_m: float) -> float:

@@ -16,7 +16,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +38,11 @@ _SAME_PLACE_M = 0.02
 """Lines of one point may round its coordinates differently."""
 _DECIMAL_COMMA = re.compile(r"^([-+]?\d+),(\d+)$")
 _GRID = "+proj=longlat +datum=WGS84 +no_defs"
+
+RECEIVERS_LOCAL_SIGMA_M: Final = 0.4
+"""How far a block without a map is bent besides shift, turn and scale, one sigma an axis. Measured on the same photos:
+0.31 m are left at five points after four unknowns; 73 to 80 % of the points that took no part lie within one stated
+sigma and 90 to 100 % within two."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -417,6 +422,6 @@ class _Views:
         away = ground - position
         # The sigma of photos that lie where receivers say has mostly what is common to all of them.
         config = active().control
-        own = config.receivers_local_sigma_m if row["stage"] == "coarse" else row.get("sigma_m")
+        own = RECEIVERS_LOCAL_SIGMA_M if row["stage"] == "coarse" else row.get("sigma_m")
         pixel_rad = config.pointing_sigma_px / focal
         return Ray(row["image"], position, away / np.linalg.norm(away), pixel_rad, float(own or 0.0))

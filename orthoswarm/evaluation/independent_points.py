@@ -2,11 +2,13 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
-from orthoswarm.config import active
 from orthoswarm.model.earth import distance_m
 from orthoswarm.model.errors import InputError
+
+_SAME_PLACE_M: Final = 0.05  # checkpoint within this distance of a control point is that point (as surveys differ) ...
+_SAME_NAME_M: Final = 10.0  # ... and within this one if it has its name
 
 
 class Surveyed(Protocol):
@@ -74,7 +76,6 @@ def shared_warning(shared: Sequence[str], count: int) -> list[str]:
 
 
 def _same(point: Surveyed, other: Surveyed) -> bool:
-    config = active().evaluation
     (lon, lat), (other_lon, other_lat) = point.surveyed, other.surveyed
     away = distance_m(float(lat), float(lon), float(other_lat), float(other_lon))
-    return away <= (config.same_name_m if point.name == other.name else config.same_place_m)
+    return away <= (_SAME_NAME_M if point.name == other.name else _SAME_PLACE_M)

@@ -2,13 +2,16 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
-
 Array = NDArray[np.float64]
+
+MISTAKE_PROBABILITY: Final = 1e-3
+"""A control point is left out if the others put it so far off with this probability only."""
+_RELIEF_SIGMA_M: Final = 10.0  # ground off the area's level where rays do not tell: holds a point of one photo
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +76,7 @@ def intersect_rays(rays: Sequence[Ray], ground_z_m: float, height_sigma_m: float
     """
     every = list(rays)
     place, away, apart = _met(every, ground_z_m, height_sigma_m)
-    limit = float(np.sqrt(-2.0 * np.log(active().control.mistake_probability)))
+    limit = float(np.sqrt(-2.0 * np.log(MISTAKE_PROBABILITY)))
     if apart <= limit:
         return RayPoint(place, _rms(away))
     if len(every) > 2:
@@ -102,7 +105,7 @@ def intersection(
         rays: camera position (3,) and unit direction (3,) of each. ground_z_m: level of the ground there, metres.
         height_sigma_m: of the point's height over it, None: as configured. pixel_rad: sigma of a ray, radians.
     """
-    height_sigma_m = active().evaluation.relief_sigma_m if height_sigma_m is None else height_sigma_m
+    height_sigma_m = _RELIEF_SIGMA_M if height_sigma_m is None else height_sigma_m
     normal, right = np.zeros((3, 3)), np.zeros(3)
     for position, direction in rays:
         distance = _range_m(position, ground_z_m)

@@ -9,7 +9,7 @@ from dataclasses import asdict
 from datetime import UTC, datetime
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,8 @@ from orthoswarm.mosaic.takeoff_altitude import TakeoffLevel, height_sigma_m, tak
 from orthoswarm.stores.addresses import address_of
 
 Array = NDArray[np.float64]
+
+OBLIQUE_AXIS_DOWN: Final = 0.2  # no sigma of a photo's centre whose axis points down by less (unit vector)
 
 
 def frame_row(placed: PlacedFrame, grid: LocalGrid, ground_z_m: float) -> dict[str, Any]:
@@ -179,7 +181,7 @@ def pose_covariance(placed: PlacedFrame, ground_z_m: float) -> Array | None:
         return None
     covariance = placed.pose_covariance.astype(np.float64)
     height = max(float(camera.position[2]) - ground_z_m, 1.0)
-    j = ground_jacobian(camera.rotation, height, config.oblique_axis_down)
+    j = ground_jacobian(camera.rotation, height, OBLIQUE_AXIS_DOWN)
     if j is None or not math.isfinite(placed.sigma_m):
         return covariance
     variance = (placed.sigma_m / config.stated_sigma_factor) ** 2

@@ -5,21 +5,33 @@ on light, colour and the sign of contrast, so they match across seasons; tiles a
 """
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.matchers.matcher import Array, Floats, Mask, Matches
 from orthoswarm.raster.subpixel_peak import vertex
+
+_CFOG_DIRECTIONS: Final = 6  # directions of gradients, evenly over 180 degrees
+_CFOG_BLUR_PX: Final = 0.8  # sigma of the blur before and after the gradients
+_CFOG_DIRECTION_BLUR: Final = 0.5  # weight of a direction itself in the blur over directions
+_CFOG_BORDER_PX: Final = 9  # side of the square by which the valid part is eroded: gradients at its edge are artefacts
+_CFOG_TILE_PX: Final = 64  # side of a tile; even
+_CFOG_VALID_SHARE: Final = 0.4  # least share of valid pixels in a tile
+_CFOG_ENERGY_SHARE: Final = 0.1  # least energy of a window as a share of the largest
+_CFOG_LEAST_PEAK: Final = 0.12  # least correlation of a match
+_CFOG_MOST_RATIO: Final = 0.92  # largest ratio of the second peak to the first
+_CFOG_PEAK_DISTANCE_PX: Final = 4  # correlations within this distance belong to the same peak
+_CFOG_SEARCH_PX: Final = 14  # search radius of tiles about the patch's common shift
+_CFOG_LEAST_SIDE_PX: Final = 16  # least side of a patch at half resolution
 
 
 def features(gray: Floats, valid: Mask) -> Floats:
     """Features float32 (directions, rows, columns), zero where not valid; their mean over directions is zero."""
     import cv2
 
-    config = active().matchers
-    directions, blur, border = config.cfog_directions, config.cfog_blur_px, config.cfog_border_px
+    directions, blur, border = _CFOG_DIRECTIONS, _CFOG_BLUR_PX, _CFOG_BORDER_PX
     smooth = cv2.GaussianBlur(np.where(valid, gray, 0.0).astype(np.float32), (0, 0), blur)
     gx, gy = cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1)
     inner = cv2.erode(valid.astype(np.uint8), np.ones((border, border), np.uint8), borderValue=0) > 0
@@ -30,7 +42,7 @@ def features(gray: Floats, valid: Mask) -> Floats:
     for k, a in enumerate(angle):
         strength = np.abs(np.float32(np.cos(a)) * gx + np.float32(np.sin(a)) * gy)
         channels[k] = cv2.GaussianBlur(strength, (0, 0), blur)
-    own = config.cfog_direction_blur
+    own = _CFOG_DIRECTION_BLUR
     adjacent = 0.5 * (1.0 - own)
     channels = adjacent * np.roll(channels, 1, 0) + own * channels + adjacent * np.roll(channels, -1, 0)
     norm = np.sqrt((channels * channels).sum(0)) + 1e-3
@@ -54,7 +66,6 @@ def correlate(tile: Floats, window: Floats) -> Peak:
     """Best position of a tile of features (D, h, w) in a window (D, h + 2 n, w + 2 n), by normalised correlation."""
     from scipy import fft
 
-    config = active().matchers
     rows, cols = window.shape[1] - tile.shape[1] + 1, window.shape[2] - tile.shape[2] + 1
     shape = tuple(int(fft.next_fast_len(n, real=True)) for n in window.shape[1:])
     product = (fft.rfft2(window, shape) * np.conj(fft.rfft2(tile, shape))).sum(0)
@@ -63,11 +74,11 @@ def correlate(tile: Floats, window: Floats) -> Peak:
     energy = fft.irfft2(fft.rfft2((window * window).sum(0), shape) * np.conj(fft.rfft2(weight, shape)), shape)
     energy = energy[:rows, :cols]
     own = float((tile * tile).sum())
-    score = dot / np.sqrt(np.maximum(energy, config.cfog_energy_share * float(energy.max()) + 1e-6) * max(own, 1e-6))
+    score = dot / np.sqrt(np.maximum(energy, _CFOG_ENERGY_SHARE * float(energy.max()) + 1e-6) * max(own, 1e-6))
     r, c = (int(v) for v in np.unravel_index(int(score.argmax()), score.shape))
     peak = float(score[r, c])
     rest = score.copy()
-    apart = config.cfog_peak_distance_px
+    apart = _CFOG_PEAK_DISTANCE_PX
     rest[max(0, r - apart) : r + apart + 1, max(0, c - apart) : c + apart + 1] = -1.0
     ratio = float(rest.max()) / max(peak, 1e-9)
     if not (0 < r < rows - 1 and 0 < c < cols - 1):
@@ -93,8 +104,7 @@ def match_tiles(
     Returns:
         One match for each tile with a clear peak; the score is the peak.
     """
-    config = active().matchers
-    half = config.cfog_tile_px // 2
+    half = _CFOG_TILE_PX // 2
     a, b, score = [], [], []
     for centre, expected in zip(centres, predict, strict=True):
         c, r = int(centre[0]), int(centre[1])
@@ -102,13 +112,13 @@ def match_tiles(
         wc, wr = round(float(expected[0])), round(float(expected[1]))
         c0, r0 = wc - half - search, wr - half - search
         size = 2 * (half + search)
-        if valid[cut].mean() < config.cfog_valid_share or c0 < 0 or r0 < 0:
+        if valid[cut].mean() < _CFOG_VALID_SHARE or c0 < 0 or r0 < 0:
             continue
         area = window[:, r0 : r0 + size, c0 : c0 + size]
         if area.shape[1:] != (size, size) or not area.any():
             continue
         found = correlate(patch[(slice(None), *cut)], area)
-        if found.peak >= config.cfog_least_peak and found.ratio <= config.cfog_most_ratio:
+        if found.peak >= _CFOG_LEAST_PEAK and found.ratio <= _CFOG_MOST_RATIO:
             a.append((c, r))
             b.append((wc + found.column, wr + found.row))
             score.append(found.peak)
@@ -119,14 +129,13 @@ def match_tiles(
 
 def tile_centres(valid: Mask) -> NDArray[np.int64]:
     """Centres (column, row), int64 (N, 2), of the tiles of a patch with a sufficient share of valid pixels."""
-    config = active().matchers
-    step = config.cfog_tile_px
+    step = _CFOG_TILE_PX
     half = step // 2
     rows, cols = valid.shape
     c, r = np.arange(half, cols - half + 1, step), np.arange(half, rows - half + 1, step)
     grid = np.stack(np.meshgrid(c, r), -1).reshape(-1, 2)
     share = [valid[r - half : r + half, c - half : c + half].mean() for c, r in grid]
-    return np.asarray(grid[np.array(share) >= config.cfog_valid_share], np.int64)
+    return np.asarray(grid[np.array(share) >= _CFOG_VALID_SHARE], np.int64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,7 +147,7 @@ class Cfog:
         import cv2
 
         size = (patch.shape[1] // 2, patch.shape[0] // 2)
-        if min(size) < active().matchers.cfog_least_side_px or not valid.any():
+        if min(size) < _CFOG_LEAST_SIDE_PX or not valid.any():
             return Matches.none()
         half_reach = reach // 2
         window_size = (size[0] + 2 * half_reach, size[1] + 2 * half_reach)
@@ -159,5 +168,5 @@ class Cfog:
             valid,
             predict=wanted,
             centres=centres,
-            search=active().matchers.cfog_search_px,
+            search=_CFOG_SEARCH_PX,
         )

@@ -5,11 +5,10 @@ are averaged over neighbouring cells, which have nearly the same shift, before t
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
-from orthoswarm.config import active
 from orthoswarm.matchers import weight_files
 from orthoswarm.matchers.matcher import Floats, Gray, Mask, Matches
 from orthoswarm.matchers.network_device import network_device
@@ -18,6 +17,15 @@ from orthoswarm.raster.subpixel_peak import vertices
 
 CELL_PX = 8
 _STRIDE = 32
+
+_WINDOW_NEIGHBOURS: Final = 5  # side of the square of cells whose scores are averaged
+_WINDOW_CONTRAST: Final = 4.0  # best shift's score exceeds the mean of its cell's scores by so many standard deviations
+_WINDOW_SURE_CONTRAST: Final = 10.0  # contrast from which on a match has the score 1
+_WINDOW_LEAST_CELLS: Final = 4  # least number of cells that are averaged
+_WINDOW_LEAST_SIDE: Final = 3  # least side of a patch in cells
+_WINDOW_VALID_SHARE: Final = 0.8  # least share of valid pixels in a cell
+_WINDOW_PART_CELLS: Final = 96  # side of the square of cells that the network describes at once (memory)
+_WINDOW_MARGIN_CELLS: Final = 12  # cells around them that it is given as well: about its receptive field
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +46,7 @@ class XFeatWindow:
         """See MapMatcher."""
         steps = reach // CELL_PX
         rows, cols = patch.shape[0] // CELL_PX, patch.shape[1] // CELL_PX
-        if steps < 1 or min(rows, cols) < active().matchers.window_least_side:
+        if steps < 1 or min(rows, cols) < _WINDOW_LEAST_SIDE:
             return Matches.none()
         spare = reach - steps * CELL_PX  # cells of both on one grid
         own, own_ok = _described(patch, valid)
@@ -55,11 +63,10 @@ class XFeatWindow:
         import cv2
         import torch
 
-        config = active().matchers
         n = 2 * steps + 1
         rows, cols = own_ok.shape
         out = np.zeros((n, n, rows, cols), np.float32)
-        side = (config.window_neighbours, config.window_neighbours)
+        side = (_WINDOW_NEIGHBOURS, _WINDOW_NEIGHBOURS)
         with torch.inference_mode():
             for dr in range(n):
                 for dc in range(n):
@@ -67,12 +74,11 @@ class XFeatWindow:
                     dot = (own * other[:, dr : dr + rows, dc : dc + cols]).sum(0).cpu().numpy()
                     total = cv2.boxFilter(np.where(both, dot, 0.0).astype(np.float32), -1, side, normalize=False)
                     count = cv2.boxFilter(both.astype(np.float32), -1, side, normalize=False)
-                    out[dr, dc] = np.where(count >= config.window_least_cells, total / np.maximum(count, 1.0), 0.0)
+                    out[dr, dc] = np.where(count >= _WINDOW_LEAST_CELLS, total / np.maximum(count, 1.0), 0.0)
         return out
 
     def _best(self, score: Floats, own_ok: Mask, steps: int, spare: int) -> Matches:
         """The clear best shift of each cell, refined between shifts by parabolas."""
-        config = active().matchers
         n, _, rows, cols = score.shape
         flat = score.reshape(n * n, rows, cols)
         best = flat.argmax(0)
@@ -80,7 +86,7 @@ class XFeatWindow:
         contrast = (peak - flat.mean(0)) / np.maximum(flat.std(0), 1e-6)
         at_r, at_c = best // n, best % n
         inside = (at_r > 0) & (at_r < n - 1) & (at_c > 0) & (at_c < n - 1)
-        rr, cc = np.nonzero(own_ok & inside & (contrast >= config.window_contrast))
+        rr, cc = np.nonzero(own_ok & inside & (contrast >= _WINDOW_CONTRAST))
         if not len(rr):
             return Matches.none()
         r, c = at_r[rr, cc], at_c[rr, cc]
@@ -90,7 +96,7 @@ class XFeatWindow:
         centre = 0.5 * (CELL_PX - 1)
         a = (np.column_stack([cc, rr]) * float(CELL_PX) + centre).astype(np.float64)
         b = a + spare + CELL_PX * np.column_stack([c + dc, r + dr])
-        sure = np.clip(contrast[rr, cc] / config.window_sure_contrast, 0.0, 1.0).astype(np.float64)
+        sure = np.clip(contrast[rr, cc] / _WINDOW_SURE_CONTRAST, 0.0, 1.0).astype(np.float64)
         return Matches(a, np.asarray(b, np.float64), sure)
 
 
@@ -102,7 +108,7 @@ def _described(gray: Floats, valid: Mask) -> tuple[Any, Mask]:
     filled = np.where(valid, gray, float(gray[valid].mean()) if valid.any() else 127.0)
     image = np.clip(filled, 0, 255).astype(np.uint8)
     rows, cols = gray.shape[0] // CELL_PX, gray.shape[1] // CELL_PX
-    side = active().matchers.window_part_cells
+    side = _WINDOW_PART_CELLS
     dense = torch.zeros((64, rows, cols), device=network_device())
     with torch.inference_mode():
         for r in range(0, rows, side):
@@ -112,14 +118,14 @@ def _described(gray: Floats, valid: Mask) -> tuple[Any, Mask]:
     share = cv2.resize(
         valid[: rows * CELL_PX, : cols * CELL_PX].astype(np.float32), (cols, rows), interpolation=cv2.INTER_AREA
     )
-    return dense[:, :rows, :cols], share > active().matchers.window_valid_share
+    return dense[:, :rows, :cols], share > _WINDOW_VALID_SHARE
 
 
 def _part(image: Gray, row: int, column: int) -> Any:
     """Unit descriptors (64, <= n, <= n) of n x n cells; in parts, since the network's memory grows with the image."""
     import torch
 
-    side, margin = active().matchers.window_part_cells, active().matchers.window_margin_cells
+    side, margin = _WINDOW_PART_CELLS, _WINDOW_MARGIN_CELLS
     r0, c0 = max(0, row - margin), max(0, column - margin)
     r1, c1 = row + side + margin, column + side + margin
     cut = image[r0 * CELL_PX : r1 * CELL_PX, c0 * CELL_PX : c1 * CELL_PX]

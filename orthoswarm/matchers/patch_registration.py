@@ -6,12 +6,25 @@ result with a share of a half or more was wrong.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
-from orthoswarm.config import active
 from orthoswarm.matchers import cfog
 from orthoswarm.matchers.matcher import Array, Floats, MapMatcher, Mask, Matches
+
+_AGREEMENT_PX: Final = 3.0  # a tile agrees with a homography within this distance, pixels of the patch
+_COARSE_AGREEMENT_PX: Final = 6.0  # the same for the first homography, from the matcher's own matches
+_TILE_SEARCH_PX: Final = (10, 6)  # search radius of tiles about the homography so far in each round
+_LEAST_MATCHES: Final = 8  # least matches of a homography or of a common shift
+_MAGSAC_ITERATIONS: Final = 5000  # most iterations of MAGSAC++ (cost)
+_MAGSAC_CONFIDENCE: Final = 0.999  # confidence at which MAGSAC++ stops
+_PLAUSIBLE_DEPTH: Final = (0.5, 2.0)  # range of the projective depth of a plausible homography at the patch's corners
+_PLAUSIBLE_STRETCH: Final = (0.8, 1.25)  # range of the scale of the patch's sides under a plausible homography
+_PLAUSIBLE_REACH: Final = 1.5  # largest shift of a corner, search radii ...
+_PLAUSIBLE_SIDE_SHARE: Final = 0.05  # ... plus this share of the patch's longer side
+_SHIFT_WIDTH_PX: Final = 8.0  # matches share a common shift within this distance
+_SHIFT_SHARE: Final = 0.1  # least share of matches with the common shift
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,9 +63,8 @@ def register(
     Returns:
         None where no homography is found; else the result, whose `share` may still be too low to trust it.
     """
-    config = active().matchers
     first = matcher.match(patch, valid, window, known, reach)
-    fit = magsac(first, config.coarse_agreement_px)
+    fit = magsac(first, _COARSE_AGREEMENT_PX)
     if fit is None or not plausible(fit, patch.shape, reach):
         shift = robust_shift(first)
         if shift is None:
@@ -63,17 +75,17 @@ def register(
     inside = known_below(known, apply(fit, centres.astype(float)))
     tried = centres[inside]
     found = Matches.none()
-    for search in config.tile_search_px:
+    for search in _TILE_SEARCH_PX:
         found = cfog.match_tiles(
             own, other, valid, predict=apply(fit, tried.astype(float)), centres=tried, search=search
         )
         chosen = found if keep is None else found.take(keep(found, fit))
-        better = magsac(chosen, config.agreement_px)
+        better = magsac(chosen, _AGREEMENT_PX)
         if better is None or not plausible(better, patch.shape, reach):
             return Registration(fit, Matches.none(), 0.0, float("nan"), len(tried))
         fit = better
     error = found.b - apply(fit, found.a)
-    agrees = np.hypot(*error.T) < config.agreement_px
+    agrees = np.hypot(*error.T) < _AGREEMENT_PX
     if keep is not None:
         agrees &= keep(found, fit)
     share = float(agrees.sum()) / max(len(tried), 1)
@@ -85,14 +97,13 @@ def magsac(matches: Matches, threshold_px: float) -> Array | None:
     """Homography from a to b by MAGSAC++; None where there is none (OpenCV 5 raises an error in that case)."""
     import cv2
 
-    config = active().matchers
-    if len(matches) < config.least_matches:
+    if len(matches) < _LEAST_MATCHES:
         return None
     cv2.setRNGSeed(1)
     try:
         found, _ = cv2.findHomography(
             matches.a, matches.b, cv2.USAC_MAGSAC, threshold_px, None,
-            config.magsac_iterations, config.magsac_confidence,
+            _MAGSAC_ITERATIONS, _MAGSAC_CONFIDENCE,
         )  # fmt: skip
     except cv2.error:
         return None
@@ -109,32 +120,30 @@ def apply(homography: Array, points: Array) -> Array:
 
 def plausible(homography: Array, shape: tuple[int, ...], reach: int) -> bool:
     """Whether a homography can be a correction of poses: moderate scale and perspective, corners within the reach."""
-    config = active().matchers
     rows, cols = shape
     corners = np.array([[0, 0], [cols, 0], [cols, rows], [0, rows]], float)
     depth = np.c_[corners, np.ones(4)] @ homography[2]
-    if (depth < config.plausible_depth[0]).any() or (depth > config.plausible_depth[1]).any():
+    if (depth < _PLAUSIBLE_DEPTH[0]).any() or (depth > _PLAUSIBLE_DEPTH[1]).any():
         return False
     moved = apply(homography, corners)
-    most = config.plausible_reach * reach + config.plausible_side_share * max(rows, cols)
+    most = _PLAUSIBLE_REACH * reach + _PLAUSIBLE_SIDE_SHARE * max(rows, cols)
     if np.abs(moved - corners - reach).max() > most:
         return False
     sides = np.linalg.norm(np.roll(moved, -1, 0) - moved, axis=1) / np.linalg.norm(
         np.roll(corners, -1, 0) - corners, axis=1
     )
-    return bool((sides > config.plausible_stretch[0]).all() and (sides < config.plausible_stretch[1]).all())
+    return bool((sides > _PLAUSIBLE_STRETCH[0]).all() and (sides < _PLAUSIBLE_STRETCH[1]).all())
 
 
 def robust_shift(matches: Matches) -> Array | None:
     """The shift (2,) in pixels that most matches share, None where too few do."""
-    config = active().matchers
-    width_px, least = config.shift_width_px, config.least_matches
+    width_px, least = _SHIFT_WIDTH_PX, _LEAST_MATCHES
     if len(matches) < least:
         return None
     shift = matches.b - matches.a
     best = shift[np.argmax([np.count_nonzero(np.abs(shift - s).max(1) < width_px) for s in shift])]
     near = np.abs(shift - best).max(1) < width_px
-    if near.sum() < max(least, config.shift_share * len(shift)):
+    if near.sum() < max(least, _SHIFT_SHARE * len(shift)):
         return None
     return np.asarray(np.median(shift[near], axis=0))
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from importlib.util import find_spec
 from inspect import signature
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -16,6 +16,8 @@ from orthoswarm.config import active
 from orthoswarm.matchers.matcher import Floats, Mask, Matches, UnavailableError
 from orthoswarm.matchers.network_device import network_device
 from orthoswarm.matchers.sparse_learned import read_state
+
+_ROMA_CERTAINTY: Final = 0.3  # least certainty of a match
 
 
 def load(state: dict[str, Any], backbone: dict[str, Any], device: Any) -> Any:
@@ -90,4 +92,4 @@ class Roma:
         score = sure.detach().cpu().numpy().astype(np.float64)
         near = np.abs(b - a - reach).max(1) <= reach
         c, r = np.clip(np.round(a), 0, np.array(patch.shape)[::-1] - 1).astype(np.int64).T
-        return Matches(a, b, score).take(near & (score >= active().matchers.roma_certainty) & valid[r, c])
+        return Matches(a, b, score).take(near & (score >= _ROMA_CERTAINTY) & valid[r, c])

@@ -1,14 +1,17 @@
 """Second attempt at a leg that correlation did not find on the map: learned matching in the prior window."""
 
 from functools import lru_cache
+from typing import Final
 
 import numpy as np
 
-from orthoswarm.config import active
 from orthoswarm.matchers.matcher import Floats, MapMatcher, Mask
 from orthoswarm.matchers.patch_registration import apply, register
 from orthoswarm.matchers.registry import map_matcher
 from orthoswarm.model.errors import InputError
+
+LEAST_TILES: Final = 12  # least number of tiles that agree
+TRUSTED_SHARE: Final = 0.35  # least share of tiles that agree. By chance a tile agrees in one of twelve cases
 
 
 def second_opinion(
@@ -32,9 +35,8 @@ def second_opinion(
             matcher = _default()
         except InputError:
             return None
-    config = active().matchers
     found = register(patch, valid, window, known=known, reach=reach, matcher=matcher)
-    if found is None or found.share < config.trusted_share or len(found.matches) < config.least_tiles:
+    if found is None or found.share < TRUSTED_SHARE or len(found.matches) < LEAST_TILES:
         return None
     middle = np.median(found.matches.a, axis=0)[None]
     shift = (apply(found.homography, middle) - middle)[0] - reach

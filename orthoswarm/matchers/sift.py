@@ -1,11 +1,15 @@
 """SIFT: good between frames of one flight, needs no weights; between dates it fails on about half of real pairs."""
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
-from orthoswarm.config import active
 from orthoswarm.matchers.matcher import Gray, Matches
+
+_SIFT_KEYPOINTS: Final = 1500  # most keypoints a picture (cost)
+_SIFT_RATIO: Final = 0.8  # ratio of the nearest to the second nearest descriptor (Lowe 2004)
+_SIFT_CONTRAST: Final = 0.02  # contrast threshold: OpenCV's default is 0.04
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,9 +20,8 @@ class Sift:
         """See PictureMatcher."""
         import cv2
 
-        config = active().matchers
         sift = cv2.SIFT_create(  # type: ignore[attr-defined,unused-ignore]
-            nfeatures=config.sift_keypoints, contrastThreshold=config.sift_contrast
+            nfeatures=_SIFT_KEYPOINTS, contrastThreshold=_SIFT_CONTRAST
         )
         points_a, descriptors_a = sift.detectAndCompute(a, None)
         points_b, descriptors_b = sift.detectAndCompute(b, None)
@@ -29,7 +32,7 @@ class Sift:
         accepted = []
         for best, second in matcher.knnMatch(descriptors_a, descriptors_b, k=2):
             share = best.distance / max(second.distance, 1e-9)
-            if share < config.sift_ratio and back.get(best.trainIdx) == best.queryIdx:
+            if share < _SIFT_RATIO and back.get(best.trainIdx) == best.queryIdx:
                 accepted.append((points_a[best.queryIdx].pt, points_b[best.trainIdx].pt, 1.0 - share))
         if not accepted:
             return Matches.none()

@@ -6,11 +6,10 @@ being resized or cropped, which would shift keypoints by fractions of a pixel.
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 
-from orthoswarm.config import active
 from orthoswarm.matchers import weight_files
 from orthoswarm.matchers.matcher import Gray, Matches, UnavailableError
 from orthoswarm.matchers.network_device import network_device
@@ -19,6 +18,10 @@ Kind = Literal["xfeat", "disk", "aliked"]
 _STRIDE = {"xfeat": 32, "disk": 16, "aliked": 32}
 _EXTRACTOR = {"xfeat": "xfeat", "disk": "disk", "aliked": "aliked"}
 _MATCHER = {"xfeat": "xfeat-lighterglue", "disk": "disk-lightglue", "aliked": "aliked-lightglue"}
+
+_LEARNED_KEYPOINTS: Final = 1024  # most keypoints a picture (cost)
+_LEARNED_DETECTION: Final = 0.05  # detection threshold of XFeat (Potje et al., CVPR 2024)
+_LEARNED_LEAST_KEYPOINTS: Final = 4  # pictures with fewer keypoints are not matched
 
 
 def read_state(name: str) -> dict[str, Any]:
@@ -125,7 +128,7 @@ class Learned:
 
         with torch.inference_mode():
             one, two = self._features(a), self._features(b)
-            if min(one["keypoints"].shape[1], two["keypoints"].shape[1]) < active().matchers.learned_least_keypoints:
+            if min(one["keypoints"].shape[1], two["keypoints"].shape[1]) < _LEARNED_LEAST_KEYPOINTS:
                 return Matches.none()
             found = glue(self.kind)({"image0": one, "image1": two})
         pairs = found["matches"][0].cpu().numpy()
@@ -137,13 +140,12 @@ class Learned:
     def _features(self, gray: Gray) -> dict[str, Any]:
         import torch
 
-        config = active().matchers
-        count = config.learned_keypoints
+        count = _LEARNED_KEYPOINTS
         rows, cols = gray.shape
         image = padded_tensor(gray, _STRIDE[self.kind], 1 if self.kind == "xfeat" else 3)
         model = extractor(self.kind)
         if self.kind == "xfeat":
-            found = model.detectAndCompute(image, top_k=count, detection_threshold=config.learned_detection)[0]
+            found = model.detectAndCompute(image, top_k=count, detection_threshold=_LEARNED_DETECTION)[0]
             points, descriptors = found["keypoints"], found["descriptors"]
         elif self.kind == "disk":
             result = model(image, n=count)[0]

@@ -2,15 +2,22 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Final
 
 import numpy as np
 
 from orthoswarm.canvas.canvas import Canvas
-from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.placement import MapWindow, PlacedFrame, Solution, Terrain
 from orthoswarm.mosaic.footprint import footprint_boxes
+
+FLAT_RELIEF_M: Final = 0.5  # relief of this standard deviation or less is noise to the adjustment's height prior
+_MAP_COVER_SHARE: Final = 0.98  # a warning says what a map covers of the flight, up to this share of pictures
+_RECORDED_HEIGHT_SIGMA_M: Final = 1.0  # sigma of a vehicle's recorded heights over its takeoff level, taken together
+_GROUND_LEVEL_SIGMA_M: Final = 0.2  # sigma of the solved ground's median level, without its relief
+_TAKEOFF_LEVEL_LIMIT_M: Final = 3.0  # a takeoff level farther from the refiner's zero is ignored ...
+_TAKEOFF_LEVEL_RELIEFS: Final = 2.0  # ... and so many sigmas of the ground's heights
 
 
 def placed_bounds(placed: Sequence[PlacedFrame], low: float, high: float) -> BoundingBox:
@@ -58,14 +65,13 @@ def from_takeoff(
     """
     if terrain is None or not placed:
         return placed, level
-    config = active().mosaic
     ground = terrain.bare_ground().height(np.array([p.camera.nadir for p in placed]))
-    relief = float(np.sqrt(max(0.0, ground.var() - active().surface.flat_relief_m ** 2)))  # less is the surface's noise
+    relief = float(np.sqrt(max(0.0, ground.var() - FLAT_RELIEF_M**2)))  # less is the surface's noise
     recorded = [p.camera.position[2] - p.frame.fix.height_m for p in placed if p.frame.fix.height_m is not None]
-    zeros = [(level, config.ground_level_sigma_m**2 + relief**2)]
+    zeros = [(level, _GROUND_LEVEL_SIGMA_M**2 + relief**2)]
     if recorded:
-        zeros.append((float(np.median(recorded)), config.recorded_height_sigma_m**2))
-    limit = config.takeoff_level_limit_m + config.takeoff_level_reliefs * relief
+        zeros.append((float(np.median(recorded)), _RECORDED_HEIGHT_SIGMA_M**2))
+    limit = _TAKEOFF_LEVEL_LIMIT_M + _TAKEOFF_LEVEL_RELIEFS * relief
     zeros = [(zero, variance) for zero, variance in zeros if abs(zero) <= limit]
     if not zeros:
         return placed, level
@@ -90,7 +96,7 @@ def partial_cover(basemap: MapWindow, placed: Sequence[PlacedFrame]) -> list[str
     west, south, east, north = basemap.bounds
     xy = np.array([p.camera.nadir for p in placed])
     inside = (xy[:, 0] >= west) & (xy[:, 0] <= east) & (xy[:, 1] >= south) & (xy[:, 1] <= north)
-    if inside.mean() > active().mosaic.map_cover_share:
+    if inside.mean() > _MAP_COVER_SHARE:
         return []
     return [
         f"the basemap covers {inside.mean():.0%} of the pictures; the others lie on it only if neighbours carry them"

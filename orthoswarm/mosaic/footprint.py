@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from functools import lru_cache
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +13,9 @@ from orthoswarm.model.camera import Camera, Lens
 from orthoswarm.mosaic.kernels.lens_arrays import INNER, OUTER, lens_row
 
 Array = NDArray[np.float64]
+
+_MOST_MAGNIFICATION: Final = 16.0
+"""A picture whose ground pixel is more than so many times the map's is none of this flight."""
 
 
 def tan_limit() -> float:
@@ -73,7 +77,7 @@ def _reason(height: float, focal_px: float, steepest: float, gsd_m: float) -> st
         return "its pose is not a number"
     if height <= 0:
         return f"its camera is not above the ground (height {height:.1f} m)"
-    if height > active().mosaic.most_magnification * gsd_m * focal_px:
+    if height > _MOST_MAGNIFICATION * gsd_m * focal_px:
         times = height / (gsd_m * focal_px)
         return (
             f"from {height:.0f} m above the ground its pixels are {times:.0f} times as large as the map's: "

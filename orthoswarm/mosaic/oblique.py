@@ -5,12 +5,18 @@ picture looks there, the map would be surrounded by that.
 """
 
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.model.placement import PlacedFrame
+
+_OBLIQUE_DEG: Final = 35.0
+"""Pictures that look farther from straight down are left out of a flight that looks straight down: more than a fixed
+camera is tilted when its vehicle accelerates (28 degrees measured)."""
+_NADIR_DEG: Final = 15.0  # a flight whose median tilt is below this looks straight down
+_OBLIQUE_SHARE: Final = 1.0 / 3.0  # a vehicle with a larger share of oblique pictures took them on purpose
 
 
 def tilts(placed: Sequence[PlacedFrame]) -> NDArray[np.float64]:
@@ -24,8 +30,7 @@ def strays(placed: Sequence[PlacedFrame]) -> dict[str, str]:
 
     A vehicle with more than a third of oblique pictures took them on purpose, and keeps them.
     """
-    config = active().mosaic
-    oblique_rad, nadir_rad = float(np.radians(config.oblique_deg)), float(np.radians(config.nadir_deg))
+    oblique_rad, nadir_rad = float(np.radians(_OBLIQUE_DEG)), float(np.radians(_NADIR_DEG))
     tilt = tilts(placed)
     members: dict[str, list[int]] = {}
     for i, p in enumerate(placed):
@@ -33,7 +38,7 @@ def strays(placed: Sequence[PlacedFrame]) -> dict[str, str]:
     out = {}
     for index in members.values():
         off = tilt[index] > oblique_rad
-        if off.any() and off.mean() <= config.oblique_share and np.median(tilt[index]) < nadir_rad:
+        if off.any() and off.mean() <= _OBLIQUE_SHARE and np.median(tilt[index]) < nadir_rad:
             for i in np.array(index)[off].tolist():
                 out[placed[i].frame.image] = (
                     f"it looks {np.degrees(tilt[i]):.0f} degrees away from straight down, the others of its vehicle "

@@ -6,7 +6,7 @@ other obliquely), and on a grid over each frame and its nearest neighbours, of a
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,21 @@ Ints = NDArray[np.int32]
 Bytes = NDArray[np.uint8]
 
 _TILE = 512
+
+_RATIO_SIGMA: Final = 0.08
+"""Log ratio of two thumbnails at one place of even ground: reflection by direction, shadows (two suburbs with all kinds
+of ground, once solved: half within 0.05, 90 % within 0.19; tried: 0.08 and 0.15)."""
+_MISPLACED: Final = 0.7
+"""Displacement of the two thumbnails against each other, in their pixels: a ratio's sigma grows by it times the
+contrast from pixel to pixel (0.35 and 0.7 tried)."""
+DARK_LEVEL: Final = 8.0  # thumbnail levels from 0 to here are partly clipped and say nothing about a gain
+BRIGHT_LEVEL: Final = 247.0  # the same for levels from here to 255
+_BESIDE_SEAM: Final = 0.35  # how far beside a seam, towards each picture's nadir, colours are compared as well
+_RATIOS_PER_PICTURE: Final = 48  # most ratios a picture at and beside seams, besides neighbours' (cost)
+_NEIGHBOURS: Final = 6  # nearest pictures with which each is compared; with 2 or 3 a lawn's steps stay
+_NEIGHBOUR_PLACES: Final = ((0.2, 0.5, 0.8), (0.3, 0.7))  # that grid: shares of a picture's width, and of its height
+_LABEL_CELLS: Final = 64  # cells across a picture on which the seams for this comparison are found (cost)
+_LABEL_MOST_CELLS: Final = 2_000_000  # most of these cells in a map; they grow beyond it (memory)
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,8 +120,7 @@ def _coarse_labels(cameras: Sequence[Camera], shots: Shots, terrain: Terrain, th
         return np.zeros((1, 1), np.int32), GroundGrid(epsg=0, west=0.0, north=0.0, gsd_m=1.0, width=1, height=1)
     side = float(np.median(boxes[:, 2:] - boxes[:, :2]))
     box = BoundingBox.around(boxes)
-    config = active().radiometry
-    cell = max(side / config.label_cells, float(np.sqrt(box.width * box.height / config.label_most_cells)), 1e-3)
+    cell = max(side / _LABEL_CELLS, float(np.sqrt(box.width * box.height / _LABEL_MOST_CELLS)), 1e-3)
     grid = GroundGrid.around(0, box, cell)
     labels = np.zeros((grid.height, grid.width), np.int32)
 
@@ -140,11 +154,11 @@ def _neighbours(cameras: Sequence[Camera], shots: Shots, terrain: Terrain) -> _M
     """A grid of points of each frame, with each of the frames that have the nearest nadirs."""
     from scipy.spatial import cKDTree
 
-    u, v = np.meshgrid(*active().radiometry.neighbour_places)
+    u, v = np.meshgrid(*_NEIGHBOUR_PLACES)
     share = np.stack([u.ravel(), v.ravel()], 1)
     ground = grid_on_ground(cameras, shots, terrain, share)
 
-    nearest = min(active().radiometry.neighbours + 1, len(cameras))
+    nearest = min(_NEIGHBOURS + 1, len(cameras))
     others = cKDTree(shots.position[:, :2]).query(shots.position[:, :2], nearest)[1].reshape(len(cameras), nearest)
     a = np.repeat(np.arange(len(cameras)), nearest)
     b = others.ravel()
@@ -171,12 +185,12 @@ def grid_on_ground(cameras: Sequence[Camera], shots: Shots, terrain: Terrain, sh
 def _towards(seams: _Meetings, frame: Ints, shots: Shots) -> _Meetings:
     """The same places, moved towards the nadirs of one of the two frames."""
     nadir = shots.position[frame, :2]
-    return _Meetings(seams.a, seams.b, seams.ground + active().radiometry.beside_seam * (nadir - seams.ground))
+    return _Meetings(seams.a, seams.b, seams.ground + _BESIDE_SEAM * (nadir - seams.ground))
 
 
 def _thinned(meetings: _Meetings, frames: int) -> _Meetings:
     """Every k-th place, so that there are not more than some a frame."""
-    step = max(1, -(-len(meetings.a) // (active().radiometry.ratios_per_picture // 3 * frames)))
+    step = max(1, -(-len(meetings.a) // (_RATIOS_PER_PICTURE // 3 * frames)))
     return _Meetings(meetings.a[::step], meetings.b[::step], meetings.ground[::step])
 
 
@@ -186,7 +200,7 @@ def _compared(
     """The samples at places whose colour both frames show."""
     west, north = (float(v) for v in shots.position[:, :2].mean(0))
     position, rotation = shots.about(west, north)
-    config, at_once = active().radiometry, active().compute.ratios_at_once
+    at_once = active().compute.ratios_at_once
 
     def compare(some: _Meetings) -> OverlapColors:
         count = len(some.a)
@@ -195,11 +209,11 @@ def _compared(
         ground = np.nan_to_num(some.ground)
         place = np.stack([ground[:, 0] - west, north - ground[:, 1], terrain.height(ground)], 1)
         _compare(
-            some.a, some.b, place, position, rotation, shots.lens, shots.size, small, config.dark_level,
-            config.bright_level, ratio, usable, seen, contrast,
+            some.a, some.b, place, position, rotation, shots.lens, shots.size, small, DARK_LEVEL,
+            BRIGHT_LEVEL, ratio, usable, seen, contrast,
         )  # fmt: skip
         usable &= np.asarray(np.isfinite(some.ground).all(axis=1))
-        sigma = np.sqrt(config.ratio_sigma**2 + np.square(config.misplaced * contrast))
+        sigma = np.sqrt(_RATIO_SIGMA**2 + np.square(_MISPLACED * contrast))
         return OverlapColors(np.stack([some.a, some.b], 1)[usable], ratio[usable], seen[usable], sigma[usable])
 
     names = "a", "b", "ground"

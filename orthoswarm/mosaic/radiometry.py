@@ -17,6 +17,7 @@ place in the picture, which the renderer evaluates at each pixel that it takes.
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +46,28 @@ curvatures."""
 _PARTS = 8
 """Parts in which samples are summed, at most so many threads (chosen)."""
 
+_ROBUST_SIGMAS: Final = 3.0  # scale of the Geman-McClure kernel on these ratios, sigmas
+_VEHICLE_SIGMA: Final = 0.30  # log gain of a vehicle's camera: another exposure or white balance
+_PICTURE_SIGMA: Final = 0.06  # log gain of a picture: automatic exposure within a flight
+_LENS_SIGMAS: Final = (0.05, 0.05, 0.15, 0.05, 0.15)
+"""x, y, x^2, xy, y^2 of a vehicle's vignetting, half the picture's width being 1: corners may be darker by a fifth or
+so."""
+_VIEW_SIGMAS: Final = (0.15, 0.15, 0.10, 0.10, 0.10)
+"""e, n, e^2, en, n^2 of the view direction's tangents; chosen (two suburbs: 0.14 to 0.22 a tangent found)."""
+_SLOPE_SIGMA: Final = 0.07  # a picture's own slopes; by steps on even ground of three flights
+_CURVE_SIGMA: Final = 0.06  # a picture's own curvatures, x^2, xy, y^2; chosen with the slopes
+_HUE_SHARE: Final = 0.35  # how much less than brightness hue may vary; by looking at four sets
+GREATEST_FACTOR: Final = 1.8  # greatest factor, and the least is its inverse: what would need more has another cause
+_HELD_LEAST_FACTOR: Final = 0.1
+"""Factors of pictures that keep theirs count as at least so much where their logarithm is needed."""
+_FLATTEST_DESCENT: Final = 0.2  # rays count as falling at least so much for their length
+_LIMITED_SHARE: Final = 0.02
+"""A warning says how many photos would need more than the greatest factor if more than so many do ..."""
+_LIMITED_LOG_SHARE: Final = 0.95  # ... which is taken from this share of its logarithm on
+_TINT_RATIO: Final = 1.15
+"""A warning says that a map has another tint where its colours' factors differ by more than this."""
+_NODES: Final = 7  # nodes along each side of a picture to which its quadratic polynomial is fitted
+
 
 def uniform(gain: Sequence[float] | NDArray[np.floating]) -> Field:
     """The field of a constant factor (3,)."""
@@ -63,14 +86,13 @@ def tone_warning(fields: Mapping[str, Field]) -> str:
         return "the tones are those of the photos: there is nothing to compare"
     red, green, blue = np.median(factors, axis=0)
     text = f"the tones follow the basemap: red, green and blue times {red:.2f}, {green:.2f} and {blue:.2f} (median)"
-    config = active().radiometry
-    greatest = config.greatest_factor
-    at_limit = float((np.abs(np.log(factors)).max(1) > config.limited_log_share * np.log(greatest)).mean())
-    if at_limit > config.limited_share:
+    greatest = GREATEST_FACTOR
+    at_limit = float((np.abs(np.log(factors)).max(1) > _LIMITED_LOG_SHARE * np.log(greatest)).mean())
+    if at_limit > _LIMITED_SHARE:
         text += (
             f"; {at_limit:.0%} of the photos would need more than {greatest:g}, the greatest factor, and differ from it"
         )
-    if max(red, green, blue) > config.tint_ratio * min(red, green, blue):
+    if max(red, green, blue) > _TINT_RATIO * min(red, green, blue):
         text += "; the map has another tint than the photos (season, light, sensor), which the orthoimage now has, too"
     return text
 
@@ -99,7 +121,7 @@ def estimate_fields(
         threads: that share the work; the result does not depend on them.
 
     Returns:
-        image -> field for every frame; factors lie within `greatest_factor` and its inverse.
+        image -> field for every frame; factors lie within `GREATEST_FACTOR` and its inverse.
     """
     held = held or {}
     known = [i for i, f in enumerate(frames) if f.frame.image in thumbnails]
@@ -130,7 +152,7 @@ def estimate_fields(
     if not fixed.any() and area.sum() > 0:
         middle = log[some].mean(1)
         log -= (area[:, None] * middle).sum(0) / area.sum()
-    limit = float(np.log(active().radiometry.greatest_factor))
+    limit = float(np.log(GREATEST_FACTOR))
     factor = np.exp(np.clip(log, -limit, limit))
     fields = np.concatenate([_as_polynomials(factor[b], shots.size[b]) for b in blocks])
     return {f.frame.image: held.get(f.frame.image, field) for f, field in zip(frames, fields)}
@@ -144,7 +166,7 @@ def _with_held(colors: OverlapColors, held: Sequence[Field | None]) -> OverlapCo
         x, y = colors.place[:, side, 0], colors.place[:, side, 1]
         basis = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], 1)
         factor = np.einsum("mk,mck->mc", basis, coefficients[colors.frame[:, side]])
-        ratio += sign * np.log(np.maximum(factor, active().radiometry.held_least_factor))
+        ratio += sign * np.log(np.maximum(factor, _HELD_LEAST_FACTOR))
     return replace(colors, ratio=ratio.astype(np.float32))
 
 
@@ -153,12 +175,12 @@ def _solve(
 ) -> tuple[Array, Array]:
     """Unknowns of vehicles (V, 11, 3) and of frames (N, 6, 3), by conjugate gradients within reweighting rounds."""
     config = active().radiometry
-    prior_v = np.array([config.vehicle_sigma, *config.lens_sigmas, *config.view_sigmas]) ** -2.0
-    prior_f = np.array([config.picture_sigma, *[config.slope_sigma] * 2, *[config.curve_sigma] * 3]) ** -2.0
+    prior_v = np.array([_VEHICLE_SIGMA, *_LENS_SIGMAS, *_VIEW_SIGMAS]) ** -2.0
+    prior_f = np.array([_PICTURE_SIGMA, *[_SLOPE_SIGMA] * 2, *[_CURVE_SIGMA] * 3]) ** -2.0
     prior = np.concatenate([np.tile(prior_v, vehicles), np.tile(prior_f, len(vehicle))])[:, None] * np.ones(3)
     of_hue = np.ones(len(prior), bool)
     of_hue[: vehicles * _COMMON : _COMMON] = False
-    prior[of_hue, 1:] /= config.hue_share**2
+    prior[of_hue, 1:] /= _HUE_SHARE**2
     samples = _Samples(colors, vehicle, vehicles, (~fixed).astype(np.float64), threads)
     x = np.zeros((len(prior), 3))
     for _ in range(config.reweightings):
@@ -203,7 +225,7 @@ class _Samples:
 
     def weigh(self, x: Array) -> tuple[Array, Array]:
         """Set the weights W by the residuals r at x; returns A' W r and the diagonal of A' W A."""
-        robust = active().radiometry.robust_sigmas
+        robust = _ROBUST_SIGMAS
 
         def part(k: int) -> tuple[Array, Array]:
             right, diagonal = np.zeros_like(x), np.zeros(len(x))
@@ -315,7 +337,7 @@ def _apply(frame, place, vehicle, free, vehicles, weight, values, out):  # type:
 
 def _nodes(size: NDArray[np.int32]) -> tuple[Array, Array]:
     """Places in the pictures (N, nodes^2) at which fields are fitted."""
-    count = active().radiometry.nodes
+    count = _NODES
     across = np.linspace(-1.0, 1.0, count)
     x = np.tile(across, count)
     y = np.repeat(across, count)[None, :] * (size[:, 1] / size[:, 0])[:, None]
@@ -329,7 +351,7 @@ def _log_factors(of_vehicle: Array, of_frame: Array, shots: Shots) -> Array:
     u, v = half * (x + 1.0) - 0.5, half * y + 0.5 * shots.size[:, 1:] - 0.5
     rays = np.stack([(u - shots.lens[:, [U]]) / shots.lens[:, [F]], (v - shots.lens[:, [V]]) / shots.lens[:, [F]]], -1)
     rays = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], -1) @ shots.rotation.transpose(0, 2, 1)
-    flattest = active().radiometry.flattest_descent
+    flattest = _FLATTEST_DESCENT
     down = np.maximum(-rays[..., 2:], flattest * np.linalg.norm(rays, axis=-1, keepdims=True))
     e, n = np.moveaxis(rays[..., :2] / down, -1, 0)
     one = np.ones_like(y)

@@ -7,6 +7,7 @@ recorded, yaw from the course flown where none is recorded. A warning names what
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +19,14 @@ from orthoswarm.model.errors import InputError
 from orthoswarm.model.frame import Frame, Ingest, Rejection
 from orthoswarm.model.geo import LocalGrid, area_epsg
 from orthoswarm.model.placement import PlacedFrame
-from orthoswarm.trajectory.courses import course
+from orthoswarm.trajectory.courses import MOVED_M, course
 
 Array = NDArray[np.float64]
+
+_FAR_M: Final = 20_000.0  # a position this far from the median of its set cannot be true: no small drone flies farther
+_FAR_SPREADS: Final = 10.0  # ... and so many times the median distance: a set may be larger than that
+_LARGEST_AREA_M: Final = 100_000.0  # no position lies farther from where most are, however they spread
+_UNTAGGED_TILT_SIGMA: Final = 0.1  # tilt without a recorded attitude: 6 degrees of sway about straight down
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +54,7 @@ def area_grid(frames: Sequence[Frame]) -> LocalGrid:
 
 
 def in_one_area(ingest: Ingest) -> Ingest:
-    """Inputs without the frames that lie on another continent than most, by `largest_area_m`; they are rejected.
+    """Inputs without the frames that lie on another continent than most, by `_LARGEST_AREA_M`; they are rejected.
 
     Raises:
         InputError: as many lie in one place as in another.
@@ -56,7 +62,7 @@ def in_one_area(ingest: Ingest) -> Ingest:
     frames = ingest.frames
     if len(frames) < 2:
         return ingest
-    limit = active().records.largest_area_m
+    limit = _LARGEST_AREA_M
     at = on_sphere([f.fix.lat_deg for f in frames], [f.fix.lon_deg for f in frames])
     # Coarse cells first: many photos are compared with few places.
     _, first, cell, count = np.unique(
@@ -175,7 +181,7 @@ def usual_height(ground: Array, lenses: Sequence[Lens]) -> float:
         return config.default_height_m
     step = float(np.median(np.hypot(*np.diff(ground, axis=0).T)))
     short = float(np.median([min(lens.width, lens.height) / lens.focal_px for lens in lenses]))
-    if step <= config.moved_m:
+    if step <= MOVED_M:
         return config.default_height_m
     return float(np.clip(step / (1.0 - config.usual_overlap) / short, *config.usual_heights_m))
 
@@ -184,15 +190,14 @@ def _sigma(frame: Frame, camera: Camera) -> float:
     """One sigma of the ground point at the photo's centre, metres."""
     config = active().records
     position = frame.fix.position_sigma_m or config.position_sigma_m
-    share = config.untagged_tilt_sigma if frame.fix.pitch_rad is None else config.tagged_tilt_sigma
+    share = _UNTAGGED_TILT_SIGMA if frame.fix.pitch_rad is None else config.tagged_tilt_sigma
     return float(np.hypot(position, share * float(camera.position[2])))
 
 
 def _near(ground: Array) -> NDArray[np.bool_]:
     """Which positions belong to the set: near their median, bool (N,)."""
-    config = active().records
     away = np.hypot(*(ground - np.median(ground, axis=0)).T)
-    return np.asarray(np.isfinite(away) & (away <= max(config.far_m, config.far_spreads * float(np.median(away)))))
+    return np.asarray(np.isfinite(away) & (away <= max(_FAR_M, _FAR_SPREADS * float(np.median(away)))))
 
 
 def _too_far(frame: Frame, ground: Array, i: int) -> Rejection:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,7 +52,7 @@ from orthoswarm.mosaic.render_passes import (
 )
 from orthoswarm.mosaic.seams.leveling import Leveling, cell_size
 from orthoswarm.mosaic.seams.previews import PreviewFile, unwritten
-from orthoswarm.mosaic.seams.seam_tiles import SeamCells, cell_size_px
+from orthoswarm.mosaic.seams.seam_tiles import BORDER_PX, SeamCells, cell_size_px
 from orthoswarm.mosaic.visible_ground import by_tile, coverage
 from orthoswarm.raster.picture_file import read_rgb
 from orthoswarm.raster.picture_parts import PictureParts
@@ -67,6 +67,10 @@ Blend = Literal["none", "seam"]
 
 _STAGING = "staging"
 _UNCHANGED = uniform(np.ones(3))
+
+_COMPLETENESS_CELLS: Final = 1_000_000
+"""The share of the ground that was drawn is measured on about so many cells at most, of 64 pixels at most (for its
+time)."""
 
 
 def serial(function: Callable[[Any], Any], arguments: Iterable[Any]) -> Iterable[Any]:
@@ -376,7 +380,7 @@ class _Job:
         rows = np.array([self.seams.previews.row[image] for image in images], np.int32)
         tone = np.array([self.gains.get(image, _UNCHANGED).mean(0) for image in images], np.float32).reshape(-1, 6)
         west, south, east, north = self.canvas.tile_bounds(key)
-        border = active().mosaic.border_px * self.canvas.grid.gsd_m
+        border = BORDER_PX * self.canvas.grid.gsd_m
         terrain = crop(self.terrain, BoundingBox(west - border, south - border, east + border, north + border))
         return SeamCells(self.seams.previews.path, rows, tone, self.cell_px, terrain)
 
@@ -440,7 +444,7 @@ class _Job:
     def seen_m2(self) -> float:
         """Ground that the usable frames see, measured on coarse cells."""
         grid, t = self.canvas.grid, self.canvas.tile_px
-        factor, most = 1, active().mosaic.completeness_cells
+        factor, most = 1, _COMPLETENESS_CELLS
         while factor < 64 and grid.width * grid.height > factor * factor * most:
             factor *= 2
         coarse = GroundGrid(

@@ -7,6 +7,7 @@ by what their receivers disagree, and their pictures would no longer show the sa
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,10 @@ from orthoswarm.trajectory.near_paths import NearPaths
 Array = NDArray[np.float64]
 _LEVELS_M = (-500.0, 9000.0)
 """Lowest and highest ground that can be true, metres."""
+
+_VERTICAL_SIGMAS: Final = 2.0
+"""Sigma of a recorded altitude over that of the recorded place (an axis): satellites stand on one side of the receiver
+only (vertical dilution of precision is 1.5 to 2.5 times the horizontal one of an axis)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +50,7 @@ class TakeoffLevel:
 def height_sigma_m(placed: PlacedFrame) -> float:
     """One sigma of a camera's height, metres: the adjustment's; as for receivers where it states none."""
     if placed.pose_covariance is None:
-        return active().mosaic.vertical_sigmas * placed.sigma_m
+        return _VERTICAL_SIGMAS * placed.sigma_m
     return math.sqrt(max(float(placed.pose_covariance[2, 2]), 0.0))
 
 
@@ -81,7 +86,7 @@ def _common_level(vehicles: Sequence[Sequence[PlacedFrame]]) -> TakeoffLevel | N
         levels.append(float(np.median(found[0])))
         scatter.append(mad_sigma(found[0] - levels[-1]))
         across = np.where(np.isfinite(found[1]), found[1], config.records.position_sigma_m)
-        stated.append(config.mosaic.vertical_sigmas * float(np.median(across)))
+        stated.append(_VERTICAL_SIGMAS * float(np.median(across)))
     if not levels:
         return None
     level = float(np.median(levels))

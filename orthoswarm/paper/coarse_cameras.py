@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from time import process_time
+from typing import Final
 
 import numpy as np
 
@@ -11,12 +12,16 @@ from orthoswarm.matchers import picture_matcher
 from orthoswarm.model.camera import focal_px
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
-from orthoswarm.paper.ground_scale import choose_pairs, estimate_fov
+from orthoswarm.paper.ground_scale import SCALE_LEAST_PAIRS, choose_pairs, estimate_fov
 from orthoswarm.paper.leg_lines import Line, find_legs, fit_line
 from orthoswarm.raster.picture_file import read_gray
 from orthoswarm.refine.bundle.block_arrays import HEIGHT, WIDTH, CameraBlock, F, Ints
 from orthoswarm.refine.bundle.flight_records import Array, read_records
 from orthoswarm.refine.features.working_pictures import Pictures
+from orthoswarm.refine.strategy.vehicle_passes import START_FOV_DEG
+
+RECEIVER_SIGMA_M: Final = 3.0  # sigma of the bias of a receiver, an axis, metres, which no line reduces
+_UNKNOWN_FOV_SIGMA_DEG: Final = 10.0  # sigma of a field of view that could not be measured
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +33,7 @@ class CoarseOptions:
         matcher: name of the picture matcher; None for the best available.
     """
 
-    fov_start_rad: float = field(default_factory=lambda: float(np.radians(active().strategy.start_fov_deg)))
+    fov_start_rad: float = field(default_factory=lambda: float(np.radians(START_FOV_DEG)))
     matcher: str | None = None
 
 
@@ -68,11 +73,11 @@ def coarse_vehicle(frames: Sequence[Frame], *, epsg: int, origin: Array, options
     count = int(leg.max()) + 1 if len(leg) else 0
     lines = [fit_line(records.position[leg == k, :2]) for k in range(count)]
     position = records.position.copy()
-    sigma = np.full(len(frames), float(np.hypot(config.receiver_sigma_m, config.receiver_sigma_m)))
+    sigma = np.full(len(frames), float(np.hypot(RECEIVER_SIGMA_M, RECEIVER_SIGMA_M)))
     for k, line in enumerate(lines):
         mine = leg == k
         position[mine, :2] = line.project(records.position[mine, :2])
-        sigma[mine] = np.hypot(config.receiver_sigma_m, line.sigma_m)
+        sigma[mine] = np.hypot(RECEIVER_SIGMA_M, line.sigma_m)
     hints = [f.fov_hint_rad for f in frames if f.fov_hint_rad is not None]
     start = float(np.median(hints)) if hints else options.fov_start_rad
     rotation = records.rotation()
@@ -81,7 +86,7 @@ def coarse_vehicle(frames: Sequence[Frame], *, epsg: int, origin: Array, options
     for k, line in enumerate(lines):
         members = np.flatnonzero(leg == k)
         along = line.along(records.position[members, :2])
-        share = max(config.scale_least_pairs, round(config.scale_pairs * len(members) / max(int((leg >= 0).sum()), 1)))
+        share = max(SCALE_LEAST_PAIRS, round(config.scale_pairs * len(members) / max(int((leg >= 0).sum()), 1)))
         tasks += choose_pairs(along, position[members, 2], tilt[members], members, share)
     warnings = []
     found = None
@@ -91,9 +96,7 @@ def coarse_vehicle(frames: Sequence[Frame], *, epsg: int, origin: Array, options
     if found is None:
         warnings.append(f"the field of view could not be measured; {np.degrees(start):.0f} degrees are used")
     fov = start if found is None else found.mean
-    fov_sigma = (
-        np.radians(config.unknown_fov_sigma_deg) if found is None else found.sigma / np.sqrt(max(found.inliers, 1))
-    )
+    fov_sigma = np.radians(_UNKNOWN_FOV_SIGMA_DEG) if found is None else found.sigma / np.sqrt(max(found.inliers, 1))
     width, height = frames[0].width, frames[0].height
     lens = np.zeros((1, 8))
     lens[0, F], lens[0, WIDTH], lens[0, HEIGHT] = focal_px(fov, width), width, height

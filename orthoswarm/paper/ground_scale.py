@@ -2,15 +2,25 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.matchers.matcher import Gray, Matches, PictureMatcher
 from orthoswarm.model.camera import focal_px
 from orthoswarm.model.robust import mad_sigma
 from orthoswarm.refine.bundle.flight_records import Array
+
+_SCALE_PAIR_HEIGHTS: Final = 0.35  # wanted distance between the two photos, flying heights: about 70 % overlap
+_SCALE_PAIR_RANGE_HEIGHTS: Final = (0.05, 1.0)  # range of that distance, flying heights
+_SCALE_CENTRE_SHARE: Final = 0.3  # matches count up to this share of the picture's height from the orthogonal centre
+_SCALE_LEAST_SHIFT_PX: Final = 2.0  # shorter shifts do not count
+_SCALE_MATCHES: Final = 12  # least matches that agree on a scale
+_SCALE_SCATTER: Final = 0.2  # largest standard deviation of the shifts as a share of their mean
+SCALE_LEAST_PAIRS: Final = 3  # least pairs that give a field of view
+_OUTLIER_SIGMAS: Final = 2.0  # Gaussian outlier suppression keeps what lies within so many standard deviations
+_OUTLIER_ROUNDS: Final = 20  # most rounds of it
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,12 +41,11 @@ def gaussian(samples: Array) -> Gaussian:
 
     It starts at the median and the median absolute deviation, since outliers may pull the mean far off.
     """
-    config = active().paper
     mean = float(np.median(samples))
     sigma = mad_sigma(samples - mean)
     inliers = samples
-    for _ in range(config.outlier_rounds):
-        inside = np.abs(samples - mean) <= config.outlier_sigmas * max(sigma, 1e-12)
+    for _ in range(_OUTLIER_ROUNDS):
+        inside = np.abs(samples - mean) <= _OUTLIER_SIGMAS * max(sigma, 1e-12)
         if not inside.any():
             break
         inliers = samples[inside]
@@ -59,17 +68,16 @@ def metres_per_pixel(matches: Matches, centre: tuple[float, float], reach_px: fl
     Returns:
         Metres per pixel; None where too few matches agree.
     """
-    config = active().paper
-    if len(matches) < config.scale_matches or flown_m <= 0:
+    if len(matches) < _SCALE_MATCHES or flown_m <= 0:
         return None
     middle = 0.5 * (matches.a + matches.b)
     near = np.hypot(*(middle - centre).T) <= reach_px
     shift = np.hypot(*(matches.b - matches.a)[near].T)
-    shift = shift[shift > config.scale_least_shift_px]
-    if len(shift) < config.scale_matches:
+    shift = shift[shift > _SCALE_LEAST_SHIFT_PX]
+    if len(shift) < _SCALE_MATCHES:
         return None
     found = gaussian(shift)
-    if found.inliers < config.scale_matches or found.sigma > config.scale_scatter * found.mean:
+    if found.inliers < _SCALE_MATCHES or found.sigma > _SCALE_SCATTER * found.mean:
         return None
     return flown_m / found.mean
 
@@ -101,7 +109,7 @@ class ScaleTask:
 
 
 def choose_pairs(along: Array, height: Array, tilt: Array, members: NDArray[np.integer], count: int) -> list[ScaleTask]:
-    """Up to `count` pairs, evenly spread over a leg, with a distance near `scale_pair_heights` flying heights.
+    """Up to `count` pairs, evenly spread over a leg, with a distance near `_SCALE_PAIR_HEIGHTS` flying heights.
 
     Args:
         along: float64 (n,), distance along the line of the leg's frames, in flying order.
@@ -110,9 +118,8 @@ def choose_pairs(along: Array, height: Array, tilt: Array, members: NDArray[np.i
         members: (n,), the frames' indices in the vehicle.
         count: how many pairs.
     """
-    config = active().paper
-    n, ratio = len(along), config.scale_pair_heights
-    least, most = config.scale_pair_range_heights
+    n, ratio = len(along), _SCALE_PAIR_HEIGHTS
+    least, most = _SCALE_PAIR_RANGE_HEIGHTS
     found = []
     for i in np.unique(np.linspace(0, n - 2, min(count, n - 1)).round().astype(int)).tolist():
         later = np.arange(i + 1, n)
@@ -151,16 +158,15 @@ def estimate_fov(
         start_rad: first guess, used only to place the orthogonal centre.
         matcher: for the pairs.
     """
-    config = active().paper
     focal = focal_px(start_rad, size[0])
     found = []
     for task in tasks:
         matches = matcher.match(gray(task.first), gray(task.second))
         centres = [orthogonal_centre(rotation[i], focal, size) for i in (task.first, task.second)]
         middle = (0.5 * (centres[0][0] + centres[1][0]), 0.5 * (centres[0][1] + centres[1][1]))
-        scale = metres_per_pixel(matches, middle, config.scale_centre_share * size[1], task.flown_m)
+        scale = metres_per_pixel(matches, middle, _SCALE_CENTRE_SHARE * size[1], task.flown_m)
         if scale is not None:
             found.append(field_of_view(scale, size[0], task.height_m, task.tilt_rad))
-    if len(found) < config.scale_least_pairs:
+    if len(found) < SCALE_LEAST_PAIRS:
         return None
     return gaussian(np.array(found))

@@ -7,12 +7,14 @@ mainly shear, remains as `rms_m`: a few centimetres on real legs.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
-from orthoswarm.config import active
 from orthoswarm.model.camera import Camera
 from orthoswarm.refine.bundle.flight_records import Array
+
+_POSE_ROUNDS: Final = 6  # most Gauss-Newton steps of the pose that reproduces a homography best
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +30,7 @@ def fit_camera(camera: Camera, corrected: Array, pixels: Array) -> Pose:
     points = np.c_[corrected, np.zeros(len(corrected))]
     position = camera.position + np.array([*(corrected - camera.to_ground(pixels)).mean(axis=0), 0.0])
     current = Camera(position, camera.rotation, camera.lens)
-    for _ in range(active().paper.pose_rounds):
+    for _ in range(_POSE_ROUNDS):
         projected = current.project(points)
         jacobian = np.empty((2 * len(points), 6))
         for k in range(6):

@@ -1,14 +1,19 @@
 """Legs and their straight lines (paper III.C): grouping by heading and path, Eq. 2 and Eq. 3."""
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
-from orthoswarm.config import active
 from orthoswarm.model.angles import wrap_rad
 from orthoswarm.refine.bundle.block_arrays import Ints
 from orthoswarm.refine.bundle.flight_records import Array, FlightRecords
 from orthoswarm.trajectory.legs import split_legs
+
+_LEG_HEADING_DEG: Final = 20.0  # frames of a leg differ in heading from its mean by less
+_LEG_PHOTOS: Final = 3  # least photos of a leg
+_LINE_DISTANCE_M: Final = 4.0  # photos before and after a leg belong to it within this distance of its line ...
+_LINE_SIGMAS: Final = 3.0  # ... or within so many standard deviations of its photos across the line
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +59,7 @@ def find_legs(records: FlightRecords) -> Ints:
     number = 0
     for k in range(int(path.max()) + 1 if len(path) else 0):
         for run in _one_heading(np.flatnonzero(path == k).astype(np.int32), records.yaw):
-            if len(run) >= active().paper.leg_photos:
+            if len(run) >= _LEG_PHOTOS:
                 out[run] = number
                 number += 1
     return _grown(out, records)
@@ -65,13 +70,12 @@ def _grown(leg: Ints, records: FlightRecords) -> Ints:
 
     The path alone detects a turn a few frames too early or too late.
     """
-    config = active().paper
-    most_turned = np.radians(config.leg_heading_deg)
+    most_turned = np.radians(_LEG_HEADING_DEG)
     out = leg.copy()
     for k in range(int(leg.max()) + 1 if len(leg) else 0):
         members = np.flatnonzero(leg == k)
         line = fit_line(records.position[members, :2])
-        reach = max(config.line_sigmas * line.sigma_m, config.line_distance_m)
+        reach = max(_LINE_SIGMAS * line.sigma_m, _LINE_DISTANCE_M)
         mean = np.angle(np.exp(1j * records.yaw[members]).mean())
         for start, step in ((members[-1] + 1, 1), (members[0] - 1, -1)):
             i = int(start)
@@ -89,7 +93,7 @@ def _grown(leg: Ints, records: FlightRecords) -> Ints:
 
 def _one_heading(members: Ints, yaw: Array) -> list[Ints]:
     """Runs of frames whose heading stays near the run's mean."""
-    most_turned = np.radians(active().paper.leg_heading_deg)
+    most_turned = np.radians(_LEG_HEADING_DEG)
     runs: list[list[int]] = []
     for i in members.tolist():
         if runs:

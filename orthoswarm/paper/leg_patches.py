@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from time import perf_counter, process_time
+from typing import Final
 
 import numpy as np
 
@@ -9,6 +10,7 @@ from orthoswarm.config import active
 from orthoswarm.matchers import Matches, map_matcher
 from orthoswarm.matchers.matcher import Floats, Mask
 from orthoswarm.matchers.patch_registration import Registration, apply, register
+from orthoswarm.matchers.second_opinion import LEAST_TILES, TRUSTED_SHARE
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import MapWindow
@@ -18,6 +20,14 @@ from orthoswarm.refine.bundle.block_arrays import WIDTH, CameraBlock, F
 from orthoswarm.refine.bundle.flight_records import Array
 from orthoswarm.refine.features.working_pictures import Pictures
 from orthoswarm.refine.registration.orientation_correlation import strip_mosaic
+
+_PATCH_GSD_M: Final = (0.3, 1.0)  # range of a patch's ground sampling distance: what suits learned matchers
+_PATCH_MOST_PX: Final = 3_000_000  # most pixels of a patch; longer legs are drawn coarser (memory)
+_PATCH_MOST_SEARCH_PX: Final = 240  # largest search radius (cost)
+_PATCH_MARGIN_WIDTHS: Final = 1.5  # a patch extends beyond its positions by so many ground widths of a picture
+_ROOF_DISTANCE_SHARE: Final = 0.15  # relief displacement is judged beyond this share of the height from the nadir
+_ROOF_TOLERANCE_M: Final = 3.0  # a match whose apparent height differs from the median by more is dropped ...
+_ROOF_SIGMAS: Final = 2.0  # ... if it also differs by more than so many standard deviations
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +91,7 @@ class PatchOptions:
 def match_patch(task: PatchTask, *, basemap: MapWindow, origin: Array, options: PatchOptions) -> PatchFit:
     """Register one leg on the map."""
     began, clock = process_time(), perf_counter()
-    config, trust = active().paper, active().matchers
+    config = active().paper
     pictures = Pictures(task.frames, lambda f: read_gray(f.path), 10_000, cache_mb=8.0)
     centre = task.cameras.position[:, :2].mean(axis=0)
     gsd = patch_gsd(task.cameras, basemap.native_gsd_m)
@@ -94,14 +104,14 @@ def match_patch(task: PatchTask, *, basemap: MapWindow, origin: Array, options: 
             epsg=basemap.epsg, west=west, north=north, gsd_m=gsd, width=patch.shape[1], height=patch.shape[0]
         )
         for reach_m in config.patch_search_m:
-            reach = min(int(np.ceil(reach_m / gsd)), config.patch_most_search_px)
+            reach = min(int(np.ceil(reach_m / gsd)), _PATCH_MOST_SEARCH_PX)
             window, known, there = map_window(basemap, origin, own, reach)
             if not known.any():
                 break
             consistent = HeightFilter(task.cameras, own, there)
             matcher = map_matcher(options.matcher)
             found = register(patch, valid, window, known=known, reach=reach, matcher=matcher, keep=consistent)
-            if found is not None and found.share >= trust.trusted_share and len(found.matches) >= trust.least_tiles:
+            if found is not None and found.share >= TRUSTED_SHARE and len(found.matches) >= LEAST_TILES:
                 homography = in_metres(found.homography, own, there, centre)
                 break
     return PatchFit(
@@ -120,11 +130,10 @@ def match_patch(task: PatchTask, *, basemap: MapWindow, origin: Array, options: 
 
 def patch_gsd(cameras: CameraBlock, map_gsd_m: float) -> float:
     """GSD of a leg's patch, metres: the coarser of pictures and map; coarser still for long legs, to limit its size."""
-    config = active().paper
     own = float(np.median(cameras.position[:, 2])) / float(cameras.lens[0, F])
-    gsd = float(np.clip(max(own, map_gsd_m), *config.patch_gsd_m))
-    spread = np.ptp(cameras.position[:, :2], axis=0) + config.patch_margin_widths * own * float(cameras.lens[0, WIDTH])
-    return max(gsd, float(np.sqrt(spread[0] * spread[1] / config.patch_most_px)))
+    gsd = float(np.clip(max(own, map_gsd_m), *_PATCH_GSD_M))
+    spread = np.ptp(cameras.position[:, :2], axis=0) + _PATCH_MARGIN_WIDTHS * own * float(cameras.lens[0, WIDTH])
+    return max(gsd, float(np.sqrt(spread[0] * spread[1] / _PATCH_MOST_PX)))
 
 
 def map_window(basemap: MapWindow, origin: Array, own: GroundGrid, reach: int) -> tuple[Floats, Mask, GroundGrid]:
@@ -176,7 +185,6 @@ class HeightFilter:
         """Which matches to keep, bool (N,)."""
         if not len(matches):
             return np.zeros(0, bool)
-        config = active().paper
         ground = self.own.to_ground(matches.a)
         residual = self.there.to_ground(matches.b) - self.there.to_ground(apply(homography, matches.a))
         away = ground[:, None] - self.cameras.position[None, :, :2]
@@ -184,12 +192,10 @@ class HeightFilter:
         lever = away[np.arange(len(ground)), nearest]
         rho = np.hypot(*lever.T)
         height = np.maximum(self.cameras.position[nearest, 2], 1.0)
-        leaning = rho > config.roof_distance_share * height
+        leaning = rho > _ROOF_DISTANCE_SHARE * height
         apparent = (residual * lever).sum(1) / np.maximum(rho, 1e-6) * height / np.maximum(rho, 1e-6)
-        if leaning.sum() < active().matchers.least_tiles:
+        if leaning.sum() < LEAST_TILES:
             return np.ones(len(matches), bool)
         usual = float(np.median(apparent[leaning]))
         spread = mad_sigma(apparent[leaning] - usual)
-        return np.asarray(
-            ~leaning | (np.abs(apparent - usual) <= max(config.roof_tolerance_m, config.roof_sigmas * spread))
-        )
+        return np.asarray(~leaning | (np.abs(apparent - usual) <= max(_ROOF_TOLERANCE_M, _ROOF_SIGMAS * spread)))

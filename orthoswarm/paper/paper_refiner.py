@@ -8,20 +8,23 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from time import perf_counter, process_time
+from typing import Final
 
 import numpy as np
 
-from orthoswarm.config import active
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import Leg, LegState, MapWindow, PlacedFrame, Refinement, Solution, Stage
 from orthoswarm.model.task_runner import Progress, Run, serial
-from orthoswarm.paper.coarse_cameras import CoarseOptions, CoarseVehicle, coarse_vehicle
+from orthoswarm.paper.coarse_cameras import RECEIVER_SIGMA_M, CoarseOptions, CoarseVehicle, coarse_vehicle
 from orthoswarm.paper.leg_cameras import carried_shift, fit_camera, pixel_grid
 from orthoswarm.paper.leg_patches import PatchFit, PatchOptions, PatchTask, match_patch
 from orthoswarm.refine.bundle.flight_records import Array
 from orthoswarm.refine.flight.solve_units import merge_units
 from orthoswarm.refine.flight.vehicle_refinement import UnitRefiner, unit_states, units_of_area
+
+_CARRYING_NEIGHBOURS: Final = 3  # nearest registered legs of neighbours that carry a vehicle without one
+_CARRIED_SIGMA_M: Final = 2.0  # least sigma of a correction carried from other legs
 
 
 @dataclass(frozen=True, slots=True)
@@ -250,20 +253,19 @@ def _carried(
 
     The second value is one sigma of such a correction, metres.
     """
-    config = active().paper
     number = np.arange(len(vehicle.frames), dtype=float)
     if matched:
         own = [(float(np.flatnonzero(vehicle.leg == k).mean()), f.shift) for k, f in matched.items()]
         shifts = np.array([s for _, s in own])
-        return carried_shift(number, own), float(max(np.hypot(*shifts.std(axis=0)), config.carried_sigma_m))
+        return carried_shift(number, own), float(max(np.hypot(*shifts.std(axis=0)), _CARRIED_SIGMA_M))
     if everyone:
         centre = np.array([c for c, _ in everyone])
         shifts = np.array([s for _, s in everyone])
         away = np.hypot(*(centre - vehicle.cameras.position[:, :2].mean(axis=0)).T)
-        nearest = np.argsort(away)[: config.carrying_neighbours]
+        nearest = np.argsort(away)[:_CARRYING_NEIGHBOURS]
         usual = np.median(shifts[nearest], axis=0)
-        return np.tile(usual, (len(number), 1)), config.receiver_sigma_m
-    return None, config.receiver_sigma_m
+        return np.tile(usual, (len(number), 1)), RECEIVER_SIGMA_M
+    return None, RECEIVER_SIGMA_M
 
 
 def _legs(vehicle: CoarseVehicle, fits: Mapping[int, PatchFit], sigma: Array, carried: bool) -> list[Leg]:

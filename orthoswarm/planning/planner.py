@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 import shapely
@@ -30,6 +31,12 @@ __all__ = ["METHODS", "Method", "Options", "plan_area", "plan_gaps", "plan_lines
 
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]
+
+_OUTLINE_SPACINGS: Final = 0.05  # the outline of an area with many corners is at most twice so many spacings outside it
+_FAIR_ENOUGH: Final = 1.25  # from here on the plan says that it is uneven
+_BETTER_SHARE: Final = 0.99  # a later candidate must be better by this factor
+_CLEARANCE_WIDTHS: Final = 0.125  # at most so many widths of a picture from no-fly zones
+_LEAST_CLEARANCE_M: Final = 0.1  # least clearance, however narrow a picture is
 
 
 @dataclass(frozen=True)
@@ -128,15 +135,15 @@ def plan_area(
 def _clearance_m(options: Options, foot: Footprint) -> float:
     """Distance from no-fly zones: that of the user, or a default that leaves small pictures no gaps."""
     config = active().planning
-    usual = min(config.clearance_m, config.clearance_widths * foot.width_m)
-    return options.clearance_m or max(config.least_clearance_m, usual)
+    usual = min(config.clearance_m, _CLEARANCE_WIDTHS * foot.width_m)
+    return options.clearance_m or max(_LEAST_CLEARANCE_M, usual)
 
 
 def _best_work(
     area: Area, swarm: Swarm, foot: Footprint, *, method: Method, motion: Motion, router: Router, reach_m: float
 ) -> Work:
     """The fairest and shortest work among the method's candidates."""
-    field = Field(coarser(area, active().planning.outline_spacings * foot.spacing_m), router.obstacles)
+    field = Field(coarser(area, _OUTLINE_SPACINGS * foot.spacing_m), router.obstacles)
     best: Work | None = None
     most = 0
     for candidate in candidates(
@@ -145,7 +152,7 @@ def _best_work(
         most = max(most, candidate.stretches)
         if candidate.stretches >= swarm.vehicles:
             work = swarm.share(candidate.legs, method != "columns")
-            best = work if best is None or work.score < active().planning.better_share * best.score else best
+            best = work if best is None or work.score < _BETTER_SHARE * best.score else best
     if best is not None:
         return best
     if not most:
@@ -286,7 +293,7 @@ def _warnings(schedule: Schedule, work: Work, foot: Footprint, options: Options)
             f"a picture every {every_s:.2f} s is more than most cameras take; fly slower or higher, or with less "
             "forward overlap"
         )
-    if work.balance > active().planning.fair_enough:
+    if work.balance > _FAIR_ENOUGH:
         result.append(
             f"the longest path is {work.balance:.2f} times the mean: few lines, or long ways out and home, "
             "cannot be shared more evenly"

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Final, Literal
 
 import numpy as np
 
@@ -16,6 +16,9 @@ from orthoswarm.planning.sorties.flight_heights import FlightHeights, GroundHeig
 Relief = Literal["auto", "follow", "level"]
 MakePlan = Callable[[float, Footprint, FlightHeights], Plan]
 """Plans with a footprint, the height above level ground that it belongs to, and the flights' heights."""
+
+_CLOSER_SHARE: Final = 0.93  # on slopes lines are laid lower by this, each round, until all is covered
+_CLOSER_ROUNDS: Final = 4  # most such rounds (time)
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +104,7 @@ def plan_over_relief(
 def _closely_enough(make: MakePlan, lens: Callable[[float], Footprint], heights: FlightHeights, least_m: float) -> Plan:
     """A plan with lines as close as the slopes ask for: across a slope pictures are narrower than over a level."""
     best: Plan | None = None
-    for closer in active().planning.closer_share ** np.arange(active().planning.closer_rounds):
+    for closer in _CLOSER_SHARE ** np.arange(_CLOSER_ROUNDS):
         above_m = float(closer) * least_m
         plan = make(above_m, lens(above_m), heights)
         if best is None or (plan.covered_share or 1.0) > (best.covered_share or 1.0):

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,11 @@ Mask = NDArray[np.bool_]
 
 # GDAL keeps 5 % of the machine's memory in blocks otherwise, in every process; it reads this at its first block.
 os.environ.setdefault("GDAL_CACHEMAX", "64")
+
+_MAP_PIXELS_AT_ONCE: Final = 8_000_000  # pixels of a map read at once (memory)
+_COLLAR_PX: Final = 15
+"""Plain black or plain white squares of at least this side, pixels, in a map without a mask are its collar and no
+ground."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,7 +151,7 @@ class RasterMap:
         """A grid in bands of rows, to limit the pixels read at once from maps without overviews."""
         t = self._open(self._level(grid)).transform
         read = grid.width * (grid.gsd_m / t.a) * (grid.gsd_m / -t.e)
-        rows = max(1, int(active().compute.map_pixels_at_once / max(read, 1.0)))
+        rows = max(1, int(_MAP_PIXELS_AT_ONCE / max(read, 1.0)))
         return [
             replace(grid, north=grid.north - top * grid.gsd_m, height=min(rows, grid.height - top))
             for top in range(0, grid.height, rows)
@@ -338,7 +343,7 @@ def _blank(values: NDArray[Any]) -> Mask:
     """Uniformly black or white patches of a map without a mask: its collar, whose edges would be false features."""
     import cv2
 
-    side = active().raster.collar_px
+    side = _COLLAR_PX
     box = np.ones((side, side), np.uint8)
     wider = np.ones((side + 4, side + 4), np.uint8)  # interpolation blurs a collar's edge by two pixels
     out = np.zeros(values.shape[1:], bool)

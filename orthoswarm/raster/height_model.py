@@ -5,12 +5,11 @@ import warnings
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.placement import Terrain
@@ -39,6 +38,14 @@ _NO_UNIT = frozenset({"unknown", "none", "unitless", "1"})
 
 _BETWEEN_NODES = 1.5
 """How far the nodes around a place and the node of a pixel are from them, together, in steps."""
+
+_DEM_FINEST_M: Final = 2.0  # finest distance of the nodes on which a height model is read
+_DEM_MEAN_STEPS: Final = 0.7  # where its pixels are smaller than so many distances of nodes, a node has their mean ...
+_DEM_HIGHEST_STEPS: Final = 1.5  # ... or the highest of them where the highest ground is asked for
+DEM_MOST_NODES: Final = 4_000_000  # most nodes read from a height model as a whole (memory)
+_DEM_WINDOW_NODES: Final = 250_000  # most nodes of a window of it (memory)
+_DEM_MOST_BURIED: Final = 0.05  # share of the cameras that a height model may bury: a few recorded heights can be wrong
+_DEM_LEAST_COVER: Final = 0.02  # height model with heights on a smaller share of the area than this is of another place
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,9 +99,9 @@ class HeightModel:
         Raises:
             InputError: if it cannot be read, has no CRS, no heights on the area, or buries cameras.
         """
-        ground = _window(path, epsg, bounds, active().raster.dem_most_nodes)
+        ground = _window(path, epsg, bounds, DEM_MOST_NODES)
         cover = float(ground.known.mean())
-        if cover < active().raster.dem_least_cover:
+        if cover < _DEM_LEAST_COVER:
             raise InputError(_no_cover(path, epsg, bounds, cover))
         at = np.asarray(cameras, float).reshape(-1, 3)
         at = at[ground.knows(at[:, :2])]
@@ -125,9 +132,9 @@ class HeightModel:
         """Heights over `zero_m` in the area's CRS within bounds, a node every pixel of the DEM or at most so many.
 
         Args:
-            bounds: west, south, east, north. most_nodes: None takes `dem_window_nodes` of the configuration.
+            bounds: west, south, east, north. most_nodes: None takes `_DEM_WINDOW_NODES`.
         """
-        return _window_over(self, bounds, most_nodes or active().raster.dem_window_nodes)
+        return _window_over(self, bounds, most_nodes or _DEM_WINDOW_NODES)
 
 
 @lru_cache(maxsize=6)
@@ -199,7 +206,7 @@ def _no_cover(path: Path, epsg: int, bounds: BoundingBox, cover: float) -> str:
 def _refuse_buried(path: Path, ground: Array, cameras: Array) -> None:
     """Refuse ground (N,) above cameras (N,), both over takeoff; NaN where a camera's height is not known."""
     known = np.isfinite(cameras)
-    if known.any() and float((ground > cameras)[known].mean()) > active().raster.dem_most_buried:
+    if known.any() and float((ground > cameras)[known].mean()) > _DEM_MOST_BURIED:
         raise InputError(
             f"by {Path(path).name} the ground lies above {float((ground > cameras)[known].mean()):.0%} of the cameras "
             f"(its heights below the flight span {ground.max() - ground.min():.0f} m); check that it is this area's "
@@ -338,9 +345,9 @@ def _pixel_m(dataset: Any, epsg: int, bounds: BoundingBox) -> float:
 
 def _resampling(pixel_steps: float, highest: bool) -> str:
     """GDAL's resampling of pixels whose side is so many steps of the nodes."""
-    if highest and pixel_steps < active().raster.dem_highest_steps:
+    if highest and pixel_steps < _DEM_HIGHEST_STEPS:
         return "max"
-    return "average" if pixel_steps < active().raster.dem_mean_steps else "bilinear"
+    return "average" if pixel_steps < _DEM_MEAN_STEPS else "bilinear"
 
 
 def _highest_within(z: Array, steps: float) -> NDArray[np.float32]:
@@ -354,10 +361,9 @@ def _highest_within(z: Array, steps: float) -> NDArray[np.float32]:
 
 def _own_step(pixel_m: float, bounds: BoundingBox, most_nodes: int | None) -> float:
     """Distance of nodes, metres: a pixel's side within the configuration's limits and a number of nodes."""
-    config = active().raster
-    nodes = config.dem_most_nodes if most_nodes is None else min(most_nodes, config.dem_most_nodes)
+    nodes = DEM_MOST_NODES if most_nodes is None else min(most_nodes, DEM_MOST_NODES)
     spread = float(np.sqrt(bounds.width * bounds.height / nodes))
-    return float(max(config.dem_finest_m, round(pixel_m, 1), spread))
+    return float(max(_DEM_FINEST_M, round(pixel_m, 1), spread))
 
 
 def _filled(z: Array, known: NDArray[np.bool_]) -> Array:

@@ -5,13 +5,15 @@ were never written are zeros. So the offsets of all blocks are compared with the
 """
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
-from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError
+
+_CHECK_SIDE: Final = 5  # windows a side of the lattice at which a map's pixels are read before the work begins (time)
+_CHECK_WINDOW_PX: Final = 4.0  # side of these windows (for its time)
 
 
 class UnreadableMapError(InputError):
@@ -21,9 +23,8 @@ class UnreadableMapError(InputError):
 def sample_windows(bounds: BoundingBox, gsd_m: float) -> list[BoundingBox]:
     """Small windows of some pixels spread over bounds, few enough to be read in a fraction of a second."""
     west, south, east, north = bounds
-    config = active().raster
-    half = 0.5 * config.check_window_px * gsd_m
-    share = (np.arange(config.check_side) + 0.5) / config.check_side
+    half = 0.5 * _CHECK_WINDOW_PX * gsd_m
+    share = (np.arange(_CHECK_SIDE) + 0.5) / _CHECK_SIDE
     return [
         BoundingBox(float(x), float(y), float(x), float(y)).grown(half)
         for y in north + share * (south - north)

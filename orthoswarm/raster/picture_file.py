@@ -12,7 +12,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.raster.kept_ranges import kept_range, limits
 from orthoswarm.stores.addresses import is_stored
@@ -29,6 +28,7 @@ take 0.6 GB in colour. A file of some hundred kilobytes can hold a picture that 
 
 
 _PNG: Final = b"\x89PNG\r\n\x1a\n"
+_DEPTH_PICTURES: Final = 9  # pictures of a folder that tell the range of its 16-bit pictures (for its time)
 
 
 class PictureError(OrthoSwarmError):
@@ -252,9 +252,7 @@ def _used_range(folder: Path, suffix: str) -> tuple[float, float] | None:
     except OSError:
         return None
     pictures = []
-    for k in (
-        np.unique(np.linspace(0, len(names) - 1, active().raster.depth_pictures).round().astype(int)) if names else ()
-    ):
+    for k in np.unique(np.linspace(0, len(names) - 1, _DEPTH_PICTURES).round().astype(int)) if names else ():
         try:
             data = _bytes(folder / names[k])
         except PictureError:

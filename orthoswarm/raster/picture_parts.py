@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,10 @@ from orthoswarm.raster.packed_records import records
 Bytes = NDArray[np.uint8]
 _HEAD = np.dtype("<i4")
 _NUMBERS = 4  # columns and rows of the part, column and row of its corner
+
+_PART_MARGIN: Final = 0.1
+"""What the real-time map shows of a picture is kept for the refined maps with a border of this share of the picture's
+longer side; what they need beyond it is decoded again (measured on 1,017 photos: 6 % are)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -90,12 +95,12 @@ class PictureParts:
         return Part(record[head:].reshape(rows, columns, 3), (left, top))
 
     def keep(self, path: Path, picture: Bytes, drawn: Box) -> None:
-        """Keep what was drawn of a picture and `part_margin` around it, unless some of it is kept already.
+        """Keep what was drawn of a picture and `_PART_MARGIN` around it, unless some of it is kept already.
 
         Args:
             path: its file. picture: uint8 (rows, columns, 3), all of it. drawn: lies in it.
         """
-        margin = round(active().raster.part_margin * max(picture.shape))
+        margin = round(_PART_MARGIN * max(picture.shape))
         left, top = max(drawn.left - margin, 0), max(drawn.top - margin, 0)
         part = picture[top : drawn.bottom + margin + 1, left : drawn.right + margin + 1]
         if drawn.right < drawn.left or part.size > self.most_bytes or path in records(self.folder):

@@ -2,17 +2,25 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.evaluation.displacement import Displacements, FieldSettings, displacement_field
 from orthoswarm.model.geo import GroundGrid
 
 Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
+
+_BLOCK_PX: Final = 64  # side of a block
+_SEARCH_PX: Final = 15  # how far it is searched
+_APART_PX: Final = 6  # correlations within this distance, pixels, belong to the same peak
+_MOST_BLOCKS: Final = 500  # most blocks of a map (for its time)
+_LEAST_COVER: Final = 0.9  # least share of a block and of its search area that is drawn
+_LEAST_PEAK: Final = 0.4  # least correlation: chance likeness reaches 0.3 (measured on simulated disasters)
+_BAND_PX: Final = 500_000  # pixels that are compared at once (memory: gradients take a hundred bytes a pixel)
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,16 +62,15 @@ def moved(ortho: Bytes, seen: Mask, basemap: Bytes, valid: Mask, grid: GroundGri
         valid: where the map means something.
         grid: of both.
     """
-    config = active().evaluation
-    step = max(config.block_px, float(np.sqrt(seen.sum() / config.most_blocks)))
+    step = max(_BLOCK_PX, float(np.sqrt(seen.sum() / _MOST_BLOCKS)))
     settings = FieldSettings(
         gsd_m=grid.gsd_m,
-        block_m=config.block_px * grid.gsd_m,
+        block_m=_BLOCK_PX * grid.gsd_m,
         step_m=step * grid.gsd_m,
-        search_m=config.search_px * grid.gsd_m,
-        apart_m=config.apart_px * grid.gsd_m,
-        min_cover=config.least_cover,
-        min_peak=config.least_peak,
+        search_m=_SEARCH_PX * grid.gsd_m,
+        apart_m=_APART_PX * grid.gsd_m,
+        min_cover=_LEAST_COVER,
+        min_peak=_LEAST_PEAK,
     )
     field = Displacements.joined(list(_fields(ortho, seen, basemap, valid, settings)))
     found = field.matched
@@ -78,7 +85,7 @@ def _fields(ortho: Bytes, seen: Mask, basemap: Bytes, valid: Mask, settings: Fie
     )
     wide_ortho, wide_seen = np.pad(ortho, reach), np.pad(seen, reach)
     rows, columns = basemap.shape
-    at_once = step * max(1, active().evaluation.band_px // columns // step)
+    at_once = step * max(1, _BAND_PX // columns // step)
     for top in range(0, rows - side + 1, at_once):
         last = min(top + at_once, rows - side + 1) - 1
         end = last // step * step + side

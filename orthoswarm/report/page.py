@@ -6,13 +6,12 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm import __version__
-from orthoswarm.config import active
 from orthoswarm.export.catalog.tiled_raster import product_file
 from orthoswarm.export.product_files import iso_time, write_text
 from orthoswarm.model.bounding_box import BoundingBox
@@ -54,6 +53,10 @@ _LEGS = {"matched": (0, 158, 115), "carried": (230, 159, 0), "failed": (163, 32,
 _LEG_WIDTHS = {"matched": 2, "carried": 4, "failed": 7}
 """Pixels: which is which can be seen without the colours."""
 _VEHICLES = charts.PALETTE
+
+_LEAST_PICTURE_PX: Final = 200
+"""Side that pictures of the report have at least where a map's pixel is large (one of 640 m would leave nothing to
+see)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +111,7 @@ def write_page(
     shifts = None
     if best is not None:
         bounds = product_bounds(best)
-        coarsest = max(bounds.width, bounds.height) / active().evaluation.least_picture_px
+        coarsest = max(bounds.width, bounds.height) / _LEAST_PICTURE_PX
         least = max(float(report["gsd_m"]), min(basemap.native_gsd_m, coarsest) if basemap else 0.0)
         ortho = product_picture(best, view_grid(report["epsg"], bounds, 2000, least))
         there = None if basemap is None else MapView.read(basemap, ortho.grid)

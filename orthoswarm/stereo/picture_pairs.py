@@ -1,6 +1,7 @@
 """Selection of picture pairs for matching: a sufficient base for heights, and similar lines of sight."""
 
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,15 @@ from orthoswarm.model.camera import Camera
 from orthoswarm.model.placement import PlacedFrame, Terrain
 
 Array = NDArray[np.float64]
+
+_BEST_BASE: Final = 0.4
+"""Distance of two cameras over their height above ground at which a pair is preferred. Single pairs of a simulated city
+had ground heights within (68 %) 1.4, 0.64, 0.49 and 0.21 m at 0.13, 0.25, 0.4 and 0.7 at 0.67 m a pixel; the higher,
+the more ground is hidden behind roofs."""
+_LEAST_BASE: Final = 0.12  # pairs with a smaller ratio give inaccurate heights
+_MOST_BASE: Final = 0.9  # with a larger ratio the two views differ too much to be matched
+_LEAST_OVERLAP: Final = 0.4  # least share of a picture's footprint that the other one also covers
+_MOST_TURN_DEG: Final = 40.0  # angle between the two lines of sight at most
 
 
 def choose_pairs(frames: Sequence[PlacedFrame], terrain: Terrain) -> list[tuple[int, int]]:
@@ -30,17 +40,17 @@ def choose_pairs(frames: Sequence[PlacedFrame], terrain: Terrain) -> list[tuple[
     tree = cKDTree(position[index])
     pairs: set[tuple[int, int]] = set()
     for i in index.tolist():
-        near = index[tree.query_ball_point(position[i], c.most_base * height[i])]
+        near = index[tree.query_ball_point(position[i], _MOST_BASE * height[i])]
         base = np.linalg.norm(position[near] - position[i], axis=1) / height[i]
-        same_direction = sight[near] @ sight[i] >= np.cos(np.radians(c.most_turn_deg))
-        fit = same_direction & (base >= c.least_base) & (near != i)
+        same_direction = sight[near] @ sight[i] >= np.cos(np.radians(_MOST_TURN_DEG))
+        fit = same_direction & (base >= _LEAST_BASE) & (near != i)
         near, base = near[fit], base[fit]
-        order = np.lexsort((near, np.round(np.abs(np.log(base / c.best_base)), 6)))
+        order = np.lexsort((near, np.round(np.abs(np.log(base / _BEST_BASE)), 6)))
         used = 0
         for j in near[order].tolist():
             if used == c.partners:
                 break
-            if _overlap(frames[i].camera, frames[j].camera, terrain) >= c.least_overlap:
+            if _overlap(frames[i].camera, frames[j].camera, terrain) >= _LEAST_OVERLAP:
                 pairs.add((min(i, j), max(i, j)))
                 used += 1
     return sorted(pairs)

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,9 @@ _PAIRS_PER_TASK = 12
 """Pairs of a task: enough of them share pictures."""
 _PICTURES_HELD = 8
 """Number of decoded pictures that a task caches for its next pairs."""
+
+_CELL_PIXELS: Final = 2.0  # side of a cell, ground pixels of the (reduced) pictures: fewer would hold no more detail
+_MOST_CELLS: Final = 8_000_000  # larger cells beyond this many, for memory and disk: 50 bytes a cell
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,15 +74,14 @@ def surface_model(
 
 def _grid(frames: Sequence[PlacedFrame], terrain: Terrain, epsg: int, pairs: Sequence[tuple[int, int]]) -> GroundGrid:
     """Cells over the footprints of all frames with a partner."""
-    c = active().stereo
     some = [frames[i] for i in sorted({i for pair in pairs for i in pair})]
     level = [float(terrain.height(p.camera.nadir)) for p in some]
     corners = np.concatenate([p.camera.corners(z) for p, z in zip(some, level)])
     bounds = BoundingBox.around_points(corners[np.isfinite(corners).all(1)], 0.0)
     pixel = [(p.camera.position[2] - z) / p.camera.lens.focal_px * _factor(p) for p, z in zip(some, level)]
     west, south, east, north = bounds
-    smallest = float(np.sqrt((east - west) * (north - south) / c.most_cells))
-    return GroundGrid.around(epsg, bounds, round(max(c.cell_pixels * float(np.median(pixel)), smallest), 3))
+    smallest = float(np.sqrt((east - west) * (north - south) / _MOST_CELLS))
+    return GroundGrid.around(epsg, bounds, round(max(_CELL_PIXELS * float(np.median(pixel)), smallest), 3))
 
 
 def _factor(placed: PlacedFrame) -> int:

@@ -1,24 +1,27 @@
 """Directions of flight from positions alone."""
 
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.model.angles import wrap_rad
 
 Array = NDArray[np.float64]
+
+MOVED_M: Final = 1.0  # steps that are shorter have no direction and no spacing: receivers scatter by about that
+_CORNER_DEG: Final = 50.0  # a change of course above this is a corner between two legs and no bend
 
 
 def course(ground: Array) -> Array:
     """Grid azimuth of flight at each of a vehicle's positions (N, 2), radians; at a corner that of the leg it ends.
 
-    Steps under `moved_m` have no direction and take that of the nearest step that has; 0 where nothing moved.
+    Steps under `MOVED_M` have no direction and take that of the nearest step that has; 0 where nothing moved.
     """
-    config = active().records
-    corner_rad = np.radians(config.corner_deg)
+    corner_rad = np.radians(_CORNER_DEG)
     n = len(ground)
     steps = np.diff(ground, axis=0)
-    moved = np.nonzero(np.hypot(*steps.T) > config.moved_m)[0] if n > 1 else np.empty(0, np.intp)
+    moved = np.nonzero(np.hypot(*steps.T) > MOVED_M)[0] if n > 1 else np.empty(0, np.intp)
     if len(moved) == 0:
         return np.zeros(n)
     azimuth = np.arctan2(steps[moved, 0], steps[moved, 1])

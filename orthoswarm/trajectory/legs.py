@@ -1,5 +1,7 @@
 """Straight runs of a flight, from the path flown (paper III.C groups frames into legs by heading and path)."""
 
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,6 +11,14 @@ from orthoswarm.model.angles import wrap_rad
 Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
+PAUSE_S: Final = 60.0  # photos farther apart in time do not follow each other: the vehicle did something else between
+_LEG_TURN_DEG: Final = 35.0  # least bend of the path at the corner between two legs
+_LEG_FEWEST: Final = 3  # fewer frames are not a leg
+_LEG_JUMP_STEPS: Final = 6.0  # a step of more than so many median steps and the next field ends a leg ...
+_LEG_JUMP_M: Final = 30.0  # ... metres (receivers' outliers are below)
+_ONE_WAY_DEG: Final = 35.0  # legs within this angle of the longest lead in its direction; not the opposite one
+_OTHER_WAY_SHARE: Final = 0.3  # ways in other directions over the longest leg that tell drift from tilt
+
 
 def split_legs(position: Array, time_s: Array | None = None) -> Ints:
     """Leg of each frame, -1 for frames in turns and strays: int32 (N,), numbered in order.
@@ -17,10 +27,10 @@ def split_legs(position: Array, time_s: Array | None = None) -> Ints:
 
     Args:
         position: float64 (N, 2) or (N, 3), smoothed or recorded positions in flying order, metres.
-        time_s: float64 (N,) or None; a longer gap than `pause_s` of the configuration ends a leg.
+        time_s: float64 (N,) or None; a longer gap than `PAUSE_S` ends a leg.
     """
     config = active().records
-    reach, turn_rad = config.leg_reach, float(np.radians(config.leg_turn_deg))
+    reach, turn_rad = config.leg_reach, float(np.radians(_LEG_TURN_DEG))
     n = len(position)
     leg = np.full(n, -1, np.int32)
     if n < 2:
@@ -34,7 +44,7 @@ def split_legs(position: Array, time_s: Array | None = None) -> Ints:
     first, number = 0, 0
     for i in range(n + 1):
         if i == n or corner[i] or breaks[i]:
-            if i - first >= config.leg_fewest:
+            if i - first >= _LEG_FEWEST:
                 leg[first:i] = number
                 number += 1
             first = i + 1 if i < n and corner[i] else i
@@ -54,14 +64,13 @@ def _bend(position: Array) -> Array:
 
 def _breaks(position: Array, time_s: Array | None) -> NDArray[np.bool_]:
     """Frames before which the flight was interrupted: a pause, or a jump of many steps."""
-    config = active().records
     n = len(position)
     out = np.zeros(n, bool)
     step = np.hypot(*np.diff(position[:, :2], axis=0).T)
     usual = float(np.median(step))
-    out[1:] = step > config.leg_jump_steps * usual + config.leg_jump_m
+    out[1:] = step > _LEG_JUMP_STEPS * usual + _LEG_JUMP_M
     if time_s is not None and np.isfinite(time_s).all():
-        out[1:] |= np.diff(time_s) > config.pause_s
+        out[1:] |= np.diff(time_s) > PAUSE_S
     return out
 
 
@@ -78,7 +87,6 @@ def leads_one_way(position: Array, leg: Ints) -> bool:
     length = np.hypot(*np.array(ways).T) if ways else np.zeros(1)
     if length.max() < 1e-6:
         return True
-    config = active().records
     longest = ways[int(length.argmax())] / length.max()
-    other = np.array(ways) @ longest < np.cos(np.radians(config.one_way_deg)) * length
-    return float(length[other].sum()) < config.other_way_share * float(length.max())
+    other = np.array(ways) @ longest < np.cos(np.radians(_ONE_WAY_DEG)) * length
+    return float(length[other].sum()) < _OTHER_WAY_SHARE * float(length.max())

@@ -1,18 +1,19 @@
 """Which flight paths come near enough for common ground."""
 
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
-
 Array = NDArray[np.float64]
+
+_NEIGHBOUR_REACH_HEIGHTS: Final = 1.5  # vehicles whose paths come within so many flying heights share ground
 
 
 def reach_m(path: Array) -> float:
     """How far beside a path (N, 3) its pictures may show ground that others show, metres."""
-    return active().strategy.neighbour_reach_heights * float(np.median(path[:, 2]))
+    return _NEIGHBOUR_REACH_HEIGHTS * float(np.median(path[:, 2]))
 
 
 def near_paths(path: Array, others: Sequence[Array]) -> list[int]:

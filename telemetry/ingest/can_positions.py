@@ -1,6 +1,7 @@
 """A CAN log combined with the autopilot's log of the same vehicle: the more accurate values of the two are used."""
 
 from dataclasses import replace
+from typing import Final
 
 import numpy as np
 
@@ -11,6 +12,10 @@ from telemetry.samples.sample import Sample
 from telemetry.samples.timeline import Timeline
 
 _POSITION = ("lat_deg", "lon_deg", "altitude_m", "sigma_m")
+
+BUS_SAME_VEHICLE_M: Final = 20.0
+"""A CAN log belongs to the autopilot's log whose track is within this distance (median)."""
+_BUS_LEAST_COMMON: Final = 10  # positions at common times that this takes
 
 
 def apart_m(log: FlightLog, bus: FlightLog) -> float | None:
@@ -25,7 +30,7 @@ def apart_m(log: FlightLog, bus: FlightLog) -> float | None:
     east = np.radians(track.values("lon_deg", times) - lon) * np.cos(np.radians(lat))
     distance = MEAN_RADIUS_M * np.hypot(north, east)
     common = distance[np.isfinite(distance)]
-    return float(np.median(common)) if len(common) >= active().ingest.bus_least_common else None
+    return float(np.median(common)) if len(common) >= _BUS_LEAST_COMMON else None
 
 
 def bettered(log: FlightLog, bus: FlightLog) -> tuple[FlightLog, list[str]] | None:
@@ -36,7 +41,7 @@ def bettered(log: FlightLog, bus: FlightLog) -> tuple[FlightLog, list[str]] | No
     accurate.
     """
     distance = apart_m(log, bus)
-    if distance is None or distance > active().ingest.bus_same_vehicle_m:
+    if distance is None or distance > BUS_SAME_VEHICLE_M:
         return None
     track = bus.timeline()
     sigma_m = log.position_sigma_m or active().records.position_sigma_m

@@ -9,13 +9,15 @@ import hashlib
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Final
 
-from orthoswarm.config import active
 from orthoswarm.stores.addresses import is_stored
 from telemetry.photos.photo_tags import read_photo
 from telemetry.samples.unreadable import Unreadable, read_or_reason
 
 _SAMPLE_BYTES, _SAMPLES = 16 << 10, 8
+
+_COPIED_LEAST: Final = 3  # two folders with so many photos in common may be one and its copy
 
 
 def copies_among(photos: Sequence[Path]) -> dict[Path, Path]:
@@ -36,7 +38,7 @@ def copies_among(photos: Sequence[Path]) -> dict[Path, Path]:
     in_common: dict[tuple[Path, Path], set[Path]] = {}
     for copy, first in found.items():
         in_common.setdefault((copy.parent, first.parent), set()).add(first)
-    least = active().ingest.copied_least
+    least = _COPIED_LEAST
     return {copy: first for copy, first in found.items() if len(in_common[copy.parent, first.parent]) >= least}
 
 

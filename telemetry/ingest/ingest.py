@@ -11,8 +11,8 @@ from contextlib import closing
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
+from typing import Final
 
-from orthoswarm.config import active
 from orthoswarm.model.earth import distance_m
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.frame import Ingest, Rejection
@@ -41,6 +41,8 @@ __all__ = ["LoadOptions", "SourceInfo", "Survey", "load", "require_frames", "sur
 
 _BANDS = ("", "green", "red", "blue", "nir", "red edge", "rededge")
 """Spectral bands by how well they show the ground; "" is a colour picture."""
+
+_CONTRADICTION_M: Final = 500.0  # table that puts a photo so far from its tags, or from another table, contradicts them
 
 
 def load(inputs: Sequence[Path], *, progress: Progress | None = None, options: LoadOptions | None = None) -> Ingest:
@@ -347,7 +349,7 @@ def _merge_tables(
         if row.lat_deg is not None and row.lon_deg is not None:
             if photo.lat_deg is not None and photo.lon_deg is not None:
                 away = distance_m(photo.lat_deg, photo.lon_deg, row.lat_deg, row.lon_deg)
-                if away > active().ingest.contradiction_m:
+                if away > _CONTRADICTION_M:
                     moved_m.append(away)
             photo.lat_deg, photo.lon_deg = row.lat_deg, row.lon_deg
             photo.origin["position"] = kind

@@ -3,16 +3,18 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
-from orthoswarm.config import active
 from orthoswarm.model.earth import distance_m
 from telemetry.formats.log.flight_logs import FlightLog
-from telemetry.ingest.can_positions import apart_m
+from telemetry.ingest.can_positions import BUS_SAME_VEHICLE_M, apart_m
 from telemetry.ingest.survey import SourceInfo
 from telemetry.samples.findings import Finding
 from telemetry.samples.timeline import Timeline
+
+LOG_SAME_EXPOSURE_S: Final = 1.0  # exposures of two logs at most so far apart in time (and 3 m) are one exposure
 
 
 @dataclass(slots=True, kw_only=True)
@@ -82,7 +84,7 @@ def same_flight(a: LogSource, b: LogSource) -> bool:
     """Whether two logs, of autopilot and ground station perhaps, record one vehicle's flight."""
     distance = apart_m(a.log, b.log)
     distance = _exposures_apart_m(a.log, b.log) if distance is None else distance
-    return distance is not None and distance <= active().ingest.bus_same_vehicle_m
+    return distance is not None and distance <= BUS_SAME_VEHICLE_M
 
 
 def _exposures_apart_m(a: FlightLog, b: FlightLog) -> float | None:
@@ -93,7 +95,7 @@ def _exposures_apart_m(a: FlightLog, b: FlightLog) -> float | None:
     for event in few:
         i = int(np.argmin(np.abs(times - (event.time_s or 0.0))))
         own, other = event.sample, many[i].sample
-        if abs(times[i] - (event.time_s or 0.0)) > active().ingest.log_same_exposure_s:
+        if abs(times[i] - (event.time_s or 0.0)) > LOG_SAME_EXPOSURE_S:
             continue
         if (
             own.lat_deg is not None

@@ -4,10 +4,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
-from orthoswarm.config import active
 from orthoswarm.stores.local_copies import local_file
 from telemetry.formats.log.can_log import SUFFIXES as CAN_LOGS
 from telemetry.formats.log.can_log import is_can_log
@@ -16,13 +16,13 @@ from telemetry.formats.log.flight_logs import FlightLog, read_log
 from telemetry.formats.log.mavlink_poses import CameraEvent, fixed_camera
 from telemetry.ingest.can_positions import apart_m, bettered
 from telemetry.ingest.discovery import Discovery
-from telemetry.ingest.log_choice import LogMatch, LogSource, same_flight
+from telemetry.ingest.log_choice import LOG_SAME_EXPOSURE_S, LogMatch, LogSource, same_flight
 from telemetry.ingest.pairing.event_pairing import Pairing, pair
 from telemetry.ingest.pairing.motion_chains import PictureMotion
 from telemetry.ingest.pairing.picture_evidence import picture_motion
-from telemetry.ingest.several_flights import logs_of_one_clock, nearest_span, of_one_vehicle
+from telemetry.ingest.several_flights import LOG_LEAST_SHARE, logs_of_one_clock, nearest_span, of_one_vehicle
 from telemetry.ingest.survey import SourceInfo, Survey
-from telemetry.ingest.track_poses import add_track, best_log_of, explain, fill
+from telemetry.ingest.track_poses import EVENT_FAR_M, add_track, best_log_of, explain, fill
 from telemetry.photos.flight_checks import number_of
 from telemetry.photos.photo_tags import PhotoTags
 from telemetry.samples.course import local_metres
@@ -37,6 +37,10 @@ _SEVERAL_WAYS = (
     "to it, or give the logs of all flights"
 )
 _NO_EVENT = "it has no camera event in the log; put a geo.txt next to it, or give the log of its flight"
+
+_LOG_SAME_FIT: Final = 0.05  # two logs whose misfits to photos differ by no more than this fit equally well
+_FAR_SHARE: Final = 0.2  # up to this share of photos far from their camera events have wrong positions
+_MOST_ZONE_S: Final = 54_000.0  # largest offset by a time zone: 14 hours (IANA), and one for error
 
 
 def read_logs(found: Discovery, result: Survey) -> list[LogSource]:
@@ -124,10 +128,7 @@ def _same_exposures(a: FlightLog, b: FlightLog) -> bool:
     for event in a.events:
         i = int(np.argmin(np.abs(times - (event.time_s or 0.0))))
         other = b.events[i]
-        if (
-            abs(times[i] - (event.time_s or 0.0)) > active().ingest.log_same_exposure_s
-            or _apart_m(event.sample, other.sample) > 3.0
-        ):
+        if abs(times[i] - (event.time_s or 0.0)) > LOG_SAME_EXPOSURE_S or _apart_m(event.sample, other.sample) > 3.0:
             return False
     return True
 
@@ -157,7 +158,6 @@ def add_logs(
         findings: findings are appended here.
         workers: threads that read photos if their times do not decide which camera event they belong to.
     """
-    config = active().ingest
     near = [entry for entry in logs if folder.is_relative_to(entry.folder)]
     if not near or not photos or all(_is_complete(photo) for photo in photos):
         return
@@ -165,7 +165,7 @@ def add_logs(
     matches = []
     for entry in near:
         pairing = _pair(photos, entry.log.events)
-        if len(pairing.pairs) >= max(1.0, config.log_least_share * min(len(photos), len(entry.log.events))):
+        if len(pairing.pairs) >= max(1.0, LOG_LEAST_SHARE * min(len(photos), len(entry.log.events))):
             pairings[id(entry)] = pairing
             matches.append(
                 LogMatch(
@@ -174,7 +174,7 @@ def add_logs(
                     how="by their camera events",
                     rank=0,
                     misfit=_misfit(photos, pairing, entry),
-                    margin=config.log_same_fit,
+                    margin=_LOG_SAME_FIT,
                 )
             )
     if not matches:
@@ -236,10 +236,10 @@ def _misfit(photos: Sequence[PhotoTags], pairing: Pairing, entry: LogSource) -> 
     events = entry.log.events
     share = len(pairing.pairs) / max(len(photos), len(events))
     apart = [_photo_apart_m(photos[i], events[j].sample) for i, j in pairing.pairs if photos[i].lat_deg is not None]
-    away = float(np.median(apart)) / active().ingest.event_far_m if apart else 0.0
+    away = float(np.median(apart)) / EVENT_FAR_M if apart else 0.0
     clock = 0.5 * (pairing.how != "time") + 0.01 * math.log1p(pairing.residual_s)
     # No zone explains more: another flight of the same mission.
-    other_day = 2.0 * active().ingest.log_same_fit * (abs(pairing.offset_s or 0.0) > active().ingest.most_zone_s)
+    other_day = 2.0 * _LOG_SAME_FIT * (abs(pairing.offset_s or 0.0) > _MOST_ZONE_S)
     return 1.0 - share + clock + other_day + 0.6 * entry.used + away
 
 
@@ -265,7 +265,6 @@ def _use_events(
     photos: Sequence[PhotoTags], pairing: Pairing, entry: LogSource, vehicle: str, findings: list[Finding]
 ) -> None:
     """Assign photos the poses of their events."""
-    config = active().ingest
     entry.used = True
     log = entry.log
     far = list[tuple[PhotoTags, float | None]]()
@@ -280,7 +279,7 @@ def _use_events(
         if not log.has_gimbal:
             pose = fixed_camera(pose)
         photo = photos[i]
-        if _photo_apart_m(photo, pose) > config.event_far_m:
+        if _photo_apart_m(photo, pose) > EVENT_FAR_M:
             far.append((photo, event.time_s))
             continue
         origin = f"{event.kind} ({entry.name})"
@@ -291,12 +290,12 @@ def _use_events(
             photo.ambiguous = True
         fill(photo, replace(pose, time_s=event.time_s), origin, gimbal=log.has_gimbal)
     findings += [replace(f, vehicle=vehicle) for f in _pairing_findings(photos, pairing, log)]
-    if len(far) <= config.far_share * len(pairing.pairs):  # the log is theirs, their positions are wrong
+    if len(far) <= _FAR_SHARE * len(pairing.pairs):  # the log is theirs, their positions are wrong
         for photo, time_s in far:
             photo.time_s, photo.origin["time"] = time_s, f"exposure ({entry.name})"
     if far:
         text = (
-            f"{plural(len(far), 'photo')} more than {config.event_far_m:.0f} m from the camera events of "
+            f"{plural(len(far), 'photo')} more than {EVENT_FAR_M:.0f} m from the camera events of "
             f"{log.path.name}, without a position from it; the log may be that of another flight"
         )
         findings.append(Finding("pairing-distance", text, vehicle))

@@ -8,14 +8,15 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from telemetry.ingest.discovery import natural_key
 from telemetry.photos.photo_tags import PhotoTags
 from telemetry.samples.course import local_metres
 from telemetry.samples.findings import Finding, plural
+from telemetry.samples.wild_fixes import TIME_RESOLUTION_S
 
 SHIFTED: Final = "shifted after a jump"
 """Said in the origin of a photo's time that was moved to follow the photos before it."""
+CLOCK_JUMP_S: Final = 60.0  # a step back in the photos' times by more than this is a jump of the camera's clock
 
 
 def in_order(photos: Sequence[PhotoTags], vehicle: str, findings: list[Finding]) -> list[PhotoTags]:
@@ -36,11 +37,7 @@ def in_order(photos: Sequence[PhotoTags], vehicle: str, findings: list[Finding])
     times = np.array([p.time_s for p in by_name], dtype=np.float64)
     steps = np.diff(times)
     back = np.flatnonzero(steps < 0.0)
-    if (
-        len(back) > 3
-        or steps[back].min() > -active().ingest.clock_jump_s
-        or _length_m(by_name) > 0.7 * _length_m(by_time)
-    ):
+    if len(back) > 3 or steps[back].min() > -CLOCK_JUMP_S or _length_m(by_name) > 0.7 * _length_m(by_time):
         return by_time
     usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 1.0
     for at in back:
@@ -71,7 +68,7 @@ def clock_went_back(photos: Sequence[PhotoTags]) -> bool:
 
 
 def _went_back(times: NDArray[np.float64]) -> bool:
-    back = np.flatnonzero(np.diff(times) < -active().ingest.time_resolution_s) + 1
+    back = np.flatnonzero(np.diff(times) < -TIME_RESOLUTION_S) + 1
     if not 0 < len(back) <= 3:  # more: names that are not in the order of exposure
         return False
     spans = sorted((run.min(), run.max()) for run in np.split(times, back))

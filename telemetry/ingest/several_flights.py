@@ -7,17 +7,21 @@ different system ids are.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from telemetry.formats.log.log_data import FlightLog
+from telemetry.ingest.pairing.clock_jumps import JUMP_LEAST_PHOTOS, LEAST_JUMP_S
 from telemetry.ingest.pairing.clock_offset import SPAN_MARGIN_S, ZONES_S
 from telemetry.ingest.pairing.event_pairing import Pairing
+from telemetry.ingest.pairing.sequence_model import MOST_DRIFT
 from telemetry.samples.timeline import Timeline
 
 Array = NDArray[np.float64]
+
+LOG_LEAST_SHARE: Final = 0.5  # a log belongs to photos if this share of the shorter of both is paired
 
 
 def of_one_vehicle(logs: Iterable[FlightLog]) -> bool:
@@ -46,7 +50,6 @@ def logs_of_one_clock(
     Returns:
         Keys in order of time.
     """
-    config = active().ingest
     sure = {key: photos for key, pairing in pairings.items() if (photos := _sure(pairing))}
     groups = [_joined(key, sure, pairings, times) for key in sure]
     best = max(groups, key=lambda keys: sum(len(sure[key]) for key in keys), default=[])
@@ -61,7 +64,7 @@ def logs_of_one_clock(
         fitting = {i for i, _ in pairings[key].pairs}
         for own in best:
             common = len(fitting.intersection(sure[own]))
-            if common >= config.log_least_share * len(sure[own]) and not same_flight(key, own):
+            if common >= LOG_LEAST_SHARE * len(sure[own]) and not same_flight(key, own):
                 return []
     return sorted(best, key=lambda key: float(np.median(times[sure[key]])))
 
@@ -71,7 +74,7 @@ def _sure(pairing: Pairing) -> list[int]:
     if pairing.how != "time" or pairing.offset_s is None or pairing.ambiguous or pairing.jumps:
         return []
     photos = [i for i, _ in pairing.pairs if i not in pairing.doubtful]
-    return photos if len(photos) >= active().pairing.jump_least_photos else []
+    return photos if len(photos) >= JUMP_LEAST_PHOTOS else []
 
 
 def _joined(first: int, sure: Mapping[int, Sequence[int]], pairings: Mapping[int, Pairing], times: Array) -> list[int]:
@@ -89,8 +92,7 @@ def _same_clock(
 ) -> bool:
     between_s = abs(float(np.median(times[sure[a]]) - np.median(times[sure[b]])))
     apart_s = abs((pairings[a].offset_s or 0.0) - (pairings[b].offset_s or 0.0))
-    config = active().pairing
-    return apart_s <= config.least_jump_s + config.most_drift * between_s
+    return apart_s <= LEAST_JUMP_S + MOST_DRIFT * between_s
 
 
 def nearest_span(times: Array, spans: Sequence[tuple[float, float]]) -> NDArray[np.int64]:

@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import PurePath
+from typing import Final
 
 import numpy as np
 
-from orthoswarm.config import active
 from orthoswarm.model.earth import distance_m
 from telemetry.formats.log.mavlink_poses import fixed_camera
 from telemetry.ingest.log_choice import LogMatch, LogSource, best_log
@@ -16,7 +16,7 @@ from telemetry.ingest.pairing.clock_offset import (
     offset_by_zone,
     zones_of_flight,
 )
-from telemetry.ingest.photo_order import clock_went_back
+from telemetry.ingest.photo_order import CLOCK_JUMP_S, clock_went_back
 from telemetry.ingest.several_flights import nearest_span, of_one_vehicle, zone_of_all
 from telemetry.photos.flight_checks import number_of
 from telemetry.photos.photo_tags import PhotoTags
@@ -31,6 +31,10 @@ _NO_LOG_FITS = (
 _CLOCK_UNSET = "it was taken before the camera's clock was set, so that no log can place it; put a geo.txt next to it"
 _LEAST_PLACED = 5
 """Photos with positions that it takes to find the camera's clock by them."""
+
+EVENT_FAR_M: Final = 60.0  # photos whose own position is farther than this from their camera event are reported
+_TRACK_FAR_M: Final = 10.0  # photos nearer than this to a log's track at their times do not contradict it
+_TRACK_FAR_TIMES: Final = 5.0  # photos farther from it than so many times their median distance contradict it
 
 
 def best_log_of(matches: Sequence[LogMatch], vehicle: str) -> LogMatch | Finding:
@@ -141,7 +145,7 @@ def _at_longest_pause(photos: Sequence[PhotoTags]) -> list[Sequence[PhotoTags]]:
     """Photos in order of time before and after their longest pause: two flights perhaps; none without a pause."""
     steps = np.diff([p.time_s or 0.0 for p in photos])
     longest = int(np.argmax(steps))
-    if steps[longest] <= active().ingest.clock_jump_s:
+    if steps[longest] <= CLOCK_JUMP_S:
         return []
     return [photos[: longest + 1], photos[longest + 1 :]]
 
@@ -190,9 +194,8 @@ def _other_zones(photos: Sequence[PhotoTags], match: LogMatch) -> list[str]:
 
 def _far_m(match: LogMatch) -> float:
     """Distance from the track from which on a photo's own position contradicts it, metres."""
-    config = active().ingest
-    usual_m = match.misfit if match.by_positions else config.event_far_m
-    return min(config.event_far_m, max(config.track_far_m, config.track_far_times * usual_m))
+    usual_m = match.misfit if match.by_positions else EVENT_FAR_M
+    return min(EVENT_FAR_M, max(_TRACK_FAR_M, _TRACK_FAR_TIMES * usual_m))
 
 
 def _fill_from(match: LogMatch, photos: Sequence[PhotoTags]) -> tuple[int, list[PhotoTags]]:

@@ -1,13 +1,14 @@
 """Aligns a flight log with a video that has no poses of its own."""
 
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from telemetry.ingest.log_choice import LogMatch, LogSource, best_log
 from telemetry.ingest.pairing.clock_offset import (
+    TURNING_MARGIN,
     median_distance_m,
     offset_by_positions,
     offset_by_turning,
@@ -20,6 +21,10 @@ from telemetry.videos.video_file import VideoScan
 
 Array = NDArray[np.float64]
 _BY_CREATION = "by the container's creation time"
+
+_TURNING_RATE_HZ: Final = 4.0  # pictures a second of a video that are compared with a log's turns
+_TURNING_WIDTH_PX: Final = 320  # width at which they are compared
+_TURNING_LONGEST_S: Final = 600.0  # longest part of a video that is compared
 
 
 def add_log(poses: Poses, found: VideoScan, logs: Sequence[LogSource]) -> list[Finding]:
@@ -54,7 +59,7 @@ def _matches(poses: Poses, found: VideoScan, logs: Sequence[LogSource]) -> list[
     logs = [entry for entry in logs if any(sample.has_position for sample in entry.log.samples)]
     if not logs:
         return []
-    margin = active().ingest.turning_margin
+    margin = TURNING_MARGIN
     times, rates = picture_rates(found)
     matches = []
     for entry in logs:
@@ -94,14 +99,13 @@ def _longest(entry: LogSource) -> float:
 
 def picture_rates(found: VideoScan) -> tuple[Array, Array]:
     """Video times and yaw rates (degrees a second) measured in the pictures of a file's first ten minutes."""
-    config = active().ingest
     import cv2
 
     from telemetry.videos.extraction import decoded
     from telemetry.videos.picture_choice import luma
 
     rate = found.rate or 30.0
-    every = max(1, round(rate / config.turning_rate_hz))
+    every = max(1, round(rate / _TURNING_RATE_HZ))
     times: list[float] = []
     rates: list[float] = []
     before: tuple[float, NDArray[np.uint8]] | None = None
@@ -110,10 +114,10 @@ def picture_rates(found: VideoScan) -> tuple[Array, Array]:
             continue
         note = found.pictures[index] if index is not None and index < len(found.pictures) else None
         t = note.video_s if note is not None and note.video_s is not None else number / rate
-        if t > config.turning_longest_s:
+        if t > _TURNING_LONGEST_S:
             break
         gray = np.ascontiguousarray(luma(frame))
-        scale = min(1.0, config.turning_width_px / gray.shape[1])
+        scale = min(1.0, _TURNING_WIDTH_PX / gray.shape[1])
         small = np.asarray(cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), dtype=np.uint8)
         if before is not None:
             middle, turned = turning_of_pictures([before[1], small], np.array([before[0], t]))

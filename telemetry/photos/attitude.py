@@ -7,11 +7,11 @@ content is not used here.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.model.angles import wrap_deg
 from telemetry.photos.maker_angles import Angles
 from telemetry.photos.photo_tags import PhotoTags
@@ -25,6 +25,8 @@ RELATIVE_GIMBAL_MODELS = frozenset({"FC7203"})
 
 Measured on a flight of one: pictures turn with the sum of both (slope 1.1 on the gimbal's yaw), not with the flight
 yaw alone."""
+
+_NADIR_WITHIN_DEG: Final = 45.0  # gimbal roll near 180 degrees is a turned yaw if the camera looks within this of nadir
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,9 +85,7 @@ def _drop_unfilled(camera: Array, flight: Array, findings: list[Finding], vehicl
 def _repair_upside_down(camera: Array, findings: list[Finding], vehicle: str) -> None:
     """Replace a roll near 180 at nadir by the equivalent yaw turned by 180 (gimbals do not hang upside down)."""
     with np.errstate(invalid="ignore"):
-        flipped = (np.abs(wrap_deg(camera[:, 2] - 180.0)) < 30.0) & (
-            camera[:, 1] < -90.0 + active().ingest.nadir_within_deg
-        )
+        flipped = (np.abs(wrap_deg(camera[:, 2] - 180.0)) < 30.0) & (camera[:, 1] < -90.0 + _NADIR_WITHIN_DEG)
     if flipped.any():
         camera[flipped, 0] += 180.0
         camera[flipped, 2] = wrap_deg(camera[flipped, 2] - 180.0)

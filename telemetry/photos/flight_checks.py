@@ -6,6 +6,7 @@ Nothing is changed here; most findings are notes, not errors.
 import math
 import re
 from collections.abc import Iterable, Sequence
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,9 @@ from telemetry.samples.findings import Finding, plural
 from telemetry.samples.times import ZONE_UNKNOWN
 
 Array = NDArray[np.float64]
+
+_OUTLYING_POSITION_M: Final = 100.0  # a photo farther from those beside it (and 15 steps) has a wrong position
+_LOW_SHARE: Final = 0.4  # a few photos lower than this share of the usual height are reported
 
 
 def flight_findings(photos: Sequence[PhotoTags], frames: Sequence[Frame], vehicle: str) -> list[Finding]:
@@ -132,12 +136,7 @@ def _outlying_positions(frames: Sequence[Frame], ground: Array) -> Finding | Non
     step = np.hypot(*np.diff(ground, axis=0).T)
     across = np.hypot(*(ground[2:] - ground[:-2]).T)
     least = np.minimum(step[:-1], step[1:])
-    far = (
-        np.flatnonzero(
-            (least > active().ingest.outlying_position_m) & (least > 15.0 * np.median(step)) & (least > 3.0 * across)
-        )
-        + 1
-    )
+    far = np.flatnonzero((least > _OUTLYING_POSITION_M) & (least > 15.0 * np.median(step)) & (least > 3.0 * across)) + 1
     if not len(far):
         return None
     away = float(least[far - 1].max())
@@ -222,7 +221,7 @@ def _low(frames: Sequence[Frame]) -> Finding | None:
     if np.isnan(heights).mean() > 0.5:
         return None
     usual = float(np.nanmedian(heights))
-    low = np.flatnonzero(heights < active().ingest.low_share * usual)
+    low = np.flatnonzero(heights < _LOW_SHARE * usual)
     if not 0 < len(low) <= 0.2 * len(frames):
         return None
     text = (

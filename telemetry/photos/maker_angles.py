@@ -13,7 +13,8 @@
 Sources: ExifTool's tag tables, published photos and packets of these makers.
 """
 
-from orthoswarm.config import active
+from typing import Final
+
 from telemetry.formats.photo import xmp
 
 Angles = tuple[float | None, float | None, float | None]
@@ -34,6 +35,8 @@ _FLIGHT = (
     ("drone-parrot", ("DroneYawDegree", "DronePitchDegree", "DroneRollDegree")),
     ("drone-yuneec", ("DroneYaw", "DronePitch", "DroneRoll")),
 )
+
+_FROM_HORIZON_DEG: Final = -25.0  # pitches below this are counted from the horizon, not from nadir
 
 
 def camera_angles(found: xmp.Properties, make: str) -> tuple[Angles, str] | None:
@@ -86,7 +89,7 @@ def _from_pix4d(angles: Angles, make: str) -> Angles:
     yaw, pitch, roll = angles
     maker = make.lower()
     if pitch is not None:
-        from_horizon = pitch < (0.0 if maker.startswith("autel") else active().ingest.from_horizon_deg)
+        from_horizon = pitch < (0.0 if maker.startswith("autel") else _FROM_HORIZON_DEG)
         pitch = pitch if from_horizon and maker != "orthoswarm" else pitch - 90.0
     if roll is not None and maker.startswith("sensefly"):
         roll = -roll

@@ -4,10 +4,10 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
-from orthoswarm.config import active
 from orthoswarm.model.frame import Frame
 from telemetry.photos.attitude import check_legs, decide
 from telemetry.photos.maker_angles import Angles
@@ -16,6 +16,8 @@ from telemetry.samples.course import courses_deg, local_metres, straight_legs
 from telemetry.samples.findings import Finding, plural
 from telemetry.samples.sample import Sample
 from telemetry.samples.sample_frame import fix_of
+
+LEAST_HEIGHT_M: Final = 1.0  # recorded heights below this were never filled in
 
 
 def frames_of(
@@ -98,19 +100,18 @@ def _frame(
 
 def _heights(photos: Sequence[PhotoTags], findings: list[Finding], vehicle: str) -> list[float | None]:
     """Plausible heights: not zero or negative, and not altitudes."""
-    config = active().ingest
     heights = [p.height_m if p.height_m is not None and math.isfinite(p.height_m) else None for p in photos]
-    low = [h for h in heights if h is not None and h < config.least_height_m]
+    low = [h for h in heights if h is not None and h < LEAST_HEIGHT_M]
     if low:
         findings.append(
             Finding(
                 "height-implausible",
-                f"the recorded height is below {config.least_height_m:g} m in {plural(len(low), 'photo')} "
+                f"the recorded height is below {LEAST_HEIGHT_M:g} m in {plural(len(low), 'photo')} "
                 f"(down to {min(low):.1f} m); these heights are ignored",
                 vehicle,
             )
         )
-    heights = [h if h is not None and h >= config.least_height_m else None for h in heights]
+    heights = [h if h is not None and h >= LEAST_HEIGHT_M else None for h in heights]
     missing = sum(h is None for h in heights)
     if missing:
         findings.append(

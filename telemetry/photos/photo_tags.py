@@ -9,7 +9,7 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from orthoswarm.config import active
 from orthoswarm.stores.addresses import is_stored
@@ -31,6 +31,8 @@ HEMISPHERE_UNKNOWN = "without hemisphere, taken as north and east"
 
 _FULL_FRAME_DIAGONAL_MM = 43.2666
 _CHUNK = 64
+
+_MOST_HEIGHT_M: Final = 12_000.0  # recorded heights above this are not heights above ground
 
 
 @dataclass(slots=True, kw_only=True)
@@ -192,18 +194,17 @@ def _xmp_position(found: xmp.Properties) -> tuple[float, float] | None:
 
 
 def _heights(photo: PhotoTags, tags: exif.Exif, found: xmp.Properties) -> None:
-    config = active().ingest
     photo.altitude_m = exif.gps_altitude(tags.gps)
     if photo.altitude_m is None:
         photo.altitude_m = xmp.number(found, "drone-dji:AbsoluteAltitude")
     ground = xmp.number(found, "Camera:AboveGroundAltitude")
-    if ground is not None and 0.0 < ground < config.most_height_m:
+    if ground is not None and 0.0 < ground < _MOST_HEIGHT_M:
         photo.height_m, photo.height_is_ground = ground, True
         photo.origin["height"] = "XMP AboveGroundAltitude"
         return
     others = sorted(name for name in found if name.endswith(":RelativeAltitude"))  # makers that follow DJI's names
     relative = xmp.number(found, *_RELATIVE_ALTITUDES, *others)
-    if relative is not None and abs(relative) < config.most_height_m:
+    if relative is not None and abs(relative) < _MOST_HEIGHT_M:
         photo.height_m = relative
         photo.origin["height"] = "XMP RelativeAltitude"
 

@@ -7,11 +7,11 @@ belongs to the airframe instead of the camera.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.model.angles import wrap_deg
 from orthoswarm.model.frame import Frame
 from telemetry.photos.flight_checks import track_of
@@ -20,6 +20,9 @@ from telemetry.samples.course import Straight, straight_legs
 from telemetry.samples.findings import Finding, plural
 
 Array = NDArray[np.float64]
+
+_YAW_PAIRS_A_LEG: Final = 3  # pairs of pictures by which the recorded yaw of a leg is checked
+_YAW_LEAST_STEP_M: Final = 1.0  # distance flown between such pictures at least (receivers' noise)
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +50,7 @@ def seen_headings(frames: Sequence[Frame], *, most_legs: int = 12) -> list[SeenH
     for leg in legs:
         middle = (leg.first + leg.last) // 2
         order = sorted(range(leg.first, leg.last), key=lambda i: abs(i - middle))
-        for i in order[: active().ingest.yaw_pairs_a_leg]:
+        for i in order[:_YAW_PAIRS_A_LEG]:
             seen = _match(frames[i], frames[i + 1], ground[i + 1] - ground[i])
             if seen is not None:
                 found.append(SeenHeading(leg, (i, i + 1), seen[1], seen[0]))
@@ -57,7 +60,7 @@ def seen_headings(frames: Sequence[Frame], *, most_legs: int = 12) -> list[SeenH
 
 def _match(a: Frame, b: Frame, moved: Array) -> tuple[float, int] | None:
     """Yaw of the second picture in degrees and how many matches agree; None if the two cannot be matched."""
-    if np.hypot(*moved) < active().ingest.yaw_least_step_m:
+    if np.hypot(*moved) < _YAW_LEAST_STEP_M:
         return None
     one, two = (features(PictureFile(f.path, f.width, f.height)) for f in (a, b))
     matched = centre_shift(one, two) if one is not None and two is not None else None

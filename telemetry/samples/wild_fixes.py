@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,11 @@ from telemetry.samples.findings import Finding, plural
 from telemetry.samples.sample import Sample
 
 Array = NDArray[np.float64]
+
+TIME_RESOLUTION_S: Final = 1.0  # times of positions may be off by this: many are written in whole seconds
+_WILD_MOST_SHARE: Final = 0.1  # positions that cannot be reached are wild up to this share of all
+_WILD_MOST_PIECES: Final = 10_000  # a track broken at more places has wrong times, not wild positions
+_LONGEST_REPEAT_S: Final = 30.0  # a receiver may repeat a fix for so long, during which it flies on
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +50,6 @@ def wild_fixes(times_s: Sequence[float | None], places: Sequence[tuple[float, fl
         times_s: of the fixes, in one clock; what has none is not judged.
         places: latitude and longitude in degrees.
     """
-    config = active().ingest
     timed = [i for i, t in enumerate(times_s) if t is not None and t == t]
     order = sorted(timed, key=lambda i: times_s[i] or 0.0)
     if len(order) < 3:
@@ -54,19 +59,19 @@ def wild_fixes(times_s: Sequence[float | None], places: Sequence[tuple[float, fl
     cuts = np.flatnonzero(~_flyable(times[:-1], ground[:-1], times[1:], ground[1:])) + 1
     first = np.concatenate([[0], cuts])
     last = np.concatenate([cuts, [len(order)]]) - 1
-    if len(first) > config.wild_most_pieces:
+    if len(first) > _WILD_MOST_PIECES:
         return WildFixes([], doubtful=len(first) - 1)
     if len(first) == 1:
         return WildFixes([])
     new = np.concatenate([[True], np.any(np.diff(ground, axis=0) != 0.0, axis=1)])
     since = times[np.maximum.accumulate(np.where(new, np.arange(len(order)), 0))]  # a fix that is repeated may be old
-    since = np.maximum(since, times - config.longest_repeat_s)
+    since = np.maximum(since, times - _LONGEST_REPEAT_S)
     kept = _longest_track(first, last, since, times, ground)
     if len(kept) == len(first):
         return WildFixes([])
     pieces = [np.arange(a, b + 1) for k, (a, b) in enumerate(zip(first, last, strict=True)) if k not in kept]
     wild = np.concatenate(pieces)
-    if len(wild) > max(1.0, config.wild_most_share * len(order)):
+    if len(wild) > max(1.0, _WILD_MOST_SHARE * len(order)):
         return WildFixes([], doubtful=len(wild))
     sound = np.setdiff1d(np.arange(len(order)), wild)
     after = np.searchsorted(sound, wild).clip(0, len(sound) - 1)
@@ -80,7 +85,7 @@ def wild_fixes(times_s: Sequence[float | None], places: Sequence[tuple[float, fl
 def _flyable(t0: Array, a: Array, t1: Array, b: Array) -> NDArray[np.bool_]:
     """Whether an aircraft can fly from places `a` (N, 2), metres, at times `t0` to places `b` at `t1`."""
     config = active().ingest
-    reach = config.fastest_m_s * (t1 - t0 + config.time_resolution_s)
+    reach = config.fastest_m_s * (t1 - t0 + TIME_RESOLUTION_S)
     return np.asarray(np.hypot(b[..., 0] - a[..., 0], b[..., 1] - a[..., 1]) <= reach)
 
 

@@ -6,12 +6,11 @@ from bisect import bisect_right
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from telemetry.photos.photo_tags import PhotoTags
 from telemetry.samples.findings import Finding, plural
 from telemetry.samples.sample import Sample
@@ -24,6 +23,8 @@ from telemetry.videos.picture_poses import Pose, Poses
 from telemetry.videos.video_file import VideoScan, demux, open_video, parked, picture_stream, scan, square_size
 
 JPEG_QUALITY = 95
+
+_ZOOM_STEP: Final = 0.03  # natural logarithm of the field of view's change from which a video's lens counts as another
 
 
 @dataclass(slots=True, kw_only=True)
@@ -344,7 +345,7 @@ class _LensKey:
         self.zooms: set[float] = set()
 
     def of(self, sample: Sample | None) -> str:
-        step = active().ingest.zoom_step
+        step = _ZOOM_STEP
         fov = None if sample is None else sample.fov_deg
         if fov is None:
             return self._base if sample is None or sample.zoom is None else self._zoomed(sample.zoom, step)

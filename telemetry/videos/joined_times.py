@@ -1,8 +1,8 @@
 """Times of packets in files whose clock starts again: recordings joined end to end, an encoder that was restarted."""
 
-from typing import Any
+from typing import Any, Final
 
-from orthoswarm.config import active
+_RESTART_S: Final = 1.0  # a stream whose decoding times go back by more than this starts its clock again
 
 
 class JoinedTimes:
@@ -41,7 +41,7 @@ class JoinedTimes:
         part = self._part.get(stream, 0)
         if packet.dts is not None:
             decoded_s = float(packet.dts * packet.time_base)
-            part += decoded_s < self._decoded_s.get(stream, decoded_s) - active().ingest.restart_s
+            part += decoded_s < self._decoded_s.get(stream, decoded_s) - _RESTART_S
             self._decoded_s[stream] = decoded_s
         if packet.stream is not self._pictures:  # what follows the first picture of a part belongs to it, or to a later
             part = max(part, len(self.joints_s))

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -10,6 +10,10 @@ from orthoswarm.config import active
 from orthoswarm.model.angles import wrap_deg
 from orthoswarm.model.earth import MEAN_RADIUS_M
 from telemetry.samples.sample import Sample
+
+_VIDEO_EARLY: Final = 0.8  # from this share of that distance on, pictures are candidates, of which the sharpest is used
+_VIDEO_LATE: Final = 1.2  # to this share
+_VIDEO_CANDIDATES: Final = 6  # candidates at most (memory)
 
 
 @dataclass(slots=True, kw_only=True)
@@ -49,15 +53,14 @@ class Picker:
 
     def push(self, candidate: Candidate) -> Iterator[Candidate]:
         """Offer the next picture; yields the selected ones."""
-        config = active().ingest
         if self._last is None:
             self._last = candidate
             yield candidate
             return
         progress = self._progress(candidate, self._last)
-        if progress < config.video_early:
+        if progress < _VIDEO_EARLY:
             return
-        if progress <= config.video_late and len(self._waiting) < config.video_candidates:
+        if progress <= _VIDEO_LATE and len(self._waiting) < _VIDEO_CANDIDATES:
             self._waiting.append(candidate)
             return
         if not self._waiting:

@@ -7,11 +7,11 @@ subtitles) is interpolated at the picture's time. The sources are merged field b
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from telemetry.formats.log.mavlink_poses import fixed_camera
 from telemetry.formats.video import srt
 from telemetry.samples.findings import Finding, plural
@@ -21,6 +21,9 @@ from telemetry.samples.wild_fixes import without_wild_fixes
 from telemetry.videos.video_file import VideoScan, square_size
 
 Array = NDArray[np.float64]
+
+_SUBTITLE_EXCESS_S: Final = 3.0  # subtitles that end later than their video by more than this are of another length
+_HELD_AT_ENDS_S: Final = 1.0  # metadata counts this long before its first and after its last value
 
 
 @dataclass(frozen=True, slots=True)
@@ -355,7 +358,7 @@ class Poses:
         ]
         ends = self._times[~np.isnan(self._times)]
         last_s = max((cue.end_s for cue in cues.cues if cue.sample is not None), default=0.0)
-        if len(ends) and last_s > ends.max() + active().ingest.subtitle_excess_s and cues.has_positions:
+        if len(ends) and last_s > ends.max() + _SUBTITLE_EXCESS_S and cues.has_positions:
             text = (
                 f"the subtitles of {name} last {last_s:.0f} s, its pictures {ends.max() + self._interval:.0f} s: if "
                 "the video was cut or sped up, its pictures lie elsewhere; give the video as the camera wrote it, or "
@@ -376,11 +379,10 @@ def _interpolated(rows: list[tuple[float, Sample]], times: Array) -> list[Sample
 
 def _held_timeline(samples: list[Sample]) -> Timeline:
     """A timeline extended at its ends by one usual interval (at most a second), as pictures lie between samples."""
-    config = active().ingest
     samples = sorted((s for s in samples if s.time_s is not None), key=lambda s: s.time_s or 0.0)
     times = np.array([s.time_s for s in samples], dtype=np.float64)
-    usual = float(np.median(np.diff(times))) if len(times) > 1 else config.held_at_ends_s
-    usual = min(max(usual, 1e-3), config.held_at_ends_s)
+    usual = float(np.median(np.diff(times))) if len(times) > 1 else _HELD_AT_ENDS_S
+    usual = min(max(usual, 1e-3), _HELD_AT_ENDS_S)
     before = replace(samples[0], time_s=float(times[0]) - usual)
     after = replace(samples[-1], time_s=float(times[-1]) + usual)
     return Timeline([before, *samples, after], max_gap_s=max(2.0, 4.0 * usual))

@@ -11,9 +11,8 @@ from dataclasses import dataclass, field
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
-from orthoswarm.config import active
 from telemetry.formats.video import bitstream, djmd, gpmf, klv, sei, srt
 from telemetry.samples.sample import Sample
 from telemetry.samples.times import parse_time
@@ -27,6 +26,9 @@ _RAW_FORMATS = frozenset({"h264", "hevc"})
 """FFmpeg's names of streams without a container, which give no times to their pictures."""
 _MOST_BEFORE_FIRST = 100
 """Packets within which a picture is decoded, unless the file is damaged (decoders hold back up to 16)."""
+
+_SQUARE_WITHIN: Final = 0.01  # pixels whose width and height differ by no more are square
+_MOST_ASPECT: Final = 4.0  # a ratio of a pixel's sides beyond this is damage (anamorphic lenses have 2, DV has 16:11)
 
 
 class NotAVideo(Unreadable):
@@ -145,8 +147,7 @@ def _pixels(stream: Any) -> int:
 
 def square_size(columns: int, rows: int, aspect: float) -> tuple[int, int]:
     """Columns and rows of a picture once its pixels are square; none is lost."""
-    config = active().ingest
-    if abs(aspect - 1.0) <= config.square_within or not 1.0 / config.most_aspect <= aspect <= config.most_aspect:
+    if abs(aspect - 1.0) <= _SQUARE_WITHIN or not 1.0 / _MOST_ASPECT <= aspect <= _MOST_ASPECT:
         return columns, rows
     return (round(columns * aspect), rows) if aspect > 1.0 else (columns, round(rows / aspect))
 

@@ -73,9 +73,9 @@ def test_a_file_overrides_defaults_and_workers_follow(tmp_path):
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("[nothing]\na = 1\n", "no stage 'nothing'"),
+        ("[nothing]\na = 1\n", r"no settings \[nothing\]"),
         ("records = 3\n", "write it as a table"),
-        ("[records]\nnothing = 1\n", "no 'nothing'"),
+        ("[records]\nnothing = 1\n", "no setting records.nothing"),
         ("[records]\ntheta_hat_deg = 'wide'\n", "another kind"),
         ("[records\n", "not a TOML file"),
     ],
@@ -102,15 +102,12 @@ def test_what_is_wrong_with_a_file_is_said_and_changes_nothing(text, says, tmp_p
         ("coverage", "oblique_deg = 400", "a number above 0 and at most 360"),
         ("records", "usual_overlap = 1", "a number of at least 0 and below 1"),
         ("initial", "default_fov_deg = 180", "a number above 0 and below 180"),
-        ("planning", "straight_cos = -1.1", "a number of at least -1 and at most 1"),
         ("planning", "launch_s = -1", "a number of at least 0"),
         ("ardupilot", "speed_share = 0", "a number above 0"),
         ("mosaic", "most_off_nadir_deg = 120", "below 90"),
-        ("radiometry", "hue_share = 0", "a number above 0"),
         ("records", "usual_heights_m = [50, -1]", "numbers above 0"),
         ("records", "usual_heights_m = [150, 50]", "the smaller number first"),
         ("raster", "stretch_percent = [1, 101]", "numbers of at least 0 and at most 100"),
-        ("radiometry", "neighbour_places = [[0.2, 0.5, -0.8], [0.3, 0.7]]", "numbers above 0"),
         ("records", "usual_heights_m = [50, 'far']", "another kind"),
         ("records", "usual_heights_m = [50]", "another kind"),
     ],
@@ -127,15 +124,10 @@ def test_a_number_out_of_range_is_refused_and_the_range_said(stage, line, allowe
     ("stage", "name", "value"),
     [
         ("planning", "launch_s", 0),  # "none of it", said of the field
-        ("planning", "balance_prices", (6.0, 2.0)),  # two prices, no bounds
         ("raster", "stretch_percent", (0.0, 100.0)),
         ("ardupilot", "speed_share", 1.001),
         ("coverage", "blurred_share", 0),
         ("coverage", "blurred_share", 1),
-        ("registration", "oblique_sigma_share", 2.5),  # by its default a factor
-        ("ingest", "from_horizon_deg", -40.0),
-        ("matchers", "tile_search_px", (6, 10)),  # two rounds, no bounds
-        ("radiometry", "neighbour_places", ((0.1, 0.5, 0.9), (0.4, 0.6))),
     ],
 )
 def test_a_number_at_the_end_of_its_range_is_taken(stage, name, value):

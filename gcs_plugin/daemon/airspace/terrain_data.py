@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcs_plugin.links.mavlink import Message, dialect
-from orthoswarm.config import active
+from gcs_plugin.plans.ground_below import DEM_MARGIN_M
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.geo import LocalGrid, area_epsg
@@ -102,7 +102,7 @@ def _block(dem: Path, lat_e7: int, lon_e7: int, spacing_m: int) -> tuple[NDArray
     lats, lons = np.meshgrid(north, east, indexing="ij")
     epsg = area_epsg(lats.ravel(), lons.ravel())
     places = LocalGrid(epsg).to_grid(lats, lons)
-    bounds = BoundingBox.around_points(places.reshape(-1, 2), active().raster.dem_margin_m)
+    bounds = BoundingBox.around_points(places.reshape(-1, 2), DEM_MARGIN_M)
     model = HeightModel.open(dem, epsg, bounds, np.empty((0, 3)))
     ground = model.window(bounds)
     return ground.terrain.height(places) + model.zero_m, ground.knows(places)

@@ -4,8 +4,7 @@ import bisect
 from collections.abc import Iterable
 from typing import Final
 
-from orthoswarm.config import active
-from orthoswarm.coverage.picture_flaws import picture_flaws
+from orthoswarm.coverage.picture_flaws import NEIGHBOURS, picture_flaws
 from orthoswarm.coverage.view import NO_FLAW, Flaw, View
 from orthoswarm.raster.picture_quality import PictureQuality
 
@@ -41,7 +40,7 @@ class FlawedPictures:
         changed = set()
         for camera, first in self._first.items():
             row = self._cameras[camera]
-            reach = active().coverage.neighbours
+            reach = NEIGHBOURS
             begin = max(0, first - 2 * reach)  # the median for the first one needs those before it
             found = picture_flaws([quality for *_, quality in row[begin:]])
             for k in range(max(0, first - reach), len(row)):

@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,13 +23,16 @@ from gcs_plugin.daemon.jobs.solution_file import Bytes, Gain, SolutionFile, read
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
 from gcs_plugin.daemon.layers.layers import new_name
 from gcs_plugin.daemon.store.journal import Change, Journal, unpacked
-from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.placement import PlacedFrame, Terrain
 from orthoswarm.mosaic.radiometry import estimate_fields
 
 _GROUND_STEP_M = 10.0
 _MOST_NODES = 250_000  # of the ground's height
+
+_REDRAW_TONE: Final = 0.015
+"""Log factors of a flight's pictures, 95 %: if balancing all flights together changes them by more, it is drawn again
+(1.5 grey levels of 100, less than is seen as a step)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,7 +52,7 @@ def balance_tones(task: ToneTask) -> tuple[list[float], int, float]:
 
     Returns:
         For each sortie, by how much its pictures' log factors change (95 %); a new file is written if by more than
-        `redraw_tone` of the configuration. The number of pictures; CPU seconds used.
+        `_REDRAW_TONE`. The number of pictures; CPU seconds used.
     """
     began = time.process_time()
     sorties = [read_solution(path) for path in task.solutions]
@@ -73,7 +77,7 @@ def balance_tones(task: ToneTask) -> tuple[list[float], int, float]:
     common = np.median(np.concatenate(changes), axis=0)  # the map as a whole stays as bright as it was drawn
     greatest = [float(np.percentile(np.abs(each - common), 95)) if len(each) else 0.0 for each in changes]
     for sortie, gains, change, target in zip(sorties, balanced, greatest, task.targets, strict=True):
-        if change > active().radiometry.redraw_tone:
+        if change > _REDRAW_TONE:
             factor = np.exp(-common).astype(np.float32)[:, None]
             replace(sortie, gains={**sortie.gains, **{k: v * factor for k, v in gains.items()}}).write(target)
     return greatest, len(frames), round(time.process_time() - began, 3)

@@ -4,16 +4,19 @@ Between the nodes of the surface heights are interpolated. Across a wall that wo
 shows roof and facade once more, mirrored. At a wall each place is either on its top or at its foot.
 """
 
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel
-from orthoswarm.config import active
 from orthoswarm.model.placement import Terrain
 from orthoswarm.mosaic.kernels.pixel_sampling import cubic_convolution
 from orthoswarm.mosaic.kernels.render_arrays import LATTICE_PX
 
 _NEAR_WALL, _WALL = np.uint8(1), np.uint8(2)
+
+_WALL_SLOPE: Final = 1.2  # steeper measured surfaces are walls (50 degrees; roofs and rubble are flatter)
 
 
 def heights(terrain: Terrain, west: float, north: float, gsd_m: float, tile_px: int) -> NDArray[np.float32]:
@@ -31,7 +34,7 @@ def heights(terrain: Terrain, west: float, north: float, gsd_m: float, tile_px: 
     _smooth(z, rows.index, rows.cubic, columns.index, columns.cubic, np.empty((len(z), n), np.float32), out)
     if terrain.bare is not None:
         walls = np.zeros(z.shape, np.uint8)
-        wall = np.float32(active().mosaic.wall_slope * terrain.step_m)
+        wall = np.float32(_WALL_SLOPE * terrain.step_m)
         if _find_walls(z, wall, walls):
             _step(z, walls, rows.index, rows.spline, columns.index, columns.spline, out)
     return out

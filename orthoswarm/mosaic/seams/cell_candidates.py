@@ -6,17 +6,17 @@ which something taller hides the cell shows that instead: it costs more than any
 """
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel, kernel
-from orthoswarm.config import active
 from orthoswarm.mosaic.footprint import tan_limit
 from orthoswarm.mosaic.kernels.lens_arrays import U_HIGH, U_LOW, V_HIGH, V_LOW
 from orthoswarm.mosaic.kernels.render_arrays import LATTICE_PX, Shots, lattice_height, project
 from orthoswarm.mosaic.seam_labels import OUTSIDE, block_heights, sight
-from orthoswarm.mosaic.seams.previews import Previews
+from orthoswarm.mosaic.seams.previews import GLARE_LEVEL, Previews
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -26,6 +26,23 @@ SLOTS = 5
 """Candidates a cell: the cheapest ones."""
 BLOCK = 16
 """Cells a side of the blocks at whose corners contrasts are compared."""
+
+_WEAK_COST: Final = 1e6  # cost of a picture that is used only where no other sees (damaged, weakly determined)
+_CANDIDATE_TAN2: Final = 0.5  # pictures more oblique than the best by this squared tangent are none of a cell's (time)
+_OBLIQUENESS_COST: Final = 15000.0
+"""Cost of obliqueness, times the squared tangent of the view angle. Chosen by looking at four sets."""
+_HAZE_COST: Final = 6000.0
+"""Cost of less local contrast than the clearest picture has on the same ground, times the logarithm of the ratio: half
+the contrast outweighs a view that is some 20 degrees more oblique."""
+_HAZE_IGNORED_LOG: Final = 0.3  # log ratios of contrast up to this cost nothing: parallax, shadows, noise
+_GLARE_COST: Final = 3000.0  # cost of ground that is burnt out (glints of water): as of a view at 25 degrees
+_HIDDEN_COST: Final = 10000.0
+"""Cost of a picture from which something taller hides the cell: as of a view at 39 degrees, more than `_CANDIDATE_TAN2`
+allows."""
+_HIDDEN_M: Final = 1.0  # what rises above the line of sight by less than this hides nothing
+_BLUR_COST: Final = 6000.0
+"""Cost of a picture that is less sharp than the median of those around, times the logarithm of the ratio."""
+_BLUR_IGNORED_LOG: Final = 0.25  # log ratios of sharpness up to this cost nothing
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,13 +88,12 @@ def cell_candidates(region: Region, shots: Shots, tone: Floats, previews: Previe
         tone: float32 (N, 6), factor of brightness over each picture (mean of the rows of radiometry.Field).
         previews: of the N pictures; one that has none is not a candidate.
     """
-    config = active().mosaic
     position, rotation = shots.about(region.west, region.north)
     height = float(np.median(position[:, 2] - float(np.median(region.lattice)))) if len(position) else 1.0
     unit = region.cell_px * region.gsd_m / max(height, 1.0)  # of an area cost against the cost of a cell's side
     sharpness = previews.sharpness
-    blur = np.log(np.maximum(np.median(sharpness), 1e-3) / np.maximum(sharpness, 1e-3)) - config.blur_ignored_log
-    penalty = unit * config.blur_cost * np.maximum(blur, 0.0) + config.weak_cost * shots.weak
+    blur = np.log(np.maximum(np.median(sharpness), 1e-3) / np.maximum(sharpness, 1e-3)) - _BLUR_IGNORED_LOG
+    penalty = unit * _BLUR_COST * np.maximum(blur, 0.0) + _WEAK_COST * shots.weak
     usable = np.nonzero(previews.written)[0]
     local = previews.contrast * np.maximum(tone[:, :1, None], 0.1)
     contrast = np.log(np.maximum(_smoothed(local), 0.5)).astype(np.float32)
@@ -98,15 +114,15 @@ def cell_candidates(region: Region, shots: Shots, tone: Floats, previews: Previe
         region.lattice,
         region.gsd_m,
         region.cell_px,
-        np.float32(config.haze_ignored_log),
+        np.float32(_HAZE_IGNORED_LOG),
         haze,
     )
-    haze *= np.float32(unit * config.haze_cost)
+    haze *= np.float32(unit * _HAZE_COST)
     _candidates(
         *arrays, usable, penalty, haze, previews.gray, previews.rows, tone, region.lattice, region.gsd_m,
-        region.cell_px, unit * config.obliqueness_cost, cells.candidate, cells.cost, cells.level,
-        np.ascontiguousarray(local, np.float32), cells.texture, unit * config.glare_cost,
-        config.glare_level, config.candidate_tan2, tan_limit() ** 2, unit * config.hidden_cost, config.hidden_m,
+        region.cell_px, unit * _OBLIQUENESS_COST, cells.candidate, cells.cost, cells.level,
+        np.ascontiguousarray(local, np.float32), cells.texture, unit * _GLARE_COST,
+        GLARE_LEVEL, _CANDIDATE_TAN2, tan_limit() ** 2, unit * _HIDDEN_COST, _HIDDEN_M,
     )  # fmt: skip
     return cells
 

@@ -15,17 +15,38 @@ vanishes; roofs and crowns, where the two pictures do not fit, hardly count.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.canvas.tile_store import Key, Tile
-from orthoswarm.config import active
 from orthoswarm.mosaic.kernels.leveling_kernels import BOTH, SLOTS, apply_factors, laplacian, sum_colors
+from orthoswarm.mosaic.overlap_colors import BRIGHT_LEVEL, DARK_LEVEL
+from orthoswarm.mosaic.radiometry import GREATEST_FACTOR
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Integers = NDArray[np.int64]
+
+_LEVEL_CELLS: Final = 32
+"""Cells across a picture in which it is corrected, about 3 m of the ground at a height of 75 m (the factor of a lawn
+must not reach the road beside it)."""
+_LEVEL_MOST_CELLS: Final = 300_000  # most of these cells in a map; they grow beyond it (memory)
+_LEVEL_LEAST_PX: Final = 8.0  # fewest pixels that two pictures share in a cell for their ratio to count
+_LEVEL_SIGMA: Final = 0.02  # log ratio in a cell of even ground (0.01, 0.02 tried: no difference on four flights)
+_LEVEL_CORRELATED_PX: Final = 4.0  # pixels with one error of the ratio in common (4, 16 tried: no difference)
+_LEVEL_RISE: Final = 0.05
+"""Sigma of the difference of a picture's log factors in neighbouring cells (0.02 and 0.05 tried: with 0.02 seams keep a
+little more of their step)."""
+_LEVEL_STEP: Final = 0.2
+"""Scale of Welsch's kernel on log ratios: 0.1 is a step of tone (weight 0.9), 0.7 is roof against ground (0.002). With
+0.25 a roof that only one picture shows tints the lawn beside it."""
+_LEVEL_REACH: Final = 0.5
+"""How far a correction reaches from its seam before it fades, widths of a picture (0.3 and 1.0 tried: no difference on
+four flights)."""
+_LEVEL_STEPS: Final = 80  # most steps of conjugate gradients (12 to 70 were needed)
+_LEVEL_TOLERANCE: Final = 0.01  # preconditioned residual, as a share of the first one, at which they end
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,13 +59,12 @@ class CellSize:
 
 
 def cell_size(picture_px: float, tile_px: int, map_px: int) -> CellSize:
-    """Cells for a map: about `level_cells` of the configuration across a picture.
+    """Cells for a map: about `_LEVEL_CELLS` across a picture.
 
     Args:
         picture_px: width of a picture, pixels of the map. tile_px: side of the tiles. map_px: pixels of the map.
     """
-    config = active().radiometry
-    wanted = max(picture_px / config.level_cells, float(np.sqrt(map_px / config.level_most_cells)), 4.0)
+    wanted = max(picture_px / _LEVEL_CELLS, float(np.sqrt(map_px / _LEVEL_MOST_CELLS)), 4.0)
     fitting = [px for px in range(1, tile_px + 1) if tile_px % px == 0]
     px = min(fitting, key=lambda px: abs(np.log(px / wanted)))
     return CellSize(px, picture_px / px, tile_px // px)
@@ -73,10 +93,7 @@ def tile_colors(key: Key, tile: Tile, other: Tile | None, cell_px: int) -> TileC
     labels, pixels = np.zeros((side, side, SLOTS), np.int32), np.zeros((side, side, SLOTS), np.float32)
     pairs, both = np.zeros((side, side, SLOTS, 2), np.int32), np.zeros((side, side, SLOTS, BOTH))
     second = (np.zeros_like(tile.rgba), np.zeros_like(tile.plane)) if other is None else (other.rgba, other.plane)
-    config = active().radiometry
-    sum_colors(
-        tile.rgba, tile.plane, *second, cell_px, config.dark_level, config.bright_level, labels, pixels, pairs, both
-    )
+    sum_colors(tile.rgba, tile.plane, *second, cell_px, DARK_LEVEL, BRIGHT_LEVEL, labels, pixels, pairs, both)
     corner = np.array(key) * side
     cells = np.nonzero(labels)
     place = np.column_stack([np.stack(cells[:2], 1) + corner, labels[cells]]).astype(np.int64)
@@ -125,7 +142,7 @@ class Leveling:
 
     def of_tile(self, key: Key) -> TileFactors:
         """The factors for a tile."""
-        side, limit = self._cells.across_tile, float(np.log(active().radiometry.greatest_factor))
+        side, limit = self._cells.across_tile, float(np.log(GREATEST_FACTOR))
         labels = np.zeros((side + 2, side + 2, SLOTS), np.int32)
         factors = np.ones((side + 2, side + 2, SLOTS, 3), np.float32)
         west, east = max(key[1] * side - 1, 0), min((key[1] + 1) * side + 1, self._columns)
@@ -149,17 +166,16 @@ class Leveling:
 
     def _steps(self, seam: Integers, both: Array) -> tuple[Integers, Integers, Array, Array]:
         """Pairs of unknowns at seams (S,), the log ratio of their colours (S, 3), and its weight (S,)."""
-        config = active().radiometry
         one, found = self._index(self._key(seam[:, 0], seam[:, 1], seam[:, 2]))
         other, too = self._index(self._key(seam[:, 0], seam[:, 1], seam[:, 3]))
-        good = found & too & (both[:, 0] >= config.level_least_px)
+        good = found & too & (both[:, 0] >= _LEVEL_LEAST_PX)
         one, other, both = one[good], other[good], both[good]
         ratio = np.log(both[:, 1:4] / both[:, 4:7])
         n = both[:, 0]
         variance = np.maximum(both[:, 8] / n - np.square(both[:, 7] / n), 0.0)
-        sigma2 = config.level_sigma**2 + variance * config.level_correlated_px / n
-        robust = np.exp(-0.5 * np.square(ratio.mean(1) / config.level_step))  # Welsch's kernel
-        return one, other, ratio, config.level_rise**2 / sigma2 * robust
+        sigma2 = _LEVEL_SIGMA**2 + variance * _LEVEL_CORRELATED_PX / n
+        robust = np.exp(-0.5 * np.square(ratio.mean(1) / _LEVEL_STEP))  # Welsch's kernel
+        return one, other, ratio, _LEVEL_RISE**2 / sigma2 * robust
 
     def _solved(self, one: Integers, other: Integers, ratio: Array, weight: Array) -> Array:
         """Log factors (M, 3), by conjugate gradients."""
@@ -171,7 +187,7 @@ class Leveling:
             weights.append(np.ones(int(found.sum())))
         first, second = (np.concatenate(parts).astype(np.int32) for parts in (firsts, seconds))
         links, count = np.concatenate(weights), len(self._keys)
-        reach = active().radiometry.level_reach * self._cells.across_picture
+        reach = _LEVEL_REACH * self._cells.across_picture
         anchor = np.maximum(self._pixels / self._cells.px**2, 1e-3) / reach**2
         right = np.zeros((count, 3))
         for channel in range(3):
@@ -186,12 +202,11 @@ def _conjugate_gradients(
     first: NDArray[np.int32], second: NDArray[np.int32], weight: Array, *, anchor: Array, diagonal: Array, right: Array
 ) -> Array:
     """The solution (M, 3) of the normal equations; their diagonal is the preconditioner."""
-    config = active().radiometry
     x, left, image = np.zeros_like(right), right.copy(), np.empty_like(right)
     z = left / diagonal[:, None]
     towards, product = z.copy(), (left * z).sum(0)
-    enough = config.level_tolerance**2 * product
-    for _ in range(config.level_steps):
+    enough = _LEVEL_TOLERANCE**2 * product
+    for _ in range(_LEVEL_STEPS):
         if (product <= enough).all():
             break
         laplacian(first, second, weight, anchor, towards, image)

@@ -7,12 +7,12 @@ that was never written is zero (the file is sparse).
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel
-from orthoswarm.config import active
 from orthoswarm.model.errors import StorageError
 from orthoswarm.raster.picture_quality import LEAST_SIDE_PX, picture_quality
 
@@ -29,6 +29,9 @@ RECORD = np.dtype(
         ("written", np.uint32),
     ]
 )
+
+GLARE_LEVEL: Final = 240  # grey levels from here on are taken for glints of water or burnt-out ground
+_GLARE_SHARE: Final = 0.05  # a block of the preview with a larger share of glare says nothing about haze
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,11 +82,10 @@ def make_preview(picture: Bytes) -> NDArray[np.void]:
     """The record of a picture, uint8 (H, W, 3): an array of one element of dtype RECORD."""
     import cv2
 
-    config = active().mosaic
     record = np.zeros(1, RECORD)
     gray = cv2.resize(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), (COLUMNS, ROWS), interpolation=cv2.INTER_AREA)
     record["gray"][0] = gray
-    _contrasts(record["gray"][0], config.glare_level, config.glare_share, record["contrast"][0])
+    _contrasts(record["gray"][0], GLARE_LEVEL, _GLARE_SHARE, record["contrast"][0])
     sharp = picture_quality(picture).sharpness if min(picture.shape[:2]) >= LEAST_SIDE_PX else 0.0
     record["sharpness"] = max(sharp, 1e-3)
     record["written"] = 1

@@ -6,11 +6,12 @@ added. It is lowered by moves of square blocks to a neighbour's label, large blo
 Besag 1986, on several scales): a block the size of a house escapes minima in which single cells stay.
 """
 
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel, kernel
-from orthoswarm.config import active
 from orthoswarm.mosaic.seams.cell_candidates import SLOTS, Cells
 
 Ints = NDArray[np.int32]
@@ -21,6 +22,17 @@ NONE, FOREIGN = -1, -2
 _MOST_LABELS = 8
 """Room for the labels in and around a block; a block of 8 cells seldom has more than four."""
 
+_SEAM_COST: Final = 3.0  # cost of a seam where pictures are alike: short and few; by looking at four sets
+_DIFFERENCE_SCALE: Final = 16.0  # the squared difference of the two pictures, in levels, is divided by this
+_TEXTURE_LEVEL: Final = 8.0  # local contrast, levels, at which that scale doubles (it grows with the square)
+_DIFFERENCE_MOST: Final = 80.0  # greatest cost of a difference, so that one roof edge does not decide alone
+_HEIGHT_COST: Final = 20.0  # cost of a seam over what stands above the bare ground, a metre of its height
+_HEIGHT_MOST_M: Final = 10.0  # greater heights cost no more
+_BLOCK_SIDES: Final = (8, 4, 2, 1)
+"""Sides of the blocks of cells that are moved to another picture, in cells, one sweep each: 8 cells are about a
+house."""
+_BLOCK_OFFSETS: Final = (0, 2, 1, 0)  # where the first of these blocks begins, cells before the tile's corner
+
 
 def relax(cells: Cells, fixed: Ints, standing_m: Floats) -> Ints:
     """Labels int32 (rows, columns) of cells: indices of shots, NONE where there is no candidate.
@@ -30,15 +42,12 @@ def relax(cells: Cells, fixed: Ints, standing_m: Floats) -> Ints:
         fixed: int32 (rows, columns), labels that are settled already (FOREIGN included), NONE elsewhere.
         standing_m: float32 (rows, columns), height over the bare ground.
     """
-    config = active().mosaic
     label = np.where(fixed == NONE, cells.candidate[..., 0], fixed).astype(np.int32)
     held = fixed != NONE
-    over = (np.float32(config.height_cost) * np.clip(standing_m, 0.0, config.height_most_m)).astype(np.float32)
-    costs = np.array([config.seam_cost, config.difference_most], np.float32)
-    scale = (1.0 / (config.difference_scale * (1.0 + np.square(cells.texture / config.texture_level)))).astype(
-        np.float32
-    )
-    for side, offset in zip(config.block_sides, config.block_offsets, strict=True):
+    over = (np.float32(_HEIGHT_COST) * np.clip(standing_m, 0.0, _HEIGHT_MOST_M)).astype(np.float32)
+    costs = np.array([_SEAM_COST, _DIFFERENCE_MOST], np.float32)
+    scale = (1.0 / (_DIFFERENCE_SCALE * (1.0 + np.square(cells.texture / _TEXTURE_LEVEL)))).astype(np.float32)
+    for side, offset in zip(_BLOCK_SIDES, _BLOCK_OFFSETS, strict=True):
         _sweep(label, held, cells.candidate, cells.cost, cells.level, scale, over, costs, side, offset)
     return label
 

@@ -2,12 +2,11 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import shapely
 
-from orthoswarm.config import active
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid, area_epsg
 from orthoswarm.planning.area.shape_files import Polygon, Ring, refuse_many_corners
@@ -16,6 +15,10 @@ Geometry = Any  # shapely has no type information here
 
 _SMALLEST_M2 = 1.0
 _NARROWEST_M = 0.5
+
+_OUTLINE_CORNERS: Final = 2_000
+"""An area with more corners is given a coarser outline before lines are laid (outlines that are drawn or simplified for
+a map have fewer, and 4,000 cost no second)."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +83,7 @@ def coarser(area: Area, tolerance_m: float) -> Geometry:
         area: returned as it is where it has no more corners than usual. tolerance_m: the outline moves out by at most
             twice as much.
     """
-    if int(shapely.get_num_coordinates(area.ground)) <= active().planning.outline_corners:
+    if int(shapely.get_num_coordinates(area.ground)) <= _OUTLINE_CORNERS:
         return area.ground
     grown = shapely.buffer(area.ground, tolerance_m, quad_segs=2)
     # the grown outline lies at least cos(22.5 degrees) of the tolerance outside: it may come back by so much

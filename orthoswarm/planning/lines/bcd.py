@@ -8,14 +8,13 @@ between them.
 
 import itertools
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import kernel
-from orthoswarm.config import active
 from orthoswarm.planning.lines.detours import Router
 from orthoswarm.planning.lines.line_spacing import Footprint
 from orthoswarm.planning.lines.sweep_lines import Field, Turned, line_count, strip_legs
@@ -26,6 +25,12 @@ Array = NDArray[np.float64]
 # Walls exactly across the sweep have no single critical point; a hair of rotation gives them one.
 _HAIR_RAD = 1e-7
 _SNAP_M, _INTO_M = 1e-4, 0.01
+
+_TOOTH_SPACINGS: Final = 0.1  # outlines are simplified by so many line spacings before they are cut into cells
+_EXACT_CELLS: Final = 8  # so many cells are put in the shortest order exactly (0.02 s)
+_ROW_STARTS: Final = 60  # more cells are put in order from so many of them at most (for its time) ...
+_ROW_MANY: Final = 80  # ... and up to this number of cells the order is improved ...
+_ROW_ROUNDS: Final = (20, 2)  # ... in so many rounds at most, with more cells in so many (for its time)
 
 
 def cells(ground: Geometry) -> list[Geometry]:
@@ -114,7 +119,7 @@ def bcd_legs(field: Field, angle_rad: float, foot: Footprint, router: Router, mu
     frame = Turned(angle_rad, (field.ground.centroid.x, field.ground.centroid.y))
     local = field.turned(frame)
     # A ragged coast has a critical point at every tooth, so cells are cut from a smoothed outline.
-    parts = cells(local.ground.simplify(active().planning.tooth_spacings * foot.spacing_m))
+    parts = cells(local.ground.simplify(_TOOTH_SPACINGS * foot.spacing_m))
     sweeps = [
         _Sweep([frame.to_grid(np.array(line)) for line in lines])
         for lines in _by_cell(_lines(local, foot, multiple), parts)
@@ -166,11 +171,10 @@ def order_cells(ways: Array) -> list[int]:
     n = len(ways) // 4
     if n == 1:
         return [0]
-    config = active().planning
-    if n <= config.exact_cells:
+    if n <= _EXACT_CELLS:
         return _shortest_order(ways)
-    first = np.linspace(0, n - 1, min(n, config.row_starts)).astype(int)
-    rounds = config.row_rounds[0] if n <= config.row_many else config.row_rounds[1]
+    first = np.linspace(0, n - 1, min(n, _ROW_STARTS)).astype(int)
+    rounds = _ROW_ROUNDS[0] if n <= _ROW_MANY else _ROW_ROUNDS[1]
     row, code = _best_row(np.ascontiguousarray(ways), first, rounds)
     return [4 * int(cell) + int(way) for cell, way in zip(row, code)]
 

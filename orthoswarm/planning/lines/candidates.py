@@ -2,12 +2,11 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Final, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.planning.lines import planned_coverage
 from orthoswarm.planning.lines.bcd import bcd_legs
 from orthoswarm.planning.lines.columns import column_legs
@@ -22,6 +21,11 @@ Method = Literal["columns", "bcd", "tmstc"]
 
 METHODS: tuple[str, ...] = get_args(Method)
 _TRIES: dict[str, int] = {"columns": 6, "bcd": 6, "tmstc": 8}
+_SAME_GRID_RAD: Final = 0.02  # grids of the spanning tree nearer to each other are tried once
+_TRIES_IF_FEW: Final = 12  # directions tried where lines are few: cheap to lay, hard to share
+_MANY_LEGS: Final = 400  # from so many legs on no further directions are tried: they hardly differ (for its time)
+_DENSER: Final = 1.25  # closer lines are tried up to so many times their number, to share evenly
+_HOPELESS: Final = 1.08  # gaps are not filled for a direction whose path is so many times as long as the best
 
 
 @dataclass(frozen=True)
@@ -54,14 +58,10 @@ def candidates(
     angles = rank_directions(field, foot, turn_m, vehicles)
     if method == "tmstc":  # a grid looks the same after a right angle
         quarter = [a % (0.5 * np.pi) for a in angles]
-        angles = [
-            a
-            for k, a in enumerate(quarter)
-            if not any(abs(a - b) < active().planning.same_grid_rad for b in quarter[:k])
-        ]
+        angles = [a for k, a in enumerate(quarter) if not any(abs(a - b) < _SAME_GRID_RAD for b in quarter[:k])]
     few, least = False, np.inf
     for number, angle in enumerate(angles):
-        if number >= (active().planning.tries_if_few if few else _TRIES[method]):
+        if number >= (_TRIES_IF_FEW if few else _TRIES[method]):
             return
         legs = _lay(field, angle, foot, method=method, router=router, multiple=1)
         if not len(legs):
@@ -70,14 +70,14 @@ def candidates(
         few = few or count < 4 * vehicles
         rough = _rough_cost(legs, turn_m)
         least = min(least, rough)
-        if not few and rough > active().planning.hopeless * least:
+        if not few and rough > _HOPELESS * least:
             continue
         yield from _finished(field, legs, count, angle=angle, foot=foot, method=method, router=router, reach_m=reach_m)
-        if len(legs) > active().planning.many_legs:  # directions hardly differ then, and each takes its time
+        if len(legs) > _MANY_LEGS:  # directions hardly differ then, and each takes its time
             return
         if method != "tmstc" and vehicles <= len(legs) < 4 * vehicles:
             denser = _lay(field, angle, foot, method=method, router=router, multiple=vehicles)
-            if len(legs) < len(denser) <= active().planning.denser * len(legs):
+            if len(legs) < len(denser) <= _DENSER * len(legs):
                 yield from _finished(
                     field, denser, count, angle=angle, foot=foot, method=method, router=router, reach_m=reach_m
                 )

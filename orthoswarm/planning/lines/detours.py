@@ -4,7 +4,7 @@ Obstacles are the zones grown by a clearance, with enclosed pockets filled, beca
 Sight lines are tested against the obstacles shrunk by a hair, so that paths may touch corners and run along edges.
 """
 
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import shapely
@@ -12,11 +12,15 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse.csgraph import shortest_path
 
 from orthoswarm.compute.jit import kernel
-from orthoswarm.config import active
 from orthoswarm.model.errors import InputError
 
 Geometry = Any
 Array = NDArray[np.float64]
+
+_DETOUR_INSIDE_M: Final = 0.02  # how far a detour may pass inside an obstacle: its corners touch it (rounding)
+_OBSTACLE_TOLERANCE: Final = 0.1  # obstacles are simplified outwards by this share of the clearance ...
+_OBSTACLE_TOLERANCE_M: Final = 50.0  # ... doubled until they have few corners, up to this
+_DETOUR_MOST_CORNERS: Final = 300  # obstacles are simplified to so many corners: cost grows with their square (time)
 
 
 def make_obstacles(no_fly: Geometry, clearance_m: float) -> Geometry:
@@ -28,14 +32,13 @@ def make_obstacles(no_fly: Geometry, clearance_m: float) -> Geometry:
     """
     if no_fly.is_empty:
         return shapely.MultiPolygon()
-    config = active().planning
-    tolerance = config.obstacle_tolerance * clearance_m
+    tolerance = _OBSTACLE_TOLERANCE * clearance_m
     while True:
         grown = no_fly.buffer(clearance_m + tolerance, join_style="mitre", mitre_limit=2.0).simplify(tolerance)
         parts = [shapely.Polygon(p.exterior) for p in shapely.get_parts(grown)]
         obstacles = shapely.union_all(parts)
         corners = shapely.get_num_coordinates(obstacles)
-        if corners <= config.detour_most_corners or tolerance > config.obstacle_tolerance_m:
+        if corners <= _DETOUR_MOST_CORNERS or tolerance > _OBSTACLE_TOLERANCE_M:
             return obstacles
         tolerance *= 2.0
 
@@ -84,7 +87,7 @@ class Router:
 
     def __init__(self, obstacles: Geometry) -> None:
         self.obstacles = obstacles
-        shrunk = obstacles.buffer(-active().planning.detour_inside_m, join_style="mitre")
+        shrunk = obstacles.buffer(-_DETOUR_INSIDE_M, join_style="mitre")
         rings = [shapely.get_coordinates(r) for p in shapely.get_parts(shrunk) for r in shapely.get_rings(p)]
         self._edges = np.concatenate([np.hstack([r[:-1], r[1:]]) for r in rings]) if rings else np.empty((0, 4))
         shapely.prepare(shrunk)

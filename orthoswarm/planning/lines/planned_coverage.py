@@ -1,6 +1,6 @@
 """Is every point of the area seen by the narrowest camera? What is missed, and legs that mend it."""
 
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import shapely
@@ -13,6 +13,14 @@ from orthoswarm.planning.lines.sweep_lines import Field, Turned, strip_legs
 
 Geometry = Any
 Array = NDArray[np.float64]
+
+_REPAIR_ROUNDS: Final = 5  # most rounds of mending (for its time)
+_REPAIR_PLACES: Final = 8  # places in the order of legs where one that mends a gap is tried (time)
+_CRUMB_M2: Final = 0.5  # smaller gaps are none: rounding of outlines
+_GAP_LEAST_SHARE: Final = 0.2  # a gap of which further legs would show a smaller share is left as it is
+_GAP_WALLS: Final = 8  # longest edges, of the gap and of obstacles around it, along which legs for it are tried (time)
+_GAP_SHIFTS: Final = 7  # places across a gap at which they are tried (for its time)
+_GAP_LEG_PRICE: Final = 0.02  # price of a line spacing of flight, in shares of the gap
 
 
 def bands(legs: Array, width_m: float, reach_m: float) -> Geometry:
@@ -39,7 +47,7 @@ def missed(ground: Geometry, legs: Array, width_m: float, reach_m: float) -> Geo
 
 def pieces(geometry: Geometry, least_m2: float | None = None) -> list[Geometry]:
     """Polygons of at least a size (None: as configured) in a geometry, largest first."""
-    least_m2 = active().planning.crumb_m2 if least_m2 is None else least_m2
+    least_m2 = _CRUMB_M2 if least_m2 is None else least_m2
     parts = [p for p in shapely.get_parts(shapely.get_parts(geometry)) if p.geom_type == "Polygon"]
     return sorted((p for p in parts if p.area >= least_m2), key=lambda p: -p.area)
 
@@ -55,7 +63,7 @@ def prune(field: Field, legs: Array, foot: Footprint) -> Array:
             break
         near = [n for n in tree.query(boxes[k]) if n != k and keep[n]]
         own = boxes[k].intersection(field.ground)
-        if own.difference(shapely.union_all(boxes[near])).area < active().planning.crumb_m2:
+        if own.difference(shapely.union_all(boxes[near])).area < _CRUMB_M2:
             keep[k] = False
     return legs[keep] if keep.any() else legs
 
@@ -75,7 +83,7 @@ def mend(field: Field, legs: Array, foot: Footprint, *, router: Router, reach_m:
     """
     hopeless: list[Geometry] = []
     ways = router.each(legs[:-1, 1], legs[1:, 0])
-    for _ in range(active().planning.repair_rounds):
+    for _ in range(_REPAIR_ROUNDS):
         left = missed(field.ground, legs, foot.width_m, reach_m)
         if left.area <= (1.0 - active().planning.target_share) * field.ground.area:
             break
@@ -84,7 +92,7 @@ def mend(field: Field, legs: Array, foot: Footprint, *, router: Router, reach_m:
             if excess <= 0.0 or any(h.contains(gap.centroid) for h in hopeless):
                 continue
             more, gained = legs_for(gap, field.obstacles, foot, reach_m, angle_rad)
-            if gained < active().planning.gap_least_share * gap.area:
+            if gained < _GAP_LEAST_SHARE * gap.area:
                 hopeless.append(gap)
                 continue
             excess -= gained
@@ -110,8 +118,7 @@ def legs_for(gap: Geometry, obstacles: Geometry, foot: Footprint, reach_m: float
     box = shapely.get_coordinates(shapely.minimum_rotated_rectangle(gap))
     edges = [np.diff(shapely.get_coordinates(r), axis=0) for p in pieces(near) for r in shapely.get_rings(p)]
     walls = np.concatenate([np.diff(box[:3], axis=0), *edges]) if len(box) > 2 else np.array([[1.0, 0.0]])
-    config = active().planning
-    walls = walls[np.argsort(-np.hypot(*walls.T))][: config.gap_walls]
+    walls = walls[np.argsort(-np.hypot(*walls.T))][:_GAP_WALLS]
     # Lines run along +y of a turned frame: a wall's direction less a right angle.
     angles = np.unique(np.round([*(np.arctan2(walls[:, 1], walls[:, 0]) - np.pi / 2) % np.pi, angle % np.pi], 3))
     best: tuple[float, Array, float] = (-np.inf, np.empty((0, 2, 2)), 0.0)
@@ -121,7 +128,7 @@ def legs_for(gap: Geometry, obstacles: Geometry, foot: Footprint, reach_m: float
         x0, y0, x1, y1 = local.ground.bounds
         count = max(1, int(np.ceil((x1 - x0) / foot.width_m - 1e-6)))
         play = max(0.0, 0.5 * (count * foot.width_m - (x1 - x0)))
-        for shift in np.linspace(-play, play, config.gap_shifts):
+        for shift in np.linspace(-play, play, _GAP_SHIFTS):
             middle = 0.5 * (x0 + x1) + shift + foot.width_m * (np.arange(count) - 0.5 * (count - 1))
             new = [
                 leg
@@ -135,7 +142,7 @@ def legs_for(gap: Geometry, obstacles: Geometry, foot: Footprint, reach_m: float
             legs = np.array(new)
             seen = local.ground.area - missed(local.ground, legs, foot.width_m, reach_m).area
             cost = float(np.hypot(*(legs[:, 1] - legs[:, 0]).T).sum()) + 2.0 * foot.spacing_m * len(legs)
-            score = seen / local.ground.area - config.gap_leg_price * cost / foot.spacing_m
+            score = seen / local.ground.area - _GAP_LEG_PRICE * cost / foot.spacing_m
             if score > best[0] and seen > 0.0:
                 best = (score, frame.to_grid(legs), seen)
     return best[1], best[2]
@@ -162,7 +169,7 @@ def insert(legs: Array, ways: Array, leg: Array, router: Router) -> tuple[Array,
     straight[:-1] += away[:, ::-1]
     straight[1:n] -= ways[:, None]
     best, place, turned = np.inf, 0, 0
-    for k, t in sorted(np.ndindex(n + 1, 2), key=lambda kt: float(straight[kt]))[: active().planning.repair_places]:
+    for k, t in sorted(np.ndindex(n + 1, 2), key=lambda kt: float(straight[kt]))[:_REPAIR_PLACES]:
         growth = float(router.distances(legs[k - 1, 1], leg[t])[0, 0]) if k > 0 else 0.0
         growth += float(router.distances(leg[1 - t], legs[k, 0])[0, 0]) if k < n else 0.0
         growth -= float(ways[k - 1]) if 0 < k < n else 0.0

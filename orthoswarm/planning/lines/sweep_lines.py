@@ -6,13 +6,12 @@ it reaches from the lowest to the highest ground in the strip, so that slanted b
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.model.errors import InputError
 from orthoswarm.planning.lines.line_spacing import Footprint
 
@@ -20,6 +19,15 @@ Geometry = Any
 Array = NDArray[np.float64]
 
 MOST_LINES = 20_000
+
+_LINE_CRUMB_M2: Final = 0.05  # smaller parts of an area get no line of their own
+_STRETCH_SPACINGS: Final = 5.0  # least part of a long leg for a vehicle, in line spacings: else turns outweigh it
+_EDGE_SPACINGS: Final = 0.1  # edges whose directions are tried: the outline simplified by so many spacings
+_EDGE_DIRECTIONS: Final = 24  # longest edges of which the directions are tried (for its time)
+_DIRECTION_STEP_DEG: Final = 15.0  # further directions are tried at this step (for its time)
+_SAME_DIRECTION_DEG: Final = 1.0  # directions nearer to each other than this are tried once
+_RANKED_SPACINGS: Final = 0.05  # outlines are simplified by so many line spacings before directions are ranked (time)
+_SHORTEST_M: Final = 0.01  # shorter parts of lines are rounding
 
 
 @dataclass(frozen=True)
@@ -92,7 +100,7 @@ def strip_legs(field: Field, box: tuple[float, float, float, float], foot: Footp
         float64 (2, 2) arrays, start and end.
     """
     piece = shapely.clip_by_rect(field.ground, *box)
-    bounds = shapely.bounds([p for p in shapely.get_parts(piece) if p.area > active().planning.line_crumb_m2])
+    bounds = shapely.bounds([p for p in shapely.get_parts(piece) if p.area > _LINE_CRUMB_M2])
     if not len(bounds):
         return []
     x, more = 0.5 * (box[0] + box[2]), foot.overshoot_m
@@ -106,7 +114,7 @@ def strip_legs(field: Field, box: tuple[float, float, float, float], foot: Footp
     for low, high in reaches:
         for free_low, free_high in _free_parts(field.obstacles, x, low - more, high + more):
             inside = [(max(b[1] - more, free_low), min(b[3] + more, free_high)) for b in bounds]
-            seen = [(a, b) for a, b in inside if b - a > active().planning.shortest_m]
+            seen = [(a, b) for a, b in inside if b - a > _SHORTEST_M]
             if seen:
                 ends = (min(a for a, _ in seen), max(b for _, b in seen))
                 legs.append(_at_least(field.obstacles, x, ends, foot.trigger_m))
@@ -117,12 +125,12 @@ def _free_parts(obstacles: Geometry, x: float, low: float, high: float) -> list[
     line = shapely.LineString([(x, low), (x, high)])
     free = line.difference(obstacles) if not obstacles.is_empty else line
     parts = [shapely.bounds(p) for p in shapely.get_parts(free)]
-    return [(float(b[1]), float(b[3])) for b in parts if b[3] - b[1] > active().planning.shortest_m]
+    return [(float(b[1]), float(b[3])) for b in parts if b[3] - b[1] > _SHORTEST_M]
 
 
 def _at_least(obstacles: Geometry, x: float, ends: tuple[float, float], length: float) -> Array:
     """A leg of at least a length about its middle, if nothing stands in the way."""
-    (low, high), slip = ends, active().planning.shortest_m
+    (low, high), slip = ends, _SHORTEST_M
     if high - low < length:
         middle = 0.5 * (low + high)
         low, high = next(
@@ -152,20 +160,19 @@ def line_count(width_m: float, spacing_m: float) -> int:
 
 def candidate_angles(ground: Geometry, spacing_m: float) -> Array:
     """Turning angles worth trying, radians in [0, pi): of long edges, of the tightest box, and at even steps."""
-    config = active().planning
-    outline = ground.simplify(config.edge_spacings * spacing_m)
+    outline = ground.simplify(_EDGE_SPACINGS * spacing_m)
     edges = [
         np.diff(shapely.get_coordinates(r), axis=0) for p in shapely.get_parts(outline) for r in shapely.get_rings(p)
     ]
     steps = np.concatenate(edges)
     length, angle = np.hypot(*steps.T), np.arctan2(steps[:, 1], steps[:, 0]) % np.pi
-    found = list(angle[np.argsort(-length, kind="stable")][: config.edge_directions])
+    found = list(angle[np.argsort(-length, kind="stable")][:_EDGE_DIRECTIONS])
     box = shapely.get_coordinates(shapely.minimum_rotated_rectangle(ground))
     found.append(float(np.arctan2(*(box[1] - box[0])[::-1]) % np.pi))
-    found += list(np.radians(np.arange(0, 180, config.direction_step_deg)))
+    found += list(np.radians(np.arange(0, 180, _DIRECTION_STEP_DEG)))
     # Lines run across the sweep, so a line along an edge means a sweep turned by a right angle: both are worth a try.
     both = np.array([*found, *[(a + 0.5 * np.pi) % np.pi for a in found]])
-    same, distinct = np.radians(config.same_direction_deg), list[float]()
+    same, distinct = np.radians(_SAME_DIRECTION_DEG), list[float]()
     for a in both:
         if all(abs((a - k + 0.5 * np.pi) % np.pi - 0.5 * np.pi) > same for k in distinct):
             distinct.append(float(a))
@@ -187,12 +194,12 @@ def direction_cost(field: Field, angle_rad: float, spacing_m: float, turn_m: flo
 
 def stretches(lengths_m: Array, spacing_m: float) -> int:
     """Among how many vehicles legs can be shared: one takes a leg, or a stretch five spacings long of a long leg."""
-    return int(np.maximum(1, np.floor(lengths_m / (active().planning.stretch_spacings * spacing_m))).sum())
+    return int(np.maximum(1, np.floor(lengths_m / (_STRETCH_SPACINGS * spacing_m))).sum())
 
 
 def rank_directions(field: Field, foot: Footprint, turn_m: float, vehicles: int) -> list[float]:
     """Sweep angles in radians from the cheapest on; those with too few lines for the vehicles come last."""
-    outline = Field(field.ground.simplify(active().planning.ranked_spacings * foot.spacing_m), field.obstacles)
+    outline = Field(field.ground.simplify(_RANKED_SPACINGS * foot.spacing_m), field.obstacles)
     ranked = []
     for angle in candidate_angles(outline.ground, foot.spacing_m):
         cost, lines = direction_cost(outline, float(angle), foot.spacing_m, turn_m)

@@ -5,13 +5,12 @@ what drones over free outlines need: cells only partly filled by the area keep o
 to the outline instead of ending at cell centres, and where a line was left out the order is mended by local search.
 """
 
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.planning.lines.bricks import joins
 from orthoswarm.planning.lines.line_spacing import Footprint
 from orthoswarm.planning.lines.spanning_tree import circumnavigate, spanning_edges
@@ -20,6 +19,8 @@ from orthoswarm.planning.lines.sweep_lines import Field, Turned, line_count, str
 Geometry = Any
 Array = NDArray[np.float64]
 Loop = NDArray[np.int64]
+
+_TMSTC_CRUMB_SHARE: Final = 0.02  # a cell of the spanning tree that holds a smaller share of the area is left out
 
 
 def tmstc_legs(field: Field, angle_rad: float, foot: Footprint) -> list[Array]:
@@ -57,10 +58,7 @@ def occupied(
     shapely.prepare(ground)
     result = np.asarray(shapely.contains_properly(ground, boxes), bool)
     edge = shapely.intersects(ground, boxes) & ~result
-    result[edge] = (
-        shapely.area(shapely.intersection(ground, boxes[edge]))
-        > active().planning.tmstc_crumb_share * size[0] * size[1]
-    )
+    result[edge] = shapely.area(shapely.intersection(ground, boxes[edge])) > _TMSTC_CRUMB_SHARE * size[0] * size[1]
     return result
 
 

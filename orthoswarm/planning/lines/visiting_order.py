@@ -1,13 +1,16 @@
 """In which order, and which way round, to fly legs: local search on the length of the ways between them."""
 
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel, kernel
-from orthoswarm.config import active
 from orthoswarm.planning.lines.detours import Router
 
 Array = NDArray[np.float64]
+
+_ORDERED_MOST_LEGS: Final = 500  # orders of more legs are not improved: cost grows with the square (for its time)
 
 
 @kernel
@@ -107,10 +110,10 @@ def shorten(legs: Array, router: Router, depot: Array | None = None) -> Array:
         depot: float64 (2,) where the row begins and ends; None leaves both ends open.
 
     Returns:
-        float64 (n, 2, 2). Rows of more than `ordered_most_legs` legs come back as they are.
+        float64 (n, 2, 2). Rows of more than `_ORDERED_MOST_LEGS` legs come back as they are.
     """
     n = len(legs)
-    if n < 2 or n > active().planning.ordered_most_legs:
+    if n < 2 or n > _ORDERED_MOST_LEGS:
         return legs
     ends = legs.reshape(-1, 2)
     if depot is not None:

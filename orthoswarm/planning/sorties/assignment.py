@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +31,18 @@ _SLOWEST_M_S, _FASTEST_M_S = 0.5, 60.0
 _LONGEST_RUN_IN_M = 200.0
 _LONGEST_WAIT_S = 3600.0
 _MOST_WIND = 0.8  # of the speed through the air
+
+_FAIR_BALANCE: Final = 1.15  # the longest sortie over the mean up to which a division is fair
+_UNFAIR_BALANCE: Final = 1.22  # ... and from which on it is priced steeply
+_BALANCE_PRICES: Final = (2.0, 6.0)  # prices of what the balance is above either, in shares of the longest sortie
+_ITEMS_A_LEG: Final = 4  # mission items of a leg: two ends, camera on and off
+_SPARE_ITEMS: Final = 40  # mission items kept for ways, takeoff and landing
+_LEAST_LEG_TRIGGERS: Final = 4.0  # legs are no shorter than so many picture distances, if endurance allows
+_SORTIE_PARTS: Final = 40.0  # a leg's parts are at most this fraction of a sortie long
+_ROW_PARTS: Final = 2000.0  # most parts of a vehicle's legs (for its time)
+_SORTIE_TRIES: Final = 12  # most times that legs are cut again because a sortie is longer than was estimated ...
+_SORTIE_SHORTER: Final = 0.005  # ... each time shorter by this share ...
+_SORTIE_SHORTER_GROWTH: Final = 1.6  # ... times this with each further one
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,9 +144,8 @@ class Work:
     @property
     def score(self) -> float:
         """Less is better: the makespan, dearer where the work is shared unevenly."""
-        config = active().planning
-        limits = config.fair_balance, config.unfair_balance
-        price = sum(p * max(0.0, self.balance - limit) for p, limit in zip(config.balance_prices, limits, strict=True))
+        limits = _FAIR_BALANCE, _UNFAIR_BALANCE
+        price = sum(p * max(0.0, self.balance - limit) for p, limit in zip(_BALANCE_PRICES, limits, strict=True))
         return self.longest_s * (1.0 + price)
 
 
@@ -185,8 +197,7 @@ class Swarm:
             fixed += above / motion.climb_m_s + motion.autopilot.height_change_s
         most_legs = max(
             1,
-            (self._options.most_items - active().planning.spare_items)
-            // (active().planning.items_a_leg + (self._options.run_in_m > 0.0)),
+            (self._options.most_items - _SPARE_ITEMS) // (_ITEMS_A_LEG + (self._options.run_in_m > 0.0)),
         )
         return Limits(self._endurances_s, fixed, apart.swap_s, most_legs)
 
@@ -205,7 +216,7 @@ class Swarm:
             if not far < _FARTHEST_M:
                 raise InputError(f"a start is {far / 1000:.0f} km from the area; check that it is given as LAT,LON")
         by_time = self._shared(legs, reorder, self._options.motion)
-        if by_time.balance <= active().planning.fair_balance:
+        if by_time.balance <= _FAIR_BALANCE:
             return by_time
         # Where turns take most of the time, even times are uneven paths: try even paths, too.
         by_length = self._shared(legs, reorder, self._options.motion.without_turns())
@@ -267,19 +278,19 @@ class Swarm:
 
     @property
     def _least_leg_m(self) -> float:
-        return active().planning.least_leg_triggers * self._foot.trigger_m
+        return _LEAST_LEG_TRIGGERS * self._foot.trigger_m
 
     def _sorties(self, legs: Array, home: Array, endurance_s: float) -> list[Array]:
         """A vehicle's legs, cut into as many flights as endurance and mission size ask for."""
-        options, least, within_s, config = self._options, self._least_leg_m, endurance_s, active().planning
+        options, least, within_s = self._options, self._least_leg_m, endurance_s
         limits = replace(self._limits, endurance_s=within_s)
         top = options.separation.layers * options.separation.height_m
-        for attempt in range(config.sortie_tries):
+        for attempt in range(_SORTIE_TRIES):
             step = least
             if np.isfinite(within_s):
-                step = min(max(within_s * options.motion.speed_m_s / config.sortie_parts, self._foot.trigger_m), least)
+                step = min(max(within_s * options.motion.speed_m_s / _SORTIE_PARTS, self._foot.trigger_m), least)
             total = float(np.hypot(*(legs[:, 1] - legs[:, 0]).T).sum())
-            coarse = max(step, total / config.row_parts)
+            coarse = max(step, total / _ROW_PARTS)
             row = cut(legs, self._router, options.motion, shares=1, least_m=step, step_m=coarse)
             found = sorties(row, home, self._returns, router=self._router, motion=options.motion, limits=limits)
             if found is None:
@@ -292,7 +303,7 @@ class Swarm:
             # The cut knows turns and detours only roughly: cut again a little shorter, and by more where that does not
             # move the cut.
             fewer = limits.most_legs if most <= options.most_items else limits.most_legs * options.most_items // most
-            shorter = 1.0 - config.sortie_shorter * config.sortie_shorter_growth**attempt
+            shorter = 1.0 - _SORTIE_SHORTER * _SORTIE_SHORTER_GROWTH**attempt
             within_s = shorter * within_s * min(1.0, endurance_s / longest)
             limits = replace(limits, endurance_s=within_s, most_legs=max(1, fewer))
         raise self._too_short(row, home[None], endurance_s)

@@ -10,6 +10,7 @@ would take too long, only some time after each other, because they stand some me
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,9 @@ from orthoswarm.planning.sorties.flight_time import Motion, start_slack_s
 
 Array = NDArray[np.float64]
 Maker = Callable[[float, float], Flight]
+
+_STEP_S: Final = 0.5  # time step in which flights are compared (for its time)
+_LAYER_PRICE_S: Final = 3.0  # price of each further height layer, in seconds of delay
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -101,7 +105,7 @@ class _Track:
 
 def _step_s() -> float:
     """Time step in which flights are compared, seconds."""
-    return active().planning.step_s
+    return _STEP_S
 
 
 def _sampled(flight: Flight, motion: Motion, apart: Separation) -> _Track:
@@ -210,7 +214,7 @@ class _Sky:
         best: tuple[float, Slot, _Track, int] | None = None
         soonest = 0.0
         for out, home in pairs:
-            price = active().planning.layer_price_s * (out + home)
+            price = _LAYER_PRICE_S * (out + home)
             if best is not None and price + soonest >= best[0]:
                 break
             flight = make(out * self._apart.height_m, home * self._apart.height_m)

@@ -5,6 +5,7 @@ Heights here are metres over one level for all vehicles: takeoff without a heigh
 
 import math
 from dataclasses import KW_ONLY, dataclass, field
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,11 +17,13 @@ Array = NDArray[np.float64]
 
 _SAME_M = 0.01
 
+_PROFILE_FINEST_M: Final = 1.0  # least distance of the places at which the ground below a flight is read (for its time)
+_PROFILE_COARSEST_M: Final = 10.0  # greatest distance of them (slopes of up to 45 degrees)
+
 
 def profile_step_m(*grounds: Terrain) -> float:
     """Distance of the places along a flight at which heights of the ground are read, metres."""
-    config = active().planning
-    return float(np.clip(0.5 * min(g.step_m for g in grounds), config.profile_finest_m, config.profile_coarsest_m))
+    return float(np.clip(0.5 * min(g.step_m for g in grounds), _PROFILE_FINEST_M, _PROFILE_COARSEST_M))
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,11 @@
 """One flight from its legs: way out, legs with the ways between, way home, in grid metres."""
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.planning.lines.detours import Router
 from orthoswarm.planning.sorties.flight_heights import FlightHeights
 from orthoswarm.planning.sorties.flight_time import Motion, length, turns
@@ -13,6 +13,8 @@ from orthoswarm.planning.sorties.flight_time import Motion, length, turns
 Array = NDArray[np.float64]
 
 _SAME_M = 0.05
+
+_STRAIGHT_COS: Final = 0.985  # a vehicle comes straight into a leg up to this angle, without run-in: 10 degrees
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,7 +176,7 @@ def _entry(leg: Array, before: Array, router: Router, run_in_m: float) -> Array:
         return start
     along = (leg[1] - leg[0]) / np.hypot(*(leg[1] - leg[0]))
     way = leg[0] - before
-    comes_straight = float(way @ along) >= active().planning.straight_cos * float(np.hypot(*way))
+    comes_straight = float(way @ along) >= _STRAIGHT_COS * float(np.hypot(*way))
     ahead = start - run_in_m * along
     if comes_straight or router.inside(ahead)[0] or router.blocked(ahead, start)[0]:
         return start

@@ -1,7 +1,7 @@
 """Flights over a height model: how high above the ground they are, and which ground their pictures see."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import shapely
@@ -17,6 +17,8 @@ from orthoswarm.planning.sorties.flight_path import Flight
 
 Geometry = Any
 Array = NDArray[np.float64]
+
+_EDGE_ROUNDS: Final = 12  # bisections of the highest ground between two places of a profile (to millimetres)
 
 
 def leg_paths(flight: Flight) -> list[Array]:
@@ -57,7 +59,7 @@ def _half_widths(points: Array, ground: Terrain, slope: float) -> tuple[Array, A
     above = points[:, 2] - np.asarray(ground.height(points[:, :2]))
     reach = np.repeat(slope * above[None], 2, 0)
     # Damped, as ground steeper than the ray would make plain iteration swing.
-    for _ in range(active().planning.edge_rounds):
+    for _ in range(_EDGE_ROUNDS):
         places = points[None, :, :2] + (sides * reach)[..., None] * left
         height = points[None, :, 2] - np.asarray(ground.height(places))
         reach = 0.5 * (reach + slope * np.maximum(height, 0.0))

@@ -7,17 +7,25 @@ hardly longer than that, pieces even and legs whole.
 
 import itertools
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from orthoswarm.compute.jit import kernel
-from orthoswarm.config import active
 from orthoswarm.planning.lines.detours import Router
 from orthoswarm.planning.sorties.flight_time import Motion, angles
 
 Array = NDArray[np.float64]
+
+_FIRST_CAP: Final = 1.3
+"""Divisions are searched up to so many times the mean share first, which keeps the search narrow ..."""
+_CAP_GROWTH: Final = 1.5  # ... then up to so many times more ...
+_CAPS: Final = 8  # ... so often, and at last without a limit
+_CUT_PRICE: Final = 0.25  # price of a cut within a leg, in the unit of what is divided
+_LEEWAY: Final = 1.04  # how much longer than it must be the longest share may get so that legs stay whole
+_CUTS_PER_SHARE: Final = 24  # possible cuts in a share (for its time)
 
 
 @dataclass(frozen=True)
@@ -58,7 +66,7 @@ def cut(
         step_m: longest part; by default a small fraction of a share.
     """
     length = np.hypot(*(legs[:, 1] - legs[:, 0]).T)
-    step = max(least_m, length.sum() / shares / active().planning.cuts_per_share if step_m is None else step_m)
+    step = max(least_m, length.sum() / shares / _CUTS_PER_SHARE if step_m is None else step_m)
     count = np.maximum(1, (length / step).astype(np.int64))
     leg = np.repeat(np.arange(len(legs)), count)
     at = np.arange(len(leg)) - np.repeat(np.cumsum(count) - count, count)
@@ -171,13 +179,12 @@ def _evenly(
         np.array(np.broadcast_to(np.asarray(limits.endurance_s, np.float64), len(out))),
         np.array([limits.fixed_s, limits.swap_s, limits.most_legs], np.float64),
     )
-    config = active().planning
     # A cap that is met keeps the search narrow, so try small ones first.
     share_s = (row.end_s[-1] - row.begin_s[0]) / len(out)
-    for cap in (*(share_s * config.first_cap * config.cap_growth ** np.arange(config.caps)), np.inf):
-        cuts, longest = _cut_evenly(*problem, config.cut_price, cap, True)
+    for cap in (*(share_s * _FIRST_CAP * _CAP_GROWTH ** np.arange(_CAPS)), np.inf):
+        cuts, longest = _cut_evenly(*problem, _CUT_PRICE, cap, True)
         if cuts[0] >= 0:
-            return np.asarray(_cut_evenly(*problem, config.cut_price, config.leeway * longest + 1e-6, False)[0])
+            return np.asarray(_cut_evenly(*problem, _CUT_PRICE, _LEEWAY * longest + 1e-6, False)[0])
     return None
 
 

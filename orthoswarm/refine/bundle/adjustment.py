@@ -5,6 +5,7 @@ with priors (Förstner and Wrobel 2016, chapter 15). Tie points, ground heights 
 """
 
 from dataclasses import dataclass, field, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,11 @@ from orthoswarm.refine.bundle.rotation_vectors import exp_rotation
 
 Array = NDArray[np.float64]
 _LENS_COLUMNS = [F, K1, K2, K3, CX, CY]
+
+TRACK_ROBUST_C: Final = 9.0  # robust scale of image observations near the minimum, squared sigmas: 3 sigmas
+TIE_ROBUST_C: Final = 9.0  # robust scale of ties to the map, squared sigmas, where a step names no other
+_HEIGHT_ROBUST_C: Final = 4.0  # robust scale of the points' height prior, squared sigmas, where it names no other
+_DAMPING_SHARE: Final = 1e-6  # added to the diagonal of the cameras' equations, as a share (Levenberg 1944)
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +60,7 @@ class HeightPrior:
     height: Array
     sigma: float
     soft_sigma: float
-    c: float = field(default_factory=lambda: active().bundle.height_robust_c)
+    c: float = field(default_factory=lambda: _HEIGHT_ROBUST_C)
 
 
 @dataclass(slots=True, kw_only=True)
@@ -150,7 +156,7 @@ class Adjustment:
         """
         config = active().bundle
         system = self._assemble(c, heights, MapTies.none() if ties is None else ties, tie_c)
-        system.band[0] *= 1.0 + (config.damping_share if damping is None else damping)
+        system.band[0] *= 1.0 + (_DAMPING_SHARE if damping is None else damping)
         step_camera, step_common, self.information = system.solve()
         self._move(step_camera, step_common)
         normal_equations.back_substitute(
@@ -235,7 +241,7 @@ class Adjustment:
             tie_point=tie_of_point,
             tie_xy=ties.xy,
             tie_weight=1.0 / ties.sigma_m**2,
-            tie_c=active().bundle.tie_robust_c if tie_c is None else tie_c,
+            tie_c=TIE_ROBUST_C if tie_c is None else tie_c,
             band=system.band,
             side=lens_side,
             corner=lens_corner,

@@ -1,11 +1,13 @@
 """Stated errors: the adjustment's covariance propagated to the ground, plus systematic errors outside its model."""
 
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.config import active
+from orthoswarm.export.product_files import OBLIQUE_AXIS_DOWN
 from orthoswarm.model.camera import fov_rad, ground_jacobian
 from orthoswarm.model.robust import MEDIAN_SIGMA, mad_sigma
 from orthoswarm.refine.bundle.adjustment import Adjustment, HeightPrior, MapTies
@@ -16,6 +18,15 @@ Array = NDArray[np.float64]
 
 _LENS_CX = 4
 """Column of the principal point's cx among a lens's unknowns, cy is the next (see priors.Priors)."""
+
+RECEIVER_COMMON_SIGMA_M: Final = 1.5
+"""The part of the error that all receivers at a place and time share, an axis: ionosphere and orbits. The GPS standard
+(SPS PS 2020) commits to 8 m (95 %) horizontally on average; 3 to 4 m are usual, most of it shared."""
+_COVARIANCE_EVERY_PHOTOS: Final = 24  # covariances are computed for every so many-th photo and interpolated between
+_SCATTER_LEAST_TIES: Final = 40  # with fewer ties the adjustment follows them, and their residuals are too small
+_SYSTEMATIC_LEAST_TIES: Final = 4  # with fewer ties about a photo a systematic offset of the map there is not estimated
+_SYSTEMATIC_REACH_PHOTOS: Final = 4  # ... which uses the ties of so many photos before and after, of the same leg
+_SYSTEMATIC_SIGMAS: Final = 2.0  # sigmas of the ties' median taken off before it counts as systematic
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +61,7 @@ def stated_errors(
     if ties is None:
         adjustment = replace(adjustment, priors=with_seen_drift(adjustment))
     free = np.flatnonzero(adjustment.free)
-    chosen = np.unique(np.r_[free[:: config.covariance_every_photos], free[-1]])
+    chosen = np.unique(np.r_[free[::_COVARIANCE_EVERY_PHOTOS], free[-1]])
     covariance, common, between = adjustment.covariance(chosen, c, heights, ties, tie_c)
     variance = np.array(
         [_ground_variance(adjustment, int(i), q, common, b) for i, q, b in zip(chosen, covariance, between)]
@@ -76,7 +87,7 @@ def with_seen_drift(adjustment: Adjustment) -> Priors:
         adjustment: without a map, after its last step.
     """
     p, layout, config = adjustment.priors, adjustment.layout, active()
-    bias2 = config.registration.receiver_bias_sigma_m**2 + config.registration.receiver_common_sigma_m**2
+    bias2 = config.registration.receiver_bias_sigma_m**2 + RECEIVER_COMMON_SIGMA_M**2
     drift = layout.drift(adjustment.common, p.group)
     models = list(p.models)
     for g, (model, knots) in enumerate(zip(p.models, layout.knots, strict=True)):
@@ -143,7 +154,7 @@ def common_map_sigma(residual: Array, sigma_m: Array, gsd_m: float) -> float:
         return floor
     scatter = mad_sigma(residual)
     # so few ties do not resist the adjustment: their residuals are too small
-    if len(residual) < config.scatter_least_ties:
+    if len(residual) < _SCATTER_LEAST_TIES:
         scatter = max(scatter, float(np.median(sigma_m)))
     return float(np.hypot(floor, config.tie_scatter_share * scatter))
 
@@ -160,8 +171,7 @@ def systematic_tie_offset(leg: NDArray[np.int32], camera: NDArray[np.integer], r
     Returns:
         float64 (N,), metres, 0 where ties are few, do not agree, or agree with the adjustment.
     """
-    config = active().bundle
-    near = config.systematic_reach_photos
+    near = _SYSTEMATIC_REACH_PHOTOS
     out = np.zeros(len(leg))
     order = np.argsort(camera, kind="stable")
     camera, residual = camera[order], residual[order]
@@ -171,13 +181,11 @@ def systematic_tie_offset(leg: NDArray[np.int32], camera: NDArray[np.integer], r
     )
     for i, (a, b) in enumerate(zip(first.tolist(), last.tolist(), strict=True)):
         mine = residual[a:b][leg[camera[a:b]] == leg[i]]
-        if len(mine) < config.systematic_least_ties:
+        if len(mine) < _SYSTEMATIC_LEAST_TIES:
             continue
         middle = np.median(mine, axis=0)
         spread = mad_sigma(mine - middle)
-        out[i] = max(
-            0.0, float(np.hypot(*middle)) - config.systematic_sigmas * MEDIAN_SIGMA * spread / np.sqrt(len(mine))
-        )
+        out[i] = max(0.0, float(np.hypot(*middle)) - _SYSTEMATIC_SIGMAS * MEDIAN_SIGMA * spread / np.sqrt(len(mine)))
     return out
 
 
@@ -193,7 +201,7 @@ def _ground_variance(adjustment: Adjustment, i: int, covariance: Array, common: 
     """
     cameras = adjustment.cameras
     height = max(float(cameras.position[i, 2]), 1.0)
-    j = ground_jacobian(cameras.rotation[i], height, active().bundle.oblique_axis_down)
+    j = ground_jacobian(cameras.rotation[i], height, OBLIQUE_AXIS_DOWN)
     if j is None:
         return height**2
     lens = int(cameras.lens_id[i])

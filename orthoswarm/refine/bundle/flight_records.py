@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,12 @@ from orthoswarm.trajectory.courses import course
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
+
+_COURSE_REACH_PHOTOS: Final = 3  # flown steps are medians over so many photos before and after
+_COURSE_TURN_DEG: Final = 12.0  # ... of those whose heading differs by less
+_STEP_TIME_FACTOR: Final = 1.7  # ... and that took at most so many times longer or shorter
+_VELOCITY_REACH_PHOTOS: Final = 2  # velocities are differences over so many photos before and after
+_VELOCITY_LEAP: Final = 3.0  # so many times the median velocity, plus 1 m/s, is a leap and counts as 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,8 +58,7 @@ class FlightRecords:
         The median over neighbours on the same course that took about as long; the recorded step where too few did, as
         where pictures between two frames are missing.
         """
-        config = active().bundle
-        reach, turn_rad = config.course_reach_photos, np.radians(config.course_turn_deg)
+        reach, turn_rad = _COURSE_REACH_PHOTOS, np.radians(_COURSE_TURN_DEG)
         n = len(self.position)
         raw = np.diff(self.position, axis=0, prepend=self.position[:1])
         took = np.maximum(np.diff(self.time_s, prepend=self.time_s[:1]), 1e-3)
@@ -60,7 +66,7 @@ class FlightRecords:
         for i in range(1, n):
             near = np.arange(max(1, i - reach), min(n, i + reach + 1))
             same = np.abs(wrap_rad(self.yaw[near] - self.yaw[i])) < turn_rad
-            same &= np.abs(np.log(took[near] / took[i])) < np.log(config.step_time_factor)
+            same &= np.abs(np.log(took[near] / took[i])) < np.log(_STEP_TIME_FACTOR)
             chosen = near[same]
             if len(chosen) >= 3:
                 out[i] = np.median(raw[chosen], axis=0)
@@ -68,14 +74,14 @@ class FlightRecords:
 
     def velocity(self) -> Array:
         """Smoothed horizontal velocity (N, 2) in m/s (metres per picture where times are unknown)."""
-        n, config = len(self.position), active().bundle
-        reach = config.velocity_reach_photos
+        n = len(self.position)
+        reach = _VELOCITY_REACH_PHOTOS
         a, b = np.maximum(np.arange(n) - reach, 0), np.minimum(np.arange(n) + reach, n - 1)
         dt = np.maximum(self.time_s[b] - self.time_s[a], 1e-3)[:, None]
         v = (self.position[b, :2] - self.position[a, :2]) / dt
         speed = np.hypot(*v.T)
         usual = float(np.median(speed)) if n else 0.0
-        return np.asarray(np.where((speed > config.velocity_leap * usual + 1)[:, None], 0.0, v))
+        return np.asarray(np.where((speed > _VELOCITY_LEAP * usual + 1)[:, None], 0.0, v))
 
     def with_yaw(self, yaw: Array) -> "FlightRecords":
         """The records with other headings."""

@@ -9,6 +9,7 @@ aircraft sway, and legs cross: the picture's movement with the recorded attitude
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,13 @@ from orthoswarm.refine.bundle.adjustment import Adjustment
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
+
+_CONTRADICTION_SIGMAS: Final = 4.0  # a recorded height is contradicted by an offset of so many of its sigmas ...
+_CONTRADICTION_SHARE: Final = 0.15
+"""... and this share of the height: distortion and principal point of real lenses, as far as they are not modelled,
+also look like a wrong height (measured: 10 % on a lens of k1 = -0.4 that looks straight down)."""
+_AGREEMENT_SIGMAS: Final = 2.0  # what an offset exceeds so many sigmas by enters the sigma of the field of view
+_AGREEING_SHARE: Final = 0.08  # pictures that come to rest within this share of the recorded height agree with it
 
 
 def offsets_without_height_prior(adjustment: Adjustment) -> tuple[Array, Array]:
@@ -47,7 +55,7 @@ def contradicted_heights(adjustment: Adjustment) -> Flags:
         return np.zeros(len(sigma), bool)
     offset, offset_sigma = offsets_without_height_prior(adjustment)
     total = np.hypot(offset_sigma, sigma)
-    limit = np.maximum(config.contradiction_sigmas * total, config.contradiction_share * _height(adjustment))
+    limit = np.maximum(_CONTRADICTION_SIGMAS * total, _CONTRADICTION_SHARE * _height(adjustment))
     return np.asarray((np.abs(offset) > limit) & (sigma < config.unknown_height_sigma_m), np.bool_)
 
 
@@ -58,10 +66,7 @@ def predicted_height_offset(adjustment: Adjustment) -> tuple[float, float]:
     is no solution of the normal equations that predicted it: the pictures determine no height.
     """
     offset, sigma = offsets_without_height_prior(adjustment)
-    config = active().bundle
-    tolerance = max(
-        config.contradiction_sigmas * float(np.median(sigma)), config.contradiction_share * _height(adjustment)
-    )
+    tolerance = max(_CONTRADICTION_SIGMAS * float(np.median(sigma)), _CONTRADICTION_SHARE * _height(adjustment))
     return float(np.median(offset)), tolerance
 
 
@@ -109,7 +114,7 @@ class FreeHeight:
         minimum.
         """
         offset_m, (predicted_m, tolerance_m) = self.solved_m - self.recorded_m, self.predicted
-        agrees = abs(offset_m) < active().strategy.agreeing_share * self.recorded_m
+        agrees = abs(offset_m) < _AGREEING_SHARE * self.recorded_m
         return self.converged and abs(offset_m - predicted_m) <= tolerance_m and not agrees
 
 
@@ -124,7 +129,7 @@ def height_disagreement(adjustment: Adjustment) -> float:
     if not known.any() or not adjustment.information.size:
         return 0.0
     offset, offset_sigma = offsets_without_height_prior(adjustment)
-    beyond = np.abs(offset) - config.agreement_sigmas * np.hypot(offset_sigma, sigma)
+    beyond = np.abs(offset) - _AGREEMENT_SIGMAS * np.hypot(offset_sigma, sigma)
     return float(np.maximum(beyond[known], 0.0).max()) / _height(adjustment)
 
 

@@ -6,15 +6,26 @@ nearly rigid: it follows a displaced map as a whole, by a shift, a turn and a sc
 residuals. What it followed is its error.
 """
 
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
-
-from orthoswarm.config import active
 
 Array = NDArray[np.float64]
 
 _LN2 = float(np.log(2.0))
 """Median of the squared length of a Gaussian vector of two axes, for one of its mean."""
+
+_VARIOGRAM_MOST_TIES: Final = 200  # of more ties every so many-th is used: pairs grow with their square (its cost)
+_VARIOGRAM_CLASSES: Final = 9  # classes of distance between ties; the first ends at ....
+_VARIOGRAM_NEAR_HEIGHTS: Final = 0.1  # ... so many flying heights ...
+_VARIOGRAM_FAR_SHARE: Final = 0.85  # ... the last at this share of the largest distance: few pairs are farther apart
+_VARIOGRAM_LEAST_PAIRS: Final = 30  # a class with fewer pairs is left out
+_VARIOGRAM_LEAST_CLASSES: Final = 3  # fewer classes do not tell the map's distortion
+_VARIOGRAM_FLAT_SHARE: Final = 0.1  # classes weigh by their value, those below this share of the largest alike
+_CORRELATION_LENGTHS: Final = 8  # correlation lengths that are tried, from ... (its cost)
+_CORRELATION_HEIGHTS: Final = 0.2  # ... so many flying heights to ...
+_CORRELATION_RADII: Final = 1.5  # ... so many radii (root mean square) of the vehicle's ties
 
 
 def map_distortion_variance(place: Array, residual: Array, height_m: float) -> float:
@@ -32,26 +43,25 @@ def map_distortion_variance(place: Array, residual: Array, height_m: float) -> f
     Returns:
         The variance; 0 where there are too few pairs of ties to estimate it.
     """
-    config = active().bundle
-    step = max(1, -(-len(place) // config.variogram_most_ties))
+    step = max(1, -(-len(place) // _VARIOGRAM_MOST_TIES))
     place, residual = place[::step], residual[::step]
     i, j = np.triu_indices(len(place), 1)
     apart = np.hypot(*(place[i] - place[j]).T)
-    if len(i) < config.variogram_least_pairs or not apart.max() > 0.0:
+    if len(i) < _VARIOGRAM_LEAST_PAIRS or not apart.max() > 0.0:
         return 0.0
     half = ((residual[i] - residual[j]) ** 2).sum(1) / 4.0
-    near, far = config.variogram_near_heights * height_m, config.variogram_far_share * float(apart.max())
-    edges = np.r_[0.0, np.geomspace(min(near, far), far, config.variogram_classes)]
+    near, far = _VARIOGRAM_NEAR_HEIGHTS * height_m, _VARIOGRAM_FAR_SHARE * float(apart.max())
+    edges = np.r_[0.0, np.geomspace(min(near, far), far, _VARIOGRAM_CLASSES)]
     number = np.digitize(apart, edges) - 1
-    classes = [np.flatnonzero(number == k) for k in range(config.variogram_classes)]
-    classes = [pairs for pairs in classes if len(pairs) >= config.variogram_least_pairs]
-    if len(classes) < config.variogram_least_classes:
+    classes = [np.flatnonzero(number == k) for k in range(_VARIOGRAM_CLASSES)]
+    classes = [pairs for pairs in classes if len(pairs) >= _VARIOGRAM_LEAST_PAIRS]
+    if len(classes) < _VARIOGRAM_LEAST_CLASSES:
         return 0.0
     found = np.array([np.median(half[pairs]) / _LN2 for pairs in classes])
     radius = float(np.sqrt(((place - place.mean(axis=0)) ** 2).sum(axis=1).mean()))
-    shortest, longest = config.correlation_heights * height_m, config.correlation_radii * radius
+    shortest, longest = _CORRELATION_HEIGHTS * height_m, _CORRELATION_RADII * radius
     best = (np.inf, 0.0)
-    for length_m in np.geomspace(min(shortest, longest), longest, config.correlation_lengths):
+    for length_m in np.geomspace(min(shortest, longest), longest, _CORRELATION_LENGTHS):
         left, followed = _followed(place, length_m)
         level = np.diag(left)
         expected = 0.5 * (level[i] + level[j]) - left[i, j]
@@ -85,7 +95,7 @@ def _followed(place: Array, length_m: float) -> tuple[Array, float]:
 
 def _fit(found: Array, expected: Array) -> tuple[float, float]:
     """Variance of the displacement and misfit of found = noise + variance x expected, both at least 0."""
-    weight = 1.0 / np.maximum(found, active().bundle.variogram_flat_share * found.max() + 1e-12)
+    weight = 1.0 / np.maximum(found, _VARIOGRAM_FLAT_SHARE * found.max() + 1e-12)
     one, shape, value = weight, weight * expected, weight * found
     a, b, c = one @ one, one @ shape, shape @ shape
     p, q = one @ value, shape @ value

@@ -1,15 +1,17 @@
 """Choice of the best picture for each tie point, and of one point for each ground cell and leg."""
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.refine.bundle.block_arrays import CameraBlock, Tracks
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
+
+INLIER_WEIGHT: Final = 0.5  # an observation counts as an inlier from this robust weight on
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +32,7 @@ def best_views(
     cameras: CameraBlock, tracks: Tracks, points: Array, obs_weight: Array, own: NDArray[np.bool_] | None = None
 ) -> BestViews:
     """Best view of each point; `own` bool (N,) limits the choice of camera."""
-    n, inlier_weight = len(points), active().bundle.inlier_weight
+    n, inlier_weight = len(points), INLIER_WEIGHT
     distance = np.hypot(*(cameras.position[tracks.camera, :2] - points[tracks.point, :2]).T)
     usable = obs_weight > inlier_weight
     if own is not None:

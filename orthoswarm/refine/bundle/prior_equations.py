@@ -1,9 +1,10 @@
 """The records' part of the normal equations: priors of lenses, attitudes, positions, biases, lag and drift."""
 
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.refine.bundle.banded_solver import BandedSystem
 from orthoswarm.refine.bundle.block_arrays import CameraBlock, Ints
 from orthoswarm.refine.bundle.priors import Layout, Priors
@@ -14,6 +15,8 @@ Array = NDArray[np.float64]
 
 _HELD = 1e18
 """Weight of an unknown that is held."""
+
+_ATTITUDE_ROBUST_C: Final = 25.0  # robust scale of recorded attitudes, squared sigmas: wider than that of positions
 
 
 def add_priors(
@@ -95,7 +98,7 @@ def _add_attitudes(
     r = log_rotation(np.swapaxes(recorded, 1, 2) @ cameras.rotation[index]) - bias
     w = _weights(priors.rotation_sigma[index])
     e2 = (r * r * w).sum(1)
-    w = w * robust_weights(e2, active().bundle.attitude_robust_c)[:, None]
+    w = w * robust_weights(e2, _ATTITUDE_ROBUST_C)[:, None]
     for a in range(3):
         system.band[0, at + 3 + a] += w[:, a]
         system.rhs[at + 3 + a] -= w[:, a] * r[:, a]

@@ -1,14 +1,23 @@
 """Priors of the bundle adjustment: recorded positions and attitudes with sigmas, biases, lag, drift, lens."""
 
 from dataclasses import dataclass, field
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
-
 Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
+
+POSITION_ROBUST_C: Final = 9.0  # robust scale of recorded horizontal positions, squared sigmas
+ATTITUDE_BIAS_SIGMA_DEG: Final = (1.0, 1.0, 3.0)
+"""Sigma of a sortie's common attitude error about the camera's x, y, z axes: mounting, gimbal, compass. Biases of
+made-up flights were found to 0.1 degrees with it."""
+HEIGHT_OFFSET_SIGMA_M: Final = 1.0  # sigma of a sortie's common offset of recorded heights
+DRIFT_SIGMA_M: Final = 15.0  # drift of a receiver without corrections (made-up flights: up to 10 m)
+_DRIFT_BEND_SIGMA_M: Final = 0.5  # sigma of the second difference of the drift's knots: it changes slowly
+_DRIFT_KNOT_PHOTOS: Final = 60  # photos between two knots of the piecewise linear drift
+LAG_SIGMA_S: Final = 0.5  # sigma of the delay of recorded positions behind the shutter (lags of up to 0.4 s are found)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -23,14 +32,12 @@ class GroupPriors:
             knots, metres; knot_every: frames between knots.
     """
 
-    bias_sigma: tuple[float, float, float] = field(
-        default_factory=lambda: tuple(np.radians(active().bundle.attitude_bias_sigma_deg))
-    )
-    height_sigma: float = field(default_factory=lambda: active().bundle.height_offset_sigma_m)
-    lag_sigma: float = field(default_factory=lambda: active().records.lag_sigma_s)
-    drift_sigma: float = field(default_factory=lambda: active().bundle.drift_sigma_m)
-    drift_bend: float = field(default_factory=lambda: active().bundle.drift_bend_sigma_m)
-    knot_every: int = field(default_factory=lambda: active().bundle.drift_knot_photos)
+    bias_sigma: tuple[float, float, float] = field(default_factory=lambda: tuple(np.radians(ATTITUDE_BIAS_SIGMA_DEG)))
+    height_sigma: float = field(default_factory=lambda: HEIGHT_OFFSET_SIGMA_M)
+    lag_sigma: float = field(default_factory=lambda: LAG_SIGMA_S)
+    drift_sigma: float = field(default_factory=lambda: DRIFT_SIGMA_M)
+    drift_bend: float = field(default_factory=lambda: _DRIFT_BEND_SIGMA_M)
+    knot_every: int = field(default_factory=lambda: _DRIFT_KNOT_PHOTOS)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,7 +63,7 @@ class Priors:
     models: tuple[GroupPriors, ...]
     lens: Array
     lens_sigma: Array
-    position_c: float = field(default_factory=lambda: active().bundle.position_robust_c)
+    position_c: float = field(default_factory=lambda: POSITION_ROBUST_C)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -6,6 +6,7 @@ flow (a yaw tag that flips) are corrected.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Final
 
 import cv2
 import numpy as np
@@ -19,6 +20,25 @@ from orthoswarm.refine.bundle.flight_records import FlightRecords
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
+
+_CALIBRATION_PAIRS: Final = 24  # about so many pairs of pictures of a flight, evenly over its legs (its cost)
+_CALIBRATION_PAIRS_PER_LEG: Final = 3  # ... at least so many of each leg
+_CALIBRATION_FLOW_SHARE: Final = 0.2  # expected flow of a pair, as a share of the picture's rows
+_CALIBRATION_SPAN_PHOTOS: Final = 8  # a pair lies no more photos apart
+_CALIBRATION_REDUCED_FROM_PX: Final = 400  # pictures of more columns are halved first (its cost)
+_CALIBRATION_RESPONSE: Final = 0.03  # least response of the pair's phase correlation
+_CALIBRATION_LEAST_PREDICTED_PX: Final = 2.0  # a pair with less predicted flow gives no scale
+_CALIBRATION_LEAST_FLOW_PX: Final = 1.0  # a pair with less measured flow gives no scale
+_CALIBRATION_RATIO: Final = 10.0  # measured over predicted flow beyond this factor, either way, is a wrong peak
+_CALIBRATION_FOV_DEG: Final = (35.0, 135.0)  # a focal length outside these fields of view does not exist
+_CALIBRATION_LEAST_HEIGHT_M: Final = 3.0  # a median recorded height below this is none: the takeoff's, or a missing one
+_CALIBRATION_SIGMA: Final = 0.03  # relative sigma of the focal length by flow: receivers drift and lag by some per cent
+_HEADING_RATIO: Final = 0.25  # pairs whose flow differs from the median by more than this share give no heading
+_HEADING_LEAST_PAIRS: Final = 3  # fewest pairs of a leg that give its heading
+_HEADING_SPREAD_DEG: Final = 20.0  # without a recorded yaw the flow gives headings where its pairs agree to this
+_HEADING_WRONG_DEG: Final = 40.0  # a recorded yaw that is off by more is corrected
+_HEADING_WRONG_SPREAD_DEG: Final = 8.0  # ... if the pairs agree to this
+_HEADING_FLIP_DEG: Final = 150.0  # from here on it is said to be turned by 180 degrees (words only)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,7 +65,7 @@ class Calibration:
     @property
     def focal_sigma(self) -> float:
         """Relative sigma of the focal length."""
-        return float(np.hypot(active().features.calibration_sigma, self.spread / np.sqrt(max(self.pairs, 1))))
+        return float(np.hypot(_CALIBRATION_SIGMA, self.spread / np.sqrt(max(self.pairs, 1))))
 
 
 def calibrate(
@@ -58,16 +78,15 @@ def calibrate(
         gray: picture at working scale. size: its (width, height).
         fov_start: assumed horizontal field of view, radians.
     """
-    config = active().features
     width = size[0]
     f0 = 0.5 * width / np.tan(0.5 * fov_start)
     h0 = float(np.median(records.position[:, 2]))
-    usable = h0 > config.calibration_least_height_m and bool(records.has_height.any())
+    usable = h0 > _CALIBRATION_LEAST_HEIGHT_M and bool(records.has_height.any())
     if not usable:
         h0 = active().records.default_height_m
     rotation = records.rotation()
     legs = [np.flatnonzero(leg == k) for k in range(int(leg.max()) + 1)] if len(leg) else []
-    per_leg = max(config.calibration_pairs_per_leg, config.calibration_pairs // max(len(legs), 1))
+    per_leg = max(_CALIBRATION_PAIRS_PER_LEG, _CALIBRATION_PAIRS // max(len(legs), 1))
     ratios: list[complex] = []
     owners: list[int] = []
     for k, members in enumerate(legs):
@@ -106,7 +125,7 @@ def _with_scale(
 ) -> Calibration:
     """Attribute the measured scale to the lens if that gives a possible one, else to the height."""
     focal = f0 * scale
-    narrowest, widest = np.radians(active().features.calibration_fov_deg)
+    narrowest, widest = np.radians(_CALIBRATION_FOV_DEG)
     if usable and narrowest < fov_rad(focal, width) < widest:
         return Calibration(
             focal_px=focal, height_m=h0, yaw_offset=offset, trusted_height=True, pairs=pairs, warnings=warnings
@@ -125,25 +144,24 @@ def _heading(
     records: FlightRecords, leg: NDArray[np.int32], ratio: NDArray[np.complex128], owner: Array
 ) -> tuple[Array, list[str]]:
     """Offset to the recorded yaw of each frame: legs whose yaw is flipped, or headings taken from the course."""
-    config = active().features
     offset = np.zeros(len(leg))
     warnings: list[str] = []
     angle = -np.angle(ratio)  # a flow rotated against its prediction means a camera rotated the other way
     usual = float(np.median(np.abs(ratio)))
-    wrong = np.radians(config.heading_wrong_deg)
+    wrong = np.radians(_HEADING_WRONG_DEG)
     for k in range(int(leg.max()) + 1):
-        mine = angle[(owner == k) & (np.abs(np.abs(ratio) / usual - 1.0) < config.heading_ratio)]
+        mine = angle[(owner == k) & (np.abs(np.abs(ratio) / usual - 1.0) < _HEADING_RATIO)]
         last = 0.0
-        if len(mine) >= config.heading_least_pairs:
+        if len(mine) >= _HEADING_LEAST_PAIRS:
             turn = float(np.angle(np.median(np.cos(mine)) + 1j * np.median(np.sin(mine))))
             spread = float(np.median(np.abs(wrap_rad(mine - turn))))
-            if not records.has_yaw.any() and spread < np.radians(config.heading_spread_deg):
+            if not records.has_yaw.any() and spread < np.radians(_HEADING_SPREAD_DEG):
                 last = turn
-            elif abs(turn) > wrong and spread < np.radians(config.heading_wrong_spread_deg):
+            elif abs(turn) > wrong and spread < np.radians(_HEADING_WRONG_SPREAD_DEG):
                 last = turn
                 what = (
                     "turned by 180 deg"
-                    if abs(turn) > np.radians(config.heading_flip_deg)
+                    if abs(turn) > np.radians(_HEADING_FLIP_DEG)
                     else f"off by {np.degrees(turn):.0f} deg"
                 )
                 first = int(np.flatnonzero(leg == k)[0])
@@ -171,7 +189,6 @@ def _pairs(
 
     Picture.
     """
-    config = active().features
     if len(members) < 2:
         return []
     step = float(np.median(np.hypot(*np.diff(records.position[members, :2], axis=0).T)))
@@ -179,9 +196,9 @@ def _pairs(
         return []
     span = int(
         np.clip(
-            round(config.calibration_flow_share * rows / (px_per_m * step)),
+            round(_CALIBRATION_FLOW_SHARE * rows / (px_per_m * step)),
             1,
-            max(1, min(config.calibration_span_photos, len(members) - 1)),
+            max(1, min(_CALIBRATION_SPAN_PHOTOS, len(members) - 1)),
         )
     )
     starts = np.unique(np.linspace(0, len(members) - 1 - span, most).astype(int))
@@ -192,7 +209,6 @@ def _flow_ratio(
     first: Gray, second: Gray, ra: Array, rb: Array, *, move: Array, focal: float, height: float
 ) -> complex | None:
     """Measured flow divided by predicted flow, complex (scale and rotation); None without agreement."""
-    config = active().features
     shape = first.shape
     if second.shape != shape or not np.isfinite(move).all():
         return None
@@ -200,18 +216,18 @@ def _flow_ratio(
     turned = rb.T @ ra @ centre
     spin = focal * turned[:2] / max(turned[2], 0.2)  # flow caused by rotation alone
     shift = -focal / height * (rb.T @ move)[:2]
-    factor = 0.5 if shape[1] > config.calibration_reduced_from_px else 1.0
+    factor = 0.5 if shape[1] > _CALIBRATION_REDUCED_FROM_PX else 1.0
     small = [
         cv2.resize(g, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA).astype(np.float32)
         for g in (first, second)
     ]
     window = cv2.createHanningWindow(small[0].shape[::-1], cv2.CV_32F)
     (dx, dy), response = cv2.phaseCorrelate(small[0], small[1], window)
-    if response < config.calibration_response:
+    if response < _CALIBRATION_RESPONSE:
         return None
     flow = complex(dx / factor - spin[0], dy / factor - spin[1])
     expected = complex(shift[0], shift[1])
-    if abs(expected) < config.calibration_least_predicted_px or abs(flow) < config.calibration_least_flow_px:
+    if abs(expected) < _CALIBRATION_LEAST_PREDICTED_PX or abs(flow) < _CALIBRATION_LEAST_FLOW_PX:
         return None
     ratio = flow / expected
-    return ratio if 1.0 / config.calibration_ratio < abs(ratio) < config.calibration_ratio else None
+    return ratio if 1.0 / _CALIBRATION_RATIO < abs(ratio) < _CALIBRATION_RATIO else None

@@ -1,13 +1,24 @@
 """The homography between two pictures, measured in the pictures without relying on their records."""
 
+from typing import Final
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
-
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
+
+_HOMOGRAPHY_PX: Final = 3.0  # flow within this distance agrees with a homography (RANSAC; chosen; not measured)
+_HOMOGRAPHY_SHARE: Final = 0.4  # least share of the flow that must agree
+_HOMOGRAPHY_LEAST: Final = 12  # fewest corners that must agree
+_PYRAMID_WINDOW_PX: Final = 21  # window of the flow over several octaves (OpenCV's default)
+_PYRAMID_OCTAVES: Final = 4  # octaves below the full picture of that flow: it reaches some 16 windows
+_ORB_CORNERS: Final = 1000  # ORB corners (Rublee et al. 2011) of a turn that nobody recorded
+_ORB_LEAST: Final = 30  # fewest ORB matches that must agree
+_ORB_SHARE: Final = 0.25  # least share of the ORB matches that must agree
+_PHASE_REDUCTION: Final = 4  # phase correlation for a prediction's missing shift works on pictures reduced by this
+_PHASE_RESPONSE: Final = 0.05  # least response of that phase correlation
 
 
 def measured_homography(previous: Gray | None, gray: Gray, uv: NDArray[np.float32], predicted: Array) -> Array | None:
@@ -21,7 +32,7 @@ def measured_homography(previous: Gray | None, gray: Gray, uv: NDArray[np.float3
         previous, gray: uint8 (rows, columns). uv: float32 (K, 2), corners of the previous one.
         predicted: 3x3 homography from the previous one's pixels.
     """
-    if previous is None or len(uv) < active().features.homography_least:
+    if previous is None or len(uv) < _HOMOGRAPHY_LEAST:
         return None
     for start in (predicted, np.eye(3)):
         aligned = shifted_prediction(previous, gray, start)
@@ -33,17 +44,14 @@ def measured_homography(previous: Gray | None, gray: Gray, uv: NDArray[np.float3
 
 def _flow_homography(previous: Gray, gray: Gray, uv: NDArray[np.float32], start: Array) -> Array | None:
     """The homography that most of the flow from a given start agrees on, None without agreement."""
-    config = active().features
     guess = apply_homography(start, uv)
     warped = cv2.warpPerspective(previous, start, (gray.shape[1], gray.shape[0]), borderMode=cv2.BORDER_REPLICATE)
-    window = (config.pyramid_window_px, config.pyramid_window_px)
-    found, status, _ = cv2.calcOpticalFlowPyrLK(
-        warped, gray, guess, None, winSize=window, maxLevel=config.pyramid_octaves
-    )
+    window = (_PYRAMID_WINDOW_PX, _PYRAMID_WINDOW_PX)
+    found, status, _ = cv2.calcOpticalFlowPyrLK(warped, gray, guess, None, winSize=window, maxLevel=_PYRAMID_OCTAVES)
     ok = is_inside(guess, gray.shape, 0.0) & (status.ravel() == 1) & is_inside(found, gray.shape, 0.0)
-    if ok.sum() < config.homography_least:
+    if ok.sum() < _HOMOGRAPHY_LEAST:
         return None
-    return _agreed(uv[ok], found[ok], max(config.homography_least, config.homography_share * ok.sum()))
+    return _agreed(uv[ok], found[ok], max(_HOMOGRAPHY_LEAST, _HOMOGRAPHY_SHARE * ok.sum()))
 
 
 def _turned_homography(previous: Gray, gray: Gray) -> Array | None:
@@ -51,22 +59,21 @@ def _turned_homography(previous: Gray, gray: Gray) -> Array | None:
 
     For turns of the flight without recorded headings.
     """
-    config = active().features
-    orb = cv2.ORB.create(nfeatures=config.orb_corners)
+    orb = cv2.ORB.create(nfeatures=_ORB_CORNERS)
     (before, ours), (after, theirs) = (orb.detectAndCompute(picture, None) for picture in (previous, gray))
     if ours is None or theirs is None:
         return None
     pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(ours, theirs)
-    if len(pairs) < config.orb_least:
+    if len(pairs) < _ORB_LEAST:
         return None
     a = np.array([before[m.queryIdx].pt for m in pairs], np.float32)
     b = np.array([after[m.trainIdx].pt for m in pairs], np.float32)
-    return _agreed(a, b, max(config.orb_least, config.orb_share * len(pairs)))
+    return _agreed(a, b, max(_ORB_LEAST, _ORB_SHARE * len(pairs)))
 
 
 def _agreed(a: NDArray[np.float32], b: NDArray[np.float32], fewest: float) -> Array | None:
     """The homography by RANSAC over pairs of pixels (K, 2), None with too few inliers."""
-    homography, inlier = cv2.findHomography(a, b, cv2.RANSAC, active().features.homography_px)
+    homography, inlier = cv2.findHomography(a, b, cv2.RANSAC, _HOMOGRAPHY_PX)
     if homography is None or inlier.sum() < fewest:
         return None
     return np.asarray(homography, np.float64)
@@ -79,8 +86,7 @@ def shifted_prediction(previous: Gray | None, gray: Gray, predicted: Array) -> A
     """
     if previous is None:
         return None
-    config = active().features
-    reduction = config.phase_reduction
+    reduction = _PHASE_REDUCTION
     warped = cv2.warpPerspective(previous, predicted, (gray.shape[1], gray.shape[0]), borderMode=cv2.BORDER_REPLICATE)
     small = [
         cv2.resize(g, None, fx=1.0 / reduction, fy=1.0 / reduction, interpolation=cv2.INTER_AREA).astype(np.float32)
@@ -88,7 +94,7 @@ def shifted_prediction(previous: Gray | None, gray: Gray, predicted: Array) -> A
     ]
     window = cv2.createHanningWindow(small[0].shape[::-1], cv2.CV_32F)
     (dx, dy), response = cv2.phaseCorrelate(small[0], small[1], window)
-    if response <= config.phase_response:
+    if response <= _PHASE_RESPONSE:
         return None
     return np.array([[1.0, 0, reduction * dx], [0, 1.0, reduction * dy], [0, 0, 1.0]]) @ predicted
 

@@ -7,16 +7,29 @@ and the ground is not flat) and on one epipolar geometry (tightly).
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.refine.features.sift_features import Features, root_sift
+from orthoswarm.trajectory.legs import PAUSE_S
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 Ints = NDArray[np.int32]
+
+_MATCH_RATIO: Final = 0.85
+"""A match is clearly nearer than the next candidate: ratio test (Lowe 2004: 0.8; chosen on four real flights)."""
+_MATCH_LEAST: Final = 15  # fewest matches of a pair of photos (chosen on four real flights)
+_PLANE_SHARE: Final = 0.03  # matches agree with one similarity of the plane within this share of the width
+_PLANE_SCALES: Final = (0.5, 2.0)  # scales of that similarity which are possible
+_EPIPOLAR_PX: Final = 1.5
+"""Matches agree with one epipolar geometry within so many reduced pixels (MAGSAC; four real flights)."""
+_RANSAC_ROUNDS: Final = 1000  # most rounds of both consensus searches (its cost)
+_RANSAC_CONFIDENCE: Final = 0.999  # confidence at which they end earlier
+_PAIR_SECTORS: Final = 6  # directions over which a photo's neighbours are spread
+_PAIR_BEST_DISTANCE: Final = 0.4  # best distance of a pair as a share of its reach
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,21 +53,20 @@ def match_features(one: Features, two: Features) -> Ints:
     """Rows of matching features in two photos, int32 (n, 2); (0, 2) without a match.
 
     Mutual nearest neighbours that pass the ratio test, then a similarity by RANSAC, then the fundamental matrix by
-    MAGSAC (Barath et al. 2020). Fewer than `match_least` inliers count as no match.
+    MAGSAC (Barath et al. 2020). Fewer than `_MATCH_LEAST` inliers count as no match.
     """
-    config = active().features
     none = np.zeros((0, 2), np.int32)
     candidates = mutual_nearest(_unit(one), _unit(two))
-    if len(candidates) < config.match_least:
+    if len(candidates) < _MATCH_LEAST:
         return none
     p = one.uv[candidates[:, 0]] / np.float32(one.step_px)
     q = two.uv[candidates[:, 1]] / np.float32(two.step_px)
-    plane = _similarity_inliers(p, q, config.plane_share * two.width / two.step_px)
-    if plane.sum() < config.match_least:
+    plane = _similarity_inliers(p, q, _PLANE_SHARE * two.width / two.step_px)
+    if plane.sum() < _MATCH_LEAST:
         return none
     candidates, p, q = candidates[plane], p[plane], q[plane]
     epipolar = _epipolar_inliers(p, q)
-    return candidates[epipolar] if epipolar.sum() >= config.match_least else none
+    return candidates[epipolar] if epipolar.sum() >= _MATCH_LEAST else none
 
 
 def mutual_nearest(one: NDArray[np.float32], two: NDArray[np.float32]) -> Ints:
@@ -68,7 +80,7 @@ def mutual_nearest(one: NDArray[np.float32], two: NDArray[np.float32]) -> Ints:
     top = dot[rows, best]
     dot[rows, best] = -1.0
     second = dot.max(axis=1)
-    clear = (1.0 - top) < active().features.match_ratio ** 2 * (1.0 - second)
+    clear = (1.0 - top) < _MATCH_RATIO**2 * (1.0 - second)
     keep = mutual & clear
     return np.stack([rows[keep], best[keep]], axis=1).astype(np.int32)
 
@@ -76,20 +88,19 @@ def mutual_nearest(one: NDArray[np.float32], two: NDArray[np.float32]) -> Ints:
 def _similarity_inliers(p: NDArray[np.float32], q: NDArray[np.float32], threshold: float) -> NDArray[np.bool_]:
     import cv2
 
-    config = active().features
     matrix, inliers = cv2.estimateAffinePartial2D(
         p,
         q,
         method=cv2.RANSAC,
         ransacReprojThreshold=threshold,
-        maxIters=config.ransac_rounds,
-        confidence=config.ransac_confidence,
+        maxIters=_RANSAC_ROUNDS,
+        confidence=_RANSAC_CONFIDENCE,
         refineIters=2,
     )
     if matrix is None:
         return np.zeros(len(p), bool)
     scale = float(np.hypot(matrix[0, 0], matrix[1, 0]))
-    if not config.plane_scales[0] <= scale <= config.plane_scales[1]:
+    if not _PLANE_SCALES[0] <= scale <= _PLANE_SCALES[1]:
         return np.zeros(len(p), bool)
     return np.asarray(inliers[:, 0] > 0)
 
@@ -97,11 +108,8 @@ def _similarity_inliers(p: NDArray[np.float32], q: NDArray[np.float32], threshol
 def _epipolar_inliers(p: NDArray[np.float32], q: NDArray[np.float32]) -> NDArray[np.bool_]:
     import cv2
 
-    config = active().features
     try:
-        _, inliers = cv2.findFundamentalMat(
-            p, q, cv2.USAC_MAGSAC, config.epipolar_px, config.ransac_confidence, config.ransac_rounds
-        )
+        _, inliers = cv2.findFundamentalMat(p, q, cv2.USAC_MAGSAC, _EPIPOLAR_PX, _RANSAC_CONFIDENCE, _RANSAC_ROUNDS)
     except cv2.error:  # OpenCV 5.0 asserts where it finds no model
         return np.zeros(len(p), bool)
     return np.zeros(len(p), bool) if inliers is None else np.asarray(inliers[:, 0] > 0)
@@ -138,7 +146,7 @@ def consecutive(group: NDArray[np.integer], time_s: Array) -> Ints:
         group: integers (N,), photos of a group in order of time.
         time_s: float64 (N,), NaN where unknown (then order alone counts).
     """
-    pause_s = active().records.pause_s
+    pause_s = PAUSE_S
     last: dict[int, int] = {}
     pairs: list[tuple[int, int]] = []
     for k, g in enumerate(group.tolist()):
@@ -163,7 +171,7 @@ def nearby(centre: Complex, reach: Array, group: NDArray[np.integer], count: int
     """
     from scipy.spatial import cKDTree
 
-    best, sectors = active().features.pair_best_distance, active().features.pair_sectors
+    best, sectors = _PAIR_BEST_DISTANCE, _PAIR_SECTORS
     points = np.stack([centre.real, centre.imag], axis=1)
     tree = cKDTree(points)
     chosen: set[tuple[int, int]] = set()

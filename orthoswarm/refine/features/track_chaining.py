@@ -1,21 +1,24 @@
 """Tracks from pairwise matches: features of many photos joined into one tie point by union-find."""
 
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel, kernel
-from orthoswarm.config import active
 from orthoswarm.refine.bundle.block_arrays import Tracks
 from orthoswarm.refine.features.pair_matching import Pair
-from orthoswarm.refine.features.sift_features import Features
+from orthoswarm.refine.features.sift_features import SIFT_CELLS, Features
 
 Ints = NDArray[np.int32]
 
+_TRACK_LONGEST: Final = 20  # longest track; longer ones stay in pieces (its cost)
+_TRACK_PER_CELL: Final = 2  # observations in a cell of a photo from which on further tracks are dropped (its cost)
+
 
 def build_tracks(features: Sequence[Features], pairs: Sequence[Pair]) -> Tracks:
-    """Tie points through all photos, each observed 2 to `track_longest` times.
+    """Tie points through all photos, each observed 2 to `_TRACK_LONGEST` times.
 
     The strongest pair is joined first; a join that would put two points of one photo into a track is refused, so that
     one wrong match cannot merge two places.
@@ -36,7 +39,7 @@ def build_tracks(features: Sequence[Features], pairs: Sequence[Pair]) -> Tracks:
         b = offset[pair.second] + same[pair.second][pair.match[:, 1]]
         joins.append(np.stack([a, b], axis=1))
     edges = np.concatenate(joins) if joins else np.zeros((0, 2), np.int64)
-    root = _union(edges, photo, len(photo), active().features.track_longest)
+    root = _union(edges, photo, len(photo), _TRACK_LONGEST)
     return _tracks(root, photo, features)
 
 
@@ -107,8 +110,7 @@ def thin_tracks(tracks: Tracks, width: NDArray[np.float64], rows: NDArray[np.flo
     """
     if not len(tracks.camera):
         return tracks
-    config = active().features
-    nx, ny = config.sift_cells
+    nx, ny = SIFT_CELLS
     length = np.bincount(tracks.point, minlength=tracks.count)
     order = np.lexsort((tracks.camera, tracks.point, -length[tracks.point]))
     start = np.flatnonzero(np.r_[True, np.diff(tracks.point[order]) != 0, True])
@@ -116,7 +118,7 @@ def thin_tracks(tracks: Tracks, width: NDArray[np.float64], rows: NDArray[np.flo
     cy = np.clip(tracks.uv[:, 1] * ny / np.asarray(rows)[tracks.camera], 0, ny - 1).astype(np.int64)
     cell = tracks.camera.astype(np.int64) * nx * ny + cy * nx + cx
     keep = np.zeros(len(order), np.bool_)
-    _thin(cell[order], start, config.track_per_cell, nx * ny * len(width), keep)
+    _thin(cell[order], start, _TRACK_PER_CELL, nx * ny * len(width), keep)
     selected = np.sort(order[keep])
     _, point = np.unique(tracks.point[selected], return_inverse=True)
     return Tracks(

@@ -6,7 +6,7 @@ rotated and scaled as predicted, so that tracks survive the turns of the flight.
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final
 
 import cv2
 import numpy as np
@@ -21,6 +21,31 @@ from orthoswarm.refine.features.pair_homography import measured_homography, shif
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
+
+_BORDER_PX: Final = 9  # corners nearer to the picture's border are not begun: the window of the flow would leave it
+_CORNER_WINDOW_PX: Final = 5  # window of the minimum-eigenvalue corner measure (Shi and Tomasi 1994)
+_CORNER_FLOOR: Final = 1e-4  # least corner measure, as of OpenCV's cornerMinEigenVal: below it there is no texture
+_FLOW_SIGMA_PX: Final = 0.35
+"""Sigma of a followed corner in working pixels: 0.05 of noise and a drift along the track (measured together on
+simulated flights; it gave the best adjustments)."""
+_TRACK_LEAST_OBSERVATIONS: Final = 3  # shorter tracks are dropped: two rays cannot be checked
+_FLOW_INSIDE_PX: Final = 3.0  # flow that ends nearer to the border is dropped
+_FLOW_MEDIAN_LIMIT_PX: Final = 12.0  # where the median flow is farther from the prediction, all is dropped
+_FLOW_GATE_PX: Final = 5.0  # flow that is farther from the median of its picture is dropped
+_FLOW_LEAST: Final = 3  # fewer corners that agree are not a consensus
+_SHIFT_BELOW_SHARE: Final = 0.3  # with fewer followed corners the shift is measured on the whole picture
+_SHIFT_BELOW_CORNERS: Final = 6  # ... or fewer corners than this
+_HOMOGRAPHY_BELOW_SHARE: Final = 0.6
+"""Where a smaller share is followed, the recorded angles are not what the pictures show (3 degrees are 17 pixels), and
+the homography is measured."""
+_ANCHOR_PHOTOS: Final = 48  # photos that are held so that corners are compared with their first observation
+_ANCHOR_LIMIT_PX: Final = 1.5  # largest correction by that comparison; beyond it the track begins anew there
+_KLT_LEAST_TEXTURE: Final = 2.0  # least eigenvalue of a window's gradient matrix a pixel, grey values squared
+_KLT_STEP_PX: Final = 0.01  # a smaller step ends the iterations
+_KLT_ROUNDS: Final = (8, 10, 8)  # most iterations: at half size, at full size, against the first observation
+_KLT_MISMATCH: Final = 0.75  # largest mean square error of a window from picture to picture, as a share of its variance
+_KLT_ANCHOR_MISMATCH: Final = 0.4  # the same against the first observation: stricter, or tracks would creep
+_KLT_NOISE_VARIANCE: Final = 4.0  # noise of the picture that is added to both, grey values squared
 
 
 @dataclass(slots=True)
@@ -63,7 +88,7 @@ class Tracker:
     _gray: Gray | None = None
     _half: Gray | None = None
     _stack: NDArray[np.uint8] | None = None
-    _chain: Array = field(default_factory=lambda: np.tile(np.eye(3), (active().features.anchor_photos, 1, 1)))
+    _chain: Array = field(default_factory=lambda: np.tile(np.eye(3), (_ANCHOR_PHOTOS, 1, 1)))
     _count: int = 0
     _next: int = 0
     _log: list[tuple[int, NDArray[np.int64], NDArray[np.float32]]] = field(default_factory=list)
@@ -97,16 +122,15 @@ class Tracker:
 
     def tracks(self) -> Tracks:
         """Observations of all tracks that are long enough, in full-resolution pixels."""
-        config = active().features
         if not self._log:
             return Tracks(np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros((0, 2)), np.zeros(0, np.float32))
         camera = np.concatenate([np.full(len(ident), i, np.int32) for i, ident, _ in self._log])
         ident = np.concatenate([ident for _, ident, _ in self._log])
         uv = np.concatenate([uv for _, _, uv in self._log]).astype(np.float64)
-        keep = np.bincount(ident, minlength=self._next)[ident] >= config.track_least_observations
+        keep = np.bincount(ident, minlength=self._next)[ident] >= _TRACK_LEAST_OBSERVATIONS
         _, point = np.unique(ident[keep], return_inverse=True)
         uv = (uv[keep] + 0.5) * self.scale - 0.5
-        sigma = np.full(len(point), config.flow_sigma_px * self.scale, np.float32)
+        sigma = np.full(len(point), _FLOW_SIGMA_PX * self.scale, np.float32)
         return Tracks(camera[keep], point.astype(np.int32), uv, sigma)
 
     def _go_on(self, homography: Array | None) -> None:
@@ -116,14 +140,13 @@ class Tracker:
         self._chain[(self._count - 1) % photos] = now / now[2, 2]
 
     def _follow(self, gray: Gray, half: Gray, predicted: Array) -> float:
-        config = active().features
         before, live = len(self._live.ident), self._live
         flow = self._flow(gray, half, predicted)
-        if flow.kept < max(config.shift_below_corners, config.shift_below_share * flow.expected):
+        if flow.kept < max(_SHIFT_BELOW_CORNERS, _SHIFT_BELOW_SHARE * flow.expected):
             shifted = shifted_prediction(self._gray, gray, predicted)
             if shifted is not None:
                 flow, predicted = self._better(gray, half, shifted, flow, predicted)
-        if flow.kept < config.homography_below_share * flow.expected:
+        if flow.kept < _HOMOGRAPHY_BELOW_SHARE * flow.expected:
             measured = measured_homography(self._gray, gray, live.uv, predicted)
             if measured is not None:
                 flow, predicted = self._better(gray, half, measured, flow, predicted)
@@ -145,7 +168,6 @@ class Tracker:
         """Compare each window with its first observation; where that no longer matches, the present one replaces it."""
         if self._stack is None or not len(live.uv):
             return
-        config = active().features
         photos, now, ok = len(self._stack), self._count - 1, np.zeros(len(live.uv), bool)
         klt.anchor(
             stack=self._stack,
@@ -154,12 +176,12 @@ class Tracker:
             points=live.anchor_uv,
             after=gray,
             here=np.linalg.inv(self._chain[now % photos]),
-            limit=config.anchor_limit_px,
-            rounds=config.klt_rounds[2],
-            texture=config.klt_least_texture,
-            step=config.klt_step_px,
-            mismatch=config.klt_anchor_mismatch,
-            noise=config.klt_noise_variance,
+            limit=_ANCHOR_LIMIT_PX,
+            rounds=_KLT_ROUNDS[2],
+            texture=_KLT_LEAST_TEXTURE,
+            step=_KLT_STEP_PX,
+            mismatch=_KLT_ANCHOR_MISMATCH,
+            noise=_KLT_NOISE_VARIANCE,
             found=live.uv,
             ok=ok,
         )
@@ -168,7 +190,7 @@ class Tracker:
 
     def _hold(self, gray: Gray) -> None:
         if self._stack is None or self._stack.shape[1:] != gray.shape:
-            self._stack = np.zeros((active().features.anchor_photos, *gray.shape), np.uint8)
+            self._stack = np.zeros((_ANCHOR_PHOTOS, *gray.shape), np.uint8)
         self._stack[(self._count - 1) % len(self._stack)] = gray
 
     def _flow(self, gray: Gray, half: Gray, predicted: Array) -> "_Flow":
@@ -183,18 +205,18 @@ class Tracker:
             points=self._live.uv,
             homography=predicted,
             back=np.linalg.inv(predicted),
-            rounds=config.klt_rounds[:2],
-            texture=config.klt_least_texture,
-            step=config.klt_step_px,
-            mismatch=config.klt_mismatch,
-            noise=config.klt_noise_variance,
+            rounds=_KLT_ROUNDS[:2],
+            texture=_KLT_LEAST_TEXTURE,
+            step=_KLT_STEP_PX,
+            mismatch=_KLT_MISMATCH,
+            noise=_KLT_NOISE_VARIANCE,
             guess=guess,
             found=found,
             ok=good,
         )
         kept, expected = _gate(
-            guess, found, good, *gray.shape, config.flow_inside_px, config.flow_least, config.flow_median_limit_px,
-            config.flow_gate_px, config.flow_chance_share,
+            guess, found, good, *gray.shape, _FLOW_INSIDE_PX, _FLOW_LEAST, _FLOW_MEDIAN_LIMIT_PX,
+            _FLOW_GATE_PX, config.flow_chance_share,
         )  # fmt: skip
         return _Flow(good, found, kept, expected)
 
@@ -209,12 +231,8 @@ class Tracker:
         r = ((self._live.uv[:, 1] - top) // size).astype(int).clip(0, rows - 1)
         c = ((self._live.uv[:, 0] - left) // size).astype(int).clip(0, cols - 1)
         empty[r, c] = False
-        config, uv = active().features, np.empty((rows * cols, 2), np.float32)
-        uv = uv[
-            : strongest(
-                gray, empty, size, top, left, config.corner_window_px, config.border_px, config.corner_floor, uv
-            )
-        ]
+        uv = np.empty((rows * cols, 2), np.float32)
+        uv = uv[: strongest(gray, empty, size, top, left, _CORNER_WINDOW_PX, _BORDER_PX, _CORNER_FLOOR, uv)]
         if len(uv):
             ident = np.arange(self._next, self._next + len(uv))
             self._next += len(uv)

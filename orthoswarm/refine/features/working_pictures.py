@@ -3,7 +3,7 @@
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from copy import copy
-from typing import Any
+from typing import Any, Final
 
 import cv2
 import numpy as np
@@ -14,6 +14,8 @@ from orthoswarm.model.frame import Frame
 from orthoswarm.raster.picture_file import PictureError
 
 Gray = NDArray[np.uint8]
+
+_SMALL_WIDTH_PX: Final = 160  # columns of the reduced pictures that stay in memory
 
 
 class Pictures:
@@ -57,13 +59,13 @@ class Pictures:
         if len(self._cache) > self._limit:
             self._cache.popitem(last=False)
         if i not in self._small:
-            width = min(active().features.small_width_px, self.size[0])
+            width = min(_SMALL_WIDTH_PX, self.size[0])
             size = (width, max(1, round(width * self.size[1] / self.size[0])))
             self._small[i] = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
         return picture
 
     def small(self, i: int) -> Gray:
-        """Picture i reduced to `small_width_px` columns."""
+        """Picture i reduced to `_SMALL_WIDTH_PX` columns."""
         if i not in self._small:
             self.gray(i)
         return self._small[i]

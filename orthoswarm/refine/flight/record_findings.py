@@ -1,10 +1,10 @@
 """Messages for the report: contradictions between pictures and records, and reasons why photos were not placed."""
 
 from collections.abc import Mapping, Sequence
+from typing import Final
 
 import numpy as np
 
-from orthoswarm.config import active
 from orthoswarm.model.angles import wrap_rad
 from orthoswarm.model.frame import Frame
 from orthoswarm.refine.bundle.adjustment import Adjustment
@@ -12,6 +12,20 @@ from orthoswarm.refine.bundle.height_consistency import log_focal_sigmas
 from orthoswarm.refine.initial.heading import tag_yaw
 from orthoswarm.refine.initial.initial_orientation import InitialOrientation
 from orthoswarm.refine.initial.planar_similarity import Array, Flags, PhotoRecords
+
+_FLIPPED_YAW_DEG: Final = 150.0  # a recorded yaw that differs by more is reported as turned by 180 degrees
+_HEADING_OFFSET_DEG: Final = 5.0  # a larger common offset of recorded headings is reported
+_TILT_DIFFERENCE_DEG: Final = 2.0  # a larger difference of recorded tilts is reported
+_TILT_DIFFERENCE_SIGMAS: Final = 3.0  # ... if it exceeds so many of its sigmas
+_ONE_WAY_LENGTH: Final = 0.9  # mean unit vector of headings from which a tilt is like a slope of the ground
+_SLOPE_DEG: Final = 6.0  # then a difference of tilts is reported only above this
+_OBLIQUE_DEG: Final = 35.0  # a photo tilted more that matches no other is reported as oblique
+_HEIGHT_DIFFERENCE_SHARE: Final = 0.15  # a recorded height that differs by more is reported, as a share
+_HEIGHT_DIFFERENCE_SIGMAS: Final = 4.0  # ... and by more than so many sigmas of the focal length
+_LEAST_HEIGHT_M: Final = 2.0  # a recorded height below this cannot be meant and is reported
+_LAG_M: Final = 1.0  # a lag of recorded positions that moves them by more is reported
+_LAG_LEAST_SPEED_M_S: Final = 0.3  # a lag is not estimated from slower photos, metres a second
+NAMED_MOST: Final = 3  # runs of photos, or vehicles, that a message names
 
 
 def flipped_yaw(records: PhotoRecords, start: InitialOrientation) -> Flags:
@@ -21,7 +35,7 @@ def flipped_yaw(records: PhotoRecords, start: InitialOrientation) -> Flags:
         if tag.source:
             rows = (records.vehicle == v) & start.yaw_known
             off = np.abs(wrap_rad(start.yaw - tag_yaw(records, tag.source) - tag.offset))
-            flipped |= rows & (np.nan_to_num(off) > np.radians(active().flight.flipped_yaw_deg))
+            flipped |= rows & (np.nan_to_num(off) > np.radians(_FLIPPED_YAW_DEG))
     return flipped
 
 
@@ -42,7 +56,7 @@ def unplaced_reasons(
         tilt = float(np.degrees(records.pitch[k])) + 90.0
         if k in reasons:
             continue
-        if tilt > active().flight.oblique_deg:
+        if tilt > _OBLIQUE_DEG:
             reasons[k] = f"{frames[k].image} looks {tilt:.0f} degrees off nadir and matches no other photo"
         else:
             reasons[k] = f"{frames[k].image} matches no other photo; it is placed by its tags alone"
@@ -51,7 +65,7 @@ def unplaced_reasons(
 
 def runs(names: Sequence[str], flags: Flags) -> str:
     """Runs of flagged photos as text: "A to C, F"."""
-    most = active().flight.named_most
+    most = NAMED_MOST
     edge = np.diff(np.concatenate([[0], flags.astype(np.int8), [0]]))
     first, last = np.flatnonzero(edge == 1), np.flatnonzero(edge == -1) - 1
     parts = [
@@ -76,7 +90,7 @@ def _yaw_findings(frames: Sequence[Frame], records: PhotoRecords, start: Initial
         who = _name(frames, records, v)
         if not tag.source and (rows & np.isfinite(records.yaw)).sum() >= 3:
             found.append(f"{who}: the recorded yaw does not follow the pictures; headings come from the pictures")
-        elif tag.source and abs(np.degrees(tag.offset)) > active().flight.heading_offset_deg:
+        elif tag.source and abs(np.degrees(tag.offset)) > _HEADING_OFFSET_DEG:
             found.append(f"{who}: recorded headings are {-np.degrees(tag.offset):+.0f} degrees off, put right")
         elif tag.source == "flight_yaw" and np.isfinite(records.yaw[rows]).any():
             found.append(f"{who}: the pictures follow the airframe's heading, not the recorded camera yaw")
@@ -90,7 +104,6 @@ def tilt_of(level: Array) -> Array:
 
 def _tilt_findings(frames: Sequence[Frame], records: PhotoRecords, start: InitialOrientation) -> list[str]:
     found = []
-    c = active().flight
     tagged = records.tag_level()
     between = np.degrees(tilt_of(np.asarray(start.level @ np.swapaxes(tagged, 1, 2))))
     for v in range(len(start.tags)):
@@ -98,8 +111,8 @@ def _tilt_findings(frames: Sequence[Frame], records: PhotoRecords, start: Initia
         sigma = np.degrees(start.tilt_sigma[records.segment[rows]].max())
         off, seen = float(np.median(between[rows])), float(np.degrees(np.median(tilt_of(start.level[rows]))))
         who = _name(frames, records, v)
-        one_way = abs(np.exp(1j * start.yaw[rows]).mean()) > c.one_way_length
-        if off < max(c.slope_deg if one_way else c.tilt_difference_deg, c.tilt_difference_sigmas * sigma):
+        one_way = abs(np.exp(1j * start.yaw[rows]).mean()) > _ONE_WAY_LENGTH
+        if off < max(_SLOPE_DEG if one_way else _TILT_DIFFERENCE_DEG, _TILT_DIFFERENCE_SIGMAS * sigma):
             continue
         tag = float(np.degrees(np.median(tilt_of(tagged[rows]))))
         if not np.isfinite(records.pitch[rows]).any():
@@ -122,7 +135,6 @@ def height_findings(
         frames: N photos. records: what they recorded. start: from the pairs.
         adjustment: of all of them, without a map.
     """
-    c = active().flight
     found, without = [], []
     ground = float(np.median(adjustment.points[:, 2])) if len(adjustment.points) else 0.0
     height = adjustment.cameras.position[:, 2] - ground
@@ -137,13 +149,11 @@ def height_findings(
             without.append((who, seen))
             continue
         said = float(np.nanmedian(recorded))
-        limit = max(c.height_difference_share, c.height_difference_sigmas * float(doubt[rows][0]))
-        if said <= c.least_height_m or abs(np.log(max(seen, 1.0) / said)) > limit:
+        limit = max(_HEIGHT_DIFFERENCE_SHARE, _HEIGHT_DIFFERENCE_SIGMAS * float(doubt[rows][0]))
+        if said <= _LEAST_HEIGHT_M or abs(np.log(max(seen, 1.0) / said)) > limit:
             found.append(contradiction(who, said, seen))
     if without:
-        names = ", ".join(who for who, _ in without[: c.named_most]) + (
-            " and others" if len(without) > c.named_most else ""
-        )
+        names = ", ".join(who for who, _ in without[:NAMED_MOST]) + (" and others" if len(without) > NAMED_MOST else "")
         seen = float(np.median([height for _, height in without]))
         found.append(f"{names}: no height is recorded; {seen:.0f} m come from metres per pixel")
     return found
@@ -164,8 +174,8 @@ def _position_findings(frames: Sequence[Frame], records: PhotoRecords, start: In
     speed = np.abs(records.velocity())
     for v, lag in enumerate(start.lag.tolist()):
         rows = records.vehicle == v
-        moving = speed[rows & (speed > active().flight.lag_least_speed_m_s)]
-        if len(moving) and abs(lag) * float(np.median(moving)) > active().flight.lag_m:
+        moving = speed[rows & (speed > _LAG_LEAST_SPEED_M_S)]
+        if len(moving) and abs(lag) * float(np.median(moving)) > _LAG_M:
             who = _name(frames, records, v)
             found.append(f"{who}: recorded positions lag by {lag:.1f} s")
     return found

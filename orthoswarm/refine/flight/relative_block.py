@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from orthoswarm.refine.bundle.adjustment import Adjustment
 from orthoswarm.refine.bundle.block_arrays import K1, CameraBlock, Tracks
 from orthoswarm.refine.bundle.flight_records import FlightRecords, read_records
 from orthoswarm.refine.bundle.observation_selection import BestViews, best_views
-from orthoswarm.refine.bundle.priors import GroupPriors, Priors
+from orthoswarm.refine.bundle.priors import DRIFT_SIGMA_M, HEIGHT_OFFSET_SIGMA_M, LAG_SIGMA_S, GroupPriors, Priors
 from orthoswarm.refine.bundle.rotation_vectors import log_rotation
 from orthoswarm.refine.features.flow_calibration import Calibration, calibrate
 from orthoswarm.refine.features.tracks import follow, predicted_homography
@@ -26,6 +27,36 @@ from orthoswarm.trajectory.legs import leads_one_way, split_legs
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
+
+_FOLLOWED_PHOTOS: Final = 10  # flights of fewer photos are matched in pairs instead of being followed
+_FOLLOWED_OVERLAP: Final = 0.78
+"""Flights of less forward overlap are matched in pairs: of 150 corners 106 to 127 survive at an overlap of 0.90, 76 to
+109 at 0.81, 51 at 0.72, 15 to 42 at 0.52 (measured on real and simulated sets)."""
+_FOLLOWED_CALIBRATION_PAIRS: Final = 3  # with fewer pairs for the first focal length a flight is matched in pairs
+_FOLLOWED_SURVIVAL: Final = 0.5  # least median share of tracks that survive into the next picture
+_FOLLOWED_TRACKS_FACTOR: Final = 3.0  # least number of tracks, times the square root of the number of photos
+_UNBROKEN_SURVIVAL: Final = 0.3
+"""Least share of tracks that survive into each picture of an unbroken chain. Photos without a height mostly have no
+angles either, and what lies behind a break is then held by positions alone."""
+FEW_PHOTOS: Final = 100  # flights of fewer photos are followed at four times as many corners
+_PREDICTED_STEP_SHARE: Final = 0.8  # step longer than this share of the picture's height is not predicted by the record
+_STATED_POSITION_FLOOR_M: Final = 0.02  # least sigma of a position that states its own (RTK)
+_HEIGHT_LEAP_M: Final = 5.0
+"""A recorded height that leaves those around it by more than this is a spike, which is replaced by theirs, or a
+climb."""
+_FASTEST_CLIMB_M_S: Final = 10.0  # faster changes of height are spikes and no climb (multirotors: up to 8)
+_HEIGHT_REACH_PHOTOS: Final = 3  # photos before and after whose median is compared with a recorded height
+_HEIGHT_SIGMA_RANGE_M: Final = (0.1, 2.0)  # range of the sigma of recorded heights after a look at their noise
+_ATTITUDE_SIGMA_RANGE_DEG: Final = (0.05, 3.0)  # range of the sigma of recorded attitudes after a look at their noise
+_TILT_SIGMA_DEG: Final = 0.2  # first sigma of recorded pitch and roll about their common bias
+_FREE_TILT_SIGMA_DEG: Final = 3.0  # sigma of pitch and roll that were not recorded
+_YAW_SIGMA_DEG: Final = 0.2  # first sigma of recorded headings about their common bias
+_FREE_YAW_SIGMA_DEG: Final = 5.0  # sigma of headings that were not recorded
+_UNTIMED_LAG_SIGMA_S: Final = 0.3  # sigma of the lag of positions of photos without time, in steps between them
+_LENS_SIGMA: Final = (0.3, 0.1, 0.03)  # sigma of log f, k1, k2 of a lens
+_STRONG_K1: Final = 0.12  # a lens with a larger |k1| distorts so much that two parameters do not describe it
+_STRONG_LENS_SIGMA: Final = (0.3, 0.3, 0.2, 0.3)  # sigma of log f, k1, k2, k3 of such a lens
+PRINCIPAL_POINT_SHARE: Final = 0.012  # sigma of the principal point of lenses solved in full, in picture widths
 
 
 @dataclass(slots=True, kw_only=True)
@@ -83,7 +114,7 @@ def open_flight(
     `open_sparse_flight`): too little overlap, a height that contradicts the scale, or, where no height was recorded, a
     chain that breaks, or a single straight line, on which drift and scale cannot be separated.
     """
-    if len(frames) < active().flight.followed_photos:
+    if len(frames) < _FOLLOWED_PHOTOS:
         return None
     records = read_records(frames, grid, origin)
     leg = split_legs(records.position, records.time_s if records.timed else None)
@@ -114,20 +145,19 @@ def open_flight(
 
 def _follow(records: FlightRecords, leg: NDArray[np.int32], pictures: Pictures, fov_start: float) -> Followed | None:
     """Measure the flow and track the corners of a flight's pictures; None where they cannot be tracked."""
-    c = active().flight
     calibration = calibrate(records, leg, pictures.gray, pictures.size, fov_start)
     steps = np.hypot(*records.steps()[1:, :2].T)
     flow = float(np.median(steps)) * calibration.focal_px / calibration.height_m / pictures.size[1]
-    if calibration.pairs < c.followed_calibration_pairs or flow > 1.0 - c.followed_overlap:
+    if calibration.pairs < _FOLLOWED_CALIBRATION_PAIRS or flow > 1.0 - _FOLLOWED_OVERLAP:
         return None
     unknown = not records.has_height.any()
     if leads_one_way(records.position, leg) if unknown else not calibration.trusted_height:
         return None
     tracks, survived = _track(records.with_yaw(records.yaw + calibration.yaw_offset), pictures, calibration)
-    few = c.followed_tracks_factor * len(records.position) ** 0.5
-    if np.median(survived[1:]) < c.followed_survival or tracks.count < few:
+    few = _FOLLOWED_TRACKS_FACTOR * len(records.position) ** 0.5
+    if np.median(survived[1:]) < _FOLLOWED_SURVIVAL or tracks.count < few:
         return None
-    if unknown and survived[1:].min() < c.unbroken_survival:
+    if unknown and survived[1:].min() < _UNBROKEN_SURVIVAL:
         return None
     return Followed(
         calibration=calibration,
@@ -148,8 +178,8 @@ def weigh_records(flight: Flight) -> None:
     p = adj.priors
     height = adj.cameras.position[:, 2] - p.position[:, 2]
     attitude = log_rotation(np.swapaxes(p.rotation, 1, 2) @ adj.cameras.rotation)
-    z = float(np.clip(_step_sigma(height[:, None])[0], *c.height_sigma_range_m))
-    turn = np.clip(_step_sigma(attitude), *np.radians(c.attitude_sigma_range_deg))
+    z = float(np.clip(_step_sigma(height[:, None])[0], *_HEIGHT_SIGMA_RANGE_M))
+    turn = np.clip(_step_sigma(attitude), *np.radians(_ATTITUDE_SIGMA_RANGE_DEG))
     sigma = p.position_sigma.copy()
     if flight.calibration.trusted_height:
         sigma[:, 2] = np.where(sigma[:, 2] > c.first_height_sigma_m, sigma[:, 2], z)
@@ -161,7 +191,7 @@ def weigh_records(flight: Flight) -> None:
 
 def distorts_strongly(flight: Flight) -> bool:
     """True if the distortion is too strong for two parameters."""
-    return bool(np.abs(flight.adjustment.cameras.lens[:, K1]).max() >= active().flight.strong_k1)
+    return bool(np.abs(flight.adjustment.cameras.lens[:, K1]).max() >= _STRONG_K1)
 
 
 def free_full_lens(flight: Flight) -> bool:
@@ -173,9 +203,8 @@ def free_full_lens(flight: Flight) -> bool:
     adj = flight.adjustment
     if not distorts_strongly(flight):
         return False
-    c = active().flight
-    centre_px = c.principal_point_share * flight.pictures.size[0]
-    sigma = np.tile([*c.strong_lens_sigma, centre_px, centre_px], (len(adj.cameras.lens), 1))
+    centre_px = PRINCIPAL_POINT_SHARE * flight.pictures.size[0]
+    sigma = np.tile([*_STRONG_LENS_SIGMA, centre_px, centre_px], (len(adj.cameras.lens), 1))
     adj.priors = replace(adj.priors, lens_sigma=sigma)
     return True
 
@@ -191,8 +220,7 @@ def _track(records: FlightRecords, pictures: Pictures, calibration: Calibration)
     width, height = pictures.size
     f = calibration.focal_px
     matrix = np.array([[f, 0, 0.5 * (width - 1)], [0, f, 0.5 * (height - 1)], [0, 0, 1.0]])
-    c = active().flight
-    reach = c.predicted_step_share * height / f * calibration.height_m
+    reach = _PREDICTED_STEP_SHARE * height / f * calibration.height_m
 
     def prediction(i: int) -> Array | None:
         if i == 0 or np.hypot(*steps[i, :2]) > reach:
@@ -200,13 +228,12 @@ def _track(records: FlightRecords, pictures: Pictures, calibration: Calibration)
         step = np.array([steps[i, 0], steps[i, 1], 0.0])
         return predicted_homography(rotation[i - 1], rotation[i], calibration.height_m, step, matrix)
 
-    few = len(rotation) < c.few_photos
+    few = len(rotation) < FEW_PHOTOS
     cell_px = active().features.cell_px
     return follow(len(rotation), pictures.gray, prediction, cell_px=cell_px // 2 if few else cell_px)
 
 
 def _begin(records: FlightRecords, pictures: Pictures, calibration: Calibration, tracks: Tracks) -> Adjustment:
-    c = active().flight
     n = len(records.position)
     width, height = pictures.size
     position = records.position.copy()
@@ -214,15 +241,15 @@ def _begin(records: FlightRecords, pictures: Pictures, calibration: Calibration,
     rotation = records.rotation()
     lens = np.array([[calibration.focal_px, 0, 0, 0, 0, 0, width, height]], float)
     cameras = CameraBlock(position.copy(), rotation.copy(), np.zeros(n, np.int32), lens)
-    stated = np.maximum(records.position_sigma, c.stated_position_floor_m)
+    stated = np.maximum(records.position_sigma, _STATED_POSITION_FLOOR_M)
     horizontal = np.where(np.isfinite(records.position_sigma), stated, active().records.position_sigma_m)
-    tilt = np.where(records.has_tilt, np.radians(c.tilt_sigma_deg), np.radians(c.free_tilt_sigma_deg))
-    yaw = np.where(records.has_yaw, np.radians(c.yaw_sigma_deg), np.radians(c.free_yaw_sigma_deg))
+    tilt = np.where(records.has_tilt, np.radians(_TILT_SIGMA_DEG), np.radians(_FREE_TILT_SIGMA_DEG))
+    yaw = np.where(records.has_yaw, np.radians(_YAW_SIGMA_DEG), np.radians(_FREE_YAW_SIGMA_DEG))
     usual = active().bundle
     model = GroupPriors(
-        height_sigma=usual.height_offset_sigma_m if calibration.trusted_height else usual.unknown_height_sigma_m,
-        lag_sigma=active().records.lag_sigma_s if records.timed else c.untimed_lag_sigma_s,
-        drift_sigma=usual.drift_sigma_m if not np.isfinite(records.position_sigma).all() else 0.0,
+        height_sigma=HEIGHT_OFFSET_SIGMA_M if calibration.trusted_height else usual.unknown_height_sigma_m,
+        lag_sigma=LAG_SIGMA_S if records.timed else _UNTIMED_LAG_SIGMA_S,
+        drift_sigma=DRIFT_SIGMA_M if not np.isfinite(records.position_sigma).all() else 0.0,
     )
     priors = Priors(
         position=position,
@@ -233,7 +260,7 @@ def _begin(records: FlightRecords, pictures: Pictures, calibration: Calibration,
         group=np.zeros(n, np.int32),
         models=(model,),
         lens=np.array([[np.log(calibration.focal_px), 0, 0, 0, 0, 0]]),
-        lens_sigma=np.array([[*c.lens_sigma, 0, 0, 0]]),
+        lens_sigma=np.array([[*_LENS_SIGMA, 0, 0, 0]]),
     )
     return Adjustment.begin(cameras, tracks, priors, first_points(cameras, tracks))
 
@@ -258,10 +285,10 @@ def height_prior(records: FlightRecords, calibration: Calibration) -> tuple[Arra
     z = records.position[:, 2]
     if not calibration.trusted_height:
         return np.full(len(z), calibration.height_m), np.full(len(z), c.first_height_sigma_m)
-    reach = c.height_reach_photos
+    reach = _HEIGHT_REACH_PHOTOS
     smooth = np.array([np.median(z[max(0, i - reach) : i + reach + 1]) for i in range(len(z))])
     off = np.abs(z - smooth)
-    leaps = off > c.height_leap_m
+    leaps = off > _HEIGHT_LEAP_M
     spikes = leaps & ~_climbed_to(records)
     return np.where(spikes, smooth, z), np.where(leaps, off, c.first_height_sigma_m)
 
@@ -271,7 +298,7 @@ def _climbed_to(records: FlightRecords) -> NDArray[np.bool_]:
     if not records.timed:
         return np.zeros(len(records.position), bool)
     rise = np.abs(np.diff(records.position[:, 2]))
-    can = rise <= active().flight.fastest_climb_m_s * np.diff(records.time_s)
+    can = rise <= _FASTEST_CLIMB_M_S * np.diff(records.time_s)
     return np.asarray(np.concatenate([[True], can]) & np.concatenate([can, [True]]))
 
 

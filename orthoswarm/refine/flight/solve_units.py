@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
+from typing import Final
 
 import numpy as np
 
@@ -10,6 +11,14 @@ from orthoswarm.config import active
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.placement import Solution
 from orthoswarm.trajectory.separate_places import separate_places
+
+_OWN_UNIT_PHOTOS: Final = 6  # fewer photos of another camera name but the same size stay with the vehicle's main camera
+_UNIT_GAP_M: Final = 500.0
+"""Groups of photos at least so far apart are solved like different vehicles: they show no common ground, so what places
+the one says nothing about the other (more than the footprint of a photo from 200 m) ..."""
+_UNIT_GAP_STEPS: Final = 10.0
+"""... and at least so many times the usual distance of a photo to the nearest one: of high flights lines are far apart
+(with overlaps of 80 and 20 % lines are five times as far apart as photos)."""
 
 
 def split_units(vehicles: Mapping[str, Sequence[Frame]]) -> list[list[Frame]]:
@@ -32,11 +41,10 @@ def split_units(vehicles: Mapping[str, Sequence[Frame]]) -> list[list[Frame]]:
 
 def _by_place(frames: list[Frame]) -> list[list[Frame]]:
     """Frames by the place where they were taken, groups of a few with the largest."""
-    config = active().flight
     lat, lon = (np.array([getattr(f.fix, name) for f in frames], float) for name in ("lat_deg", "lon_deg"))
-    group = separate_places(lat, lon, config.unit_gap_m, config.unit_gap_steps)
+    group = separate_places(lat, lon, _UNIT_GAP_M, _UNIT_GAP_STEPS)
     count = np.bincount(group)
-    group[count[group] < config.own_unit_photos] = count.argmax()
+    group[count[group] < _OWN_UNIT_PHOTOS] = count.argmax()
     return [[f for f, k in zip(frames, group, strict=True) if k == number] for number in np.unique(group)]
 
 
@@ -48,7 +56,7 @@ def _absorb(groups: dict[tuple[str, int, int], list[Frame]]) -> list[list[Frame]
     for keys in by_size.values():
         main = max(keys, key=lambda k: len(groups[k]))
         for key in keys:
-            if key != main and len(groups[key]) < active().flight.own_unit_photos:
+            if key != main and len(groups[key]) < _OWN_UNIT_PHOTOS:
                 groups[main] = _in_order([*groups[main], *groups.pop(key)])
         out += [groups[k] for k in keys if k in groups]
     return out

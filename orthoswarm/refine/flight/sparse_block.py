@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.model.angles import wrap_rad
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
@@ -18,7 +17,13 @@ from orthoswarm.refine.features.flow_calibration import Calibration
 from orthoswarm.refine.features.working_pictures import Pictures
 from orthoswarm.refine.flight.record_findings import height_findings
 from orthoswarm.refine.flight.relative_block import Flight
-from orthoswarm.refine.flight.sparse_adjustment import datum_prior, heights_above_ground, solve_sparse, trusted_heights
+from orthoswarm.refine.flight.sparse_adjustment import (
+    SPARSE_STAGE_C,
+    datum_prior,
+    heights_above_ground,
+    solve_sparse,
+    trusted_heights,
+)
 from orthoswarm.refine.flight.sparse_start import SparseStart, read_photo_records, sparse_start
 from orthoswarm.refine.initial.pair_graph import ReadGray
 from orthoswarm.refine.initial.planar_similarity import Array
@@ -132,7 +137,7 @@ def in_reduced_pixels(adjustment: Adjustment, step: float, size: tuple[int, int]
     common_lens[:, 4:] /= step
     # a step computes the weights and normal equations of the new adjustment
     out.step(
-        active().flight.sparse_stage_c[-1],
+        SPARSE_STAGE_C[-1],
         datum_prior(out, float(np.median(out.points[:, 2])) if len(out.points) else 0.0),
     )
     return out

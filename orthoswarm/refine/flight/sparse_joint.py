@@ -7,11 +7,11 @@ lens, close to the shared one.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.task_runner import Progress, Run, serial
@@ -26,6 +26,16 @@ from orthoswarm.refine.flight.sparse_block import make_flight, open_sparse_fligh
 from orthoswarm.refine.flight.sparse_start import SparseStart, read_photo_records, sparse_start
 from orthoswarm.refine.initial.pair_graph import ReadGray
 from orthoswarm.refine.initial.planar_similarity import Array
+
+_JOINT_MOST_VEHICLES: Final = 16  # of more vehicles those with the same camera name share one lens (cost)
+_JOINT_LENS_STEPS: Final = 4  # steps with a lens for each vehicle
+_JOINT_LENS_SIGMA: Final = (0.01, 0.01, 0.01, 0.05)
+"""Sigma of log f, k1, k2, k3 of a vehicle's lens about the common one."""
+_JOINT_PRINCIPAL_POINT_SHARE: Final = 0.004  # sigma of its principal point about the common one, in picture widths
+_JOINT_LENS_C: Final = 9.0  # robust scale c of those steps, squared sigmas
+_HELD_POSITION_SIGMA_M: Final = 0.3  # sigma of positions found together, in the block of one vehicle
+_HELD_ATTITUDE_SIGMA_DEG: Final = 0.3  # sigma of attitudes found together
+_HELD_LENS_SIGMA: Final = 0.003  # sigma of lens parameters found together
 
 
 def open_sparse_flights(
@@ -60,7 +70,7 @@ def open_sparse_flights(
     adjustment = solve_sparse(start)
     trusted = trusted_heights(adjustment, start)
     focal_sigma = log_focal_sigmas(adjustment)[adjustment.cameras.lens_id]
-    if int(records.vehicle.max()) < active().flight.joint_most_vehicles:
+    if int(records.vehicle.max()) < _JOINT_MOST_VEHICLES:
         adjustment = own_lenses(adjustment, start)
         focal_sigma = np.hypot(focal_sigma, log_focal_sigmas(adjustment)[adjustment.cameras.lens_id])
     found = height_findings(frames, start.records, start.plane, adjustment)
@@ -91,27 +101,25 @@ def _by_unit(warnings: Sequence[str], names: Sequence[str]) -> list[list[str]]:
 
 def own_lenses(adjustment: Adjustment, start: SparseStart) -> Adjustment:
     """Give every vehicle its own lens, close to the shared one, and continue the adjustment."""
-    c = active().flight
     vehicle = start.records.vehicle
     first = [int(np.argmax(vehicle == v)) for v in range(int(vehicle.max()) + 1)]
     lens = adjustment.cameras.lens[adjustment.cameras.lens_id[first]].copy()
     p = adjustment.priors
     sigma = np.empty((len(lens), 6))
-    sigma[:, :4] = c.joint_lens_sigma
-    sigma[:, 4:] = c.joint_principal_point_share * lens[:, 6:7]
+    sigma[:, :4] = _JOINT_LENS_SIGMA
+    sigma[:, 4:] = _JOINT_PRINCIPAL_POINT_SHARE * lens[:, 6:7]
     sigma[p.lens_sigma[adjustment.cameras.lens_id[first]] == 0] = 0.0
     cameras = replace(adjustment.cameras, lens=lens, lens_id=vehicle.astype(np.int32))
     priors = replace(p, lens=np.column_stack([np.log(lens[:, 0]), lens[:, 1:6]]), lens_sigma=sigma)
     own = Adjustment.begin(cameras, adjustment.tracks, priors, adjustment.points)
     own.common[own.layout.lens_columns :] = adjustment.common[adjustment.layout.lens_columns :]
-    for _ in range(c.joint_lens_steps):
-        own.step(c.joint_lens_c, datum_prior(own))
+    for _ in range(_JOINT_LENS_STEPS):
+        own.step(_JOINT_LENS_C, datum_prior(own))
     return own
 
 
 def _extract_block(adjustment: Adjustment, start: SparseStart, rows: NDArray[np.int64]) -> Adjustment:
     """The part of a joint adjustment that concerns some photos."""
-    c = active().flight
     local = np.full(len(adjustment.cameras), -1, np.int32)
     local[rows] = np.arange(len(rows), dtype=np.int32)
     t = adjustment.tracks
@@ -128,11 +136,11 @@ def _extract_block(adjustment: Adjustment, start: SparseStart, rows: NDArray[np.
     lens = np.concatenate([[np.log(cameras.lens[0, 0])], cameras.lens[0, 1:6]])[None]
     free = adjustment.priors.lens_sigma[lens_row] > 0
     width = cameras.lens[0, WIDTH]
-    held = c.held_lens_sigma * np.array([1, 1, 1, 1, width, width])
-    attitude = float(np.radians(c.held_attitude_sigma_deg))
+    held = _HELD_LENS_SIGMA * np.array([1, 1, 1, 1, width, width])
+    attitude = float(np.radians(_HELD_ATTITUDE_SIGMA_DEG))
     priors = Priors(
         position=cameras.position.copy(),
-        position_sigma=np.full((len(rows), 3), c.held_position_sigma_m),
+        position_sigma=np.full((len(rows), 3), _HELD_POSITION_SIGMA_M),
         rotation=cameras.rotation.copy(),
         rotation_sigma=np.full((len(rows), 3), attitude),
         velocity=start.velocity[rows],

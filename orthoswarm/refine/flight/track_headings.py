@@ -2,16 +2,19 @@
 
 from dataclasses import replace
 from itertools import pairwise
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.model.angles import wrap_rad
 from orthoswarm.refine.bundle.block_arrays import Tracks
 from orthoswarm.refine.bundle.flight_records import FlightRecords
 
 Array = NDArray[np.float64]
+
+_HEADING_REACH_PHOTOS: Final = 7  # heading that was not recorded follows from those of so many photos before and after
+_HEADING_LEAST_CORNERS: Final = 10  # fewest tracked corners that tell how far a photo is turned from the one before
 
 
 def with_measured_headings(records: FlightRecords, tracks: Tracks) -> FlightRecords:
@@ -26,13 +29,12 @@ def with_measured_headings(records: FlightRecords, tracks: Tracks) -> FlightReco
     """
     if records.has_yaw.all():
         return records
-    config = active().flight
     turn = turns(tracks, len(records.yaw))
     broken = np.isnan(turn)
     chain, heading = np.cumsum(broken), np.cumsum(np.where(broken, 0.0, turn))
     yaw = records.yaw.copy()
     for i in np.flatnonzero(~records.has_yaw):
-        near = slice(max(0, i - config.heading_reach_photos), i + config.heading_reach_photos + 1)
+        near = slice(max(0, i - _HEADING_REACH_PHOTOS), i + _HEADING_REACH_PHOTOS + 1)
         from_others = records.yaw[near] + heading[i] - heading[near] - records.yaw[i]
         yaw[i] += _median_angle(from_others[chain[near] == chain[i]])
     return replace(records, yaw=wrap_rad(yaw))
@@ -47,14 +49,13 @@ def turns(tracks: Tracks, count: int) -> Array:
     Returns:
         float64 (count,); the first is NaN.
     """
-    config = active().flight
     order = np.argsort(tracks.camera, kind="stable")
     edges = np.searchsorted(tracks.camera[order], np.arange(count + 1))
     seen = [order[a:b] for a, b in pairwise(edges)]
     out = np.full(count, np.nan)
     for i in range(1, count):
         _, before, now = np.intersect1d(tracks.point[seen[i - 1]], tracks.point[seen[i]], return_indices=True)
-        if len(before) < config.heading_least_corners:
+        if len(before) < _HEADING_LEAST_CORNERS:
             continue
         p, q = (uv - np.median(uv, axis=0) for uv in (tracks.uv[seen[i - 1]][before], tracks.uv[seen[i]][now]))
         away = np.hypot(*p.T) > np.median(np.hypot(*p.T))  # those near the middle say little

@@ -6,17 +6,25 @@ They stay as recorded, or move as their solved neighbours did.
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.model.camera import Camera
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.placement import PlacedFrame
 
 BeforeAfter = tuple[PlacedFrame, PlacedFrame]
 """A frame as recorded and as solved."""
+
+_LEAST_PHOTOS_OF_KIND: Final = 3  # fewer photos of one camera and size are not refined but placed by their neighbours
+_HOVER_SHARE: Final = 0.05  # a vehicle whose positions spread by less than this share of its height hovers
+_WANDER_SHARE: Final = 0.3  # ... also if they spread by less than this share, but as a receiver's noise does
+_WANDER_STEPS: Final = 0.9  # noise: steps are longer than this share of the positions' rms spread
+_WANDER_PHOTOS: Final = 6  # least photos to tell noise from a way
+_UNSOLVED_NEIGHBOURS: Final = 5  # solved neighbours by which an unsolved picture is placed
+_UNSOLVED_SIGMA_M: Final = 2.0  # added in squares to the largest sigma of those neighbours
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +64,7 @@ def few_of_their_kind(frames: Sequence[Frame]) -> NDArray[np.bool_]:
     """Frames with too few others of their vehicle, camera and size, while other cameras have enough: bool (N,)."""
     kinds = [(f.vehicle, f.camera, f.width, f.height) for f in frames]
     count = Counter(kinds)
-    least = active().flight.least_photos_of_kind
+    least = _LEAST_PHOTOS_OF_KIND
     few = np.array([count[kind] < least for kind in kinds], bool)
     return few if not few.all() else np.zeros(len(frames), bool)
 
@@ -69,21 +77,20 @@ def hovering_vehicles(recorded: Sequence[PlacedFrame]) -> set[str]:
     out = set()
     for vehicle, own in members.items():
         positions = np.array([p.camera.position for p in own])
-        if len(own) > active().flight.least_photos_of_kind and _hovers(positions):
+        if len(own) > _LEAST_PHOTOS_OF_KIND and _hovers(positions):
             out.add(vehicle)
     return out
 
 
 def _hovers(positions: NDArray[np.float64]) -> bool:
     """True if a path (N, 3) is one position with a receiver's noise: steps as long as the total spread."""
-    c = active().flight
     spread = float(np.hypot(*np.subtract(*np.percentile(positions[:, :2], [95, 5], axis=0))))
     height = float(np.median(positions[:, 2]))
-    if spread < c.hover_share * height:
+    if spread < _HOVER_SHARE * height:
         return True
     rms = float(np.sqrt(((positions[:, :2] - positions[:, :2].mean(0)) ** 2).sum(1).mean()))
     steps = float(np.sqrt((np.diff(positions[:, :2], axis=0) ** 2).sum(1).mean()))
-    return len(positions) >= c.wander_photos and spread < c.wander_share * height and steps > c.wander_steps * rms
+    return len(positions) >= _WANDER_PHOTOS and spread < _WANDER_SHARE * height and steps > _WANDER_STEPS * rms
 
 
 def place_by_neighbours(
@@ -126,7 +133,7 @@ def _nearest(
     """The refined frames nearest to a frame, of its own vehicle if there are any."""
     own = [pair for pair in pairs if pair[0].frame.vehicle == one.frame.vehicle] or list(pairs)
     away = [float(np.hypot(*(p.camera.nadir - one.camera.nadir))) for p, _ in own]
-    return [own[i] for i in np.argsort(away, kind="stable")[: active().flight.unsolved_neighbours]]
+    return [own[i] for i in np.argsort(away, kind="stable")[:_UNSOLVED_NEIGHBOURS]]
 
 
 def _moved_like(near: Sequence[BeforeAfter], one: PlacedFrame) -> PlacedFrame:
@@ -137,5 +144,5 @@ def _moved_like(near: Sequence[BeforeAfter], one: PlacedFrame) -> PlacedFrame:
     ratio = float(np.median([a.camera.lens.focal_px / o.camera.lens.focal_px for o, a in near]))
     lens = replace(one.camera.lens, focal_px=one.camera.lens.focal_px * ratio)
     camera = Camera(one.camera.position + shift, turn @ one.camera.rotation, lens)
-    sigma = float(np.hypot(max(a.sigma_m for _, a in near), active().flight.unsolved_sigma_m))
+    sigma = float(np.hypot(max(a.sigma_m for _, a in near), _UNSOLVED_SIGMA_M))
     return PlacedFrame(one.frame, camera, after.stage, sigma, weak=True)

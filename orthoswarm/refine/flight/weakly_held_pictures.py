@@ -1,25 +1,39 @@
 """Pictures with too few observations (water, haze, blur), which are placed between their neighbours."""
 
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.refine.flight.relative_block import Flight
 
 Array = NDArray[np.float64]
+
+_SPARSE_FEWEST_OBSERVATIONS: Final = 12  # photos matched in pairs with fewer observations are weakly determined
+HELD_OBSERVATIONS: Final = 8  # pictures with fewer well fitting observations are placed between their neighbours
+_HELD_WEIGHT: Final = 0.3  # robust weight from which on an observation fits well
+_OUTLIER_M: Final = 4.0  # a record farther than this from the middle of those around it is an outlier
+_OUTLIER_SIGMAS: Final = 6.0  # ... and farther than so many times the usual distance
+_OUTLIER_REACH_PHOTOS: Final = 2  # photos before and after that are asked
+_GAP_M: Final = 4.0  # where record and straight line differ by less, the record's shape is followed
+_GAP_SHARE: Final = 0.3  # ... or by less than this share of the gap's length
+_WEAK_SIGMA_M: Final = 1.0  # sigma of a picture placed between its neighbours
+_WEAK_SIGMA_PER_PHOTO_M: Final = 0.1  # ... and more for each photo to the nearest held one
+_WEAK_MOST_PHOTOS: Final = 40  # ... up to so many photos
+_WEAK_DISAGREEMENT_SHARE: Final = 0.5  # a weak picture's sigma is at least this share of what record and line differ by
 
 
 def observations_per_camera(flight: Flight) -> NDArray[np.int64]:
     """Number of inlier observations of each of the vehicle's cameras: int64 (N,)."""
     adj = flight.adjustment
     n = len(flight.frames)
-    good = (adj.obs_weight > active().flight.held_weight) & (adj.tracks.camera < n)
+    good = (adj.obs_weight > _HELD_WEIGHT) & (adj.tracks.camera < n)
     return np.bincount(adj.tracks.camera[good], minlength=n)
 
 
 def weakly_held(flight: Flight) -> NDArray[np.bool_]:
     """Whether too few observations hold a camera: bool (N,)."""
-    fewest = active().registration.sparse_fewest_observations if flight.sparse else active().flight.held_observations
+    fewest = _SPARSE_FEWEST_OBSERVATIONS if flight.sparse else HELD_OBSERVATIONS
     return np.asarray(observations_per_camera(flight) < fewest)
 
 
@@ -28,8 +42,7 @@ def without_outliers(recorded: Array, leg: NDArray[np.int32]) -> Array:
 
     Within a long gap a position 5 to 20 m off looks like the aircraft's way when only the gap's ends are compared.
     """
-    c = active().flight
-    reach = c.outlier_reach_photos
+    reach = _OUTLIER_REACH_PHOTOS
     out, n = recorded.copy(), len(recorded)
     middle, known = np.zeros((n, 2)), np.zeros(n, bool)
     for i in range(reach, n - reach):
@@ -41,7 +54,7 @@ def without_outliers(recorded: Array, leg: NDArray[np.int32]) -> Array:
         known[i] = True
     away = np.hypot(*(recorded[:, :2] - middle).T)
     if known.any():
-        outlier = known & (away > max(c.outlier_m, c.outlier_sigmas * float(np.median(away[known]))))
+        outlier = known & (away > max(_OUTLIER_M, _OUTLIER_SIGMAS * float(np.median(away[known]))))
         out[outlier, :2] = middle[outlier]
     return out
 
@@ -53,10 +66,9 @@ def interpolate_weak(flight: Flight, sigma_m: Array) -> NDArray[np.bool_]:
     attitude is the recorded one with the bias of the neighbours. Their sigma grows with the distance, and with the
     difference of record and line.
     """
-    c = active().flight
     adj = flight.adjustment
     n = len(flight.frames)
-    weak = observations_per_camera(flight) < c.held_observations
+    weak = observations_per_camera(flight) < HELD_OBSERVATIONS
     strong = np.flatnonzero(~weak)
     if len(strong) < 2:
         return weak
@@ -72,7 +84,7 @@ def interpolate_weak(flight: Flight, sigma_m: Array) -> NDArray[np.bool_]:
         gap = float(np.hypot(*(follows - straight)[:2]))
         step = float(np.hypot(*(adj.cameras.position[b] - adj.cameras.position[a])[:2]))
         turning = flight.leg[a] != flight.leg[b]  # no straight line to follow there
-        follow_record = a == b or turning or gap < max(c.gap_m, c.gap_share * step)  # a == b at an end
+        follow_record = a == b or turning or gap < max(_GAP_M, _GAP_SHARE * step)  # a == b at an end
         adj.cameras.position[i] = follows if follow_record else straight
         # receivers err mostly horizontally; a height far from the others' is real
         adj.cameras.position[i, 2] = follows[2]
@@ -81,8 +93,8 @@ def interpolate_weak(flight: Flight, sigma_m: Array) -> NDArray[np.bool_]:
         adj.cameras.rotation[i] = turn @ adj.priors.rotation[i]
         moved = float(np.hypot(*(adj.priors.position[i] - recorded[i])[:2]))
         difference = max(moved, 0.0 if follow_record else gap)
-        away = min(abs(i - a), abs(b - i), c.weak_most_photos)
+        away = min(abs(i - a), abs(b - i), _WEAK_MOST_PHOTOS)
         sigma_m[i] = max(
-            sigma_m[i], c.weak_sigma_m + c.weak_sigma_per_photo_m * away, c.weak_disagreement_share * difference
+            sigma_m[i], _WEAK_SIGMA_M + _WEAK_SIGMA_PER_PHOTO_M * away, _WEAK_DISAGREEMENT_SHARE * difference
         )
     return weak

@@ -7,16 +7,23 @@ Gauss-Newton steps are complex least squares.
 """
 
 from dataclasses import dataclass, field
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix, csc_matrix, diags
 from scipy.sparse.linalg import splu
 
-from orthoswarm.config import active
 from orthoswarm.refine.initial.heading import components
+from orthoswarm.refine.initial.planar_network import NETWORK_GATE_SIGMAS
 from orthoswarm.refine.initial.planar_similarity import Array, Complex, Flags, Ints, PairGraph
 from orthoswarm.refine.initial.tilt_and_lens import spaced
+
+FREE_PAIR_SHARE: Final = 0.02  # sigma of the match centres of two level photos, in picture widths
+_FREE_SCALE_SIGMA: Final = 0.02  # ... and of scales and turns from the similarity's, radians or relative
+_FREE_SCHEDULE: Final = (400.0, 400.0, 100.0, 100.0, 36.0, 9.0, 9.0, 9.0)  # robust schedule of that network
+_ANCHOR_APART_SIGMAS: Final = 10.0  # two surveyed points turn and scale such photos if they lie so many sigmas apart
+_ANCHOR_MOST: Final = 60  # so many observations of the ground take part in the search for their common similarity
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -156,14 +163,14 @@ def _chained(graph: PairGraph, inside: Flags, members: Ints, count: int) -> tupl
 
 def _datum(a: Complex, t: Complex, anchors: Anchors, held: NDArray[np.intp]) -> tuple[complex, complex] | None:
     """The similarity onto the ground that most anchors of a part agree on, by pairs of them; None without two."""
-    held = held[spaced(len(held), active().initial.anchor_most)]
+    held = held[spaced(len(held), _ANCHOR_MOST)]
     shown = a[anchors.photo[held]] * anchors.pixel[held] + t[anchors.photo[held]]
     ground, sigma = anchors.ground[held], anchors.sigma_m[held]
     best: tuple[float, complex, complex] | None = None
     for i in range(len(held)):
         for j in range(i + 1, len(held)):
             apart = ground[j] - ground[i]
-            if abs(apart) <= active().initial.anchor_apart_sigmas * np.hypot(sigma[i], sigma[j]):
+            if abs(apart) <= _ANCHOR_APART_SIGMAS * np.hypot(sigma[i], sigma[j]):
                 continue
             if abs(shown[j] - shown[i]) < 1e-12:
                 continue
@@ -179,12 +186,12 @@ def _adjusted(
     graph: PairGraph, members: Ints, anchors: Anchors, *, a: Complex, t: Complex, width: Array
 ) -> tuple[Complex, Complex, Array, Flags]:
     """The robust adjustment of a part: a, t and the sigma of t of its members, and which anchors agree."""
-    config, n, pairs = active().initial, len(members), len(graph)
+    n, pairs = len(members), len(graph)
     at = np.full(len(a), -1)
     at[members] = np.arange(n)
     ends = at[graph.first], at[graph.second], at[anchors.photo]
-    log_a, t, share = np.log(a[members]), t[members].copy(), config.free_pair_share * width[members]
-    for c in config.free_schedule:
+    log_a, t, share = np.log(a[members]), t[members].copy(), FREE_PAIR_SHARE * width[members]
+    for c in _FREE_SCHEDULE:
         matrix, rhs = _rows(graph, anchors, ends, log_a=log_a, t=t, share=share)
         squared = np.abs(rhs) ** 2
         together = squared[:pairs] + squared[pairs : 2 * pairs]  # a wrong pair is wrong in both
@@ -193,7 +200,7 @@ def _adjusted(
         step = factor.solve(matrix.conj().T @ (weight * rhs))
         log_a, t = log_a + step[:n], t + step[n:]
     variance = np.diag(factor.solve(np.eye(2 * n, dtype=np.complex128)))[n:].real
-    good = squared[2 * pairs :] < config.network_gate_sigmas**2
+    good = squared[2 * pairs :] < NETWORK_GATE_SIGMAS**2
     return np.exp(log_a), t, np.sqrt(np.maximum(variance, 0.0)), good
 
 
@@ -210,7 +217,7 @@ def _rows(
     size = np.abs(a)
     ratio = log_a[i] - log_a[j] - np.log(graph.factor)
     ratio = ratio.real + 1j * np.angle(np.exp(1j * ratio.imag))
-    ratio_sigma = np.hypot(graph.turn_sigma, active().initial.free_scale_sigma)
+    ratio_sigma = np.hypot(graph.turn_sigma, _FREE_SCALE_SIGMA)
     meet = a[i] * graph.centre_first + t[i] - a[j] * graph.centre_second - t[j]
     meet_sigma = np.hypot(share[i] * size[i], share[j] * size[j])
     anchor = a[k] * anchors.pixel + t[k] - anchors.ground

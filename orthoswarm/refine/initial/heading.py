@@ -5,6 +5,7 @@ heading cannot be found from pairs.
 """
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +13,19 @@ from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 from scipy.sparse.linalg import spsolve
 
-from orthoswarm.config import active
 from orthoswarm.model.angles import wrap_rad
 from orthoswarm.refine.initial.planar_similarity import Array, Complex, Flags, Ints, PairGraph, PhotoRecords
+
+_COURSE_SIGMA_DEG: Final = 2.0  # sigma of the course between two photos, besides that of their positions
+_COURSE_SIGMA_LIMIT_RAD: Final = 1.0  # a course known no better than this is dropped
+_COURSE_SHIFT_SHARE: Final = 0.3  # ... and one whose pair shows less than this share of the recorded way
+_HEADING_SCHEDULE: Final = (400.0, 100.0, 36.0, 9.0, 9.0)  # robust schedule of the headings
+_HEADING_CANDIDATES: Final = 360  # angles that are tried for the one that most courses support (its cost)
+_HEADING_AGREE_DEG: Final = 20.0  # angles within this of each other agree
+_HEADING_ROUNDS: Final = 5  # rounds of the robust mean of those that agree
+_TAG_LEAST_PHOTOS: Final = 3  # fewest photos with a yaw tag for it to be compared with the pictures
+_TAG_BETTER_SHARE: Final = 0.1  # a second kind of yaw tag must agree on so many more of the photos
+_TAG_AGREE_SHARE: Final = 0.5  # share of the photos whose tag must follow the pictures
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +92,6 @@ def course_headings(
     Returns:
         Heading (E,) and its one sigma (E,), infinite where the movement is too short.
     """
-    config = active().initial
     i, j = graph.first, graph.second
     back = np.conj(graph.turn)
     ratio = metres[j] / metres[i]
@@ -90,9 +100,9 @@ def course_headings(
     blur = np.hypot(records.gps_sigma()[i], records.gps_sigma()[j])
     length = np.maximum(np.abs(way), 1e-9)
     tilt = np.abs(1.0 - ratio * back) * offset_sigma_px[i] * metres[i] / length
-    sigma = np.sqrt(float(np.radians(config.course_sigma_deg)) ** 2 + (blur / length) ** 2 + tilt**2)
-    short = np.abs(shift) * metres[i] < config.course_shift_share * length
-    sigma[(sigma > config.course_sigma_limit_rad) | short] = np.inf
+    sigma = np.sqrt(float(np.radians(_COURSE_SIGMA_DEG)) ** 2 + (blur / length) ** 2 + tilt**2)
+    short = np.abs(shift) * metres[i] < _COURSE_SHIFT_SHARE * length
+    sigma[(sigma > _COURSE_SIGMA_LIMIT_RAD) | short] = np.inf
     return wrap_rad(np.angle(shift) - np.angle(way)), sigma
 
 
@@ -120,7 +130,7 @@ def solve_headings(
         turn = circular_mode(wrap_rad(course[rows] - yaw[graph.first[rows]]), course_sigma[rows] ** -2)
         yaw[component == part] += turn
         known[component == part] = True
-    for c in active().initial.heading_schedule:
+    for c in _HEADING_SCHEDULE:
         yaw = yaw + _heading_step(graph, yaw, course, course_sigma, c)
     return wrap_rad(yaw), known
 
@@ -152,12 +162,11 @@ def _identity(count: int) -> csr_matrix:
 
 def circular_mode(angle: Array, weight: Array) -> float:
     """Mode of weighted angles: the mean around the densest window."""
-    config = active().initial
-    width = float(np.radians(config.heading_agree_deg))
-    tried = angle[:: max(1, len(angle) // config.heading_candidates)]
+    width = float(np.radians(_HEADING_AGREE_DEG))
+    tried = angle[:: max(1, len(angle) // _HEADING_CANDIDATES)]
     support = (weight[None, :] * (np.abs(wrap_rad(angle[None, :] - tried[:, None])) < width)).sum(1)
     mode = float(tried[int(support.argmax())])
-    for _ in range(config.heading_rounds):
+    for _ in range(_HEADING_ROUNDS):
         r = wrap_rad(angle - mode)
         w = weight / (1.0 + (r / (0.5 * width)) ** 2) ** 2
         mode += float((w * r).sum() / w.sum())
@@ -172,19 +181,18 @@ def tag_heading(records: PhotoRecords, rows: NDArray[np.intp], yaw: Array) -> Ta
         rows: photos of one vehicle whose headings follow from pairs.
         yaw: float64 (N,), the pictures' headings.
     """
-    config = active().initial
     best = TagHeading("", 0.0, 0.0)
     for source in ("yaw", "flight_yaw"):
         tag = tag_yaw(records, source)[rows]
         finite = np.isfinite(tag)
-        if finite.sum() < config.tag_least_photos:
+        if finite.sum() < _TAG_LEAST_PHOTOS:
             continue
         difference = wrap_rad(yaw[rows] - tag)[finite]
         offset = circular_mode(difference, np.ones(len(difference)))
-        agree = float((np.abs(wrap_rad(difference - offset)) < np.radians(config.heading_agree_deg)).mean())
-        if agree > best.agree + config.tag_better_share:
+        agree = float((np.abs(wrap_rad(difference - offset)) < np.radians(_HEADING_AGREE_DEG)).mean())
+        if agree > best.agree + _TAG_BETTER_SHARE:
             best = TagHeading(source, offset, agree)
-    return best if best.agree >= config.tag_agree_share else TagHeading("", 0.0, best.agree)
+    return best if best.agree >= _TAG_AGREE_SHARE else TagHeading("", 0.0, best.agree)
 
 
 def tag_yaw(records: PhotoRecords, source: str) -> Array:

@@ -7,10 +7,10 @@ give headings (`heading`), scales give relative heights (`relative_scale`), shif
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
-from orthoswarm.config import active
 from orthoswarm.model.angles import wrap_rad
 from orthoswarm.refine.features.pair_matching import Pair
 from orthoswarm.refine.features.sift_features import Features
@@ -45,6 +45,19 @@ from orthoswarm.refine.initial.relative_scale import (
     relative_scales,
 )
 from orthoswarm.refine.initial.tilt_and_lens import Matches, TiltAndLens, similarities, solve_tilt_and_lens
+
+_TAG_TILT_SIGMA_DEG: Final = 3.0  # sigma of a segment's recorded tilt
+_FREE_TILT_SIGMA_DEG: Final = 9.0  # sigma of the tilt about straight down where most photos record none
+_TAG_TILT_SHARE: Final = 0.5  # share of a segment's photos that must record a tilt
+_TILT_FLOOR_DEG: Final = 0.7  # least sigma of a tilt for the nadir's prior
+_TILT_SIGMA_FACTOR: Final = 2.0  # the nadir's prior is so many times looser than the shapes' own sigma
+_HEIGHT_FOCAL_SIGMA: Final = 0.12  # relative sigma of a focal length by recorded height
+_FOCAL_CHANGE: Final = 0.03  # a focal length by height that differs by more is solved for again
+_ROUNDS: Final = 2  # rounds of shapes, headings, scales and network (a third changed nothing)
+_LINK_SIGMA: Final = 0.15  # relative sigma of a segment's ground scale about its lens's
+_LINK_HEIGHT_SIGMA: Final = 0.03  # the same where recorded heights scale it
+_LENS_SCALE_SIGMA: Final = 0.5  # relative sigma of a lens's ground scale
+_COURSE_LEAST_M_S: Final = 0.3  # slower photos have no course for a heading
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -164,8 +177,7 @@ class _Solved:
 
 def _solve(matches: Matches, records: PhotoRecords, lens_of: Ints) -> _Solved:
     """Solve tilt and lens, relative scales, headings and network in rounds; lens_of: int32 (S,)."""
-    config = active().initial
-    tilt_floor = float(np.radians(config.tilt_floor_deg))
+    tilt_floor = float(np.radians(_TILT_FLOOR_DEG))
     count = len(records)
     hint, hint_sigma = focal_by_hint(records)
     shape = shape_of(matches, records, hint, hint_sigma)
@@ -174,7 +186,7 @@ def _solve(matches: Matches, records: PhotoRecords, lens_of: Ints) -> _Solved:
     component = components(graph, count)
     yaw = chain_headings(graph, count)
     no_offset = np.zeros(count, np.complex128)
-    for round_ in range(max(config.rounds, 1)):
+    for round_ in range(max(_ROUNDS, 1)):
         focal = np.exp(shape.log_focal)
         heights = recorded_heights(records, metres * focal[lens_of])
         by_height = focal_by_height(records, heights, metres, lens_of)
@@ -183,7 +195,7 @@ def _solve(matches: Matches, records: PhotoRecords, lens_of: Ints) -> _Solved:
             graph = similarities(matches, records, shape)
             focal = np.exp(shape.log_focal)
         relative = relative_scales(graph, records, heights, count)
-        tilt_px = np.maximum(config.tilt_sigma_factor * shape.tilt_sigma, tilt_floor) * focal[lens_of]
+        tilt_px = np.maximum(_TILT_SIGMA_FACTOR * shape.tilt_sigma, tilt_floor) * focal[lens_of]
         course, sigma = course_headings(
             graph, records, metres[records.segment] * relative, no_offset, tilt_px[records.segment]
         )
@@ -207,14 +219,13 @@ def _solve(matches: Matches, records: PhotoRecords, lens_of: Ints) -> _Solved:
 
 def shape_of(matches: Matches, records: PhotoRecords, log_focal: Array, log_focal_sigma: Array) -> TiltAndLens:
     """Tilt of each segment and lens, with the priors of its tags; log_focal, log_focal_sigma: float64 (L,), priors."""
-    config = active().initial
     tagged = np.isfinite(records.pitch)
     segments = int(records.segment.max()) + 1
     share = np.array([tagged[records.segment == s].mean() for s in range(segments)])
     tilt_sigma: Array = np.where(
-        share > config.tag_tilt_share,
-        float(np.radians(config.tag_tilt_sigma_deg)),
-        float(np.radians(config.free_tilt_sigma_deg)),
+        share > _TAG_TILT_SHARE,
+        float(np.radians(_TAG_TILT_SIGMA_DEG)),
+        float(np.radians(_FREE_TILT_SIGMA_DEG)),
     )
     return solve_tilt_and_lens(
         matches,
@@ -228,13 +239,13 @@ def shape_of(matches: Matches, records: PhotoRecords, log_focal: Array, log_foca
 
 def _combine(log_focal: Array, sigma: Array, by_height: Array) -> tuple[Array, Array]:
     """Weighted mean of the log focal lengths from tags and from recorded heights, and its sigma; both float64 (L,)."""
-    weight = np.where(np.isfinite(by_height), active().initial.height_focal_sigma ** -2, 0.0)
+    weight = np.where(np.isfinite(by_height), _HEIGHT_FOCAL_SIGMA**-2, 0.0)
     total = sigma**-2 + weight
     return (log_focal * sigma**-2 + weight * np.log(np.where(weight > 0, by_height, 1.0))) / total, total**-0.5
 
 
 def _differs(one: Array, two: Array) -> bool:
-    return bool(np.any(np.isfinite(one) & (np.abs(np.log(one / two)) > active().initial.focal_change)))
+    return bool(np.any(np.isfinite(one) & (np.abs(np.log(one / two)) > _FOCAL_CHANGE)))
 
 
 def _network_priors(
@@ -248,19 +259,18 @@ def _network_priors(
     by_height: Array,
 ) -> NetworkPriors:
     """Priors of the network: segments of one lens share its scale, times their plausible recorded heights."""
-    config = active().initial
-    link, link_sigma = np.ones(len(metres)), np.full(len(metres), config.link_sigma)
+    link, link_sigma = np.ones(len(metres)), np.full(len(metres), _LINK_SIGMA)
     for k in range(len(by_height)):
         rows = lens_of == k
         if np.isfinite(by_height[k]) and np.isfinite(heights.segment[rows]).all():
             link[rows] = heights.segment[rows] / np.median(heights.segment[rows])
-            link_sigma[rows] = config.link_height_sigma
+            link_sigma[rows] = _LINK_HEIGHT_SIGMA
     return NetworkPriors(
         metres=metres,
         relief=relative,
         link=link,
         link_sigma=link_sigma,
-        metres_sigma=config.lens_scale_sigma,
+        metres_sigma=_LENS_SCALE_SIGMA,
         offset_sigma=tilt_px,
         lens=lens_of,
         vehicle=records.vehicle,
@@ -273,9 +283,7 @@ def _fill_headings(
     """Fill unknown headings: from the tag that follows the pictures elsewhere, else from the course flown."""
     yaw = yaw.copy()
     velocity = records.velocity()
-    course = np.where(
-        np.abs(velocity) > active().initial.course_least_m_s, wrap_rad(np.pi / 2 - np.angle(velocity)), np.nan
-    )
+    course = np.where(np.abs(velocity) > _COURSE_LEAST_M_S, wrap_rad(np.pi / 2 - np.angle(velocity)), np.nan)
     guess = np.full(len(yaw), np.nan)
     for v, tag in enumerate(tags):
         rows = records.vehicle == v

@@ -5,12 +5,16 @@ of view of 95 and 105 degrees under one name came out 10 degrees off, heights 24
 """
 
 from dataclasses import replace
+from typing import Final
 
 import numpy as np
 
-from orthoswarm.config import active
 from orthoswarm.refine.initial.initial_orientation import InitialOrientation
 from orthoswarm.refine.initial.planar_similarity import Array, Flags, Ints, PhotoRecords
+
+_UNLIKE_SIGMAS: Final = 2.5  # vehicles' focal lengths that differ by more sigmas are of two lenses
+_UNLIKE_SHARE: Final = 0.06  # ... and by more than this share
+_ONE_WAY_CONCENTRATION: Final = 0.9  # mean unit vector of headings from which shapes give no focal length
 
 
 def lens_per_vehicle(records: PhotoRecords) -> PhotoRecords:
@@ -29,7 +33,7 @@ def split_unlike_lenses(records: PhotoRecords, alone: InitialOrientation) -> Pho
     Returns:
         The same records if no vehicle's focal length differs from that of others with its camera name.
     """
-    one_way = active().initial.one_way_concentration
+    one_way = _ONE_WAY_CONCENTRATION
     vehicles = len(alone.focal)
     name = np.array([int(records.lens[records.vehicle == v][0]) for v in range(vehicles)])
     sure = np.array([abs(np.exp(1j * alone.yaw[records.vehicle == v]).mean()) < one_way for v in range(vehicles)])
@@ -48,7 +52,6 @@ def split_unlike_lenses(records: PhotoRecords, alone: InitialOrientation) -> Pho
 
 def group_focal_lengths(log_focal: Array, sigma: Array, sure: Flags) -> Ints:
     """Group of each vehicle (V,): in order of certainty, with a new group for a value unlike all existing groups."""
-    config = active().initial
     group = np.zeros(len(log_focal), np.int32)
     weight, mean = np.zeros(0), np.zeros(0)
     for v in sorted(range(len(log_focal)), key=lambda v: (not sure[v], sigma[v])):
@@ -57,7 +60,7 @@ def group_focal_lengths(log_focal: Array, sigma: Array, sure: Flags) -> Ints:
         limit = 0.0
         if near >= 0:
             total_sigma = float(np.hypot(sigma[v], weight[near] ** -0.5))
-            limit = max(config.unlike_share, config.unlike_sigmas * total_sigma)
+            limit = max(_UNLIKE_SHARE, _UNLIKE_SIGMAS * total_sigma)
         if near < 0 or (sure[v] and off[near] > limit):
             group[v] = len(mean)
             weight, mean = np.append(weight, sigma[v] ** -2), np.append(mean, log_focal[v])

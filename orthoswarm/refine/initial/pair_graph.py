@@ -7,21 +7,34 @@ of time are matched first, then near ones, then more for photos with few pairs.
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.task_runner import Progress, Run, serial
 from orthoswarm.raster.picture_file import PictureError
 from orthoswarm.refine.features.pair_matching import Pair, consecutive, match_features, nearby
-from orthoswarm.refine.features.sift_features import Features, detect
+from orthoswarm.refine.features.sift_features import SIFT_PIXELS, Features, detect
 from orthoswarm.refine.initial.initial_orientation import InitialOrientation, find_initial_orientation
 from orthoswarm.refine.initial.planar_similarity import Ints, PhotoRecords
 
 Gray = NDArray[np.uint8]
 ReadGray = Callable[[Frame], Gray]
+
+_SIFT_FINE_PIXELS: Final = 640 * 480  # pixels of reduced pictures that matched too few others (four real flights)
+_PAIR_REACH_SHARE: Final = 0.68
+"""Photos nearer than this share of the footprint's diagonal may overlap (chosen on four real flights)."""
+_WEAK_REACH_SHARE: Final = 0.8  # the same for photos with few matches
+_PAIRS_FIRST: Final = 3  # neighbours that each photo tries first, before the tilt is known
+_PAIRS_USUAL: Final = 6  # ... and then
+_PAIRS_MORE: Final = 12  # ... and for photos with few pairs
+_ENOUGH_PAIRS: Final = 5  # photos with fewer pairs try more neighbours
+_WEAK_PAIRS: Final = 2  # photos with fewer pairs get finer features (chosen on four real flights)
+_WEAK_MATCHES: Final = 40  # ... and those with fewer matches in all (chosen on four real flights)
+_PAIRS_PER_TASK: Final = 64  # pairs that a worker matches at a time (for speed alone)
+_HEADER_SIZE_SHARE: Final = 0.02  # a picture's shape may differ from its header's by so much
 
 
 @dataclass(slots=True, kw_only=True)
@@ -48,12 +61,12 @@ class PairGraphBuilder:
     def detect_all(self) -> None:
         """Find the features of all photos."""
         self.features = [Features.none(f.width, f.height) for f in self.frames]
-        self._detect(list(range(len(self.frames))), active().features.sift_pixels)
+        self._detect(list(range(len(self.frames))), SIFT_PIXELS)
 
     def try_pairs(self, pairs: Ints) -> None:
         """Match the pairs that have not been tried yet."""
         fresh = [(int(a), int(b)) for a, b in pairs if (int(a), int(b)) not in self.tried]
-        size = active().initial.pairs_per_task
+        size = _PAIRS_PER_TASK
         chunks = [fresh[k : k + size] for k in range(0, len(fresh), size)]
         tasks = [(chunk, {k: self.features[k] for pair in chunk for k in pair}) for chunk in chunks]
         done = 0
@@ -87,7 +100,7 @@ class PairGraphBuilder:
 
     def redetect(self, weak: NDArray[np.bool_]) -> None:
         """Detect features of weakly connected photos again on larger pictures, and drop their pairs."""
-        self._detect(np.flatnonzero(weak).tolist(), active().features.sift_fine_pixels)
+        self._detect(np.flatnonzero(weak).tolist(), _SIFT_FINE_PIXELS)
         self.tried = {pair: m for pair, m in self.tried.items() if not (weak[pair[0]] or weak[pair[1]])}
 
     def _detect(self, photos: list[int], pixels: int) -> None:
@@ -112,7 +125,7 @@ def features_of(frame: Frame, *, read_gray: ReadGray, pixels: int) -> Features |
     except PictureError as error:
         return error.reason
     rows, columns = gray.shape
-    if abs(columns * frame.height - rows * frame.width) > active().initial.header_size_share * columns * frame.height:
+    if abs(columns * frame.height - rows * frame.width) > _HEADER_SIZE_SHARE * columns * frame.height:
         return f"{frame.image} is {columns}x{rows}, not as its header says; copy it again"
     return detect(gray, frame.width, frame.height, pixels)
 
@@ -125,24 +138,23 @@ def match_chunk(task: tuple[list[tuple[int, int]], dict[int, Features]]) -> list
 
 def build_pair_graph(builder: PairGraphBuilder) -> InitialOrientation:
     """Find features, pairs and start values of all photos; the results are in the returned builder."""
-    config = active().initial
     records = builder.records
     builder.detect_all()
     builder.try_pairs(consecutive(records.vehicle, records.time_s))
     start = builder.start()
-    for count in (config.pairs_first, config.pairs_usual):
-        builder.try_pairs(builder.near(start, count, config.pair_reach_share))
+    for count in (_PAIRS_FIRST, _PAIRS_USUAL):
+        builder.try_pairs(builder.near(start, count, _PAIR_REACH_SHARE))
         start = builder.start()
-    few = builder.degree()[0] < config.enough_pairs
+    few = builder.degree()[0] < _ENOUGH_PAIRS
     if few.any():
-        builder.try_pairs(builder.near(start, config.pairs_more, config.pair_reach_share, few))
+        builder.try_pairs(builder.near(start, _PAIRS_MORE, _PAIR_REACH_SHARE, few))
         start = builder.start()
     pairs, matches = builder.degree()
-    weak = (pairs < config.weak_pairs) | (matches < config.weak_matches)
+    weak = (pairs < _WEAK_PAIRS) | (matches < _WEAK_MATCHES)
     weak[list(builder.damaged)] = False
     if weak.any():
         builder.redetect(weak)
-        builder.try_pairs(builder.near(start, config.pairs_more, config.weak_reach_share, weak))
+        builder.try_pairs(builder.near(start, _PAIRS_MORE, _WEAK_REACH_SHARE, weak))
         builder.try_pairs(consecutive(records.vehicle, records.time_s))
         start = builder.start()
     return start

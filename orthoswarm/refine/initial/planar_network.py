@@ -6,15 +6,25 @@ does a wrong position; as photos have several neighbours, the two can be disting
 """
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import splu
 
-from orthoswarm.config import active
+from orthoswarm.refine.bundle.priors import LAG_SIGMA_S
 from orthoswarm.refine.initial.planar_similarity import Array, Complex, Flags, Ints, PairGraph, PhotoRecords
+
+_NETWORK_SCHEDULE: Final = (400.0, 400.0, 36.0, 9.0, 9.0)
+"""Robust schedule of pairs and recorded positions (chosen on four real flights)."""
+NETWORK_GATE_SIGMAS: Final = 5.0
+"""Pairs and recorded positions farther off the network are wrong (chosen on four real flights)."""
+_PAIR_SIGMA_M: Final = 0.6  # sigma of a pair's vector (chosen on four real flights)
+_PAIR_SIGMA_SHARE: Final = 0.05
+"""... and this share of the distance of its matches from the nadirs (chosen on four real flights)."""
+LAG_SPREAD_S: Final = 0.3  # scatter of the delay of recorded positions along the way (chosen on four real flights)
+_NETWORK_STILL_M_S: Final = 0.1  # a slower vehicle has no direction along the way
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -127,7 +137,6 @@ def solve_network(graph: PairGraph, records: PhotoRecords, yaw: Array, beliefs: 
         yaw: float64 (N,), grid headings.
         beliefs: priors of the common unknowns.
     """
-    config = active().initial
     at = _Columns(len(records), len(beliefs.metres), int(beliefs.lens.max()) + 1, int(beliefs.vehicle.max()) + 1)
     rows = _Rows(at.size)
     _pair_rows(rows, at, graph, records=records, unit=np.exp(-1j * yaw), b=beliefs)
@@ -138,7 +147,7 @@ def solve_network(graph: PairGraph, records: PhotoRecords, yaw: Array, beliefs: 
     x[: 2 * at.photos] = np.r_[records.position.real, records.position.imag]
     x[at.metres : at.offset] = beliefs.metres
     pairs, photos = len(graph), at.photos
-    for c in config.network_schedule:
+    for c in _NETWORK_SCHEDULE:
         residual = (rhs - matrix @ x)[: 2 * (pairs + photos)]
         weight = np.ones(len(rhs))
         weight[: 2 * pairs] = np.tile(_robust(residual[: 2 * pairs], c), 2)
@@ -156,8 +165,8 @@ def solve_network(graph: PairGraph, records: PhotoRecords, yaw: Array, beliefs: 
         offset=(q[0] + 1j * q[1]) / metres,
         offset_sigma=_sigmas(factor, at).max(0) / metres,
         lag=lag,
-        pair_ok=_norm(residual[: 2 * pairs]) < config.network_gate_sigmas,
-        gps_ok=_norm(residual[2 * pairs : 2 * (pairs + photos)]) < config.network_gate_sigmas,
+        pair_ok=_norm(residual[: 2 * pairs]) < NETWORK_GATE_SIGMAS,
+        gps_ok=_norm(residual[2 * pairs : 2 * (pairs + photos)]) < NETWORK_GATE_SIGMAS,
         gps_residual=records.position + lag[beliefs.vehicle] * velocity - (x[:photos] + 1j * x[photos : 2 * photos]),
     )
 
@@ -184,12 +193,11 @@ def _pair_rows(
     rows: _Rows, at: _Columns, graph: PairGraph, *, records: PhotoRecords, unit: Complex, b: NetworkPriors
 ) -> None:
     """East, then north rows of all pairs."""
-    config = active().initial
     i, j = graph.first, graph.second
     si, sj = records.segment[i], records.segment[j]
     ui, uj = unit[i] * b.relief[i], unit[j] * b.relief[j]
     reach = np.abs(b.metres[si] * graph.centre_first) + np.abs(b.metres[sj] * graph.centre_second)
-    sigma = np.asarray(config.pair_sigma_m + config.pair_sigma_share * reach)
+    sigma = np.asarray(_PAIR_SIGMA_M + _PAIR_SIGMA_SHARE * reach)
     for part, axis in ((0, 1.0 + 0j), (1, -1j)):  # the real part of axis * value: east, then north
         east = part * at.photos
         rows.block(
@@ -207,13 +215,12 @@ def _pair_rows(
 
 def _gps_rows(rows: _Rows, at: _Columns, records: PhotoRecords, vehicle: Ints) -> Complex:
     """Rows of recorded positions along and across the course: P - lag v = recorded; returns v (N,)."""
-    config = active().initial
     velocity = records.velocity()
     speed = np.abs(velocity)
-    ahead = np.where(speed > config.network_still_m_s, velocity / np.maximum(speed, 1e-9), 1.0)
+    ahead = np.where(speed > _NETWORK_STILL_M_S, velocity / np.maximum(speed, 1e-9), 1.0)
     across = records.gps_sigma()
     photo = np.arange(at.photos)
-    for axis, sigma in ((ahead, np.hypot(across, config.lag_spread_s * speed)), (1j * ahead, across)):
+    for axis, sigma in ((ahead, np.hypot(across, LAG_SPREAD_S * speed)), (1j * ahead, across)):
         rows.block(
             (records.position * np.conj(axis)).real / sigma,
             (photo, axis.real / sigma),
@@ -231,4 +238,4 @@ def _prior_rows(rows: _Rows, at: _Columns, b: NetworkPriors) -> None:
         rows.block(np.zeros(at.segments), (at.offset + part + segment, 1.0 / (b.offset_sigma * b.metres)))
     expected = np.array([np.median((b.metres / b.link)[b.lens == k]) for k in range(at.lenses)])
     rows.block(np.full(at.lenses, 1.0 / b.metres_sigma), (at.lens + lens, 1.0 / (b.metres_sigma * expected)))
-    rows.block(np.zeros(at.vehicles), (at.lag + vehicle, 1.0 / active().records.lag_sigma_s))
+    rows.block(np.zeros(at.vehicles), (at.lag + vehicle, 1.0 / LAG_SIGMA_S))

@@ -5,6 +5,7 @@ the ground point P + m exp(-i yaw) z: P straight below, m metres per pixel, yaw 
 """
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,11 +13,20 @@ from numpy.typing import NDArray
 from orthoswarm.config import active
 from orthoswarm.model.camera import NADIR_PITCH_RAD, rotation_from_angles
 from orthoswarm.refine.features.sift_features import Features
+from orthoswarm.trajectory.legs import PAUSE_S
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 Ints = NDArray[np.int32]
 Flags = NDArray[np.bool_]
+
+_TURN_SIGMA_DEG: Final = 1.0  # sigma of the turn between two photos by relief and tilt
+_TURN_MISFIT_SIGMAS: Final = 3.0  # ... and so many times the misfit over the spread, by the root of matches
+_TAG_TILT_LIMIT_DEG: Final = 45.0  # recorded tilt beyond this is not a start: such a photo could not be matched anyway
+_STATED_SIGMA_FLOOR_M: Final = 0.1  # least sigma of a position whose source states one: an antenna is not a camera
+_VELOCITY_LEAST_S: Final = 0.05  # photos nearer in time give no velocity
+_VELOCITY_LIMIT_M_S: Final = 40.0  # faster is a leap of the record (faster than small drones fly)
+_VELOCITY_TURN_SHARE: Final = 0.5  # a larger difference of velocities before and after is a turn
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,35 +67,35 @@ class PhotoRecords:
 
     def gps_sigma(self) -> Array:
         """One sigma of the recorded positions in metres, (N,): as stated (with a floor), else as configured."""
-        stated = np.hypot(self.position_sigma, active().initial.stated_sigma_floor_m)
+        stated = np.hypot(self.position_sigma, _STATED_SIGMA_FLOOR_M)
         return np.asarray(np.where(np.isfinite(stated), stated, active().records.position_sigma_m))
 
     def velocity(self) -> Complex:
         """Ground velocity, complex (N,) m/s, from the neighbours in the segment; 0 at turns and where unknown."""
-        config, pause_s = active().initial, active().records.pause_s
+        pause_s = PAUSE_S
         v = np.zeros(len(self), np.complex128)
         for s in np.unique(self.segment):
             rows = np.flatnonzero(self.segment == s)
             dt, dp = np.diff(self.time_s[rows]), np.diff(self.position[rows])
-            good = (dt > config.velocity_least_s) & (dt < pause_s) & (np.abs(dp) < config.velocity_limit_m_s * dt)
+            good = (dt > _VELOCITY_LEAST_S) & (dt < pause_s) & (np.abs(dp) < _VELOCITY_LIMIT_M_S * dt)
             leap = np.where(good, dp / np.where(good, dt, 1.0), np.nan)
             sides = np.stack([np.r_[np.nan, leap], np.r_[leap, np.nan]])
             known = np.isfinite(sides)
             mean = np.where(known, sides, 0.0).sum(0) / np.maximum(known.sum(0), 1)
             larger = np.abs(np.where(known, sides, 0.0)).max(0)
-            turn = known.all(0) & (np.abs(sides[0] - sides[1]) > config.velocity_turn_share * larger)
+            turn = known.all(0) & (np.abs(sides[0] - sides[1]) > _VELOCITY_TURN_SHARE * larger)
             v[rows] = np.where(turn, 0.0, mean)
         return v
 
     def tag_level(self) -> Array:
         """Rotations camera to level camera by the tilt tags, float64 (N, 3, 3); the identity where there are none.
 
-        Tilts beyond `tag_tilt_limit_deg` are ignored: such a picture could not be matched anyway.
+        Tilts beyond `_TAG_TILT_LIMIT_DEG` are ignored: such a picture could not be matched anyway.
         """
         pitch = np.where(np.isfinite(self.pitch), self.pitch, NADIR_PITCH_RAD)
         roll = np.where(np.isfinite(self.roll), self.roll, 0.0)
         level = _from_level(0.0).T @ rotation_from_angles(0.0, pitch, roll)
-        level[level[:, 2, 2] < np.cos(float(np.radians(active().initial.tag_tilt_limit_deg)))] = np.eye(3)
+        level[level[:, 2, 2] < np.cos(float(np.radians(_TAG_TILT_LIMIT_DEG)))] = np.eye(3)
         return np.asarray(level)
 
 
@@ -116,12 +126,11 @@ class PairGraph:
     @property
     def turn_sigma(self) -> Array:
         """One sigma of the turn, radians (E,): larger for few, close or ill-fitting matches."""
-        config = active().initial
         arm = np.maximum(self.spread * np.abs(self.factor), 1.0)
         return np.asarray(
             np.hypot(
-                np.radians(config.turn_sigma_deg),
-                config.turn_misfit_sigmas * self.residual / (arm * np.sqrt(self.count)),
+                np.radians(_TURN_SIGMA_DEG),
+                _TURN_MISFIT_SIGMAS * self.residual / (arm * np.sqrt(self.count)),
             )
         )
 

@@ -1,6 +1,7 @@
 """Ground scale of photos and segments from the distance flown, the scale between photos and recorded heights."""
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,23 @@ from scipy.sparse.linalg import spsolve
 from orthoswarm.config import active
 from orthoswarm.model.camera import fov_rad
 from orthoswarm.refine.initial.planar_similarity import Array, Flags, Ints, PairGraph, PhotoRecords
+
+_HINT_FOV_DEG: Final = (30.0, 120.0)  # fields of view of lenses that exist
+_HINT_SIGMA: Final = 0.06  # relative sigma of a focal length by tags
+_DEFAULT_FOV_SIGMA: Final = 0.35  # relative sigma of the default focal length
+_SCALE_LEAST_WAY_M: Final = 3.0  # a pair whose positions are nearer gives no scale
+_SCALE_LEAST_SHIFT_SHARE: Final = 0.02  # ... nor one whose pictures shift by less than this share of the width
+_SCALE_TURN_COSINE: Final = 0.9  # cosine of the turn up to which a pair's shift hardly depends on the tilt
+_SCALE_LENS_PAIRS: Final = 3  # with fewer such pairs of a lens, all its pairs count
+_SCALE_SEGMENT_PAIRS: Final = 5  # from so many such pairs on a segment has a scale of its own
+_SCALE_SCHEDULE: Final = (100.0, 25.0, 9.0, 9.0)  # robust schedule of the photos' relative scales
+_ZOOM_SIGMA: Final = 0.02  # relative sigma of the zoom between two photos by relief
+_ZOOM_MISFIT_SIGMAS: Final = 3.0  # ... and so many times the misfit over the spread, by the root of matches
+_RELATIVE_HEIGHT_SIGMA: Final = 0.03  # relative sigma of a recorded height within its segment
+_RELATIVE_LEVEL_SIGMA: Final = 0.15  # the same of a photo without one: about as level as its segment
+_HEIGHT_KNOWN_SHARE: Final = 0.5  # share of a segment's photos that must record a height
+_HEIGHT_LEAST_M: Final = 2.0  # a median recorded height below this is that of a takeoff or none
+_HEIGHT_RATIO: Final = 5.0  # a height beyond this factor of its segment's, either way, is dropped
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,14 +52,13 @@ def recorded_heights(records: PhotoRecords, above: Array) -> RecordedHeights:
         records: of N photos.
         above: float64 (S,), height of each segment above the ground as known so far (altitudes give differences only).
     """
-    config = active().initial
-    share, least, most = config.height_known_share, 1.0 / config.height_ratio, config.height_ratio
+    share, least, most = _HEIGHT_KNOWN_SHARE, 1.0 / _HEIGHT_RATIO, _HEIGHT_RATIO
     relative = np.full(len(records), np.nan)
     level = np.full(len(above), np.nan)
     for s in range(len(above)):
         rows = records.segment == s
         h, a = records.height_m[rows], records.altitude_m[rows]
-        if np.isfinite(h).sum() > share * rows.sum() and np.nanmedian(h) > config.height_least_m:
+        if np.isfinite(h).sum() > share * rows.sum() and np.nanmedian(h) > _HEIGHT_LEAST_M:
             level[s] = float(np.nanmedian(h))
             ratio = h / level[s]
         elif np.isfinite(a).sum() > share * rows.sum():
@@ -67,19 +84,19 @@ def first_scale(graph: PairGraph, records: PhotoRecords, lens_of: Ints, focal: A
         lens_of: int32 (S,), lens of each segment.
         focal: float64 (L,), pixels, as known so far.
     """
-    config, default_m = active().initial, active().records.default_height_m
+    default_m = active().records.default_height_m
     i, j = graph.first, graph.second
     way = np.abs(records.position[j] - records.position[i])
     shift = np.abs(graph.centre_first - np.conj(graph.turn) * graph.centre_second)
-    same = (records.lens[i] == records.lens[j]) & (way > config.scale_least_way_m)
-    same &= shift > config.scale_least_shift_share * records.width[i]
-    straight = same & (graph.turn.real > config.scale_turn_cosine)
+    same = (records.lens[i] == records.lens[j]) & (way > _SCALE_LEAST_WAY_M)
+    same &= shift > _SCALE_LEAST_SHIFT_SHARE * records.width[i]
+    straight = same & (graph.turn.real > _SCALE_TURN_COSINE)
     by_lens, measured = np.full(len(focal), np.nan), np.zeros(len(focal), bool)
     recorded = recorded_heights(records, np.full(len(lens_of), default_m)).segment
     for k in range(len(focal)):
         mine = records.lens[i] == k
         rows = np.flatnonzero(straight & mine)
-        rows = rows if len(rows) >= config.scale_lens_pairs else np.flatnonzero(same & mine)
+        rows = rows if len(rows) >= _SCALE_LENS_PAIRS else np.flatnonzero(same & mine)
         if len(rows):
             by_lens[k], measured[k] = weighted_median(way[rows] / shift[rows], way[rows]), True
         else:
@@ -88,7 +105,7 @@ def first_scale(graph: PairGraph, records: PhotoRecords, lens_of: Ints, focal: A
     metres = by_lens[lens_of]
     for s in range(len(lens_of)):
         rows = np.flatnonzero(straight & (records.segment[i] == s) & (records.segment[j] == s))
-        if len(rows) >= config.scale_segment_pairs:
+        if len(rows) >= _SCALE_SEGMENT_PAIRS:
             metres[s] = weighted_median(way[rows] / shift[rows], way[rows])
     return np.asarray(metres), measured
 
@@ -98,18 +115,17 @@ def relative_scales(graph: PairGraph, records: PhotoRecords, heights: RecordedHe
 
     One robust adjustment of the scales within each segment, with the recorded heights as priors.
     """
-    config = active().initial
     i, j = graph.first, graph.second
     inside = np.flatnonzero(records.segment[i] == records.segment[j])
     i, j = i[inside], j[inside]
     zoom = np.log(np.maximum(np.abs(graph.factor[inside]), 1e-6))
     misfit = graph.residual[inside] / np.maximum(graph.spread[inside] * np.exp(zoom), 1.0)
-    sigma = np.hypot(config.zoom_sigma, config.zoom_misfit_sigmas * misfit / np.sqrt(graph.count[inside]))
+    sigma = np.hypot(_ZOOM_SIGMA, _ZOOM_MISFIT_SIGMAS * misfit / np.sqrt(graph.count[inside]))
     prior = np.log(heights.relative)
-    prior_sigma = np.where(heights.known, config.relative_height_sigma, config.relative_level_sigma)
+    prior_sigma = np.where(heights.known, _RELATIVE_HEIGHT_SIGMA, _RELATIVE_LEVEL_SIGMA)
     x = prior.copy()
     k = np.arange(len(inside))
-    for c in config.scale_schedule:
+    for c in _SCALE_SCHEDULE:
         e = (zoom - (x[i] - x[j])) / sigma
         d = (prior - x) / prior_sigma
         # both sides of each row are multiplied by the square root of its Geman-McClure weight
@@ -126,7 +142,7 @@ def relative_scales(graph: PairGraph, records: PhotoRecords, heights: RecordedHe
 
 def focal_by_height(records: PhotoRecords, heights: RecordedHeights, metres: Array, lens_of: Ints) -> Array:
     """Focal length of each lens in pixels, height over metres per pixel; NaN where no such lens exists."""
-    narrowest, widest = np.radians(active().initial.hint_fov_deg)
+    narrowest, widest = np.radians(_HINT_FOV_DEG)
     focal = np.full(len(records.fov_hint), np.nan)
     for k in range(len(focal)):
         rows = (lens_of == k) & np.isfinite(heights.segment)
@@ -140,12 +156,12 @@ def focal_by_height(records: PhotoRecords, heights: RecordedHeights, metres: Arr
 def focal_by_hint(records: PhotoRecords) -> tuple[Array, Array]:
     """Log focal length (pixels) of each lens from its tags or the default, and its sigma; both float64 (L,)."""
     config = active().initial
-    narrowest, widest = np.radians(config.hint_fov_deg)
+    narrowest, widest = np.radians(_HINT_FOV_DEG)
     width = np.array([records.width[records.lens == k][0] for k in range(len(records.fov_hint))])
     with np.errstate(invalid="ignore"):
         good = (records.fov_hint > narrowest) & (records.fov_hint < widest)
     view = np.where(good, records.fov_hint, float(np.radians(config.default_fov_deg)))
-    return np.log(0.5 * width / np.tan(0.5 * view)), np.where(good, config.hint_sigma, config.default_fov_sigma)
+    return np.log(0.5 * width / np.tan(0.5 * view)), np.where(good, _HINT_SIGMA, _DEFAULT_FOV_SIGMA)
 
 
 def weighted_median(value: Array, weight: Array) -> float:

@@ -8,12 +8,12 @@ Gauss-Newton on the residuals after each pair's own similarity is projected out 
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel, kernel
-from orthoswarm.config import active
 from orthoswarm.refine.features.pair_matching import Pair
 from orthoswarm.refine.features.sift_features import Features
 from orthoswarm.refine.initial.planar_similarity import (
@@ -25,6 +25,17 @@ from orthoswarm.refine.initial.planar_similarity import (
     centred,
     level_from_nadir,
 )
+
+_SHAPE_ITERATIONS: Final = 12  # most Gauss-Newton iterations (they end earlier)
+_SHAPE_SETTLED: Final = 1e-3  # a largest step below this, radians or relative, ends them
+_SHAPE_MOST_MATCHES: Final = 64  # matches of a pair that are used, evenly picked (its cost)
+_SHAPE_INDEPENDENT_SHARE: Final = 0.05  # share of the matches that are independent
+_SHAPE_FLOOR_SHARE: Final = 1e-3  # least misfit of a pair, as a share of the picture's width
+_SHAPE_TILT_STEP_RAD: Final = 0.15  # largest change of a tilt in one iteration
+_SHAPE_BEND_LIMIT: Final = 0.3  # largest radial distortion at the picture's corner, as a share of the radius
+_SHAPE_BEND_SIGMA: Final = 0.06  # prior sigma of that distortion
+_SHAPE_ROUNDS: Final = 4  # reweightings of a pair's similarity
+_SHAPE_ROBUST_SCALE: Final = 2.0  # a match's weight falls to a quarter at so many median misfits
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,7 +57,7 @@ class Matches:
     @classmethod
     def of(cls, pairs: Sequence[Pair], features: Sequence[Features]) -> "Matches":
         """Collect the matches, evenly thinned where a pair has many."""
-        most = active().initial.shape_most_matches
+        most = _SHAPE_MOST_MATCHES
         z = [centred(f) for f in features]
         picked = [p.match[spaced(len(p.match), most)] for p in pairs]
         start = np.concatenate([[0], np.cumsum([len(m) for m in picked], dtype=np.int64)])
@@ -105,18 +116,17 @@ def solve_tilt_and_lens(
         log_focal_sigma: float64 (L,), its one sigma.
         tilt_sigma: float64 (S,), one sigma of the tilt about that of `level`, radians.
     """
-    config = active().initial
     segments, lenses = int(records.segment.max()) + 1, len(log_focal)
     size = 2 * segments + 2 * lenses
     sigma = np.concatenate(
-        [np.repeat(tilt_sigma, 2), np.stack([log_focal_sigma, np.full(lenses, config.shape_bend_sigma)], 1).ravel()]
+        [np.repeat(tilt_sigma, 2), np.stack([log_focal_sigma, np.full(lenses, _SHAPE_BEND_SIGMA)], 1).ravel()]
     )
     total = np.zeros(size)
     first_misfit = float("nan")
     level = level.copy()
     lens = np.stack([log_focal, np.zeros(lenses), corner_radius(records) ** 2], axis=1)
     normal, misfit = np.zeros((size, size)), np.zeros(len(matches.first))
-    for _ in range(config.shape_iterations):
+    for _ in range(_SHAPE_ITERATIONS):
         normal, gradient = np.zeros((size, size)), np.zeros(size)
         _accumulate(
             first=matches.first,
@@ -128,25 +138,25 @@ def solve_tilt_and_lens(
             lens=lens,
             lens_id=records.lens,
             segment=records.segment,
-            floor=config.shape_floor_share * records.width,
-            rounds=config.shape_rounds,
-            robust=config.shape_robust_scale,
+            floor=_SHAPE_FLOOR_SHARE * records.width,
+            rounds=_SHAPE_ROUNDS,
+            robust=_SHAPE_ROBUST_SCALE,
             normal=normal,
             gradient=gradient,
             misfit=misfit,
         )
         if np.isnan(first_misfit) and len(misfit):
             first_misfit = float(np.median(misfit))
-        normal = config.shape_independent_share * normal + np.diag(sigma**-2)
-        step = np.linalg.solve(normal, config.shape_independent_share * gradient - total / sigma**2)
-        step *= min(1.0, config.shape_tilt_step_rad / float(np.abs(step[: 2 * segments]).max(initial=1e-9)))
+        normal = _SHAPE_INDEPENDENT_SHARE * normal + np.diag(sigma**-2)
+        step = np.linalg.solve(normal, _SHAPE_INDEPENDENT_SHARE * gradient - total / sigma**2)
+        step *= min(1.0, _SHAPE_TILT_STEP_RAD / float(np.abs(step[: 2 * segments]).max(initial=1e-9)))
         total += step
         for s in range(segments):
             rows = records.segment == s
             level[rows] = level_from_nadir(complex(step[2 * s], step[2 * s + 1]), 1.0) @ level[rows]
         lens[:, :2] += step[2 * segments :].reshape(-1, 2)
-        lens[:, 1] = np.clip(lens[:, 1], -config.shape_bend_limit, config.shape_bend_limit)
-        if np.abs(step).max() < config.shape_settled:
+        lens[:, 1] = np.clip(lens[:, 1], -_SHAPE_BEND_LIMIT, _SHAPE_BEND_LIMIT)
+        if np.abs(step).max() < _SHAPE_SETTLED:
             break
     deviation = np.sqrt(np.diag(np.linalg.inv(normal)))
     last_misfit = float(np.median(misfit)) if len(misfit) else float("nan")
@@ -162,7 +172,6 @@ def solve_tilt_and_lens(
 
 def similarities(matches: Matches, records: PhotoRecords, shape: TiltAndLens) -> PairGraph:
     """The similarity of every pair between its level, undistorted pictures."""
-    config = active().initial
     pairs = len(matches.first)
     table = np.zeros((pairs, 5), np.complex128)
     radius = corner_radius(records)
@@ -176,9 +185,9 @@ def similarities(matches: Matches, records: PhotoRecords, shape: TiltAndLens) ->
         level=shape.level,
         lens=lens,
         lens_id=records.lens,
-        floor=config.shape_floor_share * records.width,
-        rounds=config.shape_rounds,
-        robust=config.shape_robust_scale,
+        floor=_SHAPE_FLOOR_SHARE * records.width,
+        rounds=_SHAPE_ROUNDS,
+        robust=_SHAPE_ROBUST_SCALE,
         table=table,
     )
     return PairGraph(

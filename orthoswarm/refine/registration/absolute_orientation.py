@@ -1,6 +1,7 @@
 """Absolute orientation of one vehicle: tie points on the map, links between legs, and the adjustment with both."""
 
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,17 +10,67 @@ from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.placement import MapWindow
 from orthoswarm.model.robust import mad_sigma
-from orthoswarm.refine.bundle.adjustment import Adjustment, MapTies
+from orthoswarm.refine.bundle.adjustment import TRACK_ROBUST_C, Adjustment, MapTies
 from orthoswarm.refine.bundle.block_arrays import Tracks
 from orthoswarm.refine.bundle.observation_selection import one_per_cell
 from orthoswarm.refine.flight.relative_block import Flight
 from orthoswarm.refine.registration.coarse_registration import shift_cameras
 from orthoswarm.refine.registration.map_windows import LoadedMap
-from orthoswarm.refine.registration.tie_points import MapMatches, link_legs, match_points
+from orthoswarm.refine.registration.tie_points import LINK_VIEW_WEIGHT, LINK_VIEWS, MapMatches, link_legs, match_points
 from orthoswarm.refine.surface.ground_densification import refit_ground
 from orthoswarm.refine.surface.vehicle_ground import GroundModel
 
 Array = NDArray[np.float64]
+
+_PICTURE_GSD_SHARE: Final = 1.07  # ground pixel in which pictures are compared with each other, in pixels at nadir
+_MAP_GSD_M: Final = (0.25, 2.0)  # limits of the ground pixel for the map where pictures are finer than the next field
+_MAP_GSD_FINE_M: Final = 0.4  # pictures of finer pixels are compared at the coarser of their and the map's
+_MAP_GSD_COARSE_M: Final = 0.5  # least ground pixel for all other pictures
+_MAP_MARGIN_SHARE: Final = 1.1  # the map is read so many half diagonals beyond the cameras (pictures tilt) ...
+_MAP_MARGIN_M: Final = 40.0  # ... and this: the search and a patch
+_TIE_VIEWS: Final = 3  # fewest pictures that show a point which is compared with the map ...
+_TIE_VIEWS_SPARSE: Final = 2  # ... and of photos that are matched in pairs
+_TIE_VIEW_WEIGHT: Final = 0.4  # least mean robust weight of its observations
+_TIE_HEIGHT_M: Final = 3.0  # points farther above or below the ground are not compared: what is around them leans
+_TIE_HALF_SHARE: Final = 0.1
+"""Half a patch, as a share of the flying height. Measured with half patches of 10, 13, 16 and 20 m from 150 m: on maps
+of another date (benchmarks/accuracy/other_dates.py) errors fall up to 16 m, on relief of 25 m they stay ..."""
+_TIE_HALF_LIMITS_M: Final = (10.0, 20.0)
+"""... within these limits (what is on the ground does not grow with the flying height)."""
+TIE_HALF_PX: Final = 8  # ... and at least so many pixels
+TIE_REACH_PX: Final = 4  # least search, pixels, where a search in metres is less
+FIRST_TIE_REACH_M: Final = 14.0  # search for a tie point after the coarse registration, to each side
+TIE_REACH_M: Final = 5.0  # the same once the flight lies on the map
+_FIRST_TIE_CELL_SPARSE_M: Final = 25.0  # first ties of photos matched in pairs: one in each cell of this size
+_TIE_CELL_SPARSE_M: Final = 15.0  # later ties of photos matched in pairs: one in each cell of this size
+_TIE_PEAK: Final = 0.2  # least correlation of a tie point
+_TIE_RATIO: Final = 0.75  # largest ratio of the second peak to the first
+_TIE_SIGMA_M: Final = 0.35  # sigma of a tie point, an axis, before their residuals tell it
+_TIE_SIGMA_LIMITS_M: Final = (0.1, 1.0)  # limits of the sigma by their residuals
+_TIE_FEWEST_FOR_SIGMA: Final = 20  # fewer residuals tell no sigma
+_EDGE_FEWEST: Final = 60  # fewer tie points do not tell how far strong edges are displaced from texture
+_EDGE_MOST: Final = 300  # more are not compared (cost)
+_EDGE_SEARCH_M: Final = 2.5  # how far the edges of tie points are searched: the flight is decimetres off by then (cost)
+_EDGE_REACH_M: Final = 1.0  # differences farther than this from their median are gross errors
+_MODE_M: Final = 0.7  # the shift that most tie points agree on has most others within this distance
+_MODE_SCALES_M: Final = (0.5, 0.5, 0.35, 0.25, 0.25)  # scales of the reweighted means that refine it
+_LINE_SCALES_M: Final = (4.0, 2.0, 1.0, 0.7, 0.5, 0.5)  # the same for the line of shifts along a leg
+_LINE_FEWEST: Final = 6  # fewest tie points of a leg that must agree on such a line ...
+_LINE_LEAST_SHARE: Final = 0.6  # ... and the least share of its tie points
+_LINE_AGREES_M: Final = 0.7  # tie points this near to the line agree with it
+_LINE_APART_M: Final = 0.7  # a leg whose line is nowhere farther from the common shift is moved by the common shift
+_FIRST_TIE_SCALES: Final = (36.0, 9.0, 6.0, 6.0)  # robust scales of the first tie points in its steps
+TIE_SCALES: Final = (9.0, 6.0)  # the same of the next ones, in the first step and in all others
+_SECOND_STEPS: Final = 3  # steps with the second tie points
+_RENEWED_STEPS: Final = 4  # steps with renewed tie points, of a flight on the map after two with the old ones
+_ROOF_VIEWS: Final = 6  # fewest pictures that show a raised point
+_ROOF_VIEW_WEIGHT: Final = 0.5  # least mean robust weight of its observations
+_ROOF_HEIGHTS_M: Final = (4.0, 40.0)  # heights over the ground: a floor, and what is probably a wrong track
+_ROOF_CELL_M: Final = 30.0  # one roof a leg in each cell of this size (cost)
+_ROOF_HALF_M: Final = 7.5  # half a patch: about a roof
+_ROOF_REACH_M: Final = 11.0  # how far it is searched: maps lean by up to 0.3 m a metre
+_ROOF_RATIO: Final = 0.85  # largest ratio of the second peak to the first; the vote sorts out wrong ones
+_LINK_SIGMA_PX: Final = 0.7  # sigma of a link to another leg, working pixels
 
 
 @dataclass(slots=True)
@@ -43,9 +94,8 @@ def load_map(flight: Flight, basemap: MapWindow, origin: Array, gsd_m: float) ->
     """The map under a vehicle's pictures, with a margin for the search."""
     cameras = flight.cameras()
     height = float(np.median(cameras.position[:, 2]))
-    config = active().registration
     diagonal = float(np.hypot(*flight.pictures.size)) / 2 / float(cameras.lens[0, 0])
-    reach = config.map_margin_share * height * diagonal + config.map_margin_m
+    reach = _MAP_MARGIN_SHARE * height * diagonal + _MAP_MARGIN_M
     return LoadedMap.load(basemap, origin, BoundingBox.around_points(cameras.position[:, :2], reach), gsd_m)
 
 
@@ -68,13 +118,12 @@ def tie_matches(
         cell_m: side of a cell. reach_m: search to each side. half_m: half a patch, None: as `tie_half_m`. All metres.
         pictures: bool (N,), the ones to compare, None for all.
     """
-    config = active().registration
     adj = flight.adjustment
     seen = flight.best_views(pictures)
     height = adj.points[:, 2] - surface.height(adj.points[:, :2])
-    fewest = config.tie_views_sparse if flight.sparse else config.tie_views
-    usable = (seen.camera >= 0) & (seen.count >= fewest) & (seen.mean_weight > config.tie_view_weight)
-    usable &= np.abs(height) < config.tie_height_m
+    fewest = _TIE_VIEWS_SPARSE if flight.sparse else _TIE_VIEWS
+    usable = (seen.camera >= 0) & (seen.count >= fewest) & (seen.mean_weight > _TIE_VIEW_WEIGHT)
+    usable &= np.abs(height) < _TIE_HEIGHT_M
     half_m = tie_half_m(flight) if half_m is None else half_m
     leg = flight.leg[np.maximum(seen.camera, 0)]
     chosen = one_per_cell(adj.points, leg, np.where(usable, np.abs(height), np.inf), cell_m)
@@ -94,10 +143,9 @@ def _ground_matches(
     half_m: float,
     texture: bool,
 ) -> MapMatches:
-    config = active().registration
     adj = flight.adjustment
-    half = max(config.tie_half_px, round(half_m / ground.gsd_m))
-    reach = max(config.tie_reach_px, round(reach_m / ground.gsd_m))
+    half = max(TIE_HALF_PX, round(half_m / ground.gsd_m))
+    reach = max(TIE_REACH_PX, round(reach_m / ground.gsd_m))
     level = surface.height(adj.points[:, :2])
     return match_points(
         adj.cameras,
@@ -120,8 +168,7 @@ def edge_displacement(flight: Flight, surface: GroundModel, ground: LoadedMap, m
     differ from it. (Regression over simulated cities with exact truth: an error of 1.0 to 1.1 times this difference is
     left in tie points by texture.) So subtracting it extrapolates to ground without edges.
     """
-    config = active().registration
-    step = max(1, -(-len(matches.point) // config.edge_most))
+    step = max(1, -(-len(matches.point) // _EDGE_MOST))
     some = matches.take(np.arange(0, len(matches.point), step))
     camera = np.full(len(flight.adjustment.points), -1, np.int32)
     camera[some.point] = some.camera
@@ -133,34 +180,32 @@ def edge_displacement(flight: Flight, surface: GroundModel, ground: LoadedMap, m
             ground,
             chosen=some.point,
             camera=camera,
-            reach_m=config.edge_search_m,
+            reach_m=_EDGE_SEARCH_M,
             half_m=half_m,
             texture=False,
         )
     )
     _, mine, its = np.intersect1d(some.point, edges.point, return_indices=True)
     away = edges.shift[its] - some.shift[mine]
-    if len(away) < config.edge_fewest:
+    if len(away) < _EDGE_FEWEST:
         return np.zeros(2)
-    away = away[np.hypot(*(away - np.median(away, axis=0)).T) < config.edge_reach_m]
-    return np.asarray(away.mean(0)) if len(away) >= config.edge_fewest else np.zeros(2)
+    away = away[np.hypot(*(away - np.median(away, axis=0)).T) < _EDGE_REACH_M]
+    return np.asarray(away.mean(0)) if len(away) >= _EDGE_FEWEST else np.zeros(2)
 
 
 def clear_matches(matches: MapMatches, ratio: float | None = None) -> MapMatches:
     """Matches with a clear peak; ratio: largest ratio of the second peak to the first, None: as configured."""
-    config = active().registration
-    ratio = config.tie_ratio if ratio is None else ratio
-    return matches.take((matches.peak > config.tie_peak) & (matches.ratio < ratio))
+    ratio = _TIE_RATIO if ratio is None else ratio
+    return matches.take((matches.peak > _TIE_PEAK) & (matches.ratio < ratio))
 
 
 def mode_shift(shift: Array) -> Array:
     """Mode (2,) of the shifts (Q, 2) of tie points: the one with most others near it, then reweighted."""
-    config = active().registration
     if len(shift) == 0:
         return np.zeros(2)
     d2 = ((shift[:, None, :] - shift[None, :, :]) ** 2).sum(-1)
-    centre = shift[int((d2 < config.mode_m**2).sum(1).argmax())]
-    for scale in config.mode_scales_m:
+    centre = shift[int((d2 < _MODE_M**2).sum(1).argmax())]
+    for scale in _MODE_SCALES_M:
         w = 1.0 / (1.0 + ((shift - centre) ** 2).sum(1) / scale**2) ** 2
         centre = (shift * w[:, None]).sum(0) / w.sum()
     return np.asarray(centre)
@@ -182,20 +227,19 @@ def shifted_along(flight: Flight, matches: MapMatches) -> MapMatches:
 
 def leg_corrections(leg: NDArray[np.int32], matches: MapMatches, common: Array) -> Array:
     """Shift of each picture, float64 (N, 2): the common one, except in legs whose matches agree on another line."""
-    config = active().registration
     out = np.tile(common, (len(leg), 1))
     for k in np.unique(leg[leg >= 0]):
         members = np.flatnonzero(leg == k)
         mine = leg[matches.camera] == k
-        if int(mine.sum()) < config.line_fewest:
+        if int(mine.sum()) < _LINE_FEWEST:
             continue
         t = matches.camera[mine] - members.mean()
         line, agree = _line(t, matches.shift[mine])
-        if int(agree.sum()) < max(config.line_fewest, config.line_least_share * len(t)):
+        if int(agree.sum()) < max(_LINE_FEWEST, _LINE_LEAST_SHARE * len(t)):
             continue
         ends = np.clip(members - members.mean(), t[agree].min(), t[agree].max())
         own = line[0] + line[1] * ends[:, None]
-        if np.hypot(*(own - common).T).max() > config.line_apart_m:
+        if np.hypot(*(own - common).T).max() > _LINE_APART_M:
             out[members] = own
     between, within = np.flatnonzero(leg < 0), np.flatnonzero(leg >= 0)
     if len(between) and len(within):
@@ -205,14 +249,13 @@ def leg_corrections(leg: NDArray[np.int32], matches: MapMatches, common: Array) 
 
 def _line(t: Array, shift: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Robust line (2, 2), value and slope, through shifts (Q, 2) along t (Q,), and which shifts lie on it."""
-    config = active().registration
     a = np.column_stack([np.ones(len(t)), t])
     line = np.array([mode_shift(shift), np.zeros(2)])
-    for scale in config.line_scales_m:
+    for scale in _LINE_SCALES_M:
         off = ((shift - a @ line) ** 2).sum(1)
         w = 1.0 / (1.0 + off / scale**2) ** 2
         line = np.linalg.solve((a * w[:, None]).T @ a + 1e-9 * np.eye(2), (a * w[:, None]).T @ shift)
-    return line, np.asarray(np.hypot(*(shift - a @ line).T) < config.line_agrees_m)
+    return line, np.asarray(np.hypot(*(shift - a @ line).T) < _LINE_AGREES_M)
 
 
 def as_ties(matches: MapMatches, points: Array) -> MapTies:
@@ -221,32 +264,30 @@ def as_ties(matches: MapMatches, points: Array) -> MapTies:
     The surroundings of a point were compared, which are ground and do not lean. So an error of the height datum does
     not displace them.
     """
-    sigma = np.full(len(matches.point), active().registration.tie_sigma_m)
+    sigma = np.full(len(matches.point), _TIE_SIGMA_M)
     return MapTies(matches.point, points[matches.point, :2] + matches.shift, sigma)
 
 
 def with_sigma_of_residuals(ties: MapTies, residual: Array) -> MapTies:
     """The same tie points with the sigma that their residuals show: decimetres on new maps, a metre on old ones."""
-    config = active().registration
-    if len(residual) < config.tie_fewest_for_sigma:
+    if len(residual) < _TIE_FEWEST_FOR_SIGMA:
         return ties
-    sigma = float(np.clip(mad_sigma(residual), *config.tie_sigma_limits_m))
+    sigma = float(np.clip(mad_sigma(residual), *_TIE_SIGMA_LIMITS_M))
     return replace(ties, sigma_m=np.full(len(ties.point), sigma))
 
 
 def roof_matches(flight: Flight, surface: GroundModel, ground: LoadedMap) -> tuple[MapMatches, Array]:
     """Matches of raised points (roofs) with the map, and their heights over the ground (Q,), metres."""
-    config = active().registration
     adj = flight.adjustment
     seen = flight.best_views()
     height = adj.points[:, 2] - surface.height(adj.points[:, :2])
-    low, high = config.roof_heights_m
-    usable = (seen.camera >= 0) & (seen.count >= config.roof_views) & (seen.mean_weight > config.roof_view_weight)
+    low, high = _ROOF_HEIGHTS_M
+    usable = (seen.camera >= 0) & (seen.count >= _ROOF_VIEWS) & (seen.mean_weight > _ROOF_VIEW_WEIGHT)
     usable &= (height > low) & (height < high)
     leg = flight.leg[np.maximum(seen.camera, 0)]
-    chosen = one_per_cell(adj.points, leg, np.where(usable, -seen.count.astype(float), np.inf), config.roof_cell_m)
-    half = max(config.tie_half_px, round(config.roof_half_m / ground.gsd_m))
-    reach = max(config.tie_half_px, round(config.roof_reach_m / ground.gsd_m))
+    chosen = one_per_cell(adj.points, leg, np.where(usable, -seen.count.astype(float), np.inf), _ROOF_CELL_M)
+    half = max(TIE_HALF_PX, round(_ROOF_HALF_M / ground.gsd_m))
+    reach = max(TIE_HALF_PX, round(_ROOF_REACH_M / ground.gsd_m))
     found = match_points(
         adj.cameras,
         adj.points,
@@ -257,7 +298,7 @@ def roof_matches(flight: Flight, surface: GroundModel, ground: LoadedMap) -> tup
         half=half,
         reach=reach,
     )
-    found = clear_matches(found, config.roof_ratio)
+    found = clear_matches(found, _ROOF_RATIO)
     return found, height[found.point]
 
 
@@ -266,7 +307,7 @@ def add_links(flight: Flight, gsd_m: float) -> int:
     config = active().registration
     adj = flight.adjustment
     seen = flight.best_views()
-    usable = (seen.camera >= 0) & (seen.count >= config.link_views) & (seen.mean_weight > config.link_view_weight)
+    usable = (seen.camera >= 0) & (seen.count >= LINK_VIEWS) & (seen.mean_weight > LINK_VIEW_WEIGHT)
     leg = flight.leg[np.maximum(seen.camera, 0)]
     chosen = one_per_cell(adj.points, leg, np.where(usable, -seen.count.astype(float), np.inf), config.link_cell_m)
     candidates = np.flatnonzero(flight.leg >= 0)
@@ -283,7 +324,7 @@ def add_links(flight: Flight, gsd_m: float) -> int:
         gsd_m=gsd_m,
     )
     if len(camera):
-        add_observations(flight, camera, point, uv, config.link_sigma_px)
+        add_observations(flight, camera, point, uv, _LINK_SIGMA_PX)
     return len(camera)
 
 
@@ -306,13 +347,13 @@ def add_observations(
 def first_ties(flight: Flight, surface: GroundModel, ground: LoadedMap) -> MapMatches:
     """Tie points of a flight that the coarse registration put on the map within some metres."""
     config = active().registration
-    cell_m = config.first_tie_cell_sparse_m if flight.sparse else config.first_tie_cell_m
-    return clear_matches(tie_matches(flight, surface, ground, cell_m=cell_m, reach_m=config.first_tie_reach_m))
+    cell_m = _FIRST_TIE_CELL_SPARSE_M if flight.sparse else config.first_tie_cell_m
+    return clear_matches(tie_matches(flight, surface, ground, cell_m=cell_m, reach_m=FIRST_TIE_REACH_M))
 
 
 def small_ties(flight: Flight, surface: GroundModel, ground: LoadedMap, half_m: float) -> MapMatches:
     """Matches of small patches that touch each other: more evidence where few large ones fit, too noisy as ties."""
-    reach = active().registration.first_tie_reach_m
+    reach = FIRST_TIE_REACH_M
     return clear_matches(tie_matches(flight, surface, ground, cell_m=2.0 * half_m, reach_m=reach, half_m=half_m))
 
 
@@ -324,18 +365,17 @@ def orient_on_map(flight: Flight, ground: LoadedMap, matches: MapMatches, surfac
         matches: the tie points that confirm the coarse registration.
         surface: ground after the relative adjustment.
     """
-    config = active().registration
     matches = shifted_along(flight, matches)
     ties = as_ties(matches, flight.adjustment.points)
-    for k, c in enumerate(config.first_tie_scales):
+    for k, c in enumerate(_FIRST_TIE_SCALES):
         _step(flight, surface, ties, c)
         if k in (1, 3):
             surface = refit_ground(flight, surface, as_smooth=k == 3)
     roofs = roof_matches(flight, surface, ground)
     links = 0 if flight.sparse else add_links(flight, working_gsd(flight))
-    _step(flight, surface, ties, config.tie_scales[1])
+    _step(flight, surface, ties, TIE_SCALES[1])
     surface = refit_ground(flight, surface, as_smooth=True)
-    surface, ties, matches = _second_round(flight, ground, surface, config.second_steps)
+    surface, ties, matches = _second_round(flight, ground, surface, _SECOND_STEPS)
     return AbsoluteOrientation(surface, ties, matches, roofs, links)
 
 
@@ -352,16 +392,15 @@ def reorient_on_map(
         flight: on the map. ground: the map below it. surface: its ground. ties: its tie points so far.
         pictures: bool (N,), the ones to compare with the map, None for all.
     """
-    config = active().registration
     for _ in range(2):
-        _step(flight, surface, ties, config.tie_scales[1])
-    return _second_round(flight, ground, refit_ground(flight, surface), config.renewed_steps, pictures)
+        _step(flight, surface, ties, TIE_SCALES[1])
+    return _second_round(flight, ground, refit_ground(flight, surface), _RENEWED_STEPS, pictures)
 
 
 def _step(flight: Flight, surface: GroundModel, ties: MapTies, tie_scale: float) -> None:
     """One Gauss-Newton step with tie points, heights held near the ground."""
     prior = surface.height_prior(flight.adjustment.points)
-    flight.adjustment.step(active().bundle.track_robust_c, prior, ties, tie_scale)
+    flight.adjustment.step(TRACK_ROBUST_C, prior, ties, tie_scale)
 
 
 def _second_round(
@@ -373,12 +412,12 @@ def _second_round(
 ) -> tuple[GroundModel, MapTies, MapMatches]:
     """New tie points, compared on the ground as the caller has just fitted it, and steps with them."""
     config = active().registration
-    cell_m, reach_m = config.tie_cell_sparse_m if flight.sparse else config.tie_cell_m, config.tie_reach_m
+    cell_m, reach_m = _TIE_CELL_SPARSE_M if flight.sparse else config.tie_cell_m, TIE_REACH_M
     matches = clear_matches(tie_matches(flight, surface, ground, cell_m=cell_m, reach_m=reach_m, pictures=pictures))
     matches = replace(matches, shift=matches.shift - edge_displacement(flight, surface, ground, matches))
     ties = as_ties(matches, flight.adjustment.points)
     for k in range(rounds):
-        _step(flight, surface, ties, config.tie_scales[min(k, 1)])
+        _step(flight, surface, ties, TIE_SCALES[min(k, 1)])
         if k in (0, 1):
             ties = with_sigma_of_residuals(ties, flight.adjustment.tie_residual)
         if k == rounds - 2:
@@ -388,24 +427,20 @@ def _second_round(
 
 def tie_half_m(flight: Flight) -> float:
     """Half the patch about a tie point, metres: a share of the flying height."""
-    config = active().registration
     height = float(np.median(flight.cameras().position[:, 2]))
-    return float(np.clip(config.tie_half_share * height, *config.tie_half_limits_m))
+    return float(np.clip(_TIE_HALF_SHARE * height, *_TIE_HALF_LIMITS_M))
 
 
 def working_gsd(flight: Flight) -> float:
     """Ground pixel in which pictures are compared with each other, metres: about their own."""
     cameras = flight.cameras()
-    return (
-        active().registration.picture_gsd_share * float(np.median(cameras.position[:, 2])) / float(cameras.lens[0, 0])
-    )
+    return _PICTURE_GSD_SHARE * float(np.median(cameras.position[:, 2])) / float(cameras.lens[0, 0])
 
 
 def map_gsd(flight: Flight, basemap: MapWindow) -> float:
     """Ground pixel in which pictures are compared with the map, metres: no finer than either of them."""
-    config = active().registration
     cameras = flight.cameras()
     picture = float(np.median(cameras.position[:, 2])) / float(cameras.lens[0, 0])
-    if picture < config.map_gsd_fine_m:
-        return float(np.clip(max(picture, basemap.native_gsd_m), *config.map_gsd_m))
-    return max(config.map_gsd_coarse_m, picture)
+    if picture < _MAP_GSD_FINE_M:
+        return float(np.clip(max(picture, basemap.native_gsd_m), *_MAP_GSD_M))
+    return max(_MAP_GSD_COARSE_M, picture)

@@ -2,17 +2,18 @@
 
 from dataclasses import dataclass, field, replace
 from time import process_time
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.model.camera import fov_rad
 from orthoswarm.model.placement import Leg, LegState, PlacedFrame, Solution, Stage, Terrain
 from orthoswarm.refine.bundle.adjustment import MapTies
 from orthoswarm.refine.bundle.block_arrays import CX, CY, WIDTH, CameraBlock, F
 from orthoswarm.refine.flight.relative_block import Flight
 from orthoswarm.refine.flight.weakly_held_pictures import weakly_held
+from orthoswarm.refine.registration.absolute_orientation import TIE_REACH_M
 from orthoswarm.refine.registration.coarse_map import CoarseMapShift
 from orthoswarm.refine.registration.map_evidence import agreement_probability
 from orthoswarm.refine.registration.tie_points import MapMatches
@@ -28,6 +29,9 @@ SHIFTED = (
     "the map's pixel is {gsd_m:.0f} m: the flight was shifted onto it as a whole, good to {sigma_m:.1f} m (one sigma "
     "of each axis); a map of 2 m or finer places it within decimetres"
 )
+
+_LEG_BY_CHANCE: Final = 0.01  # a leg is matched if chance agrees as well with this probability only
+_LEG_AGREES_M: Final = 1.2  # a tie point whose residual is below this agrees with its leg's place
 
 
 @dataclass(slots=True, kw_only=True)
@@ -203,17 +207,16 @@ def leg_states(state: VehicleState) -> list[Leg]:
     receiver says.
     """
     flight = state.flight
-    config = active().registration
     residual = flight.adjustment.tie_residual
     leg_of_tie = flight.leg[state.matches.camera]
     agrees = np.ones(len(leg_of_tie), bool)
     if len(residual) == len(leg_of_tie):
-        agrees = np.hypot(*residual.T) < config.leg_agrees_m
+        agrees = np.hypot(*residual.T) < _LEG_AGREES_M
     count = int(flight.leg.max()) + 1 if len(flight.leg) else 0
     ties = [int((leg_of_tie == k).sum()) for k in range(count)]
     agree = [int((agrees & (leg_of_tie == k)).sum()) for k in range(count)]
-    chance = [agreement_probability(a, n, config.leg_agrees_m, config.tie_reach_m) for a, n in zip(agree, ties)]
-    matched = [state.on_map and p <= config.leg_by_chance for p in chance]
+    chance = [agreement_probability(a, n, _LEG_AGREES_M, TIE_REACH_M) for a, n in zip(agree, ties)]
+    matched = [state.on_map and p <= _LEG_BY_CHANCE for p in chance]
     if state.coarse_shift is not None:
         matched = [True] * count
     if state.on_map and not any(matched):

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,19 @@ from orthoswarm.refine.flight.relative_block import Flight
 from orthoswarm.refine.registration.orientation_correlation import Match, by_learning, register, stacked, strip_and_map
 
 Array = NDArray[np.float64]
+
+_STRIP_PICTURES: Final = 25  # pictures of a strip in which corners are followed
+_STRIP_PICTURES_SPARSE: Final = 3  # the same of photos that are matched in pairs: some hundred metres of ground
+_STRIP_ACROSS_PX: Final = 150.0  # width of a picture in a strip (cost)
+_STRIP_GSD_M: Final = (0.2, 2.5)  # limits of a strip's ground pixel
+_CONSENSUS_M: Final = 6.0  # strips whose shifts lie this near to a line over the pictures agree
+_CONSENSUS_SLOPE_M: Final = 0.5  # steepest such line, metres a picture: a receiver's drift
+_CONSENSUS_LEAST_WEIGHT: Final = 0.02  # least weight of a strip (1 minus the ratio of its second peak to its first)
+_LEARNED_PICTURES: Final = 16  # pictures of a strip that is matched by learned features
+_LEARNED_STRIPS: Final = 5  # strips of a flight that are matched so: some seconds each (for its time)
+_LEARNED_ACROSS_PX: Final = 300.0  # width of a picture in such a strip
+_LEARNED_GSD_M: Final = (0.2, 0.6)  # limits of its ground pixel
+_LEARNED_REACH_M: Final = 30.0  # how far they are searched (for its time)
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +51,7 @@ def coarse_fits(flight: Flight, basemap: MapWindow, origin: Array) -> Iterator[C
     Strips of each leg near their records; then one shift for all strips together; then strips within a wider search.
     """
     config = active().registration
-    gsd = float(np.clip(picture_width_m(flight) / config.strip_across_px, *config.strip_gsd_m))
+    gsd = float(np.clip(picture_width_m(flight) / _STRIP_ACROSS_PX, *_STRIP_GSD_M))
     tiles = TiledMap(basemap, gsd)
     near, far = config.coarse_reach_m
     for find, reach_m in ((_fit_within, near), (_fit_together, near), (_fit_within, far)):
@@ -98,12 +112,11 @@ def _fit_within(reach_m: float, flight: Flight, basemap: MapWindow, origin: Arra
 
 def learned_fit(flight: Flight, basemap: MapWindow, origin: Array) -> CoarseFit | None:
     """Registration by learned matching of a few strips, where correlation found no consensus; None without one."""
-    config = active().registration
-    cameras, reach_m = flight.cameras(), config.learned_reach_m
-    gsd = float(np.clip(picture_width_m(flight) / config.learned_across_px, *config.learned_gsd_m))
-    windows = _windows(flight.leg, config.learned_pictures)
+    cameras, reach_m = flight.cameras(), _LEARNED_REACH_M
+    gsd = float(np.clip(picture_width_m(flight) / _LEARNED_ACROSS_PX, *_LEARNED_GSD_M))
+    windows = _windows(flight.leg, _LEARNED_PICTURES)
     basemap = TiledMap(basemap, gsd)
-    spread = np.linspace(0, len(windows) - 1, config.learned_strips).round().astype(int)
+    spread = np.linspace(0, len(windows) - 1, _LEARNED_STRIPS).round().astype(int)
     chosen = [windows[k] for k in np.unique(spread)]
     matches = [
         m
@@ -156,8 +169,7 @@ def picture_width_m(flight: Flight) -> float:
 
 
 def _strips(flight: Flight) -> list[NDArray[np.int64]]:
-    config = active().registration
-    return _windows(flight.leg, config.strip_pictures_sparse if flight.sparse else config.strip_pictures)
+    return _windows(flight.leg, _STRIP_PICTURES_SPARSE if flight.sparse else _STRIP_PICTURES)
 
 
 def _windows(leg: NDArray[np.int32], size: int) -> list[NDArray[np.int64]]:
@@ -172,20 +184,19 @@ def _windows(leg: NDArray[np.int32], size: int) -> list[NDArray[np.int64]]:
 
 def _consensus(matches: Sequence[Match]) -> NDArray[np.bool_]:
     """Largest set of windows that lie on a line of correction against picture number, sure ones counting more."""
-    config = active().registration
     t = np.array([0.5 * (m.first + m.last) for m in matches])
     s = np.array([m.shift for m in matches])
-    weight = np.clip(1.0 - np.array([m.ratio for m in matches]), config.consensus_least_weight, 1.0)
+    weight = np.clip(1.0 - np.array([m.ratio for m in matches]), _CONSENSUS_LEAST_WEIGHT, 1.0)
     n = len(matches)
     best, best_score = np.zeros(n, bool), -1.0
     for i in range(n):
         for j in range(i, n):
             slope = (s[j] - s[i]) / (t[j] - t[i]) if j > i and t[j] > t[i] else np.zeros(2)
-            if np.hypot(*slope) > config.consensus_slope_m:
+            if np.hypot(*slope) > _CONSENSUS_SLOPE_M:
                 continue
             error = np.hypot(*(s - s[i] - slope * (t - t[i])[:, None]).T)
-            inside = error < config.consensus_m
-            score = float((weight * inside * (1.0 - 0.5 * error / config.consensus_m)).sum())
+            inside = error < _CONSENSUS_M
+            score = float((weight * inside * (1.0 - 0.5 * error / _CONSENSUS_M)).sum())
             if score > best_score:
                 best, best_score = inside, score
     return best

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +10,14 @@ from numpy.typing import NDArray
 from orthoswarm.config import active
 from orthoswarm.model.placement import MapWindow
 from orthoswarm.refine.flight.relative_block import Flight
-from orthoswarm.refine.registration.absolute_orientation import first_ties, load_map, map_gsd, small_ties, tie_half_m
+from orthoswarm.refine.registration.absolute_orientation import (
+    FIRST_TIE_REACH_M,
+    first_ties,
+    load_map,
+    map_gsd,
+    small_ties,
+    tie_half_m,
+)
 from orthoswarm.refine.registration.coarse_registration import CoarseFit, shift_cameras
 from orthoswarm.refine.registration.map_evidence import false_matches_log10
 from orthoswarm.refine.registration.map_windows import LoadedMap
@@ -17,6 +25,8 @@ from orthoswarm.refine.registration.tie_points import MapMatches
 from orthoswarm.refine.surface.vehicle_ground import GroundModel
 
 Array = NDArray[np.float64]
+
+_EVIDENCE_SMALL_HALF_M: Final = 4.0  # half a patch where those of the usual size confirm nothing
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +65,7 @@ def confirmed(
         tests += 1  # each test is one more chance to agree
         chance = _false_matches_log10(flight, matches, tie_half_m(flight)) + np.log10(tests)
         if chance > limit:  # a few photos have room for a few patches of this size only: more and smaller ones
-            half_m, tests = config.evidence_small_half_m, tests + 1
+            half_m, tests = _EVIDENCE_SMALL_HALF_M, tests + 1
             chance = _false_matches_log10(flight, small_ties(flight, surface, ground, half_m), half_m) + np.log10(tests)
         if chance <= limit:
             return ConfirmedFit(fit, ground, matches, float(10.0**chance))
@@ -69,6 +79,6 @@ def _false_matches_log10(flight: Flight, matches: MapMatches, half_m: float) -> 
         matches.shift,
         matches.camera.astype(float),
         leg=flight.leg[matches.camera],
-        reach_m=active().registration.first_tie_reach_m,
+        reach_m=FIRST_TIE_REACH_M,
         patch_m=2.0 * half_m,
     )

@@ -8,6 +8,7 @@ accurate as its neighbours among them, 0.1 to 0.3 m worse beside or beyond them;
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Final
 
 import cv2
 import numpy as np
@@ -24,6 +25,25 @@ from orthoswarm.refine.flight.unsolved_pictures import place_by_neighbours
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
+
+_NEIGHBOURS: Final = 4  # refined pictures with which a late one is compared, nearest first (for its time)
+_WORK_WIDTH_PX: Final = 640  # columns in which pictures are compared (for its time)
+_CORNERS: Final = 300  # most corners of a late picture that are followed into each neighbour (for its time)
+_CORNER_QUALITY: Final = 0.005  # least corner measure as a share of the best one
+_CORNER_DISTANCE_PX: Final = 8.0  # least distance of corners (spread matters more than number)
+_BORDER_PX: Final = 15  # side of the square by which the overlap is eroded before corners are chosen
+_FLOW_WINDOW_PX: Final = 21  # side of the window of the Lucas-Kanade flow (OpenCV's default)
+_FLOW_LEVELS: Final = 4  # levels of its pyramid: about 100 pixels of error of the start
+_FLOW_BACK_PX: Final = 0.7  # a corner that does not come back this near when it is followed both ways is dropped
+_FEWEST: Final = 25  # fewest points that must agree with the resection ...
+_LEAST_SHARE: Final = 0.4  # ... and the least share of those found
+_AGREES_PX: Final = 1.5  # points this near to where the resection puts them agree
+_POSITION_SIGMA_M: Final = 5.0  # sigma of the start's position, an axis
+_ATTITUDE_SIGMA_RAD: Final = 0.05  # the same of its attitude: 3 degrees
+_CORNER_HEIGHT_M: Final = 0.5  # height of corners above the terrain, all alike (measured: 0.1 to 0.5)
+_LEAST_NOISE_PX: Final = 0.1  # least noise of a followed corner, pixels, in the sigma that is stated
+_SCALES_PX: Final = (20.0, 8.0, 3.0, 1.5, 1.0, 1.0)  # robust scales of the resection, pixels, one after the other
+_ROUNDS: Final = 3  # Gauss-Newton steps at each scale, and steps onto the terrain
 
 
 def register_late_pictures(
@@ -80,13 +100,13 @@ def register_late_pictures(
 
 def working_size(lens: Lens) -> tuple[int, int]:
     """Columns and rows in which a picture is compared."""
-    scale = min(1.0, active().late.work_width_px / lens.width)
+    scale = min(1.0, _WORK_WIDTH_PX / lens.width)
     return max(1, round(lens.width * scale)), max(1, round(lens.height * scale))
 
 
 def _nearest(one: PlacedFrame, others: Sequence[PlacedFrame]) -> list[PlacedFrame]:
     away = [float(np.hypot(*(p.camera.nadir - one.camera.nadir))) for p in others]
-    return [others[i] for i in np.argsort(away, kind="stable")[: active().late.neighbours]]
+    return [others[i] for i in np.argsort(away, kind="stable")[:_NEIGHBOURS]]
 
 
 def ground_observations(
@@ -101,7 +121,6 @@ def ground_observations(
     Returns:
         Pixels (M, 2) of the first picture at full size, and the ground points (M, 3) that the other one gives them.
     """
-    config = active().late
     z = float(terrain.height(one.camera.nadir))
     mine, its = _reduced(one.camera.lens, gray), _reduced(other.camera.lens, known)
     here = replace(one.camera, lens=mine).homography(z)
@@ -111,16 +130,16 @@ def ground_observations(
     warp = cv2.WARP_INVERSE_MAP | cv2.INTER_LINEAR
     turned = cv2.warpPerspective(known, move, (cols, rows), flags=warp)
     inside = cv2.warpPerspective(np.full_like(known, 255), move, (cols, rows), flags=warp & ~3)
-    inner = cv2.erode(inside, np.ones((config.border_px, config.border_px), np.uint8))
-    quality, distance = config.corner_quality, config.corner_distance_px
-    corners = cv2.goodFeaturesToTrack(gray, config.corners, quality, distance, mask=inner)
+    inner = cv2.erode(inside, np.ones((_BORDER_PX, _BORDER_PX), np.uint8))
+    quality, distance = _CORNER_QUALITY, _CORNER_DISTANCE_PX
+    corners = cv2.goodFeaturesToTrack(gray, _CORNERS, quality, distance, mask=inner)
     nothing = np.empty((0, 2)), np.empty((0, 3))
     if corners is None:
         return nothing
-    window, levels = (config.flow_window_px, config.flow_window_px), config.flow_levels
+    window, levels = (_FLOW_WINDOW_PX, _FLOW_WINDOW_PX), _FLOW_LEVELS
     moved, ok, _ = cv2.calcOpticalFlowPyrLK(gray, turned, corners, corners.copy(), winSize=window, maxLevel=levels)
     back, ok_back, _ = cv2.calcOpticalFlowPyrLK(turned, gray, moved, corners.copy(), winSize=window, maxLevel=levels)
-    good = (ok.ravel() > 0) & (ok_back.ravel() > 0) & (np.hypot(*(back - corners)[:, 0].T) < config.flow_back_px)
+    good = (ok.ravel() > 0) & (ok_back.ravel() > 0) & (np.hypot(*(back - corners)[:, 0].T) < _FLOW_BACK_PX)
     if not good.any():
         return nothing
     found = cv2.perspectiveTransform(moved[good].astype(np.float64), move)[:, 0]
@@ -149,7 +168,7 @@ def _local(homography: Array, origin: Array, *, inverse: bool = True) -> Array:
 def on_terrain(camera: Camera, uv: Array, terrain: Terrain) -> Array:
     """Ground points (M, 3) of pixels (M, 2); NaN above the horizon."""
     z = np.full(len(uv), float(terrain.height(camera.nadir)))
-    for _ in range(active().late.rounds):
+    for _ in range(_ROUNDS):
         xy = camera.to_ground(uv, z)
         z = np.where(np.isfinite(xy).all(1), terrain.height(np.nan_to_num(xy)), z)
     return np.column_stack([xy, z])
@@ -157,20 +176,19 @@ def on_terrain(camera: Camera, uv: Array, terrain: Terrain) -> Array:
 
 def _fitted(guess: PlacedFrame, seen: Sequence[tuple[Array, Array]], near: Sequence[PlacedFrame]) -> PlacedFrame:
     """The frame with its camera resected by the neighbours' ground points; the start where too few of them agree."""
-    config = active().late
-    if sum(len(uv) for uv, _ in seen) < config.fewest:
+    if sum(len(uv) for uv, _ in seen) < _FEWEST:
         return guess
     uv, ground = (np.concatenate(parts) for parts in zip(*seen, strict=True))
     camera = resected(guess.camera, uv, ground)
-    scale = max(1.0, guess.camera.lens.width / config.work_width_px)
+    scale = max(1.0, guess.camera.lens.width / _WORK_WIDTH_PX)
     off = np.hypot(*(camera.project(ground) - uv).T) / scale
-    agree = off < config.agrees_px
-    if agree.sum() < max(config.fewest, config.least_share * len(uv)):
+    agree = off < _AGREES_PX
+    if agree.sum() < max(_FEWEST, _LEAST_SHARE * len(uv)):
         return guess
     source = np.repeat(np.arange(len(near)), [len(uv) for uv, _ in seen])[agree]
     away = np.array([p.camera.nadir for p in near])[source].mean(0) - camera.nadir
     neighbour_sigma_m = float(np.median([p.sigma_m for p in near]))
-    leaning = config.corner_height_m * float(np.hypot(*away)) / float(camera.position[2] - ground[agree, 2].mean())
+    leaning = _CORNER_HEIGHT_M * float(np.hypot(*away)) / float(camera.position[2] - ground[agree, 2].mean())
     own = (
         active().bundle.stated_sigma_factor
         * float(np.sqrt(len(near)))
@@ -187,7 +205,7 @@ def centre_sigma(camera: Camera, uv: Array, ground: Array, scale: float) -> floa
             those in which it was compared.
     """
     off = (camera.project(ground) - uv) / scale
-    noise = max(float(np.sqrt((off**2).mean())), active().late.least_noise_px)
+    noise = max(float(np.sqrt((off**2).mean())), _LEAST_NOISE_PX)
     moved = [_moved(camera, step) for step in _STEPS]
     size = _STEPS.sum(1)
     jacobian = np.stack([(c.project(ground) - uv) / scale - off for c in moved], -1).reshape(-1, 6) / size
@@ -203,13 +221,12 @@ def resected(camera: Camera, uv: Array, ground: Array) -> Camera:
 
     Gauss-Newton on six numbers, with the camera itself as a loose prior.
     """
-    config = active().late
-    scale = max(1.0, camera.lens.width / config.work_width_px)
+    scale = max(1.0, camera.lens.width / _WORK_WIDTH_PX)
     prior = _prior()
     total = np.zeros(6)
     now = camera
-    for c in config.scales_px:
-        for _ in range(config.rounds):
+    for c in _SCALES_PX:
+        for _ in range(_ROUNDS):
             off = (now.project(ground) - uv) / scale
             off = np.where(np.isfinite(off), off, 1e3)
             weight = (c * c / (c * c + (off**2).sum(1))) ** 2
@@ -226,8 +243,7 @@ def resected(camera: Camera, uv: Array, ground: Array) -> Camera:
 
 def _prior() -> Array:
     """Weights (6, 6) of the start's position and attitude: loose, for what points do not determine."""
-    config = active().late
-    return np.diag(1.0 / np.array([config.position_sigma_m] * 3 + [config.attitude_sigma_rad] * 3) ** 2)
+    return np.diag(1.0 / np.array([_POSITION_SIGMA_M] * 3 + [_ATTITUDE_SIGMA_RAD] * 3) ** 2)
 
 
 _STEPS = np.diag([1e-3] * 3 + [1e-5] * 3)

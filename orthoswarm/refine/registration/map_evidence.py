@@ -7,14 +7,18 @@ were tried times its tail is the expected number of false matches: how many agre
 wrong map would give. Ties that share ground are not independent; only one of a patch's size is counted.
 """
 
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import bdtrc
 
-from orthoswarm.config import active
-
 Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
+
+_EVIDENCE_FEWEST: Final = 4  # fewest tie points of a leg or a flight: fewer agree with themselves alone
+_EVIDENCE_PAIRS: Final = 400  # most lines through two tie points that are tried in a group (for its time)
+_EVIDENCE_TOLERANCES_M: Final = (0.7, 1.5, 3.0)  # distances within which tie points agree on a place on the map
 
 
 def false_matches_log10(
@@ -31,13 +35,12 @@ def false_matches_log10(
         order: float64 (Q,), number of the picture. leg: int32 (Q,), its leg, -1 between legs.
         reach_m: how far each was searched, to each side. patch_m: side of what was compared.
     """
-    config = active().registration
     alone = _one_a_patch(ground, patch_m)
     shift, order, leg = shift[alone], order[alone], leg[alone]
     groups = [(shift, np.zeros(len(shift)))]
     groups += [(shift[leg == k], order[leg == k]) for k in np.unique(leg[leg >= 0])]
-    groups = [g for g in groups if len(g[0]) >= config.evidence_fewest]
-    best = min((_group(s, t, reach_m, config.evidence_tolerances_m) for s, t in groups), default=0.0)
+    groups = [g for g in groups if len(g[0]) >= _EVIDENCE_FEWEST]
+    best = min((_group(s, t, reach_m, _EVIDENCE_TOLERANCES_M) for s, t in groups), default=0.0)
     return best + float(np.log10(max(len(groups), 1)))
 
 
@@ -53,7 +56,7 @@ def _group(shift: Array, along: Array, reach_m: float, tolerances: tuple[float, 
         i, j = np.triu_indices(count, 1)
         apart = along[j] != along[i]
         i, j = i[apart], j[apart]
-        step = -(-len(i) // active().registration.evidence_pairs)
+        step = -(-len(i) // _EVIDENCE_PAIRS)
         i, j = i[::step], j[::step]
         slope = (shift[j] - shift[i]) / (along[j] - along[i])[:, None]
         fixed = 2

@@ -8,6 +8,7 @@ and place (ionosphere) does not become smaller with more vehicles.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +16,14 @@ from numpy.typing import NDArray
 from orthoswarm.config import active
 from orthoswarm.model.frame import SURVEYED, Frame
 from orthoswarm.model.placement import PlacedFrame
+from orthoswarm.refine.bundle.covariance import RECEIVER_COMMON_SIGMA_M
 
 Array = NDArray[np.float64]
+
+_CORRECTED_SIGMA_M: Final = 0.5  # a position that states at most this sigma was corrected (RTK, PPK)
+_CORRECTED_FLOOR_M: Final = 0.05  # corrected positions are not trusted better than this: antenna offset, base station
+_OFFSET_OUTLIER: Final = 5.0  # differences of more than so many median distances from the median are gross errors
+_OFFSET_PROBABILITY: Final = 0.01  # a right map is doubted with this probability only
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,11 +56,11 @@ class MapOffset:
     @property
     def doubted(self) -> bool:
         """Whether the receivers' errors do not explain it."""
-        return self.by_chance < active().registration.offset_probability
+        return self.by_chance < _OFFSET_PROBABILITY
 
     def explains(self, east: float, north: float) -> bool:
         """Whether receivers' errors of this size would explain another offset, metres."""
-        return replace(self, east=east, north=north).by_chance >= active().registration.offset_probability
+        return replace(self, east=east, north=north).by_chance >= _OFFSET_PROBABILITY
 
     def document(self) -> dict[str, float | int | bool]:
         """As JSON values: `east`, `north`, `sigma` in metres, `vehicles`, `doubted`."""
@@ -106,7 +113,7 @@ def control_warning(control: MapOffset, on_map: MapOffset | None, shift_m: Array
 def had_corrections(frames: Sequence[Frame]) -> bool:
     """Whether a vehicle's receiver states an accuracy that only corrections (RTK, PPK) give."""
     stated = [np.inf if f.fix.position_sigma_m is None else f.fix.position_sigma_m for f in frames]
-    return float(np.median(stated)) <= active().registration.corrected_sigma_m
+    return float(np.median(stated)) <= _CORRECTED_SIGMA_M
 
 
 def measure_map_offset(recorded: Sequence[PlacedFrame], refined: Sequence[PlacedFrame]) -> MapOffset | None:
@@ -149,16 +156,16 @@ def _measured(recorded: Sequence[PlacedFrame], refined: Sequence[PlacedFrame], f
     if not moved:
         return None
     accuracy = {vehicle: float(np.median(values)) for vehicle, values in stated.items()}
-    corrected = {v for v, s in accuracy.items() if s <= config.corrected_sigma_m}
+    corrected = {v for v, s in accuracy.items() if s <= _CORRECTED_SIGMA_M}
     used = sorted(corrected or moved)
     means, sigmas = [], []
     for vehicle in used:
         mean, spread = _mean(np.array(moved[vehicle]))
         means.append(mean)
-        own = max(accuracy[vehicle], config.corrected_floor_m) if corrected else config.receiver_bias_sigma_m
+        own = max(accuracy[vehicle], _CORRECTED_FLOOR_M) if corrected else config.receiver_bias_sigma_m
         sigmas.append(np.hypot(own, spread))
     offset, sigma = _together(np.array(means), np.array(sigmas))
-    common = 0.0 if corrected else config.receiver_common_sigma_m
+    common = 0.0 if corrected else RECEIVER_COMMON_SIGMA_M
     sigma = float(np.linalg.norm([sigma, common, found_m]))
     return MapOffset(float(offset[0]), float(offset[1]), sigma, len(used), bool(corrected))
 
@@ -166,7 +173,7 @@ def _measured(recorded: Sequence[PlacedFrame], refined: Sequence[PlacedFrame], f
 def _mean(moved: Array) -> tuple[Array, float]:
     """Mean of a vehicle's differences (n, 2) without gross errors, and their spread, an axis."""
     away = np.hypot(*(moved - np.median(moved, axis=0)).T)
-    inliers = moved[away <= active().registration.offset_outlier * max(float(np.median(away)), 1e-6)]
+    inliers = moved[away <= _OFFSET_OUTLIER * max(float(np.median(away)), 1e-6)]
     return np.asarray(inliers.mean(axis=0)), float(np.sqrt(inliers.var(axis=0).mean()))
 
 

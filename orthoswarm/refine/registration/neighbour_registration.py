@@ -9,6 +9,7 @@ its points, which are observed in these pictures, whose cameras are fixed; so re
 from copy import deepcopy
 from dataclasses import replace
 from itertools import chain
+from typing import Final
 
 import cv2
 import numpy as np
@@ -32,6 +33,16 @@ from orthoswarm.refine.surface.vehicle_ground import fit_surface
 Array = NDArray[np.float64]
 
 _BLOCK_PX = 512
+
+_UNFOUND_REACH_PX: Final = 24  # how far points are searched in the neighbours' pictures once strips agree
+_UNFOUND_CELL_SHARE: Final = 0.15
+"""`link_cell_m` for it is at most this share of a picture's width: low flights have room for few points 40 m apart
+(legs of six photos from 40 m had 2 to 4 links)."""
+_UNFOUND_SCALES: Final = (1e4, 400.0, 36.0, 9.0, 9.0)  # robust scales of the steps with these links
+_UNFOUND_FEWEST: Final = 8  # fewest links that must agree in the end, or the vehicle stays where its receiver says ...
+_UNFOUND_LEAST_SHARE: Final = 0.4  # ... and the least share of them
+_UNFOUND_AGREES: Final = 0.3  # links with at least this robust weight agree
+_UNFOUND_REACH_SHARE: Final = 0.6  # neighbours' pictures are drawn to this share of their diagonal from their cameras
 
 
 class FixedCameraMosaic:
@@ -73,7 +84,7 @@ class FixedCameraMosaic:
         north = grid.north - rows.start * gsd - float(self._origin[1])
         high, wide = gray.shape
         x, y = cameras.position[:, 0], cameras.position[:, 1]
-        reach = active().registration.unfound_reach_share * self._reach_m
+        reach = _UNFOUND_REACH_SHARE * self._reach_m
         near = (
             (x > west - reach)
             & (x < west + wide * gsd + reach)
@@ -152,16 +163,16 @@ def _linked(state: VehicleState, fit: CoarseFit, others: list[VehicleState]) -> 
     fixed = fixed_cameras_near(state, others)
     if fixed is None:
         return False
-    cell_m = min(config.link_cell_m, config.unfound_cell_share * picture_width_m(flight))
-    found = link_to_fixed(flight, fixed, working_gsd(flight), reach_px=config.unfound_reach_px, cell_m=cell_m)
-    if found < config.unfound_fewest:
+    cell_m = min(config.link_cell_m, _UNFOUND_CELL_SHARE * picture_width_m(flight))
+    found = link_to_fixed(flight, fixed, working_gsd(flight), reach_px=_UNFOUND_REACH_PX, cell_m=cell_m)
+    if found < _UNFOUND_FEWEST:
         return False
     adj = flight.adjustment
-    for c in config.unfound_scales:
+    for c in _UNFOUND_SCALES:
         adj.step(c, state.surface.height_prior(adj.points))
     linked = adj.tracks.camera >= len(flight.frames)
-    agree = int((adj.obs_weight[linked] > config.unfound_agrees).sum())
-    if agree < max(config.unfound_fewest, config.unfound_least_share * found):
+    agree = int((adj.obs_weight[linked] > _UNFOUND_AGREES).sum())
+    if agree < max(_UNFOUND_FEWEST, _UNFOUND_LEAST_SHARE * found):
         return False
     remove_fixed(flight)
     state.confidence = agree / found

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +14,15 @@ from orthoswarm.refine.bundle.observation_selection import one_per_cell
 from orthoswarm.refine.bundle.priors import Priors
 from orthoswarm.refine.flight.relative_block import Flight
 from orthoswarm.refine.registration.block_state import VehicleState, lies_on_map
-from orthoswarm.refine.registration.tie_points import link_legs
+from orthoswarm.refine.registration.tie_points import LINK_VIEW_WEIGHT, LINK_VIEWS, link_legs
 
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
+
+_NEIGHBOUR_SIGMA_PX: Final = 1.5  # sigma of a link to another vehicle, whose cameras do not move, working pixels
+_NEIGHBOUR_PICTURES: Final = 2  # most vehicles in which a point is observed, one picture each (cost)
+_NEIGHBOUR_REACH_HEIGHTS: Final = 1.2  # other vehicles' cameras within so many flying heights may show its ground
+_NEIGHBOUR_EVERY: Final = 2  # every so-manieth of these cameras is used: neighbours in time show the same (cost)
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,16 +42,15 @@ class FixedCameras:
 
 def fixed_cameras_near(state: VehicleState, others: Sequence[VehicleState]) -> FixedCameras | None:
     """The neighbours' cameras near a vehicle's path (not all are needed); None where there are none."""
-    config = active().registration
     own = state.flight.adjustment.cameras.position[:, :2]
     height = float(np.median(state.flight.adjustment.cameras.position[:, 2]))
-    reach = config.neighbour_reach_heights * height
+    reach = _NEIGHBOUR_REACH_HEIGHTS * height
     low, high = own.min(0) - reach, own.max(0) + reach
     parts: list[tuple[VehicleState, NDArray[np.int64]]] = []
     for other in others:
         xy = other.flight.adjustment.cameras.position[: len(other.flight.frames), :2]
         within = ((xy > low) & (xy < high)).all(1) & (other.flight.leg >= 0)
-        near = np.flatnonzero(within)[:: config.neighbour_every]
+        near = np.flatnonzero(within)[::_NEIGHBOUR_EVERY]
         fits = other.on_map if state.on_map else lies_on_map(other) == lies_on_map(state)
         if len(near) and fits:
             parts.append((other, near))
@@ -90,7 +95,7 @@ def link_to_fixed(
     n = len(adj.cameras)
     joint = _joined(adj.cameras, fixed.cameras)
     seen = flight.best_views(pictures)
-    usable = (seen.camera >= 0) & (seen.count >= config.link_views) & (seen.mean_weight > config.link_view_weight)
+    usable = (seen.camera >= 0) & (seen.count >= LINK_VIEWS) & (seen.mean_weight > LINK_VIEW_WEIGHT)
     leg = np.concatenate([flight.leg, int(flight.leg.max()) + 1 + fixed.vehicle]).astype(np.int32)
     cost = np.where(usable, -seen.count.astype(float), np.inf)
     cell_m = config.link_cell_m if cell_m is None else cell_m
@@ -109,7 +114,7 @@ def link_to_fixed(
         candidates=candidates,
         gray=gray,
         gsd_m=gsd_m,
-        most=config.neighbour_pictures,
+        most=_NEIGHBOUR_PICTURES,
         reach=reach_px,
     )
     if not len(camera):
@@ -118,7 +123,7 @@ def link_to_fixed(
         np.concatenate([adj.tracks.camera, camera]),
         np.concatenate([adj.tracks.point, point]),
         np.concatenate([adj.tracks.uv, uv]),
-        np.concatenate([adj.tracks.sigma_px, np.full(len(camera), config.neighbour_sigma_px, np.float32)]),
+        np.concatenate([adj.tracks.sigma_px, np.full(len(camera), _NEIGHBOUR_SIGMA_PX, np.float32)]),
     )
     free = np.arange(len(joint)) < n
     new = Adjustment.begin(

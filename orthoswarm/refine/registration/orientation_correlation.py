@@ -2,13 +2,13 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import MapWindow
@@ -18,6 +18,22 @@ from orthoswarm.refine.bundle.block_arrays import CameraBlock
 Array = NDArray[np.float64]
 Gray = NDArray[np.uint8]
 Complex = NDArray[np.complex64]
+
+_STRIP_MOST_PX: Final = 4_000_000  # larger strips are not correlated (memory)
+_STRIP_FARTHEST_HEIGHTS: Final = 4.0
+"""A picture that looks farther than so many flying heights and the next field is left out: horizon."""
+_STRIP_FARTHEST_M: Final = 50.0  # ... and this
+STRIP_MAP_SHARE: Final = 0.1  # least share of a strip's search area that the map covers
+_STRIP_BLUR_PX: Final = 0.7  # sigma of the blur before the gradients
+STRIP_FEWEST_EDGES: Final = 400  # fewer pixels with an orientation, in the strip or on the map, show nothing
+STRIP_BORDER_PX: Final = 5  # side of the square by which the valid part is eroded: gradients at its edge are artefacts
+_ENERGY_SHARE: Final = 0.05  # least energy of the map under a shift, as a share of the largest
+PEAK_APART_PX: Final = 4  # correlations within this distance, pixels, belong to the same peak
+_STACK_BLUR_PX: Final = 2.0
+"""Sigma of the blur of the correlations that are summed over a flight: strips lie a little wrong among themselves (of
+96 flights of 42 pictures 37 had no consensus; 20 of them are found by the sum, none wrong)."""
+_STACK_APART_PX: Final = 6  # `PEAK_APART_PX` for that sum (measured together)
+_STACK_MAP_SHARE: Final = 0.7  # least share of the search area that the map covers, for a strip to be summed
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +58,7 @@ def orientation_field(gray: NDArray[np.float32], valid: NDArray[np.bool_]) -> Co
 
     An edge keeps its value when light and dark change places.
     """
-    side = active().registration.strip_border_px
+    side = STRIP_BORDER_PX
     gx, gy = cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1)
     inner = cv2.erode(valid.astype(np.uint8), np.ones((side, side), np.uint8), borderValue=0).astype(bool)
     g = gx + 1j * gy
@@ -64,7 +80,7 @@ def correlation(moving: Complex, fixed: Complex, reach: int) -> NDArray[np.float
     energy_fixed = fft.irfft2(fft.rfft2(np.abs(fixed) ** 2, shape) * np.conj(fft.rfft2(weight, shape)), shape)
     energy = float((np.abs(moving) ** 2).sum())
     n = 2 * reach + 1
-    floor = active().registration.energy_share * float(energy_fixed[:n, :n].max()) + 1e-6
+    floor = _ENERGY_SHARE * float(energy_fixed[:n, :n].max()) + 1e-6
     score = product[:n, :n] / np.sqrt(np.maximum(energy_fixed[:n, :n], floor) * max(energy, 1e-6))
     return np.asarray(score, np.float32)
 
@@ -75,7 +91,7 @@ def correlate(moving: Complex, fixed: Complex, reach: int) -> tuple[float, float
     Returns:
         Column and row of the shift from the centre (sub-pixel), peak, ratio of second peak to peak.
     """
-    return highest(correlation(moving, fixed, reach), active().registration.peak_apart_px)
+    return highest(correlation(moving, fixed, reach), PEAK_APART_PX)
 
 
 def highest(score: NDArray[np.float32], apart: int) -> tuple[float, float, float, float]:
@@ -116,13 +132,12 @@ def strip_mosaic(
     Returns:
         Grey (rows, columns), validity, west and north edges; None where nothing is seen.
     """
-    config = active().registration
     corners, homographies = [], []
     for i in index:
         camera = cameras.camera(int(i), np.zeros(2))
         quad = camera.corners(ground_z)
         height = abs(camera.position[2] - ground_z)
-        farthest = config.strip_farthest_heights * height + config.strip_farthest_m
+        farthest = _STRIP_FARTHEST_HEIGHTS * height + _STRIP_FARTHEST_M
         if not np.isfinite(quad).all() or np.abs(quad - camera.nadir).max() > farthest:
             continue
         corners.append(quad)
@@ -132,7 +147,7 @@ def strip_mosaic(
     low, high = np.min(corners, axis=(0, 1)), np.max(corners, axis=(0, 1))
     west, north = np.floor(low[0] / gsd_m) * gsd_m, np.ceil(high[1] / gsd_m) * gsd_m
     width, height = int(np.ceil((high[0] - west) / gsd_m)), int(np.ceil((north - low[1]) / gsd_m))
-    if width * height > config.strip_most_px:
+    if width * height > _STRIP_MOST_PX:
         return None
     out = np.zeros((height, width), np.float32)
     best = np.full((height, width), np.inf, np.float32)
@@ -203,7 +218,7 @@ def strip_and_map(
     )
     ground, known = basemap.gray(bounds, gsd_m)
     ground, known = ground[: rows + 2 * reach, : cols + 2 * reach], known[: rows + 2 * reach, : cols + 2 * reach]
-    if ground.shape != (rows + 2 * reach, cols + 2 * reach) or known.mean() < active().registration.strip_map_share:
+    if ground.shape != (rows + 2 * reach, cols + 2 * reach) or known.mean() < STRIP_MAP_SHARE:
         return None
     grid = GroundGrid.around(basemap.epsg, bounds, gsd_m)
     return Strip(
@@ -229,12 +244,11 @@ def by_edges(strip: Strip) -> Found | None:
 
 def _edges(strip: Strip) -> tuple[Complex, Complex] | None:
     """Orientation fields of a strip and of its map; None where one of them has hardly an edge."""
-    config = active().registration
-    blur = config.strip_blur_px
+    blur = _STRIP_BLUR_PX
     moving = orientation_field(cv2.GaussianBlur(strip.gray, (0, 0), blur), strip.valid)
     fixed = orientation_field(cv2.GaussianBlur(strip.ground, (0, 0), blur), strip.known)
     edges = min(np.count_nonzero(moving), np.count_nonzero(fixed))
-    return None if edges < config.strip_fewest_edges else (moving, fixed)
+    return None if edges < STRIP_FEWEST_EDGES else (moving, fixed)
 
 
 def stacked(strips: Sequence[Strip]) -> tuple[Array, float, float] | None:
@@ -252,14 +266,13 @@ def stacked(strips: Sequence[Strip]) -> tuple[Array, float, float] | None:
         Shift (2,) east, north in metres, peak in standard deviations of the rest, ratio of second peak to peak: a guess
         that the caller must confirm. None where no strip has an edge.
     """
-    config = active().registration
-    total, apart = None, config.stack_apart_px
+    total, apart = None, _STACK_APART_PX
     for strip in strips:
-        fields = None if strip.known.mean() < config.stack_map_share else _edges(strip)
+        fields = None if strip.known.mean() < _STACK_MAP_SHARE else _edges(strip)
         if fields is None:
             continue
         energy = float((np.abs(fields[0]) ** 2).sum())
-        score = cv2.GaussianBlur(correlation(*fields, strip.reach), (0, 0), config.stack_blur_px)
+        score = cv2.GaussianBlur(correlation(*fields, strip.reach), (0, 0), _STACK_BLUR_PX)
         score *= np.sqrt(energy) / max(float(score.std()), 1e-9)
         total = score if total is None else total + score
     if total is None:

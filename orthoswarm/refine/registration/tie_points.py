@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,33 @@ from orthoswarm.refine.registration.patch_search import search_map, search_pictu
 Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
 Gray = NDArray[np.uint8]
+
+_MAP_WINDOW_SHARE: Final = 0.7  # least share of a patch's search window that the map covers
+_PATCH_SHARE: Final = 0.85  # least share of a patch that its picture shows
+_LEAN_FEWEST: Final = 12  # fewest roofs, by count and by sum of weights, that tell the lean
+_LEAN_SIGMA_M: Final = 0.25  # sigma of a roof's shift ...
+_LEAN_SIGMA_SHARE: Final = 0.05  # ... plus this share of its height
+_LEAN_SCALE: Final = 4.0  # robust scale of the vote (2 sigmas)
+_LEAN_MOST: Final = 1.0  # largest lean, metres of shift a metre of height (45 degrees)
+_LEAN_OVER_NONE: Final = 1.5  # a lean must have so many times the sum of weights that no lean has
+_LEAN_LEAST_SHARE: Final = 0.25  # ... and at least this mean weight
+LINK_VIEWS: Final = 3  # fewest pictures that show the point
+LINK_VIEW_WEIGHT: Final = 0.5  # least mean robust weight of its observations
+_LINK_HALF_PX: Final = 15  # half a patch
+_LINK_REACH_PX: Final = 6  # how far it is searched
+_LINK_MARGIN_PX: Final = 12.0  # points nearer to a picture's border are not searched in it, working pixels
+_LINK_TEMPLATE_SHARE: Final = 0.95  # least share of the patch that its own picture shows ...
+_LINK_WINDOW_SHARE: Final = 0.8  # ... and of the search window in the other picture
+_LINK_APART_PX: Final = 3  # correlations within this distance, pixels, belong to the same peak
+_LINK_PEAK: Final = 0.45  # least correlation of a link
+_LINK_RATIO: Final = 0.8  # largest ratio of the second peak to the first
+_LINKS_AT_ONCE: Final = 2_000  # points whose patches are held at once, 9 kB each (memory)
+_PEAK_EXCLUDE_PX: Final = 4  # the second peak of a correlation is sought farther than this from the first
+_SEARCH_WIDE_PX: Final = 16  # searches of more pixels than this to each side on the map look first at half size
+_SEARCH_PROMISING_SHARE: Final = 0.6
+"""... and then where that correlates with at least this share of its highest value. Of 1,030 sure first ties 3 are not
+found or lie elsewhere with 0.5, 13 with 0.65, 38 with 0.8."""
+_GRADIENT_FLOOR: Final = 1e-3  # least median gradient, grey values: a blank patch has no texture to compress
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,7 +102,6 @@ def match_points(
         level: float64 (P,) height on which to rectify around each point; None takes the points' own heights (roofs).
         texture: compare texture instead of edges, see `patch_matching.gradients`.
     """
-    config, features = active().registration, active().features
     chosen = chosen[np.argsort(camera[chosen], kind="stable")]
     by, z = camera[chosen], points[chosen, 2]
     plane = z if level is None else np.asarray(level, float)[chosen]
@@ -86,8 +113,8 @@ def match_points(
         search_map(
             cameras.position[i], cameras.rotation[i], cameras.lens[cameras.lens_id[i]], gray(i), place[part],
             pixel[part], ground.gray, ground.valid, ground.gsd_m, half, reach, texture,
-            np.float32(features.gradient_floor), features.peak_exclude_px, config.map_window_share,
-            config.patch_share, features.search_wide_px, features.search_promising_share, found[part],
+            np.float32(_GRADIENT_FLOOR), _PEAK_EXCLUDE_PX, _MAP_WINDOW_SHARE,
+            _PATCH_SHARE, _SEARCH_WIDE_PX, _SEARCH_PROMISING_SHARE, found[part],
         )  # fmt: skip
     good = found[:, 2] > 0
     found, by = found[good], by[good]
@@ -117,19 +144,18 @@ def vote_lean(matches: MapMatches, height: Array, offset: Array) -> tuple[float,
     Returns:
         East and north lean, or None where too few roofs agree (the caller then takes zero).
     """
-    config = active().registration
-    if len(height) < config.lean_fewest:
+    if len(height) < _LEAN_FEWEST:
         return None
     shift = matches.shift - offset
     slope = shift / height[:, None]
-    sigma = config.lean_sigma_m + config.lean_sigma_share * height
+    sigma = _LEAN_SIGMA_M + _LEAN_SIGMA_SHARE * height
 
     def support(lean: Array) -> tuple[float, Array]:
         e2 = ((shift - lean * height[:, None]) ** 2).sum(1) / sigma**2
-        w = 1.0 / (1.0 + e2 / config.lean_scale) ** 2
+        w = 1.0 / (1.0 + e2 / _LEAN_SCALE) ** 2
         return float(w.sum()), w
 
-    candidates = slope[np.hypot(*slope.T) < config.lean_most]
+    candidates = slope[np.hypot(*slope.T) < _LEAN_MOST]
     if not len(candidates):
         return None
     best = candidates[int(np.argmax([support(c)[0] for c in candidates]))]
@@ -138,7 +164,7 @@ def vote_lean(matches: MapMatches, height: Array, offset: Array) -> tuple[float,
         best = (shift * (w * height)[:, None]).sum(0) / max(float((w * height**2).sum()), 1e-9)
     total, w = support(best)
     zero = support(np.zeros(2))[0]
-    least = max(config.lean_fewest, config.lean_over_none * zero, config.lean_least_share * len(height))
+    least = max(_LEAN_FEWEST, _LEAN_OVER_NONE * zero, _LEAN_LEAST_SHARE * len(height))
     if total < least:
         return None
     return float(best[0]), float(best[1])
@@ -166,27 +192,27 @@ def link_legs(
     Returns:
         Camera (K,), point (K,), pixel (K, 2) of new observations, and how many were tried.
     """
-    config, features = active().registration, active().features
+    config = active().registration
     most = config.link_pictures if most is None else most
-    half, reach = config.link_half_px, config.link_reach_px if reach is None else reach
-    floor = np.float32(features.gradient_floor)
+    half, reach = _LINK_HALF_PX, _LINK_REACH_PX if reach is None else reach
+    floor = np.float32(_GRADIENT_FLOOR)
     chosen = chosen[np.argsort(camera[chosen], kind="stable")]
     _, number = np.unique(leg, return_inverse=True)
     views = np.empty((len(chosen), most), np.int64)
     views_of_other_legs(
         cameras.position, cameras.rotation, cameras.lens_id, cameras.lens, points[chosen], number[camera[chosen]],
-        number, int(number.max(initial=-1)) + 1, np.asarray(candidates, np.int64), config.link_margin_px, views,
+        number, int(number.max(initial=-1)) + 1, np.asarray(candidates, np.int64), _LINK_MARGIN_PX, views,
     )  # fmt: skip
     chosen, views = chosen[views[:, 0] >= 0], views[views[:, 0] >= 0]
     found, tried = np.zeros((*views.shape, 4)), 0
-    for start in range(0, len(chosen), config.links_at_once):
-        some = slice(start, start + config.links_at_once)
+    for start in range(0, len(chosen), _LINKS_AT_ONCE):
+        some = slice(start, start + _LINKS_AT_ONCE)
         own = points[chosen[some]]
         fields = np.zeros((len(own), *template_of(half).shape), np.float32)
         for i, part in _by_picture(camera[chosen[some]]):
             templates(
                 cameras.position[i], cameras.rotation[i], cameras.lens[cameras.lens_id[i]], gray(i), own[part],
-                gsd_m, half, floor, config.link_template_share, fields[part],
+                gsd_m, half, floor, _LINK_TEMPLATE_SHARE, fields[part],
             )  # fmt: skip
         shown = np.isfinite(fields[:, 0, 0, 0])
         point, view = np.nonzero((views[some] >= 0) & shown[:, None])
@@ -198,12 +224,12 @@ def link_legs(
         for i, part in _by_picture(by):
             search_picture(
                 cameras.position[i], cameras.rotation[i], cameras.lens[cameras.lens_id[i]], gray(i),
-                own[point[part]], fields, point[part], gsd_m, half, reach, floor, config.link_apart_px,
-                config.link_window_share, result[part],
+                own[point[part]], fields, point[part], gsd_m, half, reach, floor, _LINK_APART_PX,
+                _LINK_WINDOW_SHARE, result[part],
             )  # fmt: skip
         found[start + point, view] = result
     peak, second = found[..., 2], found[..., 3]
-    point, view = np.nonzero((peak > 0) & (peak >= config.link_peak) & (second <= config.link_ratio * peak))
+    point, view = np.nonzero((peak > 0) & (peak >= _LINK_PEAK) & (second <= _LINK_RATIO * peak))
     moved = points[chosen[point]]
     moved[:, :2] += found[point, view, :2] * [gsd_m, -gsd_m]
     by_camera = views[point, view].astype(np.int32)

@@ -8,11 +8,11 @@ found at all, where the drift is not held), two legs in opposite directions 0.5 
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid, local_origin
@@ -22,7 +22,7 @@ from orthoswarm.refine.flight.relative_block import Flight
 from orthoswarm.refine.flight.solve_units import merge_units, split_units
 from orthoswarm.refine.flight.sparse_block import open_sparse_flight
 from orthoswarm.refine.flight.unsolved_pictures import hovering_vehicles
-from orthoswarm.refine.flight.weakly_held_pictures import observations_per_camera
+from orthoswarm.refine.flight.weakly_held_pictures import HELD_OBSERVATIONS, observations_per_camera
 from orthoswarm.refine.registration.block_state import Stopwatch, VehicleState, to_solution
 from orthoswarm.refine.registration.coarse_map import is_coarse
 from orthoswarm.refine.registration.coarse_registration import CoarseFit, coarse_fits
@@ -34,6 +34,20 @@ from orthoswarm.trajectory.legs import leads_one_way
 __all__ = ["coarse_of", "local_origin", "place_in_flight"]
 
 Array = NDArray[np.float64]
+
+_FOLLOWED_FEWEST: Final = 10  # fewer pictures are not followed from one to the next but matched in pairs
+_SPARSE_FEWEST: Final = 4  # fewer photos are not placed in flight
+_SPARSE_MOST: Final = 60  # more photos that must be matched in pairs wait for the refinement
+_HELD_DRIFT_M: Final = 3.0
+"""Sigma of a receiver's drift over one straight run: tilt and drift cannot be separated there. Without this prior
+single legs were up to 12 m off on the map or not found; with it 2 to 4 m (simulated flights)."""
+_HELD_DRIFT_BEND_M: Final = 0.3  # the same for the second difference of the drift's knots (measured together)
+_HELD_LAG_S: Final = 0.2  # the same for the delay of positions behind the shutter (measured together)
+_ONE_WAY_SIGMA_SHARE: Final = 0.025  # error of a leg's coarse placement over the height (simulated: 2 to 4 m)
+_MANY_WAYS_SIGMA_SHARE: Final = 0.014  # the same with legs in opposite directions (simulated: 0.5 to 2 m)
+_ODD_FOCAL_CHANGE: Final = 0.2  # a placement whose focal length left its start by more (logarithm) is not shown
+_ODD_HEIGHT_CHANGE: Final = 0.2  # the same for the height
+_ODD_TURN_DEG: Final = 12.0  # the same for the attitude where tilt was recorded
 
 
 def place_in_flight(
@@ -61,7 +75,7 @@ def place_in_flight(
     if frames and hovering_vehicles(recorded_cameras(frames, LocalGrid(epsg)).placed):
         raise OrthoSwarmError("all its pictures were taken at one spot; they are drawn where its receiver says")
     units = split_units({frames[0].vehicle: frames} if frames else {})
-    fewest = active().strategy.sparse_fewest
+    fewest = _SPARSE_FEWEST
     found = [_unit(unit, epsg, origin, basemap, options or Options()) for unit in units if len(unit) >= fewest]
     if not found:
         raise OrthoSwarmError(f"{len(frames)} pictures are too few to be adjusted; the next leg is tried")
@@ -89,10 +103,10 @@ def coarse_of(solution: Solution, origin: Array) -> Solution:
 
 def _unit(frames: Sequence[Frame], epsg: int, origin: Array, basemap: MapWindow | None, options: Options) -> Solution:
     grid, watch = LocalGrid(epsg), Stopwatch()
-    enough = len(frames) >= active().strategy.followed_fewest
+    enough = len(frames) >= _FOLLOWED_FEWEST
     flight = tracked_flight(frames, grid, origin, options) if enough else None
     if flight is None:
-        if len(frames) > active().strategy.sparse_most:
+        if len(frames) > _SPARSE_MOST:
             raise OrthoSwarmError("its pictures overlap too little to be placed in flight; the refinement places them")
         flight = open_sparse_flight(frames, grid, origin, options.read)
     one_way = leads_one_way(flight.records.position, flight.leg)
@@ -109,8 +123,7 @@ def _unit(frames: Sequence[Frame], epsg: int, origin: Array, basemap: MapWindow 
     if found is not None:
         state.false_matches = found.false_matches
         height = float(np.median(flight.cameras().position[:, 2]))
-        config = active().strategy
-        share = config.one_way_sigma_share if one_way else config.many_ways_sigma_share
+        share = _ONE_WAY_SIGMA_SHARE if one_way else _MANY_WAYS_SIGMA_SHARE
         state = _shifted(state, found.fit.correction)
         state.coarse_sigma_m = np.minimum(np.hypot(share * height, _scatter(found.fit)), state.coarse_sigma_m)
     legs = _legs(state, fit)
@@ -119,11 +132,11 @@ def _unit(frames: Sequence[Frame], epsg: int, origin: Array, basemap: MapWindow 
 
 def _hold_drift(flight: Flight) -> None:
     """Tighter priors of the receiver's drift, which on a single straight run cannot be told from the camera's tilt."""
-    held, priors = active().strategy, flight.adjustment.priors
+    priors = flight.adjustment.priors
     models = tuple(
         replace(
-            m, drift_sigma=min(m.drift_sigma, held.held_drift_m), drift_bend=held.held_drift_bend_m,
-            lag_sigma=min(m.lag_sigma, held.held_lag_s),
+            m, drift_sigma=min(m.drift_sigma, _HELD_DRIFT_M), drift_bend=_HELD_DRIFT_BEND_M,
+            lag_sigma=min(m.lag_sigma, _HELD_LAG_S),
         )
         for m in priors.models
     )  # fmt: skip
@@ -136,8 +149,8 @@ def _check(flight: Flight) -> None:
     Raises:
         OrthoSwarmError: they are.
     """
-    config, cameras, records = active().strategy, flight.cameras(), flight.records
-    if float(np.median(observations_per_camera(flight))) < active().flight.held_observations:
+    cameras, records = flight.cameras(), flight.records
+    if float(np.median(observations_per_camera(flight))) < HELD_OBSERVATIONS:
         raise OrthoSwarmError("its pictures have too few points in common")
     if not (np.isfinite(cameras.position).all() and np.isfinite(cameras.rotation).all()):
         raise OrthoSwarmError("its pictures cannot be adjusted yet")
@@ -147,10 +160,10 @@ def _check(flight: Flight) -> None:
     axes = np.einsum("ni,ni->n", cameras.rotation[:, :, 2], records.rotation()[:, :, 2])
     turned = np.arccos(np.clip(axes, -1.0, 1.0))
     tilted = records.has_tilt
-    tilt_off = bool(tilted.any()) and float(np.median(turned[tilted])) > np.radians(config.odd_turn_deg)
+    tilt_off = bool(tilted.any()) and float(np.median(turned[tilted])) > np.radians(_ODD_TURN_DEG)
     if (
-        abs(np.log(focal / flight.calibration.focal_px)) > config.odd_focal_change
-        or abs(np.log(max(height, 0.1) / begun)) > config.odd_height_change
+        abs(np.log(focal / flight.calibration.focal_px)) > _ODD_FOCAL_CHANGE
+        or abs(np.log(max(height, 0.1) / begun)) > _ODD_HEIGHT_CHANGE
         or tilt_off
     ):
         raise OrthoSwarmError("its pictures cannot be adjusted yet; they are drawn where its receiver says")

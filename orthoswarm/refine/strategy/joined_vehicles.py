@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import replace
 from functools import partial
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,8 @@ from orthoswarm.config import active
 from orthoswarm.model.placement import MapWindow
 from orthoswarm.model.plane_similarity import Similarity
 from orthoswarm.model.task_runner import Run
+from orthoswarm.refine.bundle.covariance import RECEIVER_COMMON_SIGMA_M
+from orthoswarm.refine.bundle.priors import ATTITUDE_BIAS_SIGMA_DEG, POSITION_ROBUST_C
 from orthoswarm.refine.registration.block_state import VehicleState, lies_on_map
 from orthoswarm.refine.registration.coarse_map import is_coarse, shift_on_coarse_map
 from orthoswarm.refine.registration.map_offset import had_corrections
@@ -26,6 +29,10 @@ from orthoswarm.refine.surface.vehicle_ground import fit_surface
 Array = NDArray[np.float64]
 Block = list[int]
 Join = Callable[[tuple[VehicleState, list[VehicleState]]], VehicleState]
+
+_DATUM_SHIFT_SIGMA_M: Final = 100.0  # what is known of the shift of such a block before its receivers are asked
+_DATUM_ROUNDS: Final = 5  # rounds of reweighting, so that a receiver that is far off counts little
+TAKEOFF_LEVEL_SIGMA_M: Final = 2.0  # how well the takeoff spot is known to lie at the level of the ground
 
 
 def join_unmapped(
@@ -96,14 +103,14 @@ def _back_to_receivers(out: list[VehicleState], block: Block) -> None:
     own = [_own_solution(out[k]) for k in block]
     now, alone = (np.array([o[i] for o in own]) for i in (0, 1))
     weight = np.array([1.0 / o[3] ** 2 for o in own])
-    level_sigma = config.strategy.takeoff_level_sigma_m / max(float(np.median(now[:, 2])), 1.0)
-    shift_sigma = config.registration.datum_shift_sigma_m
+    level_sigma = TAKEOFF_LEVEL_SIGMA_M / max(float(np.median(now[:, 2])), 1.0)
+    shift_sigma = _DATUM_SHIFT_SIGMA_M
     turn = float(np.average([o[2] for o in own], weights=weight))
     prior = np.array([0.0, 0.0, turn, float(np.mean(alone[:, 2] / now[:, 2])) - 1.0])
     prior_sigma = np.array([shift_sigma, shift_sigma, 1.0 / np.sqrt(weight.sum()), level_sigma])
-    common = config.registration.receiver_common_sigma_m
+    common = RECEIVER_COMMON_SIGMA_M
     sigma_m, counts = np.array([out[k].receiver_sigma_m for k in block]), np.ones(len(block))
-    for _ in range(config.registration.datum_rounds):
+    for _ in range(_DATUM_ROUNDS):
         similarity = Similarity.between(
             now[:, :2],
             alone[:, :2],
@@ -113,7 +120,7 @@ def _back_to_receivers(out: list[VehicleState], block: Block) -> None:
             prior=prior,
         )
         away = (((similarity.moved(now[:, :2]) - alone[:, :2]) / sigma_m) ** 2).sum(axis=1)
-        counts = 1.0 / (1.0 + away / config.bundle.position_robust_c) ** 2
+        counts = 1.0 / (1.0 + away / POSITION_ROBUST_C) ** 2
     level_m, factor = _level_m(out, block), config.bundle.stated_sigma_factor
     for k in block:
         placed = np.hypot(similarity.sigma_m(out[k].flight.cameras().position[:, :2]), common)
@@ -147,7 +154,7 @@ def _own_solution(state: VehicleState) -> tuple[Array, Array, float, float]:
     now, alone = state.flight.adjustment.cameras, state.coarse
     apart = alone.rotation @ now.rotation.transpose(0, 2, 1)
     turn = float(np.median(np.arctan2(apart[:, 1, 0] - apart[:, 0, 1], apart[:, 0, 0] + apart[:, 1, 1])))
-    sigma = float(np.radians(active().bundle.attitude_bias_sigma_deg[2]))
+    sigma = float(np.radians(ATTITUDE_BIAS_SIGMA_DEG[2]))
     if state.pose_covariance is not None:
         sigma = float(np.sqrt(np.median(state.pose_covariance[:, 5, 5])))
     return now.position.mean(axis=0), alone.position.mean(axis=0), turn, sigma

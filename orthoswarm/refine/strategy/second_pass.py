@@ -3,14 +3,16 @@
 from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
+from orthoswarm.export.product_files import OBLIQUE_AXIS_DOWN
 from orthoswarm.model.camera import fov_rad
 from orthoswarm.model.placement import MapWindow
 from orthoswarm.model.task_runner import Continued
+from orthoswarm.refine.bundle.adjustment import TRACK_ROBUST_C
 from orthoswarm.refine.bundle.block_arrays import WIDTH, F
 from orthoswarm.refine.bundle.covariance import (
     common_map_sigma,
@@ -19,17 +21,29 @@ from orthoswarm.refine.bundle.covariance import (
     with_distance_errors,
 )
 from orthoswarm.refine.bundle.map_distortion import map_distortion_variance
+from orthoswarm.refine.bundle.priors import HEIGHT_OFFSET_SIGMA_M
 from orthoswarm.refine.flight.relative_block import Flight
 from orthoswarm.refine.flight.weakly_held_pictures import interpolate_weak
-from orthoswarm.refine.registration.absolute_orientation import load_map, map_gsd, reorient_on_map, working_gsd
+from orthoswarm.refine.registration.absolute_orientation import (
+    TIE_SCALES,
+    load_map,
+    map_gsd,
+    reorient_on_map,
+    working_gsd,
+)
 from orthoswarm.refine.registration.block_state import Stopwatch, VehicleState, lies_on_map
 from orthoswarm.refine.registration.map_heights import map_heights
 from orthoswarm.refine.registration.map_windows import LoadedMap
 from orthoswarm.refine.registration.neighbour_ties import fixed_cameras_near, link_to_fixed, remove_fixed
-from orthoswarm.refine.strategy.vehicle_passes import level_sigma_deg
+from orthoswarm.refine.strategy.vehicle_passes import SIGMA_FLOOR_M, level_sigma_deg
 from orthoswarm.refine.surface.ground_densification import dense_points, spaced_pictures
 
 Array = NDArray[np.float64]
+
+_COHERENT_SIGMAS: Final = 2.0
+"""Ties around a picture whose common offset exceeds so many sigmas show an error that the covariance does not
+contain."""
+_SECOND_STEPS: Final = 4  # steps of the second pass without a map
 
 
 def second_pass(
@@ -60,8 +74,8 @@ def second_pass(
         ground = load_map(flight, basemap, origin, map_gsd(flight, basemap))
         state.surface, state.ties, state.matches = reorient_on_map(flight, ground, state.surface, state.ties, pictures)
     else:
-        for _ in range(active().strategy.second_steps):
-            flight.adjustment.step(active().bundle.track_robust_c, state.surface.height_prior(flight.adjustment.points))
+        for _ in range(_SECOND_STEPS):
+            flight.adjustment.step(TRACK_ROBUST_C, state.surface.height_prior(flight.adjustment.points))
     watch.lap("second adjustment")
     watch.add_to(state.timings)
     return Continued(_errors_and_ground, (state, others, ground, pictures))
@@ -92,11 +106,10 @@ def _own_errors(state: VehicleState, others: Sequence[VehicleState], ground: Loa
     flight = state.flight
     adj = flight.adjustment
     ties = state.ties if state.on_map else None
-    config = active().bundle
-    floor = config.sigma_floor_m
+    floor = SIGMA_FLOOR_M
     if ground is not None:
         floor = common_map_sigma(adj.tie_residual, state.ties.sigma_m, ground.gsd_m)
-    track_c, tie_c = config.track_robust_c, active().registration.tie_scales[1]
+    track_c, tie_c = TRACK_ROBUST_C, TIE_SCALES[1]
     stated = stated_errors(adj, track_c, state.surface.height_prior(adj.points), ties=ties, tie_c=tie_c, floor_m=floor)
     level_deg = level_sigma_deg(flight, state.surface)
     state.fov_sigma_deg = float(np.hypot(stated.fov_sigma_deg, level_deg))
@@ -118,7 +131,7 @@ def _own_errors(state: VehicleState, others: Sequence[VehicleState], ground: Loa
         )  # of which the floor covers so much
         state.map_distortion_m2 = max(0.0, beyond)
         off = systematic_tie_offset(flight.leg, state.matches.camera, adj.tie_residual)
-        off[off < active().strategy.coherent_sigmas * state.sigma_m] = 0.0
+        off[off < _COHERENT_SIGMAS * state.sigma_m] = 0.0
         state.sigma_m = np.hypot(state.sigma_m, off)
 
 
@@ -130,10 +143,10 @@ def _with_focal_error(flight: Flight, pose: NDArray[np.float32], fov_sigma_deg: 
     cameras = flight.cameras()
     fov = fov_rad(float(cameras.lens[0, F]), int(cameras.lens[0, WIDTH]))
     share = float(np.radians(fov_sigma_deg)) / float(np.sin(fov))
-    down = np.maximum(-cameras.rotation[:, 2, 2], active().bundle.oblique_axis_down)
+    down = np.maximum(-cameras.rotation[:, 2, 2], OBLIQUE_AXIS_DOWN)
     height_sigma_m = share * cameras.position[:, 2]
     if flight.calibration.trusted_height:
-        height_sigma_m = np.minimum(height_sigma_m, active().bundle.height_offset_sigma_m)
+        height_sigma_m = np.minimum(height_sigma_m, HEIGHT_OFFSET_SIGMA_M)
     return with_distance_errors(pose, cameras.rotation, height_sigma_m / down)
 
 

@@ -7,6 +7,7 @@ refiner then adjusts these photos like all others.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,7 @@ from orthoswarm.model.frame import SURVEYED, Frame
 from orthoswarm.model.geo import LocalGrid, area_epsg
 from orthoswarm.model.task_runner import Progress, Run
 from orthoswarm.refine.flight.sparse_start import read_photo_records
-from orthoswarm.refine.initial.free_network import Anchors, FreeNetwork, solve_free_network
+from orthoswarm.refine.initial.free_network import FREE_PAIR_SHARE, Anchors, FreeNetwork, solve_free_network
 from orthoswarm.refine.initial.initial_orientation import shape_of
 from orthoswarm.refine.initial.pair_graph import PairGraphBuilder, ReadGray
 from orthoswarm.refine.initial.planar_similarity import Ints, PhotoRecords
@@ -26,6 +27,11 @@ from orthoswarm.refine.initial.relative_scale import focal_by_hint
 from orthoswarm.refine.initial.tilt_and_lens import Matches, level_pixels, similarities
 
 Array = NDArray[np.float64]
+
+_FREE_NADIR_SHARE: Final = 0.05
+"""The ground straight below such a photo lies so far from where its level picture has it, sigma as a share of its
+width: tilts of three degrees at a field of view of 60."""
+_FREE_MOST_PAIRS: Final = 40_000  # most pairs tried where nothing tells overlaps: 280 photos, two minutes of CPU
 
 
 def place_unpositioned(
@@ -74,13 +80,13 @@ def place_unpositioned(
 def candidate_pairs(without: int, count: int) -> Ints:
     """Pairs to try, int32 (n, 2), of photos of which the first `without` have no position.
 
-    All pairs with a photo without position, as nothing tells which overlap; beyond `free_most_pairs` those nearest in
+    All pairs with a photo without position, as nothing tells which overlap; beyond `_FREE_MOST_PAIRS` those nearest in
     order.
     """
     first, second = np.triu_indices(count, 1)
     wanted = first < without
     pairs = np.stack([first[wanted], second[wanted]], axis=1)
-    most = active().initial.free_most_pairs
+    most = _FREE_MOST_PAIRS
     if len(pairs) > most:
         order = np.argsort(pairs[:, 1] - pairs[:, 0], kind="stable")[:most]
         pairs = pairs[np.sort(order)]
@@ -130,11 +136,11 @@ def _anchors(
             frame = frames[number[name]]
             mark.check_inside(frame.width, frame.height)
             pixel = complex(mark.column - 0.5 * (frame.width - 1), -(mark.row - 0.5 * (frame.height - 1)))
-            sigma_px = config.initial.free_pair_share * frame.width
+            sigma_px = FREE_PAIR_SHARE * frame.width
             rows.append((number[name], pixel, ground, point.sigma_m or config.control.survey_sigma_m, sigma_px))
     sigma = records.gps_sigma()
     for k in range(known, len(frames)):  # below the camera is the middle of the level picture
-        sigma_px = config.initial.free_nadir_share * frames[k].width
+        sigma_px = _FREE_NADIR_SHARE * frames[k].width
         rows.append((k, 0j, complex(records.position[k]), float(sigma[k]), sigma_px))
     photo, pixel_, ground_, sigma_m, sigma_px_ = zip(*rows) if rows else ((),) * 5
     return Anchors(
@@ -155,7 +161,7 @@ def _placed(photos: Sequence[Frame], network: FreeNetwork, *, grid: LocalGrid, o
         centre = network.centre[k]
         lat, lon = (float(v) for v in grid.to_geographic(origin + np.array([centre.real, centre.imag])))
         yaw = float(-np.angle(network.scale[k]) + grid.convergence_rad(lat, lon))
-        leaning = active().initial.free_nadir_share * frame.width * abs(network.scale[k])
+        leaning = _FREE_NADIR_SHARE * frame.width * abs(network.scale[k])
         fix = replace(
             frame.fix,
             lat_deg=lat,

@@ -1,6 +1,7 @@
 """What vehicles of an area share: which are neighbours, the lean of the map, one terrain."""
 
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,12 @@ from orthoswarm.refine.surface.vehicle_ground import ground_points
 from orthoswarm.trajectory.near_paths import near_paths
 
 Array = NDArray[np.float64]
+
+_DRAWN_NODES: Final = 4_000_000  # most nodes of a surface that pictures are drawn on (memory)
+_TERRAIN_REACH_HEIGHTS: Final = 1.1  # terrain is made to so many flying heights beyond the cameras
+_TERRAIN_POINTS: Final = 60  # fewer points make no common terrain; that of the first vehicle is taken
+_DEM_DIFFERS_M: Final = 0.2  # what is left over a given height model is said from here on
+_DEM_COVERS_SHARE: Final = 0.97  # a height model that covers more than this of the area covers it
 
 
 def neighbours_of(state: VehicleState, states: Sequence[VehicleState]) -> list[VehicleState]:
@@ -65,15 +72,15 @@ def common_terrain(
     tied = [ground_points(s.flight.adjustment) for s in states]
     points = np.concatenate([p for p, _ in tied] + [s.dense[0] for s in states])
     sigma = np.concatenate([q for _, q in tied] + [s.dense[1] for s in states])
-    if len(points) < active().strategy.terrain_points:
+    if len(points) < _TERRAIN_POINTS:
         return states[0].surface.terrain(), []
     path = np.concatenate([s.flight.adjustment.cameras.position for s in (own if near_own else states)])
-    reach = active().strategy.terrain_reach_heights * float(np.median(path[:, 2]))
+    reach = _TERRAIN_REACH_HEIGHTS * float(np.median(path[:, 2]))
     bounds = BoundingBox.around_points(path[:, :2], reach)
     lift = float(np.median([s.surface.ground_offset_m for s in states]))
     fit, off = None, 0.0
     how = FitSettings.for_drawing(on_map=any(s.on_map for s in states))
-    drawn_nodes = active().surface.drawn_nodes
+    drawn_nodes = _DRAWN_NODES
     if dem is not None:
         fit, off = fit_over_dem(dem, points, sigma, bounds, settings=how, most_nodes=drawn_nodes)
     drawn = (fit or fit_terrain(points, sigma, bounds, settings=how)).rendering(lift)
@@ -121,9 +128,9 @@ def coarse_terrain(states: Sequence[VehicleState]) -> Terrain | None:
         return None
     paths = [s.coarse.position for s in states]
     path = np.concatenate(paths)
-    reach = active().strategy.terrain_reach_heights * float(np.median(path[:, 2]))
+    reach = _TERRAIN_REACH_HEIGHTS * float(np.median(path[:, 2]))
     low, high = path[:, :2].min(0) - reach, path[:, :2].max(0) + reach
-    step = max(min(steps), float(np.sqrt(np.prod(high - low) / active().surface.drawn_nodes)))
+    step = max(min(steps), float(np.sqrt(np.prod(high - low) / _DRAWN_NODES)))
     columns, rows = (np.ceil((high - low) / step).astype(int) + 1).tolist()
     nodes = np.stack(np.meshgrid(low[0] + step * np.arange(columns), low[1] + step * np.arange(rows)), -1)
     vehicle = np.repeat(np.arange(len(states)), [len(p) for p in paths])
@@ -149,12 +156,12 @@ def _dem_warnings(dem: LocalDem, unused: bool, off_m: float, states: Sequence[Ve
         who = ", ".join(sorted({s.vehicle for s in doubted}))
         off = max(s.surface.contradicted_m for s in doubted)
         out.append(f"{name} contradicts the pictures of {who} by {off:.1f} m in the median; check it")
-    elif off_m > active().strategy.dem_differs_m:
+    elif off_m > _DEM_DIFFERS_M:
         out.append(
             f"the ground differs from {name} by {off_m:.1f} m in the median: it is coarse, old or displaced; the "
             "pictures are followed where they differ from it"
         )
-    if dem.model.cover < active().strategy.dem_covers_share:
+    if dem.model.cover < _DEM_COVERS_SHARE:
         share = dem.model.cover
         out.append(f"{name} has heights on {share:.0%} of the area; elsewhere the ground is found from the pictures")
     return out

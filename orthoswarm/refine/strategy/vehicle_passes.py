@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,7 @@ from orthoswarm.model.placement import MapWindow
 from orthoswarm.model.task_runner import Continued, whole
 from orthoswarm.raster.height_model import HeightModel
 from orthoswarm.raster.picture_file import read_gray, reduction
-from orthoswarm.refine.bundle.adjustment import Adjustment, MapTies
+from orthoswarm.refine.bundle.adjustment import TIE_ROBUST_C, TRACK_ROBUST_C, Adjustment, MapTies
 from orthoswarm.refine.bundle.block_arrays import WIDTH, F
 from orthoswarm.refine.bundle.covariance import receiver_sigma, stated_errors
 from orthoswarm.refine.bundle.height_consistency import (
@@ -26,9 +27,11 @@ from orthoswarm.refine.bundle.height_consistency import (
     predicted_height_offset,
     release_heights,
 )
+from orthoswarm.refine.bundle.observation_selection import INLIER_WEIGHT
 from orthoswarm.refine.flight.kept_tracks import KeptTracks
 from orthoswarm.refine.flight.record_findings import contradiction
 from orthoswarm.refine.flight.relative_block import (
+    FEW_PHOTOS,
     Flight,
     distorts_strongly,
     free_full_lens,
@@ -43,6 +46,7 @@ from orthoswarm.refine.registration.coarse_registration import CoarseFit, coarse
 from orthoswarm.refine.registration.confirmed_registration import confirmed
 from orthoswarm.refine.registration.map_offset import had_corrections
 from orthoswarm.refine.registration.tie_points import MapMatches
+from orthoswarm.refine.strategy.joined_vehicles import TAKEOFF_LEVEL_SIGMA_M
 from orthoswarm.refine.surface.dem_surface import LocalDem
 from orthoswarm.refine.surface.vehicle_ground import GroundModel, fit_surface
 from orthoswarm.stores.local_copies import copy_ahead
@@ -50,6 +54,38 @@ from orthoswarm.trajectory.legs import leads_one_way
 
 Array = NDArray[np.float64]
 ReadGray = Callable[[Frame], NDArray[np.uint8]]
+
+SIGMA_FLOOR_M: Final = 0.05  # least sigma of a photo on the ground where no map tells it
+START_FOV_DEG: Final = 80.0  # horizontal field of view to start from where no tag hints at one
+_FULL_LENS_STEPS: Final = 4  # steps at the last scale more where all parameters of a lens are solved
+_RECORDS_WEIGHED_STEP: Final = 3  # from this step, from 0, records are weighed and the ground fitted (nearly converged)
+_FIRST_STEPS: Final = 2  # steps, from the first, with the wide height prior of the next two fields ...
+_FIRST_GROUND_SIGMA_M: Final = 3.0  # sigma of points about the expected ground in these steps
+_FIRST_GROUND_ROBUST_C: Final = 1e3  # robust scale of that prior, squared sigmas: nearly none
+_GROUND_SIGMA_M: Final = 2.0  # the sigma in all later steps
+_GROUND_ROBUST_C: Final = 1.0  # the robust scale in all later steps, squared sigmas
+_FLOW_PAIRS: Final = 6  # fewest pairs of pictures whose focal length by flow an adjustment is compared with
+_RUNAWAY_SHARE: Final = 0.15
+"""An adjustment whose focal length differs from that of the flow by this share has found another minimum and is
+rejected, unless the flow itself is that uncertain (next field)."""
+_RUNAWAY_SIGMAS: Final = 5.0  # ... and by so many of its sigmas
+_SOLVED_INLIERS: Final = 0.7
+"""Least share of a tracked flight's observations that fit its adjustment. Of 17 flights, four without heights over
+relief of 25 m ended elsewhere, with 0.00 to 0.40; the others have 0.93 to 0.98. Those four are right when matched in
+pairs."""
+_NARROWEST_FOV_DEG: Final = 33.0  # recorded heights are rejected if they lead to a horizontal field of view below this
+_WIDEST_FOV_DEG: Final = 137.0  # ... or above this; a little above the widest that is accepted from flow
+_REST_STEPS: Final = 3  # steps after which a contradiction must still be there
+_FREE_STEPS: Final = 6  # steps of a round without the recorded heights
+_FREE_ROUNDS: Final = 4  # rounds without the recorded heights at most
+_MAP_FOV_SIGMAS: Final = 6.0  # a registration that changes the field of view by more sigmas is rejected ...
+_MAP_FOV_DEG: Final = 4.0  # ... and by more than this
+_LEG_LINK_STEPS: Final = 6  # steps of a flight without a map once its legs are linked to each other
+_NO_HEIGHT_SHARE: Final = 0.03  # sigma of focal lengths without a height, a share (15 flights: 2.5 % rms)
+_ONE_WAY_FOV_SIGMA_DEG: Final = 5.0  # the same for photos on one straight line (11 such legs: 5.6 rms)
+_DECENTRED_SHARE: Final = 0.02
+"""What tangential distortion, which is not modelled, does to the focal length of a strong lens, a share (measured: 1.6
+%)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +99,7 @@ class Options:
         kept: where tracks are kept for a refinement of the same pictures, None if they are not.
     """
 
-    fov_start_rad: float = field(default_factory=lambda: float(np.radians(active().strategy.start_fov_deg)))
+    fov_start_rad: float = field(default_factory=lambda: float(np.radians(START_FOV_DEG)))
     dem: HeightModel | None = None
     read: ReadGray = field(default_factory=lambda: read_frame)
     kept: KeptTracks | None = None
@@ -124,10 +160,9 @@ def refine_tracked(
         surface = adjust_without_map(flight, options.ground(origin))
         if basemap is None:
             surface = link_own_legs(flight, surface)
-        config = active().strategy
-        if not config.narrowest_fov_deg < field_of_view_deg(flight.adjustment, flight) < config.widest_fov_deg:
+        if not _NARROWEST_FOV_DEG < field_of_view_deg(flight.adjustment, flight) < _WIDEST_FOV_DEG:
             return None  # a recorded height that leads to such a lens is wrong
-        if len(frames) < active().flight.few_photos and distorts_strongly(flight):
+        if len(frames) < FEW_PHOTOS and distorts_strongly(flight):
             return None  # too few corners for all parameters of such a lens; photos matched in pairs have more
         state = adjusted_state(flight, surface, watch)
     except AdjustmentError:
@@ -185,9 +220,9 @@ def registered_state(
 
 def adjusted_state(flight: Flight, surface: GroundModel, watch: Stopwatch) -> VehicleState:
     """The state of a vehicle that is adjusted without a map, with its sigmas."""
-    adj, c = flight.adjustment, active().bundle
+    adj = flight.adjustment
     belief = surface.height_prior(adj.points)
-    stated = stated_errors(adj, c.track_robust_c, belief, ties=None, tie_c=c.tie_robust_c, floor_m=c.sigma_floor_m)
+    stated = stated_errors(adj, TRACK_ROBUST_C, belief, ties=None, tie_c=TIE_ROBUST_C, floor_m=SIGMA_FLOOR_M)
     coarse = replace(
         adj.cameras,
         position=adj.cameras.position.copy(),
@@ -255,8 +290,8 @@ def adjust_without_map(flight: Flight, surface: GroundModel | None = None) -> Gr
         flight.adjustment.priors = replace(p, lens_sigma=sigma)
         found = adjust_by_schedule(flight, surface)
     found = _without_wrong_heights(flight, found)
-    inliers = float((flight.adjustment.obs_weight > active().bundle.inlier_weight).mean())
-    if inliers < active().strategy.solved_inliers:
+    inliers = float((flight.adjustment.obs_weight > INLIER_WEIGHT).mean())
+    if inliers < _SOLVED_INLIERS:
         raise AdjustmentError(f"only {inliers:.0%} of the observations fit the adjustment")
     return found
 
@@ -269,7 +304,7 @@ def link_own_legs(flight: Flight, surface: GroundModel) -> GroundModel:
     """
     if not add_links(flight, working_gsd(flight)):
         return surface
-    return _steps(flight, surface, active().strategy.leg_link_steps)[0]
+    return _steps(flight, surface, _LEG_LINK_STEPS)[0]
 
 
 def field_of_view_deg(adjustment: Adjustment, flight: Flight) -> float:
@@ -280,26 +315,25 @@ def field_of_view_deg(adjustment: Adjustment, flight: Flight) -> float:
 def focal_length_ran_away(flight: Flight) -> bool:
     """Whether the focal length is far from the one by optical flow: the adjustment converged to another minimum."""
     flow = flight.calibration
-    config = active().strategy
-    if flow.pairs < config.flow_pairs or not flow.trusted_height or not np.isfinite(flow.spread):
+    if flow.pairs < _FLOW_PAIRS or not flow.trusted_height or not np.isfinite(flow.spread):
         return False
     away = abs(float(np.log(flight.adjustment.cameras.lens[0, F] / flow.focal_px)))
-    return away > max(config.runaway_share, config.runaway_sigmas * flow.focal_sigma)
+    return away > max(_RUNAWAY_SHARE, _RUNAWAY_SIGMAS * flow.focal_sigma)
 
 
 def adjust_by_schedule(flight: Flight, surface: GroundModel) -> GroundModel:
     """Adjust a tracked flight by the steps of `strategy.schedule`; returns the ground fitted to its points."""
-    config, schedule = active().strategy, list(active().strategy.schedule)
-    wide = config.first_ground_sigma_m, config.first_ground_robust_c
-    narrow = config.ground_sigma_m, config.ground_robust_c
+    schedule = list(active().strategy.schedule)
+    wide = _FIRST_GROUND_SIGMA_M, _FIRST_GROUND_ROBUST_C
+    narrow = _GROUND_SIGMA_M, _GROUND_ROBUST_C
     for k, c in enumerate(schedule):
-        prior = wide if k < config.first_steps else narrow
+        prior = wide if k < _FIRST_STEPS else narrow
         flight.adjustment.step(c, surface.height_prior(flight.adjustment.points, *prior))
-        if k == config.records_weighed_step:
+        if k == _RECORDS_WEIGHED_STEP:
             weigh_records(flight)
             if free_full_lens(flight):
-                schedule += [active().bundle.track_robust_c] * config.full_lens_steps
-        if k >= config.records_weighed_step:
+                schedule += [TRACK_ROBUST_C] * _FULL_LENS_STEPS
+        if k >= _RECORDS_WEIGHED_STEP:
             surface = fit_surface(flight.adjustment, surface)
     return surface
 
@@ -310,17 +344,16 @@ def _without_wrong_heights(flight: Flight, surface: GroundModel) -> GroundModel:
     The contradiction must remain once the adjustment has converged, and the adjustment without the heights must confirm
     it (`FreeHeight.refutes_record`).
     """
-    config = active().strategy
     if not flight.records.has_height.any() or not contradicted_heights(flight.adjustment).any():
         return surface
-    surface, _ = _steps(flight, surface, config.rest_steps)
+    surface, _ = _steps(flight, surface, _REST_STEPS)
     with_heights, calibration, ground_with_heights = flight.adjustment.copy(), flight.calibration, surface
     predicted = predicted_height_offset(flight.adjustment)
     if not release_heights(flight.adjustment).any():
         return surface
     flight.calibration = replace(calibration, trusted_height=False)
-    for _ in range(config.free_rounds):
-        surface, focal_px = _steps(flight, surface, config.free_steps)
+    for _ in range(_FREE_ROUNDS):
+        surface, focal_px = _steps(flight, surface, _FREE_STEPS)
         free = FreeHeight(
             focal_px=focal_px,
             recorded_m=float(np.median(flight.records.position[flight.records.has_height, 2])),
@@ -340,7 +373,7 @@ def _steps(flight: Flight, surface: GroundModel, count: int) -> tuple[GroundMode
     """Take steps at the final robust scale; the ground, and the focal length in pixels after each step."""
     focal_px = []
     for _ in range(count):
-        flight.adjustment.step(active().bundle.track_robust_c, surface.height_prior(flight.adjustment.points))
+        flight.adjustment.step(TRACK_ROBUST_C, surface.height_prior(flight.adjustment.points))
         surface = fit_surface(flight.adjustment, surface)
         focal_px.append(float(flight.adjustment.cameras.lens[0, F]))
     return surface, focal_px
@@ -396,8 +429,8 @@ def _onto_map(
         return False
     settled = orient_on_map(flight, found.ground, found.matches, state.surface)
     alone_deg, now_deg = (field_of_view_deg(a, flight) for a in (before, flight.adjustment))
-    config, known_deg = active().strategy, float(np.hypot(sigma, level_sigma_deg(flight, ground_alone)))
-    if abs(now_deg - alone_deg) > max(config.map_fov_sigmas * known_deg, config.map_fov_deg):
+    known_deg = float(np.hypot(sigma, level_sigma_deg(flight, ground_alone)))
+    if abs(now_deg - alone_deg) > max(_MAP_FOV_SIGMAS * known_deg, _MAP_FOV_DEG):
         flight.adjustment = before
         flight.warnings.append(
             f"on the map its field of view would be {now_deg:.0f} degrees, by its own pictures it is {alone_deg:.0f}: "
@@ -426,20 +459,17 @@ def level_sigma_deg(flight: Flight, surface: GroundModel) -> float:
     - A lens that was solved with other vehicles is held, and has the sigma of that solution.
     - A lens that distorts strongly has tangential distortion, too, which is not modelled.
     """
-    config = active().strategy
     unknown = flight.sparse or not flight.records.has_height.any()
     if unknown and not flight.calibration.trusted_height and leads_one_way(flight.records.position, flight.leg):
-        return config.one_way_fov_sigma_deg
+        return _ONE_WAY_FOV_SIGMA_DEG
     cameras = flight.cameras()
     held = flight.focal_sigma
-    share = float(np.hypot(held, config.decentred_share if distorts_strongly(flight) else 0.0))
+    share = float(np.hypot(held, _DECENTRED_SHARE if distorts_strongly(flight) else 0.0))
     if flight.calibration.trusted_height and flight.records.has_height.any():
         relief = 0.0 if surface.fit is None else surface.fit.sd_m
-        level = float(np.hypot(config.takeoff_level_sigma_m, relief)) / max(
-            float(np.median(cameras.position[:, 2])), 1.0
-        )
+        level = float(np.hypot(TAKEOFF_LEVEL_SIGMA_M, relief)) / max(float(np.median(cameras.position[:, 2])), 1.0)
         share = float(np.linalg.norm([share, level, height_disagreement(flight.adjustment)]))
     elif not flight.sparse:
-        share = float(np.hypot(share, config.no_height_share))
+        share = float(np.hypot(share, _NO_HEIGHT_SHARE))
     half = 0.5 * fov_rad(float(cameras.lens[0, F]), int(cameras.lens[0, WIDTH]))
     return float(np.degrees(np.sin(2 * half))) * share

@@ -7,12 +7,11 @@ the pictures are used. A model that explains none of the relief is ignored.
 """
 
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.placement import Terrain
 from orthoswarm.raster.height_model import HeightModel, KnownGround
@@ -21,6 +20,18 @@ from orthoswarm.refine.surface.smooth_surface import FitSettings
 from orthoswarm.refine.surface.terrain import fit_terrain, robust_centre
 
 Array = NDArray[np.float64]
+
+_DEM_BLOCK_M: Final = 64.0  # windows of a height model lie on multiples, so that a path that moves reads none again
+_DEM_NODES: Final = 150_000  # nodes of the height model in memory for one vehicle (memory)
+_DEM_ROUGHER_M: Final = 0.3  # a model contradicts the pictures if heights over it vary by so much more than the ground
+_DEM_NOISE_M: Final = 0.4  # differences from a model of this size are errors of the points' own surface
+_DEM_NOISE_LEAST_SHARE: Final = 0.25  # a model that seldom agrees is kept only below this share of `_DEM_NOISE_M`
+_DEM_NOISE_NODES: Final = 2.0  # differences are averaged over a Gaussian of this sigma, nodes
+_DEM_TRUSTED_M: Final = 0.15  # median difference up to which a model is better than the points' own surface
+_DEM_DOUBTED_M: Final = 0.3  # median difference from which it is not
+_DEM_LEVEL_KERNEL_M: Final = 0.2  # Gaussian kernel of the mode by which the model's level is found
+_DEM_LEAST_POINTS: Final = 60  # with fewer points on a model its level is a guess, and it is left out
+_DEM_SEAM_M: Final = 90.0  # over this distance the ground beyond a model is led to its level at the border
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,11 +47,10 @@ class LocalDem:
 
     def window(self, bounds: BoundingBox, most_nodes: int | None = None) -> KnownGround:
         """Heights above the model's zero within bounds; both in the local frame."""
-        c = active().surface
-        block = c.dem_block_m
+        block = _DEM_BLOCK_M
         low = [float(np.floor((v + o) / block) * block) for v, o in zip(bounds[:2], self.origin)]
         high = [float(np.ceil((v + o) / block) * block) for v, o in zip(bounds[2:], self.origin)]
-        ground = self.model.window(BoundingBox(*low, *high), most_nodes or c.dem_nodes)
+        ground = self.model.window(BoundingBox(*low, *high), most_nodes or _DEM_NODES)
         t = ground.terrain
         return replace(ground, terrain=replace(t, west=t.west - self.origin[0], south=t.south - self.origin[1]))
 
@@ -131,8 +141,7 @@ def fit_over_dem(
         The fit, None if the model contradicts the points (or has no heights there); and how far the ground differs
         from the model, the median over nodes with data.
     """
-    c = active().surface
-    most_nodes = most_nodes or c.dem_nodes
+    most_nodes = most_nodes or _DEM_NODES
     ground = dem.window(bounds, most_nodes)
     if not ground.known.any():
         return None, 0.0
@@ -140,10 +149,10 @@ def fit_over_dem(
     if not ground.known.all():
         found = fit_terrain(points, sigma_z, bounds, kappa=kappa, settings=settings)
         on = ground.knows(points[:, :2])
-        if int(on.sum()) < c.dem_least_points:
+        if int(on.sum()) < _DEM_LEAST_POINTS:
             return None, 0.0
         above = points[on, 2] - ground.terrain.height(points[on, :2])
-        beyond = _shifted(found.rendering(), -kernel_mode(above, c.dem_level_kernel_m))
+        beyond = _shifted(found.rendering(), -kernel_mode(above, _DEM_LEVEL_KERNEL_M))
     shape = _completed(ground, beyond)
     over = points.copy()
     over[:, 2] -= shape.height(points[:, :2])
@@ -152,10 +161,10 @@ def fit_over_dem(
     if not known.any():
         return None, 0.0
     sd = float((nodes.z + shape.height(_nodes(nodes)))[known].std())
-    shift = kernel_mode(nodes.z[known].astype(np.float64), c.dem_level_kernel_m)
+    shift = kernel_mode(nodes.z[known].astype(np.float64), _DEM_LEVEL_KERNEL_M)
     difference = nodes.z - np.float32(shift)
     off = float(np.median(np.abs(difference[known])))
-    if float(difference[known].std()) > sd + c.dem_rougher_m:
+    if float(difference[known].std()) > sd + _DEM_ROUGHER_M:
         return None, off
     rest = replace(nodes, z=difference * _difference_share(difference, left.support, off))
     good = np.isfinite(over).all(1) & (sigma_z > 0)
@@ -180,12 +189,11 @@ def _difference_share(difference: NDArray[np.float32], known: NDArray[np.bool_],
     """
     from scipy.ndimage import gaussian_filter
 
-    c = active().surface
-    doubt = (c.dem_doubted_m - usual_m) / (c.dem_doubted_m - c.dem_trusted_m)
-    noise = c.dem_noise_m * float(np.clip(doubt, c.dem_noise_least_share, 1.0))
+    doubt = (_DEM_DOUBTED_M - usual_m) / (_DEM_DOUBTED_M - _DEM_TRUSTED_M)
+    noise = _DEM_NOISE_M * float(np.clip(doubt, _DEM_NOISE_LEAST_SHARE, 1.0))
     weight = known.astype(np.float64)
-    power = gaussian_filter(weight * difference**2, c.dem_noise_nodes)
-    power /= np.maximum(gaussian_filter(weight, c.dem_noise_nodes), 1e-3)
+    power = gaussian_filter(weight * difference**2, _DEM_NOISE_NODES)
+    power /= np.maximum(gaussian_filter(weight, _DEM_NOISE_NODES), 1e-3)
     return np.asarray(np.maximum(0.0, 1.0 - noise**2 / np.maximum(power, 1e-9)), np.float32)
 
 
@@ -209,7 +217,7 @@ def _completed(ground: KnownGround, beyond: Terrain | None) -> Terrain:
     from scipy.ndimage import distance_transform_edt, gaussian_filter
 
     other = beyond.height(_nodes(t))
-    seam_m = active().surface.dem_seam_m
+    seam_m = _DEM_SEAM_M
     blur = seam_m / 3.0 / t.step_m
     gap = gaussian_filter(np.where(known, t.z - other, 0.0), blur, mode="nearest")
     gap /= np.maximum(gaussian_filter(known.astype(np.float64), blur, mode="nearest"), 1e-6)

@@ -1,6 +1,7 @@
 """Ground between the tie points of one vehicle: heights at free positions for its terrain, and a dense grid."""
 
 from dataclasses import replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,9 +11,13 @@ from orthoswarm.refine.flight.relative_block import Flight
 from orthoswarm.refine.surface.ground_offset import draw_positions, measure_ground_offset
 from orthoswarm.refine.surface.terrain import TerrainFit
 from orthoswarm.refine.surface.vehicle_ground import GroundModel, fit_surface
-from orthoswarm.refine.surface.vertical_line_locus import Sweep, dense_ground, spaced_cameras
+from orthoswarm.refine.surface.vertical_line_locus import REFERENCE_HEIGHT_M, Sweep, dense_ground, spaced_cameras
 
 Array = NDArray[np.float64]
+
+_DENSE_CELL_M: Final = 14.0  # side of the cells that get one height each at the reference height
+_DENSE_MOST_CELLS: Final = 400_000  # areas of more cells are left without dense points (memory)
+_HIGH_BASELINES_M: Final = (25.0, 50.0, 75.0)  # baselines of that search at reference height
 
 
 def refit_ground(flight: Flight, surface: GroundModel, *, as_smooth: bool = False) -> GroundModel:
@@ -49,7 +54,7 @@ def dense_points(flight: Flight, surface: GroundModel) -> tuple[Array, Array, Ar
     if reach_m > 0.0:
         left = np.delete(cells, found.cell, axis=0)
         raised = replace(ground, z=ground.z + np.float32(middle_m))
-        patches = (replace(s, baselines_m=c.high_baselines_m) for s in (Sweep.small(), Sweep.large()))
+        patches = (replace(s, baselines_m=_HIGH_BASELINES_M) for s in (Sweep.small(), Sweep.large()))
         sweeps = [replace(s.at_height(height), reach_m=reach_m) for s in patches]
         high = dense_ground(cameras, gray, left, terrain=raised, leg_of_camera=flight.leg, sweeps=sweeps).points
     return found.points, found.sigma_z, high
@@ -69,8 +74,7 @@ def spaced_pictures(flight: Flight, surface: GroundModel) -> NDArray[np.bool_]:
 
 def dense_cell(height_m: float) -> float:
     """Spacing of the cells at a flying height, metres."""
-    c = active().surface
-    return c.dense_cell_m * height_m / c.reference_height_m
+    return _DENSE_CELL_M * height_m / REFERENCE_HEIGHT_M
 
 
 def sight_reach(flight: Flight) -> float:
@@ -84,7 +88,7 @@ def cells_near(path: Array, cell_m: float, reach_m: float) -> Array:
     """Centres of the cells within reach of the path."""
     low = np.floor((path.min(0) - reach_m) / cell_m).astype(int)
     high = np.ceil((path.max(0) + reach_m) / cell_m).astype(int)
-    if (high - low).prod() > active().surface.dense_most_cells:
+    if (high - low).prod() > _DENSE_MOST_CELLS:
         return np.zeros((0, 2))
     near = np.zeros(tuple(high - low), bool)
     k = int(reach_m / cell_m)

@@ -6,22 +6,36 @@ of the view. Small patches at free positions, not at corners, measure the ground
 """
 
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.model.placement import Terrain
 from orthoswarm.refine.bundle.block_arrays import CameraBlock
-from orthoswarm.refine.surface.vertical_line_locus import Gray, LocusPoints, Sweep, dense_ground, height_above
+from orthoswarm.refine.surface.vertical_line_locus import (
+    REFERENCE_HEIGHT_M,
+    Gray,
+    LocusPoints,
+    Sweep,
+    dense_ground,
+    height_above,
+)
 
 Array = NDArray[np.float64]
+
+_OFFSET_POSITIONS: Final = 900  # free positions where the ground is measured against the surface (0.05 s)
+_OFFSET_SPREAD_M: Final = 100.0  # half side of the square about each camera for positions at reference height
+_OFFSET_LEAST_HEIGHTS: Final = 60  # with fewer heights found the offset is 0
+_OFFSET_KERNEL_M: Final = 0.2  # Gaussian kernel of the mode of the differences
+_OFFSET_LIMITS_M: Final = (-1.5, 0.5)  # the offset is clipped to this range
+_OFFSET_REACH_M: Final = 3.0  # heights searched above and below the surface for the offset
+_OFFSET_HEIGHT_STEP_M: Final = 0.25  # distance of the heights searched for the offset at the reference height
 
 
 def near_surface() -> Sweep:
     """A sweep of small patches near the surface; a large patch includes rubble and finds only half of the offset."""
-    c = active().surface
-    return replace(Sweep.small(), reach_m=c.offset_reach_m, height_step_m=c.offset_height_step_m, rival_m=np.inf)
+    return replace(Sweep.small(), reach_m=_OFFSET_REACH_M, height_step_m=_OFFSET_HEIGHT_STEP_M, rival_m=np.inf)
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,8 +60,7 @@ def draw_positions(camera_xy: Array, height_m: float, *, seed: int = 0) -> Array
 
     Deterministic for the same cameras, so that the offset depends on the surface and not on the draw.
     """
-    c = active().surface
-    count, spread_m = c.offset_positions, c.offset_spread_m * height_m / c.reference_height_m
+    count, spread_m = _OFFSET_POSITIONS, _OFFSET_SPREAD_M * height_m / REFERENCE_HEIGHT_M
     rng = np.random.default_rng(seed)
     at = np.asarray(camera_xy, float)[np.linspace(0, len(camera_xy) - 1, count).round().astype(int)]
     return np.asarray(at[:, :2] + rng.uniform(-spread_m, spread_m, (count, 2)))
@@ -72,13 +85,12 @@ def measure_ground_offset(
         leg_of_camera: int (N,), -1 for cameras that must not be used.
         sweep: how heights are searched; None: `near_surface` for the cameras' height above the terrain.
     """
-    c = active().surface
     sweep = sweep or near_surface().at_height(height_above(cameras, terrain))
     found = dense_ground(cameras, gray, positions, terrain=terrain, leg_of_camera=leg_of_camera, sweeps=(sweep,))
     above = found.points[:, 2] - terrain.height(found.points[:, :2])
-    if len(above) < c.offset_least_heights:
+    if len(above) < _OFFSET_LEAST_HEIGHTS:
         return GroundOffset(0.0, len(above), found)
-    offset_m = float(np.clip(kernel_mode(above, c.offset_kernel_m), *c.offset_limits_m))
+    offset_m = float(np.clip(kernel_mode(above, _OFFSET_KERNEL_M), *_OFFSET_LIMITS_M))
     return GroundOffset(offset_m, len(above), found)
 
 

@@ -2,15 +2,25 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from orthoswarm.config import active
 from orthoswarm.model.robust import MEDIAN_SIGMA, mad_sigma
 
 Array = NDArray[np.float64]
+
+_LEVEL_RADIUS_M: Final = 25.0  # points of two vehicles this near each other, horizontally, are common ground
+_LEVEL_NEIGHBOURS: Final = 3  # points of the other vehicle within that radius whose median height is compared
+_LEVEL_LEAST_POINTS: Final = 15  # common points that make a pair of vehicles
+_LEVEL_MOST_POINTS: Final = 400  # points of each vehicle compared in a pair: a median of more is no better
+_LEVEL_SIGMA_FLOOR_M: Final = 0.03  # least sigma of a pair's difference
+_LEVEL_SPREAD_FLAT_M: Final = 0.8  # spread of the levels up to which the least corrected vehicle stays
+_LEVEL_SPREAD_RELIEF_M: Final = 1.6  # spread of the levels from which their mean stays: relief
+_LEVEL_QUANTILE: Final = 0.1  # of many vehicles this quantile stands for the lowest: the lowest of many is noise
+_LEVEL_MANY_VEHICLES: Final = 10  # more vehicles than this are many
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,20 +55,19 @@ def level_network(ground: Sequence[Array]) -> LevelNetwork:
     Args:
         ground: for each vehicle float64 (M, 3), its points on the ground, in a common horizontal frame.
     """
-    c = active().surface
     count = len(ground)
-    trees = [cKDTree(g[:, :2]) if len(g) >= c.level_neighbours else None for g in ground]
+    trees = [cKDTree(g[:, :2]) if len(g) >= _LEVEL_NEIGHBOURS else None for g in ground]
     pairs: list[tuple[int, int]] = []
     difference: list[float] = []
     sigma: list[float] = []
     for i in range(count):
         for j in range(i + 1, count):
             d = _common_difference(ground[i], ground[j], trees[i], trees[j])
-            if len(d) >= c.level_least_points:
+            if len(d) >= _LEVEL_LEAST_POINTS:
                 pairs.append((i, j))
                 difference.append(float(np.median(d)))
                 spread = mad_sigma(d - difference[-1])
-                sigma.append(float(np.hypot(MEDIAN_SIGMA * spread / np.sqrt(len(d)), c.level_sigma_floor_m)))
+                sigma.append(float(np.hypot(MEDIAN_SIGMA * spread / np.sqrt(len(d)), _LEVEL_SIGMA_FLOOR_M)))
     edge = np.array(pairs, np.int64).reshape(-1, 2)
     return _adjust(count, edge, np.array(difference, float), np.array(sigma, float))
 
@@ -71,22 +80,21 @@ def _common_difference(a: Array, b: Array, tree_a: cKDTree | None, tree_b: cKDTr
     """
     if tree_a is None or tree_b is None:
         return np.empty(0)
-    c = active().surface
-    radius, k = c.level_radius_m, c.level_neighbours
+    radius, k = _LEVEL_RADIUS_M, _LEVEL_NEIGHBOURS
     low, high = np.maximum(tree_a.mins, tree_b.mins) - radius, np.minimum(tree_a.maxes, tree_b.maxes) + radius
     if (low > high).any():
         return np.empty(0)
     difference, off_centre = [np.empty(0)], [np.empty(0)]
     for points, other, tree, sign in ((a, b, tree_b, 1.0), (b, a, tree_a, -1.0)):
         near = points[((points[:, :2] >= low) & (points[:, :2] <= high)).all(1)]
-        near = near[:: max(1, len(near) // c.level_most_points)]
+        near = near[:: max(1, len(near) // _LEVEL_MOST_POINTS)]
         distance, index = tree.query(near[:, :2], k=k, distance_upper_bound=radius)
         ok = np.isfinite(distance).reshape(len(near), k).all(1)
         around = other[index.reshape(len(near), k)[ok]]
         difference.append(sign * (near[ok, 2] - np.median(around[..., 2], axis=1)))
         off_centre.append(np.hypot(*(around[..., :2].mean(1) - near[ok, :2]).T))
     d, away = np.concatenate(difference), np.concatenate(off_centre)
-    return d[np.argsort(away, kind="stable")[: max(c.level_least_points, len(d) // 2)]]
+    return d[np.argsort(away, kind="stable")[: max(_LEVEL_LEAST_POINTS, len(d) // 2)]]
 
 
 def _adjust(count: int, edge: NDArray[np.int64], difference: Array, sigma: Array) -> LevelNetwork:
@@ -124,10 +132,9 @@ def _adjust(count: int, edge: NDArray[np.int64], difference: Array, sigma: Array
 
 def _anchor(correction: Array) -> float:
     """The correction (relative to their mean) that becomes zero."""
-    c = active().surface
-    tail = c.level_quantile if len(correction) > c.level_many_vehicles else 0.0
+    tail = _LEVEL_QUANTILE if len(correction) > _LEVEL_MANY_VEHICLES else 0.0
     lowest = float(np.quantile(correction, tail))
     spread = float(np.quantile(correction, 1.0 - tail)) - lowest
-    share = (spread - c.level_spread_flat_m) / (c.level_spread_relief_m - c.level_spread_flat_m)
+    share = (spread - _LEVEL_SPREAD_FLAT_M) / (_LEVEL_SPREAD_RELIEF_M - _LEVEL_SPREAD_FLAT_M)
     share = float(np.clip(share, 0.0, 1.0))
     return (1.0 - share) * lowest

@@ -6,20 +6,52 @@ normal equations are banded along the shorter side of the grid.
 """
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel, kernel
-from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
+from orthoswarm.mosaic.extent import FLAT_RELIEF_M
 
 Array = NDArray[np.float64]
 
 KAPPA_SPACING_M = 30.0
 """Kappa, the smoothness, is defined as the sigma of second differences between nodes this far apart, metres; for other
 distances it is scaled, so that it means the same ground."""
+
+_NODE_SPACING_M: Final = 30.0  # distance of the terrain's nodes
+_POINT_SIGMA_FLOOR_M: Final = 0.25  # added in squares to every point's own sigma
+_ROBUST_START_M: Final = 10.0  # robust scale above the surface in the first solve: higher than most houses
+_ROBUST_END_M: Final = 0.3
+"""Robust scale above the surface in the last solve. It seeks the mode of the heights: 0.6 above and 1.5 below let cars
+and bushes lift the surface by 0.1 to 0.2 m (measured on synthetic towns)."""
+_ROBUST_BELOW_FACTOR: Final = 3.0  # the robust scale below the surface is this multiple of that above
+_ROBUST_BELOW_LEAST_M: Final = 0.8  # the robust scale below the surface is never less than this (see `_ROBUST_END_M`)
+_ROBUST_SOLVES: Final = 12  # solves over which the robust scale shrinks geometrically from start to end
+_SLOPE_SIGMA_M: Final = 6.0  # sigma of first differences between nodes: ground is rather level
+_SLOPE_FULL_KAPPA_M: Final = 0.8  # smoother surfaces get a sigma of first differences smaller in proportion
+_OPEN_SLOPE_RATIO: Final = 1.5
+"""Sigma of first differences next to nodes without data, as a multiple of kappa: beyond the data the surface goes on
+level instead of diving (linear extrapolation dived by 4 to 10 m at borders)."""
+_KAPPAS_M: Final = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
+"""Smoothness tried by the hold-out, from smooth to rough: sigma of the second difference between nodes 30 m apart
+(scaled for other distances, so that it means the same ground)."""
+_HOLD_OUT_EVERY: Final = 4  # every so many-th point is left out to find the smoothness
+_HOLD_OUT_POINTS: Final = 10  # with fewer points left out the smoothest surface is taken
+_HOLD_OUT_SOLVES: Final = 8  # solves for each smoothness tried (its cost; not measured)
+_HOLD_OUT_STANDARD_ERRORS: Final = 0.5  # the smoothest surface within so many of the best's errors at points left out
+_TILE_NODES: Final = 40  # larger areas are solved in tiles of so many nodes a side
+_TILE_OVERLAP_NODES: Final = 8  # nodes by which tiles overlap on each side
+_TILE_KAPPA_VOTES: Final = 4
+"""So many of the fullest tiles ask for a smoothness, and the median is taken for all (its cost)."""
+_DRAWN_HOLD_OUT_STANDARD_ERRORS: Final = 1.0  # as `_HOLD_OUT_STANDARD_ERRORS`, of the surface for drawing
+_DRAWN_FLAT_RELIEF_M: Final = 0.15  # as `FLAT_RELIEF_M`, for drawing
+_DRAWN_ON_MAP_SIGMA_FLOOR_M: Final = 0.15
+"""As `_POINT_SIGMA_FLOOR_M`, where heights by the map are among the points (chosen with them: the 95 % of the map's
+error fell by a quarter on flat ground, by half on relief)."""
+_DRAWN_ON_MAP_FLAT_RELIEF_M: Final = 0.0  # as `_DRAWN_FLAT_RELIEF_M`, with heights by the map
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,24 +88,22 @@ class FitSettings:
     @classmethod
     def configured(cls, **changes: Any) -> "FitSettings":
         """The active configuration with some fields changed."""
-        c = active().surface
         settings = cls(
-            step_m=c.node_spacing_m, floor_sigma_m=c.point_sigma_floor_m, scale_start_m=c.robust_start_m,
-            scale_end_m=c.robust_end_m, below_factor=c.robust_below_factor, below_min_m=c.robust_below_least_m,
-            solves=c.robust_solves, slope_sigma_m=c.slope_sigma_m, level_ratio=c.open_slope_ratio,
-            flat_sd_m=c.flat_relief_m, render_flat_sd_m=c.drawn_flat_relief_m,
-            held_out_se=c.hold_out_standard_errors,
+            step_m=_NODE_SPACING_M, floor_sigma_m=_POINT_SIGMA_FLOOR_M, scale_start_m=_ROBUST_START_M,
+            scale_end_m=_ROBUST_END_M, below_factor=_ROBUST_BELOW_FACTOR, below_min_m=_ROBUST_BELOW_LEAST_M,
+            solves=_ROBUST_SOLVES, slope_sigma_m=_SLOPE_SIGMA_M, level_ratio=_OPEN_SLOPE_RATIO,
+            flat_sd_m=FLAT_RELIEF_M, render_flat_sd_m=_DRAWN_FLAT_RELIEF_M,
+            held_out_se=_HOLD_OUT_STANDARD_ERRORS,
         )  # fmt: skip
         return replace(settings, **changes)
 
     @classmethod
     def for_drawing(cls, *, on_map: bool) -> "FitSettings":
         """Settings for the surface that pictures are drawn on; on_map: its points include heights from the map."""
-        c = active().surface
-        drawn = cls.configured(held_out_se=c.drawn_hold_out_standard_errors)
+        drawn = cls.configured(held_out_se=_DRAWN_HOLD_OUT_STANDARD_ERRORS)
         if not on_map:
             return drawn
-        return replace(drawn, floor_sigma_m=c.drawn_on_map_sigma_floor_m, render_flat_sd_m=c.drawn_on_map_flat_relief_m)
+        return replace(drawn, floor_sigma_m=_DRAWN_ON_MAP_SIGMA_FLOOR_M, render_flat_sd_m=_DRAWN_ON_MAP_FLAT_RELIEF_M)
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,7 +203,7 @@ class Surface:
         s, inner = self.settings, self.inner
         base = self.base if base is None else base
         ratio = s.step_m / KAPPA_SPACING_M
-        slope_sigma = s.slope_sigma_m * min(1.0, kappa / active().surface.slope_full_kappa_m) * ratio
+        slope_sigma = s.slope_sigma_m * min(1.0, kappa / _SLOPE_FULL_KAPPA_M) * ratio
         kappa *= ratio**2
         penalty = self.curvature / kappa**2 + self.slope / slope_sigma**2 + self.level / (s.level_ratio * kappa) ** 2
         band, rhs = np.empty_like(penalty), np.empty(len(self.support))
@@ -192,16 +222,16 @@ class Surface:
 
         The best itself would be too rough: it would follow rubble, which is not ground.
         """
-        s, c = self.settings, active().surface
-        out = np.flatnonzero(self.base > 0)[c.hold_out_every - 1 :: c.hold_out_every]
-        if len(out) < c.hold_out_points:
-            return c.kappas_m[0]
+        s = self.settings
+        out = np.flatnonzero(self.base > 0)[_HOLD_OUT_EVERY - 1 :: _HOLD_OUT_EVERY]
+        if len(out) < _HOLD_OUT_POINTS:
+            return _KAPPAS_M[0]
         base = self.base.copy()
         base[out] = 0.0
         costs: list[Array] = []
         mean: list[float] = []
-        for kappa in c.kappas_m:
-            z = self.solve(kappa, base, c.hold_out_solves)
+        for kappa in _KAPPAS_M:
+            z = self.solve(kappa, base, _HOLD_OUT_SOLVES)
             e = self.z[out] - _interpolate(z, self.cell[out], self.share[out], self.inner)
             q = e**2 / (np.where(e > 0, s.scale_end_m, s.below_min_m) ** 2 + self.sigma[out] ** 2)
             costs.append(q / (1.0 + q))
@@ -210,7 +240,7 @@ class Surface:
                 break
         best = int(np.argmin(mean))
         limit = mean[best] + s.held_out_se * float(costs[best].std()) / np.sqrt(len(out))
-        return c.kappas_m[next(i for i, m in enumerate(mean) if m <= limit)]
+        return _KAPPAS_M[next(i for i, m in enumerate(mean) if m <= limit)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -237,8 +267,7 @@ def fit_nodes(
 
     All tiles use the median smoothness of those with most points. tile_nodes: overrides the configuration, for tests.
     """
-    config = active().surface
-    core, overlap = tile_nodes or config.tile_nodes, config.tile_overlap_nodes
+    core, overlap = tile_nodes or _TILE_NODES, _TILE_OVERLAP_NODES
     grid = _Grid.over(bounds, s.step_m)
     if max(grid.columns, grid.rows) <= core + 3 * overlap:
         surface = Surface.over(points, sigma_z, grid, s)
@@ -256,7 +285,7 @@ def fit_nodes(
     if not tiles:
         return None
     if kappa is None:
-        fullest = sorted(tiles, key=lambda tile: -int(tile[1].sum()))[: config.tile_kappa_votes]
+        fullest = sorted(tiles, key=lambda tile: -int(tile[1].sum()))[:_TILE_KAPPA_VOTES]
         asked = [Surface.over(points[i], sigma_z[i], part, s).choose_kappa() for part, i in fullest]
         kappa = sorted(asked)[len(asked) // 2]
     total, weight = np.zeros((grid.rows, grid.columns)), np.zeros((grid.rows, grid.columns))

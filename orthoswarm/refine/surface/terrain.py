@@ -5,11 +5,11 @@ below: points far above it lose their weight first. Heights and nodes are in the
 """
 
 from dataclasses import dataclass, field
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.placement import Terrain
@@ -19,6 +19,12 @@ Array = NDArray[np.float64]
 
 HALF_MAXIMUM_SIGMAS = 1.1774
 """Half width of a Gaussian at half its maximum, in sigmas: sqrt(2 ln 2)."""
+
+_GROUND_MODE_KERNEL_M: Final = 0.15  # Gaussian kernel of the density of heights in which the ground's level is sought
+_GROUND_MODE_WINDOW_M: Final = 15.0  # heights farther than this from the median do not count for the ground's level
+_GROUND_MODE_BIN_M: Final = 0.05  # bin of that density: a third of its kernel (exactness)
+_GROUND_MODE_SHARE: Final = 0.4  # the lowest peak of at least this share of the highest one's density is the ground
+_POINTS_CENTRE_SCALE_M: Final = 2.0  # robust scale of the points' centre over the ground
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -126,8 +132,7 @@ def lower_flank(height: Array, sigma: Array | None = None) -> float:
     noise would have: a symmetric peak returns its mode, a peak skewed upwards returns its lower edge. Of
     several peaks the lowest one of sufficient density is used, as many corners lie on car roofs.
     """
-    c = active().surface
-    window_m, bin_m, kernel_m = c.ground_mode_window_m, c.ground_mode_bin_m, c.ground_mode_kernel_m
+    window_m, bin_m, kernel_m = _GROUND_MODE_WINDOW_M, _GROUND_MODE_BIN_M, _GROUND_MODE_KERNEL_M
     z = np.asarray(height, float)
     if len(z) == 0:
         return 0.0
@@ -139,7 +144,7 @@ def lower_flank(height: Array, sigma: Array | None = None) -> float:
     reach = np.arange(-bins, bins + 1) * bin_m
     density = np.convolve(counts, np.exp(-0.5 * (reach / kernel_m) ** 2), mode="same")
     peak = np.r_[False, (density[1:-1] >= density[:-2]) & (density[1:-1] > density[2:]), False]
-    peak &= density >= c.ground_mode_share * density.max()
+    peak &= density >= _GROUND_MODE_SHARE * density.max()
     top = int(np.flatnonzero(peak)[0]) if peak.any() else int(density.argmax())
     below = np.flatnonzero(density[:top] < 0.5 * density[top])
     if len(below) == 0:
@@ -156,7 +161,7 @@ def lower_flank(height: Array, sigma: Array | None = None) -> float:
 
 def robust_centre(x: Array, rounds: int = 20) -> float:
     """Geman-McClure centre of values, started at their median."""
-    scale_m = active().surface.points_centre_scale_m
+    scale_m = _POINTS_CENTRE_SCALE_M
     if len(x) == 0:
         return 0.0
     c = float(np.median(x))

@@ -1,19 +1,28 @@
 """The ground under one vehicle during its adjustment: fitted to the points, used as their height prior."""
 
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.placement import Terrain
 from orthoswarm.refine.bundle.adjustment import Adjustment, HeightPrior
 from orthoswarm.refine.surface.dem_surface import DemFit, LocalDem, fit_over_dem
+from orthoswarm.refine.surface.mapped_level import TERRAIN_POINTS
 from orthoswarm.refine.surface.smooth_surface import FitSettings
 from orthoswarm.refine.surface.terrain import TerrainFit, fit_terrain
 
 Array = NDArray[np.float64]
+
+_GROUND_POINT_OBSERVATIONS: Final = 4  # least observations of a point that the terrain is fitted to
+_GROUND_POINT_WEIGHT: Final = 0.6  # least mean robust weight of such a point's observations
+_GROUND_POINT_SIGMA_M: Final = 1.5  # largest sigma of such a point's height
+_TERRAIN_REACH_HEIGHTS: Final = 1.08  # how far beyond the outermost cameras the terrain reaches, in flying heights
+_HEIGHT_PRIOR_SIGMA_M: Final = 2.0  # sigma of the robust height prior of points about the terrain
+_HEIGHT_PRIOR_SOFT_SIGMA_M: Final = 20.0  # sigma of the weak height prior that is not robust
+_HEIGHT_PRIOR_ROBUST_C: Final = 1.0  # scale c of the robust height prior's kernel, squared sigmas
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,16 +57,15 @@ class GroundModel:
 
     def height_prior(self, points: Array, sigma_m: float | None = None, robust_c: float | None = None) -> HeightPrior:
         """The height prior of points (P, 3); sigma and robust scale default to the configuration's."""
-        config = active().surface
         if self.fit is None:
             expected = self._initial_height(points[:, :2])
         else:
             expected = self.fit.prior(self.level_m).height(points[:, :2]) + self.fit.points_above_m
         return HeightPrior(
             expected,
-            sigma_m or config.height_prior_sigma_m,
-            config.height_prior_soft_sigma_m,
-            robust_c or config.height_prior_robust_c,
+            sigma_m or _HEIGHT_PRIOR_SIGMA_M,
+            _HEIGHT_PRIOR_SOFT_SIGMA_M,
+            robust_c or _HEIGHT_PRIOR_ROBUST_C,
         )
 
     def _initial_height(self, xy: Array) -> Array:
@@ -67,14 +75,13 @@ class GroundModel:
 
 def ground_points(adjustment: Adjustment) -> tuple[Array, Array]:
     """Points suitable for the terrain, float64 (K, 3), and one sigma of their heights (K,)."""
-    c = active().surface
     n = len(adjustment.points)
     point = adjustment.tracks.point
     total = np.maximum(np.bincount(point, minlength=n), 1)
     weight = np.bincount(point, adjustment.obs_weight, minlength=n) / total
     sigma = np.sqrt(np.maximum(adjustment.point_inverse[:, 2, 2], 0.0))
-    good = (total >= c.ground_point_observations) & (weight > c.ground_point_weight)
-    good &= (sigma < c.ground_point_sigma_m) & (sigma > 0)
+    good = (total >= _GROUND_POINT_OBSERVATIONS) & (weight > _GROUND_POINT_WEIGHT)
+    good &= (sigma < _GROUND_POINT_SIGMA_M) & (sigma > 0)
     return adjustment.points[good], sigma[good]
 
 
@@ -106,10 +113,9 @@ def fit_ground(
 
     A height model that contradicts the points is dropped for good.
     """
-    c = active().surface
-    if len(points) < c.terrain_points:
+    if len(points) < TERRAIN_POINTS:
         return before
-    reach = c.terrain_reach_heights * float(np.median(camera_position[:, 2]))
+    reach = _TERRAIN_REACH_HEIGHTS * float(np.median(camera_position[:, 2]))
     bounds = BoundingBox.around_points(camera_position[:, :2], reach)
     if before.dem is not None:
         fit, off = fit_over_dem(before.dem, points, sigma, bounds, kappa=kappa, settings=settings)

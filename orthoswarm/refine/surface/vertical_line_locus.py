@@ -10,17 +10,41 @@ the strip. Pictures are read one after the other along the legs, with only a win
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.model.placement import Terrain
 from orthoswarm.refine.bundle.block_arrays import HEIGHT, WIDTH, CameraBlock, F
 from orthoswarm.refine.surface import vertical_line_kernels as kernels
 
 Array = NDArray[np.float64]
 Gray = Callable[[int], NDArray[np.uint8]]
+
+REFERENCE_HEIGHT_M: Final = 150.0  # flying height for which lengths of patches are stated
+_SWEEP_REACH_M: Final = 9.0  # heights searched above and below the terrain
+_SWEEP_HEIGHT_STEP_M: Final = 0.375  # distance of the heights searched at reference height
+_SWEEP_BASELINES_M: Final = (40.0, 75.0, 110.0)  # wished distances of partners on both sides, at reference height
+_SWEEP_SPACING_M: Final = 17.0  # only pictures this far apart along a leg are used at reference height
+_SWEEP_LEAST_BASELINE_SHARE: Final = 0.4  # least baseline as a share of the shortest that is wished
+_SWEEP_PARTNERS: Final = 3  # partners below which pictures of other legs are asked for, where a leg ends
+_SWEEP_RIVAL_M: Final = 4.0  # second peak farther than this from the best makes a height ambiguous at reference height
+_SWEEP_RIVAL_SHARE: Final = 0.95  # ... if it is above this share of the best
+_SWEEP_LEAST_VARIANCE: Final = 2.0  # least variance of a patch's grey values, squared: less is the noise of a JPEG
+_SWEEP_STEEPEST: Final = 1.5  # steepest slope of a patch's plane: across a wall it is none
+_SWEEP_SLOPE_REACH_M: Final = 5.0  # the slope below a patch is taken over this distance at least
+_SWEEP_PICTURES: Final = 64  # pictures held at a time (memory)
+_SMALL_PATCH_HALF: Final = 4  # half width of the small patch, samples: 9 x 9
+_SMALL_PATCH_STEP_M: Final = 0.5
+"""Distance of its samples at the reference height. It fits between cars, bushes and houses: on a street scene three
+quarters of its heights lie within 0.2 m of bare ground, half of the large one's, most others above."""
+_SMALL_PATCH_SCORE: Final = 0.7  # least mean normalised correlation of the small patch
+_SMALL_PATCH_SIGMA_M: Final = 0.15  # sigma of its heights at the reference height (see `_SMALL_PATCH_STEP_M`)
+_LARGE_PATCH_HALF: Final = 7  # half width of the large patch, samples (15 x 15): heights where texture is weak
+_LARGE_PATCH_STEP_M: Final = 0.7  # distance of its samples at the reference height
+_LARGE_PATCH_SCORE: Final = 0.6  # least mean normalised correlation of the large patch
+_LARGE_PATCH_SIGMA_M: Final = 0.25  # sigma of its heights on open ground at the reference height
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,27 +78,24 @@ class Sweep:
     @classmethod
     def small(cls) -> "Sweep":
         """Small patches, which fit between cars, bushes and houses, so that most of their heights are bare ground."""
-        c = active().surface
-        return cls._with_patch(c.small_patch_half, c.small_patch_step_m, c.small_patch_score, c.small_patch_sigma_m)
+        return cls._with_patch(_SMALL_PATCH_HALF, _SMALL_PATCH_STEP_M, _SMALL_PATCH_SCORE, _SMALL_PATCH_SIGMA_M)
 
     @classmethod
     def large(cls) -> "Sweep":
         """Large patches, for ground with little texture."""
-        c = active().surface
-        return cls._with_patch(c.large_patch_half, c.large_patch_step_m, c.large_patch_score, c.large_patch_sigma_m)
+        return cls._with_patch(_LARGE_PATCH_HALF, _LARGE_PATCH_STEP_M, _LARGE_PATCH_SCORE, _LARGE_PATCH_SIGMA_M)
 
     @classmethod
     def _with_patch(cls, half: int, step_m: float, min_score: float, sigma_m: float) -> "Sweep":
-        c = active().surface
         return cls(
-            half=half, step_m=step_m, reach_m=c.sweep_reach_m, height_step_m=c.sweep_height_step_m,
-            min_score=min_score, rival_m=c.sweep_rival_m, rival_share=c.sweep_rival_share, sigma_m=sigma_m,
-            baselines_m=c.sweep_baselines_m, spacing_m=c.sweep_spacing_m,
+            half=half, step_m=step_m, reach_m=_SWEEP_REACH_M, height_step_m=_SWEEP_HEIGHT_STEP_M,
+            min_score=min_score, rival_m=_SWEEP_RIVAL_M, rival_share=_SWEEP_RIVAL_SHARE, sigma_m=sigma_m,
+            baselines_m=_SWEEP_BASELINES_M, spacing_m=_SWEEP_SPACING_M,
         )  # fmt: skip
 
     def at_height(self, height_m: float) -> "Sweep":
         """The same sweep for cameras at another height above ground: all lengths but the reach are scaled."""
-        k = height_m / active().surface.reference_height_m
+        k = height_m / REFERENCE_HEIGHT_M
         return replace(
             self,
             step_m=self.step_m * k,
@@ -132,13 +153,12 @@ def dense_ground(
             and spacing are the first one's. None: small patches, then large, for the cameras' height above the terrain.
         slots: pictures in memory at a time (more only if the cells of one reference need more); None: as configured.
     """
-    c = active().surface
     if sweeps is None:
         height = height_above(cameras, terrain)
         sweeps = (Sweep.small().at_height(height), Sweep.large().at_height(height))
     s = sweeps[0]
     cells = np.ascontiguousarray(cells, dtype=np.float64).reshape(-1, 2)
-    plane = _planes(terrain, cells, max(c.sweep_slope_reach_m, s.half * s.step_m))
+    plane = _planes(terrain, cells, max(_SWEEP_SLOPE_REACH_M, s.half * s.step_m))
     usable = _usable_cameras(cameras, np.asarray(leg_of_camera), s.spacing_m)
     ref = np.full(len(cells), -1, np.int32)
     found = np.full((len(cells), 3), -1.0)
@@ -147,12 +167,12 @@ def dense_ground(
         partner = np.full((len(cells), len(wished)), -1, np.int32)
         kernels.choose(
             cameras.position, cameras.rotation, cameras.lens_id, cameras.lens, usable.camera, usable.leg, usable.along,
-            cells, plane, s.half * s.step_m, wished, c.sweep_least_baseline_share * min(s.baselines_m),
-            c.sweep_partners, ref, partner,
+            cells, plane, s.half * s.step_m, wished, _SWEEP_LEAST_BASELINE_SHARE * min(s.baselines_m),
+            _SWEEP_PARTNERS, ref, partner,
         )  # fmt: skip
         _sweep_in_windows(
             cameras, gray, usable.order, cells, plane, ref=ref, partner=partner, sweeps=sweeps,
-            slots=slots or c.sweep_pictures, found=found,
+            slots=slots or _SWEEP_PICTURES, found=found,
         )  # fmt: skip
     good = np.flatnonzero(found[:, 1] >= 0.0)
     points = np.empty((len(good), 3))
@@ -163,7 +183,7 @@ def dense_ground(
 def height_above(cameras: CameraBlock, terrain: Terrain) -> float:
     """Median height of cameras above the terrain, metres, at least 1."""
     if len(cameras) == 0:
-        return active().surface.reference_height_m
+        return REFERENCE_HEIGHT_M
     return max(1.0, float(np.median(cameras.position[:, 2] - terrain.height(cameras.position[:, :2]))))
 
 
@@ -217,7 +237,7 @@ def _planes(terrain: Terrain, cells: Array, reach: float) -> Array:
     z = terrain.height(cells)
     ge = (terrain.height(cells + e) - terrain.height(cells - e)) / (2 * reach)
     gn = (terrain.height(cells + n) - terrain.height(cells - n)) / (2 * reach)
-    steepest = active().surface.sweep_steepest
+    steepest = _SWEEP_STEEPEST
     return np.stack([z, np.clip(ge, -steepest, steepest), np.clip(gn, -steepest, steepest)], 1)
 
 
@@ -249,7 +269,7 @@ def _sweep_in_windows(
     slots = max(min(slots, int(order.max()) + 1), *(len(needed) for _, _, needed in groups))
     window = _Window(cameras, gray, _reduction(cameras, plane, ref, min(s.step_m for s in sweeps)), slots)
     factor = window.factor.astype(np.float64)
-    least_variance = active().surface.sweep_least_variance
+    least_variance = _SWEEP_LEAST_VARIANCE
 
     def search(block: NDArray[np.int64], needed: set[int]) -> None:
         window.hold(sorted(needed, key=lambda camera: int(order[camera])))

@@ -19,8 +19,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
+from typing import Final
 
-from orthoswarm.config import active
 from orthoswarm.model.earth import DEGREE_M
 from telemetry.samples.findings import plural
 from telemetry.samples.sample import Sample, checked
@@ -45,6 +45,8 @@ _COMMA_TUPLE = re.compile(r"\bGPS\s*\((?:\s*[+-]?\d+\s*,){3}\s*[+-]?\d", re.IGNO
 """Four whole numbers where two or three numbers belong: two of them are decimals behind a comma."""
 _DECIMAL_COMMA = re.compile(r"(\d+),(\d+)")
 _COUNT = re.compile(r"\b(?:FrameCnt|SrtCnt)\s*:\s*(\d{1,9})")
+
+_SUBTITLE_RESTART_S: Final = 5.0  # subtitles whose times go back by more than this are those of another recording
 
 
 @dataclass(slots=True)
@@ -147,7 +149,7 @@ def _join(blocks: list[_Raw]) -> list[float]:
     Each counts its times from zero. Blocks that are only out of order go back by less. A block with a damaged time
     tells neither where a recording begins nor where it ends.
     """
-    restart_s = active().ingest.subtitle_restart_s
+    restart_s = _SUBTITLE_RESTART_S
     starts_s = [block.start_s for block in blocks]
     joints_s: list[float] = []
     shift_s = before_s = end_s = 0.0

@@ -1,14 +1,15 @@
 """The result of matching two sequences of exposures: probabilities of pairings, and the best alignment."""
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
-
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
+
+_LEAST_PROBABILITY: Final = 0.02  # events that a photo has with less probability are not listed as its alternatives
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,7 +45,7 @@ class SequenceMatch:
         nodes: list[tuple[int, int, float, int]] = []  # photo, event, probability, node before
         for i, row in enumerate(self.probability):
             reached = []
-            for column in np.flatnonzero(row > active().pairing.least_probability).tolist():
+            for column in np.flatnonzero(row > _LEAST_PROBABILITY).tolist():
                 event = int(self.first[i]) + column
                 value, before = _prefix_maximum(tree, event)
                 nodes.append((i, event, float(row[column]), before))
@@ -60,12 +61,12 @@ class SequenceMatch:
 
     def may_have_none(self, photo: int) -> bool:
         """Whether another clock, under which a photo has no event, is possible: then its event is no likely place."""
-        least = active().pairing.least_probability
+        least = _LEAST_PROBABILITY
         return bool(self.other_clock > least and self.probability[photo].sum() < 1.0 - least)
 
     def alternatives(self, photo: int) -> list[int]:
         """Events that a photo may belong to."""
-        columns = np.flatnonzero(self.probability[photo] > active().pairing.least_probability)
+        columns = np.flatnonzero(self.probability[photo] > _LEAST_PROBABILITY)
         return [int(self.events[self.first[photo] + column]) for column in columns]
 
 

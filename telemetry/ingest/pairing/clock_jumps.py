@@ -6,15 +6,21 @@ differ by another offset, so that they are matched as sequences part by part.
 
 from collections.abc import Callable
 from itertools import pairwise
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
+from telemetry.ingest.pairing.motion_chains import SAME_EXPOSURE_SHARE
+from telemetry.ingest.pairing.sequence_model import MOST_DRIFT
 
 Array = NDArray[np.float64]
 Matcher = Callable[[Array, Array], Array | None]
 """Offsets (photo minus event) of the certain pairs of photos (N,) and events (M,); None if the times do not decide."""
+
+_JUMP_WINDOWS: Final = 4  # parts of a flight compared to find whether the camera's clock was set in between
+JUMP_LEAST_PHOTOS: Final = 6  # photos of a part of a flight, and those only its clock gives an event, at least
+LEAST_JUMP_S: Final = 0.6  # clocks of two parts that differ by more than this and the largest drift are two settings
 
 
 def parts_between_jumps(photos: Array, events: Array, offsets: Matcher) -> list[slice]:
@@ -25,12 +31,11 @@ def parts_between_jumps(photos: Array, events: Array, offsets: Matcher) -> list[
         events: (M,) times by the vehicle, in order.
         offsets: matches a part of the photos with the events.
     """
-    config = active().pairing
     count = len(photos)
-    if count < config.jump_windows * config.jump_least_photos:
+    if count < _JUMP_WINDOWS * JUMP_LEAST_PHOTOS:
         return [slice(0, count)]
-    edges = np.linspace(0, count, config.jump_windows + 1).round().astype(int)
-    allowed = config.most_drift * float(np.ptp(events)) + config.least_jump_s
+    edges = np.linspace(0, count, _JUMP_WINDOWS + 1).round().astype(int)
+    allowed = MOST_DRIFT * float(np.ptp(events)) + LEAST_JUMP_S
     parts = list(pairwise(edges.tolist()))
     begin, end = (offsets(photos[a:b], events) for a, b in (parts[0], parts[-1]))
     if begin is not None and end is not None and abs(float(np.median(end) - np.median(begin))) <= allowed:
@@ -46,7 +51,7 @@ def parts_between_jumps(photos: Array, events: Array, offsets: Matcher) -> list[
 
 def _first_after(photos: Array, events: Array, before: float, after: float, start: int) -> int:
     """Index of the first photo of the later clock: under the clock of their part photos are nearest to events."""
-    far = active().pairing.same_exposure_share * float(np.median(np.diff(events)))
+    far = SAME_EXPOSURE_SHARE * float(np.median(np.diff(events)))
     own, other = (np.minimum(_apart(photos[start:] - clock, events), far) for clock in (before, after))
     return start + int(np.argmin(np.concatenate([[0.0], np.cumsum(own - other)])))
 

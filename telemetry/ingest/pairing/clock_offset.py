@@ -4,11 +4,11 @@ All functions return camera time minus vehicle time in seconds, or None if nothi
 """
 
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from telemetry.samples.course import local_metres
 from telemetry.samples.timeline import Timeline
 
@@ -24,6 +24,8 @@ _MOVED_M = 2.0
 """A vehicle moved that is farther away at the next photo, metres (chosen: receivers at rest wander less)."""
 _LEAST_MOVED = 0.8
 """Zones under which a vehicle moved less often, by this share of the most, are not the photos' (chosen)."""
+
+TURNING_MARGIN: Final = 0.1  # a video's turns decide between two clocks, or logs, if correlations differ by more
 
 
 def offset_by_zone(times: Array, timeline: Timeline) -> float | None:
@@ -148,7 +150,7 @@ def offset_by_turning(
         return None
     correlation, offset = max(best)
     rivals = [c for c, o in best if abs(o - offset) > 3.0]
-    if correlation < 0.5 or (rivals and max(rivals) > correlation - active().ingest.turning_margin):
+    if correlation < 0.5 or (rivals and max(rivals) > correlation - TURNING_MARGIN):
         return None
     return offset, correlation
 

@@ -11,10 +11,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
-from telemetry.ingest.pairing.clock_jumps import parts_between_jumps
+from telemetry.ingest.pairing.clock_jumps import JUMP_LEAST_PHOTOS, parts_between_jumps
 from telemetry.ingest.pairing.motion_chains import PictureMotion
-from telemetry.ingest.pairing.sequence_match import match_sequences
+from telemetry.ingest.pairing.sequence_match import CERTAIN, match_sequences
 
 Array = NDArray[np.float64]
 
@@ -121,12 +120,12 @@ def by_time(photos: Array, events: Array, motion: PictureMotion | None = None) -
     if found is None:
         return Pairing()
     pairs = found.pairs()
-    certain = sum(probability >= active().pairing.certain for _, _, probability in pairs)
+    certain = sum(probability >= CERTAIN for _, _, probability in pairs)
     result = Pairing(offset_s=found.offset_s, ambiguous=certain < 0.5 * len(pairs), by_pictures=found.by_pictures)
     for i, j, probability in pairs:
         photo, event = int(order_p[i]), int(order_e[j])
         result.pairs.append((photo, event))
-        if probability < active().pairing.certain or result.ambiguous:
+        if probability < CERTAIN or result.ambiguous:
             result.doubtful[photo] = [int(order_e[k]) for k in found.alternatives(i)]
         if found.may_have_none(i):
             result.open.add(photo)
@@ -180,14 +179,14 @@ def _explains_more(parts: Pairing, whole: Pairing) -> bool:
     these belong to: legs of one mission have one rhythm.
     """
     found, before = (sum(i not in pairing.doubtful for i, _ in pairing.pairs) for pairing in (parts, whole))
-    return found >= before + active().pairing.jump_least_photos
+    return found >= before + JUMP_LEAST_PHOTOS
 
 
 def _certain_offsets(photos: Array, events: Array) -> Array | None:
     """The offsets of the pairs of a part of a flight, if its times leave no doubt."""
     found = by_time(photos, events) if np.ptp(photos) > 0.0 else Pairing()
     sure = [(i, j) for i, j in found.pairs if i not in found.doubtful]
-    if len(sure) < max(active().pairing.jump_least_photos - 1, 0.5 * len(photos)):
+    if len(sure) < max(JUMP_LEAST_PHOTOS - 1, 0.5 * len(photos)):
         return None
     return np.array([photos[i] - events[j] for i, j in sure])
 

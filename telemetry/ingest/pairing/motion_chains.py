@@ -7,14 +7,20 @@ one was taken) and a scale (metres a pixel, from height and lens). Both are hypo
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
-
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
+
+_MOST_CHAIN_PHOTOS: Final = 24  # longest chain whose motion is added up: errors of relief and scale grow
+_PHASE_STEP_S: Final = 0.06  # step of the hypotheses for when in its second a chain's first photo was taken
+_CHAIN_SCALES: Final = (0.96, 1.0, 1.04)  # scale of a chain over that of the flight: the height above ground varies
+_LEAST_SPEED_M_S: Final = 0.3  # slowest speed by which errors of position become errors of time, m/s
+SAME_EXPOSURE_SHARE: Final = 0.35  # a photo nearer to an event than this share of their usual distance is its exposure
+_FALSE_MATCH: Final = 1e-3  # probability that the motion between two pictures is wrong although it looks right
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +83,6 @@ class Chains:
 
         Against an exposure without an event at any time that the photo's clock allows.
         """
-        config = active().pairing
         found = self._expected(photo, offset, drift)
         if found is None:
             return np.ones((len(offset), len(self.phases_s), width))
@@ -86,20 +91,19 @@ class Chains:
         apart = (there[None, None, :] - expected[:, :, None]) / self.sigma_m
         width_m = np.maximum(speed * self.resolution_s, np.sqrt(2.0 * np.pi) * self.sigma_m)[:, None, None]
         near = np.exp(-0.5 * apart**2) * width_m / (np.sqrt(2.0 * np.pi) * self.sigma_m)
-        return np.asarray(config.false_match + (1.0 - config.false_match) * near)
+        return np.asarray(_FALSE_MATCH + (1.0 - _FALSE_MATCH) * near)
 
     def alone(self, photo: int, offset: Array, drift: Array) -> Array:
         """(H, C) how likely it is that a photo has no event although one is where the photo was taken.
 
         Exposures do not come closer to each other than the camera takes them: such a photo is that event.
         """
-        config = active().pairing
         found = self._expected(photo, offset, drift)
         if found is None:
             return np.ones((len(offset), len(self.phases_s)))
         after = np.clip(np.searchsorted(self.path_m, found[0]), 1, len(self.path_m) - 1)
         nearest = np.minimum(np.abs(self.path_m[after] - found[0]), np.abs(self.path_m[after - 1] - found[0]))
-        return np.where(nearest < config.same_exposure_share * self.step_m, config.false_match, 1.0)
+        return np.where(nearest < SAME_EXPOSURE_SHARE * self.step_m, _FALSE_MATCH, 1.0)
 
     def _expected(self, photo: int, offset: Array, drift: Array) -> tuple[Array, Array] | None:
         """(H, C) way of a photo in metres, and (H,) speed; None if its chain has one photo only."""
@@ -109,7 +113,7 @@ class Chains:
         times = (self.p[members][None, :] - offset[:, None]) / (1.0 + drift[:, None])
         ways = np.interp(times, self.e, self.path_m)
         span = times[:, -1] - times[:, 0]
-        speed = np.maximum((ways[:, -1] - ways[:, 0]) / np.maximum(span, 1.0), active().pairing.least_speed_m_s)
+        speed = np.maximum((ways[:, -1] - ways[:, 0]) / np.maximum(span, 1.0), _LEAST_SPEED_M_S)
         own = self.metres_a_pixel * self.scales * self.along_px[photo]
         return ways.mean(axis=1)[:, None] + own[None, :] + speed[:, None] * self.phases_s[None, :], speed
 
@@ -123,7 +127,6 @@ def chains_of(
         p, e, resolution_s: as in `Chains`. path_m: (K,) way of each event.
         offset, drift: a clock that is about right.
     """
-    config = active().pairing
     ways = np.interp((p - offset) / (1.0 + drift), e, path_m)
     scale = _scale(_split(steps_px), ways)
     if scale is None:
@@ -136,8 +139,8 @@ def chains_of(
     if scale is None:
         return None
     number, along = _split(steps_px)
-    reach = np.arange(-0.55 * resolution_s, 0.55 * resolution_s + 1e-9, config.phase_step_s)
-    phases, scales = (part.ravel() for part in np.meshgrid(reach, config.chain_scales, indexing="ij"))
+    reach = np.arange(-0.55 * resolution_s, 0.55 * resolution_s + 1e-9, _PHASE_STEP_S)
+    phases, scales = (part.ravel() for part in np.meshgrid(reach, _CHAIN_SCALES, indexing="ij"))
     step_m = float(np.median(np.diff(path_m)))
     return Chains(
         number=number,
@@ -160,7 +163,7 @@ def _split(steps_px: Array) -> tuple[Indices, Array]:
     number, along = np.zeros(count, dtype=np.int64), np.zeros(count)
     length = 1
     for i, step in enumerate(steps_px.tolist(), 1):
-        linked = step == step and length < active().pairing.most_chain_photos
+        linked = step == step and length < _MOST_CHAIN_PHOTOS
         length = length + 1 if linked else 1
         number[i] = number[i - 1] + (not linked)
         along[i] = along[i - 1] + step if linked else 0.0

@@ -1,11 +1,11 @@
 """The way flown by photos and by a log, for photos whose times leave several camera events."""
 
 from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from telemetry.formats.log.log_data import FlightLog
 from telemetry.formats.log.mavlink_poses import fixed_camera
 from telemetry.ingest.pairing.motion_chains import PictureMotion
@@ -16,6 +16,8 @@ from telemetry.samples.sample import Sample
 from telemetry.samples.timeline import Timeline
 
 Array = NDArray[np.float64]
+
+_MOST_TILT_DEG: Final = 60.0  # pictures that look farther from nadir than this tell nothing of the distance flown
 
 
 def picture_motion(
@@ -40,6 +42,6 @@ def _way_m(poses: Sequence[Sample]) -> Array:
         if pose.height_m is None or pose.pitch_deg is None or pose.yaw_deg is None:
             continue
         tilt = pose.pitch_deg + 90.0
-        if abs(tilt) < active().pairing.most_tilt_deg:
+        if abs(tilt) < _MOST_TILT_DEG:
             way[i] += pose.height_m * np.tan(np.radians(tilt)) * np.cos(np.radians(pose.yaw_deg - course[i]))
     return way

@@ -8,14 +8,16 @@ undecided, not as the nearest event.
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from telemetry.ingest.pairing.alignment import SequenceMatch
 from telemetry.ingest.pairing.motion_chains import PictureMotion, chains_of, variants
 from telemetry.ingest.pairing.sequence_model import (
+    FIRST_JITTER_S,
+    MOST_DRIFT,
     ClockGrid,
     SequenceModel,
     clock_grid,
@@ -27,6 +29,26 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Clock = tuple[float, float]
 """Offset in seconds and drift."""
+
+CERTAIN: Final = 1.0 - 1e-4  # probability from which on a pairing counts as certain
+_OTHER_CLOCK_INTERVALS: Final = 10.0  # clocks that differ by more usual intervals are two ways to pair a flight
+_SAME_EXPOSURE_S: Final = 0.12
+"""Camera events closer than this are one exposure that was recorded twice; at most 0.35 of the usual interval
+(CAMERA_TRIGGER and CAMERA_IMAGE_CAPTURED of one exposure are up to 0.1 s apart)."""
+_INTERVAL_MARGIN: Final = 0.9  # no two exposures are closer than this share of the shortest recorded interval
+_NEGLIGIBLE_LOG_ODDS: Final = 16.0  # clocks of lower odds than exp(-16), 1e-7, against the best are left out
+_JITTERS_S: Final = (0.02, 0.03, 0.045, 0.07, 0.1, 0.16)  # the sigmas that are then tried
+_MISSING_ODDS: Final = (0.03, 0.06, 0.12, 0.2, 0.35)
+"""Odds of a missing photo, and of a missing event, that are tried; not less than 0.03, since a flight without any loss
+does not show that there can be none."""
+_CLOCK_CANDIDATES: Final = 24  # maxima of the correlation of the two recordings whose clocks are examined
+_MOST_WINDOWS: Final = 64  # windows of possible clocks over which the probabilities are summed at most
+_WINDOW_DRIFT_S: Final = 0.16  # half width in drift of such a window, as the shift of the first and last exposure
+_MOST_BINS: Final = 1 << 19  # bins of the correlation at most: longer recordings get wider bins (8 MB)
+_MOST_DRIFTS: Final = 81  # drifts that are correlated at most
+_PICTURES_FROM_S: Final = 0.5  # resolution of the camera's times from which pictures decide
+_LEAST_AGREEMENT: Final = 0.9  # a pairing by pictures keeps this share of the pairs by times alone
+_LEAST_MATCHED: Final = 0.6  # share of photos or events with a partner
 
 
 def match_sequences(photos: Array, events: Array, motion: PictureMotion | None = None) -> SequenceMatch | None:
@@ -53,7 +75,7 @@ def match_sequences(photos: Array, events: Array, motion: PictureMotion | None =
     if not windows:
         return None
     result = _alignment(model, windows, single)
-    if motion is not None and resolution >= active().pairing.pictures_from_s and (~_decided(result)).any():
+    if motion is not None and resolution >= _PICTURES_FROM_S and (~_decided(result)).any():
         chained = _chained(model, result, motion)
         again = None if chained is None else _alignment(chained, windows, single)
         result = again if again is not None and _decides_more(again, result) else result
@@ -84,17 +106,15 @@ def _alignment(model: SequenceModel, windows: list[Clock], single: Indices) -> S
 
 def _decided(match: SequenceMatch) -> NDArray[np.bool_]:
     """(N,) whether a photo's event is certain, or that it has none."""
-    config = active().pairing
     likeliest = match.probability.max(axis=1, initial=0.0)
-    return np.asarray((likeliest >= config.certain) | (match.probability.sum(axis=1) <= 1.0 - config.certain))
+    return np.asarray((likeliest >= CERTAIN) | (match.probability.sum(axis=1) <= 1.0 - CERTAIN))
 
 
 def _decides_more(now: SequenceMatch, before: SequenceMatch) -> bool:
     """Whether more photos are decided now and hardly fewer have an event; else log and pictures disagree."""
-    config = active().pairing
     more = _decided(now).sum() > _decided(before).sum()
-    least = config.least_matched * min(len(now.probability), len(now.events))
-    return bool(more and now.probability.sum() > max(config.least_agreement * before.probability.sum(), least))
+    least = _LEAST_MATCHED * min(len(now.probability), len(now.events))
+    return bool(more and now.probability.sum() > max(_LEAST_AGREEMENT * before.probability.sum(), least))
 
 
 def _chained(model: SequenceModel, match: SequenceMatch, motion: PictureMotion) -> SequenceModel | None:
@@ -123,17 +143,16 @@ def _single_events(events: Array) -> Indices:
     """Indices of events without repetitions."""
     steps = np.diff(events)
     usual = float(np.median(steps[steps > 0.01])) if (steps > 0.01).any() else 1.0
-    return np.flatnonzero(np.concatenate([[True], steps > min(active().pairing.same_exposure_s, 0.35 * usual)]))
+    return np.flatnonzero(np.concatenate([[True], steps > min(_SAME_EXPOSURE_S, 0.35 * usual)]))
 
 
 def _least_interval(photos: Array, events: Array, resolution: float) -> float:
     """Time between exposures in seconds that hardly any two of them go below."""
-    config = active().pairing
     least = float(np.quantile(np.diff(events), 0.02))
     if resolution < 0.05:
-        return config.interval_margin * min(least, float(np.quantile(np.diff(photos), 0.02)))
+        return _INTERVAL_MARGIN * min(least, float(np.quantile(np.diff(photos), 0.02)))
     together = int(np.unique(np.floor(photos / resolution), return_counts=True)[1].max())
-    return config.interval_margin * (min(least, resolution / (together - 1)) if together > 1 else least)
+    return _INTERVAL_MARGIN * (min(least, resolution / (together - 1)) if together > 1 else least)
 
 
 def _resolution(times: Array) -> float:
@@ -146,14 +165,13 @@ def _resolution(times: Array) -> float:
 
 def _correlation_peaks(model: SequenceModel) -> Iterator[Clock]:
     """Offsets and drifts under which most photos fall on events, the best first."""
-    config = active().pairing
     p, e = model.p, model.e
-    span = float(np.ptp(p) + np.ptp(e)) * (1.0 + config.most_drift) + 4.0
-    bin_s = max(0.25 if model.resolution_s >= 0.5 else 0.1, span / config.most_bins)
+    span = float(np.ptp(p) + np.ptp(e)) * (1.0 + MOST_DRIFT) + 4.0
+    bin_s = max(0.25 if model.resolution_s >= 0.5 else 0.1, span / _MOST_BINS)
     size = 1 << int(np.ceil(np.log2(span / bin_s + 16)))
     half = max(0.5 * float(np.ptp(e)), 1e-3)
-    count = min(int(np.ceil(config.most_drift * half / bin_s)), config.most_drifts // 2)
-    drifts = np.linspace(-config.most_drift, config.most_drift, 2 * count + 1) if count else np.zeros(1)
+    count = min(int(np.ceil(MOST_DRIFT * half / bin_s)), _MOST_DRIFTS // 2)
+    drifts = np.linspace(-MOST_DRIFT, MOST_DRIFT, 2 * count + 1) if count else np.zeros(1)
     photos = np.fft.rfft(_train(p - p[0], bin_s, size, model.resolution_s))
     best, drift_at = np.full(size, -np.inf), np.zeros(size)
     for drift in drifts:
@@ -163,7 +181,7 @@ def _correlation_peaks(model: SequenceModel) -> Iterator[Clock]:
         better = together > best
         best[better], drift_at[better] = together[better], drift
     apart = max(1, round(_reach_s(model) / bin_s))
-    for _ in range(config.clock_candidates):
+    for _ in range(_CLOCK_CANDIDATES):
         lag = int(np.argmax(best))
         if not np.isfinite(best[lag]) or best[lag] < 0.25:
             return
@@ -193,7 +211,6 @@ def _train(times: Array, bin_s: float, size: int, width_s: float) -> Array:
 
 def _plausible(model: SequenceModel) -> tuple[SequenceModel, list[Clock]]:
     """The model's parameters for the best clock, and centres of windows that hold all clocks still possible."""
-    config = active().pairing
     bin_s = 0.25 if model.resolution_s >= 0.5 else 0.1
     grids = [clock_grid(model, *peak, _reach_s(model), bin_s) for peak in _correlation_peaks(model)]
     if not grids:
@@ -204,12 +221,12 @@ def _plausible(model: SequenceModel) -> tuple[SequenceModel, list[Clock]]:
     if not np.isfinite(evidence[best]):
         return model, []
     # The first parameters are guesses: exclude only what they make impossible.
-    possible = evidence > evidence[best] - 3.0 * config.negligible_log_odds
+    possible = evidence > evidence[best] - 3.0 * _NEGLIGIBLE_LOG_ODDS
     order = np.argsort(-evidence, kind="stable")
     clocks = clocks[:, order[possible[order]]]
     model = _fitted(model, *clocks[:, 0].tolist()).regular()
     windows: list[Clock] = []
-    while clocks.shape[1] and len(windows) < config.most_windows:
+    while clocks.shape[1] and len(windows) < _MOST_WINDOWS:
         windows.append((float(clocks[0, 0]), float(clocks[1, 0])))
         clocks = clocks[:, ~_inside(model, windows[-1], clocks[0], clocks[1], share=0.75)]
     return model, windows
@@ -217,42 +234,38 @@ def _plausible(model: SequenceModel) -> tuple[SequenceModel, list[Clock]]:
 
 def _window(model: SequenceModel, centre: Clock) -> ClockGrid:
     """A fine grid of clocks around one."""
-    config = active().pairing
-    return clock_grid(model, *centre, 2.0 * config.first_jitter_s + 0.3 * _reach_s(model), config.window_drift_s)
+    return clock_grid(model, *centre, 2.0 * FIRST_JITTER_S + 0.3 * _reach_s(model), _WINDOW_DRIFT_S)
 
 
 def _inside(
     model: SequenceModel, centre: Clock, offset: Array, drift: Array, *, share: float = 1.0
 ) -> NDArray[np.bool_]:
     """Which clocks lie in a share of the window around one."""
-    config = active().pairing
     half = max(0.5 * float(np.ptp(model.e)), 1e-3)
-    reach = share * (2.0 * config.first_jitter_s + 0.3 * _reach_s(model))
+    reach = share * (2.0 * FIRST_JITTER_S + 0.3 * _reach_s(model))
     apart = half * np.abs(drift - centre[1])
-    return np.asarray((np.abs(offset - centre[0]) <= reach) & (apart <= share * config.window_drift_s))
+    return np.asarray((np.abs(offset - centre[0]) <= reach) & (apart <= share * _WINDOW_DRIFT_S))
 
 
 def _fitted(model: SequenceModel, offset: float, drift: float) -> SequenceModel:
     """Jitter and shares of missing exposures with the most evidence."""
-    config = active().pairing
     trials = []
-    for jitter in config.jitters_s:
+    for jitter in _JITTERS_S:
         trial = replace(model, jitter_s=jitter)
-        grid = clock_grid(trial, offset, drift, 2.0 * config.first_jitter_s, 2.0 * config.first_jitter_s)
-        trials += [(replace(trial, no_event=odds, no_photo=odds), grid) for odds in config.missing_odds[::2]]
+        grid = clock_grid(trial, offset, drift, 2.0 * FIRST_JITTER_S, 2.0 * FIRST_JITTER_S)
+        trials += [(replace(trial, no_event=odds, no_photo=odds), grid) for odds in _MISSING_ODDS[::2]]
     return _with_odds(*max(trials, key=lambda trial: _normalised(*trial)))
 
 
 def _with_odds(model: SequenceModel, grid: ClockGrid) -> SequenceModel:
     """The odds of missing events and missing photos with the most evidence, one after the other."""
-    config = active().pairing
 
     def best(trials: Iterable[SequenceModel]) -> SequenceModel:
         return max(trials, key=lambda trial: _normalised(trial, grid))
 
-    model = best(replace(model, no_event=odds) for odds in config.missing_odds)
-    model = best(replace(model, no_photo=odds) for odds in config.missing_odds)
-    return best(replace(model, no_event=odds) for odds in config.missing_odds)
+    model = best(replace(model, no_event=odds) for odds in _MISSING_ODDS)
+    model = best(replace(model, no_photo=odds) for odds in _MISSING_ODDS)
+    return best(replace(model, no_event=odds) for odds in _MISSING_ODDS)
 
 
 def _normalised(model: SequenceModel, grid: ClockGrid) -> float:
@@ -279,13 +292,13 @@ def _probabilities(model: SequenceModel, windows: list[Clock]) -> tuple[Indices,
     total = np.logaddexp.reduce(np.concatenate([evidence for _, evidence in scored]))
     parts: list[tuple[Indices, Array]] = []
     for grid, evidence in scored:
-        chosen = np.flatnonzero(evidence > most - active().pairing.negligible_log_odds)
+        chosen = np.flatnonzero(evidence > most - _NEGLIGIBLE_LOG_ODDS)
         if len(chosen):
             some = replace(grid, offset=grid.offset[chosen], drift=grid.drift[chosen])
             parts.append((some.band(model)[0], posterior(model, some, float(total))))
     best, values = max(scored, key=lambda row: float(row[1].max()))
     at = int(np.argmax(values))
-    far = active().pairing.other_clock_intervals * float(np.median(np.diff(model.e)))
+    far = _OTHER_CLOCK_INTERVALS * float(np.median(np.diff(model.e)))
     away = [values[np.abs(grid.offset - best.offset[at]) > far] for grid, values in scored]
     other_clock = float(np.exp(np.logaddexp.reduce(np.concatenate([*away, [-np.inf]])) - total))
     first = np.min([lo for lo, _ in parts], axis=0)

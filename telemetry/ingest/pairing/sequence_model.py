@@ -9,17 +9,24 @@ an end weigh less than those missing in between: logs begin before the first pho
 """
 
 from dataclasses import dataclass, field, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from orthoswarm.config import active
 from orthoswarm.model.robust import mad_sigma
 from telemetry.ingest.pairing.motion_chains import Chains
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
+
+MOST_DRIFT: Final = 1.2e-3
+"""Largest drift between the two clocks, seconds a second: quartz clocks of cameras stay below 1e-4, and a tenfold
+margin for poor ones."""
+FIRST_JITTER_S: Final = 0.08  # one sigma of the time between trigger and exposure at which the search begins
+_MISSING_AT_END: Final = 0.5  # odds of a missing exposure before the first or after the last pair: logs begin earlier
+_FALSE_TIME: Final = 1e-5  # probability of an exposure that is closer to another than the camera's shortest interval
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,7 +47,7 @@ class SequenceModel:
     resolution_s: float
     interval_s: float
     least_s: float
-    jitter_s: float = field(default_factory=lambda: active().pairing.first_jitter_s)
+    jitter_s: float = field(default_factory=lambda: FIRST_JITTER_S)
     no_event: float = 0.1
     no_photo: float = 0.1
     chains: Chains | None = None
@@ -80,7 +87,7 @@ class SequenceModel:
         begins = np.concatenate([np.zeros((len(offset), 1)), np.clip(places + least, 0.0, 1.0)], axis=1)
         ends = np.concatenate([np.clip(places - least, 0.0, 1.0), np.ones((len(offset), 1))], axis=1)
         room = np.maximum(ends - begins, 0.0).sum(axis=1)
-        room = np.maximum(room, active().pairing.false_time)
+        room = np.maximum(room, _FALSE_TIME)
         if self.chains is None:
             return np.asarray(room)
         return np.asarray(np.minimum(room[:, None], self.chains.alone(i, offset, drift)).ravel())
@@ -122,13 +129,12 @@ class ClockGrid:
 
 def clock_grid(model: SequenceModel, offset: float, drift: float, reach_s: float, drift_reach_s: float) -> ClockGrid:
     """A grid as fine as the jitter: offsets within reach_s, drifts that move the ends by up to drift_reach_s."""
-    config = active().pairing
     step = 0.8 * max(model.jitter_s, 0.04 * model.resolution_s)
     half = max(0.5 * float(np.ptp(model.e)), 1e-3)
     offsets = offset + step * np.arange(-np.ceil(reach_s / step), np.ceil(reach_s / step) + 1)
     count = np.ceil(drift_reach_s / (2.0 * step))
     drifts = drift + 2.0 * step / half * np.arange(-count, count + 1)
-    drifts = np.unique(np.clip(drifts, -config.most_drift, config.most_drift))
+    drifts = np.unique(np.clip(drifts, -MOST_DRIFT, MOST_DRIFT))
     both = np.meshgrid(offsets, drifts, indexing="ij")
     return ClockGrid(both[0].ravel(), both[1].ravel(), (offset, drift), reach_s + drift_reach_s + 2.0 * step)
 
@@ -158,7 +164,7 @@ def forward(model: SequenceModel, grid: ClockGrid, *, backward: bool = False, ke
     """
     first, width = grid.band(model)
     count, total, clocks = len(model.p), len(model.e), len(grid.offset) * model.hypotheses
-    s, log_t = model.no_photo, float(np.log(active().pairing.missing_at_end))
+    s, log_t = model.no_photo, float(np.log(_MISSING_AT_END))
     columns = np.arange(width + 1)
     decay = np.tril(s ** np.maximum(columns[1:, None] - columns[None, 1:], 0).astype(np.float64)).T
     sums, scale = np.zeros((clocks, width + 1)), np.zeros(clocks)
