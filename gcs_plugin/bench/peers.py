@@ -33,8 +33,9 @@ from orthoswarm.model.errors import InputError, OrthoSwarmError
 
 SUCCESS = 0.9
 """A map succeeds if at least this share of the photographed ground is within a metre of its true position."""
-
 _INSIDE = Path(__file__).parent / "inside"
+Cell = tuple[str, Path | None]
+"""Title above a map, and its thumbnail; None where there is no map."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,8 +77,6 @@ class Program:
 
 
 # -- the programs -------------------------------------------------------------------------------------------------
-
-
 def _own(refine: str) -> Program:
     def command(job: Job, _: Path) -> list[str]:
         return mosaic_command(
@@ -124,8 +123,8 @@ def _pasted(job: Job) -> tuple[Path, int | None]:
     import numpy as np
 
     import telemetry
+    from gcs_plugin.bench.accuracy import paste
     from gcs_plugin.bench.georeferencing import placed_models
-    from gcs_plugin.bench.pasting import paste
     from orthoswarm.model.geo import LocalGrid, area_epsg
     from orthoswarm.model.placement import PlacedFrame, Terrain
 
@@ -170,8 +169,6 @@ PROGRAMS = {
 
 
 # -- running ------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
     """How to compare.
@@ -359,8 +356,6 @@ def _picture(product: Path, out: Path) -> None:
 
 
 # -- judging ------------------------------------------------------------------------------------------------------
-
-
 def with_verdict(row: dict[str, Any], ceiling: dict[str, Any]) -> dict[str, Any]:
     """A row with `right_share`, `shape_share` and `succeeded`.
 
@@ -383,8 +378,6 @@ def with_verdict(row: dict[str, Any], ceiling: dict[str, Any]) -> dict[str, Any]
 
 def peers_sheet(result: dict[str, Any], settings: Settings, out: Path) -> None:
     """Draw the maps of all programs side by side, one row per set."""
-    from gcs_plugin.bench.contact_sheet import contact_sheet, verdict
-
     by_set: dict[str, list[tuple[str, Path | None]]] = {}
     for row in result["rows"]:
         title = PROGRAMS[row["program"]].title if row["program"] in PROGRAMS else "true poses"
@@ -432,3 +425,45 @@ def _line(row: dict[str, Any]) -> str:
             share(figures["unmatched_share"]),
         ]
     return f"| {label(row)}{thin} | {name} | " + " | ".join(middle + costs) + " |"
+
+
+def contact_sheet(rows: Sequence[tuple[str, Sequence[Cell]]], out: Path) -> None:
+    """Draw rows of maps, one row for each set.
+
+    Args:
+        rows: the name of each set and its maps.
+        out: a JPEG.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+    from PIL import Image
+
+    columns = max(len(cells) for _, cells in rows)
+    size = (2.6 * columns, 3.4 * len(rows))
+    figure, grid = pyplot.subplots(len(rows), columns, figsize=size, squeeze=False, layout="constrained")
+    for axes_of_row, (name, cells) in zip(grid, rows, strict=True):
+        axes_of_row[0].set_ylabel(name, fontsize=8)
+        for axes in axes_of_row:
+            axes.set(xticks=[], yticks=[], frame_on=False)
+        for axes, (title, picture) in zip(axes_of_row, cells, strict=False):
+            axes.set_title(title, fontsize=8)
+            if picture is not None and picture.exists():
+                with Image.open(picture) as image:
+                    axes.imshow(image.convert("RGB"))
+            else:
+                axes.text(0.5, 0.5, "no map", ha="center", va="center", fontsize=9)
+    part = out.with_suffix(".part")
+    figure.savefig(part, dpi=110, format="jpg", pil_kwargs={"quality": 88})
+    pyplot.close(figure)
+    os.replace(part, out)
+
+
+def verdict(title: str, row: dict[str, Any]) -> str:
+    """Title above a map: the program and the share of the ground within 1 m of its true position."""
+    if "error" in row:
+        return f"{title}\nfailed"
+    if row["right_share"] is None:
+        return f"{title}\nno place; shape {100 * (row['shape_share'] or 0.0):.0f} % within 1 m"
+    return f"{title}\n{100 * row['right_share']:.0f} % within 1 m"

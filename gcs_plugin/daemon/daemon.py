@@ -15,9 +15,8 @@ from gcs_plugin.daemon import views
 from gcs_plugin.daemon.airspace.terrain_data import TerrainData
 from gcs_plugin.daemon.exports import Exports
 from gcs_plugin.daemon.fetched_pictures import make_picture_requests
-from gcs_plugin.daemon.flight_coverage.event_requests import EventRequests
 from gcs_plugin.daemon.flight_coverage.exposure_journal import MESSAGES as EVENT_MESSAGES
-from gcs_plugin.daemon.flight_coverage.exposure_journal import ExposureJournal
+from gcs_plugin.daemon.flight_coverage.exposure_journal import EventRequests, ExposureJournal
 from gcs_plugin.daemon.flight_coverage.live_coverage import LiveCoverage
 from gcs_plugin.daemon.flight_coverage.picture_requests import PictureRequests
 from gcs_plugin.daemon.flight_coverage.picture_views import PictureViews
@@ -25,8 +24,7 @@ from gcs_plugin.daemon.flight_coverage.planned_area import area_source
 from gcs_plugin.daemon.gap_flights import GapFlights
 from gcs_plugin.daemon.intake.can_reader import CanReader
 from gcs_plugin.daemon.intake.picture_sources import Source
-from gcs_plugin.daemon.intake.pose_relay import linked_pose
-from gcs_plugin.daemon.intake.posted_pose import PostedPose, frame_of
+from gcs_plugin.daemon.intake.posted_pose import PostedPose, frame_of, linked_pose
 from gcs_plugin.daemon.intake.refused_pictures import RefusedPictures
 from gcs_plugin.daemon.jobs.job_queue import Job, Jobs
 from gcs_plugin.daemon.jobs.joint_refinement import JointRefinement
@@ -348,7 +346,7 @@ class Daemon:
 
     def _link_log(self, vehicle: str, out: Path) -> bool:
         """Write a vehicle's packets on the links, of this and earlier runs, into its own log."""
-        from gcs_plugin.daemon.intake.vehicle_log import write_link_log
+        from gcs_plugin.links.tlog_writer import write_link_log
 
         systems = {v.id: v.system for v in self.settings.vehicles}
         system = systems.get(vehicle) or system_in_name(vehicle)

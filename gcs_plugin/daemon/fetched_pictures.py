@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from gcs_plugin.daemon.flight_coverage.file_numbers import PictureNames
 from gcs_plugin.daemon.flight_coverage.picture_requests import PictureRequests, WantedPicture, wanted_pictures
-from gcs_plugin.daemon.intake.pose_relay import linked_pose
-from gcs_plugin.daemon.intake.posted_pose import PostedPose
+from gcs_plugin.daemon.intake.posted_pose import PostedPose, linked_pose
 from gcs_plugin.daemon.settings import Settings
 from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.journal import Journal, packed, unpacked

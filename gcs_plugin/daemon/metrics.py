@@ -1,11 +1,12 @@
 """The daemon's figures as Prometheus text."""
 
+import os
 import time
 from typing import Final
 
 from gcs_plugin.daemon.daemon import Daemon
-from gcs_plugin.daemon.jobs.process_usage import resident_mb
 from orthoswarm import __version__
+from orthoswarm.compute.workers import peak_rss_mb
 
 _QUANTILES: Final = (0.5, 0.9, 0.99, 1)
 
@@ -65,7 +66,7 @@ def prometheus(daemon: Daemon, uploads_waiting: int = 0) -> str:
     single("coverage_seconds", "gauge", "Time that finding the gaps took last.", daemon.coverage.seconds)
     single("problems", "gauge", "Problems at present.", len(daemon.problems()))
     single("cpu_seconds_total", "counter", "CPU time of the daemon's own process.", time.process_time())
-    single("resident_megabytes", "gauge", "Memory of the daemon's own process.", resident_mb())
+    single("resident_megabytes", "gauge", "Memory of the daemon's own process.", _resident_mb())
     return "\n".join(lines) + "\n"
 
 
@@ -75,3 +76,12 @@ def _escape(text: str) -> str:
 
 def _number(value: float) -> str:
     return f"{value:.9g}" if isinstance(value, float) else str(value)
+
+
+def _resident_mb() -> float:
+    """Memory of this process now, megabytes."""
+    try:
+        with open("/proc/self/statm", encoding="ascii") as file:
+            return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+    except (OSError, AttributeError):  # not Linux: the largest so far
+        return peak_rss_mb()

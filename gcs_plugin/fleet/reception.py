@@ -23,7 +23,7 @@ from gcs_plugin.links.transports import Peer
 from gcs_plugin.mission.completion import RELEVANT, CompletionDetector, MissionEvent, Phase
 from gcs_plugin.mission.exchange import Address
 from gcs_plugin.mission.flight_modes import modes_of
-from gcs_plugin.mission.lateness import Lateness
+from gcs_plugin.mission.track import Lateness
 
 Handler = Callable[[Vehicle, Message, float], None]
 

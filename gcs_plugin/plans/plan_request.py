@@ -1,33 +1,35 @@
-"""A plan from the values that a user gives, on the command line or over HTTP."""
+"""A plan from the values that a user gives, on the command line or over HTTP, with the ground below and its fences."""
 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 
 from gcs_plugin.mission.mission_files import Autopilot
 from gcs_plugin.plans.area_files import read_fences, read_shapes
 from gcs_plugin.plans.gap_area import gap_area, read_gaps
-from gcs_plugin.plans.ground_below import read_ground, relief_notes, return_height_m
-from gcs_plugin.plans.plan_fence import refuse_outside, zone_fences
 from orthoswarm.config import active
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid, area_epsg
-from orthoswarm.model.plan import End, Plan
+from orthoswarm.model.placement import Terrain
+from orthoswarm.model.plan import End, Fence, Plan, Sortie
 from orthoswarm.planning.area.area import Area, make_area
 from orthoswarm.planning.area.shape_files import Polygon, Ring
 from orthoswarm.planning.lines.candidates import Method
 from orthoswarm.planning.lines.line_spacing import Footprint, footprint
 from orthoswarm.planning.planner import plan_area, plan_gaps, plan_lines
-from orthoswarm.planning.relief_plan import Relief, plan_over_relief
+from orthoswarm.planning.relief_plan import GroundBelow, Relief, plan_over_relief
 from orthoswarm.planning.sorties.assignment import Options
 from orthoswarm.planning.sorties.deconfliction import Separation
 from orthoswarm.planning.sorties.flight_heights import FlightHeights
 from orthoswarm.planning.sorties.flight_time import Motion, autopilot_config
+from orthoswarm.raster.height_model import DEM_MOST_NODES, HeightModel
 
 AUTOPILOTS: Final[tuple[Autopilot, ...]] = ("ardupilot", "px4")
 METHODS: Final = ("columns", "bcd", "tmstc")
@@ -38,6 +40,12 @@ ENDS: Final = ("rtl", "land", "hover")
 _MOST_LAYERS: Final = 12.0  # of ways out and home
 _TOLERANCE: Final = 0.1
 """Of the height above ground, as a share of it."""
+Geometry = Any  # shapely has no type information here
+_BESIDE_STEPS: Final = 2.0
+"""The highest ground is read at so many steps within that distance at least, where the number of nodes allows it."""
+DEM_MARGIN_M: Final = 50.0  # a height model is read so far beyond the places that are asked for (some of its nodes)
+_ROUNDING_M: Final = 0.5
+"""A path along an edge of the fence may lie so far outside: rounding and the grid's scale."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -299,3 +307,132 @@ def _zones_only(lines: tuple[Ring, ...], no_fly: list[Ring]) -> Area:
     checked = [make_area([Polygon(zone)]) for zone in no_fly]  # says what is wrong with a zone
     zones = [shapely.transform(c.ground, lambda p, c=c: grid.to_grid(*c.grid.to_geographic(p).T)) for c in checked]
     return Area(grid, shapely.MultiPolygon(), shapely.MultiPolygon(list(shapely.get_parts(shapely.union_all(zones)))))
+
+
+def read_ground(dem: Path, wanted: shapely.Geometry, grid: LocalGrid, starts: NDArray[np.float64]) -> GroundBelow:
+    """The ground below what is to be flown, over that of the lowest start.
+
+    Args:
+        dem: a GeoTIFF with a CRS. wanted: area or lines, grid metres. grid: of it. starts: takeoff points (n, 2), grid
+            metres, at least one.
+
+    Raises:
+        InputError: the model cannot be read, or has no heights there.
+    """
+    points = np.concatenate([shapely.get_coordinates(wanted), starts])
+    bounds = BoundingBox.around_points(points, DEM_MARGIN_M)
+    most, beside_m = DEM_MOST_NODES, active().planning.beside_m
+    model = HeightModel.open(dem, grid.epsg, bounds, np.empty((0, 3)))
+    found = model.window(bounds, most)
+    terrain = found.terrain
+    # One step around the outline, too: a small area may lie between nodes.
+    within = _nodes_in(wanted.buffer(terrain.step_m), terrain)
+    hull = shapely.MultiPoint(points).convex_hull.buffer(terrain.step_m)
+    if not found.known[within | _nodes_in(hull, terrain)].all():
+        raise InputError(
+            f"{dem} has no heights on a part of the area or of the ways to it; give a height model without holes there"
+        )
+    zero = np.float32(terrain.height(starts).min())
+    highest = model.highest(bounds, beside_m, _BESIDE_STEPS, most)
+    highest = replace(highest, z=highest.z - zero)
+    way_m = float(highest.z[_nodes_in(hull, highest)].max())
+    z = terrain.z - zero
+    ground = replace(terrain, z=z)
+    return GroundBelow(ground, highest, float(z[within].min()), float(z[within].max()), way_m)
+
+
+def _nodes_in(outline: shapely.Geometry, terrain: Terrain) -> NDArray[np.bool_]:
+    """Which nodes (rows, columns) lie within an outline, grid metres."""
+    rows, columns = terrain.z.shape
+    east = terrain.west + terrain.step_m * np.arange(columns)
+    north = terrain.south + terrain.step_m * np.arange(rows)
+    shapely.prepare(outline)
+    return np.asarray(shapely.contains_xy(outline, *np.meshgrid(east, north)))
+
+
+def return_height_m(ground: GroundBelow) -> float:
+    """Height above takeoff, whole metres, at which a straight way home passes over all ground and what stands on it."""
+    return float(math.ceil(ground.way_m + active().planning.least_above_ground_m))
+
+
+def relief_notes(plan: Plan, ground: GroundBelow) -> list[str]:
+    """What to know about a plan over a height model, in words."""
+    over = plan.over_ground
+    if over is None:
+        return []
+    how = (
+        f"legs follow the ground at {over.nominal_m:g} m"
+        if over.follows
+        else f"all legs are flown {plan.altitude_m:.0f} m above the lowest takeoff"
+    )
+    if over.by_vehicle:
+        how += ", by the terrain data of the vehicles: the ground station must send it to them, or their card hold it"
+    return [
+        f"the ground of the area lies {ground.low_m:.0f} to {ground.high_m:.0f} m over takeoff: {how}, "
+        f"{over.least_m:.0f} to {over.most_m:.0f} m above ground, {over.way_least_m:.0f} m or more above the highest "
+        f"within {active().planning.beside_m:g} m; side overlap {100 * over.side_overlap[0]:.0f} % or "
+        f"more on 95 % of the legs, forward overlap at least {100 * over.forward_overlap:.0f} %",
+        f"a vehicle that turns home by itself flies straight back: set its return height (ArduPilot RTL_ALT, "
+        f"RTL_ALT_M from 4.7 on; PX4 RTL_RETURN_ALT) to {return_height_m(ground):.0f} m or more",
+    ]
+
+
+def zone_fences(area: Area, fences: Sequence[Fence]) -> list[Fence]:
+    """The no-fly zones of an area as exclusion fences, but for what given ones of these cover already.
+
+    Holes of a zone are closed: a fence has none, and a flight out of one would cross the zone.
+    """
+    known = shapely.union_all([_shape(fence, area.grid) for fence in fences if not fence.inclusion])
+    zones = [shapely.Polygon(zone.exterior) for zone in area.no_fly.geoms]
+    left = [zone for zone in zones if not known.buffer(_ROUNDING_M).covers(zone)]
+    places = [area.grid.to_geographic(shapely.get_coordinates(zone.exterior)[:-1]) for zone in left]
+    return [Fence(inclusion=False, points=tuple((float(lat), float(lon)) for lat, lon in ring)) for ring in places]
+
+
+def refuse_outside(plan: Plan, fences: Sequence[Fence], autopilots: Sequence[Autopilot]) -> None:
+    """Refuse a plan of which a flight leaves the inclusion fences.
+
+    An ArduPilot must stay inside all of them (unless FENCE_OPTIONS says otherwise), a PX4 inside any.
+
+    Args:
+        plan: with flights around the exclusion fences. fences: of all kinds. autopilots: that fly it.
+
+    Raises:
+        InputError: a flight leaves them, or they have no ground in common.
+    """
+    grid = LocalGrid(plan.epsg)
+    allowed = [_shape(fence, grid) for fence in fences if fence.inclusion]
+    if not allowed:
+        return
+    all_of_them = "ardupilot" in autopilots
+    inside = shapely.intersection_all(allowed) if all_of_them else shapely.union_all(allowed)
+    if inside.is_empty:
+        raise InputError("the inclusion fences have no ground in common, where ArduPilot could fly; leave one of them")
+    for vehicle in plan.vehicles:
+        outside_m = max(_farthest_m(_path(sortie, grid), inside) for sortie in vehicle.sorties)
+        if outside_m > _ROUNDING_M:
+            raise InputError(
+                f"{vehicle.id} would fly up to {outside_m:.0f} m outside the inclusion fence; move the start or the "
+                "area inside, give less --run-in, or draw a larger fence"
+            )
+
+
+def _shape(fence: Fence, grid: LocalGrid) -> Geometry:
+    """A fence in grid metres."""
+    points = grid.to_grid(*np.array(fence.points, float).T)
+    if fence.radius_m is not None:
+        return shapely.Point(points[0]).buffer(fence.radius_m, quad_segs=64)
+    return shapely.make_valid(shapely.Polygon(points))
+
+
+def _path(sortie: Sortie, grid: LocalGrid) -> Geometry:
+    """A flight on the map, in grid metres."""
+    home = (sortie.home_lat_deg, sortie.home_lon_deg)
+    places = np.array([home, *((point.lat_deg, point.lon_deg) for point in sortie.waypoints)], float)
+    return shapely.LineString(grid.to_grid(*places.T))
+
+
+def _farthest_m(path: Geometry, inside: Geometry) -> float:
+    """How far a path gets outside, metres."""
+    outside = shapely.get_coordinates(path.difference(inside))
+    return float(shapely.distance(shapely.points(outside), inside).max(initial=0.0))

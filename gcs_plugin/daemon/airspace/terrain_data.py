@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcs_plugin.links.mavlink import Message, dialect
-from gcs_plugin.plans.ground_below import DEM_MARGIN_M
+from gcs_plugin.plans.plan_request import DEM_MARGIN_M
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.geo import LocalGrid, area_epsg

@@ -1,23 +1,38 @@
-"""The exposures that vehicles report on their links, stored in the journal."""
+"""The exposures that vehicles report on their links, stored in the journal; those that a link has lost are asked for.
+
+CAMERA_IMAGE_CAPTURED counts the pictures of a camera. A number that is left out was an exposure whose message did not
+come: the camera sends it again on MAV_CMD_REQUEST_MESSAGE with that number (MAVLink camera protocol). ArduPilot's
+CAMERA_FEEDBACK cannot be asked for.
+"""
 
 import sqlite3
 from collections import deque
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from gcs_plugin.daemon.store.journal import Journal, packed, unpacked
+from gcs_plugin.links.mavlink import Message, dialect
 from orthoswarm.coverage.camera_events import CameraEvent
 from orthoswarm.model.geo import LocalGrid
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from gcs_plugin.fleet.fleet import Fleet
     from gcs_plugin.fleet.vehicle_state import Vehicle
 
 MESSAGES: Final = ("CAMERA_IMAGE_CAPTURED", "CAMERA_FEEDBACK")
 _AFTER_2001_S: Final = 1e9
 Row = tuple[str, int, float, float | None, float | None]
+_CAPTURED: Final = int(dialect.MAVLINK_MSG_ID_CAMERA_IMAGE_CAPTURED)
+_REQUEST: Final = int(dialect.MAV_CMD_REQUEST_MESSAGE)
+_AT_ONCE: Final = 5  # numbers that are asked for in one go
+_TRIES: Final = 8  # requests for one number
+_AGAIN_S: Final = 2.0
+_LONGEST_HOLE: Final = 200
+"""A camera whose numbers jump by more has restarted its count."""
 
 
 class ExposureJournal:
@@ -85,3 +100,54 @@ class ExposureJournal:
 def _utc(time_s: float, received_s: float) -> float:
     """Time of exposure: from the message, or its arrival if its clock has no date."""
     return time_s if time_s > _AFTER_2001_S else received_s
+
+
+@dataclass(slots=True)
+class _Camera:
+    """What is known of a camera's numbers: the highest, and those left out with tries made and the time of the last."""
+
+    highest: int | None = None
+    missing: dict[int, tuple[int, float]] = field(default_factory=dict)
+
+
+class EventRequests:
+    """Asks vehicles' cameras for the events that have not come; runs in the links' thread.
+
+    Args:
+        fleet: the vehicles.
+    """
+
+    def __init__(self, fleet: "Fleet") -> None:
+        self._fleet = fleet
+        self._cameras: dict[tuple[int, int], _Camera] = {}
+        fleet.subscribe(self._captured, "CAMERA_IMAGE_CAPTURED")
+        fleet.subscribe(self._tick, "HEARTBEAT")
+
+    def _captured(self, vehicle: "Vehicle", message: Any, _: float) -> None:
+        camera = self._cameras.setdefault((vehicle.system, int(message.get_srcComponent())), _Camera())
+        number, highest = int(message.image_index), camera.highest
+        camera.missing.pop(number, None)
+        if highest is None or not highest - _LONGEST_HOLE <= number <= highest + _LONGEST_HOLE:
+            camera.highest, camera.missing = number, {}
+            return
+        camera.missing |= dict.fromkeys(range(highest + 1, number), (0, 0.0))
+        camera.highest = max(highest, number)
+
+    def _tick(self, vehicle: "Vehicle", _: Any, utc_s: float) -> None:
+        for (system, component), camera in self._cameras.items():
+            if system == vehicle.system:
+                self._fleet.send(system, _requests(system, component, camera, utc_s))
+
+
+def _requests(system: int, component: int, camera: _Camera, utc_s: float) -> list[Message]:
+    """Commands for a few of the missing events, the oldest first; those asked for often enough are given up."""
+    due = [n for n, (_, asked_s) in sorted(camera.missing.items()) if utc_s - asked_s >= _AGAIN_S][:_AT_ONCE]
+    for number in due:
+        tries = camera.missing[number][0] + 1
+        camera.missing[number] = tries, utc_s
+        if tries >= _TRIES:
+            del camera.missing[number]
+    return [
+        dialect.MAVLink_command_long_message(system, component, _REQUEST, 0, _CAPTURED, number, 0, 0, 0, 0, 0)
+        for number in due
+    ]

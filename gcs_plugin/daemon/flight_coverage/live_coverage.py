@@ -4,6 +4,7 @@ Pictures count with their recorded poses as soon as they are on the map, and wit
 placed. At a start all is rebuilt from the journal and the solution files; the finished legs are in the journal.
 """
 
+import io
 import logging
 import sqlite3
 import threading
@@ -17,16 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcs_plugin.daemon.flight_coverage.battery_use import BatteryUse
-from gcs_plugin.daemon.flight_coverage.cells_picture import cells_png, picture_corners
 from gcs_plugin.daemon.flight_coverage.exposure_journal import ExposureJournal
-from gcs_plugin.daemon.flight_coverage.flawed_pictures import FlawedPictures
 from gcs_plugin.daemon.flight_coverage.flown_legs import FlownLegs, flies
-from gcs_plugin.daemon.flight_coverage.picture_views import Measured, PictureViews
+from gcs_plugin.daemon.flight_coverage.picture_views import FlawedPictures, Measured, PictureViews
 from gcs_plugin.daemon.flight_coverage.planned_area import AreaSource, CoveredArea, read_covered_area, zone_features
 from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.journal import Journal
 from orthoswarm.coverage.camera_events import missing_by_events
-from orthoswarm.coverage.coverage_files import gap_feature
+from orthoswarm.coverage.coverage_files import COLOURS, gap_feature
 from orthoswarm.coverage.coverage_grid import Cells, CoverageGrid, Shares, State
 from orthoswarm.coverage.gaps import below_legs, find_gaps
 from orthoswarm.coverage.missing_pictures import MissingPicture
@@ -39,7 +38,6 @@ from orthoswarm.model.placement import PlacedFrame
 from orthoswarm.raster.picture_quality import PictureQuality
 
 Rows = list[dict[str, Any]]
-
 _LOOK_S: Final = 0.5
 _LEAST_PAUSE: Final = 3.0
 """Pause after finding gaps, in multiples of the time that it took: a quarter of one core at most."""
@@ -47,6 +45,8 @@ _MOST_CELLS: Final = 16_000_000  # of the grid; cells grow beyond it
 _ON_THE_WAY_S: Final = 15.0
 _FACT: Final = "coverage"
 _log = logging.getLogger(__name__)
+_LARGEST_PX: Final = 2048
+_SHOWN_FIRST: Final = (State.MISSED, State.POOR, State.PLANNED, State.SEEN, State.EXCLUDED)
 
 
 @dataclass(kw_only=True)
@@ -400,3 +400,33 @@ def _warnings(cover: CoverageGrid) -> list[str]:
     if cover.cells.grid.gsd_m > 1.0:
         found.append(f"the area is large: its cells are {cover.cells.grid.gsd_m:g} m wide; plan it in parts for 1 m")
     return found
+
+
+def cells_png(states: NDArray[np.uint8]) -> bytes:
+    """A PNG with a palette, uint8 (rows, columns) of State; large areas are reduced without losing gaps."""
+    from PIL import Image
+
+    step = -(-max(states.shape) // _LARGEST_PX)
+    if step > 1:
+        rows, columns = (-(-side // step) * step for side in states.shape)
+        padded = np.zeros((rows, columns), np.uint8)
+        padded[: states.shape[0], : states.shape[1]] = states
+        blocks = padded.reshape(rows // step, step, columns // step, step)
+        states = np.zeros((rows // step, columns // step), np.uint8)
+        for state in reversed(_SHOWN_FIRST):
+            states[(blocks == state).any((1, 3))] = state
+    picture = Image.fromarray(states, "P")
+    table = [COLOURS[state] for state in State]
+    picture.putpalette([value for red, green, blue, _ in table for value in (red, green, blue)])
+    out = io.BytesIO()
+    picture.save(out, "PNG", transparency=bytes(alpha for *_, alpha in table))
+    return out.getvalue()
+
+
+def picture_corners(grid: GroundGrid, states: NDArray[np.uint8]) -> list[list[float]]:
+    """Longitude and latitude of the picture's corners: top left, top right, bottom right, bottom left."""
+    step = -(-max(states.shape) // _LARGEST_PX)
+    rows, columns = (-(-side // step) * step * grid.gsd_m for side in states.shape)
+    east, south = grid.west + columns, grid.north - rows
+    corners = [[grid.west, grid.north], [east, grid.north], [east, south], [grid.west, south]]
+    return [[round(float(lon), 8), round(float(lat), 8)] for lat, lon in LocalGrid(grid.epsg).to_geographic(corners)]

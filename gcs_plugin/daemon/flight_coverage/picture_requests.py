@@ -16,8 +16,7 @@ from urllib.parse import unquote, urlsplit
 
 from gcs_plugin.daemon.flight_coverage.file_download import FileRead, FolderList
 from gcs_plugin.daemon.flight_coverage.file_numbers import PictureNames
-from gcs_plugin.daemon.flight_coverage.ftp_talk import FtpTalk
-from gcs_plugin.daemon.flight_coverage.link_share import LinkShare
+from gcs_plugin.daemon.flight_coverage.ftp_talk import FtpTalk, LinkShare
 from gcs_plugin.links.file_transfer import payload_of
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 

@@ -11,7 +11,7 @@ import shapely
 from numpy.typing import NDArray
 
 from gcs_plugin.plans.area_files import read_shapes
-from gcs_plugin.plans.planned_flight import read_planned_flight
+from gcs_plugin.plans.plan_files import read_planned_flight
 from orthoswarm.coverage.gaps import PlannedFlight
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid

@@ -1,15 +1,25 @@
-"""The pose of a posted picture: a JSON object with degrees, as the journal keeps it, and the frame that it makes."""
+"""The pose of a posted picture: a JSON object with degrees, as the journal keeps it, and the frame that it makes.
 
+Poses from files and links take the same form.
+"""
+
+import json
+import sqlite3
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
+from gcs_plugin.daemon.store.journal import unpacked
+from gcs_plugin.daemon.store.picture_store import PictureStore
+from orthoswarm.model.earth import distance_m
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.frame import Frame
+from telemetry.live.live_poses import LinkPose
 from telemetry.samples import sample_frame
 from telemetry.samples.sample import Sample
+from telemetry.samples.sample_frame import sample_of
 
 MOST_TEXT: Final = 1 << 20
 _OPTIONAL: Final = {
@@ -139,3 +149,30 @@ def _number(document: Mapping[str, Any], key: str, largest: float) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= largest:
         raise InputError(f"{key} of the pose is missing or out of range; send a number, at most {largest:g}")
     return float(value)
+
+
+def apart_m(a: Mapping[str, float], b: Mapping[str, float]) -> float:
+    """Metres between the places of two poses."""
+    return distance_m(a["lat_deg"], a["lon_deg"], b["lat_deg"], b["lon_deg"])
+
+
+def linked_pose(vehicle: str, name: str, time_s: float | None, linked: LinkPose | None) -> PostedPose | None:
+    """What a vehicle's link and bus say as if it had been posted; None without a position."""
+    values = None if linked is None else pose_values(linked.sample)
+    return None if linked is None or values is None else PostedPose(vehicle, name, time_s, values, linked.origin)
+
+
+def posted_frame(frame: Frame, vehicle: str, name: str) -> PostedPose:
+    """A frame of a file as if it had been posted."""
+    values = pose_values(sample_of(frame)) or {}
+    if frame.damaged:
+        values["damaged"] = True
+    return PostedPose(vehicle, name, frame.time_s, values, dict(frame.origin))
+
+
+def frame_of_row(row: sqlite3.Row, store: PictureStore) -> Frame:
+    """The frame of a journal's row."""
+    return frame_of(
+        json.loads(row["pose"]), image=unpacked(row["image"]), path=store.path(row["path"]),
+        vehicle=unpacked(row["vehicle"]), time_s=row["time"], size=(row["width"], row["height"]),
+    )  # fmt: skip

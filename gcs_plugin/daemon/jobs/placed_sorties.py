@@ -6,10 +6,10 @@ import time
 from collections.abc import Iterable
 from typing import Any
 
+from gcs_plugin.daemon.intake.posted_pose import frame_of_row
 from gcs_plugin.daemon.jobs.job_queue import Job
 from gcs_plugin.daemon.jobs.solution_file import Bytes, thumbnail_of
 from gcs_plugin.daemon.jobs.worker_tasks import SortieResult
-from gcs_plugin.daemon.layers.journal_frames import frame_of_row
 from gcs_plugin.daemon.store.journal import Change, Journal, packed
 from gcs_plugin.daemon.store.picture_store import PictureStore
 from orthoswarm.export.product_files import finite

@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from gcs_plugin.daemon.jobs.process_usage import used_by
 from orthoswarm.compute.workers import Usage, prepare_worker, spawn_context
 from orthoswarm.config import Overrides, overridden, override
 from orthoswarm.model.errors import OrthoSwarmError, WorkerStoppedError
@@ -144,7 +144,7 @@ class WorkerPool:
 
 
 def _used(pool: ProcessPoolExecutor | None) -> Usage:
-    parts = [used_by(pid) for pid in list(getattr(pool, "_processes", None) or {})]
+    parts = [_used_by(pid) for pid in list(getattr(pool, "_processes", None) or {})]
     return Usage(sum(part.cpu_s for part in parts), sum(part.peak_rss_mb for part in parts))
 
 
@@ -174,3 +174,14 @@ def _warm_kernels(_: int) -> None:
     from gcs_plugin.daemon.jobs.kernel_warmup import refine_something
 
     refine_something()
+
+
+def _used_by(pid: int) -> Usage:
+    """Usage of another process so far; zero if it has ended, or if the system does not report it (not Linux)."""
+    try:
+        status = Path(f"/proc/{pid}/status").read_text(encoding="ascii", errors="replace")
+        ran = Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace").rpartition(")")[2].split()
+        largest = next((int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM:")), 0)
+        return Usage((int(ran[11]) + int(ran[12])) / os.sysconf("SC_CLK_TCK"), largest * 1024 / 1e6)
+    except (OSError, ValueError, IndexError, AttributeError):
+        return Usage()

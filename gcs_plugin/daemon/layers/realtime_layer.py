@@ -17,9 +17,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from gcs_plugin.daemon.intake.posted_pose import frame_of_row
 from gcs_plugin.daemon.layers.anchor import Anchor
 from gcs_plugin.daemon.layers.draw_queue import DrawQueue, MapDelay, Pending
-from gcs_plugin.daemon.layers.journal_frames import frame_of_row
 from gcs_plugin.daemon.layers.layers import Area, Layer, new_name
 from gcs_plugin.daemon.layers.map_site import MapSite
 from gcs_plugin.daemon.store.event_bus import Events

@@ -17,7 +17,7 @@ import pytest
 from gcs_plugin.daemon.intake.refused_pictures import RefusedPictures
 from gcs_plugin.daemon.settings import Settings, VehicleSettings
 from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
-from gcs_plugin.web.listener import open_listener
+from gcs_plugin.web.connections import open_listener
 from gcs_plugin.web.standstill import Standstill
 from gcs_plugin.web.uploads import UploadLimits, moving
 from orthoswarm.model.errors import InputError

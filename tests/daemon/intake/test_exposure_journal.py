@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from gcs_plugin.daemon.flight_coverage.event_requests import EventRequests
-from gcs_plugin.daemon.flight_coverage.exposure_journal import ExposureJournal
+from gcs_plugin.daemon.flight_coverage.exposure_journal import EventRequests, ExposureJournal
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.sim.lossy_radio import Faults

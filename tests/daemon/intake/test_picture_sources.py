@@ -15,10 +15,9 @@ import pytest
 from gcs_plugin.daemon.intake.file_complete import is_complete, is_video_complete
 from gcs_plugin.daemon.intake.picture_sources import Source
 from gcs_plugin.daemon.intake.posted_pose import frame_of
-from gcs_plugin.daemon.intake.vehicle_log import write_link_log
 from gcs_plugin.daemon.store.picture_store import frame_key
 from gcs_plugin.links.mavlink import Autopilot, dialect
-from gcs_plugin.links.tlog_writer import TlogWriter, read_tlog
+from gcs_plugin.links.tlog_writer import TlogWriter, read_tlog, write_link_log
 from gcs_plugin.sim.multirotor import Airframe
 from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
 from telemetry import load

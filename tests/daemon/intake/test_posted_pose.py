@@ -10,7 +10,7 @@ def test_a_pose_comes_back_as_it_was_recorded():
     """A file's frame, posted as JSON and read from it again, is the same to the last bit."""
     import random
 
-    from gcs_plugin.daemon.intake.pose_relay import posted_frame
+    from gcs_plugin.daemon.intake.posted_pose import posted_frame
     from telemetry.samples.sample import Sample
     from telemetry.samples.sample_frame import frame_of as recorded_frame
 

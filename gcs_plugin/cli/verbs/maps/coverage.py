@@ -44,7 +44,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Compute, write, print."""
     from gcs_plugin.plans.area_files import read_shapes
-    from gcs_plugin.plans.planned_flight import read_planned_flight
+    from gcs_plugin.plans.plan_files import read_planned_flight
     from orthoswarm.coverage.camera_events import missing_by_events
     from orthoswarm.coverage.coverage_files import draw_cells, write_cells, write_gaps
     from orthoswarm.coverage.gaps import find_gaps

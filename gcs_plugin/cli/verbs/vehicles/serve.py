@@ -160,9 +160,8 @@ def serve(settings: "Settings", *, end_with_input: bool = False) -> int:
     from gcs_plugin.daemon.daemon import Daemon
     from gcs_plugin.daemon.intake.picture_sources import STREAM_THREAD
     from gcs_plugin.web.app import make_app
-    from gcs_plugin.web.connections import ConnectionLimits, Connections, bounded_protocol, open_files
+    from gcs_plugin.web.connections import ConnectionLimits, Connections, bounded_protocol, open_files, open_listener
     from gcs_plugin.web.guard import take_token
-    from gcs_plugin.web.listener import open_listener
 
     logging.basicConfig(stream=sys.stderr, level=logging.INFO, format="%(levelname)s %(message)s")
     os.umask(0o077)  # pictures, plans and the token are readable by their owner only
