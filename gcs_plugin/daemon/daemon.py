@@ -55,7 +55,7 @@ from orthoswarm.compute.workers import peak_rss_mb, prepare_process
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.frame import Frame
 from orthoswarm.raster.basemap import Basemap
-from telemetry.live.live_poses import Poses
+from telemetry.live.live_poses import LinkPoses
 
 _FEW: Final = 10  # posted pictures of a vehicle, after which the kernels of a refinement are compiled
 _SOURCES_S: Final = 1.0
@@ -172,7 +172,7 @@ class Daemon:
         """The vehicles on their links, what is asked of them and what is shown of them to others."""
         settings = self.settings
         self.posted: Counter[str] = Counter()
-        self.poses = Poses()
+        self.poses = LinkPoses()
         self.links: VehicleLinks | None = None
         self.takeoffs: Takeoffs | None = None
         self.terrain: TerrainData | None = None

@@ -11,7 +11,7 @@ from gcs_plugin.daemon.settings import Settings
 from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.journal import Journal, packed, unpacked
 from orthoswarm.model.errors import InputError
-from telemetry.live.live_poses import Poses
+from telemetry.live.live_poses import LinkPoses
 
 if TYPE_CHECKING:
     from gcs_plugin.daemon.vehicles import VehicleLinks
@@ -24,7 +24,7 @@ def make_picture_requests(
     settings: Settings,
     *,
     journal: Journal,
-    poses: Poses,
+    poses: LinkPoses,
     events: Events,
     missing: Callable[[], list[dict[str, Any]]],
     add_picture: Callable[[PostedPose, bytes], object],

@@ -43,7 +43,7 @@ from gcs_plugin.fleet.separation.separation_watch import apart_text, near_text, 
 from gcs_plugin.mission.exchange import Verdict
 from gcs_plugin.mission.plan_folder import NO_NEEDS, PlanNeeds
 from orthoswarm.model.errors import InputError, OrthoSwarmError
-from telemetry.live.live_poses import Poses
+from telemetry.live.live_poses import LinkPoses
 
 if TYPE_CHECKING:
     from gcs_plugin.fleet.commands import Verb
@@ -89,7 +89,7 @@ class VehicleLinks:
     """
 
     def __init__(
-        self, settings: Settings, journal: Journal, events: Events, jobs: Jobs, poses: "Poses | None" = None
+        self, settings: Settings, journal: Journal, events: Events, jobs: Jobs, poses: "LinkPoses | None" = None
     ) -> None:
         """Open the links; the vehicles' poses are stored in `poses`, by their ids.
 
@@ -104,7 +104,7 @@ class VehicleLinks:
         self._titles = {v.id: v.name for v in settings.vehicles}
         self._names = {v.system: v.id for v in settings.vehicles if v.system is not None}
         self._records: dict[int, _VehicleRecord] = {}
-        self._poses = Poses() if poses is None else poses
+        self._poses = LinkPoses() if poses is None else poses
         self._stop, self._silent = threading.Event(), threading.Event()
         self.latest: list[dict[str, Any]] = []
         self.cancel_takeoff: Callable[[str], str] = lambda _: ""

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from gcs_plugin.demo.setting import FOV_MIN_DEG, HEIGHT_M, Setting, write_world
+from gcs_plugin.demo.setting import FOV_MIN_DEG, HEIGHT_M, DemoSetting, write_world
 from gcs_plugin.demo.simulator import simulate
 from orthoswarm.compute.workers import spawn_context
 from orthoswarm.model.errors import InputError, OrthoSwarmError
@@ -31,7 +31,7 @@ ReportProgress = Callable[[str, int, int], None]
 
 
 def run_demo(
-    setting: Setting,
+    setting: DemoSetting,
     out: Path,
     report: ReportProgress,
     *,
@@ -133,7 +133,7 @@ def _receive_addresses(pipe: Any, process: Any) -> dict[str, list[str]]:
     raise OrthoSwarmError("the simulated swarm did not start; run the demonstration again")
 
 
-def _daemon(setting: Setting, out: Path, addresses: dict[str, list[str]]) -> "Daemon":
+def _daemon(setting: DemoSetting, out: Path, addresses: dict[str, list[str]]) -> "Daemon":
     from gcs_plugin.daemon.daemon import Daemon
     from gcs_plugin.daemon.settings import Settings, VehicleSettings
     from orthoswarm.compute.workers import cores
@@ -186,7 +186,7 @@ class Served:
         self._socket.close()
 
 
-def _fly(daemon: "Daemon", setting: Setting, report: ReportProgress) -> None:
+def _fly(daemon: "Daemon", setting: DemoSetting, report: ReportProgress) -> None:
     """Plan, upload, start one after the other, and wait until all have completed."""
     links = daemon.links
     assert links is not None
@@ -249,7 +249,7 @@ def _wait(done: Callable[[], bool], limit_s: float, what: str) -> None:
         time.sleep(0.2)
 
 
-def _measure(setting: Setting, out: Path, end: dict[str, Any], wall_s: float) -> dict[str, Any]:
+def _measure(setting: DemoSetting, out: Path, end: dict[str, Any], wall_s: float) -> dict[str, Any]:
     """Compare the orthoimages with the truth and add the figures to the report."""
     from orthoswarm.evaluation.orthoimage import evaluate_ortho, find_mask
     from orthoswarm.export.product_files import write_json

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from gcs_plugin.demo.setting import Setting
+from gcs_plugin.demo.setting import DemoSetting
 from gcs_plugin.demo.simulated_camera import TwinCamera, VideoSender, VideoServer
 from orthoswarm.export.product_files import iso_time
 from orthoswarm.model.errors import InputError
@@ -264,7 +264,7 @@ class FollowingCameras:
     ) -> None:  # fmt: skip
         self._rays = rays
         self._fleet, self._stage, self._site, self._stream = fleet, stage, site, stream
-        self._setting, self._shutter, self._level, self._opened = Setting(seed=seed), shutter, level, opened
+        self._setting, self._shutter, self._level, self._opened = DemoSetting(seed=seed), shutter, level, opened
         self.followers: dict[int, Follower] = {}
         fleet.subscribe(self._message)
 

@@ -24,7 +24,7 @@ WIDTH, HEIGHT = 640, 480
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
+class DemoSetting:
     """The demonstration's parameters.
 
     Attributes:
@@ -76,14 +76,14 @@ class Errors:
     roll_rad: float
 
     @classmethod
-    def of(cls, setting: Setting, system: int) -> "Errors":
+    def of(cls, setting: DemoSetting, system: int) -> "Errors":
         """The errors of a vehicle, constant during its flight."""
         rng = np.random.default_rng([setting.seed, 211, system])
         yaw, pitch, roll = np.radians(rng.normal(0.0, [2.0, 0.8, 0.8]))
         return cls(float(np.radians(rng.choice(_FOVS_DEG))), float(yaw), float(pitch), float(roll))
 
 
-def build_stage(setting: Setting) -> tuple["Stage", Site]:
+def build_stage(setting: DemoSetting) -> tuple["Stage", Site]:
     """The city after the disaster, prepared for rendering, and its site."""
     from orthoswarm.twin.dataset_files import after_disaster
 
@@ -93,7 +93,7 @@ def build_stage(setting: Setting) -> tuple["Stage", Site]:
     return after_disaster(twin, scene, slots, disaster_zones(twin, site)), site
 
 
-def write_world(setting: Setting, folder: Path) -> None:
+def write_world(setting: DemoSetting, folder: Path) -> None:
     """Write the map before the disaster and the truth after it, but no photos."""
     from orthoswarm.twin.make import make_twin
 

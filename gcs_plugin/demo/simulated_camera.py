@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from gcs_plugin.demo.setting import HEIGHT, WIDTH, Errors, Setting
+from gcs_plugin.demo.setting import HEIGHT, WIDTH, DemoSetting, Errors
 from orthoswarm.model.camera import Camera, Lens, focal_px, rotation_from_angles
 from orthoswarm.twin.imaging.ray_marching import lens_rays, render
 from orthoswarm.twin.imaging.sensor import Sensor
@@ -39,7 +39,7 @@ class TwinCamera:
         rays: along the side of a pixel; 2 gives smooth edges, 1 is four times faster.
     """
 
-    def __init__(self, stage: "Stage", site: "Site", setting: Setting, system: int, rays: int = 2) -> None:
+    def __init__(self, stage: "Stage", site: "Site", setting: DemoSetting, system: int, rays: int = 2) -> None:
         self._stage, self._site, self._system = stage, site, system
         self._errors = Errors.of(setting, system)
         self._lens = Lens(WIDTH, HEIGHT, focal_px(self._errors.fov_rad, WIDTH))

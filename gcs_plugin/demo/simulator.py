@@ -6,7 +6,7 @@ import time
 from multiprocessing.connection import Connection
 from typing import Any, Final
 
-from gcs_plugin.demo.setting import Setting
+from gcs_plugin.demo.setting import DemoSetting
 
 _MOST_WAITING: Final = 4  # pictures
 _SLOW: Final = 0.15  # times real time while cameras lag behind
@@ -29,7 +29,7 @@ class PacedClock:
             return self._now
 
 
-def simulate(setting: Setting, pipe: Connection) -> None:
+def simulate(setting: DemoSetting, pipe: Connection) -> None:
     """Run until "stop" is received or the pipe is closed.
 
     Sends {"links": [...], "streams": [...]} first, and {"taken": N, "problem": text} at the end.

@@ -55,7 +55,7 @@ class FenceLimits:
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class FenceFinding:
     """What a mission does at a limit, in words, and whether it goes beyond it or just near it."""
 
     text: str
@@ -96,7 +96,7 @@ def in_all_zones(vehicle: "Vehicle") -> bool:
     return vehicle.autopilot is Autopilot.ARDUPILOT and not (options is not None and int(options.value) & _ANY_ZONE)
 
 
-def fence_findings(vehicle: "Vehicle", mission: "Mission", limits: FenceLimits) -> list[Finding]:
+def fence_findings(vehicle: "Vehicle", mission: "Mission", limits: FenceLimits) -> list[FenceFinding]:
     """Where a mission goes near the limits of a geofence or beyond them; those beyond come first."""
     place = None if vehicle.lat_deg is None or vehicle.lon_deg is None else (vehicle.lat_deg, vehicle.lon_deg)
     # On the ground its home is set where it stands as it arms.
@@ -107,7 +107,9 @@ def fence_findings(vehicle: "Vehicle", mission: "Mission", limits: FenceLimits) 
     return sorted(_findings(vehicle, mission, limits, points), key=lambda finding: not finding.beyond)
 
 
-def _findings(vehicle: "Vehicle", mission: "Mission", limits: FenceLimits, points: np.ndarray) -> Iterator[Finding]:
+def _findings(
+    vehicle: "Vehicle", mission: "Mission", limits: FenceLimits, points: np.ndarray
+) -> Iterator[FenceFinding]:
     """The findings about a path, float64 (n, 3): east and north of home and height above it, metres."""
     margin_m = limits.margin_m
     if len(points) and limits.radius is not None:
@@ -118,13 +120,13 @@ def _findings(vehicle: "Vehicle", mission: "Mission", limits: FenceLimits, point
         if any(i.is_nav and PLAIN_FRAME.get(i.frame, i.frame) == FRAME_TERRAIN for i in mission.items):
             text = "its mission's heights count from the ground below it"
             text += f"; whether it stays below {limits.top.value:g} m above home ({limits.top.name}) is not known"
-            yield Finding(text, beyond=False)
+            yield FenceFinding(text, beyond=False)
         back = vehicle.settings.get(Setting.RETURN_HEIGHT)
         px4_returns = vehicle.autopilot is Autopilot.PX4 and back is not None and back.value >= limits.top.value
         if px4_returns and back is not None:  # ArduCopter's way home stays below
             text = f"it flies home {back.value:g} m above home ({back.name}), above its geofence's top at"
             text += f" {limits.top.value:g} m ({limits.top.name}); lower {back.name}, or raise {limits.top.name}"
-            yield Finding(text, beyond=False)
+            yield FenceFinding(text, beyond=False)
     if limits.floor is not None:
         low_m, been_above = math.inf, False
         for item, height_m in heights_m(mission):
@@ -135,12 +137,12 @@ def _findings(vehicle: "Vehicle", mission: "Mission", limits: FenceLimits, point
         if low_m <= limits.floor.value:
             text = f"its mission goes down to {low_m:.0f} m, but its geofence begins at {limits.floor.value:g} m"
             text += f" ({limits.floor.name})" + (f", {limits.does}" if limits.does else ", which it reports")
-            yield Finding(f"{text}; plan higher, or lower {limits.floor.name}", beyond=bool(limits.does))
+            yield FenceFinding(f"{text}; plan higher, or lower {limits.floor.name}", beyond=bool(limits.does))
 
 
 def _over(
     limit: "SetTo", most_m: float, limits: FenceLimits, goes: str, near_m: float | None = None
-) -> Iterator[Finding]:
+) -> Iterator[FenceFinding]:
     """What a mission that goes up to so many metres does at a limit, if anything."""
     margin_m = limits.margin_m if near_m is None else near_m
     if most_m < limit.value - margin_m:
@@ -151,7 +153,7 @@ def _over(
     does = f", {limits.does}" if limits.does else ", which it only reports"
     text += f", but {ends}{does}" if beyond else f", and {ends}: it may be carried beyond"
     advice = f"plan within that, or set {limit.name} to {needed} if it may fly there"
-    yield Finding(f"{text}; {advice}", beyond=beyond and bool(limits.does))
+    yield FenceFinding(f"{text}; {advice}", beyond=beyond and bool(limits.does))
 
 
 def _some(limit: "SetTo") -> "SetTo | None":

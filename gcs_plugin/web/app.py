@@ -87,7 +87,7 @@ class CoverageRoutes:
         return Response(data, media_type="image/png", headers=headers)
 
 
-class Routes:
+class HttpRoutes:
     """The functions of the routes.
 
     Args:
@@ -324,7 +324,7 @@ _FORM: Final = {
 
 def make_app(daemon: Daemon, token: str, bind: str = "127.0.0.1") -> Any:
     """The ASGI application of a running daemon."""
-    routes = Routes(daemon)
+    routes = HttpRoutes(daemon)
 
     @contextlib.asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:

@@ -263,7 +263,7 @@ class LivePoses:
         return event
 
 
-class Poses:
+class LinkPoses:
     """The recent poses of all vehicles, by id."""
 
     def __init__(self) -> None:

@@ -19,7 +19,7 @@ from telemetry.videos.extraction_cache import CachedExtraction, CachedPicture, k
 from telemetry.videos.on_ground import on_ground
 from telemetry.videos.packet_loss import Damage, transport_gaps
 from telemetry.videos.picture_choice import Candidate, Picker
-from telemetry.videos.picture_poses import Pose, Poses
+from telemetry.videos.picture_poses import PicturePose, Poses
 from telemetry.videos.video_file import VideoScan, demux, open_video, parked, picture_stream, scan, square_size
 
 JPEG_QUALITY = 95
@@ -360,7 +360,7 @@ class _LensKey:
         return self._base if times == 1.0 else f"{self._base} x{times:.2f}"
 
 
-def _photo(path: Path, picture: CachedPicture, pose: Pose | None, lens: _LensKey) -> PhotoTags:
+def _photo(path: Path, picture: CachedPicture, pose: PicturePose | None, lens: _LensKey) -> PhotoTags:
     photo = PhotoTags(path=path, width=picture.columns, height=picture.rows)
     photo.damaged = picture.damaged
     photo.camera = lens.of(None if pose is None else pose.sample)

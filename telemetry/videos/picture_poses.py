@@ -27,7 +27,7 @@ _HELD_AT_ENDS_S: Final = 1.0  # metadata counts this long before its first and a
 
 
 @dataclass(frozen=True, slots=True)
-class Pose:
+class PicturePose:
     """The merged sample of a picture and the sources of its parts."""
 
     sample: Sample
@@ -91,7 +91,7 @@ class Poses:
         self._note_file()
         self._note(cues)
 
-    def of(self, index: int) -> Pose | None:
+    def of(self, index: int) -> PicturePose | None:
         """Pose of the picture of a packet (its index in `VideoScan.pictures`); None if unknown."""
         note, t = self._scan.pictures[index], self._times[index]
         parts: list[tuple[Sample, str]] = []
@@ -119,7 +119,7 @@ class Poses:
             merged = replace(merged, time_s=own.time_s)
         for sample, _ in parts[1:]:
             merged = merged.merge(sample)
-        return Pose(merged, " + ".join(name for _, name in parts if name))
+        return PicturePose(merged, " + ".join(name for _, name in parts if name))
 
     @property
     def has_positions(self) -> bool:

@@ -75,7 +75,7 @@ class VideoScan:
     rate: float | None = None
     created_s: float | None = None
     pictures: list[PictureNote] = field(default_factory=list)
-    klv_packets: list[tuple[float | None, int, klv.Packet]] = field(default_factory=list)
+    klv_packets: list[tuple[float | None, int, klv.KlvPacket]] = field(default_factory=list)
     djmd_samples: list[tuple[float, Sample]] = field(default_factory=list)
     gpmf_samples: list[tuple[float, Sample]] = field(default_factory=list)
     cues: srt.Subtitles = field(default_factory=srt.Subtitles)

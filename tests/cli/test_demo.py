@@ -10,7 +10,7 @@ import time
 import pytest
 
 from gcs_plugin.cli.main import main
-from gcs_plugin.demo.setting import Errors, Setting
+from gcs_plugin.demo.setting import DemoSetting, Errors
 from gcs_plugin.demo.simulator import PacedClock
 
 
@@ -27,7 +27,7 @@ def test_impossible_demonstrations_are_refused(arguments, tmp_path):
 
 
 def test_the_area_grows_with_the_swarm():
-    small, large = Setting(vehicles=1), Setting(vehicles=6)
+    small, large = DemoSetting(vehicles=1), DemoSetting(vehicles=6)
     assert large.extent_m[0] == 6 * small.extent_m[0]
     across, along = large.twin.plan.extent_m
     assert across < 0.5 * large.extent_m[0]
@@ -35,7 +35,7 @@ def test_the_area_grows_with_the_swarm():
 
 
 def test_vehicles_differ_and_stay_as_they_are():
-    setting = Setting()
+    setting = DemoSetting()
     assert Errors.of(setting, 1) == Errors.of(setting, 1)
     assert Errors.of(setting, 1) != Errors.of(setting, 2)
 

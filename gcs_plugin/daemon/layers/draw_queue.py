@@ -20,7 +20,7 @@ _STEP_SHARE: Final = 0.06  # of the height above ground: distance of pictures on
 
 
 @dataclass(frozen=True, slots=True)
-class Pending:
+class PendingFrame:
     """A frame to be drawn: its number, when it came (UTC epoch seconds), its sortie."""
 
     seq: int
@@ -63,7 +63,7 @@ class DrawQueue:
 
     def __init__(self, most: int) -> None:
         self.most = most
-        self._queues: list[deque[Pending]] = [deque() for _ in range(LEVELS)]
+        self._queues: list[deque[PendingFrame]] = [deque() for _ in range(LEVELS)]
         self._drawn: set[tuple[int, int]] = set()
         self._step_m = 0.0
         self._east_m = DEGREE_M
@@ -72,10 +72,10 @@ class DrawQueue:
     def __len__(self) -> int:
         return self._count
 
-    def put(self, pending: Pending) -> Pending | None:
+    def put(self, pending: PendingFrame) -> PendingFrame | None:
         """Add a frame; returns the one dropped for it (possibly itself), None if there is room."""
         level = self._level(pending.frame)
-        left: Pending | None = None
+        left: PendingFrame | None = None
         if self._count >= self.most:
             lowest = next(k for k, queue in enumerate(self._queues) if queue)
             if lowest >= level:
@@ -86,7 +86,7 @@ class DrawQueue:
         self._count += 1
         return left
 
-    def take(self) -> Pending | None:
+    def take(self) -> PendingFrame | None:
         """The frame to be drawn next, counted as drawn from now on; None if there is none."""
         for level in range(LEVELS - 1, -1, -1):
             queue = self._queues[level]

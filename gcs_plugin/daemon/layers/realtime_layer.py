@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from gcs_plugin.daemon.intake.posted_pose import frame_of_row
 from gcs_plugin.daemon.layers.anchor import Anchor
-from gcs_plugin.daemon.layers.draw_queue import DrawQueue, MapDelay, Pending
+from gcs_plugin.daemon.layers.draw_queue import DrawQueue, MapDelay, PendingFrame
 from gcs_plugin.daemon.layers.layers import Area, Layer, new_name
 from gcs_plugin.daemon.layers.map_site import MapSite
 from gcs_plugin.daemon.store.event_bus import Events
@@ -133,7 +133,7 @@ class Drawer:
         with self._condition:
             self._delay.came(frame.vehicle, arrived)
             if seq not in self._waiting:
-                self._put(Pending(seq, arrived, sortie, frame))
+                self._put(PendingFrame(seq, arrived, sortie, frame))
             self._condition.notify_all()
 
     @property
@@ -250,9 +250,9 @@ class Drawer:
                     if len(self._queue) >= self._in_memory:
                         self._more = True
                         break
-                    self._put(Pending(row["seq"], row["arrived"], row["sortie"], frame_of_row(row, self._store)))
+                    self._put(PendingFrame(row["seq"], row["arrived"], row["sortie"], frame_of_row(row, self._store)))
 
-    def _put(self, pending: Pending) -> None:
+    def _put(self, pending: PendingFrame) -> None:
         self._waiting.add(pending.seq)
         left = self._queue.put(pending)
         if left is not None:  # it is found in the journal when there is room
@@ -281,7 +281,7 @@ class Drawer:
             self._waiting.difference_update(seqs)
             self._condition.notify_all()
 
-    def _note(self, pending: Pending, result: Drawn) -> None:
+    def _note(self, pending: PendingFrame, result: Drawn) -> None:
         took = time.time() - pending.arrived
         with self._condition:
             self._delay.drawn(pending.frame.vehicle, pending.arrived)
@@ -299,7 +299,7 @@ class Drawer:
 
     # -- one frame ------------------------------------------------------------------------------------------------
 
-    def _draw(self, pending: Pending) -> Drawn:
+    def _draw(self, pending: PendingFrame) -> Drawn:
         frame = pending.frame
         try:
             place = self._site.place(frame, self.drawn)
@@ -324,7 +324,7 @@ class Drawer:
             self._on_drawn(PlacedFrame(frame, camera, "realtime", sigma), quality)
         return self._report(pending, Drawn(pending.seq, added.reason, sigma, _thumbnail(picture), quality), camera)
 
-    def _report(self, pending: Pending, drawn: Drawn, camera: Camera | None) -> Drawn:
+    def _report(self, pending: PendingFrame, drawn: Drawn, camera: Camera | None) -> Drawn:
         frame, fix = pending.frame, pending.frame.fix
         outline, grid = None, self._site.grid
         if camera is not None and grid is not None and drawn.reason is None:

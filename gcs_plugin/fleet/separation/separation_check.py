@@ -23,7 +23,7 @@ _PLANNED_SHARE: Final = 0.95
 
 
 @dataclass(frozen=True, slots=True)
-class Flight:
+class TimedFlight:
     """What a vehicle flies.
 
     Attributes:
@@ -57,15 +57,15 @@ def flights_of(
     missions: "Mapping[int, Mission]",
     stored: "Mapping[int, Mission]",
     starts: Mapping[int, float],
-) -> dict[int, Flight]:
+) -> dict[int, TimedFlight]:
     """The flights of vehicles that are to start; arguments as for `preflight_all`."""
     return {
-        s: Flight(missions.get(s) or stored.get(s) or v.mission, starts.get(s, 0.0), v.home_alt_m, s in missions)
+        s: TimedFlight(missions.get(s) or stored.get(s) or v.mission, starts.get(s, 0.0), v.home_alt_m, s in missions)
         for s, v in vehicles.items()
     }
 
 
-def others_of(vehicles: "Mapping[int, Vehicle]", waiting: Mapping[int, float]) -> dict[int, Flight]:
+def others_of(vehicles: "Mapping[int, Vehicle]", waiting: Mapping[int, float]) -> dict[int, TimedFlight]:
     """The flights of other vehicles: of those in the air, and of those whose takeoff waits.
 
     Args:
@@ -74,16 +74,16 @@ def others_of(vehicles: "Mapping[int, Vehicle]", waiting: Mapping[int, float]) -
     found = {}
     for s, vehicle in vehicles.items():
         if s in waiting:
-            found[s] = Flight(vehicle.mission, waiting[s], vehicle.home_alt_m, examined=False)
+            found[s] = TimedFlight(vehicle.mission, waiting[s], vehicle.home_alt_m, examined=False)
         elif vehicle.flying:
             mission = vehicle.mission if flight_state(vehicle).word in (Word.ON_MISSION, Word.TAKING_OFF) else None
             elapsed_s = 0.0 if mission is None else _elapsed_s(vehicle, mission)
-            found[s] = Flight(mission, -elapsed_s, vehicle.home_alt_m, examined=False)
+            found[s] = TimedFlight(mission, -elapsed_s, vehicle.home_alt_m, examined=False)
     return found
 
 
 def separation_of(
-    flights: Mapping[int, Flight], name: Callable[[int], str] = number_name, apart: "Apart | None" = None
+    flights: Mapping[int, TimedFlight], name: Callable[[int], str] = number_name, apart: "Apart | None" = None
 ) -> Separation:
     """Which vehicles come too near each other; takes a second or more for a large swarm.
 
@@ -112,7 +112,7 @@ def separation_of(
 
 @lru_cache(maxsize=8)
 def _conflicts(
-    flights: tuple[tuple[int, Flight], ...], apart: "Apart | None"
+    flights: tuple[tuple[int, TimedFlight], ...], apart: "Apart | None"
 ) -> tuple[tuple[int, int, float, float], ...]:
     """Both vehicles, the time and the distance; the same flights are asked about again and again before a start."""
     about = dict(flights)

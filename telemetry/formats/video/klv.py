@@ -21,7 +21,7 @@ MAX_PACKET = 1 << 20
 
 
 @dataclass(slots=True)
-class Packet:
+class KlvPacket:
     """One KLV packet.
 
     Attributes:
@@ -35,7 +35,7 @@ class Packet:
     values: dict[str, float | str] = field(default_factory=dict)
 
 
-def packets(data: bytes) -> Iterator[Packet]:
+def packets(data: bytes) -> Iterator[KlvPacket]:
     """Every ST 0601 and EG 0104 packet in a run of bytes; damaged ones with the reason. Never raises."""
     at = data.find(_PREFIX)
     while at >= 0:
@@ -45,7 +45,7 @@ def packets(data: bytes) -> Iterator[Packet]:
             continue
         length, start = ber_length(data, at + 16)
         if length is None or length > MAX_PACKET or start + length > len(data):
-            yield Packet(kind, None, "the packet is cut off")
+            yield KlvPacket(kind, None, "the packet is cut off")
             at = data.find(_PREFIX, at + 4)
             continue
         packet_bytes = data[at : start + length]
@@ -127,8 +127,8 @@ _TEXTS = {3: "mission", 4: "tail_number", 10: "platform", 59: "call_sign"}
 # Item 10 is the model, which all vehicles of a fleet share: it names none of them.
 
 
-def _read_0601(packet_bytes: bytes, start: int) -> Packet:
-    packet = Packet("ST 0601", None)
+def _read_0601(packet_bytes: bytes, start: int) -> KlvPacket:
+    packet = KlvPacket("ST 0601", None)
     values = packet.values
     at, size, seen_checksum = start, len(packet_bytes), False
     while at < size:
@@ -186,8 +186,8 @@ _UNIVERSAL = {
 _UNIVERSAL_TEXTS = frozenset({"platform", "mission"})
 
 
-def _read_0104(packet_bytes: bytes, start: int) -> Packet:
-    packet = Packet("EG 0104", None)
+def _read_0104(packet_bytes: bytes, start: int) -> KlvPacket:
+    packet = KlvPacket("EG 0104", None)
     values = packet.values
     at, size = start, len(packet_bytes)
     while at + 17 <= size:

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gcs_plugin.daemon.intake.posted_pose import frame_of, parse_pose
-from gcs_plugin.daemon.layers.draw_queue import DrawQueue, MapDelay, Pending
+from gcs_plugin.daemon.layers.draw_queue import DrawQueue, MapDelay, PendingFrame
 from gcs_plugin.daemon.layers.layers import Layer
 from gcs_plugin.daemon.layers.realtime_layer import Drawer
 from gcs_plugin.daemon.store.event_bus import Events
@@ -24,7 +24,7 @@ from tests.kit.mosaic_scene import EAST, NORTH
 
 def pending(seq, east, north=0.0, height=100.0):
     lat, lon = (float(v) for v in GRID.to_geographic([EAST + east, NORTH + north]))
-    return Pending(
+    return PendingFrame(
         seq,
         0.0,
         1,

@@ -120,12 +120,12 @@ def _scaling(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 
 def _peers(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from gcs_plugin.bench.peers import Settings, peers_sheet, peers_table, run_peers
+    from gcs_plugin.bench.peers import PeerSettings, peers_sheet, peers_table, run_peers
     from orthoswarm.model.errors import InputError
 
     if args.every < 1 or args.limit_s <= 0 or (args.workers or 1) < 1:
         raise InputError("--every, --limit-s and --workers take numbers above 0")
-    settings = Settings(
+    settings = PeerSettings(
         programs=tuple(_list(args.programs)),
         out=args.out.absolute(),
         environments=args.environments or args.out.absolute() / "environments",

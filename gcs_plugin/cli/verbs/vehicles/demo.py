@@ -33,7 +33,7 @@ def run(args: argparse.Namespace) -> int:
     from gcs_plugin.cli.machine_check import compile_cold_kernels
     from gcs_plugin.cli.progress import ProgressBars
     from gcs_plugin.demo.demonstration import run_demo
-    from gcs_plugin.demo.setting import Setting
+    from gcs_plugin.demo.setting import DemoSetting
     from orthoswarm.model.errors import InputError, OrthoSwarmError
 
     if not 1 <= args.vehicles <= 12:
@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
 
     with ProgressBars() as progress:
         report = run_demo(
-            Setting(args.vehicles, args.seed, args.speed),
+            DemoSetting(args.vehicles, args.seed, args.speed),
             args.out,
             progress,
             port=args.port,
