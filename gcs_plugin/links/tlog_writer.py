@@ -14,7 +14,6 @@ from gcs_plugin.links.packets import Framer, Packet
 
 _TIME = struct.Struct(">Q")
 _STEP: Final = 8  # bytes of the time before each packet of a tlog
-_MARKS: Final = (0xFD, 0xFE)
 
 
 class TlogWriter:
