@@ -63,7 +63,7 @@ def test_thresholds_of_a_file_are_used_and_stand_in_the_report(area, tmp_path, c
     assert "config" not in json.loads(capsys.readouterr().out)
     config.write_text("[planning]\nclearance = 3\n")
     assert plan(area, "--vehicles", 2, *FLAGS, "--out", tmp_path / "none", "--config", config) == 2
-    assert "has no 'clearance'" in capsys.readouterr().err and not (tmp_path / "none").exists()
+    assert "no setting planning.clearance;" in capsys.readouterr().err and not (tmp_path / "none").exists()
 
 
 @pytest.mark.parametrize("method", ["columns", "bcd", "tmstc"])
