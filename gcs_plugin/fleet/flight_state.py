@@ -153,9 +153,9 @@ def _word(vehicle: Observed) -> Word:
         return Word.TAKING_OFF
     if vehicle.custom_mode == vehicle.modes.mission:
         return _on_mission(vehicle)
-    if vehicle.sinks_s >= _SINKING_S:
-        return Word.DESCENDING
     brakes = vehicle.custom_mode == vehicle.modes.hold and vehicle.in_mode_s < _BRAKES_S
+    if vehicle.sinks_s >= _SINKING_S and not brakes:
+        return Word.DESCENDING
     if mode not in HOLDS or (math.hypot(*vehicle.velocity_m_s[:2]) > _SLOW_M_S and not brakes):
         return Word.FLYING
     return Word.PAUSED if _interrupted(vehicle) else Word.HOLDING

@@ -38,7 +38,7 @@ def resumed(vehicle: "Vehicle") -> "Exchange":
     if not in_mission and way is None and not _on_its_way(vehicle):
         text = f"{name} holds, but not on the way to its mission's present item, so it may have been returning"
         raise OrthoSwarmError(f"{text}: send it home (rtl), or give 'continue' to go on with its mission")
-    return pilot.go_on(in_mission_mode=in_mission)
+    return pilot.go_on(vehicle.custom_mode)
 
 
 def continued(vehicle: "Vehicle") -> "Exchange":
@@ -50,7 +50,7 @@ def continued(vehicle: "Vehicle") -> "Exchange":
     if not vehicle.flying or vehicle.unbegun:
         why = "has not begun the mission that it was given" if vehicle.unbegun else "does not fly"
         raise OrthoSwarmError(f"vehicle {vehicle.system} {why}; start it")
-    return vehicle.pilot.go_on(in_mission_mode=vehicle.custom_mode == vehicle.modes.mission)
+    return vehicle.pilot.go_on(vehicle.custom_mode)
 
 
 def _on_its_way(vehicle: "Vehicle") -> bool:

@@ -303,7 +303,7 @@ class Vehicle:
     def says(self, text: str, now: float, severity: int = _INFO) -> None:
         """Process a text of its autopilot, of a MAV_SEVERITY."""
         self.texts.append(text)
-        if severity <= _FAULT:
+        if severity <= _FAULT and self.flying:
             self._severe = text, self.time_boot_s
         if text.startswith(("PreArm", "Arm:", "Preflight")):
             self._prearm.pop(text, None)

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from gcs_plugin.config import COMMAND
-from gcs_plugin.links.mavlink import Autopilot, Message, dialect
+from gcs_plugin.links.mavlink import Autopilot, Message, dialect, is_autopilot
 from gcs_plugin.mission.exchange import NEVER, Address, Exchange, Outcome, Verdict
-from gcs_plugin.mission.flight_modes import Modes, mode_params
+from gcs_plugin.mission.flight_modes import LANDS, RETURNS, Modes, mode_params
 
 _ACCEPTED: Final = int(dialect.MAV_RESULT_ACCEPTED)
 _IN_PROGRESS: Final = int(dialect.MAV_RESULT_IN_PROGRESS)
@@ -114,6 +114,26 @@ class Command(Exchange):
         name = str(entry.name).removeprefix("MAV_RESULT_").lower().replace("_", " ") if entry else str(result)
         why = "; ".join(self.reasons) or "it gives no reason"
         self._end(False, f"vehicle {self.vehicle.system} refuses to {self.verb} ({name}): {why}")
+
+
+@dataclass(slots=True)
+class GoOn(Command):
+    """A command to go on with a mission; it ends where the vehicle is seen to be sent home, or to land, meanwhile.
+
+    Attributes:
+        modes: the autopilot's. was: the mode that it was in.
+    """
+
+    modes: Modes = field(kw_only=True)
+    was: int = field(kw_only=True)
+
+    def feed(self, message: Message, now: float) -> list[Message]:
+        """Look at its mode, too."""
+        if self.outcome is None and message.get_type() == "HEARTBEAT" and is_autopilot(message):
+            mode = int(message.custom_mode)
+            if mode != self.was and self.modes.name(mode) in RETURNS | LANDS:
+                self._end(False, f"vehicle {self.vehicle.system} was put into {self.modes.name(mode)} meanwhile")
+        return Command.feed(self, message, now)
 
 
 @dataclass(slots=True)
@@ -251,14 +271,20 @@ class Pilot:
             stay = dialect.MAV_CMD_DO_REPOSITION
             ways.insert(0, Command(self.vehicle, self.own, command=stay, params=(-1.0, flag, 0.0, *here), verb="hold"))
         if self.autopilot is Autopilot.ARDUPILOT:
-            ways.insert(0, self._pause_continue(0.0, "pause", _FIRST_S))
+            pause = dialect.MAV_CMD_DO_PAUSE_CONTINUE
+            ways.insert(0, Command(self.vehicle, self.own, command=pause, verb="pause", patience_s=_FIRST_S))
         return Either(self.vehicle, self.own, steps=ways)
 
-    def go_on(self, *, in_mission_mode: bool) -> Exchange:
-        """Continue the mission where it was left."""
-        if self.autopilot is Autopilot.ARDUPILOT and in_mission_mode:
-            return self._pause_continue(1.0, "resume", COMMAND.fresh_s)
-        return self.set_mode(self.modes.mission)
+    def go_on(self, mode: int) -> Exchange:
+        """Continue the mission where it was left, from a mode."""
+        pauses = self.autopilot is Autopilot.ARDUPILOT and mode == self.modes.mission
+        params = (1.0, 0.0, 0.0) if pauses else mode_params(self.autopilot, self.modes.mission)
+        command = dialect.MAV_CMD_DO_PAUSE_CONTINUE if pauses else dialect.MAV_CMD_DO_SET_MODE
+        verb = "resume" if pauses else f"change to {self.modes.name(self.modes.mission)}"
+        return GoOn(
+            self.vehicle, self.own, command=command, params=params, verb=verb, insist_s=0.0 if pauses else 3.0,
+            modes=self.modes, was=mode,
+        )  # fmt: skip
 
     def rtl(self) -> Exchange:
         """Fly home and land."""
@@ -272,9 +298,3 @@ class Pilot:
         """Land where it is."""
         down = Command(self.vehicle, self.own, command=dialect.MAV_CMD_NAV_LAND, verb="land", patience_s=_FIRST_S)
         return Either(self.vehicle, self.own, steps=[down, self.set_mode(self.modes.land)])
-
-    def _pause_continue(self, go_on: float, verb: str, patience_s: float) -> Command:
-        return Command(
-            self.vehicle, self.own, command=dialect.MAV_CMD_DO_PAUSE_CONTINUE, params=(go_on,), verb=verb,
-            patience_s=patience_s,
-        )  # fmt: skip

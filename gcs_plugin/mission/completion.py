@@ -157,8 +157,9 @@ class CompletionDetector:
         return untold + self._events_of(message)
 
     def _position(self, message: Message) -> list[MissionEvent]:
-        if self.flown is not None and self.phase is Phase.ACTIVE and has_place(message):
-            self.flown.position(message.time_boot_ms / 1e3, message.lat / 1e7, message.lon / 1e7)
+        if self.flown is not None and self.phase in (Phase.ACTIVE, Phase.SUSPENDED) and has_place(message):
+            here = message.lat / 1e7, message.lon / 1e7
+            self.flown.position(message.time_boot_ms / 1e3, *here, counts=self.phase is Phase.ACTIVE)
         return self._complete() if self._judging else []
 
     def _events_of(self, message: Message) -> list[MissionEvent]:

@@ -51,13 +51,15 @@ class FlownItems:
                 triggers = item.params[0] > 0.0
         return cls(places, lines or list(places))
 
-    def position(self, time_s: float, lat_deg: float, lon_deg: float) -> None:
-        """It was seen at a place, at a time of its own clock."""
+    def position(self, time_s: float, lat_deg: float, lon_deg: float, *, counts: bool = True) -> None:
+        """It was seen at a place, at a time of its own clock; while it is paused that does not count as reached."""
         silent_s = 0.0 if self._at_s is None else time_s - self._at_s
         self._unseen_m = silent_s * _FASTEST_M_S if silent_s > _SILENT_S else self._unseen_m
         if silent_s > _SILENT_S:
             self._excuse()
         self._at_s, self._here = time_s, (lat_deg, lon_deg)
+        if not counts:
+            return
         for seq in (s for s in (self._seq, self._before) if s is not None and s not in self.reached):
             if seq in self.places and _metres(self._here, self.places[seq]) < _NEAR_M:
                 self.reached.add(seq)

@@ -121,6 +121,11 @@ class LastLook(Exchange):
     _fix: float = field(default=-math.inf, init=False)
     _read: float = field(default=-math.inf, init=False)
 
+    @property
+    def seen_s(self) -> float:
+        """When all of it was seen, on the caller's clock: the time of what was seen first."""
+        return min(self._beat, self._fix, self._read)
+
     def start(self, now: float) -> list[Message]:
         """Begin to look, and ask for the mission."""
         self._began = now
@@ -210,7 +215,7 @@ class LastLook(Exchange):
             self._holds(self.mission, now)
         if self.outcome is not None:
             return messages
-        if min(self._beat, self._fix, self._read) >= now - FRESH_S:
+        if self.seen_s >= now - FRESH_S:
             self._end(True, f"vehicle {self.vehicle.system} is as it was")
         elif self._reading is None and expected is not None and now - self._read > FRESH_S and not expected.known_id:
             messages = messages + self._read_again(now)
@@ -235,6 +240,7 @@ class Guarded(Exchange):
     mission: Mission | None = field(default=None, init=False)
     _step: Exchange = field(init=False)
     _ordered: bool = field(default=False, init=False)
+    _again_s: float | None = field(default=None, init=False)
 
     def start(self, now: float) -> list[Message]:
         """Begin to look."""
@@ -249,23 +255,31 @@ class Guarded(Exchange):
             if (mode, bool(message.base_mode & ARMED)) == self.obeyed:
                 self._end(True, f"{name}: {self.order.verb} accepted")
                 return []
-            if mode not in (self.look.mode, self.look.was, self.obeyed[0]):
+            if mode not in (self.look.mode, self.obeyed[0]) and isinstance(self._step, Command):
                 self._end(False, f"{name} was put into {self.look.modes.name(mode)} meanwhile, so it was not started")
                 return []
-        return self._follow(self._step.feed(message, now), now)
+        if message.get_type() == "COMMAND_ACK" and others_command(message, self.own):
+            text = "has been commanded by another station meanwhile, so it was not started"
+            self._end(False, f"vehicle {self.vehicle.system} {text}")
+            return []
+        return self._follow(self._step.feed(message, now), now) if self._again_s is None else []
 
     def tick(self, now: float) -> list[Message]:
         """Let time pass."""
-        return self._follow(self._step.tick(now), now) if self.outcome is None else []
+        if self.outcome is not None or (self._again_s is not None and now < self._again_s):
+            return []
+        if self._again_s is not None:
+            self._again_s = None
+            return self._follow(self._next(replace(self.look, was=None), now), now)
+        return self._follow(self._step.tick(now), now)
 
     def took(self) -> None:
         """A link has accepted a message."""
         self.delivered += 1
         self._step.took()
 
-    def _next(self, step: Exchange, now: float) -> list[Message]:
-        self._step, step.pace = step, self.pace
-        step.expires = min(now + FRESH_S, self.expires) if isinstance(step, Command) else self.expires
+    def _next(self, step: Exchange, now: float, expires: float = math.inf) -> list[Message]:
+        self._step, step.pace, step.expires = step, self.pace, min(expires, self.expires)
         return step.start(now)
 
     def _follow(self, messages: list[Message], now: float) -> list[Message]:
@@ -276,9 +290,13 @@ class Guarded(Exchange):
                 if not outcome.ok:
                     self._end(False, outcome.text, outcome.verdict)
                     return messages
-                messages, self._ordered = messages + self._next(replace(self.order), now), True
+                order = self._next(replace(self.order), now, step.seen_s + FRESH_S)
+                messages, self._ordered = messages + order, True
             elif outcome.ok or now + FRESH_S >= self.expires:
                 self._end(outcome.ok, outcome.text, outcome.verdict)
+                return messages
+            elif outcome.verdict is Verdict.REFUSED:  # it may be ready a second later
+                self._again_s = self.deadline = now + FRESH_S
                 return messages
             else:
                 messages = messages + self._next(replace(self.look, was=None), now)

@@ -328,6 +328,10 @@ class Flight:
         if item.command != TAKEOFF and (item.x or item.y):
             north, east = motion.chart.to_metres(item.lat_deg, item.lon_deg)
         height = item.z - (motion.chart.alt_m if item.frame in (0, 5) else 0.0)
+        if item.command == TAKEOFF and motion.up > _LIFTED_M:  # it flies: where it stops, and no lower
+            motion.stop()
+            motion.climb_to(height)
+            return
         stays_high = item.command in (LAND, VTOL_LAND) or not item.has_place
         # On a leg it keeps to the line, which is what makes the leg straight.
         motion.go((north, east, motion.up if stays_high else height), along_line=bool(self._reached_any))

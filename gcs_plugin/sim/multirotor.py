@@ -25,6 +25,7 @@ _ECCENTRICITY2: Final = 6.69437999014e-3  # of WGS 84
 STEP_S: Final = 0.05
 _FILTER_S: Final = 3.0
 _LOOK_AHEAD_S: Final = 0.8
+_LOWEST_M: Final = 0.5  # it stops no lower, unless it lands
 _LIFT_M_S2: Final = 1.5  # greatest change of its rate of climb
 
 
@@ -189,8 +190,13 @@ class Motion:
         """Brake to a stop with the largest acceleration."""
         north, east = self.seen
         after_s = math.hypot(self.vn, self.ve) / (2.0 * self.airframe.accel_m_s2) + 0.7
-        up = max(0.0, self.up + self.vu * abs(self.vu) / (2.0 * _LIFT_M_S2))
+        up = max(min(self.up, _LOWEST_M), self.up + self.vu * abs(self.vu) / (2.0 * _LIFT_M_S2))
         self.go((north + self.vn * after_s, east + self.ve * after_s, up))
+
+    def climb_to(self, up: float) -> None:
+        """Raise the target."""
+        if self.target is not None:
+            self.target = (self.target[0], self.target[1], max(up, self.target[2]))
 
     def still(self) -> None:
         """Stand on the ground."""

@@ -5,17 +5,19 @@ import zlib
 from dataclasses import dataclass, field
 
 from gcs_plugin.fleet.flight_state import Word, flight_state
+from gcs_plugin.links.mavlink import dialect
 from gcs_plugin.links.packets import Framer
 from gcs_plugin.mission.comparison import difference
 from gcs_plugin.mission.exchange import GROUND_STATION
 from gcs_plugin.mission.flight_modes import HOLDS, mode_params
-from gcs_plugin.mission.items import LAND, RTL, MissionItem
+from gcs_plugin.mission.items import RTL, MissionItem
 from orthoswarm.model.earth import distance_m
-from tests.vehicles.safety.two_stations import AP, ARM, CURRENT, DOWN, HOME, OTHER, PAUSE, SET_MODE, START
+from tests.vehicles.safety.two_stations import ARM, OTHER, PAUSE, SET_MODE, START
 
 LOOK_S = 1.0 + 2 * 0.05  # a second, and the steps of time here
 FRESH_S = 1.2  # since a stop of others, which may not have been told yet
 CHANGE_S = 6.0  # a word may lag so long behind a change, seconds of the vehicle's clock
+REQUEST = {int(dialect.MAV_CMD_REQUEST_MESSAGE), int(dialect.MAV_CMD_SET_MESSAGE_INTERVAL)}
 _BEATS = {"HEARTBEAT": 3, "EXTENDED_SYS_STATE": 2, "MISSION_CURRENT": 4, "GLOBAL_POSITION_INT": 20}
 
 
@@ -31,7 +33,8 @@ class Heard:
     items: dict = field(default_factory=dict)  # seq -> item
     asked: float | None = None  # for its mission
     read: tuple = (-math.inf, -math.inf, ())  # begun, ended, items
-    seq: int | None = None
+    seq: int = 0
+    at: float = -math.inf
     counts: dict = field(default_factory=dict)
 
 
@@ -49,6 +52,7 @@ class Rules:
         self._told = {v.system: 0 for v in field.vehicles}
         self._looked, self._events = -1.0, 0
         self._silent: dict[int, float] = {}
+        self._last = {}
         field.fleet.tap(self._arrived)
         self._put = field.world.link.send
         field.world.link.send = self._sent
@@ -61,8 +65,8 @@ class Rules:
                 self._obeyed(vehicle, told)
             self._told[vehicle.system] = len(vehicle.told)
         for event in field.world.events[self._events :]:
-            if event.kind == "complete":
-                self._complete(next(v for v in field.vehicles if v.system == event.system))
+            if event.kind in ("complete", "aborted"):
+                self._ended(next(v for v in field.vehicles if v.system == event.system), event.kind)
         self._events = len(field.world.events)
         if field.now - self._looked >= 0.25:
             self._looked = field.now
@@ -78,9 +82,9 @@ class Rules:
         heard = self.heard.get(packet.system)
         if heard is None or packet.component != 1:
             return
-        late = heard.seq is not None and (packet.seq - heard.seq - 1) & 0xFF >= 192
-        heard.seq = heard.seq if late else packet.seq
         message, now = packet.message, self.field.now
+        late = now - heard.at < 1.0 and (packet.seq - heard.seq - 1) & 0xFF >= 192
+        heard.seq, heard.at = heard.seq if late else packet.seq, now
         kind = message.get_type()
         heard.counts[kind] = heard.counts.get(kind, 0) + 1
         if kind == "HEARTBEAT" and not late:
@@ -128,6 +132,7 @@ class Rules:
         if given is None:
             self._breaks(1, f"{what} without a start")
             return
+        self._last[vehicle.system] = given
         if command == ARM:
             self._fresh(vehicle, given, what)
         self._not_stopped(vehicle, given, what)
@@ -136,7 +141,7 @@ class Rules:
     def _fresh(self, vehicle, given, what):
         self.judged["1"] += 1
         heard, standing, now, modes = self.heard[vehicle.system], given.standing, self.field.now, vehicle.flight.modes
-        beat = heard.beats[-1]
+        beat = heard.beats[-1] if heard.beats else (-math.inf, 0, False)
         if now - beat[0] > LOOK_S:
             self._breaks(1, f"{what}, its heartbeat is {now - beat[0]:.2f} s old")
         if beat[1:] != (modes.ready, standing.armed):
@@ -146,7 +151,7 @@ class Rules:
                 self._breaks(1, f"{what}, {now - at:.2f} s ago it was in {modes.name(mode)}, armed {armed}")
                 break
         if standing.place is not None:
-            at, *place = heard.places[-1]
+            at, *place = heard.places[-1] if heard.places else (-math.inf, 0.0, 0.0)
             if now - at > LOOK_S or distance_m(*place, *standing.place) > 10.1:
                 metres = distance_m(*place, *standing.place)
                 self._breaks(1, f"{what}, its place is {now - at:.2f} s old and {metres:.0f} m away")
@@ -203,7 +208,7 @@ class Rules:
             self.judged["5"] += 1
             for other in self.field.vehicles:
                 if plan.planned.get(other.system, math.inf) < mine and other.system not in plan.cancelled:
-                    peak = max((up for at, up in other.highest if at >= plan.at), default=0.0)
+                    peak = max((up for at, up in other.heights if at >= plan.at), default=0.0)
                     if peak < 1.0:
                         self._breaks(5, f"{what}, but {other.system} has climbed to {peak:.1f} m only")
 
@@ -224,7 +229,7 @@ class Rules:
         field, modes = self.field, vehicle.flight.modes
         if told.by != GROUND_STATION.system or not (told.command == START or (told.command == ARM and told.params[0])):
             return
-        given = field.given[vehicle.system][-1]
+        given = self._last[vehicle.system]
         window = FRESH_S + 2 * field.delay_s + 0.05
         for stop in vehicle.stops:
             old = told.at - stop.at
@@ -249,27 +254,27 @@ class Rules:
             return
         _, since, counts = before
         told = all(heard.counts.get(kind, 0) - counts.get(kind, 0) >= number for kind, number in _BEATS.items())
-        if wrong and told and field.now - since > CHANGE_S:
-            self._breaks(3, f"{system} is '{flight_state(known).text}' for {field.now - since:.1f} s, but {wrong}")
+        seen_s = heard.places[-1][0] - since
+        if wrong and told and seen_s > CHANGE_S:
+            self._breaks(3, f"{system} is '{flight_state(known).text}' for {seen_s:.1f} s, but {wrong}")
             self._since.pop(system)
 
     # --- rule 4: complete ---
 
-    def _complete(self, vehicle):
-        """All places of the mission that it holds, or of the one that it began with, were flown over."""
-        self.judged["4"] += 1
+    def _ended(self, vehicle, kind):
+        """Complete is a mission whose places were flown over, and one that nobody disturbed is complete."""
         begun = vehicle.path[0][0] if vehicle.path else self.field.now
         if self._silent.get(vehicle.system, -math.inf) >= begun:
             return  # what it did meanwhile nobody can know
-        best = []
-        for items in vehicle.held_since(begun):
-            first = 1 if vehicle.autopilot is AP else 0
-            places = [i for i in items[first:] if i.is_nav and i.has_place and i.command == 16]
-            missed = [p for p in places if vehicle.nearest_m(p) > 15.5]
-            best.append(len(missed) if places else 1)
-        if not best or min(best):
-            jumped = any(t.command == CURRENT for t in vehicle.told if t.at >= begun)
-            self._breaks(4, f"{vehicle.system} is complete, but {best} places were not flown (jumped: {jumped})")
+        self.judged["4"] += 1
+        held = vehicle.held_since(begun)
+        if kind == "complete" and all(vehicle.missed(items, 15.5) != 0 for items in held):
+            missed = [vehicle.missed(items, 15.5) for items in held]
+            self._breaks(4, f"{vehicle.system} is complete, but {missed} places were not flown over")
+        told = [t for t in vehicle.told if t.at > begun and t.command not in REQUEST]
+        alone = all(t.by == GROUND_STATION.system and t.command == START for t in told) and not vehicle.reboots
+        if kind == "aborted" and alone and len(held) == 1 and vehicle.missed(held[0], 12.0) == 0:
+            self._breaks(4, f"{vehicle.system} has ended its mission, though it was flown undisturbed")
 
 
 def contradiction(word, known, flight):
@@ -305,6 +310,3 @@ def contradiction(word, known, flight):
         case Word.FLYING | Word.RETURNING | Word.ON_MISSION | Word.TAKING_OFF if up < 0.1:
             return "it stands"
     return ""
-
-
-_ = (DOWN, HOME, LAND)

@@ -5,7 +5,7 @@ Everything happens in virtual time and from one seed. What the vehicles truly do
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from random import Random
 
@@ -29,12 +29,14 @@ BY_HAND = {AP: 0, PX4: 7 << 16}
 ARM, START = int(dialect.MAV_CMD_COMPONENT_ARM_DISARM), int(dialect.MAV_CMD_MISSION_START)
 SET_MODE, CURRENT = int(dialect.MAV_CMD_DO_SET_MODE), int(dialect.MAV_CMD_DO_SET_MISSION_CURRENT)
 HOME, DOWN = int(dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH), int(dialect.MAV_CMD_NAV_LAND)
+UPLOAD = -1  # no command: another station stores a mission
+ENDINGS = ("rtl", "land", "waypoint")
 PAUSE = int(dialect.MAV_CMD_DO_PAUSE_CONTINUE)
 
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """A command that a vehicle has obeyed: when, from which system, and its mode before and after."""
+    """What a vehicle obeyed: when, of which system (its own: remote control, failsafe), its mode before and after."""
 
     at: float
     by: int
@@ -49,14 +51,14 @@ class Witness(SimVehicle):
 
     Attributes:
         told: commands that it obeyed. stops: those of others, of its remote control and of itself that end a flight.
-        path: (time, north, east, up) since it was armed last.
+        path: (time, north, east) since it was armed last. heights: (time, up) always.
         stored: (time, items) at each change of its mission.
     """
 
     def __init__(self, **options):
         super().__init__(**options)
         self.told, self.stops, self.path, self.stored = [], [], [], []
-        self.highest = []
+        self.heights = []
         self._held, self._armed = None, False
 
     def handle(self, message, sender, now):
@@ -70,6 +72,8 @@ class Witness(SimVehicle):
                 self.told.append(told)
                 if sender.system != GROUND_STATION.system and self._is_stop(told):
                     self.stops.append(told)
+        if message.get_type() == "MISSION_COUNT" and sender.system != GROUND_STATION.system:
+            self.told.append(Told(now, sender.system, UPLOAD, (), was, was))
         return answers
 
     def by_itself(self, now, do):
@@ -77,6 +81,7 @@ class Witness(SimVehicle):
         was = self.flight.mode
         do()
         told = Told(now, self.system, SET_MODE, (), was, self.flight.mode)
+        self.told.append(told)
         if self._is_stop(told):
             self.stops.append(told)
 
@@ -92,8 +97,8 @@ class Witness(SimVehicle):
         if armed and not self._armed:
             self.path.clear()
         self._armed = armed
-        self.path.append((now, motion.north, motion.east, motion.up))
-        self.highest.append((now, motion.up))
+        self.path.append((now, motion.north, motion.east))
+        self.heights.append((now, motion.up))
         held = tuple(self.store.items)
         if held != self._held:
             self._held = held
@@ -106,24 +111,26 @@ class Witness(SimVehicle):
         before = [items for at, items in self.stored if at < since]
         return before[-1:] + recent
 
-    def nearest_m(self, item, since=-math.inf):
-        """How near it came to a place on this flight."""
-        north, east = self.flight.motion.chart.to_metres(item.lat_deg, item.lon_deg)
-        return min((math.hypot(n - north, e - east) for t, n, e, _ in self.path if t >= since), default=math.inf)
+    def missed(self, items, near_m):
+        """How many places of a mission it did not come so near to on this flight; None without places."""
+        places = [i for i in items[self.autopilot is AP :] if i.command == WAYPOINT]
+        spots = [self.flight.motion.chart.to_metres(place.lat_deg, place.lon_deg) for place in places]
+        away = [min((math.hypot(n - north, e - east) for _, n, e in self.path), default=99.0) for north, east in spots]
+        return sum(metres > near_m for metres in away) if places else None
 
 
-def short_mission(vehicle, mirrored=False, ending="rtl"):
+def short_mission(vehicle, mirrored=False, ending="rtl", height_m=8.0, hold_s=0.0):
     """A flight of half a minute over three places; mirrored: to three others, with as many items."""
     chart, sign = Chart(*vehicle.home), -1.0 if mirrored else 1.0
     yaw = 0.0 if vehicle.autopilot is AP else math.nan
 
-    def at(command, north, east, height):
-        return MissionItem.at(command, *chart.to_degrees(north, east), height, params=(0.0, 0.0, 0.0, yaw))
+    def at(command, north, east, height=height_m, hold=0.0):
+        return MissionItem.at(command, *chart.to_degrees(north, east), height, params=(hold, 0.0, 0.0, yaw))
 
-    items = [at(WAYPOINT, 0, 0, 10.0)] if vehicle.autopilot is AP else []
-    items += [at(TAKEOFF, 0, 0, 8.0), MissionItem.do(CHANGE_SPEED, 1, 8)]
-    items += [at(WAYPOINT, sign * n, sign * e, 8.0) for n, e in ((25.0, 0.0), (25.0, 20.0), (0.0, 20.0))]
-    end = {"rtl": MissionItem.do(RTL), "land": at(LAND, 0, 0, 0.0), "waypoint": at(WAYPOINT, 0, 0, 8.0)}
+    items = [at(WAYPOINT, 0, 0)] if vehicle.autopilot is AP else []
+    items += [at(TAKEOFF, 0, 0), MissionItem.do(CHANGE_SPEED, 1, 8)]
+    items += [at(WAYPOINT, sign * n, sign * e, hold=hold_s) for n, e in ((25.0, 0.0), (25.0, 20.0), (0.0, 20.0))]
+    end = {"rtl": MissionItem.do(RTL), "land": at(LAND, 0, 0, 0.0), "waypoint": at(WAYPOINT, 0, 0)}
     return Mission(vehicle.autopilot, (*items, end[ending]))
 
 
@@ -152,11 +159,12 @@ class OtherStation:
         self.command(vehicle, SET_MODE, *mode_params(vehicle.autopilot, mode))
 
     def upload(self, vehicle, mission):
-        count, items = len(mission.items), mission.items
-        answers = self.say(vehicle, dialect.MAVLink_mission_count_message(vehicle.system, 1, count, 0))
+        """Its steps: the mission, item by item as the vehicle asks for them."""
+        answers = self.say(vehicle, dialect.MAVLink_mission_count_message(vehicle.system, 1, len(mission.items), 0))
         while wanted := [m for m in answers if m.get_type() in ("MISSION_REQUEST", "MISSION_REQUEST_INT")]:
+            yield
             seq = int(wanted[0].seq)
-            answers = self.say(vehicle, items[seq].message(seq, vehicle.system, 1))
+            answers = self.say(vehicle, mission.items[seq].message(seq, vehicle.system, 1))
 
 
 @dataclass(eq=False)
@@ -210,10 +218,9 @@ class Field:
         self.plans: list[Plan] = []
         self.orders: list[Order] = []
         self.went_on: dict[int, float] = {}
-        self.missions = {
-            v.system: short_mission(v, ending=random.choice(("rtl", "land", "waypoint"))) for v in vehicles
-        }
+        self.missions = {v.system: self._mission(v) for v in vehicles}
         self.log: list[str] = []
+        self._later: list[tuple[float, float, Iterator[None]]] = []  # uploads of the other station: when, how often
         self.fleet.takeoff_due = lambda s: any(s in plan.schedule.waiting for plan in self.plans)
 
     @property
@@ -234,15 +241,16 @@ class Field:
             loss, delay = random.choice((0.0, 0.1, 0.2, 0.3)), (self.delay_s, self.delay_s)
             channel.faults = replace(channel.faults, loss=loss, delay_s=delay, silent=tuple(silent))
 
-    def run(self, look: Callable[[], None], busy_s=26.0, limit_s=75.0):
+    def run(self, look: Callable[[], None], busy_s=30.0, limit_s=80.0):
         """Let things happen for so long, and then until the vehicles have come to rest."""
         begin, still = self.now, 0.0
         self.start_plan()
-        next_at = self.now + self.random.uniform(0.2, 4.0)
+        next_at = self.now + self.random.choice((self.random.uniform(0.2, 4.0), self.random.uniform(6.0, 14.0)))
         while self.now - begin < limit_s and still < 8.0:
             self.world.clock.now += STEP_S
             self.fleet.poll(0.0)
             self._follow_plans()
+            self._go_on_uploading()
             look()
             if self.now >= next_at and self.now - begin < busy_s:
                 self.act()
@@ -313,19 +321,23 @@ class Field:
             self.log.append(f"   -> {order.outcome.text}")
 
     def upload(self, vehicle):
-        mission = short_mission(vehicle, ending=self.random.choice(("rtl", "land", "waypoint")))
+        self.log.append(f"{self.now:.2f} we upload to {vehicle.system}")
+        mission = self._mission(vehicle)
         try:
             self.fleet.upload(vehicle.system, mission)
             self.missions[vehicle.system] = mission
         except OrthoSwarmError as error:
             self.log.append(f"   -> {error}")
 
+    def _mission(self, vehicle):
+        return short_mission(vehicle, ending=self.random.choice(ENDINGS), height_m=self.random.choice((8.0, 14.0)))
+
     # --- everybody ---
 
     def act(self):
         """One thing that somebody does to one vehicle."""
         vehicle = self.random.choice(self.vehicles)
-        who = self.random.choices(("we", "other", "pilot", "fate"), (5, 5, 2, 1))[0]
+        who = self.random.choices(("we", "other", "pilot", "fate"), (5, 5, 3, 1))[0]
         getattr(self, f"_{who}")(vehicle)
 
     def _we(self, vehicle):
@@ -334,7 +346,6 @@ class Field:
         if verb == "plan":
             self.start_plan()
         elif verb == "upload":
-            self.log.append(f"{self.now:.2f} we upload to {vehicle.system}")
             self.upload(vehicle)
         else:
             self.order(verb, vehicle.system)
@@ -355,11 +366,24 @@ class Field:
             "disarm": lambda: other.command(vehicle, ARM, 0.0),
             "last item": lambda: other.command(vehicle, CURRENT, float(last)),
             "first item": lambda: other.command(vehicle, CURRENT, 0.0),
-            "upload": lambda: other.upload(vehicle, short_mission(vehicle, mirrored=True)),
+            "upload": lambda: self._uploads(vehicle),
         }
-        deed = self.random.choices(list(deeds), (5, 2, 3, 2, 2, 2, 2, 2, 1, 2, 1, 3, 1, 4))[0]
+        deed = self.random.choices(list(deeds), (5, 2, 3, 2, 2, 4, 2, 2, 1, 2, 1, 3, 1, 4))[0]
         self.log.append(f"{self.now:.2f} other {deed} {vehicle.system}")
         deeds[deed]()
+
+    def _uploads(self, vehicle):
+        steps = self.other.upload(vehicle, short_mission(vehicle, mirrored=True))
+        self._later.append((self.now, self.random.choice((0.0, 0.0, 0.1, 0.2)), steps))
+
+    def _go_on_uploading(self):
+        later, self._later = self._later, []
+        for at, every_s, steps in later:
+            goes_on = True
+            while goes_on and at <= self.now:
+                goes_on, at = next(steps, "ended") is None, at + every_s
+            if goes_on:
+                self._later.append((at, every_s, steps))
 
     def _fly_away(self, vehicle):
         self.other.mode(vehicle, vehicle.flight.modes.ready)
@@ -368,9 +392,10 @@ class Field:
 
     def _pilot(self, vehicle):
         flight, modes = vehicle.flight, vehicle.flight.modes
+        low, loiter = self.random.choice((-0.8, -1.5)), LOITER[vehicle.autopilot]
         mode, sinks = self.random.choice((
-            (LOITER[vehicle.autopilot], 0.0), (LOITER[vehicle.autopilot], -1.5), (BY_HAND[vehicle.autopilot], 0.0),
-            (modes.rtl, 0.0), (modes.land, 0.0),
+            (loiter, 0.0), (loiter, low), (loiter, low), (BY_HAND[vehicle.autopilot], 0.0), (modes.rtl, 0.0),
+            (modes.land, 0.0),
         ))  # fmt: skip
         self.log.append(f"{self.now:.2f} pilot {vehicle.system} {modes.name(mode)} {sinks}")
         vehicle.by_itself(self.now, lambda: flight.set_mode(mode))
