@@ -158,12 +158,14 @@ def _word(vehicle: Observed) -> Word:
         return Word.DESCENDING
     if mode not in HOLDS or (math.hypot(*vehicle.velocity_m_s[:2]) > _SLOW_M_S and not brakes):
         return Word.FLYING
+    if vehicle.detector.phase is Phase.ACTIVE:
+        return Word.ON_MISSION  # it pauses, resumes or ends: PX4's mode and mission state arrive up to a second apart
     return Word.PAUSED if _interrupted(vehicle) else Word.HOLDING
 
 
 def _interrupted(vehicle: Observed) -> bool:
     """Whether one that holds was under way: on a return, or between the ends of its mission."""
-    if vehicle.detector.phase in (Phase.SUSPENDED, Phase.ACTIVE):
+    if vehicle.detector.phase is Phase.SUSPENDED:
         return True
     if vehicle.way is not None:
         return vehicle.modes.name(vehicle.way) in RETURNS | LANDS
