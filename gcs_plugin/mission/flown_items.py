@@ -13,7 +13,7 @@ from typing import Any, Final
 from gcs_plugin.mission.items import LAND, TAKEOFF, TRIGGER_DISTANCE, VTOL_LAND, VTOL_TAKEOFF, Mission
 from gcs_plugin.mission.track import home_of, metres
 
-_NEAR_M: Final = 25.0  # autopilots round corners by 10 m and more (PX4 at 8 m/s), receivers err by some metres
+_NEAR_M: Final = 15.0  # autopilots round corners by up to 10 m (PX4's NAV_ACC_RAD), receivers err by some metres
 _SILENT_S: Final = 2.0  # between two positions: what happened in between was not seen
 _FASTEST_M_S: Final = 25.0  # no multirotor on a survey flies faster
 _ENDS: Final = frozenset({TAKEOFF, VTOL_TAKEOFF, LAND, VTOL_LAND})
