@@ -13,12 +13,13 @@ from gcs_plugin.mission.flight_modes import LANDS, RETURNS, Modes, mode_params
 _ACCEPTED: Final = int(dialect.MAV_RESULT_ACCEPTED)
 _IN_PROGRESS: Final = int(dialect.MAV_RESULT_IN_PROGRESS)
 _UNSUPPORTED: Final = int(dialect.MAV_RESULT_UNSUPPORTED)
+_ENDS: Final = frozenset({int(dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH), int(dialect.MAV_CMD_NAV_LAND)})
 _AGAIN_S: Final = 1.0
 _ANSWER_S: Final = 1.0
 _FIRST_S: Final = 2.0  # silence after which the other way is tried
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Command(Exchange):
     """One COMMAND_LONG, repeated until it is acknowledged or expires.
 
@@ -133,6 +134,9 @@ class GoOn(Command):
             mode = int(message.custom_mode)
             if mode != self.was and self.modes.name(mode) in RETURNS | LANDS:
                 self._end(False, f"vehicle {self.vehicle.system} was put into {self.modes.name(mode)} meanwhile")
+        others = message.get_type() == "COMMAND_ACK" and message.target_system not in (0, self.own.system)
+        if self.outcome is None and others and message.result == _ACCEPTED and message.command in _ENDS:
+            self._end(False, f"vehicle {self.vehicle.system} was sent home, or down, by another station meanwhile")
         return Command.feed(self, message, now)
 
 

@@ -100,6 +100,7 @@ class CompletionDetector:
     _learned: dict[int, int] = dataclasses.field(default_factory=dict)
     _learned_count: int = 0
     _joined: bool = False
+    _midway: bool = False
     _judging: int = 0
     _untold: list[MissionEvent] = dataclasses.field(default_factory=list)
 
@@ -120,6 +121,8 @@ class CompletionDetector:
             if self.flown is not None:
                 self._replaced()
             self.flown = flown
+            if self._midway:  # stored in flight: what lies before its present item was not flown
+                self.flown.current(self._first_seq)
             if self.seq is not None and self.phase is not Phase.IDLE:
                 self.flown.current(self.seq)
         self._commands = commands
@@ -144,6 +147,7 @@ class CompletionDetector:
         """Another mission was stored: one under way has ended, which is told with the next message."""
         if self.phase in (Phase.ACTIVE, Phase.SUSPENDED):
             self._untold.append(MissionEvent.ABORTED)
+            self._midway = bool(self.armed)
             self._restart(hot=bool(self.armed))
 
     def feed(self, message: Message) -> list[MissionEvent]:
@@ -159,7 +163,11 @@ class CompletionDetector:
     def _position(self, message: Message) -> list[MissionEvent]:
         if self.flown is not None and self.phase in (Phase.ACTIVE, Phase.SUSPENDED) and has_place(message):
             here = message.lat / 1e7, message.lon / 1e7
-            self.flown.position(message.time_boot_ms / 1e3, *here, counts=self.phase is Phase.ACTIVE)
+            if self.flown.position(message.time_boot_ms / 1e3, *here, counts=self.phase is Phase.ACTIVE):
+                self._replaced()  # that item lies elsewhere
+                self.uploaded(None)
+                untold, self._untold = self._untold, []
+                return untold
         return self._complete() if self._judging else []
 
     def _events_of(self, message: Message) -> list[MissionEvent]:
@@ -269,7 +277,7 @@ class CompletionDetector:
                 events += self._abort()
             if self.phase in (Phase.COMPLETE, Phase.ABORTED):
                 self._restart(hot=False)
-            self._airborne = self._landing_seen = self._crashed = False
+            self._airborne = self._landing_seen = self._crashed = self._midway = False
         if self.armed and self._dropped:
             self._armed_since_drop += 1
             if self._armed_since_drop >= 2:  # still flying: the mission was reset, it has not landed
@@ -339,7 +347,7 @@ class CompletionDetector:
         self._restart(hot=False)
         self.phase = Phase.ACTIVE
         if self.flown is not None:
-            self.flown = FlownItems(self.flown.places, self.flown.lines)
+            self.flown = FlownItems(places=self.flown.places, lines=self.flown.lines)
             if not self._joined:  # else it may have flown a part before it was heard
                 self.flown.current(self._first_seq)
             self.flown.current(self.seq or 0)
@@ -361,7 +369,7 @@ class CompletionDetector:
             return []
         self._reached = max(self._reached, seq)
         if self.flown is not None:
-            self.flown.reached.add(seq)
+            self.flown.claims(seq)
         final = self.final_seq
         done = self._has_state is False and self.phase is Phase.ACTIVE and final is not None and seq >= final
         return self._complete() if done and self.ending is not Ending.NEVER else []

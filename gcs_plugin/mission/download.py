@@ -5,9 +5,8 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from gcs_plugin.links.mavlink import Autopilot, Message, dialect
-from gcs_plugin.mission.exchange import MISSION, Exchange, RoundTrip, Verdict
+from gcs_plugin.mission.exchange import ACCEPTED, DENIED, MISSION, UNSUPPORTED, Exchange, RoundTrip, Verdict
 from gcs_plugin.mission.items import MissionItem
-from gcs_plugin.mission.refusal import ACCEPTED, DENIED, UNSUPPORTED
 
 AT_ONCE: Final = {Autopilot.ARDUPILOT: 8, Autopilot.PX4: 1}
 """Items that are asked for at once: PX4 hands out one after the other only."""

@@ -16,6 +16,17 @@ from gcs_plugin.links.mavlink import AUTOPILOT_COMPONENT, BROADCAST, Message, di
 NEVER: Final = float("inf")
 MISSION: Final = int(dialect.MAV_MISSION_TYPE_MISSION)
 
+# MAV_MISSION_RESULT
+ACCEPTED: Final = int(dialect.MAV_MISSION_ACCEPTED)
+ERROR: Final = int(dialect.MAV_MISSION_ERROR)
+UNSUPPORTED_FRAME: Final = int(dialect.MAV_MISSION_UNSUPPORTED_FRAME)
+UNSUPPORTED: Final = int(dialect.MAV_MISSION_UNSUPPORTED)
+NO_SPACE: Final = int(dialect.MAV_MISSION_NO_SPACE)
+INVALID: Final = int(dialect.MAV_MISSION_INVALID)
+INVALID_SEQUENCE: Final = int(dialect.MAV_MISSION_INVALID_SEQUENCE)
+DENIED: Final = int(dialect.MAV_MISSION_DENIED)
+CANCELLED: Final = int(dialect.MAV_MISSION_OPERATION_CANCELLED)
+
 
 @dataclass(frozen=True, slots=True)
 class Address:

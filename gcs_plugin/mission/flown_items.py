@@ -13,13 +13,14 @@ from typing import Any, Final
 from gcs_plugin.mission.items import LAND, TAKEOFF, TRIGGER_DISTANCE, VTOL_LAND, VTOL_TAKEOFF, Mission
 from gcs_plugin.mission.track import home_of, metres
 
+_CLAIMED_M: Final = 30.0  # corners are rounded by less than that
 _NEAR_M: Final = 15.0  # autopilots round corners by up to 10 m (PX4's NAV_ACC_RAD), receivers err by some metres
 _SILENT_S: Final = 2.0  # between two positions: what happened in between was not seen
 _FASTEST_M_S: Final = 25.0  # no multirotor on a survey flies faster
 _ENDS: Final = frozenset({TAKEOFF, VTOL_TAKEOFF, LAND, VTOL_LAND})
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class FlownItems:
     """The places of one mission, and which of them were reached.
 
@@ -38,6 +39,8 @@ class FlownItems:
     _unseen_m: float = 0.0
     _skipped: int | None = None
     _from: tuple[float, float] | None = None
+    _claimed: list[int] = field(default_factory=list)
+    _passed: set[int] = field(default_factory=set)
 
     @classmethod
     def of(cls, mission: Mission) -> "FlownItems":
@@ -49,24 +52,40 @@ class FlownItems:
                 lines += [seq] if triggers else []
             elif item.command == TRIGGER_DISTANCE:
                 triggers = item.params[0] > 0.0
-        return cls(places, lines or list(places))
+        return cls(places=places, lines=lines or list(places))
 
-    def position(self, time_s: float, lat_deg: float, lon_deg: float, *, counts: bool = True) -> None:
-        """It was seen at a place, at a time of its own clock; while it is paused that does not count as reached."""
+    def position(self, time_s: float, lat_deg: float, lon_deg: float, *, counts: bool = True) -> bool:
+        """It was seen at a place, at a time of its own clock; while it is paused that does not count as reached.
+
+        Returns whether it says that it has reached a place that it is far from: then it flies another mission.
+        """
         silent_s = 0.0 if self._at_s is None else time_s - self._at_s
         self._unseen_m = silent_s * _FASTEST_M_S if silent_s > _SILENT_S else self._unseen_m
         if silent_s > _SILENT_S:
             self._excuse()
         self._at_s, self._here = time_s, (lat_deg, lon_deg)
         if not counts:
-            return
+            return False
+        near = {s for s in self._claimed if s not in self.places or _metres(self._here, self.places[s]) < _CLAIMED_M}
+        elsewhere, self._claimed = len(near) < len(set(self._claimed)), []
+        self.reached |= near
+        # Of places near each other it may pass several before the next MISSION_CURRENT is heard.
+        self._passed.update(s for s, place in self.places.items() if _metres(self._here, place) < _NEAR_M)
         for seq in (s for s in (self._seq, self._before) if s is not None and s not in self.reached):
             if seq in self.places and _metres(self._here, self.places[seq]) < _NEAR_M:
                 self.reached.add(seq)
+        return elsewhere
+
+    def claims(self, seq: int) -> None:
+        """Its autopilot says that it has reached an item; its next position must not be far from there."""
+        self._claimed.append(seq)
 
     def current(self, seq: int) -> None:
         """An item has become the present one."""
         last, self._seq = self._seq, seq
+        if last is not None:
+            self.reached.update(s for s in self._passed if last <= s < seq)
+        self._passed.clear()
         if last is None:  # what it did before it was heard is not known
             self.reached.update(s for s in self.places if s < seq)
         elif any(last <= s < seq and s not in self.reached for s in self.places):
@@ -110,14 +129,15 @@ class FlownItems:
     def state(self) -> dict[str, Any]:
         """As JSON values."""
         places = [[seq, *place] for seq, place in self.places.items()]
-        return asdict(self) | {"places": places, "reached": sorted(self.reached)}
+        return asdict(self) | {"places": places, "reached": sorted(self.reached), "_passed": sorted(self._passed)}
 
     @classmethod
     def from_state(cls, values: Mapping[str, Any]) -> "FlownItems":
         """What `state` described."""
         spots = {key: tuple(values[key]) if values[key] else None for key in ("_here", "_from")}
         places = {int(s): (float(a), float(b)) for s, a, b in values["places"]}
-        return cls(**{**values, **spots, "places": places, "reached": set(values["reached"])})
+        sets = {key: set(values.get(key, ())) for key in ("reached", "_passed")}
+        return cls(**{**values, **spots, **sets, "places": places})
 
 
 def off_leg_m(mission: Mission, seq: int, place: tuple[float, float]) -> float | None:

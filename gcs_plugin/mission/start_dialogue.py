@@ -95,7 +95,7 @@ class Expected:
         return "" if found is None else f"no longer holds the mission that was checked ({found.text}); check it again"
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class LastLook(Exchange):
     """Waits until a vehicle shows, all within a second, what the next command relies on; else says what is not so.
 
@@ -187,6 +187,8 @@ class LastLook(Exchange):
             self._stays(f"was put into {self.modes.name(mode)} since its start was given")
         elif armed and not self.armed:
             self._stays("was armed by someone else since its start was given")
+        elif self.armed and not armed and not late:
+            self._stays("was disarmed since its start was given")
         elif mode == self.mode and armed == self.armed:
             self._beat = now
 
@@ -236,7 +238,7 @@ class Guarded(Exchange):
 
     look: LastLook = field(kw_only=True)
     order: Command = field(kw_only=True)
-    obeyed: tuple[int, bool] = field(kw_only=True)
+    obeyed: tuple[int, bool] | None = field(kw_only=True)
     mission: Mission | None = field(default=None, init=False)
     _step: Exchange = field(init=False)
     _ordered: bool = field(default=False, init=False)
@@ -255,10 +257,19 @@ class Guarded(Exchange):
             if (mode, bool(message.base_mode & ARMED)) == self.obeyed:
                 self._end(True, f"{name}: {self.order.verb} accepted")
                 return []
-            if mode not in (self.look.mode, self.obeyed[0]) and isinstance(self._step, Command):
+            if self.obeyed and mode not in (self.look.mode, self.obeyed[0]) and isinstance(self._step, Command):
                 self._end(False, f"{name} was put into {self.look.modes.name(mode)} meanwhile, so it was not started")
                 return []
-        if message.get_type() == "COMMAND_ACK" and others_command(message, self.own):
+        if isinstance(self._step, Command):  # what was seen must stay so while the order is repeated
+            watch = replace(self.look, was=None)
+            asked = watch.feed(message, now)
+            if watch.outcome is not None and not watch.outcome.ok:
+                self._end(False, watch.outcome.text, watch.outcome.verdict)
+                return []
+            if asked and watch.expected is not None and watch.expected.known_id:  # another mission, by its checksum
+                self._again_s = None
+                return self._follow(self._next(replace(self.look, was=None), now), now)
+        elif message.get_type() == "COMMAND_ACK" and others_command(message, self.own):
             text = "has been commanded by another station meanwhile, so it was not started"
             self._end(False, f"vehicle {self.vehicle.system} {text}")
             return []
@@ -404,8 +415,10 @@ def start_mission(pilot: Pilot, standing: Standing, expected: Expected, *, reads
         steps.append(Guarded(vehicle, own, look=look, order=change, obeyed=obeyed))
     if expected.in_air and pilot.autopilot is Autopilot.ARDUPILOT:
         # Its MISSION_START goes on at the item at which it left a mission, be that another one; PX4's names item 0.
-        first = dialect.MAV_CMD_DO_SET_MISSION_CURRENT
-        steps.append(Command(vehicle, own, command=first, params=(0.0,), verb="begin its mission anew"))
+        item, again = dialect.MAV_CMD_DO_SET_MISSION_CURRENT, "begin its mission anew"
+        first = Command(vehicle, own, command=item, params=(0.0,), verb=again, repeat_s=_OFTEN_S)
+        there = replace(look, mode=modes.ready, was=standing.mode)
+        steps.append(Guarded(vehicle, own, look=there, order=first, obeyed=None))
     place, held = None if expected.in_air else standing.place, expected if reads else None
     last = replace(look, mode=modes.ready, was=standing.mode, place=place, expected=held)
     arming, starting = dialect.MAV_CMD_COMPONENT_ARM_DISARM, dialect.MAV_CMD_MISSION_START

@@ -19,10 +19,25 @@ from typing import Final
 from gcs_plugin.links.mavlink import Autopilot, Message, dialect
 from gcs_plugin.mission.comparison import difference
 from gcs_plugin.mission.download import MissionDownload
-from gcs_plugin.mission.exchange import MISSION, Exchange, Outcome, RoundTrip, Verdict
+from gcs_plugin.mission.exchange import (
+    ACCEPTED,
+    CANCELLED,
+    DENIED,
+    ERROR,
+    INVALID,
+    INVALID_SEQUENCE,
+    MISSION,
+    NO_SPACE,
+    UNSUPPORTED,
+    UNSUPPORTED_FRAME,
+    Exchange,
+    Outcome,
+    RoundTrip,
+    Verdict,
+)
 from gcs_plugin.mission.items import Mission
-from gcs_plugin.mission.refusal import ACCEPTED, CANCELLED, DENIED, ERROR, INVALID_SEQUENCE, NO_SPACE, Refusal, explain
 
+_PARAMETER = {6: "param1", 7: "param2", 8: "param3", 9: "param4", 10: "latitude", 11: "longitude", 12: "altitude"}
 # Vehicles repeat a request every 0.25 s (PX4) or 1 s (ArduPilot): a silence of several intervals is more than packet
 # loss.
 _COUNT_AGAIN_S: Final = 1.0
@@ -36,6 +51,23 @@ _CLEARS: Final = 6
 _MIXTURES: Final = 4
 # Copies of one request within this time are the network's; a vehicle that misses an item waits longer.
 _SAME_REQUEST_S: Final = 0.03
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """A negative MISSION_ACK.
+
+    Attributes:
+        code: MAV_MISSION_RESULT.
+        item: sequence number of the refused item, None if the complete mission is refused.
+        field: the refused field, empty if none.
+        reason: one sentence without the vehicle's name.
+    """
+
+    code: int
+    item: int | None
+    field: str
+    reason: str
 
 
 class Stage(enum.Enum):
@@ -349,3 +381,51 @@ class MissionUpload(Exchange):
             self.outcome = Outcome(
                 ok=False, text=self.outcome.text, item=refusal.item, field=refusal.field, code=refusal.code
             )
+
+
+def explain(code: int, mission: Mission, item: int | None) -> Refusal:
+    """Put a negative MISSION_ACK into words.
+
+    Args:
+        code: MAV_MISSION_RESULT of the acknowledgement.
+        mission: the uploaded mission.
+        item: the last item sent, None if the vehicle had not requested one yet.
+    """
+    if code == DENIED:
+        return Refusal(code, None, "", "another ground station is uploading to it; wait until that has ended")
+    if code == NO_SPACE:
+        return Refusal(code, None, "", f"its memory does not hold {len(mission)} items; split the mission into sorties")
+    if code == CANCELLED:
+        return Refusal(code, None, "", "it gave up because items did not arrive; come closer or try again")
+    if item is None or item >= len(mission):
+        return Refusal(code, None, "", f"it refused the mission ({_result_name(code)})")
+    what = f"item {item} ({mission.items[item].name})"
+    if code == UNSUPPORTED:
+        return Refusal(code, item, "command", f"{what} is a command that it does not know; leave it out")
+    if code == UNSUPPORTED_FRAME:
+        frame = dialect.enums["MAV_FRAME"].get(mission.items[item].frame)
+        name = frame.name if frame else mission.items[item].frame
+        return Refusal(
+            code, item, "frame", f"{what} has a frame that it does not accept ({name}); use heights over home"
+        )
+    if code in _PARAMETER:
+        name, value = _PARAMETER[code], _value(mission, item, code)
+        return Refusal(code, item, name, f"{what} has an unacceptable {name} ({value}); correct it")
+    if code == INVALID:
+        return Refusal(code, item, "", f"{what} has an unacceptable value; check its parameters")
+    return Refusal(code, item, "", f"it refused {what} ({_result_name(code)}); check that item, a jump's target too")
+
+
+def _value(mission: Mission, item: int, code: int) -> str:
+    it = mission.items[item]
+    if code <= 9:
+        return f"{it.params[code - 6]:g}"
+    if code == 12:
+        return f"{it.z:g}"
+    raw = it.x if code == 10 else it.y
+    return f"{raw / 1e7:.7f}" if it.has_place else str(raw)
+
+
+def _result_name(code: int) -> str:
+    entry = dialect.enums["MAV_MISSION_RESULT"].get(code)
+    return str(entry.name) if entry else f"result {code}"

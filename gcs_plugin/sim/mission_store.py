@@ -5,10 +5,7 @@ from dataclasses import dataclass, field, replace
 from typing import Final
 
 from gcs_plugin.links.mavlink import Autopilot, Message, dialect
-from gcs_plugin.mission.exchange import Address
-from gcs_plugin.mission.geofence import FENCE
-from gcs_plugin.mission.items import FRAME_GLOBAL, JUMP, PLAIN_FRAME, TAKEOFF, WAYPOINT, MissionItem
-from gcs_plugin.mission.refusal import (
+from gcs_plugin.mission.exchange import (
     ACCEPTED,
     CANCELLED,
     DENIED,
@@ -17,7 +14,10 @@ from gcs_plugin.mission.refusal import (
     NO_SPACE,
     UNSUPPORTED,
     UNSUPPORTED_FRAME,
+    Address,
 )
+from gcs_plugin.mission.geofence import FENCE
+from gcs_plugin.mission.items import FRAME_GLOBAL, JUMP, PLAIN_FRAME, TAKEOFF, WAYPOINT, MissionItem
 from orthoswarm.planning.sorties.flight_time import autopilot_config
 
 _MISSION: Final = dialect.MAV_MISSION_TYPE_MISSION

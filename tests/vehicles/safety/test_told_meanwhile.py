@@ -6,8 +6,12 @@ They are the shortest of what `test_two_stations` found.
 import pytest
 
 from gcs_plugin.fleet.commands import Order
-from gcs_plugin.links.mavlink import Autopilot
+from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.links.packets import Framer
+from gcs_plugin.mission.completion import CompletionDetector, MissionEvent
+from gcs_plugin.mission.exchange import Address
+from gcs_plugin.mission.start_dialogue import LastLook
+from gcs_plugin.sim.flight_values import State
 from gcs_plugin.sim.lossy_radio import NO_FAULTS, Faults
 from gcs_plugin.sim.memory_link import World
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
@@ -179,3 +183,115 @@ def test_what_was_said_on_the_ground_is_no_alarm_in_the_air():
     pair.until(lambda: pair.flight.motion.up > 5.0)
     assert any("denied" in event.text for event in pair.world.events)
     assert "danger" not in [event.kind for event in pair.world.events]
+
+
+def test_in_the_air_a_start_ends_when_another_station_stops_the_vehicle_before_it_is_armed():
+    pair = Pair(AP)
+    pair.fly()
+    pair.other.mode(pair.sim, pair.modes.hold)
+    pair.world.wait(6.0)
+    pair.lost_on_its_way(CURRENT, "start")
+    pair.other.command(pair.sim, HOME)
+    pair.world.wait(0.2)
+    pair.other.mode(pair.sim, pair.modes.ready)
+    pair.link_is_back(0.1)
+    pair.world.wait(8.0)
+    assert pair.flight.mode == pair.modes.ready
+
+
+@BOTH
+def test_a_vehicle_that_is_carried_away_while_it_is_being_armed_stays_down(autopilot):
+    pair = Pair(autopilot)
+    pair.lost_on_its_way(ARM, "start")
+    pair.flight.motion.north += 30.0
+    pair.link_is_back(0.3)
+    pair.world.wait(15.0)
+    assert not pair.flight.armed
+
+
+def test_a_mission_that_was_replaced_unseen_by_one_of_as_many_items_is_not_complete():
+    """ArduPilot flies on at the same item, and reaches it elsewhere."""
+    pair = Pair(AP, ending="waypoint")
+    pair.fly()
+    pair.until(lambda: pair.flight.motion.east > 8.0)
+    for _ in pair.other.upload(pair.sim, short_mission(pair.sim, mirrored=True, ending="waypoint")):
+        pass
+    pair.until(lambda: pair.flight.state is State.COMPLETE)
+    pair.world.wait(8.0)
+    assert "complete" not in pair.world.kinds(1)
+
+
+@BOTH
+def test_a_mission_that_was_stored_in_flight_is_not_complete_where_it_was_flown_from_its_middle(autopilot):
+    """It is read only after it was seen to be flown: the link loses packets, and reading takes a while."""
+    vehicle = SimVehicle(system=1, autopilot=autopilot)
+    first, events = int(autopilot is AP), []
+    mission, other = (short_mission(vehicle, mirrored=m, ending="waypoint") for m in (False, True))
+    detector, mode = CompletionDetector(autopilot=autopilot), vehicle.flight.modes.mission
+    disarmed, armed = (dialect.MAVLink_heartbeat_message(2, 3, 81 | flag, mode, 4, 3) for flag in (0, 128))
+
+    def current(seq, state=3):
+        return dialect.MAVLink_mission_current_message(seq + first, 6, state, 1)
+
+    def feed(*messages):
+        for message in messages:
+            events.extend(detector.feed(message))
+
+    detector.uploaded(mission)
+    feed(disarmed, armed, armed, current(0), current(0), current(2), current(3))
+    feed(dialect.MAVLink_mission_request_int_message(254, 190, 0, 0), current(3), current(3), current(3))
+    detector.knows_mission(other)
+    for seq, item in enumerate(other.items[3 + first :], 3):
+        place = dialect.MAVLink_global_position_int_message(1000 * seq, item.x, item.y, 0, 8000, 0, 0, 0, 0)
+        feed(current(seq), place, dialect.MAVLink_mission_item_reached_message(seq + first), place)
+    feed(current(5, 5), place, place)
+    assert events == [MissionEvent.STARTED, MissionEvent.ABORTED, MissionEvent.STARTED, MissionEvent.ABORTED]
+
+
+def test_a_look_ends_when_a_vehicle_that_was_armed_is_disarmed_amid_it():
+    """One that was told to start in the air has landed."""
+    modes = SimVehicle(system=1).flight.modes
+    look = LastLook(Address(1), modes=modes, mode=modes.ready, armed=True, place=(47.0, 8.0))
+    look.start(0.0)
+    for at, flag in ((0.1, 128), (0.6, 0)):
+        look.feed(dialect.MAVLink_heartbeat_message(2, 3, 81 | flag, modes.ready, 4, 3), at)
+    look.feed(dialect.MAVLink_global_position_int_message(1000, 470000000, 80000000, 0, 0, 0, 0, 0, 0), 0.7)
+    assert look.outcome is not None and not look.outcome.ok
+
+
+def test_going_on_ends_when_the_vehicle_answers_another_station_that_sends_it_home():
+    """Its heartbeat may come a second later."""
+    pair = Pair(PX4, shared=True)
+    pair.fly()
+    pair.other.mode(pair.sim, pair.modes.hold)
+    pair.world.wait(6.0)
+    beats = []
+    pair.fleet.subscribe(lambda *_: beats.append(1), "HEARTBEAT")
+    pair.until(lambda: beats)  # the next one comes in a second
+    pair.lost_on_its_way(SET_MODE, "resume")
+    pair.other.command(pair.sim, HOME)
+    pair.world.wait(0.1)
+    told = pair.world.clock.now
+    pair.link_is_back(0.0)
+    pair.world.wait(8.0)
+    assert SET_MODE not in [command for at, command in pair.sent if at > told]
+
+
+def test_a_place_that_was_passed_between_two_messages_about_the_present_item_counts():
+    vehicle = SimVehicle(system=1, autopilot=AP)
+    mission, detector, events = short_mission(vehicle), CompletionDetector(autopilot=AP), []
+    heartbeat = dialect.MAVLink_heartbeat_message(2, 3, 81 | 128, 3, 4, 3)
+    places = [i for i in mission.items[1:] if i.command == 16]
+
+    def feed(*messages):
+        for message in messages:
+            events.extend(detector.feed(message))
+
+    detector.uploaded(mission)
+    feed(heartbeat, heartbeat, *[dialect.MAVLink_mission_current_message(3, 6, 3, 1)] * 2)
+    for second, place in enumerate(places):
+        feed(dialect.MAVLink_global_position_int_message(1000 * second, place.x, place.y, 0, 8000, 0, 0, 0, 0))
+    # MISSION_CURRENT of items 4 and 5 was lost, and so were all MISSION_ITEM_REACHED
+    feed(dialect.MAVLink_mission_current_message(6, 6, 3, 1), dialect.MAVLink_mission_current_message(6, 6, 5, 1))
+    feed(dialect.MAVLink_global_position_int_message(3000, places[2].x, places[2].y, 0, 8000, 0, 0, 0, 0))
+    assert events == [MissionEvent.STARTED, MissionEvent.COMPLETE]
