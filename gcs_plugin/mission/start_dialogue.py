@@ -176,10 +176,14 @@ class LastLook(Exchange):
         return self._judge(messages if self._reading is None else [*messages, *self._reading.tick(now)], now)
 
     def _ask_state(self, now: float) -> list[Message]:
-        """A heartbeat comes once a second only: what it would tell is asked for."""
-        self._ask_at, to, beat = now + _OFTEN_S, self.vehicle, dialect.MAVLINK_MSG_ID_HEARTBEAT
-        ask = dialect.MAV_CMD_REQUEST_MESSAGE
-        return [dialect.MAVLink_command_long_message(to.system, to.component, ask, 0, beat, 0, 0, 0, 0, 0, 0)]
+        """Its state comes once a second or less often, on a slow link: what it would tell is asked for."""
+        self._ask_at, to, ask = now + _OFTEN_S, self.vehicle, dialect.MAV_CMD_REQUEST_MESSAGE
+        kinds = [dialect.MAVLINK_MSG_ID_HEARTBEAT]
+        if now - self._fix > FRESH_S:
+            kinds.append(dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT)
+        return [
+            dialect.MAVLink_command_long_message(to.system, to.component, ask, 0, kind, *(0.0,) * 6) for kind in kinds
+        ]
 
     def _state(self, mode: int, armed: bool, now: float) -> None:
         late = now - self._began < _OVERTAKEN_S and self._beat < self._began

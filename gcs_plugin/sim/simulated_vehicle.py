@@ -64,7 +64,7 @@ class SimVehicle:
             are sent first.
         files: what it serves over MAVLink FTP; None for one without.
         on_exposure: called at each picture.
-        withheld: ids of messages that it does not send, whatever it is asked for.
+        withheld: ids of messages that it does not stream, whatever rate it is asked for.
         used_s: for how long its motors have used its battery, seconds.
         second_battery: what is left in a second one, 0 to 1; None for one without.
         parameters: by name; integers are those that the autopilot keeps as such.

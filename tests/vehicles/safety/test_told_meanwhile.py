@@ -126,6 +126,14 @@ def test_arming_is_not_repeated_on_what_was_heard_over_a_second_ago():
     assert max(at for at, command in pair.sent if command == ARM) <= beats[-1] + 1.05
 
 
+@BOTH
+def test_a_vehicle_that_shows_its_place_seldom_is_asked_for_it(autopilot):
+    pair = Pair(autopilot)
+    pair.sim.withheld = {int(dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT)}
+    pair.give("start")
+    pair.until(lambda: pair.flight.armed, 10.0)
+
+
 def test_a_refused_arming_is_not_repeated_many_times_a_second():
     pair = Pair(AP)
     pair.sim.arms = False
