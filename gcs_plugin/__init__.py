@@ -1,1 +1,40 @@
 """The ground station: command line, links, missions, daemon."""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from gcs_plugin.fleet.fleet import Fleet
+    from gcs_plugin.fleet.fleet_events import FleetEvent
+    from gcs_plugin.mission.items import Mission, MissionItem
+    from gcs_plugin.mission.mission_builder import read_mission
+    from gcs_plugin.plans.plan_files import write_plan
+    from gcs_plugin.plans.plan_request import PlanRequest, make_plan
+
+__all__ = [
+    "Fleet",
+    "FleetEvent",
+    "Mission",
+    "MissionItem",
+    "PlanRequest",
+    "make_plan",
+    "read_mission",
+    "write_plan",
+]
+
+_WHERE: Final = {
+    "fleet.fleet": ("Fleet",),
+    "fleet.fleet_events": ("FleetEvent",),
+    "mission.items": ("Mission", "MissionItem"),
+    "mission.mission_builder": ("read_mission",),
+    "plans.plan_files": ("write_plan",),
+    "plans.plan_request": ("PlanRequest", "make_plan"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import on first use, so that importing the package is fast."""
+    for module, names in _WHERE.items():
+        if name in names:
+            return getattr(import_module(f"gcs_plugin.{module}"), name)
+    raise AttributeError(f"module 'gcs_plugin' has no attribute '{name}'")

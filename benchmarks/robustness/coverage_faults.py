@@ -33,7 +33,7 @@ from orthoswarm.model.plan import Plan
 from orthoswarm.planning.area.area import Area
 from orthoswarm.planning.lines.line_spacing import Footprint, footprint
 from orthoswarm.planning.planner import plan_area, plan_gaps
-from orthoswarm.planning.sorties.assignment import Options
+from orthoswarm.planning.sorties.assignment import PlanOptions
 
 EPSG = 32632
 CORNER = np.array([600_000.0, 5_300_000.0])
@@ -240,7 +240,9 @@ def _fly_gaps(
             write_gaps(Path(folder), gaps, grid)
             found = read_gaps(Path(folder) / "gaps.geojson")
         target = gap_area(found, [], solved, fly_not_arrived=True).area
-        again = plan_gaps(replace(target, no_fly=shapely.MultiPolygon()), 2, plan.altitude_m, solved, options=Options())
+        again = plan_gaps(
+            replace(target, no_fly=shapely.MultiPolygon()), 2, plan.altitude_m, solved, options=PlanOptions()
+        )
         flown = _fly(again, grid, rng, faults=(), fov_deg=fov_deg, first=len(cover.views) * 10)
         cover.put(s.view for s in flown.shots)
         seen |= _truly_seen(cells, flown.shots)

@@ -23,7 +23,7 @@ from orthoswarm.model.plan import Plan
 from orthoswarm.planning.area.area import Area
 from orthoswarm.planning.lines.line_spacing import footprint
 from orthoswarm.planning.planner import plan_area
-from orthoswarm.planning.sorties.assignment import Options
+from orthoswarm.planning.sorties.assignment import PlanOptions
 from orthoswarm.planning.sorties.deconfliction import Separation
 from orthoswarm.planning.sorties.flight_time import Motion, autopilot_config
 
@@ -134,20 +134,20 @@ def main() -> None:
                     )
 
 
-def plans_of(kinds: Sequence[str], starts: list[tuple[float, float]]) -> list[tuple[str, Options]]:
+def plans_of(kinds: Sequence[str], starts: list[tuple[float, float]]) -> list[tuple[str, PlanOptions]]:
     """Plans to compare: their name, and the options of the flights."""
     times = [autopilot_config(kind) for kind in kinds]
     slack_s = max(t.schedule_slack_s for t in times)
     slowest = Motion(autopilot=min(times, key=lambda t: t.acceleration_m_s2))
     return [
         *(
-            (f"constant speed, {allowed:g} s", Options(motion=constant_speed(), starts=starts, separation=apart))
+            (f"constant speed, {allowed:g} s", PlanOptions(motion=constant_speed(), starts=starts, separation=apart))
             for allowed in (3.0, 20.0)
             for apart in [Separation(slack_s=allowed)]
         ),
         (
             f"autopilots' times, {slack_s:g} s",
-            Options(motion=slowest, autopilots=times, starts=starts, separation=Separation(slack_s=slack_s)),
+            PlanOptions(motion=slowest, autopilots=times, starts=starts, separation=Separation(slack_s=slack_s)),
         ),
     ]
 

@@ -17,7 +17,7 @@ import rasterio
 from rasterio.windows import Window
 
 import telemetry
-from orthoswarm.batch.pipeline import Options, run
+from orthoswarm.batch.pipeline import MapOptions, run
 from orthoswarm.compute.workers import prepare_process, workers
 from orthoswarm.model.frame import Frame, Ingest
 from orthoswarm.model.geo import LocalGrid
@@ -103,7 +103,7 @@ def main() -> None:
 
     begun = time.perf_counter()
     try:
-        report = run(load, args.out / "map", Options(basemap=basemap, config=config), pool, progress)
+        report = run(load, args.out / "map", MapOptions(basemap=basemap, config=config), pool, progress)
     finally:
         pool.close()
     states = [leg["state"] for leg in report["legs"]]

@@ -245,7 +245,7 @@ def compile_cold_kernels(report: Callable[[str, int, int], None]) -> None:
 def _make_maps(folder: Path) -> None:
     """Map a dense flight, and a sparse one, whose pictures are matched in pairs instead of tracked."""
     import telemetry
-    from orthoswarm.batch.pipeline import Options, run
+    from orthoswarm.batch.pipeline import MapOptions, run
     from orthoswarm.compute.workers import Serial
     from orthoswarm.model.frame import Ingest
     from orthoswarm.twin.make import make_twin
@@ -253,7 +253,7 @@ def _make_maps(folder: Path) -> None:
 
     make_twin(spec("tiny"), folder / "twin")
     photos = sorted((folder / "twin" / "photos").rglob("*.JPG"))
-    options = Options(basemap=folder / "twin" / "basemap.tif")
+    options = MapOptions(basemap=folder / "twin" / "basemap.tif")
     for name, some in (("dense", photos), ("sparse", photos[::3])):
 
         def load(_: Callable[[str, int, int], None], some: list[Path] = some) -> Ingest:

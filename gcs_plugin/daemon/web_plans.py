@@ -324,13 +324,7 @@ def _positions(document: Any) -> Iterator[tuple[float, float]]:
 
 def plan_into(request: PlanRequest, notes: Sequence[str]) -> dict[str, Any]:
     """Plan in a worker and write the plan's folder; returns the figures, with notes before the plan's warnings."""
-    from gcs_plugin.plans.plan_files import geojson, mission_files, report, write_folder
+    from gcs_plugin.plans.plan_files import write_plan
 
     plan, area = make_plan(request)
-    figures = report(plan, request.autopilots, request.fov_min_deg, request.endurance_min)
-    figures["warnings"] = [*notes, *figures["warnings"]]
-    files: dict[str, str | bytes] = dict(mission_files(plan, request.autopilots))
-    files["all.geojson"] = geojson(plan, area)
-    files["plan.json"] = json.dumps(figures, indent=1) + "\n"
-    write_folder(request.area.parent, files)
-    return figures
+    return write_plan(request.area.parent, plan, area, request, notes=notes, picture=False)

@@ -111,15 +111,16 @@ class MissionDownload(Exchange):
     def _ask(self, now: float, *, again: bool) -> list[Message]:
         self._asked_at, self._asked_again = now, again
         self.deadline = now + self._trip.wait_s
-        to = self.vehicle
+        to, twice = self.vehicle, 2 if again and self.urgent else 1  # the link loses packets, and somebody waits
         if self._count is None or self._asks_list:
             self._under_way.clear()
-            return [dialect.MAVLink_mission_request_list_message(to.system, to.component, self.list_type)]
+            return [dialect.MAVLink_mission_request_list_message(to.system, to.component, self.list_type)] * twice
         if again:
             self._under_way.clear()
         missing = (seq for seq in range(self._count) if seq not in self._got and seq not in self._under_way)
         wanted = list(itertools.islice(missing, max(0, self.window - len(self._under_way))))
         self._under_way.update(wanted)
+        wanted *= twice
         return [dialect.MAVLink_mission_request_int_message(to.system, to.component, s, self.list_type) for s in wanted]
 
     def _heard(self, now: float) -> None:

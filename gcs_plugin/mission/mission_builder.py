@@ -35,7 +35,7 @@ _WITH_YAW: Final = frozenset({WAYPOINT, TAKEOFF, LAND, LOITER_TIME})
 
 def build_mission(
     autopilot: Autopilot,
-    items: Iterable[mission_files.MissionItem],
+    items: Iterable[mission_files.FileItem],
     home: tuple[float, float, float] | None = None,
     name: str = "",
 ) -> Mission:
@@ -87,7 +87,7 @@ def read_mission(path: Path, autopilot: Autopilot) -> Mission:
     return build_mission(autopilot, parsed.items, parsed.home, path.name)
 
 
-def _wire(item: mission_files.MissionItem, autopilot: Autopilot) -> MissionItem:
+def _wire(item: mission_files.FileItem, autopilot: Autopilot) -> MissionItem:
     placed = MissionItem.at(item.command, item.lat_deg, item.lon_deg, item.alt_m, params=item.params, frame=item.frame)
     if not placed.has_place:
         x, y = (int(value) if math.isfinite(value) else 0 for value in (item.lat_deg, item.lon_deg))

@@ -31,7 +31,7 @@ _ALTITUDE_MODE = {FRAME_GLOBAL_RELATIVE: 1, FRAME_TERRAIN: 4}  # QGroundControl'
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MissionItem:
+class FileItem:
     """One mission item, free of any autopilot's numbering.
 
     Attributes:
@@ -58,7 +58,7 @@ class MissionItem:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Mission:
+class MissionFile:
     """A mission file's content.
 
     Attributes:
@@ -70,7 +70,7 @@ class Mission:
         speed_m_s: speed set in the file, or None.
     """
 
-    items: tuple[MissionItem, ...]
+    items: tuple[FileItem, ...]
     home: tuple[float, float, float] | None = None
     surveys: tuple[tuple[LatLon, ...], ...] = ()
     polylines: tuple[tuple[LatLon, ...], ...] = ()
@@ -101,7 +101,7 @@ class Mission:
         return tuple(tuple(line) for line in found if len(line) > 1)
 
 
-def sortie_items(plan: Plan, sortie: Sortie, autopilot: Autopilot) -> tuple[MissionItem, ...]:
+def sortie_items(plan: Plan, sortie: Sortie, autopilot: Autopilot) -> tuple[FileItem, ...]:
     """The mission of one sortie: takeoff, speed, waypoints with camera triggers, the end; home not among them.
 
     DO_SET_CAM_TRIGG_DIST follows a leg's first waypoint (its third parameter takes a picture at once) and its last
@@ -114,19 +114,19 @@ def sortie_items(plan: Plan, sortie: Sortie, autopilot: Autopilot) -> tuple[Miss
     yaw = math.nan if autopilot == "px4" else 0.0
     by_vehicle = plan.over_ground is not None and plan.over_ground.by_vehicle
 
-    def nav(command: int, lat: float, lon: float, height: float, frame: int = FRAME_GLOBAL_RELATIVE) -> MissionItem:
-        return MissionItem(
+    def nav(command: int, lat: float, lon: float, height: float, frame: int = FRAME_GLOBAL_RELATIVE) -> FileItem:
+        return FileItem(
             command=command, frame=frame, params=(0.0, 0.0, 0.0, yaw), lat_deg=lat, lon_deg=lon, alt_m=height
         )
 
-    def fly_to(point: Waypoint) -> MissionItem:
+    def fly_to(point: Waypoint) -> FileItem:
         if by_vehicle and point.above_ground_m is not None:
             return nav(NAV_WAYPOINT, point.lat_deg, point.lon_deg, point.above_ground_m, FRAME_TERRAIN)
         return nav(NAV_WAYPOINT, point.lat_deg, point.lon_deg, point.height_m)
 
     items = [
         nav(NAV_TAKEOFF, sortie.home_lat_deg, sortie.home_lon_deg, sortie.takeoff_height_m),
-        MissionItem(command=DO_CHANGE_SPEED, params=(_GROUND_SPEED, plan.speed_m_s, -1.0, 0.0)),
+        FileItem(command=DO_CHANGE_SPEED, params=(_GROUND_SPEED, plan.speed_m_s, -1.0, 0.0)),
     ]
     for point in sortie.waypoints:
         if by_vehicle and point.between:
@@ -134,11 +134,11 @@ def sortie_items(plan: Plan, sortie: Sortie, autopilot: Autopilot) -> tuple[Miss
         items.append(fly_to(point))
         if point.camera is not None:
             distance, at_once = (plan.trigger_m, 1.0) if point.camera else (0.0, 0.0)
-            items.append(MissionItem(command=DO_SET_CAM_TRIGG_DIST, params=(distance, 0.0, at_once, 0.0)))
+            items.append(FileItem(command=DO_SET_CAM_TRIGG_DIST, params=(distance, 0.0, at_once, 0.0)))
         if point.wait_s:
             items.append(replace(fly_to(point), command=NAV_LOITER_TIME, params=(point.wait_s, 0.0, 0.0, yaw)))
     if plan.end == "rtl":
-        items.append(MissionItem(command=NAV_RTL))
+        items.append(FileItem(command=NAV_RTL))
     elif plan.end == "land":
         items.append(nav(NAV_LAND, sortie.home_lat_deg, sortie.home_lon_deg, 0.0))
     else:  # a plain waypoint last: both autopilots then report the mission as complete
@@ -147,7 +147,7 @@ def sortie_items(plan: Plan, sortie: Sortie, autopilot: Autopilot) -> tuple[Miss
 
 
 def plan_text(
-    items: Sequence[MissionItem],
+    items: Sequence[FileItem],
     home: tuple[float, float, float],
     autopilot: Autopilot,
     speed_m_s: float,
@@ -198,7 +198,7 @@ def _rounded(point: LatLon) -> list[float]:
     return [round(point[0], 8), round(point[1], 8)]
 
 
-def _simple_item(item: MissionItem, number: int) -> dict[str, Any]:
+def _simple_item(item: FileItem, number: int) -> dict[str, Any]:
     lat, lon, alt = round(item.lat_deg, 8), round(item.lon_deg, 8), round(item.alt_m, 3)
     values = [*(None if math.isnan(p) else p for p in item.params), lat, lon, alt]
     result: dict[str, Any] = {
@@ -214,13 +214,13 @@ def _simple_item(item: MissionItem, number: int) -> dict[str, Any]:
     return result
 
 
-def waypoints_text(items: Sequence[MissionItem], home: tuple[float, float, float]) -> str:
+def waypoints_text(items: Sequence[FileItem], home: tuple[float, float, float]) -> str:
     """The text of a `.waypoints` file: "QGC WPL 110", twelve tab-separated columns, line 0 is home.
 
     A parameter that PX4 is to choose is "nan", which QGroundControl (Qt's toDouble) and MAVProxy (Python's float) read
     as such; a 0 would turn its nose north.
     """
-    first = MissionItem(
+    first = FileItem(
         command=NAV_WAYPOINT,
         frame=FRAME_GLOBAL,
         params=(0.0, 0.0, 0.0, 0.0),
@@ -237,7 +237,7 @@ def waypoints_text(items: Sequence[MissionItem], home: tuple[float, float, float
     return "\n".join(lines) + "\n"
 
 
-def parse_mission(text: str, name: str = "the file") -> Mission:
+def parse_mission(text: str, name: str = "the file") -> MissionFile:
     """Read a `.plan` or a `.waypoints` file, distinguished by content.
 
     Args:
@@ -264,7 +264,7 @@ def parse_mission(text: str, name: str = "the file") -> Mission:
         raise InputError(f"{name} is a .plan with a broken item ({error!r}); save it again in QGroundControl") from None
 
 
-def _parse_waypoints(text: str, name: str) -> Mission:
+def _parse_waypoints(text: str, name: str) -> MissionFile:
     version, *lines = [line for line in text.splitlines() if line.strip()]
     if version.split()[-1] not in ("110", "120"):
         raise InputError(f"{name} is '{version.strip()}', but only 'QGC WPL 110' is understood; export it again")
@@ -282,7 +282,7 @@ def _parse_waypoints(text: str, name: str) -> Mission:
     if not all(math.isfinite(r[2]) and math.isfinite(r[3]) for r in rows):
         raise InputError(f"{name} has a command or a frame that is not finite; export it again")
     items = [
-        MissionItem(
+        FileItem(
             command=int(r[3]),
             frame=int(r[2]),
             params=(r[4], r[5], r[6], r[7]),
@@ -296,12 +296,12 @@ def _parse_waypoints(text: str, name: str) -> Mission:
     home = (items[0].lat_deg, items[0].lon_deg, items[0].alt_m) if items else None
     for item in items:
         _check_item(item, name)
-    return Mission(items=tuple(items[1:]), home=home)
+    return MissionFile(items=tuple(items[1:]), home=home)
 
 
-def _parse_plan(document: Mapping[str, Any]) -> Mission:
+def _parse_plan(document: Mapping[str, Any]) -> MissionFile:
     mission = document["mission"]
-    items: list[MissionItem] = []
+    items: list[FileItem] = []
     surveys: list[tuple[LatLon, ...]] = []
     polylines: list[tuple[LatLon, ...]] = []
     for entry in mission["items"]:
@@ -324,7 +324,7 @@ def _parse_plan(document: Mapping[str, Any]) -> Mission:
     no_fly = [f.points if f.radius_m is None else _around(f) for f in fences if not f.inclusion]
     home = mission.get("plannedHomePosition")
     speed = mission.get("hoverSpeed") or mission.get("cruiseSpeed")
-    return Mission(
+    return MissionFile(
         items=tuple(items),
         home=(float(home[0]), float(home[1]), float(home[2] if len(home) > 2 else 0.0)) if home else None,
         surveys=tuple(surveys),
@@ -335,13 +335,13 @@ def _parse_plan(document: Mapping[str, Any]) -> Mission:
     )
 
 
-def _read_item(entry: Mapping[str, Any]) -> MissionItem:
+def _read_item(entry: Mapping[str, Any]) -> FileItem:
     values = [math.nan if v is None else float(v) for v in entry["params"]]
     if len(values) != 7:
         raise ValueError(f"an item has {len(values)} params instead of 7")
     lat, lon, alt = (0.0 if math.isnan(v) else v for v in values[4:])
     p1, p2, p3, p4 = values[:4]
-    return MissionItem(
+    return FileItem(
         command=int(entry["command"]),
         frame=int(entry["frame"]),
         params=(p1, p2, p3, p4),
@@ -352,7 +352,7 @@ def _read_item(entry: Mapping[str, Any]) -> MissionItem:
     )
 
 
-def _check_item(item: MissionItem, name: str) -> None:
+def _check_item(item: FileItem, name: str) -> None:
     _check_position(item.lat_deg, item.lon_deg, name, item.has_position)
     if not abs(item.alt_m) < _HIGHEST_M:
         raise InputError(f"{name} has the altitude {item.alt_m:g} m, where nothing flies; correct it")

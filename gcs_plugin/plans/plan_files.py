@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from gcs_plugin.mission.mission_files import Autopilot, plan_text, sortie_items, waypoints_text
+from gcs_plugin.plans.plan_request import PlanRequest
 from orthoswarm.coverage.gaps import PlannedFlight
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid
@@ -170,6 +171,38 @@ def _rings(area: Area, polygon: Any) -> list[list[list[float]]]:
     rings = shapely.get_rings(shapely.geometry.polygon.orient(polygon))
     places = [area.grid.to_geographic(shapely.get_coordinates(ring)) for ring in rings]
     return [[[round(float(lon), 8), round(float(lat), 8)] for lat, lon in ring] for ring in places]
+
+
+def write_plan(
+    folder: Path,
+    plan: Plan,
+    area: Area | None,
+    request: PlanRequest,
+    *,
+    notes: Sequence[str] = (),
+    picture: bool = True,
+    settings: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """Write a plan's folder: missions, `all.geojson`, `plan.json`, `plan.png`; returns the content of `plan.json`.
+
+    Args:
+        folder: missions of an earlier plan in it are replaced. plan, area: as `make_plan` gives them for the request.
+        notes: warnings before the plan's own. picture: whether `plan.png` is drawn. settings: those that were changed.
+
+    Raises:
+        InputError: the folder cannot be written, or holds other missions.
+    """
+    figures = report(plan, request.autopilots, request.fov_min_deg, request.endurance_min)
+    figures["warnings"] = [*notes, *figures["warnings"]]
+    if settings:
+        figures["config"] = {stage: dict(values) for stage, values in settings.items()}
+    files: dict[str, str | bytes] = dict(mission_files(plan, request.autopilots))
+    files["all.geojson"] = geojson(plan, area)
+    files["plan.json"] = json.dumps(figures, indent=1) + "\n"
+    if picture:
+        files["plan.png"] = plan_picture(plan, area)
+    write_folder(folder, files)
+    return figures
 
 
 def check_folder(folder: Path) -> None:

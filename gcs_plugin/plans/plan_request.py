@@ -25,7 +25,7 @@ from orthoswarm.planning.lines.candidates import Method
 from orthoswarm.planning.lines.line_spacing import Footprint, footprint
 from orthoswarm.planning.planner import plan_area, plan_gaps, plan_lines
 from orthoswarm.planning.relief_plan import GroundBelow, Relief, plan_over_relief
-from orthoswarm.planning.sorties.assignment import Options
+from orthoswarm.planning.sorties.assignment import PlanOptions
 from orthoswarm.planning.sorties.deconfliction import Separation
 from orthoswarm.planning.sorties.flight_heights import FlightHeights
 from orthoswarm.planning.sorties.flight_time import Motion, autopilot_config
@@ -120,7 +120,7 @@ class PlanRequest:
             return Motion(wind_m_s=wind, autopilot=autopilot)
         return Motion(self.speed_m_s, wind_m_s=wind, autopilot=autopilot)
 
-    def flight_options(self) -> Options:
+    def flight_options(self) -> PlanOptions:
         """How the flights are to be.
 
         Raises:
@@ -133,7 +133,7 @@ class PlanRequest:
             raise InputError(f"the ceiling of {ceiling:g} m is below the altitude of {self.altitude_m:g} m; raise it")
         step = self.height_step_m
         layers = int(min(_MOST_LAYERS, (ceiling - self.altitude_m) / step + 1e-9)) if step > 0 else 0
-        return Options(
+        return PlanOptions(
             motion=self._motion(),
             autopilots=[autopilot_config(name) for name in self.autopilots],
             end=self.end,
@@ -272,7 +272,7 @@ def _footprint(request: PlanRequest, above_m: float) -> Footprint:
     return foot.turned(request.flight_options().motion.crab_rad)
 
 
-def _gap_plan(request: PlanRequest, options: Options, progress: Callable[[str], None]) -> tuple[Plan, Area]:
+def _gap_plan(request: PlanRequest, options: PlanOptions, progress: Callable[[str], None]) -> tuple[Plan, Area]:
     """A plan over the gaps of a coverage, and the ground that it aims at."""
     if request.endurance_min is None and not request.endurances_min:
         raise InputError("say with --endurance how many minutes the batteries last: a gap flight must not guess it")

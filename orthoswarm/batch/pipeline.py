@@ -18,7 +18,7 @@ from orthoswarm.batch.run_state import (
     REALTIME,
     WRITTEN,
     Load,
-    Options,
+    MapOptions,
     RunContext,
     RunState,
     is_written,
@@ -57,7 +57,7 @@ __all__ = [
     "REALTIME",
     "WRITTEN",
     "Load",
-    "Options",
+    "MapOptions",
     "Progress",
     "is_written",
     "run",
@@ -67,7 +67,7 @@ __all__ = [
 def run(
     load: Load,
     out: Path,
-    options: Options,
+    options: MapOptions,
     workers: Workers,
     progress: Progress,
     *,
@@ -79,7 +79,7 @@ def run(
     Args:
         load: reads the inputs, calling a progress function meanwhile.
         out: output folder; holds `PRODUCTS` afterwards.
-        options: see Options.
+        options: see MapOptions.
         workers: run the tasks; the products do not depend on their number.
         progress: called during long work.
         drawers: run the tasks that write into the output folder, where the workers do not see it; None: the workers.

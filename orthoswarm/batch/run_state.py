@@ -58,7 +58,7 @@ def is_written(name: str) -> bool:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Options:
+class MapOptions:
     """The options of a run.
 
     Attributes:
@@ -103,13 +103,13 @@ class RunContext:
 
     Attributes:
         out: output folder; space: its lock and results of an interrupted run.
-        options: see Options. workers: run the tasks. progress: called during long work. clock: times by stage.
+        options: see MapOptions. workers: run the tasks. progress: called during long work. clock: times by stage.
         drawers: run the tasks that write into the output folder; the same workers where these see it.
     """
 
     out: Path
     space: Workspace
-    options: Options
+    options: MapOptions
     workers: Workers
     drawers: Workers
     progress: Progress

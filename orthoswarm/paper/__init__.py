@@ -4,6 +4,6 @@ It serves for comparison; the default refiner (orthoswarm.refine) is more accura
 paper is ambiguous and how each case is decided here.
 """
 
-from orthoswarm.paper.paper_refiner import Options, PaperRefiner
+from orthoswarm.paper.paper_refiner import PaperOptions, PaperRefiner
 
-__all__ = ["Options", "PaperRefiner"]
+__all__ = ["PaperOptions", "PaperRefiner"]

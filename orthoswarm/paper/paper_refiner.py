@@ -28,7 +28,7 @@ _CARRIED_SIGMA_M: Final = 2.0  # least sigma of a correction carried from other 
 
 
 @dataclass(frozen=True, slots=True)
-class Options:
+class PaperOptions:
     """How the paper's refiner works: see CoarseOptions (III.C) and PatchOptions (III.D)."""
 
     coarse: CoarseOptions = field(default_factory=CoarseOptions)
@@ -52,10 +52,10 @@ class PaperRefiner(UnitRefiner):
     """The paper's refiner behind the interface `placement.Refiner`.
 
     Attributes:
-        options: see Options.
+        options: see PaperOptions.
     """
 
-    options: Options = field(default_factory=Options)
+    options: PaperOptions = field(default_factory=PaperOptions)
 
     def solve(self, units: list[list[Frame]], neighbours: Sequence[Solution], basemap: MapWindow | None) -> Solution:
         """All steps for one vehicle; if none of its legs is found on the map, it gets its neighbours' correction."""
@@ -108,7 +108,7 @@ def _refine(
     *,
     grid: LocalGrid,
     origin: Array,
-    options: Options,
+    options: PaperOptions,
     run: Run,
     progress: Progress | None,
 ) -> Refinement:

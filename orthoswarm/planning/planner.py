@@ -20,14 +20,14 @@ from orthoswarm.planning.lines.detours import Router, make_obstacles
 from orthoswarm.planning.lines.line_spacing import Footprint
 from orthoswarm.planning.lines.sweep_lines import Field, stretches
 from orthoswarm.planning.lines.visiting_order import shorten
-from orthoswarm.planning.sorties.assignment import Options, Swarm, Work
+from orthoswarm.planning.sorties.assignment import PlanOptions, Swarm, Work
 from orthoswarm.planning.sorties.deconfliction import Schedule, Separation, Slot
 from orthoswarm.planning.sorties.flight_heights import FlightHeights, LevelHeights
 from orthoswarm.planning.sorties.flight_path import Flight
 from orthoswarm.planning.sorties.flight_time import Motion
 from orthoswarm.planning.sorties.ground_check import leg_paths, over_ground, swaths
 
-__all__ = ["METHODS", "Method", "Options", "plan_area", "plan_gaps", "plan_lines"]
+__all__ = ["METHODS", "Method", "PlanOptions", "plan_area", "plan_gaps", "plan_lines"]
 
 Array = NDArray[np.float64]
 Progress = Callable[[str], None]
@@ -79,7 +79,7 @@ def plan_area(
     foot: Footprint,
     *,
     method: Method = "bcd",
-    options: Options | None = None,
+    options: PlanOptions | None = None,
     progress: Progress = lambda _: None,
     heights: FlightHeights | None = None,
 ) -> Plan:
@@ -99,7 +99,7 @@ def plan_area(
     Raises:
         InputError: more vehicles than lines, a start in a no-fly zone, an endurance too short for the area.
     """
-    options = options or Options()
+    options = options or PlanOptions()
     options.check()
     over = _Over(altitude_m, foot, heights or LevelHeights(altitude_m))
     clearance_m = _clearance_m(options, foot)
@@ -132,7 +132,7 @@ def plan_area(
     )
 
 
-def _clearance_m(options: Options, foot: Footprint) -> float:
+def _clearance_m(options: PlanOptions, foot: Footprint) -> float:
     """Distance from no-fly zones: that of the user, or a default that leaves small pictures no gaps."""
     config = active().planning
     usual = min(config.clearance_m, _CLEARANCE_WIDTHS * foot.width_m)
@@ -169,7 +169,7 @@ def plan_gaps(
     altitude_m: float,
     foot: Footprint,
     *,
-    options: Options | None = None,
+    options: PlanOptions | None = None,
     progress: Progress = lambda _: None,
     heights: FlightHeights | None = None,
 ) -> Plan:
@@ -188,7 +188,7 @@ def plan_gaps(
     Raises:
         InputError: no piece can be reached, a start in a no-fly zone, an endurance too short.
     """
-    options = options or Options()
+    options = options or PlanOptions()
     options.check()
     over = _Over(altitude_m, foot, heights or LevelHeights(altitude_m))
     router = Router(make_obstacles(area.no_fly, _clearance_m(options, foot)))
@@ -233,7 +233,7 @@ def plan_lines(
     foot: Footprint,
     *,
     no_fly: Area | None = None,
-    options: Options | None = None,
+    options: PlanOptions | None = None,
     progress: Progress = lambda _: None,
     heights: FlightHeights | None = None,
 ) -> Plan:
@@ -254,7 +254,7 @@ def plan_lines(
     Raises:
         InputError: no stretch is long enough, more vehicles than stretches, or a line crosses a no-fly zone.
     """
-    options = options or Options()
+    options = options or PlanOptions()
     options.check()
     over = _Over(altitude_m, foot, heights or LevelHeights(altitude_m))
     points = np.concatenate(lines)
@@ -285,7 +285,7 @@ def plan_lines(
     return _plan("lines", schedule, over, grid=grid, options=options, warnings=warnings, covered=(None, None, ()))
 
 
-def _warnings(schedule: Schedule, work: Work, foot: Footprint, options: Options) -> list[str]:
+def _warnings(schedule: Schedule, work: Work, foot: Footprint, options: PlanOptions) -> list[str]:
     result = []
     every_s = foot.trigger_m / options.motion.speed_m_s
     if every_s < active().planning.quickest_s:
@@ -360,7 +360,7 @@ def _plan(
     over: _Over,
     *,
     grid: LocalGrid,
-    options: Options,
+    options: PlanOptions,
     warnings: list[str],
     covered: tuple[float | None, float | None, tuple[Gap, ...]],
 ) -> Plan:

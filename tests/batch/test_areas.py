@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from orthoswarm.batch.merged_ground import merged_ground
-from orthoswarm.batch.pipeline import PRODUCTS, Options, run
+from orthoswarm.batch.pipeline import PRODUCTS, MapOptions, run
 from orthoswarm.batch.swarm_areas import divide
 from orthoswarm.batch.workspace import Workspace
 from orthoswarm.compute.workers import Processes, Serial
@@ -46,7 +46,7 @@ def make(folder, out, *, basemap=True, config=IN_AREAS, workers=None, progress=l
     def read(tell):
         return load([folder / "photos"], progress=tell, options=LoadOptions(exclude=(out,)))
 
-    options = Options(basemap=folder / "map.tif" if basemap else None, config=config)
+    options = MapOptions(basemap=folder / "map.tif" if basemap else None, config=config)
     return run(read, out, options, workers or Serial(), progress)
 
 

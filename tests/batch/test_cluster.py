@@ -134,7 +134,7 @@ def test_a_worker_that_would_sum_differently_is_refused(tmp_path, monkeypatch):
 
 
 def test_the_same_map_as_with_local_workers(loopback, tmp_path):
-    from orthoswarm.batch.pipeline import Options, run
+    from orthoswarm.batch.pipeline import MapOptions, run
     from telemetry import LoadOptions, load
     from tests.kit.scene import Scene, legs
 
@@ -149,7 +149,7 @@ def test_the_same_map_as_with_local_workers(loopback, tmp_path):
             def read(tell, out=out):
                 return load([tmp_path / "photos"], progress=tell, options=LoadOptions(exclude=(out,)))
 
-            run(read, out, Options(basemap=basemap, gsd_m=0.5), pool, lambda *_: None)
+            run(read, out, MapOptions(basemap=basemap, gsd_m=0.5), pool, lambda *_: None)
             files = [out / n for n in ("realtime.tif", "coarse.tif", "orthoimage.tif", "frames.jsonl")]
             sums.append([hashlib.sha256(f.read_bytes()).hexdigest() for f in files])
     assert sums[0] == sums[1]
@@ -223,7 +223,7 @@ def test_a_scheduler_that_stays_away_is_one_sentence(tmp_path, configure):
 
 
 def test_a_run_whose_cluster_is_lost_keeps_finished_flights(tmp_path):
-    from orthoswarm.batch.pipeline import Options, run
+    from orthoswarm.batch.pipeline import MapOptions, run
     from telemetry import load
     from tests.kit.scene import Scene, legs
 
@@ -249,11 +249,11 @@ def test_a_run_whose_cluster_is_lost_keeps_finished_flights(tmp_path):
                 yield from super().map(function, [item])
 
     whole, lost, again = Watched(), Watched(tmp_path / "out" / ".work" / "vehicle-1-0.pickle"), Watched()
-    run(read, tmp_path / "whole", Options(gsd_m=0.5), whole, lambda *_: None)
+    run(read, tmp_path / "whole", MapOptions(gsd_m=0.5), whole, lambda *_: None)
     with pytest.raises(ClusterLostError):
-        run(read, tmp_path / "out", Options(gsd_m=0.5), lost, lambda *_: None)
+        run(read, tmp_path / "out", MapOptions(gsd_m=0.5), lost, lambda *_: None)
     assert lost.last.exists()
-    report = run(read, tmp_path / "out", Options(gsd_m=0.5), again, lambda *_: None)
+    report = run(read, tmp_path / "out", MapOptions(gsd_m=0.5), again, lambda *_: None)
     assert again.flights == whole.flights - 1 and any("was continued" in text for text in report["warnings"])
     for name in ("realtime.tif", "coarse.tif", "orthoimage.tif", "frames.jsonl"):
         assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()

@@ -11,7 +11,7 @@ import pytest
 import rasterio
 
 from gcs_plugin.cli.main import main
-from orthoswarm.batch.pipeline import PRODUCTS, Options, run
+from orthoswarm.batch.pipeline import PRODUCTS, MapOptions, run
 from orthoswarm.batch.refiners import REFINERS
 from orthoswarm.batch.split_legs import legs_as_vehicles
 from orthoswarm.batch.workspace import Workspace
@@ -49,7 +49,7 @@ def mapped(flight, tmp_path_factory):
     """The flight mapped on its map with one worker."""
     _, _, folder = flight
     out = tmp_path_factory.mktemp("mapped") / "out"
-    report = make(folder / "photos", out, Options(basemap=folder / "map.tif"))
+    report = make(folder / "photos", out, MapOptions(basemap=folder / "map.tif"))
     return out, report
 
 
@@ -57,7 +57,7 @@ def make(photos, out, options=None, workers=None, progress=lambda *_: None):
     def read(tell):
         return load([photos], progress=tell, options=LoadOptions(exclude=(out,)))
 
-    return run(read, out, options or Options(), workers or Serial(), progress)
+    return run(read, out, options or MapOptions(), workers or Serial(), progress)
 
 
 def rows_of(out):
@@ -180,13 +180,13 @@ def test_footprints_open_as_polygons(flight, mapped):
 
 def test_results_do_not_depend_on_the_number_of_workers(flight, mapped, tmp_path):
     with Processes(2) as two:
-        make(flight[2] / "photos", tmp_path / "two", Options(basemap=flight[2] / "map.tif"), two)
+        make(flight[2] / "photos", tmp_path / "two", MapOptions(basemap=flight[2] / "map.tif"), two)
     assert content(tmp_path / "two") == content(mapped[0])
 
 
 @pytest.mark.parametrize("when", ["drawing realtime", "solo", "joint", "drawing orthoimage", "writing orthoimage.tif"])
 def test_an_interrupted_run_is_continued(flight, mapped, tmp_path, when):
-    photos, options = flight[2] / "photos", Options(basemap=flight[2] / "map.tif")
+    photos, options = flight[2] / "photos", MapOptions(basemap=flight[2] / "map.tif")
     seen = []
 
     def interrupt(what, done, total):
@@ -217,13 +217,13 @@ def test_a_refusal_leaves_an_interrupted_run_to_be_continued(flight, mapped, tmp
         if what == "drawing orthoimage":
             raise KeyboardInterrupt
 
-    photos, out, options = flight[2] / "photos", tmp_path / "out", Options(basemap=flight[2] / "map.tif")
+    photos, out, options = flight[2] / "photos", tmp_path / "out", MapOptions(basemap=flight[2] / "map.tif")
     with pytest.raises(KeyboardInterrupt):
         make(photos, out, options, progress=interrupt)
     before = {p: p.stat().st_mtime_ns for p in out.rglob("*") if p.is_file()}
     Scene(47.5, 8.9).basemap(tmp_path / "elsewhere.tif")
     with pytest.raises(InputError, match="does not overlap"):
-        make(photos, out, Options(basemap=tmp_path / "elsewhere.tif"))
+        make(photos, out, MapOptions(basemap=tmp_path / "elsewhere.tif"))
     assert before == {p: p.stat().st_mtime_ns for p in out.rglob("*") if p.is_file()}
     report = make(photos, out, options)
     assert any("continued" in w for w in report["warnings"]) and content(out) == content(mapped[0])
@@ -235,7 +235,7 @@ def test_a_map_that_was_replaced_does_not_continue_an_interrupted_run(flight, tm
             raise KeyboardInterrupt
 
     scene, _, folder = flight
-    photos, out, options = folder / "photos" / "a", tmp_path / "out", Options(basemap=tmp_path / "map.tif")
+    photos, out, options = folder / "photos" / "a", tmp_path / "out", MapOptions(basemap=tmp_path / "map.tif")
     scene.basemap(tmp_path / "map.tif")
     with pytest.raises(KeyboardInterrupt):
         make(photos, out, options, progress=interrupt)
@@ -250,8 +250,8 @@ def test_other_options_do_not_continue_an_interrupted_run(flight, tmp_path):
 
     photos, out, seen = flight[2] / "photos", tmp_path / "out", []
     with pytest.raises(KeyboardInterrupt):
-        make(photos, out, Options(), progress=interrupt)
-    make(photos, out, Options(gsd_m=1.0, until="realtime"), progress=lambda what, *_: seen.append(what))
+        make(photos, out, MapOptions(), progress=interrupt)
+    make(photos, out, MapOptions(gsd_m=1.0, until="realtime"), progress=lambda what, *_: seen.append(what))
     assert "drawing realtime" in seen
     assert {p.name for p in out.iterdir()} == set(PRODUCTS) - {"coarse.tif", "orthoimage.tif", "seamlines.gpkg"}
 
@@ -259,7 +259,7 @@ def test_other_options_do_not_continue_an_interrupted_run(flight, tmp_path):
 def test_what_a_killed_run_left_half_written_is_cleared(flight, tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / ".orthoimage.part4711.tif").write_bytes(b"half")
-    make(flight[2] / "photos" / "a", tmp_path / "out", Options(until="realtime"))
+    make(flight[2] / "photos" / "a", tmp_path / "out", MapOptions(until="realtime"))
     assert {p.name for p in (tmp_path / "out").iterdir()} == set(PRODUCTS) - {
         "coarse.tif",
         "orthoimage.tif",
@@ -329,7 +329,7 @@ def test_without_a_map_the_orthoimage_is_the_coarse_one(flight, tmp_path):
 
 def test_stopping_early_makes_what_was_asked(flight, tmp_path):
     folder = flight[2]
-    report = make(folder / "photos" / "a", tmp_path / "r", Options(until="realtime", fov_min_deg=60, gsd_m=0.8))
+    report = make(folder / "photos" / "a", tmp_path / "r", MapOptions(until="realtime", fov_min_deg=60, gsd_m=0.8))
     assert {p.name for p in (tmp_path / "r").iterdir()} == set(PRODUCTS) - {
         "coarse.tif",
         "orthoimage.tif",
@@ -341,7 +341,7 @@ def test_stopping_early_makes_what_was_asked(flight, tmp_path):
     assert report["vehicles"][0]["frames"] == 16
     with rasterio.open(tmp_path / "r" / "realtime.tif") as image:
         assert image.res == (0.8, 0.8)
-    report = make(folder / "photos" / "a", tmp_path / "c", Options(basemap=folder / "map.tif", until="coarse"))
+    report = make(folder / "photos" / "a", tmp_path / "c", MapOptions(basemap=folder / "map.tif", until="coarse"))
     assert {p.name for p in (tmp_path / "c").iterdir()} == set(PRODUCTS) - {"orthoimage.tif", "seamlines.gpkg"}
     assert {r["stage"] for r in rows_of(tmp_path / "c").values()} == {"coarse", "rejected"}
     page = (tmp_path / "c" / "report.html").read_text()  # nothing was searched for on the map, so nothing failed
@@ -354,7 +354,7 @@ def test_the_output_folder_may_lie_among_the_photos(flight, tmp_path):
     photos = tmp_path / "photos"
     scene.fly(photos, shots["a"][:8])
     for _ in range(2):
-        report = make(photos, photos / "map", Options(until="realtime"))
+        report = make(photos, photos / "map", MapOptions(until="realtime"))
         assert report["frames"] == {"input": 8, "used": 8, "rejected": 0}
 
 
@@ -365,7 +365,7 @@ def test_legs_become_vehicles(flight, tmp_path):
     named = [f.vehicle for f in legs_as_vehicles(frames, scene.grid)]
     assert named[0] == "photos/leg1" and named[-1] == "photos/leg2"
     assert named == sorted(named) and 6 <= named.count("photos/leg1") <= 10
-    report = make(tmp_path / "photos", tmp_path / "out", Options(split_legs=True, until="realtime"))
+    report = make(tmp_path / "photos", tmp_path / "out", MapOptions(split_legs=True, until="realtime"))
     assert [v["id"] for v in report["vehicles"]] == ["photos/leg1", "photos/leg2"]
 
 
@@ -393,7 +393,7 @@ def test_a_map_that_only_the_report_cannot_read_costs_the_reports_pictures_alone
 
     monkeypatch.setattr("orthoswarm.batch.run_report.write_page", page)
     photos, out = folder / "photos" / "b", tmp_path / "out"
-    report = make(photos, out, Options(basemap=folder / "map.tif", until="realtime"))
+    report = make(photos, out, MapOptions(basemap=folder / "map.tif", until="realtime"))
     assert any("without the map: the basemap map.tif is damaged" in w for w in report["warnings"])
     assert {p.name for p in out.iterdir()} >= {"report.html", "report.json", "frames.jsonl"}
 

@@ -110,6 +110,8 @@ def standing(*rows: dict[str, Any]) -> Iterator[Station]:
     }  # fmt: skip
 
     class Handler(BaseHTTPRequestHandler):
+        protocol_version = "HTTP/1.1"  # a page asks for eighty files
+
         def do_GET(self) -> None:
             path = self.path.split("?")[0]
             if path == "/kit/heard":
@@ -148,7 +150,7 @@ def standing(*rows: dict[str, Any]) -> Iterator[Station]:
 
     server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
     server.daemon_threads = True
-    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread = threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True)  # it looks so often for its end
     thread.start()
     station.url = f"http://127.0.0.1:{server.server_address[1]}"
     try:

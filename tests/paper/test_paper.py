@@ -11,7 +11,7 @@ from orthoswarm.matchers.matcher import Matches
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import Camera, Lens, focal_px, rotation_from_angles
 from orthoswarm.model.geo import GroundGrid, local_origin
-from orthoswarm.paper import Options, PaperRefiner
+from orthoswarm.paper import PaperOptions, PaperRefiner
 from orthoswarm.paper.coarse_cameras import CoarseOptions
 from orthoswarm.paper.ground_scale import choose_pairs, field_of_view, gaussian, metres_per_pixel, orthogonal_centre
 from orthoswarm.paper.leg_cameras import carried_shift, fit_camera, pixel_grid
@@ -23,7 +23,7 @@ from orthoswarm.refine.bundle.flight_records import FlightRecords
 from telemetry import load
 from tests.kit.scene import FOV, Scene, legs
 
-OPTIONS = Options(CoarseOptions(matcher="sift"), PatchOptions(matcher="cfog"))
+OPTIONS = PaperOptions(CoarseOptions(matcher="sift"), PatchOptions(matcher="cfog"))
 BIAS = (6.0, -4.0)
 
 

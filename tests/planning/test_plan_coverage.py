@@ -16,7 +16,7 @@ from orthoswarm.planning.area.area import Area, make_area
 from orthoswarm.planning.lines.detours import Router, make_obstacles
 from orthoswarm.planning.lines.line_spacing import footprint
 from orthoswarm.planning.planner import plan_area, plan_lines
-from orthoswarm.planning.sorties.assignment import Options
+from orthoswarm.planning.sorties.assignment import PlanOptions
 from orthoswarm.planning.sorties.deconfliction import Separation
 from orthoswarm.planning.sorties.flight_time import Motion
 from tests.kit.plan_checks import GRID, ORIGIN, crossed, fly, on_globe, seen_by, to_metres
@@ -87,7 +87,7 @@ def test_any_area_is_seen_without_crossing_holes_and_shared_evenly(shape, method
             height * radius,
             foot,
             method=method,
-            options=Options(end=end, starts=starts),
+            options=PlanOptions(end=end, starts=starts),
         )
     except InputError as error:
         assert "lines" in str(error) and vehicles > 1
@@ -166,7 +166,7 @@ def test_what_cannot_be_seen_is_listed_as_gaps():
     slit = [(-300, -300), (300, -300), (300, 300), (1.5, 300), (1.5, 0), (-1.5, 0), (-1.5, 300), (-300, 300)]
     shell = [(-500, -500), (500, -500), (500, 500), (-500, 500)]
     foot = footprint(30.0, np.radians(40.0))
-    plan = plan_area(make_area([on_globe(shell, [slit])]), 2, 30.0, foot, options=Options(clearance_m=2.0))
+    plan = plan_area(make_area([on_globe(shell, [slit])]), 2, 30.0, foot, options=PlanOptions(clearance_m=2.0))
     gap = plan.gaps[0]
     x, y = to_metres([(gap.lat_deg, gap.lon_deg)])[0]
     assert abs(x) < 2 and 0 < y < 300
@@ -179,7 +179,7 @@ def test_what_cannot_be_seen_is_listed_as_gaps():
 def test_sorties_keep_within_the_endurance_and_resume_where_the_last_one_stopped():
     foot, motion = footprint(60.0, np.radians(60.0)), Motion()
     start = start_at(-50.0, -50.0)
-    options = Options(starts=[start], endurance_s=9 * 60.0)
+    options = PlanOptions(starts=[start], endurance_s=9 * 60.0)
     plan = plan_area(make_area([on_globe(CONCAVE, [HOLE])]), 2, 60.0, foot, method="columns", options=options)
     assert covered(plan, CONCAVE, [HOLE], foot) >= 0.999
     for vehicle in plan.vehicles:
@@ -199,7 +199,7 @@ def test_sorties_keep_within_the_endurance_and_resume_where_the_last_one_stopped
 
 
 def test_an_endurance_that_cannot_reach_the_far_end_is_refused_with_what_it_takes():
-    options = Options(starts=[start_at(-50.0, -50.0)], endurance_s=180.0)
+    options = PlanOptions(starts=[start_at(-50.0, -50.0)], endurance_s=180.0)
     with pytest.raises(InputError, match=r"endurance of 3\.0 min is too short: .* needs about \d"):
         plan_area(make_area([on_globe(CONCAVE)]), 2, 60.0, footprint(60.0, np.radians(60.0)), options=options)
 
@@ -207,7 +207,7 @@ def test_an_endurance_that_cannot_reach_the_far_end_is_refused_with_what_it_take
 def test_a_mission_never_holds_more_items_than_the_autopilot():
     foot = footprint(10.0, np.radians(50.0))
     shell = [(0, 0), (700, 0), (700, 60), (0, 60)]
-    options = Options(most_items=60)
+    options = PlanOptions(most_items=60)
     plan = plan_area(make_area([on_globe(shell)]), 1, 10.0, foot, method="columns", options=options)
     assert len(plan.vehicles[0].sorties) > 1 and any("60 items" in w for w in plan.warnings)
     for text in mission_files(plan, ["ardupilot"]).values():
@@ -233,7 +233,7 @@ def positions(plan, sortie, motion, step=0.25):
 @pytest.mark.parametrize(("method", "vehicles", "start"), [("columns", 6, True), ("tmstc", 9, False), ("bcd", 8, True)])
 def test_vehicles_stay_apart_even_off_schedule(method, vehicles, start):
     foot, apart = footprint(60.0, np.radians(60.0)), Separation(distance_m=12.0, height_m=4.0, slack_s=2.0)
-    options = Options(starts=[start_at(-60.0, 200.0)] if start else [], separation=apart)
+    options = PlanOptions(starts=[start_at(-60.0, 200.0)] if start else [], separation=apart)
     plan = plan_area(make_area([on_globe(CONCAVE, [HOLE])]), vehicles, 60.0, foot, method=method, options=options)
     tracks = [positions(plan, v.sorties[0], options.motion) for v in plan.vehicles]
     met = 0
@@ -272,7 +272,7 @@ def test_starts_are_given_to_the_vehicles_in_turn_and_each_works_near_its_own():
     starts = [start_at(-30.0, 0.0), start_at(2030.0, 0.0)]
     foot = footprint(60.0, np.radians(60.0))
     area = make_area([on_globe([(0, 0), (2000, 0), (2000, 300), (0, 300)])])
-    plan = plan_area(area, 4, 60.0, foot, options=Options(starts=starts))
+    plan = plan_area(area, 4, 60.0, foot, options=PlanOptions(starts=starts))
     for number, vehicle in enumerate(plan.vehicles):
         (sortie,) = vehicle.sorties
         assert (sortie.home_lat_deg, sortie.home_lon_deg) == pytest.approx(starts[number % 2], abs=1e-7)
@@ -290,7 +290,7 @@ def test_starts_are_given_to_the_vehicles_in_turn_and_each_works_near_its_own():
     ],
 )
 def test_impossible_swarms_are_refused(vehicles, start, word):
-    options = Options(starts=[start_at(*start)] if start else [])
+    options = PlanOptions(starts=[start_at(*start)] if start else [])
     with pytest.raises(InputError, match=word):
         plan_area(
             make_area([on_globe(CONCAVE, [HOLE])]), vehicles, 100.0, footprint(100.0, np.radians(60.0)), options=options
@@ -368,7 +368,7 @@ def test_flights_that_the_first_cut_makes_too_long_are_cut_again_until_they_keep
     holes = [zone(i, j) for i in range(5) for j in range(5)]
     area = make_area([on_globe([(0, 0), (800, 0), (800, 800), (0, 800)], holes)])
     start = tuple(on_globe([(-50.0, -50.0)]).shell[0])
-    options = Options(starts=[start], endurance_s=660.0, clearance_m=10.0)
+    options = PlanOptions(starts=[start], endurance_s=660.0, clearance_m=10.0)
     plan = plan_area(area, 4, 40.0, footprint(40.0, np.radians(60.0)), method="columns", options=options)
     assert plan.covered_share >= 0.999
     assert max(sortie.time_s for vehicle in plan.vehicles for sortie in vehicle.sorties) <= 660.0

@@ -13,7 +13,7 @@ from gcs_plugin.mission.mission_files import (
     NAV_RTL,
     NAV_TAKEOFF,
     NAV_WAYPOINT,
-    MissionItem,
+    FileItem,
     parse_mission,
     plan_text,
     sortie_items,
@@ -25,7 +25,7 @@ from orthoswarm.model.plan import Plan, Sortie, VehiclePlan, Waypoint
 from orthoswarm.planning.area.area import make_area
 from orthoswarm.planning.lines.line_spacing import footprint
 from orthoswarm.planning.planner import plan_area
-from orthoswarm.planning.sorties.assignment import Options
+from orthoswarm.planning.sorties.assignment import PlanOptions
 from tests.kit.plan_checks import on_globe, to_metres
 
 # After QGroundControl's "Plan file format": what its reader asks for, and nothing it does not know.
@@ -190,7 +190,7 @@ def test_waypoint_files_begin_with_home_and_have_twelve_columns():
 
 positions = st.tuples(st.floats(-89, 89), st.floats(-179, 179)).filter(lambda p: abs(p[0]) + abs(p[1]) > 0.01)
 flown_items = st.builds(
-    lambda command, place, height, p1: MissionItem(
+    lambda command, place, height, p1: FileItem(
         command=command, frame=3, params=(p1, 0.0, 0.0, 0.0), lat_deg=place[0], lon_deg=place[1], alt_m=height
     ),
     st.sampled_from([NAV_WAYPOINT, NAV_TAKEOFF, NAV_LAND]),
@@ -199,7 +199,7 @@ flown_items = st.builds(
     st.floats(0, 100),
 )
 do_items = st.builds(
-    lambda command, p1: MissionItem(command=command, frame=2, params=(p1, 0.0, 1.0, 0.0)),
+    lambda command, p1: FileItem(command=command, frame=2, params=(p1, 0.0, 1.0, 0.0)),
     st.sampled_from([178, 206]),
     st.floats(0, 99),
 )
@@ -321,7 +321,7 @@ def test_the_report_has_the_promised_keys_and_adds_up(concave):
 
 def test_sorties_of_one_vehicle_get_a_file_each():
     area = make_area([on_globe([(0, 0), (900, 0), (900, 700), (0, 700)])])
-    plan = plan_area(area, 1, 60.0, footprint(60.0, math.radians(60.0)), options=Options(endurance_s=900.0))
+    plan = plan_area(area, 1, 60.0, footprint(60.0, math.radians(60.0)), options=PlanOptions(endurance_s=900.0))
     names = mission_files(plan, ["ardupilot"])
     count = len(plan.vehicles[0].sorties)
     assert count > 1

@@ -12,7 +12,7 @@ from orthoswarm.planning.area.area import make_area
 from orthoswarm.planning.lines.line_spacing import footprint
 from orthoswarm.planning.planner import plan_area
 from orthoswarm.planning.sorties import deconfliction
-from orthoswarm.planning.sorties.assignment import Options
+from orthoswarm.planning.sorties.assignment import PlanOptions
 from orthoswarm.planning.sorties.deconfliction import Separation
 from orthoswarm.planning.sorties.flight_time import Motion, autopilot_config
 from tests.kit.missions import sortie_mission
@@ -25,7 +25,7 @@ AREA = make_area([on_globe(CONCAVE, [HOLE])])
 
 def planned(vehicles, starts, autopilot="ardupilot", end="rtl"):
     times = autopilot_config(autopilot)
-    options = Options(
+    options = PlanOptions(
         motion=Motion(autopilot=times), starts=starts, end=end, separation=Separation(slack_s=times.schedule_slack_s)
     )
     return plan_area(AREA, vehicles, 60.0, FOOT, options=options), options

@@ -147,7 +147,7 @@ def test_a_file_of_either_kind_becomes_the_same_mission(tmp_path, autopilot, wri
 
 @pytest.mark.parametrize("command", [WAYPOINT, TAKEOFF, LAND, LOITER_TIME])
 def test_a_yaw_of_0_is_none_for_px4(command):
-    item = mission_files.MissionItem(command=command, frame=3, lat_deg=47.4, lon_deg=8.5, alt_m=60.0)
+    item = mission_files.FileItem(command=command, frame=3, lat_deg=47.4, lon_deg=8.5, alt_m=60.0)
     assert math.isnan(build_mission(PX4, [item]).items[0].params[3])
     assert build_mission(AP, [item]).items[1].params[3] == 0.0
 
@@ -161,7 +161,7 @@ def test_a_vehicle_stores_what_is_built(autopilot):
 
 
 def test_what_cannot_be_flown_is_refused_before_anything_is_sent(tmp_path):
-    item = mission_files.MissionItem
+    item = mission_files.FileItem
     with pytest.raises(InputError, match="no items"):
         build_mission(PX4, [], name="empty.plan")
     with pytest.raises(InputError, match="not a place"):
@@ -225,15 +225,15 @@ def jumping(target, times=2.0, hold_s=0.0):
     """Takeoff (1), two waypoints (2, 3), a jump, return."""
     at = [47.397, 47.3979, 47.3988]
     flown = [
-        mission_files.MissionItem(
+        mission_files.FileItem(
             command=command, frame=3, params=(hold, 0.0, 0.0, 0.0), lat_deg=lat, lon_deg=8.545, alt_m=20.0
         )
         for command, lat, hold in ((22, at[0], 0.0), (16, at[1], hold_s), (16, at[2], 0.0))
     ]
     return [
         *flown,
-        mission_files.MissionItem(command=JUMP, params=(target, times, 0.0, 0.0)),
-        mission_files.MissionItem(command=RTL),
+        mission_files.FileItem(command=JUMP, params=(target, times, 0.0, 0.0)),
+        mission_files.FileItem(command=RTL),
     ]
 
 

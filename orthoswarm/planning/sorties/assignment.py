@@ -46,7 +46,7 @@ _SORTIE_SHORTER_GROWTH: Final = 1.6  # ... times this with each further one
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options:
+class PlanOptions:
     """Everything about the flights that has a good default.
 
     Attributes:
@@ -165,7 +165,7 @@ class Swarm:
         foot: Footprint,
         grid: LocalGrid,
         router: Router,
-        options: Options,
+        options: PlanOptions,
     ) -> None:
         if not 1 <= vehicles <= MOST_VEHICLES:
             raise InputError(f"{vehicles} vehicles were asked for; give a number from 1 to {MOST_VEHICLES}")

@@ -18,7 +18,7 @@ from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.links.transports import Link, parse_link
 from gcs_plugin.mission.items import CHANGE_SPEED, LAND, LOITER_UNLIM, RTL, TAKEOFF, TRIGGER_DISTANCE, WAYPOINT
 from gcs_plugin.mission.mission_builder import build_mission
-from gcs_plugin.mission.mission_files import MissionItem
+from gcs_plugin.mission.mission_files import FileItem
 from gcs_plugin.sim.lossy_radio import Channel, Faults
 from gcs_plugin.sim.memory_link import World
 from gcs_plugin.sim.multirotor import Chart
@@ -186,7 +186,7 @@ class Site:
         return [e.kind for e in self.place.events[self.begun :] if e.system == self.system and e.kind in missions]
 
     def mission(self, *last, height=15.0, legs=2):
-        items = [self.at(TAKEOFF, 0, 0, height), MissionItem(command=CHANGE_SPEED, params=(1.0, 8.0, -1.0, 0.0))]
+        items = [self.at(TAKEOFF, 0, 0, height), FileItem(command=CHANGE_SPEED, params=(1.0, 8.0, -1.0, 0.0))]
         for leg in range(legs):
             ends = (5.0, 45.0) if leg % 2 == 0 else (45.0, 5.0)
             items += [
@@ -200,7 +200,7 @@ class Site:
     def at(self, command, north, east, height):
         lat, lon = self.chart.to_degrees(north, east)
         yaw_free = (0.0, 0.0, 0.0, math.nan)
-        return MissionItem(command=command, frame=3, params=yaw_free, lat_deg=lat, lon_deg=lon, alt_m=height)
+        return FileItem(command=command, frame=3, params=yaw_free, lat_deg=lat, lon_deg=lon, alt_m=height)
 
     def fly(self, *last):
         upload = self.finish(self.fleet.upload(self.system, self.mission(*last)))
@@ -210,7 +210,7 @@ class Site:
 
 
 def trigger(distance):
-    return MissionItem(command=TRIGGER_DISTANCE, params=(distance, 0.0, 1.0 if distance else 0.0, 0.0))
+    return FileItem(command=TRIGGER_DISTANCE, params=(distance, 0.0, 1.0 if distance else 0.0, 0.0))
 
 
 PLACES = [
@@ -240,7 +240,7 @@ def make_site(request):
 
 def last_items(site, ending):
     return {
-        "rtl": [MissionItem(command=RTL)],
+        "rtl": [FileItem(command=RTL)],
         "land": [site.at(LAND, 3, 3, 0.0)],
         "waypoint": [site.at(WAYPOINT, 3, 3, 15.0)],
         "do": [site.at(WAYPOINT, 3, 3, 15.0), trigger(0.0)],
@@ -285,16 +285,16 @@ def test_loiter_unlimited_and_the_operators_rtl_are_no_completion(make_site):
 
 def test_a_new_upload_after_a_flight_is_not_complete(make_site):
     site = make_site()
-    site.fly(MissionItem(command=RTL))
+    site.fly(FileItem(command=RTL))
     assert site.place.until(lambda: "complete" in site.kinds() and not site.vehicle.armed, 300.0)
-    assert site.finish(site.fleet.upload(site.system, site.mission(MissionItem(command=RTL), height=18.0))).ok
+    assert site.finish(site.fleet.upload(site.system, site.mission(FileItem(command=RTL), height=18.0))).ok
     site.place.until(lambda: False, 5.0)
     assert site.kinds() == ["started", "complete"]
 
 
 def test_pause_and_resume(make_site):
     site = make_site()
-    site.fly(MissionItem(command=RTL))
+    site.fly(FileItem(command=RTL))
     site.follow(lambda: flight_state(site.vehicle).word.value == "on mission", 100.0)
     assert site.place.until(lambda: site.vehicle.mission_seq >= site.vehicle.detector.final_seq - 4, 200.0)
     assert site.finish(site.fleet.pause(site.system)).ok
@@ -328,14 +328,14 @@ def test_an_upload_through_thirty_percent_loss_both_ways(make_site):
     faults = (Faults(loss=0.3, duplicate=0.1, seed=1), Faults(loss=0.3, duplicate=0.1, seed=2))
     site = make_site(faults)
     for height in (15.0, 16.0):
-        mission = site.mission(MissionItem(command=RTL), height=height)
+        mission = site.mission(FileItem(command=RTL), height=height)
         outcome = site.finish(site.fleet.upload(site.system, mission), 180.0)
         assert outcome is not None and outcome.ok, outcome
 
 
 def test_a_mission_that_is_refused_names_the_item_and_leaves_no_success(make_site):
     site = make_site()
-    good = site.mission(MissionItem(command=RTL))
+    good = site.mission(FileItem(command=RTL))
     assert site.finish(site.fleet.upload(site.system, good)).ok
     items = list(good.items)
     wrong = good.first_seq + 2
@@ -363,4 +363,4 @@ def test_a_vehicle_without_a_mission_is_not_armed_by_start(make_site):
     assert not outcome.ok and "no mission" in outcome.text
     assert not site.vehicle.armed
     # In the mode of missions ArduPilot is not ready to arm without one: the next test would wait in vain.
-    assert site.finish(site.fleet.upload(site.system, site.mission(MissionItem(command=RTL)))).ok
+    assert site.finish(site.fleet.upload(site.system, site.mission(FileItem(command=RTL)))).ok

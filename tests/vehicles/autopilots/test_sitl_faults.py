@@ -17,7 +17,7 @@ from gcs_plugin.fleet.preflight import Level
 from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.mission.exchange import Address
 from gcs_plugin.mission.items import RTL
-from gcs_plugin.mission.mission_files import MissionItem
+from gcs_plugin.mission.mission_files import FileItem
 from gcs_plugin.sim.lossy_radio import Faults
 from tests.kit.daemon_kit import start, stop
 from tests.vehicles.autopilots.test_fleet_scenarios import ADDRESSES, REAL, Real, Site, further_link
@@ -87,7 +87,7 @@ def per_autopilot(site, **kinds):
 
 
 def on_mission(site):
-    site.fly(MissionItem(command=RTL))
+    site.fly(FileItem(command=RTL))
     return site.follow(lambda: flight_state(site.vehicle).word.value == "on mission", 120.0)
 
 
@@ -122,7 +122,7 @@ def test_a_mission_beyond_the_geofence_is_red_before_it_is_flown(site, parameter
         assert site.place.until(lambda: site.vehicle.ready_to_check, 60.0)
         return next(item for item in site.check().items if item.name == "fence")
 
-    assert site.finish(site.fleet.upload(site.system, site.mission(MissionItem(command=RTL)))).ok
+    assert site.finish(site.fleet.upload(site.system, site.mission(FileItem(command=RTL)))).ok
     assert found().level is Level.OK
     fences = per_autopilot(
         site,
@@ -187,7 +187,7 @@ def test_a_flight_is_started_paused_and_completed_through_twenty_percent_loss(ad
     place = Real(address, [Faults(loss=0.2, seed=seed) for seed in (1, 2)])
     try:
         site = Site(place)
-        assert site.finish(site.fleet.upload(site.system, site.mission(MissionItem(command=RTL), legs=4))).ok
+        assert site.finish(site.fleet.upload(site.system, site.mission(FileItem(command=RTL), legs=4))).ok
         began, tries = time.monotonic(), []
         while not tries or not (tries[-1].ok or len(tries) > 3):
             tries.append(site.finish(site.fleet.start(site.system)))
@@ -207,7 +207,7 @@ def test_a_mission_is_flown_in_wind_of_twelve_metres_a_second(site, parameters):
     if site.vehicle.autopilot is PX4:
         pytest.skip("the simulation inside PX4 has no wind")
     parameters.set(SIM_WIND_SPD=12, SIM_WIND_DIR=270)
-    site.fly(MissionItem(command=RTL))
+    site.fly(FileItem(command=RTL))
     began, leans, words = time.monotonic(), [], []
 
     def done():
@@ -262,7 +262,7 @@ def test_a_mission_is_flown_over_a_radio_of_57600_baud_with_five_percent_loss(ad
     try:
         site = Site(place)
         began = time.monotonic()
-        upload = site.finish(site.fleet.upload(site.system, site.mission(MissionItem(command=RTL))))
+        upload = site.finish(site.fleet.upload(site.system, site.mission(FileItem(command=RTL))))
         assert upload.ok, upload
         uploaded = time.monotonic() - began
         assert site.finish(site.fleet.start(site.system)).ok
@@ -338,7 +338,7 @@ def test_a_second_station_that_asks_for_everything_disturbs_nothing(address):
         heard = []
         second.subscribe(lambda vehicle, message, utc: heard.append(message), "PARAM_VALUE")
         reading = second.call(lambda: (second._dialogues.send(to.system, asked), second.download(to.system))[1])
-        upload = site.finish(site.fleet.upload(site.system, site.mission(MissionItem(command=RTL))))
+        upload = site.finish(site.fleet.upload(site.system, site.mission(FileItem(command=RTL))))
         assert upload.ok, upload
         assert site.finish(site.fleet.start(site.system)).ok
         assert place.until(lambda: "complete" in site.kinds() and not site.vehicle.armed, 300.0)

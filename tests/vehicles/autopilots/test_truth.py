@@ -18,13 +18,13 @@ from gcs_plugin.mission.exchange import Address, Verdict
 from gcs_plugin.mission.flight_modes import mode_params
 from gcs_plugin.mission.flown_items import off_leg_m
 from gcs_plugin.mission.items import RTL, WAYPOINT
-from gcs_plugin.mission.mission_files import MissionItem
+from gcs_plugin.mission.mission_files import FileItem
 from orthoswarm.model.errors import OrthoSwarmError
 from tests.vehicles.autopilots.test_fleet_scenarios import PLACES, Real, Simulated, Site, further_link
 
 AP, PX4 = Autopilot.ARDUPILOT, Autopilot.PX4
 OTHER = Address(254, 190)
-HOME = MissionItem(command=RTL)
+HOME = FileItem(command=RTL)
 
 
 class Beside:

@@ -10,7 +10,7 @@ from gcs_plugin.cli.configuration import add_config, read_config
 from orthoswarm.stores.addresses import address_of, path_of
 
 if TYPE_CHECKING:
-    from orthoswarm.batch.pipeline import Options
+    from orthoswarm.batch.pipeline import MapOptions
     from orthoswarm.compute.workers import Workers
     from orthoswarm.config import Overrides
     from orthoswarm.model.frame import Ingest
@@ -168,11 +168,11 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _options(args: argparse.Namespace) -> "Options":
+def _options(args: argparse.Namespace) -> "MapOptions":
     """What the pipeline is asked for."""
-    from orthoswarm.batch.pipeline import Options
+    from orthoswarm.batch.pipeline import MapOptions
 
-    return Options(
+    return MapOptions(
         basemap=args.basemap,
         refine=args.refine,
         until=args.until,

@@ -92,7 +92,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Plan, write the folder, print the figures."""
-    from gcs_plugin.plans.plan_files import check_folder, geojson, mission_files, plan_picture, report, write_folder
+    from gcs_plugin.plans.plan_files import check_folder, write_plan
     from gcs_plugin.plans.plan_request import make_plan
 
     changed = use_config(args.config)
@@ -100,15 +100,7 @@ def run(args: argparse.Namespace) -> int:
     request = _request(args)
     plan, area = make_plan(request, _say)
     _say("files")
-
-    figures = report(plan, request.autopilots, request.fov_min_deg, request.endurance_min)
-    if changed:
-        figures["config"] = {stage: dict(values) for stage, values in changed.items()}
-    files: dict[str, str | bytes] = dict(mission_files(plan, request.autopilots))
-    files["all.geojson"] = geojson(plan, area)
-    files["plan.json"] = json.dumps(figures, indent=1) + "\n"
-    files["plan.png"] = plan_picture(plan, area)
-    write_folder(args.out, files)
+    figures = write_plan(args.out, plan, area, request, settings=changed)
     _say("")
     if args.json:
         print(json.dumps(figures))
