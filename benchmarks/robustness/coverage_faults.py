@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from gcs_plugin.plans.gap_area import gap_area, read_gaps
 from orthoswarm.coverage.camera_events import CameraEvent, missing_by_events
 from orthoswarm.coverage.coverage_files import write_gaps
-from orthoswarm.coverage.coverage_grid import Cells, CoverageGrid, State
+from orthoswarm.coverage.coverage_grid import Cells, CellState, CoverageGrid
 from orthoswarm.coverage.gaps import PlannedFlight, find_gaps
 from orthoswarm.coverage.missing_pictures import Cause
 from orthoswarm.coverage.planning_lens import planning_fovs_deg
@@ -113,10 +113,10 @@ def simulate(seed: int, side_m: float = 500.0) -> Outcome:
     after = _fly_gaps(plan, cover, truth, solved=solved, rng=rng, fov_deg=true_fov, planned=foot, events=flown.events)
     return Outcome(
         faults=faults,
-        seen=float((said == State.SEEN)[wanted].mean()),
-        falsely_seen=float(((said == State.SEEN) & ~truth)[wanted].mean()),
-        falsely_missed=float(((said == State.MISSED) & truth)[wanted].mean()),
-        doubtful=float(((said == State.POOR) & truth)[wanted].mean()),
+        seen=float((said == CellState.SEEN)[wanted].mean()),
+        falsely_seen=float(((said == CellState.SEEN) & ~truth)[wanted].mean()),
+        falsely_missed=float(((said == CellState.MISSED) & truth)[wanted].mean()),
+        doubtful=float(((said == CellState.POOR) & truth)[wanted].mean()),
         named=len(listed & flown.not_arrived) / max(1, len(flown.not_arrived)) if flown.not_arrived else 1.0,
         misnamed=len(listed - flown.not_arrived),
         after=after,

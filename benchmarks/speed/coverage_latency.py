@@ -32,7 +32,7 @@ from PIL import Image
 from benchmarks.speed.daemon_load import same_course
 from gcs_plugin.sim.multirotor import Airframe
 from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
-from orthoswarm.coverage.coverage_grid import State
+from orthoswarm.coverage.coverage_grid import CellState
 
 HOME = (48.1371, 11.5754)
 METRES = (111_200.0, 111_200.0 * math.cos(math.radians(HOME[0])))
@@ -120,8 +120,12 @@ def cells_known(client: httpx.Client, legs: list[Leg], etag: str) -> str:
             spot = leg.end - back * along - corners[0]
             column = int(spot @ right / (right @ right) * states.shape[1])
             row = int(spot @ down / (down @ down) * states.shape[0])
-            if 0 <= row < states.shape[0] and 0 <= column < states.shape[1] and states[row, column] != State.OUTSIDE:
-                leg.known = now if states[row, column] != State.PLANNED else None
+            if (
+                0 <= row < states.shape[0]
+                and 0 <= column < states.shape[1]
+                and states[row, column] != CellState.OUTSIDE
+            ):
+                leg.known = now if states[row, column] != CellState.PLANNED else None
                 break
     return answer.headers.get("etag", "")
 

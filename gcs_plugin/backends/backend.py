@@ -18,7 +18,7 @@ from gcs_plugin.mission.items import Mission
 from gcs_plugin.mission.plan_folder import NO_NEEDS, PlanNeeds
 
 if TYPE_CHECKING:
-    from gcs_plugin.mission.geofence import Zone
+    from gcs_plugin.mission.geofence import FenceZone
     from gcs_plugin.mission.start_dialogue import Standing
     from gcs_plugin.mission.track import Airspace
 
@@ -126,7 +126,7 @@ class Backend(abc.ABC):
         """
 
     @abc.abstractmethod
-    def zones(self, systems: Collection[int], report: Report) -> dict[int, "tuple[Zone, ...]"]:
+    def zones(self, systems: Collection[int], report: Report) -> dict[int, "tuple[FenceZone, ...]"]:
         """Download the zones of geofences; without those of vehicles that do not answer.
 
         Args:
@@ -143,7 +143,7 @@ class Backend(abc.ABC):
         legal_height_m: float,
         *,
         needs: PlanNeeds = NO_NEEDS,
-        zones: "Mapping[int, tuple[Zone, ...]] | None" = None,
+        zones: "Mapping[int, tuple[FenceZone, ...]] | None" = None,
     ) -> list[Check]:
         """Preflight check of vehicles with their present telemetry.
 

@@ -16,7 +16,7 @@ from gcs_plugin.links.transports import Link
 from gcs_plugin.mission.completion import Phase
 from gcs_plugin.mission.download import MissionDownload
 from gcs_plugin.mission.exchange import Address, Exchange, Outcome
-from gcs_plugin.mission.geofence import Zone, zones_of
+from gcs_plugin.mission.geofence import FenceZone, zones_of
 from gcs_plugin.mission.items import Mission, MissionItem
 from orthoswarm.model.errors import OrthoSwarmError
 
@@ -64,7 +64,7 @@ class DirectBackend(Backend):
         items = self._downloaded(self.fleet.download, systems, report)
         return {s: Mission(self.fleet.vehicles[s].autopilot, items[s]) if s in items else None for s in systems}
 
-    def zones(self, systems: Collection[int], report: Report) -> dict[int, tuple[Zone, ...]]:
+    def zones(self, systems: Collection[int], report: Report) -> dict[int, tuple[FenceZone, ...]]:
         """All downloads at the same time."""
         found = self._downloaded(self.fleet.read_fence, systems, report)
         return {system: tuple(zones_of(items)) for system, items in found.items()}

@@ -27,7 +27,7 @@ from gcs_plugin.mission.comparison import difference
 from gcs_plugin.mission.completion import CompletionDetector, Phase
 from gcs_plugin.mission.exchange import Address, Exchange, Outcome, Verdict
 from gcs_plugin.mission.flight_modes import modes_of, why_no_missions
-from gcs_plugin.mission.geofence import Zone, zones_of
+from gcs_plugin.mission.geofence import FenceZone, zones_of
 from gcs_plugin.mission.items import Mission, MissionItem
 from gcs_plugin.mission.start_dialogue import Expected, start_mission
 from orthoswarm.model.errors import InputError, OrthoSwarmError
@@ -141,9 +141,9 @@ class MavsdkBackend(Backend):
             report("read", len(found), len(systems))
         return found
 
-    def zones(self, systems: Collection[int], report: Report) -> dict[int, tuple[Zone, ...]]:
+    def zones(self, systems: Collection[int], report: Report) -> dict[int, tuple[FenceZone, ...]]:
         """Downloads one after the other."""
-        found: dict[int, tuple[Zone, ...]] = {}
+        found: dict[int, tuple[FenceZone, ...]] = {}
         for count, system in enumerate(systems, 1):
             items = _downloaded(self._crafts[system].raw.download_geofence)
             if items is not None:

@@ -19,7 +19,7 @@ _LEAST_INLIERS = 40  # matches
 _MATCHED_PX = 6_000_000
 
 
-class Similarity(NamedTuple):
+class SpaceSimilarity(NamedTuple):
     """X -> scale * rotation @ X + shift."""
 
     scale: float
@@ -31,7 +31,7 @@ class Similarity(NamedTuple):
         return np.asarray(self.scale * points @ self.rotation.T + self.shift)
 
 
-def fit_similarity(source: Array, target: Array, rounds: int = 30) -> Similarity:
+def fit_similarity(source: Array, target: Array, rounds: int = 30) -> SpaceSimilarity:
     """Robust similarity from source to target points: iteratively reweighted least squares (Umeyama).
 
     Args:
@@ -52,7 +52,7 @@ def fit_similarity(source: Array, target: Array, rounds: int = 30) -> Similarity
     return found
 
 
-def _weighted(source: Array, target: Array, weight: Array) -> Similarity:
+def _weighted(source: Array, target: Array, weight: Array) -> SpaceSimilarity:
     weight = weight / weight.sum()
     mean_s, mean_t = weight @ source, weight @ target
     s, t = source - mean_s, target - mean_t
@@ -62,7 +62,7 @@ def _weighted(source: Array, target: Array, weight: Array) -> Similarity:
     sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
     rotation = (u * sign) @ vt
     scale = float((d * sign).sum() / (weight @ (s * s).sum(1)))
-    return Similarity(scale, rotation, mean_t - scale * rotation @ mean_s)
+    return SpaceSimilarity(scale, rotation, mean_t - scale * rotation @ mean_s)
 
 
 def placed_models(models: Sequence[dict[str, Any]], recorded: Mapping[str, Array]) -> "tuple[dict[str, Camera], float]":

@@ -15,7 +15,7 @@ from gcs_plugin.mission.plan_folder import NO_NEEDS, PlanNeeds
 
 if TYPE_CHECKING:
     from gcs_plugin.fleet.fleet import Fleet
-    from gcs_plugin.fleet.separation.separation_check import Separation
+    from gcs_plugin.fleet.separation.separation_check import SeparationFindings
 
 _SOON_S: Final = 5.0
 _READ_S: Final = 20.0
@@ -66,12 +66,12 @@ class StartChecks:
             A row per vehicle, see the top of `vehicles`.
         """
         from gcs_plugin.fleet.preflight import preflight_all
-        from gcs_plugin.fleet.separation.separation_check import Separation
+        from gcs_plugin.fleet.separation.separation_check import SeparationFindings
 
         stored = self._missions(systems, reread=reread)
         if reread:
             self._hear_settings(systems)
-        separation = Separation()
+        separation = SeparationFindings()
         if reread:  # it is a schedule's, otherwise
             first = min(starts.values(), default=0.0)
             after_s = {s: at - first for s, at in starts.items()}
@@ -110,7 +110,7 @@ class StartChecks:
         starts: Mapping[int, float],
         *,
         needs: PlanNeeds,
-    ) -> "Separation":
+    ) -> "SeparationFindings":
         """How they keep apart from each other and from others, found in this thread: the links' must not wait."""
         from gcs_plugin.fleet.separation.separation_check import flights_of, others_of, separation_of
 

@@ -12,10 +12,10 @@ from orthoswarm.model.errors import InputError
 from orthoswarm.twin.presets import TwinSpec, spec
 from orthoswarm.twin.recorded_noise import Noise
 from orthoswarm.twin.site import Site, disaster_zones, with_heading
-from orthoswarm.twin.true_flight import FlightPlan, Motion
+from orthoswarm.twin.true_flight import FlightDeviations, FlightPlan
 
 if TYPE_CHECKING:
-    from orthoswarm.twin.imaging.ray_marching import Stage
+    from orthoswarm.twin.imaging.ray_marching import PreparedScene
 
 _FAR_M = 20_000.0
 
@@ -35,7 +35,7 @@ def read_spec(folder: Path) -> TwinSpec:
     try:
         values: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         values.pop("generator", None)
-        parts = {"plan": FlightPlan, "motion": Motion, "noise": Noise}
+        parts = {"plan": FlightPlan, "motion": FlightDeviations, "noise": Noise}
         for name, kind in parts.items():
             values[name] = kind(**{key: _tuples(value) for key, value in values[name].items()})
         return TwinSpec(**{key: _tuples(value) for key, value in values.items()})
@@ -79,7 +79,7 @@ def area_of(world: TwinSpec) -> dict[str, Any]:
     return {"type": "Polygon", "coordinates": [[[float(lon), float(lat)] for lat, lon in places]]}
 
 
-def build_world(world: TwinSpec) -> tuple["Stage", Site]:
+def build_world(world: TwinSpec) -> tuple["PreparedScene", Site]:
     """The city after the disaster, prepared for rendering, and its site."""
     from orthoswarm.twin.dataset_files import after_disaster
 

@@ -31,7 +31,7 @@ from telemetry.samples.sample import Sample
 if TYPE_CHECKING:
     from gcs_plugin.fleet.fleet import Fleet
     from gcs_plugin.fleet.vehicle_state import Vehicle
-    from orthoswarm.twin.imaging.ray_marching import Stage
+    from orthoswarm.twin.imaging.ray_marching import PreparedScene
     from orthoswarm.twin.site import Site
 
 LATE_S: Final = 0.25
@@ -259,8 +259,8 @@ class FollowingCameras:
     """
 
     def __init__(
-        self, fleet: "Fleet", stage: "Stage", site: "Site", stream: str, *, seed: int, shutter: Callable[[], Shutter],
-        level: bool, rays: int, opened: Callable[[Follower], None],
+        self, fleet: "Fleet", stage: "PreparedScene", site: "Site", stream: str, *, seed: int,
+        shutter: Callable[[], Shutter], level: bool, rays: int, opened: Callable[[Follower], None],
     ) -> None:  # fmt: skip
         self._rays = rays
         self._fleet, self._stage, self._site, self._stream = fleet, stage, site, stream

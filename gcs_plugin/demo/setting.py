@@ -11,7 +11,7 @@ from orthoswarm.twin.site import Site, disaster_zones
 from orthoswarm.twin.true_flight import FlightPlan
 
 if TYPE_CHECKING:
-    from orthoswarm.twin.imaging.ray_marching import Stage
+    from orthoswarm.twin.imaging.ray_marching import PreparedScene
 
 HEIGHT_M: Final = 90.0
 FOV_MIN_DEG: Final = 75.0
@@ -83,7 +83,7 @@ class Errors:
         return cls(float(np.radians(rng.choice(_FOVS_DEG))), float(yaw), float(pitch), float(roll))
 
 
-def build_stage(setting: DemoSetting) -> tuple["Stage", Site]:
+def build_stage(setting: DemoSetting) -> tuple["PreparedScene", Site]:
     """The city after the disaster, prepared for rendering, and its site."""
     from orthoswarm.twin.dataset_files import after_disaster
 

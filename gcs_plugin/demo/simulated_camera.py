@@ -17,8 +17,8 @@ from orthoswarm.twin.imaging.sensor import Sensor
 from telemetry.samples.sample import Sample
 
 if TYPE_CHECKING:
-    from gcs_plugin.sim.mission_flight import Exposure
-    from orthoswarm.twin.imaging.ray_marching import Stage
+    from gcs_plugin.sim.flight_values import TakenPicture
+    from orthoswarm.twin.imaging.ray_marching import PreparedScene
     from orthoswarm.twin.site import Site
 
 _POSITION_M: Final = 0.8
@@ -39,7 +39,7 @@ class TwinCamera:
         rays: along the side of a pixel; 2 gives smooth edges, 1 is four times faster.
     """
 
-    def __init__(self, stage: "Stage", site: "Site", setting: DemoSetting, system: int, rays: int = 2) -> None:
+    def __init__(self, stage: "PreparedScene", site: "Site", setting: DemoSetting, system: int, rays: int = 2) -> None:
         self._stage, self._site, self._system = stage, site, system
         self._errors = Errors.of(setting, system)
         self._lens = Lens(WIDTH, HEIGHT, focal_px(self._errors.fov_rad, WIDTH))
@@ -47,7 +47,7 @@ class TwinCamera:
         self._sensor = Sensor(WIDTH, HEIGHT, setting.seed)
         self._seed = setting.seed
 
-    def take(self, exposure: "Exposure", time_s: float) -> tuple[NDArray[np.uint8], Sample]:
+    def take(self, exposure: "TakenPicture", time_s: float) -> tuple[NDArray[np.uint8], Sample]:
         """The picture, uint8 (480, 640, 3), and its recorded pose; a gimbal keeps the camera at nadir."""
         pose = exposure.pose
         true = Sample(
@@ -273,7 +273,7 @@ class RenderQueue:
     cameras: dict[int, TwinCamera]
     servers: dict[int, VideoServer]
     taken: int = 0
-    _waiting: "queue.SimpleQueue[tuple[int, Exposure, float] | None]" = None  # type: ignore[assignment]
+    _waiting: "queue.SimpleQueue[tuple[int, TakenPicture, float] | None]" = None  # type: ignore[assignment]
     _thread: threading.Thread = None  # type: ignore[assignment]
     problem: str = ""
 
@@ -288,7 +288,7 @@ class RenderQueue:
         """Number of pictures waiting to be rendered."""
         return self._waiting.qsize()
 
-    def expose(self, vehicle: Any, exposure: "Exposure") -> None:
+    def expose(self, vehicle: Any, exposure: "TakenPicture") -> None:
         """Queue a picture (SimVehicle.on_exposure)."""
         self._waiting.put((vehicle.system, exposure, vehicle.utc_s(exposure.time_s)))
 

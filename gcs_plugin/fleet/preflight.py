@@ -13,7 +13,7 @@ from gcs_plugin.config import LIMITS
 from gcs_plugin.fleet.autopilot_settings import Setting
 from gcs_plugin.fleet.fence_limits import fence_findings, fence_limits, in_all_zones
 from gcs_plugin.fleet.message_rates import GPS_RAW_INT
-from gcs_plugin.fleet.separation.separation_check import Separation, flights_of, separation_of
+from gcs_plugin.fleet.separation.separation_check import SeparationFindings, flights_of, separation_of
 from gcs_plugin.fleet.separation.separation_watch import number_name
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.comparison import difference
@@ -28,7 +28,7 @@ from orthoswarm.model.earth import distance_m
 if TYPE_CHECKING:
     from gcs_plugin.fleet.autopilot_settings import SetTo
     from gcs_plugin.fleet.vehicle_state import Vehicle
-    from gcs_plugin.mission.geofence import Zone
+    from gcs_plugin.mission.geofence import FenceZone
     from gcs_plugin.mission.items import Mission
 
 ITEMS: Final = (
@@ -122,7 +122,7 @@ class Wanted:
     near: str = ""
     _: KW_ONLY
     unexamined: str = ""
-    zones: "Sequence[Zone] | None" = None
+    zones: "Sequence[FenceZone] | None" = None
     reading: bool = False
 
 
@@ -153,8 +153,8 @@ def preflight_all(
     needs: PlanNeeds = NO_NEEDS,
     legal_height_m: float = LIMITS.legal_height_m,
     name: Callable[[int], str] = number_name,
-    separation: Separation | None = None,
-    zones: "Mapping[int, Sequence[Zone]] | None" = None,
+    separation: SeparationFindings | None = None,
+    zones: "Mapping[int, Sequence[FenceZone]] | None" = None,
     reading: Collection[int] = (),
 ) -> list[Check]:
     """Check vehicles that are to start together.
@@ -305,7 +305,7 @@ def _mission(vehicle: "Vehicle", wanted: Wanted) -> Item:
     return Item("mission", Level.OK, f"holds a mission of {len(held)} items")
 
 
-def _fence(vehicle: "Vehicle", mission: "Mission | None", zones: "Sequence[Zone] | None") -> Item:
+def _fence(vehicle: "Vehicle", mission: "Mission | None", zones: "Sequence[FenceZone] | None") -> Item:
     limits = fence_limits(vehicle)
     if mission is None:
         return Item("fence", Level.OK, "no mission to compare with its geofence")

@@ -26,7 +26,7 @@ _CIRCLES: Final[dict[int, Kind]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Zone:
+class FenceZone:
     """A zone that a vehicle must stay inside (inclusion) or outside of (exclusion).
 
     Attributes:
@@ -46,7 +46,7 @@ class Zone:
         return {"kind": self.kind, "center": list(self.points[0]), "radius_m": self.radius_m}
 
 
-def breach(mission: "Mission", zones: "Sequence[Zone]", *, in_all: bool = False) -> str:
+def breach(mission: "Mission", zones: "Sequence[FenceZone]", *, in_all: bool = False) -> str:
     """Where a mission leaves the zones it must stay inside of, or enters others, in words; empty if it keeps to them.
 
     Args:
@@ -78,24 +78,24 @@ def breach(mission: "Mission", zones: "Sequence[Zone]", *, in_all: bool = False)
     return ""
 
 
-def zones_of(items: Sequence[MissionItem]) -> list[Zone]:
+def zones_of(items: Sequence[MissionItem]) -> list[FenceZone]:
     """The zones of a fence list; return points and polygons that are not complete are left out.
 
     Args:
         items: as downloaded. A polygon is a row of vertices that each state how many it has (param1).
     """
-    zones: list[Zone] = []
+    zones: list[FenceZone] = []
     k = 0
     while k < len(items):
         item = items[k]
         place = (item.lon_deg, item.lat_deg)
         if item.command in _CIRCLES and math.isfinite(item.params[0]):
-            zones.append(Zone(_CIRCLES[item.command], (place,), item.params[0]))
+            zones.append(FenceZone(_CIRCLES[item.command], (place,), item.params[0]))
         elif item.command in _POLYGONS:
             count = int(item.params[0]) if math.isfinite(item.params[0]) else 0
             row = [i for i in items[k : k + count] if i.command == item.command and i.params[0] == item.params[0]]
             if count >= 3 and len(row) == count:
-                zones.append(Zone(_POLYGONS[item.command], tuple((i.lon_deg, i.lat_deg) for i in row)))
+                zones.append(FenceZone(_POLYGONS[item.command], tuple((i.lon_deg, i.lat_deg) for i in row)))
                 k += count
                 continue
         k += 1

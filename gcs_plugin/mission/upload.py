@@ -70,7 +70,7 @@ class Refusal:
     reason: str
 
 
-class Stage(enum.Enum):
+class UploadStage(enum.Enum):
     """The state of an upload."""
 
     LEAVE = "leaving the mission's mode"
@@ -99,7 +99,7 @@ class MissionUpload(Exchange):
     patience_s: float = field(default=30.0, kw_only=True)
     attempts: int = field(default=12, kw_only=True)
     leave: Exchange | None = field(default=None, kw_only=True)
-    stage: Stage = field(default=Stage.PAUSE, init=False)
+    stage: UploadStage = field(default=UploadStage.PAUSE, init=False)
     refusal: Refusal | None = field(default=None, init=False)
     _begun: int = field(default=0, init=False)
     _heard_at: float = field(default=0.0, init=False)
@@ -123,16 +123,16 @@ class MissionUpload(Exchange):
         self._heard_at = now
         self._trip.longest_s = 2.0 / max(1.0, self.pace)
         if self.leave is not None:
-            self.stage = Stage.LEAVE
+            self.stage = UploadStage.LEAVE
             return self._follow(self.leave, self.leave.start(now), now)
         return self._announce(now)
 
     def feed(self, message: Message, now: float) -> list[Message]:
         """Process requests, acknowledgements and, while reading back, items."""
-        if self.stage is Stage.LEAVE and self.leave is not None and self.outcome is None:
+        if self.stage is UploadStage.LEAVE and self.leave is not None and self.outcome is None:
             return self._follow(self.leave, self.leave.feed(message, now), now)
         kind = self._mission_kind(message)
-        if self.stage is Stage.CLEAR:
+        if self.stage is UploadStage.CLEAR:
             if kind == "MISSION_ACK" and message.type == ACCEPTED:
                 self._unknown("was cleared")
             return []
@@ -148,9 +148,9 @@ class MissionUpload(Exchange):
         """Repeat, start again, or give up."""
         if self.outcome is not None or now < self.deadline:
             return []
-        if self.stage is Stage.LEAVE and self.leave is not None:
+        if self.stage is UploadStage.LEAVE and self.leave is not None:
             return self._follow(self.leave, self.leave.tick(now), now)
-        if self.stage is Stage.CLEAR:
+        if self.stage is UploadStage.CLEAR:
             return self._clear(now)
         if self._reading is not None:
             return self._read(self._reading.tick(now), now)
@@ -163,11 +163,11 @@ class MissionUpload(Exchange):
             return []
         if self._doubt is not None:
             return self._nack(self._doubt, now)
-        if self.stage is Stage.ITEMS and now < self._silence_ends:
+        if self.stage is UploadStage.ITEMS and now < self._silence_ends:
             return self._repeat(now)
-        if self.stage is Stage.ITEMS and self._all_sent:
+        if self.stage is UploadStage.ITEMS and self._all_sent:
             return self._verify(now)
-        if self.stage is Stage.COUNT:
+        if self.stage is UploadStage.COUNT:
             self.deadline = now + _COUNT_AGAIN_S
             return [self._count_message()]
         return self._announce(now)
@@ -179,7 +179,7 @@ class MissionUpload(Exchange):
     def took(self) -> None:
         """A link has accepted a message."""
         self.delivered += 1
-        if self.stage is Stage.LEAVE and self.leave is not None:
+        if self.stage is UploadStage.LEAVE and self.leave is not None:
             self.leave.took()
 
     @property
@@ -195,7 +195,7 @@ class MissionUpload(Exchange):
     @property
     def leaves_mode(self) -> bool:
         """See Exchange."""
-        return self.stage is Stage.LEAVE
+        return self.stage is UploadStage.LEAVE
 
     @property
     def progress(self) -> float:
@@ -215,7 +215,7 @@ class MissionUpload(Exchange):
             return messages
         if outcome.ok:
             return messages + self._announce(now)
-        self.stage = Stage.DONE
+        self.stage = UploadStage.DONE
         self._end(
             False, f"{outcome.text}; it was sent no mission, since it would fly items as they come", outcome.failure
         )
@@ -230,24 +230,24 @@ class MissionUpload(Exchange):
         if self._begun > self.attempts:
             self._fail(self._mixed or f"did not take the mission in {self.attempts} attempts; check the link")
             return []
-        self.stage, self._reading, self._doubt = Stage.COUNT, None, None
+        self.stage, self._reading, self._doubt = UploadStage.COUNT, None, None
         self._served, self._ahead, self._repeated = -1, -1, False
         self._answered.clear()
         self.deadline = now + _COUNT_AGAIN_S
         return [self._count_message()]
 
     def _pause(self, now: float, wait_s: float) -> list[Message]:
-        self.stage, self._reading, self._doubt, self.deadline = Stage.PAUSE, None, None, now + wait_s
+        self.stage, self._reading, self._doubt, self.deadline = UploadStage.PAUSE, None, None, now + wait_s
         return []
 
     def _requested(self, seq: int, now: float) -> list[Message]:
-        if seq >= len(self.mission) or self.stage is Stage.PAUSE or (self.stage is Stage.COUNT and seq > 0):
+        if seq >= len(self.mission) or self.stage is UploadStage.PAUSE or (self.stage is UploadStage.COUNT and seq > 0):
             return []  # for another upload, or late from one before
         self._heard_at, self._touched, self._denied, self._doubt = now, True, None, None
         if now - self._answered.get(seq, -1.0) < _SAME_REQUEST_S:
             return []
         if self._reading is None:
-            self.stage = Stage.ITEMS
+            self.stage = UploadStage.ITEMS
             if self._served < seq <= self._ahead + 1:  # a vehicle asks in order; further ahead is a late copy
                 if seq > 0:
                     self._trip.answered(now - self._answered.get(seq - 1, now), asked_again=self._repeated)
@@ -278,12 +278,12 @@ class MissionUpload(Exchange):
             if code == CANCELLED:  # it was still waiting for an item
                 return self._announce(now)
             return self._read(self._reading.feed(message, now), now)
-        if code == INVALID_SEQUENCE and self.stage is Stage.ITEMS and self._repeated and not self._all_sent:
+        if code == INVALID_SEQUENCE and self.stage is UploadStage.ITEMS and self._repeated and not self._all_sent:
             self._ahead = self._served + 1
             return [self._item(self._ahead)]  # it has that one, so it waits for the next
-        if self.stage is Stage.PAUSE or code == INVALID_SEQUENCE:
+        if self.stage is UploadStage.PAUSE or code == INVALID_SEQUENCE:
             return []
-        if self.stage is Stage.COUNT:
+        if self.stage is UploadStage.COUNT:
             return self._answered_count(code, now)
         if code == ACCEPTED:
             return self._verify(now) if self._all_sent else []
@@ -311,7 +311,7 @@ class MissionUpload(Exchange):
     def _nack(self, refusal: Refusal, now: float) -> list[Message]:
         if refusal.code == DENIED:
             self._denied = refusal
-            self._begun -= self.stage is Stage.COUNT  # waiting for another ground station is not an attempt
+            self._begun -= self.stage is UploadStage.COUNT  # waiting for another ground station is not an attempt
             return self._pause(now, _DENIED_AGAIN_S)
         if self._refused is not None and (self._refused.code, self._refused.item) == (refusal.code, refusal.item):
             self.refusal = refusal
@@ -324,7 +324,7 @@ class MissionUpload(Exchange):
     # --- reading back ---
 
     def _verify(self, now: float) -> list[Message]:
-        self.stage = Stage.VERIFY
+        self.stage = UploadStage.VERIFY
         self._reading = MissionDownload(self.vehicle, self.own, patience_s=self.patience_s)
         self._reading.pace = self.pace
         return self._read(self._reading.start(now), now)
@@ -337,11 +337,11 @@ class MissionUpload(Exchange):
             return messages
         self._heard_at = now
         if reading.items is None:
-            self._reading, self.stage, self._clears = None, Stage.CLEAR, 0
+            self._reading, self.stage, self._clears = None, UploadStage.CLEAR, 0
             return messages + self._clear(now)
         wrong = difference(self.mission, reading.items)
         if wrong is None:
-            self.stage = Stage.DONE
+            self.stage = UploadStage.DONE
             self._end(True, f"vehicle {self.vehicle.system} holds the mission: {len(self.mission)} items, read back")
             return messages
         if self._doubt is not None:
@@ -365,13 +365,13 @@ class MissionUpload(Exchange):
         return [dialect.MAVLink_mission_clear_all_message(to.system, to.component, MISSION)]
 
     def _unknown(self, what: str) -> None:
-        self.stage = Stage.DONE
+        self.stage = UploadStage.DONE
         name = f"vehicle {self.vehicle.system}"
         text = f"{name}: its mission could not be read back and {what}; what it holds is not known: upload again"
         self._end(False, text, Verdict.UNKNOWN)
 
     def _fail(self, text: str, failure: Verdict = Verdict.REFUSED) -> None:
-        self.stage = Stage.DONE
+        self.stage = UploadStage.DONE
         # ArduPilot writes items as they come; `_mixed` says by itself what it then holds.
         mixture = self._touched and self.mission.autopilot is Autopilot.ARDUPILOT and text != self._mixed
         warning = "; it may now hold a mixture of two missions, so upload again before flying" if mixture else ""

@@ -3,7 +3,7 @@
 import enum
 from dataclasses import dataclass
 
-from gcs_plugin.sim.multirotor import Pose
+from gcs_plugin.sim.multirotor import VehiclePose
 
 
 class Landed(enum.IntEnum):
@@ -15,7 +15,7 @@ class Landed(enum.IntEnum):
     LANDING = 4
 
 
-class State(enum.IntEnum):
+class MissionState(enum.IntEnum):
     """MISSION_STATE."""
 
     NONE = 1
@@ -38,7 +38,7 @@ class Task(enum.Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Exposure:
+class TakenPicture:
     """A picture that the vehicle has taken.
 
     Attributes:
@@ -50,6 +50,6 @@ class Exposure:
 
     index: int
     time_s: float
-    pose: Pose
+    pose: VehiclePose
     lat_deg: float
     lon_deg: float

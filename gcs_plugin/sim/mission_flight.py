@@ -20,10 +20,10 @@ from gcs_plugin.mission.items import (
     VTOL_LAND,
     MissionItem,
 )
-from gcs_plugin.sim.flight_values import Exposure as Exposure
-from gcs_plugin.sim.flight_values import Landed, State, Task
+from gcs_plugin.sim.flight_values import Landed, MissionState, Task
+from gcs_plugin.sim.flight_values import TakenPicture as TakenPicture
 from gcs_plugin.sim.mission_store import MissionStore
-from gcs_plugin.sim.multirotor import STEP_S, Airframe, Chart, Motion
+from gcs_plugin.sim.multirotor import STEP_S, Airframe, Chart, VehicleMotion
 from orthoswarm.model.angles import wrap_rad
 
 _LOITER_TIME: Final = int(dialect.MAV_CMD_NAV_LOITER_TIME)
@@ -39,7 +39,7 @@ _IDLE_S: Final = {Autopilot.ARDUPILOT: 10.0, Autopilot.PX4: 2.0}
 
 
 @dataclass(slots=True, kw_only=True)
-class Flight:
+class MissionFlight:
     """The flight of one vehicle.
 
     Attributes:
@@ -57,16 +57,16 @@ class Flight:
     autopilot: Autopilot
     modes: Modes
     store: MissionStore
-    motion: Motion
+    motion: VehicleMotion
     mode: int = 0
     armed: bool = False
     failsafe: bool = False
     seq: int = 0
-    state: State = State.NONE
+    state: MissionState = MissionState.NONE
     landed: Landed = Landed.ON_GROUND
     reached: list[int] = field(default_factory=list)
     texts: list[str] = field(default_factory=list)
-    exposures: list[Exposure] = field(default_factory=list)
+    exposures: list[TakenPicture] = field(default_factory=list)
     triggers: int = 0
     misfires: Collection[int] = ()
     time_s: float = 0.0
@@ -85,14 +85,14 @@ class Flight:
     @classmethod
     def make(
         cls, autopilot: Autopilot, modes: Modes, *, store: MissionStore, chart: Chart, frame: Airframe, seed: int
-    ) -> "Flight":
+    ) -> "MissionFlight":
         """A vehicle standing at home."""
         mode = modes.hold if autopilot is Autopilot.PX4 else 0
         return cls(
             autopilot=autopilot,
             modes=modes,
             store=store,
-            motion=Motion(chart=chart, airframe=frame, random=Random(seed), speed=frame.speed_m_s),
+            motion=VehicleMotion(chart=chart, airframe=frame, random=Random(seed), speed=frame.speed_m_s),
             mode=mode,
         )
 
@@ -115,7 +115,7 @@ class Flight:
         self.armed = self.failsafe = False
         self._stand()
         self._trigger_m = 0.0
-        if self.state is State.COMPLETE or self.autopilot is Autopilot.ARDUPILOT:
+        if self.state is MissionState.COMPLETE or self.autopilot is Autopilot.ARDUPILOT:
             self.seq = 0
 
     def set_mode(self, mode: int, *, anew: bool = False) -> None:
@@ -126,11 +126,11 @@ class Flight:
         modes = self.modes
         self._let_go()
         if mode == modes.mission:
-            if self.armed and self.state is not State.COMPLETE:
+            if self.armed and self.state is not MissionState.COMPLETE:
                 self._enter_mission()
             return
-        if was == modes.mission and self.state is State.ACTIVE:
-            self.state = State.NOT_STARTED if self.autopilot is Autopilot.ARDUPILOT else State.PAUSED
+        if was == modes.mission and self.state is MissionState.ACTIVE:
+            self.state = MissionState.NOT_STARTED if self.autopilot is Autopilot.ARDUPILOT else MissionState.PAUSED
         self.paused = False
         if not self.armed or self.landed is Landed.ON_GROUND:
             return
@@ -157,18 +157,18 @@ class Flight:
             return "Mission start: not armed"
         self.armed, self.mode = True, self.modes.mission
         self._let_go()
-        if self.state is not State.ACTIVE or self._task is Task.STAND:
+        if self.state is not MissionState.ACTIVE or self._task is Task.STAND:
             # ArduCopter goes on where it left a mission, though another one has been stored since (MIS_RESTART 0).
-            goes_on = self.autopilot is Autopilot.ARDUPILOT and self.state is not State.COMPLETE
+            goes_on = self.autopilot is Autopilot.ARDUPILOT and self.state is not MissionState.COMPLETE
             if not (goes_on and first <= self.seq < len(self.store.items)):
                 self.seq, self._jumps = first, {}
-            self.state = State.NOT_STARTED
+            self.state = MissionState.NOT_STARTED
             self._enter_mission()
         return ""
 
     def pause(self, go_on: bool) -> bool:
         """DO_PAUSE_CONTINUE: between waypoints only."""
-        if self.state is not State.ACTIVE or self._task is not Task.ITEM or self.mode != self.modes.mission:
+        if self.state is not MissionState.ACTIVE or self._task is not Task.ITEM or self.mode != self.modes.mission:
             return False
         item = self.store.items[self.seq]
         if item.command in (TAKEOFF, LAND, RTL):
@@ -184,10 +184,10 @@ class Flight:
             return False
         if seq < self._first:
             seq, self._jumps = self._first, {}
-        if self.state is State.COMPLETE:
-            self.state = State.NOT_STARTED
+        if self.state is MissionState.COMPLETE:
+            self.state = MissionState.NOT_STARTED
         self.seq, self.paused = seq, False
-        if self.state is State.ACTIVE:
+        if self.state is MissionState.ACTIVE:
             self._run_from(seq)
         return True
 
@@ -264,13 +264,13 @@ class Flight:
                 self._finish()
                 self._hold()
             return
-        if self.state is not State.COMPLETE:
-            self.state = State.NOT_STARTED if len(self.store.items) > self._first else State.NONE
+        if self.state is not MissionState.COMPLETE:
+            self.state = MissionState.NOT_STARTED if len(self.store.items) > self._first else MissionState.NONE
         if not self.armed:
             self.seq = 0
 
     def _enter_mission(self) -> None:
-        self.state, self.paused, self._reached_any = State.ACTIVE, False, False
+        self.state, self.paused, self._reached_any = MissionState.ACTIVE, False, False
         self._run_from(max(self.seq, self._first))
 
     def _run_from(self, seq: int) -> None:
@@ -403,7 +403,7 @@ class Flight:
         self.texts.append(f"Reached command #{seq}")
 
     def _finish(self) -> None:
-        self.state = State.COMPLETE
+        self.state = MissionState.COMPLETE
         self._trigger_m = 0.0
 
     # --- going home and landing ---
@@ -442,9 +442,9 @@ class Flight:
         state = self.state
         self.disarm()
         if landing and self.autopilot is Autopilot.ARDUPILOT:
-            self.seq, self.state = 1, State.ACTIVE  # measured: back at the first item, still "active"
-        elif state is not State.COMPLETE:
-            self.state = State.NOT_STARTED
+            self.seq, self.state = 1, MissionState.ACTIVE  # measured: back at the first item, still "active"
+        elif state is not MissionState.COMPLETE:
+            self.state = MissionState.NOT_STARTED
 
     # --- by hand ---
 
@@ -490,7 +490,7 @@ class Flight:
         if self.triggers in self.misfires:
             return
         lat, lon = self.motion.chart.to_degrees(north, east)
-        self.exposures.append(Exposure(len(self.exposures), self.time_s, self.motion.pose(self.time_s), lat, lon))
+        self.exposures.append(TakenPicture(len(self.exposures), self.time_s, self.motion.pose(self.time_s), lat, lon))
 
 
 def _step(before: tuple[float, ...], place: tuple[float, ...]) -> tuple[float, float] | None:

@@ -62,7 +62,7 @@ class Chart:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Pose:
+class VehiclePose:
     """The true pose of a vehicle.
 
     Attributes:
@@ -139,7 +139,7 @@ class Airframe:
 
 
 @dataclass(slots=True, kw_only=True)
-class Motion:
+class VehicleMotion:
     """The state of motion of one vehicle, advanced in steps of STEP_S.
 
     Attributes:
@@ -220,11 +220,11 @@ class Motion:
         north, east = self.seen
         return math.hypot(self.target[0] - north, self.target[1] - east), abs(self.target[2] - self.up)
 
-    def pose(self, time_s: float) -> Pose:
+    def pose(self, time_s: float) -> VehiclePose:
         """The true pose now."""
         return self._pose(time_s, (self.north, self.east, self.up, self.yaw, self.pitch, self.roll))
 
-    def pose_at(self, time_s: float) -> Pose:
+    def pose_at(self, time_s: float) -> VehiclePose:
         """The true pose at a time since boot, in the last ten minutes of flight; beyond its ends, the nearest."""
         track = self._track
         if not track:
@@ -240,10 +240,10 @@ class Motion:
         values[3] = before[4] + share * wrap_rad(after[4] - before[4])
         return self._pose(time_s, tuple(values))
 
-    def _pose(self, time_s: float, values: tuple[float, ...]) -> Pose:
+    def _pose(self, time_s: float, values: tuple[float, ...]) -> VehiclePose:
         north, east, up, yaw, pitch, roll = values
         lat, lon = self.chart.to_degrees(north, east)
-        return Pose(
+        return VehiclePose(
             time_s=time_s,
             lat_deg=lat,
             lon_deg=lon,

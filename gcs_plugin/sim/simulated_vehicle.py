@@ -18,10 +18,10 @@ from gcs_plugin.mission.flight_modes import modes_of
 from gcs_plugin.mission.items import FRAME_GLOBAL, WAYPOINT, MissionItem
 from gcs_plugin.sim.factory_parameters import factory_parameters, parameter_answer
 from gcs_plugin.sim.file_server import FileServer
-from gcs_plugin.sim.flight_values import Exposure, Landed, State
-from gcs_plugin.sim.mission_flight import Flight
+from gcs_plugin.sim.flight_values import Landed, MissionState, TakenPicture
+from gcs_plugin.sim.mission_flight import MissionFlight
 from gcs_plugin.sim.mission_store import MissionStore
-from gcs_plugin.sim.multirotor import STEP_S, Airframe, Chart, Pose
+from gcs_plugin.sim.multirotor import STEP_S, Airframe, Chart, VehiclePose
 from gcs_plugin.sim.sent_messages import MissionCurrent, bytes_of, severity_of
 
 _OK, _REJECTED, _DENIED, _UNSUPPORTED, _FAILED = (
@@ -82,8 +82,8 @@ class SimVehicle:
     wipes: bool = False
     tx_bytes_s: float = math.inf
     files: FileServer | None = None
-    on_exposure: "Callable[[SimVehicle, Exposure], None] | None" = None
-    flight: Flight = field(init=False)
+    on_exposure: "Callable[[SimVehicle, TakenPicture], None] | None" = None
+    flight: MissionFlight = field(init=False)
     store: MissionStore = field(init=False)
     second_battery: float | None = field(default=None, init=False)
     withheld: set[int] = field(default_factory=set, init=False)
@@ -115,7 +115,7 @@ class SimVehicle:
         self.store = MissionStore(autopilot=self.autopilot, home=home, items=items)
         chart = Chart(*self.home)
         modes = modes_of(self.autopilot, self.kind)
-        self.flight = Flight.make(
+        self.flight = MissionFlight.make(
             self.autopilot, modes, store=self.store, chart=chart, frame=self.airframe, seed=self.seed + self.system
         )
         self._boot(0.0)
@@ -123,7 +123,7 @@ class SimVehicle:
     # --- for tests and cameras ---
 
     @property
-    def exposures(self) -> list[Exposure]:
+    def exposures(self) -> list[TakenPicture]:
         """All pictures so far."""
         return self.flight.exposures
 
@@ -132,7 +132,7 @@ class SimVehicle:
         """True while it restarts."""
         return self._now < self._off_until
 
-    def pose_at(self, time_s: float) -> Pose:
+    def pose_at(self, time_s: float) -> VehiclePose:
         """Its true pose at a time since boot, in the last ten minutes of flight."""
         return self.flight.motion.pose_at(time_s)
 
@@ -153,7 +153,7 @@ class SimVehicle:
         flight.disarm()
         flight.mode = flight.modes.hold if self.autopilot is Autopilot.PX4 else 0
         flight.seq, flight.paused = 0, False
-        flight.state = State.NOT_STARTED if len(self.store.items) > 1 else State.NONE
+        flight.state = MissionState.NOT_STARTED if len(self.store.items) > 1 else MissionState.NONE
         self._boot(now + silence_s)
 
     def _boot(self, at: float) -> None:
@@ -353,7 +353,7 @@ class SimVehicle:
         changed, self._reported_state = self._reported_state != state, state
         return [self._heartbeat()] if changed and self.autopilot is Autopilot.ARDUPILOT else []
 
-    def _photo(self, exposure: Exposure) -> list[Message]:
+    def _photo(self, exposure: TakenPicture) -> list[Message]:
         pose, utc_us = exposure.pose, int(self.utc_s(self._booted + exposure.time_s) * 1e6)
         lat, lon = round(exposure.lat_deg * 1e7), round(exposure.lon_deg * 1e7)
         if self.autopilot is Autopilot.ARDUPILOT:

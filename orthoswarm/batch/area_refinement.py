@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from orthoswarm.batch.merged_ground import merged_ground
 from orthoswarm.batch.run_state import RunContext
-from orthoswarm.batch.swarm_areas import Area
+from orthoswarm.batch.swarm_areas import SolvedArea
 from orthoswarm.compute.workers import trim_memory
 from orthoswarm.control.area_adjustment import AreaMove, AreaTie, adjust_areas
 from orthoswarm.control.moved_block import moved_camera, moved_terrain
@@ -28,7 +28,7 @@ _TIE_PLACES = 8
 
 
 @dataclass(frozen=True, slots=True)
-class _Solved:
+class _KeptArea:
     """What is kept of an area.
 
     Attributes:
@@ -57,7 +57,7 @@ def refine_by_area(
     vehicles: Mapping[str, Sequence[Frame]],
     basemap: MapWindow | None,
     *,
-    areas: Sequence[Area],
+    areas: Sequence[SolvedArea],
     grid: LocalGrid,
     label: str,
 ) -> Refinement:
@@ -73,10 +73,10 @@ def refine_by_area(
     Raises:
         AdjustmentError: if no vehicle of any area could be refined.
     """
-    solved: list[_Solved] = []
+    solved: list[_KeptArea] = []
     for k, area in enumerate(areas):
         name = f"{label} area-{k}"
-        one: _Solved | None = run.space.recall(name)
+        one: _KeptArea | None = run.space.recall(name)
         if one is None:
             one = _solve(run, refiner, vehicles, basemap, area=area, grid=grid, of=(k, len(areas), label))
             run.space.remember(name, one)
@@ -110,10 +110,10 @@ def _solve(
     vehicles: Mapping[str, Sequence[Frame]],
     basemap: MapWindow | None,
     *,
-    area: Area,
+    area: SolvedArea,
     grid: LocalGrid,
     of: tuple[int, int, str],
-) -> _Solved:
+) -> _KeptArea:
     """Refine one area; `of`: its number, how many there are, name of stored results."""
     k, count, label = of
     names = {*area.own, *area.halo}
@@ -127,13 +127,13 @@ def _solve(
         refined = refiner.refine_batch(frames, basemap, tasks, progress, halo=frozenset(area.halo))
     except AdjustmentError as error:  # of all its vehicles; those of other areas are mapped
         as_recorded = [unrefined(frames[vehicle], str(error), grid) for vehicle in area.own]
-        return _Solved(Refinement(as_recorded, as_recorded, None), {}, failure=str(error))
+        return _KeptArea(Refinement(as_recorded, as_recorded, None), {}, failure=str(error))
     places = {s.vehicle: _some_places(s.placed) for s in refined.fine if s.placed}
     coarse, fine = (
         [replace(s, state=None) for s in solutions if s.vehicle in area.own]
         for solutions in (refined.coarse, refined.fine)
     )
-    return _Solved(replace(refined, coarse=coarse, fine=fine), places)
+    return _KeptArea(replace(refined, coarse=coarse, fine=fine), places)
 
 
 def _single_vehicle(function: Callable[..., Any], item: Any, *, label: str) -> str | None:
@@ -151,7 +151,7 @@ def _some_places(placed: Sequence[PlacedFrame]) -> Array:
     return np.array([placed[i].camera.position for i in index])
 
 
-def _joined(every: Sequence[_Solved]) -> Refinement:
+def _joined(every: Sequence[_KeptArea]) -> Refinement:
     """Move areas onto each other, and join them."""
     solved = [area for area in every if len(area.nadirs)]  # all pictures of an area may be damaged
     ties = []

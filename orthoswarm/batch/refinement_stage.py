@@ -10,7 +10,7 @@ import numpy as np
 from orthoswarm.batch.area_refinement import refine_by_area, with_frames
 from orthoswarm.batch.refiners import make_refiner
 from orthoswarm.batch.run_state import RunContext, RunState
-from orthoswarm.batch.swarm_areas import Area, divide
+from orthoswarm.batch.swarm_areas import SolvedArea, divide
 from orthoswarm.compute.stage_times import Clock, Stage
 from orthoswarm.compute.workers import trim_memory
 from orthoswarm.config import active
@@ -136,7 +136,7 @@ def _call_refiner(run: RunContext, frames: Sequence[Frame], state: RunState) -> 
     return refinement
 
 
-def _areas(vehicles: Mapping[str, Sequence[Frame]], state: RunState) -> list[Area]:
+def _areas(vehicles: Mapping[str, Sequence[Frame]], state: RunState) -> list[SolvedArea]:
     """The areas that the vehicles are solved in."""
     at = {p.frame.image: p.camera.position for p in state.recorded.placed}
     paths = {vehicle: np.array([at[frame.image] for frame in frames]) for vehicle, frames in vehicles.items()}

@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class Area:
+class SolvedArea:
     """Vehicles that are solved together.
 
     Attributes:
@@ -26,7 +26,7 @@ class Area:
     halo: tuple[str, ...]
 
 
-def divide(paths: Mapping[str, Array], most: int) -> list[Area]:
+def divide(paths: Mapping[str, Array], most: int) -> list[SolvedArea]:
     """Divide vehicles into areas of about the same number of pictures.
 
     Args:
@@ -41,13 +41,13 @@ def divide(paths: Mapping[str, Array], most: int) -> list[Area]:
     count = np.array([len(path) for path in paths.values()])
     parts = _halves(np.arange(len(names)), middle, count, most)
     if len(parts) == 1:
-        return [Area(tuple(names), ())]
+        return [SolvedArea(tuple(names), ())]
     neighbours = NearPaths(list(paths.values()))
     areas = []
     for part in parts:
         own = set(part.tolist())
         near = {other for k in part.tolist() for other in neighbours.of(k)}
-        areas.append(Area(tuple(names[k] for k in sorted(own)), tuple(names[k] for k in sorted(near - own))))
+        areas.append(SolvedArea(tuple(names[k] for k in sorted(own)), tuple(names[k] for k in sorted(near - own))))
     return areas
 
 

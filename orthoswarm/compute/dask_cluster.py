@@ -39,7 +39,7 @@ class ClusterLostError(RunInterruptedError):
 
 
 @dataclass(slots=True)
-class _Task:
+class _SentTask:
     """What was sent, to be sent again if the scheduler dies, its future, and the client that it belongs to."""
 
     payload: bytes
@@ -48,7 +48,7 @@ class _Task:
 
 
 @dataclass(frozen=True, slots=True)
-class _Outcome:
+class _PickledOutcome:
     """A pickled result, or the pickled exception, with what its process has used since it started."""
 
     value: bytes
@@ -123,7 +123,7 @@ class Cluster:
     def map(self, function: Callable[[Item], Result | Continued[Result]], items: Iterable[Item]) -> Iterator[Result]:
         """See Workers; a task is continued where it began, since there are mostly more flights than workers."""
         source = iter(items)
-        queue: deque[_Task] = deque()
+        queue: deque[_SentTask] = deque()
         try:
             while True:
                 wanted = _CLUSTER_QUEUE_PER_WORKER * self.count
@@ -164,9 +164,9 @@ class Cluster:
             return {}
         return known
 
-    def _submit(self, function: Callable[[Any], Any], item: Any) -> _Task:
+    def _submit(self, function: Callable[[Any], Any], item: Any) -> _SentTask:
         payload = pickle.dumps((function, item, overridden(), self._begin), pickle.HIGHEST_PROTOCOL)
-        return _Task(payload, self._sent(payload), self._client)
+        return _SentTask(payload, self._sent(payload), self._client)
 
     def _sent(self, payload: bytes) -> Any:
         """The future of a payload; None if the scheduler is gone, which is found out when its result is due."""
@@ -176,14 +176,14 @@ class Cluster:
         except (OSError, RuntimeError, TimeoutError):
             return None
 
-    def _cancel(self, queue: Iterable[_Task]) -> None:
+    def _cancel(self, queue: Iterable[_SentTask]) -> None:
         """Have unfinished tasks forgotten."""
         for task in queue:
             with contextlib.suppress(OSError, RuntimeError, TimeoutError):
                 if task.future is not None:
                     task.future.cancel()
 
-    def _outcome(self, queue: deque[_Task]) -> _Outcome:
+    def _outcome(self, queue: deque[_SentTask]) -> _PickledOutcome:
         """The result of the first task; all are sent again when the scheduler was lost."""
         from distributed import KilledWorker
         from distributed import TimeoutError as Late
@@ -193,7 +193,7 @@ class Cluster:
             try:
                 if queue[0].future is None:
                     raise CancelledError
-                outcome: _Outcome = queue[0].future.result(timeout=active().compute.cluster_poll_s)
+                outcome: _PickledOutcome = queue[0].future.result(timeout=active().compute.cluster_poll_s)
                 return outcome
             except Late:
                 if self._workers():
@@ -239,7 +239,7 @@ class Cluster:
                     ) from None
                 time.sleep(active().compute.cluster_poll_s)
 
-    def _account(self, outcome: _Outcome) -> Any:
+    def _account(self, outcome: _PickledOutcome) -> Any:
         """A task's value or error, after adding up what its process has used."""
         self._cpu_s[outcome.process] = max(outcome.cpu_s, self._cpu_s.get(outcome.process, 0.0))
         self._rss_mb[outcome.process] = max(outcome.rss_mb, self._rss_mb.get(outcome.process, 0.0))
@@ -294,7 +294,7 @@ def _short(error: BaseException) -> str:
     return (str(error).splitlines() or [type(error).__name__])[0][:120]
 
 
-def _work(payload: bytes) -> _Outcome:
+def _work(payload: bytes) -> _PickledOutcome:
     """Runs on a worker."""
     prepare_process()
     function, item, config, beginning = pickle.loads(payload)
@@ -306,7 +306,7 @@ def _work(payload: bytes) -> _Outcome:
         value = pickle.dumps(whole(function, item), pickle.HIGHEST_PROTOCOL)
     except Exception as error:  # raised again at its item's turn, as by Processes; Dask would retry some
         value, raised = pickle.dumps(error, pickle.HIGHEST_PROTOCOL), True
-    return _Outcome(value, raised, _process(), time.process_time(), peak_rss_mb())
+    return _PickledOutcome(value, raised, _process(), time.process_time(), peak_rss_mb())
 
 
 def _samples(path: Path) -> list[Path]:

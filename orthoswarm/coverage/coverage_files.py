@@ -8,19 +8,19 @@ from xml.sax.saxutils import escape
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.coverage.coverage_grid import CoverageGrid, State
+from orthoswarm.coverage.coverage_grid import CellState, CoverageGrid
 from orthoswarm.coverage.gaps import CoverageGap, Gaps
 from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.export.product_files import write_json, write_text
 from orthoswarm.model.geo import GroundGrid, LocalGrid
 
 COLOURS = {
-    State.OUTSIDE: (0, 0, 0, 0),
-    State.PLANNED: (120, 150, 190, 90),
-    State.SEEN: (0, 158, 115, 110),
-    State.POOR: (240, 228, 66, 170),
-    State.MISSED: (213, 94, 0, 190),
-    State.EXCLUDED: (90, 90, 90, 150),
+    CellState.OUTSIDE: (0, 0, 0, 0),
+    CellState.PLANNED: (120, 150, 190, 90),
+    CellState.SEEN: (0, 158, 115, 110),
+    CellState.POOR: (240, 228, 66, 170),
+    CellState.MISSED: (213, 94, 0, 190),
+    CellState.EXCLUDED: (90, 90, 90, 150),
 }
 """Red, green, blue, alpha of each state; those of ground that was flown over are Okabe and Ito's."""
 
@@ -47,7 +47,7 @@ def write_cells(path: Path, cover: CoverageGrid) -> None:
         file.write(np.minimum(cover.good, 255).astype(np.uint8), 3)
         for band, name in enumerate(("state", "flaws of the best view", "views without a flaw"), start=1):
             file.set_band_description(band, name)
-        file.update_tags(1, **{f"value_{s.value}": s.name.lower() for s in State})
+        file.update_tags(1, **{f"value_{s.value}": s.name.lower() for s in CellState})
 
 
 def gap_row(gap: CoverageGap, grid: LocalGrid) -> dict[str, Any]:
@@ -148,7 +148,7 @@ def draw_cells(path: Path, cover: CoverageGrid, gaps: Gaps, ortho: Path | None =
     if ortho is not None:
         axes.imshow(_background(ortho, grid), extent=extent)
     states = cover.states()
-    table = np.array([COLOURS[s] for s in State], np.uint8)
+    table = np.array([COLOURS[s] for s in CellState], np.uint8)
     axes.imshow(table[states], extent=extent, interpolation="nearest")
     for number, gap in enumerate(gaps.gaps):
         x, y = np.array(gap.polygon.exterior.xy)
@@ -159,7 +159,7 @@ def draw_cells(path: Path, cover: CoverageGrid, gaps: Gaps, ortho: Path | None =
             box = {"boxstyle": "round,pad=0.15", "facecolor": "white", "alpha": 0.75, "linewidth": 0.4}
             axes.annotate(text, (point.x - west, point.y - south), fontsize=6, ha="center", va="center", bbox=box)
     shares = cover.shares()
-    parts = {State.SEEN: shares.seen, State.POOR: shares.poor, State.MISSED: shares.missed}
+    parts = {CellState.SEEN: shares.seen, CellState.POOR: shares.poor, CellState.MISSED: shares.missed}
     marks = [
         Patch(color=np.array(COLOURS[s]) / 255.0, label=f"{s.name.lower()} {100 * share:.2f} %")
         for s, share in parts.items()

@@ -38,7 +38,7 @@ _ROWS_AT_ONCE = 64
 _MOST_CELLS: Final = 60_000_000  # areas with more cells are refused, or need larger ones (memory)
 
 
-class State(IntEnum):
+class CellState(IntEnum):
     """State of a cell; OUTSIDE is not part of the area and nodata in files."""
 
     OUTSIDE = 0
@@ -180,21 +180,21 @@ class CoverageGrid:
             due: cells whose flight is over, bool (rows, columns) or one value for all: of these, cells in no picture
                 are MISSED, else PLANNED.
         """
-        state = np.full(self.best.shape, State.OUTSIDE, np.uint8)
+        state = np.full(self.best.shape, CellState.OUTSIDE, np.uint8)
         wanted = self.cells.wanted
-        state[wanted] = State.PLANNED
-        state[wanted & due] = State.MISSED
-        state[wanted & (self.best != UNSEEN)] = State.POOR
-        state[wanted & (self.best == 0)] = State.SEEN
-        state[self.cells.excluded] = State.EXCLUDED
+        state[wanted] = CellState.PLANNED
+        state[wanted & due] = CellState.MISSED
+        state[wanted & (self.best != UNSEEN)] = CellState.POOR
+        state[wanted & (self.best == 0)] = CellState.SEEN
+        state[self.cells.excluded] = CellState.EXCLUDED
         return state
 
     def shares(self, due: Due = True) -> Shares:
         """Parts of the area by state; `due` as for `states`."""
-        counts = np.bincount(self.states(due)[self.cells.wanted], minlength=len(State)) / self.cells.wanted.sum()
+        counts = np.bincount(self.states(due)[self.cells.wanted], minlength=len(CellState)) / self.cells.wanted.sum()
         return Shares(
-            float(counts[State.SEEN]), float(counts[State.POOR]), float(counts[State.MISSED]),
-            float(counts[State.PLANNED]),
+            float(counts[CellState.SEEN]), float(counts[CellState.POOR]), float(counts[CellState.MISSED]),
+            float(counts[CellState.PLANNED]),
         )  # fmt: skip
 
     def _paint(self, view: View, box: Box) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.config import active
-from orthoswarm.coverage.coverage_grid import Cells, CoverageGrid, Due, State
+from orthoswarm.coverage.coverage_grid import Cells, CellState, CoverageGrid, Due
 from orthoswarm.coverage.missing_pictures import Cause, MissingPicture
 from orthoswarm.coverage.painting import UNSEEN
 from orthoswarm.coverage.view import FLAW_NAMES, Flaw
@@ -102,8 +102,8 @@ def find_gaps(
     vehicles = sorted({v.vehicle for v in cover.views})
     size = state.shape
     explained = _Explained(np.full(size, _NONE, np.uint8), np.zeros(size, np.float32), np.full(size, -1, np.int16))
-    explained.enter((state == State.POOR) & due, Cause.POOR, 1.0)
-    missed = state == State.MISSED
+    explained.enter((state == CellState.POOR) & due, Cause.POOR, 1.0)
+    missed = state == CellState.MISSED
     for vehicle in vehicles:
         for cause in (Cause.REJECTED, Cause.NOT_ARRIVED, Cause.NOT_TRIGGERED):
             lacking = [m for m in missing if m.view.vehicle == vehicle and m.cause == cause]

@@ -39,7 +39,7 @@ THUMBNAIL = (12, 16)
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class TilePlace:
     """Where tiles are: their folder, their side, and the grid under them."""
 
     folder: Path
@@ -107,7 +107,7 @@ class LabelTask:
         seams: what seam lines are chosen by; None takes the nearest nadir point alone.
     """
 
-    place: Place
+    place: TilePlace
     key: Key
     ids: Ints
     shots: Shots
@@ -161,7 +161,7 @@ class FeatherTask:
         place: where. key: the tile. width_px: how far from a seam pictures are mixed.
     """
 
-    place: Place
+    place: TilePlace
     key: Key
     width_px: int
 
@@ -189,7 +189,7 @@ def feather_pass(task: FeatherTask) -> list[tuple[int, Window]]:
 class ColorTask:
     """Sum the colours of a tile. place: where. key: the tile. cell_px: side of the cells."""
 
-    place: Place
+    place: TilePlace
     key: Key
     cell_px: int
 
@@ -210,7 +210,7 @@ class FinishTask:
         width_px: how far from a seam pictures are mixed, 0 not to.
     """
 
-    place: Place
+    place: TilePlace
     key: Key
     factors: TileFactors | None
     width_px: int
@@ -276,7 +276,7 @@ class TaskLayer:
         place: where. shots: the cameras of the task's pictures. terrain: the ground by tile.
     """
 
-    place: Place
+    place: TilePlace
     shots: Shots
     terrain: dict[Key, Terrain]
 

@@ -36,13 +36,13 @@ from orthoswarm.mosaic.render_passes import (
     FeatherTask,
     FinishTask,
     LabelTask,
-    Place,
     PreviewTask,
     Read,
     Sampled,
     SampleTask,
     Shot,
     TaskLayer,
+    TilePlace,
     color_pass,
     feather_pass,
     finish_pass,
@@ -268,7 +268,7 @@ class _Job:
     def __init__(self, layer: Layer, staging: Path, run: Run) -> None:
         self.frames, self.terrain, self.canvas, self.run = layer.frames, layer.terrain, layer.canvas, run
         self.gains = dict(layer.gains)
-        self.place = Place(staging, self.canvas.tile_px, self.canvas.grid)
+        self.place = TilePlace(staging, self.canvas.tile_px, self.canvas.grid)
         self.keys = None if layer.bounds is None else _tiles_within(self.canvas, layer.bounds)
         self.shots = Shots.of([f.camera for f in self.frames], [f.weak or f.frame.damaged for f in self.frames])
         position = np.nan_to_num(self.shots.position)

@@ -18,14 +18,14 @@ _POSE_ROUNDS: Final = 6  # most Gauss-Newton steps of the pose that reproduces a
 
 
 @dataclass(frozen=True, slots=True)
-class Pose:
+class CorrectedCamera:
     """A corrected camera and the rms of the residuals of its ground points, metres."""
 
     camera: Camera
     rms_m: float
 
 
-def fit_camera(camera: Camera, corrected: Array, pixels: Array) -> Pose:
+def fit_camera(camera: Camera, corrected: Array, pixels: Array) -> CorrectedCamera:
     """Space resection by Gauss-Newton: the pose that images ground points (N, 2) at height 0 at pixels (N, 2)."""
     points = np.c_[corrected, np.zeros(len(corrected))]
     position = camera.position + np.array([*(corrected - camera.to_ground(pixels)).mean(axis=0), 0.0])
@@ -42,7 +42,7 @@ def fit_camera(camera: Camera, corrected: Array, pixels: Array) -> Pose:
         if np.abs(step).max() < 1e-7:
             break
     error = current.to_ground(pixels) - corrected
-    return Pose(current, float(np.sqrt((error**2).sum(1).mean())))
+    return CorrectedCamera(current, float(np.sqrt((error**2).sum(1).mean())))
 
 
 def pixel_grid(camera: Camera, columns: int = 6, rows: int = 5) -> Array:

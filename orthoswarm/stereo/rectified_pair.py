@@ -33,7 +33,7 @@ _WIDE_MARGIN: Final = 0.15  # ... with this share of their range to either side,
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class PairView:
     """A picture with its camera.
 
     Attributes:
@@ -76,7 +76,7 @@ class PairPoints:
     sigma_m: Array
 
 
-def match_pair(first: View, second: View, terrain: Terrain) -> PairPoints:
+def match_pair(first: PairView, second: PairView, terrain: Terrain) -> PairPoints:
     """Ground points of two overlapping pictures, with the sigmas of their heights.
 
     Args:
@@ -106,7 +106,7 @@ def match_pair(first: View, second: View, terrain: Terrain) -> PairPoints:
     return PairPoints(points, along * depth / total)
 
 
-def _common_frame(left: View, right: View, terrain: Terrain) -> _Rectified | None:
+def _common_frame(left: PairView, right: PairView, terrain: Terrain) -> _Rectified | None:
     """The rectified frame: the first picture's extent, on the rows that both have, with the heights' disparities."""
     c = active().stereo
     first, second = left.camera, right.camera
@@ -168,7 +168,7 @@ def _depths(camera: Camera, axes: Array, level_m: float) -> Array:
     return np.asarray(np.nan_to_num((points - camera.position) @ axes[:, 2], nan=-1.0))
 
 
-def _resampled(view: View, frame: _Rectified, shift: int) -> tuple[Gray, NDArray[np.bool_]]:
+def _resampled(view: PairView, frame: _Rectified, shift: int) -> tuple[Gray, NDArray[np.bool_]]:
     """A picture in the rectified frame, moved right by `shift` pixels, and where it has content."""
     lens, factor = view.camera.lens, view.factor
     u, v = ((p + 0.5) / factor - 0.5 for p in lens.principal_point)

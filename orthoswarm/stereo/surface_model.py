@@ -17,7 +17,7 @@ from orthoswarm.model.placement import PlacedFrame, Terrain
 from orthoswarm.model.task_runner import Run, serial
 from orthoswarm.raster.picture_file import PictureError, read_gray, reduction
 from orthoswarm.stereo.picture_pairs import choose_pairs
-from orthoswarm.stereo.rectified_pair import View, match_pair
+from orthoswarm.stereo.rectified_pair import PairView, match_pair
 from orthoswarm.stereo.surface_cells import CellHeights, SurfaceCells, SurfaceModel, cell_heights
 
 _PAIRS_PER_TASK = 12
@@ -30,7 +30,7 @@ _MOST_CELLS: Final = 8_000_000  # larger cells beyond this many, for memory and 
 
 
 @dataclass(frozen=True, slots=True)
-class _Task:
+class _PairsTask:
     """Pairs of neighbouring pictures: frames, indices of pairs into them, ground below them, cells."""
 
     frames: list[PlacedFrame]
@@ -91,18 +91,18 @@ def _factor(placed: PlacedFrame) -> int:
 
 def _tasks(
     frames: Sequence[PlacedFrame], pairs: Sequence[tuple[int, int]], terrain: Terrain, grid: GroundGrid
-) -> list[_Task]:
+) -> list[_PairsTask]:
     bare = terrain.bare_ground()
     tasks = []
     for start in range(0, len(pairs), _PAIRS_PER_TASK):
         some = pairs[start : start + _PAIRS_PER_TASK]
         index = sorted({i for pair in some for i in pair})
         place = {i: k for k, i in enumerate(index)}
-        tasks.append(_Task([frames[i] for i in index], [(place[i], place[j]) for i, j in some], bare, grid))
+        tasks.append(_PairsTask([frames[i] for i in index], [(place[i], place[j]) for i, j in some], bare, grid))
     return tasks
 
 
-def _match(task: _Task) -> tuple[list[CellHeights], int]:
+def _match(task: _PairsTask) -> tuple[list[CellHeights], int]:
     """The heights of a task's pairs, and how many pairs it had."""
 
     @lru_cache(_PICTURES_HELD)
@@ -119,7 +119,7 @@ def _match(task: _Task) -> tuple[list[CellHeights], int]:
         if one is None or two is None:
             continue
         found = match_pair(
-            View(first.camera, one, _factor(first)), View(second.camera, two, _factor(second)), task.terrain
+            PairView(first.camera, one, _factor(first)), PairView(second.camera, two, _factor(second)), task.terrain
         )
         out.append(cell_heights(found, task.grid))
     return out, len(task.pairs)

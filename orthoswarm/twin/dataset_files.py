@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 
 from orthoswarm.model.angles import wrap_deg
 from orthoswarm.model.geo import GroundGrid
-from orthoswarm.twin.city.builder import Slot
+from orthoswarm.twin.city.builder import ParkingPlace
 from orthoswarm.twin.city.city import place_cars
 from orthoswarm.twin.city.scene import TEXEL_M, WATER, Scene
 from orthoswarm.twin.city.sunlight import change_season, lit_texture
-from orthoswarm.twin.disaster import Zone, debris_flow, flood, haze_opacity, zone_mask
-from orthoswarm.twin.imaging.ray_marching import Stage, make_stage, satellite_view
+from orthoswarm.twin.disaster import DamagedGround, debris_flow, flood, haze_opacity, zone_mask
+from orthoswarm.twin.imaging.ray_marching import PreparedScene, make_stage, satellite_view
 from orthoswarm.twin.presets import TwinSpec
 from orthoswarm.twin.site import Site, light_of, map_lean
-from orthoswarm.twin.true_flight import Flight
+from orthoswarm.twin.true_flight import TrueFlight
 
 
 def write_atomic(path: Path, data: bytes) -> None:
@@ -52,7 +52,7 @@ def write_geotiff(path: Path, image: NDArray[Any], grid: GroundGrid, nodata: flo
     os.replace(part, path)
 
 
-def write_basemap(spec: TwinSpec, scene: Scene, slots: list[Slot], path: Path, truth: Path) -> None:
+def write_basemap(spec: TwinSpec, scene: Scene, slots: list[ParkingPlace], path: Path, truth: Path) -> None:
     """Write the map before the disaster: other light, season and cars, leaning buildings; truth/basemap.json: lean."""
     import cv2
 
@@ -76,7 +76,9 @@ def write_basemap(spec: TwinSpec, scene: Scene, slots: list[Slot], path: Path, t
     write_atomic(truth / "basemap.json", json.dumps({"lean_east": lean[0], "lean_north": lean[1]}).encode())
 
 
-def after_disaster(spec: TwinSpec, scene: Scene, slots: list[Slot], zones: dict[str, Zone]) -> Stage:
+def after_disaster(
+    spec: TwinSpec, scene: Scene, slots: list[ParkingPlace], zones: dict[str, DamagedGround]
+) -> PreparedScene:
     """The scene at the time of the flight, ready for rendering; the scene is changed in place."""
     place_cars(scene, slots, spec.seed * 2 + 2, spec.cars)
     haze = np.zeros((0, 0), np.float32)
@@ -91,7 +93,7 @@ def after_disaster(spec: TwinSpec, scene: Scene, slots: list[Slot], zones: dict[
     return make_stage(scene, lit, sun.direction(), sun.ambient, haze)
 
 
-def write_truth(spec: TwinSpec, stage: Stage, zones: dict[str, Zone], truth: Path) -> None:
+def write_truth(spec: TwinSpec, stage: PreparedScene, zones: dict[str, DamagedGround], truth: Path) -> None:
     """Write the true orthoimage after the disaster, surface, bare ground, and masks: moving, disaster, open ground."""
     import cv2
 
@@ -156,7 +158,7 @@ def photo_name(vehicle: str, index: int) -> str:
     return f"{vehicle}/DJI_{index + 1:04d}.JPG"
 
 
-def write_frames(spec: TwinSpec, site: Site, flights: list[Flight], path: Path) -> None:
+def write_frames(spec: TwinSpec, site: Site, flights: list[TrueFlight], path: Path) -> None:
     """The true cameras of all pictures as a table; angles are degrees from true north, heights over takeoff."""
     rows: list[list[object]] = []
     for flight in flights:

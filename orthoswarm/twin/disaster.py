@@ -18,7 +18,7 @@ SIZES_M = {"debris": (400.0, 880.0), "water": (330.0, 320.0), "haze": (440.0, 19
 
 
 @dataclass(frozen=True, slots=True)
-class Zone:
+class DamagedGround:
     """An irregular patch of ground.
 
     Attributes:
@@ -34,7 +34,7 @@ class Zone:
     angle_rad: float
 
 
-def zone_depth(scene: Scene, zone: Zone, step: int, seed: int) -> Floats:
+def zone_depth(scene: Scene, zone: DamagedGround, step: int, seed: int) -> Floats:
     """Signed distance of each cell from a zone's ragged edge, metres, positive inside; float32 (rows, columns).
 
     Args:
@@ -143,7 +143,7 @@ def _bury(albedo, kind, dsm, dtm, wall, facade, depth, flow_x, flow_y, seed):  #
                 wall[r, c, i] = 0.7 * albedo[2 * r, 2 * c, i]
 
 
-def debris_flow(scene: Scene, zone: Zone, seed: int) -> None:
+def debris_flow(scene: Scene, zone: DamagedGround, seed: int) -> None:
     """Bury a zone under 0 to 3 m of rubble, in place; buildings inside it disappear."""
     depth = zone_depth(scene, zone, 2, seed * 13 + 1)
     _bury(
@@ -152,7 +152,7 @@ def debris_flow(scene: Scene, zone: Zone, seed: int) -> None:
     )  # fmt: skip
 
 
-def flood(scene: Scene, zone: Zone, seed: int) -> None:
+def flood(scene: Scene, zone: DamagedGround, seed: int) -> None:
     """Flood a zone with muddy water, whose only texture is moving glints, in place; the water is at ground level."""
     depth = zone_depth(scene, zone, 2, seed * 13 + 2)
     wet = depth > 0.0
@@ -164,13 +164,13 @@ def flood(scene: Scene, zone: Zone, seed: int) -> None:
     scene.albedo[fine] = (104, 94, 74)
 
 
-def haze_opacity(scene: Scene, zone: Zone, seed: int) -> Floats:
+def haze_opacity(scene: Scene, zone: DamagedGround, seed: int) -> Floats:
     """Opacity of white haze over a zone, float32 on HAZE_CELL_M cells, 0 outside, about 0.65 inside."""
     depth = zone_depth(scene, zone, int(HAZE_CELL_M / TEXEL_M), seed * 13 + 3)
     return np.asarray(0.66 * np.clip((depth + 6.0) / 26.0, 0.0, 1.0), np.float32)
 
 
-def zone_mask(scene: Scene, zone: Zone, disaster: str, seed: int) -> NDArray[np.bool_]:
+def zone_mask(scene: Scene, zone: DamagedGround, disaster: str, seed: int) -> NDArray[np.bool_]:
     """Cells of the height fields inside the zone of a disaster ("debris", "water" or "haze"), bool."""
     salt = {"debris": 1, "water": 2, "haze": 3}[disaster]
     return np.asarray(zone_depth(scene, zone, 2, seed * 13 + salt) > 0.0)

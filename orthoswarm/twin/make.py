@@ -23,12 +23,12 @@ from orthoswarm.twin.dataset_files import (
     write_truth,
 )
 from orthoswarm.twin.imaging.photo_tags_writer import PhotoTags, with_tags
-from orthoswarm.twin.imaging.ray_marching import Stage, lens_rays, render
+from orthoswarm.twin.imaging.ray_marching import PreparedScene, lens_rays, render
 from orthoswarm.twin.imaging.sensor import Sensor
 from orthoswarm.twin.presets import TwinSpec
 from orthoswarm.twin.recorded_noise import Record, record
 from orthoswarm.twin.site import Site, disaster_zones
-from orthoswarm.twin.true_flight import Flight, fly, raised
+from orthoswarm.twin.true_flight import TrueFlight, fly, raised
 
 SEA_LEVEL_M = 512.0
 """Absolute altitude of the takeoff point; far from 0, so that mixing up altitude and height shows at once."""
@@ -112,26 +112,26 @@ def _claim(manifest: Path, spec: TwinSpec) -> None:
 
 
 @dataclass(frozen=True, slots=True)
-class _Shot:
+class _TwinShot:
     path: Path
-    flight: Flight
+    flight: TrueFlight
     record: Record
     vehicle: int
     index: int
 
 
-def _missing(spec: TwinSpec, flights: list[Flight], records: list[Record], folder: Path) -> Iterator[_Shot]:
+def _missing(spec: TwinSpec, flights: list[TrueFlight], records: list[Record], folder: Path) -> Iterator[_TwinShot]:
     """The pictures that do not exist yet."""
     for v, (flight, recorded) in enumerate(zip(flights, records, strict=True)):
         (folder / "photos" / flight.vehicle).mkdir(parents=True, exist_ok=True)
         for i in range(0, len(flight.time_s), spec.every):
             path = folder / "photos" / photo_name(flight.vehicle, i)
             if not path.exists():
-                yield _Shot(path, flight, recorded, v, i)
+                yield _TwinShot(path, flight, recorded, v, i)
 
 
 def _render_all(
-    spec: TwinSpec, stage: Stage, grid: LocalGrid, *, shots: list[_Shot], workers: int, report: Progress
+    spec: TwinSpec, stage: PreparedScene, grid: LocalGrid, *, shots: list[_TwinShot], workers: int, report: Progress
 ) -> None:
     """Render and write all shots."""
     import cv2
@@ -141,7 +141,7 @@ def _render_all(
     sensor = Sensor(spec.plan.width, spec.plan.height, spec.seed)
     report("photos", 0, len(shots))
 
-    def one(shot: _Shot) -> None:
+    def one(shot: _TwinShot) -> None:
         write_atomic(shot.path, _photo(spec, stage, grid, shot=shot, rays=rays[shot.vehicle], sensor=sensor))
 
     with ThreadPoolExecutor(workers) as pool:
@@ -150,7 +150,7 @@ def _render_all(
 
 
 def _photo(
-    spec: TwinSpec, stage: Stage, grid: LocalGrid, *, shot: _Shot, rays: NDArray[np.float32], sensor: Sensor
+    spec: TwinSpec, stage: PreparedScene, grid: LocalGrid, *, shot: _TwinShot, rays: NDArray[np.float32], sensor: Sensor
 ) -> bytes:
     """One JPEG with its tags."""
     flight, i = shot.flight, shot.index

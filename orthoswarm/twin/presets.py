@@ -5,7 +5,7 @@ from typing import Any
 
 from orthoswarm.model.errors import InputError
 from orthoswarm.twin.recorded_noise import Noise
-from orthoswarm.twin.true_flight import FlightPlan, Motion
+from orthoswarm.twin.true_flight import FlightDeviations, FlightPlan
 
 _HARD = Noise(
     heading_bias_deg=3.0, tilt_bias_deg=1.0, angle_deg=0.07, outlier_share=0.02, lag_s=(0.1, 0.5), height_m=0.15,
@@ -58,7 +58,7 @@ class TwinSpec:
     noise_name: str = "paper"
     noise: Noise = field(default_factory=Noise)
     plan: FlightPlan = field(default_factory=FlightPlan)
-    motion: Motion = field(default_factory=Motion)
+    motion: FlightDeviations = field(default_factory=FlightDeviations)
     relief_m: float = 0.0
     follow_ground: bool = False
     lens_k: tuple[float, float] = (0.0, 0.0)

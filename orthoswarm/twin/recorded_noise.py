@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.twin.true_flight import Flight
+from orthoswarm.twin.true_flight import TrueFlight
 
 Array = NDArray[np.float64]
 
@@ -53,7 +53,7 @@ class Record:
     body: Array
 
 
-def record(flight: Flight, noise: Noise, vehicle: int, seed: int) -> Record:
+def record(flight: TrueFlight, noise: Noise, vehicle: int, seed: int) -> Record:
     """The recorded poses of a flight; the same seed gives the same errors."""
     rng = np.random.default_rng([seed, 43, vehicle])
     n = len(flight.time_s)

@@ -6,11 +6,11 @@ import numpy as np
 
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid, utm_epsg
-from orthoswarm.twin.city.builder import Slot
+from orthoswarm.twin.city.builder import ParkingPlace
 from orthoswarm.twin.city.city import build_city
 from orthoswarm.twin.city.scene import Scene, scene_grid
 from orthoswarm.twin.city.sunlight import Sun
-from orthoswarm.twin.disaster import SIZES_M, Zone
+from orthoswarm.twin.disaster import SIZES_M, DamagedGround
 from orthoswarm.twin.presets import TwinSpec
 
 
@@ -34,7 +34,7 @@ class Site:
         east, north = np.round(grid.to_grid(spec.lat_deg, spec.lon_deg))
         return cls(grid, (float(east), float(north)), spec.plan.heading_rad)
 
-    def build(self, spec: TwinSpec) -> tuple[Scene, list[Slot]]:
+    def build(self, spec: TwinSpec) -> tuple[Scene, list[ParkingPlace]]:
         """The scene before the disaster, without cars, and its parking places."""
         across, along = (0.5 * x + spec.margin_m for x in spec.plan.extent_m)
         c, s = abs(np.cos(spec.plan.heading_rad)), abs(np.sin(spec.plan.heading_rad))
@@ -46,7 +46,7 @@ class Site:
         return build_city(scene_grid(self.grid.epsg, self.center, *half), spec.seed, relief_m=spec.relief_m)
 
 
-def disaster_zones(spec: TwinSpec, site: Site) -> dict[str, Zone]:
+def disaster_zones(spec: TwinSpec, site: Site) -> dict[str, DamagedGround]:
     """Disaster zones by name: one near the middle of the area, or with `all` one in each third of it.
 
     Raises:
@@ -62,7 +62,7 @@ def disaster_zones(spec: TwinSpec, site: Site) -> dict[str, Zone]:
     return {spec.disaster: _zone(spec, site, spec.disaster, 0.0)}
 
 
-def _zone(spec: TwinSpec, site: Site, disaster: str, place: float) -> Zone:
+def _zone(spec: TwinSpec, site: Site, disaster: str, place: float) -> DamagedGround:
     """A disaster's zone, parallel to the area's long side; `place`: its middle along that side, as a share of it."""
     alone = spec.disaster != "all"
     rng = np.random.default_rng([spec.seed, 53] if alone else [spec.seed, 53, list(SIZES_M).index(disaster)])
@@ -77,7 +77,7 @@ def _zone(spec: TwinSpec, site: Site, disaster: str, place: float) -> Zone:
     offset[int(extent.argmax())] += place * extent.max()
     east, north = spec.plan.to_grid(offset, site.center)
     angle = np.pi / 2 - lengthwise + rng.uniform(-0.25, 0.25)
-    return Zone(float(east), float(north), across * shrink, along * shrink, float(angle))
+    return DamagedGround(float(east), float(north), across * shrink, along * shrink, float(angle))
 
 
 def suns(seed: int) -> tuple[Sun, Sun]:

@@ -81,7 +81,7 @@ class FlightPlan:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Flight:
+class TrueFlight:
     """The true flight of one vehicle.
 
     Attributes:
@@ -146,7 +146,9 @@ def _curved(corners: Array, radius: float) -> Array:
     return np.concatenate(points)
 
 
-def _ground_speed(heading: Array, motion: "Motion", wind_from_rad: float, calm_m_s: float) -> tuple[Array, Array]:
+def _ground_speed(
+    heading: Array, motion: "FlightDeviations", wind_from_rad: float, calm_m_s: float
+) -> tuple[Array, Array]:
     """Ground speed (N,) and crab angle (N,) along courses; without wind the plan's speed and 0.
 
     The vehicle flies `air_speed_m_s` through the air and points its nose into the wind so far that it keeps its course.
@@ -168,7 +170,7 @@ def _slew(heading: Array, seconds: Array, rate_rad_s: float) -> Array:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Motion:
+class FlightDeviations:
     """Deviations of the true flight from the plan.
 
     Attributes:
@@ -196,14 +198,14 @@ class Motion:
 
 def fly(
     plan: FlightPlan,
-    motion: Motion,
+    motion: FlightDeviations,
     center: tuple[float, float],
     *,
     vehicle: int,
     seed: int,
     lens_k: tuple[float, float] = (0.0, 0.0),
     start_s: float = 1_750_000_000.0,
-) -> Flight:
+) -> TrueFlight:
     """One vehicle's true flight.
 
     Args:
@@ -249,7 +251,7 @@ def fly(
     lens = Lens(plan.width, plan.height, focal_px(np.radians(fov), plan.width), k1=lens_k[0], k2=lens_k[1])
     time: Array = start_s + 7.0 * vehicle + since_start
     name = f"uav{vehicle + 1:0{max(2, len(str(plan.vehicles)))}d}"
-    return Flight(
+    return TrueFlight(
         vehicle=name,
         lens=lens,
         mount_rad=(float(mount[0]), float(mount[1])),
@@ -262,7 +264,7 @@ def fly(
     )
 
 
-def raised(flight: Flight, ground: Terrain) -> Flight:
+def raised(flight: TrueFlight, ground: Terrain) -> TrueFlight:
     """The flight with its heights above the ground instead of above takeoff (terrain following)."""
     up = np.zeros_like(flight.planned)
     up[:, 2] = ground.height(flight.planned[:, :2])

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import shapely
 
-from orthoswarm.coverage.coverage_grid import Cells, CoverageGrid, State
+from orthoswarm.coverage.coverage_grid import Cells, CellState, CoverageGrid
 from orthoswarm.coverage.view import View
 from orthoswarm.export.product_files import frame_row
 from orthoswarm.model.camera import Camera, Lens, rotation_from_angles
@@ -33,8 +33,8 @@ def test_putting_in_parts_and_replacing_equals_putting_at_once() -> None:
 def test_cells_are_planned_until_the_flight_is_complete() -> None:
     cover = CoverageGrid(_cells())
     assert cover.put([]) is None
-    assert set(np.unique(cover.states(due=False))) == {State.PLANNED}
-    assert set(np.unique(cover.states())) == {State.MISSED}
+    assert set(np.unique(cover.states(due=False))) == {CellState.PLANNED}
+    assert set(np.unique(cover.states())) == {CellState.MISSED}
 
 
 def test_a_view_sees_what_its_camera_projects_into_the_picture() -> None:
@@ -66,7 +66,7 @@ def test_oblique_views_are_poor() -> None:
     cover = CoverageGrid(_cells())
     cover.put([View.of_camera(camera, "a", "v1", 0.1)])
     state = cover.states()
-    columns, rows = np.nonzero(state == State.POOR)[::-1], np.nonzero(state == State.SEEN)[::-1]
+    columns, rows = np.nonzero(state == CellState.POOR)[::-1], np.nonzero(state == CellState.SEEN)[::-1]
     near = np.hypot(*(cover.cells.grid.to_ground(np.stack(rows, -1)) - CORNER).T)
     far = np.hypot(*(cover.cells.grid.to_ground(np.stack(columns, -1)) - CORNER).T)
     assert len(far) > 1000 and near.max() <= 80.0 < np.median(far)

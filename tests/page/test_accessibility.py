@@ -3,7 +3,7 @@
 import pytest
 
 from orthoswarm.coverage.coverage_files import COLOURS as COLOURS_OF_CELLS
-from orthoswarm.coverage.coverage_grid import State
+from orthoswarm.coverage.coverage_grid import CellState
 from tests.kit.looks.colour_vision import least_difference, rgb_of
 from tests.kit.page_kit import DESK, PHONE, TABLET, ok_for_all, opened, standing, vehicle
 
@@ -74,7 +74,7 @@ SIGNS = """[...new Set(orthoswarm.map.queryRenderedFeatures({ layers: ["legs-sig
 
 
 def test_cells_of_the_coverage_are_told_apart_and_are_those_of_its_legend(browser):
-    cells = [COLOURS_OF_CELLS[state][:3] for state in (State.SEEN, State.POOR, State.MISSED)]
+    cells = [COLOURS_OF_CELLS[state][:3] for state in (CellState.SEEN, CellState.POOR, CellState.MISSED)]
     assert least_difference(cells) > 30  # it was 19
     read = """['seen', 'poor', 'missed'].map((state) => {
       const swatch = document.body.appendChild(document.createElement('i'));

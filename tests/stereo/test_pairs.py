@@ -12,7 +12,7 @@ from orthoswarm.model.camera import Lens
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import Terrain
 from orthoswarm.stereo.picture_pairs import choose_pairs
-from orthoswarm.stereo.rectified_pair import PairPoints, View, match_pair
+from orthoswarm.stereo.rectified_pair import PairPoints, PairView, match_pair
 from orthoswarm.stereo.surface_cells import cell_heights, merge_heights
 from tests.kit.mosaic_scene import EAST, NORTH, Flight, camera, hills, terrain_of
 
@@ -22,7 +22,7 @@ LENS = Lens(240, 180, 135.0, k1=-0.08, k2=0.01, cx=2.0, cy=-1.5)
 
 def view(flight, index, factor=1):
     picture = flight.pictures[flight.frames[index].frame.image][..., 1]
-    return View(flight.frames[index].camera, np.ascontiguousarray(picture), factor)
+    return PairView(flight.frames[index].camera, np.ascontiguousarray(picture), factor)
 
 
 @pytest.mark.parametrize("yaws", [(0.0, 0.0), (40.0, 220.0), (90.0, 95.0)])

@@ -7,14 +7,14 @@ import pytest
 
 from orthoswarm.twin.presets import NOISES, PRESETS, spec
 from orthoswarm.twin.recorded_noise import Noise, record
-from orthoswarm.twin.true_flight import FOVS_DEG, FlightPlan, Motion, fly, smooth_noise
+from orthoswarm.twin.true_flight import FOVS_DEG, FlightDeviations, FlightPlan, fly, smooth_noise
 
 PLAN = FlightPlan()
 CENTER = (400000.0, 3400000.0)
 
 
 def flights(plan=PLAN, motion=None, seed=3):
-    return [fly(plan, motion or Motion(), CENTER, vehicle=v, seed=seed) for v in range(plan.vehicles)]
+    return [fly(plan, motion or FlightDeviations(), CENTER, vehicle=v, seed=seed) for v in range(plan.vehicles)]
 
 
 def test_presets_have_the_papers_numbers_of_pictures():
@@ -155,5 +155,5 @@ def test_curved_legs_have_a_radius_of_fifty_metres_and_stay_near_the_leg():
 
 
 def test_kinds_without_wind_and_curves_fly_as_they_did():
-    flight = fly(PLAN, Motion(), CENTER, vehicle=1, seed=3)
+    flight = fly(PLAN, FlightDeviations(), CENTER, vehicle=1, seed=3)
     assert np.array_equal(flight.time_s, 1_750_000_007.0 + PLAN.spacing_m / PLAN.speed_m_s * np.arange(PLAN.photos))

@@ -17,7 +17,7 @@ from gcs_plugin.mission.exchange import GROUND_STATION, Verdict
 from gcs_plugin.mission.items import TAKEOFF, MissionItem
 from gcs_plugin.sim.lossy_radio import Faults
 from gcs_plugin.sim.memory_link import SimLink, VirtualClock
-from gcs_plugin.sim.mission_flight import Flight
+from gcs_plugin.sim.mission_flight import MissionFlight
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
 from orthoswarm.model.errors import OrthoSwarmError
 from tests.vehicles.test_fleet import END, kinds, sent_by
@@ -68,7 +68,7 @@ def test_a_start_that_is_refused_after_arming_leaves_no_motor_running(make_world
     world = make_world(SimVehicle(system=1, autopilot=autopilot))
     world.meet()
     assert world.finish(world.fleet.upload(1, mission(autopilot, END)))[0].ok
-    monkeypatch.setattr(Flight, "start_mission", lambda _: "Auto: Missing Takeoff Cmd")
+    monkeypatch.setattr(MissionFlight, "start_mission", lambda _: "Auto: Missing Takeoff Cmd")
     result = end_of(world, give(world, "start", 1))
     assert result.outcome is Verdict.REFUSED and result.reason.endswith("it was disarmed again")
     assert "akeoff" in result.reason and not world.vehicles[1].flight.armed

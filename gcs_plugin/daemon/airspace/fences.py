@@ -11,7 +11,7 @@ from orthoswarm.model.errors import OrthoSwarmError
 if TYPE_CHECKING:
     from gcs_plugin.fleet.fleet import Fleet
     from gcs_plugin.mission.download import MissionDownload
-    from gcs_plugin.mission.geofence import Zone
+    from gcs_plugin.mission.geofence import FenceZone
 
 _AT_ONCE: Final = 4  # fences that are read at a time, so that links stay free
 _AGAIN_S: Final = 60.0
@@ -30,7 +30,7 @@ class _Fence:
     due: float
     read: "MissionDownload | None" = None
     document: dict[str, Any] | None = None
-    zones: "tuple[Zone, ...] | None" = None
+    zones: "tuple[FenceZone, ...] | None" = None
 
 
 class Fences:
@@ -68,7 +68,7 @@ class Fences:
                     fence.read = self._fleet.read_fence(system)
                     under_way += 1
 
-    def zones(self) -> "dict[int, tuple[Zone, ...]]":
+    def zones(self) -> "dict[int, tuple[FenceZone, ...]]":
         """The zones of each vehicle whose fence has been read, by system id; from any thread."""
         return {s: fence.zones for s, fence in list(self._fences.items()) if fence.zones is not None}
 

@@ -26,7 +26,7 @@ from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.journal import Journal
 from orthoswarm.coverage.camera_events import missing_by_events
 from orthoswarm.coverage.coverage_files import COLOURS, gap_feature
-from orthoswarm.coverage.coverage_grid import Cells, CoverageGrid, Shares, State
+from orthoswarm.coverage.coverage_grid import Cells, CellState, CoverageGrid, Shares
 from orthoswarm.coverage.gaps import below_legs, find_gaps
 from orthoswarm.coverage.missing_pictures import MissingPicture
 from orthoswarm.coverage.planning_lens import planning_fovs_deg
@@ -46,7 +46,7 @@ _ON_THE_WAY_S: Final = 15.0
 _FACT: Final = "coverage"
 _log = logging.getLogger(__name__)
 _LARGEST_PX: Final = 2048
-_SHOWN_FIRST: Final = (State.MISSED, State.POOR, State.PLANNED, State.SEEN, State.EXCLUDED)
+_SHOWN_FIRST: Final = (CellState.MISSED, CellState.POOR, CellState.PLANNED, CellState.SEEN, CellState.EXCLUDED)
 
 
 @dataclass(kw_only=True)
@@ -381,8 +381,8 @@ def _is_unseen(ends: NDArray[np.float64], states: NDArray[np.uint8], grid: Groun
     rows, columns = ((grid.north - north) / grid.gsd_m).astype(int), ((east - grid.west) / grid.gsd_m).astype(int)
     inside = (rows >= 0) & (columns >= 0) & (rows < states.shape[0]) & (columns < states.shape[1])
     below = states[rows[inside], columns[inside]]
-    below = below[below != State.OUTSIDE]
-    return bool(not below.size or np.isin(below, (State.MISSED, State.PLANNED)).any())
+    below = below[below != CellState.OUTSIDE]
+    return bool(not below.size or np.isin(below, (CellState.MISSED, CellState.PLANNED)).any())
 
 
 def _missing_rows(missing: Sequence[MissingPicture]) -> list[Mapping[str, Any]]:
@@ -403,7 +403,7 @@ def _warnings(cover: CoverageGrid) -> list[str]:
 
 
 def cells_png(states: NDArray[np.uint8]) -> bytes:
-    """A PNG with a palette, uint8 (rows, columns) of State; large areas are reduced without losing gaps."""
+    """A PNG with a palette, uint8 (rows, columns) of CellState; large areas are reduced without losing gaps."""
     from PIL import Image
 
     step = -(-max(states.shape) // _LARGEST_PX)
@@ -416,7 +416,7 @@ def cells_png(states: NDArray[np.uint8]) -> bytes:
         for state in reversed(_SHOWN_FIRST):
             states[(blocks == state).any((1, 3))] = state
     picture = Image.fromarray(states, "P")
-    table = [COLOURS[state] for state in State]
+    table = [COLOURS[state] for state in CellState]
     picture.putpalette([value for red, green, blue, _ in table for value in (red, green, blue)])
     out = io.BytesIO()
     picture.save(out, "PNG", transparency=bytes(alpha for *_, alpha in table))

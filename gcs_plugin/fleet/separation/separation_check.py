@@ -41,7 +41,7 @@ class TimedFlight:
 
 
 @dataclass(frozen=True, slots=True)
-class Separation:
+class SeparationFindings:
     """Findings by system id, in words.
 
     Attributes:
@@ -84,7 +84,7 @@ def others_of(vehicles: "Mapping[int, Vehicle]", waiting: Mapping[int, float]) -
 
 def separation_of(
     flights: Mapping[int, TimedFlight], name: Callable[[int], str] = number_name, apart: "Apart | None" = None
-) -> Separation:
+) -> SeparationFindings:
     """Which vehicles come too near each other; takes a second or more for a large swarm.
 
     Args:
@@ -107,7 +107,7 @@ def separation_of(
         why = aloft if flight.mission is not None else "its mission is not known"
         if flight.examined and why:
             unexamined[s] = why
-    return Separation(near, unexamined)
+    return SeparationFindings(near, unexamined)
 
 
 @lru_cache(maxsize=8)

@@ -29,7 +29,7 @@ _HOPELESS: Final = 1.08  # gaps are not filled for a direction whose path is so 
 
 
 @dataclass(frozen=True)
-class Candidate:
+class LineCandidate:
     """One way to lay lines.
 
     Attributes:
@@ -43,7 +43,7 @@ class Candidate:
 
 def candidates(
     field: Field, vehicles: int, foot: Footprint, *, method: Method, turn_m: float, router: Router, reach_m: float
-) -> Iterator[Candidate]:
+) -> Iterator[LineCandidate]:
     """Ways to lay lines, the most promising directions first; none where the area is all within obstacles.
 
     Args:
@@ -107,12 +107,12 @@ def _finished(
     method: Method,
     router: Router,
     reach_m: float,
-) -> Iterator[Candidate]:
+) -> Iterator[LineCandidate]:
     """The legs without gaps, in the method's own order, and in the order of a local search."""
     mended = planned_coverage.mend(field, legs, foot, router=router, reach_m=reach_m, angle_rad=angle)
-    yield Candidate(mended, count)
+    yield LineCandidate(mended, count)
     if method != "columns":
-        yield Candidate(shorten(mended, router), count)
+        yield LineCandidate(shorten(mended, router), count)
 
 
 def chained(loops: list[Array]) -> Array:

@@ -25,7 +25,7 @@ CARS: list[Color] = [(225, 225, 225), (60, 60, 64), (150, 152, 156), (150, 40, 3
 
 
 @dataclass(frozen=True, slots=True)
-class Slot:
+class ParkingPlace:
     """A parking place for a car: X, Y (metres from the grid's upper left) and direction."""
 
     x: float
@@ -40,7 +40,7 @@ class Builder:
     scene: Scene
     rng: np.random.Generator
     bend: tuple[Array, Array]
-    slots: list[Slot] = field(default_factory=list)
+    slots: list[ParkingPlace] = field(default_factory=list)
 
     def place(self, uv: Array) -> Array:
         """X, Y in metres from the upper left of city coordinates (..., 2); streets bend gently."""
@@ -125,7 +125,7 @@ class Builder:
     def slot(self, u: float, v: float, turn: float) -> None:
         """Add a parking place."""
         x, y, angle = self.local(u, v)
-        self.slots.append(Slot(x, y, angle + turn))
+        self.slots.append(ParkingPlace(x, y, angle + turn))
 
 
 def pick(rng: np.random.Generator, colors: list[Color]) -> Color:

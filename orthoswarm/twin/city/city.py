@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.twin.city import scene as kinds
-from orthoswarm.twin.city.builder import CARS, Area, Array, Builder, Color, Slot, pick, rect
+from orthoswarm.twin.city.builder import CARS, Area, Array, Builder, Color, ParkingPlace, pick, rect
 from orthoswarm.twin.city.procedural_noise import add_detail, noise_field
 from orthoswarm.twin.city.quarters import fill_block
 from orthoswarm.twin.city.scene import CELL_M, TEXEL_M, Scene
@@ -28,7 +28,7 @@ _DETAIL: dict[int, tuple[tuple[float, float, float, float, float], Color]] = {
 }
 
 
-def build_city(grid: GroundGrid, seed: int, *, relief_m: float = 0.0) -> tuple[Scene, list[Slot]]:
+def build_city(grid: GroundGrid, seed: int, *, relief_m: float = 0.0) -> tuple[Scene, list[ParkingPlace]]:
     """A city on a texture grid, without cars, and its parking places.
 
     Args:
@@ -68,7 +68,7 @@ def smooth_relief(shape: tuple[int, ...], relief_m: float, seed: int) -> NDArray
     return np.asarray(cv2.resize(coarse, (shape[1], shape[0]), interpolation=cv2.INTER_CUBIC), np.float32)
 
 
-def place_cars(scene: Scene, slots: list[Slot], seed: int, share: float = 0.55) -> None:
+def place_cars(scene: Scene, slots: list[ParkingPlace], seed: int, share: float = 0.55) -> None:
     """Put cars on a random share of the parking places, in place; another seed gives other cars."""
     rng = np.random.default_rng([seed, 23])
     for slot in slots:

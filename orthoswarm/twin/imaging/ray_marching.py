@@ -25,7 +25,7 @@ BLOCK = 16
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Stage:
+class PreparedScene:
     """A scene prepared for rendering.
 
     Attributes:
@@ -46,8 +46,10 @@ class Stage:
     noise: Floats
 
 
-def make_stage(scene: Scene, lit: Pixels, sun: tuple[float, float, float], ambient: float, haze: Floats) -> Stage:
-    """Prepare a scene and its lit colours for rendering; arguments as the attributes of `Stage`."""
+def make_stage(
+    scene: Scene, lit: Pixels, sun: tuple[float, float, float], ambient: float, haze: Floats
+) -> PreparedScene:
+    """Prepare a scene and its lit colours for rendering; arguments as the attributes of `PreparedScene`."""
     import cv2
 
     half = cv2.resize(lit, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
@@ -56,7 +58,7 @@ def make_stage(scene: Scene, lit: Pixels, sun: tuple[float, float, float], ambie
     blocks = scene.dsm.reshape(rows // TILE_CELLS, TILE_CELLS, cols // TILE_CELLS, TILE_CELLS)
     tiles = np.ascontiguousarray(blocks.max(axis=(1, 3)) + 0.3, np.float32)
     noise = noise_field((NOISE_SIDE, NOISE_SIDE), 1.0, 48.0, 5, 4711)
-    return Stage(
+    return PreparedScene(
         scene=scene,
         levels=(lit, np.asarray(half), np.asarray(quarter)),
         tiles=tiles,
@@ -322,7 +324,7 @@ def lens_rays(lens: Lens, side: int = 2) -> Floats:
     return np.ascontiguousarray(lens.undistort(xy) if not lens.is_pinhole else xy, np.float32)
 
 
-def render(stage: Stage, camera: Camera, rays: Floats, motion: NDArray[np.float64]) -> Floats:
+def render(stage: PreparedScene, camera: Camera, rays: Floats, motion: NDArray[np.float64]) -> Floats:
     """One picture, float32 (rows, columns, 3), red first, before the sensor.
 
     Args:
@@ -391,7 +393,7 @@ def _satellite(texture, dsm, dtm, tiles, wall, facade, sun, ambient, ca, sa, lea
             out[r, c, 0], out[r, c, 1], out[r, c, 2] = 0.25 * s0, 0.25 * s1, 0.25 * s2
 
 
-def satellite_view(stage: Stage, lean: tuple[float, float], gsd_m: float) -> tuple[Floats, GroundGrid]:
+def satellite_view(stage: PreparedScene, lean: tuple[float, float], gsd_m: float) -> tuple[Floats, GroundGrid]:
     """A satellite image rectified on the bare ground: buildings lean (relief displacement) and hide what is behind.
 
     Args:

@@ -96,7 +96,7 @@ def test_a_gap_that_a_failing_camera_left_is_flown_and_closed(autopilot, tmp_pat
         again = gaps.json()
         assert again["names"] == {again["vehicles"][0]["id"]: name}
         fly(served, again["id"], again["names"], pace, flights=2)
-        after = coverage_of(served, lambda found: found["seen_share"] >= 0.999 and found["missed_share"] == 0.0)
+        after = coverage_of(served, lambda found: found["seen_share"] >= 0.998 and found["missed_share"] == 0.0)
         figures = [f"{100 * c['seen_share']:.2f} % seen, {len(c['gaps'])} gaps" for c in (before, after)]
         flown = [f"{p['vehicles'][0]['length_m']:.0f} m" for p in (plan, again)]
         print(f"{figures[0]} after {flown[0]} without {uplink.lost} pictures; {figures[1]} after {flown[1]} more")

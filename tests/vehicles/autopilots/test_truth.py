@@ -228,8 +228,9 @@ def word(site):
 def stays_down(site, outcome, *words):
     assert not outcome.ok and outcome.verdict in (Verdict.REFUSED, Verdict.NOT_SENT), outcome
     assert any(w in outcome.text for w in words), outcome.text
+    stands_m = site.vehicle.height_m  # a barometer drifts by a metre within an hour
     site.place.until(lambda: False, 5.0)
-    assert not site.vehicle.armed and site.vehicle.height_m < 1.0
+    assert not site.vehicle.armed and abs(site.vehicle.height_m - stands_m) < 1.0
     print(outcome.text)
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from gcs_plugin.fleet.flight_state import danger_of, flight_state
 from gcs_plugin.links.mavlink import Autopilot
-from gcs_plugin.sim.flight_values import State
+from gcs_plugin.sim.flight_values import MissionState
 from gcs_plugin.sim.lossy_radio import Faults
 from gcs_plugin.sim.memory_link import World
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
@@ -165,7 +165,7 @@ def reports_a_fault(scene):
 
 def has_flown_its_mission(scene):
     scene.climb()
-    scene.until(lambda: scene.flight.state is State.COMPLETE)
+    scene.until(lambda: scene.flight.state is MissionState.COMPLETE)
     scene.world.wait(4.0)
 
 

@@ -10,7 +10,7 @@ from gcs_plugin.fleet.autopilot_settings import Setting, SetTo
 from gcs_plugin.fleet.preflight import Level, Wanted, preflight, preflight_all
 from gcs_plugin.fleet.separation.separation_check import flights_of, others_of, separation_of
 from gcs_plugin.links.mavlink import Autopilot
-from gcs_plugin.mission.geofence import Zone
+from gcs_plugin.mission.geofence import FenceZone
 from gcs_plugin.mission.items import FRAME_GLOBAL
 from gcs_plugin.mission.plan_folder import PlanNeeds
 from gcs_plugin.sim.simulated_swarm import make_swarm
@@ -170,7 +170,7 @@ def test_a_mission_that_breaks_the_geofence_is_red(make_world, kind, radius_m, l
     world = standing(make_world, AP, loaded)
     north = 0.0 if kind == "inclusion" else 60.0
     lat, lon = CHART.to_degrees(north, 10.0)
-    zones = [Zone(kind, ((lon, lat),), radius_m)]
+    zones = [FenceZone(kind, ((lon, lat),), radius_m)]
     assert item(world, "fence", Wanted(zones=zones)).level is level
     other = line(AP, 10, 90)  # whoever allows the fence does not allow another mission with it
     assert item(world, "mission", Wanted(mission=other, zones=zones)).level is Level.RED
@@ -182,7 +182,7 @@ def test_a_mission_within_one_of_two_inclusion_zones(make_world, autopilot):
     """ArduPilot wants it in all, unless FENCE_OPTIONS says otherwise."""
     world = standing(make_world, autopilot, line(autopilot, 10, 80))
     (lat, lon), (beside, _) = CHART.to_degrees(0.0, 10.0), CHART.to_degrees(400.0, 10.0)
-    zones = [Zone("inclusion", ((lon, lat),), 300.0), Zone("inclusion", ((lon, beside),), 300.0)]
+    zones = [FenceZone("inclusion", ((lon, lat),), 300.0), FenceZone("inclusion", ((lon, beside),), 300.0)]
     assert item(world, "fence", Wanted(zones=zones)).level is (Level.RED if autopilot is AP else Level.OK)
     world.fleet.vehicles[1].settings[Setting.FENCE_OPTIONS] = SetTo("FENCE_OPTIONS", 2.0)
     assert item(world, "fence", Wanted(zones=zones)).level is Level.OK
@@ -192,7 +192,7 @@ def test_a_way_along_the_edge_of_a_fence_keeps_to_it(make_world):
     world = standing(make_world, AP, line(AP, 10, 80))
     corners = [CHART.to_degrees(north, east) for north, east in ((-10, 10), (200, 10), (200, 300), (-10, 300))]
     ring = tuple((round(lon, 6), round(lat, 6)) for lat, lon in corners)
-    found = item(world, "fence", Wanted(zones=[Zone("exclusion", ring)]))
+    found = item(world, "fence", Wanted(zones=[FenceZone("exclusion", ring)]))
     assert found.level is Level.OK, found.reason
 
 

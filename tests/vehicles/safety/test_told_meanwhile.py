@@ -11,7 +11,7 @@ from gcs_plugin.links.packets import Framer
 from gcs_plugin.mission.completion import CompletionDetector, MissionEvent
 from gcs_plugin.mission.exchange import Address
 from gcs_plugin.mission.start_dialogue import LastLook
-from gcs_plugin.sim.flight_values import State
+from gcs_plugin.sim.flight_values import MissionState
 from gcs_plugin.sim.lossy_radio import NO_FAULTS, Faults
 from gcs_plugin.sim.memory_link import World
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
@@ -224,7 +224,7 @@ def test_a_mission_that_was_replaced_unseen_by_one_of_as_many_items_is_not_compl
     pair.until(lambda: pair.flight.motion.east > 8.0)
     for _ in pair.other.upload(pair.sim, short_mission(pair.sim, mirrored=True, ending="waypoint")):
         pass
-    pair.until(lambda: pair.flight.state is State.COMPLETE)
+    pair.until(lambda: pair.flight.state is MissionState.COMPLETE)
     pair.world.wait(8.0)
     assert "complete" not in pair.world.kinds(1)
 
