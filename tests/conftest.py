@@ -2,6 +2,8 @@
 
 import json
 import os
+import re
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +20,17 @@ settings.register_profile("unhurried", deadline=None, derandomize=bool(os.enviro
 settings.load_profile("unhurried")
 
 ROOT = Path(__file__).resolve().parent.parent
-IN_REAL_TIME = {"vehicles", "daemon", "page", "cli"}
-"""Rooms whose tests wait for vehicles, servers and browsers: never two of them at once (see the Makefile)."""
+ROOMS_IN_REAL_TIME = {"vehicles", "daemon", "page", "cli"}
+IN_REAL_TIME = re.compile(r"\b(SimSwarm|serving|standing|subprocess|socket|threading|time\.sleep)\b")
+"""What files of these rooms name that wait for vehicles, servers and browsers: one after the other (see the Makefile)."""
+
+
+@cache
+def waits(file: str) -> bool:
+    """True for a file of tests, by its path from the root, that run in real time; others compute."""
+    if file.split("/")[1] not in ROOMS_IN_REAL_TIME:
+        return False
+    return bool(IN_REAL_TIME.search((ROOT / file).read_text(encoding="utf-8")))
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -33,7 +44,9 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     class ByPlace(LoadScopeScheduling):
         def _split_scope(self, nodeid: str) -> str:
             file = nodeid.split("::")[0]
-            return "real time" if file.split("/")[1] in IN_REAL_TIME else file
+            if not waits(file):
+                return file
+            return "page" if file.startswith("tests/page") else "real time"
 
     return ByPlace(config, log) if config.getvalue("dist") == "loadgroup" else None
 
