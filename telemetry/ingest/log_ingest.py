@@ -14,12 +14,10 @@ from telemetry.formats.log.can_log import is_can_log
 from telemetry.formats.log.dataflash import has_dataflash_records
 from telemetry.formats.log.flight_logs import FlightLog, read_log
 from telemetry.formats.log.mavlink_poses import CameraEvent, fixed_camera
-from telemetry.ingest.can_positions import apart_m, bettered
 from telemetry.ingest.discovery import Discovery
-from telemetry.ingest.log_choice import LOG_SAME_EXPOSURE_S, LogMatch, LogSource, same_flight
+from telemetry.ingest.log_choice import LOG_SAME_EXPOSURE_S, LogMatch, LogSource, apart_m, bettered, same_flight
 from telemetry.ingest.pairing.event_pairing import Pairing, pair
-from telemetry.ingest.pairing.motion_chains import PictureMotion
-from telemetry.ingest.pairing.picture_evidence import picture_motion
+from telemetry.ingest.pairing.motion_chains import PictureMotion, picture_motion
 from telemetry.ingest.several_flights import LOG_LEAST_SHARE, logs_of_one_clock, nearest_span, of_one_vehicle
 from telemetry.ingest.survey import SourceInfo, Survey
 from telemetry.ingest.track_poses import EVENT_FAR_M, add_track, best_log_of, explain, fill

@@ -13,7 +13,7 @@ from telemetry.ingest.discovery import natural_key
 from telemetry.ingest.side_files import control_point_findings, raster_finding, read_control_points
 from telemetry.ingest.survey import SourceInfo, Survey
 from telemetry.photos.flight_checks import track_of
-from telemetry.photos.picture_yaw import heading_findings
+from telemetry.photos.picture_motion import heading_findings
 from telemetry.samples.course import local_metres, straight_legs
 from telemetry.samples.findings import Finding, plural
 from telemetry.samples.sample import Sample

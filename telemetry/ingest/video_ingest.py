@@ -1,31 +1,49 @@
-"""Videos and their subtitles as sources of frames."""
+"""Videos, their subtitles and the logs that fit them as sources of frames."""
 
 import hashlib
 import tempfile
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
 
 from orthoswarm.model.frame import Rejection
 from orthoswarm.model.task_runner import Progress
 from orthoswarm.stores.local_copies import local_file
 from telemetry.formats.video import srt
 from telemetry.ingest.discovery import Discovery, Folder
-from telemetry.ingest.log_choice import LogSource
+from telemetry.ingest.log_choice import LogMatch, LogSource, best_log
+from telemetry.ingest.pairing.clock_offset import (
+    TURNING_MARGIN,
+    median_distance_m,
+    offset_by_positions,
+    offset_by_turning,
+    offset_by_zone,
+    turning_of_pictures,
+)
 from telemetry.ingest.survey import LoadOptions, SourceInfo, Survey
-from telemetry.ingest.video_log_match import add_log
 from telemetry.photos.photo_frames import frames_of
-from telemetry.samples.findings import Finding
+from telemetry.samples.findings import Finding, plural
 from telemetry.samples.sample import Sample
 from telemetry.samples.unreadable import Unreadable, read_or_reason, reason_of
 from telemetry.samples.wild_fixes import without_wild_fixes
-from telemetry.videos.extraction import extract
+from telemetry.videos.extraction import decoded, extract
+from telemetry.videos.picture_choice import luma
 from telemetry.videos.picture_poses import Poses
 from telemetry.videos.video_file import VideoScan, scan
 
-NO_POSITION = "the video carries no position (SEI, KLV, djmd, subtitles); put an SRT next to it, or give its log, too"
+Array = NDArray[np.float64]
+
+_NO_POSITION = "the video carries no position (SEI, KLV, djmd, subtitles); put an SRT next to it, or give its log, too"
 _WHY_NOT = ("rate-unknown", "log-ambiguous", "log-unused", "srt-length", "srt-no-position", "unreadable")
 """Findings that say why a log or an SRT that is there gives no position, in this order."""
+_BY_CREATION = "by the container's creation time"
+_TURNING_RATE_HZ: Final = 4.0  # pictures a second of a video that are compared with a log's turns
+_TURNING_WIDTH_PX: Final = 320  # width at which they are compared
+_TURNING_LONGEST_S: Final = 600.0  # longest part of a video that is compared
 
 
 def read_videos(
@@ -60,7 +78,7 @@ def read_videos(
             continue
         near = [entry for entry in logs if folder.path.is_relative_to(entry.folder)]
         if near and scanned.has_times and not (poses.has_positions and poses.has_angles):
-            matched = read_or_reason(add_log, poses, scanned, near)
+            matched = read_or_reason(_add_log, poses, scanned, near)
             unmatched = [Finding("log-unused", f"no log could be matched with {name}: {matched}")]
             poses.findings += unmatched if isinstance(matched, Unreadable) else matched
         if options.decode:
@@ -130,7 +148,7 @@ def _take(
 def _without_position(findings: Sequence[Finding]) -> str:
     """Why a video has no position, one sentence."""
     found = {finding.code: finding.message for finding in findings}
-    return next((f"it has no position: {found[code]}" for code in _WHY_NOT if code in found), NO_POSITION)
+    return next((f"it has no position: {found[code]}" for code in _WHY_NOT if code in found), _NO_POSITION)
 
 
 def _look(vehicle: str, scanned: VideoScan, poses: Poses, source: SourceInfo) -> None:
@@ -175,3 +193,100 @@ def _lone_subtitles(path: Path, name: str, result: Survey) -> None:
     source.tracks[path.stem], wild = without_wild_fixes(samples, times, path.name)
     source.findings += wild
     source.shown[path.stem] = 0
+
+
+def _add_log(poses: Poses, found: VideoScan, logs: Sequence[LogSource]) -> list[Finding]:
+    """Assign a video's pictures the poses of the log that fits it best.
+
+    The clocks are aligned by the video's own positions, else by the rotation of its pictures, else by the
+    container's creation time. Where logs of several vehicles fit equally well, only a log that is named like the video
+    is taken: the vehicles of a swarm fly at the same time.
+    """
+    name = found.path.name
+    matches = _matches(poses, found, logs)
+    if not matches:
+        what = "fits its positions" if poses.has_positions else "fits how its pictures turn, or its creation time"
+        return [Finding("log-unused", f"no log beside {name} could be aligned with it: none {what}")]
+    best = best_log(matches, name, lambda log: log.path.stem.lower() == found.path.stem.lower())
+    if isinstance(best, Finding):
+        return [best]
+    log = best.entry.log
+    count = poses.add_track(f"track of {log.path.name}", best.entry.timeline, best.offset_s, has_gimbal=log.has_gimbal)
+    if not count:
+        return [Finding("log-unused", f"{log.path.name} has no position while {name} was recorded")]
+    best.entry.used = True
+    text = f"{plural(count, 'picture')} of {name} got poses from {log.path.name}; its clock was found {best.how}"
+    return [Finding("posed-by-log", text, note=best.how != _BY_CREATION)]
+
+
+def _matches(poses: Poses, found: VideoScan, logs: Sequence[LogSource]) -> list[LogMatch]:
+    if poses.has_positions:
+        times, places = poses.track()
+        clocks = {clock for clock in (found.created_s, poses.clock_s) if clock is not None}
+        return [m for entry in logs if (m := _by_positions(times, places, clocks, entry)) is not None]
+    logs = [entry for entry in logs if any(sample.has_position for sample in entry.log.samples)]
+    if not logs:
+        return []
+    margin = TURNING_MARGIN
+    times, rates = _picture_rates(found)
+    matches = []
+    for entry in logs:
+        turning = offset_by_turning(times, rates, entry.timeline, search_s=_longest(entry))
+        if turning is not None:
+            how = f"by how its pictures turn (correlation {turning[1]:.2f})"
+            matches.append(
+                LogMatch(entry=entry, offset_s=turning[0], how=how, rank=0, misfit=-turning[1], margin=margin)
+            )
+        elif found.created_s is not None:
+            length = len(found.pictures) / (found.rate or 30.0)
+            zone = offset_by_zone(np.array([found.created_s, found.created_s + length]), entry.timeline)
+            if zone is not None:
+                matches.append(
+                    LogMatch(entry=entry, offset_s=zone - found.created_s, how=_BY_CREATION, rank=1, misfit=abs(zone))
+                )
+    return matches
+
+
+def _by_positions(times: Array, places: Array, clocks: set[float], entry: LogSource) -> LogMatch | None:
+    """The match under the clock (UTC of video time zero, in any zone) that brings the positions nearest to the log."""
+    best: LogMatch | None = None
+    for clock in clocks:
+        offset = offset_by_positions(times + clock, places, entry.timeline, search_s=60.0)
+        if offset is None:
+            continue
+        apart = median_distance_m(times + clock - offset, places, entry.timeline)
+        if apart is not None and (best is None or apart < best.misfit):
+            best = LogMatch(entry=entry, offset_s=offset - clock, how="by its own positions", rank=0, misfit=apart)
+    return best
+
+
+def _longest(entry: LogSource) -> float:
+    span = entry.timeline.span
+    return 0.0 if span is None else span[1] - span[0]
+
+
+def _picture_rates(found: VideoScan) -> tuple[Array, Array]:
+    """Video times and yaw rates (degrees a second) measured in the pictures of a file's first ten minutes."""
+    import cv2
+
+    rate = found.rate or 30.0
+    every = max(1, round(rate / _TURNING_RATE_HZ))
+    times: list[float] = []
+    rates: list[float] = []
+    before: tuple[float, NDArray[np.uint8]] | None = None
+    for number, index, frame in decoded(found):
+        if number % every:
+            continue
+        note = found.pictures[index] if index is not None and index < len(found.pictures) else None
+        t = note.video_s if note is not None and note.video_s is not None else number / rate
+        if t > _TURNING_LONGEST_S:
+            break
+        gray = np.ascontiguousarray(luma(frame))
+        scale = min(1.0, _TURNING_WIDTH_PX / gray.shape[1])
+        small = np.asarray(cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+        if before is not None:
+            middle, turned = turning_of_pictures([before[1], small], np.array([before[0], t]))
+            times += middle.tolist()
+            rates += turned.tolist()
+        before = t, small
+    return np.array(times), np.array(rates)

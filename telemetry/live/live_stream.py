@@ -20,7 +20,7 @@ from telemetry.samples.timeline import Timeline
 from telemetry.videos.display_turn import turn_of
 from telemetry.videos.extraction import to_rgb
 from telemetry.videos.packet_loss import LiveDamage
-from telemetry.videos.picture_choice import Candidate, Picker
+from telemetry.videos.picture_choice import DecodedPicture, Picker
 from telemetry.videos.video_file import NotAVideo, open_video, parked, picture_stream, square_size
 
 _HELD_S = 0.5
@@ -205,7 +205,7 @@ def _offer(
             )
     if sample is not None:
         sample = turn_of(frame).sample(sample, *square_size(frame.width, frame.height, aspect))
-    candidate = Candidate(number=number, frame=frame, sample=sample, video_s=seconds, origin=origin, damaged=lost)
+    candidate = DecodedPicture(number=number, frame=frame, sample=sample, video_s=seconds, origin=origin, damaged=lost)
     chosen = [candidate] if picker is None else picker.push(candidate)
     for one in chosen:
         stated = None if one.sample is None else one.sample.time_s
