@@ -56,22 +56,19 @@ class LogMatch:
     offset_s: float
     how: str
     rank: int
-    misfit: float
+    misfit: float = 0.0
     margin: float = 0.0
     by_positions: bool = False
 
 
 def best_log(matches: Sequence[LogMatch], what: str, is_named: Callable[[FlightLog], bool]) -> LogMatch | Finding:
-    """The match that fits best; where logs of several vehicles fit equally well, only one that is named like the input.
+    """The match that fits best, or a finding that says why there is none.
 
-    The vehicles of a swarm fly at the same time, so that a guess would put pictures elsewhere without a sign of it.
+    Where logs of several vehicles fit equally well, only one that is named like the pictures (`is_named`) is taken: the
+    vehicles of a swarm fly at the same time, so that a guess would put pictures elsewhere without a sign of it.
 
     Args:
         matches: at least one. what: the pictures, for messages ("a.mp4").
-        is_named: whether the name of a log says that it belongs to the pictures.
-
-    Returns:
-        The match, or a finding that says why there is none.
     """
     best = min(matches, key=lambda match: (match.rank, match.misfit))
     rivals = [m for m in matches if m.rank == best.rank and m.misfit <= best.misfit + best.margin]
@@ -105,13 +102,8 @@ def _exposures_apart_m(a: FlightLog, b: FlightLog) -> float | None:
         own, other = event.sample, many[i].sample
         if abs(times[i] - (event.time_s or 0.0)) > LOG_SAME_EXPOSURE_S:
             continue
-        if (
-            own.lat_deg is not None
-            and own.lon_deg is not None
-            and other.lat_deg is not None
-            and other.lon_deg is not None
-        ):
-            apart.append(distance_m(own.lat_deg, own.lon_deg, other.lat_deg, other.lon_deg))
+        if own.has_position and other.has_position:
+            apart.append(distance_m(*own.place, *other.place))
     return float(np.median(apart)) if apart and len(apart) >= 0.5 * len(few) else None
 
 
@@ -157,10 +149,7 @@ def bettered(log: FlightLog, bus: FlightLog) -> tuple[FlightLog, list[str]] | No
 
 
 def _placed(sample: Sample, track: Timeline, sigma_m: float) -> Sample:
-    """The sample with the position of the bus if that is known at its time and more accurate.
-
-    Else the sample itself.
-    """
+    """The sample, with the position of the bus if that is known at its time and more accurate."""
     if not sample.has_position or sample.time_s is None:
         return sample
     known = track.at(sample.time_s)

@@ -3,7 +3,8 @@
 import hashlib
 import tempfile
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -81,20 +82,15 @@ def read_videos(
             matched = read_or_reason(_add_log, poses, scanned, near)
             unmatched = [Finding("log-unused", f"no log could be matched with {name}: {matched}")]
             poses.findings += unmatched if isinstance(matched, Unreadable) else matched
-        if options.decode:
-            _take(
-                path,
-                name,
-                found.videos[path],
-                scanned=scanned,
-                poses=poses,
-                options=options,
-                progress=progress,
-                source=source,
-                result=result,
-            )
-        else:
+        if not options.decode:
             _look(found.videos[path], scanned, poses, source)
+        elif poses.has_positions:
+            told = None if progress is None else partial(progress, f"reading {path.name}")
+            _take(scanned, poses, found.videos[path], options=options, progress=told, source=source, result=result)
+        else:
+            source.findings += poses.findings
+            why = _without_position(source.findings)
+            result.rejected.append(Rejection(name, why, found.videos[path], lacks_position=True))
     for path in (path for path in folder.subtitles if path not in taken):
         _lone_subtitles(path, found.name(path), result)
 
@@ -106,31 +102,26 @@ def cache_folder(root: Path) -> Path:
 
 
 def _take(
-    path: Path,
-    name: str,
-    vehicle: str,
-    *,
     scanned: VideoScan,
     poses: Poses,
+    vehicle: str,
+    *,
     options: LoadOptions,
-    progress: Progress | None,
+    progress: Callable[[int, int], None] | None,
     source: SourceInfo,
     result: Survey,
 ) -> None:
     """Extract pictures and make frames of them."""
-    if not poses.has_positions:
-        source.findings += poses.findings
-        result.rejected.append(Rejection(name, _without_position(source.findings), vehicle, lacks_position=True))
-        return
+    name = source.path
     try:
         extraction = extract(
-            local_file(path),
+            scanned.path,
             name,
             options.cache or cache_folder(result.root),
             poses=poses,
             every_m=options.every_m,
             every_s=options.every_s,
-            progress=None if progress is None else lambda done, total: progress(f"reading {path.name}", done, total),
+            progress=progress,
             found=scanned,
             vehicle=vehicle,
         )
@@ -154,10 +145,10 @@ def _without_position(findings: Sequence[Finding]) -> str:
 def _look(vehicle: str, scanned: VideoScan, poses: Poses, source: SourceInfo) -> None:
     """Read only the metadata: the poses of all pictures, by vehicle."""
     source.findings += poses.findings
+    lost = sum((pose := poses.of(i)) is None or not pose.sample.has_position for i in range(len(scanned.pictures)))
     if not poses.has_positions:
         source.findings.append(Finding("no-position", f"{source.path}: {_without_position(source.findings)}"))
-    lost = sum((pose := poses.of(i)) is None or not pose.sample.has_position for i in range(len(scanned.pictures)))
-    if poses.has_positions and lost:
+    elif lost:
         text = f"{lost} pictures of {len(scanned.pictures)} in {source.path} have no position and are not mapped"
         source.findings.append(Finding("pictures-without-position", text))
     order = sorted(range(len(scanned.pictures)), key=lambda i: (scanned.pictures[i].video_s or 0.0, i))
@@ -227,23 +218,23 @@ def _matches(poses: Poses, found: VideoScan, logs: Sequence[LogSource]) -> list[
     logs = [entry for entry in logs if any(sample.has_position for sample in entry.log.samples)]
     if not logs:
         return []
-    margin = TURNING_MARGIN
     times, rates = _picture_rates(found)
     matches = []
     for entry in logs:
-        turning = offset_by_turning(times, rates, entry.timeline, search_s=_longest(entry))
+        span = entry.timeline.span
+        longest_s = 0.0 if span is None else span[1] - span[0]
+        turning = offset_by_turning(times, rates, entry.timeline, search_s=longest_s)
         if turning is not None:
-            how = f"by how its pictures turn (correlation {turning[1]:.2f})"
-            matches.append(
-                LogMatch(entry=entry, offset_s=turning[0], how=how, rank=0, misfit=-turning[1], margin=margin)
-            )
+            offset_s, correlation = turning
+            how = f"by how its pictures turn (correlation {correlation:.2f})"
+            fit = LogMatch(entry=entry, offset_s=offset_s, how=how, rank=0, misfit=-correlation, margin=TURNING_MARGIN)
+            matches.append(fit)
         elif found.created_s is not None:
             length = len(found.pictures) / (found.rate or 30.0)
             zone = offset_by_zone(np.array([found.created_s, found.created_s + length]), entry.timeline)
             if zone is not None:
-                matches.append(
-                    LogMatch(entry=entry, offset_s=zone - found.created_s, how=_BY_CREATION, rank=1, misfit=abs(zone))
-                )
+                offset_s = zone - found.created_s
+                matches.append(LogMatch(entry=entry, offset_s=offset_s, how=_BY_CREATION, rank=1, misfit=abs(zone)))
     return matches
 
 
@@ -258,11 +249,6 @@ def _by_positions(times: Array, places: Array, clocks: set[float], entry: LogSou
         if apart is not None and (best is None or apart < best.misfit):
             best = LogMatch(entry=entry, offset_s=offset - clock, how="by its own positions", rank=0, misfit=apart)
     return best
-
-
-def _longest(entry: LogSource) -> float:
-    span = entry.timeline.span
-    return 0.0 if span is None else span[1] - span[0]
 
 
 def _picture_rates(found: VideoScan) -> tuple[Array, Array]:

@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from telemetry.photos.photo_tags import PhotoTags
+from telemetry.photos.photo_tags import Photo
 from telemetry.samples.findings import Finding, plural
 from telemetry.samples.sample import Sample
 from telemetry.samples.times import ZONE_UNKNOWN
@@ -33,7 +33,7 @@ _ZOOM_STEP: Final = 0.03  # natural logarithm of the field of view's change from
 class Extraction:
     """The pictures of a video as photos by vehicle, the number of each in the video, and findings."""
 
-    photos: dict[str, list[PhotoTags]] = field(default_factory=dict)
+    photos: dict[str, list[Photo]] = field(default_factory=dict)
     names: dict[Path, int] = field(default_factory=dict)
     findings: list[Finding] = field(default_factory=list)
 
@@ -363,8 +363,8 @@ class _LensKey:
         return self._base if times == 1.0 else f"{self._base} x{times:.2f}"
 
 
-def _photo(path: Path, picture: _WrittenPicture, pose: PicturePose | None, lens: _LensKey) -> PhotoTags:
-    photo = PhotoTags(path=path, width=picture.columns, height=picture.rows)
+def _photo(path: Path, picture: _WrittenPicture, pose: PicturePose | None, lens: _LensKey) -> Photo:
+    photo = Photo(path=path, width=picture.columns, height=picture.rows)
     photo.damaged = picture.damaged
     photo.camera = lens.of(None if pose is None else pose.sample)
     if pose is None:

@@ -105,10 +105,11 @@ class Picker:
 
 
 def _distance_m(a: Sample | None, b: Sample | None) -> float | None:
-    if a is None or b is None or a.lat_deg is None or b.lat_deg is None or a.lon_deg is None or b.lon_deg is None:
+    if a is None or b is None or not (a.has_position and b.has_position):
         return None
-    north = np.radians(a.lat_deg - b.lat_deg)
-    east = np.radians(wrap_deg(a.lon_deg - b.lon_deg)) * np.cos(np.radians(a.lat_deg))
+    (lat, lon), (other_lat, other_lon) = a.place, b.place
+    north = np.radians(lat - other_lat)
+    east = np.radians(wrap_deg(lon - other_lon)) * np.cos(np.radians(lat))
     return float(MEAN_RADIUS_M * np.hypot(north, east))
 
 

@@ -130,7 +130,6 @@ class VideoScan:
         pictures: one for each video packet, in order of the file.
         klv_packets: video time (None if unknown), number of video packets before it, packet.
         djmd_samples, gpmf_samples: video time and sample. cues: of a subtitle track.
-        damaged: packets that could not be read.
         unknown_sei: (UUID, size) -> number of private SEI messages without a decoder.
         joints_s: times at which the file's clock starts again (recordings joined); times continue over them.
         aspect: width of a pixel over its height. others: width and height of other video streams.
@@ -148,7 +147,6 @@ class VideoScan:
     djmd_samples: list[tuple[float, Sample]] = field(default_factory=list)
     gpmf_samples: list[tuple[float, Sample]] = field(default_factory=list)
     cues: srt.Subtitles = field(default_factory=srt.Subtitles)
-    damaged: int = 0
     unknown_sei: Counter[tuple[str, int]] = field(default_factory=Counter)
     joints_s: list[float] = field(default_factory=list)
     aspect: float = 1.0
@@ -379,9 +377,7 @@ def _note(
     messages = [] if form is None else bitstream.sei_messages(data, form)
     reading = sei.read(messages)
     unknown.update(sei.unknown(messages))
-    if reading is None:
-        return PictureNote(seconds)
-    return PictureNote(seconds, reading.sample, reading.decoders)
+    return PictureNote(seconds) if reading is None else PictureNote(seconds, reading.sample, reading.decoders)
 
 
 def _subtitle_text(data: bytes) -> str:
@@ -404,8 +400,7 @@ def _scan_data(packet: Any, seconds: float | None, result: VideoScan, leftovers:
         if found[-1].error == "the packet is cut off" and len(data) < 1 << 16:
             leftovers[packet.stream.index] = data[data.rfind(bytes.fromhex("060e2b3402")) :]
             found.pop()
-        for item in found:
-            result.klv_packets.append((seconds, len(result.pictures), item))
+        result.klv_packets += [(seconds, len(result.pictures), item) for item in found]
         return
     sample = djmd.read_djmd(data)
     if sample is not None and seconds is not None:

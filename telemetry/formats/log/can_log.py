@@ -17,6 +17,7 @@ from telemetry.formats.log.log_data import LEAST_STEP_S, FlightLog, NotALog
 from telemetry.samples.findings import Finding, plural
 from telemetry.samples.sample import Sample
 from telemetry.samples.times import YEAR_2000_S
+from telemetry.samples.unreadable import beginning
 
 SUFFIXES: Final = frozenset({".log", ".asc", ".blf", ".trc"})
 
@@ -34,11 +35,7 @@ _HEADS: Final = {
 def is_can_log(path: Path) -> bool:
     """Whether a file begins like a CAN log; other kinds of files share these suffixes."""
     head = _HEADS.get(path.suffix.lower())
-    try:
-        with path.open("rb") as handle:
-            return head is not None and head.match(handle.read(4096)) is not None
-    except OSError:
-        return False
+    return head is not None and head.match(beginning(path, 4096)) is not None
 
 
 @dataclass(slots=True)

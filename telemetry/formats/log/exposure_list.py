@@ -21,7 +21,7 @@ from typing import Any, Final
 import numpy as np
 
 from telemetry.formats.log.log_data import FlightLog, NotALog
-from telemetry.formats.log.mavlink_poses import CameraEvent
+from telemetry.formats.log.mavlink_poses import ExposureEvent
 from telemetry.samples.sample import Sample, checked
 from telemetry.samples.times import GPS_EPOCH_S, GPS_MINUS_UTC_S, WEEK_S, parse_time
 from telemetry.samples.unreadable import MOST_TEXT_BYTES
@@ -69,7 +69,7 @@ def _solution(path: Path, text: str) -> FlightLog:
     return FlightLog(path=path, kind="RTKLIB events", vehicle=path.stem, events=events)
 
 
-def _marks(text: str) -> list[CameraEvent]:
+def _marks(text: str) -> list[ExposureEvent]:
     events = []
     for match in _MARK.finditer(text):
         number, seconds, week, lat, lon, height, sigma_north, sigma_east = (float(group) for group in match.groups())
@@ -79,15 +79,15 @@ def _marks(text: str) -> list[CameraEvent]:
     return events
 
 
-def _event(time_s: float, number: int, sample: Sample) -> list[CameraEvent]:
+def _event(time_s: float, number: int, sample: Sample) -> list[ExposureEvent]:
     found = checked(sample)
     if found is None or not found.has_position or not 0.0 < time_s < 7.3e9:
         return []
-    return [CameraEvent(time_s, None, number, found, "exposure")]
+    return [ExposureEvent(time_s, None, number, found, "exposure")]
 
 
 @dataclass(frozen=True, slots=True)
-class _Columns:
+class _PositionColumns:
     """What the header says.
 
     Attributes:
@@ -108,7 +108,7 @@ def _positions(text: str) -> list[Sample]:
     Raises:
         NotALog: it states no positions on the earth.
     """
-    columns = _Columns(GPS_MINUS_UTC_S, 3, _degrees)
+    columns = _PositionColumns(GPS_MINUS_UTC_S, 3, _degrees)
     found = []
     for line in text.splitlines():
         if line.startswith("%"):
@@ -123,9 +123,7 @@ def _positions(text: str) -> list[Sample]:
 def _is_track(stem: str, samples: Sequence[Sample]) -> bool:
     """Whether positions are a receiver's track, not exposures.
 
-    Args:
-        stem: the file's name; RTKLIB ends those of exposures in `_events`, and people add to that.
-        samples: its positions.
+    RTKLIB ends the names of exposures' files in `_events`, and people add to that.
     """
     if "event" in stem.lower() or len(samples) < _LEAST_EPOCHS:
         return False
@@ -140,7 +138,7 @@ def _words(line: str) -> list[str]:
     return line.replace(",", " ").replace(";", " ").split()
 
 
-def _header(words: Sequence[str]) -> _Columns | None:
+def _header(words: Sequence[str]) -> _PositionColumns | None:
     """The columns named by a comment line, None if it names none."""
     if not words or words[0] not in _SCALES:
         return None
@@ -151,11 +149,11 @@ def _header(words: Sequence[str]) -> _Columns | None:
         )
     ahead_s = _SCALES[words[0]]
     if "ecef" in names:
-        return _Columns(ahead_s, 3, _geocentric, deviations=3)
-    return _Columns(ahead_s, 7, _minutes) if "latitude(d'" in names else _Columns(ahead_s, 3, _degrees)
+        return _PositionColumns(ahead_s, 3, _geocentric, deviations=3)
+    return _PositionColumns(ahead_s, 7, _minutes) if "latitude(d'" in names else _PositionColumns(ahead_s, 3, _degrees)
 
 
-def _sample(words: Sequence[str], columns: _Columns) -> Sample | None:
+def _sample(words: Sequence[str], columns: _PositionColumns) -> Sample | None:
     end = 2 + columns.words
     if len(words) < end + 4:
         return None

@@ -63,10 +63,8 @@ def pair(
     """Pair photos with events; both are in order of time (or of name).
 
     Args:
-        photo_times: by the camera's clock, None where unknown.
-        event_times: UTC, None where unknown.
-        photo_numbers: of file names.
-        event_numbers: the autopilot's image counts.
+        photo_times: by the camera's clock, None where unknown. event_times: UTC, None where unknown.
+        photo_numbers: of file names. event_numbers: the autopilot's image counts.
         motion: the way flown as the photos show it, for photos that the times leave open.
     """
     if not len(photo_times) or not len(event_times):
@@ -220,9 +218,7 @@ def _by_number(photos: Sequence[int | None], events: Sequence[int | None]) -> Pa
 def _parts_between_jumps(photos: Array, events: Array) -> list[slice]:
     """The parts of a flight between which the camera's clock was set; one if it never was.
 
-    Args:
-        photos: (N,) times by the camera, in order of exposure (of the files' numbers).
-        events: (M,) times by the vehicle, in order.
+    Photos (N,) by the camera are in order of exposure (of the files' numbers), events (M,) by the vehicle in order.
     """
     count = len(photos)
     if count < _JUMP_WINDOWS * JUMP_LEAST_PHOTOS:

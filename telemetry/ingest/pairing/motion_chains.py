@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from telemetry.formats.log.log_data import FlightLog
 from telemetry.formats.log.mavlink_poses import fixed_camera
-from telemetry.photos.photo_tags import PhotoTags
+from telemetry.photos.photo_tags import Photo
 from telemetry.photos.picture_motion import PictureFile, shifts_px
-from telemetry.samples.course import local_metres
+from telemetry.samples.course import ground_track
 from telemetry.samples.sample import Sample
 from telemetry.samples.timeline import Timeline
 
@@ -200,21 +200,19 @@ def variants(chains: Chains) -> list[Chains]:
     ]
 
 
-def picture_motion(
-    photos: Sequence[PhotoTags], log: FlightLog, timeline: Timeline, workers: int
-) -> PictureMotion | None:
+def picture_motion(photos: Sequence[Photo], log: FlightLog, timeline: Timeline, workers: int) -> PictureMotion | None:
     """Distances flown by the photos and by the log's positions; None if the log has none."""
     poses = [event.sample.merge(timeline.at(event.time_s or 0.0)) for event in log.events]
     if len(poses) < 2 or not all(pose.has_position for pose in poses):
         return None
     poses = poses if log.has_gimbal else [fixed_camera(pose) for pose in poses]
     files = [PictureFile(photo.path, photo.width, photo.height) for photo in photos]
-    return PictureMotion(_way_m(poses), lambda some: shifts_px([files[i] for i in some], workers=workers))
+    return PictureMotion(_way_m(poses), lambda some: shifts_px([files[i] for i in some], workers))
 
 
 def _way_m(poses: Sequence[Sample]) -> Array:
     """(M,) way to what the camera looks at along the track: a nod moves the picture as the vehicle's motion does."""
-    ground = local_metres([pose.lat_deg or 0.0 for pose in poses], [pose.lon_deg or 0.0 for pose in poses])
+    ground = ground_track(poses)
     way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(ground, axis=0).T))])
     around = np.gradient(ground, axis=0)
     course = np.degrees(np.arctan2(around[:, 0], around[:, 1]))
