@@ -334,9 +334,9 @@ def _merge_tables(
         if row is None:
             continue
         vehicle = row.vehicle or vehicle
-        if row.lat_deg is not None and row.lon_deg is not None:
+        if row.has_position:
             if photo.lat_deg is not None and photo.lon_deg is not None:
-                away = distance_m(photo.lat_deg, photo.lon_deg, row.lat_deg, row.lon_deg)
+                away = distance_m(photo.lat_deg, photo.lon_deg, *row.place)
                 if away > _CONTRADICTION_M:
                     moved_m.append(away)
             photo.lat_deg, photo.lon_deg = row.lat_deg, row.lon_deg

@@ -132,10 +132,10 @@ def bettered(log: FlightLog, bus: FlightLog) -> tuple[FlightLog, list[str]] | No
     distance = apart_m(log, bus)
     if distance is None or distance > BUS_SAME_VEHICLE_M:
         return None
-    track = bus.timeline()
-    sigma_m = log.position_sigma_m or active().records.position_sigma_m
-    samples = [_placed(sample, track, sigma_m) for sample in log.samples]
-    events = [replace(event, sample=_placed(event.sample, track, sigma_m)) for event in log.events]
+    track, unstated_m = bus.timeline(), active().records.position_sigma_m
+    sigmas_m = log.position_sigma_m or unstated_m, unstated_m
+    samples = [_placed(sample, track, *sigmas_m) for sample in log.samples]
+    events = [replace(event, sample=_placed(event.sample, track, *sigmas_m)) for event in log.events]
     changed = sum(new is not old for new, old in zip(samples, log.samples, strict=True))
     better = ["positions"] if changed else []
     gimbal = bus.has_gimbal and not log.has_gimbal
@@ -148,11 +148,14 @@ def bettered(log: FlightLog, bus: FlightLog) -> tuple[FlightLog, list[str]] | No
     return replace(log, samples=samples, events=events, has_gimbal=log.has_gimbal or gimbal), better
 
 
-def _placed(sample: Sample, track: Timeline, sigma_m: float) -> Sample:
-    """The sample, with the position of the bus if that is known at its time and more accurate."""
+def _placed(sample: Sample, track: Timeline, own_sigma_m: float, bus_sigma_m: float) -> Sample:
+    """The sample, with the position of the bus if that is known at its time and more accurate.
+
+    Where a position states no sigma, the one given for its source holds.
+    """
     if not sample.has_position or sample.time_s is None:
         return sample
     known = track.at(sample.time_s)
-    if not known.has_position or (known.sigma_m or active().records.position_sigma_m) >= (sample.sigma_m or sigma_m):
+    if not known.has_position or (known.sigma_m or bus_sigma_m) >= (sample.sigma_m or own_sigma_m):
         return sample
     return replace(sample, **{name: getattr(known, name) for name in _POSITION})

@@ -202,11 +202,11 @@ def _fill_from(match: LogMatch, photos: Sequence[Photo]) -> tuple[int, list[Phot
     limit_m = _far_m(match)
     times = np.array([p.time_s for p in photos], dtype=np.float64)
     for photo, pose in zip(photos, match.entry.timeline.at_all(times - match.offset_s), strict=True):
-        if pose.lat_deg is None or pose.lon_deg is None:
+        if not pose.has_position:
             explain([photo], _NO_LOG_THEN, _not_in(match, photo))
             continue
         if photo.lat_deg is not None and photo.lon_deg is not None:
-            apart = distance_m(photo.lat_deg, photo.lon_deg, pose.lat_deg, pose.lon_deg)
+            apart = distance_m(photo.lat_deg, photo.lon_deg, *pose.place)
             if apart > limit_m:
                 far.append(photo)
                 continue

@@ -194,10 +194,7 @@ class LivePoses:
             self.latest.vehicle = self.vehicle
 
     def at(self, time_s: float) -> Sample:
-        """The interpolated pose at a time (UTC); unknown fields are None.
-
-        A camera without a reported attitude is assumed fixed under the airframe.
-        """
+        """The interpolated pose at a time (UTC); a camera without a reported attitude is fixed under the airframe."""
         return self.read(time_s).sample
 
     def read(self, time_s: float) -> LinkPose:

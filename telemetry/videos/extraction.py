@@ -231,9 +231,7 @@ def extract(
     Pictures of an earlier call are used again if video, selection and poses are unchanged.
 
     Args:
-        path: the video.
-        name: its name relative to the inputs; names its folder in the cache.
-        cache: folder for the pictures.
+        name: of the video relative to the inputs; names its folder in `cache`, the folder for the pictures.
         poses: of its pictures, including those from other files; None for those in the file itself.
         every_m: spacing in metres. every_s: in seconds.
         progress: called with pictures decoded and their number.

@@ -6,7 +6,7 @@ subtitles) is interpolated at the picture's time. The sources are merged field b
 """
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -123,20 +123,18 @@ class Poses:
     @property
     def has_positions(self) -> bool:
         """Whether any source of this video has positions."""
-        return (
-            any(sample.has_position for _, samples in self._interpolated for sample in samples)
-            or any(sample is not None and sample.has_position for sample in self._sei)
-            or any(sample.has_position for _, sample in self._djmd)
-        )
+        return any(sample.has_position for sample in self._all_samples())
 
     @property
     def has_angles(self) -> bool:
         """Whether any source of this video has a camera's yaw."""
-        return (
-            any(sample.yaw_deg is not None for _, samples in self._interpolated for sample in samples)
-            or any(note.sample is not None and note.sample.yaw_deg is not None for note in self._scan.pictures)
-            or any(sample.yaw_deg is not None for _, sample in self._djmd)
-        )
+        return any(sample.yaw_deg is not None for sample in self._all_samples())
+
+    def _all_samples(self) -> Iterator[Sample]:
+        for _, samples in self._interpolated:
+            yield from samples
+        yield from (sample for sample in self._sei if sample is not None)
+        yield from (sample for _, sample in self._djmd)
 
     def add_track(self, name: str, timeline: Timeline, offset_s: float, *, has_gimbal: bool) -> int:
         """Add a vehicle's log as the last source; returns the number of pictures it gives a pose.

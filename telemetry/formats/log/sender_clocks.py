@@ -115,9 +115,8 @@ class SenderClocks:
         """Whether a component is the autopilot, as far as the messages up to now tell.
 
         Args:
-            component: MAVLink component id of a sender.
+            component: MAVLink component id of a sender. positions: it reports a valid position of the vehicle.
             timed: the message is one of those by which autopilots tell their time since boot.
-            positions: it reports a valid position of the vehicle.
         """
         if positions and component not in self._positioned:
             self._positioned.append(component)

@@ -17,6 +17,7 @@ show that cells stand under wrong titles: 47,5,8,25 with commas between the cell
 blanks.
 """
 
+import contextlib
 import csv
 import io
 import re
@@ -158,12 +159,10 @@ def _read(path: Path, header_at: int, layout: _Layout, title: str) -> PoseTable:
     body = [line for line in lines[header_at + 1 :] if line.strip() and not line.startswith("#")]
     commas = csv.reader(io.StringIO("\n".join(body)), delimiter=layout.separator)
     rows = (_words(line, len(layout.keys)) for line in body) if layout.separator == " " else commas
-    table, found = PoseTable(), []
-    try:
+    table, found = PoseTable(), list[_Line | None]()
+    with contextlib.suppress(csv.Error):  # an unterminated quoted cell: nothing after it can be separated
         for cells in rows:
             found.append(_line(table, layout, cells))
-    except csv.Error:  # an unterminated quoted cell: nothing after it can be separated
-        pass
     named = [line for line in found if line is not None]
     marks = layout.separator != "," and not any(map(_has_point, named))
     for line in named:
@@ -192,8 +191,8 @@ def _words(line: str, most: int) -> list[str]:
     words = [" ".join(words[:first]), *words[first:]]
     for at in range(len(words) - 1):
         if _DATE.fullmatch(words[at]) and _CLOCK.fullmatch(words[at + 1]) and len(words) > most:
-            zone = len(words) > most + 1 and at + 2 < len(words) and bool(_ZONE.fullmatch(words[at + 2]))
-            end = at + 2 + int(zone)
+            zone = len(words) > most + 1 and at + 2 < len(words) and _ZONE.fullmatch(words[at + 2])
+            end = at + (3 if zone else 2)
             return [*words[:at], " ".join(words[at:end]), *words[end:]]
     return words
 
