@@ -21,14 +21,11 @@ _COPIED_LEAST: Final = 3  # two folders with so many photos in common may be one
 
 
 def copies_among(photos: Sequence[Path]) -> dict[Path, Path]:
-    """Photos that are the same files as earlier ones in another folder, with these.
+    """Photos, of all folders, that are the same files as earlier ones in another folder, with these.
 
     Folders that have only one or two photos in common count as two. Only files that share their size with another are
     opened, and only those that begin like another are read beyond: raw pictures are all of one size, and each sample
     is a seek on a disk. Files in stores are not compared.
-
-    Args:
-        photos: of all folders.
     """
     found: dict[Path, Path] = {}
     for of_one_size in _of_one_size(photos):
@@ -38,8 +35,8 @@ def copies_among(photos: Sequence[Path]) -> dict[Path, Path]:
     in_common: dict[tuple[Path, Path], set[Path]] = {}
     for copy, first in found.items():
         in_common.setdefault((copy.parent, first.parent), set()).add(first)
-    least = _COPIED_LEAST
-    return {copy: first for copy, first in found.items() if len(in_common[copy.parent, first.parent]) >= least}
+    many = {folders for folders, photos in in_common.items() if len(photos) >= _COPIED_LEAST}
+    return {copy: first for copy, first in found.items() if (copy.parent, first.parent) in many}
 
 
 def _of_one_size(photos: Sequence[Path]) -> Iterator[list[Path]]:

@@ -140,7 +140,7 @@ def discover(inputs: Sequence[Path], exclude: Sequence[Path] = ()) -> Discovery:
             sorted_in.add(file)
             _sort_in(file, folders, explicit=not walked)
     for folder in folders.values():
-        folder.pictures.sort(key=_by_name)
+        folder.pictures.sort(key=lambda path: natural_key(path.name))
     ordered = [folders[path] for path in sorted(folders, key=lambda p: natural_key(str(p)))]
     copies = copies_among([path for folder in ordered for path in folder.pictures])
     _name_vehicles(ordered, root)
@@ -157,10 +157,6 @@ def _twice(folder: Path, root: Path) -> str:
     """Why a photo that is in a folder, too, is left out; without its name, so that it is said once for all of them."""
     name = _text(_relative(str(folder), str(root)))
     return f"the same photos are in {_text(root.name) if name == os.curdir else name}, {_ALREADY}"
-
-
-def _by_name(path: Path) -> tuple[tuple[int, int, str], ...]:
-    return natural_key(path.name)
 
 
 def _walk(top: Path, outside: set[str], unreadable: dict[Path, str]) -> list[Path]:

@@ -19,7 +19,7 @@ from orthoswarm.model.frame import Ingest, Rejection
 from orthoswarm.model.task_runner import Progress
 from orthoswarm.stores.local_copies import local_file
 from telemetry.formats.table import geo_txt, pose_csv
-from telemetry.formats.table.pose_row import PoseTable, leave_out_folder, lookup, names_of, take_base_names
+from telemetry.formats.table.pose_table import PoseTable, leave_out_folder, lookup, names_of, take_base_names
 from telemetry.formats.video.sei import register
 from telemetry.formats.video.sei_layout import read_sei_layout
 from telemetry.ingest.discovery import Discovery, Folder, discover, natural_key
@@ -32,8 +32,8 @@ from telemetry.ingest.video_ingest import read_videos
 from telemetry.photos.flight_checks import flight_findings, times_without_zone
 from telemetry.photos.maker_angles import Angles
 from telemetry.photos.photo_frames import frame_without_position, frames_of
-from telemetry.photos.photo_tags import PhotoTags, read_photos
-from telemetry.samples.findings import Finding, plural
+from telemetry.photos.photo_tags import Photo, read_photos
+from telemetry.samples.findings import Finding, metres, plural
 from telemetry.samples.unreadable import Unreadable, read_or_reason
 from telemetry.samples.wild_fixes import doubtful_finding, wild_fixes
 
@@ -46,12 +46,7 @@ _CONTRADICTION_M: Final = 500.0  # table that puts a photo so far from its tags,
 
 
 def load(inputs: Sequence[Path], *, progress: Progress | None = None, options: LoadOptions | None = None) -> Ingest:
-    """Read inputs into frames.
-
-    Args:
-        inputs: folders of photos (recursive; each folder with photos is one vehicle), photos, videos.
-        progress: called while reading.
-        options: see LoadOptions.
+    """Read inputs into frames: folders of photos (recursive; each folder with photos is one vehicle), photos, videos.
 
     Raises:
         InputError: an input does not exist or is of no known kind, or a SEI layout is wrong.
@@ -99,19 +94,14 @@ def survey(inputs: Sequence[Path], *, progress: Progress | None = None, options:
     with closing(read_photos(pictures, workers=options.workers, run=options.run, progress=advance)) as tags:
         for folder in found.folders:
             if folder.pictures:
-                _photo_folder(
-                    folder,
-                    islice(tags, len(folder.pictures)),
-                    found,
-                    tables=tables,
-                    logs=logs,
-                    result=result,
-                    workers=options.workers,
-                )
+                own = islice(tags, len(folder.pictures))
+                _photo_folder(folder, own, found, tables=tables, logs=logs, result=result, workers=options.workers)
             if folder.videos or folder.subtitles:
                 read_videos(folder, found, logs, options=options, progress=progress, result=result)
     result.findings += _logs_apart(found, logs)
-    _check_vehicles(result)
+    if not result.sources and not result.rejected:
+        result.findings.append(Finding("nothing", "no picture was found in the inputs"))
+    result.findings += times_without_zone(frame for source in result.sources for frame in source.frames)
     return result
 
 
@@ -133,18 +123,18 @@ def _logs_apart(found: Discovery, logs: Sequence[LogSource]) -> list[Finding]:
 def _copy_findings(found: Discovery) -> list[Finding]:
     """One finding for each two folders of which one holds copies of the other's photos."""
     counts = Counter((copy.parent, first.parent) for copy, first in found.copies.items())
+
+    def name(folder: Path) -> str:
+        return folder.name if folder == found.root else found.name(folder)
+
     findings = []
     for (there, here), count in counts.items():
         text = (
-            f"{count} photos in {_folder_name(found, there)} are the same files as photos in "
-            f"{_folder_name(found, here)}; both are used, as two vehicles: leave one folder out if it is a backup"
+            f"{count} photos in {name(there)} are the same files as photos in {name(here)}; both are used, as two "
+            "vehicles: leave one folder out if it is a backup"
         )
         findings.append(Finding("copies", text))
     return findings
-
-
-def _folder_name(found: Discovery, folder: Path) -> str:
-    return folder.name if folder == found.root else found.name(folder)
 
 
 def _tables(found: Discovery, result: Survey) -> list[tuple[Path, str, PoseTable]]:
@@ -166,10 +156,8 @@ def _tables(found: Discovery, result: Survey) -> list[tuple[Path, str, PoseTable
             elif table is None:
                 assert isinstance(copy, Path)
                 if pose_csv.names_pictures(copy) and read_control_points(copy) is None:
-                    text = (
-                        f"{found.name(path)} names pictures, but is not a table of poses that is known; it is not used"
-                    )
-                    result.findings.append(Finding("table-unknown", text, note=True))
+                    text = "names pictures, but is not a table of poses that is known; it is not used"
+                    result.findings.append(Finding("table-unknown", f"{found.name(path)} {text}", note=True))
             else:
                 where = found.scope(path)
                 tables.append((where, kind, table))
@@ -222,7 +210,7 @@ def _match_pictures(path: Path, table: PoseTable, pictures: Sequence[str]) -> li
 
 def _photo_folder(
     folder: Folder,
-    tags: Iterable[PhotoTags | Unreadable | None],
+    tags: Iterable[Photo | Unreadable | None],
     found: Discovery,
     *,
     tables: Sequence[tuple[Path, str, PoseTable]],
@@ -231,9 +219,9 @@ def _photo_folder(
     workers: int,
 ) -> None:
     """Make one source from a folder's photos with these tags."""
-    at_root = folder.path == found.root
-    source = SourceInfo(path=folder.path.name if at_root else found.name(folder.path), kind="photos")
-    groups: dict[str, list[PhotoTags]] = {}
+    named = folder.path.name if folder.path == found.root else found.name(folder.path)
+    source = SourceInfo(path=named, kind="photos")
+    groups: dict[str, list[Photo]] = {}
     seen, moved_m = 0, list[float]()
     for path, photo in zip(folder.pictures, tags, strict=True):
         if photo is None:
@@ -252,7 +240,8 @@ def _photo_folder(
         )
         source.findings.append(Finding("positions-contradict", text))
     for vehicle in sorted(groups, key=natural_key):
-        photos = sorted(groups[vehicle], key=_photo_key)
+        photos = sorted(groups[vehicle], key=lambda p: natural_key(p.path.name))
+        photos.sort(key=lambda p: math.inf if p.time_s is None else p.time_s)
         add_logs(photos, folder.path, vehicle, logs=logs, findings=source.findings, workers=workers)
         photos = _one_band(photos, vehicle, found, result)
         photos = _with_position(photos, vehicle, found, result)
@@ -266,7 +255,7 @@ def _photo_folder(
         result.sources.append(source)
 
 
-def _one_band(photos: Sequence[PhotoTags], vehicle: str, found: Discovery, result: Survey) -> list[PhotoTags]:
+def _one_band(photos: Sequence[Photo], vehicle: str, found: Discovery, result: Survey) -> list[Photo]:
     """Keep a multispectral camera's colour pictures, else those of one band; the others are rejected."""
     bands = {photo.band for photo in photos}
     if len(bands) < 2:
@@ -280,7 +269,7 @@ def _one_band(photos: Sequence[PhotoTags], vehicle: str, found: Discovery, resul
     return [photo for photo in photos if photo.band.lower() == mapped_band]
 
 
-def _with_position(photos: Sequence[PhotoTags], vehicle: str, found: Discovery, result: Survey) -> list[PhotoTags]:
+def _with_position(photos: Sequence[Photo], vehicle: str, found: Discovery, result: Survey) -> list[Photo]:
     """Keep photos with a position; the others are rejected, with the reason, and listed for surveyed points."""
     placed = []
     for photo in photos:
@@ -288,17 +277,22 @@ def _with_position(photos: Sequence[PhotoTags], vehicle: str, found: Discovery, 
             placed.append(photo)
         else:
             why, detail = photo.unplaced
-            reason = "the picture has no position; put a geo.txt next to it, or give its log as well"
-            reason = f"the picture has no position: {why}" if why else reason
-            name = found.name(photo.path)
-            result.rejected.append(Rejection(name, reason, vehicle, photo.time_s, True, detail=detail))
-            result.unpositioned.append(frame_without_position(photo, vehicle, name))
+            reason = f": {why}" if why else "; put a geo.txt next to it, or give its log as well"
+            _leave_out(
+                photo, vehicle, found.name(photo.path), f"the picture has no position{reason}", result, detail=detail
+            )
     return placed
 
 
+def _leave_out(photo: Photo, vehicle: str, name: str, reason: str, result: Survey, *, detail: str = "") -> None:
+    """Reject a photo without a usable position, and list it for surveyed points."""
+    result.rejected.append(Rejection(name, reason, vehicle, photo.time_s, True, detail=detail))
+    result.unpositioned.append(frame_without_position(photo, vehicle, name))
+
+
 def _where_it_can_be(
-    photos: Sequence[PhotoTags], vehicle: str, found: Discovery, source: SourceInfo, result: Survey
-) -> list[PhotoTags]:
+    photos: Sequence[Photo], vehicle: str, found: Discovery, source: SourceInfo, result: Survey
+) -> list[Photo]:
     """Photos without those whose positions the aircraft cannot have reached; these are rejected like those without.
 
     Where the clock was set back, photos of two places seem to alternate, and nothing is known of speeds.
@@ -311,28 +305,22 @@ def _where_it_can_be(
     if not wild.indices:
         return list(photos)
     text = (
-        f"{plural(len(wild.indices), 'picture')} up to {wild.distance} away from the pictures before and after "
+        f"{plural(len(wild.indices), 'picture')} up to {metres(wild.away_m)} away from the pictures before and after "
         f"({found.name(photos[wild.indices[0]].path)} first), farther than any aircraft flies in that time; their "
         "positions are wrong, and they are left out"
     )
     source.findings.append(Finding("position-astray", text, vehicle))
+    reason = (
+        "its position is farther from those before and after than any aircraft flies in that time; put a geo.txt "
+        "with the right one next to it"
+    )
     for i in wild.indices:
-        photo, name = photos[i], found.name(photos[i].path)
-        reason = (
-            "its position is farther from those before and after than any aircraft flies in that time; put a geo.txt "
-            "with the right one next to it"
-        )
-        result.rejected.append(Rejection(name, reason, vehicle, photo.time_s, True))
-        result.unpositioned.append(frame_without_position(photo, vehicle, name))
+        _leave_out(photos[i], vehicle, found.name(photos[i].path), reason, result)
     return [photo for i, photo in enumerate(photos) if i not in set(wild.indices)]
 
 
-def _photo_key(photo: PhotoTags) -> tuple[object, ...]:
-    return (math.inf if photo.time_s is None else photo.time_s, natural_key(photo.path.name))
-
-
 def _merge_tables(
-    photo: PhotoTags, path: Path, tables: Iterable[tuple[Path, str, PoseTable]], moved_m: list[float]
+    photo: Photo, path: Path, tables: Iterable[tuple[Path, str, PoseTable]], moved_m: list[float]
 ) -> str | None:
     """Overwrite the photo's own tags by table values, field by field; returns the vehicle's name if a table has one.
 
@@ -346,9 +334,9 @@ def _merge_tables(
         if row is None:
             continue
         vehicle = row.vehicle or vehicle
-        if row.lat_deg is not None and row.lon_deg is not None:
+        if row.has_position:
             if photo.lat_deg is not None and photo.lon_deg is not None:
-                away = distance_m(photo.lat_deg, photo.lon_deg, row.lat_deg, row.lon_deg)
+                away = distance_m(photo.lat_deg, photo.lon_deg, *row.place)
                 if away > _CONTRADICTION_M:
                     moved_m.append(away)
             photo.lat_deg, photo.lon_deg = row.lat_deg, row.lon_deg
@@ -373,13 +361,6 @@ def _merge_tables(
             photo.origin["angles"] = kind
             photo.yaw_is_stated |= angles[0] is not None
     return vehicle
-
-
-def _check_vehicles(result: Survey) -> None:
-    """Findings over all sources."""
-    if not result.sources and not result.rejected:
-        result.findings.append(Finding("nothing", "no picture was found in the inputs"))
-    result.findings += times_without_zone(frame for source in result.sources for frame in source.frames)
 
 
 def require_frames(ingest: Ingest) -> None:

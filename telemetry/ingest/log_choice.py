@@ -1,20 +1,28 @@
-"""Which of several logs belongs to some pictures: the one that fits best, and none if several fit equally well."""
+"""Which of several logs belongs to some pictures: the one that fits best, and none if several fit equally well.
+
+A CAN log and the autopilot's log of the same vehicle become one log with the more accurate values of the two.
+"""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from orthoswarm.model.earth import distance_m
-from telemetry.formats.log.flight_logs import FlightLog
-from telemetry.ingest.can_positions import BUS_SAME_VEHICLE_M, apart_m
+from orthoswarm.config import active
+from orthoswarm.model.earth import MEAN_RADIUS_M, distance_m
+from telemetry.formats.log.log_data import FlightLog
 from telemetry.ingest.survey import SourceInfo
 from telemetry.samples.findings import Finding
+from telemetry.samples.sample import Sample
 from telemetry.samples.timeline import Timeline
 
 LOG_SAME_EXPOSURE_S: Final = 1.0  # exposures of two logs at most so far apart in time (and 3 m) are one exposure
+_POSITION = ("lat_deg", "lon_deg", "altitude_m", "sigma_m")
+BUS_SAME_VEHICLE_M: Final = 20.0
+"""A CAN log belongs to the autopilot's log whose track is within this distance (median)."""
+_BUS_LEAST_COMMON: Final = 10  # positions at common times that this takes
 
 
 @dataclass(slots=True, kw_only=True)
@@ -48,22 +56,19 @@ class LogMatch:
     offset_s: float
     how: str
     rank: int
-    misfit: float
+    misfit: float = 0.0
     margin: float = 0.0
     by_positions: bool = False
 
 
 def best_log(matches: Sequence[LogMatch], what: str, is_named: Callable[[FlightLog], bool]) -> LogMatch | Finding:
-    """The match that fits best; where logs of several vehicles fit equally well, only one that is named like the input.
+    """The match that fits best, or a finding that says why there is none.
 
-    The vehicles of a swarm fly at the same time, so that a guess would put pictures elsewhere without a sign of it.
+    Where logs of several vehicles fit equally well, only one that is named like the pictures (`is_named`) is taken: the
+    vehicles of a swarm fly at the same time, so that a guess would put pictures elsewhere without a sign of it.
 
     Args:
         matches: at least one. what: the pictures, for messages ("a.mp4").
-        is_named: whether the name of a log says that it belongs to the pictures.
-
-    Returns:
-        The match, or a finding that says why there is none.
     """
     best = min(matches, key=lambda match: (match.rank, match.misfit))
     rivals = [m for m in matches if m.rank == best.rank and m.misfit <= best.misfit + best.margin]
@@ -97,11 +102,60 @@ def _exposures_apart_m(a: FlightLog, b: FlightLog) -> float | None:
         own, other = event.sample, many[i].sample
         if abs(times[i] - (event.time_s or 0.0)) > LOG_SAME_EXPOSURE_S:
             continue
-        if (
-            own.lat_deg is not None
-            and own.lon_deg is not None
-            and other.lat_deg is not None
-            and other.lon_deg is not None
-        ):
-            apart.append(distance_m(own.lat_deg, own.lon_deg, other.lat_deg, other.lon_deg))
+        if own.has_position and other.has_position:
+            apart.append(distance_m(*own.place, *other.place))
     return float(np.median(apart)) if apart and len(apart) >= 0.5 * len(few) else None
+
+
+def apart_m(log: FlightLog, bus: FlightLog) -> float | None:
+    """Median distance of the tracks of two logs in metres; None if they share too little time."""
+    own = [sample for sample in log.samples if sample.has_position]
+    if not own:
+        return None
+    times = np.array([sample.time_s for sample in own])
+    track = bus.timeline()
+    lat, lon = (np.array([getattr(s, name) for s in own], np.float64) for name in ("lat_deg", "lon_deg"))
+    north = np.radians(track.values("lat_deg", times) - lat)
+    east = np.radians(track.values("lon_deg", times) - lon) * np.cos(np.radians(lat))
+    distance = MEAN_RADIUS_M * np.hypot(north, east)
+    common = distance[np.isfinite(distance)]
+    return float(np.median(common)) if len(common) >= _BUS_LEAST_COMMON else None
+
+
+def bettered(log: FlightLog, bus: FlightLog) -> tuple[FlightLog, list[str]] | None:
+    """The autopilot's log with values of the CAN bus that state a lower sigma, and a description of these.
+
+    Positions are compared by their stated sigmas; without one `records.position_sigma_m` holds. A gimbal on
+    the bus is used where the autopilot reports none. None if the logs are not of one vehicle, or nothing is more
+    accurate.
+    """
+    distance = apart_m(log, bus)
+    if distance is None or distance > BUS_SAME_VEHICLE_M:
+        return None
+    track, unstated_m = bus.timeline(), active().records.position_sigma_m
+    sigmas_m = log.position_sigma_m or unstated_m, unstated_m
+    samples = [_placed(sample, track, *sigmas_m) for sample in log.samples]
+    events = [replace(event, sample=_placed(event.sample, track, *sigmas_m)) for event in log.events]
+    changed = sum(new is not old for new, old in zip(samples, log.samples, strict=True))
+    better = ["positions"] if changed else []
+    gimbal = bus.has_gimbal and not log.has_gimbal
+    if gimbal:
+        better.append("camera angles")
+        samples += [sample for sample in bus.samples if sample.yaw_deg is not None]
+        samples.sort(key=lambda sample: sample.time_s or 0.0)
+    if not better:
+        return None
+    return replace(log, samples=samples, events=events, has_gimbal=log.has_gimbal or gimbal), better
+
+
+def _placed(sample: Sample, track: Timeline, own_sigma_m: float, bus_sigma_m: float) -> Sample:
+    """The sample, with the position of the bus if that is known at its time and more accurate.
+
+    Where a position states no sigma, the one given for its source holds.
+    """
+    if not sample.has_position or sample.time_s is None:
+        return sample
+    known = track.at(sample.time_s)
+    if not known.has_position or (known.sigma_m or bus_sigma_m) >= (sample.sigma_m or own_sigma_m):
+        return sample
+    return replace(sample, **{name: getattr(known, name) for name in _POSITION})

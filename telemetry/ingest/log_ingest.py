@@ -13,21 +13,18 @@ from telemetry.formats.log.can_log import SUFFIXES as CAN_LOGS
 from telemetry.formats.log.can_log import is_can_log
 from telemetry.formats.log.dataflash import has_dataflash_records
 from telemetry.formats.log.flight_logs import FlightLog, read_log
-from telemetry.formats.log.mavlink_poses import CameraEvent, fixed_camera
-from telemetry.ingest.can_positions import apart_m, bettered
+from telemetry.formats.log.mavlink_poses import ExposureEvent, fixed_camera
 from telemetry.ingest.discovery import Discovery
-from telemetry.ingest.log_choice import LOG_SAME_EXPOSURE_S, LogMatch, LogSource, same_flight
+from telemetry.ingest.log_choice import LOG_SAME_EXPOSURE_S, LogMatch, LogSource, apart_m, bettered, same_flight
 from telemetry.ingest.pairing.event_pairing import Pairing, pair
-from telemetry.ingest.pairing.motion_chains import PictureMotion
-from telemetry.ingest.pairing.picture_evidence import picture_motion
+from telemetry.ingest.pairing.motion_chains import PictureMotion, picture_motion
 from telemetry.ingest.several_flights import LOG_LEAST_SHARE, logs_of_one_clock, nearest_span, of_one_vehicle
 from telemetry.ingest.survey import SourceInfo, Survey
 from telemetry.ingest.track_poses import EVENT_FAR_M, add_track, best_log_of, explain, fill
 from telemetry.photos.flight_checks import number_of
-from telemetry.photos.photo_tags import PhotoTags
-from telemetry.samples.course import local_metres
+from telemetry.photos.photo_tags import Photo
+from telemetry.samples.course import Placed, local_metres
 from telemetry.samples.findings import Finding, plural
-from telemetry.samples.sample import Sample
 from telemetry.samples.unreadable import Unreadable, read_or_reason
 from telemetry.samples.wild_fixes import without_wild_fixes
 
@@ -87,19 +84,17 @@ def _with_buses(logs: Sequence[LogSource]) -> list[LogSource]:
     apart: list[LogSource] = []
     flown = [entry for entry in logs if entry.log.kind != _BUS]
     for bus in (entry for entry in logs if entry.log.kind == _BUS):
-        distances = [(apart_m(entry.log, bus.log), entry) for entry in flown]
-        near = sorted(((d, n) for n, (d, _) in enumerate(distances) if d is not None), key=lambda pair: pair[0])
-        found = bettered(flown[near[0][1]].log, bus.log) if near else None
-        if found is None:
+        distances = [apart_m(entry.log, bus.log) for entry in flown]
+        near = [(distance, n) for n, distance in enumerate(distances) if distance is not None]
+        entry = flown[min(near)[1]] if near else None
+        found = None if entry is None else bettered(entry.log, bus.log)
+        if entry is None or found is None:
             apart.append(bus)
             continue
-        entry = flown[near[0][1]]
         entry.log, better = found
         entry.timeline = entry.log.timeline()
         entry.better = f"{' and '.join(better)} of {bus.log.path.name}"
-        text = (
-            f"{' and '.join(better)} of {bus.log.path.name} are used in place of its own: their stated sigma is lower"
-        )
+        text = f"{entry.better} are used in place of its own: their stated sigma is lower"
         entry.source.findings.append(Finding("dronecan-better", text, note=True))
     return [*flown, *apart]
 
@@ -133,14 +128,14 @@ def _same_exposures(a: FlightLog, b: FlightLog) -> bool:
     return True
 
 
-def _apart_m(a: Sample, b: Sample) -> float:
+def _apart_m(a: Placed, b: Placed) -> float:
     if a.lat_deg is None or b.lat_deg is None or a.lon_deg is None or b.lon_deg is None:
         return 0.0
     return float(np.hypot(*local_metres([a.lat_deg, b.lat_deg], [a.lon_deg, b.lon_deg])[1]))
 
 
 def add_logs(
-    photos: Sequence[PhotoTags],
+    photos: Sequence[Photo],
     folder: Path,
     vehicle: str,
     *,
@@ -148,14 +143,10 @@ def add_logs(
     findings: list[Finding],
     workers: int = 1,
 ) -> None:
-    """Fill what photos lack from the log that fits them best.
+    """Fill what photos of one vehicle, in order of time and name, lack from the log that fits them best.
 
     Args:
-        photos: of one vehicle, in order of time and name.
-        folder: their folder; logs there and above are considered.
-        vehicle: id, for messages.
-        logs: all logs.
-        findings: findings are appended here.
+        folder: of the photos; logs there and above are considered.
         workers: threads that read photos if their times do not decide which camera event they belong to.
     """
     near = [entry for entry in logs if folder.is_relative_to(entry.folder)]
@@ -167,16 +158,8 @@ def add_logs(
         pairing = _pair(photos, entry.log.events)
         if len(pairing.pairs) >= max(1.0, LOG_LEAST_SHARE * min(len(photos), len(entry.log.events))):
             pairings[id(entry)] = pairing
-            matches.append(
-                LogMatch(
-                    entry=entry,
-                    offset_s=pairing.offset_s or 0.0,
-                    how="by their camera events",
-                    rank=0,
-                    misfit=_misfit(photos, pairing, entry),
-                    margin=_LOG_SAME_FIT,
-                )
-            )
+            match = LogMatch(entry=entry, offset_s=pairing.offset_s or 0.0, how="by their camera events", rank=0)
+            matches.append(replace(match, misfit=_misfit(photos, pairing, entry), margin=_LOG_SAME_FIT))
     if not matches:
         add_track(photos, near, vehicle, findings)
         return
@@ -192,7 +175,12 @@ def add_logs(
         certain = next(pairings[key] for key in flights if not pairings[key].ambiguous)
         offset_s = certain.offset_s or 0.0
         part_of = nearest_span(times, [_event_span(entries[key].log, offset_s) for key in flights])
-        findings.append(_several_flights([entries[key] for key in flights], offset_s, vehicle))
+        names = ", ".join(entries[key].log.path.name for key in flights)
+        text = (
+            f"the photos are of {len(flights)} flights: {names} find one camera clock for different photos "
+            f"({offset_s:+.1f} s off); each photo is paired with the log of its time"
+        )
+        findings.append(Finding("several-flights", text, vehicle))
         for number, key in enumerate(flights):
             part = [photo for photo, own in zip(photos, part_of.tolist(), strict=True) if own == number]
             _use_log(part, entries[key], _pair(part, entries[key].log.events), vehicle, findings, workers=workers)
@@ -211,17 +199,8 @@ def _event_span(log: FlightLog, offset_s: float) -> tuple[float, float]:
     return min(moments) + offset_s, max(moments) + offset_s
 
 
-def _several_flights(entries: Sequence[LogSource], offset_s: float, vehicle: str) -> Finding:
-    names = ", ".join(entry.log.path.name for entry in entries)
-    text = (
-        f"the photos are of {len(entries)} flights: {names} find one camera clock for different photos "
-        f"({offset_s:+.1f} s off); each photo is paired with the log of its time"
-    )
-    return Finding("several-flights", text, vehicle)
-
-
 def _use_log(
-    photos: Sequence[PhotoTags], entry: LogSource, pairing: Pairing, vehicle: str, findings: list[Finding], *,
+    photos: Sequence[Photo], entry: LogSource, pairing: Pairing, vehicle: str, findings: list[Finding], *,
     workers: int,
 ) -> None:  # fmt: skip
     """Assign photos the poses of a log's events; pictures are read where the times do not decide."""
@@ -231,11 +210,11 @@ def _use_log(
     _use_events(photos, pairing, entry, vehicle, findings)
 
 
-def _misfit(photos: Sequence[PhotoTags], pairing: Pairing, entry: LogSource) -> float:
+def _misfit(photos: Sequence[Photo], pairing: Pairing, entry: LogSource) -> float:
     """How badly a log fits photos: 0 if each has its event where it lies; leftovers, residuals and repeated use add."""
     events = entry.log.events
     share = len(pairing.pairs) / max(len(photos), len(events))
-    apart = [_photo_apart_m(photos[i], events[j].sample) for i, j in pairing.pairs if photos[i].lat_deg is not None]
+    apart = [_apart_m(photos[i], events[j].sample) for i, j in pairing.pairs if photos[i].lat_deg is not None]
     away = float(np.median(apart)) / EVENT_FAR_M if apart else 0.0
     clock = 0.5 * (pairing.how != "time") + 0.01 * math.log1p(pairing.residual_s)
     # No zone explains more: another flight of the same mission.
@@ -243,15 +222,11 @@ def _misfit(photos: Sequence[PhotoTags], pairing: Pairing, entry: LogSource) -> 
     return 1.0 - share + clock + other_day + 0.6 * entry.used + away
 
 
-def _photo_apart_m(photo: PhotoTags, pose: Sample) -> float:
-    return _apart_m(Sample(lat_deg=photo.lat_deg, lon_deg=photo.lon_deg), pose)
-
-
-def _is_complete(photo: PhotoTags) -> bool:
+def _is_complete(photo: Photo) -> bool:
     return photo.lat_deg is not None and photo.height_m is not None and photo.camera_deg[0] is not None
 
 
-def _pair(photos: Sequence[PhotoTags], events: Sequence[CameraEvent], motion: PictureMotion | None = None) -> Pairing:
+def _pair(photos: Sequence[Photo], events: Sequence[ExposureEvent], motion: PictureMotion | None = None) -> Pairing:
     return pair(
         [p.time_s for p in photos],
         [e.time_s for e in events],
@@ -262,12 +237,12 @@ def _pair(photos: Sequence[PhotoTags], events: Sequence[CameraEvent], motion: Pi
 
 
 def _use_events(
-    photos: Sequence[PhotoTags], pairing: Pairing, entry: LogSource, vehicle: str, findings: list[Finding]
+    photos: Sequence[Photo], pairing: Pairing, entry: LogSource, vehicle: str, findings: list[Finding]
 ) -> None:
     """Assign photos the poses of their events."""
     entry.used = True
     log = entry.log
-    far = list[tuple[PhotoTags, float | None]]()
+    far = list[tuple[Photo, float | None]]()
     explain(photos, _NO_EVENT, log.path.name)  # those that get a position below need no reason
     explain([photos[i] for i in pairing.open], _SEVERAL_WAYS, log.path.name)
     for i, j in pairing.pairs:
@@ -279,7 +254,7 @@ def _use_events(
         if not log.has_gimbal:
             pose = fixed_camera(pose)
         photo = photos[i]
-        if _photo_apart_m(photo, pose) > EVENT_FAR_M:
+        if _apart_m(photo, pose) > EVENT_FAR_M:
             far.append((photo, event.time_s))
             continue
         origin = f"{event.kind} ({entry.name})"
@@ -301,7 +276,7 @@ def _use_events(
         findings.append(Finding("pairing-distance", text, vehicle))
 
 
-def _pairing_findings(photos: Sequence[PhotoTags], pairing: Pairing, log: FlightLog) -> list[Finding]:
+def _pairing_findings(photos: Sequence[Photo], pairing: Pairing, log: FlightLog) -> list[Finding]:
     used_photos, used_events = {i for i, _ in pairing.pairs}, {j for _, j in pairing.pairs}
     how = {"time": "by time", "number": "by their numbers", "order": "by order alone"}[pairing.how]
     count = f"{len(pairing.pairs) - len(pairing.open)} of {plural(len(photos), 'photo')}"

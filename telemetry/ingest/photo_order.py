@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telemetry.ingest.discovery import natural_key
-from telemetry.photos.photo_tags import PhotoTags
-from telemetry.samples.course import local_metres
+from telemetry.photos.photo_tags import Photo
+from telemetry.samples.course import ground_track, length_m
 from telemetry.samples.findings import Finding, plural
 from telemetry.samples.wild_fixes import TIME_RESOLUTION_S
 
@@ -19,16 +19,11 @@ SHIFTED: Final = "shifted after a jump"
 CLOCK_JUMP_S: Final = 60.0  # a step back in the photos' times by more than this is a jump of the camera's clock
 
 
-def in_order(photos: Sequence[PhotoTags], vehicle: str, findings: list[Finding]) -> list[PhotoTags]:
+def in_order(photos: Sequence[Photo], vehicle: str, findings: list[Finding]) -> list[Photo]:
     """Sort photos by time, or by name where the clock jumped.
 
     Where the two orders differ, the one with the shorter track is used; times are then shifted after each jump so
     that they continue, which preserves intervals within each part.
-
-    Args:
-        photos: of one vehicle.
-        vehicle: id, for messages.
-        findings: findings are appended here.
     """
     by_name = sorted(photos, key=lambda p: natural_key(p.path.name))
     by_time = sorted(by_name, key=lambda p: float("inf") if p.time_s is None else p.time_s)
@@ -37,7 +32,9 @@ def in_order(photos: Sequence[PhotoTags], vehicle: str, findings: list[Finding])
     times = np.array([p.time_s for p in by_name], dtype=np.float64)
     steps = np.diff(times)
     back = np.flatnonzero(steps < 0.0)
-    if len(back) > 3 or steps[back].min() > -CLOCK_JUMP_S or _length_m(by_name) > 0.7 * _length_m(by_time):
+    if len(back) > 3 or steps[back].min() > -CLOCK_JUMP_S:
+        return by_time
+    if length_m(ground_track(by_name)) > 0.7 * length_m(ground_track(by_time)):
         return by_time
     usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 1.0
     for at in back:
@@ -55,7 +52,7 @@ def in_order(photos: Sequence[PhotoTags], vehicle: str, findings: list[Finding])
     return by_name
 
 
-def clock_went_back(photos: Sequence[PhotoTags]) -> bool:
+def clock_went_back(photos: Sequence[Photo]) -> bool:
     """Whether the clock was set back between photos: runs of names, in order within, of which two share some time.
 
     Runs one after the other are no sign of it: numbers begin anew after the last one.
@@ -73,8 +70,3 @@ def _went_back(times: NDArray[np.float64]) -> bool:
         return False
     spans = sorted((run.min(), run.max()) for run in np.split(times, back))
     return any(later[0] < earlier[1] for earlier, later in pairwise(spans))
-
-
-def _length_m(photos: Sequence[PhotoTags]) -> float:
-    ground = local_metres([p.lat_deg or 0.0 for p in photos], [p.lon_deg or 0.0 for p in photos])
-    return float(np.hypot(*np.diff(ground, axis=0).T).sum()) if len(ground) > 1 else 0.0

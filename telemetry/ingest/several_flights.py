@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telemetry.formats.log.log_data import FlightLog
-from telemetry.ingest.pairing.clock_jumps import JUMP_LEAST_PHOTOS, LEAST_JUMP_S
 from telemetry.ingest.pairing.clock_offset import SPAN_MARGIN_S, ZONES_S
-from telemetry.ingest.pairing.event_pairing import Pairing
+from telemetry.ingest.pairing.event_pairing import JUMP_LEAST_PHOTOS, LEAST_JUMP_S, Pairing
 from telemetry.ingest.pairing.sequence_model import MOST_DRIFT
 from telemetry.samples.timeline import Timeline
 

@@ -1,5 +1,6 @@
 """The summary for `inspect`: sources, vehicles, legs and findings as plain data."""
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -12,22 +13,17 @@ from orthoswarm.model.frame import Frame
 from telemetry.ingest.discovery import natural_key
 from telemetry.ingest.side_files import control_point_findings, raster_finding, read_control_points
 from telemetry.ingest.survey import SourceInfo, Survey
-from telemetry.photos.flight_checks import track_of
-from telemetry.photos.picture_yaw import heading_findings
-from telemetry.samples.course import local_metres, straight_legs
+from telemetry.photos.picture_motion import heading_findings
+from telemetry.samples.course import ground_track, length_m, straight_legs
 from telemetry.samples.findings import Finding, plural
 from telemetry.samples.sample import Sample
 
-COUNTS = ("frames", "sei", "klv", "camera_events")
+_COUNTS = ("frames", "sei", "klv", "camera_events")
+_THINNED_M = 3.0
 
 
 def summarise(found: Survey, *, pictures: bool = True) -> dict[str, Any]:
-    """The document of `inspect --json`.
-
-    Args:
-        found: the inputs' survey.
-        pictures: True to match pairs of pictures to confirm the recorded yaw.
-    """
+    """The document of `inspect --json`; with `pictures`, pairs of them are matched to confirm the recorded yaw."""
     sources = [_source(source, pictures=pictures) for source in found.sources]
     sources += _side_files(found)
     return {
@@ -73,8 +69,7 @@ def _source(source: SourceInfo, *, pictures: bool) -> dict[str, Any]:
     return {
         "path": source.path,
         "kind": source.kind,
-        "counts": {name: source.counts.get(name, 0) for name in COUNTS}
-        | {name: count for name, count in source.counts.items() if name not in COUNTS},
+        "counts": {**dict.fromkeys(_COUNTS, 0), **source.counts},
         "vehicles": sorted(vehicles, key=lambda v: natural_key(v["id"])),
         "findings": [_plain(f) for f in findings],
     }
@@ -82,7 +77,7 @@ def _source(source: SourceInfo, *, pictures: bool) -> dict[str, Any]:
 
 def _of_frames(vehicle: str, frames: Sequence[Frame], source: SourceInfo) -> dict[str, Any]:
     times = [f.time_s for f in frames if f.time_s is not None]
-    ground = track_of(frames)
+    ground = ground_track([f.fix for f in frames])
     return {
         "id": vehicle,
         "frames": source.shown.get(vehicle, len(frames)),
@@ -99,31 +94,29 @@ def _of_frames(vehicle: str, frames: Sequence[Frame], source: SourceInfo) -> dic
 def _of_samples(vehicle: str, samples: Sequence[Sample], shown: int) -> dict[str, Any]:
     placed = [s for s in samples if s.lat_deg is not None and s.lon_deg is not None]
     times = [s.time_s for s in samples if s.time_s is not None]
-    ground = local_metres([s.lat_deg or 0.0 for s in placed], [s.lon_deg or 0.0 for s in placed])
     return {
         "id": vehicle,
         "frames": shown,
-        **_flown(_thinned(ground), times),
+        **_flown(_thinned(ground_track(placed)), times),
         **_ranges(height_m=[s.height_m for s in samples], pitch_deg=[s.pitch_deg for s in samples]),
     }
 
 
-def _thinned(ground: NDArray[np.float64], step_m: float = 3.0) -> NDArray[np.float64]:
-    """Thin positions to a least distance; the legs of a dense track are those of its thinned one."""
+def _thinned(ground: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Positions thinned to a least distance; the legs of a dense track are those of its thinned one."""
     spaced: list[int] = []
     for i, point in enumerate(ground):
-        if not spaced or np.hypot(*(point - ground[spaced[-1]])) >= step_m:
+        if not spaced or np.hypot(*(point - ground[spaced[-1]])) >= _THINNED_M:
             spaced.append(i)
     return ground[spaced] if spaced else np.zeros((0, 2))
 
 
 def _flown(ground: NDArray[np.float64], times: Sequence[float]) -> dict[str, Any]:
-    length = float(np.hypot(*np.diff(ground, axis=0).T).sum()) if len(ground) > 1 else 0.0
     return {
         "legs": len(straight_legs(ground)),
         "start": iso(min(times)) if times else None,
         "end": iso(max(times)) if times else None,
-        "length_m": round(length, 1),
+        "length_m": round(length_m(ground), 1),
     }
 
 
@@ -138,12 +131,11 @@ def _ranges(**columns: Iterable[float | None]) -> dict[str, Any]:
 
 def _fields(origins: Sequence[dict[str, str]]) -> dict[str, str]:
     """Field -> its most frequent source."""
-    counts: dict[str, dict[str, int]] = {}
+    sources: dict[str, Counter[str]] = {}
     for origin in origins:
         for name, source in origin.items():
-            counts.setdefault(name, {}).setdefault(source, 0)
-            counts[name][source] += 1
-    return {name: max(sources, key=lambda s: sources[s]) for name, sources in sorted(counts.items())}
+            sources.setdefault(name, Counter())[source] += 1
+    return {name: counts.most_common(1)[0][0] for name, counts in sorted(sources.items())}
 
 
 def _side_files(found: Survey) -> list[dict[str, Any]]:
@@ -172,7 +164,7 @@ def _bare(found: Survey, path: Path, kind: str, findings: list[Finding]) -> dict
     return {
         "path": found.discovery.name(path),
         "kind": kind,
-        "counts": dict.fromkeys(COUNTS, 0),
+        "counts": dict.fromkeys(_COUNTS, 0),
         "vehicles": [],
         "findings": [_plain(f) for f in findings],
     }

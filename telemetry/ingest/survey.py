@@ -20,7 +20,7 @@ class LoadOptions:
 
     Attributes:
         every_m: distance between pictures extracted from a video, metres; None for the default of `picture_choice`.
-        every_s: seconds between pictures extracted from a video.
+        every_s: seconds between them.
         cache: folder for pictures extracted from videos; None makes one under the system's temporary folder.
         exclude: files and folders that are left out (the output folder, for instance).
         workers: threads that read.

@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 
 from orthoswarm.model.earth import distance_m
+from telemetry.formats.log.log_data import FlightLog
 from telemetry.formats.log.mavlink_poses import fixed_camera
 from telemetry.ingest.log_choice import LogMatch, LogSource, best_log
 from telemetry.ingest.pairing.clock_offset import (
@@ -19,7 +20,7 @@ from telemetry.ingest.pairing.clock_offset import (
 from telemetry.ingest.photo_order import CLOCK_JUMP_S, clock_went_back
 from telemetry.ingest.several_flights import nearest_span, of_one_vehicle, zone_of_all
 from telemetry.photos.flight_checks import number_of
-from telemetry.photos.photo_tags import PhotoTags
+from telemetry.photos.photo_tags import Photo
 from telemetry.samples.findings import Finding, plural
 from telemetry.samples.sample import Sample
 from telemetry.samples.times import YEAR_2000_S, ZONE_UNKNOWN
@@ -39,21 +40,19 @@ _TRACK_FAR_TIMES: Final = 5.0  # photos farther from it than so many times their
 
 def best_log_of(matches: Sequence[LogMatch], vehicle: str) -> LogMatch | Finding:
     """The log that fits a vehicle's photos best, or a finding that says why there is none; see `best_log`."""
-    found = best_log(
-        matches, f"the photos of {vehicle}", lambda log: _is_named_like(vehicle, log.path.name, log.vehicle)
-    )
+    found = best_log(matches, f"the photos of {vehicle}", lambda log: _is_named_like(vehicle, log))
     return replace(found, vehicle=vehicle) if isinstance(found, Finding) else found
 
 
-def _is_named_like(vehicle: str, log_name: str, log_vehicle: str) -> bool:
+def _is_named_like(vehicle: str, log: FlightLog) -> bool:
     """Whether vehicle and log have one name or number (logs of a swarm are similar and can be confused)."""
-    if PurePath(log_name).stem.lower() == PurePath(vehicle).name.lower():
+    if log.path.stem.lower() == PurePath(vehicle).name.lower():
         return True
     number = number_of(vehicle)
-    return number is not None and number in (number_of(log_name), number_of(log_vehicle))
+    return number is not None and number in (number_of(log.path.name), number_of(log.vehicle))
 
 
-def add_track(photos: Sequence[PhotoTags], near: Sequence[LogSource], vehicle: str, findings: list[Finding]) -> None:
+def add_track(photos: Sequence[Photo], near: Sequence[LogSource], vehicle: str, findings: list[Finding]) -> None:
     """Fill what photos lack from the track that fits them best, the camera's clock found by positions or its zone.
 
     Photos whose own positions contradict the track at their times (the clock was set in between, or another flight
@@ -114,12 +113,11 @@ def add_track(photos: Sequence[PhotoTags], near: Sequence[LogSource], vehicle: s
             photo.origin["time"] = f"track of {best.entry.name}"
 
 
-def _add_tracks(photos: Sequence[PhotoTags], near: Sequence[LogSource], vehicle: str, findings: list[Finding]) -> bool:
+def _add_tracks(photos: Sequence[Photo], near: Sequence[LogSource], vehicle: str, findings: list[Finding]) -> bool:
     """Fill photos of several flights from the tracks of their logs; False if their times do not tell which is which."""
     logs = [entry for entry in near if any(sample.has_position for sample in entry.log.samples)]
     times = np.array([p.time_s for p in photos], dtype=np.float64)
-    known = all(ZONE_UNKNOWN not in p.origin.get("time", "") for p in photos)
-    zone = zone_of_all(times, [entry.timeline for entry in logs], zone_known=known)
+    zone = zone_of_all(times, [entry.timeline for entry in logs], zone_known=not _is_zone_unknown(photos))
     if zone is None:
         return False
     own = nearest_span(times - zone, [span for entry in logs if (span := entry.timeline.span) is not None])
@@ -141,7 +139,7 @@ def _add_tracks(photos: Sequence[PhotoTags], near: Sequence[LogSource], vehicle:
     return True
 
 
-def _at_longest_pause(photos: Sequence[PhotoTags]) -> list[Sequence[PhotoTags]]:
+def _at_longest_pause(photos: Sequence[Photo]) -> list[Sequence[Photo]]:
     """Photos in order of time before and after their longest pause: two flights perhaps; none without a pause."""
     steps = np.diff([p.time_s or 0.0 for p in photos])
     longest = int(np.argmax(steps))
@@ -150,7 +148,7 @@ def _at_longest_pause(photos: Sequence[PhotoTags]) -> list[Sequence[PhotoTags]]:
     return [photos[: longest + 1], photos[longest + 1 :]]
 
 
-def _by_positions(photos: Sequence[PhotoTags], near: Sequence[LogSource]) -> list[LogMatch]:
+def _by_positions(photos: Sequence[Photo], near: Sequence[LogSource]) -> list[LogMatch]:
     times = np.array([p.time_s for p in photos], dtype=np.float64)
     places = np.array([[p.lat_deg, p.lon_deg] for p in photos], dtype=np.float64)
     matches = []
@@ -163,7 +161,7 @@ def _by_positions(photos: Sequence[PhotoTags], near: Sequence[LogSource]) -> lis
     return matches
 
 
-def _by_zone(photos: Sequence[PhotoTags], near: Sequence[LogSource]) -> list[LogMatch]:
+def _by_zone(photos: Sequence[Photo], near: Sequence[LogSource]) -> list[LogMatch]:
     times = np.array([p.time_s for p in photos], dtype=np.float64)
     unknown = _is_zone_unknown(photos)  # then no zone is likelier than another
     if unknown:
@@ -179,11 +177,11 @@ def _by_zone(photos: Sequence[PhotoTags], near: Sequence[LogSource]) -> list[Log
     ]
 
 
-def _is_zone_unknown(photos: Sequence[PhotoTags]) -> bool:
+def _is_zone_unknown(photos: Sequence[Photo]) -> bool:
     return any(ZONE_UNKNOWN in p.origin.get("time", "") for p in photos)
 
 
-def _other_zones(photos: Sequence[PhotoTags], match: LogMatch) -> list[str]:
+def _other_zones(photos: Sequence[Photo], match: LogMatch) -> list[str]:
     """Offsets in hours, from that of a match, of further zones under which photos lie in the log's flights."""
     if not _is_zone_unknown(photos):
         return []
@@ -198,17 +196,17 @@ def _far_m(match: LogMatch) -> float:
     return min(EVENT_FAR_M, max(_TRACK_FAR_M, _TRACK_FAR_TIMES * usual_m))
 
 
-def _fill_from(match: LogMatch, photos: Sequence[PhotoTags]) -> tuple[int, list[PhotoTags]]:
+def _fill_from(match: LogMatch, photos: Sequence[Photo]) -> tuple[int, list[Photo]]:
     """Fill photos from a log's track: how many got a pose, and those whose own positions contradict it."""
-    log, far, count = match.entry.log, list[PhotoTags](), 0
+    log, far, count = match.entry.log, list[Photo](), 0
     limit_m = _far_m(match)
     times = np.array([p.time_s for p in photos], dtype=np.float64)
     for photo, pose in zip(photos, match.entry.timeline.at_all(times - match.offset_s), strict=True):
-        if pose.lat_deg is None or pose.lon_deg is None:
+        if not pose.has_position:
             explain([photo], _NO_LOG_THEN, _not_in(match, photo))
             continue
         if photo.lat_deg is not None and photo.lon_deg is not None:
-            apart = distance_m(photo.lat_deg, photo.lon_deg, pose.lat_deg, pose.lon_deg)
+            apart = distance_m(photo.lat_deg, photo.lon_deg, *pose.place)
             if apart > limit_m:
                 far.append(photo)
                 continue
@@ -218,13 +216,13 @@ def _fill_from(match: LogMatch, photos: Sequence[PhotoTags]) -> tuple[int, list[
     return count, far
 
 
-def explain(photos: Sequence[PhotoTags], why: str, detail: str = "") -> None:
+def explain(photos: Sequence[Photo], why: str, detail: str = "") -> None:
     """Say why no log gives photos a position."""
     for photo in photos:
         photo.unplaced = why, detail
 
 
-def _not_in(match: LogMatch, photo: PhotoTags) -> str:
+def _not_in(match: LogMatch, photo: Photo) -> str:
     """How a photo's time lies to a log that holds no position then."""
     log, span = match.entry.log.path.name, match.entry.timeline.span
     moment = (photo.time_s or 0.0) - match.offset_s
@@ -235,7 +233,7 @@ def _not_in(match: LogMatch, photo: PhotoTags) -> str:
     return f"{moment - span[1]:.0f} s after {log} ends"
 
 
-def fill(photo: PhotoTags, pose: Sample, origin: str, *, gimbal: bool) -> None:
+def fill(photo: Photo, pose: Sample, origin: str, *, gimbal: bool) -> None:
     """Fill a photo's missing fields from a pose; its time replaces the camera's clock."""
     if photo.lat_deg is None and pose.has_position:
         photo.lat_deg, photo.lon_deg = pose.lat_deg, pose.lon_deg

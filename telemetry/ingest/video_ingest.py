@@ -1,31 +1,50 @@
-"""Videos and their subtitles as sources of frames."""
+"""Videos, their subtitles and the logs that fit them as sources of frames."""
 
 import hashlib
 import tempfile
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
 
 from orthoswarm.model.frame import Rejection
 from orthoswarm.model.task_runner import Progress
 from orthoswarm.stores.local_copies import local_file
 from telemetry.formats.video import srt
 from telemetry.ingest.discovery import Discovery, Folder
-from telemetry.ingest.log_choice import LogSource
+from telemetry.ingest.log_choice import LogMatch, LogSource, best_log
+from telemetry.ingest.pairing.clock_offset import (
+    TURNING_MARGIN,
+    median_distance_m,
+    offset_by_positions,
+    offset_by_turning,
+    offset_by_zone,
+    turning_of_pictures,
+)
 from telemetry.ingest.survey import LoadOptions, SourceInfo, Survey
-from telemetry.ingest.video_log_match import add_log
 from telemetry.photos.photo_frames import frames_of
-from telemetry.samples.findings import Finding
+from telemetry.samples.findings import Finding, plural
 from telemetry.samples.sample import Sample
 from telemetry.samples.unreadable import Unreadable, read_or_reason, reason_of
 from telemetry.samples.wild_fixes import without_wild_fixes
-from telemetry.videos.extraction import extract
+from telemetry.videos.extraction import decoded, extract
+from telemetry.videos.picture_choice import luma
 from telemetry.videos.picture_poses import Poses
 from telemetry.videos.video_file import VideoScan, scan
 
-NO_POSITION = "the video carries no position (SEI, KLV, djmd, subtitles); put an SRT next to it, or give its log, too"
+Array = NDArray[np.float64]
+
+_NO_POSITION = "the video carries no position (SEI, KLV, djmd, subtitles); put an SRT next to it, or give its log, too"
 _WHY_NOT = ("rate-unknown", "log-ambiguous", "log-unused", "srt-length", "srt-no-position", "unreadable")
 """Findings that say why a log or an SRT that is there gives no position, in this order."""
+_BY_CREATION = "by the container's creation time"
+_TURNING_RATE_HZ: Final = 4.0  # pictures a second of a video that are compared with a log's turns
+_TURNING_WIDTH_PX: Final = 320  # width at which they are compared
+_TURNING_LONGEST_S: Final = 600.0  # longest part of a video that is compared
 
 
 def read_videos(
@@ -60,23 +79,18 @@ def read_videos(
             continue
         near = [entry for entry in logs if folder.path.is_relative_to(entry.folder)]
         if near and scanned.has_times and not (poses.has_positions and poses.has_angles):
-            matched = read_or_reason(add_log, poses, scanned, near)
+            matched = read_or_reason(_add_log, poses, scanned, near)
             unmatched = [Finding("log-unused", f"no log could be matched with {name}: {matched}")]
             poses.findings += unmatched if isinstance(matched, Unreadable) else matched
-        if options.decode:
-            _take(
-                path,
-                name,
-                found.videos[path],
-                scanned=scanned,
-                poses=poses,
-                options=options,
-                progress=progress,
-                source=source,
-                result=result,
-            )
-        else:
+        if not options.decode:
             _look(found.videos[path], scanned, poses, source)
+        elif poses.has_positions:
+            told = None if progress is None else partial(progress, f"reading {path.name}")
+            _take(scanned, poses, found.videos[path], options=options, progress=told, source=source, result=result)
+        else:
+            source.findings += poses.findings
+            why = _without_position(source.findings)
+            result.rejected.append(Rejection(name, why, found.videos[path], lacks_position=True))
     for path in (path for path in folder.subtitles if path not in taken):
         _lone_subtitles(path, found.name(path), result)
 
@@ -88,31 +102,26 @@ def cache_folder(root: Path) -> Path:
 
 
 def _take(
-    path: Path,
-    name: str,
-    vehicle: str,
-    *,
     scanned: VideoScan,
     poses: Poses,
+    vehicle: str,
+    *,
     options: LoadOptions,
-    progress: Progress | None,
+    progress: Callable[[int, int], None] | None,
     source: SourceInfo,
     result: Survey,
 ) -> None:
     """Extract pictures and make frames of them."""
-    if not poses.has_positions:
-        source.findings += poses.findings
-        result.rejected.append(Rejection(name, _without_position(source.findings), vehicle, lacks_position=True))
-        return
+    name = source.path
     try:
         extraction = extract(
-            local_file(path),
+            scanned.path,
             name,
             options.cache or cache_folder(result.root),
             poses=poses,
             every_m=options.every_m,
             every_s=options.every_s,
-            progress=None if progress is None else lambda done, total: progress(f"reading {path.name}", done, total),
+            progress=progress,
             found=scanned,
             vehicle=vehicle,
         )
@@ -130,16 +139,16 @@ def _take(
 def _without_position(findings: Sequence[Finding]) -> str:
     """Why a video has no position, one sentence."""
     found = {finding.code: finding.message for finding in findings}
-    return next((f"it has no position: {found[code]}" for code in _WHY_NOT if code in found), NO_POSITION)
+    return next((f"it has no position: {found[code]}" for code in _WHY_NOT if code in found), _NO_POSITION)
 
 
 def _look(vehicle: str, scanned: VideoScan, poses: Poses, source: SourceInfo) -> None:
     """Read only the metadata: the poses of all pictures, by vehicle."""
     source.findings += poses.findings
+    lost = sum((pose := poses.of(i)) is None or not pose.sample.has_position for i in range(len(scanned.pictures)))
     if not poses.has_positions:
         source.findings.append(Finding("no-position", f"{source.path}: {_without_position(source.findings)}"))
-    lost = sum((pose := poses.of(i)) is None or not pose.sample.has_position for i in range(len(scanned.pictures)))
-    if poses.has_positions and lost:
+    elif lost:
         text = f"{lost} pictures of {len(scanned.pictures)} in {source.path} have no position and are not mapped"
         source.findings.append(Finding("pictures-without-position", text))
     order = sorted(range(len(scanned.pictures)), key=lambda i: (scanned.pictures[i].video_s or 0.0, i))
@@ -175,3 +184,95 @@ def _lone_subtitles(path: Path, name: str, result: Survey) -> None:
     source.tracks[path.stem], wild = without_wild_fixes(samples, times, path.name)
     source.findings += wild
     source.shown[path.stem] = 0
+
+
+def _add_log(poses: Poses, found: VideoScan, logs: Sequence[LogSource]) -> list[Finding]:
+    """Assign a video's pictures the poses of the log that fits it best.
+
+    The clocks are aligned by the video's own positions, else by the rotation of its pictures, else by the
+    container's creation time. Where logs of several vehicles fit equally well, only a log that is named like the video
+    is taken: the vehicles of a swarm fly at the same time.
+    """
+    name = found.path.name
+    matches = _matches(poses, found, logs)
+    if not matches:
+        what = "fits its positions" if poses.has_positions else "fits how its pictures turn, or its creation time"
+        return [Finding("log-unused", f"no log beside {name} could be aligned with it: none {what}")]
+    best = best_log(matches, name, lambda log: log.path.stem.lower() == found.path.stem.lower())
+    if isinstance(best, Finding):
+        return [best]
+    log = best.entry.log
+    count = poses.add_track(f"track of {log.path.name}", best.entry.timeline, best.offset_s, has_gimbal=log.has_gimbal)
+    if not count:
+        return [Finding("log-unused", f"{log.path.name} has no position while {name} was recorded")]
+    best.entry.used = True
+    text = f"{plural(count, 'picture')} of {name} got poses from {log.path.name}; its clock was found {best.how}"
+    return [Finding("posed-by-log", text, note=best.how != _BY_CREATION)]
+
+
+def _matches(poses: Poses, found: VideoScan, logs: Sequence[LogSource]) -> list[LogMatch]:
+    if poses.has_positions:
+        times, places = poses.track()
+        clocks = {clock for clock in (found.created_s, poses.clock_s) if clock is not None}
+        return [m for entry in logs if (m := _by_positions(times, places, clocks, entry)) is not None]
+    logs = [entry for entry in logs if any(sample.has_position for sample in entry.log.samples)]
+    if not logs:
+        return []
+    times, rates = _picture_rates(found)
+    matches = []
+    for entry in logs:
+        span = entry.timeline.span
+        longest_s = 0.0 if span is None else span[1] - span[0]
+        turning = offset_by_turning(times, rates, entry.timeline, search_s=longest_s)
+        if turning is not None:
+            offset_s, correlation = turning
+            how = f"by how its pictures turn (correlation {correlation:.2f})"
+            fit = LogMatch(entry=entry, offset_s=offset_s, how=how, rank=0, misfit=-correlation, margin=TURNING_MARGIN)
+            matches.append(fit)
+        elif found.created_s is not None:
+            length = len(found.pictures) / (found.rate or 30.0)
+            zone = offset_by_zone(np.array([found.created_s, found.created_s + length]), entry.timeline)
+            if zone is not None:
+                offset_s = zone - found.created_s
+                matches.append(LogMatch(entry=entry, offset_s=offset_s, how=_BY_CREATION, rank=1, misfit=abs(zone)))
+    return matches
+
+
+def _by_positions(times: Array, places: Array, clocks: set[float], entry: LogSource) -> LogMatch | None:
+    """The match under the clock (UTC of video time zero, in any zone) that brings the positions nearest to the log."""
+    best: LogMatch | None = None
+    for clock in clocks:
+        offset = offset_by_positions(times + clock, places, entry.timeline, search_s=60.0)
+        if offset is None:
+            continue
+        apart = median_distance_m(times + clock - offset, places, entry.timeline)
+        if apart is not None and (best is None or apart < best.misfit):
+            best = LogMatch(entry=entry, offset_s=offset - clock, how="by its own positions", rank=0, misfit=apart)
+    return best
+
+
+def _picture_rates(found: VideoScan) -> tuple[Array, Array]:
+    """Video times and yaw rates (degrees a second) measured in the pictures of a file's first ten minutes."""
+    import cv2
+
+    rate = found.rate or 30.0
+    every = max(1, round(rate / _TURNING_RATE_HZ))
+    times: list[float] = []
+    rates: list[float] = []
+    before: tuple[float, NDArray[np.uint8]] | None = None
+    for number, index, frame in decoded(found):
+        if number % every:
+            continue
+        note = found.pictures[index] if index is not None and index < len(found.pictures) else None
+        t = note.video_s if note is not None and note.video_s is not None else number / rate
+        if t > _TURNING_LONGEST_S:
+            break
+        gray = np.ascontiguousarray(luma(frame))
+        scale = min(1.0, _TURNING_WIDTH_PX / gray.shape[1])
+        small = np.asarray(cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+        if before is not None:
+            middle, turned = turning_of_pictures([before[1], small], np.array([before[0], t]))
+            times += middle.tolist()
+            rates += turned.tolist()
+        before = t, small
+    return np.array(times), np.array(rates)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from orthoswarm.model.errors import InputError
 from telemetry.formats.log.dronecan_poses import MESSAGES, DronecanPoses
 from telemetry.live.live_poses import LivePoses
-from telemetry.samples.rotations import euler_ned
+from telemetry.samples.rotations import airframe_ned
 
 _WAIT_S: Final = 0.2
 _MOST_FAILURES: Final = 100
@@ -55,11 +55,7 @@ def open_bus(url: str) -> Any:
 
 
 class CanSource:
-    """Passes the frames of one bus into a vehicle's poses, each node as a source of its own.
-
-    Attributes:
-        poses: of the vehicle.
-    """
+    """Passes the frames of one bus into a vehicle's poses, each node as a source of its own."""
 
     def __init__(self, poses: LivePoses, *, clock: Callable[[], float] = time.time) -> None:
         self.poses = poses
@@ -109,10 +105,7 @@ class CanSource:
         return True
 
     def feed(self, message: Any) -> None:
-        """Process a MAVLink CAN_FRAME or CANFD_FRAME message.
-
-        Pymavlink's `id` carries the flag of an extended frame.
-        """
+        """Process a MAVLink CAN_FRAME or CANFD_FRAME message, whose `id` carries the flag of an extended frame."""
         name = message.get_type()
         if message.id & _EXTENDED:
             size = min(int(message.len), _FRAME_BYTES[name])
@@ -126,7 +119,4 @@ class CanSource:
 
     def _body_at(self, time_s: float) -> NDArray[np.float64] | None:
         """The airframe's attitude from the vehicle's other messages, for a gimbal alone on its bus."""
-        sample = self.poses.at(time_s)
-        if sample.flight_yaw_deg is None:
-            return None
-        return euler_ned(sample.flight_yaw_deg, sample.flight_pitch_deg or 0.0, sample.flight_roll_deg or 0.0)
+        return airframe_ned(self.poses.at(time_s))

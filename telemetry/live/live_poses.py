@@ -15,18 +15,16 @@ from typing import Any, Final
 
 from orthoswarm.config import active
 from orthoswarm.model.angles import wrap_deg
-from telemetry.formats.log.mavlink_poses import CameraEvent, MavlinkPoses, fixed_camera
-from telemetry.samples.sample import Sample
+from telemetry.formats.log.mavlink_poses import ExposureEvent, MavlinkPoses, fixed_camera
+from telemetry.samples.sample import CAMERA_ANGLES, FLIGHT_ANGLES, Sample
 
 MAVLINK: Final = "MAVLink"
 """The source that a vehicle's link is."""
 
 _POSITION = ("lat_deg", "lon_deg", "altitude_m", "sigma_m")
-_FLIGHT = ("flight_yaw_deg", "flight_pitch_deg", "flight_roll_deg")
-_CAMERA = ("yaw_deg", "pitch_deg", "roll_deg")
 _HELD_S = 0.3
 _ALL_HEARD_S: Final = 0.5
-_TURNS = frozenset({"lon_deg", *_FLIGHT, *_CAMERA})
+_TURNS = frozenset({"lon_deg", *FLIGHT_ANGLES, *CAMERA_ANGLES})
 
 
 class _Series:
@@ -57,10 +55,7 @@ class _Series:
             del self.times[:old], self.values[:old]
 
     def at(self, time_s: float, gap_s: float) -> tuple[float | None, ...] | None:
-        """The interpolated values at a time; the newest is extrapolated as constant for a short time only.
-
-        None if unknown.
-        """
+        """The interpolated values at a time; the newest hold for a short time only. None if unknown."""
         at = bisect_right(self.times, time_s)
         if at == 0:
             return None
@@ -77,11 +72,7 @@ class _Series:
 def _between(name: str, a: float | None, b: float | None, share: float) -> float | None:
     if a is None or b is None:
         return a if share < 0.5 else b
-    step = b - a
-    if name in _TURNS:
-        step = wrap_deg(step)
-        return wrap_deg(a + share * step)
-    return a + share * step
+    return wrap_deg(a + share * wrap_deg(b - a)) if name in _TURNS else a + share * (b - a)
 
 
 class _Sources:
@@ -94,10 +85,9 @@ class _Sources:
 
     def add(self, source: str, sample: Sample, sigma: float) -> None:
         """Add a sample's values."""
-        series = self._series.get(source)
-        if series is None:
-            series = self._series[source] = _Series(self._names, self._keep_s)
-        series.add(sample.time_s or 0.0, (*(getattr(sample, name) for name in self._names), sigma))
+        if source not in self._series:
+            self._series[source] = _Series(self._names, self._keep_s)
+        self._series[source].add(sample.time_s or 0.0, (*(getattr(sample, name) for name in self._names), sigma))
         self.filled = True
 
     def __len__(self) -> int:
@@ -149,8 +139,8 @@ class LivePoses:
         self._arrival_offset: float | None = None
         self._lock = threading.Lock()
         self._position = _Sources(_POSITION, keep_s)
-        self._flight = _Sources(_FLIGHT, keep_s)
-        self._camera = _Sources(_CAMERA, keep_s)
+        self._flight = _Sources(FLIGHT_ANGLES, keep_s)
+        self._camera = _Sources(CAMERA_ANGLES, keep_s)
         self._height = _Sources(("height_m",), keep_s)
         self._ground = _Sources(("height_m",), keep_s)
 
@@ -158,7 +148,7 @@ class LivePoses:
         """Number of stored positions."""
         return len(self._position)
 
-    def feed(self, message: Any, arrival_s: float | None = None) -> CameraEvent | None:
+    def feed(self, message: Any, arrival_s: float | None = None) -> ExposureEvent | None:
         """Process a MAVLink message of this vehicle; if it is a camera event, returns it with its complete pose.
 
         Args:
@@ -167,24 +157,22 @@ class LivePoses:
                 clocks of their own; None for now.
         """
         arrival_s = self._clock() if arrival_s is None else arrival_s
-        bases = self._mavlink.bases
+        bases = self._mavlink.clocks.bases
         found = self._mavlink.feed(message, arrival_s)
-        if self._mavlink.bases != bases:
+        if self._mavlink.clocks.bases != bases:
             self._arrival_offset = None
         if found is None:
             return None
-        if isinstance(found, CameraEvent):
+        if isinstance(found, ExposureEvent):
             return self._event(found, arrival_s)
-        boot_s = found.time_s or 0.0
-        found.time_s = self._utc(boot_s, arrival_s)
+        found.time_s = self._utc(found.time_s or 0.0, arrival_s)
         self.add(found, sigma=self._mavlink.position_sigma_m if found.has_position else None)
         return None
 
     def add(self, sample: Sample, *, source: str = MAVLINK, sigma: float | None = None) -> None:
-        """Add a sample.
+        """Add a sample, whose time is UTC.
 
         Args:
-            sample: its time is UTC.
             source: its sender.
             sigma: one sigma stated by the source, metres for a position, degrees for angles; None if not stated.
         """
@@ -206,10 +194,7 @@ class LivePoses:
             self.latest.vehicle = self.vehicle
 
     def at(self, time_s: float) -> Sample:
-        """The interpolated pose at a time (UTC); unknown fields are None.
-
-        A camera without a reported attitude is assumed fixed under the airframe.
-        """
+        """The interpolated pose at a time (UTC); a camera without a reported attitude is fixed under the airframe."""
         return self.read(time_s).sample
 
     def read(self, time_s: float) -> LinkPose:
@@ -245,11 +230,10 @@ class LivePoses:
             self._arrival_offset = offset
         return boot_s + self._arrival_offset
 
-    def _event(self, event: CameraEvent, arrival_s: float) -> CameraEvent:
+    def _event(self, event: ExposureEvent, arrival_s: float) -> ExposureEvent:
         """Complete an exposure: the autopilot's values, replaced by more accurate ones of the bus."""
         if event.time_s is None:
-            boot_s = event.boot_s
-            event.time_s = arrival_s if boot_s is None else self._utc(boot_s, arrival_s)
+            event.time_s = arrival_s if event.boot_s is None else self._utc(event.boot_s, arrival_s)
         own = event.sample
         own.vehicle, own.time_s = self.vehicle, event.time_s
         around = self.read(event.time_s)

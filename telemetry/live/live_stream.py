@@ -20,7 +20,7 @@ from telemetry.samples.timeline import Timeline
 from telemetry.videos.display_turn import turn_of
 from telemetry.videos.extraction import to_rgb
 from telemetry.videos.packet_loss import LiveDamage
-from telemetry.videos.picture_choice import Candidate, Picker
+from telemetry.videos.picture_choice import DecodedPicture, Picker
 from telemetry.videos.video_file import NotAVideo, open_video, parked, picture_stream, square_size
 
 _HELD_S = 0.5
@@ -65,15 +65,11 @@ def open_stream(
 
     Args:
         url: rtsp://, rtmp://, udp://, tcp://, or a file.
-        every_m: spacing in metres.
-        every_s: spacing in seconds.
-        all_pictures: True to get every picture.
+        every_m: spacing in metres. every_s: in seconds. all_pictures: True to get every picture.
         stop: ends the iteration when set (within `timeout_s`).
         reconnect: True to reopen a lost link; False to end with the stream.
-        timeout_s: of opening and of waiting for data.
-        options: for FFmpeg, over the defaults.
-        clock: gives the time of arrival.
-        on_state: called with "open" and "lost: reason".
+        timeout_s: of opening and of waiting for data. options: for FFmpeg, over the defaults.
+        clock: gives the time of arrival. on_state: called with "open" and "lost: reason".
 
     Raises:
         NotAVideo: the first opening fails and `reconnect` is False.
@@ -199,15 +195,12 @@ def _offer(
         from_klv = _klv_at(klv_samples, seconds)
         if from_klv is not None:
             from_klv = replace(from_klv, time_s=None if sample is None else sample.time_s)
-            sample, origin = (
-                (from_klv if sample is None else from_klv.merge(sample)),
-                " + ".join(filter(None, ("KLV", origin))),
-            )
+            sample = from_klv if sample is None else from_klv.merge(sample)
+            origin = " + ".join(filter(None, ("KLV", origin)))
     if sample is not None:
         sample = turn_of(frame).sample(sample, *square_size(frame.width, frame.height, aspect))
-    candidate = Candidate(number=number, frame=frame, sample=sample, video_s=seconds, origin=origin, damaged=lost)
-    chosen = [candidate] if picker is None else picker.push(candidate)
-    for one in chosen:
+    candidate = DecodedPicture(number=number, frame=frame, sample=sample, video_s=seconds, origin=origin, damaged=lost)
+    for one in [candidate] if picker is None else picker.push(candidate):
         stated = None if one.sample is None else one.sample.time_s
         yield LivePicture(
             number=one.number,

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from orthoswarm.config import active
 from orthoswarm.model.frame import Frame
-from telemetry.photos.photo_tags import PhotoTags
-from telemetry.samples.course import Straight, local_metres, straight_legs
-from telemetry.samples.findings import Finding, plural
+from telemetry.photos.photo_tags import Photo
+from telemetry.samples.course import Straight, ground_track, straight_legs
+from telemetry.samples.findings import Finding, metres, plural
 from telemetry.samples.times import ZONE_UNKNOWN
 
 Array = NDArray[np.float64]
@@ -24,11 +24,11 @@ _OUTLYING_POSITION_M: Final = 100.0  # a photo farther from those beside it (and
 _LOW_SHARE: Final = 0.4  # a few photos lower than this share of the usual height are reported
 
 
-def flight_findings(photos: Sequence[PhotoTags], frames: Sequence[Frame], vehicle: str) -> list[Finding]:
+def flight_findings(photos: Sequence[Photo], frames: Sequence[Frame], vehicle: str) -> list[Finding]:
     """Findings on one vehicle's photos (in order, with the frames made of them)."""
     if len(frames) < 2:
         return []
-    ground = track_of(frames)
+    ground = ground_track([f.fix for f in frames])
     legs = straight_legs(ground)
     found = [
         _maker_notes(photos),
@@ -57,12 +57,7 @@ def times_without_zone(frames: Iterable[Frame]) -> list[Finding]:
     return [Finding("time-without-zone", text)]
 
 
-def track_of(frames: Sequence[Frame]) -> Array:
-    """East and north (N, 2) of frames in metres about the first."""
-    return local_metres([f.fix.lat_deg for f in frames], [f.fix.lon_deg for f in frames])
-
-
-def _maker_notes(photos: Sequence[PhotoTags]) -> Finding | None:
+def _maker_notes(photos: Sequence[Photo]) -> Finding | None:
     count = sum(p.origin.get("angles") == "DJI MakerNotes" for p in photos)
     if not count:
         return None
@@ -70,7 +65,7 @@ def _maker_notes(photos: Sequence[PhotoTags]) -> Finding | None:
     return Finding("attitude-makernotes", text, note=True)
 
 
-def _distortion(photos: Sequence[PhotoTags]) -> Finding | None:
+def _distortion(photos: Sequence[Photo]) -> Finding | None:
     known = [p.dewarp_k1 for p in photos if p.dewarp_k1 is not None]
     if not known:
         return None
@@ -91,9 +86,9 @@ def _accurate_positions(frames: Sequence[Frame]) -> Finding | None:
 
 def _times(frames: Sequence[Frame], ground: Array) -> list[Finding]:
     times = np.array([np.nan if f.time_s is None else f.time_s for f in frames])
-    found: list[Finding] = []
     if np.isnan(times).all():
         return [Finding("time-missing", "the pictures have no times; they are taken in the order of their names")]
+    found: list[Finding] = []
     step, flown = np.diff(times), np.hypot(*np.diff(ground, axis=0).T)
     moving = (step > 0) & (step < 120) & (flown > 2.0)
     speed = float(np.median(flown[moving] / step[moving])) if moving.any() else 0.0
@@ -139,14 +134,12 @@ def _outlying_positions(frames: Sequence[Frame], ground: Array) -> Finding | Non
     far = np.flatnonzero((least > _OUTLYING_POSITION_M) & (least > 15.0 * np.median(step)) & (least > 3.0 * across)) + 1
     if not len(far):
         return None
-    away = float(least[far - 1].max())
-    metres = f"{away / 1000:.0f} km" if away > 10_000 else f"{away:.0f} m"
-    first = frames[int(far[0])].image
-    return Finding(
-        "position-astray",
-        f"{plural(len(far), 'picture')} lie up to {metres} away from the pictures before and after ({first} first); "
-        "their positions are wrong",
+    away_m = float(least[far - 1].max())
+    text = (
+        f"{plural(len(far), 'picture')} lie up to {metres(away_m)} away from the pictures before and after "
+        f"({frames[int(far[0])].image} first); their positions are wrong"
     )
+    return Finding("position-astray", text)
 
 
 def _standing(ground: Array) -> Finding | None:
@@ -179,13 +172,8 @@ def _spacing(frames: Sequence[Frame], ground: Array, legs: Sequence[Straight]) -
     step = np.concatenate([np.hypot(*np.diff(ground[g.first : g.last + 1], axis=0).T) for g in legs])
     usual = float(np.median(step))
     first = frames[0]
-    footprint = (
-        2.0
-        * height
-        * math.tan(0.5 * (first.fov_hint_rad or math.radians(active().records.theta_hat_deg)))
-        * first.height
-        / first.width
-    )
+    fov_rad = first.fov_hint_rad or math.radians(active().records.theta_hat_deg)
+    footprint = 2.0 * height * math.tan(0.5 * fov_rad) * first.height / first.width
     if usual < 0.1 * height:
         text = (
             f"pictures are {usual:.1f} m apart at {height:.0f} m height, a short base: neighbours see heights of the "

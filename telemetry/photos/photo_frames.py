@@ -11,8 +11,8 @@ import numpy as np
 from orthoswarm.model.frame import Frame
 from telemetry.photos.attitude import check_legs, decide
 from telemetry.photos.maker_angles import Angles
-from telemetry.photos.photo_tags import HEMISPHERE_UNKNOWN, PhotoTags
-from telemetry.samples.course import courses_deg, local_metres, straight_legs
+from telemetry.photos.photo_tags import HEMISPHERE_UNKNOWN, Photo
+from telemetry.samples.course import courses_deg, ground_track, straight_legs
 from telemetry.samples.findings import Finding, plural
 from telemetry.samples.sample import Sample
 from telemetry.samples.sample_frame import fix_of
@@ -21,17 +21,15 @@ LEAST_HEIGHT_M: Final = 1.0  # recorded heights below this were never filled in
 
 
 def frames_of(
-    photos: Sequence[PhotoTags], vehicle: str, name: Callable[[Path], str], findings: list[Finding]
+    photos: Sequence[Photo], vehicle: str, name: Callable[[Path], str], findings: list[Finding]
 ) -> list[Frame]:
     """Frames of one vehicle's photos (in order of time), after comparing their tags.
 
     Args:
-        photos: with positions.
-        vehicle: id.
-        name: maps a file to its name in the products.
-        findings: findings are appended here.
+        photos: with positions. vehicle: id. name: maps a file to its name in the products.
+        findings: are appended here.
     """
-    ground = local_metres([p.lat_deg or 0.0 for p in photos], [p.lon_deg or 0.0 for p in photos])
+    ground = ground_track(photos)
     course = courses_deg(ground)
     heights = _heights(photos, findings, vehicle)
     unsigned = sum(p.origin.get("position", "").endswith(HEMISPHERE_UNKNOWN) for p in photos)
@@ -52,21 +50,18 @@ def frames_of(
     frames = []
     for i, photo in enumerate(photos):
         angles, yaw_origin = chosen[i]
-        frames.append(
-            _frame(photo, vehicle, name(photo.path), height_m=heights[i], angles=angles, yaw_origin=yaw_origin)
-        )
+        image = name(photo.path)
+        frames.append(_frame(photo, vehicle, image, height_m=heights[i], angles=angles, yaw_origin=yaw_origin))
     return frames
 
 
-def frame_without_position(photo: PhotoTags, vehicle: str, image: str) -> Frame:
+def frame_without_position(photo: Photo, vehicle: str, image: str) -> Frame:
     """The frame of a photo without a position: latitude and longitude are NaN, and no angle is believed."""
     nowhere = replace(photo, lat_deg=math.nan, lon_deg=math.nan)
     return _frame(nowhere, vehicle, image, height_m=photo.height_m, angles=(None, None, None), yaw_origin="")
 
 
-def _frame(
-    photo: PhotoTags, vehicle: str, image: str, *, height_m: float | None, angles: Angles, yaw_origin: str
-) -> Frame:
+def _frame(photo: Photo, vehicle: str, image: str, *, height_m: float | None, angles: Angles, yaw_origin: str) -> Frame:
     origin = dict(photo.origin)
     if angles[0] is not None and yaw_origin:
         origin["yaw"] = f"{yaw_origin} ({origin.get('angles') or origin.get('flight_yaw', '')})"
@@ -98,39 +93,28 @@ def _frame(
     )
 
 
-def _heights(photos: Sequence[PhotoTags], findings: list[Finding], vehicle: str) -> list[float | None]:
+def _heights(photos: Sequence[Photo], findings: list[Finding], vehicle: str) -> list[float | None]:
     """Plausible heights: not zero or negative, and not altitudes."""
     heights = [p.height_m if p.height_m is not None and math.isfinite(p.height_m) else None for p in photos]
     low = [h for h in heights if h is not None and h < LEAST_HEIGHT_M]
     if low:
-        findings.append(
-            Finding(
-                "height-implausible",
-                f"the recorded height is below {LEAST_HEIGHT_M:g} m in {plural(len(low), 'photo')} "
-                f"(down to {min(low):.1f} m); these heights are ignored",
-                vehicle,
-            )
+        text = (
+            f"the recorded height is below {LEAST_HEIGHT_M:g} m in {plural(len(low), 'photo')} "
+            f"(down to {min(low):.1f} m); these heights are ignored"
         )
+        findings.append(Finding("height-implausible", text, vehicle))
     heights = [h if h is not None and h >= LEAST_HEIGHT_M else None for h in heights]
     missing = sum(h is None for h in heights)
     if missing:
-        findings.append(
-            Finding(
-                "height-missing",
-                f"{missing} of {plural(len(photos), 'photo')} without a height above ground; "
-                "it is estimated from the distance flown",
-                vehicle,
-            )
-        )
+        count = f"{missing} of {plural(len(photos), 'photo')}"
+        text = f"{count} without a height above ground; it is estimated from the distance flown"
+        findings.append(Finding("height-missing", text, vehicle))
     altitudes = np.array([p.altitude_m for p in photos if p.altitude_m is not None], dtype=np.float64)
     wrong = altitudes[(altitudes < 0.0) | (altitudes > 15_000.0)]
     if len(wrong):
-        findings.append(
-            Finding(
-                "altitude-implausible",
-                f"the GPS altitude is {wrong.min():.0f} to {wrong.max():.0f} m in {plural(len(wrong), 'photo')}, "
-                "which cannot be where it flew; altitudes are not used as heights",
-                vehicle,
-            )
+        text = (
+            f"the GPS altitude is {wrong.min():.0f} to {wrong.max():.0f} m in {plural(len(wrong), 'photo')}, "
+            "which cannot be where it flew; altitudes are not used as heights"
         )
+        findings.append(Finding("altitude-implausible", text, vehicle))
     return heights

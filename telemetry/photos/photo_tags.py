@@ -1,4 +1,4 @@
-"""The tags of one photo: position, attitude, time and lens of its camera.
+"""A photo and its tags: position, attitude, time and lens of its camera.
 
 Tags are only collected here, with their values unchanged; `telemetry.photos.attitude` decides which of several
 yaws is the picture's, and `telemetry.ingest` merges photos with other sources.
@@ -36,8 +36,8 @@ _MOST_HEIGHT_M: Final = 12_000.0  # recorded heights above this are not heights 
 
 
 @dataclass(slots=True, kw_only=True)
-class PhotoTags:
-    """The tags of one photo.
+class Photo:
+    """One photo with its tags, and what tables and logs add to them.
 
     Attributes:
         path: the file. width: columns as stored; height: rows.
@@ -84,7 +84,7 @@ class PhotoTags:
     unplaced: tuple[str, str] = ("", "")
 
 
-def read_photo(path: Path) -> PhotoTags | None:
+def read_photo(path: Path) -> Photo | None:
     """Read the tags of one photo; None for a georeferenced raster, which is not a photo.
 
     Raises:
@@ -100,11 +100,10 @@ def read_photo(path: Path) -> PhotoTags | None:
 
 def read_photos(
     paths: Sequence[Path], *, workers: int = 4, run: Run | None = None, progress: Callable[[int], None] | None = None
-) -> Generator[PhotoTags | Unreadable | None, None, None]:
+) -> Generator[Photo | Unreadable | None, None, None]:
     """Read many photos in parallel, in order; for a file that cannot be read, the reason.
 
     Args:
-        paths: files.
         workers: threads, used without `run`, as reading from a slow disk is mostly waiting.
         run: maps a function over items in processes, in order, where the photos are many and the disk is fast.
         progress: called with the number of photos done since the last call.
@@ -130,23 +129,23 @@ def _chunk(paths: Sequence[Path]) -> _Chunk:
     return _Chunk(paths, {path: file for path, file in found if file is not None})
 
 
-def _read_chunk(chunk: _Chunk) -> list[PhotoTags | Unreadable | None]:
+def _read_chunk(chunk: _Chunk) -> list[Photo | Unreadable | None]:
     if not any(map(is_stored, chunk.paths)):
-        return [_tags_or_reason(path) for path in chunk.paths]
+        return list(map(_tags_or_reason, chunk.paths))
     expect(chunk.stored)
     with ThreadPoolExecutor(active().stores.connections) as pool:  # a request mostly waits for the network
         return list(pool.map(_tags_or_reason, chunk.paths))
 
 
-def _tags_or_reason(path: Path) -> PhotoTags | Unreadable | None:
+def _tags_or_reason(path: Path) -> Photo | Unreadable | None:
     return read_or_reason(read_photo, path)
 
 
-def tags_of(path: Path, container: Container) -> PhotoTags:
+def tags_of(path: Path, container: Container) -> Photo:
     """The tags in a picture container."""
     tags = container.exif
     found = xmp.properties(container.xmp) if container.xmp else {}
-    photo = PhotoTags(path=path, width=container.width, height=container.height)
+    photo = Photo(path=path, width=container.width, height=container.height)
     photo.make = exif.text(tags.main.get(exif.MAKE)) or found.get("tiff:Make", "")
     photo.model = exif.text(tags.main.get(exif.MODEL)) or found.get("tiff:Model", "")
     _position(photo, tags, found)
@@ -157,7 +156,7 @@ def tags_of(path: Path, container: Container) -> PhotoTags:
     return photo
 
 
-def _position(photo: PhotoTags, tags: exif.Exif, found: xmp.Properties) -> None:
+def _position(photo: Photo, tags: exif.Exif, found: xmp.Properties) -> None:
     position = exif.gps_position(tags.gps)
     source = "EXIF GPS"
     if position is None:
@@ -193,7 +192,7 @@ def _xmp_position(found: xmp.Properties) -> tuple[float, float] | None:
     return (lat, lon) if lat is not None and lon is not None and is_position(lat, lon) else None
 
 
-def _heights(photo: PhotoTags, tags: exif.Exif, found: xmp.Properties) -> None:
+def _heights(photo: Photo, tags: exif.Exif, found: xmp.Properties) -> None:
     photo.altitude_m = exif.gps_altitude(tags.gps)
     if photo.altitude_m is None:
         photo.altitude_m = xmp.number(found, "drone-dji:AbsoluteAltitude")
@@ -216,7 +215,7 @@ _RELATIVE_ALTITUDES = (
 )
 
 
-def _time(photo: PhotoTags, tags: exif.Exif, found: xmp.Properties) -> None:
+def _time(photo: Photo, tags: exif.Exif, found: xmp.Properties) -> None:
     exact = parse_time(found.get("drone-dji:UTCAtExposure", ""))
     exposed = (exact[0], "XMP UTCAtExposure") if exact is not None else exif.exposure_time(tags)
     if exposed is None:
@@ -227,7 +226,7 @@ def _time(photo: PhotoTags, tags: exif.Exif, found: xmp.Properties) -> None:
         photo.time_s, photo.origin["time"] = exposed
 
 
-def _angles(photo: PhotoTags, tags: exif.Exif, found: xmp.Properties) -> None:
+def _angles(photo: Photo, tags: exif.Exif, found: xmp.Properties) -> None:
     """Camera and airframe attitude: XMP, then DJI's maker note, then the EXIF direction."""
     camera, flight = camera_angles(found, photo.make), flight_angles(found)
     if camera is not None:
@@ -238,7 +237,7 @@ def _angles(photo: PhotoTags, tags: exif.Exif, found: xmp.Properties) -> None:
     if photo.camera_deg == (None, None, None) and isinstance(note, bytes):
         dji = parse_dji(note)
         if dji is not None:
-            photo.camera_deg = (dji.camera_yaw_deg, dji.camera_pitch_deg, dji.camera_roll_deg)
+            photo.camera_deg = (dji.yaw_deg, dji.pitch_deg, dji.roll_deg)
             photo.flight_deg = (dji.flight_yaw_deg, dji.flight_pitch_deg, dji.flight_roll_deg)
             photo.origin["angles"] = photo.origin["flight_yaw"] = "DJI MakerNotes"
     direction = exif.number(tags.gps.get(17))
@@ -253,7 +252,7 @@ def _angles(photo: PhotoTags, tags: exif.Exif, found: xmp.Properties) -> None:
         photo.origin["angles"] = "EXIF GPSImgDirection"
 
 
-def _lens(photo: PhotoTags, tags: exif.Exif, found: xmp.Properties) -> None:
+def _lens(photo: Photo, tags: exif.Exif, found: xmp.Properties) -> None:
     focal = exif.number(tags.exif.get(exif.FOCAL_MM))
     focal_35 = exif.number(tags.exif.get(exif.FOCAL_35MM))
     zoom = exif.number(tags.exif.get(exif.DIGITAL_ZOOM)) or 1.0
@@ -261,12 +260,9 @@ def _lens(photo: PhotoTags, tags: exif.Exif, found: xmp.Properties) -> None:
     if photo.band.strip("{}").upper() in ("RGB", "R,G,B"):
         photo.band = ""
     sensor = found.get("drone-dji:ImageSource", "")
-    key = [photo.model or "camera", f"{photo.width}x{photo.height}"]
-    if focal:
-        key.append(f"{focal:.1f}mm")
-    if zoom > 1.0:
-        key.append(f"zoom{zoom:.1f}")
-    photo.camera = " ".join([*key, *filter(None, (sensor, photo.band))])
+    length, zoomed = f"{focal:.1f}mm" if focal else "", f"zoom{zoom:.1f}" if zoom > 1.0 else ""
+    key = (photo.model or "camera", f"{photo.width}x{photo.height}", length, zoomed, sensor, photo.band)
+    photo.camera = " ".join(filter(None, key))
     photo.dewarp_k1 = _dewarp_k1(found)
     for hint, source in _fov_hints(photo, found, tags, focal=focal, focal_35=focal_35, zoom=max(zoom, 1.0)):
         if hint is not None and math.radians(2.0) < hint < math.radians(150.0):
@@ -287,7 +283,7 @@ def _dewarp_k1(found: xmp.Properties) -> float | None:
 
 
 def _fov_hints(
-    photo: PhotoTags,
+    photo: Photo,
     found: xmp.Properties,
     tags: exif.Exif,
     *,
@@ -296,17 +292,14 @@ def _fov_hints(
     zoom: float,
 ) -> Iterator[tuple[float | None, str]]:
     """Horizontal field of view by several tags, the most trustworthy first."""
-    calibrated, centre = (
-        xmp.number(found, "drone-dji:CalibratedFocalLength"),
-        xmp.number(found, "drone-dji:CalibratedOpticalCenterX"),
-    )
-    if calibrated and centre and calibrated > 0 and centre > 0:
+    for length, centre in (
+        ("drone-dji:CalibratedFocalLength", "drone-dji:CalibratedOpticalCenterX"),
+        ("drone-skydio:CalibratedFocalLength/X", "drone-skydio:CalibratedOpticalCenter/X"),
+    ):
         # Stated for the full picture, whose half width is the principal point: valid for a scaled copy, too.
-        yield 2.0 * math.atan(centre / calibrated), "XMP CalibratedFocalLength"
-    skydio = xmp.number(found, "drone-skydio:CalibratedFocalLength/X")
-    middle = xmp.number(found, "drone-skydio:CalibratedOpticalCenter/X")
-    if skydio and middle and skydio > 0 and middle > 0:
-        yield 2.0 * math.atan(middle / skydio), "XMP CalibratedFocalLength"
+        calibrated, middle = xmp.number(found, length), xmp.number(found, centre)
+        if calibrated and middle and calibrated > 0 and middle > 0:
+            yield 2.0 * math.atan(middle / calibrated), "XMP CalibratedFocalLength"
     perspective = xmp.number(found, "Camera:PerspectiveFocalLength") or focal
     per_unit = exif.number(tags.exif.get(exif.FOCAL_PLANE_X))
     unit = exif.number(tags.exif.get(exif.FOCAL_PLANE_UNIT))

@@ -1,4 +1,9 @@
-"""How far the ground moves from one picture to the next, from features of pictures decoded at reduced size."""
+"""How far the ground moves from one picture to the next, and the yaw that this shows on straight legs.
+
+The camera moves along the leg's course; the direction in which the ground moves through the picture gives the azimuth
+of the picture's up direction. Accurate to a few degrees, which is enough to find a yaw that is flipped or belongs to
+the airframe instead of the camera. PictureFeatures are those of pictures decoded at reduced size.
+"""
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -9,13 +14,20 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.model.angles import wrap_deg
+from orthoswarm.model.frame import Frame
 from orthoswarm.raster.picture_file import PictureError, read_gray, reduction
+from telemetry.samples.course import Straight, ground_track, straight_legs
+from telemetry.samples.findings import Finding, plural
 
 Array = NDArray[np.float64]
 
 _MOTION_LEAST_INLIERS: Final = 25  # corners that the motion between two pictures takes at least
 _MOTION_RATIO: Final = 0.8  # ratio test of their matches (Lowe 2004)
 _MOTION_MOST_TURN_RAD: Final = 0.4  # two pictures that turn by more are not on one straight leg
+_YAW_PAIRS_A_LEG: Final = 3  # pairs of pictures by which the recorded yaw of a leg is checked
+_YAW_MOST_LEGS: Final = 12  # legs of a flight that are checked at most
+_YAW_LEAST_STEP_M: Final = 1.0  # distance flown between such pictures at least (receivers' noise)
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,8 +40,8 @@ class PictureFile:
 
 
 @dataclass(frozen=True, slots=True)
-class Features:
-    """Features of one picture at reduced size.
+class PictureFeatures:
+    """PictureFeatures of one picture at reduced size.
 
     Attributes:
         points: (N, 2) column and row. descriptors: (N, 128) float32. centre: (2,) column and row of the middle.
@@ -40,7 +52,7 @@ class Features:
     centre: Array
 
 
-def features(picture: PictureFile, *, width: int = 480, most: int = 800) -> Features | None:
+def features(picture: PictureFile, *, width: int, most: int) -> PictureFeatures | None:
     """SIFT features of a picture reduced to a width in pixels; None where it cannot be decoded or shows too few."""
     import cv2
 
@@ -54,7 +66,7 @@ def features(picture: PictureFile, *, width: int = 480, most: int = 800) -> Feat
     if descriptors is None or len(points) < _MOTION_LEAST_INLIERS:
         return None
     middle = 0.5 * (np.array([small.shape[1], small.shape[0]], dtype=np.float64) - 1.0)
-    return Features(np.array([p.pt for p in points]), descriptors, middle)
+    return PictureFeatures(np.array([p.pt for p in points]), descriptors, middle)
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,15 +74,14 @@ class Shift:
     """How the ground in the middle of one picture moves to another.
 
     Attributes:
-        pixels: (2,) columns and rows at the reduced size. turned_rad: clockwise as seen. inliers: matches that agree.
+        pixels: (2,) columns and rows at the reduced size. turned_rad: clockwise as seen.
     """
 
     pixels: Array
     turned_rad: float
-    inliers: int
 
 
-def centre_shift(one: Features, two: Features) -> Shift | None:
+def centre_shift(one: PictureFeatures, two: PictureFeatures) -> Shift | None:
     """The similarity on which most matches agree; None where too few do."""
     import cv2
 
@@ -81,20 +92,19 @@ def centre_shift(one: Features, two: Features) -> Shift | None:
     source = np.array([one.points[m.queryIdx] for m in good])
     target = np.array([two.points[m.trainIdx] for m in good])
     model, inliers = cv2.estimateAffinePartial2D(source, target, method=cv2.RANSAC, ransacReprojThreshold=4.0)
-    count = 0 if inliers is None else int(inliers.sum())
-    if model is None or count < _MOTION_LEAST_INLIERS:
+    if model is None or inliers.sum() < _MOTION_LEAST_INLIERS:
         return None
     shift = model[:, :2] @ one.centre + model[:, 2] - one.centre
-    return Shift(shift, float(np.arctan2(model[1, 0], model[0, 0])), count)
+    return Shift(shift, float(np.arctan2(model[1, 0], model[0, 0])))
 
 
-def shifts_px(pictures: Sequence[PictureFile], *, width: int = 320, most: int = 250, workers: int = 2) -> Array:
-    """(N - 1,) pixels, at this width, that the ground moves between consecutive pictures; 20 ms a picture.
+def shifts_px(pictures: Sequence[PictureFile], workers: int = 2) -> Array:
+    """(N - 1,) pixels, of pictures 320 wide, that the ground moves between consecutive pictures; 20 ms a picture.
 
     NaN where two do not match, or where the vehicle turned: the way around a turn is longer than the shift.
     """
     with ThreadPoolExecutor(max(1, workers)) as pool:
-        found = list(pool.map(lambda picture: features(picture, width=width, most=most), pictures))
+        found = list(pool.map(lambda picture: features(picture, width=320, most=250), pictures))
 
         def length(i: int) -> float:
             one, two = found[i], found[i + 1]
@@ -103,3 +113,73 @@ def shifts_px(pictures: Sequence[PictureFile], *, width: int = 320, most: int = 
             return float(np.hypot(*shift.pixels)) if shift is not None and straight else float("nan")
 
         return np.array(list(pool.map(length, range(len(pictures) - 1))), dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True)
+class _SeenHeading:
+    """The yaw measured on a leg: azimuth of the up direction of a picture (its index)."""
+
+    leg: Straight
+    picture: int
+    yaw_deg: float
+
+
+def _seen_headings(frames: Sequence[Frame]) -> list[_SeenHeading]:
+    """Yaw of each straight leg of a vehicle, measured in its pictures; legs that cannot be matched are left out."""
+    ground = ground_track([f.fix for f in frames])
+    legs = straight_legs(ground)
+    if len(legs) > _YAW_MOST_LEGS:
+        legs = [legs[i] for i in np.linspace(0, len(legs) - 1, _YAW_MOST_LEGS).round().astype(int)]
+    found: list[_SeenHeading] = []
+    for leg in legs:
+        middle = (leg.first + leg.last) // 2
+        order = sorted(range(leg.first, leg.last), key=lambda i: abs(i - middle))
+        for i in order[:_YAW_PAIRS_A_LEG]:
+            yaw_deg = _seen_yaw_deg(frames[i], frames[i + 1], ground[i + 1] - ground[i])
+            if yaw_deg is not None:
+                found.append(_SeenHeading(leg, i + 1, yaw_deg))
+                break
+    return found
+
+
+def _seen_yaw_deg(a: Frame, b: Frame, moved: Array) -> float | None:
+    """Yaw of the second of two pictures; None if they cannot be matched."""
+    if np.hypot(*moved) < _YAW_LEAST_STEP_M:
+        return None
+    one, two = (features(PictureFile(f.path, f.width, f.height), width=480, most=800) for f in (a, b))
+    matched = centre_shift(one, two) if one is not None and two is not None else None
+    if matched is None or np.hypot(*matched.pixels) < 4.0:
+        return None
+    # In the second picture the first one's centre lies in the direction the camera came from; up is opposite to the
+    # rows.
+    to_the_right_of_up = np.degrees(np.arctan2(-matched.pixels[0], matched.pixels[1]))
+    course = np.degrees(np.arctan2(moved[0], moved[1]))
+    return wrap_deg(float(course - to_the_right_of_up))
+
+
+def heading_findings(frames: Sequence[Frame], vehicle: str) -> list[Finding]:
+    """Contradictions between recorded yaw and pictures, leg by leg."""
+    seen = [h for h in _seen_headings(frames) if frames[h.picture].fix.yaw_rad is not None]
+    if not seen:
+        return []
+    recorded = np.array([np.degrees(frames[h.picture].fix.yaw_rad or 0.0) for h in seen])
+    apart = wrap_deg(recorded - np.array([h.yaw_deg for h in seen]))
+    turned = np.abs(apart) > 130.0
+    found: list[Finding] = []
+    if turned.any():
+        ends = ((frames[h.leg.first].image, frames[h.leg.last].image) for h, t in zip(seen, turned) if t)
+        text = (
+            "the recorded yaw is turned by 180 degrees against the pictures on "
+            f"{plural(int(turned.sum()), 'leg')} of {len(seen)} ({', '.join(f'{a} to {b}' for a, b in ends)})"
+        )
+        found.append(Finding("yaw-flip", text, vehicle))
+    rest = apart[~turned]
+    if len(rest) and np.median(np.abs(rest)) > 25.0:
+        off = float(np.median(np.abs(rest)))
+        text = f"the recorded yaw is {off:.0f} degrees off what the pictures show (median)"
+        found.append(Finding("yaw-wrong", text, vehicle))
+    elif len(rest):
+        within = float(np.abs(rest).max())
+        text = f"the pictures confirm the recorded yaw on {plural(len(rest), 'leg')} within {within:.0f} degrees"
+        found.append(Finding("yaw-confirmed", text, vehicle, note=True))
+    return found

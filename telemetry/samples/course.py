@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,23 @@ from orthoswarm.model.angles import wrap_deg, wrap_rad
 from orthoswarm.model.earth import MEAN_RADIUS_M
 
 Array = NDArray[np.float64]
+
+_LEAST_STEP_M: Final = 1.0  # shorter steps have no course: receivers at rest wander
+_COURSE_BEND_DEG: Final = 40.0  # a bend from which a position lies in a turn
+_LEG_BEND_DEG: Final = 30.0  # a step that is off a leg's own course by more ends it
+_LEAST_LEG_M: Final = 5.0  # what is shorter is a part of a turn
+
+
+class Placed(Protocol):
+    """What has a position: a photo, a sample, a frame's fix."""
+
+    @property
+    def lat_deg(self) -> float | None:
+        """Latitude, WGS 84."""
+
+    @property
+    def lon_deg(self) -> float | None:
+        """Longitude."""
 
 
 def local_metres(lat_deg: Sequence[float] | Array, lon_deg: Sequence[float] | Array) -> Array:
@@ -22,7 +40,17 @@ def local_metres(lat_deg: Sequence[float] | Array, lon_deg: Sequence[float] | Ar
     return MEAN_RADIUS_M * np.stack([dlon * np.cos(np.median(lat)), lat - lat[0]], axis=-1)
 
 
-def courses_deg(east_north: Array, *, least_step_m: float = 1.0, bend_deg: float = 40.0) -> Array:
+def ground_track(places: Sequence[Placed]) -> Array:
+    """East and north (N, 2) in metres about the first place."""
+    return local_metres([p.lat_deg or 0.0 for p in places], [p.lon_deg or 0.0 for p in places])
+
+
+def length_m(east_north: Array) -> float:
+    """Length of a track (N, 2), metres."""
+    return float(np.hypot(*np.diff(east_north, axis=0).T).sum()) if len(east_north) > 1 else 0.0
+
+
+def courses_deg(east_north: Array) -> Array:
     """Course over ground (N,) in degrees clockwise from north at each position; NaN in turns and while stationary."""
     count = len(east_north)
     result = np.full(count, np.nan)
@@ -30,11 +58,11 @@ def courses_deg(east_north: Array, *, least_step_m: float = 1.0, bend_deg: float
         return result
     step = np.diff(east_north, axis=0)
     length = np.hypot(step[:, 0], step[:, 1])
-    heading = np.where(length >= least_step_m, np.degrees(np.arctan2(step[:, 0], step[:, 1])), np.nan)
+    heading = np.where(length >= _LEAST_STEP_M, np.degrees(np.arctan2(step[:, 0], step[:, 1])), np.nan)
     before = np.concatenate([[np.nan], heading])
     after = np.concatenate([heading, [np.nan]])
     change = wrap_deg(after - before)
-    straight = np.abs(change) < bend_deg
+    straight = np.abs(change) < _COURSE_BEND_DEG
     result[straight] = before[straight] + 0.5 * change[straight]
     result[0] = heading[0]
     result[-1] = heading[-1]
@@ -50,13 +78,11 @@ class Straight:
     course_deg: float
 
 
-def straight_legs(
-    east_north: Array, *, bend_deg: float = 30.0, least_frames: int = 3, least_length_m: float = 5.0
-) -> list[Straight]:
+def straight_legs(east_north: Array, *, least_frames: int = 3) -> list[Straight]:
     """Straight runs of a track, in order.
 
-    A run goes on while each step keeps within `bend_deg` of the run's own course; steps much shorter than usual
-    (hovering) are bridged. Runs of fewer than `least_frames` positions or shorter than `least_length_m` are turns.
+    A run goes on while each step keeps near the run's own course; steps much shorter than usual (hovering) are bridged.
+    Short runs, and those of fewer than `least_frames` positions, are turns.
     """
     count = len(east_north)
     if count < 2:
@@ -66,6 +92,12 @@ def straight_legs(
     usual = float(np.median(length))
     legs: list[Straight] = []
     first = 0
+
+    def close(last: int) -> None:
+        run = east_north[last] - east_north[first]
+        if last - first + 1 >= least_frames and np.hypot(*run) >= _LEAST_LEG_M:
+            legs.append(Straight(first, last, float(np.degrees(np.arctan2(run[0], run[1])))))
+
     for i in range(count - 1):
         if length[i] < 0.2 * usual:
             continue
@@ -73,18 +105,8 @@ def straight_legs(
         if np.hypot(*run) < 0.2 * usual:
             continue
         bend = wrap_deg(float(np.degrees(np.arctan2(step[i, 0], step[i, 1]) - np.arctan2(run[0], run[1]))))
-        if abs(float(bend)) > bend_deg:
-            _close(legs, east_north, first, last=i, least_frames=least_frames, least_length_m=least_length_m)
+        if abs(float(bend)) > _LEG_BEND_DEG:
+            close(i)
             first = i if i - first < least_frames - 1 else i + 1
-            if first == i:
-                first = i
-    _close(legs, east_north, first, last=count - 1, least_frames=least_frames, least_length_m=least_length_m)
+    close(count - 1)
     return legs
-
-
-def _close(
-    legs: list[Straight], points: Array, first: int, *, last: int, least_frames: int, least_length_m: float
-) -> None:
-    run = points[last] - points[first]
-    if last - first + 1 >= least_frames and np.hypot(*run) >= least_length_m:
-        legs.append(Straight(first, last, float(np.degrees(np.arctan2(run[0], run[1])))))

@@ -21,6 +21,11 @@ class Finding:
         return f"{self.vehicle}: {self.message}" if self.vehicle else self.message
 
 
+def metres(distance_m: float) -> str:
+    """A distance as text, in kilometres if it is long."""
+    return f"{distance_m / 1000:.0f} km" if distance_m > 10_000 else f"{distance_m:.0f} m"
+
+
 def plural(count: int, noun: str) -> str:
     """A count with its noun, as in 1 photo, 3 photos."""
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"

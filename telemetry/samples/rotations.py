@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.model.camera import NED_TO_ENU, angles_from_rotation
+from telemetry.samples.sample import Sample
 
 Array = NDArray[np.float64]
 
@@ -22,6 +23,13 @@ def euler_ned(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Array:
             [-sp, cp * sr, cp * cr],
         ]
     )
+
+
+def airframe_ned(sample: Sample) -> Array | None:
+    """The airframe's rotation body to north-east-down, pitch and roll 0 where unknown; None without a yaw."""
+    if sample.flight_yaw_deg is None:
+        return None
+    return euler_ned(sample.flight_yaw_deg, sample.flight_pitch_deg or 0.0, sample.flight_roll_deg or 0.0)
 
 
 def quaternion_ned(w: float, x: float, y: float, z: float) -> Array:
@@ -43,13 +51,16 @@ def camera_angles_deg(forward_ned: Array) -> tuple[float, float, float]:
     This is the form of MISB sensor angles and of MAVLink gimbals: x along the optical axis, y to the picture's right,
     z towards its lower edge.
     """
-    yaw, pitch, roll = angles_from_rotation(NED_TO_ENU @ forward_ned @ _CAMERA_TO_FORWARD)
-    return float(np.degrees(yaw)), float(np.degrees(pitch)), float(np.degrees(roll))
+    return camera_frame_angles_deg(forward_ned @ _CAMERA_TO_FORWARD)
 
 
 def camera_frame_angles_deg(camera_ned: Array) -> tuple[float, float, float]:
     """Our yaw, pitch, roll in degrees of a camera-to-NED rotation whose z is the optical axis, x right, y down."""
-    yaw, pitch, roll = angles_from_rotation(NED_TO_ENU @ camera_ned)
+    return _degrees(NED_TO_ENU @ camera_ned)
+
+
+def _degrees(camera_enu: Array) -> tuple[float, float, float]:
+    yaw, pitch, roll = angles_from_rotation(camera_enu)
     return float(np.degrees(yaw)), float(np.degrees(pitch)), float(np.degrees(roll))
 
 
@@ -70,5 +81,4 @@ def camera_angles_from_opk_deg(omega: float, phi: float, kappa: float) -> tuple[
     about_x = np.array([[1.0, 0.0, 0.0], [0.0, co, -so], [0.0, so, co]])
     about_y = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
     about_z = np.array([[ck, -sk, 0.0], [sk, ck, 0.0], [0.0, 0.0, 1.0]])
-    yaw, pitch, roll = angles_from_rotation(about_x @ about_y @ about_z @ np.diag([1.0, -1.0, -1.0]))
-    return float(np.degrees(yaw)), float(np.degrees(pitch)), float(np.degrees(roll))
+    return _degrees(about_x @ about_y @ about_z @ np.diag([1.0, -1.0, -1.0]))

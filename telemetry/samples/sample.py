@@ -3,7 +3,8 @@
 import math
 from dataclasses import dataclass, fields
 
-_ANGLES = ("yaw_deg", "pitch_deg", "roll_deg", "flight_yaw_deg", "flight_pitch_deg", "flight_roll_deg")
+CAMERA_ANGLES = ("yaw_deg", "pitch_deg", "roll_deg")
+FLIGHT_ANGLES = ("flight_yaw_deg", "flight_pitch_deg", "flight_roll_deg")
 
 
 @dataclass(slots=True, kw_only=True)
@@ -49,6 +50,11 @@ class Sample:
         """Whether it contains a position."""
         return self.lat_deg is not None and self.lon_deg is not None
 
+    @property
+    def place(self) -> tuple[float, float]:
+        """Latitude and longitude, 0 where unknown."""
+        return self.lat_deg or 0.0, self.lon_deg or 0.0
+
     def merge(self, other: "Sample") -> "Sample":
         """This sample with gaps filled from another; a position, a height and its kind stay together."""
         result = Sample()
@@ -72,7 +78,7 @@ def checked(sample: Sample) -> Sample | None:
             setattr(sample, name, None)
     if sample.lat_deg is None or sample.lon_deg is None or not is_position(sample.lat_deg, sample.lon_deg):
         sample.lat_deg = sample.lon_deg = None
-    for name in _ANGLES:
+    for name in (*CAMERA_ANGLES, *FLIGHT_ANGLES):
         value = getattr(sample, name)
         if value is not None and abs(value) > 720.0:
             setattr(sample, name, None)

@@ -18,17 +18,11 @@ def frame_of(
     camera: str = "",
     origin: str = "",
 ) -> Frame | None:
-    """The frame of a picture with its pose; None if the sample has no position.
+    """The frame of a picture of so many columns and rows with its pose; None if the sample has no position.
 
     Args:
-        sample: the pose; its yaw is the picture's.
-        image: name in all products.
-        path: of the picture file.
-        vehicle: id.
-        width: columns of the picture.
-        height: rows of the picture.
-        camera: distinguishes lenses of one vehicle.
-        origin: source of the pose.
+        sample: the pose; its yaw is the picture's. image: name in all products.
+        camera: distinguishes lenses of one vehicle. origin: source of the pose.
     """
     if sample.lat_deg is None or sample.lon_deg is None:
         return None

@@ -11,15 +11,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthoswarm.model.angles import wrap_deg
-from telemetry.samples.sample import Sample
+from telemetry.samples.sample import CAMERA_ANGLES, FLIGHT_ANGLES, Sample
 
 Array = NDArray[np.float64]
 
-ANGLES = ("yaw_deg", "pitch_deg", "roll_deg", "flight_yaw_deg", "flight_pitch_deg", "flight_roll_deg")
-LINEAR = ("lat_deg", "height_m", "altitude_m", "fov_deg", "zoom", "sigma_m")
-_WRAPPED = (*ANGLES, "lon_deg")
-FIELDS = (*LINEAR, *_WRAPPED)
-GROUND = "ground_m"
+_WRAPPED = (*CAMERA_ANGLES, *FLIGHT_ANGLES, "lon_deg")
+_FIELDS = ("lat_deg", "height_m", "altitude_m", "fov_deg", "zoom", "sigma_m", *_WRAPPED)
+_GROUND = "ground_m"
 """Name of the series of heights above the ground below."""
 
 
@@ -33,10 +31,10 @@ class Timeline:
     def __init__(self, samples: Iterable[Sample], *, max_gap_s: float = 2.0) -> None:
         self.max_gap_s = max_gap_s
         rows = sorted((s for s in samples if s.time_s is not None), key=lambda s: s.time_s or 0.0)
-        self._series = {name: _series(rows, name) for name in FIELDS if name != "height_m"}
+        self._series = {name: _series(rows, name) for name in _FIELDS if name != "height_m"}
         # Heights above takeoff and above the ground are different quantities, even where both are recorded.
         self._series["height_m"] = _series([s for s in rows if not s.height_is_ground], "height_m")
-        self._series[GROUND] = _series([s for s in rows if s.height_is_ground], "height_m")
+        self._series[_GROUND] = _series([s for s in rows if s.height_is_ground], "height_m")
         self._times = np.array([s.time_s for s in rows], dtype=np.float64)
         self._vehicle = next((s.vehicle for s in rows if s.vehicle), None)
 
@@ -72,8 +70,8 @@ class Timeline:
     def at_all(self, times: ArrayLike) -> list[Sample]:
         """The poses at many times."""
         moments = np.asarray(times, dtype=np.float64)
-        columns = [(name, self.values(name, moments).tolist()) for name in FIELDS if len(self._series[name][0])]
-        ground = self.values(GROUND, moments).tolist()
+        columns = [(name, self.values(name, moments).tolist()) for name in _FIELDS if len(self._series[name][0])]
+        ground = self.values(_GROUND, moments).tolist()
         result = []
         for i, moment in enumerate(moments.tolist()):
             sample = Sample(time_s=moment, vehicle=self._vehicle)

@@ -1,6 +1,7 @@
 """The failure of a reader: a damaged file must not end a run that has other inputs."""
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import ParamSpec, TypeVar
 
 from orthoswarm.model.errors import OrthoSwarmError, RunInterruptedError
@@ -19,13 +20,8 @@ class Unreadable(Exception):
 def read_or_reason(read: Callable[P, T], *args: P.args, **options: P.kwargs) -> T | Unreadable:
     """The reader's result, or the reason why it cannot read the file.
 
-    A reader parses untrusted bytes, partly in C code (FFmpeg, OpenCV, GDAL), so any
-    exception concerns that file only, not the run.
-
-    Args:
-        read: the reader.
-        args: passed to it.
-        options: passed to it.
+    A reader parses untrusted bytes, partly in C code (FFmpeg, OpenCV, GDAL), so any exception concerns that file only,
+    not the run.
     """
     try:
         return read(*args, **options)
@@ -33,6 +29,15 @@ def read_or_reason(read: Callable[P, T], *args: P.args, **options: P.kwargs) -> 
         raise
     except Exception as error:
         return reason_of(error)
+
+
+def beginning(path: Path, size: int) -> bytes:
+    """The first bytes of a file, b"" if it cannot be read: enough to tell what it is."""
+    try:
+        with path.open("rb") as handle:
+            return handle.read(size)
+    except OSError:
+        return b""
 
 
 def reason_of(error: Exception) -> Unreadable:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from orthoswarm.config import active
 from telemetry.samples.course import local_metres
-from telemetry.samples.findings import Finding, plural
+from telemetry.samples.findings import Finding, metres, plural
 from telemetry.samples.sample import Sample
 
 Array = NDArray[np.float64]
@@ -32,11 +32,6 @@ class WildFixes:
     indices: list[int]
     away_m: float = 0.0
     doubtful: int = 0
-
-    @property
-    def distance(self) -> str:
-        """`away_m` as text."""
-        return f"{self.away_m / 1000:.0f} km" if self.away_m > 10_000 else f"{self.away_m:.0f} m"
 
 
 def wild_fixes(times_s: Sequence[float | None], places: Sequence[tuple[float, float]]) -> WildFixes:
@@ -84,8 +79,7 @@ def wild_fixes(times_s: Sequence[float | None], places: Sequence[tuple[float, fl
 
 def _flyable(t0: Array, a: Array, t1: Array, b: Array) -> NDArray[np.bool_]:
     """Whether an aircraft can fly from places `a` (N, 2), metres, at times `t0` to places `b` at `t1`."""
-    config = active().ingest
-    reach = config.fastest_m_s * (t1 - t0 + TIME_RESOLUTION_S)
+    reach = active().ingest.fastest_m_s * (t1 - t0 + TIME_RESOLUTION_S)
     return np.asarray(np.hypot(b[..., 0] - a[..., 0], b[..., 1] - a[..., 1]) <= reach)
 
 
@@ -122,26 +116,23 @@ def doubtful_finding(count: int, of_what: str) -> Finding:
 def without_wild_fixes(
     samples: Sequence[Sample], times_s: Sequence[float | None], source: str
 ) -> tuple[list[Sample], list[Finding]]:
-    """Samples whose wild fixes have no position any more, and a finding if there are any.
+    """One flight's samples whose wild fixes have no position any more, and a finding if there are any.
 
     Args:
-        samples: of one flight.
-        times_s: of the samples, in one clock.
-        source: name of the file, for the message.
+        times_s: of the samples, in one clock. source: name of the file, for the message.
     """
     placed = [i for i, sample in enumerate(samples) if sample.has_position]
-    found = wild_fixes(
-        [times_s[i] for i in placed], [(samples[i].lat_deg or 0.0, samples[i].lon_deg or 0.0) for i in placed]
-    )
+    found = wild_fixes([times_s[i] for i in placed], [samples[i].place for i in placed])
     if found.doubtful:
         return list(samples), [doubtful_finding(found.doubtful, f"{plural(len(placed), 'position')} of {source}")]
     if not found.indices:
         return list(samples), []
     wild = {placed[i] for i in found.indices}
     sound = [replace(s, lat_deg=None, lon_deg=None) if i in wild else s for i, s in enumerate(samples)]
+    lie, they_are = ("lie", "they are") if len(wild) > 1 else ("lies", "it is")
     text = (
-        f"{plural(len(wild), 'position')} of {source} {'lie' if len(wild) > 1 else 'lies'} up to {found.distance} away "
-        f"from those before and after, farther than any aircraft flies in that time "
-        f"({active().ingest.fastest_m_s:.0f} m/s); {'they are' if len(wild) > 1 else 'it is'} not used"
+        f"{plural(len(wild), 'position')} of {source} {lie} up to {metres(found.away_m)} away from those before and "
+        "after, farther than any aircraft flies in that time "
+        f"({active().ingest.fastest_m_s:.0f} m/s); {they_are} not used"
     )
     return sound, [Finding("wild-fix", text)]

@@ -49,9 +49,14 @@ def _is_payload(rows: NDArray[np.uint8], pid: int) -> NDArray[np.bool_]:
 
 
 class Damage:
-    """Tracks damage through the packets of a video, by their index in decoding order."""
+    """Tracks damage through the packets of a video, by their index in decoding order.
+
+    Attributes:
+        undecoded: number of packets that could not be decoded at all.
+    """
 
     def __init__(self) -> None:
+        self.undecoded = 0
         self._recoveries: list[int] = []
         self._losses: set[int] = set()
         self._last_loss: dict[int, int] = {}

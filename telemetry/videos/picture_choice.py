@@ -1,4 +1,4 @@
-"""Selection of pictures from a video: one every few metres or seconds, the sharpest of its neighbours."""
+"""Which pictures of a video are used: one every few metres or seconds, the sharpest of its neighbours, in flight."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -9,16 +9,20 @@ import numpy as np
 from orthoswarm.config import active
 from orthoswarm.model.angles import wrap_deg
 from orthoswarm.model.earth import MEAN_RADIUS_M
+from telemetry.photos.photo_frames import LEAST_HEIGHT_M
 from telemetry.samples.sample import Sample
+from telemetry.videos.picture_poses import Poses
+from telemetry.videos.video_file import VideoScan
 
 _VIDEO_EARLY: Final = 0.8  # from this share of that distance on, pictures are candidates, of which the sharpest is used
 _VIDEO_LATE: Final = 1.2  # to this share
 _VIDEO_CANDIDATES: Final = 6  # candidates at most (memory)
+_LEAST_FLOWN_HEIGHT_M: Final = 5.0  # a video whose heights reach this was recorded with heights
 
 
 @dataclass(slots=True, kw_only=True)
-class Candidate:
-    """A picture that may be selected.
+class DecodedPicture:
+    """A picture of a video as decoded, that may be selected.
 
     Attributes:
         number: in order of presentation. frame: as decoded. sample: its pose. video_s: its time in the video.
@@ -48,10 +52,10 @@ class Picker:
 
     def __init__(self, every_m: float | None = None, every_s: float | None = None) -> None:
         self._every_m, self._every_s = every_m, every_s
-        self._last: Candidate | None = None
-        self._waiting: list[Candidate] = []
+        self._last: DecodedPicture | None = None
+        self._waiting: list[DecodedPicture] = []
 
-    def push(self, candidate: Candidate) -> Iterator[Candidate]:
+    def push(self, candidate: DecodedPicture) -> Iterator[DecodedPicture]:
         """Offer the next picture; yields the selected ones."""
         if self._last is None:
             self._last = candidate
@@ -70,12 +74,12 @@ class Picker:
         yield self._take()
         yield from self.push(candidate)
 
-    def flush(self) -> Iterator[Candidate]:
+    def flush(self) -> Iterator[DecodedPicture]:
         """At the end: yields the remaining selection."""
         if self._waiting:
             yield self._take()
 
-    def _take(self) -> Candidate:
+    def _take(self) -> DecodedPicture:
         best = self._waiting[0]
         if len(self._waiting) > 1:
             sound = [c for c in self._waiting if not c.damaged]
@@ -84,7 +88,7 @@ class Picker:
         self._last = best
         return best
 
-    def _progress(self, new: Candidate, last: Candidate) -> float:
+    def _progress(self, new: DecodedPicture, last: DecodedPicture) -> float:
         """Distance of a picture from the last selected one, in units of the spacing."""
         config = active().ingest
         seconds = abs(new.video_s - last.video_s)
@@ -101,10 +105,11 @@ class Picker:
 
 
 def _distance_m(a: Sample | None, b: Sample | None) -> float | None:
-    if a is None or b is None or a.lat_deg is None or b.lat_deg is None or a.lon_deg is None or b.lon_deg is None:
+    if a is None or b is None or not (a.has_position and b.has_position):
         return None
-    north = np.radians(a.lat_deg - b.lat_deg)
-    east = np.radians(wrap_deg(a.lon_deg - b.lon_deg)) * np.cos(np.radians(a.lat_deg))
+    (lat, lon), (other_lat, other_lon) = a.place, b.place
+    north = np.radians(lat - other_lat)
+    east = np.radians(wrap_deg(lon - other_lon)) * np.cos(np.radians(lat))
     return float(MEAN_RADIUS_M * np.hypot(north, east))
 
 
@@ -124,3 +129,20 @@ def luma(frame: Any) -> Any:
         rows = np.frombuffer(plane, np.uint8).reshape(-1, plane.line_size)
         return rows[: frame.height, : frame.width]
     return frame.to_ndarray(format="gray")
+
+
+def on_ground(found: VideoScan, poses: Poses) -> frozenset[int]:
+    """Packets whose pictures were taken on the ground: at its level until the first climb, or after the last descent.
+
+    Empty if the heights never leave the ground: then they were never filled in. A flight that passes the takeoff's
+    level in a valley is not interrupted.
+    """
+    order = sorted(range(len(found.pictures)), key=lambda i: (found.pictures[i].video_s or 0.0, i))
+    sampled = [(i, pose.sample.height_m) for i in order if (pose := poses.of(i)) is not None]
+    known = [(i, height) for i, height in sampled if height is not None]
+    heights = np.abs([height for _, height in known])
+    flown = np.flatnonzero(heights >= LEAST_HEIGHT_M)
+    if not len(flown) or heights.max() < _LEAST_FLOWN_HEIGHT_M:
+        return frozenset()
+    first, last = int(flown[0]), int(flown[-1])
+    return frozenset(i for n, (i, _) in enumerate(known) if n < first or n > last)

@@ -5,7 +5,8 @@ Metadata in or with a picture's own packet (SEI, djmd) belongs to that packet an
 subtitles) is interpolated at the picture's time. The sources are merged field by field, the one with a position first.
 """
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -34,24 +35,22 @@ class PicturePose:
     origin: str
 
 
-class Clock:
+class VideoClock:
     """UTC of video times, from pairs of both; beyond its ends it continues at rate one."""
 
-    def __init__(self, video_s: Sequence[float], utc_s: Sequence[float]) -> None:
-        order = np.argsort(video_s, kind="stable")
-        self._video = np.asarray(video_s, dtype=np.float64)[order]
-        self._utc = np.asarray(utc_s, dtype=np.float64)[order]
+    def __init__(self, pairs: Iterable[tuple[float, float]]) -> None:
+        table = np.array(list(pairs), dtype=np.float64).reshape(-1, 2)
+        self._video, self._utc = table[np.argsort(table[:, 0], kind="stable")].T
 
     def __len__(self) -> int:
         return len(self._video)
 
     def at(self, video_s: Array) -> Array:
         """UTC epoch seconds, NaN where the time is NaN or nothing is known."""
-        t = np.asarray(video_s, dtype=np.float64)
         if len(self) == 0:
-            return np.full(t.shape, np.nan)
-        inside = np.clip(t, self._video[0], self._video[-1])
-        return np.asarray(np.interp(inside, self._video, self._utc) + (t - inside))
+            return np.full(video_s.shape, np.nan)
+        inside = np.clip(video_s, self._video[0], self._video[-1])
+        return np.asarray(np.interp(inside, self._video, self._utc) + (video_s - inside))
 
     @property
     def rate(self) -> float:
@@ -81,9 +80,9 @@ class Poses:
         self._interpolated: list[tuple[str, list[Sample]]] = []
         self._sei = self._sei_samples()
         # A file beside the video counts before its own track, unless it is of some other kind.
-        cues = (
-            found.cues if subtitles is None or (found.cues.has_positions and not subtitles.has_positions) else subtitles
-        )
+        cues = subtitles or found.cues
+        if found.cues.has_positions and not cues.has_positions:
+            cues = found.cues
         self._add("KLV", self._klv_rows())
         self._add("GPMF", [(t, s) for t, s in found.gpmf_samples if s.has_position])
         rows = [(c.start_s, c.sample) for c in cues.cues if c.sample is not None and c.sample.has_position]
@@ -124,28 +123,24 @@ class Poses:
     @property
     def has_positions(self) -> bool:
         """Whether any source of this video has positions."""
-        return (
-            any(sample.has_position for _, samples in self._interpolated for sample in samples)
-            or any(sample is not None and sample.has_position for sample in self._sei)
-            or any(sample.has_position for _, sample in self._djmd)
-        )
+        return any(sample.has_position for sample in self._all_samples())
 
     @property
     def has_angles(self) -> bool:
         """Whether any source of this video has a camera's yaw."""
-        return (
-            any(sample.yaw_deg is not None for _, samples in self._interpolated for sample in samples)
-            or any(note.sample is not None and note.sample.yaw_deg is not None for note in self._scan.pictures)
-            or any(sample.yaw_deg is not None for _, sample in self._djmd)
-        )
+        return any(sample.yaw_deg is not None for sample in self._all_samples())
+
+    def _all_samples(self) -> Iterator[Sample]:
+        for _, samples in self._interpolated:
+            yield from samples
+        yield from (sample for sample in self._sei if sample is not None)
+        yield from (sample for _, sample in self._djmd)
 
     def add_track(self, name: str, timeline: Timeline, offset_s: float, *, has_gimbal: bool) -> int:
         """Add a vehicle's log as the last source; returns the number of pictures it gives a pose.
 
         Args:
-            name: origin of its fields.
-            timeline: the vehicle's poses over UTC.
-            offset_s: video time minus UTC.
+            name: origin of its fields. timeline: the vehicle's poses over UTC. offset_s: video time minus UTC.
             has_gimbal: False if the camera is assumed fixed under the airframe.
         """
         samples = timeline.at_all(self._times - offset_s)
@@ -192,7 +187,6 @@ class Poses:
         """Interpolate a source with times of its own at all pictures, but not from one recording to the next.
 
         Args:
-            name: of the source.
             rows: video times and samples.
             joints_s: video times at which the source's next recording begins, besides the file's own.
         """
@@ -233,13 +227,12 @@ class Poses:
         found = self._scan
         return found.turn.sample(sample, *square_size(found.width, found.height, found.aspect))
 
-    def _sei_clock(self) -> Clock:
-        pairs = [
+    def _sei_clock(self) -> VideoClock:
+        return VideoClock(
             (n.video_s, n.sample.time_s)
             for n in self._scan.pictures
             if n.video_s is not None and n.sample is not None and n.sample.time_s is not None
-        ]
-        return Clock([t for t, _ in pairs], [u for _, u in pairs])
+        )
 
     def _klv_rows(self) -> list[tuple[float, Sample]]:
         """KLV poses with video times: their own, else from UTC and the SEI times, else from their place in the file."""
@@ -251,8 +244,8 @@ class Poses:
         if not rows:
             return []
         sei_clock = self._sei_clock()
-        dated = [(t, s.time_s) for t, _, s in rows if t is not None and s.time_s is not None]
-        self._compare_clocks(sei_clock, Clock([t for t, _ in dated], [u for _, u in dated]))
+        dated = ((t, s.time_s) for t, _, s in rows if t is not None and s.time_s is not None)
+        self._compare_clocks(sei_clock, VideoClock(dated))
         if all(t is not None for t, _, _ in rows):
             return [(t, s) for t, _, s in rows if t is not None]
         utc = np.array([s.time_s if s.time_s is not None else np.nan for _, _, s in rows])
@@ -268,29 +261,23 @@ class Poses:
         last = len(self._times) - 1
         return [(float(self._times[min(after, last)]), s) for _, after, s in rows if last >= 0]
 
-    def _compare_clocks(self, sei_clock: Clock, klv_clock: Clock) -> None:
+    def _compare_clocks(self, sei_clock: VideoClock, klv_clock: VideoClock) -> None:
         """Report SEI time stamps that contradict the KLV's; ignore them if their rate is wrong."""
         name = self._scan.path.name
         ratio = sei_clock.rate / klv_clock.rate if klv_clock.rate > 0 else float("nan")
         if ratio == ratio and not 0.8 < ratio < 1.25:
             self._trust_sei_times = False
-            self.findings.append(
-                Finding(
-                    "sei-clock",
-                    f"the SEI time stamps of {name} run {ratio:.3g} times as fast as its KLV times; they are not used",
-                )
-            )
+            text = f"the SEI time stamps of {name} run {ratio:.3g} times as fast as its KLV times; they are not used"
+            self.findings.append(Finding("sei-clock", text))
         elif len(sei_clock) and len(klv_clock):
             known = self._times[~np.isnan(self._times)]
             offset = float(np.median(sei_clock.at(known) - klv_clock.at(known)))
             if abs(offset) > 0.5:
-                self.findings.append(
-                    Finding(
-                        "clock-offset",
-                        f"the SEI times of {name} are {offset:+.1f} s off its KLV times; poses are bound by the "
-                        "transport's time stamps",
-                    )
+                text = (
+                    f"the SEI times of {name} are {offset:+.1f} s off its KLV times; poses are bound by the "
+                    "transport's time stamps"
                 )
+                self.findings.append(Finding("clock-offset", text))
 
     def _note_file(self) -> None:
         """Report what of the file is read otherwise than it looks."""
@@ -344,10 +331,7 @@ class Poses:
                 "hold poses, describe their layout with --sei-layout"
             )
             self.findings.append(Finding("sei-unknown", text, note=True))
-        errors: dict[str, int] = {}
-        for _, _, packet in self._scan.klv_packets:
-            if packet.error:
-                errors[packet.error] = errors.get(packet.error, 0) + 1
+        errors = Counter(packet.error for _, _, packet in self._scan.klv_packets if packet.error)
         for reason, count in errors.items():
             self.findings.append(Finding("klv-damaged", f"{plural(count, 'KLV packet')} of {name} refused: {reason}"))
         if any(packet.kind == "EG 0104" for _, _, packet in self._scan.klv_packets):
@@ -369,8 +353,7 @@ class Poses:
 
 def _interpolated(rows: list[tuple[float, Sample]], times: Array) -> list[Sample]:
     """Samples with video times at other video times; their UTC goes on beyond them."""
-    dated = [(t, s.time_s) for t, s in rows if s.time_s is not None]
-    utc = Clock([t for t, _ in dated], [u for _, u in dated]).at(times)
+    utc = VideoClock((t, s.time_s) for t, s in rows if s.time_s is not None).at(times)
     samples = _held_timeline([replace(s, time_s=t) for t, s in rows]).at_all(times)
     for sample, moment in zip(samples, utc.tolist(), strict=True):
         sample.time_s = moment if moment == moment else None

@@ -1,7 +1,8 @@
 """All metadata of video files.
 
 One pass over the packets, without decoding, finds all metadata: SEI of each picture, KLV, DJI's djmd track, a
-subtitle track. `telemetry.videos.picture_poses` makes one pose for each picture of it.
+subtitle track. `telemetry.videos.picture_poses` makes one pose for each picture of it. In recordings joined end to end,
+and where an encoder was restarted, the clock of the packets starts again.
 """
 
 from collections import Counter
@@ -18,7 +19,6 @@ from telemetry.samples.sample import Sample
 from telemetry.samples.times import parse_time
 from telemetry.samples.unreadable import Unreadable
 from telemetry.videos.display_turn import AS_CODED, Turn, turn_of
-from telemetry.videos.joined_times import JoinedTimes
 
 _MAX_PICTURES = 5_000_000
 _MOST_BOXES = 1000
@@ -26,9 +26,78 @@ _RAW_FORMATS = frozenset({"h264", "hevc"})
 """FFmpeg's names of streams without a container, which give no times to their pictures."""
 _MOST_BEFORE_FIRST = 100
 """Packets within which a picture is decoded, unless the file is damaged (decoders hold back up to 16)."""
-
 _SQUARE_WITHIN: Final = 0.01  # pixels whose width and height differ by no more are square
 _MOST_ASPECT: Final = 4.0  # a ratio of a pixel's sides beyond this is damage (anamorphic lenses have 2, DV has 16:11)
+_RESTART_S: Final = 1.0  # a stream whose decoding times go back by more than this starts its clock again
+
+
+class _JoinedTimes:
+    """Continues the pictures' clock where it starts again; metadata keeps the part of the file that it belongs to.
+
+    Each stream shows by its own decoding times where a part ends: what lies side by side in a file at that place may
+    belong to different parts.
+
+    Args:
+        pictures: the stream of pictures, whose first presentation is time zero. interval_s: between two, usually.
+
+    Attributes:
+        joints_s: times at which a part begins, without the first.
+    """
+
+    def __init__(self, pictures: Any, interval_s: float) -> None:
+        self._pictures = pictures
+        self._start = pictures.start_time or 0
+        self._base_s = float(pictures.start_time * pictures.time_base) if pictures.start_time is not None else 0.0
+        self._interval_s = interval_s
+        self._shifts_s = [0.0]
+        self.joints_s: list[float] = []
+        self._latest_s = 0.0
+        self._part: dict[int, int] = {}
+        self._decoded_s: dict[int, float] = {}
+
+    @property
+    def parts(self) -> int:
+        """Number of parts whose pictures have begun."""
+        return len(self._shifts_s)
+
+    def place(self, packet: Any) -> tuple[int, float | None]:
+        """The part of the next packet of the file and its seconds within it, None if it has no time."""
+        stream = packet.stream.index
+        part = self._part.get(stream, 0)
+        if packet.dts is not None:
+            decoded_s = float(packet.dts * packet.time_base)
+            part += decoded_s < self._decoded_s.get(stream, decoded_s) - _RESTART_S
+            self._decoded_s[stream] = decoded_s
+        if packet.stream is not self._pictures:  # what follows the first picture of a part belongs to it, or to a later
+            part = max(part, len(self.joints_s))
+        self._part[stream] = part
+        if packet.pts is None:
+            return part, None
+        if packet.stream is self._pictures:
+            return part, float((packet.pts - self._start) * packet.time_base)
+        return part, float(packet.pts * packet.time_base) - self._base_s
+
+    def picture(self, part: int, seconds: float | None) -> float | None:
+        """Time of a picture in the whole file; the first one of a part begins it after all before."""
+        if part >= len(self._shifts_s):
+            self.joints_s.append(self._latest_s + self._interval_s)
+            self._shifts_s.append(self.joints_s[-1] - (seconds or 0.0))
+        return self._moment(part, seconds)
+
+    def metadata(self, part: int, seconds: float | None) -> float | None:
+        """Time of metadata in the whole file, never before its part begins.
+
+        Parts whose pictures never begin count as the last one that did.
+        """
+        part = min(part, len(self._shifts_s) - 1)
+        moment = self._moment(part, seconds)
+        return max(moment, self.joints_s[part - 1]) if part and moment is not None else moment
+
+    def _moment(self, part: int, seconds: float | None) -> float | None:
+        if seconds is None:
+            return None
+        self._latest_s = max(self._latest_s, seconds + self._shifts_s[part])
+        return seconds + self._shifts_s[part]
 
 
 class NotAVideo(Unreadable):
@@ -61,7 +130,6 @@ class VideoScan:
         pictures: one for each video packet, in order of the file.
         klv_packets: video time (None if unknown), number of video packets before it, packet.
         djmd_samples, gpmf_samples: video time and sample. cues: of a subtitle track.
-        damaged: packets that could not be read.
         unknown_sei: (UUID, size) -> number of private SEI messages without a decoder.
         joints_s: times at which the file's clock starts again (recordings joined); times continue over them.
         aspect: width of a pixel over its height. others: width and height of other video streams.
@@ -79,7 +147,6 @@ class VideoScan:
     djmd_samples: list[tuple[float, Sample]] = field(default_factory=list)
     gpmf_samples: list[tuple[float, Sample]] = field(default_factory=list)
     cues: srt.Subtitles = field(default_factory=srt.Subtitles)
-    damaged: int = 0
     unknown_sei: Counter[tuple[str, int]] = field(default_factory=Counter)
     joints_s: list[float] = field(default_factory=list)
     aspect: float = 1.0
@@ -256,7 +323,7 @@ def demux(container: Any, streams: list[Any]) -> Iterator[Any]:
 def _scan_packets(container: Any, stream: Any, result: VideoScan) -> None:
     form = bitstream.StreamFormat.of(result.codec, stream.codec_context.extradata)
     wanted = [s for s in container.streams if s is stream or s.type in ("data", "subtitle")]
-    times = JoinedTimes(stream, 1.0 / (result.rate or 30.0))
+    times = _JoinedTimes(stream, 1.0 / (result.rate or 30.0))
     texts: list[tuple[float, float, str]] = []
     leftovers: dict[int, bytes] = {}
     ahead: list[tuple[Any, int, float | None]] = []  # metadata of a part whose pictures have not begun
@@ -310,9 +377,7 @@ def _note(
     messages = [] if form is None else bitstream.sei_messages(data, form)
     reading = sei.read(messages)
     unknown.update(sei.unknown(messages))
-    if reading is None:
-        return PictureNote(seconds)
-    return PictureNote(seconds, reading.sample, reading.decoders)
+    return PictureNote(seconds) if reading is None else PictureNote(seconds, reading.sample, reading.decoders)
 
 
 def _subtitle_text(data: bytes) -> str:
@@ -335,8 +400,7 @@ def _scan_data(packet: Any, seconds: float | None, result: VideoScan, leftovers:
         if found[-1].error == "the packet is cut off" and len(data) < 1 << 16:
             leftovers[packet.stream.index] = data[data.rfind(bytes.fromhex("060e2b3402")) :]
             found.pop()
-        for item in found:
-            result.klv_packets.append((seconds, len(result.pictures), item))
+        result.klv_packets += [(seconds, len(result.pictures), item) for item in found]
         return
     sample = djmd.read_djmd(data)
     if sample is not None and seconds is not None:

@@ -12,7 +12,8 @@ from typing import Any
 from orthoswarm.model.errors import InputError
 from telemetry.formats.video import bitstream, sei
 from telemetry.samples.sample import Sample
-from telemetry.videos.video_file import NotAVideo, demux, open_video, picture_stream
+from telemetry.videos.extraction import decoded
+from telemetry.videos.video_file import NotAVideo, demux, open_video, picture_stream, scan
 
 _RAW = frozenset({".h264", ".264", ".avc", ".h265", ".265", ".hevc"})
 
@@ -30,8 +31,7 @@ def add_sei(source: Path, target: Path, pose_of: PoseOf) -> int:
     """Copy a video, adding SEI to its pictures; the target's suffix names its container.
 
     Args:
-        source: an H.264 or H.265 video.
-        target: path of the copy.
+        source: an H.264 or H.265 video. target: path of the copy.
         pose_of: returns the sample for each picture, by its number in order of presentation from 0.
 
     Returns:
@@ -53,10 +53,11 @@ def add_sei(source: Path, target: Path, pose_of: PoseOf) -> int:
             form = bitstream.StreamFormat.of(stream.codec_context.name, stream.codec_context.extradata)
             if form is None:
                 raise InputError(f"{source.name} is neither H.264 nor H.265; SEI cannot be put into it")
-            if target.suffix.lower() in _RAW:
-                written = _write_raw(reader, stream, form, order=order, pose_of=pose_of, target=temporary)
-            else:
-                written = _write_container(reader, stream, form, order=order, pose_of=pose_of, target=temporary)
+            if form.prefix and target.suffix.lower() in _RAW:
+                raise InputError("an MP4 cannot become a raw stream here; choose .mp4, .mkv or .ts for the copy")
+            packets = _packets(reader, stream, form, order, pose_of)
+            write = _write_raw if target.suffix.lower() in _RAW else _write_container
+            written = write(reader, stream, packets, temporary)
         os.replace(temporary, target)
     except av.error.FFmpegError as error:
         raise InputError(f"{target.name} cannot be written ({error.strerror}); choose .mp4, .mkv or .ts") from None
@@ -82,9 +83,6 @@ def presentation_order(path: Path) -> list[int]:
 
 def _order_by_decoding(path: Path, count: int) -> list[int]:
     """The order where the stream has no times (raw streams), from the decoder."""
-    from telemetry.videos.extraction import decoded
-    from telemetry.videos.video_file import scan
-
     order = list(range(count))
     for number, index, _ in decoded(scan(path)):
         if index is not None and index < count:
@@ -106,29 +104,23 @@ def _packets(reader: Any, stream: Any, form: bitstream.StreamFormat, order: list
         yield packet, data if pose is None else with_sei(data, pose, form), pose is not None
 
 
-def _write_raw(
-    reader: Any, stream: Any, form: bitstream.StreamFormat, *, order: list[int], pose_of: PoseOf, target: Path
-) -> int:
-    if form.prefix:
-        raise InputError("an MP4 cannot become a raw stream here; choose .mp4, .mkv or .ts for the copy")
+def _write_raw(_reader: Any, stream: Any, packets: Any, target: Path) -> int:
     written = 0
     with target.open("wb") as handle:
-        for packet, data, marked in _packets(reader, stream, form, order, pose_of):
+        for packet, data, marked in packets:
             if packet.stream is stream:
                 handle.write(data)
                 written += marked
     return written
 
 
-def _write_container(
-    reader: Any, stream: Any, form: bitstream.StreamFormat, *, order: list[int], pose_of: PoseOf, target: Path
-) -> int:
+def _write_container(reader: Any, _stream: Any, packets: Any, target: Path) -> int:
     import av
 
     written = 0
     with av.open(str(target), "w") as writer:
         outputs = {s.index: writer.add_stream_from_template(s) for s in reader.streams if s.type in ("video", "audio")}
-        for packet, data, marked in _packets(reader, stream, form, order, pose_of):
+        for packet, data, marked in packets:
             copy = packet
             if data is not None:
                 copy = av.Packet(data)

@@ -17,6 +17,7 @@ from telemetry.formats.log.log_data import LEAST_STEP_S, FlightLog, NotALog
 from telemetry.samples.findings import Finding, plural
 from telemetry.samples.sample import Sample
 from telemetry.samples.times import YEAR_2000_S
+from telemetry.samples.unreadable import beginning
 
 SUFFIXES: Final = frozenset({".log", ".asc", ".blf", ".trc"})
 
@@ -34,11 +35,7 @@ _HEADS: Final = {
 def is_can_log(path: Path) -> bool:
     """Whether a file begins like a CAN log; other kinds of files share these suffixes."""
     head = _HEADS.get(path.suffix.lower())
-    try:
-        with path.open("rb") as handle:
-            return head is not None and head.match(handle.read(4096)) is not None
-    except OSError:
-        return False
+    return head is not None and head.match(beginning(path, 4096)) is not None
 
 
 @dataclass(slots=True)
@@ -62,9 +59,16 @@ def read_can_log(path: Path) -> FlightLog:
     reading, buses = _Reading(), dict[str, DronecanPoses]()
     for message in _messages(path, reading):
         reading.frames += 1
-        if message.is_extended_id and not message.is_error_frame and not message.is_remote_frame:
-            channel = str(message.channel)
-            _take(reading, buses.setdefault(channel, DronecanPoses()), channel, message)
+        if not message.is_extended_id or message.is_error_frame or message.is_remote_frame:
+            continue
+        channel = str(message.channel)
+        bus = buses.setdefault(channel, DronecanPoses())
+        pose = bus.feed(message.arbitration_id, bytes(message.data), message.timestamp, fd=message.is_fd)
+        if pose is None:
+            continue
+        reading.poses.append((f"{channel}, node {pose.node}", pose))
+        if not bus.knows_utc:
+            reading.undated.append((bus, pose))
     if not reading.frames:
         raise NotALog("the log holds no CAN frame that can be read; record it again")
     if not reading.poses:
@@ -78,15 +82,6 @@ def read_can_log(path: Path) -> FlightLog:
     log.has_gimbal = any(sample.yaw_deg is not None for sample in log.samples)
     log.findings = _findings(path, reading, buses, len(reading.poses) - len(poses))
     return log
-
-
-def _take(reading: _Reading, bus: DronecanPoses, channel: str, message: Any) -> None:
-    pose = bus.feed(message.arbitration_id, bytes(message.data), message.timestamp, fd=message.is_fd)
-    if pose is None:
-        return
-    reading.poses.append((f"{channel}, node {pose.node}", pose))
-    if not bus.knows_utc:
-        reading.undated.append((bus, pose))
 
 
 def _messages(path: Path, reading: _Reading) -> Iterator[Any]:

@@ -7,17 +7,19 @@ Time since boot is TimeUS (microseconds) since 2015, TimeMS (milliseconds) befor
 the GPS time of week and T the time since boot.
 """
 
+import contextlib
 import mmap
 import struct
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from telemetry.formats.log.log_data import LEAST_STEP_S, FlightLog, NotALog, Row, each, mapped
-from telemetry.formats.log.mavlink_poses import CameraEvent
+from telemetry.formats.log.log_data import LEAST_STEP_S, FlightLog, NotALog, Row, add_sample, each, mapped
+from telemetry.formats.log.mavlink_poses import ExposureEvent
+from telemetry.samples.rotations import camera_angles_deg, euler_ned
 from telemetry.samples.sample import Sample, checked
 from telemetry.samples.times import GPS_EPOCH_S, GPS_MINUS_UTC_S, WEEK_S
+from telemetry.samples.unreadable import beginning
 
 _MARK = b"\xa3\x95"
 _FMT, _FMT_SIZE = 128, 89
@@ -69,8 +71,8 @@ def read_dataflash(path: Path) -> FlightLog:
     each(rows.get("RFND", []), lambda row: _rangefinder(log, row, clock))
     each(rows.get("TERR", []), lambda row: _terrain(log, row, clock))
     each(rows.get("MNT", []), lambda row: _gimbal(log, row, clock))
-    for name in ("CAM", "TRIG"):
-        each(rows.get(name, []), lambda row, name=name: log.events.append(_event(row, name, clock)))  # type: ignore[misc]
+    each(rows.get("CAM", []), lambda row: log.events.append(_event(row, "CAM", clock)))
+    each(rows.get("TRIG", []), lambda row: log.events.append(_event(row, "TRIG", clock)))
     if clock is None and not any(event.time_s is not None for event in log.events):
         raise NotALog("the log has no GPS time, so nothing in it can be dated; log GPS records or use the tlog")
     return log
@@ -78,11 +80,7 @@ def read_dataflash(path: Path) -> FlightLog:
 
 def has_dataflash_records(path: Path) -> bool:
     """Whether a file begins like a DataFlash log: with a record that describes a format."""
-    try:
-        with path.open("rb") as handle:
-            return _MARK + bytes([_FMT]) in handle.read(1 << 16)
-    except OSError:
-        return False
+    return _MARK + bytes([_FMT]) in beginning(path, 1 << 16)
 
 
 def _rows(data: mmap.mmap) -> dict[str, list[Row]]:
@@ -118,12 +116,8 @@ def _learn(data: mmap.mmap, at: int, formats: dict[int, _Format | None], lengths
     text = name.rstrip(b"\0").decode("ascii", "replace")
     formats[kind] = None
     if text in _WANTED:
-        try:
-            formats[kind] = _Format(
-                text, length, codes.rstrip(b"\0").decode("ascii"), columns.rstrip(b"\0").decode("ascii")
-            )
-        except (ValueError, KeyError, UnicodeDecodeError):
-            return
+        with contextlib.suppress(ValueError, KeyError):
+            formats[kind] = _Format(text, length, *(part.rstrip(b"\0").decode("ascii") for part in (codes, columns)))
 
 
 def _utc_minus_boot(rows: list[Row]) -> float | None:
@@ -155,18 +149,16 @@ def _has_fix(row: Row) -> bool:
     return bool(row.get("Status", 3) >= 3)
 
 
-def _add(log: FlightLog, row: Row, clock: float | None, **values: Any) -> None:
-    sample = checked(Sample(**values))
+def _utc_s(row: Row, clock: float | None) -> float | None:
     boot_s = _boot_s(row)
-    if sample is None or clock is None or boot_s is None or ("lat_deg" in values and not sample.has_position):
-        return
-    sample.time_s = boot_s + clock
-    log.samples.append(sample)
+    return None if clock is None or boot_s is None else boot_s + clock
 
 
 def _position(log: FlightLog, row: Row, clock: float | None) -> None:
     height = row.get("RelHomeAlt", row.get("RelAlt"))
-    _add(log, row, clock, lat_deg=row["Lat"], lon_deg=row["Lng"], altitude_m=row.get("Alt"), height_m=height)
+    add_sample(
+        log, _utc_s(row, clock), lat_deg=row["Lat"], lon_deg=row["Lng"], altitude_m=row.get("Alt"), height_m=height
+    )
 
 
 def _fix(log: FlightLog, row: Row, clock: float | None) -> None:
@@ -176,31 +168,31 @@ def _fix(log: FlightLog, row: Row, clock: float | None) -> None:
 
 
 def _attitude(log: FlightLog, row: Row, clock: float | None) -> None:
-    _add(log, row, clock, flight_yaw_deg=row["Yaw"], flight_pitch_deg=row["Pitch"], flight_roll_deg=row["Roll"])
+    add_sample(
+        log, _utc_s(row, clock), flight_yaw_deg=row["Yaw"], flight_pitch_deg=row["Pitch"], flight_roll_deg=row["Roll"]
+    )
 
 
 def _rangefinder(log: FlightLog, row: Row, clock: float | None) -> None:
     if row.get("Orient", 25) == 25 and row.get("Stat", 4) == 4 and 0.5 < row["Dist"] < 5000.0:
-        _add(log, row, clock, height_m=float(row["Dist"]), height_is_ground=True)
+        add_sample(log, _utc_s(row, clock), height_m=float(row["Dist"]), height_is_ground=True)
 
 
 def _terrain(log: FlightLog, row: Row, clock: float | None) -> None:
     if row.get("Status", 2) == 2 and row["CHeight"] > 0.5:
-        _add(log, row, clock, height_m=float(row["CHeight"]), height_is_ground=True)
+        add_sample(log, _utc_s(row, clock), height_m=float(row["CHeight"]), height_is_ground=True)
 
 
 def _gimbal(log: FlightLog, row: Row, clock: float | None) -> None:
-    from telemetry.samples.rotations import camera_angles_deg, euler_ned
-
     yaw = row.get("YawE", row.get("Yaw"))
     if yaw is None or not np.isfinite([yaw, row.get("Pitch", np.nan), row.get("Roll", np.nan)]).all():
         return
     log.has_gimbal = True
-    angles = camera_angles_deg(euler_ned(float(yaw), float(row["Pitch"]), float(row["Roll"])))
-    _add(log, row, clock, yaw_deg=angles[0], pitch_deg=angles[1], roll_deg=angles[2])
+    yaw, pitch, roll = camera_angles_deg(euler_ned(float(yaw), float(row["Pitch"]), float(row["Roll"])))
+    add_sample(log, _utc_s(row, clock), yaw_deg=yaw, pitch_deg=pitch, roll_deg=roll)
 
 
-def _event(row: Row, kind: str, clock: float | None) -> CameraEvent:
+def _event(row: Row, kind: str, clock: float | None) -> ExposureEvent:
     sample = Sample(
         lat_deg=row.get("Lat"),
         lon_deg=row.get("Lng"),
@@ -210,9 +202,10 @@ def _event(row: Row, kind: str, clock: float | None) -> CameraEvent:
         flight_pitch_deg=row.get("P", row.get("Pitch")),
         flight_yaw_deg=row.get("Y", row.get("Yaw")),
     )
-    boot_s = _boot_s(row)
-    time_s = None if clock is None or boot_s is None else boot_s + clock
+    time_s = _utc_s(row, clock)
     if time_s is None and row.get("GPSWeek", 0) > 1000:
         time_s = GPS_EPOCH_S + row["GPSWeek"] * WEEK_S + row["GPSTime"] * 1e-3 - GPS_MINUS_UTC_S
     number = row.get("Img", row.get("ImageNo"))
-    return CameraEvent(time_s, boot_s, None if number is None else int(number), checked(sample) or Sample(), kind)
+    return ExposureEvent(
+        time_s, _boot_s(row), None if number is None else int(number), checked(sample) or Sample(), kind
+    )

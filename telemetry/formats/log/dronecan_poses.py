@@ -60,9 +60,8 @@ class DronecanPoses:
     def __init__(self, body_at: Callable[[float], Array | None] = lambda time_s: None) -> None:
         """Start without frames.
 
-        Args:
-            body_at: returns the airframe's rotation to north-east-down at a time (UTC), for a gimbal on a bus without
-                ahrs.Solution; None where unknown.
+        A gimbal on a bus without ahrs.Solution needs `body_at`: the airframe's rotation to north-east-down at a time
+        (UTC), None where unknown.
         """
         self.received: Counter[int] = Counter()
         self.lost: Counter[int] = Counter()
@@ -77,10 +76,8 @@ class DronecanPoses:
         """Process a frame; returns the pose of the message that it completes, None if it completes none.
 
         Args:
-            identifier: 29 bits, of an extended frame.
-            data: 0 to 8 bytes, to 64 of CAN FD.
+            identifier: 29 bits, of an extended frame. data: 0 to 8 bytes, to 64 of CAN FD (`fd`).
             arrival_s: time of arrival, seconds of any steady clock; UTC follows from the fixes.
-            fd: whether it is a frame of CAN FD.
         """
         kind, node = (identifier >> 8) & 0xFFFF, identifier & 0x7F
         if kind not in MESSAGES or identifier & _SERVICE or node == 0 or not data:
@@ -125,7 +122,7 @@ class DronecanPoses:
         if m.status < m.STATUS_2D_FIX:
             return None
         self._with_fix2.add(node)
-        sigma = _position_sigma_m([float(c) for c in m.covariance])
+        sigma = _sigma(m.covariance)
         if sigma is None and m.mode == m.MODE_RTK:
             sigma = _RTK_FIXED_M if m.sub_mode == m.SUB_MODE_RTK_FIXED else _RTK_FLOAT_M
         return self._position(m, node, arrival_s, sigma)
@@ -133,7 +130,7 @@ class DronecanPoses:
     def _fix(self, m: Any, node: int, arrival_s: float) -> NodePose | None:
         if m.status < m.STATUS_2D_FIX or node in self._with_fix2:  # the older message repeats the newer one
             return None
-        return self._position(m, node, arrival_s, _position_sigma_m([float(c) for c in m.position_covariance]))
+        return self._position(m, node, arrival_s, _sigma(m.position_covariance))
 
     def _position(self, m: Any, node: int, arrival_s: float, sigma: float | None) -> NodePose | None:
         sample = checked(
@@ -192,24 +189,18 @@ def _rotation(xyzw: Sequence[float]) -> Array | None:
     return quaternion_ned(w, x, y, z) if math.isfinite(x + y + z + w) and any((x, y, z, w)) else None
 
 
-def _variance(covariance: Sequence[float]) -> float | None:
-    """The larger of the first two variances of a covariance: full, its diagonal, or one number."""
+def _sigma(covariance: Sequence[float]) -> float | None:
+    """One sigma by the larger of the first two variances of a covariance: full, its diagonal, or one number."""
     index = {36: (0, 7), 21: (0, 6), 9: (0, 4), 6: (0, 1), 3: (0, 1), 1: (0, 0)}.get(len(covariance))
     if index is None:
         return None
     largest = max(float(covariance[index[0]]), float(covariance[index[1]]))
-    return largest if math.isfinite(largest) and 0.0 < largest < 1e8 else None
+    return math.sqrt(largest) if math.isfinite(largest) and 0.0 < largest < 1e8 else None
 
 
-def _position_sigma_m(covariance: Sequence[float]) -> float | None:
-    variance = _variance(covariance)
-    return None if variance is None else math.sqrt(variance)
-
-
-def _angle_sigma_deg(covariance: Any) -> float | None:
-    """One sigma of an attitude whose covariance is in radians squared."""
-    variance = _variance([float(value) for value in covariance])
-    return None if variance is None else math.degrees(math.sqrt(variance))
+def _angle_sigma_deg(covariance: Sequence[float]) -> float | None:
+    sigma_rad = _sigma(covariance)
+    return None if sigma_rad is None else math.degrees(sigma_rad)
 
 
 def _gnss_utc_s(m: Any) -> float | None:

@@ -17,7 +17,7 @@ from telemetry.formats.log.can_log import read_can_log
 from telemetry.formats.log.dataflash import read_dataflash
 from telemetry.formats.log.exposure_list import read_exposure_list
 from telemetry.formats.log.log_data import LEAST_STEP_S, FlightLog, NotALog, mapped
-from telemetry.formats.log.mavlink_poses import TYPES, CameraEvent, MavlinkPoses
+from telemetry.formats.log.mavlink_poses import TYPES, ExposureEvent, MavlinkPoses
 from telemetry.formats.log.ulog import read_ulog
 from telemetry.samples.findings import Finding, plural
 from telemetry.samples.sample import Sample
@@ -31,21 +31,18 @@ def read_log(path: Path) -> list[FlightLog]:
     Raises:
         NotALog: it is not a flight log, or holds nothing that can be used.
     """
-    readers: dict[str, Callable[[Path], list[FlightLog]]] = {
-        ".tlog": read_tlog,
-        ".bin": lambda p: [read_dataflash(p)],
-        ".ulg": lambda p: [read_ulog(p)],
-        ".pos": lambda p: [read_exposure_list(p)],
-        ".mrk": lambda p: [read_exposure_list(p)],
-        **dict.fromkeys(CAN_LOGS, lambda p: [read_can_log(p)]),
-    }
-    reader = readers.get(path.suffix.lower())
-    if reader is None:
+    of_one_vehicle: dict[str, Callable[[Path], FlightLog]] = {
+        ".bin": read_dataflash, ".ulg": read_ulog, ".pos": read_exposure_list, ".mrk": read_exposure_list,
+        **dict.fromkeys(CAN_LOGS, read_can_log),
+    }  # fmt: skip
+    suffix = path.suffix.lower()
+    reader = of_one_vehicle.get(suffix)
+    if reader is None and suffix != ".tlog":
         raise NotALog("the file is not a flight log (.tlog, .BIN, .ulg, .pos, .MRK, .log, .asc, .blf, .trc)")
     try:
         if path.stat().st_size == 0:
             raise NotALog("the log is empty; copy it again")
-        logs = reader(path)
+        logs = read_tlog(path) if reader is None else [reader(path)]
     except OSError as error:
         raise NotALog(f"the log cannot be read ({error.strerror}); check its permissions") from None
     for log in logs:
@@ -79,19 +76,13 @@ def finish(log: FlightLog) -> None:
     lost = len(log.events) - len(events)
     undated = sum(e.time_s is None for e in log.events)
     if undated:
-        log.findings.append(
-            Finding("event-without-time", f"{plural(undated, 'camera event')} of {log.path.name} have no time")
-        )
+        text = f"{plural(undated, 'camera event')} of {log.path.name} have no time"
+        log.findings.append(Finding("event-without-time", text))
     elif lost:
-        log.findings.append(
-            Finding("event-repeated", f"{plural(lost, 'camera event')} of {log.path.name} were repeated", note=True)
-        )
+        text = f"{plural(lost, 'camera event')} of {log.path.name} were repeated"
+        log.findings.append(Finding("event-repeated", text, note=True))
     log.events = events
     log.samples.sort(key=lambda s: s.time_s or 0.0)
-    _note_missing_numbers(log)
-
-
-def _note_missing_numbers(log: FlightLog) -> None:
     numbers = sorted({e.number for e in log.events if e.number is not None})
     missing = (numbers[-1] - numbers[0] + 1 - len(numbers)) if numbers else 0
     if 0 < missing < 10 * len(numbers):
@@ -172,19 +163,19 @@ class _TlogVehicle:
     def __init__(self) -> None:
         self._poses = MavlinkPoses()
         self._samples: list[Sample] = []
-        self._events: list[CameraEvent] = []
-        self._done: tuple[list[Sample], list[CameraEvent]] = ([], [])
+        self._events: list[ExposureEvent] = []
+        self._done: tuple[list[Sample], list[ExposureEvent]] = ([], [])
         self._clocks: list[float] = []
         self._arrivals: list[tuple[float, float]] = []
         self._paces: list[float] = []
         self._latest: dict[tuple[bool, bool, bool], float] = {}
 
     def feed(self, message: object, arrival_s: float) -> None:
-        bases = self._poses.bases
+        bases = self._poses.clocks.bases
         found = self._poses.feed(message, arrival_s)
-        if self._poses.bases != bases:
+        if self._poses.clocks.bases != bases:
             self._close()
-        clock = self._poses.utc_minus_boot_s
+        clock = self._poses.clocks.utc_minus_boot_s
         if clock is not None and (not self._clocks or clock != self._clocks[-1]):
             self._clocks.append(clock)
         if isinstance(found, Sample):
@@ -220,25 +211,16 @@ class _TlogVehicle:
     def log(self, path: Path, system: int) -> FlightLog:
         self._close()
         samples, events = self._done
-        log = FlightLog(
-            path=path,
-            kind="tlog",
-            vehicle=f"sysid{system}",
-            samples=samples,
-            events=events,
-            has_gimbal=self._poses.has_gimbal,
-        )
-        log.position_sigma_m = self._poses.position_sigma_m
-        if self._poses.reboots:
-            text = f"the vehicle of {path.name} was restarted {plural(self._poses.reboots, 'time')}"
+        log = FlightLog(path=path, kind="tlog", vehicle=f"sysid{system}", samples=samples, events=events)
+        log.has_gimbal, log.position_sigma_m = self._poses.has_gimbal, self._poses.position_sigma_m
+        if self._poses.clocks.reboots:
+            text = f"the vehicle of {path.name} was restarted {plural(self._poses.clocks.reboots, 'time')}"
             log.findings.append(Finding("reboot", text))
         pace = max(self._paces, default=1.0)
         if not 0.8 < pace < 1.25:
-            log.findings.append(
-                Finding(
-                    "tlog-pace",
-                    f"the vehicle's times in {path.name} run {pace:.1f} times as fast as their arrival (a simulation "
-                    "or a replay); the vehicle's times are used",
-                )
+            text = (
+                f"the vehicle's times in {path.name} run {pace:.1f} times as fast as their arrival (a simulation "
+                "or a replay); the vehicle's times are used"
             )
+            log.findings.append(Finding("tlog-pace", text))
         return log

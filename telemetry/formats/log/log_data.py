@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from telemetry.formats.log.mavlink_poses import CameraEvent
+from telemetry.formats.log.mavlink_poses import ExposureEvent
 from telemetry.samples.findings import Finding
-from telemetry.samples.sample import Sample
+from telemetry.samples.sample import Sample, checked
 from telemetry.samples.timeline import Timeline
 from telemetry.samples.unreadable import Unreadable
 
@@ -41,7 +41,7 @@ class FlightLog:
     kind: str
     vehicle: str
     samples: list[Sample] = field(default_factory=list)
-    events: list[CameraEvent] = field(default_factory=list)
+    events: list[ExposureEvent] = field(default_factory=list)
     has_gimbal: bool = False
     findings: list[Finding] = field(default_factory=list)
     position_sigma_m: float | None = None
@@ -60,6 +60,14 @@ def mapped(path: Path) -> Iterator[mmap.mmap]:
     """
     with path.open("rb") as handle, mmap.mmap(handle.fileno(), 0, access=mmap.ACCESS_READ) as data:
         yield data
+
+
+def add_sample(log: FlightLog, time_s: float | None, **values: Any) -> None:
+    """Add a pose to a log if it is dated and has valid values: where it states a position, a valid one."""
+    sample = checked(Sample(**values))
+    if sample is not None and time_s is not None and (sample.has_position or "lat_deg" not in values):
+        sample.time_s = time_s
+        log.samples.append(sample)
 
 
 def each(rows: Iterable[Row], take: Callable[[Row], None]) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from telemetry.formats.log.sender_clocks import AUTOPILOT, SenderClocks
-from telemetry.samples.rotations import camera_angles_deg, euler_ned, mounted_down_deg, quaternion_ned
+from telemetry.samples.rotations import airframe_ned, camera_angles_deg, euler_ned, mounted_down_deg, quaternion_ned
 from telemetry.samples.sample import Sample, checked, is_position
 from telemetry.samples.times import YEAR_2000_S
 
@@ -49,7 +49,7 @@ _NO_VEHICLES = frozenset({6, 26, 30})
 
 
 @dataclass(slots=True)
-class CameraEvent:
+class ExposureEvent:
     """One exposure that an autopilot reported.
 
     Attributes:
@@ -72,32 +72,17 @@ class MavlinkPoses:
     Attributes:
         heading_deg: of the airframe, latest. has_gimbal: whether a gimbal reported.
         home_altitude_m: altitude of home above sea level.
-        position_sigma_m: horizontal sigma stated by the receiver, None if it states none.
+        position_sigma_m: horizontal sigma stated by the receiver, None if it states none. clocks: of all components.
     """
 
     heading_deg: float | None = None
     has_gimbal: bool = False
     home_altitude_m: float | None = None
     position_sigma_m: float | None = None
-    _clocks: SenderClocks = field(default_factory=SenderClocks, repr=False)
+    clocks: SenderClocks = field(default_factory=SenderClocks, repr=False)
     _arrival_s: float | None = field(default=None, repr=False)
 
-    @property
-    def utc_minus_boot_s(self) -> float | None:
-        """Offset from the autopilot's time since boot to UTC, None until it knows UTC."""
-        return self._clocks.utc_minus_boot_s
-
-    @property
-    def reboots(self) -> int:
-        """Number of times that the autopilot's time since boot went back."""
-        return self._clocks.reboots
-
-    @property
-    def bases(self) -> int:
-        """Number of times that times since boot began to count from another moment; earlier ones do not compare."""
-        return self._clocks.bases
-
-    def feed(self, message: Any, arrival_s: float | None = None) -> Sample | CameraEvent | None:
+    def feed(self, message: Any, arrival_s: float | None = None) -> Sample | ExposureEvent | None:
         """Process a message of any component of the vehicle.
 
         Args:
@@ -110,15 +95,13 @@ class MavlinkPoses:
         """
         name = message.get_type()
         handler = _HANDLERS.get(name)
-        if handler is None:
-            return None
-        if not self._counts(message, name):
+        if handler is None or not self._counts(message, name):
             return None
         self._arrival_s = arrival_s
-        result: Sample | CameraEvent | None = handler(self, message)
+        result: Sample | ExposureEvent | None = handler(self, message)
         if isinstance(result, Sample):
             if result.time_s is None:
-                result.time_s = self._clocks.boot_s
+                result.time_s = self.clocks.boot_s
             return _checked(result)
         return result
 
@@ -128,29 +111,28 @@ class MavlinkPoses:
         if name == "HEARTBEAT":
             return True
         positions = name == "GLOBAL_POSITION_INT" and is_position(message.lat * 1e-7, message.lon * 1e-7)
-        chosen = self._clocks.is_autopilot(sender, timed=name in _TIMED, positions=positions)
+        chosen = self.clocks.is_autopilot(sender, timed=name in _TIMED, positions=positions)
         if name == "GLOBAL_POSITION_INT":
-            return chosen or self._clocks.places(sender)
-        return chosen or name not in _OF_AUTOPILOT or (name not in _TIMED and self._clocks.speaks_for_vehicle(sender))
+            return chosen or self.clocks.places(sender)
+        return chosen or name not in _OF_AUTOPILOT or (name not in _TIMED and sender in self.clocks.fliers)
 
     def utc(self, boot_s: float | None) -> float | None:
         """UTC of a time since boot, None while unknown."""
-        if boot_s is None or self.utc_minus_boot_s is None:
-            return None
-        return boot_s + self.utc_minus_boot_s
+        offset_s = self.clocks.utc_minus_boot_s
+        return None if boot_s is None or offset_s is None else boot_s + offset_s
 
     def _boot(self, m: Any) -> float | None:
         """Seconds since the autopilot's boot of a message's time_boot_ms; None while that clock is unknown."""
-        return self._clocks.heard(_sender(m), m.time_boot_ms * 1e-3, self._arrival_s)
+        return self.clocks.heard(_sender(m), m.time_boot_ms * 1e-3, self._arrival_s)
 
     def _heartbeat(self, m: Any) -> None:
         if m.autopilot != _NO_AUTOPILOT and m.type not in _NO_VEHICLES:
-            self._clocks.flies(_sender(m))
+            self.clocks.fliers.add(_sender(m))
 
     def _system_time(self, m: Any) -> None:
         utc_s, boot_s = m.time_unix_usec * 1e-6, self._boot(m)
         if utc_s > YEAR_2000_S and m.time_boot_ms > 0 and boot_s is not None:  # 0: the sender has no clock of its own
-            self._clocks.utc_minus_boot_s = utc_s - boot_s
+            self.clocks.utc_minus_boot_s = utc_s - boot_s
 
     def _position(self, m: Any) -> Sample | None:
         boot_s = self._boot(m)
@@ -178,9 +160,7 @@ class MavlinkPoses:
 
     def _gimbal(self, m: Any) -> Sample | None:
         rotation = gimbal_rotation(m.q, m.flags, self.heading_deg)
-        if rotation is None:
-            return None
-        return self._camera(m, rotation)
+        return None if rotation is None else self._camera(m, rotation)
 
     def _mount(self, m: Any) -> Sample | None:
         yaw = m.yaw_absolute
@@ -218,7 +198,7 @@ class MavlinkPoses:
             return None
         return _above_ground(m.current_distance * 1e-2)
 
-    def _feedback(self, m: Any) -> CameraEvent:
+    def _feedback(self, m: Any) -> ExposureEvent:
         sample = Sample(
             lat_deg=m.lat * 1e-7,
             lon_deg=m.lng * 1e-7,
@@ -230,7 +210,7 @@ class MavlinkPoses:
         )
         return self._event(m, m.time_usec * 1e-6, m.img_idx, sample)
 
-    def _captured(self, m: Any) -> CameraEvent | None:
+    def _captured(self, m: Any) -> ExposureEvent | None:
         if m.capture_result == 0:
             return None
         sample = Sample(lat_deg=m.lat * 1e-7, lon_deg=m.lon * 1e-7, altitude_m=m.alt * 1e-3)
@@ -242,22 +222,21 @@ class MavlinkPoses:
         utc_s = m.time_utc * 1e-6  # 0, or time since boot, from a camera that does not know UTC
         return self._event(m, utc_s if utc_s > YEAR_2000_S else m.time_boot_ms * 1e-3, m.image_index, sample)
 
-    def _trigger(self, m: Any) -> CameraEvent:
+    def _trigger(self, m: Any) -> ExposureEvent:
         return self._event(m, m.time_usec * 1e-6, m.seq, Sample())
 
-    def _event(self, m: Any, seconds: float, number: int, sample: Sample) -> CameraEvent:
+    def _event(self, m: Any, seconds: float, number: int, sample: Sample) -> ExposureEvent:
         """An event whose time is UTC, or time since boot where the value is too small for UTC."""
         if seconds > YEAR_2000_S:
-            boot_s = None if self.utc_minus_boot_s is None else seconds - self.utc_minus_boot_s
+            boot_s = None if self.clocks.utc_minus_boot_s is None else seconds - self.clocks.utc_minus_boot_s
             time_s: float | None = seconds
         else:
-            boot_s = self._clocks.of(_sender(m), seconds, self._arrival_s, number=int(number), kind=m.get_type())
+            boot_s = self.clocks.of(_sender(m), seconds, self._arrival_s, number=int(number), kind=m.get_type())
             time_s = self.utc(boot_s)
-        return CameraEvent(time_s, boot_s, int(number), checked(sample) or Sample(), m.get_type())
+        return ExposureEvent(time_s, boot_s, int(number), checked(sample) or Sample(), m.get_type())
 
 
 def _sender(message: Any) -> int:
-    """The component that sent a message."""
     return message.get_srcComponent() or AUTOPILOT
 
 
@@ -284,8 +263,7 @@ def gimbal_rotation(q: Sequence[float], flags: int, heading_deg: float | None) -
     """Rotation of a gimbal to north-east-down, from a GIMBAL_DEVICE_ATTITUDE_STATUS in the frame that its flags name.
 
     Args:
-        q: quaternion w, x, y, z.
-        flags: GIMBAL_DEVICE_FLAGS.
+        q: quaternion w, x, y, z. flags: GIMBAL_DEVICE_FLAGS.
         heading_deg: of the airframe, for a yaw that is relative to it.
 
     Returns:
@@ -318,8 +296,7 @@ def _above_ground(metres: float) -> Sample | None:
 
 def fixed_camera(sample: Sample) -> Sample:
     """The sample; where camera angles are unknown, those of a camera fixed under the airframe."""
-    if sample.yaw_deg is None and sample.flight_yaw_deg is not None:
-        body = euler_ned(sample.flight_yaw_deg, sample.flight_pitch_deg or 0.0, sample.flight_roll_deg or 0.0)
+    if sample.yaw_deg is None and (body := airframe_ned(sample)) is not None:
         sample.yaw_deg, sample.pitch_deg, sample.roll_deg = mounted_down_deg(body)
     return sample
 

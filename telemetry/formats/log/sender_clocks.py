@@ -95,6 +95,7 @@ class SenderClocks:
         reboots: number of times that it went back.
         bases: number of times that times since boot began to count from another moment: at a reboot, and where
             the autopilot turned out to be another component than was thought.
+        fliers: components whose HEARTBEAT is an autopilot's. One is chosen once it sends more than that.
     """
 
     boot_s: float = 0.0
@@ -105,22 +106,17 @@ class SenderClocks:
     _rank: int = field(default=0, repr=False)
     _heard: bool = field(default=False, repr=False)
     _arrival_s: float | None = field(default=None, repr=False)
-    _fliers: set[int] = field(default_factory=set, repr=False)
+    fliers: set[int] = field(default_factory=set, repr=False)
     _positioned: list[int] = field(default_factory=list, repr=False)
     _others: dict[int, _Difference] = field(default_factory=dict, repr=False)
     _pictures: dict[tuple[int, str], _Pictures] = field(default_factory=dict, repr=False)
-
-    def flies(self, component: int) -> None:
-        """Note that a component's HEARTBEAT is an autopilot's. It is chosen once it sends more than that."""
-        self._fliers.add(component)
 
     def is_autopilot(self, component: int, *, timed: bool, positions: bool = False) -> bool:
         """Whether a component is the autopilot, as far as the messages up to now tell.
 
         Args:
-            component: MAVLink component id of a sender.
+            component: MAVLink component id of a sender. positions: it reports a valid position of the vehicle.
             timed: the message is one of those by which autopilots tell their time since boot.
-            positions: it reports a valid position of the vehicle.
         """
         if positions and component not in self._positioned:
             self._positioned.append(component)
@@ -135,20 +131,16 @@ class SenderClocks:
 
     def _rank_of(self, component: int, timed: bool) -> int:
         """The rank of a component that sends such a message; 0 if it cannot be the autopilot."""
-        flies, positioned = component in self._fliers, component in self._positioned
+        flies, positioned = component in self.fliers, component in self._positioned
         if timed and component == AUTOPILOT and (flies or positioned):
             return _BY_ID
         if timed and flies:
             return _FLIES
         if timed and positioned:
             return _POSITIONED
-        if self._fliers:  # the autopilot is another one, which has not told its time yet
+        if self.fliers:  # the autopilot is another one, which has not told its time yet
             return 0
         return _ID_ONLY if timed and component == AUTOPILOT else _ANY
-
-    def speaks_for_vehicle(self, component: int) -> bool:
-        """Whether a component is an autopilot by its HEARTBEAT, be it the chosen one or not."""
-        return component in self._fliers
 
     def places(self, component: int) -> bool:
         """Whether a component's positions are taken: the autopilot's, or another's while the autopilot sends none.
@@ -157,7 +149,7 @@ class SenderClocks:
         """
         if self._autopilot in self._positioned:
             return component == self._autopilot
-        first = next((c for c in self._positioned if c in self._fliers), None)
+        first = next((c for c in self._positioned if c in self.fliers), None)
         return component == (first if first is not None else next(iter(self._positioned), component))
 
     def heard(self, component: int, boot_s: float, arrival_s: float | None) -> float | None:

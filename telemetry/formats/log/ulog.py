@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from telemetry.formats.log.log_data import LEAST_STEP_S, FlightLog, NotALog, Row, each, mapped
-from telemetry.formats.log.mavlink_poses import CameraEvent, euler_deg, gimbal_rotation, put_capture_attitude
+from telemetry.formats.log.log_data import LEAST_STEP_S, FlightLog, NotALog, Row, add_sample, each, mapped
+from telemetry.formats.log.mavlink_poses import ExposureEvent, euler_deg, gimbal_rotation, put_capture_attitude
 from telemetry.samples.rotations import camera_angles_deg, quaternion_ned
 from telemetry.samples.sample import Sample, checked
 
@@ -129,8 +129,7 @@ def _rows(data: mmap.mmap) -> dict[tuple[str, int], list[Row]]:
 
 def _is_later(row: Row, last: Row) -> bool:
     """Whether a record is late enough after the last stored one to be stored, too."""
-    step = (row["timestamp"] - last["timestamp"]) * 1e-6
-    return not 0.0 <= step < LEAST_STEP_S
+    return not 0.0 <= (row["timestamp"] - last["timestamp"]) * 1e-6 < LEAST_STEP_S
 
 
 def _fields(text: str) -> list[tuple[str, str, int]]:
@@ -191,11 +190,7 @@ def _utc_minus_boot(rows: list[Row]) -> float | None:
 
 
 def _add(log: FlightLog, row: Row, clock: float | None, **values: Any) -> None:
-    sample = checked(Sample(**values))
-    if sample is None or clock is None or ("lat_deg" in values and not sample.has_position):
-        return
-    sample.time_s = row["timestamp"] * 1e-6 + clock
-    log.samples.append(sample)
+    add_sample(log, None if clock is None else row["timestamp"] * 1e-6 + clock, **values)
 
 
 def _gimbal(log: FlightLog, row: Row, clock: float | None, headings: list[tuple[float, float]]) -> None:
@@ -211,7 +206,7 @@ def _gimbal(log: FlightLog, row: Row, clock: float | None, headings: list[tuple[
     _add(log, row, clock, yaw_deg=yaw, pitch_deg=pitch, roll_deg=roll)
 
 
-def _event(row: Row, kind: str, clock: float | None, home: float | None) -> CameraEvent | None:
+def _event(row: Row, kind: str, clock: float | None, home: float | None) -> ExposureEvent | None:
     if kind == "camera_capture" and row.get("result", 1) < 0:
         return None
     boot_s = row["timestamp"] * 1e-6
@@ -229,4 +224,4 @@ def _event(row: Row, kind: str, clock: float | None, home: float | None) -> Came
         if "q" in row:
             put_capture_attitude(sample, row["q"])
     number = row.get("seq")
-    return CameraEvent(time_s, boot_s, None if number is None else int(number), checked(sample) or Sample(), kind)
+    return ExposureEvent(time_s, boot_s, None if number is None else int(number), checked(sample) or Sample(), kind)

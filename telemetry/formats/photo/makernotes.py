@@ -7,30 +7,17 @@ camera pitch -90 = straight down). Source: ExifTool's DJI tag table, checked wit
 
 import math
 import struct
-from dataclasses import dataclass
+
+from telemetry.samples.sample import Sample
 
 _MAX_ENTRIES = 256
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DjiNote:
-    """Attitude in degrees, speed in metres a second; None where absent."""
-
-    flight_pitch_deg: float | None = None
-    flight_yaw_deg: float | None = None
-    flight_roll_deg: float | None = None
-    camera_pitch_deg: float | None = None
-    camera_yaw_deg: float | None = None
-    camera_roll_deg: float | None = None
-    speed: tuple[float, float, float] | None = None
-
-
-def parse_dji(note: bytes) -> DjiNote | None:
+def parse_dji(note: bytes) -> Sample | None:
     """Attitude in a DJI maker note, None if it is another note or has no attitude. Never raises."""
     if len(note) < 14:
         return None
-    # Software that rewrites the EXIF may change its byte order but not the note's: the note's own count shows which it
-    # is.
+    # Software that rewrites the EXIF may change its byte order but not the note's, which the note's own count shows.
     order = "<" if note[1] == 0 else ">"
     (count,) = struct.unpack_from(order + "H", note)
     count = min(count, _MAX_ENTRIES, (len(note) - 2) // 12)
@@ -46,14 +33,12 @@ def parse_dji(note: bytes) -> DjiNote | None:
                 floats[tag] = round(value, 4)
     if not is_dji or not floats:
         return None
-    speed = (floats[3], floats[4], floats[5]) if {3, 4, 5} <= floats.keys() else None
     pitch, yaw, roll, camera_pitch, camera_yaw, camera_roll = (floats.get(tag) for tag in range(6, 12))
-    return DjiNote(
+    return Sample(
         flight_pitch_deg=pitch,
         flight_yaw_deg=yaw,
         flight_roll_deg=roll,
-        camera_pitch_deg=camera_pitch,
-        camera_yaw_deg=camera_yaw,
-        camera_roll_deg=camera_roll,
-        speed=speed,
+        pitch_deg=camera_pitch,
+        yaw_deg=camera_yaw,
+        roll_deg=camera_roll,
     )

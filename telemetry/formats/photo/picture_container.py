@@ -76,7 +76,7 @@ def _by_content(parts: Parts, head: bytes, size: int) -> Container:
     if head[:3] == b"\xff\xd8\xff":
         return _jpeg(parts, head, size)
     if head[:8] == b"\x89PNG\r\n\x1a\n":
-        return _png(parts, size)
+        return _png(parts)
     if head[:4] == b"RIFF" and head[8:12] == b"WEBP":
         return _webp(parts, size)
     if head[:4] in (b"II*\0", b"MM\0*"):
@@ -145,7 +145,7 @@ def _jpeg_is_complete(parts: Parts, scan: int, size: int) -> bool:
     return False
 
 
-def _png(parts: Parts, size: int) -> Container:
+def _png(parts: Parts) -> Container:
     at, width, height = 8, 0, 0
     tags, packet = exif.Exif(), b""
     for _ in range(_MAX_SEGMENTS):

@@ -70,9 +70,7 @@ def coordinate_deg(cell: str, axis: str, factor: float = 1.0) -> float | None:
     47°30.5', 47:30:00) or blanks between, with a sign, or with a hemisphere (N, south) before or after.
 
     Args:
-        cell: the text.
-        axis: "NS" for a latitude, "EW" for a longitude.
-        factor: degrees in the unit of decimal numbers.
+        axis: "NS" for a latitude, "EW" for a longitude. factor: degrees in the unit of decimal numbers.
     """
     cell = _plain(cell)
     written = _degrees(cell, factor)
@@ -85,12 +83,7 @@ def coordinate_deg(cell: str, axis: str, factor: float = 1.0) -> float | None:
 
 
 def hemisphere_sign(written: str, axis: str) -> float | None:
-    """Sign of a coordinate whose hemisphere is written ("S", "South"); None if that is not understood.
-
-    Args:
-        written: the hemisphere.
-        axis: "NS" or "EW".
-    """
+    """Sign of a coordinate whose hemisphere is written ("S", "South"), on "NS" or "EW"; None if not understood."""
     hemisphere = _plain(written).upper()
     letter = hemisphere[:1]
     if hemisphere not in (letter, _WORDS.get(letter)) or letter not in set(axis):
@@ -114,9 +107,7 @@ _WORDS = {"N": "NORTH", "S": "SOUTH", "E": "EAST", "W": "WEST"}
 def length_m(cell: str, factor: float = 1.0) -> float | None:
     """Metres of "512.3", "512.3 m", "1680 ft" or "12 m Below Sea Level"; None if the cell is not understood.
 
-    Args:
-        cell: the text.
-        factor: metres in the unit of a number without one.
+    A number without a unit counts `factor` metres.
     """
     match = _LENGTH.fullmatch(_plain(cell))
     unit = match[2].strip().lower() if match else ""
@@ -139,12 +130,7 @@ def below_sea(written: str) -> bool | None:
 
 
 def angle_deg(cell: str, factor: float = 1.0) -> float | None:
-    """Degrees of "31.5", "31.5 deg" or "0.55 rad"; None if the cell is not understood.
-
-    Args:
-        cell: the text.
-        factor: degrees in the unit of a number without one.
-    """
+    """Degrees of "31.5", "31.5 deg" or "0.55 rad", a number without a unit `factor` degrees; None if not understood."""
     match = _ANGLE.fullmatch(_plain(cell))
     unit = match[2].lower() if match else ""
     if match is None or (unit and unit not in _ANGLE_UNITS):

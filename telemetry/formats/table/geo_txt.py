@@ -13,9 +13,8 @@ from pathlib import Path
 
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import projection_of
-from orthoswarm.raster.picture_file import PICTURE_SUFFIXES
-from telemetry.formats.table.pose_row import PoseRow, PoseTable, as_path, decoded, pitch_by_value, read_text
-from telemetry.samples.sample import is_position
+from telemetry.formats.table.pose_table import PoseTable, as_path, decoded, pitch_by_value, read_text, words_of_name
+from telemetry.samples.sample import Sample, is_position
 
 _MOST_NUMBERS = 8
 
@@ -50,16 +49,8 @@ def read_geo_txt(path: Path) -> PoseTable:
             table.useless += 1
             continue
         n: list[float | None] = [v if math.isfinite(v) else None for v in numbers] + [None] * 8
-        row = PoseRow(
-            lat_deg=n[1],
-            lon_deg=n[0],
-            altitude_m=n[2],
-            height_m=None,
-            yaw_deg=n[3],
-            pitch_deg=n[4],
-            roll_deg=n[5],
-            sigma_m=n[6],
-        )
+        row = Sample(lat_deg=n[1], lon_deg=n[0], altitude_m=n[2], yaw_deg=n[3], pitch_deg=n[4], roll_deg=n[5])
+        row.sigma_m = n[6]
         if row.yaw_deg == row.pitch_deg == row.roll_deg == 0.0:
             row.yaw_deg = row.pitch_deg = row.roll_deg = None  # fillers before the accuracies
         if row.sigma_m is not None and not 0.0 < row.sigma_m < 1000.0:
@@ -98,8 +89,7 @@ def to_geographic(table: PoseTable, projection: str, path: Path) -> None:
 def _fields(line: str) -> tuple[str | None, list[float]]:
     """Name and the numbers after it; a name with blanks ends with its suffix."""
     words = line.split()
-    ends = (i for i, word in enumerate(words) if Path(word).suffix.lower() in PICTURE_SUFFIXES)
-    first = next(ends, 0) + 1
+    first = words_of_name(words)
     numbers: list[float] = []
     for word in words[first : first + _MOST_NUMBERS]:
         try:

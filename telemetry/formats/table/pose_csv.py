@@ -17,6 +17,7 @@ show that cells stand under wrong titles: 47,5,8,25 with commas between the cell
 blanks.
 """
 
+import contextlib
 import csv
 import io
 import re
@@ -28,10 +29,11 @@ from orthoswarm.model.errors import InputError
 from orthoswarm.raster.picture_file import PICTURE_SUFFIXES
 from telemetry.formats.table import cell_values
 from telemetry.formats.table.geo_txt import to_geographic
-from telemetry.formats.table.pose_row import PoseRow, PoseTable, as_path, decoded, pitch_by_value, read_text
+from telemetry.formats.table.pose_table import PoseTable, as_path, decoded, pitch_by_value, read_text, words_of_name
 from telemetry.samples.rotations import camera_angles_from_opk_deg
-from telemetry.samples.sample import is_position
+from telemetry.samples.sample import Sample, is_position
 from telemetry.samples.times import epoch_seconds, parse_time
+from telemetry.samples.unreadable import beginning
 
 _HEAD_BYTES = 1 << 14
 _NAMES = {
@@ -97,11 +99,8 @@ def read_pose_csv(path: Path) -> PoseTable | None:
     Raises:
         InputError: it is a table of poses that cannot be read: no projection, too large.
     """
-    try:
-        with path.open("rb") as handle:  # most tables next to pictures are not tables of poses, and may be large
-            head = decoded(handle.read(_HEAD_BYTES)).splitlines()
-    except OSError:
-        return None
+    # Most tables next to pictures are not tables of poses, and may be large.
+    head = decoded(beginning(path, _HEAD_BYTES)).splitlines()
     for at, line in enumerate(head[:5]):
         separator = _separator(line)
         columns = [_column(cell) for cell in _cells(line, separator)]
@@ -160,12 +159,10 @@ def _read(path: Path, header_at: int, layout: _Layout, title: str) -> PoseTable:
     body = [line for line in lines[header_at + 1 :] if line.strip() and not line.startswith("#")]
     commas = csv.reader(io.StringIO("\n".join(body)), delimiter=layout.separator)
     rows = (_words(line, len(layout.keys)) for line in body) if layout.separator == " " else commas
-    table, found = PoseTable(), []
-    try:
+    table, found = PoseTable(), list[_Line | None]()
+    with contextlib.suppress(csv.Error):  # an unterminated quoted cell: nothing after it can be separated
         for cells in rows:
             found.append(_line(table, layout, cells))
-    except csv.Error:  # an unterminated quoted cell: nothing after it can be separated
-        pass
     named = [line for line in found if line is not None]
     marks = layout.separator != "," and not any(map(_has_point, named))
     for line in named:
@@ -190,13 +187,12 @@ def _words(line: str, most: int) -> list[str]:
     words = line.split()
     if len(words) <= most:
         return words
-    ends = (i for i, word in enumerate(words) if Path(word).suffix.lower() in PICTURE_SUFFIXES)
-    first = next(ends, 0) + 1
+    first = words_of_name(words)
     words = [" ".join(words[:first]), *words[first:]]
     for at in range(len(words) - 1):
         if _DATE.fullmatch(words[at]) and _CLOCK.fullmatch(words[at + 1]) and len(words) > most:
-            zone = len(words) > most + 1 and at + 2 < len(words) and bool(_ZONE.fullmatch(words[at + 2]))
-            end = at + 2 + int(zone)
+            zone = len(words) > most + 1 and at + 2 < len(words) and _ZONE.fullmatch(words[at + 2])
+            end = at + (3 if zone else 2)
             return [*words[:at], " ".join(words[at:end]), *words[end:]]
     return words
 
@@ -272,7 +268,7 @@ def _add_row(table: PoseTable, line: _Line) -> None:
     """Put the values of one line into the table."""
     values = dict(line.cells)
     vehicle = "".join(c for c in values.pop("vehicle", "") if c.isprintable()).strip()
-    row = PoseRow(vehicle=vehicle[:64] or None)
+    row = Sample(vehicle=vehicle[:64] or None)
     values = {key: cell for key, cell in values.items() if not cell_values.is_absent(cell)}
     if not values.get("time", "").strip("0:-/T. "):  # cameras without a clock write zeros
         values.pop("time", None)
@@ -355,9 +351,5 @@ _REFS = {"lat_deg": ("lat_ref", "NS"), "lon_deg": ("lon_ref", "EW"), "altitude_m
 
 def names_pictures(path: Path) -> bool:
     """Whether the first lines of a text name picture files, so that it is probably meant for them."""
-    try:
-        with path.open("rb") as handle:
-            words = re.split(r"[\s,;\"']+", decoded(handle.read(_HEAD_BYTES)))
-    except OSError:
-        return False
-    return sum(Path(word).suffix.lower() in PICTURE_SUFFIXES for word in words[:2000] if "." in word) >= 1
+    words = re.split(r"[\s,;\"']+", decoded(beginning(path, _HEAD_BYTES)))
+    return any(Path(word).suffix.lower() in PICTURE_SUFFIXES for word in words[:2000])

@@ -13,7 +13,7 @@ Airframe 1-3: roll, pitch, yaw; gimbal 1-3: pitch, roll, yaw; both int64 in 0.1 
 import math
 import struct
 
-from telemetry.samples.sample import Sample, checked
+from telemetry.samples.sample import CAMERA_ANGLES, FLIGHT_ANGLES, Sample, checked
 from telemetry.samples.times import parse_time
 
 Fields = dict[int, int | float | bytes]
@@ -114,14 +114,8 @@ def read_djmd(data: bytes) -> Sample | None:
         yaw_deg=_scaled(gimbal, 3, 0.1),
     )
     # Protobuf omits zeros: where a gimbal or an airframe is present, a missing angle is zero.
-    if gimbal:
-        sample.pitch_deg, sample.roll_deg, sample.yaw_deg = (
-            v or 0.0 for v in (sample.pitch_deg, sample.roll_deg, sample.yaw_deg)
-        )
-    if airframe:
-        sample.flight_roll_deg, sample.flight_pitch_deg, sample.flight_yaw_deg = (
-            v or 0.0 for v in (sample.flight_roll_deg, sample.flight_pitch_deg, sample.flight_yaw_deg)
-        )
+    for name in (*(CAMERA_ANGLES if gimbal else ()), *(FLIGHT_ANGLES if airframe else ())):
+        setattr(sample, name, getattr(sample, name) or 0.0)
     written = _inner(place, 6).get(1) if position_at == 2 else None
     parsed = parse_time(written.decode("ascii", "replace")) if isinstance(written, bytes) else None
     sample.time_s = None if parsed is None else parsed[0]

@@ -18,7 +18,7 @@ _MOST_DEPTH = 4
 _GPS9 = struct.Struct(">7iHH")
 
 
-class _Entry(NamedTuple):
+class _GpmfEntry(NamedTuple):
     key: bytes
     kind: int
     size: int
@@ -44,7 +44,7 @@ def read_gpmf(data: bytes) -> list[Sample]:
     return samples
 
 
-def _entries(data: bytes) -> Iterator[_Entry]:
+def _entries(data: bytes) -> Iterator[_GpmfEntry]:
     at = 0
     for _ in range(_MOST_ENTRIES):
         if at + 8 > len(data):
@@ -53,11 +53,11 @@ def _entries(data: bytes) -> Iterator[_Entry]:
         length = size * count
         if at + 8 + length > len(data):
             return
-        yield _Entry(key, kind, size, count, data[at + 8 : at + 8 + length])
+        yield _GpmfEntry(key, kind, size, count, data[at + 8 : at + 8 + length])
         at += 8 + (length + 3) // 4 * 4
 
 
-def _streams(data: bytes, depth: int) -> Iterator[list[_Entry]]:
+def _streams(data: bytes, depth: int) -> Iterator[list[_GpmfEntry]]:
     """The entries of each innermost STRM."""
     for entry in _entries(data):
         if entry.kind == 0 and entry.key == b"STRM":
@@ -66,7 +66,7 @@ def _streams(data: bytes, depth: int) -> Iterator[list[_Entry]]:
             yield from _streams(entry.value, depth + 1)
 
 
-def _scale(entry: _Entry | None) -> list[float]:
+def _scale(entry: _GpmfEntry | None) -> list[float]:
     if entry is None or entry.kind not in b"ls":
         return [1.0]
     width = 4 if entry.kind == ord("l") else 2
@@ -75,11 +75,11 @@ def _scale(entry: _Entry | None) -> list[float]:
     return [float(value) or 1.0 for value in struct.unpack_from(f">{count}{code}", entry.value)] or [1.0]
 
 
-def _without_fix(entry: _Entry | None) -> bool:
+def _without_fix(entry: _GpmfEntry | None) -> bool:
     return entry is not None and len(entry.value) >= 4 and int.from_bytes(entry.value[:4], "big") < 2
 
 
-def _utc(entry: _Entry | None) -> float | None:
+def _utc(entry: _GpmfEntry | None) -> float | None:
     """UTC of `yymmddhhmmss.sss`."""
     text = b"" if entry is None else entry.value[:16]
     digits = text.decode("ascii", "replace").rstrip("\0 ")
@@ -87,7 +87,7 @@ def _utc(entry: _Entry | None) -> float | None:
     return None if parsed is None else parsed[0]
 
 
-def _gps5(entry: _Entry, scale: list[float], utc: float | None) -> list[Sample]:
+def _gps5(entry: _GpmfEntry, scale: list[float], utc: float | None) -> list[Sample]:
     scale = (scale * 5)[:5] if len(scale) < 5 else scale
     rows = [struct.unpack_from(">5i", entry.value, 20 * i) for i in range(len(entry.value) // 20)]
     found = []
@@ -100,7 +100,7 @@ def _gps5(entry: _Entry, scale: list[float], utc: float | None) -> list[Sample]:
     return found
 
 
-def _gps9(entry: _Entry, scale: list[float]) -> list[Sample]:
+def _gps9(entry: _GpmfEntry, scale: list[float]) -> list[Sample]:
     if len(scale) < 9:
         return []
     found = []

@@ -10,7 +10,7 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from telemetry.samples.rotations import camera_angles_deg, euler_ned
+from telemetry.samples.rotations import airframe_ned, camera_angles_deg, euler_ned
 from telemetry.samples.sample import Sample, checked
 
 ST0601_KEY = bytes.fromhex("060e2b34020b01010e01030101000000")
@@ -243,8 +243,8 @@ def _sample(values: dict[str, float | str]) -> Sample | None:
 
 def _attitude(v: dict[str, float], sample: Sample) -> float | None:
     """Camera angles into the sample; returns the elevation of the optical axis in degrees."""
-    if "relative_azimuth" in v and "relative_elevation" in v and sample.flight_yaw_deg is not None:
-        body = euler_ned(sample.flight_yaw_deg, sample.flight_pitch_deg or 0.0, sample.flight_roll_deg or 0.0)
+    body = airframe_ned(sample)
+    if "relative_azimuth" in v and "relative_elevation" in v and body is not None:
         sensor = euler_ned(v["relative_azimuth"], v["relative_elevation"], v.get("relative_roll", 0.0))
         sample.yaw_deg, sample.pitch_deg, sample.roll_deg = camera_angles_deg(body @ sensor)
     elif "angle_to_north" in v and "obliquity" in v:

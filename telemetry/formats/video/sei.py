@@ -184,24 +184,26 @@ def _decode_ours(body: bytes) -> Sample | None:
     return Sample(**values, vehicle=vehicle or None, height_is_ground=bool(flags & 1))
 
 
+_MISB_UUIDS = (
+    b"MISPmicrosectime",
+    bytes.fromhex("a8687dd4d7593758a5cef0338b6545f1"),
+    bytes.fromhex("cf848278ee23306c9265e8fef22fb8b8"),
+)
+
+
 def _decode_misb_time(body: bytes) -> Sample | None:
     """MISB ST 0604 precision time stamp: status, then 8 bytes with FF between the pairs.
 
     The UUID names micro- or nanoseconds, but real encoders write nanoseconds under the UUID of microseconds: a value
     that would be later than the year 4000 in microseconds is read as nanoseconds.
     """
-    value = _misb_integer(body)
-    if value is None:
+    if len(body) < 12 or not body[3] == body[6] == body[9] == 0xFF:
         return None
+    value = int.from_bytes(body[1:3] + body[4:6] + body[7:9] + body[10:12], "big")
     return Sample(time_s=value * (1e-9 if value > 6.4e16 else 1e-6))
 
 
-def _misb_integer(body: bytes) -> int | None:
-    if len(body) < 12 or not body[3] == body[6] == body[9] == 0xFF:
-        return None
-    return int.from_bytes(body[1:3] + body[4:6] + body[7:9] + body[10:12], "big")
-
-
+_GIMBAL_UUID = bytes.fromhex("a1b2c3d4e5f6a7b8c9daebfc1a2b3c4d")
 _GIMBAL = struct.Struct("<ddfHBBBBfiii")
 
 
@@ -325,25 +327,8 @@ _JSON = Decoder("SEI JSON", USER_DATA_UNREGISTERED, None, _decode_json)
 
 for _built_in in (
     Decoder("SEI OrthoSwarm", USER_DATA_UNREGISTERED, UUID, _decode_ours),
-    Decoder("SEI MISB time", USER_DATA_UNREGISTERED, b"MISPmicrosectime", _decode_misb_time),
-    Decoder(
-        "SEI MISB time",
-        USER_DATA_UNREGISTERED,
-        bytes.fromhex("a8687dd4d7593758a5cef0338b6545f1"),
-        _decode_misb_time,
-    ),
-    Decoder(
-        "SEI MISB time",
-        USER_DATA_UNREGISTERED,
-        bytes.fromhex("cf848278ee23306c9265e8fef22fb8b8"),
-        _decode_misb_time,
-    ),
-    Decoder(
-        "SEI gimbal camera",
-        USER_DATA_UNREGISTERED,
-        bytes.fromhex("a1b2c3d4e5f6a7b8c9daebfc1a2b3c4d"),
-        _decode_gimbal_camera,
-    ),
+    *(Decoder("SEI MISB time", USER_DATA_UNREGISTERED, uuid, _decode_misb_time) for uuid in _MISB_UUIDS),
+    Decoder("SEI gimbal camera", USER_DATA_UNREGISTERED, _GIMBAL_UUID, _decode_gimbal_camera),
     Decoder("SEI DJI", DJI_TYPE, None, _decode_dji),
 ):
     register(_built_in)

@@ -51,11 +51,12 @@ _SUBTITLE_RESTART_S: Final = 5.0  # subtitles whose times go back by more than t
 
 @dataclass(slots=True)
 class Cue:
-    """One block: start and end in seconds of the video, and its sample (None if it has none)."""
+    """One block: start and end in seconds of the video, its text, and the sample in it, None if there is none."""
 
     start_s: float
     end_s: float
-    sample: Sample | None
+    text: str
+    sample: Sample | None = None
 
 
 @dataclass(slots=True)
@@ -79,13 +80,6 @@ class Subtitles:
         return any(cue.sample is not None and cue.sample.has_position for cue in self.cues)
 
 
-@dataclass(slots=True)
-class _Raw:
-    start_s: float
-    end_s: float
-    text: str
-
-
 def read_srt(path: Path) -> Subtitles:
     """Read an SRT file; blocks that are not understood are left out.
 
@@ -105,10 +99,10 @@ def parse_srt(text: str) -> Subtitles:
 
 def parse_cues(texts: list[tuple[float, float, str]]) -> Subtitles:
     """Read the packets of a subtitle track: start and end in seconds of the video, and text."""
-    return _read([_Raw(start, end, text[:_MAX_BLOCK]) for start, end, text in texts])
+    return _read([Cue(start, end, text[:_MAX_BLOCK]) for start, end, text in texts])
 
 
-def _blocks(text: str) -> Iterator[_Raw]:
+def _blocks(text: str) -> Iterator[Cue]:
     cues = list(_CUE.finditer(text))
     if not cues:
         yield from _undated_blocks(text)
@@ -117,10 +111,10 @@ def _blocks(text: str) -> Iterator[_Raw]:
         h, m, s, ms, h2, m2, s2, ms2 = (int(g) for g in cue.groups())
         start_s = h * 3600 + m * 60 + s + ms / 1000.0
         end_s = h2 * 3600 + m2 * 60 + s2 + ms2 / 1000.0
-        yield _Raw(start_s, max(end_s, start_s), text[cue.end() : min(end, cue.end() + _MAX_BLOCK)])
+        yield Cue(start_s, max(end_s, start_s), text[cue.end() : min(end, cue.end() + _MAX_BLOCK)])
 
 
-def _undated_blocks(text: str) -> Iterator[_Raw]:
+def _undated_blocks(text: str) -> Iterator[Cue]:
     """Blocks of a file without cue times, timed by their dates relative to the first one."""
     first: float | None = None
     for block in re.split(r"\n\s*\n", text.replace("\r", "")):
@@ -128,35 +122,34 @@ def _undated_blocks(text: str) -> Iterator[_Raw]:
         moment = None if date is None else _local_time(date[0])
         if moment is not None:
             first = moment if first is None else first
-            yield _Raw(moment - first, moment - first, block[:_MAX_BLOCK])
+            yield Cue(moment - first, moment - first, block[:_MAX_BLOCK])
 
 
-def _read(blocks: list[_Raw]) -> Subtitles:
+def _read(blocks: list[Cue]) -> Subtitles:
     joints_s = _join(blocks)
     if any(_COMMA_PAIR.search(block.text) or _COMMA_TUPLE.search(block.text) for block in blocks):
         for block in blocks:
             block.text = _DECIMAL_COMMA.sub(r"\1.\2", block.text)
-    result = Subtitles(latitude_first=_latitude_first(blocks), joints_s=joints_s)
+    result = Subtitles(cues=blocks, latitude_first=_latitude_first(blocks), joints_s=joints_s)
     for block in blocks:
-        result.cues.append(Cue(block.start_s, block.end_s, _sample(block.text, result.latitude_first)))
-    _note_oddities(result, blocks)
+        block.sample = _sample(block.text, result.latitude_first)
+    _note_oddities(result)
     return result
 
 
-def _join(blocks: list[_Raw]) -> list[float]:
+def _join(blocks: list[Cue]) -> list[float]:
     """Put the recordings that a file joins one after the other; returns where each but the first begins, seconds.
 
     Each counts its times from zero. Blocks that are only out of order go back by less. A block with a damaged time
     tells neither where a recording begins nor where it ends.
     """
-    restart_s = _SUBTITLE_RESTART_S
     starts_s = [block.start_s for block in blocks]
     joints_s: list[float] = []
     shift_s = before_s = end_s = 0.0
     for index, block in enumerate(blocks):
         damaged = _stands_out(starts_s, index)
         if not damaged:
-            if block.start_s < min(before_s - restart_s, restart_s):
+            if block.start_s < min(before_s - _SUBTITLE_RESTART_S, _SUBTITLE_RESTART_S):
                 shift_s = end_s
                 joints_s.append(shift_s)
             before_s = block.start_s
@@ -174,7 +167,7 @@ def _stands_out(values: list[float], index: int) -> bool:
     return len(near) == 2 and abs(near[0] - near[1]) < min(abs(values[index] - value) for value in near)
 
 
-def _latitude_first(blocks: list[_Raw]) -> bool | None:
+def _latitude_first(blocks: list[Cue]) -> bool | None:
     """Order of the GPS tuples of a file; None where there are none."""
     votes = {True: 0.0, False: 0.0}
     layout: bool | None = None
@@ -238,7 +231,7 @@ def _local_time(written: str) -> float | None:
     return None if parsed is None else parsed[0]
 
 
-def _note_oddities(result: Subtitles, blocks: list[_Raw]) -> None:
+def _note_oddities(result: Subtitles) -> None:
     samples = [cue.sample for cue in result.cues]
     placed = [s for s in samples if s is not None and s.has_position]
     if not result.cues:
@@ -254,7 +247,7 @@ def _note_oddities(result: Subtitles, blocks: list[_Raw]) -> None:
         missing = len(samples) - len(placed)
         result.notes["srt-gaps"] = f"{missing} of {len(samples)} blocks hold no position"
     decimals = max(
-        (len(m[1].partition(".")[2]) for b in blocks[:50] if (m := _TUPLE.search(b.text)) is not None), default=9
+        (len(m[1].partition(".")[2]) for b in result.cues[:50] if (m := _TUPLE.search(b.text)) is not None), default=9
     )
     if decimals <= 4:
         result.notes["position-coarse"] = (
@@ -262,7 +255,7 @@ def _note_oddities(result: Subtitles, blocks: list[_Raw]) -> None:
         )
     if all(s.yaw_deg is None and s.flight_yaw_deg is None for s in placed):
         result.notes["srt-no-attitude"] = "the subtitles hold no yaw; it has to come from the course and the pictures"
-    tuples = [_TUPLE.search(block.text) is not None for block in blocks]
+    tuples = [_TUPLE.search(block.text) is not None for block in result.cues]
     if 0 < sum(t and s is not None and s.has_position for t, s in zip(tuples, samples)) < len(placed):
         result.notes["srt-mixed"] = "the subtitles mix two layouts: recordings of two cameras were joined"
     starts = [cue.start_s for cue in result.cues]

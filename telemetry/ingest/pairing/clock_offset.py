@@ -25,6 +25,7 @@ _MOVED_M = 2.0
 _LEAST_MOVED = 0.8
 """Zones under which a vehicle moved less often, by this share of the most, are not the photos' (chosen)."""
 
+_TURNING_STEP_S: Final = 0.1  # of the clocks that are compared by turns
 TURNING_MARGIN: Final = 0.1  # a video's turns decide between two clocks, or logs, if correlations differ by more
 
 
@@ -64,13 +65,9 @@ def _moved_share(times: Array, timeline: Timeline) -> float:
 
 
 def offset_by_positions(times: Array, lat_lon: Array, timeline: Timeline, *, search_s: float = 30.0) -> float | None:
-    """The offset that brings a camera's own positions onto the vehicle's track, in any zone.
+    """The offset that brings a camera's own times (N,) and positions (N, 2), degrees, onto the vehicle's track.
 
-    Args:
-        times: (N,) by the camera.
-        lat_lon: (N, 2) degrees by the camera.
-        timeline: the vehicle's.
-        search_s: largest offset besides whole quarter hours.
+    Any zone is possible; besides whole quarter hours the clocks differ by `search_s` at most.
     """
     if timeline.span is None or len(times) < 3:
         return None
@@ -105,16 +102,14 @@ def median_distance_m(times: Array, lat_lon: Array, timeline: Timeline) -> float
 
 
 def offset_by_turning(
-    picture_times: Array, picture_rates: Array, timeline: Timeline, *, search_s: float = 120.0, step_s: float = 0.1
+    picture_times: Array, picture_rates: Array, timeline: Timeline, *, search_s: float = 120.0
 ) -> tuple[float, float] | None:
     """The offset for which the pictures rotate when the vehicle turns.
 
     Args:
-        picture_times: (N,) video seconds or camera time.
-        picture_rates: (N,) yaw rate measured in the pictures, degrees a second.
+        picture_times: (N,) video seconds. picture_rates: (N,) yaw rate measured in the pictures, degrees a second.
         timeline: the vehicle's; its flight yaw (or camera yaw) is read.
         search_s: largest difference of the clocks after their beginnings are aligned.
-        step_s: resolution.
 
     Returns:
         Offset and the correlation there (0 to 1), None if the flight has too few turns.
@@ -122,7 +117,7 @@ def offset_by_turning(
     if timeline.span is None or len(picture_times) < 10 or np.std(picture_rates) < 0.5:
         return None
     first, last = timeline.span
-    grid = np.arange(first, last, step_s)
+    grid = np.arange(first, last, _TURNING_STEP_S)
     if len(grid) < 20:
         return None
     yaw = timeline.values("flight_yaw_deg", grid)
@@ -131,12 +126,12 @@ def offset_by_turning(
     known = ~np.isnan(yaw)
     if known.sum() < 20:
         return None
-    rate = np.gradient(np.degrees(np.unwrap(np.radians(np.interp(grid, grid[known], yaw[known])))), step_s)
+    rate = np.gradient(np.degrees(np.unwrap(np.radians(np.interp(grid, grid[known], yaw[known])))), _TURNING_STEP_S)
     if np.std(rate) < 0.3:
         return None
     start = picture_times[0] - first
     best: list[tuple[float, float]] = []
-    for offset in np.arange(start - search_s, start + search_s, step_s):
+    for offset in np.arange(start - search_s, start + search_s, _TURNING_STEP_S):
         at = picture_times - offset
         inside = (at >= first) & (at <= last)
         if inside.sum() < max(10, 0.5 * len(at)):

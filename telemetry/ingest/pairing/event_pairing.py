@@ -3,19 +3,28 @@
 By time: both are matched as sequences (`sequence_match`). Where times decide nothing: by the numbers in file names and
 events, else by order alone, unless the times contradict that. Missing first, dropped and extra pictures are found that
 way and reported.
+
+Cameras set their clock by satellites after takeoff, by hand, or begin in 1980. Before and after, photos and events
+differ by another offset, so that they are matched as sequences part by part.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from telemetry.ingest.pairing.clock_jumps import JUMP_LEAST_PHOTOS, parts_between_jumps
-from telemetry.ingest.pairing.motion_chains import PictureMotion
+from telemetry.ingest.pairing.motion_chains import SAME_EXPOSURE_SHARE, PictureMotion
 from telemetry.ingest.pairing.sequence_match import CERTAIN, match_sequences
+from telemetry.ingest.pairing.sequence_model import MOST_DRIFT
 
 Array = NDArray[np.float64]
+
+_JUMP_WINDOWS: Final = 4  # parts of a flight compared to find whether the camera's clock was set in between
+JUMP_LEAST_PHOTOS: Final = 6  # photos of a part of a flight, and those only its clock gives an event, at least
+LEAST_JUMP_S: Final = 0.6  # clocks of two parts that differ by more than this and the largest drift are two settings
 
 
 @dataclass(slots=True, kw_only=True)
@@ -54,10 +63,8 @@ def pair(
     """Pair photos with events; both are in order of time (or of name).
 
     Args:
-        photo_times: by the camera's clock, None where unknown.
-        event_times: UTC, None where unknown.
-        photo_numbers: of file names.
-        event_numbers: the autopilot's image counts.
+        photo_times: by the camera's clock, None where unknown. event_times: UTC, None where unknown.
+        photo_numbers: of file names. event_numbers: the autopilot's image counts.
         motion: the way flown as the photos show it, for photos that the times leave open.
     """
     if not len(photo_times) or not len(event_times):
@@ -150,7 +157,7 @@ def _by_parts(photos: Array, events: Array, numbers: Sequence[int | None]) -> Pa
     if len(known) == len(photos):
         order = np.argsort(np.array(known), kind="stable")
     by_event = np.argsort(events, kind="stable")
-    parts = parts_between_jumps(photos[order], events[by_event], _certain_offsets)
+    parts = _parts_between_jumps(photos[order], events[by_event])
     if len(parts) < 2:
         return None
     result, clocks, free = Pairing(offset_s=None), list[float](), 0
@@ -183,7 +190,7 @@ def _explains_more(parts: Pairing, whole: Pairing) -> bool:
 
 
 def _certain_offsets(photos: Array, events: Array) -> Array | None:
-    """The offsets of the pairs of a part of a flight, if its times leave no doubt."""
+    """Offsets (photo minus event) of the certain pairs of a part of a flight; None if its times do not decide."""
     found = by_time(photos, events) if np.ptp(photos) > 0.0 else Pairing()
     sure = [(i, j) for i, j in found.pairs if i not in found.doubtful]
     if len(sure) < max(JUMP_LEAST_PHOTOS - 1, 0.5 * len(photos)):
@@ -206,3 +213,39 @@ def _by_number(photos: Sequence[int | None], events: Sequence[int | None]) -> Pa
     shift = min((s for s, v in votes.items() if v == most), key=lambda s: abs(min(own) - s - min(theirs)))
     pairs = sorted((own[m + shift], j) for m, j in theirs.items() if m + shift in own)
     return Pairing(pairs=pairs, how="number", ambiguous=sum(v == most for v in votes.values()) > 1)
+
+
+def _parts_between_jumps(photos: Array, events: Array) -> list[slice]:
+    """The parts of a flight between which the camera's clock was set; one if it never was.
+
+    Photos (N,) by the camera are in order of exposure (of the files' numbers), events (M,) by the vehicle in order.
+    """
+    count = len(photos)
+    if count < _JUMP_WINDOWS * JUMP_LEAST_PHOTOS:
+        return [slice(0, count)]
+    edges = np.linspace(0, count, _JUMP_WINDOWS + 1).round().astype(int)
+    allowed = MOST_DRIFT * float(np.ptp(events)) + LEAST_JUMP_S
+    parts = list(pairwise(edges.tolist()))
+    begin, end = (_certain_offsets(photos[a:b], events) for a, b in (parts[0], parts[-1]))
+    if begin is not None and end is not None and abs(float(np.median(end) - np.median(begin))) <= allowed:
+        return [slice(0, count)]  # a clock that was set stays so
+    found = [begin, *(_certain_offsets(photos[a:b], events) for a, b in parts[1:-1]), end]
+    clocks = [float(np.median(some)) for some in found if some is not None]
+    starts = [0]
+    for before, after in pairwise(clocks):
+        if abs(after - before) > allowed:
+            starts.append(_first_after(photos, events, before, after, starts[-1]))
+    return [slice(a, b) for a, b in zip(starts, [*starts[1:], count], strict=True) if b > a]
+
+
+def _first_after(photos: Array, events: Array, before: float, after: float, start: int) -> int:
+    """Index of the first photo of the later clock: under the clock of their part photos are nearest to events."""
+    far = SAME_EXPOSURE_SHARE * float(np.median(np.diff(events)))
+    own, other = (np.minimum(_apart(photos[start:] - clock, events), far) for clock in (before, after))
+    return start + int(np.argmin(np.concatenate([[0.0], np.cumsum(own - other)])))
+
+
+def _apart(times: Array, events: Array) -> Array:
+    """From each time the distance to the nearest event, seconds."""
+    right = np.searchsorted(events, times).clip(1, len(events) - 1)
+    return np.asarray(np.minimum(np.abs(times - events[right]), np.abs(times - events[right - 1])))

@@ -7,13 +7,12 @@ undecided, not as the nearest event.
 """
 
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from telemetry.ingest.pairing.alignment import SequenceMatch
 from telemetry.ingest.pairing.motion_chains import PictureMotion, chains_of, variants
 from telemetry.ingest.pairing.sequence_model import (
     FIRST_JITTER_S,
@@ -49,6 +48,78 @@ _MOST_DRIFTS: Final = 81  # drifts that are correlated at most
 _PICTURES_FROM_S: Final = 0.5  # resolution of the camera's times from which pictures decide
 _LEAST_AGREEMENT: Final = 0.9  # a pairing by pictures keeps this share of the pairs by times alone
 _LEAST_MATCHED: Final = 0.6  # share of photos or events with a partner
+_LEAST_PROBABILITY: Final = 0.02  # events that a photo has with less probability are not listed as its alternatives
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SequenceMatch:
+    """Probabilities of pairings.
+
+    Attributes:
+        events: (K,) index of each event, without repetitions.
+        first: (N,) index into `events` of column 0 of a photo's row.
+        probability: (N, B) of each photo and event.
+        offset_s: photo time minus event time in the middle of the events. drift: rate of the photo's clock minus one.
+        resolution_s: of the photo's clock.
+        by_pictures: whether the pictures were asked, too.
+        other_clock: probability that the clocks differ by another offset, some intervals away.
+    """
+
+    events: Indices
+    first: Indices
+    probability: Array
+    offset_s: float
+    drift: float
+    resolution_s: float
+    by_pictures: bool = False
+    other_clock: float = 0.0
+
+    def pairs(self) -> list[tuple[int, int, float]]:
+        """The alignment with the most expected matches: photo, event (both increasing) and probability.
+
+        A heaviest increasing subsequence, with a Fenwick tree of prefix maxima over the events.
+        """
+        tree: list[tuple[float, int]] = [(0.0, -1)] * (len(self.events) + 2)
+        nodes: list[tuple[int, int, float, int]] = []  # photo, event, probability, node before
+        for i, row in enumerate(self.probability):
+            reached = []
+            for column in np.flatnonzero(row > _LEAST_PROBABILITY).tolist():
+                event = int(self.first[i]) + column
+                value, before = _prefix_maximum(tree, event)
+                nodes.append((i, event, float(row[column]), before))
+                reached.append((event, value + float(row[column]), len(nodes) - 1))
+            for event, value, node in reached:
+                _raise_to(tree, event + 1, (value, node))
+        pairs = []
+        node = _prefix_maximum(tree, len(self.events))[1]
+        while node >= 0:
+            i, event, probability, node = nodes[node]
+            pairs.append((i, int(self.events[event]), probability))
+        return pairs[::-1]
+
+    def may_have_none(self, photo: int) -> bool:
+        """Whether another clock, under which a photo has no event, is possible: then its event is no likely place."""
+        possible = self.other_clock > _LEAST_PROBABILITY
+        return bool(possible and self.probability[photo].sum() < 1.0 - _LEAST_PROBABILITY)
+
+    def alternatives(self, photo: int) -> list[int]:
+        """Events that a photo may belong to."""
+        columns = np.flatnonzero(self.probability[photo] > _LEAST_PROBABILITY)
+        return [int(self.events[self.first[photo] + column]) for column in columns]
+
+
+def _prefix_maximum(tree: list[tuple[float, int]], end: int) -> tuple[float, int]:
+    best = (0.0, -1)
+    while end > 0:
+        best = max(best, tree[end])
+        end -= end & -end
+    return best
+
+
+def _raise_to(tree: list[tuple[float, int]], at: int, entry: tuple[float, int]) -> None:
+    while at < len(tree):
+        tree[at] = max(tree[at], entry)
+        at += at & -at
 
 
 def match_sequences(photos: Array, events: Array, motion: PictureMotion | None = None) -> SequenceMatch | None:
@@ -90,7 +161,6 @@ def _alignment(model: SequenceModel, windows: list[Clock], single: Indices) -> S
     for i, (lo, at) in enumerate(zip(first.tolist(), inside.tolist(), strict=True)):
         keep = max(0, min(probability.shape[1] - (at - lo), len(single) - at))
         shifted[i, :keep] = probability[i, at - lo : at - lo + keep]
-    asked = model.chains is not None
     return SequenceMatch(
         events=single,
         first=inside,
@@ -98,8 +168,7 @@ def _alignment(model: SequenceModel, windows: list[Clock], single: Indices) -> S
         offset_s=offset,
         drift=drift,
         resolution_s=model.resolution_s,
-        jitter_s=model.jitter_s,
-        by_pictures=asked,
+        by_pictures=model.chains is not None,
         other_clock=other_clock,
     )
 

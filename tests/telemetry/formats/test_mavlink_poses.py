@@ -329,7 +329,7 @@ def test_a_picture_reported_again_is_no_restart():
     poses.feed(mavlink.MAVLink_system_time_message(round(T0 * 1e6), 60_000))
     report = mavlink.MAVLink_camera_image_captured_message(20_000, 0, 1, 0, 0, 0, 0, [math.nan] * 4, 3, 1, b"")
     assert poses.feed(report).time_s == pytest.approx(T0 - 40.0)
-    assert poses.reboots == 0
+    assert poses.clocks.reboots == 0
     assert poses.utc(60.0) == pytest.approx(T0)
 
 

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from telemetry.formats.table.geo_txt import is_geo_txt, read_geo_txt
 from telemetry.formats.table.pose_csv import read_pose_csv
-from telemetry.formats.table.pose_row import decoded
+from telemetry.formats.table.pose_table import decoded
 from telemetry.ingest.ingest import survey
 from tests.telemetry.ingest.test_photos import jpeg
 

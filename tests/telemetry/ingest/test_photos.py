@@ -315,7 +315,7 @@ def test_maker_note_of_sheffield_has_the_attitude(real_data):
 def test_maker_note_agrees_with_xmp_where_both_are_there(real_data):
     for path in sorted(real_data("brighton_beach_1600").glob("*.JPG")):
         photo, note = read_photo(path), parse_dji(read_container(path).exif.exif[exif.MAKER_NOTE])
-        assert (note.camera_yaw_deg, note.camera_pitch_deg) == pytest.approx(photo.camera_deg[:2], abs=0.051)
+        assert (note.yaw_deg, note.pitch_deg) == pytest.approx(photo.camera_deg[:2], abs=0.051)
 
 
 def test_calibrated_focal_length_and_rtk_of_mirafiori(real_data):

@@ -35,7 +35,7 @@ def moving_video(path, codec):
 def grays(path):
     """Picture and whether it counts as damaged, by its presentation time."""
     damage, found, pictures = Damage(), scan(path), {}
-    for _, index, frame in decoded(found, [0], damage):
+    for _, index, frame in decoded(found, damage):
         bad = frame.is_corrupt or (index is not None and damage.is_damaged(index))
         pictures[frame.pts] = frame.to_ndarray(format="gray").astype(np.int16), bad
     return pictures

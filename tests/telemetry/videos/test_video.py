@@ -12,7 +12,7 @@ from orthoswarm.model.errors import InputError
 from telemetry.ingest.ingest import LoadOptions, load, survey
 from telemetry.samples.sample import Sample
 from telemetry.videos.extraction import decoded, extract
-from telemetry.videos.picture_choice import Candidate, Picker
+from telemetry.videos.picture_choice import DecodedPicture, Picker
 from telemetry.videos.picture_poses import Poses
 from telemetry.videos.video_file import NotAVideo, scan
 from telemetry.write.sei_writer import add_sei, presentation_order, with_sei
@@ -202,7 +202,9 @@ def test_the_sharpest_of_neighbours_is_taken():
         sharp = 40.0 if number % 10 == 1 else 5.0
         taken += [
             c.number
-            for c in picker.push(Candidate(number=number, frame=Blurred(sharp), sample=sample, video_s=number / 10))
+            for c in picker.push(
+                DecodedPicture(number=number, frame=Blurred(sharp), sample=sample, video_s=number / 10)
+            )
         ]
     assert taken[:3] == [0, 11, 21]
 
@@ -211,7 +213,9 @@ def test_a_hovering_drone_gives_one_picture():
     picker = Picker(every_m=5.0)
     sample = Sample(lat_deg=47.0, lon_deg=8.0)
     taken = [
-        c for n in range(100) for c in picker.push(Candidate(number=n, frame=Blurred(1), sample=sample, video_s=n / 10))
+        c
+        for n in range(100)
+        for c in picker.push(DecodedPicture(number=n, frame=Blurred(1), sample=sample, video_s=n / 10))
     ]
     assert len([*taken, *picker.flush()]) == 1
 

@@ -2,36 +2,20 @@
 
 import codecs
 from collections import Counter
-from collections.abc import Collection
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
 from itertools import islice, takewhile
 from pathlib import Path
 
 from orthoswarm.model.errors import InputError
+from orthoswarm.raster.picture_file import PICTURE_SUFFIXES
+from telemetry.samples.sample import Sample
 from telemetry.samples.unreadable import MOST_TEXT_BYTES
 
 _MOST_FOLDERS = 64
 """Folders of a path that may be left out: more are no path."""
 
 
-@dataclass(slots=True, kw_only=True)
-class PoseRow:
-    """A table's values for one picture; None where it has none."""
-
-    lat_deg: float | None = None
-    lon_deg: float | None = None
-    altitude_m: float | None = None
-    height_m: float | None = None
-    yaw_deg: float | None = None
-    pitch_deg: float | None = None
-    roll_deg: float | None = None
-    sigma_m: float | None = None
-    time_s: float | None = None
-    fov_deg: float | None = None
-    vehicle: str | None = None
-
-
-class PoseTable(dict[str, PoseRow]):
+class PoseTable(dict[str, Sample]):
     """Lower-case picture name (or relative path with forward slashes) -> row.
 
     Attributes:
@@ -49,7 +33,7 @@ class PoseTable(dict[str, PoseRow]):
         self.refused += 1
 
 
-def lookup(table: PoseTable, relative: str) -> PoseRow | None:
+def lookup(table: PoseTable, relative: str) -> Sample | None:
     """The row of a picture by its path relative to the table's folder, else by its name, with or without the suffix."""
     return next((table[name] for name in names_of(relative) if name in table), None)
 
@@ -59,6 +43,11 @@ def names_of(relative: str) -> tuple[str, str, str]:
     path = relative.lower()
     name = path.rsplit("/", 1)[-1]
     return path, name, name.rsplit(".", 1)[0]
+
+
+def words_of_name(words: Sequence[str]) -> int:
+    """How many of a line's words are the picture's name: a name with blanks ends with its suffix."""
+    return next((i for i, word in enumerate(words) if Path(word).suffix.lower() in PICTURE_SUFFIXES), 0) + 1
 
 
 def as_path(name: str) -> str:
@@ -92,14 +81,10 @@ def leave_out_folder(table: PoseTable, pictures: Collection[str]) -> str:
 
 
 def take_base_names(table: PoseTable, pictures: Collection[str]) -> int:
-    """Rename rows to the only picture of their file name, where no other row has it either.
+    """Rename rows to the only picture of their file name, where no other row has it either; returns how many.
 
     Args:
-        table: no name of which is a picture's.
-        pictures: paths relative to the table's folder.
-
-    Returns:
-        the number of rows that were renamed.
+        table: no name of which is a picture's. pictures: paths relative to the table's folder.
     """
     places: dict[str, list[str]] = {}
     for picture in pictures:
