@@ -22,7 +22,7 @@ settings.load_profile("unhurried")
 ROOT = Path(__file__).resolve().parent.parent
 ROOMS_IN_REAL_TIME = {"vehicles", "daemon", "page", "cli"}
 IN_REAL_TIME = re.compile(r"\b(SimSwarm|serving|standing|subprocess|socket|threading|time\.sleep)\b")
-"""What files of these rooms name that wait for vehicles, servers and browsers: one after the other (see the Makefile)."""
+"""What files name that wait for vehicles, servers or browsers: they run one after the other (see the Makefile)."""
 
 
 @cache
