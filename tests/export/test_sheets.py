@@ -16,8 +16,8 @@ from pmtiles.tile import zxy_to_tileid
 from rasterio.warp import transform
 
 from gcs_plugin.cli.main import main
+from orthoswarm.export.forms import FORMS, MapExport
 from orthoswarm.export.reduced_raster import ReducedRaster
-from orthoswarm.export.sheets.forms import write_form
 from orthoswarm.export.sheets.geopdf import write_geopdf
 from orthoswarm.export.sheets.mgrs import mgrs, utm_zone
 from orthoswarm.export.sheets.stac_item import write_stac_item
@@ -121,11 +121,12 @@ def test_an_earlier_layer_does_not_quote_the_accuracy_of_the_last(folder, layer,
     (folder / "report.json").write_text(json.dumps({"legs": [MATCHED], "basemap": basemap, "checkpoints": CHECKED}))
     for name in ("coarse.tif", "realtime.tif"):
         (folder / name).write_bytes((folder / "orthoimage.tif").read_bytes())
-    path = write_form("stac", folder / f"{layer}.tif", folder, ())
+    what = MapExport(folder=folder, dest=folder / "dest", layer=layer)
+    path = FORMS["stac"].write(what)
     properties = json.loads(path.read_text())["properties"]
     assert ("No accuracy is stated" in properties["description"]) == own
     assert ("orthoswarm:sigma_median_m" in properties) == ("orthoswarm:rmse_h_m" in properties) == (not own)
-    pack = write_form("pack", folder / f"{layer}.tif", folder / "dest", ())
+    pack = FORMS["pack"].write(what)
     with zipfile.ZipFile(pack) as archive:
         item = json.loads(archive.read("flood-map/orthoimage.stac.json"))
         page = archive.read("flood-map/index.html").decode()
@@ -220,6 +221,18 @@ def test_every_form_is_written_by_the_command_line(folder, capsys):
     assert {f"flood-map/{name}" for name in inside} <= names
     assert page.count("</script>") == 1  # a note cannot end the page's script
     assert not [p for p in (folder / "export").iterdir() if p.name.startswith(".")]
+
+
+def test_page_and_documents_name_every_form():
+    root = Path(__file__).parents[2]
+    served = {name for name, form in FORMS.items() if form.daemon}
+    page = (root / "gcs_plugin/web/static/work/exports.js").read_text(encoding="utf-8")
+    words = (root / "gcs_plugin/web/static/core/english.js").read_text(encoding="utf-8")
+    assert set(re.findall(r'"(\w+)"', re.search(r"const FORMATS = \[(.*)\]", page)[1])) == served
+    assert all(f'"export.{name}": ' in words for name in served)
+    usage, console, daemon = ((root / f"docs/{name}.md").read_text() for name in ("usage", "console", "daemon"))
+    assert set(re.search(r"orthoswarm export OUT --to (.*)", usage)[1].split()) == set(FORMS)
+    assert all(f"`{name}`" in console and f"`{name}`" in daemon for name in served)
 
 
 def test_the_surface_model_and_the_seamlines_go_along(folder):

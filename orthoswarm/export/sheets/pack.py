@@ -9,6 +9,7 @@ import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,8 +19,8 @@ from orthoswarm.export.sheets.stac_item import picture_times, write_stac_item
 from orthoswarm.export.sheets.stated_accuracy import stated_accuracy
 from orthoswarm.export.sheets.surface_asset import SURFACE, surface_path
 from orthoswarm.export.tactical.cursor_on_target import write_data_package
-from orthoswarm.export.tactical.place_files import write_csv, write_gpx, write_kml
-from orthoswarm.export.tactical.places import Place, write_geojson
+from orthoswarm.export.tactical.place_files import PLACE_FILES
+from orthoswarm.export.tactical.places import Place
 from orthoswarm.export.tiles.kmz import kmz_file
 from orthoswarm.export.tiles.mbtiles import mbtiles_file
 from orthoswarm.export.tiles.pmtiles import write_pmtiles
@@ -74,10 +75,7 @@ def write_pack(
         others: list[Callable[[], None]] = [
             lambda: write_geopdf(cog, folder / "sheet.pdf", places, title),
             lambda: write_data_package(places, folder / "places-tak.zip", title),
-            lambda: write_geojson(places, folder / "places.geojson"),
-            lambda: write_kml(places, folder / "places.kml"),
-            lambda: write_gpx(places, folder / "places.gpx"),
-            lambda: write_csv(places, folder / "places.csv"),
+            *(partial(write, places, folder / name) for name, write in PLACE_FILES.items()),
             lambda: _copy(cog, folder),
             lambda: write_stac_item(folder / "orthoimage.tif", folder / "orthoimage.stac.json", copy_of=cog),
         ]

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from orthoswarm.export.atomic_file import atomic_write
-from orthoswarm.export.tactical.places import Place
+from orthoswarm.export.tactical.places import Place, write_geojson
 from orthoswarm.export.xml_elements import element, kml_bytes, texts, xml_bytes
 
 _COLUMNS: Final = (
@@ -95,3 +95,9 @@ def _words(place: Place) -> str:
     parts = [place.note, "" if place.sigma_m is None else f"standard deviation {place.sigma_m:.2f} m"]
     parts += [f"pictures: {', '.join(place.pictures)}"] if place.pictures else []
     return "; ".join(part for part in parts if part)
+
+
+PLACE_FILES: Final = {
+    "places.geojson": write_geojson, "places.kml": write_kml, "places.gpx": write_gpx, "places.csv": write_csv,
+}  # fmt: skip
+"""Writers by the name of their file."""
