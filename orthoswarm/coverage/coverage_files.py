@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from orthoswarm.coverage.coverage_grid import CoverageGrid, State
 from orthoswarm.coverage.gaps import CoverageGap, Gaps
-from orthoswarm.export.atomic_file import atomic_write
+from orthoswarm.export.atomic_file import atomic_write, write_file
 from orthoswarm.export.product_files import write_json
 from orthoswarm.export.xml_elements import element, kml_bytes, texts
 from orthoswarm.model.geo import GroundGrid, LocalGrid
@@ -80,8 +80,7 @@ def write_gaps(folder: Path, gaps: Gaps, grid: LocalGrid) -> None:
     features = [gap_feature(gap, grid) for gap in gaps.gaps]
     rows = [(f["properties"], f["geometry"]["coordinates"]) for f in features]
     write_json(folder / "gaps.geojson", {"type": "FeatureCollection", "features": features})
-    with atomic_write(folder / "gaps.kml") as part:
-        part.write_bytes(_kml(rows))
+    write_file(folder / "gaps.kml", _kml(rows))
     _write_gpkg(folder / "gaps.gpkg", gaps.gaps, [row for row, _ in rows], grid.epsg)
 
 

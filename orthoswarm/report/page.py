@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm import __version__
+from orthoswarm.export.atomic_file import write_file
 from orthoswarm.export.catalog.tiled_raster import product_file
-from orthoswarm.export.product_files import iso_time, write_text
+from orthoswarm.export.product_files import iso_time
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.frame import Rejection
 from orthoswarm.model.geo import GroundGrid
@@ -34,9 +35,9 @@ from orthoswarm.report.report_pictures import (
     product_bounds,
     product_picture,
     scale_bar,
+    surface_picture,
     view_grid,
 )
-from orthoswarm.report.surface_picture import surface_picture
 
 Array = NDArray[np.float64]
 
@@ -127,7 +128,7 @@ def write_page(
     values["fov"] = charts.fields_of_view(report["vehicles"])
     values["times"] = charts.times(report["stages"])
     values["legs"], values["on_map"] = _leg_summary(report), _on_map(report)
-    write_text(out / "report.html", [environment.get_template("page.html.j2").render(values)])
+    write_file(out / "report.html", environment.get_template("page.html.j2").render(values))
     return None if shifts is None or not len(shifts.at) else _against_map(shifts)
 
 

@@ -18,8 +18,7 @@ from rasterio.warp import transform
 from gcs_plugin.cli.main import main
 from orthoswarm.export.forms import FORMS, MapExport
 from orthoswarm.export.reduced_raster import ReducedRaster
-from orthoswarm.export.sheets.geopdf import write_geopdf
-from orthoswarm.export.sheets.mgrs import mgrs, utm_zone
+from orthoswarm.export.sheets.geopdf import grid_zone, square, utm_zone, write_geopdf
 from orthoswarm.export.sheets.stac_item import write_stac_item
 from orthoswarm.export.sheets.stated_accuracy import stated_accuracy
 from orthoswarm.export.surface_file import write_surface
@@ -55,9 +54,9 @@ def folder(tmp_path):
 
 
 def test_mgrs_is_that_of_the_tables():
-    assert mgrs(32, 47.3977, 465_741.9, 5_249_460.2) == "32T MT 65741 49460"
-    assert mgrs(56, -33.8568, 334_897.0, 6_252_288.0).startswith("56H LH 34897 52288")  # Sydney's opera house
-    assert mgrs(31, 0.5, 166_021.0, 55_000.0).startswith("31N AA")
+    assert (grid_zone(32, 47.3977), square(32, 465_741.9, 5_249_460.2)) == ("32T", "MT")
+    assert (grid_zone(56, -33.8568), square(56, 334_897.0, 6_252_288.0)) == ("56H", "LH")  # Sydney's opera house
+    assert (grid_zone(31, 0.5), square(31, 166_021.0, 55_000.0)) == ("31N", "AA")
     assert utm_zone(32632) == 32 and utm_zone(32760) == 60 and utm_zone(2056) is None and utm_zone(32661) is None
 
 

@@ -14,13 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.export.catalog.tiled_raster import COLLECTION, FOLDER, VEHICLES, RasterTile, tiles_of, write_json
+from orthoswarm.export.catalog.tiled_raster import COLLECTION, FOLDER, VEHICLES, RasterTile, tiles_of
 from orthoswarm.export.exterior_orientation import camera_of
-from orthoswarm.export.product_files import read_frames
+from orthoswarm.export.product_files import read_frames, write_json
 from orthoswarm.export.sheets.geojson_outline import joined_bbox, outline
-from orthoswarm.export.sheets.stac_item import EXTENSIONS, raster_item
+from orthoswarm.export.sheets.stac_item import EXTENSIONS, raster_item, surface_assets
 from orthoswarm.export.sheets.stated_accuracy import stated_accuracy
-from orthoswarm.export.sheets.surface_asset import surface_assets
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.mosaic.footprint import footprint
 

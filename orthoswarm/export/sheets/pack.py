@@ -15,9 +15,8 @@ from typing import Any, Final
 
 from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.export.sheets.geopdf import write_geopdf
-from orthoswarm.export.sheets.stac_item import picture_times, write_stac_item
+from orthoswarm.export.sheets.stac_item import SURFACE, picture_times, surface_path, write_stac_item
 from orthoswarm.export.sheets.stated_accuracy import stated_accuracy
-from orthoswarm.export.sheets.surface_asset import SURFACE, surface_path
 from orthoswarm.export.tactical.cursor_on_target import write_data_package
 from orthoswarm.export.tactical.place_files import PLACE_FILES
 from orthoswarm.export.tactical.places import Place

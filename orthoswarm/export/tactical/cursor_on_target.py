@@ -7,12 +7,11 @@ import time
 import uuid
 import zipfile
 from collections.abc import Iterable
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
 from orthoswarm.export.atomic_file import atomic_write
-from orthoswarm.export.tactical.places import Place
+from orthoswarm.export.tactical.places import Place, utc_text
 from orthoswarm.export.xml_elements import element, xml_bytes
 
 _TYPES: Final = {"vehicle": "a-f-A-M-H-Q", "find": "b-m-p-s-m"}
@@ -48,8 +47,8 @@ def event(place: Place, now_s: float | None = None) -> bytes:
     return xml_bytes(
         element(
             "event", point, element("detail", *detail), version="2.0", uid=place.uid, type=_TYPES[place.kind],
-            how="m-g" if place.kind == "vehicle" else "h-e", time=_zulu(now), start=_zulu(start),
-            stale=_zulu(now + _STALE_S[place.kind]),
+            how="m-g" if place.kind == "vehicle" else "h-e", time=utc_text(now), start=utc_text(start),
+            stale=utc_text(now + _STALE_S[place.kind]),
         )
     )  # fmt: skip
 
@@ -75,7 +74,3 @@ def write_data_package(places: Iterable[Place], path: Path, name: str = "OrthoSw
         settings = [element("Parameter", name=key, value=value) for key, value in (("uid", uid), ("name", name))]
         parts = element("Configuration", *settings), element("Contents", *contents)
         archive.writestr("MANIFEST/manifest.xml", xml_bytes(element("MissionPackageManifest", *parts, version="2")))
-
-
-def _zulu(time_s: float) -> str:
-    return datetime.fromtimestamp(time_s, UTC).strftime("%Y-%m-%dT%H:%M:%S.") + f"{int(time_s % 1 * 1000):03d}Z"

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
-from orthoswarm.export.atomic_file import atomic_write
+from orthoswarm.export.atomic_file import write_file
 from orthoswarm.export.tactical.places import Place, write_geojson
 from orthoswarm.export.xml_elements import element, kml_bytes, texts, xml_bytes
 
@@ -30,8 +30,7 @@ def write_csv(places: Iterable[Place], path: Path) -> None:
     for place in places:
         values = [getattr(place, key) for key in _COLUMNS[:-1]]
         rows.writerow(_cell(value) for value in [*values, " ".join(place.pictures)])
-    with atomic_write(path) as part:
-        part.write_text(out.getvalue(), encoding="utf-8")
+    write_file(path, out.getvalue().encode())
 
 
 def _cell(value: object) -> object:
@@ -58,8 +57,7 @@ def write_gpx(places: Iterable[Place], path: Path) -> None:
         for place in places
     ]  # fmt: skip
     space = "http://www.topografix.com/GPX/1/1"
-    with atomic_write(path) as part:
-        part.write_bytes(xml_bytes(element("gpx", *points, version="1.1", creator="OrthoSwarm", xmlns=space)))
+    write_file(path, xml_bytes(element("gpx", *points, version="1.1", creator="OrthoSwarm", xmlns=space)))
 
 
 def write_kml(places: Iterable[Place], path: Path) -> None:
@@ -82,8 +80,7 @@ def write_kml(places: Iterable[Place], path: Path) -> None:
                 element("Style", balloon), element("Point", *at),
             )
         )  # fmt: skip
-    with atomic_write(path) as part:
-        part.write_bytes(kml_bytes(*texts(name="OrthoSwarm"), *marks))
+    write_file(path, kml_bytes(*texts(name="OrthoSwarm"), *marks))
 
 
 def _html(text: str) -> str:
