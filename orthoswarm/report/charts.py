@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from typing import Any
+from xml.sax.saxutils import escape
 
 import numpy as np
 
@@ -58,8 +59,9 @@ def fields_of_view(vehicles: Sequence[Mapping[str, Any]]) -> str | None:
             f'y2="{y(value + wide):.1f}" stroke-width="2"/><circle cx="{x:.1f}" cy="{y(value):.1f}" r="3.5"/></g>'
         )
         if len(known) <= 16:
-            name = _escape(_tail(str(vehicle["id"]), max(4, int(gap / 7))))
-            parts.append(f'<text x="{x:.1f}" y="{_BASE + 20}" text-anchor="middle">{name}</text>')
+            name, most = str(vehicle["id"]), max(4, int(gap / 7))
+            shown = escape(name if len(name) <= most else "…" + name[-(most - 1) :])
+            parts.append(f'<text x="{x:.1f}" y="{_BASE + 20}" text-anchor="middle">{shown}</text>')
     if len(known) > 16:
         parts.append(f'<text x="{_LEFT}" y="{_BASE + 20}">{len(known)} vehicles</text>')
     return "".join([*parts, "</svg>"])
@@ -90,11 +92,3 @@ def _colour(name: str, index: int) -> str:
 def _round_step(value: float) -> float:
     unit = 10.0 ** np.floor(np.log10(max(value, 1e-6)))
     return float(next(s for s in (1, 2, 5, 10) if s * unit >= value) * unit)
-
-
-def _tail(name: str, most: int) -> str:
-    return name if len(name) <= most else "…" + name[-(most - 1) :]
-
-
-def _escape(text: str) -> str:
-    return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")

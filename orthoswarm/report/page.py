@@ -129,10 +129,8 @@ def write_page(
     values["times"] = charts.times(report["stages"])
     values["legs"], values["on_map"] = _leg_summary(report), _on_map(report)
     write_file(out / "report.html", environment.get_template("page.html.j2").render(values))
-    return None if shifts is None or not len(shifts.at) else _against_map(shifts)
-
-
-def _against_map(shifts: Moved) -> dict[str, float | int]:
+    if shifts is None or not len(shifts.at):
+        return None
     median, p95 = (float(v) for v in np.percentile(shifts.size_m, (50.0, 95.0)))
     return {"median": median, "p95": p95, "blocks": len(shifts.at)}
 
@@ -227,20 +225,14 @@ def _edge_crops(best: Path, ortho: Picture, there: MapView, basemap: Basemap) ->
     figures: list[Figure] = []
     while len(figures) < 3 and score.size and score.max() > 0.01:
         r, c = np.unravel_index(int(score.argmax()), score.shape)
-        middle = overview.to_ground([float(c), float(r)])
-        half = 0.5 * side * gsd
-        window = BoundingBox.around_points(middle, half)
-        picture = _with_edges(best, MapView.read(basemap, view_grid(epsg, window, side, gsd)))
+        window = BoundingBox.around_points(overview.to_ground([float(c), float(r)]), 0.5 * side * gsd)
+        part = MapView.read(basemap, view_grid(epsg, window, side, gsd))
+        picture = product_picture(best, part.grid)
+        picture.rgb[map_edges(part)] = _EDGE
+        scale_bar(picture)
         figures.append(Figure("", data_uri(picture.rgb, 88), ""))
         score[max(0, r - size) : r + size, max(0, c - size) : c + size] = 0
     return figures
-
-
-def _with_edges(best: Path, there: MapView) -> Picture:
-    picture = product_picture(best, there.grid)
-    picture.rgb[map_edges(there)] = _EDGE
-    scale_bar(picture)
-    return picture
 
 
 def _footprints(reduced: Picture, placed: Sequence[PlacedFrame], there: MapView | None, ground_z_m: float) -> Figure:
@@ -251,14 +243,12 @@ def _footprints(reduced: Picture, placed: Sequence[PlacedFrame], there: MapView 
     for i, vehicle in enumerate(vehicles):
         own = [p for p in placed if p.frame.vehicle == vehicle]
         step = max(1, len(own) // 60)
-        rings = [footprint(p.camera, ground_z_m) for p in own[::step]]
-        rings = [ring for ring in rings if len(ring)]
+        rings = [ring for p in own[::step] if len(ring := footprint(p.camera, ground_z_m))]
         colour = _VEHICLES[i % len(_VEHICLES)]
         fill_polygons(picture, rings, colour, 0.03)
         draw_lines(picture, rings, colour, 1, closed=True)
     scale_bar(picture)
-    text = f"What each picture sees, on {on}; one colour a vehicle."
-    return Figure("Footprints", data_uri(picture.rgb), text)
+    return Figure("Footprints", data_uri(picture.rgb), f"What each picture sees, on {on}; one colour a vehicle.")
 
 
 def _arrows(reduced: Picture, shifts: Moved) -> Figure:
@@ -291,9 +281,9 @@ def _paths(reduced: Picture, placed: Sequence[PlacedFrame], report: Mapping[str,
     text = (
         "Green, thin: matched to the map. Orange, wider: carried by the others. Dark red, widest: failed. "
         "Light grey: turns."
+        if _on_map(report)
+        else "Straight legs of the flights; grey: turns."
     )
-    if not _on_map(report):
-        text = "Straight legs of the flights; grey: turns."
     return Figure("Legs", data_uri(picture.rgb), text)
 
 

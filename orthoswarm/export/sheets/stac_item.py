@@ -115,6 +115,12 @@ def picture_times(folder: Path) -> tuple[str | None, str | None]:
     return (times[0], times[-1]) if times else (None, None)
 
 
+def time_span(folder: Path) -> str:
+    """First and last minute of a map's pictures, as "2026-05-28 20:26 to 2026-05-28 20:31 UTC"; empty if not known."""
+    first, last = (None if time is None else time[:16].replace("T", " ") for time in picture_times(folder))
+    return "" if first is None else f"{first} to {last} UTC"
+
+
 def surface_path(folder: Path) -> Path | None:
     """The surface model in a map's folder; None if its run made none, or wrote it elsewhere."""
     report = folder / "report.json"

@@ -181,13 +181,17 @@ def draw_tiles(source: Path, files: Sequence[TileFile], progress: Tell | None = 
             for file in files:
                 file.begin(pyramid)
             waiting: deque[tuple[TileFile, Quad, Future[Any]]] = deque()
+
+            def store(most: int) -> None:
+                while len(waiting) > most:
+                    file, quad, encoded = waiting.popleft()
+                    file.store(quad, encoded.result())
+
             quad: Quad | None = None
             for quad in _Drawing(raster, pyramid, progress).quads():
                 waiting.extend((file, quad, encoders.submit(file.encode, quad)) for file in files)
-                while len(waiting) > _AHEAD:
-                    _store(*waiting.popleft())
-            while waiting:
-                _store(*waiting.popleft())
+                store(_AHEAD)
+            store(0)
             if quad is None:
                 raise OrthoSwarmError(f"{source.name} shows nothing, so that it has no tiles; look at the map's report")
             for file in files:
@@ -195,10 +199,6 @@ def draw_tiles(source: Path, files: Sequence[TileFile], progress: Tell | None = 
             return pyramid
     except RasterioError as error:
         raise InputError(f"{source} cannot be read ({error}); make the map again") from None
-
-
-def _store(file: TileFile, quad: Quad, encoded: Future[Any]) -> None:
-    file.store(quad, encoded.result())
 
 
 def degrees_of(x: float, y: float, zoom: int) -> tuple[float, float]:
