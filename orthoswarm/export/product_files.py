@@ -14,7 +14,6 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.compute.stage_times import Stage
 from orthoswarm.config import active
 from orthoswarm.export.atomic_file import write_file
 from orthoswarm.export.footprint_layer import write_footprints
@@ -277,11 +276,6 @@ def leg_rows(solutions: Sequence[Solution]) -> list[dict[str, Any]]:
         for s in solutions
         for leg in s.legs
     ]
-
-
-def stage_row(stage: Stage) -> dict[str, Any]:
-    """One of `stages` of report.json."""
-    return {"name": stage.name, "wall_s": stage.wall_s, "cpu_s": stage.cpu_s, "items": stage.items}
 
 
 def image_root(frames: Sequence[Frame]) -> str | None:

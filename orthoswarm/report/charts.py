@@ -69,19 +69,15 @@ def fields_of_view(vehicles: Sequence[Mapping[str, Any]]) -> str | None:
 
 def times(stages: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """What the page needs for two stacked bars, wall and CPU seconds, and their legend."""
+    colours = [_colour(str(stage["name"]), i) for i, stage in enumerate(stages)]
     bars = []
     for key, title in (("wall_s", "time"), ("cpu_s", "processor time")):
-        total = sum(float(s[key]) for s in stages)
-        parts = [
-            {"share": 100.0 * float(s[key]) / total if total else 0.0, "colour": _colour(str(s["name"]), i)}
-            for i, s in enumerate(stages)
-        ]
+        seconds = [float(stage[key]) for stage in stages]
+        total = sum(seconds)
+        parts = [{"share": 100.0 * s / total if total else 0.0, "colour": c} for s, c in zip(seconds, colours)]
         bars.append({"title": title, "total": total, "parts": parts})
-    legend = [
-        {"name": s["name"], "colour": _colour(str(s["name"]), i), "wall_s": s["wall_s"], "cpu_s": s["cpu_s"]}
-        for i, s in enumerate(stages)
-    ]
-    return {"bars": bars, "legend": legend}
+    keys = ("name", "wall_s", "cpu_s")
+    return {"bars": bars, "legend": [{"colour": c} | {k: s[k] for k in keys} for s, c in zip(stages, colours)]}
 
 
 def _colour(name: str, index: int) -> str:

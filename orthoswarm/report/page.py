@@ -237,10 +237,11 @@ def _edge_crops(best: Path, ortho: Picture, there: MapView, basemap: Basemap) ->
 
 def _footprints(reduced: Picture, placed: Sequence[PlacedFrame], there: MapView | None, ground_z_m: float) -> Figure:
     """Each vehicle's footprints on the map, or on the orthoimage where there is none."""
-    under, on = (reduced, "the orthoimage") if there is None else (there.on(reduced.grid).picture(), "the map")
-    picture = under.copy()
-    vehicles = list(dict.fromkeys(p.frame.vehicle for p in placed))
-    for i, vehicle in enumerate(vehicles):
+    if there is None:
+        picture, on = Picture(reduced.rgb.copy(), reduced.seen, reduced.grid), "the orthoimage"
+    else:
+        picture, on = there.on(reduced.grid).picture(), "the map"
+    for i, vehicle in enumerate(dict.fromkeys(p.frame.vehicle for p in placed)):
         own = [p for p in placed if p.frame.vehicle == vehicle]
         step = max(1, len(own) // 60)
         rings = [ring for p in own[::step] if len(ring := footprint(p.camera, ground_z_m))]
@@ -359,11 +360,11 @@ def _control_verdict(control: Mapping[str, Any], expected: str, offset: Mapping[
 
 
 def _facts(report: Mapping[str, Any], placed: Sequence[PlacedFrame], shifts: Moved | None) -> list[tuple[str, str]]:
-    frames = report["frames"]
-    gsd = float(report["gsd_m"])
-    days = _days(placed)
+    from pyproj import CRS
+
+    frames, gsd, days = report["frames"], float(report["gsd_m"]), _days(placed)
     facts = [
-        (str(report["epsg"]), f"EPSG code: {crs_name(report['epsg'])}"),
+        (str(report["epsg"]), f"EPSG code: {CRS.from_epsg(report['epsg']).name}"),
         *([(days, "taken")] if days else []),
         (f"{frames['used']:,} of {frames['input']:,}", "pictures mapped"),
         (str(len(report["vehicles"])), "vehicle" if len(report["vehicles"]) == 1 else "vehicles"),
@@ -377,13 +378,6 @@ def _facts(report: Mapping[str, Any], placed: Sequence[PlacedFrame], shifts: Mov
     if checked is not None:
         facts.append((f"{checked['rmse_h_m']:.2f} m", f"RMSE horizontal at {checked['checkpoints']} checkpoints"))
     return [*facts, (f"{report['wall_s']:.0f} s", "to make"), (f"{report['peak_rss_mb']:,.0f} MB", "memory")]
-
-
-def crs_name(epsg: int) -> str:
-    """Name of a coordinate system, as QGIS and others show it."""
-    from pyproj import CRS
-
-    return str(CRS.from_epsg(epsg).name)
 
 
 def _days(placed: Sequence[PlacedFrame]) -> str:

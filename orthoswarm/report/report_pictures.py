@@ -39,10 +39,6 @@ class Picture:
     seen: NDArray[np.bool_]
     grid: GroundGrid
 
-    def copy(self) -> "Picture":
-        """One to draw on."""
-        return Picture(self.rgb.copy(), self.seen, self.grid)
-
     def on(self, grid: GroundGrid) -> "Picture":
         """Resampled to another grid, as far as it reaches."""
         bands, seen = _regrid(np.ascontiguousarray(self.rgb.transpose(2, 0, 1)), self.seen, self.grid, grid)

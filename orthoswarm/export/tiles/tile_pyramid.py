@@ -334,7 +334,8 @@ def _warp(raster: Any, nodes: Array, step: int) -> Bytes | None:
 
     columns, rows = ~raster.transform * (nodes[..., 0], nodes[..., 1])
     places = np.nan_to_num(np.stack([columns, rows], -1), nan=_FAR, posinf=_FAR, neginf=_FAR)
-    scale = np.maximum(1.0, _pixels_of_source(places, step))
+    across, down = np.abs(np.diff(places, axis=1))[..., 0], np.abs(np.diff(places, axis=0))[..., 1]
+    scale = np.maximum(1.0, np.array([np.median(across), np.median(down)]) / step)  # pixels of the source in one
     margin = np.ceil(scale) + 1.0
     first = np.maximum(np.floor(places.min((0, 1)) - margin), 0.0).astype(int)
     last = np.minimum(np.ceil(places.max((0, 1)) + margin), [raster.width, raster.height]).astype(int)
@@ -346,12 +347,6 @@ def _warp(raster: Any, nodes: Array, step: int) -> Bytes | None:
     out = np.empty(((nodes.shape[0] - 1) * step, (nodes.shape[1] - 1) * step, 4), np.uint8)
     _draw(source, places - first, step, float(scale[0]), float(scale[1]), out)
     return out
-
-
-def _pixels_of_source(places: Array, step: int) -> Array:
-    """How many source columns and rows a target pixel covers, float64 (2,)."""
-    across, down = np.abs(np.diff(places, axis=1)), np.abs(np.diff(places, axis=0))
-    return np.array([np.median(across[..., 0]), np.median(down[..., 1])]) / step
 
 
 @in_place_kernel
