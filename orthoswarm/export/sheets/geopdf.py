@@ -166,15 +166,8 @@ def _mark(draw: "ImageDraw", at: tuple[float, float], name: str, frame: _Frame) 
     if left <= x <= right and top <= y <= bottom:
         size = 2.2 * _MM
         draw.ellipse((x - size, y - size, x + size, y + size), outline=_MARK, width=5)
-        draw.text(
-            (x + 1.4 * size, y),
-            name[:60],
-            fill=_MARK,
-            font=_font(3.2),
-            anchor="lm",
-            stroke_width=3,
-            stroke_fill="white",
-        )
+        font = _font(3.2)
+        draw.text((x + 1.4 * size, y), name[:60], _MARK, font, "lm", stroke_width=3, stroke_fill="white")
 
 
 def _foot(draw: "ImageDraw", frame: _Frame, grid: LocalGrid, *, cog: Path, finds: int, step: float, title: str) -> None:
