@@ -181,10 +181,7 @@ class HttpRoutes:
         return JsonAnswer([job.document() for job in jobs], status_code=202)
 
     async def export(self, request: Request) -> Response:
-        """Write {"formats": [...]} into the workspace; answers with the job.
-
-        Formats: cog, mbtiles, kmz, gpkg, odm, stac, pmtiles, pdf, places, tak, pack.
-        """
+        """Write {"formats": [...]} into the workspace; answers with the job, or with all formats if one is unknown."""
         body = await json_body(request)
         formats = body.get("formats", ["cog", "gpkg"])
         if not isinstance(formats, list) or not all(isinstance(name, str) for name in formats):

@@ -3,6 +3,7 @@
 import time
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Any
 
 from orthoswarm.batch.run_state import COARSE, ORTHOIMAGE, PRODUCTS, REALTIME, SEAMLINES, RunContext, RunState
@@ -13,7 +14,6 @@ from orthoswarm.export.product_files import (
     image_root,
     iso_time,
     leg_rows,
-    stage_row,
     vehicle_rows,
     write_frames,
     write_json,
@@ -53,7 +53,7 @@ def write_products(
             report["against_map_m"] = write_page(run.out, report, stated, rejected=left_out, basemap=None)
     wall, cpu, memory = run.clock.totals()
     report |= {"wall_s": wall, "cpu_s": cpu, "peak_rss_mb": memory}
-    report["stages"].append(stage_row(stage))
+    report["stages"].append(asdict(stage))
     if any(tiles_of(run.out, name) for name in (REALTIME, COARSE, ORTHOIMAGE)):
         from orthoswarm.export.catalog.stac_collection import write_collection
 
@@ -102,7 +102,7 @@ def _report(
         "left_out": dict(reasons.most_common()),
         "vehicles": vehicle_rows(solutions, placed),
         "legs": leg_rows(solutions),
-        "stages": [stage_row(s) for s in run.clock.stages],
+        "stages": [asdict(s) for s in run.clock.stages],
         "wall_s": wall,
         "cpu_s": cpu,
         "peak_rss_mb": memory,

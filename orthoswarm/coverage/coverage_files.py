@@ -3,15 +3,15 @@
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
-from xml.sax.saxutils import escape
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.coverage.coverage_grid import CellState, CoverageGrid
 from orthoswarm.coverage.gaps import CoverageGap, Gaps
-from orthoswarm.export.atomic_file import atomic_write
-from orthoswarm.export.product_files import write_json, write_text
+from orthoswarm.export.atomic_file import atomic_write, write_file
+from orthoswarm.export.product_files import write_json
+from orthoswarm.export.xml_elements import element, kml_bytes, texts
 from orthoswarm.model.geo import GroundGrid, LocalGrid
 
 COLOURS = {
@@ -80,7 +80,7 @@ def write_gaps(folder: Path, gaps: Gaps, grid: LocalGrid) -> None:
     features = [gap_feature(gap, grid) for gap in gaps.gaps]
     rows = [(f["properties"], f["geometry"]["coordinates"]) for f in features]
     write_json(folder / "gaps.geojson", {"type": "FeatureCollection", "features": features})
-    write_text(folder / "gaps.kml", [_kml(rows)])
+    write_file(folder / "gaps.kml", _kml(rows))
     _write_gpkg(folder / "gaps.gpkg", gaps.gaps, [row for row, _ in rows], grid.epsg)
 
 
@@ -92,27 +92,23 @@ def _rings(gap: CoverageGap, grid: LocalGrid) -> list[list[list[float]]]:
     return [[[round(float(lon), 8), round(float(lat), 8)] for lat, lon in ring] for ring in places]
 
 
-def _kml(rows: Sequence[tuple[dict[str, Any], list[list[list[float]]]]]) -> str:
+def _kml(rows: Sequence[tuple[dict[str, Any], list[list[list[float]]]]]) -> bytes:
+    opacity = {"LineStyle": "ff", "PolyStyle": "80"}
+    styles = [
+        element("Style", *(element(tag, *texts(color=alpha + colour)) for tag, alpha in opacity.items()), id=name)
+        for name, colour in (("missed", "2d2dd7"), ("poor", "28b4f5"))
+    ]
     marks = []
     for row, (outer, *holes) in rows:
-        name = escape(f"{row['area_m2']:.0f} m2, {row['cause']}" + (f": {row['detail']}" if row["detail"] else ""))
-        style = "poor" if row["detail"] else "missed"
+        name = f"{row['area_m2']:.0f} m2, {row['cause']}" + (f": {row['detail']}" if row["detail"] else "")
         borders = [("outerBoundaryIs", outer), *(("innerBoundaryIs", hole) for hole in holes)]
-        rings = "".join(
-            f"<{tag}><LinearRing><coordinates>{' '.join(f'{x},{y}' for x, y in ring)}"
-            f"</coordinates></LinearRing></{tag}>"
+        rings = [
+            element(tag, element("LinearRing", *texts(coordinates=" ".join(f"{x},{y}" for x, y in ring))))
             for tag, ring in borders
-        )
-        marks.append(
-            f"<Placemark><name>{name}</name><styleUrl>#{style}</styleUrl><Polygon>{rings}</Polygon></Placemark>\n"
-        )
-    styles = "".join(
-        f'<Style id="{name}"><LineStyle><color>ff{colour}</color></LineStyle>'
-        f"<PolyStyle><color>80{colour}</color></PolyStyle></Style>\n"
-        for name, colour in (("missed", "2d2dd7"), ("poor", "28b4f5"))
-    )
-    head = '<?xml version="1.0" encoding="UTF-8"?>\n<kml xmlns="http://www.opengis.net/kml/2.2"><Document>\n'
-    return f"{head}<name>gaps</name>\n{styles}{''.join(marks)}</Document></kml>\n"
+        ]
+        style = "#poor" if row["detail"] else "#missed"
+        marks.append(element("Placemark", *texts(name=name, styleUrl=style), element("Polygon", *rings)))
+    return kml_bytes(*texts(name="gaps"), *styles, *marks)
 
 
 def _write_gpkg(path: Path, gaps: Sequence[CoverageGap], rows: Sequence[dict[str, Any]], epsg: int) -> None:

@@ -3,7 +3,7 @@
 import errno
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final
@@ -35,6 +35,20 @@ def atomic_write(path: Path) -> Iterator[Path]:
     except BaseException:
         _remove(part)
         raise
+
+
+def write_file(path: Path, content: str | bytes | Iterable[str]) -> None:
+    """Write a file, texts in UTF-8, that appears when it is complete.
+
+    Raises:
+        StorageError: if the disk is full or the folder cannot be written.
+    """
+    with atomic_write(path) as part:
+        if isinstance(content, bytes):
+            part.write_bytes(content)
+        else:
+            with part.open("w", encoding="utf-8", newline="\n") as file:
+                file.writelines([content] if isinstance(content, str) else content)
 
 
 def disk_error(error: OSError, path: Path) -> StorageError:

@@ -28,16 +28,13 @@ def convert_cog(source: Path, path: Path, *, epsg: int | None = None, jpeg_quali
     from rasterio.errors import CRSError, RasterioError
     from rasterio.vrt import WarpedVRT
 
+    lossless = {"compress": "DEFLATE", "predictor": 2}
     settings: dict[str, Any] = {
         "driver": "COG",
         "bigtiff": "IF_SAFER",  # by default GDAL never makes one of a compressed picture, and fails at 4 GB
-        "compress": "DEFLATE",
-        "predictor": 2,
         "overview_resampling": "AVERAGE",
+        **(lossless if jpeg_quality is None else {"compress": "JPEG", "quality": jpeg_quality}),
     }
-    if jpeg_quality is not None:
-        settings |= {"compress": "JPEG", "quality": jpeg_quality}
-        settings.pop("predictor")
     try:
         with rasterio.open(source) as raster, atomic_write(path) as part, rasterio.Env(CHECK_DISK_FREE_SPACE=True):
             crs = raster.crs if epsg is None else rasterio.crs.CRS.from_epsg(epsg)

@@ -4,16 +4,23 @@ World axes are east, north, up in metres from `origin.txt`, a corner of the map'
 right, y down, z forward); its pixel (0, 0) is the upper left CORNER of the upper left pixel, ours its centre.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.export.atomic_file import atomic_write
-from orthoswarm.export.exterior_orientation import OrientedPicture, by_lens, link_pictures, oriented_pictures
+from orthoswarm.export.exterior_orientation import (
+    Find,
+    OrientedPicture,
+    Row,
+    Tell,
+    by_lens,
+    link_oriented,
+    oriented_pictures,
+)  # fmt: skip
 from orthoswarm.model.camera import Lens
 
 Array = NDArray[np.float64]
@@ -22,20 +29,12 @@ _ENOUGH_PX = 0.01
 """Terms that move no pixel by more are left out: the adjustment returns terms that it holds at zero as 1e-16."""
 
 
-def write_colmap(
-    rows: Sequence[Mapping[str, Any]],
-    find: Callable[[Mapping[str, Any]], Path | None],
-    folder: Path,
-    *,
-    progress: Callable[[int, int], None] | None = None,
-) -> list[str]:
+def write_colmap(rows: Iterable[Row], find: Find, folder: Path, *, progress: Tell | None = None) -> list[str]:
     """Write `sparse/0/{cameras,images,points3D}.txt`, `origin.txt` and `images/`.
 
     Args:
-        rows: lines of frames.jsonl.
-        find: returns the picture file of a row, None if it is missing.
-        folder: appears when it is complete; an existing one is replaced.
-        progress: called with pictures done and pictures in all.
+        rows: lines of frames.jsonl. find: their picture files.
+        folder: appears when it is complete; an existing one is replaced. progress: called with pictures done and all.
 
     Returns:
         Images whose files are missing: they are in the model, but not in `images`.
@@ -60,7 +59,7 @@ def write_colmap(
         )
         _write(model / "points3D.txt", ["# no points"])
         _write(part / "origin.txt", [f"EPSG:{pictures[0].row['epsg']} {origin[0]:.1f} {origin[1]:.1f} 0"])
-        return link_pictures(pictures, find, part / "images", progress)
+        return link_oriented(pictures, find, part / "images", progress)
 
 
 def _model(lens: Lens) -> str:

@@ -1,42 +1,43 @@
-"""Cameras from the lines of frames.jsonl, for programs that use our orientation (densify, measure)."""
+"""Cameras and pictures of a map, from the lines of frames.jsonl, for programs that use our orientation."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+import os
+import re
+import shutil
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.export.linked_pictures import link_file, unique_names
+from orthoswarm.export.atomic_file import disk_error
 from orthoswarm.model.camera import Camera, Lens, rotation_from_angles
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid
 
 Array = NDArray[np.float64]
 Row = Mapping[str, Any]
+Find = Callable[[Row], Path | None]
+"""Returns the picture file of a row, None if it is missing."""
+Tell = Callable[[int, int], None]
+_MOST_STEM: Final = 120  # characters; file systems take names of 255 bytes
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class OrientedPicture:
     """A placed picture of a map.
 
     Attributes:
-        name: unique plain file name. image: its name in frames.jsonl. row: its line there.
+        name: unique plain file name. row: its line in frames.jsonl.
         camera: position in the map's grid (east, north, height), orientation and lens.
-        lat_deg: latitude of the camera. lon_deg: its longitude. altitude_m: its altitude, or the height over the
-            takeoff level if the photos have none.
     """
 
     name: str
-    image: str
     row: Row
     camera: Camera
-    lat_deg: float
-    lon_deg: float
-    altitude_m: float
 
 
 def camera_of(row: Row) -> Camera:
@@ -58,58 +59,97 @@ def _grid(epsg: int) -> LocalGrid:
     return LocalGrid(epsg)
 
 
-def oriented_pictures(rows: Sequence[Row]) -> list[OrientedPicture]:
+def placed_rows(rows: Iterable[Row]) -> list[Row]:
+    """The lines of placed pictures.
+
+    Raises:
+        InputError: there is none.
+    """
+    placed = [row for row in rows if row["stage"] != "rejected" and "camera" in row]
+    if not placed:
+        raise InputError("the map has no placed picture to export; make it again")
+    return placed
+
+
+def oriented_pictures(rows: Iterable[Row]) -> list[OrientedPicture]:
     """The placed pictures of a map.
 
     Raises:
         InputError: there is none, or the map was made before cameras held their lens.
     """
-    placed = [row for row in rows if row["stage"] != "rejected" and "camera" in row]
-    if not placed:
-        raise InputError("the map has no placed picture to export; make it again")
+    placed = placed_rows(rows)
     if any("focal_px" not in row["camera"] for row in placed):
         raise InputError("the map's frames.jsonl does not hold the lenses; make the map again with this version")
     names = unique_names([str(row["image"]) for row in placed])
-    found = []
-    for row, name in zip(placed, names, strict=True):
-        block = row["camera"]
-        altitude = float(block.get("altitude_m", block["height_m"]))
-        found.append(
-            OrientedPicture(
-                name=name,
-                image=str(row["image"]),
-                row=row,
-                camera=camera_of(row),
-                lat_deg=float(block["lat_deg"]),
-                lon_deg=float(block["lon_deg"]),
-                altitude_m=altitude,
-            )
-        )
-    return found
+    return [OrientedPicture(name, row, camera_of(row)) for row, name in zip(placed, names, strict=True)]
+
+
+def unique_names(images: Iterable[str]) -> list[str]:
+    """Plain file names without blanks for images of several folders (`v1/a b.jpg` -> `v1_a_b.jpg`), all different.
+
+    Two vehicles may have sent pictures of the same name: each has a name of its own, in the order of the images.
+    """
+    images = list(images)
+    heads = [image.split("/")[-1] for image in images]
+    repeated = len(set(heads)) < len(heads)
+    out: list[str] = []
+    taken: set[str] = set()
+    for image, head in zip(images, heads, strict=True):
+        plain = re.sub(r"[^A-Za-z0-9._-]", "_", image if repeated else head)
+        stem, suffix = os.path.splitext(plain)
+        if not suffix or not re.fullmatch(r"\.(jpe?g|png|tiff?)", suffix.lower()):
+            stem, suffix = plain, ".jpg"
+        stem = stem[:_MOST_STEM]
+        name, number = stem + suffix, 1
+        while name.lower() in taken:
+            number += 1
+            name = f"{stem}_{number}{suffix}"
+        taken.add(name.lower())
+        out.append(name)
+    return out
 
 
 def link_pictures(
-    pictures: Sequence[OrientedPicture],
-    find: Callable[[Row], Path | None],
-    folder: Path,
-    progress: Callable[[int, int], None] | None,
-) -> list[str]:
-    """Link the pictures' files into a folder under their plain names; returns the images whose files are missing.
+    rows: Sequence[Row], names: Sequence[str], find: Find, folder: Path, progress: Tell | None
+) -> list[bool]:
+    """Link the pictures' files into a new folder under their names; returns for each whether it was there.
 
     Raises:
         OrthoSwarmError: if the disk is full.
     """
     folder.mkdir(parents=True)
-    gone = []
-    for done, picture in enumerate(pictures, 1):
-        file = find(picture.row)
-        if file is None:
-            gone.append(picture.image)
-        else:
-            link_file(file, folder / picture.name)
+    there = []
+    for row, name in zip(rows, names, strict=True):
+        file = find(row)
+        there.append(file is not None)
+        if file is not None:
+            _link(file, folder / name)
         if progress is not None:
-            progress(done, len(pictures))
-    return gone
+            progress(len(there), len(rows))
+    return there
+
+
+def link_oriented(pictures: Sequence[OrientedPicture], find: Find, folder: Path, progress: Tell | None) -> list[str]:
+    """Link the pictures as `link_pictures` does; returns the images whose files are missing."""
+    there = link_pictures([p.row for p in pictures], [p.name for p in pictures], find, folder, progress)
+    return [str(p.row["image"]) for p, found in zip(pictures, there, strict=True) if not found]
+
+
+def _link(file: Path, target: Path) -> None:
+    """Link a file under another name, or copy it if the file system has no links.
+
+    Raises:
+        FileExistsError: the name is taken. A copy there would be written into the file that it is linked to.
+    """
+    try:
+        os.link(file, target)
+    except FileExistsError:
+        raise
+    except OSError:
+        try:
+            shutil.copyfile(file, target)
+        except OSError as error:
+            raise disk_error(error, target) from None
 
 
 def by_lens(pictures: Sequence[OrientedPicture]) -> dict[Lens, int]:

@@ -46,14 +46,8 @@ def write_footprints(path: Path, features: Iterable[Feature], epsg: int) -> None
     with gpkg_file(path) as part:
         batch = list(islice(shown, _AT_ONCE))
         while batch or not part.exists():
-            append_polygons(
-                part,
-                "footprints",
-                _polygons([r for _, r in batch]),
-                rows=[v for v, _ in batch],
-                columns=_COLUMNS,
-                epsg=epsg,
-            )
+            rows, rings = [row for row, _ in batch], [ring for _, ring in batch]
+            append_polygons(part, "footprints", _polygons(rings), rows=rows, columns=_COLUMNS, epsg=epsg)
             batch = list(islice(shown, _AT_ONCE))
 
 
@@ -83,9 +77,8 @@ def _polygons(rings: Sequence[Array]) -> NDArray[Any]:
 
     if not rings:
         return np.empty(0, object)
-    points = np.concatenate([piece for ring in rings for piece in (ring, ring[:1])])
-    index = np.repeat(np.arange(len(rings)), [len(ring) + 1 for ring in rings])
-    return np.asarray(shapely.polygons(shapely.linearrings(points, indices=index)))
+    index = np.repeat(np.arange(len(rings)), [len(ring) for ring in rings])
+    return np.asarray(shapely.polygons(shapely.linearrings(np.concatenate(rings), indices=index)))
 
 
 def append_polygons(

@@ -1,24 +1,16 @@
 """A folder for OpenDroneMap: the pictures, a geo.txt with the refined positions and angles, and the solved lens."""
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 from orthoswarm.export.atomic_file import atomic_write
-from orthoswarm.export.exterior_orientation import camera_of
-from orthoswarm.export.linked_pictures import link_file, unique_names
+from orthoswarm.export.exterior_orientation import Find, Row, Tell, camera_of, link_pictures, placed_rows, unique_names
 from orthoswarm.export.opensfm_folder import brown_camera
 from orthoswarm.model.errors import InputError
 
 
-def write_odm(
-    rows: Sequence[Mapping[str, Any]],
-    find: Callable[[Mapping[str, Any]], Path | None],
-    folder: Path,
-    *,
-    progress: Callable[[int, int], None] | None = None,
-) -> list[str]:
+def write_odm(rows: Iterable[Row], find: Find, folder: Path, *, progress: Tell | None = None) -> list[str]:
     """Write `images/`, `geo.txt` and `cameras.json`.
 
     geo.txt has longitude, latitude, altitude, yaw from true north, pitch (0 looks straight down, as ODM counts),
@@ -28,10 +20,8 @@ def write_odm(
     lenses apart by the photos' tags, which are the same for two drones of a kind.
 
     Args:
-        rows: lines of frames.jsonl.
-        find: returns the picture file of a row, None if it is missing.
-        folder: appears when it is complete; an existing one is replaced.
-        progress: called with pictures done and pictures in all.
+        rows: lines of frames.jsonl. find: their picture files.
+        folder: appears when it is complete; an existing one is replaced. progress: called with pictures done and all.
 
     Returns:
         Images that were left out because their files are missing.
@@ -40,34 +30,22 @@ def write_odm(
         InputError: if no picture was placed or found.
         OrthoSwarmError: if the disk is full.
     """
-    placed = [row for row in rows if row["stage"] != "rejected" and "camera" in row]
-    if not placed:
-        raise InputError("the map has no placed picture to export; make it again")
+    placed = placed_rows(rows)
     names = unique_names([str(row["image"]) for row in placed])
-    gone: list[str] = []
-    lines = ["EPSG:4326"]
     with atomic_write(folder) as part:
-        (part / "images").mkdir(parents=True)
-        for done, (row, name) in enumerate(zip(placed, names, strict=True), 1):
-            file = find(row)
-            if file is None:
-                gone.append(str(row["image"]))
-            else:
-                link_file(file, part / "images" / name)
-                lines.append(_line(name, row))
-            if progress is not None:
-                progress(done, len(placed))
-        if len(lines) == 1:
+        there = link_pictures(placed, names, find, part / "images", progress)
+        if not any(there):
             raise InputError("none of the pictures is where it was when the map was made; give --images FOLDER")
-        (part / "geo.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
+        lines = [_line(name, row) for row, name, found in zip(placed, names, there, strict=True) if found]
+        (part / "geo.txt").write_text("\n".join(["EPSG:4326", *lines]) + "\n", encoding="utf-8")
         lenses = {camera_of(row).lens for row in placed if "focal_px" in row["camera"]}
         if len(lenses) == 1:
             cameras = {"all": brown_camera(lenses.pop())}
             (part / "cameras.json").write_text(json.dumps(cameras, indent=1), encoding="utf-8")
-    return gone
+    return [str(row["image"]) for row, found in zip(placed, there, strict=True) if not found]
 
 
-def _line(name: str, row: Mapping[str, Any]) -> str:
+def _line(name: str, row: Row) -> str:
     camera = row["camera"]
     sigma = max(float(row["sigma_m"]), 0.01)
     up, up_sigma = ("altitude_m", "altitude_sigma_m") if "altitude_m" in camera else ("height_m", "height_sigma_m")

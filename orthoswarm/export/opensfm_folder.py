@@ -5,7 +5,7 @@ from the picture's middle in units of the longer side; its camera axes are ours.
 """
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,27 +13,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.export.atomic_file import atomic_write
-from orthoswarm.export.exterior_orientation import OrientedPicture, by_lens, link_pictures, oriented_pictures
+from orthoswarm.export.exterior_orientation import (
+    Find,
+    OrientedPicture,
+    Row,
+    Tell,
+    by_lens,
+    link_oriented,
+    oriented_pictures,
+)  # fmt: skip
 from orthoswarm.model.camera import Lens
 from orthoswarm.model.geo import LocalGrid
 
 Array = NDArray[np.float64]
 
 
-def write_opensfm(
-    rows: Sequence[Mapping[str, Any]],
-    find: Callable[[Mapping[str, Any]], Path | None],
-    folder: Path,
-    *,
-    progress: Callable[[int, int], None] | None = None,
-) -> list[str]:
+def write_opensfm(rows: Iterable[Row], find: Find, folder: Path, *, progress: Tell | None = None) -> list[str]:
     """Write `reconstruction.json`, `camera_models.json`, `reference_lla.json` and `images/`.
 
     Args:
-        rows: lines of frames.jsonl.
-        find: returns the picture file of a row, None if it is missing.
-        folder: appears when it is complete; an existing one is replaced.
-        progress: called with pictures done and pictures in all.
+        rows: lines of frames.jsonl. find: their picture files.
+        folder: appears when it is complete; an existing one is replaced. progress: called with pictures done and all.
 
     Returns:
         Images whose files are missing: they are in the reconstruction, but not in `images`.
@@ -43,7 +43,7 @@ def write_opensfm(
         OrthoSwarmError: if the disk is full.
     """
     pictures = oriented_pictures(rows)
-    lat, lon = (float(np.mean([getattr(p, name) for p in pictures])) for name in ("lat_deg", "lon_deg"))
+    lat, lon = (float(np.mean([p.row["camera"][name] for p in pictures])) for name in ("lat_deg", "lon_deg"))
     reference = {"latitude": lat, "longitude": lon, "altitude": 0.0}
     names = {lens: f"lens {number}" for lens, number in by_lens(pictures).items()}
     cameras = {name: brown_camera(lens) for lens, name in names.items()}
@@ -61,7 +61,7 @@ def write_opensfm(
             ("reference_lla.json", reference),
         ):
             (part / name).write_text(json.dumps(document, indent=1), encoding="utf-8")
-        return link_pictures(pictures, find, part / "images", progress)
+        return link_oriented(pictures, find, part / "images", progress)
 
 
 def brown_camera(lens: Lens) -> dict[str, Any]:
@@ -80,17 +80,19 @@ def _topocentric(pictures: Sequence[OrientedPicture], lat: float, lon: float) ->
 
     plane_at = f"+proj=topocentric +ellps=WGS84 +lat_0={lat!r} +lon_0={lon!r} +h_0=0"
     to_plane = Transformer.from_pipeline(f"+proj=pipeline +step +proj=cart +ellps=WGS84 +step {plane_at}")
-    lats, lons = np.array([p.lat_deg for p in pictures]), np.array([p.lon_deg for p in pictures])
-    altitude = np.array([p.altitude_m for p in pictures])
-    centres = np.stack(to_plane.transform(np.radians(lons), np.radians(lats), altitude, radians=True), 1)
-    grids = {int(p.row["epsg"]): LocalGrid(int(p.row["epsg"])) for p in pictures}
-    rotations = np.empty((len(pictures), 3, 3))
-    for i, p in enumerate(pictures):
-        convergence = float(grids[int(p.row["epsg"])].convergence_rad(p.lat_deg, p.lon_deg))
-        local = _east_north_up(np.radians(p.lat_deg), np.radians(p.lon_deg))
-        plane = _east_north_up(np.radians(lat), np.radians(lon))
-        rotations[i] = plane @ local.T @ _about_up(-convergence) @ p.camera.rotation
-    return np.asarray(centres), rotations
+    # Heights are altitudes, or over the takeoff level if the photos have none.
+    geographic = np.array([
+        [c["lon_deg"], c["lat_deg"], c.get("altitude_m", c["height_m"])] for c in (p.row["camera"] for p in pictures)
+    ])  # fmt: skip
+    lons, lats, altitudes = geographic.T
+    centres = np.stack(to_plane.transform(np.radians(lons), np.radians(lats), altitudes, radians=True), 1)
+    plane = _east_north_up(np.radians(lat), np.radians(lon))
+    rotations = []
+    for picture, here_lat, here_lon in zip(pictures, lats, lons, strict=True):
+        convergence = float(LocalGrid(int(picture.row["epsg"])).convergence_rad(here_lat, here_lon))
+        local = _east_north_up(np.radians(here_lat), np.radians(here_lon))
+        rotations.append(plane @ local.T @ _about_up(-convergence) @ picture.camera.rotation)
+    return centres, np.array(rotations)
 
 
 def _east_north_up(lat: float, lon: float) -> Array:

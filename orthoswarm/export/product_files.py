@@ -4,7 +4,7 @@ import json
 import math
 import statistics
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
 from functools import lru_cache
@@ -14,9 +14,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.compute.stage_times import Stage
 from orthoswarm.config import active
-from orthoswarm.export.atomic_file import atomic_write
+from orthoswarm.export.atomic_file import write_file
 from orthoswarm.export.footprint_layer import write_footprints
 from orthoswarm.model.angles import wrap_deg
 from orthoswarm.model.camera import Camera, Lens, angles_from_rotation, ground_jacobian
@@ -64,12 +63,8 @@ def frame_row(placed: PlacedFrame, grid: LocalGrid, ground_z_m: float) -> dict[s
     row["sigma_m"] = placed.sigma_m
     if frame.fix.height_m is not None:
         row["recorded_height_m"] = frame.fix.height_m
-    if placed.weak:
-        row["weak"] = True
-    if frame.damaged:
-        row["damaged"] = True
-    if frame.ambiguous:
-        row["ambiguous"] = True
+    flags = {"weak": placed.weak, "damaged": frame.damaged, "ambiguous": frame.ambiguous}
+    row |= {name: True for name, value in flags.items() if value}
     row["camera"] = _camera_row(camera, grid)
     return row
 
@@ -212,16 +207,19 @@ def write_frames(
     levels = takeoff_levels(placed)
 
     def lines() -> Iterator[str]:  # one at a time: 32,544 pictures have 60 MB of lines
-        both: list[PlacedFrame | Rejection] = [*placed, *rejected]
-        for one in sorted(both, key=_image):
-            row = rejection_row(one, grid.epsg) if isinstance(one, Rejection) else frame_row(one, grid, z)
-            if isinstance(one, PlacedFrame):
+        both: list[tuple[str, PlacedFrame | Rejection]] = [(p.frame.image, p) for p in placed]
+        both += [(r.image, r) for r in rejected]
+        for _, one in sorted(both, key=lambda pair: pair[0]):
+            if isinstance(one, Rejection):
+                row = rejection_row(one, grid.epsg)
+            else:
+                row = frame_row(one, grid, z)
                 row["camera"] |= _vertical(one, levels.get(one.frame.vehicle))
-            if covariance and isinstance(one, PlacedFrame) and (of_pose := pose_covariance(one, z)) is not None:
-                row["camera"]["covariance"] = [[float(f"{v:.6g}") for v in line] for line in of_pose]
+                if covariance and (of_pose := pose_covariance(one, z)) is not None:
+                    row["camera"]["covariance"] = [[float(f"{v:.6g}") for v in line] for line in of_pose]
             yield json.dumps(row, ensure_ascii=False) + "\n"
 
-    write_text(out / "frames.jsonl", lines())
+    write_file(out / "frames.jsonl", lines())
     outlines = ((describe_frame(p), footprint(p.camera, z, inset_px=-0.5)) for p in placed)
     write_footprints(out / "footprints.gpkg", outlines, grid.epsg)
 
@@ -233,20 +231,6 @@ def describe_frame(placed: PlacedFrame) -> dict[str, Any]:
         "image": frame.image, "vehicle": frame.vehicle, "time": iso_time(frame.time_s), "stage": placed.stage,
         "fov_deg": fov, "sigma_m": placed.sigma_m,
     }  # fmt: skip
-
-
-def _image(one: PlacedFrame | Rejection) -> str:
-    return one.image if isinstance(one, Rejection) else one.frame.image
-
-
-def write_text(path: Path, lines: Iterable[str]) -> None:
-    """Write a text file that appears when it is complete.
-
-    Raises:
-        OrthoSwarmError: if the disk is full or the folder cannot be written.
-    """
-    with atomic_write(path) as part, part.open("w", encoding="utf-8", newline="\n") as file:
-        file.writelines(lines)
 
 
 def read_frames(path: Path) -> Iterator[dict[str, Any]]:
@@ -276,8 +260,7 @@ def vehicle_rows(solutions: Sequence[Solution], placed: Sequence[PlacedFrame]) -
         for s in solutions
     ]
     for vehicle, count in used.items():
-        assumed = [math.degrees(p.camera.lens.fov_rad) for p in placed if p.frame.vehicle == vehicle]
-        fov = statistics.median(assumed)
+        fov = statistics.median(math.degrees(p.camera.lens.fov_rad) for p in placed if p.frame.vehicle == vehicle)
         rows.append({"id": vehicle, "frames": count, "fov_deg": fov, "fov_sigma_deg": None, "legs": 0, "gsd_m": None,
                      "false_matches": None})  # fmt: skip
     for row in rows:
@@ -288,17 +271,11 @@ def vehicle_rows(solutions: Sequence[Solution], placed: Sequence[PlacedFrame]) -
 
 def leg_rows(solutions: Sequence[Solution]) -> list[dict[str, Any]]:
     """`legs` of report.json."""
-    rows = [asdict(leg) for s in solutions for leg in s.legs]
     return [
-        row
-        | {"images": list(row["images"]), "confidence": finite(row["confidence"]), "sigma_m": finite(row["sigma_m"])}
-        for row in rows
+        asdict(leg) | {"images": list(leg.images), "confidence": finite(leg.confidence), "sigma_m": finite(leg.sigma_m)}
+        for s in solutions
+        for leg in s.legs
     ]
-
-
-def stage_row(stage: Stage) -> dict[str, Any]:
-    """One of `stages` of report.json."""
-    return {"name": stage.name, "wall_s": stage.wall_s, "cpu_s": stage.cpu_s, "items": stage.items}
 
 
 def image_root(frames: Sequence[Frame]) -> str | None:
@@ -321,4 +298,4 @@ def write_json(path: Path, document: Mapping[str, Any]) -> None:
     Raises:
         OrthoSwarmError: if the disk is full or the folder cannot be written.
     """
-    write_text(path, [json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False), "\n"])
+    write_file(path, json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n")

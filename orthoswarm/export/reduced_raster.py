@@ -2,11 +2,10 @@
 
 import contextlib
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 
-class ReducedRaster:
+class ReducedRaster(contextlib.ExitStack):
     """An open raster, and its overviews as rasters of their own.
 
     The overviews of our orthoimages are means of 2 x 2 pixels, so that nothing is lost against reading all pixels; they
@@ -22,9 +21,9 @@ class ReducedRaster:
     def __init__(self, path: Path) -> None:
         import rasterio
 
+        super().__init__()
         self._path = path
-        self._open = contextlib.ExitStack()
-        self.full = self._open.enter_context(rasterio.open(path))
+        self.full = self.enter_context(rasterio.open(path))
         self._factors: list[int] = self.full.overviews(1)
         self._overviews: dict[int, Any] = {}
 
@@ -41,13 +40,5 @@ class ReducedRaster:
             return self.full, factor
         level = levels[-1]
         if level not in self._overviews:
-            self._overviews[level] = self._open.enter_context(rasterio.open(self._path, overview_level=level))
+            self._overviews[level] = self.enter_context(rasterio.open(self._path, overview_level=level))
         return self._overviews[level], factor / self._factors[level]
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._open.close()

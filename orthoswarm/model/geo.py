@@ -131,6 +131,14 @@ class GroundGrid:
         height = max(1, int(top - np.floor(south / gsd_m)))
         return cls(epsg=epsg, west=left * gsd_m, north=top * gsd_m, gsd_m=gsd_m, width=width, height=height)
 
+    @classmethod
+    def of_raster(cls, raster: Any) -> "GroundGrid":
+        """The grid of an open north-up raster with square pixels."""
+        return cls(
+            epsg=int(raster.crs.to_epsg()), west=float(raster.bounds.left), north=float(raster.bounds.top),
+            gsd_m=float(raster.res[0]), width=int(raster.width), height=int(raster.height),
+        )  # fmt: skip
+
     @property
     def bounds(self) -> BoundingBox:
         """West, south, east, north edges in metres."""

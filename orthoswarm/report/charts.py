@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from typing import Any
+from xml.sax.saxutils import escape
 
 import numpy as np
 
@@ -58,8 +59,9 @@ def fields_of_view(vehicles: Sequence[Mapping[str, Any]]) -> str | None:
             f'y2="{y(value + wide):.1f}" stroke-width="2"/><circle cx="{x:.1f}" cy="{y(value):.1f}" r="3.5"/></g>'
         )
         if len(known) <= 16:
-            name = _escape(_tail(str(vehicle["id"]), max(4, int(gap / 7))))
-            parts.append(f'<text x="{x:.1f}" y="{_BASE + 20}" text-anchor="middle">{name}</text>')
+            name, most = str(vehicle["id"]), max(4, int(gap / 7))
+            shown = escape(name if len(name) <= most else "…" + name[-(most - 1) :])
+            parts.append(f'<text x="{x:.1f}" y="{_BASE + 20}" text-anchor="middle">{shown}</text>')
     if len(known) > 16:
         parts.append(f'<text x="{_LEFT}" y="{_BASE + 20}">{len(known)} vehicles</text>')
     return "".join([*parts, "</svg>"])
@@ -67,19 +69,15 @@ def fields_of_view(vehicles: Sequence[Mapping[str, Any]]) -> str | None:
 
 def times(stages: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """What the page needs for two stacked bars, wall and CPU seconds, and their legend."""
+    colours = [_colour(str(stage["name"]), i) for i, stage in enumerate(stages)]
     bars = []
     for key, title in (("wall_s", "time"), ("cpu_s", "processor time")):
-        total = sum(float(s[key]) for s in stages)
-        parts = [
-            {"share": 100.0 * float(s[key]) / total if total else 0.0, "colour": _colour(str(s["name"]), i)}
-            for i, s in enumerate(stages)
-        ]
+        seconds = [float(stage[key]) for stage in stages]
+        total = sum(seconds)
+        parts = [{"share": 100.0 * s / total if total else 0.0, "colour": c} for s, c in zip(seconds, colours)]
         bars.append({"title": title, "total": total, "parts": parts})
-    legend = [
-        {"name": s["name"], "colour": _colour(str(s["name"]), i), "wall_s": s["wall_s"], "cpu_s": s["cpu_s"]}
-        for i, s in enumerate(stages)
-    ]
-    return {"bars": bars, "legend": legend}
+    keys = ("name", "wall_s", "cpu_s")
+    return {"bars": bars, "legend": [{"colour": c} | {k: s[k] for k in keys} for s, c in zip(stages, colours)]}
 
 
 def _colour(name: str, index: int) -> str:
@@ -90,11 +88,3 @@ def _colour(name: str, index: int) -> str:
 def _round_step(value: float) -> float:
     unit = 10.0 ** np.floor(np.log10(max(value, 1e-6)))
     return float(next(s for s in (1, 2, 5, 10) if s * unit >= value) * unit)
-
-
-def _tail(name: str, most: int) -> str:
-    return name if len(name) <= most else "…" + name[-(most - 1) :]
-
-
-def _escape(text: str) -> str:
-    return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")

@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm import __version__
+from orthoswarm.export.atomic_file import write_file
 from orthoswarm.export.catalog.tiled_raster import product_file
-from orthoswarm.export.product_files import iso_time, write_text
+from orthoswarm.export.product_files import iso_time
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.frame import Rejection
 from orthoswarm.model.geo import GroundGrid
@@ -34,9 +35,9 @@ from orthoswarm.report.report_pictures import (
     product_bounds,
     product_picture,
     scale_bar,
+    surface_picture,
     view_grid,
 )
-from orthoswarm.report.surface_picture import surface_picture
 
 Array = NDArray[np.float64]
 
@@ -127,11 +128,9 @@ def write_page(
     values["fov"] = charts.fields_of_view(report["vehicles"])
     values["times"] = charts.times(report["stages"])
     values["legs"], values["on_map"] = _leg_summary(report), _on_map(report)
-    write_text(out / "report.html", [environment.get_template("page.html.j2").render(values)])
-    return None if shifts is None or not len(shifts.at) else _against_map(shifts)
-
-
-def _against_map(shifts: Moved) -> dict[str, float | int]:
+    write_file(out / "report.html", environment.get_template("page.html.j2").render(values))
+    if shifts is None or not len(shifts.at):
+        return None
     median, p95 = (float(v) for v in np.percentile(shifts.size_m, (50.0, 95.0)))
     return {"median": median, "p95": p95, "blocks": len(shifts.at)}
 
@@ -226,38 +225,31 @@ def _edge_crops(best: Path, ortho: Picture, there: MapView, basemap: Basemap) ->
     figures: list[Figure] = []
     while len(figures) < 3 and score.size and score.max() > 0.01:
         r, c = np.unravel_index(int(score.argmax()), score.shape)
-        middle = overview.to_ground([float(c), float(r)])
-        half = 0.5 * side * gsd
-        window = BoundingBox.around_points(middle, half)
-        picture = _with_edges(best, MapView.read(basemap, view_grid(epsg, window, side, gsd)))
+        window = BoundingBox.around_points(overview.to_ground([float(c), float(r)]), 0.5 * side * gsd)
+        part = MapView.read(basemap, view_grid(epsg, window, side, gsd))
+        picture = product_picture(best, part.grid)
+        picture.rgb[map_edges(part)] = _EDGE
+        scale_bar(picture)
         figures.append(Figure("", data_uri(picture.rgb, 88), ""))
         score[max(0, r - size) : r + size, max(0, c - size) : c + size] = 0
     return figures
 
 
-def _with_edges(best: Path, there: MapView) -> Picture:
-    picture = product_picture(best, there.grid)
-    picture.rgb[map_edges(there)] = _EDGE
-    scale_bar(picture)
-    return picture
-
-
 def _footprints(reduced: Picture, placed: Sequence[PlacedFrame], there: MapView | None, ground_z_m: float) -> Figure:
     """Each vehicle's footprints on the map, or on the orthoimage where there is none."""
-    under, on = (reduced, "the orthoimage") if there is None else (there.on(reduced.grid).picture(), "the map")
-    picture = under.copy()
-    vehicles = list(dict.fromkeys(p.frame.vehicle for p in placed))
-    for i, vehicle in enumerate(vehicles):
+    if there is None:
+        picture, on = Picture(reduced.rgb.copy(), reduced.seen, reduced.grid), "the orthoimage"
+    else:
+        picture, on = there.on(reduced.grid).picture(), "the map"
+    for i, vehicle in enumerate(dict.fromkeys(p.frame.vehicle for p in placed)):
         own = [p for p in placed if p.frame.vehicle == vehicle]
         step = max(1, len(own) // 60)
-        rings = [footprint(p.camera, ground_z_m) for p in own[::step]]
-        rings = [ring for ring in rings if len(ring)]
+        rings = [ring for p in own[::step] if len(ring := footprint(p.camera, ground_z_m))]
         colour = _VEHICLES[i % len(_VEHICLES)]
         fill_polygons(picture, rings, colour, 0.03)
         draw_lines(picture, rings, colour, 1, closed=True)
     scale_bar(picture)
-    text = f"What each picture sees, on {on}; one colour a vehicle."
-    return Figure("Footprints", data_uri(picture.rgb), text)
+    return Figure("Footprints", data_uri(picture.rgb), f"What each picture sees, on {on}; one colour a vehicle.")
 
 
 def _arrows(reduced: Picture, shifts: Moved) -> Figure:
@@ -290,9 +282,9 @@ def _paths(reduced: Picture, placed: Sequence[PlacedFrame], report: Mapping[str,
     text = (
         "Green, thin: matched to the map. Orange, wider: carried by the others. Dark red, widest: failed. "
         "Light grey: turns."
+        if _on_map(report)
+        else "Straight legs of the flights; grey: turns."
     )
-    if not _on_map(report):
-        text = "Straight legs of the flights; grey: turns."
     return Figure("Legs", data_uri(picture.rgb), text)
 
 
@@ -368,11 +360,11 @@ def _control_verdict(control: Mapping[str, Any], expected: str, offset: Mapping[
 
 
 def _facts(report: Mapping[str, Any], placed: Sequence[PlacedFrame], shifts: Moved | None) -> list[tuple[str, str]]:
-    frames = report["frames"]
-    gsd = float(report["gsd_m"])
-    days = _days(placed)
+    from pyproj import CRS
+
+    frames, gsd, days = report["frames"], float(report["gsd_m"]), _days(placed)
     facts = [
-        (str(report["epsg"]), f"EPSG code: {crs_name(report['epsg'])}"),
+        (str(report["epsg"]), f"EPSG code: {CRS.from_epsg(report['epsg']).name}"),
         *([(days, "taken")] if days else []),
         (f"{frames['used']:,} of {frames['input']:,}", "pictures mapped"),
         (str(len(report["vehicles"])), "vehicle" if len(report["vehicles"]) == 1 else "vehicles"),
@@ -386,13 +378,6 @@ def _facts(report: Mapping[str, Any], placed: Sequence[PlacedFrame], shifts: Mov
     if checked is not None:
         facts.append((f"{checked['rmse_h_m']:.2f} m", f"RMSE horizontal at {checked['checkpoints']} checkpoints"))
     return [*facts, (f"{report['wall_s']:.0f} s", "to make"), (f"{report['peak_rss_mb']:,.0f} MB", "memory")]
-
-
-def crs_name(epsg: int) -> str:
-    """Name of a coordinate system, as QGIS and others show it."""
-    from pyproj import CRS
-
-    return str(CRS.from_epsg(epsg).name)
 
 
 def _days(placed: Sequence[PlacedFrame]) -> str:

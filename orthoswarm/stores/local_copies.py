@@ -8,14 +8,14 @@ import contextlib
 import os
 import threading
 import time
-from collections.abc import Iterable, Mapping
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Mapping
 from hashlib import blake2b
 from pathlib import Path
 
 from orthoswarm.config import active
 from orthoswarm.model.errors import RunInterruptedError, StorageError
 from orthoswarm.stores.addresses import address_of, is_stored
-from orthoswarm.stores.ahead import Ahead
 from orthoswarm.stores.listing import StoredFile, known, look_up, remember
 from orthoswarm.stores.requests import StoreRequestError, request
 
@@ -97,6 +97,56 @@ def _copied(path: Path) -> Path:
             return copy
     _fetch(path, copy)
     return copy
+
+
+class Ahead:
+    """Files that are copied ahead of their use by a few threads: a task would wait for the network at each.
+
+    Threads end when nothing is announced any more. What is wanted before its turn is left to the one who wants it.
+
+    Args:
+        copy: copies one; raises nothing that matters, since whoever wants the file copies it again and finds out.
+    """
+
+    def __init__(self, copy: Callable[[Path], object]) -> None:
+        self._copy = copy
+        self._lock = threading.Lock()
+        self._announced: OrderedDict[Path, None] = OrderedDict()
+        self._busy: dict[Path, threading.Event] = {}
+        self._threads = 0
+
+    def announce(self, paths: Iterable[Path], threads: int) -> None:
+        """Begin to copy files that will be wanted soon, in this order, so many at once."""
+        with self._lock:
+            self._announced.update((path, None) for path in paths if path not in self._busy)
+            more = max(0, min(len(self._announced), threads) - self._threads)
+            self._threads += more
+        for _ in range(more):
+            threading.Thread(target=self._work, daemon=True).start()
+
+    def wait(self, path: Path) -> None:
+        """Wait for a file that is being copied; one that has not begun is not copied ahead any more."""
+        with self._lock:
+            self._announced.pop(path, None)
+            busy = self._busy.get(path)
+        if busy is not None:
+            busy.wait()
+
+    def _work(self) -> None:
+        while True:
+            with self._lock:
+                if not self._announced:
+                    self._threads -= 1
+                    return
+                path, _ = self._announced.popitem(last=False)
+                done = self._busy[path] = threading.Event()
+            try:
+                with contextlib.suppress(Exception):
+                    self._copy(path)
+            finally:
+                with self._lock:
+                    del self._busy[path]
+                done.set()
 
 
 _ahead = Ahead(_copied)

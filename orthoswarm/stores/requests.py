@@ -84,14 +84,10 @@ def file_system(path: Path) -> Any:
     return _file_systems[key]
 
 
-def key_of(path: Path) -> str:
-    """What fsspec calls a path: bucket and key, or the whole address on the web, quoted."""
-    scheme, rest = split_stored(path)
-    return f"{scheme}://{quote(rest, safe='/:@')}" if scheme.startswith("http") else rest
-
-
 def request(path: Path, what: Callable[[Any, str], T]) -> T:
-    """What a function of fsspec's file system and the path's key gives, after some attempts.
+    """What a function gives of fsspec's file system and its name of a path, after some attempts.
+
+    The name is bucket and key, or the whole address on the web, quoted.
 
     Args:
         path: in a store. what: the request; may be repeated.
@@ -99,7 +95,9 @@ def request(path: Path, what: Callable[[Any, str], T]) -> T:
     Raises:
         NotStoredError, StoreRequestError, StoreLostError, StoreAccessError: see above.
     """
-    config, key = active().stores, key_of(path)
+    config, (scheme, key) = active().stores, split_stored(path)
+    if scheme.startswith("http"):
+        key = f"{scheme}://{quote(key, safe='/:@')}"
     began, attempt = time.monotonic(), 1
     while True:
         try:

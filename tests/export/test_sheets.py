@@ -12,19 +12,19 @@ import numpy as np
 import pytest
 import rasterio
 from PIL import ImageDraw
+from pmtiles.tile import zxy_to_tileid
 from rasterio.warp import transform
 
 from gcs_plugin.cli.main import main
+from orthoswarm.export.forms import FORMS, MapExport
 from orthoswarm.export.reduced_raster import ReducedRaster
-from orthoswarm.export.sheets.forms import write_form
-from orthoswarm.export.sheets.geopdf import write_geopdf
-from orthoswarm.export.sheets.mgrs import mgrs, utm_zone
+from orthoswarm.export.sheets.geopdf import grid_zone, square, utm_zone, write_geopdf
 from orthoswarm.export.sheets.stac_item import write_stac_item
 from orthoswarm.export.sheets.stated_accuracy import stated_accuracy
 from orthoswarm.export.surface_file import write_surface
 from orthoswarm.export.tactical.places import FILE, Place, write_geojson
 from orthoswarm.export.tiles.mbtiles import write_mbtiles
-from orthoswarm.export.tiles.pmtiles import tile_number, write_pmtiles
+from orthoswarm.export.tiles.pmtiles import write_pmtiles
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.stereo.surface_cells import SurfaceModel
 
@@ -54,9 +54,9 @@ def folder(tmp_path):
 
 
 def test_mgrs_is_that_of_the_tables():
-    assert mgrs(32, 47.3977, 465_741.9, 5_249_460.2) == "32T MT 65741 49460"
-    assert mgrs(56, -33.8568, 334_897.0, 6_252_288.0).startswith("56H LH 34897 52288")  # Sydney's opera house
-    assert mgrs(31, 0.5, 166_021.0, 55_000.0).startswith("31N AA")
+    assert (grid_zone(32, 47.3977), square(32, 465_741.9, 5_249_460.2)) == ("32T", "MT")
+    assert (grid_zone(56, -33.8568), square(56, 334_897.0, 6_252_288.0)) == ("56H", "LH")  # Sydney's opera house
+    assert (grid_zone(31, 0.5), square(31, 166_021.0, 55_000.0)) == ("31N", "AA")
     assert utm_zone(32632) == 32 and utm_zone(32760) == 60 and utm_zone(2056) is None and utm_zone(32661) is None
 
 
@@ -120,11 +120,12 @@ def test_an_earlier_layer_does_not_quote_the_accuracy_of_the_last(folder, layer,
     (folder / "report.json").write_text(json.dumps({"legs": [MATCHED], "basemap": basemap, "checkpoints": CHECKED}))
     for name in ("coarse.tif", "realtime.tif"):
         (folder / name).write_bytes((folder / "orthoimage.tif").read_bytes())
-    path = write_form("stac", folder / f"{layer}.tif", folder, ())
+    what = MapExport(folder=folder, dest=folder / "dest", layer=layer)
+    path = FORMS["stac"].write(what)
     properties = json.loads(path.read_text())["properties"]
     assert ("No accuracy is stated" in properties["description"]) == own
     assert ("orthoswarm:sigma_median_m" in properties) == ("orthoswarm:rmse_h_m" in properties) == (not own)
-    pack = write_form("pack", folder / f"{layer}.tif", folder / "dest", ())
+    pack = FORMS["pack"].write(what)
     with zipfile.ZipFile(pack) as archive:
         item = json.loads(archive.read("flood-map/orthoimage.stac.json"))
         page = archive.read("flood-map/index.html").decode()
@@ -166,8 +167,6 @@ def varints(data):
 
 
 def test_pmtiles_hold_every_tile_under_its_number(folder, tmp_path):
-    assert [tile_number(*at) for at in ((0, 0, 0), (1, 0, 0), (1, 0, 1), (1, 1, 1), (1, 1, 0))] == [0, 1, 2, 3, 4]
-    assert tile_number(12, 3423, 1763) == 19_078_479  # the specification's example
     write_mbtiles(folder / "orthoimage.tif", tmp_path / "m.mbtiles", tile_format="webp")
     write_pmtiles(tmp_path / "m.mbtiles", tmp_path / "m.pmtiles")
     data = (tmp_path / "m.pmtiles").read_bytes()
@@ -185,7 +184,7 @@ def test_pmtiles_hold_every_tile_under_its_number(folder, tmp_path):
     with sqlite3.connect(tmp_path / "m.mbtiles") as database:
         rows = database.execute("SELECT zoom_level, tile_column, tile_row, tile_data FROM tiles").fetchall()
     database.close()
-    assert found == {tile_number(z, x, 2**z - 1 - row): tile for z, x, row, tile in rows}
+    assert found == {zxy_to_tileid(z, x, 2**z - 1 - row): tile for z, x, row, tile in rows}
     assert json.loads(gzip.decompress(data[word[2] : word[2] + word[3]]))["name"] == "orthoimage"
 
 
@@ -221,6 +220,18 @@ def test_every_form_is_written_by_the_command_line(folder, capsys):
     assert {f"flood-map/{name}" for name in inside} <= names
     assert page.count("</script>") == 1  # a note cannot end the page's script
     assert not [p for p in (folder / "export").iterdir() if p.name.startswith(".")]
+
+
+def test_page_and_documents_name_every_form():
+    root = Path(__file__).parents[2]
+    served = {name for name, form in FORMS.items() if form.daemon}
+    page = (root / "gcs_plugin/web/static/work/exports.js").read_text(encoding="utf-8")
+    words = (root / "gcs_plugin/web/static/core/english.js").read_text(encoding="utf-8")
+    assert set(re.findall(r'"(\w+)"', re.search(r"const FORMATS = \[(.*)\]", page)[1])) == served
+    assert all(f'"export.{name}": ' in words for name in served)
+    usage, console, daemon = ((root / f"docs/{name}.md").read_text() for name in ("usage", "console", "daemon"))
+    assert set(re.search(r"orthoswarm export OUT --to (.*)", usage)[1].split()) == set(FORMS)
+    assert all(f"`{name}`" in console and f"`{name}`" in daemon for name in served)
 
 
 def test_the_surface_model_and_the_seamlines_go_along(folder):

@@ -9,7 +9,7 @@ import rasterio
 from gcs_plugin.cli.main import main
 from orthoswarm.export.surface_file import write_surface
 from orthoswarm.model.geo import GroundGrid
-from orthoswarm.report.surface_picture import relief
+from orthoswarm.report.report_pictures import relief
 from orthoswarm.stereo.surface_cells import SurfaceModel
 from orthoswarm.twin.make import SEA_LEVEL_M
 from tests.kit.scenes import tiny_twin

@@ -3,7 +3,7 @@
 import threading
 from pathlib import Path
 
-from orthoswarm.stores.ahead import Ahead
+from orthoswarm.stores.local_copies import Ahead
 
 A, B, C = Path("/s3:/b/a"), Path("/s3:/b/b"), Path("/s3:/b/c")
 

@@ -2,9 +2,8 @@
 
 import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -13,7 +12,7 @@ import numpy as np
 from gcs_plugin.daemon.jobs.solution_file import read_solution
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.compute.workers import Usage
-from orthoswarm.export.sheets.forms import FORMS, write_form
+from orthoswarm.export.forms import FORMS, MapExport
 from orthoswarm.export.tactical import places as place_files
 from orthoswarm.export.tactical.places import Place
 from orthoswarm.model.errors import InputError
@@ -25,7 +24,7 @@ from orthoswarm.raster.basemap import Basemap
 if TYPE_CHECKING:
     from orthoswarm.mosaic.recorded_pose import Recorded
 
-FORMATS: Final = ("cog", "mbtiles", "kmz", "gpkg", "odm", *FORMS)
+FORMATS: Final = tuple(name for name, form in FORMS.items() if form.daemon)
 PRODUCTS: Final = ("cog", "gpkg")
 """The formats that are written without being asked for."""
 _FILES: Final = {"realtime": "realtime.tif", "coarse": "coarse.tif", "fine": "orthoimage.tif"}
@@ -236,30 +235,12 @@ def _report(
 
 def _converted(task: ExportTask, picture: Path, formats: list[str], placed: list[PlacedFrame]) -> dict[str, str]:
     """The other formats, in the workspace's folder `export`."""
-    from orthoswarm.export.odm_folder import write_odm
-    from orthoswarm.export.product_files import read_frames
-    from orthoswarm.export.tiles.kmz import write_kmz
-    from orthoswarm.export.tiles.mbtiles import write_mbtiles
-
-    dest = task.workspace / "export"
-    files: dict[str, str] = {}
-    for name in formats:
-        path = dest / (f"{picture.stem}.{name}" if name != "odm" else "odm")
-        if name in FORMS:
-            path = write_form(name, picture, dest, task.places)
-        elif name == "mbtiles":
-            write_mbtiles(picture, path, name=picture.stem)
-        elif name == "kmz":
-            write_kmz(picture, path, name=picture.stem)
-        else:
-            paths = {(p.frame.vehicle, p.frame.image): p.frame.path for p in placed}
-            write_odm(list(read_frames(task.workspace / "frames.jsonl")), partial(_find, paths), path)
-        files[name] = path.relative_to(task.workspace).as_posix()
-    return files
-
-
-def _find(paths: dict[tuple[str, str], Path], row: Mapping[str, Any]) -> Path | None:
-    return paths.get((row["vehicle"], row["image"]))
+    paths = {(p.frame.vehicle, p.frame.image): p.frame.path for p in placed}
+    what = MapExport(
+        folder=task.workspace, dest=task.workspace / "export", layer=picture.stem, places=task.places,
+        find=lambda row: paths.get((row["vehicle"], row["image"])),
+    )  # fmt: skip
+    return {name: FORMS[name].write(what).relative_to(task.workspace).as_posix() for name in formats}
 
 
 def facts_of(

@@ -14,13 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.export.catalog.tiled_raster import COLLECTION, FOLDER, VEHICLES, RasterTile, tiles_of, write_json
+from orthoswarm.export.catalog.tiled_raster import COLLECTION, FOLDER, VEHICLES, RasterTile, tiles_of
 from orthoswarm.export.exterior_orientation import camera_of
-from orthoswarm.export.product_files import read_frames
+from orthoswarm.export.product_files import read_frames, write_json
 from orthoswarm.export.sheets.geojson_outline import joined_bbox, outline
-from orthoswarm.export.sheets.stac_item import EXTENSIONS, raster_item
+from orthoswarm.export.sheets.stac_item import EXTENSIONS, raster_item, surface_assets
 from orthoswarm.export.sheets.stated_accuracy import stated_accuracy
-from orthoswarm.export.sheets.surface_asset import surface_assets
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.mosaic.footprint import footprint
 
@@ -59,12 +58,10 @@ def write_collection(folder: Path, made: str) -> int:
     top, name = folder / FOLDER, _slug(folder.resolve().name or "map")
     items: list[tuple[str, dict[str, Any]]] = []
     for raster, tiles in rasters.items():
-        stem = Path(raster).stem
         for tile in tiles:
-            where = f"{stem}/{Path(tile.name).stem}.json"
-            items.append(
-                (where, _tile_item(tile, f"{name}-{stem}-{Path(tile.name).stem}", _TITLES[raster], pictures, made))
-            )
+            stem, part = Path(raster).stem, Path(tile.name).stem
+            item = _tile_item(tile, f"{name}-{stem}-{part}", _TITLES[raster], pictures, made)
+            items.append((f"{stem}/{part}.json", item))
     epsg = next(iter(rasters.values()))[0].grid.epsg
     items += _vehicle_items(pictures, epsg, name, made)
     for where, item in items:
@@ -122,11 +119,10 @@ def _vehicle_items(pictures: Sequence[_Picture], epsg: int, name: str, made: str
         while slug in used:
             slug += "_"
         used.add(slug)
-        up = "../../"
         assets = {
-            "frames": {"href": f"{up}frames.jsonl", "type": "application/jsonl", "roles": ["metadata"],
+            "frames": {"href": "../../frames.jsonl", "type": "application/jsonl", "roles": ["metadata"],
                        "title": "Where each picture lies"},
-            "footprints": {"href": f"{up}footprints.gpkg", "type": "application/geopackage+sqlite3",
+            "footprints": {"href": "../../footprints.gpkg", "type": "application/geopackage+sqlite3",
                            "roles": ["metadata"], "title": "What each picture sees"},
         }  # fmt: skip
         item: dict[str, Any] = {
@@ -162,8 +158,7 @@ def _collection(
     assets["report"] = {
         "href": "../report.html", "type": "text/html", "roles": ["metadata"], "title": "The map's accuracy",
     }  # fmt: skip
-    surface = surface_assets(folder, folder / FOLDER / COLLECTION)
-    assets |= surface
+    assets |= (surface := surface_assets(folder, folder / FOLDER / COLLECTION))
     links = [{"rel": "root", "href": f"./{COLLECTION}", "type": "application/json"}]
     links += [{"rel": "item", "href": f"./{where}", "type": "application/geo+json"} for where, _ in items]
     return {

@@ -5,18 +5,18 @@ tiles/orthoimage/r000_c000.tif ...
 """
 
 import contextlib
-import json
 import re
 import shutil
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
+from xml.sax.saxutils import escape
 
 from pyproj import CRS
 
 from orthoswarm.config import active
-from orthoswarm.export.atomic_file import atomic_write
+from orthoswarm.export.atomic_file import atomic_write, write_file
 from orthoswarm.export.cog import Source, write_cog
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.geo import GroundGrid
@@ -120,10 +120,7 @@ def write_tiled(
         grid, west=grid.west + col0 * grid.gsd_m, north=grid.north - row0 * grid.gsd_m, width=col1 - col0,
         height=row1 - row0,
     )  # fmt: skip
-    with atomic_write(_virtual(folder, name)) as part:
-        part.write_text(
-            _document(raster, _placed_tiles(folder, name, raster), Path(FOLDER, Path(name).stem)), encoding="utf-8"
-        )
+    write_file(_virtual(folder, name), _document(raster, _placed_tiles(folder, name, raster), Path(name).stem))
     (folder / name).unlink(missing_ok=True)
 
 
@@ -132,8 +129,7 @@ def copy_tiled(folder: Path, name: str, other: str) -> None:
     with atomic_write(_tiles(folder, other)) as part:
         shutil.copytree(_tiles(folder, name), part)
     text = _virtual(folder, name).read_text(encoding="utf-8")
-    with atomic_write(_virtual(folder, other)) as part:
-        part.write_text(text.replace(f"{FOLDER}/{Path(name).stem}/", f"{FOLDER}/{Path(other).stem}/"), encoding="utf-8")
+    write_file(_virtual(folder, other), text.replace(f"{FOLDER}/{Path(name).stem}/", f"{FOLDER}/{Path(other).stem}/"))
     (folder / other).unlink(missing_ok=True)
 
 
@@ -144,17 +140,7 @@ def tiles_of(folder: Path, name: str) -> list[RasterTile]:
     if not _virtual(folder, name).exists():
         return []
     with rasterio.open(_virtual(folder, name)) as raster:
-        grid = GroundGrid(
-            epsg=int(raster.crs.to_epsg()), west=float(raster.bounds.left), north=float(raster.bounds.top),
-            gsd_m=float(raster.res[0]), width=int(raster.width), height=int(raster.height),
-        )  # fmt: skip
-    return list(_placed_tiles(folder, name, grid))
-
-
-def write_json(path: Path, document: object) -> None:
-    """Write one JSON document that appears when it is complete."""
-    with atomic_write(path) as part:
-        part.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        return list(_placed_tiles(folder, name, GroundGrid.of_raster(raster)))
 
 
 def _virtual(folder: Path, name: str) -> Path:
@@ -179,31 +165,24 @@ def _placed_tiles(folder: Path, name: str, raster: GroundGrid) -> Iterator[Raste
     """The tiles in a raster's folder, placed on its grid."""
     side = active().raster.tile_px
     for path in sorted(_tiles(folder, name).glob("*.tif")):
-        found = _NAME.fullmatch(path.name)
-        if found is None:
-            continue
-        r, c = int(found[1]), int(found[2])
-        yield RasterTile(
-            path.name,
-            replace(
-                raster, west=raster.west + c * side * raster.gsd_m, north=raster.north - r * side * raster.gsd_m,
-                width=min(side, raster.width - c * side), height=min(side, raster.height - r * side),
-            ),
-        )  # fmt: skip
+        if found := _NAME.fullmatch(path.name):
+            row, column = int(found[1]) * side, int(found[2]) * side
+            grid = replace(
+                raster, west=raster.west + column * raster.gsd_m, north=raster.north - row * raster.gsd_m,
+                width=min(side, raster.width - column), height=min(side, raster.height - row),
+            )  # fmt: skip
+            yield RasterTile(path.name, grid)
 
 
-def _document(raster: GroundGrid, tiles: Iterable[RasterTile], tile_folder: Path) -> str:
+def _document(raster: GroundGrid, tiles: Iterable[RasterTile], stem: str) -> str:
     """The virtual raster: see https://gdal.org/en/stable/drivers/raster/vrt.html."""
-    side = active().raster.tile_px
-    placed = list(tiles)
     sources = []
-    for tile in placed:
+    for tile in tiles:
         column = round((tile.grid.west - raster.west) / raster.gsd_m)
         row = round((raster.north - tile.grid.north) / raster.gsd_m)
         size = f'xSize="{tile.grid.width}" ySize="{tile.grid.height}"'
-        file = (tile_folder / tile.name).as_posix()
         sources.append(
-            f'  <SimpleSource>\n   <SourceFilename relativeToVRT="1">{file}</SourceFilename>\n'
+            f'  <SimpleSource>\n   <SourceFilename relativeToVRT="1">{FOLDER}/{stem}/{tile.name}</SourceFilename>\n'
             "   <SourceBand>BAND</SourceBand>\n"
             f'   <SourceProperties RasterXSize="{tile.grid.width}" RasterYSize="{tile.grid.height}" DataType="Byte" '
             'BlockXSize="512" BlockYSize="512"/>\n'
@@ -216,14 +195,11 @@ def _document(raster: GroundGrid, tiles: Iterable[RasterTile], tile_folder: Path
         + " </VRTRasterBand>\n"
         for n, colour in enumerate(("Red", "Green", "Blue", "Alpha"), 1)
     )
-    step = repr(raster.gsd_m)
+    side, step = active().raster.tile_px, repr(raster.gsd_m)
+    wkt = escape(CRS.from_epsg(raster.epsg).to_wkt("WKT1_GDAL"))
     return (
         f'<VRTDataset rasterXSize="{raster.width}" rasterYSize="{raster.height}">\n <!-- tiles of {side} pixels -->\n'
-        f' <SRS dataAxisToSRSAxisMapping="1,2">{_escaped(CRS.from_epsg(raster.epsg).to_wkt("WKT1_GDAL"))}</SRS>\n'
+        f' <SRS dataAxisToSRSAxisMapping="1,2">{wkt}</SRS>\n'
         f" <GeoTransform>{raster.west!r}, {step}, 0.0, {raster.north!r}, 0.0, -{step}</GeoTransform>\n"
         f"{bands}</VRTDataset>\n"
     )
-
-
-def _escaped(text: str) -> str:
-    return text.replace("&", "&amp;").replace("<", "&lt;")

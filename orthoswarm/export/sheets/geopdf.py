@@ -10,8 +10,7 @@ import numpy as np
 
 from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.export.reduced_raster import ReducedRaster
-from orthoswarm.export.sheets.mgrs import grid_zone, square, utm_zone
-from orthoswarm.export.sheets.stac_item import picture_times
+from orthoswarm.export.sheets.stac_item import time_span
 from orthoswarm.export.sheets.stated_accuracy import stated_accuracy
 from orthoswarm.export.tactical.places import Place
 from orthoswarm.model.bounding_box import BoundingBox
@@ -108,24 +107,22 @@ def _drawn(raster: Any) -> BoundingBox:
 
 def _frame(bounds: BoundingBox) -> _Frame:
     """The page upright or lying, whichever shows the map larger."""
-    wide, high = bounds.width, bounds.height
-    best: _Frame | None = None
-    for width_mm, height_mm in (_A3_MM, _A3_MM[::-1]):
-        room = width_mm - 2 * _MARGIN_MM, height_mm - 2 * _MARGIN_MM - _FOOT_MM
-        need = 1000.0 * max(wide / room[0], high / room[1])
-        scale = next((s for s in _SCALES if s >= need), math.ceil(need))
-        metres = scale * 0.0254 / _DPI
-        box = tuple(round(v * _MM) for v in (_MARGIN_MM, _MARGIN_MM, _MARGIN_MM + room[0], _MARGIN_MM + room[1]))
-        west = 0.5 * (bounds.west + bounds.east) - 0.5 * (box[2] - box[0]) * metres
-        north = 0.5 * (bounds.north + bounds.south) + 0.5 * (box[3] - box[1]) * metres
-        page = round(width_mm * _MM), round(height_mm * _MM)
-        frame = _Frame(
-            page=page, box=(box[0], box[1], box[2], box[3]), scale=scale, west=west, north=north, metres=metres
-        )
-        if best is None or frame.scale < best.scale:
-            best = frame
-    assert best is not None
-    return best
+    return min((_frame_on(bounds, *size_mm) for size_mm in (_A3_MM, _A3_MM[::-1])), key=lambda frame: frame.scale)
+
+
+def _frame_on(bounds: BoundingBox, width_mm: float, height_mm: float) -> _Frame:
+    """The map in the middle of a page of this size, at the greatest round scale at which it fits."""
+    room = width_mm - 2 * _MARGIN_MM, height_mm - 2 * _MARGIN_MM - _FOOT_MM
+    need = 1000.0 * max(bounds.width / room[0], bounds.height / room[1])
+    scale = next((s for s in _SCALES if s >= need), math.ceil(need))
+    metres = scale * 0.0254 / _DPI
+    edges_mm = (_MARGIN_MM, _MARGIN_MM, _MARGIN_MM + room[0], _MARGIN_MM + room[1])
+    left, top, right, bottom = (round(v * _MM) for v in edges_mm)
+    return _Frame(
+        page=(round(width_mm * _MM), round(height_mm * _MM)), box=(left, top, right, bottom), scale=scale,
+        west=0.5 * (bounds.west + bounds.east) - 0.5 * (right - left) * metres,
+        north=0.5 * (bounds.north + bounds.south) + 0.5 * (bottom - top) * metres, metres=metres,
+    )  # fmt: skip
 
 
 def _page(frame: _Frame, rgba: Any, epsg: int, *, cog: Path, places: Sequence[Place], title: str) -> Any:
@@ -169,15 +166,8 @@ def _mark(draw: "ImageDraw", at: tuple[float, float], name: str, frame: _Frame) 
     if left <= x <= right and top <= y <= bottom:
         size = 2.2 * _MM
         draw.ellipse((x - size, y - size, x + size, y + size), outline=_MARK, width=5)
-        draw.text(
-            (x + 1.4 * size, y),
-            name[:60],
-            fill=_MARK,
-            font=_font(3.2),
-            anchor="lm",
-            stroke_width=3,
-            stroke_fill="white",
-        )
+        font = _font(3.2)
+        draw.text((x + 1.4 * size, y), name[:60], _MARK, font, "lm", stroke_width=3, stroke_fill="white")
 
 
 def _foot(draw: "ImageDraw", frame: _Frame, grid: LocalGrid, *, cog: Path, finds: int, step: float, title: str) -> None:
@@ -189,12 +179,8 @@ def _foot(draw: "ImageDraw", frame: _Frame, grid: LocalGrid, *, cog: Path, finds
         where = (
             f"MGRS {grid_zone(zone, lat)} {square(zone, frame.west, frame.north)}, UTM zone {zone} (EPSG:{grid.epsg})"
         )
-    first, last = picture_times(cog.parent)
-    taken = (
-        "time of the pictures is not known"
-        if first is None
-        else f"pictures of {_minute(first)} to {_minute(last or first)} UTC"
-    )
+    span = time_span(cog.parent)
+    taken = f"pictures of {span}" if span else "time of the pictures is not known"
     stated = stated_accuracy(cog.parent, cog.stem)
     lines = [
         f"Scale 1:{frame.scale:,} on A3; grid lines every {step:g} m, WGS 84, {where}; up is grid north",
@@ -242,10 +228,6 @@ def _degrees(value: float, letters: str) -> str:
     return f"{abs(value):.5f}° {letters[value < 0]}"
 
 
-def _minute(text: str) -> str:
-    return text[:16].replace("T", " ")
-
-
 def _font(height_mm: float) -> Any:
     import matplotlib
     from PIL import ImageFont
@@ -281,3 +263,32 @@ def _save(page: Any, frame: _Frame, epsg: int, path: Path, title: str) -> None:
     except RasterioError as error:
         raise OrthoSwarmError(f"{path.name} cannot be written ({error}); see whether the disk is full") from None
     path.with_name(path.name + ".aux.xml").unlink(missing_ok=True)
+
+
+# -- MGRS (NGA.STND.0037, "Universal Grids and Grid Reference Systems") ------------------------------------------------
+
+_BANDS: Final = "CDEFGHJKLMNPQRSTUVWX"
+_COLUMNS: Final = ("ABCDEFGH", "JKLMNPQR", "STUVWXYZ")
+_ROWS: Final = "ABCDEFGHJKLMNPQRSTUV"
+_SQUARE_M: Final = 100_000
+
+
+def utm_zone(epsg: int) -> int | None:
+    """Number of the UTM zone of EPSG 32601 to 32660 and 32701 to 32760, None for another system."""
+    zone = epsg % 100
+    return zone if epsg // 100 in (326, 327) and 1 <= zone <= 60 else None
+
+
+def grid_zone(zone: int, lat_deg: float) -> str:
+    """Zone and latitude band, for example `48R`."""
+    return f"{zone}{_BANDS[min(max(math.floor((lat_deg + 80.0) / 8.0), 0), 19)]}"
+
+
+def square(zone: int, east_m: float, north_m: float) -> str:
+    """The two letters of the square of 100 km.
+
+    Args:
+        zone: of UTM. east_m, north_m: grid metres, on the south with the false northing of 10,000 km.
+    """
+    column = _COLUMNS[(zone - 1) % 3][(math.floor(east_m / _SQUARE_M) - 1) % 8]
+    return column + _ROWS[(math.floor(north_m / _SQUARE_M) + (0 if zone % 2 else 5)) % 20]

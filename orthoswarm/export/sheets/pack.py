@@ -6,20 +6,20 @@ import shutil
 import sqlite3
 import tempfile
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
 from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.export.sheets.geopdf import write_geopdf
-from orthoswarm.export.sheets.stac_item import picture_times, write_stac_item
+from orthoswarm.export.sheets.stac_item import SURFACE, surface_path, time_span, write_stac_item
 from orthoswarm.export.sheets.stated_accuracy import stated_accuracy
-from orthoswarm.export.sheets.surface_asset import SURFACE, surface_path
 from orthoswarm.export.tactical.cursor_on_target import write_data_package
-from orthoswarm.export.tactical.place_files import write_csv, write_gpx, write_kml
-from orthoswarm.export.tactical.places import Place, write_geojson
+from orthoswarm.export.tactical.place_files import PLACE_FILES
+from orthoswarm.export.tactical.places import Place
 from orthoswarm.export.tiles.kmz import kmz_file
 from orthoswarm.export.tiles.mbtiles import mbtiles_file
 from orthoswarm.export.tiles.pmtiles import write_pmtiles
@@ -74,10 +74,7 @@ def write_pack(
         others: list[Callable[[], None]] = [
             lambda: write_geopdf(cog, folder / "sheet.pdf", places, title),
             lambda: write_data_package(places, folder / "places-tak.zip", title),
-            lambda: write_geojson(places, folder / "places.geojson"),
-            lambda: write_kml(places, folder / "places.kml"),
-            lambda: write_gpx(places, folder / "places.gpx"),
-            lambda: write_csv(places, folder / "places.csv"),
+            *(partial(write, places, folder / name) for name, write in PLACE_FILES.items()),
             lambda: _copy(cog, folder),
             lambda: write_stac_item(folder / "orthoimage.tif", folder / "orthoimage.stac.json", copy_of=cog),
         ]
@@ -93,14 +90,10 @@ def write_pack(
             for running in [pool.submit(run, web), pool.submit(run, others)]:
                 running.result()
         with closing(sqlite3.connect(tiles)) as database, atomic_write(path) as part:
-            about = {"bounds": bounds[0], "accuracy": _accuracy(cog)}
+            stated = stated_accuracy(cog.parent, cog.stem)
+            about = {"bounds": bounds[0], "accuracy": stated.sentence if stated else ""}
             _zip(database, folder, part, places=places, title=title, about=about)
         tell(count, count)
-
-
-def _accuracy(cog: Path) -> str:
-    stated = stated_accuracy(cog.parent, cog.stem)
-    return "" if stated is None else stated.sentence
 
 
 def _draw_tiles(cog: Path, mbtiles: Path, kmz: Path) -> tuple[float, ...]:
@@ -124,49 +117,27 @@ def _zip(
     database: sqlite3.Connection, folder: Path, path: Path, *, places: Sequence[Place], title: str,
     about: dict[str, Any],
 ) -> None:  # fmt: skip
-    top = f"{title}-map"
+    """Write the archive: the tiles, the page with what it shows, and the files that are there."""
+    top, span = f"{title}-map", time_span(folder)
     drawn = dict(database.execute("SELECT name, value FROM metadata"))
     files = [name for name in _PURPOSES if (folder / name).is_file()]
-    names = []
+    tiles = []
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, data in _tiles(database):
-            names.append(name)
-            archive.writestr(f"{top}/tiles/{name}.webp", data, zipfile.ZIP_STORED)
-        document = _document(folder, drawn, names, files=files, places=places, title=title) | about
-        page = _PAGE.read_text(encoding="utf-8").replace("/*PACK*/null", _script(document))
-        archive.writestr(f"{top}/index.html", page)
+        for zoom, x, row, data in database.execute("SELECT zoom_level, tile_column, tile_row, tile_data FROM tiles"):
+            tiles.append(f"{zoom}/{x}/{2**zoom - 1 - row}")  # rows from the north
+            archive.writestr(f"{top}/tiles/{tiles[-1]}.webp", data, zipfile.ZIP_STORED)
+        document = {
+            "title": title, "about": f"Pictures of {span}." if span else "",
+            "minzoom": int(drawn["minzoom"]), "maxzoom": int(drawn["maxzoom"]), "tiles": tiles,
+            "finds": [
+                {"name": p.name, "lat": p.lat_deg, "lon": p.lon_deg, "sigma": p.sigma_m, "note": p.note}
+                for p in places
+                if p.kind == "find"
+            ],
+            "files": [{"name": name, "purpose": _PURPOSES[name]} for name in files], **about,
+        }  # fmt: skip
+        script = json.dumps(document, ensure_ascii=True).replace("<", "\\u003c")  # which cannot end the page's script
+        archive.writestr(f"{top}/index.html", _PAGE.read_text(encoding="utf-8").replace("/*PACK*/null", script))
         for name in files:
             packed = zipfile.ZIP_STORED if Path(name).suffix in _STORED else zipfile.ZIP_DEFLATED
             archive.write(folder / name, f"{top}/{name}", packed)
-
-
-def _tiles(database: sqlite3.Connection) -> Iterator[tuple[str, bytes]]:
-    """Name (zoom/column/row from the north) and bytes of each tile."""
-    for zoom, x, row, data in database.execute("SELECT zoom_level, tile_column, tile_row, tile_data FROM tiles"):
-        yield f"{zoom}/{x}/{2**zoom - 1 - row}", data
-
-
-def _document(
-    folder: Path, drawn: dict[str, str], tiles: list[str], *, files: list[str], places: Sequence[Place], title: str
-) -> dict[str, Any]:
-    first, last = picture_times(folder)
-    return {
-        "title": title,
-        "about": "" if first is None or last is None else f"Pictures of {_minute(first)} to {_minute(last)} UTC.",
-        "minzoom": int(drawn["minzoom"]), "maxzoom": int(drawn["maxzoom"]), "tiles": tiles,
-        "finds": [
-            {"name": p.name, "lat": p.lat_deg, "lon": p.lon_deg, "sigma": p.sigma_m, "note": p.note}
-            for p in places
-            if p.kind == "find"
-        ],
-        "files": [{"name": name, "purpose": _PURPOSES[name]} for name in files],
-    }  # fmt: skip
-
-
-def _minute(text: str) -> str:
-    return text[:16].replace("T", " ")
-
-
-def _script(document: dict[str, Any]) -> str:
-    """JSON that cannot end the script it stands in."""
-    return json.dumps(document, ensure_ascii=True).replace("<", "\\u003c")

@@ -1,6 +1,7 @@
 """A STAC item (STAC 1.1.0, extensions projection 2.0.0 and raster 1.1.0) beside the COG that it describes."""
 
 import json
+import os
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
@@ -8,11 +9,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from orthoswarm.export.atomic_file import atomic_write
-from orthoswarm.export.product_files import read_frames
+from orthoswarm.export.product_files import read_frames, write_json
 from orthoswarm.export.sheets.geojson_outline import outline
 from orthoswarm.export.sheets.stated_accuracy import stated_accuracy
-from orthoswarm.export.sheets.surface_asset import surface_assets
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import GroundGrid, LocalGrid
 
@@ -22,6 +21,9 @@ EXTENSIONS: Final = [
 ]
 _COG: Final = "image/tiff; application=geotiff; profile=cloud-optimized"
 _COLOURS: Final = ("red", "green", "blue", "alpha")
+SURFACE: Final = "dsm.tif"
+"""Its name in a pack, whatever the run was asked to write."""
+_SURFACE_BANDS: Final = (("height", "m"), ("sigma", "m"), ("pairs", None))
 
 
 def write_stac_item(cog: Path, path: Path, *, copy_of: Path | None = None) -> None:
@@ -38,27 +40,21 @@ def write_stac_item(cog: Path, path: Path, *, copy_of: Path | None = None) -> No
         InputError: the COG cannot be read.
         OrthoSwarmError: the disk is full.
     """
-    import os
-
     import rasterio
     from rasterio.errors import RasterioError
 
+    source = copy_of or cog
     try:
         with rasterio.open(cog) as raster:
-            grid = GroundGrid(
-                epsg=int(raster.crs.to_epsg()), west=float(raster.bounds.left), north=float(raster.bounds.top),
-                gsd_m=float(raster.res[0]), width=int(raster.width), height=int(raster.height),
-            )  # fmt: skip
-            bands = int(raster.count)
+            grid, bands = GroundGrid.of_raster(raster), int(raster.count)
     except RasterioError as error:
         raise InputError(f"{cog} cannot be read ({error}); make the map again") from None
     item = raster_item(
-        grid, identifier=_identifier(copy_of or cog), href=Path(os.path.relpath(cog, path.parent)).as_posix(),
-        title="Orthoimage", properties=_properties(copy_of or cog), asset="orthoimage", bands=bands,
+        grid, identifier=f"{source.resolve().parent.name or 'map'}-{source.stem}", href=_relative(cog, path),
+        title="Orthoimage", properties=_properties(source), asset="orthoimage", bands=bands,
     )  # fmt: skip
     item["assets"] |= surface_assets(cog.parent, path)
-    with atomic_write(path) as part:
-        part.write_text(json.dumps(item, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    write_json(path, item)
 
 
 def raster_item(
@@ -90,8 +86,9 @@ def raster_item(
     }  # fmt: skip
 
 
-def _identifier(cog: Path) -> str:
-    return f"{cog.resolve().parent.name or 'map'}-{cog.stem}"
+def _relative(file: Path, document: Path) -> str:
+    """How a document names a file, relatively to itself."""
+    return Path(os.path.relpath(file, document.parent)).as_posix()
 
 
 def _properties(cog: Path) -> dict[str, Any]:
@@ -116,3 +113,50 @@ def picture_times(folder: Path) -> tuple[str | None, str | None]:
     rows: list[Mapping[str, Any]] = list(read_frames(lines)) if lines.exists() else []
     times = sorted(str(row["time"]) for row in rows if row.get("time"))
     return (times[0], times[-1]) if times else (None, None)
+
+
+def time_span(folder: Path) -> str:
+    """First and last minute of a map's pictures, as "2026-05-28 20:26 to 2026-05-28 20:31 UTC"; empty if not known."""
+    first, last = (None if time is None else time[:16].replace("T", " ") for time in picture_times(folder))
+    return "" if first is None else f"{first} to {last} UTC"
+
+
+def surface_path(folder: Path) -> Path | None:
+    """The surface model in a map's folder; None if its run made none, or wrote it elsewhere."""
+    report = folder / "report.json"
+    if not report.exists():
+        return None
+    made = json.loads(report.read_text(encoding="utf-8")).get("surface")
+    names = [Path(made["file"]).name, SURFACE] if made else []
+    return next((folder / name for name in names if (folder / name).is_file()), None)
+
+
+def surface_assets(folder: Path, document: Path) -> dict[str, Any]:
+    """The asset under its key; empty if the folder holds no surface model.
+
+    Args:
+        folder: of the map. document: the file that names the asset, relatively to itself.
+    """
+    import rasterio
+
+    path = surface_path(folder)
+    if path is None:
+        return {}
+    with rasterio.open(path) as raster:
+        bands = [
+            {"name": name, "data_type": "float32", "nodata": raster.nodata, "spatial_resolution": float(raster.res[0]),
+             **({"unit": unit} if unit else {})}
+            for name, unit in _SURFACE_BANDS
+        ]  # fmt: skip
+        described = [
+            {"name": name, "description": text}
+            for (name, _), text in zip(_SURFACE_BANDS, raster.descriptions, strict=True)
+        ]
+        return {
+            "surface": {
+                "href": _relative(path, document),
+                "type": _COG, "roles": ["data"], "title": "Surface model", "proj:code": f"EPSG:{raster.crs.to_epsg()}",
+                "proj:shape": [raster.height, raster.width], "proj:transform": list(raster.transform)[:6],
+                "raster:bands": bands, "bands": described,
+            }
+        }  # fmt: skip

@@ -84,15 +84,12 @@ def _placed(report: Mapping[str, Any]) -> tuple[str, str]:
         points = "1 control point" if count == 1 else f"{count} control points"
         return "control points", f"{on_map}, which {points} corrected." if matched else f"Placed on {points}."
     if matched:
-        doubt = " The map and the receivers disagree: see the report." if _doubted(report) else ""
+        doubted = (report.get("map_offset_m") or {}).get("doubted")
+        doubt = " The map and the receivers disagree: see the report." if doubted else ""
         return "map", f"{on_map}.{doubt}"
     if report.get("until") == "realtime" or report.get("refine") == "none":
         return "receivers", "Not refined: placed as the receivers recorded."
     return "receivers", "No leg was found on a map: placed where the receivers say."
-
-
-def _doubted(report: Mapping[str, Any]) -> bool:
-    return bool((report.get("map_offset_m") or {}).get("doubted"))
 
 
 def _sigmas(folder: Path, report: Mapping[str, Any]) -> list[float]:

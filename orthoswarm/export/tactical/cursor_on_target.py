@@ -7,13 +7,12 @@ import time
 import uuid
 import zipfile
 from collections.abc import Iterable
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
-from xml.etree import ElementTree
 
 from orthoswarm.export.atomic_file import atomic_write
-from orthoswarm.export.tactical.places import Place
+from orthoswarm.export.tactical.places import Place, utc_text
+from orthoswarm.export.xml_elements import element, xml_bytes
 
 _TYPES: Final = {"vehicle": "a-f-A-M-H-Q", "find": "b-m-p-s-m"}
 """Friendly unmanned rotary wing; spot map marker."""
@@ -32,26 +31,26 @@ def event(place: Place, now_s: float | None = None) -> bytes:
     """
     now = time.time() if now_s is None else now_s
     start = place.time_s if place.kind == "vehicle" else now
-    root = ElementTree.Element(
-        "event", version="2.0", uid=place.uid, type=_TYPES[place.kind], how="m-g" if place.kind == "vehicle" else "h-e",
-        time=_zulu(now), start=_zulu(start), stale=_zulu(now + _STALE_S[place.kind]),
-    )  # fmt: skip
-    ElementTree.SubElement(
-        root, "point", lat=f"{place.lat_deg:.7f}", lon=f"{place.lon_deg:.7f}",
+    detail = [element("contact", callsign=place.name)]
+    if place.course_deg is not None or place.speed_m_s is not None:
+        course, speed = (place.course_deg or 0.0) % 360.0, place.speed_m_s or 0.0
+        detail.append(element("track", course=f"{course:.1f}", speed=f"{speed:.2f}"))
+    if place.kind == "find":
+        detail += [element("color", argb=_MAGENTA), element("archive")]
+    remarks = [place.note, *([f"pictures: {', '.join(place.pictures)}"] if place.pictures else [])]
+    detail.append(element("remarks", "\n".join(text for text in remarks if text)))
+    point = element(
+        "point", lat=f"{place.lat_deg:.7f}", lon=f"{place.lon_deg:.7f}",
         hae=_UNKNOWN if place.height_m is None else f"{place.height_m:.1f}",
         ce=_UNKNOWN if place.sigma_m is None else f"{place.sigma_m:.2f}", le=_UNKNOWN,
     )  # fmt: skip
-    detail = ElementTree.SubElement(root, "detail")
-    ElementTree.SubElement(detail, "contact", callsign=_legal(place.name))
-    if place.course_deg is not None or place.speed_m_s is not None:
-        track = {"course": f"{(place.course_deg or 0.0) % 360.0:.1f}", "speed": f"{place.speed_m_s or 0.0:.2f}"}
-        ElementTree.SubElement(detail, "track", track)
-    if place.kind == "find":
-        ElementTree.SubElement(detail, "color", argb=_MAGENTA)
-        ElementTree.SubElement(detail, "archive")
-    remarks = [place.note, *([f"pictures: {', '.join(place.pictures)}"] if place.pictures else [])]
-    ElementTree.SubElement(detail, "remarks").text = _legal("\n".join(text for text in remarks if text))
-    return bytes(ElementTree.tostring(root, encoding="utf-8", xml_declaration=True))
+    return xml_bytes(
+        element(
+            "event", point, element("detail", *detail), version="2.0", uid=place.uid, type=_TYPES[place.kind],
+            how="m-g" if place.kind == "vehicle" else "h-e", time=utc_text(now), start=utc_text(start),
+            stale=utc_text(now + _STALE_S[place.kind]),
+        )
+    )  # fmt: skip
 
 
 def write_data_package(places: Iterable[Place], path: Path, name: str = "OrthoSwarm") -> None:
@@ -65,26 +64,13 @@ def write_data_package(places: Iterable[Place], path: Path, name: str = "OrthoSw
     """
     now = time.time()
     with atomic_write(path) as part, zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as archive:
-        manifest = ElementTree.Element("MissionPackageManifest", version="2")
-        settings = ElementTree.SubElement(manifest, "Configuration")
-        uid = str(uuid.uuid5(uuid.NAMESPACE_URL, f"orthoswarm/{name}"))
-        for key, value in (("uid", uid), ("name", _legal(name))):
-            ElementTree.SubElement(settings, "Parameter", name=key, value=value)
-        contents = ElementTree.SubElement(manifest, "Contents")
+        contents = []
         for place in places:
             inside = f"{uuid.uuid5(uuid.NAMESPACE_URL, place.uid)}.cot"
             archive.writestr(inside, event(place, now))
-            content = ElementTree.SubElement(contents, "Content", ignore="false", zipEntry=inside)
-            ElementTree.SubElement(content, "Parameter", name="uid", value=place.uid)
-        archive.writestr("MANIFEST/manifest.xml", ElementTree.tostring(manifest, encoding="utf-8"))
-
-
-def _zulu(time_s: float) -> str:
-    return datetime.fromtimestamp(time_s, UTC).strftime("%Y-%m-%dT%H:%M:%S.") + f"{int(time_s % 1 * 1000):03d}Z"
-
-
-def _legal(text: str) -> str:
-    """Without what XML 1.0 cannot hold."""
-    return "".join(
-        c for c in text if c in "\t\n\r" or " " <= c <= "\ud7ff" or "\ue000" <= c <= "\ufffd" or c > "\uffff"
-    )
+            about = element("Parameter", name="uid", value=place.uid)
+            contents.append(element("Content", about, ignore="false", zipEntry=inside))
+        uid = str(uuid.uuid5(uuid.NAMESPACE_URL, f"orthoswarm/{name}"))
+        settings = [element("Parameter", name=key, value=value) for key, value in (("uid", uid), ("name", name))]
+        parts = element("Configuration", *settings), element("Contents", *contents)
+        archive.writestr("MANIFEST/manifest.xml", xml_bytes(element("MissionPackageManifest", *parts, version="2")))

@@ -6,10 +6,10 @@ import io
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
-from xml.etree import ElementTree
 
-from orthoswarm.export.atomic_file import atomic_write
-from orthoswarm.export.tactical.places import Place
+from orthoswarm.export.atomic_file import write_file
+from orthoswarm.export.tactical.places import Place, write_geojson
+from orthoswarm.export.xml_elements import element, kml_bytes, texts, xml_bytes
 
 _COLUMNS: Final = (
     "uid", "kind", "name", "lat_deg", "lon_deg", "height_m", "sigma_m", "time", "note", "course_deg", "speed_m_s",
@@ -30,8 +30,7 @@ def write_csv(places: Iterable[Place], path: Path) -> None:
     for place in places:
         values = [getattr(place, key) for key in _COLUMNS[:-1]]
         rows.writerow(_cell(value) for value in [*values, " ".join(place.pictures)])
-    with atomic_write(path) as part:
-        part.write_text(out.getvalue(), encoding="utf-8")
+    write_file(path, out.getvalue().encode())
 
 
 def _cell(value: object) -> object:
@@ -46,13 +45,19 @@ def write_gpx(places: Iterable[Place], path: Path) -> None:
     Raises:
         OrthoSwarmError: the disk is full.
     """
-    root = ElementTree.Element("gpx", version="1.1", creator="OrthoSwarm", xmlns="http://www.topografix.com/GPX/1/1")
-    for place in places:
-        point = ElementTree.SubElement(root, "wpt", lat=f"{place.lat_deg:.7f}", lon=f"{place.lon_deg:.7f}")
-        rows = {"ele": None if place.height_m is None else f"{place.height_m:.1f}", "time": place.time,
-                "name": place.name, "desc": _words(place), "type": place.kind}  # fmt: skip
-        _texts(point, rows)
-    _write(root, path)
+    points = [
+        element(
+            "wpt",
+            *texts(
+                ele=None if place.height_m is None else f"{place.height_m:.1f}", time=place.time, name=place.name,
+                desc=_words(place), type=place.kind,
+            ),
+            lat=f"{place.lat_deg:.7f}", lon=f"{place.lon_deg:.7f}",
+        )
+        for place in places
+    ]  # fmt: skip
+    space = "http://www.topografix.com/GPX/1/1"
+    write_file(path, xml_bytes(element("gpx", *points, version="1.1", creator="OrthoSwarm", xmlns=space)))
 
 
 def write_kml(places: Iterable[Place], path: Path) -> None:
@@ -64,18 +69,18 @@ def write_kml(places: Iterable[Place], path: Path) -> None:
     Raises:
         OrthoSwarmError: the disk is full.
     """
-    root = ElementTree.Element("kml", xmlns="http://www.opengis.net/kml/2.2")
-    document = ElementTree.SubElement(root, "Document")
-    _texts(document, {"name": "OrthoSwarm"})
+    marks = []
     for place in places:
-        mark = ElementTree.SubElement(document, "Placemark")
         name, words = _html(place.name), _html(_words(place))
-        _texts(mark, {"name": place.name, "description": words})
-        _texts(ElementTree.SubElement(mark, "TimeStamp"), {"when": place.time})
-        balloon = ElementTree.SubElement(ElementTree.SubElement(mark, "Style"), "BalloonStyle")
-        _texts(balloon, {"text": f"<b>{name}</b><br>\n{words}"})
-        _texts(ElementTree.SubElement(mark, "Point"), {"coordinates": f"{place.lon_deg:.7f},{place.lat_deg:.7f}"})
-    _write(root, path)
+        balloon = element("BalloonStyle", *texts(text=f"<b>{name}</b><br>\n{words}"))
+        at = texts(coordinates=f"{place.lon_deg:.7f},{place.lat_deg:.7f}")
+        marks.append(
+            element(
+                "Placemark", *texts(name=place.name, description=words), element("TimeStamp", *texts(when=place.time)),
+                element("Style", balloon), element("Point", *at),
+            )
+        )  # fmt: skip
+    write_file(path, kml_bytes(*texts(name="OrthoSwarm"), *marks))
 
 
 def _html(text: str) -> str:
@@ -89,13 +94,7 @@ def _words(place: Place) -> str:
     return "; ".join(part for part in parts if part)
 
 
-def _texts(parent: ElementTree.Element, texts: dict[str, str | None]) -> None:
-    for tag, text in texts.items():
-        if text:
-            child = ElementTree.SubElement(parent, tag)
-            child.text = "".join(c for c in text if c in "\t\n\r" or (c >= " " and not "\ud800" <= c <= "\udfff"))
-
-
-def _write(root: ElementTree.Element, path: Path) -> None:
-    with atomic_write(path) as part:
-        part.write_bytes(ElementTree.tostring(root, encoding="utf-8", xml_declaration=True))
+PLACE_FILES: Final = {
+    "places.geojson": write_geojson, "places.kml": write_kml, "places.gpx": write_gpx, "places.csv": write_csv,
+}  # fmt: skip
+"""Writers by the name of their file."""

@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from orthoswarm.export.atomic_file import atomic_write
+from orthoswarm.export.atomic_file import write_file
 from orthoswarm.model.errors import InputError
 
 FILE: Final = "places.geojson"
@@ -42,7 +42,12 @@ class Place:
     @property
     def time(self) -> str:
         """When it was there, ISO 8601 in UTC with milliseconds."""
-        return datetime.fromtimestamp(self.time_s, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+        return utc_text(self.time_s)
+
+
+def utc_text(time_s: float) -> str:
+    """UTC epoch seconds as ISO 8601 with milliseconds."""
+    return datetime.fromtimestamp(time_s, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
 _OPTIONAL: Final = ("height_m", "sigma_m", "course_deg", "speed_m_s")
@@ -65,8 +70,7 @@ def write_geojson(places: Iterable[Place], path: Path) -> None:
         OrthoSwarmError: the disk is full.
     """
     document = {"type": "FeatureCollection", "features": [feature(place) for place in places]}
-    with atomic_write(path) as part:
-        part.write_text(json.dumps(document, ensure_ascii=False, indent=1) + "\n", encoding="utf-8")
+    write_file(path, json.dumps(document, ensure_ascii=False, indent=1) + "\n")
 
 
 def read_places(folder: Path) -> list[Place]:

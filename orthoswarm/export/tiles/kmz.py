@@ -9,7 +9,7 @@ import contextlib
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from xml.sax.saxutils import escape
+from xml.etree.ElementTree import Element
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.export.tiles.mbtiles import encode_tile
 from orthoswarm.export.tiles.tile_pyramid import SIDE, Pyramid, Quad, degrees_of, draw_tiles
+from orthoswarm.export.xml_elements import element, kml_bytes, texts
 
 Bytes = NDArray[np.uint8]
 Box = tuple[float, float, float, float]
@@ -73,7 +74,7 @@ class KmzFile:
         else:
             nodes = [(self._top.zoom, x, y) for x, y in self._top.tiles()]
             links = [_network_link("{}/{}/{}.kml".format(*self._node(*node)), _box(*node)) for node in nodes]
-            self._archive.writestr("doc.kml", _document(self._name, "".join(links)))
+            self._archive.writestr("doc.kml", kml_bytes(*texts(name=self._name), *links))
 
     def encode(self, quad: Quad) -> bytes | None:
         """The picture of a node; None if the quad is none."""
@@ -108,7 +109,7 @@ class KmzFile:
                 if child in self._images:
                     below = self._node(*child)
                     parts.append(_network_link(f"../../{below[0]}/{below[1]}/{below[2]}.kml", _box(*child)))
-            self._archive.writestr(f"{level}/{row}/{col}.kml", _document("", "".join(parts)))
+            self._archive.writestr(f"{level}/{row}/{col}.kml", kml_bytes(*parts))
 
     def _node(self, zoom: int, x: int, y: int) -> tuple[int, int, int]:
         """Level (0 is the coarsest), row and column of a node, counted from the first of its level."""
@@ -127,8 +128,8 @@ class KmzFile:
                 "overlay.png": (shown[:, :side], (west, south, 180.0, north)),
                 "overlay-east.png": (shown[:, side:], (-180.0, south, east - 360.0, north)),
             }
-        overlays = "".join(_overlay(self._name, image, box, 0) for image, (_, box) in pictures.items())
-        self._archive.writestr("doc.kml", _document(self._name, overlays))
+        overlays = [_overlay(self._name, image, box, 0) for image, (_, box) in pictures.items()]
+        self._archive.writestr("doc.kml", kml_bytes(*texts(name=self._name), *overlays))
         for image, (part, _) in pictures.items():
             self._archive.writestr(image, encode_tile(np.ascontiguousarray(part), "png"))
 
@@ -140,35 +141,23 @@ def _box(zoom: int, x: int, y: int) -> Box:
     return west, south, east, north
 
 
-def _document(name: str, content: str) -> str:
-    title = f"<name>{escape(name)}</name>" if name else ""
-    return (
-        '<?xml version="1.0" encoding="UTF-8"?>\n<kml xmlns="http://www.opengis.net/kml/2.2"><Document>'
-        f"{title}{content}</Document></kml>\n"
-    )
+def _overlay(name: str, image: str, box: Box, order: int) -> Element:
+    return element(
+        "GroundOverlay", *texts(name=name, drawOrder=str(order)), element("Icon", *texts(href=image)),
+        _sides("LatLonBox", box),
+    )  # fmt: skip
 
 
-def _overlay(name: str, image: str, box: Box, order: int) -> str:
-    west, south, east, north = box
-    title = f"<name>{escape(name)}</name>" if name else ""
-    return (
-        f"<GroundOverlay>{title}<drawOrder>{order}</drawOrder><Icon><href>{image}</href></Icon><LatLonBox>"
-        f"<north>{north:.9f}</north><south>{south:.9f}</south><east>{east:.9f}</east><west>{west:.9f}</west>"
-        "</LatLonBox></GroundOverlay>"
-    )
+def _region(box: Box, least: int, most: int) -> Element:
+    lod = element("Lod", *texts(minLodPixels=str(least), maxLodPixels=str(most)))
+    return element("Region", _sides("LatLonAltBox", box), lod)
 
 
-def _region(box: Box, least: int, most: int) -> str:
-    west, south, east, north = box
-    return (
-        f"<Region><LatLonAltBox><north>{north:.9f}</north><south>{south:.9f}</south><east>{east:.9f}</east>"
-        f"<west>{west:.9f}</west></LatLonAltBox><Lod><minLodPixels>{least}</minLodPixels>"
-        f"<maxLodPixels>{most}</maxLodPixels></Lod></Region>"
-    )
+def _sides(tag: str, box: Box) -> Element:
+    west, south, east, north = (f"{v:.9f}" for v in box)
+    return element(tag, *texts(north=north, south=south, east=east, west=west))
 
 
-def _network_link(href: str, box: Box) -> str:
-    return (
-        f"<NetworkLink>{_region(box, 128, -1)}<Link><href>{href}</href>"
-        "<viewRefreshMode>onRegion</viewRefreshMode></Link></NetworkLink>"
-    )
+def _network_link(href: str, box: Box) -> Element:
+    link = element("Link", *texts(href=href, viewRefreshMode="onRegion"))
+    return element("NetworkLink", _region(box, 128, -1), link)
