@@ -36,7 +36,7 @@ _STRUCTURE = (
 )
 
 
-class Source(Protocol):
+class PixelSource(Protocol):
     """The source of a COG's pixels, for example a canvas.canvas.Canvas."""
 
     grid: GroundGrid
@@ -50,7 +50,7 @@ CLASSIC_BYTES = 2**32 - 2**20
 
 
 def write_cog(
-    source: Source,
+    source: PixelSource,
     path: Path,
     *,
     window: tuple[int, int, int, int] | None = None,
@@ -125,7 +125,7 @@ class _Table:
         file.write(self.sizes.tobytes())
 
 
-def _compressed(source: Source, first: tuple[int, int], level: _Level, threads: int) -> Iterator[bytes]:
+def _compressed(source: PixelSource, first: tuple[int, int], level: _Level, threads: int) -> Iterator[bytes]:
     """The level's tiles in row order, compressed; empty where transparent."""
     pending: deque[Future[bytes]] = deque()
     with ThreadPoolExecutor(max(1, threads)) as pool:
@@ -138,7 +138,7 @@ def _compressed(source: Source, first: tuple[int, int], level: _Level, threads: 
             yield pending.popleft().result()
 
 
-def _tile(source: Source, first: tuple[int, int], level: _Level, r: int, c: int) -> Bytes:
+def _tile(source: PixelSource, first: tuple[int, int], level: _Level, r: int, c: int) -> Bytes:
     """One full tile; beyond the picture it is transparent."""
     row, col = r * TILE_PX, c * TILE_PX
     rows, cols = min(TILE_PX, level.rows - row), min(TILE_PX, level.cols - col)

@@ -17,7 +17,7 @@ from pyproj import CRS
 
 from orthoswarm.config import active
 from orthoswarm.export.atomic_file import atomic_write, write_file
-from orthoswarm.export.cog import Source, write_cog
+from orthoswarm.export.cog import PixelSource, write_cog
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.geo import GroundGrid
 
@@ -85,7 +85,7 @@ def remove_collection(folder: Path) -> None:
 
 
 def write_tiled(
-    source: Source, folder: Path, name: str, *, window: tuple[int, int, int, int], drawn: Iterable[BoundingBox],
+    source: PixelSource, folder: Path, name: str, *, window: tuple[int, int, int, int], drawn: Iterable[BoundingBox],
     progress: Callable[[int, int], None] | None = None, threads: int = 2, time_s: float | None = None,
 ) -> None:  # fmt: skip
     """Write a raster in tiles; tiles without content are left out.

@@ -39,7 +39,7 @@ _AHEAD: Final = 32
 
 
 @dataclass(frozen=True, slots=True)
-class Range:
+class TileRange:
     """Tiles of one zoom: first and last column and row (from the north), inclusive."""
 
     zoom: int
@@ -53,9 +53,9 @@ class Range:
         """How many tiles."""
         return (self.right - self.left + 1) * (self.bottom - self.top + 1)
 
-    def parent(self) -> "Range":
+    def parent(self) -> "TileRange":
         """The range one zoom coarser."""
-        return Range(self.zoom - 1, self.left // 2, self.right // 2, self.top // 2, self.bottom // 2)
+        return TileRange(self.zoom - 1, self.left // 2, self.right // 2, self.top // 2, self.bottom // 2)
 
     def tiles(self) -> list[tuple[int, int]]:
         """Column and row of each tile, row by row."""
@@ -77,10 +77,10 @@ class Pyramid:
     """
 
     bounds: tuple[float, float, float, float]
-    levels: tuple[Range, ...]
+    levels: tuple[TileRange, ...]
 
     @property
-    def finest(self) -> Range:
+    def finest(self) -> TileRange:
         """The tiles of the finest zoom."""
         return self.levels[0]
 
@@ -217,7 +217,7 @@ def _pyramid(raster: Any) -> Pyramid:
     zoom = min(max(zoom, 0), _DEEPEST)
     left, top = _tile_of(west, north, zoom)
     right, bottom = _tile_of(east, south, zoom)
-    levels = [Range(zoom, left, right, top, bottom)]
+    levels = [TileRange(zoom, left, right, top, bottom)]
     coarsest = 1 if east > 180.0 else 0  # at zoom 0 both sides are in the same tile
     while levels[-1].count > 1 and levels[-1].zoom > coarsest:
         levels.append(levels[-1].parent())

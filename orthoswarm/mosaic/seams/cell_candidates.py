@@ -46,7 +46,7 @@ _BLUR_IGNORED_LOG: Final = 0.25  # log ratios of sharpness up to this cost nothi
 
 
 @dataclass(frozen=True, slots=True)
-class SeamCells:
+class CandidateCells:
     """Candidates of a region of cells.
 
     Attributes:
@@ -79,7 +79,7 @@ class Region:
     lattice: Floats
 
 
-def cell_candidates(region: Region, shots: Shots, tone: Floats, previews: Previews) -> SeamCells:
+def cell_candidates(region: Region, shots: Shots, tone: Floats, previews: Previews) -> CandidateCells:
     """The candidates of a region's cells.
 
     Args:
@@ -98,7 +98,7 @@ def cell_candidates(region: Region, shots: Shots, tone: Floats, previews: Previe
     local = previews.contrast * np.maximum(tone[:, :1, None], 0.1)
     contrast = np.log(np.maximum(_smoothed(local), 0.5)).astype(np.float32)
     shape = (region.side, region.side, SLOTS)
-    cells = SeamCells(
+    cells = CandidateCells(
         np.full(shape, -1, np.int32),
         np.full(shape, np.inf, np.float32),
         np.zeros(shape, np.float32),

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel, kernel
-from orthoswarm.mosaic.seams.cell_candidates import SLOTS, SeamCells
+from orthoswarm.mosaic.seams.cell_candidates import SLOTS, CandidateCells
 
 Ints = NDArray[np.int32]
 Floats = NDArray[np.float32]
@@ -34,7 +34,7 @@ house."""
 _BLOCK_OFFSETS: Final = (0, 2, 1, 0)  # where the first of these blocks begins, cells before the tile's corner
 
 
-def relax(cells: SeamCells, fixed: Ints, standing_m: Floats) -> Ints:
+def relax(cells: CandidateCells, fixed: Ints, standing_m: Floats) -> Ints:
     """Labels int32 (rows, columns) of cells: indices of shots, NONE where there is no candidate.
 
     Args:
