@@ -5,6 +5,7 @@ minutes (it looks for an inode that was not), writing 300 kB 0.1 ms.
 """
 
 import contextlib
+import io
 import os
 import secrets
 import struct
@@ -74,31 +75,28 @@ class PackedRecords:
 
     def _append(self, pieces: Sequence[memoryview]) -> tuple[str, int]:
         """Append to this process's file; its name and new end."""
-        descriptor, name, end = self._open_own()
+        file, name, end = self._open_own()
         size = sum(piece.nbytes for piece in pieces)
-        try:
-            if os.writev(descriptor, pieces) != size:  # the disk is full: what is needed more is written there next
-                os.ftruncate(descriptor, end)
+        with file:
+            if sum(file.write(piece) or 0 for piece in pieces) != size:  # the disk is full: more is written there next
+                file.truncate(end)
                 raise OSError("no space left")
-        finally:
-            os.close(descriptor)
         self._own = (os.getpid(), name, end + size)
         return name, end + size
 
-    def _open_own(self) -> tuple[int, str, int]:
-        """A descriptor of this process's file, its name and end; a new file where nobody or another process has one."""
+    def _open_own(self) -> tuple[io.FileIO, str, int]:
+        """This process's file, its name and end; a new file where nobody or another process has one."""
         if self._own is not None and self._own[0] == os.getpid():
             _, name, end = self._own
             with contextlib.suppress(FileNotFoundError):
-                descriptor = os.open(self._folder / name, os.O_WRONLY | os.O_APPEND)
-                if os.fstat(descriptor).st_size == end:
-                    return descriptor, name, end
-                os.close(descriptor)  # it was changed by others, so heads in it may be torn
+                file = io.FileIO(self._folder / name, "r+")
+                if file.seek(0, os.SEEK_END) == end:
+                    return file, name, end
+                file.close()  # it was changed by others, so heads in it may be torn
         name = f"{os.getpid()}-{secrets.token_hex(4)}{_SUFFIX}"
-        flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_EXCL
-        descriptor = os.open(self._folder / name, flags, 0o644)
+        file = io.FileIO(self._folder / name, "x")
         self._own = (os.getpid(), name, 0)
-        return descriptor, name, 0
+        return file, name, 0
 
     def _find(self, key: bytes) -> tuple[str, int, int] | None:
         if key not in self._places:
@@ -113,16 +111,14 @@ class PackedRecords:
         at = self._read.get(file, 0)
         if at + _HEAD.size > size:
             return
-        descriptor = os.open(self._folder / file, os.O_RDONLY)
-        try:
-            while len(head := os.pread(descriptor, _HEAD.size, at)) == _HEAD.size:
+        with io.FileIO(self._folder / file) as records:
+            records.seek(at)
+            while len(head := records.read(_HEAD.size)) == _HEAD.size:
                 key, content = _HEAD.unpack(head)
                 if at + _HEAD.size + content > size:
                     break
                 self._places[key] = (file, at + _HEAD.size, content)
-                at += _HEAD.size + content
-        finally:
-            os.close(descriptor)
+                at = records.seek(at + _HEAD.size + content)
         self._read[file] = at
 
 
@@ -137,8 +133,6 @@ def _key(name: Path) -> bytes:
 
 
 def _read_at(path: Path, at: int, *into: memoryview) -> int:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        return os.preadv(descriptor, into, at)
-    finally:
-        os.close(descriptor)
+    with io.FileIO(path) as file:
+        file.seek(at)
+        return sum(file.readinto(part) or 0 for part in into)
