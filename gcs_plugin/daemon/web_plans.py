@@ -15,6 +15,7 @@ from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.items import Mission
 from gcs_plugin.mission.plan_folder import PlanNeeds, plan_needs
+from gcs_plugin.plans.area_files import refuse_no_zones
 from gcs_plugin.plans.plan_request import AUTOPILOTS, ENDS, METHODS, RELIEFS, PlanRequest, make_plan
 from orthoswarm.model.errors import InputError
 from orthoswarm.planning.area.shape_files import parse_geojson
@@ -241,20 +242,8 @@ def _zones(no_fly: Any) -> Mapping[str, Any] | None:
     if not isinstance(no_fly, dict):
         raise InputError("no_fly is not GeoJSON; send the polygons of the no-fly zones, or nothing")
     shapes = parse_geojson(json.dumps(no_fly), "no_fly")
-    geometries = [kind for kind, coordinates in _parts(no_fly) if coordinates != []]
-    if any(kind not in ("Polygon", "MultiPolygon") for kind in geometries):
-        raise InputError("no_fly holds a shape that is no polygon; draw each zone as a polygon")
-    return no_fly if shapes.polygons else None
-
-
-def _parts(document: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Kind and coordinates of each geometry of a GeoJSON document that was parsed before; None of an empty feature."""
-    for part in (*document.get("features", ()), *document.get("geometries", ())):
-        yield from _parts(part)
-    if "geometry" in document:
-        yield from [("nothing", None)] if document["geometry"] is None else _parts(document["geometry"])
-    if "coordinates" in document:
-        yield str(document["type"]), document["coordinates"]
+    refuse_no_zones(shapes, "no_fly")
+    return no_fly if shapes.areas else None
 
 
 def _values(body: Mapping[str, Any]) -> dict[str, Any]:

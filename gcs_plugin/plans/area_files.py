@@ -3,11 +3,15 @@
 GeoJSON, KML, KMZ, zipped shapefile, GeoPackage, QGroundControl `.plan` and `.waypoints`.
 """
 
+import codecs
 import json
+import re
 import warnings
 import zipfile
-from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import shapely
@@ -19,6 +23,7 @@ from orthoswarm.planning.area.shape_files import (
     Polygon,
     Ring,
     Shapes,
+    counted,
     parse_geojson,
     parse_kml,
     refuse_many_corners,
@@ -44,7 +49,7 @@ _SQLITE: Final = b"SQLite format 3\0"
 
 
 def read_shapes(path: Path, name: str | None = None) -> tuple[Shapes, list[Ring]]:
-    """Polygons and lines of a file, and rings of its exclusion fences; what the file is decides its content.
+    """The shapes of a file, and rings of its exclusion fences; what the file is decides its content.
 
     Args:
         path: the file. name: how to call it in an error; its path unless said.
@@ -61,27 +66,57 @@ def read_shapes(path: Path, name: str | None = None) -> tuple[Shapes, list[Ring]
         return read_geopackage(path, name), []
     if kind == "a zipped shapefile":
         return read_zipped_shapefile(path, name), []
-    text = _text(path, name)
+    texts = _texts(path, name)
     if kind == "GeoJSON":
-        return parse_geojson(text, name), []
+        return parse_geojson(texts[0], name), []
     if kind in ("KML", "KMZ"):
-        return parse_kml(text, name), []
-    mission = parse_mission(text, name)
+        return Shapes.joined([parse_kml(text, name) for text in texts]), []
+    mission = parse_mission(texts[0], name)
     polygons = tuple(Polygon(ring(survey, name)) for survey in mission.surveys)
     lines = tuple(ring(line, name, 2) for line in (mission.polylines or mission.lines()))
     return Shapes(polygons, lines), [ring(zone, name) for zone in mission.no_fly]
 
 
-def read_fences(path: Path) -> tuple[Fence, ...]:
-    """The geofences of a QGroundControl `.plan`; files of other kinds have none.
+def read_zones(path: Path) -> tuple[Shapes, list[Ring]]:
+    """What vehicles are to keep out of, by a no-fly file: all of it, also what is switched off there.
+
+    Raises:
+        InputError: the file cannot be read, or holds anything that no vehicle could be kept out of.
+    """
+    shapes, fences = read_shapes(path)
+    refuse_no_zones(shapes, str(path), mission=bool(fences))
+    shapes = replace(shapes, polygons=shapes.polygons + shapes.hidden, hidden=())
+    if not shapes.areas and not fences:
+        raise InputError(f"{path} holds no polygon to keep out of; give a polygon with --no-fly")
+    return shapes, fences
+
+
+def refuse_no_zones(shapes: Shapes, name: str, *, mission: bool = False) -> None:
+    """Refuse shapes of which a part would be passed over as no-fly zones; a mission's lines are flown.
+
+    Raises:
+        InputError: there are such shapes.
+    """
+    count = 0 if mission else len(shapes.lines)
+    left = [*shapes.unused, *counted({"line": count} if count else {})]
+    if left:
+        raise InputError(
+            f"{name} holds {', '.join(left)}, which no vehicle could be kept out of; draw each zone as a polygon, or "
+            "give a point its radius_m and a line its width_m, in metres"
+        )
+
+
+def read_fences(path: Path, *, no_fly: bool) -> tuple[Fence, ...]:
+    """The geofences of a QGroundControl `.plan`; of a no-fly file of another kind, its circles.
 
     Raises:
         InputError: it cannot be read, or a polygon has fewer than three corners.
     """
     name = str(path)
     if _kind(path, name) != "a mission":
-        return ()
-    fences = parse_mission(_text(path, name), name).fences
+        circles = read_shapes(path)[0].circles if no_fly else ()
+        return tuple(Fence(inclusion=False, points=((c.lat_deg, c.lon_deg),), radius_m=c.radius_m) for c in circles)
+    fences = parse_mission(_texts(path, name)[0], name).fences
     for fence in fences:
         if fence.radius_m is None:
             ring(fence.points, name)
@@ -111,7 +146,7 @@ def _kind(path: Path, name: str) -> str:
         return "a GeoPackage"
     if head.startswith(_SHAPEFILE):
         raise InputError(f"{name} is one file of a shapefile; put its .shp, .shx, .dbf and .prj into one ZIP")
-    text = _text(path, name).lstrip()
+    text = _texts(path, name)[0].lstrip()
     if text.startswith("QGC WPL"):
         return "a mission"
     if text.startswith("<"):
@@ -135,25 +170,38 @@ def _inside(path: Path, name: str, suffix: str) -> list[zipfile.ZipInfo]:
         raise InputError(f"{name} is a damaged ZIP; export it again") from None
     if sum(info.file_size for info in found) > _LARGEST_BYTES:
         raise InputError(f"{name} unpacks to more than {_LARGEST_BYTES // 1_000_000} MB; give a simpler outline")
-    return [info for info in found if info.filename.lower().endswith(suffix)]
+    return [info for info in found if info.filename.lower().endswith(suffix) and not _left_by_macos(info.filename)]
 
 
-def _text(path: Path, name: str) -> str:
-    """The text of a file, of a KMZ's first KML.
+def _left_by_macos(name: str) -> bool:
+    """Whether a file in a ZIP is a twin that macOS adds to each file, with what other systems have no place for."""
+    return name.startswith("__MACOSX/") or PurePosixPath(name).name.startswith("._")
+
+
+def _texts(path: Path, name: str) -> list[str]:
+    """The text of a file, those of a KMZ's KML files, in the encoding that it has or that its XML declares.
 
     Raises:
         InputError: it is not text.
     """
     try:
-        data = path.read_bytes()
-        if data.startswith(b"PK\x03\x04"):
+        data = [path.read_bytes()]
+        if data[0].startswith(b"PK\x03\x04"):
             with zipfile.ZipFile(path) as archive:
-                data = archive.read(_inside(path, name, ".kml")[0])
-        return data.decode("utf-8-sig")
-    except (UnicodeDecodeError, zipfile.BadZipFile, NotImplementedError, RuntimeError):
+                data = [archive.read(entry) for entry in _inside(path, name, ".kml")]
+        return [_decoded(text) for text in data]
+    except (UnicodeError, LookupError, zipfile.BadZipFile, NotImplementedError, RuntimeError):
         raise InputError(
             f"{name} is not a text file with a polygon or a line; give GeoJSON, KML, KMZ or .plan"
         ) from None
+
+
+def _decoded(data: bytes) -> str:
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return data.decode("utf-16")
+    declared = re.match(rb"""\s*<\?xml[^>]*encoding=["']([\w.:-]+)""", data)
+    encoding = declared[1].decode().lower() if declared else "utf-8"
+    return data.decode("utf-8-sig" if encoding == "utf-8" else encoding)
 
 
 def _is_mission(text: str, name: str) -> bool:
@@ -185,13 +233,8 @@ def read_zipped_shapefile(path: Path, name: str) -> Shapes:
     Raises:
         InputError: OGR cannot read it, a `.prj` is missing, or its coordinates are of no use.
     """
-    with zipfile.ZipFile(path) as archive:
-        inside = [entry for entry in archive.namelist() if entry.lower().endswith(".shp")]
-    found = [_shapes(f"/vsizip/{{{path}}}/{entry}", name) for entry in inside]
-    return Shapes(
-        tuple(polygon for shapes in found for polygon in shapes.polygons),
-        tuple(line for shapes in found for line in shapes.lines),
-    )
+    inside = [entry.filename for entry in _inside(path, name, ".shp")]
+    return Shapes.joined([_shapes(f"/vsizip/{{{path}}}/{entry}", name) for entry in inside])
 
 
 def _shapes(source: str, name: str) -> Shapes:
@@ -199,13 +242,12 @@ def _shapes(source: str, name: str) -> Shapes:
     from pyogrio.errors import DataLayerError, DataSourceError, FeatureError, FieldError, GeometryError
     from pyogrio.raw import read
 
-    polygons: list[Polygon] = []
-    lines: list[Ring] = []
+    polygons, lines, unused = list[Polygon](), list[Ring](), Counter[str]()
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # of OGR, about what it reads all the same
             layers = [read(source, layer=layer, columns=[], force_2d=True) for layer, _ in list_layers(source)]
-            parts = [(m["crs"], part) for m, _, g, _ in layers for part in shapely.get_parts(shapely.from_wkb(g))]
+            parts = [(m["crs"], part) for m, _, g, _ in layers for part in _parts(shapely.from_wkb(g))]
     except (DataSourceError, DataLayerError, FeatureError, FieldError, GeometryError, shapely.GEOSException):
         needs = "a shapefile's ZIP needs .shp, .shx, .dbf and .prj"
         raise InputError(f"{name} is damaged or incomplete; export it again ({needs})") from None
@@ -216,8 +258,18 @@ def _shapes(source: str, name: str) -> Shapes:
             polygons.append(Polygon(shell, tuple(holes)))
         elif part.geom_type == "LineString" and not part.is_empty:
             lines.append(_degrees(part.coords, to_degrees[crs], name, 2))
+        else:
+            unused["feature without a shape" if part.is_empty else part.geom_type.lower()] += 1
     refuse_many_corners([*polygons, *lines], name)
-    return Shapes(tuple(polygons), tuple(lines))
+    return Shapes(tuple(polygons), tuple(lines), unused=counted(unused))
+
+
+def _parts(geometries: Any) -> list[Any]:
+    """Single shapes of features; an empty one where a feature has none."""
+    empty = shapely.Point()
+    return [
+        part for g in geometries for part in (shapely.get_parts(g) if g is not None and not g.is_empty else [empty])
+    ]
 
 
 def _transformer(crs: str | None, name: str) -> "Transformer":

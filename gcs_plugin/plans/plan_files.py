@@ -7,14 +7,17 @@ import os
 import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import shapely
 
 from gcs_plugin.mission.mission_files import Autopilot, plan_text, sortie_items, waypoints_text
 from gcs_plugin.plans.plan_request import PlanRequest
 from orthoswarm.coverage.gaps import PlannedFlight
+from orthoswarm.model.angles import wrap_deg
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.plan import OverGround, Plan, Sortie, VehiclePlan
@@ -133,7 +136,9 @@ def geojson(plan: Plan, area: Area | None) -> str:
     features: list[dict[str, Any]] = []
     if area is not None:
         for kind, geometry in (("area", area.ground), ("no-fly zone", area.no_fly)):
-            features += [_feature("Polygon", _rings(area, part), kind=kind) for part in geometry.geoms]
+            features += [
+                _feature("Polygon", rings, kind=kind) for part in geometry.geoms for rings in _rings(area, part)
+            ]
     for vehicle in plan.vehicles:
         for index, sortie in enumerate(vehicle.sorties):
             features += _sortie_features(vehicle, index, sortie)
@@ -151,13 +156,13 @@ def _sortie_features(vehicle: VehiclePlan, index: int, sortie: Sortie) -> list[d
         way.append(here)
         if point.camera is False:
             number += 1
-            features.append(_feature("LineString", way, kind="leg", **who, leg=number))
+            features.append(_feature(*_line(way), kind="leg", **who, leg=number))
             way = [here]
         elif point.camera is True:
-            features.append(_feature("LineString", way, kind="way", **who))
+            features.append(_feature(*_line(way), kind="way", **who))
             way = [here]
     if len(way) > 1:
-        features.append(_feature("LineString", way, kind="way", **who))
+        features.append(_feature(*_line(way), kind="way", **who))
     return features
 
 
@@ -165,12 +170,35 @@ def _feature(shape: str, coordinates: Any, /, **properties: Any) -> dict[str, An
     return {"type": "Feature", "properties": properties, "geometry": {"type": shape, "coordinates": coordinates}}
 
 
-def _rings(area: Area, polygon: Any) -> list[list[list[float]]]:
-    import shapely
+def _line(way: list[list[float]]) -> tuple[str, list[Any]]:
+    """Kind and coordinates of a line of longitudes, latitudes and heights, cut where it crosses the 180th meridian."""
+    parts = [[way[0]]]
+    for here, there in pairwise(way):
+        if abs(there[0] - here[0]) > 180.0:
+            edge = math.copysign(180.0, here[0])
+            share = (edge - here[0]) / wrap_deg(there[0] - here[0])
+            rest = [round(a + share * (b - a), 8) for a, b in zip(here[1:], there[1:], strict=True)]
+            parts[-1].append([edge, *rest])
+            parts.append([[-edge, *rest]])
+        parts[-1].append(there)
+    return ("LineString", way) if len(parts) == 1 else ("MultiLineString", parts)
 
+
+def _rings(area: Area, polygon: Any) -> list[list[list[list[float]]]]:
+    """Rings of longitudes and latitudes of a polygon; of two where the 180th meridian cuts it (RFC 7946, 3.1.9)."""
     rings = shapely.get_rings(shapely.geometry.polygon.orient(polygon))
-    places = [area.grid.to_geographic(shapely.get_coordinates(ring)) for ring in rings]
-    return [[[round(float(lon), 8), round(float(lat), 8)] for lat, lon in ring] for ring in places]
+    places = [area.grid.to_geographic(shapely.get_coordinates(ring))[:, ::-1] for ring in rings]
+    first = places[0][0, 0]
+    across = [np.column_stack([first + wrap_deg(ring[:, 0] - first), ring[:, 1]]) for ring in places]
+    whole, parts = shapely.Polygon(across[0], across[1:]), [(across, 0.0)]
+    if whole.bounds[0] < -180.0 or whole.bounds[2] > 180.0:
+        cut = [
+            (shapely.intersection(whole, shapely.box(w - 180.0, -90.0, w + 180.0, 90.0)), w)
+            for w in (-360.0, 0.0, 360.0)
+        ]
+        pieces = [(shapely.geometry.polygon.orient(p), w) for g, w in cut for p in shapely.get_parts(g) if p.area > 0.0]
+        parts = [([shapely.get_coordinates(ring) for ring in shapely.get_rings(p)], w) for p, w in pieces]
+    return [[[[round(float(x - w), 8), round(float(y), 8)] for x, y in ring] for ring in part] for part, w in parts]
 
 
 def write_plan(
@@ -383,7 +411,9 @@ def read_planned_flight(folder: Path, grid: LocalGrid) -> PlannedFlight:
         width, height = (float(side) for side in figures["footprint_m"])
         fov = math.radians(float(figures["fov_min_deg"]))
         # A leg over hills has several points; only its ends matter here.
-        lines = [f["geometry"]["coordinates"] for f in features if f["properties"].get("kind") == "leg"]
+        shapes = [f["geometry"] for f in features if f["properties"].get("kind") == "leg"]
+        parts = [g["coordinates"] if g["type"] == "MultiLineString" else [g["coordinates"]] for g in shapes]
+        lines = [[point for part in line for point in part] for line in parts]
         ends = np.array([[line[0][:2], line[-1][:2]] for line in lines], float).reshape(-1, 2, 2)
     except OSError as error:
         raise InputError(

@@ -11,7 +11,7 @@ import shapely
 from numpy.typing import NDArray
 
 from gcs_plugin.mission.mission_files import Autopilot
-from gcs_plugin.plans.area_files import read_fences, read_shapes
+from gcs_plugin.plans.area_files import read_fences, read_shapes, read_zones
 from gcs_plugin.plans.gap_area import gap_area, read_gaps
 from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
@@ -20,7 +20,7 @@ from orthoswarm.model.geo import LocalGrid, area_epsg
 from orthoswarm.model.placement import Terrain
 from orthoswarm.model.plan import End, Fence, Plan, Sortie
 from orthoswarm.planning.area.area import Area, make_area
-from orthoswarm.planning.area.shape_files import Polygon, Ring
+from orthoswarm.planning.area.shape_files import Polygon, Ring, Shapes, counted
 from orthoswarm.planning.lines.candidates import Method
 from orthoswarm.planning.lines.line_spacing import Footprint, footprint
 from orthoswarm.planning.planner import plan_area, plan_gaps, plan_lines
@@ -164,8 +164,8 @@ def make_plan(request: PlanRequest, progress: Callable[[str], None] = lambda _: 
         InputError: a file or a value is of no use, or a flight would leave an inclusion fence.
     """
     plan, area = _made(request, progress)
-    sources = [*request.no_fly] if request.gaps else [request.area, *request.no_fly]
-    fences = [fence for path in sources for fence in read_fences(path)]
+    fences = [] if request.gaps else [*read_fences(request.area, no_fly=False)]
+    fences += [fence for path in request.no_fly for fence in read_fences(path, no_fly=True)]
     refuse_outside(plan, fences, request.autopilots)
     # Nearer to a zone a vehicle would break its fence by the errors of its receiver alone, and turn back or stop.
     if area is not None and (request.clearance_m or 0.0) >= active().planning.beside_m:
@@ -181,9 +181,9 @@ def _made(request: PlanRequest, progress: Callable[[str], None]) -> tuple[Plan, 
     if request.gaps:
         return _gap_plan(request, options, progress)
     shapes, no_fly = read_shapes(request.area)
-    no_fly += _no_fly_rings(request.no_fly)
-    if shapes.polygons and not request.follow:
-        area = make_area(shapes.polygons, no_fly)
+    no_fly += _no_fly_rings(request)
+    if shapes.areas and not request.follow:
+        area = make_area(shapes.areas, no_fly)
 
         def cover(above_m: float, foot: Footprint, heights: FlightHeights | None) -> Plan:
             return plan_area(
@@ -197,9 +197,11 @@ def _made(request: PlanRequest, progress: Callable[[str], None]) -> tuple[Plan, 
                 heights=heights,
             )
 
-        return _over_ground(request, cover, area.ground, area.grid), area
+        plan = _over_ground(request, cover, area.ground, area.grid)
+        return replace(plan, warnings=(*_not_flown(request.area, shapes), *plan.warnings)), area
     if not shapes.lines:
-        what = "line" if shapes.polygons else "polygon and no line"
+        left = ", ".join(shapes.left)
+        what = "line" if shapes.areas else f"polygon and no line, only {left}" if left else "polygon and no line"
         raise InputError(f"{request.area} holds no {what}; draw one in it")
     zones: Area | None = _zones_only(shapes.lines, no_fly) if no_fly else None
     points = np.concatenate(shapes.lines)
@@ -218,7 +220,25 @@ def _made(request: PlanRequest, progress: Callable[[str], None]) -> tuple[Plan, 
             heights=heights,
         )
 
-    return _over_ground(request, follow, paths, grid), zones
+    plan = _over_ground(request, follow, paths, grid)
+    return replace(plan, warnings=(*_not_flown(request.area, shapes, lines=True), *plan.warnings)), zones
+
+
+def _not_flown(path: Path, shapes: Shapes, *, lines: bool = False) -> list[str]:
+    """Warnings on what a plan makes nothing of, or something else of than was perhaps meant.
+
+    Args:
+        path: of the area. shapes: its own. lines: whether its lines are followed, else its polygons covered.
+    """
+    beside = counted({"polygon": len(shapes.areas)} if lines and shapes.areas else {})
+    beside += counted({"line": len(shapes.lines)} if shapes.lines and not lines else {})
+    left = [*shapes.left, *beside]
+    notes = [f"of {path.name} this is not flown: {', '.join(left)}"] if left else []
+    if lines and any(len(line) > 3 and (line[0] == line[-1]).all() for line in shapes.lines):
+        notes.append(
+            f"{path.name} has a closed path, which is flown as a line; draw a polygon to cover what it surrounds"
+        )
+    return notes
 
 
 def _over_ground(
@@ -276,7 +296,7 @@ def _gap_plan(request: PlanRequest, options: PlanOptions, progress: Callable[[st
     """A plan over the gaps of a coverage, and the ground that it aims at."""
     if request.endurance_min is None and not request.endurances_min:
         raise InputError("say with --endurance how many minutes the batteries last: a gap flight must not guess it")
-    no_fly = _no_fly_rings(request.no_fly)
+    no_fly = _no_fly_rings(request)
     nominal = _footprint(request, request.altitude_m)
     target = gap_area(read_gaps(request.area), no_fly, nominal, request.fly_not_arrived)
 
@@ -289,14 +309,16 @@ def _gap_plan(request: PlanRequest, options: PlanOptions, progress: Callable[[st
     return replace(plan, warnings=(*target.notes, *plan.warnings)), target.area
 
 
-def _no_fly_rings(paths: Sequence[Path]) -> list[Ring]:
-    """Rings of all no-fly files: their polygons' outlines and exclusion fences."""
+def _no_fly_rings(request: PlanRequest) -> list[Ring]:
+    """Rings of all no-fly files: their polygons' outlines, exclusion fences, and polygons around circles.
+
+    Circles become fences of the vehicles, so flights keep the distance at which receivers do not break a fence.
+    """
+    beyond_m = max(0.0, active().planning.beside_m - (request.clearance_m or 0.0))
     rings: list[Ring] = []
-    for path in paths:
-        further, fences = read_shapes(path)
-        if not further.polygons and not fences:
-            raise InputError(f"{path} holds no polygon to keep out of; give a polygon with --no-fly")
-        rings += [*(p.shell for p in further.polygons), *fences]
+    for path in request.no_fly:
+        zones, fences = read_zones(path)
+        rings += [*(p.shell for p in zones.polygons), *(c.polygon(beyond_m).shell for c in zones.circles), *fences]
     return rings
 
 

@@ -32,7 +32,8 @@ async def read_area(
     """Read an area file, sent as the body.
 
     GeoJSON, KML, KMZ, zipped shapefile, GeoPackage, QGroundControl .plan. Answers `polygons` (each a list of closed
-    rings of [longitude, latitude], the outline first), `lines`, and `no_fly` (closed rings: exclusion fences).
+    rings of [longitude, latitude], the outline first), `lines`, `no_fly` (closed rings: exclusion fences), and what
+    else it holds in words, `unused`.
     """
     data = await body_of(request, MOST_BYTES)
     named = (data, name[:_MOST_NAME])
@@ -65,9 +66,10 @@ def area_of(data: bytes, name: str) -> dict[str, Any]:
         path.write_bytes(data)
         shapes, zones = read_shapes(path, name)
     return {
-        "polygons": [[_closed(ring) for ring in (polygon.shell, *polygon.holes)] for polygon in shapes.polygons],
+        "polygons": [[_closed(ring) for ring in (polygon.shell, *polygon.holes)] for polygon in shapes.areas],
         "lines": [[[lon, lat] for lat, lon in line.tolist()] for line in shapes.lines],
         "no_fly": [_closed(zone) for zone in zones],
+        "unused": list(shapes.left),
     }
 
 

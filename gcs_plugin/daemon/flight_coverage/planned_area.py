@@ -89,7 +89,7 @@ def read_covered_area(source: AreaSource, grid: LocalGrid | None) -> CoveredArea
         InputError: the area or the plan cannot be used.
     """
     if source.plan is None:
-        area = make_area(parse_geojson(source.drawn, "the drawn area").polygons, (), grid)
+        area = make_area(parse_geojson(source.drawn, "the drawn area").areas, (), grid)
         return CoveredArea(area, None, None, PlannedLegs(np.empty((0, 2, 2)), [], np.empty(0, np.int64)))
     try:
         text = (source.plan / "area.geojson").read_text(encoding="utf-8")
@@ -97,8 +97,8 @@ def read_covered_area(source: AreaSource, grid: LocalGrid | None) -> CoveredArea
     except (OSError, ValueError, KeyError) as error:
         raise InputError(f"{source.plan.name} cannot be read ({error}); plan again") from None
     zones = source.plan / "no-fly.geojson"
-    shells = [p.shell for p in read_shapes(zones)[0].polygons] if zones.is_file() else []
-    area = make_area(parse_geojson(text, source.plan.name).polygons, shells, grid)
+    shells = [p.shell for p in read_shapes(zones)[0].areas] if zones.is_file() else []
+    area = make_area(parse_geojson(text, source.plan.name).areas, shells, grid)
     flight = read_planned_flight(source.plan, area.grid)
     names = dict(source.names)
     rows = [f["properties"] for f in features if f["properties"].get("kind") == "leg"]

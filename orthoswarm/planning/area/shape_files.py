@@ -1,18 +1,31 @@
-"""Polygons and lines out of GeoJSON and KML text, as latitudes and longitudes in degrees."""
+"""Polygons, circles and lines out of GeoJSON and KML text, as latitudes and longitudes in degrees.
+
+GeoJSON has no circles; they come as points with a radius: in geozone files (EUROCAE ED-269, ED-318), or with the
+property `radius_m` or `radius`. A line with `width_m` is a strip. What is none of these is named, never passed over.
+"""
 
 import json
+import math
+import re
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from orthoswarm.config import active
+from orthoswarm.model.earth import DEGREE_M
 from orthoswarm.model.errors import InputError
+from orthoswarm.model.geo import LocalGrid, area_epsg
 
 Ring = NDArray[np.float64]
+_ROUND_M = 0.2  # a circle's polygon lies so far outside it at most
+_MOST_RADIUS_M = 100_000.0
+_FOOT_M = 0.3048
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,16 +42,56 @@ class Polygon:
 
 
 @dataclass(frozen=True, slots=True)
+class Circle:
+    """A circle on the globe: its centre in degrees, its radius in metres."""
+
+    lat_deg: float
+    lon_deg: float
+    radius_m: float
+
+    def polygon(self, beyond_m: float = 0.0) -> Polygon:
+        """A polygon around it, `beyond_m` larger."""
+        radius = self.radius_m + beyond_m
+        corners = max(32, math.ceil(math.pi / math.sqrt(2.0 * _ROUND_M / radius)))
+        angles = 2.0 * math.pi * np.arange(corners) / corners
+        north = radius / math.cos(math.pi / corners) / DEGREE_M
+        east = north / math.cos(math.radians(self.lat_deg))
+        return Polygon(np.column_stack([self.lat_deg + north * np.cos(angles), self.lon_deg + east * np.sin(angles)]))
+
+
+@dataclass(frozen=True, slots=True)
 class Shapes:
     """What a file holds.
 
     Attributes:
-        polygons: its polygons.
+        polygons: its polygons, strips of lines with a width among them.
         lines: its polylines, each float64 (n, 2), latitude and longitude in degrees.
+        circles: its circles.
+        hidden: polygons that are switched off in the file (KML's visibility).
+        unused: what else it holds, in words ("2 points").
     """
 
     polygons: tuple[Polygon, ...] = ()
     lines: tuple[Ring, ...] = ()
+    circles: tuple[Circle, ...] = ()
+    hidden: tuple[Polygon, ...] = ()
+    unused: tuple[str, ...] = ()
+
+    @property
+    def areas(self) -> tuple[Polygon, ...]:
+        """Polygons, and those around circles."""
+        return (*self.polygons, *(circle.polygon() for circle in self.circles))
+
+    @property
+    def left(self) -> tuple[str, ...]:
+        """What of the file no area or line is made of, in words."""
+        hidden = len(self.hidden)
+        return (*self.unused, *counted({"polygon that is switched off": hidden} if hidden else {}))
+
+    @classmethod
+    def joined(cls, parts: Sequence["Shapes"]) -> "Shapes":
+        """All shapes of several files or layers."""
+        return cls(*(tuple(shape for part in parts for shape in getattr(part, f.name)) for f in fields(cls)))
 
 
 def ring(points: Any, name: str, least: int = 3) -> Ring:
@@ -53,15 +106,17 @@ def ring(points: Any, name: str, least: int = 3) -> Ring:
         InputError: too few points, or values that are not degrees.
     """
     try:
-        array = np.asarray(points, dtype=np.float64).reshape(-1, 2)
+        array = np.array(points, dtype=np.float64).reshape(-1, 2)
     except (TypeError, ValueError):
         raise InputError(f"{name} has coordinates that are not numbers; export it again") from None
     if not np.isfinite(array).all():
         raise InputError(f"{name} has coordinates that are not finite; export it again")
-    if (np.abs(array) > [90.0, 180.0]).any():
+    if (np.abs(array) > [90.0, 360.0]).any():
         raise InputError(
             f"{name} has coordinates that are not longitude and latitude in degrees; export it in WGS 84 (EPSG:4326)"
         )
+    if (np.abs(array[:, 1]) > 180.0).any():  # some programs go on counting across the date line
+        array[:, 1] = (array[:, 1] + 180.0) % 360.0 - 180.0
     if len(array):
         array = array[np.r_[True, (np.diff(array, axis=0) != 0).any(1)]]
     if least > 2 and len(array) > 1 and (array[0] == array[-1]).all():
@@ -101,42 +156,93 @@ def parse_geojson(text: str, name: str = "the GeoJSON file", *, any_size: bool =
         document = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise InputError(f"{name} is not valid JSON ({error}); export it again") from None
-    if not isinstance(document, dict) or "type" not in document:
+    zones = isinstance(document, dict) and isinstance(document.get("features", document.get("UASZoneList")), list)
+    if not isinstance(document, dict) or not (zones or "type" in document):
         raise InputError(f"{name} is JSON but no GeoJSON (it has no 'type'); export a polygon as GeoJSON")
     crs = str(((document.get("crs") or {}).get("properties") or {}).get("name", "CRS84"))
     if not crs.upper().replace("::", ":").endswith(("CRS84", "EPSG:4326")):
         raise InputError(f"{name} is in {crs}; export it in WGS 84 (EPSG:4326)")
-    polygons: list[Polygon] = []
-    lines: list[Ring] = []
+    polygons, lines, circles, unused = list[Polygon](), list[Ring](), list[Circle](), Counter[str]()
     try:
-        for kind, coordinates in _geometries(document):
+        for kind, coordinates, said in _geometries(document, {}):
             if kind in ("Polygon", "MultiPolygon"):
                 for part in [coordinates] if kind == "Polygon" else coordinates:
                     shell, *holes = [ring(_lat_lon(r), name) for r in part]
                     polygons.append(Polygon(shell, tuple(holes)))
             elif kind in ("LineString", "MultiLineString"):
                 for part in [coordinates] if kind == "LineString" else coordinates:
-                    lines.append(ring(_lat_lon(part), name, 2))
+                    line = ring(_lat_lon(part), name, 2)
+                    if "width_m" in said:
+                        polygons += _strip(line, said["width_m"], name)
+                    else:
+                        lines.append(line)
+            elif kind == "Point" and "radius_m" in said and coordinates != []:
+                circles.append(_circle(*_lat_lon([coordinates])[0], said["radius_m"], name))
+            elif coordinates != []:
+                unused[_NOUNS.get(kind, f"shape of kind '{kind}'")] += 1
     except (TypeError, ValueError, KeyError, IndexError, AttributeError, RecursionError, OverflowError):
         raise InputError(f"{name} is GeoJSON with a broken geometry; export it again") from None
+    found = Shapes(tuple(polygons), tuple(lines), tuple(circles), unused=counted(unused))
     if not any_size:
-        refuse_many_corners([*polygons, *lines], name)
-    return Shapes(tuple(polygons), tuple(lines))
+        refuse_many_corners([*found.areas, *lines], name)
+    return found
 
 
-def _geometries(node: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    kind = node["type"]
-    if kind == "FeatureCollection":
-        for feature in node["features"]:
-            yield from _geometries(feature)
+_NOUNS = {"Point": "point", "MultiPoint": "group of points", "": "feature without a shape"}
+
+
+def counted(nouns: Mapping[str, int]) -> tuple[str, ...]:
+    """Things and how many of them, in words."""
+    return tuple(f"{count} of: {noun}" if count > 1 else f"a {noun}" for noun, count in nouns.items())
+
+
+def _circle(lat: float, lon: float, radius: Any, name: str) -> Circle:
+    """A circle, checked."""
+    radius_m = float(radius)
+    if not 0.0 < radius_m <= _MOST_RADIUS_M:
+        raise InputError(f"{name} has a circle with a radius of {radius_m:g} m; correct it")
+    ring([(lat, lon)], name, 1)
+    return Circle(lat, lon, radius_m)
+
+
+def _strip(line: Ring, width: Any, name: str) -> Iterator[Polygon]:
+    """The ground within half a width of a line."""
+    width_m = float(width)
+    if not 0.0 < width_m <= _MOST_RADIUS_M:
+        raise InputError(f"{name} has a line with a width of {width_m:g} m; correct it")
+    grid = LocalGrid(area_epsg(line[:, 0], line[:, 1]))
+    for part in shapely.get_parts(shapely.LineString(grid.to_grid(*line.T)).buffer(0.5 * width_m)):
+        rings = [grid.to_geographic(np.array(r.coords)[:-1]) for r in (part.exterior, *part.interiors)]
+        yield Polygon(rings[0], tuple(rings[1:]))
+
+
+def _geometries(node: Mapping[str, Any], said: Mapping[str, Any]) -> Iterator[tuple[str, Any, Mapping[str, Any]]]:
+    """Kind, coordinates, and the radius or width that is said, of each geometry; kind "" where there is none."""
+    kind = node.get("type")
+    zones = node.get("features", node.get("UASZoneList"))
+    if isinstance(zones, list):
+        for feature in zones:
+            yield from _geometries(feature, {})
+    elif isinstance(node.get("geometry"), list):  # a zone of ED-269: volumes
+        for volume in node["geometry"]:
+            flat, unit = volume["horizontalProjection"], _FOOT_M if volume.get("uomDimensions") == "FT" else 1.0
+            if flat["type"] == "Circle":
+                yield "Point", flat["center"], {"radius_m": unit * float(flat["radius"])}
+            else:
+                yield str(flat["type"]), flat["coordinates"], {}
     elif kind == "Feature":
-        if node["geometry"] is not None:
-            yield from _geometries(node["geometry"])
+        values = node.get("properties") or {}
+        radius = values.get("radius_m", values.get("radius"))
+        said = ({} if radius is None else {"radius_m": radius}) | {k: values[k] for k in ("width_m",) if k in values}
+        yield from _geometries(node["geometry"], said) if node["geometry"] is not None else [("", None, said)]
     elif kind == "GeometryCollection":
         for geometry in node["geometries"]:
-            yield from _geometries(geometry)
+            yield from _geometries(geometry, said)
     else:
-        yield str(kind), node["coordinates"]
+        extent = node.get("extent") or {}  # ED-318
+        if extent.get("subType") == "Circle":
+            said = {"radius_m": extent["radius"]}
+        yield str(node["type"]), node["coordinates"], said
 
 
 def _lat_lon(positions: Sequence[Sequence[float]]) -> list[tuple[float, float]]:
@@ -150,25 +256,49 @@ def parse_kml(text: str | bytes, name: str = "the KML file") -> Shapes:
         InputError: no XML, no KML, or coordinates that are not longitude and latitude.
     """
     try:
-        root = ElementTree.fromstring(text)
+        root = ElementTree.fromstring(_with_name_spaces(text))
     except (ElementTree.ParseError, ValueError) as error:
         raise InputError(f"{name} is not valid XML ({error}); export it again") from None
     if _tag(root) not in ("kml", "Document", "Folder", "Placemark"):
         raise InputError(f"{name} is XML but no KML (its root is '{_tag(root)}'); export a polygon as KML")
-    polygons: list[Polygon] = []
-    lines: list[Ring] = []
-    for node in root.iter():
+    polygons, hidden, lines, unused = list[Polygon](), list[Polygon](), list[Ring](), Counter[str]()
+    waiting = [(root, True)]
+    while waiting:  # in the file's order, without recursion: depths are a stranger's
+        node, shown = waiting.pop()
+        shown = shown and not any(_tag(n) == "visibility" and (n.text or "").strip() == "0" for n in node)
         if _tag(node) == "Polygon":
             outer = _coordinates(node, "outerBoundaryIs")
             if not outer:
                 raise InputError(f"{name} has a polygon without an outer boundary; export it again")
             shell = ring(_numbers(outer[0], name), name)
             holes = tuple(ring(_numbers(h, name), name) for h in _coordinates(node, "innerBoundaryIs"))
-            polygons.append(Polygon(shell, holes))
-        elif _tag(node) == "LineString":
-            lines += [ring(_numbers(c, name), name, 2) for c in _coordinates(node)]
-    refuse_many_corners([*polygons, *lines], name)
-    return Shapes(tuple(polygons), tuple(lines))
+            (polygons if shown else hidden).append(Polygon(shell, holes))
+        elif _tag(node) in ("LineString", "LinearRing"):
+            if shown:
+                lines += [ring(_numbers(c, name), name, 2) for c in _coordinates(node)]
+            else:
+                unused["line that is switched off in the file"] += 1
+        elif _tag(node) in _KML_NOUNS:
+            unused[_KML_NOUNS[_tag(node)]] += 1
+        waiting += [(n, shown) for n in reversed(node) if _tag(node) != "Polygon" or _tag(n) == "Polygon"]
+    refuse_many_corners([*polygons, *hidden, *lines], name)
+    return Shapes(tuple(polygons), tuple(lines), hidden=tuple(hidden), unused=counted(unused))
+
+
+_KML_NOUNS = {
+    "Point": "point", "Track": "recorded track", "MultiTrack": "recorded track", "Model": "model",
+    "GroundOverlay": "picture overlay", "NetworkLink": "link to another file",
+}  # fmt: skip
+
+
+def _with_name_spaces(text: str | bytes) -> str | bytes:
+    """XML with prefixes that nobody declared declared, as Google Earth reads it."""
+    if isinstance(text, bytes):
+        return text
+    used = set(re.findall(r"[<\s]/?([A-Za-z_][\w.-]*):[A-Za-z_]", re.sub(r">[^<]*<", "><", text))) - {"xml", "xmlns"}
+    missing = sorted(prefix for prefix in used if f"xmlns:{prefix}" not in text)
+    declared = "".join(f' xmlns:{prefix}="urn:undeclared:{prefix}"' for prefix in missing)
+    return re.sub(r"<[A-Za-z_][\w.:-]*", lambda tag: tag[0] + declared, text, count=1) if missing else text
 
 
 def _tag(node: ElementTree.Element) -> str:

@@ -14,6 +14,7 @@ from gcs_plugin.fleet.fleet import Fleet
 from gcs_plugin.fleet.flight_state import Word, danger_of, flight_state
 from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.mission.command_dialogues import Command
+from gcs_plugin.mission.completion import Phase
 from gcs_plugin.mission.exchange import Address, Verdict
 from gcs_plugin.mission.flight_modes import mode_params
 from gcs_plugin.mission.flown_items import off_leg_m
@@ -97,6 +98,8 @@ class Apart(Beside):
         self.fleet.send(self.site.system, [dialect.MAVLink_mission_set_current_message(to.system, to.component, seq)])
 
     def store(self, mission):
+        vehicle = self.fleet.vehicles[self.site.system]
+        self.site.place.until(lambda: vehicle.detector.phase is not Phase.ACTIVE, 10.0)  # it hears of a pause later
         job = self.fleet.upload(self.site.system, mission)
         assert self.site.place.until(lambda: job.outcome is not None, 60.0) and job.outcome.ok, job.outcome
 

@@ -60,9 +60,9 @@ def run(args: argparse.Namespace) -> int:
             raise InputError(f"{name} is {value:g}; give metres larger than 0")
     flown = read_map(args.map)
     shapes, fences = read_shapes(args.area)
-    if not shapes.polygons:
+    if not shapes.areas:
         raise InputError(f"{args.area} holds no polygon; draw the area that was to be mapped")
-    area = make_area(shapes.polygons, fences, LocalGrid(flown.epsg))
+    area = make_area(shapes.areas, fences, LocalGrid(flown.epsg))
     if args.pictures:
         flown = _judged(flown)
     cover = _cover(args, flown, area)

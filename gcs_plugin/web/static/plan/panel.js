@@ -68,13 +68,14 @@ export function planPanel() {
   const form = make("form", { novalidate: true, onsubmit: submit, oninput: redraw, onchange: redraw }, ...planFields(save), go);
   async function read(dropped) {
     try {
-      const rings = await readArea(dropped);
+      const { rings, unused } = await readArea(dropped);
       const given = new Set(rings.map((points) => JSON.stringify(points)));
       const kept = area.area.rings.slice(1).filter((points) => points.length > 2 && !given.has(JSON.stringify(points)));
       editor.stopDrawing();
       area.change((old) => old.splice(0, old.length, ...rings, ...kept)); // a zone goes only if somebody deletes it
       fit(boundsOf(rings[0]));
       if (kept.length) notice("warn", t("import.kept", { n: kept.length }));
+      if (unused.length) notice("warn", t("import.unused", { name: dropped.name, what: unused.join(", ") }));
       notice("done", t("import.done", { name: dropped.name, size: units.area(area.size_m2()) }));
     } catch (error) {
       notice("bad", error.message);
