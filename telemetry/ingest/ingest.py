@@ -6,7 +6,7 @@ photos' angles, and an absolute altitude never becomes a height.
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
 from dataclasses import replace
 from itertools import islice
@@ -31,8 +31,8 @@ from telemetry.ingest.survey import LoadOptions, SourceInfo, Survey
 from telemetry.ingest.video_ingest import read_videos
 from telemetry.photos.flight_checks import flight_findings, times_without_zone
 from telemetry.photos.maker_angles import Angles
-from telemetry.photos.photo_frames import frame_without_position, frames_of
-from telemetry.photos.photo_tags import Photo, read_photos
+from telemetry.photos.photo_frames import frame_without_position, frames_of, settle_positions
+from telemetry.photos.photo_tags import SENSORS, Photo, read_photos
 from telemetry.samples.findings import Finding, metres, plural
 from telemetry.samples.unreadable import Unreadable, read_or_reason
 from telemetry.samples.wild_fixes import doubtful_finding, wild_fixes
@@ -95,7 +95,7 @@ def survey(inputs: Sequence[Path], *, progress: Progress | None = None, options:
         for folder in found.folders:
             if folder.pictures:
                 own = islice(tags, len(folder.pictures))
-                _photo_folder(folder, own, found, tables=tables, logs=logs, result=result, workers=options.workers)
+                _photo_folder(folder, own, found, tables=tables, logs=logs, result=result, options=options)
             if folder.videos or folder.subtitles:
                 read_videos(folder, found, logs, options=options, progress=progress, result=result)
     result.findings += _logs_apart(found, logs)
@@ -216,7 +216,7 @@ def _photo_folder(
     tables: Sequence[tuple[Path, str, PoseTable]],
     logs: Sequence[LogSource],
     result: Survey,
-    workers: int,
+    options: LoadOptions,
 ) -> None:
     """Make one source from a folder's photos with these tags."""
     named = folder.path.name if folder.path == found.root else found.name(folder.path)
@@ -242,10 +242,11 @@ def _photo_folder(
     for vehicle in sorted(groups, key=natural_key):
         photos = sorted(groups[vehicle], key=lambda p: natural_key(p.path.name))
         photos.sort(key=lambda p: math.inf if p.time_s is None else p.time_s)
-        add_logs(photos, folder.path, vehicle, logs=logs, findings=source.findings, workers=workers)
-        photos = _one_band(photos, vehicle, found, result)
+        add_logs(photos, folder.path, vehicle, logs=logs, findings=source.findings, workers=options.workers)
+        photos = _one_kind(photos, vehicle, options.camera, found, result)
         photos = _with_position(photos, vehicle, found, result)
         photos = in_order(photos, vehicle, source.findings)
+        source.findings += settle_positions(photos, vehicle, found.name)
         photos = _where_it_can_be(photos, vehicle, found, source, result)
         frames = frames_of(photos, vehicle, found.name, source.findings)
         source.frames += frames
@@ -255,18 +256,49 @@ def _photo_folder(
         result.sources.append(source)
 
 
-def _one_band(photos: Sequence[Photo], vehicle: str, found: Discovery, result: Survey) -> list[Photo]:
-    """Keep a multispectral camera's colour pictures, else those of one band; the others are rejected."""
-    bands = {photo.band for photo in photos}
+def _one_kind(photos: Sequence[Photo], vehicle: str, camera: str, found: Discovery, result: Survey) -> list[Photo]:
+    """Keep the pictures of one kind of a camera that takes several: one sensor, and colour or one spectral band.
+
+    A zoom's pictures stay beside those of the wide camera unless both were taken at one press.
+
+    Args:
+        camera: the sensor that is wanted, one of SENSORS; "" for the widest that sees colours.
+    """
+    sensors = {photo.sensor for photo in photos if photo.sensor}
+    bands = {photo.band.lower() for photo in photos}
+    if len(sensors) > 1 or (camera and sensors and camera not in sensors):
+        wanted = camera or next(sensor for sensor in SENSORS if sensor in sensors)
+        pressed = Counter(photo.path.stem.rpartition("_")[0] for photo in photos)
+        gone = "thermal" if not camera and max(pressed.values()) < 2 else ""
+        keep = [p for p in photos if p.sensor in ("", wanted) or (gone and p.sensor != gone)]
+        said = f"of each exposure the {wanted} pictures are mapped (--camera)"
+        _leave_out_others(photos, keep, lambda p: f"a picture of the {p.sensor} camera; {said}", vehicle, found, result)
+        photos = keep
+        bands = {photo.band.lower() for photo in photos}
     if len(bands) < 2:
         return list(photos)
-    mapped_band = next((band for band in _BANDS if band in {b.lower() for b in bands}), min(bands).lower())
+    mapped = next((band for band in _BANDS if band in bands), min(bands))
+    what = f"band {mapped}" if mapped else "the colour pictures"
+    keep = [photo for photo in photos if photo.band.lower() == mapped]
+    said = f"of each exposure {what} is mapped"
+    _leave_out_others(
+        photos, keep, lambda p: f"a picture of one spectral band ({p.band or 'colour'}); {said}", vehicle, found, result
+    )
+    return keep
+
+
+def _leave_out_others(
+    photos: Sequence[Photo],
+    keep: Sequence[Photo],
+    why: Callable[[Photo], str],
+    vehicle: str,
+    found: Discovery,
+    result: Survey,
+) -> None:
+    kept = {id(photo) for photo in keep}
     for photo in photos:
-        if photo.band.lower() != mapped_band:
-            what = "the colour pictures" if not mapped_band else f"band {mapped_band}"
-            reason = f"a picture of one spectral band ({photo.band or 'colour'}); of each exposure {what} is mapped"
-            result.rejected.append(Rejection(found.name(photo.path), reason, vehicle, photo.time_s))
-    return [photo for photo in photos if photo.band.lower() == mapped_band]
+        if id(photo) not in kept:
+            result.rejected.append(Rejection(found.name(photo.path), why(photo), vehicle, photo.time_s))
 
 
 def _with_position(photos: Sequence[Photo], vehicle: str, found: Discovery, result: Survey) -> list[Photo]:

@@ -26,6 +26,7 @@ class LoadOptions:
         workers: threads that read.
         run: maps a function over items in processes, for many photos; None: read in threads.
         sei_layouts: files that describe private SEI messages; see `telemetry.formats.video.sei_layout`.
+        camera: which sensor of cameras with several is mapped: wide, zoom or thermal; "" for the widest in colour.
         decode: False to read only the metadata of videos, without extracting pictures (for `inspect`).
     """
 
@@ -34,6 +35,7 @@ class LoadOptions:
     cache: Path | None = None
     exclude: tuple[Path, ...] = ()
     workers: int = field(default_factory=lambda: min(8, (os.cpu_count() or 1) * 2))
+    camera: str = ""
     decode: bool = True
     run: Callable[..., Iterator[Any]] | None = None
     sei_layouts: tuple[Path, ...] = ()

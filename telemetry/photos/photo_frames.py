@@ -8,12 +8,13 @@ from typing import Final
 
 import numpy as np
 
+from orthoswarm.model.earth import distance_m
 from orthoswarm.model.frame import Frame
 from telemetry.photos.attitude import check_legs, decide
 from telemetry.photos.maker_angles import Angles
-from telemetry.photos.photo_tags import HEMISPHERE_UNKNOWN, Photo
+from telemetry.photos.photo_tags import HEMISPHERE_UNKNOWN, Photo, mirrored
 from telemetry.samples.course import courses_deg, ground_track, straight_legs
-from telemetry.samples.findings import Finding, plural
+from telemetry.samples.findings import Finding, metres, plural
 from telemetry.samples.sample import Sample
 from telemetry.samples.sample_frame import fix_of
 
@@ -53,6 +54,42 @@ def frames_of(
         image = name(photo.path)
         frames.append(_frame(photo, vehicle, image, height_m=heights[i], angles=angles, yaw_origin=yaw_origin))
     return frames
+
+
+def settle_positions(photos: Sequence[Photo], vehicle: str, name: Callable[[Path], str]) -> list[Finding]:
+    """Of photos whose tags state two places, take the one that fits the others; a finding says so.
+
+    Where all of a vehicle's photos contradict themselves, nothing tells, and what was read first stays.
+    """
+    by_tags = [p for p in photos if p.origin.get("position", "").startswith(("EXIF", "XMP"))]
+    two = [(photo, photo.other_position) for photo in by_tags if photo.other_position is not None]
+    if not two:
+        return []
+    sure = [p for p in photos if p.lat_deg is not None and (p.other_position is None or p not in by_tags)]
+    apart_m = max(distance_m(p.lat_deg or 0.0, p.lon_deg or 0.0, *other) for p, other in two)
+    changed = 0
+    for photo, other in two if sure else []:
+        place, usual = (photo.lat_deg or 0.0, photo.lon_deg or 0.0), _median_place(sure)
+        if distance_m(*other, *usual) < distance_m(*place, *usual):
+            (photo.lat_deg, photo.lon_deg), changed = other, changed + 1
+            photo.origin["position"] = "the tags that fit the other photos"
+    if sure:
+        took = f"{plural(changed, 'position')} of these are taken from the tags that fit the other photos"
+    elif all(mirrored((p.lat_deg or 0.0, p.lon_deg or 0.0), other) for p, other in two):
+        took = "their hemispheres are taken from XMP"
+    else:
+        took = "nothing tells which is right: give a geo.txt"
+    text = (
+        f"the tags of {plural(len(two), 'photo')} state two places, up to {metres(apart_m)} apart "
+        f"({name(two[0][0].path)} first); {took}"
+    )
+    return [Finding("position-contradicts", text, vehicle)]
+
+
+def _median_place(photos: Sequence[Photo]) -> tuple[float, float]:
+    places = np.array([(p.lat_deg, p.lon_deg) for p in photos], dtype=np.float64)
+    lat, lon = np.median(places, axis=0)
+    return float(lat), float(lon)
 
 
 def frame_without_position(photo: Photo, vehicle: str, image: str) -> Frame:

@@ -5,6 +5,7 @@ yaws is the picture's, and `telemetry.ingest` merges photos with other sources.
 """
 
 import math
+import re
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -12,6 +13,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from orthoswarm.config import active
+from orthoswarm.model.earth import distance_m
 from orthoswarm.stores.addresses import is_stored
 from orthoswarm.stores.listing import StoredFile, known
 from orthoswarm.stores.local_copies import expect
@@ -30,8 +32,13 @@ HEMISPHERE_UNKNOWN = "without hemisphere, taken as north and east"
 """End of the origin of a position whose signs are not known."""
 
 _FULL_FRAME_DIAGONAL_MM = 43.2666
+_SAME_LENS: Final = 0.1  # focal lengths by two tags differ by less (logarithm): rounding, crops of video modes
 _CHUNK = 64
 
+SENSORS: Final = {"wide": ("wide", "visible"), "zoom": ("zoom",), "thermal": ("infrared", "thermal")}
+"""Sensors of cameras with several, the ones that are mapped first first, and what XMP calls them."""
+_SENSOR_LETTER: Final = re.compile(r"_\d{14}_\d{4}_(?:D_)?([WVZT])$")  # DJI_20260504100000_0001_V
+CONTRADICTS_M: Final = 30.0  # positions of one photo's tags that are farther apart are of two places
 _MOST_HEIGHT_M: Final = 12_000.0  # recorded heights above this are not heights above ground
 
 
@@ -42,6 +49,7 @@ class Photo:
     Attributes:
         path: the file. width: columns as stored; height: rows.
         lat_deg: latitude, None without a position; lon_deg: longitude.
+        other_position: another latitude and longitude that the photo's tags state, far from that.
         altitude_m: absolute altitude. height_m: height above takeoff.
         height_is_ground: whether height_m is above the ground instead.
         time_s: UTC epoch seconds.
@@ -50,6 +58,7 @@ class Photo:
         position_sigma_m: horizontal, one sigma, where stated.
         make: manufacturer; model: of the camera. camera: key of the lens (model, size, zoom, sensor).
         band: name of the spectral band, "" for a colour picture.
+        sensor: which of a camera's several took it, a key of SENSORS; "" if it has one.
         fov_hint_rad: horizontal field of view from focal length tags.
         dewarp_k1: radial distortion that the tags state for a picture which still has it.
         yaw_is_stated: True if the source defines its yaw as the picture's, so that there is no choice.
@@ -64,6 +73,7 @@ class Photo:
     height: int
     lat_deg: float | None = None
     lon_deg: float | None = None
+    other_position: tuple[float, float] | None = None
     altitude_m: float | None = None
     height_m: float | None = None
     height_is_ground: bool = False
@@ -75,6 +85,7 @@ class Photo:
     model: str = ""
     camera: str = ""
     band: str = ""
+    sensor: str = ""
     fov_hint_rad: float | None = None
     dewarp_k1: float | None = None
     yaw_is_stated: bool = False
@@ -93,6 +104,8 @@ def read_photo(path: Path) -> Photo | None:
     container = read_container(path)
     if container.georeferenced:
         return None
+    if b"GPano:ProjectionType" in (container.xmp or b""):
+        raise NotAPicture("a panorama, which no single camera sees; use the photos that it was made of")
     if container.raw:
         raise NotAPicture("a raw picture (DNG) cannot be mapped; use the JPEG of the same exposure or develop it first")
     return tags_of(path, container)
@@ -157,20 +170,22 @@ def tags_of(path: Path, container: Container) -> Photo:
 
 
 def _position(photo: Photo, tags: exif.Exif, found: xmp.Properties) -> None:
-    position = exif.gps_position(tags.gps)
-    source = "EXIF GPS"
+    position, other, source = exif.gps_position(tags.gps), _xmp_position(found), "EXIF GPS"
     if position is None:
-        position, source = _xmp_position(found), "XMP position"
+        position, other, source = other, None, "XMP position"
     elif not all(signs := exif.gps_signs(tags.gps)):
-        other = _xmp_position(found)
         if other is None:
             source = f"EXIF GPS {HEMISPHERE_UNKNOWN}"
         else:
             lat, lon = (a if known else math.copysign(a, b) for a, b, known in zip(position, other, signs, strict=True))
             position, source = (lat, lon), "EXIF GPS, hemisphere from XMP"
+    elif other is not None and mirrored(position, other):  # a hemisphere is one wrong letter
+        position, other, source = other, position, "XMP position"
     if position is not None:
         photo.lat_deg, photo.lon_deg = position
         photo.origin["position"] = source
+        if other is not None and distance_m(*position, *other) > CONTRADICTS_M:
+            photo.other_position = other
     flag = xmp.number(found, "drone-dji:RtkFlag")
     if flag in (34.0, 50.0):  # 50 fixed, 34 float; 16 is a single fix, whose deviations mean little
         parts = [xmp.number(found, f"drone-dji:RtkStd{axis}") for axis in ("Lat", "Lon")]
@@ -183,6 +198,12 @@ def _position(photo: Photo, tags: exif.Exif, found: xmp.Properties) -> None:
         if stated is not None and 0.0 < stated < 1000.0:
             photo.position_sigma_m = stated
             photo.origin["position_sigma"] = "stated accuracy"
+
+
+def mirrored(one: tuple[float, float], other: tuple[float, float]) -> bool:
+    """Whether two positions differ by hemispheres, which no other error does: mirrored they are much nearer."""
+    apart_m = distance_m(*one, *other)
+    return apart_m > CONTRADICTS_M and distance_m(*map(abs, one), *map(abs, other)) < 0.01 * apart_m
 
 
 def _xmp_position(found: xmp.Properties) -> tuple[float, float] | None:
@@ -260,15 +281,41 @@ def _lens(photo: Photo, tags: exif.Exif, found: xmp.Properties) -> None:
     if photo.band.strip("{}").upper() in ("RGB", "R,G,B"):
         photo.band = ""
     sensor = found.get("drone-dji:ImageSource", "")
+    photo.sensor = _sensor(sensor, photo.path.stem)
     length, zoomed = f"{focal:.1f}mm" if focal else "", f"zoom{zoom:.1f}" if zoom > 1.0 else ""
-    key = (photo.model or "camera", f"{photo.width}x{photo.height}", length, zoomed, sensor, photo.band)
+    key = (photo.model or "camera", f"{photo.width}x{photo.height}", length, zoomed, sensor or photo.sensor, photo.band)
     photo.camera = " ".join(filter(None, key))
     photo.dewarp_k1 = _dewarp_k1(found)
-    for hint, source in _fov_hints(photo, found, tags, focal=focal, focal_35=focal_35, zoom=max(zoom, 1.0)):
-        if hint is not None and math.radians(2.0) < hint < math.radians(150.0):
-            photo.fov_hint_rad = hint
-            photo.origin["fov_hint"] = source
-            return
+    hints = list(_fov_hints(photo, found, tags, focal=focal, focal_35=focal_35, zoom=max(zoom, 1.0)))
+    hints = [(fov, source) for fov, source in hints if math.radians(2.0) < fov < math.radians(150.0)]
+    if hints:
+        photo.fov_hint_rad, photo.origin["fov_hint"] = _confirmed(hints)
+
+
+def _sensor(source: str, stem: str) -> str:
+    """Which sensor took a picture, a key of SENSORS or "", by XMP's ImageSource, else by the end of DJI's file name."""
+    said = source.lower()
+    for sensor, words in SENSORS.items():
+        if any(word in said for word in words):
+            return sensor
+    match = _SENSOR_LETTER.search(stem)
+    return {"W": "wide", "V": "wide", "Z": "zoom", "T": "thermal"}[match[1]] if match else ""
+
+
+def _confirmed(hints: Sequence[tuple[float, str]]) -> tuple[float, str]:
+    """The first hint that another one confirms: each of the tags is wrong in some pictures.
+
+    Where none is, a calibrated one, or that of full frame: an editor that makes a picture smaller leaves the others as
+    they were.
+    """
+    for k, (fov, source) in enumerate(hints):
+        if any(_agree(fov, other) for other, _ in [*hints[:k], *hints[k + 1 :]]):
+            return fov, source
+    return hints[0] if hints[0][1].startswith("XMP") else hints[-1]
+
+
+def _agree(fov_rad: float, other_rad: float) -> bool:
+    return abs(math.log(math.tan(0.5 * fov_rad) / math.tan(0.5 * other_rad))) < _SAME_LENS
 
 
 def _dewarp_k1(found: xmp.Properties) -> float | None:
@@ -290,16 +337,16 @@ def _fov_hints(
     focal: float | None,
     focal_35: float | None,
     zoom: float,
-) -> Iterator[tuple[float | None, str]]:
+) -> Iterator[tuple[float, str]]:
     """Horizontal field of view by several tags, the most trustworthy first."""
     for length, centre in (
         ("drone-dji:CalibratedFocalLength", "drone-dji:CalibratedOpticalCenterX"),
         ("drone-skydio:CalibratedFocalLength/X", "drone-skydio:CalibratedOpticalCenter/X"),
     ):
-        # Stated for the full picture, whose half width is the principal point: valid for a scaled copy, too.
+        # Of the full picture without digital zoom; its half width is the principal point: valid for a scaled copy, too.
         calibrated, middle = xmp.number(found, length), xmp.number(found, centre)
         if calibrated and middle and calibrated > 0 and middle > 0:
-            yield 2.0 * math.atan(middle / calibrated), "XMP CalibratedFocalLength"
+            yield 2.0 * math.atan(middle / (calibrated * zoom)), "XMP CalibratedFocalLength"
     perspective = xmp.number(found, "Camera:PerspectiveFocalLength") or focal
     per_unit = exif.number(tags.exif.get(exif.FOCAL_PLANE_X))
     unit = exif.number(tags.exif.get(exif.FOCAL_PLANE_UNIT))

@@ -146,13 +146,12 @@ def gps_signs(gps: Tags) -> tuple[bool, bool]:
 
 
 def _sexagesimal(value: Value | None) -> float | None:
+    """Degrees, minutes and seconds as degrees, negative if any is: some programs sign all three, others the first."""
     if not isinstance(value, tuple) or not value or not math.isfinite(value[0]):
         return None
-    total = value[0]
-    for part, scale in zip(value[1:3], (60.0, 3600.0)):
-        if math.isfinite(part):
-            total += part / scale if total >= 0 else -part / scale
-    return total
+    parts = [part for part in value[:3] if math.isfinite(part)]
+    total = sum(abs(part) / scale for part, scale in zip(parts, (1.0, 60.0, 3600.0), strict=False))
+    return -total if any(part < 0.0 for part in parts) else total
 
 
 def gps_altitude(gps: Tags) -> float | None:

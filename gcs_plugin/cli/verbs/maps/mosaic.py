@@ -64,6 +64,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--every-m", type=float, metavar="M", help="of a video one picture every M metres (default: 4 %% of the height)"
     )
     add("--every-s", type=float, metavar="S", help="of a video one picture every S seconds")
+    add(
+        "--camera", choices=("wide", "zoom", "thermal"), default="",
+        help="which sensor's photos are mapped, of cameras with several (default: the widest in colour)",
+    )  # fmt: skip
     add("--split", choices=("legs",), help="treat each straight leg of a flight as a vehicle of its own")
     add("--no-gains", action="store_true", help="leave brightness as it is in each picture")
     add(
@@ -133,6 +137,7 @@ def run(args: argparse.Namespace) -> int:
             every_s=args.every_s,
             cache=out / ".work" / VIDEO,
             exclude=(args.out,),
+            camera=args.camera,
             sei_layouts=tuple(args.sei_layout),
             run=None if pool is None or (args.cluster and drawers is None) else pool.map,
         )
