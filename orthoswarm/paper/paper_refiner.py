@@ -12,6 +12,7 @@ from typing import Final
 
 import numpy as np
 
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import Leg, LegState, MapWindow, PlacedFrame, Refinement, Solution, Stage
@@ -19,7 +20,6 @@ from orthoswarm.model.task_runner import Progress, Run, serial
 from orthoswarm.paper.coarse_cameras import RECEIVER_SIGMA_M, CoarseOptions, CoarseVehicle, coarse_vehicle
 from orthoswarm.paper.leg_cameras import carried_shift, fit_camera, pixel_grid
 from orthoswarm.paper.leg_patches import PatchFit, PatchOptions, PatchTask, match_patch
-from orthoswarm.refine.bundle.flight_records import Array
 from orthoswarm.refine.flight.solve_units import merge_units
 from orthoswarm.refine.flight.vehicle_refinement import UnitRefiner, unit_states, units_of_area
 

@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.config import active
+from orthoswarm.model.arrays import Array, Flags, Indices, Ints
 from orthoswarm.refine.bundle import normal_equations
 from orthoswarm.refine.bundle.banded_solver import BandedSystem, camera_order, factorise, solve_factored
-from orthoswarm.refine.bundle.block_arrays import CX, CY, K1, K2, K3, CameraBlock, F, Ints, Tracks
+from orthoswarm.refine.bundle.block_arrays import CX, CY, K1, K2, K3, CameraBlock, F, Tracks
 from orthoswarm.refine.bundle.prior_equations import add_priors, position_residuals
 from orthoswarm.refine.bundle.priors import Layout, Priors
 from orthoswarm.refine.bundle.rotation_vectors import exp_rotation
 
-Array = NDArray[np.float64]
 _LENS_COLUMNS = [F, K1, K2, K3, CX, CY]
 
 TRACK_ROBUST_C: Final = 9.0  # robust scale of image observations near the minimum, squared sigmas: 3 sigmas
@@ -85,10 +85,10 @@ class Adjustment:
     tracks: Tracks
     priors: Priors
     points: Array
-    free: NDArray[np.bool_]
+    free: Flags
     layout: Layout
     common: Array
-    start: NDArray[np.int64]
+    start: Indices
     slot: Ints
     bandwidth: int
     obs_weight: Array
@@ -99,7 +99,7 @@ class Adjustment:
 
     @classmethod
     def begin(
-        cls, cameras: CameraBlock, tracks: Tracks, priors: Priors, points: Array, free: NDArray[np.bool_] | None = None
+        cls, cameras: CameraBlock, tracks: Tracks, priors: Priors, points: Array, free: Flags | None = None
     ) -> "Adjustment":
         """Set up the state: observations sorted by point, cameras ordered for a narrow band."""
         order = np.lexsort((tracks.camera, tracks.point))

@@ -4,15 +4,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
-from numpy.typing import NDArray
 from scipy.linalg import lapack, solve_triangular
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
+from orthoswarm.model.arrays import Array, Flags, Indices, Ints
 from orthoswarm.model.errors import AdjustmentError
-from orthoswarm.refine.bundle.block_arrays import Ints, Tracks
+from orthoswarm.refine.bundle.block_arrays import Tracks
 
-Array = NDArray[np.float64]
 _BLOCK_COLUMNS, _NARROW_ROWS = 64, 600
 """Sizes for the processor's cache; they change the speed, not the result."""
 
@@ -112,7 +111,7 @@ def _blocks_of(factor: Array, a: int, b: int, end: int) -> tuple[Array, Array]:
     return columns[: b - a], columns[b - a :]
 
 
-def camera_order(tracks: Tracks, position: Array, points: int, free: NDArray[np.bool_]) -> tuple[Ints, int]:
+def camera_order(tracks: Tracks, position: Array, points: int, free: Flags) -> tuple[Ints, int]:
     """Slot of each free camera in the band (-1 if held), int32 (N,), and the band's width in cameras.
 
     Cameras that observe a common point must lie within the band. Takes the best of the input order, that of Cuthill and
@@ -138,7 +137,7 @@ def camera_order(tracks: Tracks, position: Array, points: int, free: NDArray[np.
         reverse_cuthill_mckee(graph.tocsr(), symmetric_mode=True),
         np.argsort(_along_longer_side(position[index, :2]), kind="stable"),
     )
-    best: tuple[int, NDArray[np.int64]] = (len(index), np.arange(len(index)))
+    best: tuple[int, Indices] = (len(index), np.arange(len(index)))
     for permutation in orders:
         place = np.empty(len(index), np.int64)
         place[permutation] = np.arange(len(index))

@@ -6,10 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel
+from orthoswarm.model.arrays import Array, Floats, Ints
 from orthoswarm.model.camera import LEAST_RADIAL_SLOPE, Camera, Lens
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int32]
 
 F, K1, K2, K3, CX, CY, WIDTH, HEIGHT = range(8)
 """Columns of CameraBlock.lens: focal length in px, radial terms, offset of the principal point in px, picture size."""
@@ -109,7 +107,7 @@ class Tracks:
     camera: Ints
     point: Ints
     uv: Array
-    sigma_px: NDArray[np.float32]
+    sigma_px: Floats
 
     @property
     def count(self) -> int:

@@ -8,13 +8,12 @@ from numpy.typing import NDArray
 
 from orthoswarm.config import active
 from orthoswarm.export.product_files import OBLIQUE_AXIS_DOWN
+from orthoswarm.model.arrays import Array, Floats, Ints
 from orthoswarm.model.camera import fov_rad, ground_jacobian
 from orthoswarm.model.robust import MEDIAN_SIGMA, mad_sigma
 from orthoswarm.refine.bundle.adjustment import Adjustment, HeightPrior, MapTies
 from orthoswarm.refine.bundle.block_arrays import WIDTH, F
 from orthoswarm.refine.bundle.priors import Priors
-
-Array = NDArray[np.float64]
 
 _LENS_CX = 4
 """Column of the principal point's cx among a lens's unknowns, cy is the next (see priors.Priors)."""
@@ -43,7 +42,7 @@ class StatedErrors:
 
     sigma_m: Array
     fov_sigma_deg: float
-    pose: NDArray[np.float32]
+    pose: Floats
 
 
 def stated_errors(
@@ -122,7 +121,7 @@ def _between(chosen: NDArray[np.integer], covariance: Array, n: int) -> Array:
     return np.asarray((1.0 - share) * covariance[after - 1] + share * covariance[after])
 
 
-def with_distance_errors(pose: NDArray[np.float32], rotation: Array, distance_sigma_m: Array) -> NDArray[np.float32]:
+def with_distance_errors(pose: Floats, rotation: Array, distance_sigma_m: Array) -> Floats:
     """Covariances of cameras whose distance from the ground is wrong by what their focal length makes up for.
 
     Over level ground pictures show the ratio of both only. A camera with a wrong focal length then lies on its optical
@@ -159,7 +158,7 @@ def common_map_sigma(residual: Array, sigma_m: Array, gsd_m: float) -> float:
     return float(np.hypot(floor, config.tie_scatter_share * scatter))
 
 
-def systematic_tie_offset(leg: NDArray[np.int32], camera: NDArray[np.integer], residual: Array) -> Array:
+def systematic_tie_offset(leg: Ints, camera: NDArray[np.integer], residual: Array) -> Array:
     """Offset of the map around each picture, where its ties agree on one that the adjustment did not remove.
 
     A few deviating ties are wrong matches, or changed ground; if most of the ties around a picture are

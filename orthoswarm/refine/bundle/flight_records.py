@@ -5,17 +5,14 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.config import active
 from orthoswarm.model.angles import wrap_rad
+from orthoswarm.model.arrays import Array, Flags
 from orthoswarm.model.camera import rotation_from_angles
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.trajectory.courses import course
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 _COURSE_REACH_PHOTOS: Final = 3  # flown steps are medians over so many photos before and after
 _COURSE_TURN_DEG: Final = 12.0  # ... of those whose heading differs by less

@@ -12,13 +12,10 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.config import active
+from orthoswarm.model.arrays import Array, Flags
 from orthoswarm.refine.bundle.adjustment import Adjustment
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 _CONTRADICTION_SIGMAS: Final = 4.0  # a recorded height is contradicted by an offset of so many of its sigmas ...
 _CONTRADICTION_SHARE: Final = 0.15

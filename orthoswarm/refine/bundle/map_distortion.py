@@ -9,9 +9,8 @@ residuals. What it followed is its error.
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from orthoswarm.model.arrays import Array
 
 _LN2 = float(np.log(2.0))
 """Median of the squared length of a Gaussian vector of two axes, for one of its mean."""

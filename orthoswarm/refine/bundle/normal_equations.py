@@ -6,9 +6,9 @@ The camera system is stored as LAPACK's lower band (row = distance from the diag
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel, kernel
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.camera import LEAST_RADIAL_SLOPE
 from orthoswarm.refine.bundle.robust_kernel import robust_weight
 
@@ -100,7 +100,7 @@ def _subtract_own_block(band, row, left, right, both):  # type: ignore[no-untype
                 band[q - a, row + a] -= value
 
 
-def room_of_a_point() -> tuple[NDArray[np.float64], ...]:
+def room_of_a_point() -> tuple[Array, ...]:
     """Room for a residual, its three Jacobians, and a point's normal matrix, right side and product with it."""
     return tuple(np.zeros(shape) for shape in (2, (2, 6), (2, 3), (2, 6), (3, 3), 3, (6, 3)))
 

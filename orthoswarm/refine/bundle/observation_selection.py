@@ -4,12 +4,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array, Flags, Indices, Ints
 from orthoswarm.refine.bundle.block_arrays import CameraBlock, Tracks
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int32]
 
 INLIER_WEIGHT: Final = 0.5  # an observation counts as an inlier from this robust weight on
 
@@ -29,7 +26,7 @@ class BestViews:
 
 
 def best_views(
-    cameras: CameraBlock, tracks: Tracks, points: Array, obs_weight: Array, own: NDArray[np.bool_] | None = None
+    cameras: CameraBlock, tracks: Tracks, points: Array, obs_weight: Array, own: Flags | None = None
 ) -> BestViews:
     """Best view of each point; `own` bool (N,) limits the choice of camera."""
     n, inlier_weight = len(points), INLIER_WEIGHT
@@ -48,7 +45,7 @@ def best_views(
     return BestViews(np.where(ok, tracks.camera[best], -1).astype(np.int32), count.astype(np.int32), weight)
 
 
-def one_per_cell(points: Array, leg: Ints, cost: Array, cell_m: float) -> NDArray[np.int64]:
+def one_per_cell(points: Array, leg: Ints, cost: Array, cell_m: float) -> Indices:
     """The point of least cost (finite) in each ground cell of each leg: indices, sorted."""
     use = np.flatnonzero(np.isfinite(cost))
     key = np.column_stack([np.floor(points[use, :2] / cell_m).astype(np.int64), leg[use]])

@@ -5,13 +5,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array, Flags, Ints
 from orthoswarm.refine.bundle.banded_solver import BandedSystem
-from orthoswarm.refine.bundle.block_arrays import CameraBlock, Ints
+from orthoswarm.refine.bundle.block_arrays import CameraBlock
 from orthoswarm.refine.bundle.priors import Layout, Priors
 from orthoswarm.refine.bundle.robust_kernel import robust_weights
 from orthoswarm.refine.bundle.rotation_vectors import log_rotation
-
-Array = NDArray[np.float64]
 
 _HELD = 1e18
 """Weight of an unknown that is held."""
@@ -26,7 +25,7 @@ def add_priors(
     layout: Layout,
     *,
     common: Array,
-    free: NDArray[np.bool_],
+    free: Flags,
     slot: Ints,
 ) -> None:
     """Add all priors to the normal equations, in place.

@@ -4,10 +4,8 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.int32]
+from orthoswarm.model.arrays import Array, Ints
 
 POSITION_ROBUST_C: Final = 9.0  # robust scale of recorded horizontal positions, squared sigmas
 ATTITUDE_BIAS_SIGMA_DEG: Final = (1.0, 1.0, 3.0)

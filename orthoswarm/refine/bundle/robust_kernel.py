@@ -5,9 +5,9 @@ squared sigmas, sets where. Used as iteratively reweighted least squares.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel
+from orthoswarm.model.arrays import Array
 
 
 @in_place_kernel
@@ -17,6 +17,6 @@ def robust_weight(e2, c):  # type: ignore[no-untyped-def]
     return 1.0 / (q * q)
 
 
-def robust_weights(e2: NDArray[np.float64], c: float) -> NDArray[np.float64]:
+def robust_weights(e2: Array, c: float) -> Array:
     """The weights of an array of squared residuals, float64 in the shape of e2."""
     return np.asarray(1.0 / (1.0 + e2 / c) ** 2)

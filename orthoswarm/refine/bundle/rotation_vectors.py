@@ -1,9 +1,8 @@
 """Rotation matrices and rotation vectors (axis times angle), both ways."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from orthoswarm.model.arrays import Array
 
 
 def exp_rotation(vector: Array) -> Array:

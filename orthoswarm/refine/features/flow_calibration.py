@@ -10,16 +10,13 @@ from typing import Final
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.config import active
 from orthoswarm.model.angles import wrap_rad
+from orthoswarm.model.arrays import Array, Complex, Gray, Indices, Ints
 from orthoswarm.model.camera import fov_rad
 from orthoswarm.model.robust import mad_sigma
 from orthoswarm.refine.bundle.flight_records import FlightRecords
-
-Array = NDArray[np.float64]
-Gray = NDArray[np.uint8]
 
 _CALIBRATION_PAIRS: Final = 24  # about so many pairs of pictures of a flight, evenly over its legs (its cost)
 _CALIBRATION_PAIRS_PER_LEG: Final = 3  # ... at least so many of each leg
@@ -69,7 +66,7 @@ class Calibration:
 
 
 def calibrate(
-    records: FlightRecords, leg: NDArray[np.int32], gray: Callable[[int], Gray], size: tuple[int, int], fov_start: float
+    records: FlightRecords, leg: Ints, gray: Callable[[int], Gray], size: tuple[int, int], fov_start: float
 ) -> Calibration:
     """Compare the flow of picture pairs along each leg with the flow that the records predict.
 
@@ -140,9 +137,7 @@ def _with_scale(
     )
 
 
-def _heading(
-    records: FlightRecords, leg: NDArray[np.int32], ratio: NDArray[np.complex128], owner: Array
-) -> tuple[Array, list[str]]:
+def _heading(records: FlightRecords, leg: Ints, ratio: Complex, owner: Array) -> tuple[Array, list[str]]:
     """Offset to the recorded yaw of each frame: legs whose yaw is flipped, or headings taken from the course."""
     offset = np.zeros(len(leg))
     warnings: list[str] = []
@@ -174,7 +169,7 @@ def _heading(
     return offset, warnings
 
 
-def _fill_turns(offset: Array, leg: NDArray[np.int32]) -> None:
+def _fill_turns(offset: Array, leg: Ints) -> None:
     inside = np.flatnonzero(leg >= 0)
     if len(inside):
         outside = np.flatnonzero(leg < 0)
@@ -182,9 +177,7 @@ def _fill_turns(offset: Array, leg: NDArray[np.int32]) -> None:
         offset[outside] = offset[nearest]
 
 
-def _pairs(
-    records: FlightRecords, members: NDArray[np.int64], px_per_m: float, rows: int, most: int
-) -> list[tuple[int, int]]:
+def _pairs(records: FlightRecords, members: Indices, px_per_m: float, rows: int, most: int) -> list[tuple[int, int]]:
     """Pairs along a leg, in the configured number and with about the configured expected flow (share of the picture).
 
     Picture.

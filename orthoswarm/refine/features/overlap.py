@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Gray
 from orthoswarm.model.frame import Frame
 from orthoswarm.raster.picture_file import PictureError
 from orthoswarm.refine.features.pair_matching import match_features
@@ -40,9 +40,7 @@ class Overlap:
         return self.share >= _DENSE_OVERLAP and self.matched >= _DENSE_MATCHED
 
 
-def forward_overlap(
-    frames: Sequence[Frame], read_gray: Callable[[Frame], NDArray[np.uint8]], samples: int | None = None
-) -> Overlap:
+def forward_overlap(frames: Sequence[Frame], read_gray: Callable[[Frame], Gray], samples: int | None = None) -> Overlap:
     """Measure the overlap of consecutive photos of one vehicle from the pictures, about 15 ms a photo.
 
     No recorded height, angle or field of view is needed.
@@ -80,7 +78,7 @@ def _sample_pairs(frames: Sequence[Frame], samples: int) -> list[tuple[int, int]
     return [pairs[int(k)] for k in np.linspace(0, len(pairs) - 1, samples).round()]
 
 
-def _features(frame: Frame, read_gray: Callable[[Frame], NDArray[np.uint8]]) -> Features | None:
+def _features(frame: Frame, read_gray: Callable[[Frame], Gray]) -> Features | None:
     try:
         return detect(read_gray(frame), frame.width, frame.height, _OVERLAP_PIXELS)
     except PictureError:

@@ -4,10 +4,8 @@ from typing import Final
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Gray = NDArray[np.uint8]
+from orthoswarm.model.arrays import Array, Flags, Floats, Gray
 
 _HOMOGRAPHY_PX: Final = 3.0  # flow within this distance agrees with a homography (RANSAC; chosen; not measured)
 _HOMOGRAPHY_SHARE: Final = 0.4  # least share of the flow that must agree
@@ -21,7 +19,7 @@ _PHASE_REDUCTION: Final = 4  # phase correlation for a prediction's missing shif
 _PHASE_RESPONSE: Final = 0.05  # least response of that phase correlation
 
 
-def measured_homography(previous: Gray | None, gray: Gray, uv: NDArray[np.float32], predicted: Array) -> Array | None:
+def measured_homography(previous: Gray | None, gray: Gray, uv: Floats, predicted: Array) -> Array | None:
     """The homography that most of a flow over several octaves agrees on; None without agreement.
 
     For a swaying camera whose angles are degrees off or not recorded. Starts from the prediction and,
@@ -42,7 +40,7 @@ def measured_homography(previous: Gray | None, gray: Gray, uv: NDArray[np.float3
     return _turned_homography(previous, gray)
 
 
-def _flow_homography(previous: Gray, gray: Gray, uv: NDArray[np.float32], start: Array) -> Array | None:
+def _flow_homography(previous: Gray, gray: Gray, uv: Floats, start: Array) -> Array | None:
     """The homography that most of the flow from a given start agrees on, None without agreement."""
     guess = apply_homography(start, uv)
     warped = cv2.warpPerspective(previous, start, (gray.shape[1], gray.shape[0]), borderMode=cv2.BORDER_REPLICATE)
@@ -71,7 +69,7 @@ def _turned_homography(previous: Gray, gray: Gray) -> Array | None:
     return _agreed(a, b, max(_ORB_LEAST, _ORB_SHARE * len(pairs)))
 
 
-def _agreed(a: NDArray[np.float32], b: NDArray[np.float32], fewest: float) -> Array | None:
+def _agreed(a: Floats, b: Floats, fewest: float) -> Array | None:
     """The homography by RANSAC over pairs of pixels (K, 2), None with too few inliers."""
     homography, inlier = cv2.findHomography(a, b, cv2.RANSAC, _HOMOGRAPHY_PX)
     if homography is None or inlier.sum() < fewest:
@@ -99,13 +97,13 @@ def shifted_prediction(previous: Gray | None, gray: Gray, predicted: Array) -> A
     return np.array([[1.0, 0, reduction * dx], [0, 1.0, reduction * dy], [0, 0, 1.0]]) @ predicted
 
 
-def apply_homography(homography: Array, uv: NDArray[np.float32]) -> NDArray[np.float32]:
+def apply_homography(homography: Array, uv: Floats) -> Floats:
     """Pixels (K, 2) mapped by a homography (3, 3)."""
     p = uv.astype(float) @ homography[:, :2].T + homography[:, 2]
     return np.ascontiguousarray(p[:, :2] / p[:, 2:], dtype=np.float32)
 
 
-def is_inside(uv: NDArray[np.float32], shape: tuple[int, ...], margin: float) -> NDArray[np.bool_]:
+def is_inside(uv: Floats, shape: tuple[int, ...], margin: float) -> Flags:
     """Which pixels (K, 2) lie in a picture of this shape, at least a margin inside its border."""
     h, w = shape[:2]
     return (uv[:, 0] >= margin) & (uv[:, 1] >= margin) & (uv[:, 0] <= w - 1 - margin) & (uv[:, 1] <= h - 1 - margin)

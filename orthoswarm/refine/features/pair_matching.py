@@ -12,12 +12,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array, Complex, Flags, Floats, Indices, Ints
 from orthoswarm.refine.features.sift_features import Features, root_sift
 from orthoswarm.trajectory.legs import PAUSE_S
-
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
-Ints = NDArray[np.int32]
 
 _MATCH_RATIO: Final = 0.85
 """A match is clearly nearer than the next candidate: ratio test (Lowe 2004: 0.8; chosen on four real flights)."""
@@ -69,7 +66,7 @@ def match_features(one: Features, two: Features) -> Ints:
     return candidates[epipolar] if epipolar.sum() >= _MATCH_LEAST else none
 
 
-def mutual_nearest(one: NDArray[np.float32], two: NDArray[np.float32]) -> Ints:
+def mutual_nearest(one: Floats, two: Floats) -> Ints:
     """Rows of unit descriptors (n, d) and (m, d) nearest to each other and clearly nearer than the next, (k, 2)."""
     if len(one) < 2 or len(two) < 2:
         return np.zeros((0, 2), np.int32)
@@ -85,7 +82,7 @@ def mutual_nearest(one: NDArray[np.float32], two: NDArray[np.float32]) -> Ints:
     return np.stack([rows[keep], best[keep]], axis=1).astype(np.int32)
 
 
-def _similarity_inliers(p: NDArray[np.float32], q: NDArray[np.float32], threshold: float) -> NDArray[np.bool_]:
+def _similarity_inliers(p: Floats, q: Floats, threshold: float) -> Flags:
     import cv2
 
     matrix, inliers = cv2.estimateAffinePartial2D(
@@ -105,7 +102,7 @@ def _similarity_inliers(p: NDArray[np.float32], q: NDArray[np.float32], threshol
     return np.asarray(inliers[:, 0] > 0)
 
 
-def _epipolar_inliers(p: NDArray[np.float32], q: NDArray[np.float32]) -> NDArray[np.bool_]:
+def _epipolar_inliers(p: Floats, q: Floats) -> Flags:
     import cv2
 
     try:
@@ -131,11 +128,11 @@ class _Identity:
 
 
 @lru_cache(maxsize=64)
-def _unit_of(key: _Identity) -> NDArray[np.float32]:
+def _unit_of(key: _Identity) -> Floats:
     return root_sift(key.features.descriptor)
 
 
-def _unit(features: Features) -> NDArray[np.float32]:
+def _unit(features: Features) -> Floats:
     return _unit_of(_Identity(features))
 
 
@@ -189,7 +186,7 @@ def nearby(centre: Complex, reach: Array, group: NDArray[np.integer], count: int
     return np.array(sorted(chosen), np.int32).reshape(-1, 2)
 
 
-def _round_robin(near: NDArray[np.int64], kind: NDArray[np.int64], count: int) -> list[int]:
+def _round_robin(near: Indices, kind: Indices, count: int) -> list[int]:
     """The first item of every kind, then the second, until there are `count`."""
     rank = np.zeros(len(near), np.int64)
     for k in np.unique(kind):

@@ -10,8 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-Bytes = NDArray[np.uint8]
-Floats = NDArray[np.float32]
+from orthoswarm.model.arrays import Floats, Gray, Ints
 
 SIFT_PIXELS: Final = 480 * 360
 """Pixels of the reduced picture on which features are found, whatever its shape (measured on four real flights: 31 to
@@ -42,7 +41,7 @@ class Features:
     """
 
     uv: Floats
-    descriptor: Bytes
+    descriptor: Gray
     sigma_px: Floats
     width: int
     height: int
@@ -64,7 +63,7 @@ class Features:
             step_px=1.0,
         )
 
-    def same_point(self) -> NDArray[np.int32]:
+    def same_point(self) -> Ints:
         """For each feature the index of the first one at the same place, int32 (n,).
 
         SIFT returns a point once for each strong orientation, but a track may contain it only once.
@@ -73,14 +72,14 @@ class Features:
         return np.asarray(first[inverse.reshape(-1)], dtype=np.int32)
 
 
-def root_sift(descriptor: Bytes) -> Floats:
+def root_sift(descriptor: Gray) -> Floats:
     """Unit vectors float32 (n, 128) whose dot product compares SIFT descriptors by the Hellinger kernel."""
     d = descriptor.astype(np.float32)
     d /= np.maximum(d.sum(axis=1, keepdims=True), 1.0)
     return np.asarray(np.sqrt(d, out=d))
 
 
-def detect(gray: Bytes, width: int, height: int, working_pixels: int | None = None) -> Features:
+def detect(gray: Gray, width: int, height: int, working_pixels: int | None = None) -> Features:
     """Features of one photo.
 
     Args:
@@ -118,7 +117,7 @@ def localisation_sigma(size: Floats) -> Floats:
     return np.asarray(np.hypot(floor, share * size), dtype=np.float32)
 
 
-def reduce_picture(gray: Bytes, width: int, height: int, working_pixels: int) -> tuple[Bytes, float]:
+def reduce_picture(gray: Gray, width: int, height: int, working_pixels: int) -> tuple[Gray, float]:
     """The picture reduced to about the working size (never enlarged), and full-size pixels per reduced pixel."""
     import cv2
 

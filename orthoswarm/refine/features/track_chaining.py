@@ -4,14 +4,12 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel, kernel
+from orthoswarm.model.arrays import Array, Indices, Ints
 from orthoswarm.refine.bundle.block_arrays import Tracks
 from orthoswarm.refine.features.pair_matching import Pair
 from orthoswarm.refine.features.sift_features import SIFT_CELLS, Features
-
-Ints = NDArray[np.int32]
 
 _TRACK_LONGEST: Final = 20  # longest track; longer ones stay in pieces (its cost)
 _TRACK_PER_CELL: Final = 2  # observations in a cell of a photo from which on further tracks are dropped (its cost)
@@ -33,7 +31,7 @@ def build_tracks(features: Sequence[Features], pairs: Sequence[Pair]) -> Tracks:
     offset = np.concatenate([[0], np.cumsum([len(f) for f in features])]).astype(np.int64)
     photo = np.repeat(np.arange(len(features), dtype=np.int32), np.diff(offset))
     same = [f.same_point() for f in features]
-    joins: list[NDArray[np.int64]] = []
+    joins: list[Indices] = []
     for pair in sorted(pairs, key=lambda p: (-len(p), p.first, p.second)):
         a = offset[pair.first] + same[pair.first][pair.match[:, 0]]
         b = offset[pair.second] + same[pair.second][pair.match[:, 1]]
@@ -43,7 +41,7 @@ def build_tracks(features: Sequence[Features], pairs: Sequence[Pair]) -> Tracks:
     return _tracks(root, photo, features)
 
 
-def _tracks(root: NDArray[np.int64], photo: Ints, features: Sequence[Features]) -> Tracks:
+def _tracks(root: Indices, photo: Ints, features: Sequence[Features]) -> Tracks:
     _, inverse, count = np.unique(root, return_inverse=True, return_counts=True)
     node = np.flatnonzero(count[inverse] >= 2)
     uv = np.concatenate([f.uv for f in features]) if len(features) else np.zeros((0, 2), np.float32)
@@ -100,7 +98,7 @@ def _union(edges, photo, count, max_length):  # type: ignore[no-untyped-def]
     return root
 
 
-def thin_tracks(tracks: Tracks, width: NDArray[np.float64], rows: NDArray[np.float64]) -> Tracks:
+def thin_tracks(tracks: Tracks, width: Array, rows: Array) -> Tracks:
     """Thin the tracks but cover every photo evenly: longest first, while a cell of one of their photos has room. room.
 
     Args:

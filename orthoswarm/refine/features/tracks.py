@@ -14,13 +14,11 @@ from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import kernel
 from orthoswarm.config import active
+from orthoswarm.model.arrays import Array, Flags, Floats, Gray, Indices
 from orthoswarm.refine.bundle.block_arrays import Tracks
 from orthoswarm.refine.features import klt
 from orthoswarm.refine.features.corners import strongest
 from orthoswarm.refine.features.pair_homography import measured_homography, shifted_prediction
-
-Array = NDArray[np.float64]
-Gray = NDArray[np.uint8]
 
 _BORDER_PX: Final = 9  # corners nearer to the picture's border are not begun: the window of the flow would leave it
 _CORNER_WINDOW_PX: Final = 5  # window of the minimum-eigenvalue corner measure (Shi and Tomasi 1994)
@@ -52,11 +50,11 @@ _KLT_NOISE_VARIANCE: Final = 4.0  # noise of the picture that is added to both, 
 class _Live:
     """Tracks visible in the last picture: pixel, id, age in pictures, first observation (picture number and pixel)."""
 
-    uv: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 2), np.float32))
-    ident: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
-    age: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
-    anchor: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
-    anchor_uv: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 2), np.float32))
+    uv: Floats = field(default_factory=lambda: np.zeros((0, 2), np.float32))
+    ident: Indices = field(default_factory=lambda: np.zeros(0, np.int64))
+    age: Indices = field(default_factory=lambda: np.zeros(0, np.int64))
+    anchor: Indices = field(default_factory=lambda: np.zeros(0, np.int64))
+    anchor_uv: Floats = field(default_factory=lambda: np.zeros((0, 2), np.float32))
 
     def take(self, keep: NDArray[Any]) -> "_Live":
         """A subset of the tracks."""
@@ -67,8 +65,8 @@ class _Live:
 class _Flow:
     """Flow of K tracks: which are good, where they are now (K, 2), how many are good, how many stay in the picture."""
 
-    good: NDArray[np.bool_]
-    found: NDArray[np.float32]
+    good: Flags
+    found: Floats
     kept: int
     expected: int
 
@@ -87,11 +85,11 @@ class Tracker:
     _live: _Live = field(default_factory=_Live)
     _gray: Gray | None = None
     _half: Gray | None = None
-    _stack: NDArray[np.uint8] | None = None
+    _stack: Gray | None = None
     _chain: Array = field(default_factory=lambda: np.tile(np.eye(3), (_ANCHOR_PHOTOS, 1, 1)))
     _count: int = 0
     _next: int = 0
-    _log: list[tuple[int, NDArray[np.int64], NDArray[np.float32]]] = field(default_factory=list)
+    _log: list[tuple[int, Indices, Floats]] = field(default_factory=list)
 
     def add(self, index: int, gray: Gray, predicted: Array | None) -> float:
         """Track all live corners into the next picture and start new ones in empty cells.
@@ -314,7 +312,7 @@ def follow(
     prediction: Callable[[int], Array | None],
     scale: float = 1.0,
     cell_px: int | None = None,
-) -> tuple[Tracks, NDArray[np.float64]]:
+) -> tuple[Tracks, Array]:
     """Track corners through pictures 0 .. count - 1.
 
     Args:

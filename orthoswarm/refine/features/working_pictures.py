@@ -7,13 +7,11 @@ from typing import Any, Final
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.config import active
+from orthoswarm.model.arrays import Gray
 from orthoswarm.model.frame import Frame
 from orthoswarm.raster.picture_file import PictureError
-
-Gray = NDArray[np.uint8]
 
 _SMALL_WIDTH_PX: Final = 160  # columns of the reduced pictures that stay in memory
 

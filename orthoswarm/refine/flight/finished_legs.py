@@ -1,12 +1,10 @@
 """Legs that are complete while the vehicle still flies; later pictures do not change them."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.config import active
+from orthoswarm.model.arrays import Array
 from orthoswarm.trajectory.legs import split_legs
-
-Array = NDArray[np.float64]
 
 
 def ended_legs(position: Array, time_s: Array | None = None, *, over: bool = False) -> list[tuple[int, int]]:

@@ -11,10 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from orthoswarm.config import active
+from orthoswarm.model.arrays import Array, Gray
 from orthoswarm.model.frame import Frame
 from orthoswarm.refine.bundle.block_arrays import Tracks
 from orthoswarm.refine.features.flow_calibration import Calibration
@@ -35,8 +33,8 @@ class Followed:
 
     calibration: Calibration
     tracks: Tracks
-    survived: NDArray[np.float64]
-    small: dict[int, NDArray[np.uint8]]
+    survived: Array
+    small: dict[int, Gray]
     damaged: dict[int, str]
 
 
@@ -50,7 +48,7 @@ class KeptTracks:
 
     folder: Path
 
-    def file(self, frames: Sequence[Frame], epsg: int, origin: NDArray[np.float64], fov_start: float) -> Path:
+    def file(self, frames: Sequence[Frame], epsg: int, origin: Array, fov_start: float) -> Path:
         """Where the tracks of a flight are kept.
 
         Args:

@@ -6,12 +6,13 @@ from typing import Final
 import numpy as np
 
 from orthoswarm.model.angles import wrap_rad
+from orthoswarm.model.arrays import Array, Flags
 from orthoswarm.model.frame import Frame
 from orthoswarm.refine.bundle.adjustment import Adjustment
 from orthoswarm.refine.bundle.height_consistency import log_focal_sigmas
 from orthoswarm.refine.initial.heading import tag_yaw
 from orthoswarm.refine.initial.initial_orientation import InitialOrientation
-from orthoswarm.refine.initial.planar_similarity import Array, Flags, PhotoRecords
+from orthoswarm.refine.initial.planar_similarity import PhotoRecords
 
 _FLIPPED_YAW_DEG: Final = 150.0  # a recorded yaw that differs by more is reported as turned by 180 degrees
 _HEADING_OFFSET_DEG: Final = 5.0  # a larger common offset of recorded headings is reported

@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.config import active
+from orthoswarm.model.arrays import Array, Flags, Gray, Ints
 from orthoswarm.model.camera import fov_rad
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
@@ -24,9 +24,6 @@ from orthoswarm.refine.features.working_pictures import Pictures
 from orthoswarm.refine.flight.kept_tracks import Followed, KeptTracks
 from orthoswarm.refine.flight.track_headings import with_measured_headings
 from orthoswarm.trajectory.legs import leads_one_way, split_legs
-
-Array = NDArray[np.float64]
-Gray = NDArray[np.uint8]
 
 _FOLLOWED_PHOTOS: Final = 10  # flights of fewer photos are matched in pairs instead of being followed
 _FOLLOWED_OVERLAP: Final = 0.78
@@ -73,7 +70,7 @@ class Flight:
 
     frames: Sequence[Frame]
     records: FlightRecords
-    leg: NDArray[np.int32]
+    leg: Ints
     pictures: Pictures
     calibration: Calibration
     adjustment: Adjustment
@@ -86,7 +83,7 @@ class Flight:
         """The vehicle's own cameras (without neighbours that the adjustment holds fixed; there may be more lenses)."""
         return self.adjustment.cameras.take(slice(0, len(self.frames)))
 
-    def best_views(self, some: NDArray[np.bool_] | None = None) -> BestViews:
+    def best_views(self, some: Flags | None = None) -> BestViews:
         """Best view of each tie point, chosen among the vehicle's own pictures, or among some (N,) of them."""
         adj = self.adjustment
         own = np.zeros(len(adj.cameras), bool)
@@ -143,7 +140,7 @@ def open_flight(
     )
 
 
-def _follow(records: FlightRecords, leg: NDArray[np.int32], pictures: Pictures, fov_start: float) -> Followed | None:
+def _follow(records: FlightRecords, leg: Ints, pictures: Pictures, fov_start: float) -> Followed | None:
     """Measure the flow and track the corners of a flight's pictures; None where they cannot be tracked."""
     calibration = calibrate(records, leg, pictures.gray, pictures.size, fov_start)
     steps = np.hypot(*records.steps()[1:, :2].T)
@@ -293,7 +290,7 @@ def height_prior(records: FlightRecords, calibration: Calibration) -> tuple[Arra
     return np.where(spikes, smooth, z), np.where(leaps, off, c.first_height_sigma_m)
 
 
-def _climbed_to(records: FlightRecords) -> NDArray[np.bool_]:
+def _climbed_to(records: FlightRecords) -> Flags:
     """Heights that a vehicle reaches from those before and after in the time between them, bool (N,)."""
     if not records.timed:
         return np.zeros(len(records.position), bool)

@@ -9,9 +9,9 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.config import active
+from orthoswarm.model.arrays import Array, Flags
 from orthoswarm.model.robust import mad_sigma, mad_sigmas
 from orthoswarm.refine.bundle.adjustment import Adjustment, HeightPrior
 from orthoswarm.refine.bundle.block_arrays import K1, WIDTH, F, Tracks
@@ -21,7 +21,6 @@ from orthoswarm.refine.bundle.priors import HEIGHT_OFFSET_SIGMA_M, LAG_SIGMA_S, 
 from orthoswarm.refine.bundle.rotation_vectors import log_rotation
 from orthoswarm.refine.flight.relative_block import PRINCIPAL_POINT_SHARE, first_points
 from orthoswarm.refine.flight.sparse_start import SparseStart
-from orthoswarm.refine.initial.planar_similarity import Array
 
 NO_PRIOR_SIGMA_M = 1e6
 """A sigma that makes a prior's weight vanish, metres."""
@@ -99,7 +98,7 @@ def solve_sparse(start: SparseStart) -> Adjustment:
     return adjustment
 
 
-def trusted_heights(adjustment: Adjustment, start: SparseStart) -> NDArray[np.bool_]:
+def trusted_heights(adjustment: Adjustment, start: SparseStart) -> Flags:
     """Photos whose recorded heights the final adjustment used, bool (N,)."""
     p = adjustment.priors
     sigma = np.array([model.height_sigma for model in p.models])

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.model.angles import wrap_rad
+from orthoswarm.model.arrays import Array, Flags, Indices
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.task_runner import Progress, Run, serial
@@ -26,7 +26,6 @@ from orthoswarm.refine.flight.sparse_adjustment import (
 )
 from orthoswarm.refine.flight.sparse_start import SparseStart, read_photo_records, sparse_start
 from orthoswarm.refine.initial.pair_graph import ReadGray
-from orthoswarm.refine.initial.planar_similarity import Array
 from orthoswarm.refine.initial.segments import photo_legs
 
 
@@ -69,9 +68,9 @@ def make_flight(
     read: ReadGray,
     *,
     start: SparseStart,
-    rows: NDArray[np.int64],
+    rows: Indices,
     adjustment: Adjustment,
-    trusted_height: NDArray[np.bool_],
+    trusted_height: Flags,
     warnings: Sequence[str],
     focal_sigma: float = 0.0,
 ) -> Flight:

@@ -10,8 +10,8 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array, Indices
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.task_runner import Progress, Run, serial
@@ -25,7 +25,6 @@ from orthoswarm.refine.flight.sparse_adjustment import datum_prior, solve_sparse
 from orthoswarm.refine.flight.sparse_block import make_flight, open_sparse_flight
 from orthoswarm.refine.flight.sparse_start import SparseStart, read_photo_records, sparse_start
 from orthoswarm.refine.initial.pair_graph import ReadGray
-from orthoswarm.refine.initial.planar_similarity import Array
 
 _JOINT_MOST_VEHICLES: Final = 16  # of more vehicles those with the same camera name share one lens (cost)
 _JOINT_LENS_STEPS: Final = 4  # steps with a lens for each vehicle
@@ -118,7 +117,7 @@ def own_lenses(adjustment: Adjustment, start: SparseStart) -> Adjustment:
     return own
 
 
-def _extract_block(adjustment: Adjustment, start: SparseStart, rows: NDArray[np.int64]) -> Adjustment:
+def _extract_block(adjustment: Adjustment, start: SparseStart, rows: Indices) -> Adjustment:
     """The part of a joint adjustment that concerns some photos."""
     local = np.full(len(adjustment.cameras), -1, np.int32)
     local[rows] = np.arange(len(rows), dtype=np.int32)

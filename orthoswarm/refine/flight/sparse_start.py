@@ -10,6 +10,7 @@ from typing import Final
 
 import numpy as np
 
+from orthoswarm.model.arrays import Array, Flags, Ints
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.task_runner import Progress, Run, serial
@@ -22,7 +23,7 @@ from orthoswarm.refine.initial.initial_orientation import InitialOrientation, fi
 from orthoswarm.refine.initial.lens_groups import lens_per_vehicle, split_unlike_lenses
 from orthoswarm.refine.initial.pair_graph import PairGraphBuilder, ReadGray, build_pair_graph
 from orthoswarm.refine.initial.planar_network import LAG_SPREAD_S
-from orthoswarm.refine.initial.planar_similarity import Array, Flags, Ints, PhotoRecords
+from orthoswarm.refine.initial.planar_similarity import PhotoRecords
 from orthoswarm.refine.initial.relative_scale import focal_by_hint
 from orthoswarm.refine.initial.segments import split_segments
 

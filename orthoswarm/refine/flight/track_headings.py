@@ -5,13 +5,11 @@ from itertools import pairwise
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.model.angles import wrap_rad
+from orthoswarm.model.arrays import Array
 from orthoswarm.refine.bundle.block_arrays import Tracks
 from orthoswarm.refine.bundle.flight_records import FlightRecords
-
-Array = NDArray[np.float64]
 
 _HEADING_REACH_PHOTOS: Final = 7  # heading that was not recorded follows from those of so many photos before and after
 _HEADING_LEAST_CORNERS: Final = 10  # fewest tracked corners that tell how far a photo is turned from the one before

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array, Flags
 from orthoswarm.model.camera import Camera
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.placement import PlacedFrame
@@ -60,7 +60,7 @@ def split_refinable(recorded: Sequence[PlacedFrame]) -> RefinableSplit:
     return RefinableSplit(fit, odd, [p for p in recorded if p.frame.vehicle in spots], warnings)
 
 
-def few_of_their_kind(frames: Sequence[Frame]) -> NDArray[np.bool_]:
+def few_of_their_kind(frames: Sequence[Frame]) -> Flags:
     """Frames with too few others of their vehicle, camera and size, while other cameras have enough: bool (N,)."""
     kinds = [(f.vehicle, f.camera, f.width, f.height) for f in frames]
     count = Counter(kinds)
@@ -82,7 +82,7 @@ def hovering_vehicles(recorded: Sequence[PlacedFrame]) -> set[str]:
     return out
 
 
-def _hovers(positions: NDArray[np.float64]) -> bool:
+def _hovers(positions: Array) -> bool:
     """True if a path (N, 3) is one position with a receiver's noise: steps as long as the total spread."""
     spread = float(np.hypot(*np.subtract(*np.percentile(positions[:, :2], [95, 5], axis=0))))
     height = float(np.median(positions[:, 2]))

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix, csc_matrix, diags
 from scipy.sparse.linalg import splu
 
+from orthoswarm.model.arrays import Array, Complex, Flags, Indices, Ints
 from orthoswarm.refine.initial.heading import components
 from orthoswarm.refine.initial.planar_network import NETWORK_GATE_SIGMAS
-from orthoswarm.refine.initial.planar_similarity import Array, Complex, Flags, Ints, PairGraph
+from orthoswarm.refine.initial.planar_similarity import PairGraph
 from orthoswarm.refine.initial.tilt_and_lens import spaced
 
 FREE_PAIR_SHARE: Final = 0.02  # sigma of the match centres of two level photos, in picture widths
@@ -64,8 +65,8 @@ class _System:
     """Rows of complex equations in units of one sigma: columns, values, right-hand side."""
 
     size: int
-    row: list[NDArray[np.int64]] = field(default_factory=list)
-    column: list[NDArray[np.int64]] = field(default_factory=list)
+    row: list[Indices] = field(default_factory=list)
+    column: list[Indices] = field(default_factory=list)
     value: list[Complex] = field(default_factory=list)
     rhs: list[Complex] = field(default_factory=list)
     count: int = 0

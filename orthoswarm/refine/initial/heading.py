@@ -14,7 +14,8 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, mini
 from scipy.sparse.linalg import spsolve
 
 from orthoswarm.model.angles import wrap_rad
-from orthoswarm.refine.initial.planar_similarity import Array, Complex, Flags, Ints, PairGraph, PhotoRecords
+from orthoswarm.model.arrays import Array, Complex, Flags, Ints
+from orthoswarm.refine.initial.planar_similarity import PairGraph, PhotoRecords
 
 _COURSE_SIGMA_DEG: Final = 2.0  # sigma of the course between two photos, besides that of their positions
 _COURSE_SIGMA_LIMIT_RAD: Final = 1.0  # a course known no better than this is dropped

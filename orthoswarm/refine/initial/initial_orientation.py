@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 
 from orthoswarm.model.angles import wrap_rad
+from orthoswarm.model.arrays import Array, Complex, Flags, Ints
 from orthoswarm.refine.features.pair_matching import Pair
 from orthoswarm.refine.features.sift_features import Features
 from orthoswarm.refine.initial.heading import (
@@ -25,16 +26,7 @@ from orthoswarm.refine.initial.heading import (
     tag_yaw,
 )
 from orthoswarm.refine.initial.planar_network import Network, NetworkPriors, solve_network
-from orthoswarm.refine.initial.planar_similarity import (
-    Array,
-    Complex,
-    Flags,
-    Ints,
-    PairGraph,
-    PhotoRecords,
-    level_from_nadir,
-    rotation_of,
-)
+from orthoswarm.refine.initial.planar_similarity import PairGraph, PhotoRecords, level_from_nadir, rotation_of
 from orthoswarm.refine.initial.relative_scale import (
     RecordedHeights,
     first_of,

@@ -9,8 +9,9 @@ from typing import Final
 
 import numpy as np
 
+from orthoswarm.model.arrays import Array, Flags, Ints
 from orthoswarm.refine.initial.initial_orientation import InitialOrientation
-from orthoswarm.refine.initial.planar_similarity import Array, Flags, Ints, PhotoRecords
+from orthoswarm.refine.initial.planar_similarity import PhotoRecords
 
 _UNLIKE_SIGMAS: Final = 2.5  # vehicles' focal lengths that differ by more sigmas are of two lenses
 _UNLIKE_SHARE: Final = 0.06  # ... and by more than this share

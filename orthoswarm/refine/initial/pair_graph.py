@@ -10,17 +10,16 @@ from functools import partial
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Flags, Gray, Indices, Ints
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.task_runner import Progress, Run, serial
 from orthoswarm.raster.picture_file import PictureError
 from orthoswarm.refine.features.pair_matching import Pair, consecutive, match_features, nearby
 from orthoswarm.refine.features.sift_features import SIFT_PIXELS, Features, detect
 from orthoswarm.refine.initial.initial_orientation import InitialOrientation, find_initial_orientation
-from orthoswarm.refine.initial.planar_similarity import Ints, PhotoRecords
+from orthoswarm.refine.initial.planar_similarity import PhotoRecords
 
-Gray = NDArray[np.uint8]
 ReadGray = Callable[[Frame], Gray]
 
 _SIFT_FINE_PIXELS: Final = 640 * 480  # pixels of reduced pictures that matched too few others (four real flights)
@@ -55,7 +54,7 @@ class PairGraphBuilder:
     run: Run = serial
     progress: Progress | None = None
     features: list[Features] = field(default_factory=list)
-    tried: dict[tuple[int, int], NDArray[np.int32]] = field(default_factory=dict)
+    tried: dict[tuple[int, int], Ints] = field(default_factory=dict)
     damaged: dict[int, str] = field(default_factory=dict)
 
     def detect_all(self) -> None:
@@ -79,7 +78,7 @@ class PairGraphBuilder:
         """The matched pairs in order."""
         return [Pair(a, b, m) for (a, b), m in sorted(self.tried.items()) if len(m)]
 
-    def degree(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def degree(self) -> tuple[Indices, Indices]:
         """Numbers of pairs and of matches of each photo, both int64 (N,)."""
         pairs, matches = np.zeros(len(self.frames), np.int64), np.zeros(len(self.frames), np.int64)
         for (a, b), m in self.tried.items():
@@ -88,7 +87,7 @@ class PairGraphBuilder:
                 matches[k] += len(m)
         return pairs, matches
 
-    def near(self, start: InitialOrientation, count: int, share: float, only: NDArray[np.bool_] | None = None) -> Ints:
+    def near(self, start: InitialOrientation, count: int, share: float, only: Flags | None = None) -> Ints:
         """Pairs that should overlap according to the initial orientation; at least one of each in `only`, bool (N,)."""
         reach = share * start.metres * np.hypot(self.records.width, self.records.rows)
         pairs = nearby(start.middle(), reach, self.records.segment, count)
@@ -98,7 +97,7 @@ class PairGraphBuilder:
         """Start values from the pairs found so far."""
         return find_initial_orientation(self.records, self.pairs(), self.features)
 
-    def redetect(self, weak: NDArray[np.bool_]) -> None:
+    def redetect(self, weak: Flags) -> None:
         """Detect features of weakly connected photos again on larger pictures, and drop their pairs."""
         self._detect(np.flatnonzero(weak).tolist(), _SIFT_FINE_PIXELS)
         self.tried = {pair: m for pair, m in self.tried.items() if not (weak[pair[0]] or weak[pair[1]])}
@@ -130,7 +129,7 @@ def features_of(frame: Frame, *, read_gray: ReadGray, pixels: int) -> Features |
     return detect(gray, frame.width, frame.height, pixels)
 
 
-def match_chunk(task: tuple[list[tuple[int, int]], dict[int, Features]]) -> list[NDArray[np.int32]]:
+def match_chunk(task: tuple[list[tuple[int, int]], dict[int, Features]]) -> list[Ints]:
     """Match some pairs; the task contains the pairs and the features of their photos."""
     pairs, features = task
     return [match_features(features[a], features[b]) for a, b in pairs]

@@ -9,12 +9,13 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import splu
 
+from orthoswarm.model.arrays import Array, Complex, Flags, Indices, Ints
 from orthoswarm.refine.bundle.priors import LAG_SIGMA_S
-from orthoswarm.refine.initial.planar_similarity import Array, Complex, Flags, Ints, PairGraph, PhotoRecords
+from orthoswarm.refine.initial.planar_similarity import PairGraph, PhotoRecords
 
 _NETWORK_SCHEDULE: Final = (400.0, 400.0, 36.0, 9.0, 9.0)
 """Robust schedule of pairs and recorded positions (chosen on four real flights)."""
@@ -109,7 +110,7 @@ class _Rows:
 
     size: int
     count: int = 0
-    parts: list[tuple[NDArray[np.int64], NDArray[np.int64], Array]] = field(default_factory=list)
+    parts: list[tuple[Indices, Indices, Array]] = field(default_factory=list)
     rhs: list[Array] = field(default_factory=list)
 
     def block(self, rhs: Array, *terms: tuple[ArrayLike, ArrayLike]) -> None:

@@ -8,17 +8,12 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.config import active
+from orthoswarm.model.arrays import Array, Complex, Indices, Ints
 from orthoswarm.model.camera import NADIR_PITCH_RAD, rotation_from_angles
 from orthoswarm.refine.features.sift_features import Features
 from orthoswarm.trajectory.legs import PAUSE_S
-
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
-Ints = NDArray[np.int32]
-Flags = NDArray[np.bool_]
 
 _TURN_SIGMA_DEG: Final = 1.0  # sigma of the turn between two photos by relief and tilt
 _TURN_MISFIT_SIGMAS: Final = 3.0  # ... and so many times the misfit over the spread, by the root of matches
@@ -116,7 +111,7 @@ class PairGraph:
     factor: Complex
     centre_first: Complex
     centre_second: Complex
-    count: NDArray[np.int64]
+    count: Indices
     spread: Array
     residual: Array
 

@@ -9,8 +9,9 @@ from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import spsolve
 
 from orthoswarm.config import active
+from orthoswarm.model.arrays import Array, Flags, Ints
 from orthoswarm.model.camera import fov_rad
-from orthoswarm.refine.initial.planar_similarity import Array, Flags, Ints, PairGraph, PhotoRecords
+from orthoswarm.refine.initial.planar_similarity import PairGraph, PhotoRecords
 
 _HINT_FOV_DEG: Final = (30.0, 120.0)  # fields of view of lenses that exist
 _HINT_SIGMA: Final = 0.06  # relative sigma of a focal length by tags

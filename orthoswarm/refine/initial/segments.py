@@ -5,11 +5,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array, Complex, Flags, Ints
 from orthoswarm.model.robust import mad_sigma
 from orthoswarm.trajectory.legs import PAUSE_S
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int32]
 
 _SEGMENT_GAP_S: Final = 180.0  # a longer pause ends a segment: landing, battery (chosen on four real flights)
 _SEGMENT_CLIMB_M: Final = 5.0  # a larger jump of the recorded height ends a segment (chosen on four real flights)
@@ -47,7 +45,7 @@ def split_segments(group: NDArray[np.integer], time_s: Array, height_m: Array, p
     return segment
 
 
-def _jumps(value: Array, limit: float) -> NDArray[np.bool_]:
+def _jumps(value: Array, limit: float) -> Flags:
     """Where a sequence jumps by more than the limit and does not return with the next value."""
     jump = np.zeros(len(value), bool)
     known = np.flatnonzero(np.isfinite(value))
@@ -65,7 +63,7 @@ def _jumps(value: Array, limit: float) -> NDArray[np.bool_]:
     return jump
 
 
-def photo_legs(position: NDArray[np.complex128], segment: Ints, time_s: Array) -> Ints:
+def photo_legs(position: Complex, segment: Ints, time_s: Array) -> Ints:
     """Leg of each photo, int32 (N,), numbered in order: runs of photos along a straight course; every photo has one.
 
     For photos far apart: two photos make a leg, and the path from the last photo of one to the first of the next

@@ -14,17 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel, kernel
+from orthoswarm.model.arrays import Array, Complex, Indices, Ints
 from orthoswarm.refine.features.pair_matching import Pair
 from orthoswarm.refine.features.sift_features import Features
-from orthoswarm.refine.initial.planar_similarity import (
-    Array,
-    Complex,
-    Ints,
-    PairGraph,
-    PhotoRecords,
-    centred,
-    level_from_nadir,
-)
+from orthoswarm.refine.initial.planar_similarity import PairGraph, PhotoRecords, centred, level_from_nadir
 
 _SHAPE_ITERATIONS: Final = 12  # most Gauss-Newton iterations (they end earlier)
 _SHAPE_SETTLED: Final = 1e-3  # a largest step below this, radians or relative, ends them
@@ -49,8 +42,8 @@ class Matches:
 
     first: Ints
     second: Ints
-    start: NDArray[np.int64]
-    count: NDArray[np.int64]
+    start: Indices
+    count: Indices
     p: Complex
     q: Complex
 

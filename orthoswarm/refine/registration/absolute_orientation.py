@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.config import active
+from orthoswarm.model.arrays import Array, Flags, Ints
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.placement import MapWindow
 from orthoswarm.model.robust import mad_sigma
@@ -19,8 +20,6 @@ from orthoswarm.refine.registration.map_windows import LoadedMap
 from orthoswarm.refine.registration.tie_points import LINK_VIEW_WEIGHT, LINK_VIEWS, MapMatches, link_legs, match_points
 from orthoswarm.refine.surface.ground_densification import refit_ground
 from orthoswarm.refine.surface.vehicle_ground import GroundModel
-
-Array = NDArray[np.float64]
 
 _PICTURE_GSD_SHARE: Final = 1.07  # ground pixel in which pictures are compared with each other, in pixels at nadir
 _MAP_GSD_M: Final = (0.25, 2.0)  # limits of the ground pixel for the map where pictures are finer than the next field
@@ -107,7 +106,7 @@ def tie_matches(
     cell_m: float,
     reach_m: float,
     half_m: float | None = None,
-    pictures: NDArray[np.bool_] | None = None,
+    pictures: Flags | None = None,
 ) -> MapMatches:
     """Match ground points, one for each cell and leg, to the map; `clear_matches` tells the sure ones.
 
@@ -138,7 +137,7 @@ def _ground_matches(
     ground: LoadedMap,
     *,
     chosen: NDArray[np.integer],
-    camera: NDArray[np.int32],
+    camera: Ints,
     reach_m: float,
     half_m: float,
     texture: bool,
@@ -225,7 +224,7 @@ def shifted_along(flight: Flight, matches: MapMatches) -> MapMatches:
     return replace(matches, shift=matches.shift - moved)
 
 
-def leg_corrections(leg: NDArray[np.int32], matches: MapMatches, common: Array) -> Array:
+def leg_corrections(leg: Ints, matches: MapMatches, common: Array) -> Array:
     """Shift of each picture, float64 (N, 2): the common one, except in legs whose matches agree on another line."""
     out = np.tile(common, (len(leg), 1))
     for k in np.unique(leg[leg >= 0]):
@@ -247,7 +246,7 @@ def leg_corrections(leg: NDArray[np.int32], matches: MapMatches, common: Array) 
     return out
 
 
-def _line(t: Array, shift: Array) -> tuple[Array, NDArray[np.bool_]]:
+def _line(t: Array, shift: Array) -> tuple[Array, Flags]:
     """Robust line (2, 2), value and slope, through shifts (Q, 2) along t (Q,), and which shifts lie on it."""
     a = np.column_stack([np.ones(len(t)), t])
     line = np.array([mode_shift(shift), np.zeros(2)])
@@ -328,9 +327,7 @@ def add_links(flight: Flight, gsd_m: float) -> int:
     return len(camera)
 
 
-def add_observations(
-    flight: Flight, camera: NDArray[np.int32], point: NDArray[np.int32], uv: Array, sigma_px: float
-) -> None:
+def add_observations(flight: Flight, camera: Ints, point: Ints, uv: Array, sigma_px: float) -> None:
     """Add observations (K,), uv (K, 2) in working pixels, to a flight's adjustment; its unknowns keep their values."""
     old = flight.adjustment
     tracks = Tracks(
@@ -384,7 +381,7 @@ def reorient_on_map(
     ground: LoadedMap,
     surface: GroundModel,
     ties: MapTies,
-    pictures: NDArray[np.bool_] | None = None,
+    pictures: Flags | None = None,
 ) -> tuple[GroundModel, MapTies, MapMatches]:
     """Adjust a flight that lies on the map with new tie points, as after its level was shifted.
 
@@ -408,7 +405,7 @@ def _second_round(
     ground: LoadedMap,
     surface: GroundModel,
     rounds: int,
-    pictures: NDArray[np.bool_] | None = None,
+    pictures: Flags | None = None,
 ) -> tuple[GroundModel, MapTies, MapMatches]:
     """New tie points, compared on the ground as the caller has just fitted it, and steps with them."""
     config = active().registration

@@ -5,8 +5,8 @@ from time import process_time
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array, Floats
 from orthoswarm.model.camera import fov_rad
 from orthoswarm.model.placement import Leg, LegState, PlacedFrame, Solution, Stage, Terrain
 from orthoswarm.refine.bundle.adjustment import MapTies
@@ -18,8 +18,6 @@ from orthoswarm.refine.registration.coarse_map import CoarseMapShift
 from orthoswarm.refine.registration.map_evidence import agreement_probability
 from orthoswarm.refine.registration.tie_points import MapMatches
 from orthoswarm.refine.surface.vehicle_ground import GroundModel, ground_points
-
-Array = NDArray[np.float64]
 
 NOT_FOUND = (
     "no part of this flight was found on the map: it lies where its receiver says; check that the map shows this place"
@@ -73,7 +71,7 @@ class VehicleState:
     coarse_sigma_m: Array
     receiver_sigma_m: Array
     fov_sigma_deg: float
-    pose_covariance: NDArray[np.float32] | None = None
+    pose_covariance: Floats | None = None
     timings: dict[str, float] = field(default_factory=dict)
     had_map: bool = False
     carried: bool = False

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
 from orthoswarm.config import active
+from orthoswarm.model.arrays import Array, Flags, Floats
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import MapWindow
@@ -25,15 +26,12 @@ from orthoswarm.refine.registration.orientation_correlation import (
     STRIP_BORDER_PX,
     STRIP_FEWEST_EDGES,
     STRIP_MAP_SHARE,
+    Field,
     correlation,
     highest,
     strip_mosaic,
     without_peak,
 )
-
-Array = NDArray[np.float64]
-Grey = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 _STEP = 2
 """Pixels of the correlation in one of the map's, and of the mosaic in one of the correlation."""
@@ -123,7 +121,7 @@ def shift_on_coarse_map(
     )
 
 
-def _mosaic(flights: Sequence[Flight], ground_z: float, gsd_m: float) -> tuple[Grey, Mask, float, float] | None:
+def _mosaic(flights: Sequence[Flight], ground_z: float, gsd_m: float) -> tuple[Floats, Flags, float, float] | None:
     """Grey mosaic of all vehicles, averaged over the map's pixel, with its validity, west and north edges."""
     fine = gsd_m / _STEP
     parts = []
@@ -154,7 +152,7 @@ def _mosaic(flights: Sequence[Flight], ground_z: float, gsd_m: float) -> tuple[G
     return np.asarray(np.where(valid, mean / np.maximum(share, 1e-6), 0.0), np.float32), valid, west, north
 
 
-def _texture(grey: Grey, valid: Mask) -> NDArray[np.complex64]:
+def _texture(grey: Floats, valid: Flags) -> Field:
     """Gradients g m / (|g|^2 + m^2) as complex numbers, 0 where not valid; see `patch_matching.gradients`."""
     side = STRIP_BORDER_PX
     gradient = cv2.Sobel(grey, cv2.CV_32F, 1, 0) + 1j * cv2.Sobel(grey, cv2.CV_32F, 0, 1)
@@ -165,7 +163,7 @@ def _texture(grey: Grey, valid: Mask) -> NDArray[np.complex64]:
     return np.asarray(np.where(inner, gradient * weight, 0), np.complex64)
 
 
-def _box(values: NDArray[np.floating], side: int) -> Grey:
+def _box(values: NDArray[np.floating], side: int) -> Floats:
     """Mean over a square of an even side, centred on each pixel's upper left corner."""
     return np.asarray(
         cv2.boxFilter(
@@ -174,7 +172,7 @@ def _box(values: NDArray[np.floating], side: int) -> Grey:
     )
 
 
-def _jackknife(moving: NDArray[np.complex64], fixed: NDArray[np.complex64], reach: int) -> float:
+def _jackknife(moving: Field, fixed: NDArray[np.complex64], reach: int) -> float:
     """Sigma of an axis of the peak's place, pixels, by leaving out a part of the mosaic at a time."""
     rows, columns = np.nonzero(moving)
     across = max(1, round(float(np.sqrt(_COARSE_MAP_PARTS))))

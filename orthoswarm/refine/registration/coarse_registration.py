@@ -5,15 +5,13 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.config import active
+from orthoswarm.model.arrays import Array, Flags, Indices, Ints
 from orthoswarm.model.placement import MapWindow
 from orthoswarm.raster.map_cache import TiledMap
 from orthoswarm.refine.flight.relative_block import Flight
 from orthoswarm.refine.registration.orientation_correlation import Match, by_learning, register, stacked, strip_and_map
-
-Array = NDArray[np.float64]
 
 _STRIP_PICTURES: Final = 25  # pictures of a strip in which corners are followed
 _STRIP_PICTURES_SPARSE: Final = 3  # the same of photos that are matched in pairs: some hundred metres of ground
@@ -41,7 +39,7 @@ class CoarseFit:
 
     correction: Array
     matches: list[Match]
-    inlier: NDArray[np.bool_]
+    inlier: Flags
     confidence: float
 
 
@@ -168,13 +166,13 @@ def picture_width_m(flight: Flight) -> float:
     return flight.pictures.size[0] / float(cameras.lens[0, 0]) * float(np.median(cameras.position[:, 2]))
 
 
-def _strips(flight: Flight) -> list[NDArray[np.int64]]:
+def _strips(flight: Flight) -> list[Indices]:
     return _windows(flight.leg, _STRIP_PICTURES_SPARSE if flight.sparse else _STRIP_PICTURES)
 
 
-def _windows(leg: NDArray[np.int32], size: int) -> list[NDArray[np.int64]]:
+def _windows(leg: Ints, size: int) -> list[Indices]:
     """Runs of about `size` pictures of one leg each; short legs are one window."""
-    out: list[NDArray[np.int64]] = []
+    out: list[Indices] = []
     for k in range(int(leg.max()) + 1 if len(leg) else 0):
         members = np.flatnonzero(leg == k)
         parts = max(1, round(len(members) / size))
@@ -182,7 +180,7 @@ def _windows(leg: NDArray[np.int32], size: int) -> list[NDArray[np.int64]]:
     return out or ([np.arange(len(leg))] if len(leg) else [])
 
 
-def _consensus(matches: Sequence[Match]) -> NDArray[np.bool_]:
+def _consensus(matches: Sequence[Match]) -> Flags:
     """Largest set of windows that lie on a line of correction against picture number, sure ones counting more."""
     t = np.array([0.5 * (m.first + m.last) for m in matches])
     s = np.array([m.shift for m in matches])
@@ -202,7 +200,7 @@ def _consensus(matches: Sequence[Match]) -> NDArray[np.bool_]:
     return best
 
 
-def _smooth(matches: Sequence[Match], inlier: NDArray[np.bool_], count: int) -> Array:
+def _smooth(matches: Sequence[Match], inlier: Flags, count: int) -> Array:
     """Correction of each picture: medians of three neighbouring windows, linear between, constant beyond."""
     chosen = [m for m, ok in zip(matches, inlier) if ok]
     t = np.array([0.5 * (m.first + m.last) for m in chosen])

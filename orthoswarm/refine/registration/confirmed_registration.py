@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.config import active
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.placement import MapWindow
 from orthoswarm.refine.flight.relative_block import Flight
 from orthoswarm.refine.registration.absolute_orientation import (
@@ -23,8 +23,6 @@ from orthoswarm.refine.registration.map_evidence import false_matches_log10
 from orthoswarm.refine.registration.map_windows import LoadedMap
 from orthoswarm.refine.registration.tie_points import MapMatches
 from orthoswarm.refine.surface.vehicle_ground import GroundModel
-
-Array = NDArray[np.float64]
 
 _EVIDENCE_SMALL_HALF_M: Final = 4.0  # half a patch where those of the usual size confirm nothing
 

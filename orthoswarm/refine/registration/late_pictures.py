@@ -12,9 +12,9 @@ from typing import Final
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.config import active
+from orthoswarm.model.arrays import Array, Gray
 from orthoswarm.model.camera import Camera, Lens
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.frame import Frame
@@ -22,9 +22,6 @@ from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import PlacedFrame, Solution, Terrain
 from orthoswarm.mosaic.recorded_pose import recorded_cameras
 from orthoswarm.refine.flight.unsolved_pictures import place_by_neighbours
-
-Array = NDArray[np.float64]
-Gray = NDArray[np.uint8]
 
 _NEIGHBOURS: Final = 4  # refined pictures with which a late one is compared, nearest first (for its time)
 _WORK_WIDTH_PX: Final = 640  # columns in which pictures are compared (for its time)

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import bdtrc
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.int32]
+from orthoswarm.model.arrays import Array, Ints
 
 _EVIDENCE_FEWEST: Final = 4  # fewest tie points of a leg or a flight: fewer agree with themselves alone
 _EVIDENCE_PAIRS: Final = 400  # most lines through two tie points that are tried in a group (for its time)

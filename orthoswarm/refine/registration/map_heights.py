@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from orthoswarm.config import active
+from orthoswarm.model.arrays import Array, Flags, Ints
 from orthoswarm.refine.bundle.block_arrays import HEIGHT, WIDTH, CameraBlock
 from orthoswarm.refine.flight.relative_block import Flight
 from orthoswarm.refine.registration.absolute_orientation import TIE_HALF_PX, TIE_REACH_PX, clear_matches
@@ -19,8 +20,6 @@ from orthoswarm.refine.registration.map_windows import LoadedMap
 from orthoswarm.refine.registration.tie_points import match_points
 from orthoswarm.refine.surface.ground_densification import cells_near, flying_height, sight_reach
 from orthoswarm.refine.surface.vehicle_ground import GroundModel
-
-Array = NDArray[np.float64]
 
 _OBLIQUE_CELL_M: Final = 5.0  # at least this far apart, however small the picture
 _OBLIQUE_SLOPE: Final = 0.35  # horizontal distance over height from which on a view counts as oblique: 19 degrees
@@ -39,7 +38,7 @@ def map_heights(
     *,
     others: Array,
     tie_sigma_m: Array,
-    pictures: NDArray[np.bool_] | None = None,
+    pictures: Flags | None = None,
 ) -> tuple[Array, Array]:
     """Ground points (K, 3) and one sigma of their heights (K,), where this flight's views are oblique.
 
@@ -100,7 +99,7 @@ def _positions(flight: Flight, height_m: float, own: NDArray[np.integer], others
     return np.asarray(cells[keep])
 
 
-def _best_views(cameras: CameraBlock, points: Array, own: NDArray[np.integer]) -> NDArray[np.int32]:
+def _best_views(cameras: CameraBlock, points: Array, own: NDArray[np.integer]) -> Ints:
     """For each point (K, 3) the camera nearest above it that sees it, -1 for none."""
     best = np.full(len(points), -1, np.int32)
     if not len(points) or not len(own):

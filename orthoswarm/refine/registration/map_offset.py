@@ -11,14 +11,12 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.config import active
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.frame import SURVEYED, Frame
 from orthoswarm.model.placement import PlacedFrame
 from orthoswarm.refine.bundle.covariance import RECEIVER_COMMON_SIGMA_M
-
-Array = NDArray[np.float64]
 
 _CORRECTED_SIGMA_M: Final = 0.5  # a position that states at most this sigma was corrected (RTK, PPK)
 _CORRECTED_FLOOR_M: Final = 0.05  # corrected positions are not trusted better than this: antenna offset, base station

@@ -3,13 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array, Flags, Gray, Indices
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import MapWindow
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,8 +22,8 @@ class LoadedMap:
     west: float
     north: float
     gsd_m: float
-    gray: NDArray[np.uint8]
-    valid: NDArray[np.bool_]
+    gray: Gray
+    valid: Flags
 
     @classmethod
     def load(cls, basemap: MapWindow, origin: Array, bounds: BoundingBox, gsd_m: float) -> "LoadedMap":
@@ -36,7 +34,7 @@ class LoadedMap:
         grid = GroundGrid.around(basemap.epsg, world, gsd_m)
         return cls(grid.west - east, grid.north - north, gsd_m, np.clip(gray + 0.5, 0, 255).astype(np.uint8), valid)
 
-    def pixel_centres(self, xy: Array) -> tuple[NDArray[np.int64], Array]:
+    def pixel_centres(self, xy: Array) -> tuple[Indices, Array]:
         """Row and column (K, 2) of the pixels that hold points (K, 2), and the coordinates (K, 2) of their middles."""
         column = ((xy[:, 0] - self.west) // self.gsd_m).astype(np.int64)
         row = ((self.north - xy[:, 1]) // self.gsd_m).astype(np.int64)

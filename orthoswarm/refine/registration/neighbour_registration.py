@@ -13,9 +13,9 @@ from typing import Final
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.config import active
+from orthoswarm.model.arrays import Array, Flags, Floats
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.refine.registration.absolute_orientation import working_gsd
@@ -29,8 +29,6 @@ from orthoswarm.refine.registration.coarse_registration import (
 from orthoswarm.refine.registration.neighbour_ties import FixedCameras, fixed_cameras_near, link_to_fixed, remove_fixed
 from orthoswarm.refine.registration.orientation_correlation import strip_mosaic
 from orthoswarm.refine.surface.vehicle_ground import fit_surface
-
-Array = NDArray[np.float64]
 
 _BLOCK_PX = 512
 
@@ -66,7 +64,7 @@ class FixedCameraMosaic:
         xy = self._fixed.cameras.position[:, :2] + self._origin[:2]
         return BoundingBox.around(np.hstack([xy - self._reach_m[:, None], xy + self._reach_m[:, None]]))
 
-    def gray(self, bounds: BoundingBox, gsd_m: float) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    def gray(self, bounds: BoundingBox, gsd_m: float) -> tuple[Floats, Flags]:
         """Grey values (rows, columns), 0 to 255, and validity of a window."""
         grid = GroundGrid.around(self.epsg, bounds, gsd_m)
         gray, valid = np.zeros((grid.height, grid.width), np.float32), np.zeros((grid.height, grid.width), bool)
@@ -76,9 +74,7 @@ class FixedCameraMosaic:
                 self._draw(grid, rows, cols, gray[rows, cols], valid[rows, cols])
         return gray, valid
 
-    def _draw(
-        self, grid: GroundGrid, rows: slice, cols: slice, gray: NDArray[np.float32], valid: NDArray[np.bool_]
-    ) -> None:
+    def _draw(self, grid: GroundGrid, rows: slice, cols: slice, gray: Floats, valid: Flags) -> None:
         cameras, gsd = self._fixed.cameras, grid.gsd_m
         west = grid.west + cols.start * gsd - float(self._origin[0])
         north = grid.north - rows.start * gsd - float(self._origin[1])

@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.config import active
+from orthoswarm.model.arrays import Array, Flags, Gray, Indices, Ints
 from orthoswarm.refine.bundle.adjustment import Adjustment
 from orthoswarm.refine.bundle.block_arrays import CameraBlock, Tracks
 from orthoswarm.refine.bundle.observation_selection import one_per_cell
@@ -15,9 +15,6 @@ from orthoswarm.refine.bundle.priors import Priors
 from orthoswarm.refine.flight.relative_block import Flight
 from orthoswarm.refine.registration.block_state import VehicleState, lies_on_map
 from orthoswarm.refine.registration.tie_points import LINK_VIEW_WEIGHT, LINK_VIEWS, link_legs
-
-Array = NDArray[np.float64]
-Gray = NDArray[np.uint8]
 
 _NEIGHBOUR_SIGMA_PX: Final = 1.5  # sigma of a link to another vehicle, whose cameras do not move, working pixels
 _NEIGHBOUR_PICTURES: Final = 2  # most vehicles in which a point is observed, one picture each (cost)
@@ -35,7 +32,7 @@ class FixedCameras:
     """
 
     cameras: CameraBlock
-    vehicle: NDArray[np.int32]
+    vehicle: Ints
     gray: Callable[[int], Gray]
     small: Callable[[int], Gray]
 
@@ -46,7 +43,7 @@ def fixed_cameras_near(state: VehicleState, others: Sequence[VehicleState]) -> F
     height = float(np.median(state.flight.adjustment.cameras.position[:, 2]))
     reach = _NEIGHBOUR_REACH_HEIGHTS * height
     low, high = own.min(0) - reach, own.max(0) + reach
-    parts: list[tuple[VehicleState, NDArray[np.int64]]] = []
+    parts: list[tuple[VehicleState, Indices]] = []
     for other in others:
         xy = other.flight.adjustment.cameras.position[: len(other.flight.frames), :2]
         within = ((xy > low) & (xy < high)).all(1) & (other.flight.leg >= 0)
@@ -80,7 +77,7 @@ def link_to_fixed(
     gsd_m: float,
     *,
     reach_px: int | None = None,
-    pictures: NDArray[np.bool_] | None = None,
+    pictures: Flags | None = None,
     cell_m: float | None = None,
 ) -> int:
     """Observe own points in fixed pictures and add these observations; the fixed cameras are appended to the block.

@@ -9,15 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from orthoswarm.model.arrays import Array, Flags, Floats, Gray
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import MapWindow
 from orthoswarm.raster.subpixel_peak import vertex
 from orthoswarm.refine.bundle.block_arrays import CameraBlock
 
-Array = NDArray[np.float64]
-Gray = NDArray[np.uint8]
-Complex = NDArray[np.complex64]
+Field = NDArray[np.complex64]
 
 _STRIP_MOST_PX: Final = 4_000_000  # larger strips are not correlated (memory)
 _STRIP_FARTHEST_HEIGHTS: Final = 4.0
@@ -53,7 +52,7 @@ class Match:
     ratio: float
 
 
-def orientation_field(gray: NDArray[np.float32], valid: NDArray[np.bool_]) -> Complex:
+def orientation_field(gray: Floats, valid: Flags) -> Field:
     """Double-angle orientation field (gx + i gy)^2 / |g|^2 * |g| / (|g| + median |g|), 0 where not valid.
 
     An edge keeps its value when light and dark change places.
@@ -67,7 +66,7 @@ def orientation_field(gray: NDArray[np.float32], valid: NDArray[np.bool_]) -> Co
     return np.asarray(np.where(inner, g * g / (np.maximum(size, 1e-3) * (size + max(middle, 1e-3))), 0), np.complex64)
 
 
-def correlation(moving: Complex, fixed: Complex, reach: int) -> NDArray[np.float32]:
+def correlation(moving: Field, fixed: Field, reach: int) -> Floats:
     """Correlation (2 reach + 1, 2 reach + 1) of a field (h, w) with a larger one (h + 2 reach, w + 2 reach).
 
     At [reach + row, reach + column] of the shift; normalised by the energies under the overlap.
@@ -85,7 +84,7 @@ def correlation(moving: Complex, fixed: Complex, reach: int) -> NDArray[np.float
     return np.asarray(score, np.float32)
 
 
-def correlate(moving: Complex, fixed: Complex, reach: int) -> tuple[float, float, float, float]:
+def correlate(moving: Field, fixed: Field, reach: int) -> tuple[float, float, float, float]:
     """Best shift of a field in a larger one (see `correlation`).
 
     Returns:
@@ -94,7 +93,7 @@ def correlate(moving: Complex, fixed: Complex, reach: int) -> tuple[float, float
     return highest(correlation(moving, fixed, reach), PEAK_APART_PX)
 
 
-def highest(score: NDArray[np.float32], apart: int) -> tuple[float, float, float, float]:
+def highest(score: Floats, apart: int) -> tuple[float, float, float, float]:
     """Peak of a correlation as `correlate` gives it; what is nearer than `apart` + 1 pixels belongs to the peak."""
     n = len(score)
     r, c = np.unravel_index(int(score.argmax()), score.shape)
@@ -108,14 +107,14 @@ def highest(score: NDArray[np.float32], apart: int) -> tuple[float, float, float
     return c + dc - n // 2, r + dr - n // 2, peak, ratio
 
 
-def without_peak(score: NDArray[np.float32], apart: int) -> NDArray[np.float32]:
+def without_peak(score: Floats, apart: int) -> Floats:
     """The values (n,) of a correlation that do not belong to its highest peak."""
     r, c = np.unravel_index(int(score.argmax()), score.shape)
     rest = _without(score, int(r), int(c), apart)
     return np.asarray(rest[rest != 0])
 
 
-def _without(score: NDArray[np.float32], row: int, column: int, apart: int) -> NDArray[np.float32]:
+def _without(score: Floats, row: int, column: int, apart: int) -> Floats:
     rest = score.copy()
     rest[max(0, row - apart) : row + apart + 1, max(0, column - apart) : column + apart + 1] = 0
     return rest
@@ -123,7 +122,7 @@ def _without(score: NDArray[np.float32], row: int, column: int, apart: int) -> N
 
 def strip_mosaic(
     cameras: CameraBlock, index: NDArray[np.integer], small: Callable[[int], Gray], ground_z: float, gsd_m: float
-) -> tuple[NDArray[np.float32], NDArray[np.bool_], float, float] | None:
+) -> tuple[Floats, Flags, float, float] | None:
     """Nearest-nadir grey mosaic of some pictures on a level plane.
 
     Args:
@@ -183,10 +182,10 @@ class Strip:
         offset: (2,) east, north: where the map's pixels lie from those of the mosaic, less than a pixel, metres.
     """
 
-    gray: NDArray[np.float32]
-    valid: NDArray[np.bool_]
-    ground: NDArray[np.float32]
-    known: NDArray[np.bool_]
+    gray: Floats
+    valid: Flags
+    ground: Floats
+    known: Flags
     reach: int
     gsd_m: float
     offset: tuple[float, float]
@@ -242,7 +241,7 @@ def by_edges(strip: Strip) -> Found | None:
     return None if fields is None else correlate(*fields, strip.reach)
 
 
-def _edges(strip: Strip) -> tuple[Complex, Complex] | None:
+def _edges(strip: Strip) -> tuple[Field, Field] | None:
     """Orientation fields of a strip and of its map; None where one of them has hardly an edge."""
     blur = _STRIP_BLUR_PX
     moving = orientation_field(cv2.GaussianBlur(strip.gray, (0, 0), blur), strip.valid)

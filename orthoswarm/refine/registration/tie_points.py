@@ -9,14 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.config import active
+from orthoswarm.model.arrays import Array, Flags, Gray, Ints
 from orthoswarm.refine.bundle.block_arrays import CameraBlock
 from orthoswarm.refine.features.patch_matching import template_of
 from orthoswarm.refine.registration.map_windows import LoadedMap
 from orthoswarm.refine.registration.patch_search import search_map, search_picture, templates, views_of_other_legs
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int32]
-Gray = NDArray[np.uint8]
 
 _MAP_WINDOW_SHARE: Final = 0.7  # least share of a patch's search window that the map covers
 _PATCH_SHARE: Final = 0.85  # least share of a patch that its picture shows
@@ -72,7 +69,7 @@ class MapMatches:
         ints = np.zeros(0, np.int32)
         return cls(point=ints, camera=ints, shift=pair, peak=number, ratio=number)
 
-    def take(self, keep: NDArray[np.bool_] | NDArray[np.integer]) -> "MapMatches":
+    def take(self, keep: Flags | NDArray[np.integer]) -> "MapMatches":
         """Some of the matches."""
         return MapMatches(**{name: getattr(self, name)[keep] for name in self.__slots__})
 

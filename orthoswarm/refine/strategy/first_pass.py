@@ -3,9 +3,7 @@
 from collections.abc import Sequence
 from functools import partial
 
-import numpy as np
-from numpy.typing import NDArray
-
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.errors import AdjustmentError
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
@@ -21,8 +19,6 @@ from orthoswarm.refine.strategy.vehicle_passes import (
     refine_tracked,
     registered_by,
 )
-
-Array = NDArray[np.float64]
 
 
 def first_passes(

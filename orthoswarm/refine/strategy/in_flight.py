@@ -11,8 +11,8 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid, local_origin
@@ -32,8 +32,6 @@ from orthoswarm.refine.surface.vehicle_ground import GroundModel, fit_surface
 from orthoswarm.trajectory.legs import leads_one_way
 
 __all__ = ["coarse_of", "local_origin", "place_in_flight"]
-
-Array = NDArray[np.float64]
 
 _FOLLOWED_FEWEST: Final = 10  # fewer pictures are not followed from one to the next but matched in pairs
 _SPARSE_FEWEST: Final = 4  # fewer photos are not placed in flight

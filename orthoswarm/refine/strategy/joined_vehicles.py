@@ -11,9 +11,9 @@ from functools import partial
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.config import active
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.placement import MapWindow
 from orthoswarm.model.plane_similarity import Similarity
 from orthoswarm.model.task_runner import Run
@@ -26,7 +26,6 @@ from orthoswarm.refine.registration.neighbour_registration import join_neighbour
 from orthoswarm.refine.strategy.vehicle_group import neighbours_of
 from orthoswarm.refine.surface.vehicle_ground import fit_surface
 
-Array = NDArray[np.float64]
 Block = list[int]
 Join = Callable[[tuple[VehicleState, list[VehicleState]]], VehicleState]
 

@@ -6,9 +6,9 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.export.product_files import OBLIQUE_AXIS_DOWN
+from orthoswarm.model.arrays import Array, Flags, Floats
 from orthoswarm.model.camera import fov_rad
 from orthoswarm.model.placement import MapWindow
 from orthoswarm.model.task_runner import Continued
@@ -37,8 +37,6 @@ from orthoswarm.refine.registration.map_windows import LoadedMap
 from orthoswarm.refine.registration.neighbour_ties import fixed_cameras_near, link_to_fixed, remove_fixed
 from orthoswarm.refine.strategy.vehicle_passes import SIGMA_FLOOR_M, level_sigma_deg
 from orthoswarm.refine.surface.ground_densification import dense_points, spaced_pictures
-
-Array = NDArray[np.float64]
 
 _COHERENT_SIGMAS: Final = 2.0
 """Ties around a picture whose common offset exceeds so many sigmas show an error that the covariance does not
@@ -82,7 +80,7 @@ def second_pass(
 
 
 def _errors_and_ground(
-    item: tuple[VehicleState, list[VehicleState], LoadedMap | None, NDArray[np.bool_] | None],
+    item: tuple[VehicleState, list[VehicleState], LoadedMap | None, Flags | None],
 ) -> VehicleState:
     """The second half: sigmas, and denser ground."""
     state, others, ground, pictures = item
@@ -135,7 +133,7 @@ def _own_errors(state: VehicleState, others: Sequence[VehicleState], ground: Loa
         state.sigma_m = np.hypot(state.sigma_m, off)
 
 
-def _with_focal_error(flight: Flight, pose: NDArray[np.float32], fov_sigma_deg: float) -> NDArray[np.float32]:
+def _with_focal_error(flight: Flight, pose: Floats, fov_sigma_deg: float) -> Floats:
     """Covariances of the frames' cameras with what a wrong field of view means for their distance from the ground.
 
     Recorded heights that the adjustment uses bound it.
@@ -154,7 +152,7 @@ def _denser_ground(
     state: VehicleState,
     others: Sequence[VehicleState],
     ground: LoadedMap | None,
-    pictures: NDArray[np.bool_] | None,
+    pictures: Flags | None,
 ) -> None:
     """Add ground points for drawing: between the tracks and, where views are oblique only, from the map."""
     flight = state.flight

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.errors import AdjustmentError
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
@@ -41,7 +41,6 @@ from orthoswarm.refine.surface.vehicle_ground import ground_points
 
 __all__ = ["Options", "SwarmRefiner", "refine_alone", "states_of"]
 
-Array = NDArray[np.float64]
 Task = Callable[..., VehicleState | Continued[VehicleState]]
 
 

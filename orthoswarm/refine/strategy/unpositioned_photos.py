@@ -10,11 +10,11 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.config import active
 from orthoswarm.evaluation.checkpoints import Checkpoint
 from orthoswarm.evaluation.photo_names import photo_named
+from orthoswarm.model.arrays import Array, Ints
 from orthoswarm.model.frame import SURVEYED, Frame
 from orthoswarm.model.geo import LocalGrid, area_epsg
 from orthoswarm.model.task_runner import Progress, Run
@@ -22,11 +22,9 @@ from orthoswarm.refine.flight.sparse_start import read_photo_records
 from orthoswarm.refine.initial.free_network import FREE_PAIR_SHARE, Anchors, FreeNetwork, solve_free_network
 from orthoswarm.refine.initial.initial_orientation import shape_of
 from orthoswarm.refine.initial.pair_graph import PairGraphBuilder, ReadGray
-from orthoswarm.refine.initial.planar_similarity import Ints, PhotoRecords
+from orthoswarm.refine.initial.planar_similarity import PhotoRecords
 from orthoswarm.refine.initial.relative_scale import focal_by_hint
 from orthoswarm.refine.initial.tilt_and_lens import Matches, level_pixels, similarities
-
-Array = NDArray[np.float64]
 
 _FREE_NADIR_SHARE: Final = 0.05
 """The ground straight below such a photo lies so far from where its level picture has it, sigma as a share of its

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from orthoswarm.config import active
@@ -23,8 +22,6 @@ from orthoswarm.refine.surface.tall_surfaces import with_tall_surfaces
 from orthoswarm.refine.surface.terrain import fit_terrain
 from orthoswarm.refine.surface.vehicle_ground import ground_points
 from orthoswarm.trajectory.near_paths import near_paths
-
-Array = NDArray[np.float64]
 
 _DRAWN_NODES: Final = 4_000_000  # most nodes of a surface that pictures are drawn on (memory)
 _TERRAIN_REACH_HEIGHTS: Final = 1.1  # terrain is made to so many flying heights beyond the cameras

@@ -6,9 +6,9 @@ from functools import partial
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.config import active
+from orthoswarm.model.arrays import Array, Gray
 from orthoswarm.model.camera import fov_rad
 from orthoswarm.model.errors import AdjustmentError
 from orthoswarm.model.frame import Frame
@@ -52,8 +52,7 @@ from orthoswarm.refine.surface.vehicle_ground import GroundModel, fit_surface
 from orthoswarm.stores.local_copies import copy_ahead
 from orthoswarm.trajectory.legs import leads_one_way
 
-Array = NDArray[np.float64]
-ReadGray = Callable[[Frame], NDArray[np.uint8]]
+ReadGray = Callable[[Frame], Gray]
 
 SIGMA_FLOOR_M: Final = 0.05  # least sigma of a photo on the ground where no map tells it
 START_FOV_DEG: Final = 80.0  # horizontal field of view to start from where no tag hints at one
@@ -111,7 +110,7 @@ class Options:
         return GroundModel(dem=LocalDem(self.dem, (float(origin[0]), float(origin[1]))))
 
 
-def read_frame(frame: Frame) -> NDArray[np.uint8]:
+def read_frame(frame: Frame) -> Gray:
     """A frame's grey picture, reduced while it is decoded where it is larger than what the refinement works on."""
     return read_gray(frame.path, reduction(frame.width, frame.height, active().features.work_width_px))
 
@@ -172,7 +171,7 @@ def refine_tracked(
 
 
 def _registered(
-    item: tuple[VehicleState, dict[int, NDArray[np.uint8]]],
+    item: tuple[VehicleState, dict[int, Gray]],
     *,
     origin: Array,
     basemap: MapWindow | None,

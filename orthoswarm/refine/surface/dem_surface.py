@@ -10,16 +10,14 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array, Flags, Floats
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.placement import Terrain
 from orthoswarm.raster.height_model import HeightModel, KnownGround
 from orthoswarm.refine.surface.ground_offset import kernel_mode
 from orthoswarm.refine.surface.smooth_surface import FitSettings
 from orthoswarm.refine.surface.terrain import fit_terrain, robust_centre
-
-Array = NDArray[np.float64]
 
 _DEM_BLOCK_M: Final = 64.0  # windows of a height model lie on multiples, so that a path that moves reads none again
 _DEM_NODES: Final = 150_000  # nodes of the height model in memory for one vehicle (memory)
@@ -56,7 +54,7 @@ class LocalDem:
 
     def height(self, xy: Array) -> Array:
         """Heights (M,) above the model's zero at positions (M, 2)."""
-        ok: NDArray[np.bool_] = np.asarray(np.isfinite(xy).all(axis=1))
+        ok: Flags = np.asarray(np.isfinite(xy).all(axis=1))
         if not ok.any():
             return np.zeros(len(xy))
         low, high = np.quantile(xy[ok], [0.01, 0.99], axis=0)
@@ -181,7 +179,7 @@ def fit_over_dem(
     ), off
 
 
-def _difference_share(difference: NDArray[np.float32], known: NDArray[np.bool_], usual_m: float) -> NDArray[np.float32]:
+def _difference_share(difference: Floats, known: Flags, usual_m: float) -> Floats:
     """Share (rows, columns) of the difference from the model to apply: none where it is small around a node.
 
     A surface through points errs by decimetres, most at its border; a model that agrees with it nearly everywhere is

@@ -4,16 +4,14 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.config import active
+from orthoswarm.model.arrays import Array, Flags
 from orthoswarm.refine.flight.relative_block import Flight
 from orthoswarm.refine.surface.ground_offset import draw_positions, measure_ground_offset
 from orthoswarm.refine.surface.terrain import TerrainFit
 from orthoswarm.refine.surface.vehicle_ground import GroundModel, fit_surface
 from orthoswarm.refine.surface.vertical_line_locus import REFERENCE_HEIGHT_M, Sweep, dense_ground, spaced_cameras
-
-Array = NDArray[np.float64]
 
 _DENSE_CELL_M: Final = 14.0  # side of the cells that get one height each at the reference height
 _DENSE_MOST_CELLS: Final = 400_000  # areas of more cells are left without dense points (memory)
@@ -60,7 +58,7 @@ def dense_points(flight: Flight, surface: GroundModel) -> tuple[Array, Array, Ar
     return found.points, found.sigma_z, high
 
 
-def spaced_pictures(flight: Flight, surface: GroundModel) -> NDArray[np.bool_]:
+def spaced_pictures(flight: Flight, surface: GroundModel) -> Flags:
     """Pictures used by `dense_points`, and those between legs: bool (N,).
 
     They cover all visible ground; steps limited to them decode fewer pictures.

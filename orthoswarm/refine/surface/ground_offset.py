@@ -11,18 +11,17 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.placement import Terrain
 from orthoswarm.refine.bundle.block_arrays import CameraBlock
 from orthoswarm.refine.surface.vertical_line_locus import (
     REFERENCE_HEIGHT_M,
-    Gray,
     LocusPoints,
+    ReadPicture,
     Sweep,
     dense_ground,
     height_above,
 )
-
-Array = NDArray[np.float64]
 
 _OFFSET_POSITIONS: Final = 900  # free positions where the ground is measured against the surface (0.05 s)
 _OFFSET_SPREAD_M: Final = 100.0  # half side of the square about each camera for positions at reference height
@@ -68,7 +67,7 @@ def draw_positions(camera_xy: Array, height_m: float, *, seed: int = 0) -> Array
 
 def measure_ground_offset(
     cameras: CameraBlock,
-    gray: Gray,
+    gray: ReadPicture,
     positions: Array,
     *,
     terrain: Terrain,

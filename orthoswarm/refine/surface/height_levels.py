@@ -5,12 +5,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from orthoswarm.model.arrays import Array, Indices
 from orthoswarm.model.robust import MEDIAN_SIGMA, mad_sigma
-
-Array = NDArray[np.float64]
 
 _LEVEL_RADIUS_M: Final = 25.0  # points of two vehicles this near each other, horizontally, are common ground
 _LEVEL_NEIGHBOURS: Final = 3  # points of the other vehicle within that radius whose median height is compared
@@ -37,8 +35,8 @@ class LevelNetwork:
 
     correction_m: Array
     sigma_m: Array
-    component: NDArray[np.int64]
-    pairs: NDArray[np.int64]
+    component: Indices
+    pairs: Indices
     residual_m: Array
 
 
@@ -97,7 +95,7 @@ def _common_difference(a: Array, b: Array, tree_a: cKDTree | None, tree_b: cKDTr
     return d[np.argsort(away, kind="stable")[: max(_LEVEL_LEAST_POINTS, len(d) // 2)]]
 
 
-def _adjust(count: int, edge: NDArray[np.int64], difference: Array, sigma: Array) -> LevelNetwork:
+def _adjust(count: int, edge: Indices, difference: Array, sigma: Array) -> LevelNetwork:
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 

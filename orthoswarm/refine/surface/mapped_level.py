@@ -4,14 +4,12 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.placement import Terrain
 from orthoswarm.mosaic.extent import FLAT_RELIEF_M
 from orthoswarm.refine.surface.terrain import lower_flank
-
-Array = NDArray[np.float64]
 
 TERRAIN_POINTS: Final = 60  # with fewer points no terrain is fitted; the ground stays level, or as it was
 _LEVEL_SPACING_M: Final = 7.5  # nodes nearer to each other are thinned for the level of the mapped ground

@@ -16,15 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.config import active
+from orthoswarm.model.arrays import Array, Flags, Floats, Gray, Ints
 from orthoswarm.model.placement import Terrain
 from orthoswarm.model.task_runner import Run
-from orthoswarm.refine.bundle.block_arrays import HEIGHT, WIDTH, CameraBlock, F, Ints
+from orthoswarm.refine.bundle.block_arrays import HEIGHT, WIDTH, CameraBlock, F
 from orthoswarm.refine.features.working_pictures import Pictures
 from orthoswarm.refine.surface import plane_sweep_kernels as kernels
 from orthoswarm.refine.surface.vertical_line_locus import REFERENCE_HEIGHT_M
-
-Array = NDArray[np.float64]
-Float32 = NDArray[np.float32]
 
 _LEAST_PICTURES = 3
 """One and two others: of fewer the two most alike are none."""
@@ -68,7 +66,7 @@ class SweepViews:
 
     cameras: CameraBlock
     pictures: Pictures
-    usable: NDArray[np.bool_]
+    usable: Flags
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +79,7 @@ class _View:
     picture: Pictures
     factor: int
 
-    def reduced(self) -> NDArray[np.uint8]:
+    def reduced(self) -> Gray:
         """The picture with pixels about as large as the cells."""
         picture = self.picture.once(0)
         if self.factor == 1:
@@ -104,7 +102,7 @@ class _Block:
 
     inner: tuple[int, int, int, int]
     corner: tuple[int, int]
-    ground: Float32
+    ground: Floats
     levels: Ints
     views: list[int]
 
@@ -125,9 +123,7 @@ class _Task:
     blocks: list[_Block]
 
 
-def tall_heights(
-    views: Sequence[SweepViews], ground: Terrain, tallest: Float32, *, height_m: float, run: Run
-) -> Float32:
+def tall_heights(views: Sequence[SweepViews], ground: Terrain, tallest: Floats, *, height_m: float, run: Run) -> Floats:
     """Heights above the ground, float32 (rows, columns) of its nodes, 0 where it is the surface.
 
     Args:
@@ -181,7 +177,7 @@ class _Swath:
                 chosen.append(left[int(np.argmin(np.hypot(*(self._nadir[left] - wished).T)))])
         return chosen
 
-    def _see(self, pictures: NDArray[np.intp], place: Array) -> NDArray[np.bool_]:
+    def _see(self, pictures: NDArray[np.intp], place: Array) -> Flags:
         """Which pictures show a place well inside their border."""
         rim = _TALL_RIM_SHARE_PX
         seen = np.zeros(len(pictures), bool)
@@ -194,7 +190,7 @@ class _Swath:
         return seen
 
 
-def _tasks(swath: _Swath, tallest: Float32) -> Iterator[_Task]:
+def _tasks(swath: _Swath, tallest: Floats) -> Iterator[_Task]:
     """The blocks with nodes that may be raised and with pictures to measure them, row by row, some a task."""
     ground = swath.ground
     step_m = _TALL_HEIGHT_STEP_M * swath.height_m / REFERENCE_HEIGHT_M
@@ -226,7 +222,7 @@ def _tasks(swath: _Swath, tallest: Float32) -> Iterator[_Task]:
         yield task()
 
 
-def _block(first: tuple[int, int], ground: Terrain, tallest: Float32, step_m: float) -> _Block | None:
+def _block(first: tuple[int, int], ground: Terrain, tallest: Floats, step_m: float) -> _Block | None:
     """The block whose inner nodes begin at a row and column; None where nothing is raised."""
     (row, column), side, border = first, _TALL_BLOCK_NODES, _TALL_BLOCK_BORDER_NODES
     rows, columns = tallest.shape
@@ -249,7 +245,7 @@ def _middle(block: _Block, ground: Terrain) -> Array:
     return np.array([ground.west + column * ground.step_m, ground.south + row * ground.step_m, z])
 
 
-def _measure(task: _Task) -> list[Float32]:
+def _measure(task: _Task) -> list[Floats]:
     """The heights of the inner nodes of each block of a task, metres."""
     pictures = [view.reduced() for view in task.views]
     out = []
@@ -261,7 +257,7 @@ def _measure(task: _Task) -> list[Float32]:
     return out
 
 
-def _heights(task: _Task, block: _Block, pictures: Sequence[NDArray[np.uint8]]) -> Float32:
+def _heights(task: _Task, block: _Block, pictures: Sequence[Gray]) -> Floats:
     """The heights of a block's nodes, those around the inner ones included."""
     c, f = active().surface, np.float32
     levels, most = block.levels, int(block.levels.max())

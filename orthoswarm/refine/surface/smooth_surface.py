@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel, kernel
+from orthoswarm.model.arrays import Array, Flags, Ints
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.mosaic.extent import FLAT_RELIEF_M
-
-Array = NDArray[np.float64]
 
 KAPPA_SPACING_M = 30.0
 """Kappa, the smoothness, is defined as the sigma of second differences between nodes this far apart, metres; for other
@@ -129,7 +128,7 @@ class _Grid:
         columns, rows = min(column + count, self.columns - 1) - c + 1, min(row + count, self.rows - 1) - r + 1
         return _Grid(self.west + c * self.step, self.south + r * self.step, self.step, max(columns, 3), max(rows, 3))
 
-    def holds(self, points: Array) -> NDArray[np.bool_]:
+    def holds(self, points: Array) -> Flags:
         """Which points (P, 3) lie inside and have a height."""
         c, r = (points[:, 0] - self.west) / self.step, (points[:, 1] - self.south) / self.step
         inside = (c >= 0) & (r >= 0) & (c < self.columns - 1) & (r < self.rows - 1) & np.isfinite(points[:, 2])
@@ -152,12 +151,12 @@ class Surface:
 
     columns: int
     rows: int
-    cell: NDArray[np.int32]
+    cell: Ints
     share: Array
     z: Array
     sigma: Array
     base: Array
-    support: NDArray[np.bool_]
+    support: Flags
     curvature: Array
     slope: Array
     level: Array
@@ -175,7 +174,7 @@ class Surface:
         c, r = np.where(good, c, 0.0), np.where(good, r, 0.0)
         ci, ri = np.floor(c), np.floor(r)
         cell = np.asarray(ri * inner + ci, np.int32)
-        support: NDArray[np.bool_] = np.zeros(inner * outer, np.bool_)
+        support: Flags = np.zeros(inner * outer, np.bool_)
         for k in (0, 1, inner, inner + 1):
             support[cell[good] + k] = True
         size = (inner * outer + 8, 2 * inner + 8)
@@ -250,7 +249,7 @@ class Nodes:
     west: float
     south: float
     z: Array
-    support: NDArray[np.bool_]
+    support: Flags
     kappa: float
 
 
@@ -289,7 +288,7 @@ def fit_nodes(
         asked = [Surface.over(points[i], sigma_z[i], part, s).choose_kappa() for part, i in fullest]
         kappa = sorted(asked)[len(asked) // 2]
     total, weight = np.zeros((grid.rows, grid.columns)), np.zeros((grid.rows, grid.columns))
-    support: NDArray[np.bool_] = np.zeros((grid.rows, grid.columns), np.bool_)
+    support: Flags = np.zeros((grid.rows, grid.columns), np.bool_)
     for part, inside in tiles:
         surface = Surface.over(points[inside], sigma_z[inside], part, s)
         r, c = round((part.south - grid.south) / s.step_m), round((part.west - grid.west) / s.step_m)
@@ -317,7 +316,7 @@ def _blended(total: Array, weight: Array) -> Array:
     return np.asarray(z[tuple(nearest)])
 
 
-def _interpolate(z: Array, cell: NDArray[np.int32], share: Array, inner: int) -> Array:
+def _interpolate(z: Array, cell: Ints, share: Array, inner: int) -> Array:
     c, r = share[:, 0], share[:, 1]
     low = z[cell] * (1 - c) + z[cell + 1] * c
     return np.asarray(low * (1 - r) + (z[cell + inner] * (1 - c) + z[cell + inner + 1] * c) * r)

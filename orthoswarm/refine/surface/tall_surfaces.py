@@ -10,16 +10,13 @@ from typing import Final
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.config import active
+from orthoswarm.model.arrays import Array, Floats
 from orthoswarm.model.placement import Terrain
 from orthoswarm.model.task_runner import Run
 from orthoswarm.refine.surface.plane_sweep import SweepViews, tall_heights
 from orthoswarm.refine.surface.vertical_line_locus import REFERENCE_HEIGHT_M
-
-Array = NDArray[np.float64]
-Float32 = NDArray[np.float32]
 
 _TALL_NEAR_M: Final = 18.0  # heights are measured within this distance of raised points at the reference height
 _TALL_ABOVE_M: Final = 2.0
@@ -68,7 +65,7 @@ def _finer(ground: Terrain, parts: int) -> Terrain:
     return Terrain(ground.west, ground.south, step, z)
 
 
-def _tallest(xy: Array, over: Array, nodes: Terrain, near_m: float) -> Float32:
+def _tallest(xy: Array, over: Array, nodes: Terrain, near_m: float) -> Floats:
     """How high something may stand at each node, metres: above all raised points within a distance; 0 without any."""
     place = np.rint((xy - (nodes.west, nodes.south)) / nodes.step_m).astype(int)
     within = ((place >= 0) & (place < nodes.z.shape[::-1])).all(1)

@@ -8,14 +8,12 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array, Flags
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.placement import Terrain
 from orthoswarm.refine.surface.smooth_surface import FitSettings, fit_nodes
-
-Array = NDArray[np.float64]
 
 HALF_MAXIMUM_SIGMAS = 1.1774
 """Half width of a Gaussian at half its maximum, in sigmas: sqrt(2 ln 2)."""
@@ -51,7 +49,7 @@ class TerrainFit:
     median_m: float
     ground_m: float
     points_above_m: float
-    support: NDArray[np.bool_]
+    support: Flags
     settings: FitSettings = field(default_factory=FitSettings.configured)
 
     @property

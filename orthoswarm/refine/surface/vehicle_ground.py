@@ -4,8 +4,8 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.placement import Terrain
 from orthoswarm.refine.bundle.adjustment import Adjustment, HeightPrior
@@ -13,8 +13,6 @@ from orthoswarm.refine.surface.dem_surface import DemFit, LocalDem, fit_over_dem
 from orthoswarm.refine.surface.mapped_level import TERRAIN_POINTS
 from orthoswarm.refine.surface.smooth_surface import FitSettings
 from orthoswarm.refine.surface.terrain import TerrainFit, fit_terrain
-
-Array = NDArray[np.float64]
 
 _GROUND_POINT_OBSERVATIONS: Final = 4  # least observations of a point that the terrain is fitted to
 _GROUND_POINT_WEIGHT: Final = 0.6  # least mean robust weight of such a point's observations

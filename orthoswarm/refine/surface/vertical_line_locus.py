@@ -15,12 +15,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array, Gray, Indices, Ints
 from orthoswarm.model.placement import Terrain
 from orthoswarm.refine.bundle.block_arrays import HEIGHT, WIDTH, CameraBlock, F
 from orthoswarm.refine.surface import vertical_line_kernels as kernels
 
-Array = NDArray[np.float64]
-Gray = Callable[[int], NDArray[np.uint8]]
+ReadPicture = Callable[[int], Gray]
 
 REFERENCE_HEIGHT_M: Final = 150.0  # flying height for which lengths of patches are stated
 _SWEEP_REACH_M: Final = 9.0  # heights searched above and below the terrain
@@ -127,12 +127,12 @@ class LocusPoints:
     points: Array
     sigma_z: Array
     score: Array
-    cell: NDArray[np.int64]
+    cell: Indices
 
 
 def dense_ground(
     cameras: CameraBlock,
-    gray: Gray,
+    gray: ReadPicture,
     cells: Array,
     *,
     terrain: Terrain,
@@ -194,15 +194,15 @@ class _UsableCameras:
     Order: rank of every camera, -1 unused.
     """
 
-    camera: NDArray[np.int32]
-    leg: NDArray[np.int64]
+    camera: Ints
+    leg: Indices
     along: Array
-    order: NDArray[np.int64]
+    order: Indices
 
 
 def spaced_cameras(
     cameras: CameraBlock, leg_of_camera: NDArray[np.integer], spacing_m: float
-) -> tuple[NDArray[np.int64], NDArray[np.int32], Array]:
+) -> tuple[Indices, Ints, Array]:
     """Cameras spaced along their legs, and each leg's last one: leg, camera and distance along it, sorted."""
     camera: list[int] = []
     leg: list[int] = []
@@ -243,13 +243,13 @@ def _planes(terrain: Terrain, cells: Array, reach: float) -> Array:
 
 def _sweep_in_windows(
     cameras: CameraBlock,
-    gray: Gray,
-    order: NDArray[np.int64],
+    gray: ReadPicture,
+    order: Indices,
     cells: Array,
     plane: Array,
     *,
-    ref: NDArray[np.int32],
-    partner: NDArray[np.int32],
+    ref: Ints,
+    partner: Ints,
     sweeps: Sequence[Sweep],
     slots: int,
     found: Array,
@@ -271,7 +271,7 @@ def _sweep_in_windows(
     factor = window.factor.astype(np.float64)
     least_variance = _SWEEP_LEAST_VARIANCE
 
-    def search(block: NDArray[np.int64], needed: set[int]) -> None:
+    def search(block: Indices, needed: set[int]) -> None:
         window.hold(sorted(needed, key=lambda camera: int(order[camera])))
         for s in sweeps:
             curve, peak = np.empty((len(block), len(s.heights)), np.float32), np.empty((len(block), 2))
@@ -297,7 +297,7 @@ def _sweep_in_windows(
 class _Window:
     """The pictures in memory, reduced to the needed resolution: a stack, and each camera's slot in it."""
 
-    def __init__(self, cameras: CameraBlock, gray: Gray, factor: NDArray[np.int64], slots: int) -> None:
+    def __init__(self, cameras: CameraBlock, gray: ReadPicture, factor: Indices, slots: int) -> None:
         self.factor = factor
         self.slot = np.full(len(cameras), -1, np.int32)
         sizes = cameras.lens[:, [HEIGHT, WIDTH]].astype(np.int64) // factor[:, None]
@@ -317,14 +317,14 @@ class _Window:
                 self.slot[camera] = place
 
 
-def _reduction(cameras: CameraBlock, plane: Array, ref: NDArray[np.int32], step: float) -> NDArray[np.int64]:
+def _reduction(cameras: CameraBlock, plane: Array, ref: Ints, step: float) -> Indices:
     """Integer by which each lens's pictures are reduced, so that pixels are not finer than the samples."""
     above = float(np.median(cameras.position[ref[ref >= 0], 2] - plane[ref >= 0, 0]))
     gsd = max(above, 1.0) / cameras.lens[:, F]
     return np.maximum(1, np.floor(step / gsd)).astype(np.int64)
 
 
-def _reduced(picture: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
+def _reduced(picture: Gray, factor: int) -> Gray:
     if factor == 1:
         return picture
     import cv2
