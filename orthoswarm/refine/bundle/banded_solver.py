@@ -52,11 +52,7 @@ class BandedSystem:
         )
 
     def solve(self) -> tuple[Array, Array, Array]:
-        """Steps of the cameras (6 n,) and of the common unknowns (s,), and the latter's inverse covariance (s, s).
-
-        Raises:
-            AdjustmentError: if the system is singular.
-        """
+        """Steps of the cameras (6 n,) and of the common unknowns (s,), and the latter's inverse covariance (s, s)."""
         if not self.band.shape[1]:
             return np.zeros(0), np.asarray(np.linalg.solve(self.corner, self.rhs_common)), self.corner
         both = solve_factored(factorise(self.band), np.column_stack([self.side, self.rhs]))
@@ -67,11 +63,7 @@ class BandedSystem:
 
 
 def factorise(band: Array) -> Array:
-    """Cholesky factor of a symmetric matrix as LAPACK's lower band, in place.
-
-    Raises:
-        AdjustmentError: if it is not positive definite.
-    """
+    """Cholesky factor of a symmetric matrix as LAPACK's lower band, in place; it must be positive definite."""
     factor, info = lapack.dpbtrf(band, lower=1, overwrite_ab=1)
     if info != 0:
         raise AdjustmentError("the adjustment is singular; check the records for NaN or repeated pictures")

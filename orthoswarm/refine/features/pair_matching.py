@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.model.arrays import Array, Complex, Flags, Floats, Indices, Ints
-from orthoswarm.refine.features.sift_features import Features, root_sift
+from orthoswarm.refine.features.sift_features import SiftFeatures, root_sift
 from orthoswarm.trajectory.legs import PAUSE_S
 
 _MATCH_RATIO: Final = 0.85
@@ -31,12 +31,7 @@ _PAIR_BEST_DISTANCE: Final = 0.4  # best distance of a pair as a share of its re
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """Two photos that show the same ground.
-
-    Attributes:
-        first: index of one photo; second: index of the other, larger.
-        match: int32 (n, 2), rows of features in the first and in the second.
-    """
+    """Photos `first` < `second` that show the same ground; match: int32 (n, 2), rows of features in the two."""
 
     first: int
     second: int
@@ -46,7 +41,7 @@ class Pair:
         return len(self.match)
 
 
-def match_features(one: Features, two: Features) -> Ints:
+def match_features(one: SiftFeatures, two: SiftFeatures) -> Ints:
     """Rows of matching features in two photos, int32 (n, 2); (0, 2) without a match.
 
     Mutual nearest neighbours that pass the ratio test, then a similarity by RANSAC, then the fundamental matrix by
@@ -117,7 +112,7 @@ class _Identity:
 
     __slots__ = ("features",)
 
-    def __init__(self, features: Features) -> None:
+    def __init__(self, features: SiftFeatures) -> None:
         self.features = features
 
     def __hash__(self) -> int:
@@ -132,7 +127,7 @@ def _unit_of(key: _Identity) -> Floats:
     return root_sift(key.features.descriptor)
 
 
-def _unit(features: Features) -> Floats:
+def _unit(features: SiftFeatures) -> Floats:
     return _unit_of(_Identity(features))
 
 
@@ -140,15 +135,13 @@ def consecutive(group: NDArray[np.integer], time_s: Array) -> Ints:
     """Pairs of photos that follow each other in one group (a vehicle) without a pause, int32 (n, 2).
 
     Args:
-        group: integers (N,), photos of a group in order of time.
-        time_s: float64 (N,), NaN where unknown (then order alone counts).
+        group: integers (N,), photos of a group in order of time. time_s: float64 (N,), NaN where unknown.
     """
-    pause_s = PAUSE_S
     last: dict[int, int] = {}
     pairs: list[tuple[int, int]] = []
     for k, g in enumerate(group.tolist()):
         before = last.get(g)
-        if before is not None and not abs(time_s[k] - time_s[before]) > pause_s:
+        if before is not None and not abs(time_s[k] - time_s[before]) > PAUSE_S:
             pairs.append((before, k))
         last[g] = k
     return np.array(pairs, np.int32).reshape(-1, 2)
@@ -157,18 +150,16 @@ def consecutive(group: NDArray[np.integer], time_s: Array) -> Ints:
 def nearby(centre: Complex, reach: Array, group: NDArray[np.integer], count: int = 8) -> Ints:
     """Pairs with possibly overlapping footprints, spread over all directions, int32 (n, 2), sorted, first < second.
 
-    Each photo chooses partners in every direction, both of its own group and of others, preferring those whose distance
-    is near the best one.
+    Each photo chooses `count` partners in every direction, both of its own group and of others, preferring those whose
+    distance is near the best one.
 
     Args:
-        centre: complex (N,), east + i north of the ground at each photo's centre.
+        centre: complex (N,), east + i north of the ground at each photo's centre. group: integers (N,), leg or segment.
         reach: float64 (N,), metres; two photos are near if their distance is below the mean of their reaches.
-        group: integers (N,), leg or segment.
-        count: how many neighbours each photo may choose.
     """
     from scipy.spatial import cKDTree
 
-    best, sectors = _PAIR_BEST_DISTANCE, _PAIR_SECTORS
+    sectors = _PAIR_SECTORS
     points = np.stack([centre.real, centre.imag], axis=1)
     tree = cKDTree(points)
     chosen: set[tuple[int, int]] = set()
@@ -178,7 +169,7 @@ def nearby(centre: Complex, reach: Array, group: NDArray[np.integer], count: int
         distance = np.abs(centre[near] - centre[i])
         mean = 0.5 * (reach[near] + reach[i])
         near, distance = near[distance <= mean], (distance / mean)[distance <= mean]
-        order = np.lexsort((near, np.abs(near - i), np.round(np.abs(distance - best), 3)))
+        order = np.lexsort((near, np.abs(near - i), np.round(np.abs(distance - _PAIR_BEST_DISTANCE), 3)))
         near = near[order]
         sector = np.floor(np.angle(centre[near] - centre[i]) / (2 * np.pi) * sectors + 0.5).astype(np.int64) % sectors
         for j in _round_robin(near, sector + sectors * (group[near] != group[i]), count):

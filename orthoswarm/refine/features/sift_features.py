@@ -29,14 +29,13 @@ _SIFT_SIGMA_SHARE: Final = 0.04  # ... beyond that it grows by this share of the
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Features:
+class SiftFeatures:
     """Features of one photo.
 
     Attributes:
-        uv: float32 (n, 2), column and row in the FULL picture, pixel centres at integers.
+        uv: float32 (n, 2), column and row in the FULL picture (width, height), pixel centres at integers.
         descriptor: uint8 (n, 128), SIFT descriptors as OpenCV gives them (see `root_sift`).
         sigma_px: float32 (n,), one sigma of the position in pixels of the full picture.
-        width: columns of the full picture; height: rows.
         step_px: full-picture pixels per pixel of the reduced picture.
     """
 
@@ -51,17 +50,11 @@ class Features:
         return len(self.uv)
 
     @classmethod
-    def none(cls, width: int, height: int) -> "Features":
+    def none(cls, width: int, height: int) -> "SiftFeatures":
         """An empty set for a picture of this size."""
         empty = np.zeros((0, 2), np.float32)
-        return cls(
-            uv=empty,
-            descriptor=np.zeros((0, 128), np.uint8),
-            sigma_px=empty[:, 0],
-            width=width,
-            height=height,
-            step_px=1.0,
-        )
+        none = np.zeros((0, 128), np.uint8)
+        return cls(uv=empty, descriptor=none, sigma_px=empty[:, 0], width=width, height=height, step_px=1.0)
 
     def same_point(self) -> Ints:
         """For each feature the index of the first one at the same place, int32 (n,).
@@ -79,42 +72,37 @@ def root_sift(descriptor: Gray) -> Floats:
     return np.asarray(np.sqrt(d, out=d))
 
 
-def detect(gray: Gray, width: int, height: int, working_pixels: int | None = None) -> Features:
-    """Features of one photo.
+def detect(gray: Gray, width: int, height: int, working_pixels: int = SIFT_PIXELS) -> SiftFeatures:
+    """At most `_SIFT_KEPT` features of one photo, the strongest of each cell first.
 
     Args:
         gray: uint8 (rows, columns), the photo at any size (decoding at reduced size saves time).
-        width: columns of the full picture, in whose pixels positions are given.
-        height: its rows.
-        working_pixels: number of pixels of the reduced working picture (None: as configured).
-
-    Returns:
-        At most `_SIFT_KEPT` features, the strongest of each cell first.
+        width, height: of the full picture, in whose pixels positions are given.
+        working_pixels: number of pixels of the reduced picture on which features are found.
     """
     import cv2
 
-    reduced, step = reduce_picture(gray, width, height, SIFT_PIXELS if working_pixels is None else working_pixels)
+    reduced, step = reduce_picture(gray, width, height, working_pixels)
     sift = cv2.SIFT_create(  # type: ignore[attr-defined,unused-ignore]
         nfeatures=_SIFT_DETECTED, contrastThreshold=_SIFT_CONTRAST, enable_precise_upscale=True
     )
     keypoints, descriptors = sift.detectAndCompute(reduced, None)
     if len(keypoints) == 0:
-        return Features.none(width, height)
+        return SiftFeatures.none(width, height)
     xy = np.array([k.pt for k in keypoints], np.float32)
     response = np.array([k.response for k in keypoints], np.float32)
     size = np.array([k.size for k in keypoints], np.float32)
     keep = spread(xy, response, reduced.shape[1], reduced.shape[0])
     uv = (xy[keep] + np.float32(0.5)) * np.float32(step) - np.float32(0.5)
     sigma = np.float32(step) * localisation_sigma(size[keep])
-    return Features(
+    return SiftFeatures(
         uv=uv, descriptor=descriptors[keep].astype(np.uint8), sigma_px=sigma, width=width, height=height, step_px=step
     )
 
 
 def localisation_sigma(size: Floats) -> Floats:
     """One sigma in reduced pixels of SIFT features of diameters (n,), float32 (n,)."""
-    floor, share = np.float32(_SIFT_SIGMA_PX), np.float32(_SIFT_SIGMA_SHARE)
-    return np.asarray(np.hypot(floor, share * size), dtype=np.float32)
+    return np.asarray(np.hypot(np.float32(_SIFT_SIGMA_PX), np.float32(_SIFT_SIGMA_SHARE) * size), dtype=np.float32)
 
 
 def reduce_picture(gray: Gray, width: int, height: int, working_pixels: int) -> tuple[Gray, float]:
@@ -132,10 +120,7 @@ def spread(xy: Floats, response: Floats, columns: int, rows: int) -> NDArray[np.
     """Indices of the features to keep: the strongest of every cell, then the second strongest, until there are enough.
 
     Args:
-        xy: float32 (n, 2), positions in a picture of `columns` by `rows`.
-        response: float32 (n,), strength.
-        columns: of the picture.
-        rows: of the picture.
+        xy: float32 (n, 2), positions in a picture of `columns` by `rows`. response: float32 (n,), strength.
     """
     nx, ny = SIFT_CELLS if columns >= rows else SIFT_CELLS[::-1]
     cx = np.clip((xy[:, 0] * nx / columns).astype(np.int64), 0, nx - 1)

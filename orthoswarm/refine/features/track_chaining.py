@@ -9,24 +9,17 @@ from orthoswarm.compute.jit import in_place_kernel, kernel
 from orthoswarm.model.arrays import Array, Indices, Ints
 from orthoswarm.refine.bundle.block_arrays import Tracks
 from orthoswarm.refine.features.pair_matching import Pair
-from orthoswarm.refine.features.sift_features import SIFT_CELLS, Features
+from orthoswarm.refine.features.sift_features import SIFT_CELLS, SiftFeatures
 
 _TRACK_LONGEST: Final = 20  # longest track; longer ones stay in pieces (its cost)
 _TRACK_PER_CELL: Final = 2  # observations in a cell of a photo from which on further tracks are dropped (its cost)
 
 
-def build_tracks(features: Sequence[Features], pairs: Sequence[Pair]) -> Tracks:
-    """Tie points through all photos, each observed 2 to `_TRACK_LONGEST` times.
+def build_tracks(features: Sequence[SiftFeatures], pairs: Sequence[Pair]) -> Tracks:
+    """Tie points through all photos, each observed 2 to `_TRACK_LONGEST` times, in full pictures.
 
     The strongest pair is joined first; a join that would put two points of one photo into a track is refused, so that
-    one wrong match cannot merge two places.
-
-    Args:
-        features: of each photo; the camera of an observation is the index here.
-        pairs: verified matches.
-
-    Returns:
-        Tracks with positions in full pictures, ordered by camera, then point.
+    one wrong match cannot merge two places. The camera of an observation is the photo's index in `features`.
     """
     offset = np.concatenate([[0], np.cumsum([len(f) for f in features])]).astype(np.int64)
     photo = np.repeat(np.arange(len(features), dtype=np.int32), np.diff(offset))
@@ -41,18 +34,12 @@ def build_tracks(features: Sequence[Features], pairs: Sequence[Pair]) -> Tracks:
     return _tracks(root, photo, features)
 
 
-def _tracks(root: Indices, photo: Ints, features: Sequence[Features]) -> Tracks:
+def _tracks(root: Indices, photo: Ints, features: Sequence[SiftFeatures]) -> Tracks:
     _, inverse, count = np.unique(root, return_inverse=True, return_counts=True)
     node = np.flatnonzero(count[inverse] >= 2)
     uv = np.concatenate([f.uv for f in features]) if len(features) else np.zeros((0, 2), np.float32)
     sigma = np.concatenate([f.sigma_px for f in features]) if len(features) else np.zeros(0, np.float32)
-    _, point = np.unique(inverse[node], return_inverse=True)
-    return Tracks(
-        camera=photo[node],
-        point=point.reshape(-1).astype(np.int32),
-        uv=uv[node].astype(np.float64),
-        sigma_px=sigma[node].astype(np.float32),
-    )
+    return Tracks(photo[node], inverse[node].astype(np.int32), uv[node].astype(np.float64), sigma[node]).renumbered()
 
 
 @in_place_kernel
@@ -99,12 +86,10 @@ def _union(edges, photo, count, max_length):  # type: ignore[no-untyped-def]
 
 
 def thin_tracks(tracks: Tracks, width: Array, rows: Array) -> Tracks:
-    """Thin the tracks but cover every photo evenly: longest first, while a cell of one of their photos has room. room.
+    """Thin the tracks but cover every photo evenly: longest first, while a cell of one of their photos has room.
 
     Args:
-        tracks: of N photos.
-        width: int (N,), columns of each photo.
-        rows: int (N,), rows of each photo.
+        width, rows: (N,), columns and rows of each photo.
     """
     if not len(tracks.camera):
         return tracks
@@ -117,14 +102,7 @@ def thin_tracks(tracks: Tracks, width: Array, rows: Array) -> Tracks:
     cell = tracks.camera.astype(np.int64) * nx * ny + cy * nx + cx
     keep = np.zeros(len(order), np.bool_)
     _thin(cell[order], start, _TRACK_PER_CELL, nx * ny * len(width), keep)
-    selected = np.sort(order[keep])
-    _, point = np.unique(tracks.point[selected], return_inverse=True)
-    return Tracks(
-        tracks.camera[selected],
-        point.reshape(-1).astype(np.int32),
-        tracks.uv[selected],
-        tracks.sigma_px[selected].copy(),
-    )
+    return tracks.take(np.sort(order[keep])).renumbered()
 
 
 @kernel

@@ -18,7 +18,7 @@ from orthoswarm.model.arrays import Array, Flags, Floats, Gray, Indices
 from orthoswarm.refine.bundle.block_arrays import Tracks
 from orthoswarm.refine.features import klt
 from orthoswarm.refine.features.corners import strongest
-from orthoswarm.refine.features.pair_homography import measured_homography, shifted_prediction
+from orthoswarm.refine.features.flow_calibration import phase_shift
 
 _BORDER_PX: Final = 9  # corners nearer to the picture's border are not begun: the window of the flow would leave it
 _CORNER_WINDOW_PX: Final = 5  # window of the minimum-eigenvalue corner measure (Shi and Tomasi 1994)
@@ -44,6 +44,16 @@ _KLT_ROUNDS: Final = (8, 10, 8)  # most iterations: at half size, at full size, 
 _KLT_MISMATCH: Final = 0.75  # largest mean square error of a window from picture to picture, as a share of its variance
 _KLT_ANCHOR_MISMATCH: Final = 0.4  # the same against the first observation: stricter, or tracks would creep
 _KLT_NOISE_VARIANCE: Final = 4.0  # noise of the picture that is added to both, grey values squared
+_HOMOGRAPHY_PX: Final = 3.0  # flow within this distance agrees with a homography (RANSAC; chosen; not measured)
+_HOMOGRAPHY_SHARE: Final = 0.4  # least share of the flow that must agree
+_HOMOGRAPHY_LEAST: Final = 12  # fewest corners that must agree
+_PYRAMID_WINDOW_PX: Final = 21  # window of the flow over several octaves (OpenCV's default)
+_PYRAMID_OCTAVES: Final = 4  # octaves below the full picture of that flow: it reaches some 16 windows
+_ORB_CORNERS: Final = 1000  # ORB corners (Rublee et al. 2011) of a turn that nobody recorded
+_ORB_LEAST: Final = 30  # fewest ORB matches that must agree
+_ORB_SHARE: Final = 0.25  # least share of the ORB matches that must agree
+_PHASE_REDUCTION: Final = 4  # phase correlation for a prediction's missing shift works on pictures reduced by this
+_PHASE_RESPONSE: Final = 0.05  # least response of that phase correlation
 
 
 @dataclass(slots=True)
@@ -76,11 +86,9 @@ class Tracker:
     """Tracks corners from picture to picture: `add` the pictures in order, then read `tracks`.
 
     Attributes:
-        scale: full-resolution pixels per pixel of the added pictures.
-        cell_px: at most one track in each cell of this size.
+        cell_px: at most one track in each cell of this size, working pixels.
     """
 
-    scale: float = 1.0
     cell_px: int = field(default_factory=lambda: active().features.cell_px)
     _live: _Live = field(default_factory=_Live)
     _gray: Gray | None = None
@@ -95,8 +103,7 @@ class Tracker:
         """Track all live corners into the next picture and start new ones in empty cells.
 
         Args:
-            index: of the picture (the camera of the observations).
-            gray: uint8 (rows, columns).
+            index: of the picture (the camera of the observations). gray: uint8 (rows, columns).
             predicted: 3x3 homography from the last picture's pixels to this one's, None to start afresh.
 
         Returns:
@@ -119,17 +126,15 @@ class Tracker:
         return survived
 
     def tracks(self) -> Tracks:
-        """Observations of all tracks that are long enough, in full-resolution pixels."""
+        """Observations of all tracks that are long enough, in working pixels."""
         if not self._log:
             return Tracks(np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros((0, 2)), np.zeros(0, np.float32))
         camera = np.concatenate([np.full(len(ident), i, np.int32) for i, ident, _ in self._log])
         ident = np.concatenate([ident for _, ident, _ in self._log])
         uv = np.concatenate([uv for _, _, uv in self._log]).astype(np.float64)
         keep = np.bincount(ident, minlength=self._next)[ident] >= _TRACK_LEAST_OBSERVATIONS
-        _, point = np.unique(ident[keep], return_inverse=True)
-        uv = (uv[keep] + 0.5) * self.scale - 0.5
-        sigma = np.full(len(point), _FLOW_SIGMA_PX * self.scale, np.float32)
-        return Tracks(camera[keep], point.astype(np.int32), uv, sigma)
+        sigma = np.full(len(ident), _FLOW_SIGMA_PX, np.float32)
+        return Tracks(camera, ident.astype(np.int32), uv, sigma).take(keep).renumbered()
 
     def _go_on(self, homography: Array | None) -> None:
         """Set the present picture's place in the chain of homographies from the first one; None begins another."""
@@ -157,7 +162,7 @@ class Tracker:
         )
         return flow.kept / max(before, 1)
 
-    def _better(self, gray: Gray, half: Gray, other: Array, now: "_Flow", predicted: Array) -> tuple["_Flow", Array]:
+    def _better(self, gray: Gray, half: Gray, other: Array, now: _Flow, predicted: Array) -> tuple[_Flow, Array]:
         """The present flow or, if it keeps more tracks, that from another prediction; with the prediction used."""
         flow = self._flow(gray, half, other)
         return (flow, other) if flow.kept > now.kept else (now, predicted)
@@ -167,22 +172,12 @@ class Tracker:
         if self._stack is None or not len(live.uv):
             return
         photos, now, ok = len(self._stack), self._count - 1, np.zeros(len(live.uv), bool)
+        here = np.linalg.inv(self._chain[now % photos])
+        limits = _KLT_ROUNDS[2], _KLT_LEAST_TEXTURE, _KLT_STEP_PX, _KLT_ANCHOR_MISMATCH, _KLT_NOISE_VARIANCE
         klt.anchor(
-            stack=self._stack,
-            chain=self._chain,
-            slot=live.anchor % photos,
-            points=live.anchor_uv,
-            after=gray,
-            here=np.linalg.inv(self._chain[now % photos]),
-            limit=_ANCHOR_LIMIT_PX,
-            rounds=_KLT_ROUNDS[2],
-            texture=_KLT_LEAST_TEXTURE,
-            step=_KLT_STEP_PX,
-            mismatch=_KLT_ANCHOR_MISMATCH,
-            noise=_KLT_NOISE_VARIANCE,
-            found=live.uv,
-            ok=ok,
-        )
+            self._stack, self._chain, live.anchor % photos, live.anchor_uv, gray, here, _ANCHOR_LIMIT_PX, limits,
+            live.uv, ok,
+        )  # fmt: skip
         lost = ~ok | (now + 1 - live.anchor >= photos)
         live.anchor[lost], live.anchor_uv[lost] = now, live.uv[lost]
 
@@ -191,27 +186,15 @@ class Tracker:
             self._stack = np.zeros((_ANCHOR_PHOTOS, *gray.shape), np.uint8)
         self._stack[(self._count - 1) % len(self._stack)] = gray
 
-    def _flow(self, gray: Gray, half: Gray, predicted: Array) -> "_Flow":
+    def _flow(self, gray: Gray, half: Gray, predicted: Array) -> _Flow:
         """Flow of the live tracks from the predicted positions, without outliers."""
         config, count = active().features, len(self._live.uv)
         guess, found, good = np.empty((count, 2), np.float32), np.empty((count, 2), np.float32), np.zeros(count, bool)
+        limits = _KLT_ROUNDS[:2], _KLT_LEAST_TEXTURE, _KLT_STEP_PX, _KLT_MISMATCH, _KLT_NOISE_VARIANCE
         klt.track(
-            before=self._gray,
-            before_half=self._half,
-            after=gray,
-            after_half=half,
-            points=self._live.uv,
-            homography=predicted,
-            back=np.linalg.inv(predicted),
-            rounds=_KLT_ROUNDS[:2],
-            texture=_KLT_LEAST_TEXTURE,
-            step=_KLT_STEP_PX,
-            mismatch=_KLT_MISMATCH,
-            noise=_KLT_NOISE_VARIANCE,
-            guess=guess,
-            found=found,
-            ok=good,
-        )
+            self._gray, self._half, gray, half, self._live.uv, predicted, np.linalg.inv(predicted), limits, guess,
+            found, good,
+        )  # fmt: skip
         kept, expected = _gate(
             guess, found, good, *gray.shape, _FLOW_INSIDE_PX, _FLOW_LEAST, _FLOW_MEDIAN_LIMIT_PX,
             _FLOW_GATE_PX, config.flow_chance_share,
@@ -247,10 +230,8 @@ class Tracker:
 def _gate(guess, found, ok, rows, cols, margin, least, limit, gate, chance):  # type: ignore[no-untyped-def]
     """Keep flow close to the median residual, which must itself be close to the prediction, in ok, in place.
 
-    None is kept where no more agree than corners on different ground would by chance (binomial, 3 sigma).
-
-    Returns:
-        How many are kept, and how many were expected inside the picture.
+    None is kept where no more agree than corners on different ground would by chance (binomial, 3 sigma). Returns how
+    many are kept, and how many were expected inside the picture.
     """
     expected = 0
     for k in range(len(ok)):
@@ -292,14 +273,88 @@ def _oldest_per_cell(uv, age, ident, cols, size):  # type: ignore[no-untyped-def
     return keep
 
 
+def measured_homography(previous: Gray | None, gray: Gray, uv: Floats, predicted: Array) -> Array | None:
+    """The homography that most of a flow over several octaves agrees on; None without agreement.
+
+    For a swaying camera whose angles are degrees off or not recorded. Starts from the prediction and, if that finds no
+    consensus (a heading more than ten degrees off), from no motion; after that from ORB corners.
+
+    Args:
+        uv: float32 (K, 2), corners of the previous picture. predicted: 3x3 homography from its pixels.
+    """
+    if previous is None or len(uv) < _HOMOGRAPHY_LEAST:
+        return None
+    for start in (predicted, np.eye(3)):
+        aligned = shifted_prediction(previous, gray, start)
+        measured = _flow_homography(previous, gray, uv, start if aligned is None else aligned)
+        if measured is not None:
+            return measured
+    return _turned_homography(previous, gray)
+
+
+def _flow_homography(previous: Gray, gray: Gray, uv: Floats, start: Array) -> Array | None:
+    """The homography that most of the flow from a given start agrees on, None without agreement."""
+    guess = apply_homography(start, uv)
+    warped = cv2.warpPerspective(previous, start, gray.shape[::-1], borderMode=cv2.BORDER_REPLICATE)
+    window = (_PYRAMID_WINDOW_PX, _PYRAMID_WINDOW_PX)
+    found, status, _ = cv2.calcOpticalFlowPyrLK(warped, gray, guess, None, winSize=window, maxLevel=_PYRAMID_OCTAVES)
+    ok = is_inside(guess, gray.shape, 0.0) & (status.ravel() == 1) & is_inside(found, gray.shape, 0.0)
+    if ok.sum() < _HOMOGRAPHY_LEAST:
+        return None
+    return _agreed(uv[ok], found[ok], max(_HOMOGRAPHY_LEAST, _HOMOGRAPHY_SHARE * ok.sum()))
+
+
+def _turned_homography(previous: Gray, gray: Gray) -> Array | None:
+    """The homography that rotation-invariant corners (ORB) agree on, for turns without recorded headings, or None."""
+    orb = cv2.ORB.create(nfeatures=_ORB_CORNERS)
+    (before, ours), (after, theirs) = (orb.detectAndCompute(picture, None) for picture in (previous, gray))
+    if ours is None or theirs is None:
+        return None
+    pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(ours, theirs)
+    if len(pairs) < _ORB_LEAST:
+        return None
+    a = np.array([before[m.queryIdx].pt for m in pairs], np.float32)
+    b = np.array([after[m.trainIdx].pt for m in pairs], np.float32)
+    return _agreed(a, b, max(_ORB_LEAST, _ORB_SHARE * len(pairs)))
+
+
+def _agreed(a: Floats, b: Floats, fewest: float) -> Array | None:
+    """The homography by RANSAC over pairs of pixels (K, 2), None with too few inliers."""
+    homography, inlier = cv2.findHomography(a, b, cv2.RANSAC, _HOMOGRAPHY_PX)
+    if homography is None or inlier.sum() < fewest:
+        return None
+    return np.asarray(homography, np.float64)
+
+
+def shifted_prediction(previous: Gray | None, gray: Gray, predicted: Array) -> Array | None:
+    """The prediction corrected by a shift from phase correlation of reduced pictures, None if that is unclear."""
+    if previous is None:
+        return None
+    warped = cv2.warpPerspective(previous, predicted, gray.shape[::-1], borderMode=cv2.BORDER_REPLICATE)
+    dx, dy, response = phase_shift(warped, gray, 1.0 / _PHASE_REDUCTION)
+    if response <= _PHASE_RESPONSE:
+        return None
+    return np.array([[1.0, 0, _PHASE_REDUCTION * dx], [0, 1.0, _PHASE_REDUCTION * dy], [0, 0, 1.0]]) @ predicted
+
+
+def apply_homography(homography: Array, uv: Floats) -> Floats:
+    """Pixels (K, 2) mapped by a homography (3, 3)."""
+    p = uv.astype(float) @ homography[:, :2].T + homography[:, 2]
+    return np.ascontiguousarray(p[:, :2] / p[:, 2:], dtype=np.float32)
+
+
+def is_inside(uv: Floats, shape: tuple[int, ...], margin: float) -> Flags:
+    """Which pixels (K, 2) lie in a picture of this shape, at least a margin inside its border."""
+    h, w = shape[:2]
+    return (uv[:, 0] >= margin) & (uv[:, 1] >= margin) & (uv[:, 0] <= w - 1 - margin) & (uv[:, 1] <= h - 1 - margin)
+
+
 def predicted_homography(before: Array, after: Array, height_m: float, step: Array, matrix: Array) -> Array:
     """The homography of flat ground from one picture's pixels to the next one's, predicted from their records.
 
     Args:
-        before: (3, 3) rotation of the earlier camera, camera to ground; after: the later camera's.
-        height_m: height of the earlier camera above the ground.
-        step: (3,) its movement in metres, east, north, up.
-        matrix: 3x3 calibration matrix.
+        before, after: (3, 3) rotations, camera to ground. height_m: of the earlier camera above the ground.
+        step: (3,) its movement in metres, east, north, up. matrix: 3x3 calibration matrix.
     """
     upward = before[2]  # the ground's normal in the earlier camera's axes
     relative = after.T @ before + np.outer(after.T @ step, upward) / height_m
@@ -307,23 +362,15 @@ def predicted_homography(before: Array, after: Array, height_m: float, step: Arr
 
 
 def follow(
-    count: int,
-    read: Callable[[int], Gray],
-    prediction: Callable[[int], Array | None],
-    scale: float = 1.0,
-    cell_px: int | None = None,
+    count: int, read: Callable[[int], Gray], prediction: Callable[[int], Array | None], cell_px: int
 ) -> tuple[Tracks, Array]:
-    """Track corners through pictures 0 .. count - 1.
+    """The tracks of corners through pictures 0 .. count - 1, and the share that survived into each, float64 (count,).
 
     Args:
-        count: number of pictures. read: returns picture i at working scale.
+        read: returns picture i at working scale. cell_px: see Tracker.
         prediction: 3x3 homography from picture i - 1 to i, None where tracking starts afresh.
-        scale: full-resolution pixels per working pixel. cell_px: see Tracker (None: as configured).
-
-    Returns:
-        The tracks, and the share of them that survived into each picture, float64 (count,).
     """
-    tracker = Tracker(scale=scale) if cell_px is None else Tracker(scale=scale, cell_px=cell_px)
+    tracker = Tracker(cell_px=cell_px)
     survived = np.ones(count)
     for i in range(count):
         survived[i] = tracker.add(i, read(i), prediction(i))

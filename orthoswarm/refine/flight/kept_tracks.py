@@ -27,8 +27,7 @@ class Followed:
     Attributes:
         calibration: focal length and headings by the flow. tracks: corners that were tracked, in working pixels.
         survived: float64 (N,), share of the tracks that survived into each picture.
-        small: index -> reduced picture, uint8 (rows, columns).
-        damaged: index -> why that picture cannot be used.
+        small: index -> reduced picture. damaged: index -> why that picture cannot be used.
     """
 
     calibration: Calibration
@@ -49,11 +48,9 @@ class KeptTracks:
     folder: Path
 
     def file(self, frames: Sequence[Frame], epsg: int, origin: Array, fov_start: float) -> Path:
-        """Where the tracks of a flight are kept.
+        """Where the tracks of a flight are kept: frames in order, their records, names, sizes and files count.
 
-        Args:
-            frames: in order; their records, names, sizes and files count. epsg: the area's grid.
-            origin: float64 (2,) of the local frame. fov_start: assumed horizontal field of view, radians.
+        fov_start: assumed horizontal field of view, radians.
         """
         asked = (frames, [_state(frame.path) for frame in frames], epsg, origin.tolist(), fov_start, active())
         return self.folder / (hashlib.sha256(repr(asked).encode()).hexdigest() + _SUFFIX)

@@ -64,8 +64,7 @@ def few_of_their_kind(frames: Sequence[Frame]) -> Flags:
     """Frames with too few others of their vehicle, camera and size, while other cameras have enough: bool (N,)."""
     kinds = [(f.vehicle, f.camera, f.width, f.height) for f in frames]
     count = Counter(kinds)
-    least = _LEAST_PHOTOS_OF_KIND
-    few = np.array([count[kind] < least for kind in kinds], bool)
+    few = np.array([count[kind] < _LEAST_PHOTOS_OF_KIND for kind in kinds], bool)
     return few if not few.all() else np.zeros(len(frames), bool)
 
 
@@ -74,12 +73,11 @@ def hovering_vehicles(recorded: Sequence[PlacedFrame]) -> set[str]:
     members: dict[str, list[PlacedFrame]] = {}
     for p in recorded:
         members.setdefault(p.frame.vehicle, []).append(p)
-    out = set()
-    for vehicle, own in members.items():
-        positions = np.array([p.camera.position for p in own])
-        if len(own) > _LEAST_PHOTOS_OF_KIND and _hovers(positions):
-            out.add(vehicle)
-    return out
+    return {
+        vehicle
+        for vehicle, own in members.items()
+        if len(own) > _LEAST_PHOTOS_OF_KIND and _hovers(np.array([p.camera.position for p in own]))
+    }
 
 
 def _hovers(positions: Array) -> bool:
@@ -99,12 +97,8 @@ def place_by_neighbours(
     """Place frames by applying the refinement's changes of their nearest neighbours: position, attitude, focal length.
 
     Args:
-        odd: as recorded.
-        recorded: the refined frames as recorded, with the same assumed field of view.
-        refined: frames after refinement.
-
-    Returns:
-        One placed frame for each odd frame; as recorded if nothing was refined.
+        odd: as recorded; they stay so if nothing was refined.
+        recorded: the refined frames as recorded, with the same assumed field of view. refined: after refinement.
     """
     before = {p.frame.image: p for p in recorded}
     pairs = [(before[p.frame.image], p) for p in refined if p.frame.image in before]
@@ -118,18 +112,14 @@ def move_with_neighbours(
     """Move frames by the changes of their nearest neighbours when those were placed again; sigmas stay.
 
     Args:
-        extra: placed after the others, not solved with them.
-        before: the others before the change.
-        after: the others after the change.
+        extra: placed after the others, not solved with them. before, after: the others before and after the change.
     """
     own = {p.frame.image for p in extra}
     moved = place_by_neighbours(extra, [p for p in before if p.frame.image not in own], after)
     return [replace(now, sigma_m=was.sigma_m, weak=was.weak) for was, now in zip(extra, moved, strict=True)]
 
 
-def _nearest(
-    one: PlacedFrame, pairs: Sequence[tuple[PlacedFrame, PlacedFrame]]
-) -> list[tuple[PlacedFrame, PlacedFrame]]:
+def _nearest(one: PlacedFrame, pairs: Sequence[BeforeAfter]) -> list[BeforeAfter]:
     """The refined frames nearest to a frame, of its own vehicle if there are any."""
     own = [pair for pair in pairs if pair[0].frame.vehicle == one.frame.vehicle] or list(pairs)
     away = [float(np.hypot(*(p.camera.nadir - one.camera.nadir))) for p, _ in own]

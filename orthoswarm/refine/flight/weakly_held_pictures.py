@@ -5,7 +5,7 @@ from typing import Final
 import numpy as np
 
 from orthoswarm.model.arrays import Array, Flags, Indices, Ints
-from orthoswarm.refine.flight.relative_block import Flight
+from orthoswarm.refine.flight.relative_block import FlightBlock
 
 _SPARSE_FEWEST_OBSERVATIONS: Final = 12  # photos matched in pairs with fewer observations are weakly determined
 HELD_OBSERVATIONS: Final = 8  # pictures with fewer well fitting observations are placed between their neighbours
@@ -21,7 +21,7 @@ _WEAK_MOST_PHOTOS: Final = 40  # ... up to so many photos
 _WEAK_DISAGREEMENT_SHARE: Final = 0.5  # a weak picture's sigma is at least this share of what record and line differ by
 
 
-def observations_per_camera(flight: Flight) -> Indices:
+def observations_per_camera(flight: FlightBlock) -> Indices:
     """Number of inlier observations of each of the vehicle's cameras: int64 (N,)."""
     adj = flight.adjustment
     n = len(flight.frames)
@@ -29,7 +29,7 @@ def observations_per_camera(flight: Flight) -> Indices:
     return np.bincount(adj.tracks.camera[good], minlength=n)
 
 
-def weakly_held(flight: Flight) -> Flags:
+def weakly_held(flight: FlightBlock) -> Flags:
     """Whether too few observations hold a camera: bool (N,)."""
     fewest = _SPARSE_FEWEST_OBSERVATIONS if flight.sparse else HELD_OBSERVATIONS
     return np.asarray(observations_per_camera(flight) < fewest)
@@ -57,7 +57,7 @@ def without_outliers(recorded: Array, leg: Ints) -> Array:
     return out
 
 
-def interpolate_weak(flight: Flight, sigma_m: Array) -> Flags:
+def interpolate_weak(flight: FlightBlock, sigma_m: Array) -> Flags:
     """Interpolate weak cameras in place from strong ones before and after; returns which were interpolated.
 
     Positions follow the recorded path where it agrees with the neighbours, else a straight line in time; the

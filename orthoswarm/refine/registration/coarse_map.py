@@ -20,13 +20,13 @@ from orthoswarm.model.arrays import Array, Flags, Floats
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import MapWindow
-from orthoswarm.refine.flight.relative_block import Flight
+from orthoswarm.refine.flight.relative_block import FlightBlock
 from orthoswarm.refine.registration.orientation_correlation import (
     PEAK_APART_PX,
     STRIP_BORDER_PX,
     STRIP_FEWEST_EDGES,
     STRIP_MAP_SHARE,
-    Field,
+    OrientationField,
     correlation,
     highest,
     strip_mosaic,
@@ -70,21 +70,18 @@ class CoarseMapShift:
     false_matches: float
 
 
-def is_coarse(flight: Flight, basemap: MapWindow) -> bool:
+def is_coarse(flight: FlightBlock, basemap: MapWindow) -> bool:
     """Whether a map's pixels are too coarse for tie points of a flight's pictures."""
-    cameras = flight.cameras()
-    picture_m = float(np.median(cameras.position[:, 2])) / float(cameras.lens[0, 0])
+    picture_m = flight.height_m / flight.focal_px
     return basemap.native_gsd_m > max(_COARSE_MAP_GSD_M, _COARSE_MAP_PICTURES * picture_m)
 
 
 def shift_on_coarse_map(
-    flights: Sequence[Flight], basemap: MapWindow, origin: Array, ground_z: float
+    flights: Sequence[FlightBlock], basemap: MapWindow, origin: Array, ground_z: float
 ) -> CoarseMapShift | None:
-    """Where vehicles that make one block lie on a coarse map; None where it does not show their ground.
+    """Where vehicles that make one block, adjusted in one frame, lie on a coarse map; None where it does not show them.
 
-    Args:
-        flights: adjusted, in one frame. basemap: the map. origin: float64 (2,) of the local frame.
-        ground_z: level of their ground, metres.
+    ground_z: level of their ground, metres.
     """
     config, gsd = active().registration, basemap.native_gsd_m / _STEP
     drawn = _mosaic(flights, ground_z, gsd)
@@ -121,7 +118,7 @@ def shift_on_coarse_map(
     )
 
 
-def _mosaic(flights: Sequence[Flight], ground_z: float, gsd_m: float) -> tuple[Floats, Flags, float, float] | None:
+def _mosaic(flights: Sequence[FlightBlock], ground_z: float, gsd_m: float) -> tuple[Floats, Flags, float, float] | None:
     """Grey mosaic of all vehicles, averaged over the map's pixel, with its validity, west and north edges."""
     fine = gsd_m / _STEP
     parts = []
@@ -152,7 +149,7 @@ def _mosaic(flights: Sequence[Flight], ground_z: float, gsd_m: float) -> tuple[F
     return np.asarray(np.where(valid, mean / np.maximum(share, 1e-6), 0.0), np.float32), valid, west, north
 
 
-def _texture(grey: Floats, valid: Flags) -> Field:
+def _texture(grey: Floats, valid: Flags) -> OrientationField:
     """Gradients g m / (|g|^2 + m^2) as complex numbers, 0 where not valid; see `patch_matching.gradients`."""
     side = STRIP_BORDER_PX
     gradient = cv2.Sobel(grey, cv2.CV_32F, 1, 0) + 1j * cv2.Sobel(grey, cv2.CV_32F, 0, 1)
@@ -165,14 +162,11 @@ def _texture(grey: Floats, valid: Flags) -> Field:
 
 def _box(values: NDArray[np.floating], side: int) -> Floats:
     """Mean over a square of an even side, centred on each pixel's upper left corner."""
-    return np.asarray(
-        cv2.boxFilter(
-            values.astype(np.float32), -1, (side, side), anchor=(side // 2, side // 2), borderType=cv2.BORDER_CONSTANT
-        )
-    )
+    grey, anchor = values.astype(np.float32), (side // 2, side // 2)
+    return np.asarray(cv2.boxFilter(grey, -1, (side, side), anchor=anchor, borderType=cv2.BORDER_CONSTANT))
 
 
-def _jackknife(moving: Field, fixed: NDArray[np.complex64], reach: int) -> float:
+def _jackknife(moving: OrientationField, fixed: NDArray[np.complex64], reach: int) -> float:
     """Sigma of an axis of the peak's place, pixels, by leaving out a part of the mosaic at a time."""
     rows, columns = np.nonzero(moving)
     across = max(1, round(float(np.sqrt(_COARSE_MAP_PARTS))))

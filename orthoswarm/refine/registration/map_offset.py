@@ -29,10 +29,8 @@ class MapOffset:
     """The map against the receivers.
 
     Attributes:
-        east, north: metres from where the receivers say to where the map shows the same ground.
-        sigma: one sigma of both, metres.
-        vehicles: how many were compared.
-        corrected: True where the receivers had corrections (RTK, PPK), by the accuracy that they state.
+        east, north: metres from where the receivers say to where the map shows the same ground. sigma: of both.
+        vehicles: how many were compared. corrected: receivers state an accuracy that only corrections (RTK, PPK) give.
     """
 
     east: float
@@ -115,11 +113,7 @@ def had_corrections(frames: Sequence[Frame]) -> bool:
 
 
 def measure_map_offset(recorded: Sequence[PlacedFrame], refined: Sequence[PlacedFrame]) -> MapOffset | None:
-    """The offset of the map against the receivers, by the frames that were refined on the map; None without any.
-
-    Args:
-        recorded: the cameras as recorded. refined: the same frames after the refinement, in the same grid.
-    """
+    """The offset of the map against the receivers, by the frames that were refined on the map; None without any."""
     on_map = [p for p in refined if p.stage == "fine" and not p.weak]
     return _measured(recorded, on_map, min((p.sigma_m for p in refined if p.stage == "fine"), default=0.0))
 
@@ -129,9 +123,7 @@ def measure_control_offset(
 ) -> MapOffset | None:
     """The offset of frames that control points placed against the receivers; None without any.
 
-    Args:
-        recorded: the cameras as recorded. placed: the same frames after the control, in the same grid.
-        found_sigma_m: sigma of the control's shift, an axis, metres.
+    found_sigma_m: sigma of the control's shift, an axis, metres.
     """
     return _measured(recorded, [p for p in placed if not p.weak], found_sigma_m)
 
