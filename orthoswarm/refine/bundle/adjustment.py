@@ -191,13 +191,19 @@ class Adjustment:
 
     def _assemble(self, c: float, heights: HeightPrior, ties: MapTies, tie_c: float) -> BandedSystem:
         """Build the reduced normal equations at the present state."""
-        free, lenses, points = int(self.free.sum()), len(self.cameras.lens), len(self.points)
-        system = BandedSystem.empty(
-            free=free, common=self.layout.size, lenses=lenses, points=points, observations=len(self.tracks.point),
-            bandwidth=self.bandwidth,
-        )  # fmt: skip
-        k = 6 * lenses
-        lens_side, lens_corner, rhs_lens = np.zeros((6 * free, k)), np.zeros((k, k)), np.zeros(k)
+        lenses, points, size = len(self.cameras.lens), len(self.points), self.layout.size
+        n, k = 6 * int(self.free.sum()), 6 * lenses
+        system = BandedSystem(
+            band=np.zeros((6 * (self.bandwidth + 1), n), order="F"),
+            side=np.zeros((n, size)),
+            corner=np.zeros((size, size)),
+            rhs=np.zeros(n),
+            rhs_common=np.zeros(size),
+            w_obs=np.zeros((len(self.tracks.point), 6, 3)),
+            w_lens=np.zeros((points, lenses, 6, 3)),
+            b_point=np.zeros((points, 3)),
+        )
+        lens_side, lens_corner, rhs_lens = np.zeros((n, k)), np.zeros((k, k)), np.zeros(k)
         tie_of_point = np.full(points, -1, np.int32)
         tie_of_point[ties.point] = np.arange(len(ties.point), dtype=np.int32)
         self.tie_residual = np.zeros((len(ties.point), 2))

@@ -35,22 +35,6 @@ class BandedSystem:
     w_lens: Array
     b_point: Array
 
-    @classmethod
-    def empty(
-        cls, *, free: int, common: int, lenses: int, points: int, observations: int, bandwidth: int
-    ) -> "BandedSystem":
-        """All zeros."""
-        return cls(
-            band=np.zeros((6 * (bandwidth + 1), 6 * free), order="F"),
-            side=np.zeros((6 * free, common)),
-            corner=np.zeros((common, common)),
-            rhs=np.zeros(6 * free),
-            rhs_common=np.zeros(common),
-            w_obs=np.zeros((observations, 6, 3)),
-            w_lens=np.zeros((points, lenses, 6, 3)),
-            b_point=np.zeros((points, 3)),
-        )
-
     def solve(self) -> tuple[Array, Array, Array]:
         """Steps of the cameras (6 n,) and of the common unknowns (s,), and the latter's inverse covariance (s, s)."""
         if not self.band.shape[1]:

@@ -94,15 +94,11 @@ def detect(gray: Gray, width: int, height: int, working_pixels: int = SIFT_PIXEL
     size = np.array([k.size for k in keypoints], np.float32)
     keep = spread(xy, response, reduced.shape[1], reduced.shape[0])
     uv = (xy[keep] + np.float32(0.5)) * np.float32(step) - np.float32(0.5)
-    sigma = np.float32(step) * localisation_sigma(size[keep])
+    spread_px = np.hypot(np.float32(_SIFT_SIGMA_PX), np.float32(_SIFT_SIGMA_SHARE) * size[keep])
+    sigma = np.float32(step) * spread_px.astype(np.float32)
     return SiftFeatures(
         uv=uv, descriptor=descriptors[keep].astype(np.uint8), sigma_px=sigma, width=width, height=height, step_px=step
     )
-
-
-def localisation_sigma(size: Floats) -> Floats:
-    """One sigma in reduced pixels of SIFT features of diameters (n,), float32 (n,)."""
-    return np.asarray(np.hypot(np.float32(_SIFT_SIGMA_PX), np.float32(_SIFT_SIGMA_SHARE) * size), dtype=np.float32)
 
 
 def reduce_picture(gray: Gray, width: int, height: int, working_pixels: int) -> tuple[Gray, float]:

@@ -10,7 +10,6 @@ from orthoswarm.model.arrays import Array, Flags
 from orthoswarm.model.frame import Frame
 from orthoswarm.refine.bundle.adjustment import Adjustment
 from orthoswarm.refine.bundle.height_consistency import log_focal_sigmas
-from orthoswarm.refine.initial.heading import tag_yaw
 from orthoswarm.refine.initial.initial_orientation import InitialOrientation
 from orthoswarm.refine.initial.planar_similarity import PhotoRecords
 
@@ -35,7 +34,7 @@ def flipped_yaw(records: PhotoRecords, start: InitialOrientation) -> Flags:
     for v, tag in enumerate(start.tags):
         if tag.source:
             rows = (records.vehicle == v) & start.yaw_known
-            off = np.abs(wrap_rad(start.yaw - tag_yaw(records, tag.source) - tag.offset))
+            off = np.abs(wrap_rad(start.yaw - getattr(records, tag.source) - tag.offset))
             flipped |= rows & (np.nan_to_num(off) > np.radians(_FLIPPED_YAW_DEG))
     return flipped
 

@@ -18,7 +18,7 @@ from orthoswarm.model.robust import mad_sigma
 from orthoswarm.model.task_runner import Progress, Run, serial
 from orthoswarm.refine.bundle.block_arrays import HEIGHT, K1, WIDTH, CameraBlock, F, Tracks
 from orthoswarm.refine.bundle.flight_records import column
-from orthoswarm.refine.features.track_chaining import build_tracks, thin_tracks
+from orthoswarm.refine.features.pair_matching import build_tracks, thin_tracks
 from orthoswarm.refine.features.working_pictures import ReadGray
 from orthoswarm.refine.flight.record_findings import findings, unplaced_reasons
 from orthoswarm.refine.initial.initial_orientation import InitialOrientation, find_initial_orientation

@@ -18,8 +18,8 @@ from scipy.sparse.linalg import splu
 from orthoswarm.compute.robust_kernel import robust_widening
 from orthoswarm.model.arrays import Array, Complex, Flags, Ints
 from orthoswarm.refine.initial.heading import components
+from orthoswarm.refine.initial.planar_network import SparseRows
 from orthoswarm.refine.initial.planar_similarity import PairGraph
-from orthoswarm.refine.initial.sparse_rows import SparseRows
 from orthoswarm.refine.initial.tilt_and_lens import spaced
 
 FREE_PAIR_SHARE: Final = 0.02  # sigma of the match centres of two level photos, in picture widths

@@ -166,7 +166,7 @@ def tag_heading(records: PhotoRecords, rows: NDArray[np.intp], yaw: Array) -> Ta
     """
     best = TagHeading("", 0.0, 0.0)
     for source in ("yaw", "flight_yaw"):
-        tag = tag_yaw(records, source)[rows]
+        tag = getattr(records, source)[rows]
         finite = np.isfinite(tag)
         if finite.sum() < _TAG_LEAST_PHOTOS:
             continue
@@ -176,8 +176,3 @@ def tag_heading(records: PhotoRecords, rows: NDArray[np.intp], yaw: Array) -> Ta
         if agree > best.agree + _TAG_BETTER_SHARE:
             best = TagHeading(source, offset, agree)
     return best if best.agree >= _TAG_AGREE_SHARE else TagHeading("", 0.0, best.agree)
-
-
-def tag_yaw(records: PhotoRecords, source: str) -> Array:
-    """A recorded heading by name, float64 (N,), NaN where unknown."""
-    return records.flight_yaw if source == "flight_yaw" else records.yaw

@@ -23,13 +23,11 @@ from orthoswarm.refine.initial.heading import (
     course_headings,
     solve_headings,
     tag_heading,
-    tag_yaw,
 )
 from orthoswarm.refine.initial.planar_network import NetworkPriors, solve_network
 from orthoswarm.refine.initial.planar_similarity import PairGraph, PhotoRecords, level_from_nadir, rotation_of
 from orthoswarm.refine.initial.relative_scale import (
     RecordedHeights,
-    first_of,
     first_scale,
     focal_by_height,
     focal_by_hint,
@@ -111,7 +109,7 @@ def find_initial_orientation(
     Tilt and lens, relative scales, headings and network are solved in rounds.
     """
     count, segments = len(records), int(records.segment.max()) + 1
-    lens_of = np.asarray(first_of(records.segment, records.lens, segments), np.int32)
+    lens_of = records.lens[np.unique(records.segment, return_index=True)[1]]
     matches = PairMatches.of(pairs, features)
     tilt_floor = float(np.radians(_TILT_FLOOR_DEG))
     hint, hint_sigma = focal_by_hint(records)
@@ -218,7 +216,7 @@ def _fill_headings(
     for v, tag in enumerate(tags):
         rows = records.vehicle == v
         source = tag.source or ("yaw" if np.isfinite(records.yaw[rows]).any() else "flight_yaw")
-        guess[rows] = tag_yaw(records, source)[rows] + tag.offset
+        guess[rows] = getattr(records, source)[rows] + tag.offset
     guess = np.where(np.isfinite(guess), guess, course)
     for part in np.unique(component[~known]):
         rows = np.flatnonzero((component == part) & np.isfinite(guess))

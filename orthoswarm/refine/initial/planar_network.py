@@ -5,18 +5,18 @@ for the centre of a pair's matches, together with recorded positions. A wrong pa
 does a wrong position; as photos have several neighbours, the two can be distinguished.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from scipy.sparse import diags
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import splu
 
 from orthoswarm.compute.robust_kernel import robust_widening
-from orthoswarm.model.arrays import Array, Complex, Flags, Ints
+from orthoswarm.model.arrays import Array, Complex, Flags, Indices, Ints
 from orthoswarm.refine.bundle.priors import LAG_SIGMA_S
 from orthoswarm.refine.initial.planar_similarity import PairGraph, PhotoRecords
-from orthoswarm.refine.initial.sparse_rows import SparseRows
 
 _NETWORK_SCHEDULE: Final = (400.0, 400.0, 36.0, 9.0, 9.0)
 """Robust schedule of pairs and recorded positions (chosen on four real flights)."""
@@ -92,6 +92,33 @@ class _NetworkColumns(NamedTuple):
         """The columns for so many photos, segments, lenses and vehicles."""
         first = np.cumsum([2 * n, s, 2 * s, lenses, v]).tolist()
         return cls(n, s, lenses, v, *first)
+
+
+@dataclass(slots=True)
+class SparseRows:
+    """Linear equations of `size` unknowns in units of one sigma, real or complex, collected by blocks."""
+
+    size: int
+    count: int = 0
+    parts: list[tuple[Indices, NDArray[Any], NDArray[Any]]] = field(default_factory=list)
+    sides: list[NDArray[Any]] = field(default_factory=list)
+
+    def add(self, right: NDArray[Any], *terms: tuple[ArrayLike, ArrayLike]) -> None:
+        """Add a row for each element of `right`: each term is (columns, values), with one of both for each row."""
+        row = self.count + np.arange(len(right))
+        for column, value in terms:
+            self.parts.append((row, np.broadcast_to(column, row.shape), np.broadcast_to(value, row.shape)))
+        self.sides.append(right)
+        self.count += len(right)
+
+    def matrix(self) -> coo_matrix:
+        """The matrix (rows, size)."""
+        row, column, value = (np.concatenate([p[k] for p in self.parts]) for k in range(3))
+        return coo_matrix((value, (row, column)), shape=(self.count, self.size))
+
+    def right(self) -> NDArray[Any]:
+        """The right-hand side (rows,)."""
+        return np.concatenate(self.sides)
 
 
 def solve_network(graph: PairGraph, records: PhotoRecords, yaw: Array, beliefs: NetworkPriors) -> Network:

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import spsolve
 
@@ -162,8 +161,3 @@ def weighted_median(value: Array, weight: Array) -> float:
     order = np.argsort(value, kind="stable")
     total = np.cumsum(weight[order])
     return float(value[order][np.searchsorted(total, 0.5 * total[-1])])
-
-
-def first_of(label: Ints, value: NDArray[np.generic], count: int) -> NDArray[np.generic]:
-    """The value of the first member of each label, (count,)."""
-    return np.array([value[label == k][0] for k in range(count)])

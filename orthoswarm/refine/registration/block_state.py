@@ -116,11 +116,6 @@ def findings(state: VehicleState) -> list[str]:
     return [*state.flight.warnings, NOT_FOUND] if state.had_map and not state.on_map else list(state.flight.warnings)
 
 
-def surface_points(state: VehicleState) -> Array:
-    """Densified points (K, 3) on the visible surface: ground, and what stands on it."""
-    return np.concatenate([state.dense[0], state.high])
-
-
 class Stopwatch:
     """CPU seconds by name, added up."""
 

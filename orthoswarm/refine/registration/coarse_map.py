@@ -141,9 +141,12 @@ def _mosaic(flights: Sequence[FlightBlock], ground_z: float, gsd_m: float) -> tu
         cut = (slice(row, row + grey.shape[0]), slice(column, column + grey.shape[1]))
         total[cut] += np.where(valid, grey, 0.0)
         count[cut] += valid
-    side = _STEP * _STEP  # the map's pixel
-    shown = (count > 0).astype(np.float32)
-    sums = (_box(part, side) for part in (np.where(count > 0, total / np.maximum(count, 1.0), 0.0), shown))
+    side, middle = (_STEP * _STEP,) * 2, (_STEP * _STEP // 2,) * 2  # the map's pixel, from its upper left corner on
+    shown = np.where(count > 0, total / np.maximum(count, 1.0), 0.0), count > 0
+    sums = (
+        cv2.boxFilter(part.astype(np.float32), -1, side, anchor=middle, borderType=cv2.BORDER_CONSTANT)
+        for part in shown
+    )
     mean, share = (part[_STEP // 2 :: _STEP, _STEP // 2 :: _STEP] for part in sums)
     valid = share > _COARSE_MAP_SHARE
     return np.asarray(np.where(valid, mean / np.maximum(share, 1e-6), 0.0), np.float32), valid, west, north
@@ -158,12 +161,6 @@ def _texture(grey: Floats, valid: Flags) -> OrientationField:
     middle = _COARSE_MAP_TEXTURE * float(np.median(length[inner])) if inner.any() else 0.0
     weight = middle / np.maximum(length**2 + middle**2, 1e-6)
     return np.asarray(np.where(inner, gradient * weight, 0), np.complex64)
-
-
-def _box(values: NDArray[np.floating], side: int) -> Floats:
-    """Mean over a square of an even side, centred on each pixel's upper left corner."""
-    grey, anchor = values.astype(np.float32), (side // 2, side // 2)
-    return np.asarray(cv2.boxFilter(grey, -1, (side, side), anchor=anchor, borderType=cv2.BORDER_CONSTANT))
 
 
 def _jackknife(moving: OrientationField, fixed: NDArray[np.complex64], reach: int) -> float:

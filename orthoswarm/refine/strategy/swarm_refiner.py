@@ -18,11 +18,19 @@ from orthoswarm.model.errors import AdjustmentError
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.placement import MapWindow, Refinement, Solution, Terrain
 from orthoswarm.model.task_runner import Continued, Progress, Run, serial, whole
+from orthoswarm.refine.flight.relative_block import FlightBlock
+from orthoswarm.refine.flight.sparse_block import open_sparse_flights
 from orthoswarm.refine.flight.unsolved_pictures import move_with_neighbours
 from orthoswarm.refine.flight.vehicle_refinement import UnitRefiner, merge_units, unit_states, units_of_area, unrefined
-from orthoswarm.refine.registration.block_state import VehicleState, WorkArea, findings, lies_on_map, to_solution
+from orthoswarm.refine.registration.block_state import (
+    Stopwatch,
+    VehicleState,
+    WorkArea,
+    findings,
+    lies_on_map,
+    to_solution,
+)
 from orthoswarm.refine.registration.neighbour_registration import register_to_neighbours
-from orthoswarm.refine.strategy.first_pass import first_passes
 from orthoswarm.refine.strategy.joined_vehicles import join_unmapped
 from orthoswarm.refine.strategy.second_pass import second_pass
 from orthoswarm.refine.strategy.vehicle_group import (
@@ -33,7 +41,15 @@ from orthoswarm.refine.strategy.vehicle_group import (
     neighbours_of,
     pooled_lean,
 )
-from orthoswarm.refine.strategy.vehicle_passes import RefinerOptions, refine_alone, tracked_flight
+from orthoswarm.refine.strategy.vehicle_passes import (
+    RefinerOptions,
+    learned_registration,
+    refine_alone,
+    refine_matched,
+    refine_tracked,
+    registered_by,
+    tracked_flight,
+)
 from orthoswarm.refine.surface.height_levels import level_corrections
 from orthoswarm.refine.surface.vehicle_ground import ground_points
 
@@ -154,7 +170,7 @@ def register_unfound(
 ) -> list[VehicleState]:
     """Register vehicles that were not found on the map on neighbours that were; then others on these, and so on.
 
-    others: more that may carry them, as they are. Returns the states in order, those that are `carried` marked so.
+    others: more that may carry them, as they are. Returns the states in order; the registered ones are `carried`.
     """
     out = list(states)
     lost = [k for k, s in enumerate(out) if s.had_map and not s.on_map]
@@ -219,3 +235,68 @@ def _shifted(terrain: Terrain | None, origin: Array) -> Terrain | None:
     if terrain is None:
         return None
     return replace(terrain, west=terrain.west + float(origin[0]), south=terrain.south + float(origin[1]))
+
+
+def first_passes(
+    units: list[list[Frame]], area: WorkArea, *, options: RefinerOptions, run: Run, progress: Progress | None
+) -> tuple[list[VehicleState], dict[int, str]]:
+    """Each vehicle by itself; those whose photos must be matched are matched and adjusted together first.
+
+    units: frames of one vehicle and one lens each. Returns the states of all units that could be adjusted, in order;
+    unit -> why not, of the others.
+    """
+    # Learned matching is left to one process afterwards: its network takes 400 MB.
+    task = partial(refine_tracked, area=area, options=options, learned=False)
+    states: list[VehicleState | None] = []
+    for n, state in enumerate(run(task, units)):
+        states.append(state)
+        if progress:
+            progress("solo", n + 1, len(units))
+    unfollowed = [k for k, state in enumerate(states) if state is None]
+    lost: dict[int, str] = {}
+    if unfollowed:
+        watch = Stopwatch()
+        together = [units[k] for k in unfollowed]
+        opened = _sparse_flights(together, area=area, options=options, run=run, progress=progress)
+        watch.lap("tracks")
+        lost = {k: flight for k, flight in zip(unfollowed, opened, strict=True) if isinstance(flight, str)}
+        flights = [flight for flight in opened if not isinstance(flight, str)]
+        place = partial(refine_matched, area=area, options=options, learned=False)
+        for k, state in zip([k for k in unfollowed if k not in lost], run(place, flights), strict=True):
+            state.timings["tracks"] = watch.seconds["tracks"] / len(unfollowed)
+            states[k] = state
+    found = [state for state in states if state is not None]
+    return _learned_registrations(found, area, run, progress), lost
+
+
+def _sparse_flights(
+    units: Sequence[list[Frame]], *, area: WorkArea, options: RefinerOptions, run: Run, progress: Progress | None
+) -> list[FlightBlock | str]:
+    """Flights whose photos are matched and adjusted together, each by itself where that fails; else the reason.
+
+    A vehicle whose photos match nothing must not keep the others from being adjusted.
+    """
+    try:
+        return list(open_sparse_flights(units, area.grid, area.origin, options.read, run=run, progress=progress))
+    except AdjustmentError as error:
+        if len(units) == 1:
+            return [str(error)]
+    alone = partial(_sparse_flights, area=area, options=options, run=run, progress=progress)
+    return [flight for unit in units for flight in alone([unit])]
+
+
+def _learned_registrations(
+    states: list[VehicleState], area: WorkArea, run: Run, progress: Progress | None
+) -> list[VehicleState]:
+    """Learned matching, in this process, of flights that correlation did not find, then registration."""
+    lost = [k for k, state in enumerate(states) if state.unfound]
+    found = []
+    for n, k in enumerate(lost):
+        found.append(learned_registration(states[k], area))
+        if progress:
+            progress("learned registration", n + 1, len(lost))
+    items = [(states[k], fit) for k, fit in zip(lost, found, strict=True)]
+    out = list(states)
+    for k, state in zip(lost, run(partial(registered_by, area=area), items), strict=True):
+        out[k] = state
+    return out

@@ -11,7 +11,7 @@ from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.placement import Terrain
 from orthoswarm.model.task_runner import Run, serial
 from orthoswarm.refine.flight.weakly_held_pictures import weakly_held
-from orthoswarm.refine.registration.block_state import VehicleState, surface_points
+from orthoswarm.refine.registration.block_state import VehicleState
 from orthoswarm.refine.registration.tie_points import MapMatches, vote_lean
 from orthoswarm.refine.surface.dem_surface import LocalDem, fit_over_dem
 from orthoswarm.refine.surface.ground_densification import flying_height
@@ -76,10 +76,10 @@ def common_terrain(
         fit, off = fit_over_dem(dem, points, sigma, bounds, settings=how, most_nodes=_DRAWN_NODES)
     drawn = (fit or fit_terrain(points, sigma, bounds, settings=how)).rendering()
     height_m = float(np.median([flying_height(s.flight, s.surface) for s in states]))
+    surface = np.concatenate([part for s in own for part in (s.dense[0], s.high)])  # ground, and what stands on it
     drawn = with_tall_surfaces(
-        drawn, np.concatenate([surface_points(s) for s in own]), [_sweep_views(s) for s in states], height_m=height_m,
-        most_nodes=_DRAWN_NODES, run=run,
-    )  # fmt: skip
+        drawn, surface, [_sweep_views(s) for s in states], height_m=height_m, most_nodes=_DRAWN_NODES, run=run
+    )
     return drawn, _dem_warnings(dem, fit is None, off, states) if dem is not None else []
 
 

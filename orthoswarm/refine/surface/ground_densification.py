@@ -77,7 +77,7 @@ def dense_points(flight: FlightBlock, surface: GroundModel) -> tuple[Array, Arra
     """Ground points (K, 3) and their sigmas, one per cell where a height was found; and points (H, 3) high above it."""
     c = active().surface
     cameras, height = flight.cameras(), flying_height(flight, surface)
-    cells = cells_near(cameras.position[:, :2], dense_cell(height), sight_reach(flight))
+    cells = cells_near(cameras.position[:, :2], _DENSE_CELL_M * height / REFERENCE_HEIGHT_M, sight_reach(flight))
     if not len(cells):
         return np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3))
     ground, gray = surface.terrain(), flight.pictures.gray
@@ -104,11 +104,6 @@ def spaced_pictures(flight: FlightBlock, surface: GroundModel) -> Flags:
     out = np.asarray(flight.leg < 0)
     out[camera] = True
     return out
-
-
-def dense_cell(height_m: float) -> float:
-    """Spacing of the cells at a flying height, metres."""
-    return _DENSE_CELL_M * height_m / REFERENCE_HEIGHT_M
 
 
 def sight_reach(flight: FlightBlock) -> float:

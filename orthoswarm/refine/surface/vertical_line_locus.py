@@ -63,31 +63,29 @@ class Sweep:
 
     half: int
     step_m: float
-    reach_m: float
-    height_step_m: float
     min_score: float
-    rival_m: float
-    rival_share: float
     sigma_m: float
-    baselines_m: tuple[float, ...]
-    spacing_m: float
+    reach_m: float = _SWEEP_REACH_M
+    height_step_m: float = _SWEEP_HEIGHT_STEP_M
+    rival_m: float = _SWEEP_RIVAL_M
+    rival_share: float = _SWEEP_RIVAL_SHARE
+    baselines_m: tuple[float, ...] = _SWEEP_BASELINES_M
+    spacing_m: float = _SWEEP_SPACING_M
 
     @classmethod
     def small(cls) -> "Sweep":
         """Small patches, which fit between cars, bushes and houses, so that most of their heights are bare ground."""
-        return cls._with_patch(_SMALL_PATCH_HALF, _SMALL_PATCH_STEP_M, _SMALL_PATCH_SCORE, _SMALL_PATCH_SIGMA_M)
+        return cls(
+            half=_SMALL_PATCH_HALF, step_m=_SMALL_PATCH_STEP_M, min_score=_SMALL_PATCH_SCORE,
+            sigma_m=_SMALL_PATCH_SIGMA_M,
+        )  # fmt: skip
 
     @classmethod
     def large(cls) -> "Sweep":
         """Large patches, for ground with little texture."""
-        return cls._with_patch(_LARGE_PATCH_HALF, _LARGE_PATCH_STEP_M, _LARGE_PATCH_SCORE, _LARGE_PATCH_SIGMA_M)
-
-    @classmethod
-    def _with_patch(cls, half: int, step_m: float, min_score: float, sigma_m: float) -> "Sweep":
         return cls(
-            half=half, step_m=step_m, reach_m=_SWEEP_REACH_M, height_step_m=_SWEEP_HEIGHT_STEP_M,
-            min_score=min_score, rival_m=_SWEEP_RIVAL_M, rival_share=_SWEEP_RIVAL_SHARE, sigma_m=sigma_m,
-            baselines_m=_SWEEP_BASELINES_M, spacing_m=_SWEEP_SPACING_M,
+            half=_LARGE_PATCH_HALF, step_m=_LARGE_PATCH_STEP_M, min_score=_LARGE_PATCH_SCORE,
+            sigma_m=_LARGE_PATCH_SIGMA_M,
         )  # fmt: skip
 
     def at_height(self, height_m: float) -> "Sweep":

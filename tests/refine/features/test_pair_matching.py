@@ -8,9 +8,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from orthoswarm.refine.features.pair_matching import Pair, consecutive, match_features, nearby
+from orthoswarm.refine.features.pair_matching import (
+    Pair,
+    build_tracks,
+    consecutive,
+    match_features,
+    nearby,
+    thin_tracks,
+)
 from orthoswarm.refine.features.sift_features import SiftFeatures, detect, reduce_picture, spread
-from orthoswarm.refine.features.track_chaining import build_tracks, thin_tracks
 from tests.kit.sparse_world import texture
 
 
