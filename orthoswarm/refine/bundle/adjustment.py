@@ -27,9 +27,7 @@ _DAMPING_SHARE: Final = 1e-6  # added to the diagonal of the cameras' equations,
 
 @dataclass(frozen=True, slots=True)
 class MapTies:
-    """Horizontal control points, found by matching pictures with the map.
-
-    They lie on the ground: a map shows that in its true place, but roofs displaced.
+    """Horizontal control points on the ground, found by matching pictures with the map, which displaces roofs.
 
     Attributes:
         point: int32 (Q,), tie point, each at most once. xy: float64 (Q, 2), its place on the map, local frame.

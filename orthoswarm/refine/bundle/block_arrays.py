@@ -119,10 +119,7 @@ class Tracks:
 
 @in_place_kernel
 def project_point(position, rotation, lens, x, y, z):  # type: ignore[no-untyped-def]
-    """Pixel (u, v) of a ground point in one camera (position (3,), rotation (3, 3), lens (8,)); NaN if behind it.
-
-    A point beyond the radius at which the distortion stops being monotonic (LEAST_RADIAL_SLOPE) is not visible.
-    """
+    """Pixel (u, v) of a ground point; NaN behind the camera or where its distortion is no longer monotonic."""
     dx, dy, dz = x - position[0], y - position[1], z - position[2]
     cz = rotation[0, 2] * dx + rotation[1, 2] * dy + rotation[2, 2] * dz
     if cz < LEAST_DEPTH_M:

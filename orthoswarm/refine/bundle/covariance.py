@@ -254,10 +254,9 @@ def map_distortion_variance(place: Array, residual: Array, height_m: float) -> f
 
 
 def _followed(place: Array, length_m: float) -> tuple[Array, float]:
-    """What a similarity, fitted to ties on a map displaced by unit variance, leaves and follows.
+    """Of a map displaced by unit variance: what a similarity that is fitted to ties leaves, and what it follows.
 
-    Returns:
-        Covariance (Q, Q) of the residuals of an axis, mean of both; variance of an axis of the fitted values, mean.
+    Covariance (Q, Q) of the residuals of an axis; variance of an axis of the fitted values, mean over the ties.
     """
     n = len(place)
     apart2 = ((place[:, None] - place[None]) ** 2).sum(axis=2)

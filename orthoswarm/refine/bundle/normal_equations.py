@@ -15,10 +15,7 @@ from orthoswarm.model.camera import LEAST_RADIAL_SLOPE
 
 @in_place_kernel
 def linearise(position, rotation, lens, x, y, z, u, v, r, jc, jp, jl):  # type: ignore[no-untyped-def]
-    """Residual (2,) in pixels and Jacobians of one projection by camera (2, 6), point (2, 3) and lens (2, 6).
-
-    Returns False where the point is not visible (behind the camera, or where the distortion is not monotonic).
-    """
+    """Residual (2,), px, and Jacobians by camera (2, 6), point (2, 3), lens (2, 6); False where it is not visible."""
     ax, ay, az = x - position[0], y - position[1], z - position[2]
     dx = rotation[0, 0] * ax + rotation[1, 0] * ay + rotation[2, 0] * az
     dy = rotation[0, 1] * ax + rotation[1, 1] * ay + rotation[2, 1] * az
@@ -87,10 +84,7 @@ def _subtract_block(band, row, column, left, right):  # type: ignore[no-untyped-
 
 @in_place_kernel
 def _subtract_own_block(band, row, left, right, both):  # type: ignore[no-untyped-def]
-    """Subtract left (6, 3) times the transpose of right (6, 3) from a block on the diagonal of a lower band.
-
-    both: subtract the transposed product, too, for another observation by the same camera.
-    """
+    """As `_subtract_block`, on the diagonal; both: also the transpose, for another observation by the camera."""
     for a in range(6):
         for q in range(6):
             value = left[a, 0] * right[q, 0] + left[a, 1] * right[q, 1] + left[a, 2] * right[q, 2]

@@ -137,11 +137,7 @@ def add_priors(
     free: Flags,
     slot: Ints,
 ) -> None:
-    """Add all priors to the normal equations of the free cameras, in place.
-
-    Args:
-        system: of the free cameras; the others: of all N. common: float64 (layout.size,). free: bool (N,). slot: (N,).
-    """
+    """Add all priors to the normal equations of the free cameras in place; common: (layout.size,), free, slot: (N,)."""
     weight = np.where(priors.lens_sigma > 0, 1.0 / np.maximum(priors.lens_sigma, 1e-12) ** 2, _HELD).ravel()
     diagonal = np.arange(layout.lens_columns)
     system.corner[diagonal, diagonal] += weight

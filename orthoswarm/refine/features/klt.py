@@ -83,10 +83,7 @@ class _Lanes:
 
 @intrinsic
 def add_gradients(typing, wide, gradient, sums):  # type: ignore[no-untyped-def]
-    """Gradients (2, SIZE, LANES) of a template (WIDE, WIDE), all float32, and sums over its columns, (5, LANES).
-
-    The sums are those of gx gx, gx gy, gy gy, gx, gy; the last lane of the gradients is 0.
-    """
+    """Gradients (2, SIZE, LANES) of a template, last lane 0; sums over columns of xx, xy, yy, x, y: (5, LANES)."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         lanes = _Lanes(context, builder, signature, arguments)

@@ -113,36 +113,13 @@ def _epipolar_inliers(p: Floats, q: Floats) -> Flags:
     return np.zeros(len(p), bool) if inliers is None else np.asarray(inliers[:, 0] > 0)
 
 
-class _Identity:
-    """A dictionary key by object identity that keeps the object alive."""
-
-    __slots__ = ("features",)
-
-    def __init__(self, features: SiftFeatures) -> None:
-        self.features = features
-
-    def __hash__(self) -> int:
-        return id(self.features)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Identity) and other.features is self.features
-
-
 @lru_cache(maxsize=64)
-def _unit_of(key: _Identity) -> Floats:
-    return root_sift(key.features.descriptor)
-
-
 def _unit(features: SiftFeatures) -> Floats:
-    return _unit_of(_Identity(features))
+    return root_sift(features.descriptor)
 
 
 def consecutive(group: NDArray[np.integer], time_s: Array) -> Ints:
-    """Pairs of photos that follow each other in one group (a vehicle) without a pause, int32 (n, 2).
-
-    Args:
-        group: integers (N,), photos of a group in order of time. time_s: float64 (N,), NaN where unknown.
-    """
+    """Pairs that follow each other in one group, in order of time, without a pause: int32 (n, 2); time_s may be NaN."""
     last: dict[int, int] = {}
     pairs: list[tuple[int, int]] = []
     for k, g in enumerate(group.tolist()):
@@ -264,11 +241,7 @@ def _union(edges, photo, count, max_length):  # type: ignore[no-untyped-def]
 
 
 def thin_tracks(tracks: Tracks, width: Array, rows: Array) -> Tracks:
-    """Thin the tracks but cover every photo evenly: longest first, while a cell of one of their photos has room.
-
-    Args:
-        width, rows: (N,), columns and rows of each photo.
-    """
+    """Keep tracks, longest first, while a cell of a photo has room; width, rows: (N,), size of each photo."""
     if not len(tracks.camera):
         return tracks
     nx, ny = SIFT_CELLS

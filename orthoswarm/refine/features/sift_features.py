@@ -28,7 +28,7 @@ to a diameter of 3 pixels."""
 _SIFT_SIGMA_SHARE: Final = 0.04  # ... beyond that it grows by this share of the diameter (measured on the same flights)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SiftFeatures:
     """Features of one photo.
 
@@ -57,10 +57,7 @@ class SiftFeatures:
         return cls(uv=empty, descriptor=none, sigma_px=empty[:, 0], width=width, height=height, step_px=1.0)
 
     def same_point(self) -> Ints:
-        """For each feature the index of the first one at the same place, int32 (n,).
-
-        SIFT returns a point once for each strong orientation, but a track may contain it only once.
-        """
+        """The first feature at the place of each, int32 (n,): SIFT returns a point once for each strong orientation."""
         _, first, inverse = np.unique(self.uv, axis=0, return_index=True, return_inverse=True)
         return np.asarray(first[inverse.reshape(-1)], dtype=np.int32)
 
@@ -113,11 +110,7 @@ def reduce_picture(gray: Gray, width: int, height: int, working_pixels: int) -> 
 
 
 def spread(xy: Floats, response: Floats, columns: int, rows: int) -> NDArray[np.intp]:
-    """Indices of the features to keep: the strongest of every cell, then the second strongest, until there are enough.
-
-    Args:
-        xy: float32 (n, 2), positions in a picture of `columns` by `rows`. response: float32 (n,), strength.
-    """
+    """Indices of features to keep: the strongest of every cell, then the second strongest, until enough."""
     nx, ny = SIFT_CELLS if columns >= rows else SIFT_CELLS[::-1]
     cx = np.clip((xy[:, 0] * nx / columns).astype(np.int64), 0, nx - 1)
     cy = np.clip((xy[:, 1] * ny / rows).astype(np.int64), 0, ny - 1)

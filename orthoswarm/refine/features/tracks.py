@@ -86,11 +86,7 @@ class _Flow:
 
 @dataclass(slots=True, kw_only=True)
 class Tracker:
-    """Tracks corners from picture to picture: `add` the pictures in order, then read `tracks`.
-
-    Attributes:
-        cell_px: at most one track in each cell of this size, working pixels.
-    """
+    """Tracks corners, at most one a cell of `cell_px` working pixels: `add` pictures in order, then read `tracks`."""
 
     cell_px: int = field(default_factory=lambda: active().features.cell_px)
     _live: _Live = field(default_factory=_Live)

@@ -39,19 +39,12 @@ class Followed:
 
 @dataclass(frozen=True, slots=True)
 class KeptTracks:
-    """A folder of tracks, one file for each flight; what cannot be written or read is made again.
-
-    Attributes:
-        folder: an existing folder, of this version of the program only.
-    """
+    """A folder of this version's tracks, a file a flight; what cannot be written or read is made again."""
 
     folder: Path
 
     def file(self, frames: Sequence[Frame], epsg: int, origin: Array, fov_start: float) -> Path:
-        """Where the tracks of a flight are kept: frames in order, their records, names, sizes and files count.
-
-        fov_start: assumed horizontal field of view, radians.
-        """
+        """Where the tracks of a flight are kept, by the frames' records, names, sizes and files, and the settings."""
         asked = (frames, [_state(frame.path) for frame in frames], epsg, origin.tolist(), fov_start, active())
         return self.folder / (hashlib.sha256(repr(asked).encode()).hexdigest() + _SUFFIX)
 

@@ -124,10 +124,7 @@ def _tilt_findings(frames: Sequence[Frame], records: PhotoRecords, start: Initia
 def height_findings(
     frames: Sequence[Frame], records: PhotoRecords, start: InitialOrientation, adjustment: Adjustment
 ) -> list[str]:
-    """Sentences on recorded heights that contradict the pictures adjusted without a map, and on heights not recorded.
-
-    The ground scale comes from the distance flown, so a height is known as well as the focal length.
-    """
+    """Sentences on recorded heights that contradict pictures adjusted without a map, and on those not recorded."""
     found, without = [], []
     ground = float(np.median(adjustment.points[:, 2])) if len(adjustment.points) else 0.0
     height = adjustment.cameras.position[:, 2] - ground

@@ -107,10 +107,7 @@ def plane_prior(adjustment: Adjustment) -> HeightPrior:
 
 
 def datum_prior(adjustment: Adjustment, level_m: float = 0.0) -> HeightPrior:
-    """A prior for the median height of all points that does not constrain their scatter.
-
-    Each point's prior asks for the shift of the median; together they weigh as much as one observation.
-    """
+    """A prior that asks the median height of all points to be level_m, as one observation; their scatter stays free."""
     z = adjustment.points[:, 2]
     middle = float(np.median(z)) if len(z) else 0.0
     soft = _SPARSE_DATUM_SIGMA_M * float(np.sqrt(max(len(z), 1)))
@@ -176,10 +173,7 @@ def _free_lens(adjustment: Adjustment, start: SparseStart, *, full: bool) -> Non
 
 
 def _widen_position_sigmas(adjustment: Adjustment) -> None:
-    """Widen the sigmas of positions and heights that scatter more than stated.
-
-    Too small height sigmas push the cameras up, where height errors cost less.
-    """
+    """Widen sigmas of positions and heights that scatter more than stated; too small ones push the cameras up."""
     p = adjustment.priors
     off = adjustment.position_residuals() / np.maximum(p.position_sigma, 1e-9)
     horizontal = mad_sigma(off[:, :2])

@@ -134,11 +134,7 @@ def sparse_start(
     run: Run = serial,
     progress: Progress | None = None,
 ) -> SparseStart:
-    """Match photos (of a vehicle in order of time) with each other and find start values of all of them.
-
-    run: executes the feature and matching tasks; the result does not depend on it. progress: called with stage, number
-    done, total.
-    """
+    """Match photos with each other and find start values; run: executes tasks, the result does not depend on it."""
     builder = PairGraphBuilder(frames=frames, records=records, read_gray=read_gray, run=run, progress=progress)
     start = build_pair_graph(builder)
     if len(records.fov_hint) <= int(records.vehicle.max()):  # vehicles share lenses by name

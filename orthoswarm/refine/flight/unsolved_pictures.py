@@ -29,12 +29,11 @@ _UNSOLVED_SIGMA_M: Final = 2.0  # added in squares to the largest sigma of those
 
 @dataclass(frozen=True, slots=True)
 class RefinableSplit:
-    """Recorded frames by whether a refiner can solve them, each in the order of the frames.
+    """Recorded frames by whether a refiner can solve them, each in the frames' order, and warnings for the report.
 
     Attributes:
         fit: frames that it can solve. odd: too few of their camera and size, to be placed by their neighbours.
         still: frames of vehicles that hovered for all pictures, which stay as recorded.
-        warnings: sentences for the report on what cannot be solved.
     """
 
     fit: list[PlacedFrame]
@@ -109,11 +108,7 @@ def place_by_neighbours(
 def move_with_neighbours(
     extra: Sequence[PlacedFrame], before: Sequence[PlacedFrame], after: Sequence[PlacedFrame]
 ) -> list[PlacedFrame]:
-    """Move frames by the changes of their nearest neighbours when those were placed again; sigmas stay.
-
-    Args:
-        extra: placed after the others, not solved with them. before, after: the others before and after the change.
-    """
+    """Move frames that were not solved with the others as their nearest neighbours moved since; sigmas stay."""
     own = {p.frame.image for p in extra}
     moved = place_by_neighbours(extra, [p for p in before if p.frame.image not in own], after)
     return [replace(now, sigma_m=was.sigma_m, weak=was.weak) for was, now in zip(extra, moved, strict=True)]

@@ -33,11 +33,7 @@ _UNIT_GAP_STEPS: Final = 10.0
 
 @dataclass(frozen=True, slots=True)
 class UnitRefiner(ABC):
-    """What refiners have in common: the area's grid, and a vehicle that is solved unit by unit (placement.Refiner).
-
-    Attributes:
-        origin: (2,) of the local frame, the same for all vehicles of an area.
-    """
+    """What refiners have in common: the area's grid and origin (2,), and a vehicle that is solved unit by unit."""
 
     epsg: int
     origin: Array

@@ -68,8 +68,7 @@ class FreeNetwork:
 def solve_free_network(graph: PairGraph, count: int, width: Array, anchors: Anchors) -> FreeNetwork:
     """Place photos by their pairs and anchors; connected parts without two anchors at different points are not placed.
 
-    Args:
-        graph: pairs of level pictures. count: N photos. width: float64 (N,), columns of the pictures.
+    count: N photos. width: float64 (N,), columns of the pictures.
     """
     scale, centre = np.zeros(count, np.complex128), np.zeros(count, np.complex128)
     sigma, placed = np.full(count, np.inf), np.zeros(count, bool)

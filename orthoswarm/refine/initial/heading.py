@@ -34,8 +34,7 @@ _TAG_AGREE_SHARE: Final = 0.5  # share of the photos whose tag must follow the p
 class TagHeading:
     """Relation between one vehicle's recorded angles and the pictures' headings.
 
-    source: "yaw" or "flight_yaw", "" if neither agrees with the pictures. offset: constant difference picture - tag,
-    radians. agree: share of photos with that offset.
+    source: "yaw", "flight_yaw" or "", if neither agrees. offset: picture - tag, radians. agree: share of photos.
     """
 
     source: str
@@ -160,10 +159,7 @@ def circular_mode(angle: Array, weight: Array) -> float:
 
 
 def tag_heading(records: PhotoRecords, rows: NDArray[np.intp], yaw: Array) -> TagHeading:
-    """The recorded angle that follows the pictures' headings `yaw` (N,), up to a constant, among photos of one vehicle.
-
-    rows: its photos whose headings follow from pairs.
-    """
+    """The recorded angle that follows the headings `yaw` (N,), up to a constant, on those `rows` of one vehicle."""
     best = TagHeading("", 0.0, 0.0)
     for source in ("yaw", "flight_yaw"):
         tag = getattr(records, source)[rows]

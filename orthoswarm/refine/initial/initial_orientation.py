@@ -104,10 +104,7 @@ class InitialOrientation:
 def find_initial_orientation(
     records: PhotoRecords, pairs: Sequence[Pair], features: Sequence[SiftFeatures]
 ) -> InitialOrientation:
-    """The initial orientation of N photos from verified matches.
-
-    Tilt and lens, relative scales, headings and network are solved in rounds.
-    """
+    """Solve tilt and lens, relative scales, headings and network of N photos in rounds, from verified matches."""
     count, segments = len(records), int(records.segment.max()) + 1
     lens_of = records.lens[np.unique(records.segment, return_index=True)[1]]
     matches = PairMatches.of(pairs, features)

@@ -122,11 +122,7 @@ class SparseRows:
 
 
 def solve_network(graph: PairGraph, records: PhotoRecords, yaw: Array, beliefs: NetworkPriors) -> Network:
-    """Solve positions, scale, nadir offset and lag.
-
-    Args:
-        graph: E pairs of level pictures. records: of N photos in S segments of V vehicles. yaw: float64 (N,), headings.
-    """
+    """Solve positions, scale, nadir offset and lag of N photos; yaw: float64 (N,), their headings."""
     at = _NetworkColumns.of(
         len(records), len(beliefs.metres), int(beliefs.lens.max()) + 1, int(records.vehicle.max()) + 1
     )

@@ -104,10 +104,7 @@ def first_scale(graph: PairGraph, records: PhotoRecords, lens_of: Ints, focal: A
 
 
 def relative_scales(graph: PairGraph, records: PhotoRecords, heights: RecordedHeights, count: int) -> Array:
-    """Metres per pixel of each photo over its segment's, float64 (N,), from the scale between level pictures.
-
-    One robust adjustment of the scales within each segment, with the recorded heights as priors.
-    """
+    """Metres per pixel of each photo over its segment's (N,), by one robust adjustment; priors: recorded heights."""
     i, j = graph.first, graph.second
     inside = np.flatnonzero(records.segment[i] == records.segment[j])
     i, j = i[inside], j[inside]

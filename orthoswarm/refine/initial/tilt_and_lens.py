@@ -210,11 +210,7 @@ def _flatten(z, level, focal, bend, radius2, right, up):  # type: ignore[no-unty
 
 @kernel
 def _fit(p, q, n, floor, rounds, robust, w):  # type: ignore[no-untyped-def]
-    """Fit a robust similarity q = a p + b; returns a, mean p, mean q and the scale of the misfit.
-
-    w: receives the weights. floor: least scale. rounds: of reweighting. robust: scale of the kernel in scales of the
-    misfit.
-    """
+    """Robust similarity q = a p + b: a, mean p, mean q, the misfit's scale (at least `floor`); w gets the weights."""
     misfit = np.empty(n)
     for k in range(n):
         w[k] = 1.0

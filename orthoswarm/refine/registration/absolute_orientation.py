@@ -20,8 +20,7 @@ from orthoswarm.refine.bundle.adjustment import TRACK_ROBUST_C, Adjustment, MapT
 from orthoswarm.refine.flight.relative_block import BestViews, FlightBlock, one_per_cell
 from orthoswarm.refine.registration.coarse_registration import CoarseFit, shift_cameras
 from orthoswarm.refine.registration.map_evidence import false_matches_log10
-from orthoswarm.refine.registration.map_windows import LoadedMap
-from orthoswarm.refine.registration.tie_points import MapMatches, link_legs, match_points
+from orthoswarm.refine.registration.tie_points import LoadedMap, MapMatches, link_legs, match_points
 from orthoswarm.refine.surface.ground_densification import refit_ground
 from orthoswarm.refine.surface.vehicle_ground import GroundModel
 
@@ -81,11 +80,9 @@ _EVIDENCE_SMALL_HALF_M: Final = 4.0  # half a patch where those of the usual siz
 
 @dataclass(slots=True)
 class AbsoluteOrientation:
-    """What the absolute orientation found, besides the cameras in the flight's adjustment.
+    """The ground, the last tie points and their matches; the cameras are in the flight's adjustment.
 
-    Attributes:
-        surface: the ground. ties: the last tie points. matches: the matches that they come from.
-        roofs: matches of raised points and their heights, for the lean of the map, which all vehicles vote on.
+    roofs: matches of raised points and their heights, for the lean of the map, which all vehicles vote on.
     """
 
     surface: GroundModel
@@ -254,11 +251,7 @@ def _line(t: Array, shift: Array) -> tuple[Array, Flags]:
 
 
 def as_ties(matches: MapMatches, points: Array) -> MapTies:
-    """Tie points for the adjustment: each ground point with its place on the map, metres, and a first sigma.
-
-    The surroundings of a point were compared, which are ground and do not lean. So an error of the height datum does
-    not displace them.
-    """
+    """Tie points with their places on the map and a first sigma; what was compared is ground, which does not lean."""
     sigma = np.full(len(matches.point), _TIE_SIGMA_M)
     return MapTies(matches.point, points[matches.point, :2] + matches.shift, sigma)
 
@@ -361,10 +354,7 @@ def orient_on_map(
 def reorient_on_map(
     flight: FlightBlock, ground: LoadedMap, surface: GroundModel, ties: MapTies, pictures: Flags | None = None
 ) -> tuple[GroundModel, MapTies, MapMatches]:
-    """Adjust a flight that lies on the map with new tie points, as after its level was shifted.
-
-    ties: its tie points so far. pictures: bool (N,), the ones to compare with the map, None for all.
-    """
+    """Adjust a flight on the map with new tie points, as after its level was shifted; pictures: (N,), those to use."""
     for _ in range(2):
         _step(flight, surface, ties, TIE_SCALES[1])
     return _second_round(flight, ground, refit_ground(flight, surface), _RENEWED_STEPS, pictures)
@@ -414,11 +404,9 @@ def map_gsd(flight: FlightBlock, basemap: MapWindow) -> float:
 
 @dataclass(frozen=True, slots=True)
 class ConfirmedFit:
-    """A coarse registration that tie points confirm.
+    """A coarse registration, the map below the flight, and the tie points that confirm it.
 
-    Attributes:
-        fit: the registration. ground: the map below the flight. matches: the tie points that confirm it.
-        false_matches: expected number of agreements as good as theirs on a map of other ground.
+    false_matches: expected number of agreements as good as theirs on a map of other ground.
     """
 
     fit: CoarseFit
@@ -430,10 +418,7 @@ class ConfirmedFit:
 def confirmed(
     flight: FlightBlock, fits: Iterable[CoarseFit], basemap: MapWindow, origin: Array, surface: GroundModel
 ) -> ConfirmedFit | None:
-    """The first registration that tie points confirm; the flight's cameras then are where it puts them.
-
-    Where none is confirmed the cameras stay where they were. fits: guesses, the likely first.
-    """
+    """The first registration that tie points confirm; the cameras then lie there, else where they were."""
     before = flight.adjustment.copy()
     config = active().registration
     limit, tests = np.log10(config.false_matches), 0

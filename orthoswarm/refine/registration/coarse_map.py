@@ -54,10 +54,9 @@ to 0.5 m at 10 m."""
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CoarseMapShift:
-    """One shift of a block onto a coarse map.
+    """One shift of a block onto a coarse map of pixel gsd_m: metres to add, and their sigma, an axis.
 
     Attributes:
-        east, north: metres to add. sigma_m: of each axis. gsd_m: the map's pixel.
         confidence: 1 minus the ratio of the second peak to the first.
         false_matches: expected number of peaks as high on a map of other ground.
     """
@@ -79,10 +78,7 @@ def is_coarse(flight: FlightBlock, basemap: MapWindow) -> bool:
 def shift_on_coarse_map(
     flights: Sequence[FlightBlock], basemap: MapWindow, origin: Array, ground_z: float
 ) -> CoarseMapShift | None:
-    """Where vehicles that make one block, adjusted in one frame, lie on a coarse map; None where it does not show them.
-
-    ground_z: level of their ground, metres.
-    """
+    """Where vehicles that make one block lie on a coarse map, None if it shows no such place; ground_z: their level."""
     config, gsd = active().registration, basemap.native_gsd_m / _STEP
     drawn = _mosaic(flights, ground_z, gsd)
     if drawn is None:

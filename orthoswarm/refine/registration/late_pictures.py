@@ -182,10 +182,9 @@ def _fitted(guess: PlacedFrame, seen: Sequence[tuple[Array, Array]], near: Seque
 
 
 def centre_sigma(camera: Camera, uv: Array, ground: Array, scale: float) -> float:
-    """Sigma of an axis of where a resected picture's centre lies on the ground, by the scatter of its points, m.
+    """Sigma of an axis of where a resected picture's centre lies on the ground, by the scatter of its points, metres.
 
-    uv, ground: pixels (M, 2) and ground points (M, 3). scale: pixels of the picture in one of those in which it was
-    compared.
+    scale: pixels of the picture in one of those in which it was compared.
     """
     off = (camera.project(ground) - uv) / scale
     noise = max(float(np.sqrt((off**2).mean())), _LEAST_NOISE_PX)
@@ -200,10 +199,7 @@ def centre_sigma(camera: Camera, uv: Array, ground: Array, scale: float) -> floa
 
 
 def resected(camera: Camera, uv: Array, ground: Array) -> Camera:
-    """A camera's position and attitude from ground points (M, 3) at pixels (M, 2), robustly.
-
-    Gauss-Newton on six numbers, with the camera itself as a loose prior.
-    """
+    """A camera's pose by ground points (M, 3) at pixels (M, 2): robust Gauss-Newton, the camera as a loose prior."""
     scale = max(1.0, camera.lens.width / _WORK_WIDTH_PX)
     prior = _prior()
     total = np.zeros(6)

@@ -74,7 +74,7 @@ def _group(shift: Array, along: Array, reach_m: float, tolerances: tuple[float, 
 
 
 def _binomial_tail(successes: int, trials: int, share: float) -> float:
-    """Probability of at least so many successes; not less than the smallest number, so that it has a logarithm.
+    """Probability of at least so many successes, at least the smallest number, so that it has a logarithm.
 
     By the incomplete beta function: importing scipy.stats for it would take a third of a second.
     """

@@ -121,10 +121,7 @@ def measure_map_offset(recorded: Sequence[PlacedFrame], refined: Sequence[Placed
 def measure_control_offset(
     recorded: Sequence[PlacedFrame], placed: Sequence[PlacedFrame], found_sigma_m: float
 ) -> MapOffset | None:
-    """The offset of frames that control points placed against the receivers; None without any.
-
-    found_sigma_m: sigma of the control's shift, an axis, metres.
-    """
+    """The offset of controlled frames against the receivers, or None; found_sigma_m: of the control's shift."""
     return _measured(recorded, [p for p in placed if not p.weak], found_sigma_m)
 
 

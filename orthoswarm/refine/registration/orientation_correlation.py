@@ -182,11 +182,7 @@ class Strip:
 
 @dataclass(frozen=True, slots=True)
 class Search:
-    """Where strips are sought.
-
-    Attributes:
-        origin: float64 (2,) of the local frame. reach_m: to each side. gsd_m: pixel of strips and map.
-    """
+    """Where strips are sought: on a map about the origin (2,), to reach_m on each side, in pixels of gsd_m."""
 
     basemap: MapWindow
     origin: Array

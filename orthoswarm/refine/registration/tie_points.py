@@ -14,7 +14,10 @@ from numpy.typing import NDArray
 from orthoswarm.compute.jit import kernel
 from orthoswarm.compute.robust_kernel import robust_weights
 from orthoswarm.config import active
-from orthoswarm.model.arrays import Array, Flags, Gray, Ints
+from orthoswarm.model.arrays import Array, Flags, Gray, Indices, Ints
+from orthoswarm.model.bounding_box import BoundingBox
+from orthoswarm.model.geo import GroundGrid
+from orthoswarm.model.placement import MapWindow
 from orthoswarm.refine.bundle.block_arrays import HEIGHT, WIDTH, CameraBlock, project_point
 from orthoswarm.refine.features.patch_matching import (
     gradients,
@@ -26,7 +29,6 @@ from orthoswarm.refine.features.patch_matching import (
     window_of,
 )
 from orthoswarm.refine.features.shift_products import ROWS
-from orthoswarm.refine.registration.map_windows import LoadedMap
 
 _MAP_WINDOW_SHARE: Final = 0.7  # least share of a patch's search window that the map covers
 _PATCH_SHARE: Final = 0.85  # least share of a patch that its picture shows
@@ -52,6 +54,38 @@ _SEARCH_PROMISING_SHARE: Final = 0.6
 """... and then where that correlates with at least this share of its highest value. Of 1,030 sure first ties 3 are not
 found or lie elsewhere with 0.5, 13 with 0.65, 38 with 0.8."""
 _GRADIENT_FLOOR: Final = 1e-3  # least median gradient, grey values: a blank patch has no texture to compress
+
+
+@dataclass(frozen=True, slots=True)
+class LoadedMap:
+    """Grey map of an area in a local frame, in memory at one pixel size.
+
+    Attributes:
+        west, north: edges in the local frame (grid minus origin), metres. gsd_m: pixel.
+        gray: uint8 (rows, columns). valid: bool (rows, columns).
+    """
+
+    west: float
+    north: float
+    gsd_m: float
+    gray: Gray
+    valid: Flags
+
+    @classmethod
+    def load(cls, basemap: MapWindow, origin: Array, bounds: BoundingBox, gsd_m: float) -> "LoadedMap":
+        """Read local bounds (west, south, east, north) of a map; origin (2,) is added to reach its grid."""
+        east, north = float(origin[0]), float(origin[1])
+        world = bounds.moved(east, north)
+        gray, valid = basemap.gray(world, gsd_m)
+        grid = GroundGrid.around(basemap.epsg, world, gsd_m)
+        return cls(grid.west - east, grid.north - north, gsd_m, np.clip(gray + 0.5, 0, 255).astype(np.uint8), valid)
+
+    def pixel_centres(self, xy: Array) -> tuple[Indices, Array]:
+        """Row and column (K, 2) of the pixels that hold points (K, 2), and the coordinates (K, 2) of their middles."""
+        column = ((xy[:, 0] - self.west) // self.gsd_m).astype(np.int64)
+        row = ((self.north - xy[:, 1]) // self.gsd_m).astype(np.int64)
+        east, north = self.west + (column + 0.5) * self.gsd_m, self.north - (row + 0.5) * self.gsd_m
+        return np.column_stack([row, column]), np.column_stack([east, north])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -42,9 +42,8 @@ from orthoswarm.refine.registration.absolute_orientation import (
     working_gsd,
 )
 from orthoswarm.refine.registration.block_state import Stopwatch, VehicleState, WorkArea, lies_on_map
-from orthoswarm.refine.registration.map_windows import LoadedMap
 from orthoswarm.refine.registration.neighbour_registration import fixed_cameras_near, link_to_fixed, remove_fixed
-from orthoswarm.refine.registration.tie_points import match_points
+from orthoswarm.refine.registration.tie_points import LoadedMap, match_points
 from orthoswarm.refine.strategy.vehicle_passes import SIGMA_FLOOR_M, level_sigma_deg
 from orthoswarm.refine.surface.ground_densification import (
     cells_near,
@@ -148,10 +147,7 @@ def _own_errors(state: VehicleState, others: Sequence[VehicleState], ground: Loa
 
 
 def _with_focal_error(flight: FlightBlock, pose: Floats, fov_sigma_deg: float) -> Floats:
-    """Covariances of the frames' cameras with what a wrong field of view means for their distance from the ground.
-
-    Recorded heights that the adjustment uses bound it.
-    """
+    """Covariances with what a wrong field of view means for the distance from the ground; used heights bound it."""
     cameras = flight.cameras()
     fov = fov_rad(float(cameras.lens[0, F]), int(cameras.lens[0, WIDTH]))
     share = float(np.radians(fov_sigma_deg)) / float(np.sin(fov))

@@ -191,10 +191,7 @@ def register_unfound(
 def _all_together(
     states: list[VehicleState], area: WorkArea, *, halo: Collection[str], run: Run, progress: Progress | None
 ) -> list[VehicleState]:
-    """All vehicles again, on a common level, each with its neighbours held as the first pass left them.
-
-    Those of the halo that were found on the map have done their part with that.
-    """
+    """All vehicles again on a common level with neighbours held; mapped ones of the halo have done their part."""
     states = register_unfound(states, [], area, run)
     states, unmapped = join_unmapped(states, [], area, run)
     correction = level_corrections([ground_points(s.flight.adjustment)[0] for s in states])
@@ -272,10 +269,7 @@ def first_passes(
 def _sparse_flights(
     units: Sequence[list[Frame]], *, area: WorkArea, options: RefinerOptions, run: Run, progress: Progress | None
 ) -> list[FlightBlock | str]:
-    """Flights whose photos are matched and adjusted together, each by itself where that fails; else the reason.
-
-    A vehicle whose photos match nothing must not keep the others from being adjusted.
-    """
+    """Flights of photos matched and adjusted together, each by itself where that fails; else the reason why not."""
     try:
         return list(open_sparse_flights(units, area.grid, area.origin, options.read, run=run, progress=progress))
     except AdjustmentError as error:

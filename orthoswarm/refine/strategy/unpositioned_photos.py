@@ -72,11 +72,7 @@ def place_unpositioned(
 
 
 def candidate_pairs(without: int, count: int) -> Ints:
-    """Pairs to try, int32 (n, 2), of photos of which the first `without` have no position.
-
-    All pairs with a photo without position, as nothing tells which overlap; beyond `_FREE_MOST_PAIRS` those nearest in
-    order.
-    """
+    """Pairs with one of the first `without` photos: all, or `_FREE_MOST_PAIRS` nearest in order; int32 (n, 2)."""
     first, second = np.triu_indices(count, 1)
     wanted = first < without
     pairs = np.stack([first[wanted], second[wanted]], axis=1)

@@ -33,11 +33,7 @@ _DEM_SEAM_M: Final = 90.0  # over this distance the ground beyond a model is led
 
 @dataclass(frozen=True, slots=True)
 class LocalDem:
-    """A height model in a local frame.
-
-    Attributes:
-        model: the height model. origin: east and north of the local frame.
-    """
+    """A height model in a local frame, whose origin is east and north of it."""
 
     model: HeightModel
     origin: tuple[float, float]

@@ -33,10 +33,7 @@ _HIGH_BASELINES_M: Final = (25.0, 50.0, 75.0)  # baselines of that search at ref
 
 
 def refit_ground(flight: FlightBlock, surface: GroundModel, *, as_smooth: bool = False) -> GroundModel:
-    """Fit the ground again, to the present points and to heights at free positions between them.
-
-    as_smooth: keep the present smoothness, which saves the search.
-    """
+    """Fit the ground to the present points and heights at free positions; as_smooth: with the present smoothness."""
     if surface.fit is None:
         surface = fit_surface(flight.adjustment, surface)
         if surface.fit is None:
@@ -49,10 +46,7 @@ def refit_ground(flight: FlightBlock, surface: GroundModel, *, as_smooth: bool =
 
 
 def draw_positions(camera_xy: Array, height_m: float) -> Array:
-    """Free positions, float64 (K, 2): around pictures' positions (N, 2) evenly in a square that grows with the height.
-
-    The same for the same cameras, so that the ground depends on the pictures and not on the draw.
-    """
+    """Free positions (K, 2) in a square about each camera that grows with the height, the same for the same cameras."""
     spread_m = _FREE_SPREAD_M * height_m / REFERENCE_HEIGHT_M
     at = camera_xy[np.linspace(0, len(camera_xy) - 1, _FREE_POSITIONS).round().astype(int)]
     return np.asarray(at + np.random.default_rng(0).uniform(-spread_m, spread_m, (_FREE_POSITIONS, 2)))
@@ -95,10 +89,7 @@ def dense_points(flight: FlightBlock, surface: GroundModel) -> tuple[Array, Arra
 
 
 def spaced_pictures(flight: FlightBlock, surface: GroundModel) -> Flags:
-    """Pictures used by `dense_points`, and those between legs: bool (N,).
-
-    They cover all visible ground; steps limited to them decode fewer pictures.
-    """
+    """Pictures used by `dense_points`, which cover all visible ground, and those between legs: bool (N,)."""
     spacing_m = Sweep.small().at_height(flying_height(flight, surface)).spacing_m
     _, camera, _ = spaced_cameras(flight.cameras(), flight.leg, spacing_m)
     out = np.asarray(flight.leg < 0)

@@ -104,11 +104,7 @@ class _Block:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _SweepTask:
-    """Some blocks beside each other with their pictures.
-
-    Attributes:
-        west, south: place of node (0, 0). cell_m: distance of nodes. step_m: of heights.
-    """
+    """Some blocks side by side with their pictures; west, south: node (0, 0); cell_m: of nodes, step_m: of heights."""
 
     west: float
     south: float

@@ -190,10 +190,7 @@ class Surface:
         return z
 
     def choose_kappa(self) -> float:
-        """Choose the smoothest surface whose error at held-out points is about that of the best (settings.held_out_se).
-
-        The best itself would be too rough: it would follow rubble, which is not ground.
-        """
+        """The smoothest surface about as good as the best at held-out points; the best would follow rubble."""
         s = self.settings
         out = np.flatnonzero(self.base > 0)[_HOLD_OUT_EVERY - 1 :: _HOLD_OUT_EVERY]
         if len(out) < _HOLD_OUT_POINTS:

@@ -23,9 +23,9 @@ from orthoswarm.refine.initial.pair_graph import PairGraphBuilder
 from tests.kit.sparse_world import GRID, ORIGIN, World, lawnmower, make_world, texture, without
 
 
-def begin(world: World, frames=None) -> SparseStart:
+def begin(world: World, frames=None, **options) -> SparseStart:
     frames = frames or world.frames
-    records = read_photo_records(frames, GRID, ORIGIN)
+    records = read_photo_records(frames, GRID, ORIGIN, **options)
     tried = {(pair.first, pair.second): pair.match for pair in world.pairs}
     read = lambda frame: np.zeros((1, 1), np.uint8)  # noqa: E731
     builder = PairGraphBuilder(
@@ -155,11 +155,7 @@ def two_vehicles():
 
 def test_vehicles_adjusted_together_share_a_lens_first_and_have_their_own_then():
     world, frames = two_vehicles()
-    records = read_photo_records(frames, GRID, ORIGIN, share_lenses=True)
-    plane = find_initial_orientation(records, world.pairs, world.features)
-    start = assemble(
-        frames, records, world.features, pairs=world.pairs, start=plane, damaged={}, tried=len(world.pairs)
-    )
+    start = begin(world, frames, share_lenses=True)
     assert len(start.cameras.lens) == 1
     assert len(start.plane.tags) == 2
     own = own_lenses(solve_sparse(start), start)

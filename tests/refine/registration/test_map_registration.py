@@ -19,7 +19,6 @@ from orthoswarm.refine.registration.absolute_orientation import (
     mode_shift,
     tie_half_m,
 )
-from orthoswarm.refine.registration.map_windows import LoadedMap
 from orthoswarm.refine.registration.orientation_correlation import (
     PEAK_APART_PX,
     Search,
@@ -31,7 +30,7 @@ from orthoswarm.refine.registration.orientation_correlation import (
     register,
     stacked,
 )
-from orthoswarm.refine.registration.tie_points import MapMatches, match_points, vote_lean
+from orthoswarm.refine.registration.tie_points import LoadedMap, MapMatches, match_points, vote_lean
 from orthoswarm.refine.strategy.second_pass import map_heights
 from orthoswarm.refine.surface.vehicle_ground import GroundModel
 
@@ -326,8 +325,7 @@ def test_larger_patches_are_found_where_most_of_the_ground_looks_different():
 
 @pytest.mark.parametrize(("height_m", "half_m"), [(30.0, 10.0), (150.0, 15.0), (600.0, 20.0)])
 def test_patches_grow_with_the_flying_height_within_limits(height_m, half_m):
-    cameras = SimpleNamespace(position=np.array([[0.0, 0.0, height_m]]))
-    assert tie_half_m(SimpleNamespace(cameras=lambda: cameras)) == pytest.approx(half_m)
+    assert tie_half_m(SimpleNamespace(height_m=height_m)) == pytest.approx(half_m)
 
 
 def test_what_strong_edges_pull_more_is_what_they_pull_texture():
@@ -343,6 +341,7 @@ def test_what_strong_edges_pull_more_is_what_they_pull_texture():
         pictures=SimpleNamespace(size=(320, 320), gray=lambda i: 255 - images[i]),
         best_views=lambda: SimpleNamespace(camera=camera),
         cameras=lambda: cameras,
+        height_m=float(np.median(cameras.position[:, 2])),
     )
     level = SimpleNamespace(height=lambda xy: np.zeros(len(xy)))
     loaded = LoadedMap.load(before, np.zeros(2), BoundingBox(-160.0, -120.0, 160.0, 140.0), GSD)
