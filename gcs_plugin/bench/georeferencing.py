@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.compute.robust_kernel import robust_weights
 from orthoswarm.model.errors import OrthoSwarmError
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ def fit_similarity(source: Array, target: Array, rounds: int = 30) -> SpaceSimil
         found = _weighted(source, target, weight)
         residual = np.linalg.norm(found.apply(source) - target, axis=1)
         spread = max(float(np.median(residual)), 1e-6)
-        weight = 1.0 / (1.0 + (residual / (2.0 * spread)) ** 2) ** 2
+        weight = robust_weights((residual / (2.0 * spread)) ** 2, 1.0)
     return found
 
 

@@ -18,9 +18,9 @@ pictures that are decoded already, or None."""
 
 
 def _swarm(epsg: int, origin: Array, dem: HeightModel | None, pictures: GreyPictures | None) -> Refiner:
-    from orthoswarm.refine.strategy.swarm_refiner import Options, SwarmRefiner
+    from orthoswarm.refine.strategy.swarm_refiner import RefinerOptions, SwarmRefiner
 
-    options = Options(dem=dem) if pictures is None else Options(dem=dem, read=pictures.gray)
+    options = RefinerOptions(dem=dem) if pictures is None else RefinerOptions(dem=dem, read=pictures.gray)
     return SwarmRefiner(epsg, origin, options)
 
 

@@ -60,6 +60,22 @@ class Leg:
     confidence: float = 0.0
     sigma_m: float = float("nan")
 
+    @classmethod
+    def of(
+        cls,
+        frames: Sequence[Frame],
+        members: NDArray[np.integer],
+        state: LegState = "failed",
+        confidence: float = 0.0,
+        sigma_m: float = float("nan"),
+    ) -> "Leg":
+        """The leg of a vehicle's frames with these ascending indices."""
+        first, last = int(members[0]), int(members[-1])
+        return cls(
+            vehicle=frames[first].vehicle, first=first, last=last, images=(frames[first].image, frames[last].image),
+            state=state, confidence=confidence, sigma_m=sigma_m,
+        )  # fmt: skip
+
 
 @dataclass(frozen=True, slots=True)
 class Terrain:

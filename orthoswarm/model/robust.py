@@ -1,9 +1,9 @@
 """Robust statistics that several stages share."""
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from orthoswarm.model.arrays import Array
 
 MAD_TO_SIGMA = 1.4826
 """Sigma of a Gaussian over the median of its absolute values: 1 / 0.6745 (Huber 1981)."""

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel, kernel
+from orthoswarm.compute.robust_kernel import robust_weight
 from orthoswarm.compute.threads import on_threads
 from orthoswarm.config import active
 from orthoswarm.model.placement import PlacedFrame, Terrain
@@ -314,7 +315,7 @@ def _weigh(  # type: ignore[no-untyped-def]
         b += axes[1, 0] * red + axes[1, 1] * green + axes[1, 2] * blue
         c += axes[2, 0] * red + axes[2, 1] * green + axes[2, 2] * blue
         precision = 1.0 / (float(sigma[m]) * float(sigma[m]))
-        w = precision / (1.0 + (a * a + b * b + c * c) / 3.0 * precision / robust**2) ** 2
+        w = robust_weight((a * a + b * b + c * c) / 3.0 * precision, robust**2, precision)
         weight[m] = w
         _gather(frame[m], vehicle, vehicles, of_vehicle, of_frame, count, w * a, w * b, w * c, right)
         for side in range(count):

@@ -9,14 +9,15 @@ import numpy as np
 
 from orthoswarm.config import active
 from orthoswarm.matchers import picture_matcher
+from orthoswarm.model.arrays import Array, Ints
 from orthoswarm.model.camera import focal_px
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.paper.ground_scale import SCALE_LEAST_PAIRS, choose_pairs, estimate_fov
 from orthoswarm.paper.leg_lines import Line, find_legs, fit_line
 from orthoswarm.raster.picture_file import read_gray
-from orthoswarm.refine.bundle.block_arrays import HEIGHT, WIDTH, CameraBlock, F, Ints
-from orthoswarm.refine.bundle.flight_records import Array, read_records
+from orthoswarm.refine.bundle.block_arrays import HEIGHT, WIDTH, CameraBlock, F
+from orthoswarm.refine.bundle.flight_records import read_records
 from orthoswarm.refine.features.working_pictures import Pictures
 from orthoswarm.refine.strategy.vehicle_passes import START_FOV_DEG
 

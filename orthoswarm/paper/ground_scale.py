@@ -7,10 +7,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.matchers.matcher import Gray, Matches, PictureMatcher
+from orthoswarm.matchers.matcher import Matches, PictureMatcher
+from orthoswarm.model.arrays import Array, Gray
 from orthoswarm.model.camera import focal_px
 from orthoswarm.model.robust import mad_sigma
-from orthoswarm.refine.bundle.flight_records import Array
 
 _SCALE_PAIR_HEIGHTS: Final = 0.35  # wanted distance between the two photos, flying heights: about 70 % overlap
 _SCALE_PAIR_RANGE_HEIGHTS: Final = (0.05, 1.0)  # range of that distance, flying heights

@@ -11,8 +11,8 @@ from typing import Final
 
 import numpy as np
 
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.camera import Camera
-from orthoswarm.refine.bundle.flight_records import Array
 
 _POSE_ROUNDS: Final = 6  # most Gauss-Newton steps of the pose that reproduces a homography best
 

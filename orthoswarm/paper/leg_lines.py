@@ -6,8 +6,8 @@ from typing import Final
 import numpy as np
 
 from orthoswarm.model.angles import wrap_rad
-from orthoswarm.refine.bundle.block_arrays import Ints
-from orthoswarm.refine.bundle.flight_records import Array, FlightRecords
+from orthoswarm.model.arrays import Array, Ints
+from orthoswarm.refine.bundle.flight_records import FlightRecords
 from orthoswarm.trajectory.legs import split_legs
 
 _LEG_HEADING_DEG: Final = 20.0  # frames of a leg differ in heading from its mean by less

@@ -8,16 +8,16 @@ import numpy as np
 
 from orthoswarm.config import active
 from orthoswarm.matchers import Matches, map_matcher
-from orthoswarm.matchers.matcher import Floats, Mask
+from orthoswarm.matchers.matcher import Mask
 from orthoswarm.matchers.patch_registration import Registration, apply, register
 from orthoswarm.matchers.second_opinion import LEAST_TILES, TRUSTED_SHARE
+from orthoswarm.model.arrays import Array, Floats
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import MapWindow
 from orthoswarm.model.robust import mad_sigma
 from orthoswarm.raster.picture_file import read_gray
 from orthoswarm.refine.bundle.block_arrays import WIDTH, CameraBlock, F
-from orthoswarm.refine.bundle.flight_records import Array
 from orthoswarm.refine.features.working_pictures import Pictures
 from orthoswarm.refine.registration.orientation_correlation import strip_mosaic
 

@@ -12,6 +12,7 @@ from typing import Final
 
 import numpy as np
 
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import Leg, LegState, MapWindow, PlacedFrame, Refinement, Solution, Stage
@@ -19,9 +20,7 @@ from orthoswarm.model.task_runner import Progress, Run, serial
 from orthoswarm.paper.coarse_cameras import RECEIVER_SIGMA_M, CoarseOptions, CoarseVehicle, coarse_vehicle
 from orthoswarm.paper.leg_cameras import carried_shift, fit_camera, pixel_grid
 from orthoswarm.paper.leg_patches import PatchFit, PatchOptions, PatchTask, match_patch
-from orthoswarm.refine.bundle.flight_records import Array
-from orthoswarm.refine.flight.solve_units import merge_units
-from orthoswarm.refine.flight.vehicle_refinement import UnitRefiner, unit_states, units_of_area
+from orthoswarm.refine.flight.vehicle_refinement import UnitRefiner, merge_units, unit_states, units_of_area
 
 _CARRYING_NEIGHBOURS: Final = 3  # nearest registered legs of neighbours that carry a vehicle without one
 _CARRIED_SIGMA_M: Final = 2.0  # least sigma of a correction carried from other legs
@@ -276,15 +275,5 @@ def _legs(vehicle: CoarseVehicle, fits: Mapping[int, PatchFit], sigma: Array, ca
         found = fit is not None and fit.homography is not None
         how: LegState = "matched" if found else "carried" if carried else "failed"
         confidence = fit.share if fit is not None and found else 0.0
-        out.append(
-            Leg(
-                vehicle=vehicle.vehicle,
-                first=int(members[0]),
-                last=int(members[-1]),
-                images=(vehicle.frames[members[0]].image, vehicle.frames[members[-1]].image),
-                state=how,
-                confidence=confidence,
-                sigma_m=float(np.median(sigma[members])),
-            )
-        )
+        out.append(Leg.of(vehicle.frames, members, how, confidence, float(np.median(sigma[members]))))
     return out

@@ -7,9 +7,7 @@ from numpy.typing import NDArray
 
 from orthoswarm.config import active
 from orthoswarm.model.angles import wrap_rad
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int32]
+from orthoswarm.model.arrays import Array, Ints
 
 PAUSE_S: Final = 60.0  # photos farther apart in time do not follow each other: the vehicle did something else between
 _LEG_TURN_DEG: Final = 35.0  # least bend of the path at the corner between two legs
@@ -90,3 +88,25 @@ def leads_one_way(position: Array, leg: Ints) -> bool:
     longest = ways[int(length.argmax())] / length.max()
     other = np.array(ways) @ longest < np.cos(np.radians(_ONE_WAY_DEG)) * length
     return float(length[other].sum()) < _OTHER_WAY_SHARE * float(length.max())
+
+
+def ended_legs(position: Array, time_s: Array | None = None, *, over: bool = False) -> list[tuple[int, int]]:
+    """First and last frame (inclusive) of each finished leg, in order.
+
+    Args:
+        position: float64 (N, 2) or (N, 3), recorded positions in flying order so far, metres.
+        over: True if no more frames are expected, so that the last leg is finished, too.
+    """
+    n = len(position)
+    if n < 2:
+        return []
+    # so many frames after a leg's end neither its corner nor its frames can change any more, see `split_legs`
+    settled = 2 * active().records.leg_reach
+    leg = split_legs(position, time_s)
+    ends = []
+    for k in range(int(leg.max()) + 1):
+        members = np.flatnonzero(leg == k)
+        last = int(members[-1])
+        if over or last + settled < n:
+            ends.append((int(members[0]), last))
+    return ends

@@ -10,7 +10,7 @@ from orthoswarm.model.frame import Fix, Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.refine.bundle.block_arrays import CameraBlock
 from orthoswarm.refine.features.pair_matching import Pair
-from orthoswarm.refine.features.sift_features import Features
+from orthoswarm.refine.features.sift_features import SiftFeatures
 
 GRID = LocalGrid(32632)
 ORIGIN = np.array([500000.0, 5200000.0])
@@ -22,7 +22,7 @@ class World:
 
     frames: list[Frame]
     cameras: CameraBlock
-    features: list[Features]
+    features: list[SiftFeatures]
     pairs: list[Pair]
 
 
@@ -82,7 +82,7 @@ def make_world(
         noisy = (uv[index] + rng.normal(0, noise_px, (len(index), 2))).astype(np.float32)
         nothing = np.zeros((len(index), 128), np.uint8)
         features.append(
-            Features(
+            SiftFeatures(
                 uv=noisy,
                 descriptor=nothing,
                 sigma_px=np.full(len(index), 0.5, np.float32),

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from orthoswarm.model.camera import rotation_from_angles
-from orthoswarm.refine.bundle.block_arrays import CameraBlock, Tracks
+from orthoswarm.refine.bundle.block_arrays import CameraBlock, Tracks, exp_rotation
 from orthoswarm.refine.bundle.priors import GroupPriors, Priors
-from orthoswarm.refine.bundle.rotation_vectors import exp_rotation
 
 
 @dataclass(kw_only=True)

@@ -31,7 +31,7 @@ from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import OrthoSwarmError, StorageError, WorkerStoppedError
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
-from orthoswarm.refine.flight.finished_legs import ended_legs
+from orthoswarm.trajectory.legs import ended_legs
 
 MOST: Final = 200
 """Pictures that are placed at once: those of the newest legs; older ones stay as they were placed."""

@@ -15,7 +15,7 @@ import numpy as np
 from gcs_plugin.config import SORTIE
 from gcs_plugin.daemon.stoppable_thread import StoppableThread
 from orthoswarm.model.earth import DEGREE_M
-from orthoswarm.refine.flight.finished_legs import ended_legs
+from orthoswarm.trajectory.legs import ended_legs
 
 _LOOK_S: Final = 0.5
 _log = logging.getLogger(__name__)

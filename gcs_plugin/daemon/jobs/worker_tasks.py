@@ -36,7 +36,7 @@ from orthoswarm.raster.basemap import Basemap
 from orthoswarm.raster.grey_pictures import GreyPictures
 
 if TYPE_CHECKING:
-    from orthoswarm.refine.strategy.swarm_refiner import Options, SwarmRefiner
+    from orthoswarm.refine.strategy.swarm_refiner import RefinerOptions, SwarmRefiner
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -147,14 +147,14 @@ def _refiner(task: FollowTask) -> "SwarmRefiner":
     return SwarmRefiner(task.epsg, np.array(task.origin), _options(task))
 
 
-def _options(task: FollowTask) -> "Options":
+def _options(task: FollowTask) -> "RefinerOptions":
     """Options that use what is kept of the sortie's pictures, and keep what is made."""
     from orthoswarm.refine.flight.kept_tracks import KeptTracks
-    from orthoswarm.refine.strategy.swarm_refiner import Options
+    from orthoswarm.refine.strategy.swarm_refiner import RefinerOptions
 
     if task.kept is None:
-        return Options()
-    return Options(read=GreyPictures(task.kept, from_colors=False).gray, kept=KeptTracks(task.kept))
+        return RefinerOptions()
+    return RefinerOptions(read=GreyPictures(task.kept, from_colors=False).gray, kept=KeptTracks(task.kept))
 
 
 def register_late(task: SolveTask) -> SortieResult:

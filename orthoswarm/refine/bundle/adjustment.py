@@ -11,14 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.config import active
+from orthoswarm.model.arrays import Array, Flags, Indices, Ints
 from orthoswarm.refine.bundle import normal_equations
 from orthoswarm.refine.bundle.banded_solver import BandedSystem, camera_order, factorise, solve_factored
-from orthoswarm.refine.bundle.block_arrays import CX, CY, K1, K2, K3, CameraBlock, F, Ints, Tracks
-from orthoswarm.refine.bundle.prior_equations import add_priors, position_residuals
-from orthoswarm.refine.bundle.priors import Layout, Priors
-from orthoswarm.refine.bundle.rotation_vectors import exp_rotation
+from orthoswarm.refine.bundle.block_arrays import CX, CY, K1, K2, K3, CameraBlock, F, Tracks, exp_rotation
+from orthoswarm.refine.bundle.priors import Layout, Priors, add_priors, position_residuals
 
-Array = NDArray[np.float64]
 _LENS_COLUMNS = [F, K1, K2, K3, CX, CY]
 
 TRACK_ROBUST_C: Final = 9.0  # robust scale of image observations near the minimum, squared sigmas: 3 sigmas
@@ -29,9 +27,7 @@ _DAMPING_SHARE: Final = 1e-6  # added to the diagonal of the cameras' equations,
 
 @dataclass(frozen=True, slots=True)
 class MapTies:
-    """Horizontal control points, found by matching pictures with the map.
-
-    They lie on the ground: a map shows that in its true place, but roofs displaced.
+    """Horizontal control points on the ground, found by matching pictures with the map, which displaces roofs.
 
     Attributes:
         point: int32 (Q,), tie point, each at most once. xy: float64 (Q, 2), its place on the map, local frame.
@@ -60,7 +56,7 @@ class HeightPrior:
     height: Array
     sigma: float
     soft_sigma: float
-    c: float = field(default_factory=lambda: _HEIGHT_ROBUST_C)
+    c: float = _HEIGHT_ROBUST_C
 
 
 @dataclass(slots=True, kw_only=True)
@@ -76,7 +72,7 @@ class Adjustment:
             if held. bandwidth: of the band, in cameras.
         obs_weight: float64 (M,), robust weights of the observations at the last step.
         point_inverse: float64 (P, 3, 3), inverse of each point's own block (its covariance with the cameras held).
-        tie_residual: float64 (Q, 2), metres, at the last step. cost: of all observations at the last step.
+        tie_residual: float64 (Q, 2), metres, at the last step.
         information: float64 (layout.size, layout.size), inverse covariance of the common unknowns at the last step
             (empty before it).
     """
@@ -85,25 +81,23 @@ class Adjustment:
     tracks: Tracks
     priors: Priors
     points: Array
-    free: NDArray[np.bool_]
+    free: Flags
     layout: Layout
     common: Array
-    start: NDArray[np.int64]
+    start: Indices
     slot: Ints
     bandwidth: int
     obs_weight: Array
     point_inverse: Array
     tie_residual: Array = field(default_factory=lambda: np.zeros((0, 2)))
-    cost: float = 0.0
     information: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     @classmethod
     def begin(
-        cls, cameras: CameraBlock, tracks: Tracks, priors: Priors, points: Array, free: NDArray[np.bool_] | None = None
+        cls, cameras: CameraBlock, tracks: Tracks, priors: Priors, points: Array, free: Flags | None = None
     ) -> "Adjustment":
         """Set up the state: observations sorted by point, cameras ordered for a narrow band."""
-        order = np.lexsort((tracks.camera, tracks.point))
-        tracks = Tracks(tracks.camera[order], tracks.point[order], tracks.uv[order], tracks.sigma_px[order])
+        tracks = tracks.take(np.lexsort((tracks.camera, tracks.point)))
         free = np.ones(len(cameras), bool) if free is None else free
         slot, bandwidth = camera_order(tracks, cameras.position, len(points), free)
         layout = Layout.of(priors)
@@ -138,39 +132,29 @@ class Adjustment:
         c: float,
         heights: HeightPrior,
         ties: MapTies | None = None,
-        tie_c: float | None = None,
-        damping: float | None = None,
+        tie_c: float = TIE_ROBUST_C,
+        damping: float = _DAMPING_SHARE,
     ) -> float:
-        """One Gauss-Newton step of iteratively reweighted least squares.
+        """One Gauss-Newton step, iteratively reweighted; returns the largest change of a camera position, metres.
 
         Args:
             c: robust scale of the reprojection residuals, squared sigmas. heights: prior of the points' heights.
-            ties: map ties. tie_c: their robust scale. damping: share added to the diagonal of the cameras' part
-                (None: as configured).
-
-        Returns:
-            The largest change of a camera position, metres.
+            ties: map ties. tie_c: their robust scale. damping: share added to the diagonal of the cameras' part.
 
         Raises:
             AdjustmentError: if the system is singular even with its priors (NaN in the input).
         """
-        config = active().bundle
-        system = self._assemble(c, heights, MapTies.none() if ties is None else ties, tie_c)
-        system.band[0] *= 1.0 + (_DAMPING_SHARE if damping is None else damping)
+        system = self._assemble(c, heights, ties or MapTies.none(), tie_c)
+        system.band[0] *= 1.0 + damping
         step_camera, step_common, self.information = system.solve()
         self._move(step_camera, step_common)
         normal_equations.back_substitute(
-            points=self.points,
-            start=self.start,
-            camera=self.tracks.camera,
-            slot=self.slot,
-            w_obs=system.w_obs,
-            w_lens=system.w_lens,
-            v_inverse=self.point_inverse,
-            b_point=system.b_point,
-            step_camera=step_camera,
-            step_lens=step_common[: self.layout.lens_columns],
-            limit=config.point_step_limit_m,
+            self.points,
+            (self.start, self.tracks.camera, self.slot),
+            (system.w_obs, system.w_lens, self.point_inverse, system.b_point),
+            step_camera,
+            step_common[: self.layout.lens_columns],
+            active().bundle.point_step_limit_m,
         )
         return float(np.abs(step_camera.reshape(-1, 6)[:, :3]).max()) if len(step_camera) else 0.0
 
@@ -180,18 +164,15 @@ class Adjustment:
         c: float,
         heights: HeightPrior,
         ties: MapTies | None = None,
-        tie_c: float | None = None,
+        tie_c: float = TIE_ROBUST_C,
     ) -> tuple[Array, Array, Array]:
-        """Covariances at the present state, with the points eliminated (not held fixed).
-
-        Args:
-            chosen: (K,) free cameras. c, heights, ties, tie_c: as for `step`.
+        """Covariances of free cameras (K,) at the present state, with the points eliminated, not held; see `step`.
 
         Returns:
             float64 (K, 6, 6) of position and rotation about the camera's axes, (size, size) of the common unknowns, and
             (K, 6, size) between both.
         """
-        system = self._assemble(c, heights, MapTies.none() if ties is None else ties, tie_c)
+        system = self._assemble(c, heights, ties or MapTies.none(), tie_c)
         factor = factorise(system.band)
         y = solve_factored(factor, system.side)
         inverse = np.linalg.inv(system.corner - system.side.T @ y)
@@ -206,54 +187,37 @@ class Adjustment:
             out[k] = solved[own, 6 * k : 6 * k + 6] - between[k] @ y[own].T
         return out, np.asarray(inverse, np.float64), between
 
-    def _assemble(self, c: float, heights: HeightPrior, ties: MapTies, tie_c: float | None) -> BandedSystem:
+    def _assemble(self, c: float, heights: HeightPrior, ties: MapTies, tie_c: float) -> BandedSystem:
         """Build the reduced normal equations at the present state."""
-        free, lenses, points = int(self.free.sum()), len(self.cameras.lens), len(self.points)
-        system = BandedSystem.empty(
-            free=free,
-            common=self.layout.size,
-            lenses=lenses,
-            points=points,
-            observations=len(self.tracks.point),
-            bandwidth=self.bandwidth,
+        lenses, points, size = len(self.cameras.lens), len(self.points), self.layout.size
+        n, k = 6 * int(self.free.sum()), 6 * lenses
+        system = BandedSystem(
+            band=np.zeros((6 * (self.bandwidth + 1), n), order="F"),
+            side=np.zeros((n, size)),
+            corner=np.zeros((size, size)),
+            rhs=np.zeros(n),
+            rhs_common=np.zeros(size),
+            w_obs=np.zeros((len(self.tracks.point), 6, 3)),
+            w_lens=np.zeros((points, lenses, 6, 3)),
+            b_point=np.zeros((points, 3)),
         )
-        k = 6 * lenses
-        lens_side, lens_corner, rhs_lens = np.zeros((6 * free, k)), np.zeros((k, k)), np.zeros(k)
+        lens_side, lens_corner, rhs_lens = np.zeros((n, k)), np.zeros((k, k)), np.zeros(k)
         tie_of_point = np.full(points, -1, np.int32)
         tie_of_point[ties.point] = np.arange(len(ties.point), dtype=np.int32)
         self.tie_residual = np.zeros((len(ties.point), 2))
-        self.cost, _ = normal_equations.build(
-            position=self.cameras.position,
-            rotation=self.cameras.rotation,
-            lens_id=self.cameras.lens_id,
-            lens=self.cameras.lens,
-            points=self.points,
-            start=self.start,
-            camera=self.tracks.camera,
-            uv=self.tracks.uv,
-            weight=1.0 / self.tracks.sigma_px.astype(float) ** 2,
-            slot=self.slot,
-            c=c,
-            height=heights.height,
-            height_weight=np.full(points, 1.0 / heights.sigma**2),
-            height_c=heights.c,
-            height_soft=1.0 / heights.soft_sigma**2,
-            tie_point=tie_of_point,
-            tie_xy=ties.xy,
-            tie_weight=1.0 / ties.sigma_m**2,
-            tie_c=TIE_ROBUST_C if tie_c is None else tie_c,
-            band=system.band,
-            side=lens_side,
-            corner=lens_corner,
-            rhs=system.rhs,
-            rhs_lens=rhs_lens,
-            w_obs=system.w_obs,
-            w_lens=system.w_lens,
-            v_inverse=self.point_inverse,
-            b_point=system.b_point,
-            obs_weight=self.obs_weight,
-            tie_residual=self.tie_residual,
-            room=normal_equations.room_of_a_point(),
+        normal_equations.build(
+            self.cameras.arrays,
+            self.points,
+            (self.start, self.tracks.camera, self.tracks.uv, 1.0 / self.tracks.sigma_px.astype(float) ** 2),
+            self.slot,
+            c,
+            (heights.height, 1.0 / heights.sigma**2, heights.c, 1.0 / heights.soft_sigma**2),
+            (tie_of_point, ties.xy, 1.0 / ties.sigma_m**2, tie_c),
+            (system.band, lens_side, lens_corner, system.rhs, rhs_lens),
+            (system.w_obs, system.w_lens, self.point_inverse, system.b_point),
+            self.obs_weight,
+            self.tie_residual,
+            normal_equations.room_of_a_point(),
         )
         system.side[:, :k], system.corner[:k, :k], system.rhs_common[:k] = lens_side, lens_corner, rhs_lens
         add_priors(system, self.cameras, self.priors, self.layout, common=self.common, free=self.free, slot=self.slot)
@@ -263,15 +227,7 @@ class Adjustment:
         """Present reprojection residuals (M, 2), pixels."""
         out = np.empty((len(self.tracks.point), 2))
         normal_equations.residuals(
-            position=self.cameras.position,
-            rotation=self.cameras.rotation,
-            lens_id=self.cameras.lens_id,
-            lens=self.cameras.lens,
-            points=self.points,
-            point=self.tracks.point,
-            camera=self.tracks.camera,
-            uv=self.tracks.uv,
-            out=out,
+            self.cameras.arrays, self.points, self.tracks.point, self.tracks.camera, self.tracks.uv, out
         )
         return out
 

@@ -4,15 +4,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
-from numpy.typing import NDArray
 from scipy.linalg import lapack, solve_triangular
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
+from orthoswarm.model.arrays import Array, Flags, Indices, Ints
 from orthoswarm.model.errors import AdjustmentError
-from orthoswarm.refine.bundle.block_arrays import Ints, Tracks
+from orthoswarm.refine.bundle.block_arrays import Tracks
 
-Array = NDArray[np.float64]
 _BLOCK_COLUMNS, _NARROW_ROWS = 64, 600
 """Sizes for the processor's cache; they change the speed, not the result."""
 
@@ -36,28 +35,8 @@ class BandedSystem:
     w_lens: Array
     b_point: Array
 
-    @classmethod
-    def empty(
-        cls, *, free: int, common: int, lenses: int, points: int, observations: int, bandwidth: int
-    ) -> "BandedSystem":
-        """All zeros."""
-        return cls(
-            band=np.zeros((6 * (bandwidth + 1), 6 * free), order="F"),
-            side=np.zeros((6 * free, common)),
-            corner=np.zeros((common, common)),
-            rhs=np.zeros(6 * free),
-            rhs_common=np.zeros(common),
-            w_obs=np.zeros((observations, 6, 3)),
-            w_lens=np.zeros((points, lenses, 6, 3)),
-            b_point=np.zeros((points, 3)),
-        )
-
     def solve(self) -> tuple[Array, Array, Array]:
-        """Steps of the cameras (6 n,) and of the common unknowns (s,), and the latter's inverse covariance (s, s).
-
-        Raises:
-            AdjustmentError: if the system is singular.
-        """
+        """Steps of the cameras (6 n,) and of the common unknowns (s,), and the latter's inverse covariance (s, s)."""
         if not self.band.shape[1]:
             return np.zeros(0), np.asarray(np.linalg.solve(self.corner, self.rhs_common)), self.corner
         both = solve_factored(factorise(self.band), np.column_stack([self.side, self.rhs]))
@@ -68,11 +47,7 @@ class BandedSystem:
 
 
 def factorise(band: Array) -> Array:
-    """Cholesky factor of a symmetric matrix as LAPACK's lower band, in place.
-
-    Raises:
-        AdjustmentError: if it is not positive definite.
-    """
+    """Cholesky factor of a symmetric matrix as LAPACK's lower band, in place; it must be positive definite."""
     factor, info = lapack.dpbtrf(band, lower=1, overwrite_ab=1)
     if info != 0:
         raise AdjustmentError("the adjustment is singular; check the records for NaN or repeated pictures")
@@ -112,7 +87,7 @@ def _blocks_of(factor: Array, a: int, b: int, end: int) -> tuple[Array, Array]:
     return columns[: b - a], columns[b - a :]
 
 
-def camera_order(tracks: Tracks, position: Array, points: int, free: NDArray[np.bool_]) -> tuple[Ints, int]:
+def camera_order(tracks: Tracks, position: Array, points: int, free: Flags) -> tuple[Ints, int]:
     """Slot of each free camera in the band (-1 if held), int32 (N,), and the band's width in cameras.
 
     Cameras that observe a common point must lie within the band. Takes the best of the input order, that of Cuthill and
@@ -138,7 +113,7 @@ def camera_order(tracks: Tracks, position: Array, points: int, free: NDArray[np.
         reverse_cuthill_mckee(graph.tocsr(), symmetric_mode=True),
         np.argsort(_along_longer_side(position[index, :2]), kind="stable"),
     )
-    best: tuple[int, NDArray[np.int64]] = (len(index), np.arange(len(index)))
+    best: tuple[int, Indices] = (len(index), np.arange(len(index)))
     for permutation in orders:
         place = np.empty(len(index), np.int64)
         place[permutation] = np.arange(len(index))

@@ -1,4 +1,11 @@
-"""Stated errors: the adjustment's covariance propagated to the ground, plus systematic errors outside its model."""
+"""Stated errors: the adjustment's covariance propagated to the ground, plus systematic errors outside its model.
+
+One of these is a map that is displaced from place to place, as its ties' residuals show it. Matching noise is
+independent from tie to tie, a displacement of the map is alike for neighbours: so the semivariogram of the residuals
+rises with distance (Cressie 1993, Statistics for Spatial Data, chapter 2). A block of pictures is nearly rigid: it
+follows a displaced map as a whole, by a shift, a turn and a scale, and leaves the rest in the residuals. What it
+followed is its error.
+"""
 
 from dataclasses import dataclass, replace
 from typing import Final
@@ -8,13 +15,12 @@ from numpy.typing import NDArray
 
 from orthoswarm.config import active
 from orthoswarm.export.product_files import OBLIQUE_AXIS_DOWN
+from orthoswarm.model.arrays import Array, Floats, Ints
 from orthoswarm.model.camera import fov_rad, ground_jacobian
 from orthoswarm.model.robust import MEDIAN_SIGMA, mad_sigma
 from orthoswarm.refine.bundle.adjustment import Adjustment, HeightPrior, MapTies
 from orthoswarm.refine.bundle.block_arrays import WIDTH, F
 from orthoswarm.refine.bundle.priors import Priors
-
-Array = NDArray[np.float64]
 
 _LENS_CX = 4
 """Column of the principal point's cx among a lens's unknowns, cy is the next (see priors.Priors)."""
@@ -27,6 +33,19 @@ _SCATTER_LEAST_TIES: Final = 40  # with fewer ties the adjustment follows them, 
 _SYSTEMATIC_LEAST_TIES: Final = 4  # with fewer ties about a photo a systematic offset of the map there is not estimated
 _SYSTEMATIC_REACH_PHOTOS: Final = 4  # ... which uses the ties of so many photos before and after, of the same leg
 _SYSTEMATIC_SIGMAS: Final = 2.0  # sigmas of the ties' median taken off before it counts as systematic
+_LN2 = float(np.log(2.0))
+"""Median of the squared length of a Gaussian vector of two axes, for one of its mean."""
+
+_VARIOGRAM_MOST_TIES: Final = 200  # of more ties every so many-th is used: pairs grow with their square (its cost)
+_VARIOGRAM_CLASSES: Final = 9  # classes of distance between ties; the first ends at ....
+_VARIOGRAM_NEAR_HEIGHTS: Final = 0.1  # ... so many flying heights ...
+_VARIOGRAM_FAR_SHARE: Final = 0.85  # ... the last at this share of the largest distance: few pairs are farther apart
+_VARIOGRAM_LEAST_PAIRS: Final = 30  # a class with fewer pairs is left out
+_VARIOGRAM_LEAST_CLASSES: Final = 3  # fewer classes do not tell the map's distortion
+_VARIOGRAM_FLAT_SHARE: Final = 0.1  # classes weigh by their value, those below this share of the largest alike
+_CORRELATION_LENGTHS: Final = 8  # correlation lengths that are tried, from ... (its cost)
+_CORRELATION_HEIGHTS: Final = 0.2  # ... so many flying heights to ...
+_CORRELATION_RADII: Final = 1.5  # ... so many radii (root mean square) of the vehicle's ties
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,15 +54,14 @@ class StatedErrors:
 
     Attributes:
         sigma_m: float64 (N,), of the ground point at each picture's centre, `stated_sigma_factor` times the sigma of an
-            axis, metres.
-        fov_sigma_deg: one sigma of the field of view, degrees.
+            axis, metres. fov_sigma_deg: one sigma of the field of view.
         pose: float32 (N, 6, 6), covariance of position (metres) and rotation about the camera's axes (radians), without
             the error that is common to all pictures.
     """
 
     sigma_m: Array
     fov_sigma_deg: float
-    pose: NDArray[np.float32]
+    pose: Floats
 
 
 def stated_errors(
@@ -53,8 +71,7 @@ def stated_errors(
 
     Args:
         adjustment: after its last step. c, heights, ties, tie_c: as for Adjustment.step.
-        floor_m: error common to all pictures, which the covariance does not contain; one sigma per axis.
-
+        floor_m: error common to all pictures, one sigma per axis.
     """
     config = active().bundle
     n = len(adjustment.cameras)
@@ -77,14 +94,11 @@ def stated_errors(
 
 
 def with_seen_drift(adjustment: Adjustment) -> Priors:
-    """Priors whose receivers drift as much as this flight shows, instead of as much as any may.
+    """Priors of an adjustment without a map whose receivers drift as much as this flight shows, not as much as any may.
 
     Pictures show how a drift changes, not what it has in common over the flight. That is the receiver's bias, its own
     and what all have in common, and the mean of what it drifted by since it was right: of a drift that grows evenly the
     mean square is three times the variance about its mean.
-
-    Args:
-        adjustment: without a map, after its last step.
     """
     p, layout, config = adjustment.priors, adjustment.layout, active()
     bias2 = config.registration.receiver_bias_sigma_m**2 + RECEIVER_COMMON_SIGMA_M**2
@@ -99,12 +113,9 @@ def with_seen_drift(adjustment: Adjustment) -> Priors:
 
 
 def receiver_sigma(adjustment: Adjustment) -> Array:
-    """Sigma (2,) of a flight's place by its own receiver, east and north, metres: its bias, and its drift's mean.
+    """Sigma (2,), east and north, metres, of a flight's place by its own receiver: its bias, and its drift's mean.
 
     A receiver that drifts to the east may be right in the north. What all receivers have in common is none of it.
-
-    Args:
-        adjustment: without a map, after its last step.
     """
     p, config = adjustment.priors, active()
     drift = adjustment.layout.drift(adjustment.common, p.group)
@@ -122,7 +133,7 @@ def _between(chosen: NDArray[np.integer], covariance: Array, n: int) -> Array:
     return np.asarray((1.0 - share) * covariance[after - 1] + share * covariance[after])
 
 
-def with_distance_errors(pose: NDArray[np.float32], rotation: Array, distance_sigma_m: Array) -> NDArray[np.float32]:
+def with_distance_errors(pose: Floats, rotation: Array, distance_sigma_m: Array) -> Floats:
     """Covariances of cameras whose distance from the ground is wrong by what their focal length makes up for.
 
     Over level ground pictures show the ratio of both only. A camera with a wrong focal length then lies on its optical
@@ -141,44 +152,36 @@ def with_distance_errors(pose: NDArray[np.float32], rotation: Array, distance_si
 def common_map_sigma(residual: Array, sigma_m: Array, gsd_m: float) -> float:
     """Error common to all map ties of a picture, one sigma per axis, metres.
 
-    A poor map (old, coarse, blurred) makes ties scatter and also shifts them together: the common shift
-    grew with the scatter when maps of simulated cities were blurred and made noisy.
+    A poor map (old, coarse, blurred) makes ties scatter and also shifts them together: the common shift grew with the
+    scatter when maps of simulated cities were blurred and made noisy.
 
     Args:
-        residual: float64 (Q, 2) of the ties after the adjustment. sigma_m: float64 (Q,), their prior sigmas.
-        gsd_m: ground sampling distance of the map.
+        residual: float64 (Q, 2), of the ties, adjusted. sigma_m: float64 (Q,), prior. gsd_m: the map's pixel.
     """
     config = active().bundle
     floor = config.map_floor_px * gsd_m
     if len(residual) == 0:
         return floor
     scatter = mad_sigma(residual)
-    # so few ties do not resist the adjustment: their residuals are too small
     if len(residual) < _SCATTER_LEAST_TIES:
         scatter = max(scatter, float(np.median(sigma_m)))
     return float(np.hypot(floor, config.tie_scatter_share * scatter))
 
 
-def systematic_tie_offset(leg: NDArray[np.int32], camera: NDArray[np.integer], residual: Array) -> Array:
-    """Offset of the map around each picture, where its ties agree on one that the adjustment did not remove.
+def systematic_tie_offset(leg: Ints, camera: NDArray[np.integer], residual: Array) -> Array:
+    """Offset of the map around each picture (N,), metres, where its ties agree on one that the adjustment left; else 0.
 
-    A few deviating ties are wrong matches, or changed ground; if most of the ties around a picture are
-    off by the same vector, the picture or the map is.
+    A few deviating ties are wrong matches, or changed ground; if most of the ties around a picture are off by the same
+    vector, the picture or the map is.
 
     Args:
         leg: int32 (N,), -1 in turns. camera: (Q,), picture of each tie. residual: float64 (Q, 2), metres.
-
-    Returns:
-        float64 (N,), metres, 0 where ties are few, do not agree, or agree with the adjustment.
     """
-    near = _SYSTEMATIC_REACH_PHOTOS
-    out = np.zeros(len(leg))
+    out, near = np.zeros(len(leg)), _SYSTEMATIC_REACH_PHOTOS
     order = np.argsort(camera, kind="stable")
     camera, residual = camera[order], residual[order]
-    first, last = (
-        np.searchsorted(camera, np.arange(len(leg)) - near),
-        np.searchsorted(camera, np.arange(len(leg)) + near, side="right"),
-    )
+    first = np.searchsorted(camera, np.arange(len(leg)) - near)
+    last = np.searchsorted(camera, np.arange(len(leg)) + near, side="right")
     for i, (a, b) in enumerate(zip(first.tolist(), last.tolist(), strict=True)):
         mine = residual[a:b][leg[camera[a:b]] == leg[i]]
         if len(mine) < _SYSTEMATIC_LEAST_TIES:
@@ -190,14 +193,13 @@ def systematic_tie_offset(leg: NDArray[np.int32], camera: NDArray[np.integer], r
 
 
 def _ground_variance(adjustment: Adjustment, i: int, covariance: Array, common: Array, between: Array) -> float:
-    """Variance per axis (mean of both) of the ground at height 0 that a picture's central pixel shows.
+    """Variance per axis (mean of both) of the ground at height 0 that the central pixel of picture i shows.
 
     A principal point that is solved with the pictures is known far worse than the line of sight of that pixel: an error
     of it is one of the rotation, which makes up for it.
 
     Args:
-        adjustment: after its last step. i: camera. covariance: float64 (6, 6), its own. common: float64 (size, size),
-            of the common unknowns. between: float64 (6, size).
+        covariance: float64 (6, 6), the camera's. common: (size, size), of the common unknowns. between: (6, size).
     """
     cameras = adjustment.cameras
     height = max(float(cameras.position[i, 2]), 1.0)
@@ -211,3 +213,79 @@ def _ground_variance(adjustment: Adjustment, i: int, covariance: Array, common: 
     mixed = j @ between[:, columns] @ by_centre.T
     own = j @ covariance @ j.T + by_centre @ common[np.ix_(columns, columns)] @ by_centre.T
     return float(np.trace(own + mixed + mixed.T)) / 2
+
+
+def map_distortion_variance(place: Array, residual: Array, height_m: float) -> float:
+    """Variance per axis of what a block is displaced by on a map displaced from place to place, m^2; 0 with few ties.
+
+    Noise and a displacement with a Gaussian correlation are fitted to the semivariogram of the residuals: their
+    variances by least squares, the correlation's length by trial. For each length it is known what a similarity fitted
+    to the ties follows of such a displacement, and what semivariogram the rest has. Medians instead of means of the
+    squared differences are used, as ties may be wrong.
+
+    Args:
+        place: float64 (Q, 2), positions of the ties, metres. residual: float64 (Q, 2), theirs. height_m: flying height.
+    """
+    step = max(1, -(-len(place) // _VARIOGRAM_MOST_TIES))
+    place, residual = place[::step], residual[::step]
+    i, j = np.triu_indices(len(place), 1)
+    apart = np.hypot(*(place[i] - place[j]).T)
+    if len(i) < _VARIOGRAM_LEAST_PAIRS or not apart.max() > 0.0:
+        return 0.0
+    half = ((residual[i] - residual[j]) ** 2).sum(1) / 4.0
+    near, far = _VARIOGRAM_NEAR_HEIGHTS * height_m, _VARIOGRAM_FAR_SHARE * float(apart.max())
+    edges = np.r_[0.0, np.geomspace(min(near, far), far, _VARIOGRAM_CLASSES)]
+    number = np.digitize(apart, edges) - 1
+    classes = [np.flatnonzero(number == k) for k in range(_VARIOGRAM_CLASSES)]
+    classes = [pairs for pairs in classes if len(pairs) >= _VARIOGRAM_LEAST_PAIRS]
+    if len(classes) < _VARIOGRAM_LEAST_CLASSES:
+        return 0.0
+    found = np.array([np.median(half[pairs]) / _LN2 for pairs in classes])
+    radius = float(np.sqrt(((place - place.mean(axis=0)) ** 2).sum(axis=1).mean()))
+    shortest, longest = _CORRELATION_HEIGHTS * height_m, _CORRELATION_RADII * radius
+    best = (np.inf, 0.0)
+    for length_m in np.geomspace(min(shortest, longest), longest, _CORRELATION_LENGTHS):
+        left, followed = _followed(place, length_m)
+        level = np.diag(left)
+        expected = 0.5 * (level[i] + level[j]) - left[i, j]
+        variance, misfit = _fit(found, np.array([expected[pairs].mean() for pairs in classes]))
+        best = min(best, (misfit, variance * followed))
+    return best[1]
+
+
+def _followed(place: Array, length_m: float) -> tuple[Array, float]:
+    """Of a map displaced by unit variance: what a similarity that is fitted to ties leaves, and what it follows.
+
+    Covariance (Q, Q) of the residuals of an axis; variance of an axis of the fitted values, mean over the ties.
+    """
+    n = len(place)
+    apart2 = ((place[:, None] - place[None]) ** 2).sum(axis=2)
+    covariance = np.exp(-0.5 * apart2 / length_m**2)
+    x, y = (place - place.mean(axis=0)).T
+    radius = max(float(np.sqrt((x**2 + y**2).sum())), 1e-9)
+    one, zero = np.full(n, 1.0 / np.sqrt(n)), np.zeros(n)
+    east = np.column_stack([one, zero, x / radius, -y / radius])  # orthonormal together with north
+    north = np.column_stack([zero, one, y / radius, x / radius])
+    inner = east.T @ covariance @ east + north.T @ covariance @ north
+    left = covariance.copy()
+    for axis in (east, north):
+        cross = (covariance @ axis) @ axis.T
+        left += 0.5 * (axis @ inner @ axis.T - cross - cross.T)
+    return left, float(np.trace(inner)) / (2 * n)
+
+
+def _fit(found: Array, expected: Array) -> tuple[float, float]:
+    """Variance of the displacement and misfit of found = noise + variance x expected, both at least 0."""
+    weight = 1.0 / np.maximum(found, _VARIOGRAM_FLAT_SHARE * found.max() + 1e-12)
+    one, shape, value = weight, weight * expected, weight * found
+    a, b, c = one @ one, one @ shape, shape @ shape
+    p, q = one @ value, shape @ value
+    determinant = a * c - b * b
+    noise, variance = (
+        ((c * p - b * q) / determinant, (a * q - b * p) / determinant) if determinant > 0 else (p / a, 0.0)
+    )
+    if variance < 0.0:
+        noise, variance = p / a, 0.0
+    elif noise < 0.0:
+        noise, variance = 0.0, q / c
+    return float(variance), float(np.sum((value - noise * one - variance * shape) ** 2))

@@ -1,21 +1,18 @@
 """The records of one vehicle's frames as arrays in the local frame; gaps are filled and marked."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.config import active
 from orthoswarm.model.angles import wrap_rad
+from orthoswarm.model.arrays import Array, Flags
 from orthoswarm.model.camera import rotation_from_angles
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.trajectory.courses import course
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 _COURSE_REACH_PHOTOS: Final = 3  # flown steps are medians over so many photos before and after
 _COURSE_TURN_DEG: Final = 12.0  # ... of those whose heading differs by less
@@ -31,10 +28,9 @@ class FlightRecords:
     Attributes:
         position: float64 (N, 3), east, north minus the origin, height over the takeoff level (see has_height).
         yaw, pitch, roll: float64 (N,), GRID yaw; where unknown: the course, and nadir.
-        time_s: float64 (N,), seconds; picture number where times are unknown or not increasing.
+        time_s: float64 (N,); picture number where times are unknown or not increasing. timed: True for seconds.
         has_height, has_yaw, has_tilt: bool (N,), True where recorded.
         position_sigma: float64 (N,) horizontal, metres, as stated by the source (NaN where not).
-        timed: True if time_s are real seconds.
     """
 
     position: Array
@@ -58,14 +54,13 @@ class FlightRecords:
         The median over neighbours on the same course that took about as long; the recorded step where too few did, as
         where pictures between two frames are missing.
         """
-        reach, turn_rad = _COURSE_REACH_PHOTOS, np.radians(_COURSE_TURN_DEG)
-        n = len(self.position)
+        n, reach = len(self.position), _COURSE_REACH_PHOTOS
         raw = np.diff(self.position, axis=0, prepend=self.position[:1])
         took = np.maximum(np.diff(self.time_s, prepend=self.time_s[:1]), 1e-3)
         out = raw.copy()
         for i in range(1, n):
             near = np.arange(max(1, i - reach), min(n, i + reach + 1))
-            same = np.abs(wrap_rad(self.yaw[near] - self.yaw[i])) < turn_rad
+            same = np.abs(wrap_rad(self.yaw[near] - self.yaw[i])) < np.radians(_COURSE_TURN_DEG)
             same &= np.abs(np.log(took[near] / took[i])) < np.log(_STEP_TIME_FACTOR)
             chosen = near[same]
             if len(chosen) >= 3:
@@ -74,8 +69,7 @@ class FlightRecords:
 
     def velocity(self) -> Array:
         """Smoothed horizontal velocity (N, 2) in m/s (metres per picture where times are unknown)."""
-        n = len(self.position)
-        reach = _VELOCITY_REACH_PHOTOS
+        n, reach = len(self.position), _VELOCITY_REACH_PHOTOS
         a, b = np.maximum(np.arange(n) - reach, 0), np.minimum(np.arange(n) + reach, n - 1)
         dt = np.maximum(self.time_s[b] - self.time_s[a], 1e-3)[:, None]
         v = (self.position[b, :2] - self.position[a, :2]) / dt
@@ -83,19 +77,15 @@ class FlightRecords:
         usual = float(np.median(speed)) if n else 0.0
         return np.asarray(np.where((speed > _VELOCITY_LEAP * usual + 1)[:, None], 0.0, v))
 
-    def with_yaw(self, yaw: Array) -> "FlightRecords":
-        """The records with other headings."""
-        return replace(self, yaw=yaw)
-
 
 def read_records(frames: Sequence[Frame], grid: LocalGrid, origin: Array) -> FlightRecords:
     """Read the records of frames, in order; if no frame has a height, all get the configured default."""
     lat = np.array([f.fix.lat_deg for f in frames])
     lon = np.array([f.fix.lon_deg for f in frames])
     xy = grid.to_grid(lat, lon) - origin[:2]
-    height = _column([f.fix.height_m for f in frames])
-    yaw = _column([f.fix.yaw_rad for f in frames]) - grid.convergence_rad(lat, lon)
-    pitch, roll = _column([f.fix.pitch_rad for f in frames]), _column([f.fix.roll_rad for f in frames])
+    height = column([f.fix.height_m for f in frames])
+    yaw = column([f.fix.yaw_rad for f in frames]) - grid.convergence_rad(lat, lon)
+    pitch, roll = column([f.fix.pitch_rad for f in frames]), column([f.fix.roll_rad for f in frames])
     has_height, has_yaw, has_tilt = np.isfinite(height), np.isfinite(yaw), np.isfinite(pitch)
     filled = float(np.median(height[has_height])) if has_height.any() else active().records.default_height_m
     position = np.column_stack([xy, np.where(has_height, height, filled)])
@@ -109,17 +99,18 @@ def read_records(frames: Sequence[Frame], grid: LocalGrid, origin: Array) -> Fli
         has_height=has_height,
         has_yaw=has_yaw,
         has_tilt=has_tilt,
-        position_sigma=_column([f.fix.position_sigma_m for f in frames]),
+        position_sigma=column([f.fix.position_sigma_m for f in frames]),
         timed=timed,
     )
 
 
-def _column(values: Sequence[float | None]) -> Array:
+def column(values: Sequence[float | None]) -> Array:
+    """Values as an array, NaN for None."""
     return np.array([np.nan if v is None else v for v in values], float)
 
 
 def _times(frames: Sequence[Frame]) -> tuple[Array, bool]:
-    time = _column([f.time_s for f in frames])
+    time = column([f.time_s for f in frames])
     if len(frames) > 1 and np.isfinite(time).all() and (np.diff(time) >= 0).all() and time[-1] > time[0]:
         return time - time[0], True
     return np.arange(len(frames), dtype=float), False

@@ -1,7 +1,5 @@
 """Check of recorded heights against the pictures: the height offset that the adjustment finds without their prior.
 
-Prior.=>.
-
 Over flat ground and straight down only f / h is observable, so a wrong height gives a wrong focal length. But
 aircraft sway, and legs cross: the picture's movement with the recorded attitude gives f alone, and so h
 (measured: heights that are 30 % off are recovered to a few per cent, from 20 pictures as from 300).
@@ -12,13 +10,10 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.config import active
+from orthoswarm.model.arrays import Array, Flags
 from orthoswarm.refine.bundle.adjustment import Adjustment
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 _CONTRADICTION_SIGMAS: Final = 4.0  # a recorded height is contradicted by an offset of so many of its sigmas ...
 _CONTRADICTION_SHARE: Final = 0.15
@@ -71,11 +66,7 @@ def predicted_height_offset(adjustment: Adjustment) -> tuple[float, float]:
 
 
 def release_heights(adjustment: Adjustment) -> Flags:
-    """Loosen the prior on heights that the pictures contradict; run some more steps if there were any.
-
-    Returns:
-        bool (G,), groups whose prior this call loosened.
-    """
+    """Loosen the prior on heights that the pictures contradict; bool (G,), the groups where it did."""
     wrong = contradicted_heights(adjustment)
     if wrong.any():
         p = adjustment.priors
@@ -119,10 +110,7 @@ class FreeHeight:
 
 
 def height_disagreement(adjustment: Adjustment) -> float:
-    """Difference between recorded heights (that still have a prior) and the pictures, as a share of the height.
-
-    0 if insignificant.
-    """
+    """Significant difference of recorded heights that have a prior from the pictures, as a share of the height."""
     config = active().bundle
     sigma = np.array([m.height_sigma for m in adjustment.priors.models])
     known = sigma < config.unknown_height_sigma_m

@@ -6,19 +6,16 @@ The camera system is stored as LAPACK's lower band (row = distance from the diag
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel, kernel
+from orthoswarm.compute.robust_kernel import robust_weight
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.camera import LEAST_RADIAL_SLOPE
-from orthoswarm.refine.bundle.robust_kernel import robust_weight
 
 
 @in_place_kernel
 def linearise(position, rotation, lens, x, y, z, u, v, r, jc, jp, jl):  # type: ignore[no-untyped-def]
-    """Residual (2,) in pixels and Jacobians of one projection by camera (2, 6), point (2, 3) and lens (2, 6).
-
-    Returns False where the point is not visible (behind the camera, or where the distortion is not monotonic).
-    """
+    """Residual (2,), px, and Jacobians by camera (2, 6), point (2, 3), lens (2, 6); False where it is not visible."""
     ax, ay, az = x - position[0], y - position[1], z - position[2]
     dx = rotation[0, 0] * ax + rotation[1, 0] * ay + rotation[2, 0] * az
     dy = rotation[0, 1] * ax + rotation[1, 1] * ay + rotation[2, 1] * az
@@ -87,10 +84,7 @@ def _subtract_block(band, row, column, left, right):  # type: ignore[no-untyped-
 
 @in_place_kernel
 def _subtract_own_block(band, row, left, right, both):  # type: ignore[no-untyped-def]
-    """Subtract left (6, 3) times the transpose of right (6, 3) from a block on the diagonal of a lower band.
-
-    both: subtract the transposed product, too, for another observation by the same camera.
-    """
+    """As `_subtract_block`, on the diagonal; both: also the transpose, for another observation by the camera."""
     for a in range(6):
         for q in range(6):
             value = left[a, 0] * right[q, 0] + left[a, 1] * right[q, 1] + left[a, 2] * right[q, 2]
@@ -100,65 +94,33 @@ def _subtract_own_block(band, row, left, right, both):  # type: ignore[no-untype
                 band[q - a, row + a] -= value
 
 
-def room_of_a_point() -> tuple[NDArray[np.float64], ...]:
+def room_of_a_point() -> tuple[Array, ...]:
     """Room for a residual, its three Jacobians, and a point's normal matrix, right side and product with it."""
     return tuple(np.zeros(shape) for shape in (2, (2, 6), (2, 3), (2, 6), (3, 3), 3, (6, 3)))
 
 
 @in_place_kernel
-def build(  # type: ignore[no-untyped-def]
-    position,
-    rotation,
-    lens_id,
-    lens,
-    points,
-    start,
-    camera,
-    uv,
-    weight,
-    slot,
-    c,
-    height,
-    height_weight,
-    height_c,
-    height_soft,
-    tie_point,
-    tie_xy,
-    tie_weight,
-    tie_c,
-    band,
-    side,
-    corner,
-    rhs,
-    rhs_lens,
-    w_obs,
-    w_lens,
-    v_inverse,
-    b_point,
-    obs_weight,
-    tie_residual,
-    room,
-):
+def build(cameras, points, observations, slot, c, heights, ties, system, substitution, obs_weight, tie_residual, room):  # type: ignore[no-untyped-def]
     """Accumulate the reduced normal equations of all points.
 
     Args (P points, M observations sorted by point, N cameras, n free ones, L lenses):
-        position, rotation, lens_id, lens: as in CameraBlock. points: (P, 3). start: (P + 1,), each one's first
-            observation.
-        camera, uv, weight: (M,), (M, 2), (M,) 1 / sigma^2. slot: (N,) place of a free camera in the band, -1 if held.
-        c: robust scale of reprojection. height, height_weight: (P,) prior on Z, robust with height_c, plus a
-            constant weight height_soft that is not robust.
-        tie_point: (P,) row of the tie of a point or -1; tie_xy (Q, 2), tie_weight (Q,), tie_c: map ties
-            (X, Y) = tie_xy, height free.
-        band: (6 (bandwidth + 1), 6 n) lower band, side: (6 n, 6 L), corner: (6 L, 6 L), rhs: (6 n,), rhs_lens: (6 L,).
-        w_obs: (M, 6, 3), w_lens: (P, L, 6, 3), v_inverse: (P, 3, 3), b_point: (P, 3): for back substitution.
-        obs_weight: (M,) robust weight times 1 (0 where invisible). tie_residual: (Q, 2).
-        room: see `room_of_a_point`.
-
-    Returns:
-        Sum of the robust cost of the reprojections, number of visible observations.
+        cameras: CameraBlock.arrays. points: (P, 3).
+        observations: start (P + 1,), each point's first one; camera (M,); uv (M, 2); weight (M,), 1 / sigma^2.
+        slot: (N,) place of a free camera in the band, -1 if held. c: robust scale of reprojection.
+        heights: prior on Z: expected (P,), weight, robust scale, and a weight that is not robust.
+        ties: to the map, (X, Y) = xy, height free: (P,) row of a point's tie or -1; xy (Q, 2); weight (Q,); robust
+            scale.
+        system: band (6 (bandwidth + 1), 6 n), lower; side (6 n, 6 L); corner (6 L, 6 L); rhs (6 n,); rhs of the lenses.
+        substitution: w_obs (M, 6, 3), w_lens (P, L, 6, 3), v_inverse (P, 3, 3), b_point (P, 3).
+        obs_weight: (M,) robust weights (0 where invisible). tie_residual: (Q, 2). room: see `room_of_a_point`.
     """
+    position, rotation, lens_id, lens = cameras
+    start, camera, uv, weight = observations
+    height, height_weight, height_c, height_soft = heights
+    tie_point, tie_xy, tie_weight, tie_c = ties
+    band, side, corner, rhs, rhs_lens = system
+    w_obs, w_lens, v_inverse, b_point = substitution
     r, jc, jp, jl, v, b, wv = room
-    cost, visible = 0.0, 0
     lenses = lens.shape[0]
     for p in range(len(points)):
         v[:] = 0.0
@@ -173,12 +135,8 @@ def build(  # type: ignore[no-untyped-def]
             obs_weight[m] = 0.0
             if not linearise(position[i], rotation[i], lens[li], x, y, z, uv[m, 0], uv[m, 1], r, jc, jp, jl):
                 continue
-            e2 = (r[0] * r[0] + r[1] * r[1]) * weight[m]
-            rw = robust_weight(e2, c)
-            obs_weight[m] = rw
-            w = rw * weight[m]
-            cost += e2 / (1.0 + e2 / c)
-            visible += 1
+            obs_weight[m] = robust_weight((r[0] * r[0] + r[1] * r[1]) * weight[m], c)
+            w = obs_weight[m] * weight[m]
             s = slot[i]
             for a in range(3):
                 b[a] += w * (jp[0, a] * r[0] + jp[1, a] * r[1])
@@ -200,7 +158,7 @@ def build(  # type: ignore[no-untyped-def]
                     for q in range(3):
                         w_obs[m, a, q] = w * (jc[0, a] * jp[0, q] + jc[1, a] * jp[1, q])
         e = height[p] - z
-        hw = height_weight[p] * robust_weight(e * e * height_weight[p], height_c) + height_soft
+        hw = height_weight * robust_weight(e * e * height_weight, height_c) + height_soft
         v[2, 2] += hw
         b[2] += hw * e
         t = tie_point[p]
@@ -257,12 +215,13 @@ def build(  # type: ignore[no-untyped-def]
                         corner[6 * li + a, 6 * lj + q] -= (
                             t0 * w_lens[p, lj, q, 0] + t1 * w_lens[p, lj, q, 1] + t2 * w_lens[p, lj, q, 2]
                         )
-    return cost, visible
 
 
 @in_place_kernel
-def back_substitute(points, start, camera, slot, w_obs, w_lens, v_inverse, b_point, step_camera, step_lens, limit):  # type: ignore[no-untyped-def]
-    """Move the points (P, 3) in place by V^-1 (b - W^T step), a step no longer than `limit` metres."""
+def back_substitute(points, observations, substitution, step_camera, step_lens, limit):  # type: ignore[no-untyped-def]
+    """Move the points (P, 3) in place by V^-1 (b - W^T step), a step no longer than `limit` metres; see `build`."""
+    start, camera, slot = observations
+    w_obs, w_lens, v_inverse, b_point = substitution
     lenses = w_lens.shape[1]
     for p in range(len(points)):
         b0, b1, b2 = b_point[p, 0], b_point[p, 1], b_point[p, 2]
@@ -293,26 +252,14 @@ def back_substitute(points, start, camera, slot, w_obs, w_lens, v_inverse, b_poi
 
 
 @kernel
-def residuals(position, rotation, lens_id, lens, points, point, camera, uv, out):  # type: ignore[no-untyped-def]
+def residuals(cameras, points, point, camera, uv, out):  # type: ignore[no-untyped-def]
     """Residuals (M, 2) in pixels of all observations (NaN where invisible)."""
+    position, rotation, lens_id, lens = cameras
     r, jc, jp, jl = np.zeros(2), np.zeros((2, 6)), np.zeros((2, 3)), np.zeros((2, 6))
     for m in range(len(point)):
-        i, p = camera[m], point[m]
-        if linearise(
-            position[i],
-            rotation[i],
-            lens[lens_id[i]],
-            points[p, 0],
-            points[p, 1],
-            points[p, 2],
-            uv[m, 0],
-            uv[m, 1],
-            r,
-            jc,
-            jp,
-            jl,
-        ):
-            out[m, 0], out[m, 1] = r[0], r[1]
+        i, x = camera[m], points[point[m]]
+        own = lens[lens_id[i]]
+        if linearise(position[i], rotation[i], own, x[0], x[1], x[2], uv[m, 0], uv[m, 1], r, jc, jp, jl):
+            out[m] = r
         else:
-            out[m, 0] = np.nan
-            out[m, 1] = np.nan
+            out[m] = np.nan

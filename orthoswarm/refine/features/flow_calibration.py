@@ -5,21 +5,18 @@ flow (a yaw tag that flips) are corrected.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.config import active
 from orthoswarm.model.angles import wrap_rad
+from orthoswarm.model.arrays import Array, Complex, Gray, Indices, Ints
 from orthoswarm.model.camera import fov_rad
 from orthoswarm.model.robust import mad_sigma
 from orthoswarm.refine.bundle.flight_records import FlightRecords
-
-Array = NDArray[np.float64]
-Gray = NDArray[np.uint8]
 
 _CALIBRATION_PAIRS: Final = 24  # about so many pairs of pictures of a flight, evenly over its legs (its cost)
 _CALIBRATION_PAIRS_PER_LEG: Final = 3  # ... at least so many of each leg
@@ -48,9 +45,7 @@ class Calibration:
     Attributes:
         focal_px: focal length in working pixels. height_m: height above ground consistent with it.
         yaw_offset: float64 (N,), to be added to the recorded yaw (radians): flips, and headings taken from the course.
-        trusted_height: False if the recorded height had to be replaced.
-        pairs: number of picture pairs with a result.
-        warnings: sentences for the report.
+        trusted_height: False if the recorded height had to be replaced. pairs: number of picture pairs with a result.
         spread: robust relative sigma of the pairs' results, infinite if there are too few.
     """
 
@@ -69,13 +64,12 @@ class Calibration:
 
 
 def calibrate(
-    records: FlightRecords, leg: NDArray[np.int32], gray: Callable[[int], Gray], size: tuple[int, int], fov_start: float
+    records: FlightRecords, leg: Ints, gray: Callable[[int], Gray], size: tuple[int, int], fov_start: float
 ) -> Calibration:
     """Compare the flow of picture pairs along each leg with the flow that the records predict.
 
     Args:
-        records: the vehicle's records. leg: int32 (N,), -1 in turns.
-        gray: picture at working scale. size: its (width, height).
+        leg: int32 (N,), -1 in turns. gray: picture at working scale. size: its (width, height).
         fov_start: assumed horizontal field of view, radians.
     """
     width = size[0]
@@ -91,58 +85,38 @@ def calibrate(
     owners: list[int] = []
     for k, members in enumerate(legs):
         for a, b in _pairs(records, members, f0 / h0, size[1], per_leg):
-            ratio = _flow_ratio(
-                gray(a),
-                gray(b),
-                rotation[a],
-                rotation[b],
-                move=records.position[b] - records.position[a],
-                focal=f0,
-                height=h0,
-            )
+            move = records.position[b] - records.position[a]
+            ratio = _flow_ratio(gray(a), gray(b), rotation[a], rotation[b], move=move, focal=f0, height=h0)
             if ratio is not None:
                 ratios.append(ratio)
                 owners.append(k)
     if len(ratios) < 2:
+        none = np.zeros(len(leg))
         return Calibration(
-            focal_px=f0,
-            height_m=h0,
-            yaw_offset=np.zeros(len(leg)),
-            trusted_height=usable,
-            pairs=len(ratios),
-            warnings=[],
+            focal_px=f0, height_m=h0, yaw_offset=none, trusted_height=usable, pairs=len(ratios), warnings=[]
         )
-    r, owner = np.array(ratios), np.array(owners)
-    offset, warnings = _heading(records, leg, r, owner)
+    r = np.array(ratios)
+    offset, warnings = _heading(records, leg, r, np.array(owners))
     factor = np.abs(r)
     scale = float(np.median(factor))
-    found = _with_scale(f0, h0, scale, usable=usable, width=width, offset=offset, pairs=len(r), warnings=warnings)
-    return replace(found, spread=mad_sigma(factor / scale - 1.0))
-
-
-def _with_scale(
-    f0: float, h0: float, scale: float, *, usable: bool, width: int, offset: Array, pairs: int, warnings: list[str]
-) -> Calibration:
-    """Attribute the measured scale to the lens if that gives a possible one, else to the height."""
-    focal = f0 * scale
     narrowest, widest = np.radians(_CALIBRATION_FOV_DEG)
-    if usable and narrowest < fov_rad(focal, width) < widest:
-        return Calibration(
-            focal_px=focal, height_m=h0, yaw_offset=offset, trusted_height=True, pairs=pairs, warnings=warnings
-        )
-    height = h0 / scale
-    if usable:
+    by_lens = usable and narrowest < fov_rad(f0 * scale, width) < widest  # else the height is wrong
+    if usable and not by_lens:
         warnings.append(
-            f"the recorded height of {h0:.0f} m contradicts the pictures and the path; {height:.0f} m is assumed"
+            f"the recorded height of {h0:.0f} m contradicts the pictures and the path; {h0 / scale:.0f} m is assumed"
         )
     return Calibration(
-        focal_px=f0, height_m=height, yaw_offset=offset, trusted_height=False, pairs=pairs, warnings=warnings
+        focal_px=f0 * scale if by_lens else f0,
+        height_m=h0 if by_lens else h0 / scale,
+        yaw_offset=offset,
+        trusted_height=by_lens,
+        pairs=len(r),
+        warnings=warnings,
+        spread=mad_sigma(factor / scale - 1.0),
     )
 
 
-def _heading(
-    records: FlightRecords, leg: NDArray[np.int32], ratio: NDArray[np.complex128], owner: Array
-) -> tuple[Array, list[str]]:
+def _heading(records: FlightRecords, leg: Ints, ratio: Complex, owner: Array) -> tuple[Array, list[str]]:
     """Offset to the recorded yaw of each frame: legs whose yaw is flipped, or headings taken from the course."""
     offset = np.zeros(len(leg))
     warnings: list[str] = []
@@ -159,48 +133,28 @@ def _heading(
                 last = turn
             elif abs(turn) > wrong and spread < np.radians(_HEADING_WRONG_SPREAD_DEG):
                 last = turn
-                what = (
-                    "turned by 180 deg"
-                    if abs(turn) > np.radians(_HEADING_FLIP_DEG)
-                    else f"off by {np.degrees(turn):.0f} deg"
-                )
+                flipped = abs(turn) > np.radians(_HEADING_FLIP_DEG)
+                what = "turned by 180 deg" if flipped else f"off by {np.degrees(turn):.0f} deg"
                 first = int(np.flatnonzero(leg == k)[0])
                 warnings.append(
                     f"the yaw tags of the leg from frame {first} on are {what}; corrected from the pictures"
                 )
-        members = np.flatnonzero(leg == k)
-        offset[members] = last
-    _fill_turns(offset, leg)
+        offset[leg == k] = last
+    inside, turns = np.flatnonzero(leg >= 0), np.flatnonzero(leg < 0)
+    if len(inside) and len(turns):
+        offset[turns] = offset[inside[np.abs(inside[None, :] - turns[:, None]).argmin(1)]]
     return offset, warnings
 
 
-def _fill_turns(offset: Array, leg: NDArray[np.int32]) -> None:
-    inside = np.flatnonzero(leg >= 0)
-    if len(inside):
-        outside = np.flatnonzero(leg < 0)
-        nearest = inside[np.abs(inside[None, :] - outside[:, None]).argmin(1)] if len(outside) else outside
-        offset[outside] = offset[nearest]
-
-
-def _pairs(
-    records: FlightRecords, members: NDArray[np.int64], px_per_m: float, rows: int, most: int
-) -> list[tuple[int, int]]:
-    """Pairs along a leg, in the configured number and with about the configured expected flow (share of the picture).
-
-    Picture.
-    """
+def _pairs(records: FlightRecords, members: Indices, px_per_m: float, rows: int, most: int) -> list[tuple[int, int]]:
+    """At most so many pairs along a leg, as far apart as gives the wished flow."""
     if len(members) < 2:
         return []
     step = float(np.median(np.hypot(*np.diff(records.position[members, :2], axis=0).T)))
     if step <= 1e-3:
         return []
-    span = int(
-        np.clip(
-            round(_CALIBRATION_FLOW_SHARE * rows / (px_per_m * step)),
-            1,
-            max(1, min(_CALIBRATION_SPAN_PHOTOS, len(members) - 1)),
-        )
-    )
+    longest = max(1, min(_CALIBRATION_SPAN_PHOTOS, len(members) - 1))
+    span = int(np.clip(round(_CALIBRATION_FLOW_SHARE * rows / (px_per_m * step)), 1, longest))
     starts = np.unique(np.linspace(0, len(members) - 1 - span, most).astype(int))
     return [(int(members[s]), int(members[s + span])) for s in starts if s >= 0]
 
@@ -217,12 +171,7 @@ def _flow_ratio(
     spin = focal * turned[:2] / max(turned[2], 0.2)  # flow caused by rotation alone
     shift = -focal / height * (rb.T @ move)[:2]
     factor = 0.5 if shape[1] > _CALIBRATION_REDUCED_FROM_PX else 1.0
-    small = [
-        cv2.resize(g, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA).astype(np.float32)
-        for g in (first, second)
-    ]
-    window = cv2.createHanningWindow(small[0].shape[::-1], cv2.CV_32F)
-    (dx, dy), response = cv2.phaseCorrelate(small[0], small[1], window)
+    dx, dy, response = phase_shift(first, second, factor)
     if response < _CALIBRATION_RESPONSE:
         return None
     flow = complex(dx / factor - spin[0], dy / factor - spin[1])
@@ -231,3 +180,13 @@ def _flow_ratio(
         return None
     ratio = flow / expected
     return ratio if 1.0 / _CALIBRATION_RATIO < abs(ratio) < _CALIBRATION_RATIO else None
+
+
+def phase_shift(first: Gray, second: Gray, factor: float) -> tuple[float, float, float]:
+    """Shift (columns, rows) between two pictures reduced by a factor, and the response of their phase correlation."""
+    a, b = (
+        cv2.resize(g, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA).astype(np.float32)
+        for g in (first, second)
+    )
+    (dx, dy), response = cv2.phaseCorrelate(a, b, cv2.createHanningWindow(a.shape[::-1], cv2.CV_32F))
+    return dx, dy, response

@@ -3,14 +3,131 @@
 Translation only, inverse compositional (Baker and Matthews 2004), two levels. The template is sampled in the later
 picture's geometry through a local affine map, so a rotation between pictures does no harm; a brightness offset is
 allowed.
+
+The sums over a window are made in vector registers, one lane for each column: the compiler does not reorder the
+additions of a loop, since that changes rounding, so it adds one number after the other. Here sixteen columns are added
+at once, in an order that is always the same (see `shift_products` for why this is written in LLVM's terms).
 """
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.extending import intrinsic
 
 from orthoswarm.compute.jit import in_place_kernel, kernel
-from orthoswarm.refine.features.window_sums import LANES, SIZE, WIDE, add_gradients, add_residuals
 
+SIZE = 15
+"""Side of a window, pixels: a layout of the compiled code (Lucas and Kanade 1981)."""
+WIDE = SIZE + 2
+"""Side of a template: the window and the pixels around it, for its gradients."""
+LANES = 16
+"""Columns that are added at once: those of a window and one that is not used."""
 _HALF = SIZE // 2
+
+_FLOAT, _INT = ir.FloatType(), ir.IntType(32)
+_VECTOR = ir.VectorType(_FLOAT, LANES)
+
+
+class _Lanes:
+    """Writes vector code into the function that numba compiles."""
+
+    def __init__(self, context: Any, builder: Any, signature: Any, arguments: Any) -> None:
+        self.builder = builder
+        self.data = [
+            context.make_array(kind)(context, builder, value).data if isinstance(kind, types.Array) else value
+            for kind, value in zip(signature.args, arguments, strict=True)
+        ]
+        self.number = context.get_constant(types.intp, 0).type
+
+    def rows(self) -> Any:
+        """A loop over the rows of a window."""
+        return cgutils.for_range(self.builder, ir.Constant(self.number, SIZE))
+
+    def place(self, array: int, at: Any) -> Any:
+        """The address of a vector in an array (its number among the arguments)."""
+        return self.builder.bitcast(self.builder.gep(self.data[array], [at]), _VECTOR.as_pointer())
+
+    def load(self, array: int, row: Any, width: int, offset: int) -> Any:
+        """The vector at an offset from the beginning of a row, in an array of so many columns."""
+        at = self.builder.add(self.builder.mul(row, ir.Constant(self.number, width)), ir.Constant(self.number, offset))
+        return self.builder.load(self.place(array, at), align=4)
+
+    def store(self, value: Any, array: int, row: Any, offset: int) -> None:
+        """Put a vector into an array of LANES columns."""
+        at = self.builder.add(self.builder.mul(row, ir.Constant(self.number, LANES)), ir.Constant(self.number, offset))
+        self.builder.store(value, self.place(array, at), align=4)
+
+    def totals(self, count: int) -> list[Any]:
+        """So many vectors of zeros that stay in registers."""
+        return [cgutils.alloca_once_value(self.builder, ir.Constant(_VECTOR, None)) for _ in range(count)]
+
+    def add(self, totals: list[Any], values: Sequence[Any]) -> None:
+        """Add a vector to each of the totals."""
+        for total, value in zip(totals, values, strict=True):
+            self.builder.store(self.builder.fadd(self.builder.load(total), value), total)
+
+    def write(self, totals: list[Any], array: int) -> None:
+        """Put the totals into the lines of an array of LANES columns."""
+        for line, total in enumerate(totals):
+            self.store(self.builder.load(total), array, ir.Constant(self.number, line), 0)
+
+    def everywhere(self, value: Any) -> Any:
+        """A vector of one value."""
+        undefined = ir.Constant(_VECTOR, ir.Undefined)
+        first = self.builder.insert_element(undefined, value, ir.Constant(_INT, 0))
+        return self.builder.shuffle_vector(first, undefined, ir.Constant(ir.VectorType(_INT, LANES), [0] * LANES))
+
+
+@intrinsic
+def add_gradients(typing, wide, gradient, sums):  # type: ignore[no-untyped-def]
+    """Gradients (2, SIZE, LANES) of a template, last lane 0; sums over columns of xx, xy, yy, x, y: (5, LANES)."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        lanes = _Lanes(context, builder, signature, arguments)
+        totals = lanes.totals(5)
+        half = ir.Constant(_VECTOR, [0.5] * SIZE + [0.0] * (LANES - SIZE))
+        with lanes.rows() as row:
+            right, left = (lanes.load(0, row.index, WIDE, WIDE + k) for k in (2, 0))
+            low, high = (lanes.load(0, row.index, WIDE, WIDE * k + 1) for k in (2, 0))
+            x, y = builder.fmul(half, builder.fsub(right, left)), builder.fmul(half, builder.fsub(low, high))
+            lanes.store(x, 1, row.index, 0)
+            lanes.store(y, 1, row.index, SIZE * LANES)
+            lanes.add(totals, (builder.fmul(x, x), builder.fmul(x, y), builder.fmul(y, y), x, y))
+        lanes.write(totals, 2)
+        return context.get_dummy_value()
+
+    return types.void(wide, gradient, sums), generate
+
+
+@intrinsic
+def add_residuals(typing, under, wide, gradient, part_u, part_v, sums):  # type: ignore[no-untyped-def]
+    """What a template differs from a picture by, e: sums of gx e, gy e, e, e e over its columns, (5, LANES).
+
+    Args:
+        under: float32 (SIZE + 1, LANES + 1), the picture from the pixel before the window's place on.
+        wide, gradient: of the template, see `add_gradients`. part_u, part_v: float32, part of a pixel to the place.
+    """
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        lanes = _Lanes(context, builder, signature, arguments)
+        totals = lanes.totals(4)
+        u, v = lanes.everywhere(arguments[3]), lanes.everywhere(arguments[4])
+        with lanes.rows() as row:
+            rows = []
+            for k in range(2):
+                left, right = (lanes.load(0, row.index, LANES + 1, (LANES + 1) * k + q) for q in range(2))
+                rows.append(builder.fadd(left, builder.fmul(u, builder.fsub(right, left))))
+            seen = builder.fadd(rows[0], builder.fmul(v, builder.fsub(rows[1], rows[0])))
+            error = builder.fsub(seen, lanes.load(1, row.index, WIDE, WIDE + 1))
+            x, y = lanes.load(2, row.index, LANES, 0), lanes.load(2, row.index, LANES, SIZE * LANES)
+            lanes.add(totals, (builder.fmul(x, error), builder.fmul(y, error), error, builder.fmul(error, error)))
+        lanes.write(totals, 5)
+        return context.get_dummy_value()
+
+    return types.void(under, wide, gradient, part_u, part_v, sums), generate
 
 
 @in_place_kernel
@@ -48,7 +165,7 @@ def _template(gray, u, v, affine, wide):  # type: ignore[no-untyped-def]
 
 @kernel
 def _scratch():  # type: ignore[no-untyped-def]
-    """Template, its gradients, what lies under it, sums: see `window_sums`."""
+    """Template, its gradients, what lies under it, sums."""
     return (
         np.zeros((WIDE, WIDE), np.float32),
         np.zeros((2, SIZE, LANES), np.float32),
@@ -119,20 +236,18 @@ def _variance(wide):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def track(  # type: ignore[no-untyped-def]
-    before, before_half, after, after_half, points, homography, back, rounds, texture, step, mismatch, noise,
-    guess, found, ok,
-):  # fmt: skip
+def track(before, before_half, after, after_half, points, homography, back, limits, guess, found, ok):  # type: ignore[no-untyped-def]
     """Track K windows from one picture into the next.
 
     Args:
         before, after: uint8 pictures; before_half, after_half: the same at half size.
         points: float32 (K, 2) in `before`.
         homography: float64 (3, 3), predicted, from `before` to `after`. back: its inverse.
-        rounds: most iterations at half and at full size. texture, step: see the configuration (klt_least_texture,
-            klt_step_px). mismatch, noise: largest mean square error as a share of the window's variance, plus noise.
+        limits: most iterations at half and at full size; texture and step, see `_refine`; largest mean square error as
+            a share of the window's variance, and noise that is added to that.
         guess: float32 (K, 2) out, as predicted. found: float32 (K, 2) out. ok: bool (K,) out.
     """
+    rounds, texture, step, mismatch, noise = limits
     scratch = _scratch()
     wide, affine, q = scratch[0], np.empty((2, 2)), np.empty(2)
     for k in range(len(points)):
@@ -161,9 +276,7 @@ def track(  # type: ignore[no-untyped-def]
 
 
 @kernel
-def anchor(  # type: ignore[no-untyped-def]
-    stack, chain, slot, points, after, here, limit, rounds, texture, step, mismatch, noise, found, ok
-):
+def anchor(stack, chain, slot, points, after, here, farthest, limits, found, ok):  # type: ignore[no-untyped-def]
     """Compare K windows with their first observation, so that errors do not accumulate from picture to picture.
 
     Args:
@@ -171,10 +284,11 @@ def anchor(  # type: ignore[no-untyped-def]
             picture to them. slot: int64 (K,), the picture of each first observation.
         points: float32 (K, 2), its place there. after: the picture now.
         here: float64 (3, 3), homography from the picture now to the first one.
-        limit: farthest move in pixels. rounds (one number), texture, step, mismatch, noise: as for `track`.
+        farthest: move in pixels. limits: as for `track`, with one number of iterations.
         found: float32 (K, 2); in: as tracked from the last picture, out: improved.
         ok: bool (K,) out, False where the window no longer matches its first observation.
     """
+    rounds, texture, step, mismatch, noise = limits
     scratch = _scratch()
     wide, affine, q, back = scratch[0], np.empty((2, 2)), np.empty(2), np.empty((3, 3))
     for k in range(len(points)):
@@ -191,7 +305,7 @@ def anchor(  # type: ignore[no-untyped-def]
         error = _refine(after, scratch, q, rounds, texture, step)
         if error < 0 or error > mismatch * _variance(wide) + noise:
             continue
-        if (q[0] - found[k, 0]) ** 2 + (q[1] - found[k, 1]) ** 2 > limit * limit:
+        if (q[0] - found[k, 0]) ** 2 + (q[1] - found[k, 1]) ** 2 > farthest * farthest:
             continue
         found[k, 0], found[k, 1] = q[0], q[1]
         ok[k] = True

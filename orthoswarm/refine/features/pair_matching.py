@@ -1,10 +1,12 @@
-"""Pairs of overlapping photos: candidates, matching of their features, geometric verification.
+"""Pairs of overlapping photos: candidates, matching of their features, geometric verification, tracks through them.
 
 Candidates come from the recorded positions, not only from the order in time, as legs, vehicles and sorties overlap too.
 A pair is accepted when mutual nearest neighbours agree on one similarity of the plane (loosely, because cameras tilt
-and the ground is not flat) and on one epipolar geometry (tightly).
+and the ground is not flat) and on one epipolar geometry (tightly). Features of many photos are joined into one tie
+point by union-find.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
@@ -12,12 +14,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.refine.features.sift_features import Features, root_sift
+from orthoswarm.compute.jit import in_place_kernel, kernel
+from orthoswarm.model.arrays import Array, Complex, Flags, Floats, Indices, Ints
+from orthoswarm.refine.bundle.block_arrays import Tracks
+from orthoswarm.refine.features.sift_features import SIFT_CELLS, SiftFeatures, root_sift
 from orthoswarm.trajectory.legs import PAUSE_S
-
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
-Ints = NDArray[np.int32]
 
 _MATCH_RATIO: Final = 0.85
 """A match is clearly nearer than the next candidate: ratio test (Lowe 2004: 0.8; chosen on four real flights)."""
@@ -30,16 +31,13 @@ _RANSAC_ROUNDS: Final = 1000  # most rounds of both consensus searches (its cost
 _RANSAC_CONFIDENCE: Final = 0.999  # confidence at which they end earlier
 _PAIR_SECTORS: Final = 6  # directions over which a photo's neighbours are spread
 _PAIR_BEST_DISTANCE: Final = 0.4  # best distance of a pair as a share of its reach
+_TRACK_LONGEST: Final = 20  # longest track; longer ones stay in pieces (its cost)
+_TRACK_PER_CELL: Final = 2  # observations in a cell of a photo from which on further tracks are dropped (its cost)
 
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """Two photos that show the same ground.
-
-    Attributes:
-        first: index of one photo; second: index of the other, larger.
-        match: int32 (n, 2), rows of features in the first and in the second.
-    """
+    """Photos `first` < `second` that show the same ground; match: int32 (n, 2), rows of features in the two."""
 
     first: int
     second: int
@@ -49,7 +47,7 @@ class Pair:
         return len(self.match)
 
 
-def match_features(one: Features, two: Features) -> Ints:
+def match_features(one: SiftFeatures, two: SiftFeatures) -> Ints:
     """Rows of matching features in two photos, int32 (n, 2); (0, 2) without a match.
 
     Mutual nearest neighbours that pass the ratio test, then a similarity by RANSAC, then the fundamental matrix by
@@ -69,7 +67,7 @@ def match_features(one: Features, two: Features) -> Ints:
     return candidates[epipolar] if epipolar.sum() >= _MATCH_LEAST else none
 
 
-def mutual_nearest(one: NDArray[np.float32], two: NDArray[np.float32]) -> Ints:
+def mutual_nearest(one: Floats, two: Floats) -> Ints:
     """Rows of unit descriptors (n, d) and (m, d) nearest to each other and clearly nearer than the next, (k, 2)."""
     if len(one) < 2 or len(two) < 2:
         return np.zeros((0, 2), np.int32)
@@ -85,7 +83,7 @@ def mutual_nearest(one: NDArray[np.float32], two: NDArray[np.float32]) -> Ints:
     return np.stack([rows[keep], best[keep]], axis=1).astype(np.int32)
 
 
-def _similarity_inliers(p: NDArray[np.float32], q: NDArray[np.float32], threshold: float) -> NDArray[np.bool_]:
+def _similarity_inliers(p: Floats, q: Floats, threshold: float) -> Flags:
     import cv2
 
     matrix, inliers = cv2.estimateAffinePartial2D(
@@ -105,7 +103,7 @@ def _similarity_inliers(p: NDArray[np.float32], q: NDArray[np.float32], threshol
     return np.asarray(inliers[:, 0] > 0)
 
 
-def _epipolar_inliers(p: NDArray[np.float32], q: NDArray[np.float32]) -> NDArray[np.bool_]:
+def _epipolar_inliers(p: Floats, q: Floats) -> Flags:
     import cv2
 
     try:
@@ -115,43 +113,18 @@ def _epipolar_inliers(p: NDArray[np.float32], q: NDArray[np.float32]) -> NDArray
     return np.zeros(len(p), bool) if inliers is None else np.asarray(inliers[:, 0] > 0)
 
 
-class _Identity:
-    """A dictionary key by object identity that keeps the object alive."""
-
-    __slots__ = ("features",)
-
-    def __init__(self, features: Features) -> None:
-        self.features = features
-
-    def __hash__(self) -> int:
-        return id(self.features)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Identity) and other.features is self.features
-
-
 @lru_cache(maxsize=64)
-def _unit_of(key: _Identity) -> NDArray[np.float32]:
-    return root_sift(key.features.descriptor)
-
-
-def _unit(features: Features) -> NDArray[np.float32]:
-    return _unit_of(_Identity(features))
+def _unit(features: SiftFeatures) -> Floats:
+    return root_sift(features.descriptor)
 
 
 def consecutive(group: NDArray[np.integer], time_s: Array) -> Ints:
-    """Pairs of photos that follow each other in one group (a vehicle) without a pause, int32 (n, 2).
-
-    Args:
-        group: integers (N,), photos of a group in order of time.
-        time_s: float64 (N,), NaN where unknown (then order alone counts).
-    """
-    pause_s = PAUSE_S
+    """Pairs that follow each other in one group, in order of time, without a pause: int32 (n, 2); time_s may be NaN."""
     last: dict[int, int] = {}
     pairs: list[tuple[int, int]] = []
     for k, g in enumerate(group.tolist()):
         before = last.get(g)
-        if before is not None and not abs(time_s[k] - time_s[before]) > pause_s:
+        if before is not None and not abs(time_s[k] - time_s[before]) > PAUSE_S:
             pairs.append((before, k))
         last[g] = k
     return np.array(pairs, np.int32).reshape(-1, 2)
@@ -160,18 +133,16 @@ def consecutive(group: NDArray[np.integer], time_s: Array) -> Ints:
 def nearby(centre: Complex, reach: Array, group: NDArray[np.integer], count: int = 8) -> Ints:
     """Pairs with possibly overlapping footprints, spread over all directions, int32 (n, 2), sorted, first < second.
 
-    Each photo chooses partners in every direction, both of its own group and of others, preferring those whose distance
-    is near the best one.
+    Each photo chooses `count` partners in every direction, both of its own group and of others, preferring those whose
+    distance is near the best one.
 
     Args:
-        centre: complex (N,), east + i north of the ground at each photo's centre.
+        centre: complex (N,), east + i north of the ground at each photo's centre. group: integers (N,), leg or segment.
         reach: float64 (N,), metres; two photos are near if their distance is below the mean of their reaches.
-        group: integers (N,), leg or segment.
-        count: how many neighbours each photo may choose.
     """
     from scipy.spatial import cKDTree
 
-    best, sectors = _PAIR_BEST_DISTANCE, _PAIR_SECTORS
+    sectors = _PAIR_SECTORS
     points = np.stack([centre.real, centre.imag], axis=1)
     tree = cKDTree(points)
     chosen: set[tuple[int, int]] = set()
@@ -181,7 +152,7 @@ def nearby(centre: Complex, reach: Array, group: NDArray[np.integer], count: int
         distance = np.abs(centre[near] - centre[i])
         mean = 0.5 * (reach[near] + reach[i])
         near, distance = near[distance <= mean], (distance / mean)[distance <= mean]
-        order = np.lexsort((near, np.abs(near - i), np.round(np.abs(distance - best), 3)))
+        order = np.lexsort((near, np.abs(near - i), np.round(np.abs(distance - _PAIR_BEST_DISTANCE), 3)))
         near = near[order]
         sector = np.floor(np.angle(centre[near] - centre[i]) / (2 * np.pi) * sectors + 0.5).astype(np.int64) % sectors
         for j in _round_robin(near, sector + sectors * (group[near] != group[i]), count):
@@ -189,7 +160,7 @@ def nearby(centre: Complex, reach: Array, group: NDArray[np.integer], count: int
     return np.array(sorted(chosen), np.int32).reshape(-1, 2)
 
 
-def _round_robin(near: NDArray[np.int64], kind: NDArray[np.int64], count: int) -> list[int]:
+def _round_robin(near: Indices, kind: Indices, count: int) -> list[int]:
     """The first item of every kind, then the second, until there are `count`."""
     rank = np.zeros(len(near), np.int64)
     for k in np.unique(kind):
@@ -197,3 +168,103 @@ def _round_robin(near: NDArray[np.int64], kind: NDArray[np.int64], count: int) -
         rank[inside] = np.arange(len(inside))
     order = np.lexsort((np.arange(len(near)), rank))
     return [int(j) for j in near[order][:count]]
+
+
+def build_tracks(features: Sequence[SiftFeatures], pairs: Sequence[Pair]) -> Tracks:
+    """Tie points through all photos, each observed 2 to `_TRACK_LONGEST` times, in full pictures.
+
+    The strongest pair is joined first; a join that would put two points of one photo into a track is refused, so that
+    one wrong match cannot merge two places. The camera of an observation is the photo's index in `features`.
+    """
+    offset = np.concatenate([[0], np.cumsum([len(f) for f in features])]).astype(np.int64)
+    photo = np.repeat(np.arange(len(features), dtype=np.int32), np.diff(offset))
+    same = [f.same_point() for f in features]
+    joins: list[Indices] = []
+    for pair in sorted(pairs, key=lambda p: (-len(p), p.first, p.second)):
+        a = offset[pair.first] + same[pair.first][pair.match[:, 0]]
+        b = offset[pair.second] + same[pair.second][pair.match[:, 1]]
+        joins.append(np.stack([a, b], axis=1))
+    edges = np.concatenate(joins) if joins else np.zeros((0, 2), np.int64)
+    root = _union(edges, photo, len(photo), _TRACK_LONGEST)
+    return _tracks(root, photo, features)
+
+
+def _tracks(root: Indices, photo: Ints, features: Sequence[SiftFeatures]) -> Tracks:
+    _, inverse, count = np.unique(root, return_inverse=True, return_counts=True)
+    node = np.flatnonzero(count[inverse] >= 2)
+    uv = np.concatenate([f.uv for f in features]) if len(features) else np.zeros((0, 2), np.float32)
+    sigma = np.concatenate([f.sigma_px for f in features]) if len(features) else np.zeros(0, np.float32)
+    return Tracks(photo[node], inverse[node].astype(np.int32), uv[node].astype(np.float64), sigma[node]).renumbered()
+
+
+@in_place_kernel
+def _find(parent, x):  # type: ignore[no-untyped-def]
+    while parent[x] != x:
+        parent[x] = parent[parent[x]]
+        x = parent[x]
+    return x
+
+
+@kernel
+def _union(edges, photo, count, max_length):  # type: ignore[no-untyped-def]
+    """Root of each node after joining along the edges in order; the members of a root form a linked list."""
+    parent = np.arange(count)
+    following = np.full(count, -1)
+    tail = np.arange(count)
+    size = np.ones(count, np.int64)
+    for e in range(len(edges)):
+        a, b = _find(parent, edges[e, 0]), _find(parent, edges[e, 1])
+        if a == b or size[a] + size[b] > max_length:
+            continue
+        clash = False
+        x = a
+        while x >= 0 and not clash:
+            y = b
+            while y >= 0:
+                if photo[x] == photo[y]:
+                    clash = True
+                    break
+                y = following[y]
+            x = following[x]
+        if clash:
+            continue
+        if a > b:
+            a, b = b, a
+        parent[b] = a
+        following[tail[a]] = b
+        tail[a] = tail[b]
+        size[a] += size[b]
+    root = np.empty(count, np.int64)
+    for x in range(count):
+        root[x] = _find(parent, x)
+    return root
+
+
+def thin_tracks(tracks: Tracks, width: Array, rows: Array) -> Tracks:
+    """Keep tracks, longest first, while a cell of a photo has room; width, rows: (N,), size of each photo."""
+    if not len(tracks.camera):
+        return tracks
+    nx, ny = SIFT_CELLS
+    length = np.bincount(tracks.point, minlength=tracks.count)
+    order = np.lexsort((tracks.camera, tracks.point, -length[tracks.point]))
+    start = np.flatnonzero(np.r_[True, np.diff(tracks.point[order]) != 0, True])
+    cx = np.clip(tracks.uv[:, 0] * nx / np.asarray(width)[tracks.camera], 0, nx - 1).astype(np.int64)
+    cy = np.clip(tracks.uv[:, 1] * ny / np.asarray(rows)[tracks.camera], 0, ny - 1).astype(np.int64)
+    cell = tracks.camera.astype(np.int64) * nx * ny + cy * nx + cx
+    keep = np.zeros(len(order), np.bool_)
+    _thin(cell[order], start, _TRACK_PER_CELL, nx * ny * len(width), keep)
+    return tracks.take(np.sort(order[keep])).renumbered()
+
+
+@kernel
+def _thin(cell, start, room, cells, keep):  # type: ignore[no-untyped-def]
+    used = np.zeros(cells, np.int64)
+    for t in range(len(start) - 1):
+        wanted = False
+        for k in range(start[t], start[t + 1]):
+            if used[cell[k]] < room:
+                wanted = True
+        if wanted:
+            for k in range(start[t], start[t + 1]):
+                used[cell[k]] += 1
+                keep[k] = True

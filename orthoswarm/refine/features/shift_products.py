@@ -113,6 +113,20 @@ def padded(count, step):  # type: ignore[no-untyped-def]
 
 
 @in_place_kernel
+def _add_block(vectors, window, seen, template, own, score, out):  # type: ignore[no-untyped-def]
+    """Add one block of so many vectors: from a place in the window and in the template to one in the score."""
+    n, lines, step, columns = template.shape[2], template.shape[1] - ROWS + 1, window.shape[2], score.shape[1]
+    if vectors == 1:
+        _one(window, seen, step, template, own, n, lines, n, score, out, columns)
+    elif vectors == 2:
+        _two(window, seen, step, template, own, n, lines, n, score, out, columns)
+    elif vectors == 3:
+        _three(window, seen, step, template, own, n, lines, n, score, out, columns)
+    else:
+        _four(window, seen, step, template, own, n, lines, n, score, out, columns)
+
+
+@in_place_kernel
 def add_products(template, window, score):  # type: ignore[no-untyped-def]
     """Add to `score` the products of a template and a window at each shift, over all their channels.
 
@@ -124,25 +138,15 @@ def add_products(template, window, score):  # type: ignore[no-untyped-def]
     """
     channels, lines, n = template.shape
     rows, columns = score.shape
-    step = window.shape[2]
     for channel in range(channels):
         own = (channel * lines + ROWS - 1) * n
         for i in range(0, rows, ROWS):
-            seen, out, j = (channel * window.shape[1] + i) * step, i * columns, 0
+            seen, j = (channel * window.shape[1] + i) * window.shape[2], 0
             while j < columns:
                 left = (columns - j) // LANES
-                if left == 1:
-                    _one(window, seen + j, step, template, own, n, lines - ROWS + 1, n, score, out + j, columns)
-                    j += LANES
-                elif left == 2:
-                    _two(window, seen + j, step, template, own, n, lines - ROWS + 1, n, score, out + j, columns)
-                    j += 2 * LANES
-                elif left == 3 or left == 5:
-                    _three(window, seen + j, step, template, own, n, lines - ROWS + 1, n, score, out + j, columns)
-                    j += 3 * LANES
-                else:
-                    _four(window, seen + j, step, template, own, n, lines - ROWS + 1, n, score, out + j, columns)
-                    j += 4 * LANES
+                vectors = 3 if left == 5 else min(left, 4)
+                _add_block(vectors, window, seen + j, template, own, score, i * columns + j)
+                j += vectors * LANES
 
 
 @in_place_kernel
@@ -150,21 +154,17 @@ def add_wanted_products(template, window, score, wanted):  # type: ignore[no-unt
     """`add_products` for the wanted blocks of ROWS x LANES shifts alone: bool (rows / ROWS, columns / LANES)."""
     channels, lines, n = template.shape
     rows, columns = score.shape
-    step, blocks = window.shape[2], columns // LANES
+    blocks = columns // LANES
     for channel in range(channels):
         own = (channel * lines + ROWS - 1) * n
         for i in range(0, rows, ROWS):
-            row, seen, out, k = wanted[i // ROWS], (channel * window.shape[1] + i) * step, i * columns, 0
+            row, seen, k = wanted[i // ROWS], (channel * window.shape[1] + i) * window.shape[2], 0
             while k < blocks:
-                j = k * LANES
                 if not row[k]:
                     k += 1
-                elif k + 2 < blocks and row[k + 1] and row[k + 2]:
-                    _three(window, seen + j, step, template, own, n, lines - ROWS + 1, n, score, out + j, columns)
-                    k += 3
-                elif k + 1 < blocks and row[k + 1]:
-                    _two(window, seen + j, step, template, own, n, lines - ROWS + 1, n, score, out + j, columns)
-                    k += 2
-                else:
-                    _one(window, seen + j, step, template, own, n, lines - ROWS + 1, n, score, out + j, columns)
-                    k += 1
+                    continue
+                vectors = 1
+                while vectors < 3 and k + vectors < blocks and row[k + vectors]:
+                    vectors += 1
+                _add_block(vectors, window, seen + k * LANES, template, own, score, i * columns + k * LANES)
+                k += vectors

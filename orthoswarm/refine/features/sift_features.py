@@ -10,8 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-Bytes = NDArray[np.uint8]
-Floats = NDArray[np.float32]
+from orthoswarm.model.arrays import Floats, Gray, Ints
 
 SIFT_PIXELS: Final = 480 * 360
 """Pixels of the reduced picture on which features are found, whatever its shape (measured on four real flights: 31 to
@@ -29,20 +28,19 @@ to a diameter of 3 pixels."""
 _SIFT_SIGMA_SHARE: Final = 0.04  # ... beyond that it grows by this share of the diameter (measured on the same flights)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Features:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SiftFeatures:
     """Features of one photo.
 
     Attributes:
-        uv: float32 (n, 2), column and row in the FULL picture, pixel centres at integers.
+        uv: float32 (n, 2), column and row in the FULL picture (width, height), pixel centres at integers.
         descriptor: uint8 (n, 128), SIFT descriptors as OpenCV gives them (see `root_sift`).
         sigma_px: float32 (n,), one sigma of the position in pixels of the full picture.
-        width: columns of the full picture; height: rows.
         step_px: full-picture pixels per pixel of the reduced picture.
     """
 
     uv: Floats
-    descriptor: Bytes
+    descriptor: Gray
     sigma_px: Floats
     width: int
     height: int
@@ -52,73 +50,55 @@ class Features:
         return len(self.uv)
 
     @classmethod
-    def none(cls, width: int, height: int) -> "Features":
+    def none(cls, width: int, height: int) -> "SiftFeatures":
         """An empty set for a picture of this size."""
         empty = np.zeros((0, 2), np.float32)
-        return cls(
-            uv=empty,
-            descriptor=np.zeros((0, 128), np.uint8),
-            sigma_px=empty[:, 0],
-            width=width,
-            height=height,
-            step_px=1.0,
-        )
+        none = np.zeros((0, 128), np.uint8)
+        return cls(uv=empty, descriptor=none, sigma_px=empty[:, 0], width=width, height=height, step_px=1.0)
 
-    def same_point(self) -> NDArray[np.int32]:
-        """For each feature the index of the first one at the same place, int32 (n,).
-
-        SIFT returns a point once for each strong orientation, but a track may contain it only once.
-        """
+    def same_point(self) -> Ints:
+        """The first feature at the place of each, int32 (n,): SIFT returns a point once for each strong orientation."""
         _, first, inverse = np.unique(self.uv, axis=0, return_index=True, return_inverse=True)
         return np.asarray(first[inverse.reshape(-1)], dtype=np.int32)
 
 
-def root_sift(descriptor: Bytes) -> Floats:
+def root_sift(descriptor: Gray) -> Floats:
     """Unit vectors float32 (n, 128) whose dot product compares SIFT descriptors by the Hellinger kernel."""
     d = descriptor.astype(np.float32)
     d /= np.maximum(d.sum(axis=1, keepdims=True), 1.0)
     return np.asarray(np.sqrt(d, out=d))
 
 
-def detect(gray: Bytes, width: int, height: int, working_pixels: int | None = None) -> Features:
-    """Features of one photo.
+def detect(gray: Gray, width: int, height: int, working_pixels: int = SIFT_PIXELS) -> SiftFeatures:
+    """At most `_SIFT_KEPT` features of one photo, the strongest of each cell first.
 
     Args:
         gray: uint8 (rows, columns), the photo at any size (decoding at reduced size saves time).
-        width: columns of the full picture, in whose pixels positions are given.
-        height: its rows.
-        working_pixels: number of pixels of the reduced working picture (None: as configured).
-
-    Returns:
-        At most `_SIFT_KEPT` features, the strongest of each cell first.
+        width, height: of the full picture, in whose pixels positions are given.
+        working_pixels: number of pixels of the reduced picture on which features are found.
     """
     import cv2
 
-    reduced, step = reduce_picture(gray, width, height, SIFT_PIXELS if working_pixels is None else working_pixels)
+    reduced, step = reduce_picture(gray, width, height, working_pixels)
     sift = cv2.SIFT_create(  # type: ignore[attr-defined,unused-ignore]
         nfeatures=_SIFT_DETECTED, contrastThreshold=_SIFT_CONTRAST, enable_precise_upscale=True
     )
     keypoints, descriptors = sift.detectAndCompute(reduced, None)
     if len(keypoints) == 0:
-        return Features.none(width, height)
+        return SiftFeatures.none(width, height)
     xy = np.array([k.pt for k in keypoints], np.float32)
     response = np.array([k.response for k in keypoints], np.float32)
     size = np.array([k.size for k in keypoints], np.float32)
     keep = spread(xy, response, reduced.shape[1], reduced.shape[0])
     uv = (xy[keep] + np.float32(0.5)) * np.float32(step) - np.float32(0.5)
-    sigma = np.float32(step) * localisation_sigma(size[keep])
-    return Features(
+    spread_px = np.hypot(np.float32(_SIFT_SIGMA_PX), np.float32(_SIFT_SIGMA_SHARE) * size[keep])
+    sigma = np.float32(step) * spread_px.astype(np.float32)
+    return SiftFeatures(
         uv=uv, descriptor=descriptors[keep].astype(np.uint8), sigma_px=sigma, width=width, height=height, step_px=step
     )
 
 
-def localisation_sigma(size: Floats) -> Floats:
-    """One sigma in reduced pixels of SIFT features of diameters (n,), float32 (n,)."""
-    floor, share = np.float32(_SIFT_SIGMA_PX), np.float32(_SIFT_SIGMA_SHARE)
-    return np.asarray(np.hypot(floor, share * size), dtype=np.float32)
-
-
-def reduce_picture(gray: Bytes, width: int, height: int, working_pixels: int) -> tuple[Bytes, float]:
+def reduce_picture(gray: Gray, width: int, height: int, working_pixels: int) -> tuple[Gray, float]:
     """The picture reduced to about the working size (never enlarged), and full-size pixels per reduced pixel."""
     import cv2
 
@@ -130,14 +110,7 @@ def reduce_picture(gray: Bytes, width: int, height: int, working_pixels: int) ->
 
 
 def spread(xy: Floats, response: Floats, columns: int, rows: int) -> NDArray[np.intp]:
-    """Indices of the features to keep: the strongest of every cell, then the second strongest, until there are enough.
-
-    Args:
-        xy: float32 (n, 2), positions in a picture of `columns` by `rows`.
-        response: float32 (n,), strength.
-        columns: of the picture.
-        rows: of the picture.
-    """
+    """Indices of features to keep: the strongest of every cell, then the second strongest, until enough."""
     nx, ny = SIFT_CELLS if columns >= rows else SIFT_CELLS[::-1]
     cx = np.clip((xy[:, 0] * nx / columns).astype(np.int64), 0, nx - 1)
     cy = np.clip((xy[:, 1] * ny / rows).astype(np.int64), 0, ny - 1)

@@ -2,6 +2,10 @@
 
 Optical flow between consecutive pictures, started from the recorded attitude and the flown step; each window is
 rotated and scaled as predicted, so that tracks survive the turns of the flight.
+
+Corners are the strongest of each cell that holds none, by the minimum-eigenvalue measure: Shi and Tomasi 1994, with
+Sobel gradients and a square window as in OpenCV's cornerMinEigenVal; only wanted cells are computed, in whole numbers
+that float32 holds exactly.
 """
 
 from collections.abc import Callable
@@ -12,15 +16,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.compute.jit import kernel
+from orthoswarm.compute.jit import in_place_kernel, kernel
 from orthoswarm.config import active
+from orthoswarm.model.arrays import Array, Flags, Floats, Gray, Indices
 from orthoswarm.refine.bundle.block_arrays import Tracks
 from orthoswarm.refine.features import klt
-from orthoswarm.refine.features.corners import strongest
-from orthoswarm.refine.features.pair_homography import measured_homography, shifted_prediction
-
-Array = NDArray[np.float64]
-Gray = NDArray[np.uint8]
+from orthoswarm.refine.features.flow_calibration import phase_shift
 
 _BORDER_PX: Final = 9  # corners nearer to the picture's border are not begun: the window of the flow would leave it
 _CORNER_WINDOW_PX: Final = 5  # window of the minimum-eigenvalue corner measure (Shi and Tomasi 1994)
@@ -46,17 +47,27 @@ _KLT_ROUNDS: Final = (8, 10, 8)  # most iterations: at half size, at full size, 
 _KLT_MISMATCH: Final = 0.75  # largest mean square error of a window from picture to picture, as a share of its variance
 _KLT_ANCHOR_MISMATCH: Final = 0.4  # the same against the first observation: stricter, or tracks would creep
 _KLT_NOISE_VARIANCE: Final = 4.0  # noise of the picture that is added to both, grey values squared
+_HOMOGRAPHY_PX: Final = 3.0  # flow within this distance agrees with a homography (RANSAC; chosen; not measured)
+_HOMOGRAPHY_SHARE: Final = 0.4  # least share of the flow that must agree
+_HOMOGRAPHY_LEAST: Final = 12  # fewest corners that must agree
+_PYRAMID_WINDOW_PX: Final = 21  # window of the flow over several octaves (OpenCV's default)
+_PYRAMID_OCTAVES: Final = 4  # octaves below the full picture of that flow: it reaches some 16 windows
+_ORB_CORNERS: Final = 1000  # ORB corners (Rublee et al. 2011) of a turn that nobody recorded
+_ORB_LEAST: Final = 30  # fewest ORB matches that must agree
+_ORB_SHARE: Final = 0.25  # least share of the ORB matches that must agree
+_PHASE_REDUCTION: Final = 4  # phase correlation for a prediction's missing shift works on pictures reduced by this
+_PHASE_RESPONSE: Final = 0.05  # least response of that phase correlation
 
 
 @dataclass(slots=True)
 class _Live:
     """Tracks visible in the last picture: pixel, id, age in pictures, first observation (picture number and pixel)."""
 
-    uv: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 2), np.float32))
-    ident: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
-    age: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
-    anchor: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
-    anchor_uv: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 2), np.float32))
+    uv: Floats = field(default_factory=lambda: np.zeros((0, 2), np.float32))
+    ident: Indices = field(default_factory=lambda: np.zeros(0, np.int64))
+    age: Indices = field(default_factory=lambda: np.zeros(0, np.int64))
+    anchor: Indices = field(default_factory=lambda: np.zeros(0, np.int64))
+    anchor_uv: Floats = field(default_factory=lambda: np.zeros((0, 2), np.float32))
 
     def take(self, keep: NDArray[Any]) -> "_Live":
         """A subset of the tracks."""
@@ -67,38 +78,31 @@ class _Live:
 class _Flow:
     """Flow of K tracks: which are good, where they are now (K, 2), how many are good, how many stay in the picture."""
 
-    good: NDArray[np.bool_]
-    found: NDArray[np.float32]
+    good: Flags
+    found: Floats
     kept: int
     expected: int
 
 
 @dataclass(slots=True, kw_only=True)
 class Tracker:
-    """Tracks corners from picture to picture: `add` the pictures in order, then read `tracks`.
+    """Tracks corners, at most one a cell of `cell_px` working pixels: `add` pictures in order, then read `tracks`."""
 
-    Attributes:
-        scale: full-resolution pixels per pixel of the added pictures.
-        cell_px: at most one track in each cell of this size.
-    """
-
-    scale: float = 1.0
     cell_px: int = field(default_factory=lambda: active().features.cell_px)
     _live: _Live = field(default_factory=_Live)
     _gray: Gray | None = None
     _half: Gray | None = None
-    _stack: NDArray[np.uint8] | None = None
+    _stack: Gray | None = None
     _chain: Array = field(default_factory=lambda: np.tile(np.eye(3), (_ANCHOR_PHOTOS, 1, 1)))
     _count: int = 0
     _next: int = 0
-    _log: list[tuple[int, NDArray[np.int64], NDArray[np.float32]]] = field(default_factory=list)
+    _log: list[tuple[int, Indices, Floats]] = field(default_factory=list)
 
     def add(self, index: int, gray: Gray, predicted: Array | None) -> float:
         """Track all live corners into the next picture and start new ones in empty cells.
 
         Args:
-            index: of the picture (the camera of the observations).
-            gray: uint8 (rows, columns).
+            index: of the picture (the camera of the observations). gray: uint8 (rows, columns).
             predicted: 3x3 homography from the last picture's pixels to this one's, None to start afresh.
 
         Returns:
@@ -121,17 +125,15 @@ class Tracker:
         return survived
 
     def tracks(self) -> Tracks:
-        """Observations of all tracks that are long enough, in full-resolution pixels."""
+        """Observations of all tracks that are long enough, in working pixels."""
         if not self._log:
             return Tracks(np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros((0, 2)), np.zeros(0, np.float32))
         camera = np.concatenate([np.full(len(ident), i, np.int32) for i, ident, _ in self._log])
         ident = np.concatenate([ident for _, ident, _ in self._log])
         uv = np.concatenate([uv for _, _, uv in self._log]).astype(np.float64)
         keep = np.bincount(ident, minlength=self._next)[ident] >= _TRACK_LEAST_OBSERVATIONS
-        _, point = np.unique(ident[keep], return_inverse=True)
-        uv = (uv[keep] + 0.5) * self.scale - 0.5
-        sigma = np.full(len(point), _FLOW_SIGMA_PX * self.scale, np.float32)
-        return Tracks(camera[keep], point.astype(np.int32), uv, sigma)
+        sigma = np.full(len(ident), _FLOW_SIGMA_PX, np.float32)
+        return Tracks(camera, ident.astype(np.int32), uv, sigma).take(keep).renumbered()
 
     def _go_on(self, homography: Array | None) -> None:
         """Set the present picture's place in the chain of homographies from the first one; None begins another."""
@@ -159,7 +161,7 @@ class Tracker:
         )
         return flow.kept / max(before, 1)
 
-    def _better(self, gray: Gray, half: Gray, other: Array, now: "_Flow", predicted: Array) -> tuple["_Flow", Array]:
+    def _better(self, gray: Gray, half: Gray, other: Array, now: _Flow, predicted: Array) -> tuple[_Flow, Array]:
         """The present flow or, if it keeps more tracks, that from another prediction; with the prediction used."""
         flow = self._flow(gray, half, other)
         return (flow, other) if flow.kept > now.kept else (now, predicted)
@@ -169,22 +171,12 @@ class Tracker:
         if self._stack is None or not len(live.uv):
             return
         photos, now, ok = len(self._stack), self._count - 1, np.zeros(len(live.uv), bool)
+        here = np.linalg.inv(self._chain[now % photos])
+        limits = _KLT_ROUNDS[2], _KLT_LEAST_TEXTURE, _KLT_STEP_PX, _KLT_ANCHOR_MISMATCH, _KLT_NOISE_VARIANCE
         klt.anchor(
-            stack=self._stack,
-            chain=self._chain,
-            slot=live.anchor % photos,
-            points=live.anchor_uv,
-            after=gray,
-            here=np.linalg.inv(self._chain[now % photos]),
-            limit=_ANCHOR_LIMIT_PX,
-            rounds=_KLT_ROUNDS[2],
-            texture=_KLT_LEAST_TEXTURE,
-            step=_KLT_STEP_PX,
-            mismatch=_KLT_ANCHOR_MISMATCH,
-            noise=_KLT_NOISE_VARIANCE,
-            found=live.uv,
-            ok=ok,
-        )
+            self._stack, self._chain, live.anchor % photos, live.anchor_uv, gray, here, _ANCHOR_LIMIT_PX, limits,
+            live.uv, ok,
+        )  # fmt: skip
         lost = ~ok | (now + 1 - live.anchor >= photos)
         live.anchor[lost], live.anchor_uv[lost] = now, live.uv[lost]
 
@@ -193,27 +185,15 @@ class Tracker:
             self._stack = np.zeros((_ANCHOR_PHOTOS, *gray.shape), np.uint8)
         self._stack[(self._count - 1) % len(self._stack)] = gray
 
-    def _flow(self, gray: Gray, half: Gray, predicted: Array) -> "_Flow":
+    def _flow(self, gray: Gray, half: Gray, predicted: Array) -> _Flow:
         """Flow of the live tracks from the predicted positions, without outliers."""
         config, count = active().features, len(self._live.uv)
         guess, found, good = np.empty((count, 2), np.float32), np.empty((count, 2), np.float32), np.zeros(count, bool)
+        limits = _KLT_ROUNDS[:2], _KLT_LEAST_TEXTURE, _KLT_STEP_PX, _KLT_MISMATCH, _KLT_NOISE_VARIANCE
         klt.track(
-            before=self._gray,
-            before_half=self._half,
-            after=gray,
-            after_half=half,
-            points=self._live.uv,
-            homography=predicted,
-            back=np.linalg.inv(predicted),
-            rounds=_KLT_ROUNDS[:2],
-            texture=_KLT_LEAST_TEXTURE,
-            step=_KLT_STEP_PX,
-            mismatch=_KLT_MISMATCH,
-            noise=_KLT_NOISE_VARIANCE,
-            guess=guess,
-            found=found,
-            ok=good,
-        )
+            self._gray, self._half, gray, half, self._live.uv, predicted, np.linalg.inv(predicted), limits, guess,
+            found, good,
+        )  # fmt: skip
         kept, expected = _gate(
             guess, found, good, *gray.shape, _FLOW_INSIDE_PX, _FLOW_LEAST, _FLOW_MEDIAN_LIMIT_PX,
             _FLOW_GATE_PX, config.flow_chance_share,
@@ -249,10 +229,8 @@ class Tracker:
 def _gate(guess, found, ok, rows, cols, margin, least, limit, gate, chance):  # type: ignore[no-untyped-def]
     """Keep flow close to the median residual, which must itself be close to the prediction, in ok, in place.
 
-    None is kept where no more agree than corners on different ground would by chance (binomial, 3 sigma).
-
-    Returns:
-        How many are kept, and how many were expected inside the picture.
+    None is kept where no more agree than corners on different ground would by chance (binomial, 3 sigma). Returns how
+    many are kept, and how many were expected inside the picture.
     """
     expected = 0
     for k in range(len(ok)):
@@ -294,14 +272,83 @@ def _oldest_per_cell(uv, age, ident, cols, size):  # type: ignore[no-untyped-def
     return keep
 
 
+def measured_homography(previous: Gray | None, gray: Gray, uv: Floats, predicted: Array) -> Array | None:
+    """The homography that most of a flow over several octaves agrees on; None without agreement.
+
+    For a swaying camera whose angles are degrees off or not recorded. Starts from the prediction and, if that finds no
+    consensus (a heading more than ten degrees off), from no motion; after that from ORB corners.
+
+    Args:
+        uv: float32 (K, 2), corners of the previous picture. predicted: 3x3 homography from its pixels.
+    """
+    if previous is None or len(uv) < _HOMOGRAPHY_LEAST:
+        return None
+    for start in (predicted, np.eye(3)):
+        aligned = shifted_prediction(previous, gray, start)
+        measured = _flow_homography(previous, gray, uv, start if aligned is None else aligned)
+        if measured is not None:
+            return measured
+    return _turned_homography(previous, gray)
+
+
+def _flow_homography(previous: Gray, gray: Gray, uv: Floats, start: Array) -> Array | None:
+    """The homography that most of the flow from a given start agrees on, None without agreement."""
+    p = uv.astype(float) @ start[:, :2].T + start[:, 2]
+    guess = np.ascontiguousarray(p[:, :2] / p[:, 2:], dtype=np.float32)
+    warped = cv2.warpPerspective(previous, start, gray.shape[::-1], borderMode=cv2.BORDER_REPLICATE)
+    window = (_PYRAMID_WINDOW_PX, _PYRAMID_WINDOW_PX)
+    found, status, _ = cv2.calcOpticalFlowPyrLK(warped, gray, guess, None, winSize=window, maxLevel=_PYRAMID_OCTAVES)
+    ok = is_inside(guess, gray.shape, 0.0) & (status.ravel() == 1) & is_inside(found, gray.shape, 0.0)
+    if ok.sum() < _HOMOGRAPHY_LEAST:
+        return None
+    return _agreed(uv[ok], found[ok], max(_HOMOGRAPHY_LEAST, _HOMOGRAPHY_SHARE * ok.sum()))
+
+
+def _turned_homography(previous: Gray, gray: Gray) -> Array | None:
+    """The homography that rotation-invariant corners (ORB) agree on, for turns without recorded headings, or None."""
+    orb = cv2.ORB.create(nfeatures=_ORB_CORNERS)
+    (before, ours), (after, theirs) = (orb.detectAndCompute(picture, None) for picture in (previous, gray))
+    if ours is None or theirs is None:
+        return None
+    pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(ours, theirs)
+    if len(pairs) < _ORB_LEAST:
+        return None
+    a = np.array([before[m.queryIdx].pt for m in pairs], np.float32)
+    b = np.array([after[m.trainIdx].pt for m in pairs], np.float32)
+    return _agreed(a, b, max(_ORB_LEAST, _ORB_SHARE * len(pairs)))
+
+
+def _agreed(a: Floats, b: Floats, fewest: float) -> Array | None:
+    """The homography by RANSAC over pairs of pixels (K, 2), None with too few inliers."""
+    homography, inlier = cv2.findHomography(a, b, cv2.RANSAC, _HOMOGRAPHY_PX)
+    if homography is None or inlier.sum() < fewest:
+        return None
+    return np.asarray(homography, np.float64)
+
+
+def shifted_prediction(previous: Gray | None, gray: Gray, predicted: Array) -> Array | None:
+    """The prediction corrected by a shift from phase correlation of reduced pictures, None if that is unclear."""
+    if previous is None:
+        return None
+    warped = cv2.warpPerspective(previous, predicted, gray.shape[::-1], borderMode=cv2.BORDER_REPLICATE)
+    dx, dy, response = phase_shift(warped, gray, 1.0 / _PHASE_REDUCTION)
+    if response <= _PHASE_RESPONSE:
+        return None
+    return np.array([[1.0, 0, _PHASE_REDUCTION * dx], [0, 1.0, _PHASE_REDUCTION * dy], [0, 0, 1.0]]) @ predicted
+
+
+def is_inside(uv: Floats, shape: tuple[int, ...], margin: float) -> Flags:
+    """Which pixels (K, 2) lie in a picture of this shape, at least a margin inside its border."""
+    h, w = shape[:2]
+    return (uv[:, 0] >= margin) & (uv[:, 1] >= margin) & (uv[:, 0] <= w - 1 - margin) & (uv[:, 1] <= h - 1 - margin)
+
+
 def predicted_homography(before: Array, after: Array, height_m: float, step: Array, matrix: Array) -> Array:
     """The homography of flat ground from one picture's pixels to the next one's, predicted from their records.
 
     Args:
-        before: (3, 3) rotation of the earlier camera, camera to ground; after: the later camera's.
-        height_m: height of the earlier camera above the ground.
-        step: (3,) its movement in metres, east, north, up.
-        matrix: 3x3 calibration matrix.
+        before, after: (3, 3) rotations, camera to ground. height_m: of the earlier camera above the ground.
+        step: (3,) its movement in metres, east, north, up. matrix: 3x3 calibration matrix.
     """
     upward = before[2]  # the ground's normal in the earlier camera's axes
     relative = after.T @ before + np.outer(after.T @ step, upward) / height_m
@@ -309,24 +356,139 @@ def predicted_homography(before: Array, after: Array, height_m: float, step: Arr
 
 
 def follow(
-    count: int,
-    read: Callable[[int], Gray],
-    prediction: Callable[[int], Array | None],
-    scale: float = 1.0,
-    cell_px: int | None = None,
-) -> tuple[Tracks, NDArray[np.float64]]:
-    """Track corners through pictures 0 .. count - 1.
+    count: int, read: Callable[[int], Gray], prediction: Callable[[int], Array | None], cell_px: int
+) -> tuple[Tracks, Array]:
+    """The tracks of corners through pictures 0 .. count - 1, and the share that survived into each, float64 (count,).
 
     Args:
-        count: number of pictures. read: returns picture i at working scale.
+        read: returns picture i at working scale. cell_px: see Tracker.
         prediction: 3x3 homography from picture i - 1 to i, None where tracking starts afresh.
-        scale: full-resolution pixels per working pixel. cell_px: see Tracker (None: as configured).
-
-    Returns:
-        The tracks, and the share of them that survived into each picture, float64 (count,).
     """
-    tracker = Tracker(scale=scale) if cell_px is None else Tracker(scale=scale, cell_px=cell_px)
+    tracker = Tracker(cell_px=cell_px)
     survived = np.ones(count)
     for i in range(count):
         survived[i] = tracker.add(i, read(i), prediction(i))
     return tracker.tracks(), survived
+
+
+@kernel
+def strongest(gray, empty, size, top, left, window, border, floor, uv):  # type: ignore[no-untyped-def]
+    """The strongest corner of each wanted cell, into uv float32 (K, 2), column and row; returns how many.
+
+    Args:
+        gray: uint8 (rows, columns). empty: bool, which cells are wanted. size: of a cell; top, left: of the first one.
+        window: side of the square, odd. border: corners nearer to the picture's border are none.
+        floor: least measure; cells without texture give no corner.
+    """
+    cells, cols = empty.shape[1], gray.shape[1]
+    best, where, score = np.empty(cells, np.float32), np.empty((cells, 2), np.int64), np.empty(cols, np.float32)
+    sums = np.zeros((window + 3, 3, cols), np.float32)
+    return _search(gray, empty, size, top, left, window, border, floor, uv, best, where, score, sums)
+
+
+@in_place_kernel
+def _search(  # type: ignore[no-untyped-def]
+    gray, empty, size, top, left, window, border, floor, uv, best, where, score, sums,
+):  # fmt: skip
+    """What `strongest` does.
+
+    Args:
+        best, where: (cells of a row,), (.., 2) room for the highest measure of each cell, and its pixel.
+        score: float32 (columns,) room for the measures of a row.
+        sums: float32 (window + 3, 3, columns) room for the products of as many rows, their total, those of a new row,
+            and their sums over columns.
+    """
+    rows, cols = gray.shape
+    reach = window // 2
+    margin = max(border, reach + 1)
+    scale = 1.0 / (4.0 * window * 255.0) ** 2
+    found = 0
+    lines, total, product, across = sums[:window], sums[window], sums[window + 1], sums[window + 2]
+    for row in range(empty.shape[0]):
+        y0, y1 = max(top + row * size, margin), min(top + (row + 1) * size, rows - margin)
+        first = 0
+        while first < empty.shape[1]:
+            if not empty[row, first]:
+                first += 1
+                continue
+            last = first
+            while last < empty.shape[1] and empty[row, last]:
+                last += 1
+            x0, x1 = max(left + first * size, margin), min(left + last * size, cols - margin)
+            best[first:last] = -1.0
+            if x1 > x0 and y1 > y0:
+                n = x1 - x0 + 2 * reach
+                lines[:] = 0.0
+                total[:] = 0.0
+                for y in range(y0 - reach, y1 + reach):
+                    _products(gray, y, x0 - reach, n, product)
+                    old = lines[(y - y0 + reach) % window]
+                    for k in range(3):
+                        _exchange(product[k, :n], old[k, :n], total[k, :n])
+                    if y >= y0 + reach:
+                        _measure(total, x1 - x0, window, across, score)
+                        _highest(score, x1 - x0, x0, y - reach, left, size, best, where)
+            for cell in range(first, last):
+                if best[cell] * scale > floor:
+                    uv[found, 0], uv[found, 1] = where[cell, 0], where[cell, 1]
+                    found += 1
+            first = last
+    return found
+
+
+@in_place_kernel
+def _products(gray, y, x, n, product):  # type: ignore[no-untyped-def]
+    """Products of the Sobel gradients (xx, xy, yy) of n pixels of a row from a column on; slices vectorise."""
+    nw, north, ne = gray[y - 1, x - 1 : x - 1 + n], gray[y - 1, x : x + n], gray[y - 1, x + 1 : x + 1 + n]
+    west, east = gray[y, x - 1 : x - 1 + n], gray[y, x + 1 : x + 1 + n]
+    sw, south, se = gray[y + 1, x - 1 : x - 1 + n], gray[y + 1, x : x + n], gray[y + 1, x + 1 : x + 1 + n]
+    xx, xy, yy = product[0, :n], product[1, :n], product[2, :n]
+    two = np.float32(2.0)
+    for c in range(n):
+        a, b, d, e = np.float32(nw[c]), np.float32(ne[c]), np.float32(sw[c]), np.float32(se[c])
+        gx = b - a + e - d + two * (np.float32(east[c]) - np.float32(west[c]))
+        gy = d - a + e - b + two * (np.float32(south[c]) - np.float32(north[c]))
+        xx[c], xy[c], yy[c] = gx * gx, gx * gy, gy * gy
+
+
+@in_place_kernel
+def _exchange(new, old, total):  # type: ignore[no-untyped-def]
+    """Take an old row from the total, add a new one, and keep it in the old one's place."""
+    for c in range(len(total)):
+        total[c] += new[c] - old[c]
+        old[c] = new[c]
+
+
+@in_place_kernel
+def _measure(total, n, window, across, score):  # type: ignore[no-untyped-def]
+    """Smaller eigenvalue of the gradient matrix about n pixels, whose sums over rows are known for each column."""
+    xx, xy, yy = across[0, :n], across[1, :n], across[2, :n]
+    xx[:] = 0.0
+    xy[:] = 0.0
+    yy[:] = 0.0
+    for k in range(window):
+        a, b, d = total[0, k : k + n], total[1, k : k + n], total[2, k : k + n]
+        for c in range(n):
+            xx[c] += a[c]
+            xy[c] += b[c]
+            yy[c] += d[c]
+    half, to = np.float32(0.5), score[:n]
+    for c in range(n):
+        difference = half * (xx[c] - yy[c])
+        to[c] = half * (xx[c] + yy[c]) - np.sqrt(difference * difference + xy[c] * xy[c])
+
+
+@in_place_kernel
+def _highest(score, n, x, y, left, size, best, where):  # type: ignore[no-untyped-def]
+    """Compare the scores of a row with the best of their cells so far."""
+    c = 0
+    while c < n:
+        cell = (x + c - left) // size
+        end = min(n, left + (cell + 1) * size - x)
+        top = best[cell]
+        for k in range(c, end):
+            if score[k] > top:
+                top = score[k]
+                where[cell, 0], where[cell, 1] = x + k, y
+        best[cell] = top
+        c = end

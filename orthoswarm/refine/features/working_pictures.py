@@ -7,13 +7,14 @@ from typing import Any, Final
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.config import active
+from orthoswarm.model.arrays import Gray
 from orthoswarm.model.frame import Frame
 from orthoswarm.raster.picture_file import PictureError
 
-Gray = NDArray[np.uint8]
+ReadGray = Callable[[Frame], Gray]
+"""Returns a photo's grey values, uint8 (rows, columns), at any size; may raise PictureError."""
 
 _SMALL_WIDTH_PX: Final = 160  # columns of the reduced pictures that stay in memory
 
@@ -27,15 +28,10 @@ class Pictures:
     """
 
     def __init__(
-        self,
-        frames: Sequence[Frame],
-        read: Callable[[Frame], Gray],
-        work_width: int | None = None,
-        cache_mb: float | None = None,
+        self, frames: Sequence[Frame], read: ReadGray, work_width: int | None = None, cache_mb: float | None = None
     ) -> None:
-        config = active().features
-        cache_mb = active().compute.working_pictures_mb if cache_mb is None else cache_mb
-        work_width = config.work_width_px if work_width is None else work_width
+        cache_mb = cache_mb or active().compute.working_pictures_mb
+        work_width = work_width or active().features.work_width_px
         self._frames, self._read = frames, read
         width, height = frames[0].width, frames[0].height
         self.scale = max(1.0, max(width, height) / work_width)
@@ -46,15 +42,12 @@ class Pictures:
         self.damaged: dict[int, str] = {}
 
     def gray(self, i: int) -> Gray:
-        """Picture i, uint8 (rows, columns).
-
-        Uniform grey if it cannot be decoded (see `damaged`) or lost parts in transmission.
-        """
+        """Picture i; uniform grey if it cannot be decoded (see `damaged`) or lost parts in transmission."""
         cached = self._cache.get(i)
         if cached is not None:
             self._cache.move_to_end(i)
             return cached
-        picture = self._load(i)
+        picture = self.once(i)
         self._cache[i] = picture
         if len(self._cache) > self._limit:
             self._cache.popitem(last=False)
@@ -85,10 +78,6 @@ class Pictures:
         alone._frames, alone._cache, alone._small, alone.damaged = [self._frames[i]], OrderedDict(), {}, {}
         return alone
 
-    def once(self, i: int) -> Gray:
-        """As `gray`, of a picture that is asked for once: nothing of it is kept."""
-        return self._load(i)
-
     def drop(self) -> None:
         """Free the memory of the working-scale pictures (the reduced ones stay)."""
         self._cache.clear()
@@ -96,22 +85,30 @@ class Pictures:
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_cache": OrderedDict(), "_small": {}}
 
-    def _load(self, i: int) -> Gray:
+    def once(self, i: int) -> Gray:
+        """As `gray`, of a picture that is asked for once: nothing of it is kept."""
         if self._frames[i].damaged:  # parts of it may show another moment: its record is used, its content is not
             return np.full(self.size[::-1], 127, np.uint8)
+        frame, unusable = self._frames[i], np.full(self.size[::-1], 127, np.uint8)
         try:
-            picture = self._read(self._frames[i])
+            picture = self._read(frame)
         except PictureError as error:
             self.damaged[i] = error.reason
-            return np.full(self.size[::-1], 127, np.uint8)
-        frame = self._frames[i]
+            return unusable
         factor = max(1, round(frame.width / picture.shape[1]))
-        if (picture.shape[0] * factor, picture.shape[1] * factor) != (frame.height, frame.width):
-            self.damaged[i] = (
-                f"{frame.image} is {picture.shape[1] * factor}x{picture.shape[0] * factor}, not as its header says; "
-                "left out"
-            )
-            return np.full(self.size[::-1], 127, np.uint8)
+        rows, columns = (side * factor for side in picture.shape)
+        if (rows, columns) != (frame.height, frame.width):
+            self.damaged[i] = f"{frame.image} is {columns}x{rows}, not as its header says; left out"
+            return unusable
         if picture.shape[::-1] == self.size:
             return picture
         return np.asarray(cv2.resize(picture, self.size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def shrunk(picture: Gray, factor: int) -> Gray:
+    """A picture reduced by a whole factor; rows and columns that are left over are cut off."""
+    if factor == 1:
+        return picture
+    rows, columns = picture.shape[0] // factor, picture.shape[1] // factor
+    cut = picture[: rows * factor, : columns * factor]
+    return np.asarray(cv2.resize(cut, (columns, rows), interpolation=cv2.INTER_AREA), np.uint8)

@@ -11,10 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from orthoswarm.config import active
+from orthoswarm.model.arrays import Array, Gray
 from orthoswarm.model.frame import Frame
 from orthoswarm.refine.bundle.block_arrays import Tracks
 from orthoswarm.refine.features.flow_calibration import Calibration
@@ -29,34 +27,24 @@ class Followed:
     Attributes:
         calibration: focal length and headings by the flow. tracks: corners that were tracked, in working pixels.
         survived: float64 (N,), share of the tracks that survived into each picture.
-        small: index -> reduced picture, uint8 (rows, columns).
-        damaged: index -> why that picture cannot be used.
+        small: index -> reduced picture. damaged: index -> why that picture cannot be used.
     """
 
     calibration: Calibration
     tracks: Tracks
-    survived: NDArray[np.float64]
-    small: dict[int, NDArray[np.uint8]]
+    survived: Array
+    small: dict[int, Gray]
     damaged: dict[int, str]
 
 
 @dataclass(frozen=True, slots=True)
 class KeptTracks:
-    """A folder of tracks, one file for each flight; what cannot be written or read is made again.
-
-    Attributes:
-        folder: an existing folder, of this version of the program only.
-    """
+    """A folder of this version's tracks, a file a flight; what cannot be written or read is made again."""
 
     folder: Path
 
-    def file(self, frames: Sequence[Frame], epsg: int, origin: NDArray[np.float64], fov_start: float) -> Path:
-        """Where the tracks of a flight are kept.
-
-        Args:
-            frames: in order; their records, names, sizes and files count. epsg: the area's grid.
-            origin: float64 (2,) of the local frame. fov_start: assumed horizontal field of view, radians.
-        """
+    def file(self, frames: Sequence[Frame], epsg: int, origin: Array, fov_start: float) -> Path:
+        """Where the tracks of a flight are kept, by the frames' records, names, sizes and files, and the settings."""
         asked = (frames, [_state(frame.path) for frame in frames], epsg, origin.tolist(), fov_start, active())
         return self.folder / (hashlib.sha256(repr(asked).encode()).hexdigest() + _SUFFIX)
 

@@ -6,12 +6,12 @@ from typing import Final
 import numpy as np
 
 from orthoswarm.model.angles import wrap_rad
+from orthoswarm.model.arrays import Array, Flags
 from orthoswarm.model.frame import Frame
 from orthoswarm.refine.bundle.adjustment import Adjustment
 from orthoswarm.refine.bundle.height_consistency import log_focal_sigmas
-from orthoswarm.refine.initial.heading import tag_yaw
 from orthoswarm.refine.initial.initial_orientation import InitialOrientation
-from orthoswarm.refine.initial.planar_similarity import Array, Flags, PhotoRecords
+from orthoswarm.refine.initial.planar_similarity import PhotoRecords
 
 _FLIPPED_YAW_DEG: Final = 150.0  # a recorded yaw that differs by more is reported as turned by 180 degrees
 _HEADING_OFFSET_DEG: Final = 5.0  # a larger common offset of recorded headings is reported
@@ -34,17 +34,15 @@ def flipped_yaw(records: PhotoRecords, start: InitialOrientation) -> Flags:
     for v, tag in enumerate(start.tags):
         if tag.source:
             rows = (records.vehicle == v) & start.yaw_known
-            off = np.abs(wrap_rad(start.yaw - tag_yaw(records, tag.source) - tag.offset))
+            off = np.abs(wrap_rad(start.yaw - getattr(records, tag.source) - tag.offset))
             flipped |= rows & (np.nan_to_num(off) > np.radians(_FLIPPED_YAW_DEG))
     return flipped
 
 
 def findings(frames: Sequence[Frame], records: PhotoRecords, start: InitialOrientation) -> list[str]:
     """Sentences on records that contradict the pictures, except heights (see `height_findings`)."""
-    found = _yaw_findings(frames, records, start) + _tilt_findings(frames, records, start)
-    found += _position_findings(frames, records, start)
-    found += _overlap_findings(records, start)
-    return found
+    kinds = (_yaw_findings, _tilt_findings, _position_findings)
+    return [text for kind in kinds for text in kind(frames, records, start)] + _overlap_findings(start)
 
 
 def unplaced_reasons(
@@ -65,14 +63,13 @@ def unplaced_reasons(
 
 def runs(names: Sequence[str], flags: Flags) -> str:
     """Runs of flagged photos as text: "A to C, F"."""
-    most = NAMED_MOST
     edge = np.diff(np.concatenate([[0], flags.astype(np.int8), [0]]))
     first, last = np.flatnonzero(edge == 1), np.flatnonzero(edge == -1) - 1
     parts = [
         names[int(a)] if a == b else f"{names[int(a)]} to {names[int(b)]}" for a, b in zip(first, last, strict=True)
     ]
-    text = ", ".join(parts[:most])
-    return text if len(parts) <= most else f"{text} and {len(parts) - most} more runs"
+    text = ", ".join(parts[:NAMED_MOST])
+    return text if len(parts) <= NAMED_MOST else f"{text} and {len(parts) - NAMED_MOST} more runs"
 
 
 def _name(frames: Sequence[Frame], records: PhotoRecords, vehicle: int) -> str:
@@ -127,14 +124,7 @@ def _tilt_findings(frames: Sequence[Frame], records: PhotoRecords, start: Initia
 def height_findings(
     frames: Sequence[Frame], records: PhotoRecords, start: InitialOrientation, adjustment: Adjustment
 ) -> list[str]:
-    """Sentences on recorded heights that contradict the adjusted pictures, and on heights that are not recorded.
-
-    The ground scale comes from the distance flown, so a height is known as well as the focal length.
-
-    Args:
-        frames: N photos. records: what they recorded. start: from the pairs.
-        adjustment: of all of them, without a map.
-    """
+    """Sentences on recorded heights that contradict pictures adjusted without a map, and on those not recorded."""
     found, without = [], []
     ground = float(np.median(adjustment.points[:, 2])) if len(adjustment.points) else 0.0
     height = adjustment.cameras.position[:, 2] - ground
@@ -176,14 +166,12 @@ def _position_findings(frames: Sequence[Frame], records: PhotoRecords, start: In
         rows = records.vehicle == v
         moving = speed[rows & (speed > _LAG_LEAST_SPEED_M_S)]
         if len(moving) and abs(lag) * float(np.median(moving)) > _LAG_M:
-            who = _name(frames, records, v)
-            found.append(f"{who}: recorded positions lag by {lag:.1f} s")
+            found.append(f"{_name(frames, records, v)}: recorded positions lag by {lag:.1f} s")
     return found
 
 
-def _overlap_findings(records: PhotoRecords, start: InitialOrientation) -> list[str]:
-    sizes = np.bincount(start.component)
-    if len(records) < 2 or (sizes > 1).sum() <= 1:
+def _overlap_findings(start: InitialOrientation) -> list[str]:
+    parts = int((np.bincount(start.component) > 1).sum())
+    if parts <= 1:
         return []
-    parts = int((sizes > 1).sum())
     return [f"the photos fall into {parts} parts without overlap; each lies in the frame of its own positions"]

@@ -1,32 +1,27 @@
 """The relative block of one vehicle with overlapping pictures: records, calibration, tracks, start values."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.config import active
-from orthoswarm.model.camera import fov_rad
+from orthoswarm.model.angles import wrap_rad
+from orthoswarm.model.arrays import Array, Flags, Indices, Ints
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.robust import mad_sigma, mad_sigmas
 from orthoswarm.refine.bundle.adjustment import Adjustment
-from orthoswarm.refine.bundle.block_arrays import K1, CameraBlock, Tracks
+from orthoswarm.refine.bundle.block_arrays import K1, CameraBlock, F, Tracks, log_rotation
 from orthoswarm.refine.bundle.flight_records import FlightRecords, read_records
-from orthoswarm.refine.bundle.observation_selection import BestViews, best_views
 from orthoswarm.refine.bundle.priors import DRIFT_SIGMA_M, HEIGHT_OFFSET_SIGMA_M, LAG_SIGMA_S, GroupPriors, Priors
-from orthoswarm.refine.bundle.rotation_vectors import log_rotation
 from orthoswarm.refine.features.flow_calibration import Calibration, calibrate
 from orthoswarm.refine.features.tracks import follow, predicted_homography
-from orthoswarm.refine.features.working_pictures import Pictures
+from orthoswarm.refine.features.working_pictures import Pictures, ReadGray
 from orthoswarm.refine.flight.kept_tracks import Followed, KeptTracks
-from orthoswarm.refine.flight.track_headings import with_measured_headings
 from orthoswarm.trajectory.legs import leads_one_way, split_legs
-
-Array = NDArray[np.float64]
-Gray = NDArray[np.uint8]
 
 _FOLLOWED_PHOTOS: Final = 10  # flights of fewer photos are matched in pairs instead of being followed
 _FOLLOWED_OVERLAP: Final = 0.78
@@ -57,10 +52,27 @@ _LENS_SIGMA: Final = (0.3, 0.1, 0.03)  # sigma of log f, k1, k2 of a lens
 _STRONG_K1: Final = 0.12  # a lens with a larger |k1| distorts so much that two parameters do not describe it
 _STRONG_LENS_SIGMA: Final = (0.3, 0.3, 0.2, 0.3)  # sigma of log f, k1, k2, k3 of such a lens
 PRINCIPAL_POINT_SHARE: Final = 0.012  # sigma of the principal point of lenses solved in full, in picture widths
+_HEADING_REACH_PHOTOS: Final = 7  # heading that was not recorded follows from those of so many photos before and after
+_HEADING_LEAST_CORNERS: Final = 10  # fewest tracked corners that tell how far a photo is turned from the one before
+INLIER_WEIGHT: Final = 0.5  # an observation counts as an inlier from this robust weight on
+
+
+@dataclass(frozen=True, slots=True)
+class BestViews:
+    """For each point the inlier observation nearest to its camera's nadir, and the quality of the point's observations.
+
+    Attributes (P points):
+        camera: int32 (P,), of that observation, -1 where there is none. count: int32 (P,), inlier observations.
+        mean_weight: float64 (P,), mean robust weight.
+    """
+
+    camera: Ints
+    count: Ints
+    mean_weight: Array
 
 
 @dataclass(slots=True, kw_only=True)
-class Flight:
+class FlightBlock:
     """A vehicle's frames and their present solution.
 
     Attributes:
@@ -73,7 +85,7 @@ class Flight:
 
     frames: Sequence[Frame]
     records: FlightRecords
-    leg: NDArray[np.int32]
+    leg: Ints
     pictures: Pictures
     calibration: Calibration
     adjustment: Adjustment
@@ -86,7 +98,17 @@ class Flight:
         """The vehicle's own cameras (without neighbours that the adjustment holds fixed; there may be more lenses)."""
         return self.adjustment.cameras.take(slice(0, len(self.frames)))
 
-    def best_views(self, some: NDArray[np.bool_] | None = None) -> BestViews:
+    @property
+    def height_m(self) -> float:
+        """Median height of the cameras above the takeoff level, metres."""
+        return float(np.median(self.adjustment.cameras.position[: len(self.frames), 2]))
+
+    @property
+    def focal_px(self) -> float:
+        """Focal length of the first lens, working pixels."""
+        return float(self.adjustment.cameras.lens[0, F])
+
+    def best_views(self, some: Flags | None = None) -> BestViews:
         """Best view of each tie point, chosen among the vehicle's own pictures, or among some (N,) of them."""
         adj = self.adjustment
         own = np.zeros(len(adj.cameras), bool)
@@ -98,21 +120,21 @@ def open_flight(
     frames: Sequence[Frame],
     grid: LocalGrid,
     origin: Array,
-    read: Callable[[Frame], Gray],
+    read: ReadGray,
     fov_start: float,
     *,
     kept: KeptTracks | None = None,
-) -> Flight | None:
-    """Track corners through a vehicle's pictures and set up its adjustment, without solving it.
+) -> FlightBlock | None:
+    """Track corners through a vehicle's pictures, in order, and set up its adjustment, without solving it.
 
     Args:
-        frames: in order. grid: the area's. origin: float64 (2,) of the local frame. read: reads a grey picture.
         fov_start: assumed horizontal field of view, radians.
         kept: where the tracks are kept; they are taken from there if they were made of the same before.
 
-    Returns None where pictures cannot be tracked from one to the next and are matched in pairs instead (see
-    `open_sparse_flight`): too little overlap, a height that contradicts the scale, or, where no height was recorded, a
-    chain that breaks, or a single straight line, on which drift and scale cannot be separated.
+    Returns:
+        None where pictures cannot be tracked from one to the next and are matched in pairs instead (see
+        `open_sparse_flight`): too little overlap, a height that contradicts the scale, or, where no height was
+        recorded, a chain that breaks, or a single straight line, on which drift and scale cannot be separated.
     """
     if len(frames) < _FOLLOWED_PHOTOS:
         return None
@@ -130,8 +152,8 @@ def open_flight(
         if kept is not None and file is not None:
             kept.write(file, followed)
     calibration = followed.calibration
-    records = with_measured_headings(records.with_yaw(records.yaw + calibration.yaw_offset), followed.tracks)
-    return Flight(
+    records = with_measured_headings(replace(records, yaw=records.yaw + calibration.yaw_offset), followed.tracks)
+    return FlightBlock(
         frames=frames,
         records=records,
         leg=leg,
@@ -143,7 +165,7 @@ def open_flight(
     )
 
 
-def _follow(records: FlightRecords, leg: NDArray[np.int32], pictures: Pictures, fov_start: float) -> Followed | None:
+def _follow(records: FlightRecords, leg: Ints, pictures: Pictures, fov_start: float) -> Followed | None:
     """Measure the flow and track the corners of a flight's pictures; None where they cannot be tracked."""
     calibration = calibrate(records, leg, pictures.gray, pictures.size, fov_start)
     steps = np.hypot(*records.steps()[1:, :2].T)
@@ -153,7 +175,7 @@ def _follow(records: FlightRecords, leg: NDArray[np.int32], pictures: Pictures, 
     unknown = not records.has_height.any()
     if leads_one_way(records.position, leg) if unknown else not calibration.trusted_height:
         return None
-    tracks, survived = _track(records.with_yaw(records.yaw + calibration.yaw_offset), pictures, calibration)
+    tracks, survived = _track(replace(records, yaw=records.yaw + calibration.yaw_offset), pictures, calibration)
     few = _FOLLOWED_TRACKS_FACTOR * len(records.position) ** 0.5
     if np.median(survived[1:]) < _FOLLOWED_SURVIVAL or tracks.count < few:
         return None
@@ -168,7 +190,7 @@ def _follow(records: FlightRecords, leg: NDArray[np.int32], pictures: Pictures, 
     )
 
 
-def weigh_records(flight: Flight) -> None:
+def weigh_records(flight: FlightBlock) -> None:
     """Estimate the sigmas of recorded heights and attitudes from the differences between consecutive adjusted cameras.
 
     Positions that scatter more than their sigmas get larger sigmas, too. Heights with a loose prior keep it.
@@ -189,17 +211,13 @@ def weigh_records(flight: Flight) -> None:
     adj.priors = replace(p, position_sigma=sigma, rotation_sigma=np.where(known, turn, p.rotation_sigma))
 
 
-def distorts_strongly(flight: Flight) -> bool:
+def distorts_strongly(flight: FlightBlock) -> bool:
     """True if the distortion is too strong for two parameters."""
     return bool(np.abs(flight.adjustment.cameras.lens[:, K1]).max() >= _STRONG_K1)
 
 
-def free_full_lens(flight: Flight) -> bool:
-    """Free all parameters of a strongly distorting lens; others keep two, which are better determined.
-
-    Returns:
-        True if parameters were freed, so that more steps are needed.
-    """
+def free_full_lens(flight: FlightBlock) -> bool:
+    """Free all parameters of a lens if it distorts strongly; others keep two, which are better determined."""
     adj = flight.adjustment
     if not distorts_strongly(flight):
         return False
@@ -293,7 +311,7 @@ def height_prior(records: FlightRecords, calibration: Calibration) -> tuple[Arra
     return np.where(spikes, smooth, z), np.where(leaps, off, c.first_height_sigma_m)
 
 
-def _climbed_to(records: FlightRecords) -> NDArray[np.bool_]:
+def _climbed_to(records: FlightRecords) -> Flags:
     """Heights that a vehicle reaches from those before and after in the time between them, bool (N,)."""
     if not records.timed:
         return np.zeros(len(records.position), bool)
@@ -302,6 +320,73 @@ def _climbed_to(records: FlightRecords) -> NDArray[np.bool_]:
     return np.asarray(np.concatenate([[True], can]) & np.concatenate([can, [True]]))
 
 
-def fov_deg(flight: Flight) -> float:
-    """The vehicle's field of view now, degrees."""
-    return float(np.degrees(fov_rad(float(flight.adjustment.cameras.lens[0, 0]), flight.pictures.size[0])))
+def with_measured_headings(records: FlightRecords, tracks: Tracks) -> FlightRecords:
+    """Records whose assumed headings are those that most pictures around them agree on.
+
+    Without a recorded heading a picture is assumed to point along the path. Where the path bends, that may be off by
+    half a corner: an aircraft may turn before the picture, after it, or during several. Each picture's heading follows
+    from each neighbour's assumed one and from how the pictures turned between the two; the median is taken.
+    """
+    if records.has_yaw.all():
+        return records
+    turn = turns(tracks, len(records.yaw))
+    broken = np.isnan(turn)
+    chain, heading = np.cumsum(broken), np.cumsum(np.where(broken, 0.0, turn))
+    yaw = records.yaw.copy()
+    for i in np.flatnonzero(~records.has_yaw):
+        near = slice(max(0, i - _HEADING_REACH_PHOTOS), i + _HEADING_REACH_PHOTOS + 1)
+        from_others = records.yaw[near] + heading[i] - heading[near] - records.yaw[i]
+        yaw[i] += _median_angle(from_others[chain[near] == chain[i]])
+    return replace(records, yaw=wrap_rad(yaw))
+
+
+def turns(tracks: Tracks, count: int) -> Array:
+    """Turn of each picture's heading from the one before, radians, clockwise (count,); NaN where few corners tell."""
+    order = np.argsort(tracks.camera, kind="stable")
+    edges = np.searchsorted(tracks.camera[order], np.arange(count + 1))
+    seen = [order[a:b] for a, b in pairwise(edges)]
+    out = np.full(count, np.nan)
+    for i in range(1, count):
+        _, before, now = np.intersect1d(tracks.point[seen[i - 1]], tracks.point[seen[i]], return_indices=True)
+        if len(before) < _HEADING_LEAST_CORNERS:
+            continue
+        p, q = (uv - np.median(uv, axis=0) for uv in (tracks.uv[seen[i - 1]][before], tracks.uv[seen[i]][now]))
+        away = np.hypot(*p.T) > np.median(np.hypot(*p.T))  # those near the middle say little
+        a, b = (z[away, 0] + 1j * z[away, 1] for z in (p, q))
+        out[i] = -_median_angle(np.angle(b / a))  # the ground turns the other way in the picture
+    return out
+
+
+def _median_angle(angle: Array) -> float:
+    """The angle from which the others are least far in sum, radians."""
+    far = np.abs(wrap_rad(angle[:, None] - angle)).sum(axis=1)
+    first = angle[int(far.argmin())]
+    return float(wrap_rad(first + np.median(wrap_rad(angle - first))))
+
+
+def best_views(
+    cameras: CameraBlock, tracks: Tracks, points: Array, obs_weight: Array, own: Flags | None = None
+) -> BestViews:
+    """Best view of each point; `own` bool (N,) limits the choice of camera."""
+    n = len(points)
+    distance = np.hypot(*(cameras.position[tracks.camera, :2] - points[tracks.point, :2]).T)
+    usable = obs_weight > INLIER_WEIGHT
+    if own is not None:
+        usable &= own[tracks.camera]
+    order = np.lexsort((np.where(usable, distance, np.inf), tracks.point))
+    first = np.searchsorted(tracks.point[order], np.arange(n))
+    best = order[np.minimum(first, len(order) - 1)]
+    total = np.bincount(tracks.point, minlength=n)
+    ok = (total > 0) & usable[best]
+    weight = np.bincount(tracks.point, obs_weight, minlength=n) / np.maximum(total, 1)
+    count = np.bincount(tracks.point[obs_weight > INLIER_WEIGHT], minlength=n)
+    return BestViews(np.where(ok, tracks.camera[best], -1).astype(np.int32), count.astype(np.int32), weight)
+
+
+def one_per_cell(points: Array, leg: Ints, cost: Array, cell_m: float) -> Indices:
+    """The point of least cost (finite) in each ground cell of each leg: indices, sorted."""
+    use = np.flatnonzero(np.isfinite(cost))
+    key = np.column_stack([np.floor(points[use, :2] / cell_m).astype(np.int64), leg[use]])
+    order = np.lexsort((use, cost[use]))
+    _, first = np.unique(key[order], axis=0, return_index=True)
+    return np.sort(use[order[first]])

@@ -9,19 +9,16 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.config import active
+from orthoswarm.model.arrays import Flags
 from orthoswarm.model.robust import mad_sigma, mad_sigmas
 from orthoswarm.refine.bundle.adjustment import Adjustment, HeightPrior
-from orthoswarm.refine.bundle.block_arrays import K1, WIDTH, F, Tracks
+from orthoswarm.refine.bundle.block_arrays import K1, WIDTH, F, log_rotation
 from orthoswarm.refine.bundle.height_consistency import release_heights
-from orthoswarm.refine.bundle.prior_equations import bias_axes
-from orthoswarm.refine.bundle.priors import HEIGHT_OFFSET_SIGMA_M, LAG_SIGMA_S, GroupPriors, Priors
-from orthoswarm.refine.bundle.rotation_vectors import log_rotation
+from orthoswarm.refine.bundle.priors import HEIGHT_OFFSET_SIGMA_M, LAG_SIGMA_S, GroupPriors, Priors, bias_axes
 from orthoswarm.refine.flight.relative_block import PRINCIPAL_POINT_SHARE, first_points
 from orthoswarm.refine.flight.sparse_start import SparseStart
-from orthoswarm.refine.initial.planar_similarity import Array
 
 NO_PRIOR_SIGMA_M = 1e6
 """A sigma that makes a prior's weight vanish, metres."""
@@ -65,14 +62,7 @@ _SPARSE_LEAST_FREEDOM: Final = 0.2  # least redundancy in that scaling, observat
 
 
 def solve_sparse(start: SparseStart) -> Adjustment:
-    """Adjust cameras, lenses and points without a map.
-
-    Args:
-        start: from `sparse_start`.
-
-    Returns:
-        The adjustment, with its observations' sigmas scaled to the residuals and its attitude priors to their scatter.
-    """
+    """Adjust cameras, lenses and points without a map; observations and attitudes get the sigmas of residuals."""
     schedule = tuple(zip(SPARSE_STAGE_C, _SPARSE_STAGE_STEPS, strict=True))
     cameras, tracks = start.cameras, start.tracks
     adjustment = Adjustment.begin(cameras, tracks, _priors(start), first_points(cameras, tracks))
@@ -92,14 +82,13 @@ def solve_sparse(start: SparseStart) -> Adjustment:
                 break
         _rescale_sigmas(adjustment)
     if release_heights(adjustment).any():
-        c, steps = schedule[-1]
-        for _ in range(steps):
-            if adjustment.step(c, datum_prior(adjustment)) < _converged_m(adjustment):
+        for _ in range(_SPARSE_STAGE_STEPS[-1]):
+            if adjustment.step(SPARSE_STAGE_C[-1], datum_prior(adjustment)) < _converged_m(adjustment):
                 break
     return adjustment
 
 
-def trusted_heights(adjustment: Adjustment, start: SparseStart) -> NDArray[np.bool_]:
+def trusted_heights(adjustment: Adjustment, start: SparseStart) -> Flags:
     """Photos whose recorded heights the final adjustment used, bool (N,)."""
     p = adjustment.priors
     sigma = np.array([model.height_sigma for model in p.models])
@@ -118,10 +107,7 @@ def plane_prior(adjustment: Adjustment) -> HeightPrior:
 
 
 def datum_prior(adjustment: Adjustment, level_m: float = 0.0) -> HeightPrior:
-    """A prior for the median height of all points that does not constrain their scatter.
-
-    Each point's prior asks for the shift of the median; together they weigh as much as one observation.
-    """
+    """A prior that asks the median height of all points to be level_m, as one observation; their scatter stays free."""
     z = adjustment.points[:, 2]
     middle = float(np.median(z)) if len(z) else 0.0
     soft = _SPARSE_DATUM_SIGMA_M * float(np.sqrt(max(len(z), 1)))
@@ -139,7 +125,7 @@ def _priors(start: SparseStart) -> Priors:
         rotation=start.cameras.rotation.copy(),
         rotation_sigma=np.full((n, 3), np.radians(_SPARSE_FIRST_ATTITUDE_SIGMA_DEG)),
         velocity=start.velocity,
-        group=start.segment,
+        group=start.records.segment,  # attitude bias, height offset and lag are common to a segment
         models=_models(start),
         lens=lens,
         lens_sigma=held,
@@ -149,8 +135,8 @@ def _priors(start: SparseStart) -> Priors:
 def _models(start: SparseStart) -> tuple[GroupPriors, ...]:
     bx, by, bz = np.radians(_SPARSE_BIAS_SIGMA_DEG).tolist()
     models = []
-    for s in range(int(start.segment.max()) + 1):
-        rows = start.segment == s
+    for s in range(int(start.records.segment.max()) + 1):
+        rows = start.records.segment == s
         stated = np.isfinite(start.records.position_sigma[rows]).mean() > 0.5
         usual = active().bundle
         offset = _SPARSE_STATED_OFFSET_SIGMA_M if stated else HEIGHT_OFFSET_SIGMA_M
@@ -187,10 +173,7 @@ def _free_lens(adjustment: Adjustment, start: SparseStart, *, full: bool) -> Non
 
 
 def _widen_position_sigmas(adjustment: Adjustment) -> None:
-    """Widen the sigmas of positions and heights that scatter more than stated.
-
-    Too small height sigmas push the cameras up, where height errors cost less.
-    """
+    """Widen sigmas of positions and heights that scatter more than stated; too small ones push the cameras up."""
     p = adjustment.priors
     off = adjustment.position_residuals() / np.maximum(p.position_sigma, 1e-9)
     horizontal = mad_sigma(off[:, :2])
@@ -223,10 +206,4 @@ def _rescale_sigmas(adjustment: Adjustment) -> None:
     freedom = max(1.0 - unknowns / (2.0 * len(off)), _SPARSE_LEAST_FREEDOM)
     scale = float(np.median(seen)) / (MEDIAN_LENGTH_SIGMAS * np.sqrt(freedom))
     sigma = np.maximum(tracks.sigma_px * np.float32(scale), np.float32(_SPARSE_LEAST_SIGMA_PX))
-    adjustment.tracks = Tracks(tracks.camera, tracks.point, tracks.uv, sigma.astype(np.float32))
-
-
-def heights_above_ground(adjustment: Adjustment) -> Array:
-    """Height of each camera over the median of the points, float64 (N,)."""
-    level = float(np.median(adjustment.points[:, 2])) if len(adjustment.points) else 0.0
-    return np.asarray(adjustment.cameras.position[:, 2] - level)
+    adjustment.tracks = replace(tracks, sigma_px=sigma.astype(np.float32))

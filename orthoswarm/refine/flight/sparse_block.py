@@ -1,33 +1,47 @@
-"""The relative block of sparse photos, adjusted without a map, as a Flight for the same further steps."""
+"""The relative block of sparse photos, adjusted without a map, as a FlightBlock for the same further steps.
+
+Photos of several vehicles are matched and adjusted together, then split into flights: alone, each vehicle would have
+its own scale, tilt and drift. Cameras of the same name share a lens until the end; then each vehicle gets its own lens,
+close to the shared one.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.model.angles import wrap_rad
+from orthoswarm.model.arrays import Array, Flags, Indices
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.task_runner import Progress, Run, serial
 from orthoswarm.refine.bundle import flight_records
 from orthoswarm.refine.bundle.adjustment import Adjustment
 from orthoswarm.refine.bundle.block_arrays import CX, CY, HEIGHT, WIDTH, F, Tracks
+from orthoswarm.refine.bundle.height_consistency import log_focal_sigmas
+from orthoswarm.refine.bundle.priors import GroupPriors, Priors
 from orthoswarm.refine.features.flow_calibration import Calibration
-from orthoswarm.refine.features.working_pictures import Pictures
+from orthoswarm.refine.features.working_pictures import Pictures, ReadGray
 from orthoswarm.refine.flight.record_findings import height_findings
-from orthoswarm.refine.flight.relative_block import Flight
+from orthoswarm.refine.flight.relative_block import FlightBlock
 from orthoswarm.refine.flight.sparse_adjustment import (
     SPARSE_STAGE_C,
     datum_prior,
-    heights_above_ground,
     solve_sparse,
     trusted_heights,
 )
-from orthoswarm.refine.flight.sparse_start import SparseStart, read_photo_records, sparse_start
-from orthoswarm.refine.initial.pair_graph import ReadGray
-from orthoswarm.refine.initial.planar_similarity import Array
-from orthoswarm.refine.initial.segments import photo_legs
+from orthoswarm.refine.flight.sparse_start import SparseStart, photo_legs, read_photo_records, sparse_start
+
+_JOINT_MOST_VEHICLES: Final = 16  # of more vehicles those with the same camera name share one lens (cost)
+_JOINT_LENS_STEPS: Final = 4  # steps with a lens for each vehicle
+_JOINT_LENS_SIGMA: Final = (0.01, 0.01, 0.01, 0.05)
+"""Sigma of log f, k1, k2, k3 of a vehicle's lens about the common one."""
+_JOINT_PRINCIPAL_POINT_SHARE: Final = 0.004  # sigma of its principal point about the common one, in picture widths
+_JOINT_LENS_C: Final = 9.0  # robust scale c of those steps, squared sigmas
+_HELD_POSITION_SIGMA_M: Final = 0.3  # sigma of positions found together, in the block of one vehicle
+_HELD_ATTITUDE_SIGMA_DEG: Final = 0.3  # sigma of attitudes found together
+_HELD_LENS_SIGMA: Final = 0.003  # sigma of lens parameters found together
 
 
 def open_sparse_flight(
@@ -38,18 +52,11 @@ def open_sparse_flight(
     *,
     run: Run = serial,
     progress: Progress | None = None,
-) -> Flight:
-    """Match a vehicle's photos with each other and adjust them without a map.
+) -> FlightBlock:
+    """Match the photos of one vehicle and lens, in order of time, with each other and adjust them without a map.
 
-    The counterpart of `open_flight` for photos that cannot be tracked; its adjustment is already solved.
-
-    Args:
-        frames: of one vehicle and one lens, in order of time.
-        grid: the area's grid.
-        origin: float64 (2,), of the local frame.
-        read: returns a photo's grey values at full size.
-        run: executes the feature and matching tasks; the result does not depend on it.
-        progress: called with stage, number done, total.
+    The counterpart of `open_flight` for photos that cannot be tracked; its adjustment is already solved. run, progress:
+    see `sparse_start`.
     """
     frames = [replace(frame, camera=frames[0].camera) for frame in frames]
     start = sparse_start(frames, read_photo_records(frames, grid, origin), read, run, progress)
@@ -69,25 +76,19 @@ def make_flight(
     read: ReadGray,
     *,
     start: SparseStart,
-    rows: NDArray[np.int64],
+    rows: Indices,
     adjustment: Adjustment,
-    trusted_height: NDArray[np.bool_],
+    trusted_height: Flags,
     warnings: Sequence[str],
     focal_sigma: float = 0.0,
-) -> Flight:
+) -> FlightBlock:
     """Make a vehicle's flight from photos adjusted alone or with others.
 
     Args:
-        frames: of the vehicle.
-        grid: the area's grid.
-        origin: float64 (2,), of the local frame.
-        read: returns a photo's grey values at full size.
-        start: of all photos that were matched together.
-        rows: which of them are the vehicle's.
+        start: of all photos that were matched together. rows: which of them are the vehicle's.
         adjustment: of the vehicle's photos alone, in pixels of the full pictures.
         trusted_height: bool, of all photos, True where the final adjustment used the recorded height.
-        warnings: for the report of this vehicle.
-        focal_sigma: of a lens found together with other vehicles, see `Flight`.
+        warnings: for the report of this vehicle. focal_sigma: see `FlightBlock`.
     """
     records = flight_records.read_records(frames, grid, origin)
     pictures = Pictures(frames, read)
@@ -98,26 +99,30 @@ def make_flight(
     mine = list(warnings)
     calibration = Calibration(
         focal_px=float(adjustment.cameras.lens[0, F]),
-        height_m=float(np.median(heights_above_ground(adjustment))),
+        height_m=float(np.median(adjustment.cameras.position[:, 2] - _ground_level(adjustment))),
         yaw_offset=wrap_rad(yaw - records.yaw),
         trusted_height=bool(trusted_height[rows].any()),
         pairs=start.pairs[1],
         warnings=mine,
     )
-    leg = photo_legs(start.plane.position[rows], start.segment[rows], start.records.time_s[rows])
-    held = start.placed[rows].astype(np.float64)
-    return Flight(
+    leg = photo_legs(start.plane.position[rows], start.records.segment[rows], start.records.time_s[rows])
+    return FlightBlock(
         frames=frames,
-        records=records.with_yaw(yaw),
+        records=replace(records, yaw=yaw),
         leg=leg,
         pictures=pictures,
         calibration=calibration,
         adjustment=adjustment,
-        survived=held,
+        survived=start.placed[rows].astype(np.float64),
         warnings=list(mine),
         sparse=True,
         focal_sigma=focal_sigma,
     )
+
+
+def _ground_level(adjustment: Adjustment) -> float:
+    """Median height of the points."""
+    return float(np.median(adjustment.points[:, 2])) if len(adjustment.points) else 0.0
 
 
 def in_reduced_pixels(adjustment: Adjustment, step: float, size: tuple[int, int]) -> Adjustment:
@@ -133,11 +138,114 @@ def in_reduced_pixels(adjustment: Adjustment, step: float, size: tuple[int, int]
     priors = replace(p, lens=lens_prior, lens_sigma=lens_sigma)
     out = Adjustment.begin(replace(cameras, lens=lens), tracks, priors, adjustment.points)
     out.common[:] = adjustment.common
-    common_lens = out.common[: out.layout.lens_columns].reshape(-1, 6)
-    common_lens[:, 4:] /= step
+    out.common[: out.layout.lens_columns].reshape(-1, 6)[:, 4:] /= step
     # a step computes the weights and normal equations of the new adjustment
-    out.step(
-        SPARSE_STAGE_C[-1],
-        datum_prior(out, float(np.median(out.points[:, 2])) if len(out.points) else 0.0),
-    )
+    out.step(SPARSE_STAGE_C[-1], datum_prior(out, _ground_level(out)))
     return out
+
+
+def open_sparse_flights(
+    units: Sequence[Sequence[Frame]],
+    grid: LocalGrid,
+    origin: Array,
+    read: ReadGray,
+    *,
+    run: Run = serial,
+    progress: Progress | None = None,
+) -> list[FlightBlock]:
+    """Match the photos of several vehicles with each other and adjust them together, without a map.
+
+    Args:
+        units: frames of one vehicle and one lens each, in order of time. run, progress: see `sparse_start`.
+
+    Returns:
+        A flight for each unit. Its adjustment contains its own photos only, with priors at the joint solution: it
+        may be moved rigidly (onto a map), but keeps its shape.
+    """
+    if len(units) == 1:
+        return [open_sparse_flight(units[0], grid, origin, read, run=run, progress=progress)]
+    units = [[replace(frame, camera=part[0].camera) for frame in part] for part in units]
+    frames = [frame for part in units for frame in part]
+    records = read_photo_records(frames, grid, origin, share_lenses=True)
+    start = sparse_start(frames, records, read, run, progress)
+    adjustment = solve_sparse(start)
+    trusted = trusted_heights(adjustment, start)
+    focal_sigma = log_focal_sigmas(adjustment)[adjustment.cameras.lens_id]
+    if int(records.vehicle.max()) < _JOINT_MOST_VEHICLES:
+        adjustment = own_lenses(adjustment, start)
+        focal_sigma = np.hypot(focal_sigma, log_focal_sigmas(adjustment)[adjustment.cameras.lens_id])
+    found = height_findings(frames, start.records, start.plane, adjustment)
+    by_unit = _by_unit([*start.warnings, *found], [part[0].vehicle for part in units])
+    flights, first = [], 0
+    for part, warnings in zip(units, by_unit, strict=True):
+        rows = np.arange(first, first + len(part))
+        first += len(part)
+        alone = _extract_block(adjustment, start, rows)
+        sigma = float(focal_sigma[rows[0]])
+        flights.append(
+            make_flight(
+                part, grid, origin, read, start=start, rows=rows, adjustment=alone, trusted_height=trusted,
+                warnings=warnings, focal_sigma=sigma,
+            )
+        )  # fmt: skip
+    return flights
+
+
+def _by_unit(warnings: Sequence[str], names: Sequence[str]) -> list[list[str]]:
+    """Warnings by unit; those about several units go to the first one."""
+    by_unit: list[list[str]] = [[] for _ in names]
+    for text in warnings:
+        own = [k for k, name in enumerate(names) if text.startswith(f"{name}:")]
+        by_unit[own[0] if own else 0].append(text)
+    return by_unit
+
+
+def own_lenses(adjustment: Adjustment, start: SparseStart) -> Adjustment:
+    """Give every vehicle its own lens, close to the shared one, and continue the adjustment."""
+    vehicle = start.records.vehicle
+    first = [int(np.argmax(vehicle == v)) for v in range(int(vehicle.max()) + 1)]
+    lens = adjustment.cameras.lens[adjustment.cameras.lens_id[first]].copy()
+    p = adjustment.priors
+    sigma = np.empty((len(lens), 6))
+    sigma[:, :4] = _JOINT_LENS_SIGMA
+    sigma[:, 4:] = _JOINT_PRINCIPAL_POINT_SHARE * lens[:, 6:7]
+    sigma[p.lens_sigma[adjustment.cameras.lens_id[first]] == 0] = 0.0
+    cameras = replace(adjustment.cameras, lens=lens, lens_id=vehicle.astype(np.int32))
+    priors = replace(p, lens=np.column_stack([np.log(lens[:, 0]), lens[:, 1:6]]), lens_sigma=sigma)
+    own = Adjustment.begin(cameras, adjustment.tracks, priors, adjustment.points)
+    own.common[own.layout.lens_columns :] = adjustment.common[adjustment.layout.lens_columns :]
+    for _ in range(_JOINT_LENS_STEPS):
+        own.step(_JOINT_LENS_C, datum_prior(own))
+    return own
+
+
+def _extract_block(adjustment: Adjustment, start: SparseStart, rows: Indices) -> Adjustment:
+    """The part of a joint adjustment that concerns some photos."""
+    local = np.full(len(adjustment.cameras), -1, np.int32)
+    local[rows] = np.arange(len(rows), dtype=np.int32)
+    t = adjustment.tracks
+    mine = local[t.camera] >= 0
+    count = np.bincount(t.point[mine], minlength=len(adjustment.points))
+    observations = np.flatnonzero(mine & (count[t.point] >= 2))
+    points = np.unique(t.point[observations])
+    tracks = replace(t, camera=local[t.camera]).take(observations).renumbered()
+    cameras = adjustment.cameras.take(rows)
+    lens_row = int(cameras.lens_id[0])
+    cameras = replace(cameras, lens=cameras.lens[lens_row : lens_row + 1].copy(), lens_id=np.zeros(len(rows), np.int32))
+    lens = np.concatenate([[np.log(cameras.lens[0, 0])], cameras.lens[0, 1:6]])[None]
+    free = adjustment.priors.lens_sigma[lens_row] > 0
+    width = cameras.lens[0, WIDTH]
+    held = _HELD_LENS_SIGMA * np.array([1, 1, 1, 1, width, width])
+    attitude = float(np.radians(_HELD_ATTITUDE_SIGMA_DEG))
+    priors = Priors(
+        position=cameras.position.copy(),
+        position_sigma=np.full((len(rows), 3), _HELD_POSITION_SIGMA_M),
+        rotation=cameras.rotation.copy(),
+        rotation_sigma=np.full((len(rows), 3), attitude),
+        velocity=start.velocity[rows],
+        group=np.zeros(len(rows), np.int32),
+        models=(GroupPriors(bias_sigma=(attitude, attitude, attitude), lag_sigma=0.0),),
+        lens=lens,
+        lens_sigma=np.where(free, held, 0.0)[None],
+    )
+    return Adjustment.begin(cameras, tracks, priors, adjustment.points[points])

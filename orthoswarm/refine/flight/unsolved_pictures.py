@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array, Flags
 from orthoswarm.model.camera import Camera
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.placement import PlacedFrame
@@ -29,12 +29,11 @@ _UNSOLVED_SIGMA_M: Final = 2.0  # added in squares to the largest sigma of those
 
 @dataclass(frozen=True, slots=True)
 class RefinableSplit:
-    """Recorded frames by whether a refiner can solve them, each in the order of the frames.
+    """Recorded frames by whether a refiner can solve them, each in the frames' order, and warnings for the report.
 
     Attributes:
         fit: frames that it can solve. odd: too few of their camera and size, to be placed by their neighbours.
         still: frames of vehicles that hovered for all pictures, which stay as recorded.
-        warnings: sentences for the report on what cannot be solved.
     """
 
     fit: list[PlacedFrame]
@@ -60,12 +59,11 @@ def split_refinable(recorded: Sequence[PlacedFrame]) -> RefinableSplit:
     return RefinableSplit(fit, odd, [p for p in recorded if p.frame.vehicle in spots], warnings)
 
 
-def few_of_their_kind(frames: Sequence[Frame]) -> NDArray[np.bool_]:
+def few_of_their_kind(frames: Sequence[Frame]) -> Flags:
     """Frames with too few others of their vehicle, camera and size, while other cameras have enough: bool (N,)."""
     kinds = [(f.vehicle, f.camera, f.width, f.height) for f in frames]
     count = Counter(kinds)
-    least = _LEAST_PHOTOS_OF_KIND
-    few = np.array([count[kind] < least for kind in kinds], bool)
+    few = np.array([count[kind] < _LEAST_PHOTOS_OF_KIND for kind in kinds], bool)
     return few if not few.all() else np.zeros(len(frames), bool)
 
 
@@ -74,15 +72,14 @@ def hovering_vehicles(recorded: Sequence[PlacedFrame]) -> set[str]:
     members: dict[str, list[PlacedFrame]] = {}
     for p in recorded:
         members.setdefault(p.frame.vehicle, []).append(p)
-    out = set()
-    for vehicle, own in members.items():
-        positions = np.array([p.camera.position for p in own])
-        if len(own) > _LEAST_PHOTOS_OF_KIND and _hovers(positions):
-            out.add(vehicle)
-    return out
+    return {
+        vehicle
+        for vehicle, own in members.items()
+        if len(own) > _LEAST_PHOTOS_OF_KIND and _hovers(np.array([p.camera.position for p in own]))
+    }
 
 
-def _hovers(positions: NDArray[np.float64]) -> bool:
+def _hovers(positions: Array) -> bool:
     """True if a path (N, 3) is one position with a receiver's noise: steps as long as the total spread."""
     spread = float(np.hypot(*np.subtract(*np.percentile(positions[:, :2], [95, 5], axis=0))))
     height = float(np.median(positions[:, 2]))
@@ -99,12 +96,8 @@ def place_by_neighbours(
     """Place frames by applying the refinement's changes of their nearest neighbours: position, attitude, focal length.
 
     Args:
-        odd: as recorded.
-        recorded: the refined frames as recorded, with the same assumed field of view.
-        refined: frames after refinement.
-
-    Returns:
-        One placed frame for each odd frame; as recorded if nothing was refined.
+        odd: as recorded; they stay so if nothing was refined.
+        recorded: the refined frames as recorded, with the same assumed field of view. refined: after refinement.
     """
     before = {p.frame.image: p for p in recorded}
     pairs = [(before[p.frame.image], p) for p in refined if p.frame.image in before]
@@ -115,21 +108,13 @@ def place_by_neighbours(
 def move_with_neighbours(
     extra: Sequence[PlacedFrame], before: Sequence[PlacedFrame], after: Sequence[PlacedFrame]
 ) -> list[PlacedFrame]:
-    """Move frames by the changes of their nearest neighbours when those were placed again; sigmas stay.
-
-    Args:
-        extra: placed after the others, not solved with them.
-        before: the others before the change.
-        after: the others after the change.
-    """
+    """Move frames that were not solved with the others as their nearest neighbours moved since; sigmas stay."""
     own = {p.frame.image for p in extra}
     moved = place_by_neighbours(extra, [p for p in before if p.frame.image not in own], after)
     return [replace(now, sigma_m=was.sigma_m, weak=was.weak) for was, now in zip(extra, moved, strict=True)]
 
 
-def _nearest(
-    one: PlacedFrame, pairs: Sequence[tuple[PlacedFrame, PlacedFrame]]
-) -> list[tuple[PlacedFrame, PlacedFrame]]:
+def _nearest(one: PlacedFrame, pairs: Sequence[BeforeAfter]) -> list[BeforeAfter]:
     """The refined frames nearest to a frame, of its own vehicle if there are any."""
     own = [pair for pair in pairs if pair[0].frame.vehicle == one.frame.vehicle] or list(pairs)
     away = [float(np.hypot(*(p.camera.nadir - one.camera.nadir))) for p, _ in own]

@@ -3,11 +3,9 @@
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from orthoswarm.refine.flight.relative_block import Flight
-
-Array = NDArray[np.float64]
+from orthoswarm.model.arrays import Array, Flags, Indices, Ints
+from orthoswarm.refine.flight.relative_block import FlightBlock
 
 _SPARSE_FEWEST_OBSERVATIONS: Final = 12  # photos matched in pairs with fewer observations are weakly determined
 HELD_OBSERVATIONS: Final = 8  # pictures with fewer well fitting observations are placed between their neighbours
@@ -23,7 +21,7 @@ _WEAK_MOST_PHOTOS: Final = 40  # ... up to so many photos
 _WEAK_DISAGREEMENT_SHARE: Final = 0.5  # a weak picture's sigma is at least this share of what record and line differ by
 
 
-def observations_per_camera(flight: Flight) -> NDArray[np.int64]:
+def observations_per_camera(flight: FlightBlock) -> Indices:
     """Number of inlier observations of each of the vehicle's cameras: int64 (N,)."""
     adj = flight.adjustment
     n = len(flight.frames)
@@ -31,13 +29,13 @@ def observations_per_camera(flight: Flight) -> NDArray[np.int64]:
     return np.bincount(adj.tracks.camera[good], minlength=n)
 
 
-def weakly_held(flight: Flight) -> NDArray[np.bool_]:
+def weakly_held(flight: FlightBlock) -> Flags:
     """Whether too few observations hold a camera: bool (N,)."""
     fewest = _SPARSE_FEWEST_OBSERVATIONS if flight.sparse else HELD_OBSERVATIONS
     return np.asarray(observations_per_camera(flight) < fewest)
 
 
-def without_outliers(recorded: Array, leg: NDArray[np.int32]) -> Array:
+def without_outliers(recorded: Array, leg: Ints) -> Array:
     """Records (N, 3) with single outlying positions, across or along their leg's course, put back on it.
 
     Within a long gap a position 5 to 20 m off looks like the aircraft's way when only the gap's ends are compared.
@@ -59,7 +57,7 @@ def without_outliers(recorded: Array, leg: NDArray[np.int32]) -> Array:
     return out
 
 
-def interpolate_weak(flight: Flight, sigma_m: Array) -> NDArray[np.bool_]:
+def interpolate_weak(flight: FlightBlock, sigma_m: Array) -> Flags:
     """Interpolate weak cameras in place from strong ones before and after; returns which were interpolated.
 
     Positions follow the recorded path where it agrees with the neighbours, else a straight line in time; the

@@ -6,17 +6,20 @@ positions of other photos place the whole. With log a and t as unknowns every ob
 Gauss-Newton steps are complex least squares.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix, csc_matrix, diags
+from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from scipy.sparse.linalg import splu
 
+from orthoswarm.compute.robust_kernel import robust_widening
+from orthoswarm.model.arrays import Array, Complex, Flags, Ints
 from orthoswarm.refine.initial.heading import components
-from orthoswarm.refine.initial.planar_network import NETWORK_GATE_SIGMAS
-from orthoswarm.refine.initial.planar_similarity import Array, Complex, Flags, Ints, PairGraph
+from orthoswarm.refine.initial.planar_network import SparseRows
+from orthoswarm.refine.initial.planar_similarity import PairGraph
 from orthoswarm.refine.initial.tilt_and_lens import spaced
 
 FREE_PAIR_SHARE: Final = 0.02  # sigma of the match centres of two level photos, in picture widths
@@ -42,6 +45,10 @@ class Anchors:
     sigma_m: Array
     sigma_px: Array
 
+    def take(self, keep: NDArray[np.intp]) -> "Anchors":
+        """Some of the observations."""
+        return Anchors(**{name: getattr(self, name)[keep] for name in self.__slots__})
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FreeNetwork:
@@ -49,54 +56,22 @@ class FreeNetwork:
 
     Attributes:
         scale: complex (N,), a of each photo: metres per pixel times exp(-i yaw). centre: complex (N,), t: below the
-            camera. sigma_m: float64 (N,), one sigma of the centre, an axis. placed: bool (N,). anchor_ok: bool (M,).
+            camera. sigma_m: float64 (N,), one sigma of the centre, an axis. placed: bool (N,).
     """
 
     scale: Complex
     centre: Complex
     sigma_m: Array
     placed: Flags
-    anchor_ok: Flags
-
-
-@dataclass(slots=True, kw_only=True)
-class _System:
-    """Rows of complex equations in units of one sigma: columns, values, right-hand side."""
-
-    size: int
-    row: list[NDArray[np.int64]] = field(default_factory=list)
-    column: list[NDArray[np.int64]] = field(default_factory=list)
-    value: list[Complex] = field(default_factory=list)
-    rhs: list[Complex] = field(default_factory=list)
-    count: int = 0
-
-    def add(self, rhs: Complex, *terms: tuple[NDArray[np.integer], Complex | Array]) -> None:
-        """Add one row for each element of rhs; terms are columns and values."""
-        at = self.count + np.arange(len(rhs))
-        for column, value in terms:
-            self.row.append(at)
-            self.column.append(np.asarray(column, np.int64))
-            self.value.append(np.asarray(value, np.complex128))
-        self.rhs.append(np.asarray(rhs, np.complex128))
-        self.count += len(rhs)
-
-    def matrix(self) -> tuple[csc_matrix, Complex]:
-        """The sparse matrix and its right-hand side."""
-        at = np.concatenate(self.row), np.concatenate(self.column)
-        matrix = coo_matrix((np.concatenate(self.value), at), shape=(self.count, self.size))
-        return matrix.tocsc(), np.concatenate(self.rhs)
 
 
 def solve_free_network(graph: PairGraph, count: int, width: Array, anchors: Anchors) -> FreeNetwork:
-    """Place photos by their pairs and anchors.
+    """Place photos by their pairs and anchors; connected parts without two anchors at different points are not placed.
 
-    Args:
-        graph: pairs of level pictures. count: N photos. width: float64 (N,), columns of the pictures.
-        anchors: at least two different points are needed in each connected part; parts without them are not placed.
+    count: N photos. width: float64 (N,), columns of the pictures.
     """
     scale, centre = np.zeros(count, np.complex128), np.zeros(count, np.complex128)
     sigma, placed = np.full(count, np.inf), np.zeros(count, bool)
-    good = np.zeros(len(anchors.photo), bool)
     for members in _parts(graph, count):
         inside = np.isin(graph.first, members)
         held = np.flatnonzero(np.isin(anchors.photo, members))
@@ -106,10 +81,10 @@ def solve_free_network(graph: PairGraph, count: int, width: Array, anchors: Anch
             continue
         turn, shift = datum
         a, t = np.asarray(turn * a), np.asarray(turn * t + shift)
-        part = _adjusted(_pairs_of(graph, inside), members, _anchors_of(anchors, held), a=a, t=t, width=width)
-        scale[members], centre[members], sigma[members], good[held] = part
+        part = _adjusted(graph.take(inside), members, anchors.take(held), a=a, t=t, width=width)
+        scale[members], centre[members], sigma[members] = part
         placed[members] = True
-    return FreeNetwork(scale=scale, centre=centre, sigma_m=sigma, placed=placed, anchor_ok=good)
+    return FreeNetwork(scale=scale, centre=centre, sigma_m=sigma, placed=placed)
 
 
 def _parts(graph: PairGraph, count: int) -> list[Ints]:
@@ -119,31 +94,14 @@ def _parts(graph: PairGraph, count: int) -> list[Ints]:
     return [group for group in groups if len(group) > 1]
 
 
-def _pairs_of(graph: PairGraph, inside: Flags) -> PairGraph:
-    names = ("first", "second", "factor", "centre_first", "centre_second", "count", "spread", "residual")
-    return PairGraph(**{name: getattr(graph, name)[inside] for name in names})
-
-
-def _anchors_of(anchors: Anchors, held: NDArray[np.intp]) -> Anchors:
-    return Anchors(
-        photo=anchors.photo[held],
-        pixel=anchors.pixel[held],
-        ground=anchors.ground[held],
-        sigma_m=anchors.sigma_m[held],
-        sigma_px=anchors.sigma_px[held],
-    )
-
-
 def _chained(graph: PairGraph, inside: Flags, members: Ints, count: int) -> tuple[Complex, Complex]:
     """Similarities (N,) of a part's photos onto the pixels of one of them, along the pairs with most matches."""
-    from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
-
     pairs = np.flatnonzero(inside)
-    cost = 1.0 / graph.count[pairs]
-    shape = (count, count)
+    first, second = graph.first[pairs], graph.second[pairs]
     number = {(int(graph.first[e]), int(graph.second[e])): int(e) for e in pairs}
-    tree = minimum_spanning_tree(coo_matrix((cost, (graph.first[pairs], graph.second[pairs])), shape=shape).tocsr())
-    root = int(np.bincount(np.r_[graph.first[pairs], graph.second[pairs]], minlength=count).argmax())
+    links = coo_matrix((1.0 / graph.count[pairs], (first, second)), shape=(count, count))
+    tree = minimum_spanning_tree(links.tocsr())
+    root = int(np.bincount(np.r_[first, second], minlength=count).argmax())
     order, before = breadth_first_order(tree, root, directed=False)
     a, t = np.zeros(count, np.complex128), np.zeros(count, np.complex128)
     a[root] = 1.0
@@ -170,9 +128,8 @@ def _datum(a: Complex, t: Complex, anchors: Anchors, held: NDArray[np.intp]) -> 
     for i in range(len(held)):
         for j in range(i + 1, len(held)):
             apart = ground[j] - ground[i]
-            if abs(apart) <= _ANCHOR_APART_SIGMAS * np.hypot(sigma[i], sigma[j]):
-                continue
-            if abs(shown[j] - shown[i]) < 1e-12:
+            near = abs(apart) <= _ANCHOR_APART_SIGMAS * np.hypot(sigma[i], sigma[j])
+            if near or abs(shown[j] - shown[i]) < 1e-12:
                 continue
             turn = complex(apart / (shown[j] - shown[i]))
             shift = complex(ground[i] - turn * shown[i])
@@ -184,8 +141,8 @@ def _datum(a: Complex, t: Complex, anchors: Anchors, held: NDArray[np.intp]) -> 
 
 def _adjusted(
     graph: PairGraph, members: Ints, anchors: Anchors, *, a: Complex, t: Complex, width: Array
-) -> tuple[Complex, Complex, Array, Flags]:
-    """The robust adjustment of a part: a, t and the sigma of t of its members, and which anchors agree."""
+) -> tuple[Complex, Complex, Array]:
+    """The robust adjustment of a part: a, t and the sigma of t of its members."""
     n, pairs = len(members), len(graph)
     at = np.full(len(a), -1)
     at[members] = np.arange(n)
@@ -195,13 +152,12 @@ def _adjusted(
         matrix, rhs = _rows(graph, anchors, ends, log_a=log_a, t=t, share=share)
         squared = np.abs(rhs) ** 2
         together = squared[:pairs] + squared[pairs : 2 * pairs]  # a wrong pair is wrong in both
-        weight = (1.0 + np.r_[together, together, squared[2 * pairs :]] / c) ** -2
+        weight = robust_widening(np.r_[together, together, squared[2 * pairs :]], c) ** -2
         factor = splu((matrix.conj().T @ diags(weight) @ matrix).tocsc())
         step = factor.solve(matrix.conj().T @ (weight * rhs))
         log_a, t = log_a + step[:n], t + step[n:]
     variance = np.diag(factor.solve(np.eye(2 * n, dtype=np.complex128)))[n:].real
-    good = squared[2 * pairs :] < NETWORK_GATE_SIGMAS**2
-    return np.exp(log_a), t, np.sqrt(np.maximum(variance, 0.0)), good
+    return np.exp(log_a), t, np.sqrt(np.maximum(variance, 0.0))
 
 
 def _rows(
@@ -222,7 +178,7 @@ def _rows(
     meet_sigma = np.hypot(share[i] * size[i], share[j] * size[j])
     anchor = a[k] * anchors.pixel + t[k] - anchors.ground
     anchor_sigma = np.hypot(anchors.sigma_m, anchors.sigma_px * size[k])
-    rows = _System(size=2 * n)
+    rows = SparseRows(2 * n)
     rows.add(-ratio / ratio_sigma, (i, 1.0 / ratio_sigma), (j, -1.0 / ratio_sigma))
     rows.add(
         -meet / meet_sigma,
@@ -232,4 +188,4 @@ def _rows(
         (n + j, -1.0 / meet_sigma),
     )
     rows.add(-anchor / anchor_sigma, (k, a[k] * anchors.pixel / anchor_sigma), (n + k, 1.0 / anchor_sigma))
-    return rows.matrix()
+    return rows.matrix().tocsc(), rows.right()

@@ -9,12 +9,14 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse import coo_matrix, csr_matrix, identity
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 from scipy.sparse.linalg import spsolve
 
+from orthoswarm.compute.robust_kernel import robust_widening
 from orthoswarm.model.angles import wrap_rad
-from orthoswarm.refine.initial.planar_similarity import Array, Complex, Flags, Ints, PairGraph, PhotoRecords
+from orthoswarm.model.arrays import Array, Complex, Flags, Ints
+from orthoswarm.refine.initial.planar_similarity import PairGraph, PhotoRecords
 
 _COURSE_SIGMA_DEG: Final = 2.0  # sigma of the course between two photos, besides that of their positions
 _COURSE_SIGMA_LIMIT_RAD: Final = 1.0  # a course known no better than this is dropped
@@ -32,9 +34,7 @@ _TAG_AGREE_SHARE: Final = 0.5  # share of the photos whose tag must follow the p
 class TagHeading:
     """Relation between one vehicle's recorded angles and the pictures' headings.
 
-    Attributes:
-        source: "yaw" or "flight_yaw", "" if neither agrees with the pictures.
-        offset: constant difference picture - tag, radians. agree: share of photos with that offset.
+    source: "yaw", "flight_yaw" or "", if neither agrees. offset: picture - tag, radians. agree: share of photos.
     """
 
     source: str
@@ -43,10 +43,7 @@ class TagHeading:
 
 
 def components(graph: PairGraph, count: int) -> Ints:
-    """Connected parts of the pair graph, int32 (N,), the largest is 0.
-
-    A photo without pairs is a component by itself.
-    """
+    """Connected parts of the pair graph, int32 (N,), the largest is 0; a photo without pairs is one by itself."""
     links = coo_matrix((np.ones(len(graph)), (graph.first, graph.second)), shape=(count, count))
     _, label = connected_components(links, directed=False)
     size = np.bincount(label)
@@ -83,11 +80,8 @@ def course_headings(
     """Absolute heading of each pair's first photo, from the recorded movement and the picture's shift.
 
     Args:
-        graph: E pairs.
-        records: of N photos.
-        metres: float64 (N,), metres per pixel.
-        offset: complex (N,), nadir pixel of each photo.
-        offset_sigma_px: float64 (N,), one sigma of it.
+        graph: E pairs. metres: float64 (N,), metres per pixel. offset: complex (N,), nadir pixel of each photo.
+        offset_sigma_px: float64 (N,).
 
     Returns:
         Heading (E,) and its one sigma (E,), infinite where the movement is too short.
@@ -115,11 +109,8 @@ def solve_headings(
     together, robustly.
 
     Args:
-        graph: E pairs.
-        component: int32 (N,).
-        start: float64 (N,), relative headings within each component.
-        course: float64 (E,), absolute headings of the first photos; course_sigma: (E,).
-        course_sigma: one sigma of them, infinite where unknown.
+        component: int32 (N,). start: float64 (N,), relative headings within each component.
+        course: float64 (E,), absolute headings of the first photos; course_sigma: (E,), infinite where unknown.
     """
     yaw = start.copy()
     known = np.zeros(len(start), bool)
@@ -144,20 +135,14 @@ def _heading_step(graph: PairGraph, yaw: Array, course: Array, course_sigma: Arr
     finite = np.isfinite(course_sigma)
     sigma = np.where(finite, course_sigma, 1.0)
     absolute = np.where(finite, wrap_rad(course - yaw[i]) / sigma, 0.0)
-    # both sides of each row are multiplied by the square root of its Geman-McClure weight
-    w = np.concatenate([1.0 / (1.0 + relative**2 / c), finite / (1.0 + absolute**2 / c)])
+    w = np.concatenate([1.0 / robust_widening(relative**2, c), finite / robust_widening(absolute**2, c)])
     row = np.arange(pairs)
     pull = w[:pairs] / turn_sigma
     differences = coo_matrix((np.r_[-pull, pull], (np.r_[row, row], np.r_[i, j])), shape=(2 * pairs, count))
     matrix = differences + coo_matrix((w[pairs:] / sigma, (row + pairs, i)), shape=(2 * pairs, count))
     rhs = w * np.concatenate([relative, absolute])
-    normal = (matrix.T @ matrix + 1e-3 * _identity(count)).tocsc()
+    normal = (matrix.T @ matrix + 1e-3 * identity(count, format="csr")).tocsc()
     return np.asarray(spsolve(normal, matrix.T @ rhs), dtype=np.float64).reshape(-1)
-
-
-def _identity(count: int) -> csr_matrix:
-    k = np.arange(count)
-    return csr_matrix((np.ones(count), (k, k)), shape=(count, count))
 
 
 def circular_mode(angle: Array, weight: Array) -> float:
@@ -168,22 +153,16 @@ def circular_mode(angle: Array, weight: Array) -> float:
     mode = float(tried[int(support.argmax())])
     for _ in range(_HEADING_ROUNDS):
         r = wrap_rad(angle - mode)
-        w = weight / (1.0 + (r / (0.5 * width)) ** 2) ** 2
+        w = weight / robust_widening((r / (0.5 * width)) ** 2, 1.0) ** 2
         mode += float((w * r).sum() / w.sum())
     return wrap_rad(mode)
 
 
 def tag_heading(records: PhotoRecords, rows: NDArray[np.intp], yaw: Array) -> TagHeading:
-    """Find the recorded angle that follows the pictures' headings, up to a constant, among photos of one vehicle.
-
-    Args:
-        records: all records.
-        rows: photos of one vehicle whose headings follow from pairs.
-        yaw: float64 (N,), the pictures' headings.
-    """
+    """The recorded angle that follows the headings `yaw` (N,), up to a constant, on those `rows` of one vehicle."""
     best = TagHeading("", 0.0, 0.0)
     for source in ("yaw", "flight_yaw"):
-        tag = tag_yaw(records, source)[rows]
+        tag = getattr(records, source)[rows]
         finite = np.isfinite(tag)
         if finite.sum() < _TAG_LEAST_PHOTOS:
             continue
@@ -193,8 +172,3 @@ def tag_heading(records: PhotoRecords, rows: NDArray[np.intp], yaw: Array) -> Ta
         if agree > best.agree + _TAG_BETTER_SHARE:
             best = TagHeading(source, offset, agree)
     return best if best.agree >= _TAG_AGREE_SHARE else TagHeading("", 0.0, best.agree)
-
-
-def tag_yaw(records: PhotoRecords, source: str) -> Array:
-    """A recorded heading by name, float64 (N,), NaN where unknown."""
-    return records.flight_yaw if source == "flight_yaw" else records.yaw

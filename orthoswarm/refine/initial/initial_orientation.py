@@ -12,8 +12,9 @@ from typing import Final
 import numpy as np
 
 from orthoswarm.model.angles import wrap_rad
+from orthoswarm.model.arrays import Array, Complex, Flags, Ints
 from orthoswarm.refine.features.pair_matching import Pair
-from orthoswarm.refine.features.sift_features import Features
+from orthoswarm.refine.features.sift_features import SiftFeatures
 from orthoswarm.refine.initial.heading import (
     TagHeading,
     chain_headings,
@@ -22,29 +23,18 @@ from orthoswarm.refine.initial.heading import (
     course_headings,
     solve_headings,
     tag_heading,
-    tag_yaw,
 )
-from orthoswarm.refine.initial.planar_network import Network, NetworkPriors, solve_network
-from orthoswarm.refine.initial.planar_similarity import (
-    Array,
-    Complex,
-    Flags,
-    Ints,
-    PairGraph,
-    PhotoRecords,
-    level_from_nadir,
-    rotation_of,
-)
+from orthoswarm.refine.initial.planar_network import NetworkPriors, solve_network
+from orthoswarm.refine.initial.planar_similarity import PairGraph, PhotoRecords, level_from_nadir, rotation_of
 from orthoswarm.refine.initial.relative_scale import (
     RecordedHeights,
-    first_of,
     first_scale,
     focal_by_height,
     focal_by_hint,
     recorded_heights,
     relative_scales,
 )
-from orthoswarm.refine.initial.tilt_and_lens import Matches, TiltAndLens, similarities, solve_tilt_and_lens
+from orthoswarm.refine.initial.tilt_and_lens import PairMatches, TiltAndLens, similarities, solve_tilt_and_lens
 
 _TAG_TILT_SIGMA_DEG: Final = 3.0  # sigma of a segment's recorded tilt
 _FREE_TILT_SIGMA_DEG: Final = 9.0  # sigma of the tilt about straight down where most photos record none
@@ -112,73 +102,13 @@ class InitialOrientation:
 
 
 def find_initial_orientation(
-    records: PhotoRecords, pairs: Sequence[Pair], features: Sequence[Features]
+    records: PhotoRecords, pairs: Sequence[Pair], features: Sequence[SiftFeatures]
 ) -> InitialOrientation:
-    """Find the initial orientation of all photos.
-
-    Args:
-        records: of N photos.
-        pairs: verified matches.
-        features: of each photo.
-    """
+    """Solve tilt and lens, relative scales, headings and network of N photos in rounds, from verified matches."""
     count, segments = len(records), int(records.segment.max()) + 1
-    lens_of = np.asarray(first_of(records.segment, records.lens, segments), np.int32)
-    matches = Matches.of(pairs, features)
-    solved = _solve(matches, records, lens_of)
-    network, shape = solved.network, solved.shape
-    focal = np.exp(shape.log_focal)
-    level = shape.level.copy()
-    for s in range(segments):
-        turn = level_from_nadir(complex(network.offset[s]), float(focal[lens_of[s]]))
-        level[records.segment == s] = turn @ level[records.segment == s]
-    vehicles = [
-        np.flatnonzero(solved.yaw_known & (records.vehicle == v)) for v in range(int(records.vehicle.max()) + 1)
-    ]
-    tags = tuple(tag_heading(records, rows, solved.yaw) for rows in vehicles)
-    component = components(solved.graph, count)
-    metres = network.metres[records.segment] * solved.relative
-    return InitialOrientation(
-        position=network.position,
-        yaw=_fill_headings(records, solved.yaw, solved.yaw_known, component, tags),
-        level=level,
-        metres=metres,
-        height=metres * focal[records.lens],
-        focal=focal,
-        focal_sigma=shape.log_focal_sigma,
-        k1=shape.k1,
-        tilt_sigma=np.minimum(shape.tilt_sigma, network.offset_sigma / focal[lens_of]),
-        component=component,
-        pair_ok=network.pair_ok,
-        gps_ok=network.gps_ok,
-        gps_residual=network.gps_residual,
-        lag=network.lag,
-        yaw_known=solved.yaw_known,
-        scale_known=solved.scale_known,
-        recorded_focal=focal_by_height(records, solved.heights, network.metres, lens_of),
-        tags=tags,
-        graph=solved.graph,
-        misfit=shape.misfit,
-    )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Solved:
-    """Results of the last round (see InitialOrientation); relative: float64 (N,), scale over the segment's."""
-
-    shape: TiltAndLens
-    graph: PairGraph
-    heights: RecordedHeights
-    relative: Array
-    yaw: Array
-    yaw_known: Flags
-    scale_known: Flags
-    network: Network
-
-
-def _solve(matches: Matches, records: PhotoRecords, lens_of: Ints) -> _Solved:
-    """Solve tilt and lens, relative scales, headings and network in rounds; lens_of: int32 (S,)."""
+    lens_of = records.lens[np.unique(records.segment, return_index=True)[1]]
+    matches = PairMatches.of(pairs, features)
     tilt_floor = float(np.radians(_TILT_FLOOR_DEG))
-    count = len(records)
     hint, hint_sigma = focal_by_hint(records)
     shape = shape_of(matches, records, hint, hint_sigma)
     graph = similarities(matches, records, shape)
@@ -186,7 +116,7 @@ def _solve(matches: Matches, records: PhotoRecords, lens_of: Ints) -> _Solved:
     component = components(graph, count)
     yaw = chain_headings(graph, count)
     no_offset = np.zeros(count, np.complex128)
-    for round_ in range(max(_ROUNDS, 1)):
+    for round_ in range(_ROUNDS):
         focal = np.exp(shape.log_focal)
         heights = recorded_heights(records, metres * focal[lens_of])
         by_height = focal_by_height(records, heights, metres, lens_of)
@@ -200,40 +130,53 @@ def _solve(matches: Matches, records: PhotoRecords, lens_of: Ints) -> _Solved:
             graph, records, metres[records.segment] * relative, no_offset, tilt_px[records.segment]
         )
         yaw, yaw_known = solve_headings(graph, component, yaw, course, sigma)
-        priors = _network_priors(
-            records, heights, relative, metres=metres, lens_of=lens_of, tilt_px=tilt_px, by_height=by_height
-        )
+        link, link_sigma = _links(heights, lens_of, by_height)
+        priors = NetworkPriors(
+            metres=metres, relief=relative, link=link, link_sigma=link_sigma, metres_sigma=_LENS_SCALE_SIGMA,
+            offset_sigma=tilt_px, lens=lens_of,
+        )  # fmt: skip
         network = solve_network(graph, records, yaw, priors)
         metres = network.metres
-    return _Solved(
-        shape=shape,
-        graph=graph,
-        heights=heights,
-        relative=relative,
-        yaw=yaw,
+    level = shape.level.copy()
+    for s in range(segments):
+        turn = level_from_nadir(complex(network.offset[s]), float(focal[lens_of[s]]))
+        level[records.segment == s] = turn @ level[records.segment == s]
+    vehicles = [np.flatnonzero(yaw_known & (records.vehicle == v)) for v in range(int(records.vehicle.max()) + 1)]
+    tags = tuple(tag_heading(records, rows, yaw) for rows in vehicles)
+    below = metres[records.segment] * relative
+    return InitialOrientation(
+        position=network.position,
+        yaw=_fill_headings(records, yaw, yaw_known, component, tags),
+        level=level,
+        metres=below,
+        height=below * focal[records.lens],
+        focal=focal,
+        focal_sigma=shape.log_focal_sigma,
+        k1=shape.k1,
+        tilt_sigma=np.minimum(shape.tilt_sigma, network.offset_sigma / focal[lens_of]),
+        component=component,
+        pair_ok=network.pair_ok,
+        gps_ok=network.gps_ok,
+        gps_residual=network.gps_residual,
+        lag=network.lag,
         yaw_known=yaw_known,
         scale_known=scale_known,
-        network=network,
+        recorded_focal=focal_by_height(records, heights, metres, lens_of),
+        tags=tags,
+        graph=graph,
+        misfit=shape.misfit,
     )
 
 
-def shape_of(matches: Matches, records: PhotoRecords, log_focal: Array, log_focal_sigma: Array) -> TiltAndLens:
+def shape_of(matches: PairMatches, records: PhotoRecords, log_focal: Array, log_focal_sigma: Array) -> TiltAndLens:
     """Tilt of each segment and lens, with the priors of its tags; log_focal, log_focal_sigma: float64 (L,), priors."""
     tagged = np.isfinite(records.pitch)
     segments = int(records.segment.max()) + 1
     share = np.array([tagged[records.segment == s].mean() for s in range(segments)])
-    tilt_sigma: Array = np.where(
-        share > _TAG_TILT_SHARE,
-        float(np.radians(_TAG_TILT_SIGMA_DEG)),
-        float(np.radians(_FREE_TILT_SIGMA_DEG)),
-    )
+    tilt_sigma = np.radians(np.where(share > _TAG_TILT_SHARE, _TAG_TILT_SIGMA_DEG, _FREE_TILT_SIGMA_DEG))
+    level = records.tag_level()
     return solve_tilt_and_lens(
-        matches,
-        records,
-        records.tag_level(),
-        log_focal=log_focal,
-        log_focal_sigma=log_focal_sigma,
-        tilt_sigma=tilt_sigma,
+        matches, records, level, log_focal=log_focal, log_focal_sigma=log_focal_sigma, tilt_sigma=tilt_sigma
     )
 
 
@@ -248,33 +191,15 @@ def _differs(one: Array, two: Array) -> bool:
     return bool(np.any(np.isfinite(one) & (np.abs(np.log(one / two)) > _FOCAL_CHANGE)))
 
 
-def _network_priors(
-    records: PhotoRecords,
-    heights: RecordedHeights,
-    relative: Array,
-    *,
-    metres: Array,
-    lens_of: Ints,
-    tilt_px: Array,
-    by_height: Array,
-) -> NetworkPriors:
-    """Priors of the network: segments of one lens share its scale, times their plausible recorded heights."""
-    link, link_sigma = np.ones(len(metres)), np.full(len(metres), _LINK_SIGMA)
+def _links(heights: RecordedHeights, lens_of: Ints, by_height: Array) -> tuple[Array, Array]:
+    """Scale of each segment over its lens's, by its plausible recorded height, else 1, and its relative sigma (S,)."""
+    link, link_sigma = np.ones(len(lens_of)), np.full(len(lens_of), _LINK_SIGMA)
     for k in range(len(by_height)):
         rows = lens_of == k
         if np.isfinite(by_height[k]) and np.isfinite(heights.segment[rows]).all():
             link[rows] = heights.segment[rows] / np.median(heights.segment[rows])
             link_sigma[rows] = _LINK_HEIGHT_SIGMA
-    return NetworkPriors(
-        metres=metres,
-        relief=relative,
-        link=link,
-        link_sigma=link_sigma,
-        metres_sigma=_LENS_SCALE_SIGMA,
-        offset_sigma=tilt_px,
-        lens=lens_of,
-        vehicle=records.vehicle,
-    )
+    return link, link_sigma
 
 
 def _fill_headings(
@@ -288,7 +213,7 @@ def _fill_headings(
     for v, tag in enumerate(tags):
         rows = records.vehicle == v
         source = tag.source or ("yaw" if np.isfinite(records.yaw[rows]).any() else "flight_yaw")
-        guess[rows] = tag_yaw(records, source)[rows] + tag.offset
+        guess[rows] = getattr(records, source)[rows] + tag.offset
     guess = np.where(np.isfinite(guess), guess, course)
     for part in np.unique(component[~known]):
         rows = np.flatnonzero((component == part) & np.isfinite(guess))

@@ -4,24 +4,22 @@ Candidate pairs depend on where the photos look, hence on the tilt, which is onl
 of time are matched first, then near ones, then more for photos with few pairs.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Flags, Indices, Ints
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.task_runner import Progress, Run, serial
 from orthoswarm.raster.picture_file import PictureError
 from orthoswarm.refine.features.pair_matching import Pair, consecutive, match_features, nearby
-from orthoswarm.refine.features.sift_features import SIFT_PIXELS, Features, detect
+from orthoswarm.refine.features.sift_features import SIFT_PIXELS, SiftFeatures, detect
+from orthoswarm.refine.features.working_pictures import ReadGray
 from orthoswarm.refine.initial.initial_orientation import InitialOrientation, find_initial_orientation
-from orthoswarm.refine.initial.planar_similarity import Ints, PhotoRecords
-
-Gray = NDArray[np.uint8]
-ReadGray = Callable[[Frame], Gray]
+from orthoswarm.refine.initial.planar_similarity import PhotoRecords
 
 _SIFT_FINE_PIXELS: Final = 640 * 480  # pixels of reduced pictures that matched too few others (four real flights)
 _PAIR_REACH_SHARE: Final = 0.68
@@ -42,11 +40,9 @@ class PairGraphBuilder:
     """Features and matches of N photos, extended step by step.
 
     Attributes:
-        frames: the photos. records: what they recorded. read_gray: returns a photo's grey values at any size.
         run: executes the feature and matching tasks; results do not depend on it.
         progress: called with stage, number done, total.
-        features: of each photo. tried: pair -> match (empty where it failed).
-        damaged: photo -> why it cannot be read.
+        tried: pair -> match (empty where it failed). damaged: photo -> why it cannot be read.
     """
 
     frames: Sequence[Frame]
@@ -54,13 +50,13 @@ class PairGraphBuilder:
     read_gray: ReadGray
     run: Run = serial
     progress: Progress | None = None
-    features: list[Features] = field(default_factory=list)
-    tried: dict[tuple[int, int], NDArray[np.int32]] = field(default_factory=dict)
+    features: list[SiftFeatures] = field(default_factory=list)
+    tried: dict[tuple[int, int], Ints] = field(default_factory=dict)
     damaged: dict[int, str] = field(default_factory=dict)
 
     def detect_all(self) -> None:
         """Find the features of all photos."""
-        self.features = [Features.none(f.width, f.height) for f in self.frames]
+        self.features = [SiftFeatures.none(f.width, f.height) for f in self.frames]
         self._detect(list(range(len(self.frames))), SIFT_PIXELS)
 
     def try_pairs(self, pairs: Ints) -> None:
@@ -79,7 +75,7 @@ class PairGraphBuilder:
         """The matched pairs in order."""
         return [Pair(a, b, m) for (a, b), m in sorted(self.tried.items()) if len(m)]
 
-    def degree(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def degree(self) -> tuple[Indices, Indices]:
         """Numbers of pairs and of matches of each photo, both int64 (N,)."""
         pairs, matches = np.zeros(len(self.frames), np.int64), np.zeros(len(self.frames), np.int64)
         for (a, b), m in self.tried.items():
@@ -88,7 +84,7 @@ class PairGraphBuilder:
                 matches[k] += len(m)
         return pairs, matches
 
-    def near(self, start: InitialOrientation, count: int, share: float, only: NDArray[np.bool_] | None = None) -> Ints:
+    def near(self, start: InitialOrientation, count: int, share: float, only: Flags | None = None) -> Ints:
         """Pairs that should overlap according to the initial orientation; at least one of each in `only`, bool (N,)."""
         reach = share * start.metres * np.hypot(self.records.width, self.records.rows)
         pairs = nearby(start.middle(), reach, self.records.segment, count)
@@ -98,14 +94,14 @@ class PairGraphBuilder:
         """Start values from the pairs found so far."""
         return find_initial_orientation(self.records, self.pairs(), self.features)
 
-    def redetect(self, weak: NDArray[np.bool_]) -> None:
+    def redetect(self, weak: Flags) -> None:
         """Detect features of weakly connected photos again on larger pictures, and drop their pairs."""
         self._detect(np.flatnonzero(weak).tolist(), _SIFT_FINE_PIXELS)
         self.tried = {pair: m for pair, m in self.tried.items() if not (weak[pair[0]] or weak[pair[1]])}
 
     def _detect(self, photos: list[int], pixels: int) -> None:
         task = partial(features_of, read_gray=self.read_gray, pixels=pixels)
-        found: Iterable[Features | str] = self.run(task, [self.frames[k] for k in photos])
+        found: Iterable[SiftFeatures | str] = self.run(task, [self.frames[k] for k in photos])
         for n, (k, result) in enumerate(zip(photos, found, strict=True)):
             if isinstance(result, str):
                 self.damaged[k] = result
@@ -118,7 +114,7 @@ class PairGraphBuilder:
             self.progress(stage, done, total)
 
 
-def features_of(frame: Frame, *, read_gray: ReadGray, pixels: int) -> Features | str:
+def features_of(frame: Frame, *, read_gray: ReadGray, pixels: int) -> SiftFeatures | str:
     """Features of a photo, or the reason why it cannot be used."""
     try:
         gray = read_gray(frame)
@@ -130,14 +126,14 @@ def features_of(frame: Frame, *, read_gray: ReadGray, pixels: int) -> Features |
     return detect(gray, frame.width, frame.height, pixels)
 
 
-def match_chunk(task: tuple[list[tuple[int, int]], dict[int, Features]]) -> list[NDArray[np.int32]]:
+def match_chunk(task: tuple[list[tuple[int, int]], dict[int, SiftFeatures]]) -> list[Ints]:
     """Match some pairs; the task contains the pairs and the features of their photos."""
     pairs, features = task
     return [match_features(features[a], features[b]) for a, b in pairs]
 
 
 def build_pair_graph(builder: PairGraphBuilder) -> InitialOrientation:
-    """Find features, pairs and start values of all photos; the results are in the returned builder."""
+    """Find features, pairs and start values of all photos; features and pairs are left in the builder."""
     records = builder.records
     builder.detect_all()
     builder.try_pairs(consecutive(records.vehicle, records.time_s))

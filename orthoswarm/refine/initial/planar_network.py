@@ -6,15 +6,17 @@ does a wrong position; as photos have several neighbours, the two can be disting
 """
 
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import splu
 
+from orthoswarm.compute.robust_kernel import robust_widening
+from orthoswarm.model.arrays import Array, Complex, Flags, Indices, Ints
 from orthoswarm.refine.bundle.priors import LAG_SIGMA_S
-from orthoswarm.refine.initial.planar_similarity import Array, Complex, Flags, Ints, PairGraph, PhotoRecords
+from orthoswarm.refine.initial.planar_similarity import PairGraph, PhotoRecords
 
 _NETWORK_SCHEDULE: Final = (400.0, 400.0, 36.0, 9.0, 9.0)
 """Robust schedule of pairs and recorded positions (chosen on four real flights)."""
@@ -37,7 +39,7 @@ class NetworkPriors:
         link: float64 (S,), metres per pixel of a segment over its lens's; link_sigma: float64 (S,), relative sigma.
         metres_sigma: relative sigma of each lens's metres per pixel.
         offset_sigma: float64 (S,), pixels, of the nadir's offset from 0.
-        lens: int32 (S,), lens of each segment. vehicle: int32 (N,), vehicle of each photo.
+        lens: int32 (S,), lens of each segment.
     """
 
     metres: Array
@@ -47,7 +49,6 @@ class NetworkPriors:
     metres_sigma: float
     offset_sigma: Array
     lens: Ints
-    vehicle: Ints
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,79 +71,66 @@ class Network:
     gps_residual: Complex
 
 
-@dataclass(frozen=True, slots=True)
-class _Columns:
-    """Columns of the unknowns: east (N), north (N), m (S), m o real (S), imaginary (S), m of lenses (L), lag (V)."""
+class _NetworkColumns(NamedTuple):
+    """First columns of the unknowns east (N), north (N), m (S), m o real (S), imaginary (S), m of lenses (L), lag (V).
+
+    And their numbers: N, S, L, V; size: all columns.
+    """
 
     photos: int
     segments: int
     lenses: int
     vehicles: int
+    metres: int
+    offset: int
+    lens: int
+    lag: int
+    size: int
 
-    @property
-    def metres(self) -> int:
-        return 2 * self.photos
-
-    @property
-    def offset(self) -> int:
-        return self.metres + self.segments
-
-    @property
-    def lens(self) -> int:
-        return self.offset + 2 * self.segments
-
-    @property
-    def lag(self) -> int:
-        return self.lens + self.lenses
-
-    @property
-    def size(self) -> int:
-        return self.lag + self.vehicles
+    @classmethod
+    def of(cls, n: int, s: int, lenses: int, v: int) -> "_NetworkColumns":
+        """The columns for so many photos, segments, lenses and vehicles."""
+        first = np.cumsum([2 * n, s, 2 * s, lenses, v]).tolist()
+        return cls(n, s, lenses, v, *first)
 
 
 @dataclass(slots=True)
-class _Rows:
-    """Rows of a sparse system in units of one sigma, collected by blocks.
-
-    The rows of a block may share a robust weight.
-    """
+class SparseRows:
+    """Linear equations of `size` unknowns in units of one sigma, real or complex, collected by blocks."""
 
     size: int
     count: int = 0
-    parts: list[tuple[NDArray[np.int64], NDArray[np.int64], Array]] = field(default_factory=list)
-    rhs: list[Array] = field(default_factory=list)
+    parts: list[tuple[Indices, NDArray[Any], NDArray[Any]]] = field(default_factory=list)
+    sides: list[NDArray[Any]] = field(default_factory=list)
 
-    def block(self, rhs: Array, *terms: tuple[ArrayLike, ArrayLike]) -> None:
-        """Add rows: each term is (columns, values), with one column and value per row."""
-        row = self.count + np.arange(len(rhs))
+    def add(self, right: NDArray[Any], *terms: tuple[ArrayLike, ArrayLike]) -> None:
+        """Add a row for each element of `right`: each term is (columns, values), with one of both for each row."""
+        row = self.count + np.arange(len(right))
         for column, value in terms:
-            c, v = np.broadcast_arrays(np.asarray(column, np.int64), np.asarray(value, float))
-            self.parts.append((row, np.broadcast_to(c, row.shape), np.broadcast_to(v, row.shape)))
-        self.rhs.append(rhs)
-        self.count += len(rhs)
+            self.parts.append((row, np.broadcast_to(column, row.shape), np.broadcast_to(value, row.shape)))
+        self.sides.append(right)
+        self.count += len(right)
 
-    def finish(self) -> tuple[Any, Array]:
-        """The matrix and the right-hand side."""
+    def matrix(self) -> coo_matrix:
+        """The matrix (rows, size)."""
         row, column, value = (np.concatenate([p[k] for p in self.parts]) for k in range(3))
-        matrix = coo_matrix((value, (row, column)), shape=(self.count, self.size)).tocsr()
-        return matrix, np.concatenate(self.rhs)
+        return coo_matrix((value, (row, column)), shape=(self.count, self.size))
+
+    def right(self) -> NDArray[Any]:
+        """The right-hand side (rows,)."""
+        return np.concatenate(self.sides)
 
 
 def solve_network(graph: PairGraph, records: PhotoRecords, yaw: Array, beliefs: NetworkPriors) -> Network:
-    """Solve positions, scale, nadir offset and lag.
-
-    Args:
-        graph: E pairs of level pictures.
-        records: of N photos in S segments of V vehicles.
-        yaw: float64 (N,), grid headings.
-        beliefs: priors of the common unknowns.
-    """
-    at = _Columns(len(records), len(beliefs.metres), int(beliefs.lens.max()) + 1, int(beliefs.vehicle.max()) + 1)
-    rows = _Rows(at.size)
+    """Solve positions, scale, nadir offset and lag of N photos; yaw: float64 (N,), their headings."""
+    at = _NetworkColumns.of(
+        len(records), len(beliefs.metres), int(beliefs.lens.max()) + 1, int(records.vehicle.max()) + 1
+    )
+    rows = SparseRows(at.size)
     _pair_rows(rows, at, graph, records=records, unit=np.exp(-1j * yaw), b=beliefs)
-    velocity = _gps_rows(rows, at, records, beliefs.vehicle)
+    velocity = _gps_rows(rows, at, records)
     _prior_rows(rows, at, beliefs)
-    matrix, rhs = rows.finish()
+    matrix, rhs = rows.matrix().tocsr(), rows.right()
     x = np.zeros(at.size)
     x[: 2 * at.photos] = np.r_[records.position.real, records.position.imag]
     x[at.metres : at.offset] = beliefs.metres
@@ -150,8 +138,8 @@ def solve_network(graph: PairGraph, records: PhotoRecords, yaw: Array, beliefs: 
     for c in _NETWORK_SCHEDULE:
         residual = (rhs - matrix @ x)[: 2 * (pairs + photos)]
         weight = np.ones(len(rhs))
-        weight[: 2 * pairs] = np.tile(_robust(residual[: 2 * pairs], c), 2)
-        weight[2 * pairs : 2 * (pairs + photos)] = np.tile(_robust(residual[2 * pairs :], c), 2)
+        weight[: 2 * pairs] = _robust(residual[: 2 * pairs], c)
+        weight[2 * pairs : 2 * (pairs + photos)] = _robust(residual[2 * pairs :], c)
         weighted = diags(weight) @ matrix
         factor = splu((matrix.T @ weighted).tocsc())
         x = factor.solve(weighted.T @ rhs)
@@ -167,7 +155,7 @@ def solve_network(graph: PairGraph, records: PhotoRecords, yaw: Array, beliefs: 
         lag=lag,
         pair_ok=_norm(residual[: 2 * pairs]) < NETWORK_GATE_SIGMAS,
         gps_ok=_norm(residual[2 * pairs : 2 * (pairs + photos)]) < NETWORK_GATE_SIGMAS,
-        gps_residual=records.position + lag[beliefs.vehicle] * velocity - (x[:photos] + 1j * x[photos : 2 * photos]),
+        gps_residual=records.position + lag[records.vehicle] * velocity - (x[:photos] + 1j * x[photos : 2 * photos]),
     )
 
 
@@ -177,11 +165,11 @@ def _norm(residual: Array) -> Array:
 
 
 def _robust(residual: Array, c: float) -> Array:
-    """Geman-McClure weights 1 / (1 + e2 / c)^2 of stacked residuals."""
-    return np.asarray((1.0 + _norm(residual) ** 2 / c) ** -2)
+    """Weights of both rows of stacked residual vectors."""
+    return np.tile(robust_widening(_norm(residual) ** 2, c) ** -2, 2)
 
 
-def _sigmas(factor: Any, at: _Columns) -> Array:
+def _sigmas(factor: Any, at: _NetworkColumns) -> Array:
     """One sigma of m o, float64 (2, S), from the factor of the normal equations."""
     picks = np.zeros((at.size, 2 * at.segments))
     picks[at.offset + np.arange(2 * at.segments), np.arange(2 * at.segments)] = 1.0
@@ -190,7 +178,7 @@ def _sigmas(factor: Any, at: _Columns) -> Array:
 
 
 def _pair_rows(
-    rows: _Rows, at: _Columns, graph: PairGraph, *, records: PhotoRecords, unit: Complex, b: NetworkPriors
+    rows: SparseRows, at: _NetworkColumns, graph: PairGraph, *, records: PhotoRecords, unit: Complex, b: NetworkPriors
 ) -> None:
     """East, then north rows of all pairs."""
     i, j = graph.first, graph.second
@@ -200,7 +188,7 @@ def _pair_rows(
     sigma = np.asarray(_PAIR_SIGMA_M + _PAIR_SIGMA_SHARE * reach)
     for part, axis in ((0, 1.0 + 0j), (1, -1j)):  # the real part of axis * value: east, then north
         east = part * at.photos
-        rows.block(
+        rows.add(
             np.zeros(len(graph)),
             (j + east, 1.0 / sigma),
             (i + east, -1.0 / sigma),
@@ -213,7 +201,7 @@ def _pair_rows(
         )
 
 
-def _gps_rows(rows: _Rows, at: _Columns, records: PhotoRecords, vehicle: Ints) -> Complex:
+def _gps_rows(rows: SparseRows, at: _NetworkColumns, records: PhotoRecords) -> Complex:
     """Rows of recorded positions along and across the course: P - lag v = recorded; returns v (N,)."""
     velocity = records.velocity()
     speed = np.abs(velocity)
@@ -221,21 +209,21 @@ def _gps_rows(rows: _Rows, at: _Columns, records: PhotoRecords, vehicle: Ints) -
     across = records.gps_sigma()
     photo = np.arange(at.photos)
     for axis, sigma in ((ahead, np.hypot(across, LAG_SPREAD_S * speed)), (1j * ahead, across)):
-        rows.block(
+        rows.add(
             (records.position * np.conj(axis)).real / sigma,
             (photo, axis.real / sigma),
             (photo + at.photos, axis.imag / sigma),
-            (at.lag + vehicle, -(velocity * np.conj(axis)).real / sigma),
+            (at.lag + records.vehicle, -(velocity * np.conj(axis)).real / sigma),
         )
     return velocity
 
 
-def _prior_rows(rows: _Rows, at: _Columns, b: NetworkPriors) -> None:
+def _prior_rows(rows: SparseRows, at: _NetworkColumns, b: NetworkPriors) -> None:
     segment, lens, vehicle = np.arange(at.segments), np.arange(at.lenses), np.arange(at.vehicles)
     link = b.link_sigma * b.metres
-    rows.block(np.zeros(at.segments), (at.metres + segment, 1.0 / link), (at.lens + b.lens, -b.link / link))
+    rows.add(np.zeros(at.segments), (at.metres + segment, 1.0 / link), (at.lens + b.lens, -b.link / link))
     for part in (0, at.segments):
-        rows.block(np.zeros(at.segments), (at.offset + part + segment, 1.0 / (b.offset_sigma * b.metres)))
+        rows.add(np.zeros(at.segments), (at.offset + part + segment, 1.0 / (b.offset_sigma * b.metres)))
     expected = np.array([np.median((b.metres / b.link)[b.lens == k]) for k in range(at.lenses)])
-    rows.block(np.full(at.lenses, 1.0 / b.metres_sigma), (at.lens + lens, 1.0 / (b.metres_sigma * expected)))
-    rows.block(np.zeros(at.vehicles), (at.lag + vehicle, 1.0 / LAG_SIGMA_S))
+    rows.add(np.full(at.lenses, 1.0 / b.metres_sigma), (at.lens + lens, 1.0 / (b.metres_sigma * expected)))
+    rows.add(np.zeros(at.vehicles), (at.lag + vehicle, 1.0 / LAG_SIGMA_S))

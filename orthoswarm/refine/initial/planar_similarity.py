@@ -8,17 +8,12 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.config import active
+from orthoswarm.model.arrays import Array, Complex, Flags, Indices, Ints
 from orthoswarm.model.camera import NADIR_PITCH_RAD, rotation_from_angles
-from orthoswarm.refine.features.sift_features import Features
+from orthoswarm.refine.features.sift_features import SiftFeatures
 from orthoswarm.trajectory.legs import PAUSE_S
-
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
-Ints = NDArray[np.int32]
-Flags = NDArray[np.bool_]
 
 _TURN_SIGMA_DEG: Final = 1.0  # sigma of the turn between two photos by relief and tilt
 _TURN_MISFIT_SIGMAS: Final = 3.0  # ... and so many times the misfit over the spread, by the root of matches
@@ -31,19 +26,15 @@ _VELOCITY_TURN_SHARE: Final = 0.5  # a larger difference of velocities before an
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PhotoRecords:
-    """Records of N photos of L lenses in S segments; NaN where unknown.
-
-    Photos of a vehicle are in order of time.
+    """Records of N photos of L lenses in S segments, of a vehicle in order of time; NaN where unknown.
 
     Attributes:
-        position: complex (N,), east + i north in metres about some origin.
-        position_sigma: float64 (N,), stated one sigma, NaN where it is not stated.
+        position: complex (N,), east + i north in metres about some origin. position_sigma: float64 (N,), as stated.
         time_s: float64 (N,). height_m: float64 (N,) above takeoff or ground. altitude_m: float64 (N,) absolute.
         yaw: float64 (N,) grid azimuth of the picture's up direction; flight_yaw: of the airframe, radians.
         pitch: float64 (N,), -pi/2 is nadir; roll: float64 (N,).
-        lens: int32 (N,). segment: int32 (N,), see `segments`. vehicle: int32 (N,), a vehicle with one of its lenses.
-        width: float64 (N,), columns of the picture; rows: float64 (N,).
-        fov_hint: float64 (L,), from tags, radians.
+        lens: int32 (N,). segment: int32 (N,). vehicle: int32 (N,), a vehicle with one of its lenses.
+        width, rows: float64 (N,), of the picture. fov_hint: float64 (L,), from tags, radians.
     """
 
     position: Complex
@@ -72,12 +63,11 @@ class PhotoRecords:
 
     def velocity(self) -> Complex:
         """Ground velocity, complex (N,) m/s, from the neighbours in the segment; 0 at turns and where unknown."""
-        pause_s = PAUSE_S
         v = np.zeros(len(self), np.complex128)
         for s in np.unique(self.segment):
             rows = np.flatnonzero(self.segment == s)
             dt, dp = np.diff(self.time_s[rows]), np.diff(self.position[rows])
-            good = (dt > _VELOCITY_LEAST_S) & (dt < pause_s) & (np.abs(dp) < _VELOCITY_LIMIT_M_S * dt)
+            good = (dt > _VELOCITY_LEAST_S) & (dt < PAUSE_S) & (np.abs(dp) < _VELOCITY_LIMIT_M_S * dt)
             leap = np.where(good, dp / np.where(good, dt, 1.0), np.nan)
             sides = np.stack([np.r_[np.nan, leap], np.r_[leap, np.nan]])
             known = np.isfinite(sides)
@@ -88,10 +78,7 @@ class PhotoRecords:
         return v
 
     def tag_level(self) -> Array:
-        """Rotations camera to level camera by the tilt tags, float64 (N, 3, 3); the identity where there are none.
-
-        Tilts beyond `_TAG_TILT_LIMIT_DEG` are ignored: such a picture could not be matched anyway.
-        """
+        """Rotations camera to level camera by the tilt tags, float64 (N, 3, 3); the identity where none are usable."""
         pitch = np.where(np.isfinite(self.pitch), self.pitch, NADIR_PITCH_RAD)
         roll = np.where(np.isfinite(self.roll), self.roll, 0.0)
         level = _from_level(0.0).T @ rotation_from_angles(0.0, pitch, roll)
@@ -116,23 +103,23 @@ class PairGraph:
     factor: Complex
     centre_first: Complex
     centre_second: Complex
-    count: NDArray[np.int64]
+    count: Indices
     spread: Array
     residual: Array
 
     def __len__(self) -> int:
         return len(self.first)
 
+    def take(self, keep: Flags) -> "PairGraph":
+        """Some of the pairs."""
+        return PairGraph(**{name: getattr(self, name)[keep] for name in self.__slots__})
+
     @property
     def turn_sigma(self) -> Array:
         """One sigma of the turn, radians (E,): larger for few, close or ill-fitting matches."""
         arm = np.maximum(self.spread * np.abs(self.factor), 1.0)
-        return np.asarray(
-            np.hypot(
-                np.radians(_TURN_SIGMA_DEG),
-                _TURN_MISFIT_SIGMAS * self.residual / (arm * np.sqrt(self.count)),
-            )
-        )
+        misfit = _TURN_MISFIT_SIGMAS * self.residual / (arm * np.sqrt(self.count))
+        return np.asarray(np.hypot(np.radians(_TURN_SIGMA_DEG), misfit))
 
     @property
     def turn(self) -> Complex:
@@ -150,7 +137,7 @@ def rotation_of(yaw: Array, level: Array) -> Array:
     return np.asarray(_from_level(yaw) @ level)
 
 
-def centred(features: Features) -> Complex:
+def centred(features: SiftFeatures) -> Complex:
     """Pixels of features about the picture's centre, y up, complex (n,)."""
     uv = features.uv.astype(np.float64)
     return np.asarray((uv[:, 0] - 0.5 * (features.width - 1)) - 1j * (uv[:, 1] - 0.5 * (features.height - 1)))

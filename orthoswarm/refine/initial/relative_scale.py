@@ -4,13 +4,14 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import spsolve
 
+from orthoswarm.compute.robust_kernel import robust_widening
 from orthoswarm.config import active
+from orthoswarm.model.arrays import Array, Flags, Ints
 from orthoswarm.model.camera import fov_rad
-from orthoswarm.refine.initial.planar_similarity import Array, Flags, Ints, PairGraph, PhotoRecords
+from orthoswarm.refine.initial.planar_similarity import PairGraph, PhotoRecords
 
 _HINT_FOV_DEG: Final = (30.0, 120.0)  # fields of view of lenses that exist
 _HINT_SIGMA: Final = 0.06  # relative sigma of a focal length by tags
@@ -48,41 +49,33 @@ class RecordedHeights:
 def recorded_heights(records: PhotoRecords, above: Array) -> RecordedHeights:
     """Heights relative to the segment's median, from heights or, if there are none, from absolute altitudes.
 
-    Args:
-        records: of N photos.
-        above: float64 (S,), height of each segment above the ground as known so far (altitudes give differences only).
+    above: float64 (S,), height of each segment above the ground as known so far (altitudes give differences only).
     """
-    share, least, most = _HEIGHT_KNOWN_SHARE, 1.0 / _HEIGHT_RATIO, _HEIGHT_RATIO
     relative = np.full(len(records), np.nan)
     level = np.full(len(above), np.nan)
     for s in range(len(above)):
         rows = records.segment == s
         h, a = records.height_m[rows], records.altitude_m[rows]
-        if np.isfinite(h).sum() > share * rows.sum() and np.nanmedian(h) > _HEIGHT_LEAST_M:
+        if np.isfinite(h).sum() > _HEIGHT_KNOWN_SHARE * rows.sum() and np.nanmedian(h) > _HEIGHT_LEAST_M:
             level[s] = float(np.nanmedian(h))
             ratio = h / level[s]
-        elif np.isfinite(a).sum() > share * rows.sum():
+        elif np.isfinite(a).sum() > _HEIGHT_KNOWN_SHARE * rows.sum():
             ratio = 1.0 + (a - np.nanmedian(a)) / above[s]
         else:
             continue
-        relative[rows] = np.where((ratio > least) & (ratio < most), ratio, np.nan)
+        relative[rows] = np.where((ratio > 1.0 / _HEIGHT_RATIO) & (ratio < _HEIGHT_RATIO), ratio, np.nan)
     known = np.isfinite(relative)
     return RecordedHeights(np.where(known, relative, 1.0), known, level)
 
 
 def first_scale(graph: PairGraph, records: PhotoRecords, lens_of: Ints, focal: Array) -> tuple[Array, Flags]:
-    """Metres per pixel of each segment (S,): recorded movement over the pictures' shift.
-
-    And which lenses (L,) have one.
+    """Metres per pixel of each segment (S,): recorded movement over the pictures' shift; which lenses (L,) have one.
 
     Only pairs of nearly equal heading are used if there are any, as their shift does not depend on the tilt. A lens
     without a pair uses its recorded height and focal length.
 
     Args:
-        graph: pairs of level pictures.
-        records: of all photos.
-        lens_of: int32 (S,), lens of each segment.
-        focal: float64 (L,), pixels, as known so far.
+        lens_of: int32 (S,), lens of each segment. focal: float64 (L,), pixels, as known so far.
     """
     default_m = active().records.default_height_m
     i, j = graph.first, graph.second
@@ -111,10 +104,7 @@ def first_scale(graph: PairGraph, records: PhotoRecords, lens_of: Ints, focal: A
 
 
 def relative_scales(graph: PairGraph, records: PhotoRecords, heights: RecordedHeights, count: int) -> Array:
-    """Metres per pixel of each photo over its segment's, float64 (N,), from the scale between level pictures.
-
-    One robust adjustment of the scales within each segment, with the recorded heights as priors.
-    """
+    """Metres per pixel of each photo over its segment's (N,), by one robust adjustment; priors: recorded heights."""
     i, j = graph.first, graph.second
     inside = np.flatnonzero(records.segment[i] == records.segment[j])
     i, j = i[inside], j[inside]
@@ -128,9 +118,8 @@ def relative_scales(graph: PairGraph, records: PhotoRecords, heights: RecordedHe
     for c in _SCALE_SCHEDULE:
         e = (zoom - (x[i] - x[j])) / sigma
         d = (prior - x) / prior_sigma
-        # both sides of each row are multiplied by the square root of its Geman-McClure weight
-        w = 1.0 / ((1.0 + e * e / c) * sigma)
-        v = 1.0 / ((1.0 + d * d / c) * prior_sigma)
+        w = 1.0 / (robust_widening(e * e, c) * sigma)
+        v = 1.0 / (robust_widening(d * d, c) * prior_sigma)
         matrix = coo_matrix((np.r_[w, -w], (np.r_[k, k], np.r_[i, j])), shape=(len(inside), count)).tocsr()
         normal = (matrix.T @ matrix + diags(v * v)).tocsc()
         x = np.asarray(spsolve(normal, matrix.T @ (w * zoom) + v * v * prior)).reshape(-1)
@@ -169,8 +158,3 @@ def weighted_median(value: Array, weight: Array) -> float:
     order = np.argsort(value, kind="stable")
     total = np.cumsum(weight[order])
     return float(value[order][np.searchsorted(total, 0.5 * total[-1])])
-
-
-def first_of(label: Ints, value: NDArray[np.generic], count: int) -> NDArray[np.generic]:
-    """The value of the first member of each label, (count,)."""
-    return np.array([value[label == k][0] for k in range(count)])

@@ -14,17 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel, kernel
+from orthoswarm.compute.robust_kernel import robust_weight
+from orthoswarm.model.arrays import Array, Complex, Indices, Ints
 from orthoswarm.refine.features.pair_matching import Pair
-from orthoswarm.refine.features.sift_features import Features
-from orthoswarm.refine.initial.planar_similarity import (
-    Array,
-    Complex,
-    Ints,
-    PairGraph,
-    PhotoRecords,
-    centred,
-    level_from_nadir,
-)
+from orthoswarm.refine.features.sift_features import SiftFeatures
+from orthoswarm.refine.initial.planar_similarity import PairGraph, PhotoRecords, centred, level_from_nadir
 
 _SHAPE_ITERATIONS: Final = 12  # most Gauss-Newton iterations (they end earlier)
 _SHAPE_SETTLED: Final = 1e-3  # a largest step below this, radians or relative, ends them
@@ -39,7 +33,7 @@ _SHAPE_ROBUST_SCALE: Final = 2.0  # a match's weight falls to a quarter at so ma
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Matches:
+class PairMatches:
     """Matches of all pairs in one array: of pair e, rows start[e] to start[e + 1].
 
     Attributes:
@@ -49,17 +43,21 @@ class Matches:
 
     first: Ints
     second: Ints
-    start: NDArray[np.int64]
-    count: NDArray[np.int64]
+    start: Indices
+    count: Indices
     p: Complex
     q: Complex
 
+    @property
+    def arrays(self) -> tuple[Ints, Ints, Indices, Complex, Complex]:
+        """What compiled code takes: first, second, start, p, q."""
+        return self.first, self.second, self.start, self.p, self.q
+
     @classmethod
-    def of(cls, pairs: Sequence[Pair], features: Sequence[Features]) -> "Matches":
+    def of(cls, pairs: Sequence[Pair], features: Sequence[SiftFeatures]) -> "PairMatches":
         """Collect the matches, evenly thinned where a pair has many."""
-        most = _SHAPE_MOST_MATCHES
         z = [centred(f) for f in features]
-        picked = [p.match[spaced(len(p.match), most)] for p in pairs]
+        picked = [p.match[spaced(len(p.match), _SHAPE_MOST_MATCHES)] for p in pairs]
         start = np.concatenate([[0], np.cumsum([len(m) for m in picked], dtype=np.int64)])
         none = [np.zeros(0, np.complex128)]
         return cls(
@@ -98,7 +96,7 @@ def spaced(count: int, most: int) -> NDArray[np.intp]:
 
 
 def solve_tilt_and_lens(
-    matches: Matches,
+    matches: PairMatches,
     records: PhotoRecords,
     level: Array,
     *,
@@ -109,12 +107,9 @@ def solve_tilt_and_lens(
     """Find the tilt, focal length and first radial term for which the matches of every pair fit a similarity best.
 
     Args:
-        matches: of all pairs.
-        records: of N photos in S segments, L lenses.
-        level: float64 (N, 3, 3), camera to level camera by the tags (identity if there are none).
-        log_focal: float64 (L,), prior.
-        log_focal_sigma: float64 (L,), its one sigma.
-        tilt_sigma: float64 (S,), one sigma of the tilt about that of `level`, radians.
+        level: float64 (N, 3, 3), camera to level camera by the tags (identity if there are none). tilt_sigma: float64
+            (S,), one sigma of the tilt about it, radians.
+        log_focal: float64 (L,), prior. log_focal_sigma: float64 (L,), its one sigma.
     """
     segments, lenses = int(records.segment.max()) + 1, len(log_focal)
     size = 2 * segments + 2 * lenses
@@ -126,25 +121,13 @@ def solve_tilt_and_lens(
     level = level.copy()
     lens = np.stack([log_focal, np.zeros(lenses), corner_radius(records) ** 2], axis=1)
     normal, misfit = np.zeros((size, size)), np.zeros(len(matches.first))
+    floor = _SHAPE_FLOOR_SHARE * records.width
     for _ in range(_SHAPE_ITERATIONS):
         normal, gradient = np.zeros((size, size)), np.zeros(size)
         _accumulate(
-            first=matches.first,
-            second=matches.second,
-            start=matches.start,
-            p=matches.p,
-            q=matches.q,
-            level=level,
-            lens=lens,
-            lens_id=records.lens,
-            segment=records.segment,
-            floor=_SHAPE_FLOOR_SHARE * records.width,
-            rounds=_SHAPE_ROUNDS,
-            robust=_SHAPE_ROBUST_SCALE,
-            normal=normal,
-            gradient=gradient,
-            misfit=misfit,
-        )
+            matches.arrays, level, lens, records.lens, records.segment, floor, _SHAPE_ROUNDS, _SHAPE_ROBUST_SCALE,
+            normal, gradient, misfit,
+        )  # fmt: skip
         if np.isnan(first_misfit) and len(misfit):
             first_misfit = float(np.median(misfit))
         normal = _SHAPE_INDEPENDENT_SHARE * normal + np.diag(sigma**-2)
@@ -170,26 +153,14 @@ def solve_tilt_and_lens(
     )
 
 
-def similarities(matches: Matches, records: PhotoRecords, shape: TiltAndLens) -> PairGraph:
+def similarities(matches: PairMatches, records: PhotoRecords, shape: TiltAndLens) -> PairGraph:
     """The similarity of every pair between its level, undistorted pictures."""
     pairs = len(matches.first)
     table = np.zeros((pairs, 5), np.complex128)
     radius = corner_radius(records)
     lens = np.stack([shape.log_focal, shape.k1 * radius**2 * np.exp(-2.0 * shape.log_focal), radius**2], axis=1)
-    _similarities(
-        first=matches.first,
-        second=matches.second,
-        start=matches.start,
-        p=matches.p,
-        q=matches.q,
-        level=shape.level,
-        lens=lens,
-        lens_id=records.lens,
-        floor=_SHAPE_FLOOR_SHARE * records.width,
-        rounds=_SHAPE_ROUNDS,
-        robust=_SHAPE_ROBUST_SCALE,
-        table=table,
-    )
+    floor = _SHAPE_FLOOR_SHARE * records.width
+    _similarities(matches.arrays, shape.level, lens, records.lens, floor, _SHAPE_ROUNDS, _SHAPE_ROBUST_SCALE, table)
     return PairGraph(
         first=matches.first,
         second=matches.second,
@@ -239,12 +210,7 @@ def _flatten(z, level, focal, bend, radius2, right, up):  # type: ignore[no-unty
 
 @kernel
 def _fit(p, q, n, floor, rounds, robust, w):  # type: ignore[no-untyped-def]
-    """Fit a robust similarity q = a p + b; returns a, mean p, mean q and the scale of the misfit.
-
-    W receives the weights.
-
-    floor: least scale. rounds: of reweighting. robust: scale of the kernel in scales of the misfit.
-    """
+    """Robust similarity q = a p + b: a, mean p, mean q, the misfit's scale (at least `floor`); w gets the weights."""
     misfit = np.empty(n)
     for k in range(n):
         w[k] = 1.0
@@ -269,7 +235,7 @@ def _fit(p, q, n, floor, rounds, robust, w):  # type: ignore[no-untyped-def]
         scale = max(np.median(misfit), floor)
         for k in range(n):
             e = misfit[k] / (robust * scale)
-            w[k] = 1.0 / ((1.0 + e * e) * (1.0 + e * e))
+            w[k] = robust_weight(e * e, 1.0)
     return a, cp, cq, scale
 
 
@@ -302,24 +268,22 @@ def _project_out(g, p, cp, w, n):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _accumulate(  # type: ignore[no-untyped-def]
-    first,
-    second,
-    start,
-    p,
-    q,
-    level,
-    lens,
-    lens_id,
-    segment,
-    floor,
-    rounds,
-    robust,
-    normal,
-    gradient,
-    misfit,
-):
+def _fit_pair(matches, e, level, lens, lens_id, floor, rounds, robust, zp, zq, w):  # type: ignore[no-untyped-def]
+    """Flatten the matches of pair e into zp, zq and fit their similarity, see `_fit`."""
+    first, second, start, p, q = matches
+    i, j, n = first[e], second[e], start[e + 1] - start[e]
+    fi, ki, ri = np.exp(lens[lens_id[i], 0]), lens[lens_id[i], 1], lens[lens_id[i], 2]
+    fj, kj, rj = np.exp(lens[lens_id[j], 0]), lens[lens_id[j], 1], lens[lens_id[j], 2]
+    for k in range(n):
+        zp[k] = _flatten(p[start[e] + k], level[i], fi, ki, ri, 0.0, 0.0)
+        zq[k] = _flatten(q[start[e] + k], level[j], fj, kj, rj, 0.0, 0.0)
+    return _fit(zp, zq, n, floor[j], rounds, robust, w)
+
+
+@kernel
+def _accumulate(matches, level, lens, lens_id, segment, floor, rounds, robust, normal, gradient, misfit):  # type: ignore[no-untyped-def]
     """Normal equations of tilt (2 S) and lens (2 L) after each pair's similarity is projected out."""
+    first, second, start, p, q = matches
     segments, most = segment.max() + 1, 0
     for e in range(len(first)):
         most = max(most, start[e + 1] - start[e])
@@ -331,10 +295,7 @@ def _accumulate(  # type: ignore[no-untyped-def]
         pe, qe = p[start[e] : start[e + 1]], q[start[e] : start[e + 1]]
         fi, ki, ri = np.exp(lens[lens_id[i], 0]), lens[lens_id[i], 1], lens[lens_id[i], 2]
         fj, kj, rj = np.exp(lens[lens_id[j], 0]), lens[lens_id[j], 1], lens[lens_id[j], 2]
-        for k in range(n):
-            zp[k] = _flatten(pe[k], level[i], fi, ki, ri, 0.0, 0.0)
-            zq[k] = _flatten(qe[k], level[j], fj, kj, rj, 0.0, 0.0)
-        a, cp, cq, scale = _fit(zp, zq, n, floor[j], rounds, robust, w)
+        a, cp, cq, scale = _fit_pair(matches, e, level, lens, lens_id, floor, rounds, robust, zp, zq, w)
         misfit[e] = scale
         for k in range(n):
             r[k] = zq[k] - cq - a * (zp[k] - cp)
@@ -362,17 +323,12 @@ def _accumulate(  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _similarities(first, second, start, p, q, level, lens, lens_id, floor, rounds, robust, table):  # type: ignore[no-untyped-def]
-    for e in range(len(first)):
-        i, j = first[e], second[e]
+def _similarities(matches, level, lens, lens_id, floor, rounds, robust, table):  # type: ignore[no-untyped-def]
+    start = matches[2]
+    for e in range(len(table)):
         n = start[e + 1] - start[e]
-        fi, ki, ri = np.exp(lens[lens_id[i], 0]), lens[lens_id[i], 1], lens[lens_id[i], 2]
-        fj, kj, rj = np.exp(lens[lens_id[j], 0]), lens[lens_id[j], 1], lens[lens_id[j], 2]
         zp, zq, w = np.empty(n, np.complex128), np.empty(n, np.complex128), np.empty(n)
-        for k in range(n):
-            zp[k] = _flatten(p[start[e] + k], level[i], fi, ki, ri, 0.0, 0.0)
-            zq[k] = _flatten(q[start[e] + k], level[j], fj, kj, rj, 0.0, 0.0)
-        a, cp, cq, scale = _fit(zp, zq, n, floor[j], rounds, robust, w)
+        a, cp, cq, scale = _fit_pair(matches, e, level, lens, lens_id, floor, rounds, robust, zp, zq, w)
         spread = 0.0
         for k in range(n):
             spread += abs(zp[k] - cp) ** 2

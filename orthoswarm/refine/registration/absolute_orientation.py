@@ -1,26 +1,28 @@
-"""Absolute orientation of one vehicle: tie points on the map, links between legs, and the adjustment with both."""
+"""Absolute orientation of one vehicle: tie points on the map, links between legs, and the adjustment with both.
 
+Guesses of the coarse registration are verified by tie points; the first that is confirmed counts.
+"""
+
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.compute.robust_kernel import robust_weights
 from orthoswarm.config import active
+from orthoswarm.model.arrays import Array, Flags, Indices, Ints
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.placement import MapWindow
 from orthoswarm.model.robust import mad_sigma
 from orthoswarm.refine.bundle.adjustment import TRACK_ROBUST_C, Adjustment, MapTies
-from orthoswarm.refine.bundle.block_arrays import Tracks
-from orthoswarm.refine.bundle.observation_selection import one_per_cell
-from orthoswarm.refine.flight.relative_block import Flight
-from orthoswarm.refine.registration.coarse_registration import shift_cameras
-from orthoswarm.refine.registration.map_windows import LoadedMap
-from orthoswarm.refine.registration.tie_points import LINK_VIEW_WEIGHT, LINK_VIEWS, MapMatches, link_legs, match_points
+from orthoswarm.refine.flight.relative_block import BestViews, FlightBlock, one_per_cell
+from orthoswarm.refine.registration.coarse_registration import CoarseFit, shift_cameras
+from orthoswarm.refine.registration.map_evidence import false_matches_log10
+from orthoswarm.refine.registration.tie_points import LoadedMap, MapMatches, link_legs, match_points
 from orthoswarm.refine.surface.ground_densification import refit_ground
 from orthoswarm.refine.surface.vehicle_ground import GroundModel
-
-Array = NDArray[np.float64]
 
 _PICTURE_GSD_SHARE: Final = 1.07  # ground pixel in which pictures are compared with each other, in pixels at nadir
 _MAP_GSD_M: Final = (0.25, 2.0)  # limits of the ground pixel for the map where pictures are finer than the next field
@@ -70,51 +72,47 @@ _ROOF_CELL_M: Final = 30.0  # one roof a leg in each cell of this size (cost)
 _ROOF_HALF_M: Final = 7.5  # half a patch: about a roof
 _ROOF_REACH_M: Final = 11.0  # how far it is searched: maps lean by up to 0.3 m a metre
 _ROOF_RATIO: Final = 0.85  # largest ratio of the second peak to the first; the vote sorts out wrong ones
+_LINK_VIEWS: Final = 3  # fewest pictures that show a point which is sought in other legs or by other vehicles
+_LINK_VIEW_WEIGHT: Final = 0.5  # least mean robust weight of its observations
 _LINK_SIGMA_PX: Final = 0.7  # sigma of a link to another leg, working pixels
+_EVIDENCE_SMALL_HALF_M: Final = 4.0  # half a patch where those of the usual size confirm nothing
 
 
 @dataclass(slots=True)
 class AbsoluteOrientation:
-    """What the absolute orientation found, besides the cameras in the flight's adjustment.
+    """The ground, the last tie points and their matches; the cameras are in the flight's adjustment.
 
-    Attributes:
-        surface: the ground. ties: the last tie points. matches: the matches that they come from.
-        roofs: matches of raised points and their heights, for the lean of the map, which all vehicles vote on.
-        links: observations added between legs.
+    roofs: matches of raised points and their heights, for the lean of the map, which all vehicles vote on.
     """
 
     surface: GroundModel
     ties: MapTies
     matches: MapMatches
     roofs: tuple[MapMatches, Array]
-    links: int
 
 
-def load_map(flight: Flight, basemap: MapWindow, origin: Array, gsd_m: float) -> LoadedMap:
+def load_map(flight: FlightBlock, basemap: MapWindow, origin: Array, gsd_m: float) -> LoadedMap:
     """The map under a vehicle's pictures, with a margin for the search."""
-    cameras = flight.cameras()
-    height = float(np.median(cameras.position[:, 2]))
-    diagonal = float(np.hypot(*flight.pictures.size)) / 2 / float(cameras.lens[0, 0])
-    reach = _MAP_MARGIN_SHARE * height * diagonal + _MAP_MARGIN_M
-    return LoadedMap.load(basemap, origin, BoundingBox.around_points(cameras.position[:, :2], reach), gsd_m)
+    diagonal = float(np.hypot(*flight.pictures.size)) / 2 / flight.focal_px
+    reach = _MAP_MARGIN_SHARE * flight.height_m * diagonal + _MAP_MARGIN_M
+    return LoadedMap.load(basemap, origin, BoundingBox.around_points(flight.cameras().position[:, :2], reach), gsd_m)
 
 
 def tie_matches(
-    flight: Flight,
+    flight: FlightBlock,
     surface: GroundModel,
     ground: LoadedMap,
     *,
     cell_m: float,
     reach_m: float,
     half_m: float | None = None,
-    pictures: NDArray[np.bool_] | None = None,
+    pictures: Flags | None = None,
 ) -> MapMatches:
     """Match ground points, one for each cell and leg, to the map; `clear_matches` tells the sure ones.
 
     Ground is compared by its texture: strong edges belong to what leans and casts shadows.
 
     Args:
-        flight: its adjusted cameras and points. surface: its ground. ground: the map below it.
         cell_m: side of a cell. reach_m: search to each side. half_m: half a patch, None: as `tie_half_m`. All metres.
         pictures: bool (N,), the ones to compare, None for all.
     """
@@ -124,29 +122,33 @@ def tie_matches(
     fewest = _TIE_VIEWS_SPARSE if flight.sparse else _TIE_VIEWS
     usable = (seen.camera >= 0) & (seen.count >= fewest) & (seen.mean_weight > _TIE_VIEW_WEIGHT)
     usable &= np.abs(height) < _TIE_HEIGHT_M
-    half_m = tie_half_m(flight) if half_m is None else half_m
     leg = flight.leg[np.maximum(seen.camera, 0)]
     chosen = one_per_cell(adj.points, leg, np.where(usable, np.abs(height), np.inf), cell_m)
     return _ground_matches(
-        flight, surface, ground, chosen=chosen, camera=seen.camera, reach_m=reach_m, half_m=half_m, texture=True
+        flight,
+        surface,
+        ground,
+        chosen=chosen,
+        camera=seen.camera,
+        reach_m=reach_m,
+        half_m=half_m or tie_half_m(flight),
+        texture=True,
     )
 
 
 def _ground_matches(
-    flight: Flight,
+    flight: FlightBlock,
     surface: GroundModel,
     ground: LoadedMap,
     *,
     chosen: NDArray[np.integer],
-    camera: NDArray[np.int32],
+    camera: Ints,
     reach_m: float,
     half_m: float,
     texture: bool,
 ) -> MapMatches:
+    """Chosen points found on the map, rectified on the ground."""
     adj = flight.adjustment
-    half = max(TIE_HALF_PX, round(half_m / ground.gsd_m))
-    reach = max(TIE_REACH_PX, round(reach_m / ground.gsd_m))
-    level = surface.height(adj.points[:, :2])
     return match_points(
         adj.cameras,
         adj.points,
@@ -154,14 +156,14 @@ def _ground_matches(
         camera=camera,
         gray=flight.pictures.gray,
         ground=ground,
-        half=half,
-        reach=reach,
-        level=level,
+        half=max(TIE_HALF_PX, round(half_m / ground.gsd_m)),
+        reach=max(TIE_REACH_PX, round(reach_m / ground.gsd_m)),
+        level=surface.height(adj.points[:, :2]),
         texture=texture,
     )
 
 
-def edge_displacement(flight: Flight, surface: GroundModel, ground: LoadedMap, matches: MapMatches) -> Array:
+def edge_displacement(flight: FlightBlock, surface: GroundModel, ground: LoadedMap, matches: MapMatches) -> Array:
     """Mean displacement (2,), metres, of strong edges against texture at the same tie points; zero if it is not known.
 
     Shadows of another hour and what leans in the map displace strong edges most, but texture, too, by as much as edges
@@ -172,19 +174,11 @@ def edge_displacement(flight: Flight, surface: GroundModel, ground: LoadedMap, m
     some = matches.take(np.arange(0, len(matches.point), step))
     camera = np.full(len(flight.adjustment.points), -1, np.int32)
     camera[some.point] = some.camera
-    half_m = tie_half_m(flight)
-    edges = clear_matches(
-        _ground_matches(
-            flight,
-            surface,
-            ground,
-            chosen=some.point,
-            camera=camera,
-            reach_m=_EDGE_SEARCH_M,
-            half_m=half_m,
-            texture=False,
-        )
-    )
+    found = _ground_matches(
+        flight, surface, ground, chosen=some.point, camera=camera, reach_m=_EDGE_SEARCH_M,
+        half_m=tie_half_m(flight), texture=False,
+    )  # fmt: skip
+    edges = clear_matches(found)
     _, mine, its = np.intersect1d(some.point, edges.point, return_indices=True)
     away = edges.shift[its] - some.shift[mine]
     if len(away) < _EDGE_FEWEST:
@@ -193,9 +187,8 @@ def edge_displacement(flight: Flight, surface: GroundModel, ground: LoadedMap, m
     return np.asarray(away.mean(0)) if len(away) >= _EDGE_FEWEST else np.zeros(2)
 
 
-def clear_matches(matches: MapMatches, ratio: float | None = None) -> MapMatches:
-    """Matches with a clear peak; ratio: largest ratio of the second peak to the first, None: as configured."""
-    ratio = _TIE_RATIO if ratio is None else ratio
+def clear_matches(matches: MapMatches, ratio: float = _TIE_RATIO) -> MapMatches:
+    """Matches with a clear peak; ratio: largest ratio of the second peak to the first."""
     return matches.take((matches.peak > _TIE_PEAK) & (matches.ratio < ratio))
 
 
@@ -206,12 +199,12 @@ def mode_shift(shift: Array) -> Array:
     d2 = ((shift[:, None, :] - shift[None, :, :]) ** 2).sum(-1)
     centre = shift[int((d2 < _MODE_M**2).sum(1).argmax())]
     for scale in _MODE_SCALES_M:
-        w = 1.0 / (1.0 + ((shift - centre) ** 2).sum(1) / scale**2) ** 2
+        w = robust_weights(((shift - centre) ** 2).sum(1), scale**2)
         centre = (shift * w[:, None]).sum(0) / w.sum()
     return np.asarray(centre)
 
 
-def shifted_along(flight: Flight, matches: MapMatches) -> MapMatches:
+def shifted_along(flight: FlightBlock, matches: MapMatches) -> MapMatches:
     """Shift the cameras to where their first matches lie; returns the matches with what is left of their shifts.
 
     All cameras move by the mode of the shifts, but a leg whose own matches agree on another line of shifts moves along
@@ -225,7 +218,7 @@ def shifted_along(flight: Flight, matches: MapMatches) -> MapMatches:
     return replace(matches, shift=matches.shift - moved)
 
 
-def leg_corrections(leg: NDArray[np.int32], matches: MapMatches, common: Array) -> Array:
+def leg_corrections(leg: Ints, matches: MapMatches, common: Array) -> Array:
     """Shift of each picture, float64 (N, 2): the common one, except in legs whose matches agree on another line."""
     out = np.tile(common, (len(leg), 1))
     for k in np.unique(leg[leg >= 0]):
@@ -247,23 +240,18 @@ def leg_corrections(leg: NDArray[np.int32], matches: MapMatches, common: Array) 
     return out
 
 
-def _line(t: Array, shift: Array) -> tuple[Array, NDArray[np.bool_]]:
+def _line(t: Array, shift: Array) -> tuple[Array, Flags]:
     """Robust line (2, 2), value and slope, through shifts (Q, 2) along t (Q,), and which shifts lie on it."""
     a = np.column_stack([np.ones(len(t)), t])
     line = np.array([mode_shift(shift), np.zeros(2)])
     for scale in _LINE_SCALES_M:
-        off = ((shift - a @ line) ** 2).sum(1)
-        w = 1.0 / (1.0 + off / scale**2) ** 2
+        w = robust_weights(((shift - a @ line) ** 2).sum(1), scale**2)
         line = np.linalg.solve((a * w[:, None]).T @ a + 1e-9 * np.eye(2), (a * w[:, None]).T @ shift)
     return line, np.asarray(np.hypot(*(shift - a @ line).T) < _LINE_AGREES_M)
 
 
 def as_ties(matches: MapMatches, points: Array) -> MapTies:
-    """Tie points for the adjustment: each ground point with its place on the map, metres, and a first sigma.
-
-    The surroundings of a point were compared, which are ground and do not lean. So an error of the height datum does
-    not displace them.
-    """
+    """Tie points with their places on the map and a first sigma; what was compared is ground, which does not lean."""
     sigma = np.full(len(matches.point), _TIE_SIGMA_M)
     return MapTies(matches.point, points[matches.point, :2] + matches.shift, sigma)
 
@@ -276,18 +264,15 @@ def with_sigma_of_residuals(ties: MapTies, residual: Array) -> MapTies:
     return replace(ties, sigma_m=np.full(len(ties.point), sigma))
 
 
-def roof_matches(flight: Flight, surface: GroundModel, ground: LoadedMap) -> tuple[MapMatches, Array]:
+def roof_matches(flight: FlightBlock, surface: GroundModel, ground: LoadedMap) -> tuple[MapMatches, Array]:
     """Matches of raised points (roofs) with the map, and their heights over the ground (Q,), metres."""
     adj = flight.adjustment
     seen = flight.best_views()
     height = adj.points[:, 2] - surface.height(adj.points[:, :2])
-    low, high = _ROOF_HEIGHTS_M
     usable = (seen.camera >= 0) & (seen.count >= _ROOF_VIEWS) & (seen.mean_weight > _ROOF_VIEW_WEIGHT)
-    usable &= (height > low) & (height < high)
+    usable &= (height > _ROOF_HEIGHTS_M[0]) & (height < _ROOF_HEIGHTS_M[1])
     leg = flight.leg[np.maximum(seen.camera, 0)]
     chosen = one_per_cell(adj.points, leg, np.where(usable, -seen.count.astype(float), np.inf), _ROOF_CELL_M)
-    half = max(TIE_HALF_PX, round(_ROOF_HALF_M / ground.gsd_m))
-    reach = max(TIE_HALF_PX, round(_ROOF_REACH_M / ground.gsd_m))
     found = match_points(
         adj.cameras,
         adj.points,
@@ -295,25 +280,21 @@ def roof_matches(flight: Flight, surface: GroundModel, ground: LoadedMap) -> tup
         camera=seen.camera,
         gray=flight.pictures.gray,
         ground=ground,
-        half=half,
-        reach=reach,
+        half=max(TIE_HALF_PX, round(_ROOF_HALF_M / ground.gsd_m)),
+        reach=max(TIE_HALF_PX, round(_ROOF_REACH_M / ground.gsd_m)),
     )
     found = clear_matches(found, _ROOF_RATIO)
     return found, height[found.point]
 
 
-def add_links(flight: Flight, gsd_m: float) -> int:
+def add_links(flight: FlightBlock, gsd_m: float) -> int:
     """Observe points of each leg in pictures of other legs and add these observations; returns how many."""
-    config = active().registration
     adj = flight.adjustment
-    seen = flight.best_views()
-    usable = (seen.camera >= 0) & (seen.count >= LINK_VIEWS) & (seen.mean_weight > LINK_VIEW_WEIGHT)
-    leg = flight.leg[np.maximum(seen.camera, 0)]
-    chosen = one_per_cell(adj.points, leg, np.where(usable, -seen.count.astype(float), np.inf), config.link_cell_m)
     candidates = np.flatnonzero(flight.leg >= 0)
     if len(np.unique(flight.leg[candidates])) < 2:
         return 0
-    camera, point, uv, _ = link_legs(
+    seen, chosen = linkable_points(flight, active().registration.link_cell_m)
+    camera, point, uv = link_legs(
         adj.cameras,
         adj.points,
         chosen,
@@ -323,48 +304,38 @@ def add_links(flight: Flight, gsd_m: float) -> int:
         gray=flight.pictures.gray,
         gsd_m=gsd_m,
     )
-    if len(camera):
-        add_observations(flight, camera, point, uv, _LINK_SIGMA_PX)
+    if len(camera):  # its unknowns keep their values
+        tracks = adj.tracks.with_more(camera, point, uv, _LINK_SIGMA_PX)
+        flight.adjustment = Adjustment.begin(adj.cameras, tracks, adj.priors, adj.points, adj.free)
+        flight.adjustment.common[:] = adj.common
     return len(camera)
 
 
-def add_observations(
-    flight: Flight, camera: NDArray[np.int32], point: NDArray[np.int32], uv: Array, sigma_px: float
-) -> None:
-    """Add observations (K,), uv (K, 2) in working pixels, to a flight's adjustment; its unknowns keep their values."""
-    old = flight.adjustment
-    tracks = Tracks(
-        np.concatenate([old.tracks.camera, camera]),
-        np.concatenate([old.tracks.point, point]),
-        np.concatenate([old.tracks.uv, uv]),
-        np.concatenate([old.tracks.sigma_px, np.full(len(camera), sigma_px, np.float32)]),
-    )
-    new = Adjustment.begin(old.cameras, tracks, old.priors, old.points, old.free)
-    new.common[:] = old.common
-    flight.adjustment = new
+def linkable_points(flight: FlightBlock, cell_m: float, pictures: Flags | None = None) -> tuple[BestViews, Indices]:
+    """Best views of a flight's points in its pictures, or in some (N,), and one sure point a leg in each cell."""
+    seen = flight.best_views(pictures)
+    usable = (seen.camera >= 0) & (seen.count >= _LINK_VIEWS) & (seen.mean_weight > _LINK_VIEW_WEIGHT)
+    leg = flight.leg[np.maximum(seen.camera, 0)]
+    cost = np.where(usable, -seen.count.astype(float), np.inf)
+    return seen, one_per_cell(flight.adjustment.points, leg, cost, cell_m)
 
 
-def first_ties(flight: Flight, surface: GroundModel, ground: LoadedMap) -> MapMatches:
+def first_ties(flight: FlightBlock, surface: GroundModel, ground: LoadedMap) -> MapMatches:
     """Tie points of a flight that the coarse registration put on the map within some metres."""
-    config = active().registration
-    cell_m = _FIRST_TIE_CELL_SPARSE_M if flight.sparse else config.first_tie_cell_m
+    cell_m = _FIRST_TIE_CELL_SPARSE_M if flight.sparse else active().registration.first_tie_cell_m
     return clear_matches(tie_matches(flight, surface, ground, cell_m=cell_m, reach_m=FIRST_TIE_REACH_M))
 
 
-def small_ties(flight: Flight, surface: GroundModel, ground: LoadedMap, half_m: float) -> MapMatches:
+def small_ties(flight: FlightBlock, surface: GroundModel, ground: LoadedMap, half_m: float) -> MapMatches:
     """Matches of small patches that touch each other: more evidence where few large ones fit, too noisy as ties."""
-    reach = FIRST_TIE_REACH_M
-    return clear_matches(tie_matches(flight, surface, ground, cell_m=2.0 * half_m, reach_m=reach, half_m=half_m))
+    cell_m, reach_m = 2.0 * half_m, FIRST_TIE_REACH_M
+    return clear_matches(tie_matches(flight, surface, ground, cell_m=cell_m, reach_m=reach_m, half_m=half_m))
 
 
-def orient_on_map(flight: Flight, ground: LoadedMap, matches: MapMatches, surface: GroundModel) -> AbsoluteOrientation:
-    """Adjust a flight with tie points on the map: first with those of the coarse registration, then with new ones.
-
-    Args:
-        flight: after the coarse registration. ground: the map below it.
-        matches: the tie points that confirm the coarse registration.
-        surface: ground after the relative adjustment.
-    """
+def orient_on_map(
+    flight: FlightBlock, ground: LoadedMap, matches: MapMatches, surface: GroundModel
+) -> AbsoluteOrientation:
+    """Adjust a flight with the tie points that confirm its coarse registration, then with new ones."""
     matches = shifted_along(flight, matches)
     ties = as_ties(matches, flight.adjustment.points)
     for k, c in enumerate(_FIRST_TIE_SCALES):
@@ -372,48 +343,36 @@ def orient_on_map(flight: Flight, ground: LoadedMap, matches: MapMatches, surfac
         if k in (1, 3):
             surface = refit_ground(flight, surface, as_smooth=k == 3)
     roofs = roof_matches(flight, surface, ground)
-    links = 0 if flight.sparse else add_links(flight, working_gsd(flight))
+    if not flight.sparse:
+        add_links(flight, working_gsd(flight))
     _step(flight, surface, ties, TIE_SCALES[1])
     surface = refit_ground(flight, surface, as_smooth=True)
     surface, ties, matches = _second_round(flight, ground, surface, _SECOND_STEPS)
-    return AbsoluteOrientation(surface, ties, matches, roofs, links)
+    return AbsoluteOrientation(surface, ties, matches, roofs)
 
 
 def reorient_on_map(
-    flight: Flight,
-    ground: LoadedMap,
-    surface: GroundModel,
-    ties: MapTies,
-    pictures: NDArray[np.bool_] | None = None,
+    flight: FlightBlock, ground: LoadedMap, surface: GroundModel, ties: MapTies, pictures: Flags | None = None
 ) -> tuple[GroundModel, MapTies, MapMatches]:
-    """Adjust a flight that lies on the map with new tie points, as after its level was shifted.
-
-    Args:
-        flight: on the map. ground: the map below it. surface: its ground. ties: its tie points so far.
-        pictures: bool (N,), the ones to compare with the map, None for all.
-    """
+    """Adjust a flight on the map with new tie points, as after its level was shifted; pictures: (N,), those to use."""
     for _ in range(2):
         _step(flight, surface, ties, TIE_SCALES[1])
     return _second_round(flight, ground, refit_ground(flight, surface), _RENEWED_STEPS, pictures)
 
 
-def _step(flight: Flight, surface: GroundModel, ties: MapTies, tie_scale: float) -> None:
+def _step(flight: FlightBlock, surface: GroundModel, ties: MapTies, tie_scale: float) -> None:
     """One Gauss-Newton step with tie points, heights held near the ground."""
     prior = surface.height_prior(flight.adjustment.points)
     flight.adjustment.step(TRACK_ROBUST_C, prior, ties, tie_scale)
 
 
 def _second_round(
-    flight: Flight,
-    ground: LoadedMap,
-    surface: GroundModel,
-    rounds: int,
-    pictures: NDArray[np.bool_] | None = None,
+    flight: FlightBlock, ground: LoadedMap, surface: GroundModel, rounds: int, pictures: Flags | None = None
 ) -> tuple[GroundModel, MapTies, MapMatches]:
     """New tie points, compared on the ground as the caller has just fitted it, and steps with them."""
-    config = active().registration
-    cell_m, reach_m = _TIE_CELL_SPARSE_M if flight.sparse else config.tie_cell_m, TIE_REACH_M
-    matches = clear_matches(tie_matches(flight, surface, ground, cell_m=cell_m, reach_m=reach_m, pictures=pictures))
+    cell_m = _TIE_CELL_SPARSE_M if flight.sparse else active().registration.tie_cell_m
+    found = tie_matches(flight, surface, ground, cell_m=cell_m, reach_m=TIE_REACH_M, pictures=pictures)
+    matches = clear_matches(found)
     matches = replace(matches, shift=matches.shift - edge_displacement(flight, surface, ground, matches))
     ties = as_ties(matches, flight.adjustment.points)
     for k in range(rounds):
@@ -425,22 +384,65 @@ def _second_round(
     return surface, ties, matches
 
 
-def tie_half_m(flight: Flight) -> float:
+def tie_half_m(flight: FlightBlock) -> float:
     """Half the patch about a tie point, metres: a share of the flying height."""
-    height = float(np.median(flight.cameras().position[:, 2]))
-    return float(np.clip(_TIE_HALF_SHARE * height, *_TIE_HALF_LIMITS_M))
+    return float(np.clip(_TIE_HALF_SHARE * flight.height_m, *_TIE_HALF_LIMITS_M))
 
 
-def working_gsd(flight: Flight) -> float:
+def working_gsd(flight: FlightBlock) -> float:
     """Ground pixel in which pictures are compared with each other, metres: about their own."""
-    cameras = flight.cameras()
-    return _PICTURE_GSD_SHARE * float(np.median(cameras.position[:, 2])) / float(cameras.lens[0, 0])
+    return _PICTURE_GSD_SHARE * flight.height_m / flight.focal_px
 
 
-def map_gsd(flight: Flight, basemap: MapWindow) -> float:
+def map_gsd(flight: FlightBlock, basemap: MapWindow) -> float:
     """Ground pixel in which pictures are compared with the map, metres: no finer than either of them."""
-    cameras = flight.cameras()
-    picture = float(np.median(cameras.position[:, 2])) / float(cameras.lens[0, 0])
+    picture = flight.height_m / flight.focal_px
     if picture < _MAP_GSD_FINE_M:
         return float(np.clip(max(picture, basemap.native_gsd_m), *_MAP_GSD_M))
     return max(_MAP_GSD_COARSE_M, picture)
+
+
+@dataclass(frozen=True, slots=True)
+class ConfirmedFit:
+    """A coarse registration, the map below the flight, and the tie points that confirm it.
+
+    false_matches: expected number of agreements as good as theirs on a map of other ground.
+    """
+
+    fit: CoarseFit
+    ground: LoadedMap
+    matches: MapMatches
+    false_matches: float
+
+
+def confirmed(
+    flight: FlightBlock, fits: Iterable[CoarseFit], basemap: MapWindow, origin: Array, surface: GroundModel
+) -> ConfirmedFit | None:
+    """The first registration that tie points confirm; the cameras then lie there, else where they were."""
+    before = flight.adjustment.copy()
+    config = active().registration
+    limit, tests = np.log10(config.false_matches), 0
+    for fit in fits:
+        shift_cameras(flight, fit.correction)
+        ground = load_map(flight, basemap, origin, map_gsd(flight, basemap))
+        matches = first_ties(flight, surface, ground)
+        tests += 1  # each test is one more chance to agree
+        chance = _false_matches_log10(flight, matches, tie_half_m(flight)) + np.log10(tests)
+        if chance > limit:  # a few photos have room for a few patches of this size only: more and smaller ones
+            half_m, tests = _EVIDENCE_SMALL_HALF_M, tests + 1
+            chance = _false_matches_log10(flight, small_ties(flight, surface, ground, half_m), half_m) + np.log10(tests)
+        if chance <= limit:
+            return ConfirmedFit(fit, ground, matches, float(10.0**chance))
+        flight.adjustment = before.copy()
+    return None
+
+
+def _false_matches_log10(flight: FlightBlock, matches: MapMatches, half_m: float) -> float:
+    return false_matches_log10(
+        flight.adjustment.points[matches.point, :2],
+        matches.shift,
+        matches.camera.astype(float),
+        leg=flight.leg[matches.camera],
+        reach_m=FIRST_TIE_REACH_M,
+        patch_m=2.0 * half_m,
+    )

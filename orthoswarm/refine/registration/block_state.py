@@ -5,21 +5,20 @@ from time import process_time
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array, Floats
 from orthoswarm.model.camera import fov_rad
-from orthoswarm.model.placement import Leg, LegState, PlacedFrame, Solution, Stage, Terrain
+from orthoswarm.model.geo import LocalGrid
+from orthoswarm.model.placement import Leg, LegState, MapWindow, PlacedFrame, Solution, Stage, Terrain
 from orthoswarm.refine.bundle.adjustment import MapTies
 from orthoswarm.refine.bundle.block_arrays import CX, CY, WIDTH, CameraBlock, F
-from orthoswarm.refine.flight.relative_block import Flight
+from orthoswarm.refine.flight.relative_block import FlightBlock
 from orthoswarm.refine.flight.weakly_held_pictures import weakly_held
 from orthoswarm.refine.registration.absolute_orientation import TIE_REACH_M
 from orthoswarm.refine.registration.coarse_map import CoarseMapShift
 from orthoswarm.refine.registration.map_evidence import agreement_probability
 from orthoswarm.refine.registration.tie_points import MapMatches
 from orthoswarm.refine.surface.vehicle_ground import GroundModel, ground_points
-
-Array = NDArray[np.float64]
 
 NOT_FOUND = (
     "no part of this flight was found on the map: it lies where its receiver says; check that the map shows this place"
@@ -32,6 +31,20 @@ SHIFTED = (
 
 _LEG_BY_CHANCE: Final = 0.01  # a leg is matched if chance agrees as well with this probability only
 _LEG_AGREES_M: Final = 1.2  # a tie point whose residual is below this agrees with its leg's place
+
+
+@dataclass(frozen=True, slots=True)
+class WorkArea:
+    """Where vehicles are refined: the grid, the origin (2,) of the local frame, and the map on the grid, or None."""
+
+    epsg: int
+    origin: Array
+    basemap: MapWindow | None
+
+    @property
+    def grid(self) -> LocalGrid:
+        """The area's grid."""
+        return LocalGrid(self.epsg)
 
 
 @dataclass(slots=True, kw_only=True)
@@ -60,20 +73,21 @@ class VehicleState:
     """
 
     vehicle: str
-    flight: Flight
+    flight: FlightBlock
     coarse: CameraBlock
     surface: GroundModel
-    ties: MapTies
-    matches: MapMatches
-    roofs: tuple[MapMatches, Array]
-    dense: tuple[Array, Array]
-    on_map: bool
-    confidence: float
+    coarse_surface: GroundModel
     sigma_m: Array
     coarse_sigma_m: Array
     receiver_sigma_m: Array
     fov_sigma_deg: float
-    pose_covariance: NDArray[np.float32] | None = None
+    ties: MapTies = field(default_factory=MapTies.none)
+    matches: MapMatches = field(default_factory=MapMatches.none)
+    roofs: tuple[MapMatches, Array] = field(default_factory=lambda: (MapMatches.none(), np.zeros(0)))
+    dense: tuple[Array, Array] = field(default_factory=lambda: (np.zeros((0, 3)), np.zeros(0)))
+    on_map: bool = False
+    confidence: float = 0.0
+    pose_covariance: Floats | None = None
     timings: dict[str, float] = field(default_factory=dict)
     had_map: bool = False
     carried: bool = False
@@ -81,7 +95,6 @@ class VehicleState:
     coarse_shift: CoarseMapShift | None = None
     datum_sigma_m: Array | None = None
     map_shift: Array = field(default_factory=lambda: np.zeros(2))
-    coarse_surface: GroundModel | None = None
     high: Array = field(default_factory=lambda: np.zeros((0, 3)))
     unfound: bool = False
     false_matches: float = float("nan")
@@ -101,11 +114,6 @@ def findings(state: VehicleState) -> list[str]:
         shift = state.coarse_shift
         return [*state.flight.warnings, SHIFTED.format(gsd_m=shift.gsd_m, sigma_m=shift.sigma_m)]
     return [*state.flight.warnings, NOT_FOUND] if state.had_map and not state.on_map else list(state.flight.warnings)
-
-
-def surface_points(state: VehicleState) -> Array:
-    """Densified points (K, 3) on the visible surface: ground, and what stands on it."""
-    return np.concatenate([state.dense[0], state.high])
 
 
 class Stopwatch:
@@ -138,9 +146,8 @@ def to_solution(
 ) -> Solution:
     """The state as a Solution on the area's grid (full-resolution lenses); coarse takes the cameras before the map."""
     flight = state.flight
-    cameras = state.coarse if coarse else flight.adjustment.cameras
+    cameras = full_resolution(state.coarse if coarse else flight.adjustment.cameras, flight)
     stage: Stage = "coarse" if coarse or not lies_on_map(state) else "fine"
-    cameras = full_resolution(cameras, flight)
     sigma = state.coarse_sigma_m if coarse else state.sigma_m
     covariance = None if coarse else state.pose_covariance
     weak = weakly_held(flight)
@@ -157,13 +164,13 @@ def to_solution(
         if i not in flight.pictures.damaged
     ]
     dropped = {flight.frames[i].image: reason for i, reason in flight.pictures.damaged.items()}
-    lens = flight.adjustment.cameras.lens[0]
+    fov = fov_rad(flight.focal_px, flight.pictures.size[0])
     return Solution(
         vehicle=state.vehicle,
         placed=placed,
         dropped=dropped,
         legs=leg_states(state),
-        fov_deg=float(np.degrees(fov_rad(float(lens[F]), int(lens[WIDTH])))),
+        fov_deg=float(np.degrees(fov)),
         fov_sigma_deg=state.fov_sigma_deg,
         terrain=terrain,
         ground_z_m=ground_z_m,
@@ -176,18 +183,16 @@ def to_solution(
     )
 
 
-def _mean_gsd(cameras: CameraBlock, flight: Flight) -> float:
+def _mean_gsd(cameras: CameraBlock, flight: FlightBlock) -> float:
     """Mean height above the ground's points over the focal length (cameras: full resolution), metres a pixel."""
     points, _ = ground_points(flight.adjustment)
     if not len(points):
         return float("nan")
-    heights = flight.cameras().position[
-        :, 2
-    ]  # points and cameras of one state, also where the cameras are those before the map
+    heights = flight.cameras().position[:, 2]  # of one state with the points, also where `cameras` are those before
     return float((heights.mean() - points[:, 2].mean()) / cameras.lens[0, F])
 
 
-def full_resolution(cameras: CameraBlock, flight: Flight) -> CameraBlock:
+def full_resolution(cameras: CameraBlock, flight: FlightBlock) -> CameraBlock:
     """Cameras whose lenses are in pixels of the stored pictures instead of working pixels."""
     frame = flight.frames[0]
     scale = frame.width / flight.pictures.size[0]
@@ -229,16 +234,5 @@ def leg_states(state: VehicleState) -> list[Leg]:
         share = agree[k] / max(ties[k], 1) if matched[k] else 0.0
         if state.coarse_shift is not None:
             share = state.coarse_shift.confidence
-        sigma = float(np.median(state.sigma_m[members]))
-        out.append(
-            Leg(
-                vehicle=state.vehicle,
-                first=int(members[0]),
-                last=int(members[-1]),
-                images=(flight.frames[members[0]].image, flight.frames[members[-1]].image),
-                state=how,
-                confidence=share,
-                sigma_m=sigma,
-            )
-        )
+        out.append(Leg.of(flight.frames, members, how, share, float(np.median(state.sigma_m[members]))))
     return out

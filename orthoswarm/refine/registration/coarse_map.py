@@ -16,24 +16,22 @@ from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
 from orthoswarm.config import active
+from orthoswarm.model.arrays import Array, Flags, Floats
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import MapWindow
-from orthoswarm.refine.flight.relative_block import Flight
+from orthoswarm.refine.flight.relative_block import FlightBlock
 from orthoswarm.refine.registration.orientation_correlation import (
     PEAK_APART_PX,
     STRIP_BORDER_PX,
     STRIP_FEWEST_EDGES,
     STRIP_MAP_SHARE,
+    OrientationField,
     correlation,
     highest,
     strip_mosaic,
     without_peak,
 )
-
-Array = NDArray[np.float64]
-Grey = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 _STEP = 2
 """Pixels of the correlation in one of the map's, and of the mosaic in one of the correlation."""
@@ -56,10 +54,9 @@ to 0.5 m at 10 m."""
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CoarseMapShift:
-    """One shift of a block onto a coarse map.
+    """One shift of a block onto a coarse map of pixel gsd_m: metres to add, and their sigma, an axis.
 
     Attributes:
-        east, north: metres to add. sigma_m: of each axis. gsd_m: the map's pixel.
         confidence: 1 minus the ratio of the second peak to the first.
         false_matches: expected number of peaks as high on a map of other ground.
     """
@@ -72,22 +69,16 @@ class CoarseMapShift:
     false_matches: float
 
 
-def is_coarse(flight: Flight, basemap: MapWindow) -> bool:
+def is_coarse(flight: FlightBlock, basemap: MapWindow) -> bool:
     """Whether a map's pixels are too coarse for tie points of a flight's pictures."""
-    cameras = flight.cameras()
-    picture_m = float(np.median(cameras.position[:, 2])) / float(cameras.lens[0, 0])
+    picture_m = flight.height_m / flight.focal_px
     return basemap.native_gsd_m > max(_COARSE_MAP_GSD_M, _COARSE_MAP_PICTURES * picture_m)
 
 
 def shift_on_coarse_map(
-    flights: Sequence[Flight], basemap: MapWindow, origin: Array, ground_z: float
+    flights: Sequence[FlightBlock], basemap: MapWindow, origin: Array, ground_z: float
 ) -> CoarseMapShift | None:
-    """Where vehicles that make one block lie on a coarse map; None where it does not show their ground.
-
-    Args:
-        flights: adjusted, in one frame. basemap: the map. origin: float64 (2,) of the local frame.
-        ground_z: level of their ground, metres.
-    """
+    """Where vehicles that make one block lie on a coarse map, None if it shows no such place; ground_z: their level."""
     config, gsd = active().registration, basemap.native_gsd_m / _STEP
     drawn = _mosaic(flights, ground_z, gsd)
     if drawn is None:
@@ -123,7 +114,7 @@ def shift_on_coarse_map(
     )
 
 
-def _mosaic(flights: Sequence[Flight], ground_z: float, gsd_m: float) -> tuple[Grey, Mask, float, float] | None:
+def _mosaic(flights: Sequence[FlightBlock], ground_z: float, gsd_m: float) -> tuple[Floats, Flags, float, float] | None:
     """Grey mosaic of all vehicles, averaged over the map's pixel, with its validity, west and north edges."""
     fine = gsd_m / _STEP
     parts = []
@@ -146,15 +137,18 @@ def _mosaic(flights: Sequence[Flight], ground_z: float, gsd_m: float) -> tuple[G
         cut = (slice(row, row + grey.shape[0]), slice(column, column + grey.shape[1]))
         total[cut] += np.where(valid, grey, 0.0)
         count[cut] += valid
-    side = _STEP * _STEP  # the map's pixel
-    shown = (count > 0).astype(np.float32)
-    sums = (_box(part, side) for part in (np.where(count > 0, total / np.maximum(count, 1.0), 0.0), shown))
+    side, middle = (_STEP * _STEP,) * 2, (_STEP * _STEP // 2,) * 2  # the map's pixel, from its upper left corner on
+    shown = np.where(count > 0, total / np.maximum(count, 1.0), 0.0), count > 0
+    sums = (
+        cv2.boxFilter(part.astype(np.float32), -1, side, anchor=middle, borderType=cv2.BORDER_CONSTANT)
+        for part in shown
+    )
     mean, share = (part[_STEP // 2 :: _STEP, _STEP // 2 :: _STEP] for part in sums)
     valid = share > _COARSE_MAP_SHARE
     return np.asarray(np.where(valid, mean / np.maximum(share, 1e-6), 0.0), np.float32), valid, west, north
 
 
-def _texture(grey: Grey, valid: Mask) -> NDArray[np.complex64]:
+def _texture(grey: Floats, valid: Flags) -> OrientationField:
     """Gradients g m / (|g|^2 + m^2) as complex numbers, 0 where not valid; see `patch_matching.gradients`."""
     side = STRIP_BORDER_PX
     gradient = cv2.Sobel(grey, cv2.CV_32F, 1, 0) + 1j * cv2.Sobel(grey, cv2.CV_32F, 0, 1)
@@ -165,16 +159,7 @@ def _texture(grey: Grey, valid: Mask) -> NDArray[np.complex64]:
     return np.asarray(np.where(inner, gradient * weight, 0), np.complex64)
 
 
-def _box(values: NDArray[np.floating], side: int) -> Grey:
-    """Mean over a square of an even side, centred on each pixel's upper left corner."""
-    return np.asarray(
-        cv2.boxFilter(
-            values.astype(np.float32), -1, (side, side), anchor=(side // 2, side // 2), borderType=cv2.BORDER_CONSTANT
-        )
-    )
-
-
-def _jackknife(moving: NDArray[np.complex64], fixed: NDArray[np.complex64], reach: int) -> float:
+def _jackknife(moving: OrientationField, fixed: NDArray[np.complex64], reach: int) -> float:
     """Sigma of an axis of the peak's place, pixels, by leaving out a part of the mosaic at a time."""
     rows, columns = np.nonzero(moving)
     across = max(1, round(float(np.sqrt(_COARSE_MAP_PARTS))))

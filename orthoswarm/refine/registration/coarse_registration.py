@@ -5,15 +5,20 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.config import active
+from orthoswarm.model.arrays import Array, Flags, Indices, Ints
 from orthoswarm.model.placement import MapWindow
 from orthoswarm.raster.map_cache import TiledMap
-from orthoswarm.refine.flight.relative_block import Flight
-from orthoswarm.refine.registration.orientation_correlation import Match, by_learning, register, stacked, strip_and_map
-
-Array = NDArray[np.float64]
+from orthoswarm.refine.flight.relative_block import FlightBlock
+from orthoswarm.refine.registration.orientation_correlation import (
+    Match,
+    Search,
+    by_learning,
+    register,
+    stacked,
+    strip_and_map,
+)
 
 _STRIP_PICTURES: Final = 25  # pictures of a strip in which corners are followed
 _STRIP_PICTURES_SPARSE: Final = 3  # the same of photos that are matched in pairs: some hundred metres of ground
@@ -41,11 +46,11 @@ class CoarseFit:
 
     correction: Array
     matches: list[Match]
-    inlier: NDArray[np.bool_]
+    inlier: Flags
     confidence: float
 
 
-def coarse_fits(flight: Flight, basemap: MapWindow, origin: Array) -> Iterator[CoarseFit]:
+def coarse_fits(flight: FlightBlock, basemap: MapWindow, origin: Array) -> Iterator[CoarseFit]:
     """Hypotheses where a flight lies on the map, the likeliest first, for the caller to verify.
 
     Strips of each leg near their records; then one shift for all strips together; then strips within a wider search.
@@ -55,27 +60,15 @@ def coarse_fits(flight: Flight, basemap: MapWindow, origin: Array) -> Iterator[C
     tiles = TiledMap(basemap, gsd)
     near, far = config.coarse_reach_m
     for find, reach_m in ((_fit_within, near), (_fit_together, near), (_fit_within, far)):
-        fit = find(reach_m, flight, tiles, origin, gsd)
+        fit = find(flight, Search(tiles, origin, reach_m, gsd))
         if fit is not None:
             yield fit
 
 
-def _fit_together(reach_m: float, flight: Flight, basemap: MapWindow, origin: Array, gsd_m: float) -> CoarseFit | None:
+def _fit_together(flight: FlightBlock, search: Search) -> CoarseFit | None:
     """One shift for the flight, from the sum of the correlations of all its strips (see `stacked`)."""
-    cameras, windows = flight.cameras(), _strips(flight)
-    strips = [
-        strip_and_map(
-            cameras,
-            w,
-            flight.pictures.small,
-            basemap=basemap,
-            origin=origin,
-            ground_z=0.0,
-            reach_m=reach_m,
-            gsd_m=gsd_m,
-        )
-        for w in windows
-    ]
+    cameras = flight.cameras()
+    strips = [strip_and_map(cameras, index, flight.pictures.small, search) for index in _strips(flight)]
     found = stacked([s for s in strips if s is not None])
     if found is None:
         return None
@@ -84,58 +77,27 @@ def _fit_together(reach_m: float, flight: Flight, basemap: MapWindow, origin: Ar
     return CoarseFit(np.tile(shift, (len(cameras), 1)), [match], np.ones(1, bool), 1.0 - ratio)
 
 
-def _fit_within(reach_m: float, flight: Flight, basemap: MapWindow, origin: Array, gsd_m: float) -> CoarseFit | None:
+def _fit_within(flight: FlightBlock, search: Search) -> CoarseFit | None:
+    """A line of shifts on which most strips agree."""
     cameras = flight.cameras()
-    windows = _strips(flight)
-    matches = [
-        m
-        for index in windows
-        if (
-            m := register(
-                cameras,
-                index,
-                flight.pictures.small,
-                basemap=basemap,
-                origin=origin,
-                ground_z=0.0,
-                reach_m=reach_m,
-                gsd_m=gsd_m,
-            )
-        )
-        is not None
-    ]
+    found = [register(cameras, index, flight.pictures.small, search) for index in _strips(flight)]
+    matches = [m for m in found if m is not None]
     if not matches:
         return None
     inlier = _consensus(matches)
     return CoarseFit(_smooth(matches, inlier, len(cameras)), matches, inlier, float(inlier.mean()))
 
 
-def learned_fit(flight: Flight, basemap: MapWindow, origin: Array) -> CoarseFit | None:
+def learned_fit(flight: FlightBlock, basemap: MapWindow, origin: Array) -> CoarseFit | None:
     """Registration by learned matching of a few strips, where correlation found no consensus; None without one."""
-    cameras, reach_m = flight.cameras(), _LEARNED_REACH_M
+    cameras = flight.cameras()
     gsd = float(np.clip(picture_width_m(flight) / _LEARNED_ACROSS_PX, *_LEARNED_GSD_M))
     windows = _windows(flight.leg, _LEARNED_PICTURES)
-    basemap = TiledMap(basemap, gsd)
+    search = Search(TiledMap(basemap, gsd), origin, _LEARNED_REACH_M, gsd)
     spread = np.linspace(0, len(windows) - 1, _LEARNED_STRIPS).round().astype(int)
     chosen = [windows[k] for k in np.unique(spread)]
-    matches = [
-        m
-        for index in chosen
-        if (
-            m := register(
-                cameras,
-                index,
-                flight.pictures.gray,
-                basemap=basemap,
-                origin=origin,
-                ground_z=0.0,
-                reach_m=reach_m,
-                gsd_m=gsd,
-                find=by_learning,
-            )
-        )
-        is not None
-    ]
+    found = [register(cameras, index, flight.pictures.gray, search, by_learning) for index in chosen]
+    matches = [m for m in found if m is not None]
     if len(matches) < 2:
         return None
     inlier = _consensus(matches)
@@ -144,7 +106,7 @@ def learned_fit(flight: Flight, basemap: MapWindow, origin: Array) -> CoarseFit 
     return CoarseFit(_smooth(matches, inlier, len(cameras)), matches, inlier, float(inlier.sum()) / len(chosen))
 
 
-def shift_cameras(flight: Flight, correction: Array) -> None:
+def shift_cameras(flight: FlightBlock, correction: Array) -> None:
     """Move cameras and points by a correction (N, 2), and the drift with them, so that the records still agree."""
     adj = flight.adjustment
     adj.cameras.position[:, :2] += correction
@@ -162,19 +124,18 @@ def shift_cameras(flight: Flight, correction: Array) -> None:
                 adj.common[columns] += np.interp(np.arange(knots), where, correction[members, a])
 
 
-def picture_width_m(flight: Flight) -> float:
+def picture_width_m(flight: FlightBlock) -> float:
     """Width of a picture on the ground, metres."""
-    cameras = flight.cameras()
-    return flight.pictures.size[0] / float(cameras.lens[0, 0]) * float(np.median(cameras.position[:, 2]))
+    return flight.pictures.size[0] / flight.focal_px * flight.height_m
 
 
-def _strips(flight: Flight) -> list[NDArray[np.int64]]:
+def _strips(flight: FlightBlock) -> list[Indices]:
     return _windows(flight.leg, _STRIP_PICTURES_SPARSE if flight.sparse else _STRIP_PICTURES)
 
 
-def _windows(leg: NDArray[np.int32], size: int) -> list[NDArray[np.int64]]:
+def _windows(leg: Ints, size: int) -> list[Indices]:
     """Runs of about `size` pictures of one leg each; short legs are one window."""
-    out: list[NDArray[np.int64]] = []
+    out: list[Indices] = []
     for k in range(int(leg.max()) + 1 if len(leg) else 0):
         members = np.flatnonzero(leg == k)
         parts = max(1, round(len(members) / size))
@@ -182,7 +143,7 @@ def _windows(leg: NDArray[np.int32], size: int) -> list[NDArray[np.int64]]:
     return out or ([np.arange(len(leg))] if len(leg) else [])
 
 
-def _consensus(matches: Sequence[Match]) -> NDArray[np.bool_]:
+def _consensus(matches: Sequence[Match]) -> Flags:
     """Largest set of windows that lie on a line of correction against picture number, sure ones counting more."""
     t = np.array([0.5 * (m.first + m.last) for m in matches])
     s = np.array([m.shift for m in matches])
@@ -202,7 +163,7 @@ def _consensus(matches: Sequence[Match]) -> NDArray[np.bool_]:
     return best
 
 
-def _smooth(matches: Sequence[Match], inlier: NDArray[np.bool_], count: int) -> Array:
+def _smooth(matches: Sequence[Match], inlier: Flags, count: int) -> Array:
     """Correction of each picture: medians of three neighbouring windows, linear between, constant beyond."""
     chosen = [m for m, ok in zip(matches, inlier) if ok]
     t = np.array([0.5 * (m.first + m.last) for m in chosen])

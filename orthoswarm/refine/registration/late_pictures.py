@@ -12,9 +12,10 @@ from typing import Final
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.compute.robust_kernel import robust_weights
 from orthoswarm.config import active
+from orthoswarm.model.arrays import Array, Gray
 from orthoswarm.model.camera import Camera, Lens
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.frame import Frame
@@ -22,9 +23,6 @@ from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import PlacedFrame, Solution, Terrain
 from orthoswarm.mosaic.recorded_pose import recorded_cameras
 from orthoswarm.refine.flight.unsolved_pictures import place_by_neighbours
-
-Array = NDArray[np.float64]
-Gray = NDArray[np.uint8]
 
 _NEIGHBOURS: Final = 4  # refined pictures with which a late one is compared, nearest first (for its time)
 _WORK_WIDTH_PX: Final = 640  # columns in which pictures are compared (for its time)
@@ -49,19 +47,13 @@ _ROUNDS: Final = 3  # Gauss-Newton steps at each scale, and steps onto the terra
 def register_late_pictures(
     frames: Sequence[Frame], refined: Solution, epsg: int, read: Callable[[Frame], Gray]
 ) -> tuple[list[PlacedFrame], dict[str, str]]:
-    """Place pictures of a vehicle that was refined without them.
-
-    Args:
-        frames: the late ones, of the same vehicle.
-        refined: what is there; nothing of it changes.
-        epsg: the area's grid.
-        read: gives a picture's grey values at full size.
+    """Place pictures of a vehicle that was refined without them; nothing of what is refined changes.
 
     Returns:
         The placed frames in order of time, and image -> reason for those that cannot be placed. Those that too few
-        points resect are `weak`, placed by the neighbours' corrections alone. The sigma of the
-        others combines that of the neighbours, that of the resection, and the effect of corners above the terrain on a
-        picture that has its neighbours on one side: their height times the neighbours' distance over the flying height.
+        points resect are `weak`, placed by the neighbours' corrections alone. The sigma of the others combines that of
+        the neighbours, that of the resection, and the effect of corners above the terrain on a picture that has its
+        neighbours on one side: their height times the neighbours' distance over the flying height.
     """
     late = {frame.image for frame in frames}
     everyone = sorted([*frames, *(p.frame for p in refined.placed)], key=lambda f: (f.time_s or 0.0, f.image))
@@ -112,11 +104,7 @@ def _nearest(one: PlacedFrame, others: Sequence[PlacedFrame]) -> list[PlacedFram
 def ground_observations(
     one: PlacedFrame, gray: Gray, other: PlacedFrame, known: Gray, terrain: Terrain
 ) -> tuple[Array, Array]:
-    """Ground points of a picture, by its corners followed into a refined one.
-
-    Args:
-        one: a picture near its place. gray: it, at working size. other: a refined one. known: it, at working size.
-        terrain: the ground.
+    """Ground points of a picture near its place, by its corners followed into a refined one; both at working size.
 
     Returns:
         Pixels (M, 2) of the first picture at full size, and the ground points (M, 3) that the other one gives them.
@@ -131,8 +119,7 @@ def ground_observations(
     turned = cv2.warpPerspective(known, move, (cols, rows), flags=warp)
     inside = cv2.warpPerspective(np.full_like(known, 255), move, (cols, rows), flags=warp & ~3)
     inner = cv2.erode(inside, np.ones((_BORDER_PX, _BORDER_PX), np.uint8))
-    quality, distance = _CORNER_QUALITY, _CORNER_DISTANCE_PX
-    corners = cv2.goodFeaturesToTrack(gray, _CORNERS, quality, distance, mask=inner)
+    corners = cv2.goodFeaturesToTrack(gray, _CORNERS, _CORNER_QUALITY, _CORNER_DISTANCE_PX, mask=inner)
     nothing = np.empty((0, 2)), np.empty((0, 3))
     if corners is None:
         return nothing
@@ -189,20 +176,15 @@ def _fitted(guess: PlacedFrame, seen: Sequence[tuple[Array, Array]], near: Seque
     away = np.array([p.camera.nadir for p in near])[source].mean(0) - camera.nadir
     neighbour_sigma_m = float(np.median([p.sigma_m for p in near]))
     leaning = _CORNER_HEIGHT_M * float(np.hypot(*away)) / float(camera.position[2] - ground[agree, 2].mean())
-    own = (
-        active().bundle.stated_sigma_factor
-        * float(np.sqrt(len(near)))
-        * centre_sigma(camera, uv[agree], ground[agree], scale)
-    )
+    own = active().bundle.stated_sigma_factor * float(np.sqrt(len(near)))
+    own *= centre_sigma(camera, uv[agree], ground[agree], scale)
     return PlacedFrame(guess.frame, camera, near[0].stage, float(np.linalg.norm([neighbour_sigma_m, leaning, own])))
 
 
 def centre_sigma(camera: Camera, uv: Array, ground: Array, scale: float) -> float:
-    """One sigma of an axis of where a picture's centre lies on the ground, by the scatter of its points, metres.
+    """Sigma of an axis of where a resected picture's centre lies on the ground, by the scatter of its points, metres.
 
-    Args:
-        camera: as resected. uv, ground: pixels (M, 2) and ground points (M, 3). scale: pixels of the picture in one of
-            those in which it was compared.
+    scale: pixels of the picture in one of those in which it was compared.
     """
     off = (camera.project(ground) - uv) / scale
     noise = max(float(np.sqrt((off**2).mean())), _LEAST_NOISE_PX)
@@ -217,10 +199,7 @@ def centre_sigma(camera: Camera, uv: Array, ground: Array, scale: float) -> floa
 
 
 def resected(camera: Camera, uv: Array, ground: Array) -> Camera:
-    """A camera's position and attitude from ground points (M, 3) at pixels (M, 2), robustly (Geman-McClure).
-
-    Gauss-Newton on six numbers, with the camera itself as a loose prior.
-    """
+    """A camera's pose by ground points (M, 3) at pixels (M, 2): robust Gauss-Newton, the camera as a loose prior."""
     scale = max(1.0, camera.lens.width / _WORK_WIDTH_PX)
     prior = _prior()
     total = np.zeros(6)
@@ -229,7 +208,7 @@ def resected(camera: Camera, uv: Array, ground: Array) -> Camera:
         for _ in range(_ROUNDS):
             off = (now.project(ground) - uv) / scale
             off = np.where(np.isfinite(off), off, 1e3)
-            weight = (c * c / (c * c + (off**2).sum(1))) ** 2
+            weight = robust_weights((off**2).sum(1), c * c)
             jacobian = np.stack(
                 [(_moved(camera, total + step).project(ground) - uv) / scale - off for step in _STEPS], -1
             )

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import bdtrc
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.int32]
+from orthoswarm.model.arrays import Array, Ints
 
 _EVIDENCE_FEWEST: Final = 4  # fewest tie points of a leg or a flight: fewer agree with themselves alone
 _EVIDENCE_PAIRS: Final = 400  # most lines through two tie points that are tried in a group (for its time)
@@ -75,7 +74,7 @@ def _group(shift: Array, along: Array, reach_m: float, tolerances: tuple[float, 
 
 
 def _binomial_tail(successes: int, trials: int, share: float) -> float:
-    """Probability of at least so many successes; not less than the smallest number, so that it has a logarithm.
+    """Probability of at least so many successes, at least the smallest number, so that it has a logarithm.
 
     By the incomplete beta function: importing scipy.stats for it would take a third of a second.
     """

@@ -11,14 +11,12 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.config import active
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.frame import SURVEYED, Frame
 from orthoswarm.model.placement import PlacedFrame
 from orthoswarm.refine.bundle.covariance import RECEIVER_COMMON_SIGMA_M
-
-Array = NDArray[np.float64]
 
 _CORRECTED_SIGMA_M: Final = 0.5  # a position that states at most this sigma was corrected (RTK, PPK)
 _CORRECTED_FLOOR_M: Final = 0.05  # corrected positions are not trusted better than this: antenna offset, base station
@@ -31,10 +29,8 @@ class MapOffset:
     """The map against the receivers.
 
     Attributes:
-        east, north: metres from where the receivers say to where the map shows the same ground.
-        sigma: one sigma of both, metres.
-        vehicles: how many were compared.
-        corrected: True where the receivers had corrections (RTK, PPK), by the accuracy that they state.
+        east, north: metres from where the receivers say to where the map shows the same ground. sigma: of both.
+        vehicles: how many were compared. corrected: receivers state an accuracy that only corrections (RTK, PPK) give.
     """
 
     east: float
@@ -117,11 +113,7 @@ def had_corrections(frames: Sequence[Frame]) -> bool:
 
 
 def measure_map_offset(recorded: Sequence[PlacedFrame], refined: Sequence[PlacedFrame]) -> MapOffset | None:
-    """The offset of the map against the receivers, by the frames that were refined on the map; None without any.
-
-    Args:
-        recorded: the cameras as recorded. refined: the same frames after the refinement, in the same grid.
-    """
+    """The offset of the map against the receivers, by the frames that were refined on the map; None without any."""
     on_map = [p for p in refined if p.stage == "fine" and not p.weak]
     return _measured(recorded, on_map, min((p.sigma_m for p in refined if p.stage == "fine"), default=0.0))
 
@@ -129,12 +121,7 @@ def measure_map_offset(recorded: Sequence[PlacedFrame], refined: Sequence[Placed
 def measure_control_offset(
     recorded: Sequence[PlacedFrame], placed: Sequence[PlacedFrame], found_sigma_m: float
 ) -> MapOffset | None:
-    """The offset of frames that control points placed against the receivers; None without any.
-
-    Args:
-        recorded: the cameras as recorded. placed: the same frames after the control, in the same grid.
-        found_sigma_m: sigma of the control's shift, an axis, metres.
-    """
+    """The offset of controlled frames against the receivers, or None; found_sigma_m: of the control's shift."""
     return _measured(recorded, [p for p in placed if not p.weak], found_sigma_m)
 
 

@@ -1,36 +1,33 @@
 """A vehicle that is not found on the map (blank there, or changed) is registered to neighbours that are.
 
-Where there is no map, vehicles are registered to each other in the same way.
-
 First as a whole: its strips are correlated with a mosaic of the neighbours' pictures, as if that were the map. Then by
-its points, which are observed in these pictures, whose cameras are fixed; so relief does not matter.
+its points, which are observed in these pictures, whose cameras are fixed; so relief does not matter. Where there is no
+map, vehicles are registered to each other in the same way.
 """
 
+from collections.abc import Callable, Sequence
 from copy import deepcopy
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import chain
 from typing import Final
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.config import active
+from orthoswarm.model.arrays import Array, Flags, Floats, Gray, Indices, Ints
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.geo import GroundGrid
-from orthoswarm.refine.registration.absolute_orientation import working_gsd
-from orthoswarm.refine.registration.block_state import VehicleState, lies_on_map
-from orthoswarm.refine.registration.coarse_registration import (
-    CoarseFit,
-    coarse_fits,
-    picture_width_m,
-    shift_cameras,
-)
-from orthoswarm.refine.registration.neighbour_ties import FixedCameras, fixed_cameras_near, link_to_fixed, remove_fixed
+from orthoswarm.refine.bundle.adjustment import Adjustment
+from orthoswarm.refine.bundle.block_arrays import HEIGHT, WIDTH, CameraBlock, F
+from orthoswarm.refine.bundle.priors import Priors
+from orthoswarm.refine.flight.relative_block import FlightBlock
+from orthoswarm.refine.registration.absolute_orientation import linkable_points, working_gsd
+from orthoswarm.refine.registration.block_state import VehicleState, WorkArea, lies_on_map
+from orthoswarm.refine.registration.coarse_registration import CoarseFit, coarse_fits, picture_width_m, shift_cameras
 from orthoswarm.refine.registration.orientation_correlation import strip_mosaic
+from orthoswarm.refine.registration.tie_points import LINK_REACH_PX, link_legs
 from orthoswarm.refine.surface.vehicle_ground import fit_surface
-
-Array = NDArray[np.float64]
 
 _BLOCK_PX = 512
 
@@ -43,6 +40,134 @@ _UNFOUND_FEWEST: Final = 8  # fewest links that must agree in the end, or the ve
 _UNFOUND_LEAST_SHARE: Final = 0.4  # ... and the least share of them
 _UNFOUND_AGREES: Final = 0.3  # links with at least this robust weight agree
 _UNFOUND_REACH_SHARE: Final = 0.6  # neighbours' pictures are drawn to this share of their diagonal from their cameras
+_NEIGHBOUR_SIGMA_PX: Final = 1.5  # sigma of a link to another vehicle, whose cameras do not move, working pixels
+_NEIGHBOUR_PICTURES: Final = 2  # most vehicles in which a point is observed, one picture each (cost)
+_NEIGHBOUR_REACH_HEIGHTS: Final = 1.2  # other vehicles' cameras within so many flying heights may show its ground
+_NEIGHBOUR_EVERY: Final = 2  # every so-manieth of these cameras is used: neighbours in time show the same (cost)
+
+
+@dataclass(frozen=True, slots=True)
+class FixedCameras:
+    """Cameras (M) of neighbours that may show a vehicle's ground; they do not move in its adjustment.
+
+    vehicle: int32 (M,), number of their vehicle. gray: picture i at working scale. small: picture i, reduced.
+    """
+
+    cameras: CameraBlock
+    vehicle: Ints
+    gray: Callable[[int], Gray]
+    small: Callable[[int], Gray]
+
+
+def fixed_cameras_near(state: VehicleState, others: Sequence[VehicleState]) -> FixedCameras | None:
+    """The neighbours' cameras near a vehicle's path (not all are needed); None where there are none."""
+    own = state.flight.adjustment.cameras.position[:, :2]
+    reach = _NEIGHBOUR_REACH_HEIGHTS * float(np.median(state.flight.adjustment.cameras.position[:, 2]))
+    low, high = own.min(0) - reach, own.max(0) + reach
+    parts: list[tuple[VehicleState, Indices]] = []
+    for other in others:
+        xy = other.flight.adjustment.cameras.position[: len(other.flight.frames), :2]
+        within = ((xy > low) & (xy < high)).all(1) & (other.flight.leg >= 0)
+        near = np.flatnonzero(within)[::_NEIGHBOUR_EVERY]
+        fits = other.on_map if state.on_map else lies_on_map(other) == lies_on_map(state)
+        if len(near) and fits:
+            parts.append((other, near))
+    if not parts:
+        return None
+    cameras = CameraBlock.joined([o.flight.adjustment.cameras.take(near) for o, near in parts])
+    vehicle = np.concatenate([np.full(len(near), k, np.int32) for k, (_, near) in enumerate(parts)])
+    where = [(o, int(i)) for o, near in parts for i in near]
+    return FixedCameras(
+        cameras,
+        vehicle,
+        lambda j: where[j][0].flight.pictures.gray(where[j][1]),
+        lambda j: where[j][0].flight.pictures.small(where[j][1]),
+    )
+
+
+def link_to_fixed(
+    flight: FlightBlock,
+    fixed: FixedCameras,
+    gsd_m: float,
+    *,
+    reach_px: int = LINK_REACH_PX,
+    pictures: Flags | None = None,
+    cell_m: float | None = None,
+) -> int:
+    """Observe own points in fixed pictures and add these observations; the fixed cameras are appended to the block.
+
+    Args:
+        gsd_m: pixel in which they are compared. reach_px: how far a point is searched there.
+        pictures: bool (N,), own ones to compare, None for all. cell_m: one point a leg in each cell of this size,
+            None: as configured.
+    """
+    adj = flight.adjustment
+    n = len(adj.cameras)
+    joint = CameraBlock.joined([adj.cameras, fixed.cameras])
+    seen, chosen = linkable_points(flight, cell_m or active().registration.link_cell_m, pictures)
+    leg = np.concatenate([flight.leg, int(flight.leg.max()) + 1 + fixed.vehicle]).astype(np.int32)
+    candidates = np.arange(n, len(joint))
+
+    def gray(i: int) -> Gray:
+        return flight.pictures.gray(i) if i < n else fixed.gray(i - n)
+
+    camera, point, uv = link_legs(
+        joint,
+        adj.points,
+        chosen,
+        camera=seen.camera,
+        leg=leg,
+        candidates=candidates,
+        gray=gray,
+        gsd_m=gsd_m,
+        most=_NEIGHBOUR_PICTURES,
+        reach=reach_px,
+    )
+    if not len(camera):
+        return 0
+    tracks = adj.tracks.with_more(camera, point, uv, _NEIGHBOUR_SIGMA_PX)
+    free = np.arange(len(joint)) < n
+    new = Adjustment.begin(joint, tracks, _padded(adj.priors, fixed.cameras), adj.points, free)
+    new.common[: adj.layout.lens_columns] = adj.common[: adj.layout.lens_columns]
+    new.common[new.layout.lens_columns :] = adj.common[adj.layout.lens_columns :]
+    flight.adjustment = new
+    return len(camera)
+
+
+def remove_fixed(flight: FlightBlock) -> None:
+    """Remove the fixed cameras and their observations from a flight's adjustment."""
+    adj = flight.adjustment
+    n, lenses = len(flight.frames), int(adj.cameras.lens_id[: len(flight.frames)].max()) + 1
+    own = adj.tracks.camera < n
+    tracks = adj.tracks.take(own)
+    cameras = replace(adj.cameras.take(slice(0, n)), lens=adj.cameras.lens[:lenses])
+    p = adj.priors
+    by_camera = ("position", "position_sigma", "rotation", "rotation_sigma", "velocity", "group")
+    own_records = {name: getattr(p, name)[:n] for name in by_camera}
+    priors = replace(p, **own_records, lens=p.lens[:lenses], lens_sigma=p.lens_sigma[:lenses])
+    new = Adjustment.begin(cameras, tracks, priors, adj.points)
+    new.common[: 6 * lenses] = adj.common[: 6 * lenses]
+    new.common[6 * lenses :] = adj.common[adj.layout.lens_columns :]
+    new.obs_weight[:] = adj.obs_weight[own][np.lexsort((tracks.camera, tracks.point))]
+    new.point_inverse[:] = adj.point_inverse
+    new.tie_residual = adj.tie_residual
+    flight.adjustment = new
+
+
+def _padded(p: Priors, fixed: CameraBlock) -> Priors:
+    """Priors with fixed cameras, which belong to no sortie and whose lenses do not change."""
+    cameras, lens = len(fixed), np.column_stack([np.log(fixed.lens[:, 0]), fixed.lens[:, 1:6]])
+    return replace(
+        p,
+        position=np.concatenate([p.position, np.zeros((cameras, 3))]),
+        position_sigma=np.concatenate([p.position_sigma, np.full((cameras, 3), np.inf)]),
+        rotation=np.concatenate([p.rotation, np.broadcast_to(np.eye(3), (cameras, 3, 3))]),
+        rotation_sigma=np.concatenate([p.rotation_sigma, np.full((cameras, 3), np.inf)]),
+        velocity=np.concatenate([p.velocity, np.zeros((cameras, 2))]),
+        group=np.concatenate([p.group, np.full(cameras, -1)]).astype(np.int32),
+        lens=np.concatenate([p.lens, lens]),
+        lens_sigma=np.concatenate([p.lens_sigma, np.zeros_like(lens)]),
+    )
 
 
 class FixedCameraMosaic:
@@ -51,14 +176,9 @@ class FixedCameraMosaic:
     def __init__(self, fixed: FixedCameras, epsg: int, origin: Array) -> None:
         self.epsg = epsg
         self._fixed, self._origin = fixed, origin
-        cameras = fixed.cameras
-        focal = cameras.lens[cameras.lens_id, 0]
-        self._reach_m = (
-            cameras.position[:, 2]
-            * np.hypot(cameras.lens[cameras.lens_id, 6], cameras.lens[cameras.lens_id, 7])
-            / focal
-        )
-        self.native_gsd_m = float(np.median(cameras.position[:, 2] / focal))
+        lens, height = fixed.cameras.lens[fixed.cameras.lens_id], fixed.cameras.position[:, 2]
+        self._reach_m = height * np.hypot(lens[:, WIDTH], lens[:, HEIGHT]) / lens[:, F]
+        self.native_gsd_m = float(np.median(height / lens[:, F]))
 
     @property
     def bounds(self) -> BoundingBox:
@@ -66,7 +186,7 @@ class FixedCameraMosaic:
         xy = self._fixed.cameras.position[:, :2] + self._origin[:2]
         return BoundingBox.around(np.hstack([xy - self._reach_m[:, None], xy + self._reach_m[:, None]]))
 
-    def gray(self, bounds: BoundingBox, gsd_m: float) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    def gray(self, bounds: BoundingBox, gsd_m: float) -> tuple[Floats, Flags]:
         """Grey values (rows, columns), 0 to 255, and validity of a window."""
         grid = GroundGrid.around(self.epsg, bounds, gsd_m)
         gray, valid = np.zeros((grid.height, grid.width), np.float32), np.zeros((grid.height, grid.width), bool)
@@ -76,21 +196,15 @@ class FixedCameraMosaic:
                 self._draw(grid, rows, cols, gray[rows, cols], valid[rows, cols])
         return gray, valid
 
-    def _draw(
-        self, grid: GroundGrid, rows: slice, cols: slice, gray: NDArray[np.float32], valid: NDArray[np.bool_]
-    ) -> None:
+    def _draw(self, grid: GroundGrid, rows: slice, cols: slice, gray: Floats, valid: Flags) -> None:
         cameras, gsd = self._fixed.cameras, grid.gsd_m
         west = grid.west + cols.start * gsd - float(self._origin[0])
         north = grid.north - rows.start * gsd - float(self._origin[1])
         high, wide = gray.shape
         x, y = cameras.position[:, 0], cameras.position[:, 1]
         reach = _UNFOUND_REACH_SHARE * self._reach_m
-        near = (
-            (x > west - reach)
-            & (x < west + wide * gsd + reach)
-            & (y < north + reach)
-            & (y > north - high * gsd - reach)
-        )
+        near = (x > west - reach) & (x < west + wide * gsd + reach)
+        near &= (y < north + reach) & (y > north - high * gsd - reach)
         drawn = strip_mosaic(cameras, np.flatnonzero(near), self._fixed.small, 0.0, gsd) if near.any() else None
         if drawn is None:
             return
@@ -100,33 +214,22 @@ class FixedCameraMosaic:
         valid[:] = cv2.warpAffine(known.astype(np.uint8), move, (wide, high), flags=cv2.INTER_NEAREST) > 0
 
 
-def register_to_neighbours(item: tuple[VehicleState, list[VehicleState]], *, epsg: int, origin: Array) -> VehicleState:
-    """Register a vehicle that was not found on the map to neighbours that lie on it.
-
-    Args:
-        item: the vehicle, and neighbours.
-        epsg: the area's grid. origin: float64 (2,) of the local frame.
-
-    Returns:
-        A state that is `carried`; the same one where the neighbours' pictures share too little with it.
-    """
+def register_to_neighbours(item: tuple[VehicleState, list[VehicleState]], *, area: WorkArea) -> VehicleState:
+    """The vehicle `carried` by neighbours that lie on the map; as it was where they share too little with it."""
     state, others = item
     carried = replace(state, carried=True)  # so that the cameras of neighbours on the map are fixed
-    found = _registered(carried, [other for other in others if lies_on_map(other)], epsg, origin, near_first=False)
+    found = _registered(carried, [other for other in others if lies_on_map(other)], area, near_first=False)
     return found or state
 
 
-def join_neighbours(item: tuple[VehicleState, list[VehicleState]], *, epsg: int, origin: Array) -> VehicleState:
-    """Register a vehicle that no map holds to neighbours that none holds either, so that they make one block.
+def join_neighbours(item: tuple[VehicleState, list[VehicleState]], *, area: WorkArea) -> VehicleState:
+    """The vehicle `joined` to neighbours that no map holds either, in one block; as it was where they share too little.
 
-    Receivers without corrections differ by metres, which is farther than links are searched. Arguments as above.
-
-    Returns:
-        A state that is `joined`; the same one where the neighbours' pictures share too little with it.
+    Receivers without corrections differ by metres, which is farther than links are searched.
     """
     state, others = item
     others = [other for other in others if not lies_on_map(other)]
-    found = _registered(state, others, epsg, origin, near_first=True)
+    found = _registered(state, others, area, near_first=True)
     if found is None:
         return state
     found.joined, found.confidence = True, state.confidence
@@ -135,14 +238,14 @@ def join_neighbours(item: tuple[VehicleState, list[VehicleState]], *, epsg: int,
 
 
 def _registered(
-    state: VehicleState, others: list[VehicleState], epsg: int, origin: Array, *, near_first: bool
+    state: VehicleState, others: list[VehicleState], area: WorkArea, *, near_first: bool
 ) -> VehicleState | None:
     """A copy of the state where links to the others confirm a guess; near_first: the first guess is where it is."""
     fixed = fixed_cameras_near(state, others)
     if fixed is None:
         return None
     here = CoarseFit(np.zeros((len(state.flight.frames), 2)), [], np.zeros(0, bool), 1.0)
-    guesses = coarse_fits(state.flight, FixedCameraMosaic(fixed, epsg, origin), origin)
+    guesses = coarse_fits(state.flight, FixedCameraMosaic(fixed, area.epsg, area.origin), area.origin)
     try:
         for fit in chain([here] if near_first else [], guesses):
             out = deepcopy(state)
@@ -157,13 +260,12 @@ def _registered(
 
 def _linked(state: VehicleState, fit: CoarseFit, others: list[VehicleState]) -> bool:
     """Adjust a vehicle with its points observed in fixed pictures; False where too few of them agree."""
-    config = active().registration
     flight = state.flight
     shift_cameras(flight, fit.correction)
     fixed = fixed_cameras_near(state, others)
     if fixed is None:
         return False
-    cell_m = min(config.link_cell_m, _UNFOUND_CELL_SHARE * picture_width_m(flight))
+    cell_m = min(active().registration.link_cell_m, _UNFOUND_CELL_SHARE * picture_width_m(flight))
     found = link_to_fixed(flight, fixed, working_gsd(flight), reach_px=_UNFOUND_REACH_PX, cell_m=cell_m)
     if found < _UNFOUND_FEWEST:
         return False

@@ -9,15 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from orthoswarm.model.arrays import Array, Flags, Floats, Gray
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import MapWindow
 from orthoswarm.raster.subpixel_peak import vertex
 from orthoswarm.refine.bundle.block_arrays import CameraBlock
 
-Array = NDArray[np.float64]
-Gray = NDArray[np.uint8]
-Complex = NDArray[np.complex64]
+OrientationField = NDArray[np.complex64]
+
+Found = tuple[float, float, float, float]
+"""Column and row of a shift from the centre, pixels, peak, and ratio of second peak to peak."""
 
 _STRIP_MOST_PX: Final = 4_000_000  # larger strips are not correlated (memory)
 _STRIP_FARTHEST_HEIGHTS: Final = 4.0
@@ -41,8 +43,7 @@ class Match:
     """A window of consecutive pictures found on the map.
 
     Attributes:
-        first: first picture, last: last picture (inclusive).
-        shift: (2,) east, north: what has to be added to the cameras, metres.
+        first, last: its pictures (inclusive). shift: (2,) east, north: what has to be added to the cameras, metres.
         peak: correlation. ratio: second peak / peak (small is sure).
     """
 
@@ -53,7 +54,7 @@ class Match:
     ratio: float
 
 
-def orientation_field(gray: NDArray[np.float32], valid: NDArray[np.bool_]) -> Complex:
+def orientation_field(gray: Floats, valid: Flags) -> OrientationField:
     """Double-angle orientation field (gx + i gy)^2 / |g|^2 * |g| / (|g| + median |g|), 0 where not valid.
 
     An edge keeps its value when light and dark change places.
@@ -67,7 +68,7 @@ def orientation_field(gray: NDArray[np.float32], valid: NDArray[np.bool_]) -> Co
     return np.asarray(np.where(inner, g * g / (np.maximum(size, 1e-3) * (size + max(middle, 1e-3))), 0), np.complex64)
 
 
-def correlation(moving: Complex, fixed: Complex, reach: int) -> NDArray[np.float32]:
+def correlation(moving: OrientationField, fixed: OrientationField, reach: int) -> Floats:
     """Correlation (2 reach + 1, 2 reach + 1) of a field (h, w) with a larger one (h + 2 reach, w + 2 reach).
 
     At [reach + row, reach + column] of the shift; normalised by the energies under the overlap.
@@ -85,17 +86,8 @@ def correlation(moving: Complex, fixed: Complex, reach: int) -> NDArray[np.float
     return np.asarray(score, np.float32)
 
 
-def correlate(moving: Complex, fixed: Complex, reach: int) -> tuple[float, float, float, float]:
-    """Best shift of a field in a larger one (see `correlation`).
-
-    Returns:
-        Column and row of the shift from the centre (sub-pixel), peak, ratio of second peak to peak.
-    """
-    return highest(correlation(moving, fixed, reach), PEAK_APART_PX)
-
-
-def highest(score: NDArray[np.float32], apart: int) -> tuple[float, float, float, float]:
-    """Peak of a correlation as `correlate` gives it; what is nearer than `apart` + 1 pixels belongs to the peak."""
+def highest(score: Floats, apart: int) -> Found:
+    """Peak of a correlation, sub-pixel; what is nearer than `apart` + 1 pixels belongs to it."""
     n = len(score)
     r, c = np.unravel_index(int(score.argmax()), score.shape)
     peak = float(score[r, c])
@@ -108,14 +100,14 @@ def highest(score: NDArray[np.float32], apart: int) -> tuple[float, float, float
     return c + dc - n // 2, r + dr - n // 2, peak, ratio
 
 
-def without_peak(score: NDArray[np.float32], apart: int) -> NDArray[np.float32]:
+def without_peak(score: Floats, apart: int) -> Floats:
     """The values (n,) of a correlation that do not belong to its highest peak."""
     r, c = np.unravel_index(int(score.argmax()), score.shape)
     rest = _without(score, int(r), int(c), apart)
     return np.asarray(rest[rest != 0])
 
 
-def _without(score: NDArray[np.float32], row: int, column: int, apart: int) -> NDArray[np.float32]:
+def _without(score: Floats, row: int, column: int, apart: int) -> Floats:
     rest = score.copy()
     rest[max(0, row - apart) : row + apart + 1, max(0, column - apart) : column + apart + 1] = 0
     return rest
@@ -123,14 +115,10 @@ def _without(score: NDArray[np.float32], row: int, column: int, apart: int) -> N
 
 def strip_mosaic(
     cameras: CameraBlock, index: NDArray[np.integer], small: Callable[[int], Gray], ground_z: float, gsd_m: float
-) -> tuple[NDArray[np.float32], NDArray[np.bool_], float, float] | None:
-    """Nearest-nadir grey mosaic of some pictures on a level plane.
+) -> tuple[Floats, Flags, float, float] | None:
+    """Nearest-nadir mosaic of some pictures on a level plane: grey (rows, columns), validity, west and north edges.
 
-    Args:
-        small: reduced picture i; its scale is taken from its width.
-
-    Returns:
-        Grey (rows, columns), validity, west and north edges; None where nothing is seen.
+    None where nothing is seen. small: reduced picture i; its scale is taken from its width.
     """
     corners, homographies = [], []
     for i in index:
@@ -183,32 +171,35 @@ class Strip:
         offset: (2,) east, north: where the map's pixels lie from those of the mosaic, less than a pixel, metres.
     """
 
-    gray: NDArray[np.float32]
-    valid: NDArray[np.bool_]
-    ground: NDArray[np.float32]
-    known: NDArray[np.bool_]
+    gray: Floats
+    valid: Flags
+    ground: Floats
+    known: Flags
     reach: int
     gsd_m: float
     offset: tuple[float, float]
 
 
+@dataclass(frozen=True, slots=True)
+class Search:
+    """Where strips are sought: on a map about the origin (2,), to reach_m on each side, in pixels of gsd_m."""
+
+    basemap: MapWindow
+    origin: Array
+    reach_m: float
+    gsd_m: float
+
+
 def strip_and_map(
-    cameras: CameraBlock,
-    index: NDArray[np.integer],
-    picture: Callable[[int], Gray],
-    *,
-    basemap: MapWindow,
-    origin: Array,
-    ground_z: float,
-    reach_m: float,
-    gsd_m: float,
+    cameras: CameraBlock, index: NDArray[np.integer], picture: Callable[[int], Gray], search: Search
 ) -> Strip | None:
     """Mosaic some consecutive pictures and read the map around them; None where either has nothing to show."""
-    mosaic = strip_mosaic(cameras, index, picture, ground_z, gsd_m)
+    basemap, origin, gsd_m = search.basemap, search.origin, search.gsd_m
+    mosaic = strip_mosaic(cameras, index, picture, 0.0, gsd_m)
     if mosaic is None:
         return None
     gray, valid, west, north = mosaic
-    reach = int(np.ceil(reach_m / gsd_m))
+    reach = int(np.ceil(search.reach_m / gsd_m))
     rows, cols = gray.shape
     bounds = BoundingBox(
         origin[0] + west - reach * gsd_m,
@@ -232,21 +223,16 @@ def strip_and_map(
     )
 
 
-Found = tuple[float, float, float, float]
-"""Column and row of a shift in pixels of a strip, peak, and ratio of second peak to peak."""
-
-
 def by_edges(strip: Strip) -> Found | None:
     """Where a strip lies on its map, by their edges; None where there is nothing to find."""
     fields = _edges(strip)
-    return None if fields is None else correlate(*fields, strip.reach)
+    return None if fields is None else highest(correlation(*fields, strip.reach), PEAK_APART_PX)
 
 
-def _edges(strip: Strip) -> tuple[Complex, Complex] | None:
+def _edges(strip: Strip) -> tuple[OrientationField, OrientationField] | None:
     """Orientation fields of a strip and of its map; None where one of them has hardly an edge."""
-    blur = _STRIP_BLUR_PX
-    moving = orientation_field(cv2.GaussianBlur(strip.gray, (0, 0), blur), strip.valid)
-    fixed = orientation_field(cv2.GaussianBlur(strip.ground, (0, 0), blur), strip.known)
+    moving = orientation_field(cv2.GaussianBlur(strip.gray, (0, 0), _STRIP_BLUR_PX), strip.valid)
+    fixed = orientation_field(cv2.GaussianBlur(strip.ground, (0, 0), _STRIP_BLUR_PX), strip.known)
     edges = min(np.count_nonzero(moving), np.count_nonzero(fixed))
     return None if edges < STRIP_FEWEST_EDGES else (moving, fixed)
 
@@ -296,18 +282,11 @@ def register(
     cameras: CameraBlock,
     index: NDArray[np.integer],
     picture: Callable[[int], Gray],
-    *,
-    basemap: MapWindow,
-    origin: Array,
-    ground_z: float,
-    reach_m: float,
-    gsd_m: float,
+    search: Search,
     find: Callable[[Strip], Found | None] = by_edges,
 ) -> Match | None:
     """Find the mosaic of some consecutive pictures on the map; None where there is nothing to find."""
-    strip = strip_and_map(
-        cameras, index, picture, basemap=basemap, origin=origin, ground_z=ground_z, reach_m=reach_m, gsd_m=gsd_m
-    )
+    strip = strip_and_map(cameras, index, picture, search)
     found = None if strip is None else find(strip)
     if strip is None or found is None:
         return None

@@ -1,4 +1,7 @@
-"""Tie points on the map, roofs that show how the map leans, and links between legs."""
+"""Tie points on the map, roofs that show how the map leans, and links between legs.
+
+All patches of one picture are searched in one call of compiled code.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -8,15 +11,24 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.compute.jit import kernel
+from orthoswarm.compute.robust_kernel import robust_weights
 from orthoswarm.config import active
-from orthoswarm.refine.bundle.block_arrays import CameraBlock
-from orthoswarm.refine.features.patch_matching import template_of
-from orthoswarm.refine.registration.map_windows import LoadedMap
-from orthoswarm.refine.registration.patch_search import search_map, search_picture, templates, views_of_other_legs
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int32]
-Gray = NDArray[np.uint8]
+from orthoswarm.model.arrays import Array, Flags, Gray, Indices, Ints
+from orthoswarm.model.bounding_box import BoundingBox
+from orthoswarm.model.geo import GroundGrid
+from orthoswarm.model.placement import MapWindow
+from orthoswarm.refine.bundle.block_arrays import HEIGHT, WIDTH, CameraBlock, project_point
+from orthoswarm.refine.features.patch_matching import (
+    gradients,
+    locate,
+    locate_wanted,
+    promising_blocks,
+    rectify,
+    template_of,
+    window_of,
+)
+from orthoswarm.refine.features.shift_products import ROWS
 
 _MAP_WINDOW_SHARE: Final = 0.7  # least share of a patch's search window that the map covers
 _PATCH_SHARE: Final = 0.85  # least share of a patch that its picture shows
@@ -27,10 +39,8 @@ _LEAN_SCALE: Final = 4.0  # robust scale of the vote (2 sigmas)
 _LEAN_MOST: Final = 1.0  # largest lean, metres of shift a metre of height (45 degrees)
 _LEAN_OVER_NONE: Final = 1.5  # a lean must have so many times the sum of weights that no lean has
 _LEAN_LEAST_SHARE: Final = 0.25  # ... and at least this mean weight
-LINK_VIEWS: Final = 3  # fewest pictures that show the point
-LINK_VIEW_WEIGHT: Final = 0.5  # least mean robust weight of its observations
 _LINK_HALF_PX: Final = 15  # half a patch
-_LINK_REACH_PX: Final = 6  # how far it is searched
+LINK_REACH_PX: Final = 6  # how far it is searched
 _LINK_MARGIN_PX: Final = 12.0  # points nearer to a picture's border are not searched in it, working pixels
 _LINK_TEMPLATE_SHARE: Final = 0.95  # least share of the patch that its own picture shows ...
 _LINK_WINDOW_SHARE: Final = 0.8  # ... and of the search window in the other picture
@@ -44,6 +54,38 @@ _SEARCH_PROMISING_SHARE: Final = 0.6
 """... and then where that correlates with at least this share of its highest value. Of 1,030 sure first ties 3 are not
 found or lie elsewhere with 0.5, 13 with 0.65, 38 with 0.8."""
 _GRADIENT_FLOOR: Final = 1e-3  # least median gradient, grey values: a blank patch has no texture to compress
+
+
+@dataclass(frozen=True, slots=True)
+class LoadedMap:
+    """Grey map of an area in a local frame, in memory at one pixel size.
+
+    Attributes:
+        west, north: edges in the local frame (grid minus origin), metres. gsd_m: pixel.
+        gray: uint8 (rows, columns). valid: bool (rows, columns).
+    """
+
+    west: float
+    north: float
+    gsd_m: float
+    gray: Gray
+    valid: Flags
+
+    @classmethod
+    def load(cls, basemap: MapWindow, origin: Array, bounds: BoundingBox, gsd_m: float) -> "LoadedMap":
+        """Read local bounds (west, south, east, north) of a map; origin (2,) is added to reach its grid."""
+        east, north = float(origin[0]), float(origin[1])
+        world = bounds.moved(east, north)
+        gray, valid = basemap.gray(world, gsd_m)
+        grid = GroundGrid.around(basemap.epsg, world, gsd_m)
+        return cls(grid.west - east, grid.north - north, gsd_m, np.clip(gray + 0.5, 0, 255).astype(np.uint8), valid)
+
+    def pixel_centres(self, xy: Array) -> tuple[Indices, Array]:
+        """Row and column (K, 2) of the pixels that hold points (K, 2), and the coordinates (K, 2) of their middles."""
+        column = ((xy[:, 0] - self.west) // self.gsd_m).astype(np.int64)
+        row = ((self.north - xy[:, 1]) // self.gsd_m).astype(np.int64)
+        east, north = self.west + (column + 0.5) * self.gsd_m, self.north - (row + 0.5) * self.gsd_m
+        return np.column_stack([row, column]), np.column_stack([east, north])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,11 +110,10 @@ class MapMatches:
     @classmethod
     def none(cls) -> "MapMatches":
         """No matches."""
-        number, pair = np.zeros(0), np.zeros((0, 2))
-        ints = np.zeros(0, np.int32)
-        return cls(point=ints, camera=ints, shift=pair, peak=number, ratio=number)
+        number, ints = np.zeros(0), np.zeros(0, np.int32)
+        return cls(point=ints, camera=ints, shift=np.zeros((0, 2)), peak=number, ratio=number)
 
-    def take(self, keep: NDArray[np.bool_] | NDArray[np.integer]) -> "MapMatches":
+    def take(self, keep: Flags | NDArray[np.integer]) -> "MapMatches":
         """Some of the matches."""
         return MapMatches(**{name: getattr(self, name)[keep] for name in self.__slots__})
 
@@ -110,7 +151,7 @@ def match_points(
     place = np.column_stack([centre, plane])
     found = np.zeros((len(chosen), 4))
     for i, part in _by_picture(by):
-        search_map(
+        _search_map(
             cameras.position[i], cameras.rotation[i], cameras.lens[cameras.lens_id[i]], gray(i), place[part],
             pixel[part], ground.gray, ground.valid, ground.gsd_m, half, reach, texture,
             np.float32(_GRADIENT_FLOOR), _PEAK_EXCLUDE_PX, _MAP_WINDOW_SHARE,
@@ -135,14 +176,10 @@ def _by_picture(ascending: NDArray[np.integer]) -> Iterator[tuple[int, slice]]:
 
 
 def vote_lean(matches: MapMatches, height: Array, offset: Array) -> tuple[float, float] | None:
-    """The map's lean (metres of shift per metre of height) from roofs.
+    """The map's lean, metres of shift east and north per metre of height, from roofs; None where too few of them agree.
 
     Args:
-        height: float64 (Q,) height of each matched point above the ground.
-        offset: float64 (2,) shift that ground points have now.
-
-    Returns:
-        East and north lean, or None where too few roofs agree (the caller then takes zero).
+        height: float64 (Q,) of each matched point above the ground. offset: float64 (2,) shift of ground points now.
     """
     if len(height) < _LEAN_FEWEST:
         return None
@@ -152,7 +189,7 @@ def vote_lean(matches: MapMatches, height: Array, offset: Array) -> tuple[float,
 
     def support(lean: Array) -> tuple[float, Array]:
         e2 = ((shift - lean * height[:, None]) ** 2).sum(1) / sigma**2
-        w = 1.0 / (1.0 + e2 / _LEAN_SCALE) ** 2
+        w = robust_weights(e2, _LEAN_SCALE)
         return float(w.sum()), w
 
     candidates = slope[np.hypot(*slope.T) < _LEAN_MOST]
@@ -181,36 +218,31 @@ def link_legs(
     gray: Callable[[int], Gray],
     gsd_m: float,
     most: int | None = None,
-    reach: int | None = None,
-) -> tuple[Ints, Ints, Array, int]:
-    """Find points of one leg in the pictures of other legs.
+    reach: int = LINK_REACH_PX,
+) -> tuple[Ints, Ints, Array]:
+    """Find points of one leg in the pictures of other legs: camera (K,), point (K,), pixel (K, 2) of new observations.
 
     Args:
         camera: (P,) reference picture of each point. leg: (N,) of each camera. candidates: cameras that may be linked.
-        most: other legs in which a point is observed. reach: search in pixels. None: as configured.
-
-    Returns:
-        Camera (K,), point (K,), pixel (K, 2) of new observations, and how many were tried.
+        most: other legs in which a point is observed, None: as configured. reach: search in pixels.
     """
-    config = active().registration
-    most = config.link_pictures if most is None else most
-    half, reach = _LINK_HALF_PX, _LINK_REACH_PX if reach is None else reach
+    most, half = most or active().registration.link_pictures, _LINK_HALF_PX
     floor = np.float32(_GRADIENT_FLOOR)
     chosen = chosen[np.argsort(camera[chosen], kind="stable")]
     _, number = np.unique(leg, return_inverse=True)
     views = np.empty((len(chosen), most), np.int64)
-    views_of_other_legs(
+    _views_of_other_legs(
         cameras.position, cameras.rotation, cameras.lens_id, cameras.lens, points[chosen], number[camera[chosen]],
         number, int(number.max(initial=-1)) + 1, np.asarray(candidates, np.int64), _LINK_MARGIN_PX, views,
     )  # fmt: skip
     chosen, views = chosen[views[:, 0] >= 0], views[views[:, 0] >= 0]
-    found, tried = np.zeros((*views.shape, 4)), 0
+    found = np.zeros((*views.shape, 4))
     for start in range(0, len(chosen), _LINKS_AT_ONCE):
         some = slice(start, start + _LINKS_AT_ONCE)
         own = points[chosen[some]]
         fields = np.zeros((len(own), *template_of(half).shape), np.float32)
         for i, part in _by_picture(camera[chosen[some]]):
-            templates(
+            _templates(
                 cameras.position[i], cameras.rotation[i], cameras.lens[cameras.lens_id[i]], gray(i), own[part],
                 gsd_m, half, floor, _LINK_TEMPLATE_SHARE, fields[part],
             )  # fmt: skip
@@ -219,10 +251,9 @@ def link_legs(
         by = views[some][point, view]
         order = np.argsort(by, kind="stable")
         point, view, by = point[order], view[order], by[order]
-        tried += len(by)
         result = np.zeros((len(by), 4))
         for i, part in _by_picture(by):
-            search_picture(
+            _search_picture(
                 cameras.position[i], cameras.rotation[i], cameras.lens[cameras.lens_id[i]], gray(i),
                 own[point[part]], fields, point[part], gsd_m, half, reach, floor, _LINK_APART_PX,
                 _LINK_WINDOW_SHARE, result[part],
@@ -233,4 +264,120 @@ def link_legs(
     moved = points[chosen[point]]
     moved[:, :2] += found[point, view, :2] * [gsd_m, -gsd_m]
     by_camera = views[point, view].astype(np.int32)
-    return by_camera, chosen[point].astype(np.int32), cameras.project(by_camera, moved), tried
+    return by_camera, chosen[point].astype(np.int32), cameras.project(by_camera, moved)
+
+
+@kernel
+def _search_map(  # type: ignore[no-untyped-def]
+    position, rotation, lens, gray, place, pixel, ground, valid, gsd, half, reach, texture, floor, exclude,
+    window_share, patch_share, wide, share, found,
+):  # fmt: skip
+    """Find the surroundings of K points of one picture on the map.
+
+    Args:
+        position, rotation, lens: of the picture, (3,), (3, 3), (8,). gray: uint8, the picture.
+        place: float64 (K, 3), centre of each patch on the map's lattice, and the height on which it is rectified.
+        pixel: int64 (K, 2), the same in rows and columns of the map.
+        ground, valid: uint8 and bool (rows, columns), the map. gsd: its pixel, metres.
+        half, reach: half the patch and the search, pixels. texture, floor: see `gradients`. exclude: see `locate`.
+        window_share, patch_share: least share of the window that the map, of the patch that the picture shows.
+        wide, share: searches of more than so many pixels look first at half size, see `promising_blocks`.
+        found: float64 (K, 4) out, column and row of the shift, peak, second peak; peak 0 where there is none.
+    """
+    patch = np.empty((2 * half + 3, 2 * half + 3), np.float32)
+    around = half + reach + 1
+    size = 2 * around + 1
+    seen = np.empty((size, size), np.float32)
+    template, window = template_of(half), window_of(half, reach)
+    for k in range(len(place)):
+        found[k] = 0.0
+        row, column = pixel[k, 0] - around, pixel[k, 1] - around
+        if row < 0 or column < 0 or row + size > ground.shape[0] or column + size > ground.shape[1]:
+            continue
+        known = 0
+        for r in range(size):
+            values, counts, to = ground[row + r], valid[row + r], seen[r]
+            for c in range(size):
+                known += counts[column + c]
+                to[c] = values[column + c] if counts[column + c] else np.nan
+        if known < window_share * size * size:
+            continue
+        shown = rectify(position, rotation, lens, gray, place[k, 0], place[k, 1], place[k, 2], gsd, half + 1, patch)
+        if shown < patch_share:
+            continue
+        gradients(patch, texture, floor, template, ROWS - 1)
+        gradients(seen, texture, floor, window, 0)
+        if reach > wide:
+            wanted = promising_blocks(patch, seen, reach, texture, floor, share)
+            found[k, 0], found[k, 1], found[k, 2], found[k, 3] = locate_wanted(template, window, reach, exclude, wanted)
+        else:
+            found[k, 0], found[k, 1], found[k, 2], found[k, 3] = locate(template, window, reach, exclude)
+
+
+@kernel
+def _templates(position, rotation, lens, gray, points, gsd, half, floor, least, fields):  # type: ignore[no-untyped-def]
+    """Gradients of the surroundings of K points (K, 3) in one picture, into fields (K, ...), see `template_of`.
+
+    The first value of what the picture shows less of than the share `least` becomes NaN.
+    """
+    patch = np.empty((2 * half + 3, 2 * half + 3), np.float32)
+    for k in range(len(points)):
+        x, y, z = points[k, 0], points[k, 1], points[k, 2]
+        shown = rectify(position, rotation, lens, gray, x, y, z, gsd, half + 1, patch)
+        gradients(patch, False, floor, fields[k], ROWS - 1)
+        if shown < least:
+            fields[k, 0, 0, 0] = np.nan
+
+
+@kernel
+def _search_picture(  # type: ignore[no-untyped-def]
+    position, rotation, lens, gray, points, fields, field, gsd, half, reach, floor, exclude, least, found
+):
+    """Find K patches in one picture.
+
+    Args:
+        points: float64 (K, 3), their places. fields: of `_templates`. field: int64 (K,), the one of each place.
+        least: least share of the window that the picture shows. The others: as in `_search_map`.
+        found: float64 (K, 4) out, column and row of the shift, peak, second peak; peak 0 where there is none.
+    """
+    around = half + reach + 1
+    seen = np.empty((2 * around + 1, 2 * around + 1), np.float32)
+    window = window_of(half, reach)
+    for k in range(len(points)):
+        found[k] = 0.0
+        x, y, z = points[k, 0], points[k, 1], points[k, 2]
+        if rectify(position, rotation, lens, gray, x, y, z, gsd, around, seen) < least:
+            continue
+        gradients(seen, False, floor, window, 0)
+        found[k, 0], found[k, 1], found[k, 2], found[k, 3] = locate(fields[field[k]], window, reach, exclude)
+
+
+@kernel
+def _views_of_other_legs(  # type: ignore[no-untyped-def]
+    position, rotation, lens_id, lens, points, own_leg, leg, legs, candidates, margin, views
+):
+    """For each point (K, 3) the pictures of other legs that show it best, at most views.shape[1] of them.
+
+    Of each leg the picture whose nadir is nearest, the nearest legs first.
+
+    Args:
+        own_leg: int64 (K,), the leg of each point. leg: int64 (N,), of each camera, 0 to legs - 1.
+        candidates: int64 (C,), cameras that may be taken. margin: pixels between the point and their border.
+        views: int64 (K, V) out, cameras; -1 where there are no more.
+    """
+    nearest, which = np.empty(legs), np.empty(legs, np.int64)
+    for k in range(len(points)):
+        x, y, z = points[k, 0], points[k, 1], points[k, 2]
+        nearest[:] = np.inf
+        for i in candidates:
+            away = np.sqrt((position[i, 0] - x) ** 2 + (position[i, 1] - y) ** 2)
+            if leg[i] == own_leg[k] or away >= nearest[leg[i]]:
+                continue
+            own = lens[lens_id[i]]
+            u, v = project_point(position[i], rotation[i], own, x, y, z)
+            if u > margin and v > margin and u < own[WIDTH] - margin and v < own[HEIGHT] - margin:
+                nearest[leg[i]], which[leg[i]] = away, i
+        for n in range(views.shape[1]):
+            best = int(np.argmin(nearest))
+            views[k, n] = which[best] if nearest[best] < np.inf else -1
+            nearest[best] = np.inf

@@ -11,31 +11,28 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid, local_origin
 from orthoswarm.model.placement import Leg, LegState, MapWindow, Solution
 from orthoswarm.mosaic.recorded_pose import recorded_cameras
-from orthoswarm.refine.flight.relative_block import Flight
-from orthoswarm.refine.flight.solve_units import merge_units, split_units
+from orthoswarm.refine.flight.relative_block import FlightBlock
 from orthoswarm.refine.flight.sparse_block import open_sparse_flight
 from orthoswarm.refine.flight.unsolved_pictures import hovering_vehicles
+from orthoswarm.refine.flight.vehicle_refinement import merge_units, split_units
 from orthoswarm.refine.flight.weakly_held_pictures import HELD_OBSERVATIONS, observations_per_camera
-from orthoswarm.refine.registration.block_state import Stopwatch, VehicleState, to_solution
+from orthoswarm.refine.registration.absolute_orientation import confirmed
+from orthoswarm.refine.registration.block_state import Stopwatch, VehicleState, WorkArea, to_solution
 from orthoswarm.refine.registration.coarse_map import is_coarse
 from orthoswarm.refine.registration.coarse_registration import CoarseFit, coarse_fits
-from orthoswarm.refine.registration.confirmed_registration import confirmed
-from orthoswarm.refine.strategy.vehicle_passes import Options, adjust_without_map, registered_state, tracked_flight
+from orthoswarm.refine.strategy.vehicle_passes import RefinerOptions, adjust_without_map, adjusted_state, tracked_flight
 from orthoswarm.refine.surface.vehicle_ground import GroundModel, fit_surface
 from orthoswarm.trajectory.legs import leads_one_way
 
 __all__ = ["coarse_of", "local_origin", "place_in_flight"]
 
-Array = NDArray[np.float64]
-
-_FOLLOWED_FEWEST: Final = 10  # fewer pictures are not followed from one to the next but matched in pairs
 _SPARSE_FEWEST: Final = 4  # fewer photos are not placed in flight
 _SPARSE_MOST: Final = 60  # more photos that must be matched in pairs wait for the refinement
 _HELD_DRIFT_M: Final = 3.0
@@ -56,15 +53,12 @@ def place_in_flight(
     epsg: int,
     origin: Array,
     basemap: MapWindow | None,
-    options: Options | None = None,
+    options: RefinerOptions | None = None,
 ) -> Solution:
-    """Coarse placement of a vehicle's pictures so far.
+    """Coarse placement of a vehicle's pictures so far; without a map they stay in the receiver's frame.
 
     Args:
         frames: pictures of finished legs of one vehicle, in order of time, with the turns between them.
-        epsg: the area's grid. origin: float64 (2,) of the local frame.
-        basemap: the map, or None to stay in the receiver's frame.
-        options: see Options.
 
     Returns:
         A solution of stage coarse without state; its legs say how the map holds them (failed where there is none).
@@ -75,8 +69,9 @@ def place_in_flight(
     if frames and hovering_vehicles(recorded_cameras(frames, LocalGrid(epsg)).placed):
         raise OrthoSwarmError("all its pictures were taken at one spot; they are drawn where its receiver says")
     units = split_units({frames[0].vehicle: frames} if frames else {})
-    fewest = _SPARSE_FEWEST
-    found = [_unit(unit, epsg, origin, basemap, options or Options()) for unit in units if len(unit) >= fewest]
+    enough = [unit for unit in units if len(unit) >= _SPARSE_FEWEST]
+    area = WorkArea(epsg, origin, basemap)
+    found = [_unit(unit, area, options or RefinerOptions()) for unit in enough]
     if not found:
         raise OrthoSwarmError(f"{len(frames)} pictures are too few to be adjusted; the next leg is tried")
     return replace(merge_units(found)[0], state=None)
@@ -101,36 +96,33 @@ def coarse_of(solution: Solution, origin: Array) -> Solution:
     return replace(merge_units(parts)[0], state=None)
 
 
-def _unit(frames: Sequence[Frame], epsg: int, origin: Array, basemap: MapWindow | None, options: Options) -> Solution:
-    grid, watch = LocalGrid(epsg), Stopwatch()
-    enough = len(frames) >= _FOLLOWED_FEWEST
-    flight = tracked_flight(frames, grid, origin, options) if enough else None
+def _unit(frames: Sequence[Frame], area: WorkArea, options: RefinerOptions) -> Solution:
+    watch, origin, basemap = Stopwatch(), area.origin, area.basemap
+    flight = tracked_flight(frames, area, options)
     if flight is None:
         if len(frames) > _SPARSE_MOST:
             raise OrthoSwarmError("its pictures overlap too little to be placed in flight; the refinement places them")
-        flight = open_sparse_flight(frames, grid, origin, options.read)
+        flight = open_sparse_flight(frames, area.grid, origin, options.read)
     one_way = leads_one_way(flight.records.position, flight.leg)
     if one_way and not flight.sparse:
         _hold_drift(flight)
     surface = fit_surface(flight.adjustment, GroundModel()) if flight.sparse else adjust_without_map(flight)
     _check(flight)
-    state = registered_state(flight, surface, origin, basemap=None, watch=watch)
+    state = adjusted_state(flight, surface, watch)
     found = None
     if basemap is not None and not is_coarse(flight, basemap):
         found = confirmed(flight, coarse_fits(flight, basemap, origin), basemap, origin, surface)
-        flight.pictures.drop()
-    fit = None if found is None else found.fit
+    flight.pictures.drop()
     if found is not None:
         state.false_matches = found.false_matches
-        height = float(np.median(flight.cameras().position[:, 2]))
         share = _ONE_WAY_SIGMA_SHARE if one_way else _MANY_WAYS_SIGMA_SHARE
         state = _shifted(state, found.fit.correction)
-        state.coarse_sigma_m = np.minimum(np.hypot(share * height, _scatter(found.fit)), state.coarse_sigma_m)
-    legs = _legs(state, fit)
+        state.coarse_sigma_m = np.minimum(np.hypot(share * flight.height_m, _scatter(found.fit)), state.coarse_sigma_m)
+    legs = _legs(state, None if found is None else found.fit)
     return replace(to_solution(state, origin, None, coarse=True), legs=legs)
 
 
-def _hold_drift(flight: Flight) -> None:
+def _hold_drift(flight: FlightBlock) -> None:
     """Tighter priors of the receiver's drift, which on a single straight run cannot be told from the camera's tilt."""
     priors = flight.adjustment.priors
     models = tuple(
@@ -143,27 +135,20 @@ def _hold_drift(flight: Flight) -> None:
     flight.adjustment.priors = replace(priors, models=models)
 
 
-def _check(flight: Flight) -> None:
-    """Refuse an adjustment whose lens, height or attitudes are impossible.
-
-    Raises:
-        OrthoSwarmError: they are.
-    """
+def _check(flight: FlightBlock) -> None:
+    """Refuse, by an OrthoSwarmError, an adjustment whose lens, height or attitudes are impossible."""
     cameras, records = flight.cameras(), flight.records
     if float(np.median(observations_per_camera(flight))) < HELD_OBSERVATIONS:
         raise OrthoSwarmError("its pictures have too few points in common")
     if not (np.isfinite(cameras.position).all() and np.isfinite(cameras.rotation).all()):
         raise OrthoSwarmError("its pictures cannot be adjusted yet")
-    focal = float(cameras.lens[0, 0])
-    height = float(np.median(cameras.position[:, 2]))
-    begun = flight.calibration.height_m
     axes = np.einsum("ni,ni->n", cameras.rotation[:, :, 2], records.rotation()[:, :, 2])
     turned = np.arccos(np.clip(axes, -1.0, 1.0))
     tilted = records.has_tilt
     tilt_off = bool(tilted.any()) and float(np.median(turned[tilted])) > np.radians(_ODD_TURN_DEG)
     if (
-        abs(np.log(focal / flight.calibration.focal_px)) > _ODD_FOCAL_CHANGE
-        or abs(np.log(max(height, 0.1) / begun)) > _ODD_HEIGHT_CHANGE
+        abs(np.log(flight.focal_px / flight.calibration.focal_px)) > _ODD_FOCAL_CHANGE
+        or abs(np.log(max(flight.height_m, 0.1) / flight.calibration.height_m)) > _ODD_HEIGHT_CHANGE
         or tilt_off
     ):
         raise OrthoSwarmError("its pictures cannot be adjusted yet; they are drawn where its receiver says")
@@ -199,17 +184,7 @@ def _legs(state: VehicleState, fit: CoarseFit | None) -> list[Leg]:
     for own, part in zip(legs, share, strict=True):
         how: LegState = "failed" if fit is None else "matched" if part > least else "carried"
         sigma = float(np.median(state.coarse_sigma_m[own]))
-        out.append(
-            Leg(
-                vehicle=state.vehicle,
-                first=int(own[0]),
-                last=int(own[-1]),
-                images=(state.flight.frames[own[0]].image, state.flight.frames[own[-1]].image),
-                state=how,
-                confidence=part,
-                sigma_m=sigma,
-            )
-        )
+        out.append(Leg.of(state.flight.frames, own, how, part, sigma))
     return out
 
 

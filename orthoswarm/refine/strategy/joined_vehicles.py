@@ -11,22 +11,21 @@ from functools import partial
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.compute.robust_kernel import robust_weights
 from orthoswarm.config import active
-from orthoswarm.model.placement import MapWindow
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.plane_similarity import Similarity
 from orthoswarm.model.task_runner import Run
 from orthoswarm.refine.bundle.covariance import RECEIVER_COMMON_SIGMA_M
 from orthoswarm.refine.bundle.priors import ATTITUDE_BIAS_SIGMA_DEG, POSITION_ROBUST_C
-from orthoswarm.refine.registration.block_state import VehicleState, lies_on_map
+from orthoswarm.refine.registration.block_state import VehicleState, WorkArea, lies_on_map
 from orthoswarm.refine.registration.coarse_map import is_coarse, shift_on_coarse_map
 from orthoswarm.refine.registration.map_offset import had_corrections
 from orthoswarm.refine.registration.neighbour_registration import join_neighbours
 from orthoswarm.refine.strategy.vehicle_group import neighbours_of
 from orthoswarm.refine.surface.vehicle_ground import fit_surface
 
-Array = NDArray[np.float64]
 Block = list[int]
 Join = Callable[[tuple[VehicleState, list[VehicleState]]], VehicleState]
 
@@ -36,13 +35,7 @@ TAKEOFF_LEVEL_SIGMA_M: Final = 2.0  # how well the takeoff spot is known to lie 
 
 
 def join_unmapped(
-    states: Sequence[VehicleState],
-    others: Sequence[VehicleState],
-    basemap: MapWindow | None,
-    epsg: int,
-    *,
-    origin: Array,
-    run: Run,
+    states: Sequence[VehicleState], others: Sequence[VehicleState], area: WorkArea, run: Run
 ) -> tuple[list[VehicleState], list[Block]]:
     """Register vehicles that no map holds to each other.
 
@@ -50,14 +43,10 @@ def join_unmapped(
     block without any of these is placed by all its receivers together. Where a map is there that is too coarse to show
     single pictures, blocks are shifted onto it.
 
-    Args:
-        states: vehicles to place. others: more that stay as they are. basemap: the map on the area's grid, or None.
-        epsg: the area's grid. origin: float64 (2,) of the local frame. run: how tasks are run.
-
     Returns:
         The states in order; the numbers of the unmapped ones by block, each after those that it was registered to.
     """
-    out, join = list(states), partial(join_neighbours, epsg=epsg, origin=origin)
+    out, join = list(states), partial(join_neighbours, area=area)
     left = [k for k, state in enumerate(out) if not lies_on_map(state)]
     held = [state for state in others if not lies_on_map(state)]
     blocks = [[k for k in left if had_corrections(out[k].flight.frames)]]
@@ -68,9 +57,9 @@ def join_unmapped(
         _grow(out, block, left, held=[], join=join, run=run)
         _back_to_receivers(out, block)
         blocks.append(block)
-    if basemap is not None and not held:
+    if not held:
         for block in blocks[1:]:  # corrected receivers are more accurate than such a map
-            _onto_coarse_map(out, block, basemap, origin)
+            _onto_coarse_map(out, block, area)
     return out, [block for block in blocks if block]
 
 
@@ -99,49 +88,39 @@ def _back_to_receivers(out: list[VehicleState], block: Block) -> None:
     """
     if len(block) < 2:
         return
-    config = active()
     own = [_own_solution(out[k]) for k in block]
     now, alone = (np.array([o[i] for o in own]) for i in (0, 1))
     weight = np.array([1.0 / o[3] ** 2 for o in own])
     level_sigma = TAKEOFF_LEVEL_SIGMA_M / max(float(np.median(now[:, 2])), 1.0)
-    shift_sigma = _DATUM_SHIFT_SIGMA_M
     turn = float(np.average([o[2] for o in own], weights=weight))
     prior = np.array([0.0, 0.0, turn, float(np.mean(alone[:, 2] / now[:, 2])) - 1.0])
-    prior_sigma = np.array([shift_sigma, shift_sigma, 1.0 / np.sqrt(weight.sum()), level_sigma])
-    common = RECEIVER_COMMON_SIGMA_M
+    prior_sigma = np.array([_DATUM_SHIFT_SIGMA_M, _DATUM_SHIFT_SIGMA_M, 1.0 / np.sqrt(weight.sum()), level_sigma])
     sigma_m, counts = np.array([out[k].receiver_sigma_m for k in block]), np.ones(len(block))
     for _ in range(_DATUM_ROUNDS):
+        sigma, middle = sigma_m / np.sqrt(counts)[:, None], now[:, :2].mean(axis=0)
         similarity = Similarity.between(
-            now[:, :2],
-            alone[:, :2],
-            sigma_m / np.sqrt(counts)[:, None],
-            middle=now[:, :2].mean(axis=0),
-            prior_sigma=prior_sigma,
-            prior=prior,
+            now[:, :2], alone[:, :2], sigma, middle=middle, prior_sigma=prior_sigma, prior=prior
         )
         away = (((similarity.moved(now[:, :2]) - alone[:, :2]) / sigma_m) ** 2).sum(axis=1)
-        counts = 1.0 / (1.0 + away / POSITION_ROBUST_C) ** 2
-    level_m, factor = _level_m(out, block), config.bundle.stated_sigma_factor
+        counts = robust_weights(away, POSITION_ROBUST_C)
+    level_m, factor = _level_m(out, block), active().bundle.stated_sigma_factor
     for k in block:
-        placed = np.hypot(similarity.sigma_m(out[k].flight.cameras().position[:, :2]), common)
+        placed = np.hypot(similarity.sigma_m(out[k].flight.cameras().position[:, :2]), RECEIVER_COMMON_SIGMA_M)
         out[k] = replace(_moved(out[k], similarity, level_m), datum_sigma_m=factor * placed)
 
 
-def _onto_coarse_map(out: list[VehicleState], block: Block, basemap: MapWindow, origin: Array) -> None:
-    """Shift a block onto a coarse map that shows its ground."""
-    if not block or not all(is_coarse(out[k].flight, basemap) for k in block):
+def _onto_coarse_map(out: list[VehicleState], block: Block, area: WorkArea) -> None:
+    """Shift a block onto a coarse map that shows its ground, if there is one."""
+    basemap = area.basemap
+    if basemap is None or not block or not all(is_coarse(out[k].flight, basemap) for k in block):
         return
-    found = shift_on_coarse_map([out[k].flight for k in block], basemap, origin, _level_m(out, block))
+    found = shift_on_coarse_map([out[k].flight for k in block], basemap, area.origin, _level_m(out, block))
     if found is None:
         return
     shift = Similarity(np.zeros(2), np.array([found.east, found.north, 0.0, 0.0]), np.zeros((4, 4)))
     for k in block:
-        out[k] = replace(
-            _moved(out[k], shift, 0.0),
-            coarse_shift=found,
-            confidence=found.confidence,
-            false_matches=found.false_matches,
-        )
+        moved = _moved(out[k], shift, 0.0)
+        out[k] = replace(moved, coarse_shift=found, confidence=found.confidence, false_matches=found.false_matches)
 
 
 def _level_m(out: Sequence[VehicleState], block: Block) -> float:

@@ -12,19 +12,25 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.errors import AdjustmentError
 from orthoswarm.model.frame import Frame
-from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import MapWindow, Refinement, Solution, Terrain
 from orthoswarm.model.task_runner import Continued, Progress, Run, serial, whole
-from orthoswarm.refine.flight.solve_units import merge_units
+from orthoswarm.refine.flight.relative_block import FlightBlock
+from orthoswarm.refine.flight.sparse_block import open_sparse_flights
 from orthoswarm.refine.flight.unsolved_pictures import move_with_neighbours
-from orthoswarm.refine.flight.vehicle_refinement import UnitRefiner, unit_states, units_of_area, unrefined
-from orthoswarm.refine.registration.block_state import VehicleState, findings, lies_on_map, to_solution
+from orthoswarm.refine.flight.vehicle_refinement import UnitRefiner, merge_units, unit_states, units_of_area, unrefined
+from orthoswarm.refine.registration.block_state import (
+    Stopwatch,
+    VehicleState,
+    WorkArea,
+    findings,
+    lies_on_map,
+    to_solution,
+)
 from orthoswarm.refine.registration.neighbour_registration import register_to_neighbours
-from orthoswarm.refine.strategy.first_pass import first_passes
 from orthoswarm.refine.strategy.joined_vehicles import join_unmapped
 from orthoswarm.refine.strategy.second_pass import second_pass
 from orthoswarm.refine.strategy.vehicle_group import (
@@ -35,52 +41,52 @@ from orthoswarm.refine.strategy.vehicle_group import (
     neighbours_of,
     pooled_lean,
 )
-from orthoswarm.refine.strategy.vehicle_passes import Options, refine_alone, tracked_flight
-from orthoswarm.refine.surface.height_levels import level_network
+from orthoswarm.refine.strategy.vehicle_passes import (
+    RefinerOptions,
+    learned_registration,
+    refine_alone,
+    refine_matched,
+    refine_tracked,
+    registered_by,
+    tracked_flight,
+)
+from orthoswarm.refine.surface.height_levels import level_corrections
 from orthoswarm.refine.surface.vehicle_ground import ground_points
 
-__all__ = ["Options", "SwarmRefiner", "refine_alone", "states_of"]
+__all__ = ["RefinerOptions", "SwarmRefiner", "refine_alone"]
 
-Array = NDArray[np.float64]
 Task = Callable[..., VehicleState | Continued[VehicleState]]
 
 
 @dataclass(frozen=True, slots=True)
 class SwarmRefiner(UnitRefiner):
-    """The default refiner of an area (placement.Refiner): each vehicle by itself, then again with its neighbours held.
+    """The default refiner (placement.Refiner): each vehicle by itself, then again with its neighbours held."""
 
-    Attributes:
-        options: see Options.
-    """
-
-    options: Options = field(default_factory=Options)
+    options: RefinerOptions = field(default_factory=RefinerOptions)
 
     def solve(self, units: list[list[Frame]], neighbours: Sequence[Solution], basemap: MapWindow | None) -> Solution:
         """Each unit by itself, then their second pass with the neighbours held."""
-        others = [state for n in neighbours for state in states_of(n)]
-        place = partial(refine_alone, epsg=self.epsg, origin=self.origin, basemap=basemap, options=self.options)
+        others = [state for n in neighbours for state in unit_states(n)]
+        place = partial(refine_alone, area=self._area(basemap), options=self.options)
         return self._beside_held_others([place(unit) for unit in units], others, basemap)
 
+    def _area(self, basemap: MapWindow | None) -> WorkArea:
+        return WorkArea(self.epsg, self.origin, basemap)
+
     def follow(self, frames: Sequence[Frame]) -> None:
-        """Track a vehicle's pictures and keep that (`Options.kept`), for `refine` of the same frames."""
+        """Track a vehicle's pictures and keep that (`RefinerOptions.kept`), for `refine` of the same frames."""
         for unit in self.units(frames):
-            tracked_flight(unit, LocalGrid(self.epsg), self.origin, self.options)
+            tracked_flight(unit, self._area(None), self.options)
 
     def again(self, solution: Solution, neighbours: Sequence[Solution], basemap: MapWindow | None) -> Solution:
         """Refine a vehicle again with neighbours that were not refined, or refined without a map, when it was.
 
         Its second pass is repeated on their common level; a block that was not found on the map is registered on
-        neighbours that were. Its other pictures (late ones, those of another camera) move with the refined ones.
-
-        Args:
-            solution: an earlier result of this refiner; it stays as it is. neighbours: the same of others, held.
-            basemap: the map, or None.
-
-        Returns:
-            The new solution; the same object where it has no neighbours.
+        neighbours that were. Its other pictures (late ones, those of another camera) move with the refined ones. The
+        earlier solution stays as it is, and is returned where the vehicle has no neighbours.
         """
-        own = deepcopy(states_of(solution))
-        others = [state for n in neighbours for state in states_of(n)]
+        own = deepcopy(unit_states(solution))
+        others = [state for n in neighbours for state in unit_states(n)]
         if not own or not any(neighbours_of(state, others) for state in own):
             return solution
         outdated = {warning for state in own for warning in findings(state)}
@@ -99,16 +105,17 @@ class SwarmRefiner(UnitRefiner):
         self, own: list[VehicleState], others: Sequence[VehicleState], basemap: MapWindow | None
     ) -> Solution:
         """The second pass of one vehicle's units, others held as they are."""
-        own = register_unfound(own, others, self.epsg, self.origin, serial)
-        own = join_unmapped(own, others, basemap, self.epsg, origin=self.origin, run=serial)[0]
+        area = self._area(basemap)
+        own = register_unfound(own, others, area, serial)
+        own = join_unmapped(own, others, area, serial)[0]
         everyone = [*own, *others]
-        network = level_network([ground_points(s.flight.adjustment)[0] for s in everyone])
-        anchor = float(np.mean(network.correction_m[len(own) :])) if others else 0.0
+        correction = level_corrections([ground_points(s.flight.adjustment)[0] for s in everyone])
+        anchor = float(np.mean(correction[len(own) :])) if others else 0.0
         done = list(own)
-        task: Task = partial(second_pass, basemap=basemap, origin=self.origin)
+        task: Task = partial(second_pass, area=area)
         for k in sorted(range(len(own)), key=lambda k: not own[k].on_map):  # carried blocks last
             neighbours = neighbours_of(own[k], everyone if own[k].on_map else [*done, *others])
-            item = (own[k], neighbours, float(network.correction_m[k]) - anchor)
+            item = (own[k], neighbours, float(correction[k]) - anchor)
             done[k] = whole(task, item)
         distortion = map_distortion_sigma([*done, *others])
         for state in done:
@@ -122,7 +129,7 @@ class SwarmRefiner(UnitRefiner):
 
     def refined_frames(self, solution: Solution) -> list[Frame]:
         """The frames of the vehicle's blocks (placement.Refiner)."""
-        return [frame for state in states_of(solution) for frame in state.flight.frames]
+        return [frame for state in unit_states(solution) for frame in state.flight.frames]
 
     def refine_batch(
         self,
@@ -134,15 +141,13 @@ class SwarmRefiner(UnitRefiner):
         halo: Collection[str] = (),
     ) -> Refinement:
         """Place all vehicles of an area (placement.Refiner)."""
-        grid, origin, units = LocalGrid(self.epsg), self.origin, units_of_area(vehicles)
-        states, lost = first_passes(
-            units, basemap, grid, origin=origin, options=self.options, run=run, progress=progress
-        )
+        area, origin, units = self._area(basemap), self.origin, units_of_area(vehicles)
+        states, lost = first_passes(units, area, options=self.options, run=run, progress=progress)
         if not states:
             raise AdjustmentError(lost[0])
         below = _shifted(coarse_terrain(states), origin)
         coarse = [to_solution(s, origin, below, coarse=True) for s in states]
-        states = _all_together(states, basemap, self.epsg, origin=origin, halo=halo, run=run, progress=progress)
+        states = _all_together(states, area, halo=halo, run=run, progress=progress)
         _level(states)
         distortion = map_distortion_sigma(states)
         for state in states:
@@ -156,30 +161,20 @@ class SwarmRefiner(UnitRefiner):
         terrain = _shifted(terrain, origin)
         lean = pooled_lean(states)
         fine = [to_solution(s, origin, terrain, map_lean=lean, ground_z_m=level) for s in states]
-        left = [unrefined(units[k], why, grid) for k, why in lost.items()]
+        left = [unrefined(units[k], why, area.grid) for k, why in lost.items()]
         return Refinement(merge_units([*coarse, *left]), merge_units([*fine, *left]), terrain, warnings)
 
 
-def states_of(solution: Solution) -> list[VehicleState]:
-    """The states behind a solution of this refiner (several for a vehicle with several lenses)."""
-    return unit_states(solution)
-
-
 def register_unfound(
-    states: list[VehicleState], others: Sequence[VehicleState], epsg: int, origin: Array, run: Run
+    states: list[VehicleState], others: Sequence[VehicleState], area: WorkArea, run: Run
 ) -> list[VehicleState]:
     """Register vehicles that were not found on the map on neighbours that were; then others on these, and so on.
 
-    Args:
-        states: vehicles to place. others: more that may carry them, as they are.
-        epsg: the area's grid. origin: float64 (2,) of the local frame. run: how tasks are run.
-
-    Returns:
-        The states in order, those that were registered on neighbours `carried`.
+    others: more that may carry them, as they are. Returns the states in order; the registered ones are `carried`.
     """
     out = list(states)
     lost = [k for k, s in enumerate(out) if s.had_map and not s.on_map]
-    task = partial(register_to_neighbours, epsg=epsg, origin=origin)
+    task = partial(register_to_neighbours, area=area)
     while lost:
         anchors = [s for s in [*out, *others] if lies_on_map(s)]
         items = [(k, neighbours_of(out[k], anchors)) for k in lost]
@@ -194,52 +189,38 @@ def register_unfound(
 
 
 def _all_together(
-    states: list[VehicleState],
-    basemap: MapWindow | None,
-    epsg: int,
-    *,
-    origin: Array,
-    halo: Collection[str],
-    run: Run,
-    progress: Progress | None,
+    states: list[VehicleState], area: WorkArea, *, halo: Collection[str], run: Run, progress: Progress | None
 ) -> list[VehicleState]:
-    """All vehicles again, on a common level, each with its neighbours held as the first pass left them.
+    """All vehicles again on a common level with neighbours held; mapped ones of the halo have done their part."""
+    states = register_unfound(states, [], area, run)
+    states, unmapped = join_unmapped(states, [], area, run)
+    correction = level_corrections([ground_points(s.flight.adjustment)[0] for s in states])
+    task: Task = partial(second_pass, area=area)
+    out, count = list(states), 0
 
-    Those of the halo that were found on the map have done their part with that.
-    """
-    states = register_unfound(states, [], epsg, origin, run)
-    states, unmapped = join_unmapped(states, [], basemap, epsg, origin=origin, run=run)
-    network = level_network([ground_points(s.flight.adjustment)[0] for s in states])
-    task: Task = partial(second_pass, basemap=basemap, origin=origin)
-    mapped = [k for k, s in enumerate(states) if s.on_map and s.vehicle not in halo]
-    items = [(states[k], neighbours_of(states[k], states), float(network.correction_m[k])) for k in mapped]
-    out = list(states)
-    for done, (k, state) in enumerate(zip(mapped, run(task, items), strict=True)):
-        out[k] = state
-        if progress:
-            progress("joint", done + 1, len(states))
-    carried = [k for k, s in enumerate(states) if s.carried and not s.on_map]
+    def again(which: Sequence[int], beside: Sequence[VehicleState]) -> None:
+        nonlocal count
+        items = [(states[k], neighbours_of(states[k], beside), float(correction[k])) for k in which]
+        for k, state in zip(which, run(task, items), strict=True):
+            out[k], count = state, count + 1
+            if progress:
+                progress("joint", count, len(states))
+
+    again([k for k, s in enumerate(states) if s.on_map and s.vehicle not in halo], states)
     # After the mapped ones: their refined pictures hold it, and its accuracy is theirs at best.
-    items = [(states[k], neighbours_of(states[k], out), float(network.correction_m[k])) for k in carried]
-    for done, (k, state) in enumerate(zip(carried, run(task, items), strict=True)):
-        out[k] = state
-        if progress:
-            progress("joint", len(mapped) + done + 1, len(states))
-    mapped += carried
+    again([k for k, s in enumerate(states) if s.carried and not s.on_map], out)
     # Without a map no vehicle is the reference: each is tied to those before it, or all would move at each pass.
     before: list[VehicleState] = []
     for k in (k for block in unmapped for k in block):
-        (out[k],) = run(task, [(states[k], neighbours_of(states[k], before), float(network.correction_m[k]))])
+        again([k], before)
         before.append(out[k])
-        if progress:
-            progress("joint", len(mapped) + len(before), len(states))
     return out
 
 
 def _level(states: Sequence[VehicleState]) -> None:
     """Shift cameras and ground of each vehicle in height so that the vehicles' levels agree."""
-    network = level_network([ground_points(s.flight.adjustment)[0] for s in states])
-    for state, correction in zip(states, network.correction_m, strict=True):
+    corrections = level_corrections([ground_points(s.flight.adjustment)[0] for s in states])
+    for state, correction in zip(states, corrections, strict=True):
         adj = state.flight.adjustment
         adj.cameras.position[:, 2] += correction
         adj.points[:, 2] += correction
@@ -251,3 +232,65 @@ def _shifted(terrain: Terrain | None, origin: Array) -> Terrain | None:
     if terrain is None:
         return None
     return replace(terrain, west=terrain.west + float(origin[0]), south=terrain.south + float(origin[1]))
+
+
+def first_passes(
+    units: list[list[Frame]], area: WorkArea, *, options: RefinerOptions, run: Run, progress: Progress | None
+) -> tuple[list[VehicleState], dict[int, str]]:
+    """Each vehicle by itself; those whose photos must be matched are matched and adjusted together first.
+
+    units: frames of one vehicle and one lens each. Returns the states of all units that could be adjusted, in order;
+    unit -> why not, of the others.
+    """
+    # Learned matching is left to one process afterwards: its network takes 400 MB.
+    task = partial(refine_tracked, area=area, options=options, learned=False)
+    states: list[VehicleState | None] = []
+    for n, state in enumerate(run(task, units)):
+        states.append(state)
+        if progress:
+            progress("solo", n + 1, len(units))
+    unfollowed = [k for k, state in enumerate(states) if state is None]
+    lost: dict[int, str] = {}
+    if unfollowed:
+        watch = Stopwatch()
+        together = [units[k] for k in unfollowed]
+        opened = _sparse_flights(together, area=area, options=options, run=run, progress=progress)
+        watch.lap("tracks")
+        lost = {k: flight for k, flight in zip(unfollowed, opened, strict=True) if isinstance(flight, str)}
+        flights = [flight for flight in opened if not isinstance(flight, str)]
+        place = partial(refine_matched, area=area, options=options, learned=False)
+        for k, state in zip([k for k in unfollowed if k not in lost], run(place, flights), strict=True):
+            state.timings["tracks"] = watch.seconds["tracks"] / len(unfollowed)
+            states[k] = state
+    found = [state for state in states if state is not None]
+    return _learned_registrations(found, area, run, progress), lost
+
+
+def _sparse_flights(
+    units: Sequence[list[Frame]], *, area: WorkArea, options: RefinerOptions, run: Run, progress: Progress | None
+) -> list[FlightBlock | str]:
+    """Flights of photos matched and adjusted together, each by itself where that fails; else the reason why not."""
+    try:
+        return list(open_sparse_flights(units, area.grid, area.origin, options.read, run=run, progress=progress))
+    except AdjustmentError as error:
+        if len(units) == 1:
+            return [str(error)]
+    alone = partial(_sparse_flights, area=area, options=options, run=run, progress=progress)
+    return [flight for unit in units for flight in alone([unit])]
+
+
+def _learned_registrations(
+    states: list[VehicleState], area: WorkArea, run: Run, progress: Progress | None
+) -> list[VehicleState]:
+    """Learned matching, in this process, of flights that correlation did not find, then registration."""
+    lost = [k for k, state in enumerate(states) if state.unfound]
+    found = []
+    for n, k in enumerate(lost):
+        found.append(learned_registration(states[k], area))
+        if progress:
+            progress("learned registration", n + 1, len(lost))
+    items = [(states[k], fit) for k, fit in zip(lost, found, strict=True)]
+    out = list(states)
+    for k, state in zip(lost, run(partial(registered_by, area=area), items), strict=True):
+        out[k] = state
+    return out

@@ -10,23 +10,22 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.config import active
 from orthoswarm.evaluation.checkpoints import Checkpoint
 from orthoswarm.evaluation.photo_names import photo_named
+from orthoswarm.model.arrays import Array, Ints
 from orthoswarm.model.frame import SURVEYED, Frame
 from orthoswarm.model.geo import LocalGrid, area_epsg
 from orthoswarm.model.task_runner import Progress, Run
+from orthoswarm.refine.features.working_pictures import ReadGray
 from orthoswarm.refine.flight.sparse_start import read_photo_records
 from orthoswarm.refine.initial.free_network import FREE_PAIR_SHARE, Anchors, FreeNetwork, solve_free_network
 from orthoswarm.refine.initial.initial_orientation import shape_of
-from orthoswarm.refine.initial.pair_graph import PairGraphBuilder, ReadGray
-from orthoswarm.refine.initial.planar_similarity import Ints, PhotoRecords
+from orthoswarm.refine.initial.pair_graph import PairGraphBuilder
+from orthoswarm.refine.initial.planar_similarity import PhotoRecords
 from orthoswarm.refine.initial.relative_scale import focal_by_hint
-from orthoswarm.refine.initial.tilt_and_lens import Matches, level_pixels, similarities
-
-Array = NDArray[np.float64]
+from orthoswarm.refine.initial.tilt_and_lens import PairMatches, level_pixels, similarities
 
 _FREE_NADIR_SHARE: Final = 0.05
 """The ground straight below such a photo lies so far from where its level picture has it, sigma as a share of its
@@ -43,17 +42,12 @@ def place_unpositioned(
     run: Run,
     progress: Progress | None = None,
 ) -> list[Frame]:
-    """Give photos the positions that surveyed points and other photos tell.
+    """Give photos the positions that surveyed points and other photos tell; those that could be placed come back.
 
     Args:
         photos: without positions (their latitude and longitude are NaN), of a vehicle in order of time.
         positioned: photos with positions, which may show the same ground.
         points: surveyed, with their marks in photos of either kind.
-        read_gray: returns a photo's grey values, uint8 (rows, columns), at any size; may raise PictureError.
-        run: executes the tasks. progress: called with stage, number done, total.
-
-    Returns:
-        Those of `photos` that could be placed, with position, its sigma, and heading.
     """
     grid = _grid(positioned, points)
     if not photos or grid is None:
@@ -68,7 +62,7 @@ def place_unpositioned(
     pairs = builder.pairs()
     if not pairs:
         return []
-    matches = Matches.of(pairs, builder.features)
+    matches = PairMatches.of(pairs, builder.features)
     shape = shape_of(matches, records, *focal_by_hint(records))
     graph = similarities(matches, records, shape)
     anchors = _anchors(frames, records, points, grid=grid, origin=origin, known=len(photos))
@@ -78,17 +72,12 @@ def place_unpositioned(
 
 
 def candidate_pairs(without: int, count: int) -> Ints:
-    """Pairs to try, int32 (n, 2), of photos of which the first `without` have no position.
-
-    All pairs with a photo without position, as nothing tells which overlap; beyond `_FREE_MOST_PAIRS` those nearest in
-    order.
-    """
+    """Pairs with one of the first `without` photos: all, or `_FREE_MOST_PAIRS` nearest in order; int32 (n, 2)."""
     first, second = np.triu_indices(count, 1)
     wanted = first < without
     pairs = np.stack([first[wanted], second[wanted]], axis=1)
-    most = _FREE_MOST_PAIRS
-    if len(pairs) > most:
-        order = np.argsort(pairs[:, 1] - pairs[:, 0], kind="stable")[:most]
+    if len(pairs) > _FREE_MOST_PAIRS:
+        order = np.argsort(pairs[:, 1] - pairs[:, 0], kind="stable")[:_FREE_MOST_PAIRS]
         pairs = pairs[np.sort(order)]
     return pairs.astype(np.int32)
 
@@ -124,7 +113,6 @@ def _anchors(
     Raises:
         InputError: a mark lies outside its photo, or its name belongs to several photos.
     """
-    config = active()
     number = {f.image: k for k, f in enumerate(frames)}
     rows: list[tuple[int, complex, complex, float, float]] = []
     for point in points:
@@ -137,7 +125,7 @@ def _anchors(
             mark.check_inside(frame.width, frame.height)
             pixel = complex(mark.column - 0.5 * (frame.width - 1), -(mark.row - 0.5 * (frame.height - 1)))
             sigma_px = FREE_PAIR_SHARE * frame.width
-            rows.append((number[name], pixel, ground, point.sigma_m or config.control.survey_sigma_m, sigma_px))
+            rows.append((number[name], pixel, ground, point.sigma_m or active().control.survey_sigma_m, sigma_px))
     sigma = records.gps_sigma()
     for k in range(known, len(frames)):  # below the camera is the middle of the level picture
         sigma_px = _FREE_NADIR_SHARE * frames[k].width
@@ -162,13 +150,8 @@ def _placed(photos: Sequence[Frame], network: FreeNetwork, *, grid: LocalGrid, o
         lat, lon = (float(v) for v in grid.to_geographic(origin + np.array([centre.real, centre.imag])))
         yaw = float(-np.angle(network.scale[k]) + grid.convergence_rad(lat, lon))
         leaning = _FREE_NADIR_SHARE * frame.width * abs(network.scale[k])
-        fix = replace(
-            frame.fix,
-            lat_deg=lat,
-            lon_deg=lon,
-            yaw_rad=yaw,
-            position_sigma_m=float(np.hypot(network.sigma_m[k], leaning)),
-        )
+        sigma_m = float(np.hypot(network.sigma_m[k], leaning))
+        fix = replace(frame.fix, lat_deg=lat, lon_deg=lon, yaw_rad=yaw, position_sigma_m=sigma_m)
         origin_of = {**frame.origin, "position": SURVEYED, "angles": SURVEYED}
         out.append(replace(frame, fix=fix, origin=origin_of))
     return out

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from orthoswarm.config import active
@@ -12,23 +11,18 @@ from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.placement import Terrain
 from orthoswarm.model.task_runner import Run, serial
 from orthoswarm.refine.flight.weakly_held_pictures import weakly_held
-from orthoswarm.refine.registration.block_state import VehicleState, surface_points
+from orthoswarm.refine.registration.block_state import VehicleState
 from orthoswarm.refine.registration.tie_points import MapMatches, vote_lean
 from orthoswarm.refine.surface.dem_surface import LocalDem, fit_over_dem
 from orthoswarm.refine.surface.ground_densification import flying_height
-from orthoswarm.refine.surface.mapped_level import mapped_ground_level
-from orthoswarm.refine.surface.plane_sweep import SweepViews
+from orthoswarm.refine.surface.plane_sweep import SweepViews, with_tall_surfaces
 from orthoswarm.refine.surface.smooth_surface import FitSettings
-from orthoswarm.refine.surface.tall_surfaces import with_tall_surfaces
 from orthoswarm.refine.surface.terrain import fit_terrain
-from orthoswarm.refine.surface.vehicle_ground import ground_points
+from orthoswarm.refine.surface.vehicle_ground import TERRAIN_POINTS, ground_points, mapped_ground_level
 from orthoswarm.trajectory.near_paths import near_paths
-
-Array = NDArray[np.float64]
 
 _DRAWN_NODES: Final = 4_000_000  # most nodes of a surface that pictures are drawn on (memory)
 _TERRAIN_REACH_HEIGHTS: Final = 1.1  # terrain is made to so many flying heights beyond the cameras
-_TERRAIN_POINTS: Final = 60  # fewer points make no common terrain; that of the first vehicle is taken
 _DEM_DIFFERS_M: Final = 0.2  # what is left over a given height model is said from here on
 _DEM_COVERS_SHARE: Final = 0.97  # a height model that covers more than this of the area covers it
 
@@ -64,7 +58,6 @@ def common_terrain(
     Args:
         states: vehicles that are drawn: what stands on the ground is measured where they have found raised points.
         others: more that the ground is common to. near_own: without the ground of others alone.
-        dem: the given height model. run: how tasks are run.
     """
     own, states = states, [*states, *others]
     if not states:
@@ -72,23 +65,21 @@ def common_terrain(
     tied = [ground_points(s.flight.adjustment) for s in states]
     points = np.concatenate([p for p, _ in tied] + [s.dense[0] for s in states])
     sigma = np.concatenate([q for _, q in tied] + [s.dense[1] for s in states])
-    if len(points) < _TERRAIN_POINTS:
+    if len(points) < TERRAIN_POINTS:
         return states[0].surface.terrain(), []
     path = np.concatenate([s.flight.adjustment.cameras.position for s in (own if near_own else states)])
     reach = _TERRAIN_REACH_HEIGHTS * float(np.median(path[:, 2]))
     bounds = BoundingBox.around_points(path[:, :2], reach)
-    lift = float(np.median([s.surface.ground_offset_m for s in states]))
     fit, off = None, 0.0
     how = FitSettings.for_drawing(on_map=any(s.on_map for s in states))
-    drawn_nodes = _DRAWN_NODES
     if dem is not None:
-        fit, off = fit_over_dem(dem, points, sigma, bounds, settings=how, most_nodes=drawn_nodes)
-    drawn = (fit or fit_terrain(points, sigma, bounds, settings=how)).rendering(lift)
+        fit, off = fit_over_dem(dem, points, sigma, bounds, settings=how, most_nodes=_DRAWN_NODES)
+    drawn = (fit or fit_terrain(points, sigma, bounds, settings=how)).rendering()
     height_m = float(np.median([flying_height(s.flight, s.surface) for s in states]))
+    surface = np.concatenate([part for s in own for part in (s.dense[0], s.high)])  # ground, and what stands on it
     drawn = with_tall_surfaces(
-        drawn, np.concatenate([surface_points(s) for s in own]), [_sweep_views(s) for s in states], height_m=height_m,
-        most_nodes=drawn_nodes, run=run,
-    )  # fmt: skip
+        drawn, surface, [_sweep_views(s) for s in states], height_m=height_m, most_nodes=_DRAWN_NODES, run=run
+    )
     return drawn, _dem_warnings(dem, fit is None, off, states) if dem is not None else []
 
 
@@ -122,7 +113,7 @@ def coarse_terrain(states: Sequence[VehicleState]) -> Terrain | None:
     one that is drawn. None where no vehicle has found its ground.
     """
     found = [s.coarse_surface for s in states]
-    grounds = [None if surface is None or surface.fit is None else surface.terrain() for surface in found]
+    grounds = [None if surface.fit is None else surface.terrain() for surface in found]
     steps = [ground.step_m for ground in grounds if ground is not None]
     if not steps:
         return None

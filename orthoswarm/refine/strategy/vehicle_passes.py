@@ -1,23 +1,22 @@
 """The first pass of one vehicle: its block adjusted without a map, then registered on the map."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.config import active
+from orthoswarm.model.arrays import Array, Gray
 from orthoswarm.model.camera import fov_rad
 from orthoswarm.model.errors import AdjustmentError
 from orthoswarm.model.frame import Frame
-from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import MapWindow
 from orthoswarm.model.task_runner import Continued, whole
 from orthoswarm.raster.height_model import HeightModel
 from orthoswarm.raster.picture_file import read_gray, reduction
-from orthoswarm.refine.bundle.adjustment import TIE_ROBUST_C, TRACK_ROBUST_C, Adjustment, MapTies
+from orthoswarm.refine.bundle.adjustment import TIE_ROBUST_C, TRACK_ROBUST_C, Adjustment
 from orthoswarm.refine.bundle.block_arrays import WIDTH, F
 from orthoswarm.refine.bundle.covariance import receiver_sigma, stated_errors
 from orthoswarm.refine.bundle.height_consistency import (
@@ -27,33 +26,29 @@ from orthoswarm.refine.bundle.height_consistency import (
     predicted_height_offset,
     release_heights,
 )
-from orthoswarm.refine.bundle.observation_selection import INLIER_WEIGHT
+from orthoswarm.refine.features.working_pictures import ReadGray
 from orthoswarm.refine.flight.kept_tracks import KeptTracks
 from orthoswarm.refine.flight.record_findings import contradiction
 from orthoswarm.refine.flight.relative_block import (
     FEW_PHOTOS,
-    Flight,
+    INLIER_WEIGHT,
+    FlightBlock,
     distorts_strongly,
     free_full_lens,
     open_flight,
     weigh_records,
 )
 from orthoswarm.refine.flight.sparse_block import open_sparse_flight
-from orthoswarm.refine.registration.absolute_orientation import add_links, orient_on_map, working_gsd
-from orthoswarm.refine.registration.block_state import Stopwatch, VehicleState
+from orthoswarm.refine.registration.absolute_orientation import add_links, confirmed, orient_on_map, working_gsd
+from orthoswarm.refine.registration.block_state import Stopwatch, VehicleState, WorkArea
 from orthoswarm.refine.registration.coarse_map import is_coarse
 from orthoswarm.refine.registration.coarse_registration import CoarseFit, coarse_fits, learned_fit
-from orthoswarm.refine.registration.confirmed_registration import confirmed
 from orthoswarm.refine.registration.map_offset import had_corrections
-from orthoswarm.refine.registration.tie_points import MapMatches
 from orthoswarm.refine.strategy.joined_vehicles import TAKEOFF_LEVEL_SIGMA_M
 from orthoswarm.refine.surface.dem_surface import LocalDem
 from orthoswarm.refine.surface.vehicle_ground import GroundModel, fit_surface
 from orthoswarm.stores.local_copies import copy_ahead
 from orthoswarm.trajectory.legs import leads_one_way
-
-Array = NDArray[np.float64]
-ReadGray = Callable[[Frame], NDArray[np.uint8]]
 
 SIGMA_FLOOR_M: Final = 0.05  # least sigma of a photo on the ground where no map tells it
 START_FOV_DEG: Final = 80.0  # horizontal field of view to start from where no tag hints at one
@@ -89,13 +84,12 @@ _DECENTRED_SHARE: Final = 0.02
 
 
 @dataclass(frozen=True, slots=True)
-class Options:
+class RefinerOptions:
     """How the refiner works.
 
     Attributes:
         fov_start_rad: field of view to start from where the tags hint at none.
-        dem: given height model of the ground, None to find the ground from the pictures.
-        read: reads a frame's grey picture, see `read_frame`; picklable.
+        dem: given height model, None to find the ground. read: reads a frame's grey picture; picklable.
         kept: where tracks are kept for a refinement of the same pictures, None if they are not.
     """
 
@@ -111,35 +105,25 @@ class Options:
         return GroundModel(dem=LocalDem(self.dem, (float(origin[0]), float(origin[1]))))
 
 
-def read_frame(frame: Frame) -> NDArray[np.uint8]:
+def read_frame(frame: Frame) -> Gray:
     """A frame's grey picture, reduced while it is decoded where it is larger than what the refinement works on."""
     return read_gray(frame.path, reduction(frame.width, frame.height, active().features.work_width_px))
 
 
-def refine_alone(
-    frames: Sequence[Frame], *, epsg: int, origin: Array, basemap: MapWindow | None, options: Options
-) -> VehicleState:
+def refine_alone(frames: Sequence[Frame], *, area: WorkArea, options: RefinerOptions) -> VehicleState:
     """Refine one vehicle by itself: relative adjustment, then onto the map where there is one."""
-    track = partial(refine_tracked, epsg=epsg, origin=origin, basemap=basemap, options=options)
-    state = whole(track, frames)
+    state = whole(partial(refine_tracked, area=area, options=options), frames)
     if state is None:
         watch = Stopwatch()
-        flight = open_sparse_flight(frames, LocalGrid(epsg), origin, options.read)
+        flight = open_sparse_flight(frames, area.grid, area.origin, options.read)
         watch.lap("tracks")
-        state = registered_state(
-            flight, fit_surface(flight.adjustment, options.ground(origin)), origin, basemap=basemap, watch=watch
-        )
+        state = refine_matched(flight, area=area, options=options)
+        watch.add_to(state.timings)
     return state
 
 
 def refine_tracked(
-    frames: Sequence[Frame],
-    *,
-    epsg: int,
-    origin: Array,
-    basemap: MapWindow | None,
-    options: Options,
-    learned: bool = True,
+    frames: Sequence[Frame], *, area: WorkArea, options: RefinerOptions, learned: bool = True
 ) -> VehicleState | Continued[VehicleState | None] | None:
     """Refine one vehicle by itself, with corners tracked from picture to picture; continued on the map, if any.
 
@@ -152,13 +136,13 @@ def refine_tracked(
     """
     watch = Stopwatch()
     copy_ahead(f.path for f in frames)
-    flight = tracked_flight(frames, LocalGrid(epsg), origin, options)
+    flight = tracked_flight(frames, area, options)
     watch.lap("tracks")
     if flight is None:
         return None
     try:
-        surface = adjust_without_map(flight, options.ground(origin))
-        if basemap is None:
+        surface = adjust_without_map(flight, options.ground(area.origin))
+        if area.basemap is None:
             surface = link_own_legs(flight, surface)
         if not _NARROWEST_FOV_DEG < field_of_view_deg(flight.adjustment, flight) < _WIDEST_FOV_DEG:
             return None  # a recorded height that leads to such a lens is wrong
@@ -167,81 +151,47 @@ def refine_tracked(
         state = adjusted_state(flight, surface, watch)
     except AdjustmentError:
         return None
-    register = partial(_registered, origin=origin, basemap=basemap, learned=learned)
-    return Continued(register, (state, flight.pictures.reduced()))
+    return Continued(partial(_registered, area=area, learned=learned), (state, flight.pictures.reduced()))
 
 
-def _registered(
-    item: tuple[VehicleState, dict[int, NDArray[np.uint8]]],
-    *,
-    origin: Array,
-    basemap: MapWindow | None,
-    learned: bool,
-) -> VehicleState | None:
+def _registered(item: tuple[VehicleState, dict[int, Gray]], *, area: WorkArea, learned: bool) -> VehicleState | None:
     """The second half of `refine_tracked`; item: the state, and its reduced pictures, which it does not take along."""
     state, reduced = item
     state.flight.pictures.restore(reduced, {})
     try:
-        register_on_map(state, origin, basemap=basemap, learned=learned)
+        register_on_map(state, area, learned=learned)
     except AdjustmentError:
         return None
     return state
 
 
-def tracked_flight(frames: Sequence[Frame], grid: LocalGrid, origin: Array, options: Options) -> Flight | None:
+def tracked_flight(frames: Sequence[Frame], area: WorkArea, options: RefinerOptions) -> FlightBlock | None:
     """A vehicle's pictures with corners tracked from one to the next, see `open_flight`."""
     hints = [f.fov_hint_rad for f in frames if f.fov_hint_rad is not None]
     start = float(np.median(hints)) if hints else options.fov_start_rad
-    return open_flight(frames, grid, origin, options.read, start, kept=options.kept)
+    return open_flight(frames, area.grid, area.origin, options.read, start, kept=options.kept)
 
 
 def refine_matched(
-    flight: Flight, *, origin: Array, basemap: MapWindow | None, options: Options, learned: bool = True
+    flight: FlightBlock, *, area: WorkArea, options: RefinerOptions, learned: bool = True
 ) -> VehicleState:
     """Refine one vehicle whose photos were matched in pairs and adjusted together with those of others."""
-    surface = fit_surface(flight.adjustment, options.ground(origin))
-    return registered_state(flight, surface, origin, basemap=basemap, watch=Stopwatch(), learned=learned)
-
-
-def registered_state(
-    flight: Flight,
-    surface: GroundModel,
-    origin: Array,
-    *,
-    basemap: MapWindow | None,
-    watch: Stopwatch,
-    learned: bool = True,
-) -> VehicleState:
-    """The state of a vehicle that is adjusted without a map, registered where there is a map."""
-    state = adjusted_state(flight, surface, watch)
-    register_on_map(state, origin, basemap=basemap, learned=learned)
+    state = adjusted_state(flight, fit_surface(flight.adjustment, options.ground(area.origin)), Stopwatch())
+    register_on_map(state, area, learned=learned)
     return state
 
 
-def adjusted_state(flight: Flight, surface: GroundModel, watch: Stopwatch) -> VehicleState:
+def adjusted_state(flight: FlightBlock, surface: GroundModel, watch: Stopwatch) -> VehicleState:
     """The state of a vehicle that is adjusted without a map, with its sigmas."""
     adj = flight.adjustment
     belief = surface.height_prior(adj.points)
     stated = stated_errors(adj, TRACK_ROBUST_C, belief, ties=None, tie_c=TIE_ROBUST_C, floor_m=SIGMA_FLOOR_M)
-    coarse = replace(
-        adj.cameras,
-        position=adj.cameras.position.copy(),
-        rotation=adj.cameras.rotation.copy(),
-        lens=adj.cameras.lens.copy(),
-    )
     watch.lap("relative")
-    none = MapMatches.none()
     return VehicleState(
         vehicle=flight.frames[0].vehicle,
         flight=flight,
-        coarse=coarse,
+        coarse=adj.cameras.copy(),
         surface=surface,
-        ties=MapTies.none(),
-        matches=none,
-        roofs=(none, np.zeros(0)),
-        dense=(np.zeros((0, 3)), np.zeros(0)),
-        on_map=False,
-        confidence=0.0,
         sigma_m=stated.sigma_m,
         coarse_sigma_m=stated.sigma_m,
         receiver_sigma_m=receiver_sigma(adj),
@@ -252,14 +202,9 @@ def adjusted_state(flight: Flight, surface: GroundModel, watch: Stopwatch) -> Ve
     )
 
 
-def register_on_map(state: VehicleState, origin: Array, *, basemap: MapWindow | None, learned: bool = True) -> None:
-    """Register an adjusted vehicle on the map, if there is one, and free its pictures' memory.
-
-    Args:
-        state: changed in place. origin: float64 (2,) of the local frame. basemap: the map, or None. learned: see
-            `refine_tracked`.
-    """
-    flight, watch = state.flight, Stopwatch()
+def register_on_map(state: VehicleState, area: WorkArea, *, learned: bool = True) -> None:
+    """Register an adjusted vehicle on the map, if any, and free its pictures' memory; learned: see `refine_tracked`."""
+    flight, watch, basemap, origin = state.flight, Stopwatch(), area.basemap, area.origin
     if basemap is not None:
         state.had_map = not (is_coarse(flight, basemap) and had_corrections(flight.frames))
     if basemap is not None and not is_coarse(flight, basemap):
@@ -270,11 +215,10 @@ def register_on_map(state: VehicleState, origin: Array, *, basemap: MapWindow | 
     watch.add_to(state.timings)
 
 
-def adjust_without_map(flight: Flight, surface: GroundModel | None = None) -> GroundModel:
+def adjust_without_map(flight: FlightBlock, surface: GroundModel | None = None) -> GroundModel:
     """Adjust a tracked flight without a map and fit its ground; returns the ground.
 
-    Args:
-        flight: its adjustment is changed. surface: what is known of the ground before, None for level ground.
+    surface: what is known of the ground before, None for level ground.
 
     Raises:
         AdjustmentError: it does not fit its observations, so it has converged to something else than the truth.
@@ -296,7 +240,7 @@ def adjust_without_map(flight: Flight, surface: GroundModel | None = None) -> Gr
     return found
 
 
-def link_own_legs(flight: Flight, surface: GroundModel) -> GroundModel:
+def link_own_legs(flight: FlightBlock, surface: GroundModel) -> GroundModel:
     """Observe points of each leg in pictures of the others and adjust again; returns the ground.
 
     Corners are followed from picture to picture only: without a map nothing else holds the legs together, and what
@@ -307,12 +251,12 @@ def link_own_legs(flight: Flight, surface: GroundModel) -> GroundModel:
     return _steps(flight, surface, _LEG_LINK_STEPS)[0]
 
 
-def field_of_view_deg(adjustment: Adjustment, flight: Flight) -> float:
+def field_of_view_deg(adjustment: Adjustment, flight: FlightBlock) -> float:
     """Horizontal field of view of a flight's first lens, degrees."""
     return float(np.degrees(fov_rad(float(adjustment.cameras.lens[0, F]), flight.pictures.size[0])))
 
 
-def focal_length_ran_away(flight: Flight) -> bool:
+def focal_length_ran_away(flight: FlightBlock) -> bool:
     """Whether the focal length is far from the one by optical flow: the adjustment converged to another minimum."""
     flow = flight.calibration
     if flow.pairs < _FLOW_PAIRS or not flow.trusted_height or not np.isfinite(flow.spread):
@@ -321,11 +265,10 @@ def focal_length_ran_away(flight: Flight) -> bool:
     return away > max(_RUNAWAY_SHARE, _RUNAWAY_SIGMAS * flow.focal_sigma)
 
 
-def adjust_by_schedule(flight: Flight, surface: GroundModel) -> GroundModel:
+def adjust_by_schedule(flight: FlightBlock, surface: GroundModel) -> GroundModel:
     """Adjust a tracked flight by the steps of `strategy.schedule`; returns the ground fitted to its points."""
     schedule = list(active().strategy.schedule)
-    wide = _FIRST_GROUND_SIGMA_M, _FIRST_GROUND_ROBUST_C
-    narrow = _GROUND_SIGMA_M, _GROUND_ROBUST_C
+    wide, narrow = (_FIRST_GROUND_SIGMA_M, _FIRST_GROUND_ROBUST_C), (_GROUND_SIGMA_M, _GROUND_ROBUST_C)
     for k, c in enumerate(schedule):
         prior = wide if k < _FIRST_STEPS else narrow
         flight.adjustment.step(c, surface.height_prior(flight.adjustment.points, *prior))
@@ -338,7 +281,7 @@ def adjust_by_schedule(flight: Flight, surface: GroundModel) -> GroundModel:
     return surface
 
 
-def _without_wrong_heights(flight: Flight, surface: GroundModel) -> GroundModel:
+def _without_wrong_heights(flight: FlightBlock, surface: GroundModel) -> GroundModel:
     """Drop recorded heights that the pictures contradict; keep them where the pictures alone determine no height.
 
     The contradiction must remain once the adjustment has converged, and the adjustment without the heights must confirm
@@ -369,7 +312,7 @@ def _without_wrong_heights(flight: Flight, surface: GroundModel) -> GroundModel:
     return surface
 
 
-def _steps(flight: Flight, surface: GroundModel, count: int) -> tuple[GroundModel, list[float]]:
+def _steps(flight: FlightBlock, surface: GroundModel, count: int) -> tuple[GroundModel, list[float]]:
     """Take steps at the final robust scale; the ground, and the focal length in pixels after each step."""
     focal_px = []
     for _ in range(count):
@@ -379,26 +322,24 @@ def _steps(flight: Flight, surface: GroundModel, count: int) -> tuple[GroundMode
     return surface, focal_px
 
 
-def learned_registration(state: VehicleState, basemap: MapWindow, origin: Array) -> CoarseFit | None:
+def learned_registration(state: VehicleState, area: WorkArea) -> CoarseFit | None:
     """The coarse registration of a flight by learned matching; None where that finds nothing.
 
     PyTorch and the network take 400 MB of a process's memory: one process serves all flights, one after the other.
     """
     watch = Stopwatch()
-    fit = learned_fit(state.flight, basemap, origin)
+    fit = None if area.basemap is None else learned_fit(state.flight, area.basemap, area.origin)
     state.flight.pictures.drop()
     watch.lap("coarse registration")
     watch.add_to(state.timings)
     return fit
 
 
-def registered_by(
-    item: tuple[VehicleState, CoarseFit | None], *, basemap: MapWindow | None, origin: Array
-) -> VehicleState:
+def registered_by(item: tuple[VehicleState, CoarseFit | None], *, area: WorkArea) -> VehicleState:
     """A flight registered by the result of `learned_registration`, if tie points confirm that."""
     state, fit = item
     watch = Stopwatch()
-    _onto_map_by_learning(state, fit, basemap, origin, watch)
+    _onto_map_by_learning(state, fit, area.basemap, area.origin, watch)
     state.flight.pictures.drop()
     watch.add_to(state.timings)
     return state
@@ -438,18 +379,14 @@ def _onto_map(
         )
         return True
     state.map_shift = found.fit.correction
-    state.surface, state.ties, state.matches, state.roofs = (
-        settled.surface,
-        settled.ties,
-        settled.matches,
-        settled.roofs,
-    )
+    state.surface, state.ties = settled.surface, settled.ties
+    state.matches, state.roofs = settled.matches, settled.roofs
     state.on_map, state.confidence, state.false_matches = True, found.fit.confidence, found.false_matches
     watch.lap("ties and absolute")
     return True
 
 
-def level_sigma_deg(flight: Flight, surface: GroundModel) -> float:
+def level_sigma_deg(flight: FlightBlock, surface: GroundModel) -> float:
     """Sigma of the field of view, degrees, by what the adjustment does not model.
 
     - The takeoff point is not at the ground's median level. In nadir views of flat ground only f / h is observable, so
@@ -463,8 +400,7 @@ def level_sigma_deg(flight: Flight, surface: GroundModel) -> float:
     if unknown and not flight.calibration.trusted_height and leads_one_way(flight.records.position, flight.leg):
         return _ONE_WAY_FOV_SIGMA_DEG
     cameras = flight.cameras()
-    held = flight.focal_sigma
-    share = float(np.hypot(held, _DECENTRED_SHARE if distorts_strongly(flight) else 0.0))
+    share = float(np.hypot(flight.focal_sigma, _DECENTRED_SHARE if distorts_strongly(flight) else 0.0))
     if flight.calibration.trusted_height and flight.records.has_height.any():
         relief = 0.0 if surface.fit is None else surface.fit.sd_m
         level = float(np.hypot(TAKEOFF_LEVEL_SIGMA_M, relief)) / max(float(np.median(cameras.position[:, 2])), 1.0)

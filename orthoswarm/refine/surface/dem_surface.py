@@ -10,16 +10,13 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array, Flags, Floats
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.placement import Terrain
 from orthoswarm.raster.height_model import HeightModel, KnownGround
-from orthoswarm.refine.surface.ground_offset import kernel_mode
 from orthoswarm.refine.surface.smooth_surface import FitSettings
 from orthoswarm.refine.surface.terrain import fit_terrain, robust_centre
-
-Array = NDArray[np.float64]
 
 _DEM_BLOCK_M: Final = 64.0  # windows of a height model lie on multiples, so that a path that moves reads none again
 _DEM_NODES: Final = 150_000  # nodes of the height model in memory for one vehicle (memory)
@@ -36,27 +33,22 @@ _DEM_SEAM_M: Final = 90.0  # over this distance the ground beyond a model is led
 
 @dataclass(frozen=True, slots=True)
 class LocalDem:
-    """A height model in a local frame.
-
-    Attributes:
-        model: the height model. origin: east and north of the local frame.
-    """
+    """A height model in a local frame, whose origin is east and north of it."""
 
     model: HeightModel
     origin: tuple[float, float]
 
-    def window(self, bounds: BoundingBox, most_nodes: int | None = None) -> KnownGround:
+    def window(self, bounds: BoundingBox, most_nodes: int = _DEM_NODES) -> KnownGround:
         """Heights above the model's zero within bounds; both in the local frame."""
-        block = _DEM_BLOCK_M
-        low = [float(np.floor((v + o) / block) * block) for v, o in zip(bounds[:2], self.origin)]
-        high = [float(np.ceil((v + o) / block) * block) for v, o in zip(bounds[2:], self.origin)]
-        ground = self.model.window(BoundingBox(*low, *high), most_nodes or _DEM_NODES)
+        low = [float(np.floor((v + o) / _DEM_BLOCK_M) * _DEM_BLOCK_M) for v, o in zip(bounds[:2], self.origin)]
+        high = [float(np.ceil((v + o) / _DEM_BLOCK_M) * _DEM_BLOCK_M) for v, o in zip(bounds[2:], self.origin)]
+        ground = self.model.window(BoundingBox(*low, *high), most_nodes)
         t = ground.terrain
         return replace(ground, terrain=replace(t, west=t.west - self.origin[0], south=t.south - self.origin[1]))
 
     def height(self, xy: Array) -> Array:
         """Heights (M,) above the model's zero at positions (M, 2)."""
-        ok: NDArray[np.bool_] = np.asarray(np.isfinite(xy).all(axis=1))
+        ok: Flags = np.asarray(np.isfinite(xy).all(axis=1))
         if not ok.any():
             return np.zeros(len(xy))
         low, high = np.quantile(xy[ok], [0.01, 0.99], axis=0)
@@ -81,12 +73,10 @@ class DemFit:
     """A height model shifted to the points' level; used in place of a TerrainFit.
 
     Attributes:
-        dem: the height model. bounds: of the nodes, local frame. most_nodes: most nodes read from the model.
-        shift_m: added to the model's heights.
-        rest: difference between the ground and the shifted model.
+        bounds: of the nodes, local frame. most_nodes: most nodes read from the model. shift_m: added to its heights.
+        rest: difference of the ground from the shifted model. beyond: ground above the model's zero where it has none.
         points_above_m: how far the robust centre of the points lies over the ground (see TerrainFit).
         sd_m: standard deviation of the ground over nodes with data.
-        beyond: ground above the model's zero where the model has no heights.
     """
 
     dem: LocalDem
@@ -103,17 +93,17 @@ class DemFit:
         """Pickle without the nodes, which are read again from the file."""
         return {**self.__dict__, "_made": {}}
 
-    def prior(self, z0_m: float = 0.0) -> SurfaceSum:
+    def prior(self, z0_m: float) -> SurfaceSum:
         """The surface around which point heights are held, the model's zero at z0."""
         return SurfaceSum(self._shape(), _shifted(self.rest, z0_m))
 
-    def rendering(self, ground_offset_m: float = 0.0) -> Terrain:
-        """The ground for rectifying pictures, plus an offset."""
+    def rendering(self) -> Terrain:
+        """The ground for rectifying pictures."""
         if "drawn" not in self._made:
             shape = self._shape()
             z = shape.z + self.rest.height(_nodes(shape)) + self.shift_m
             self._made["drawn"] = replace(shape, z=z.astype(np.float32))
-        return _shifted(self._made["drawn"], ground_offset_m) if ground_offset_m else self._made["drawn"]
+        return self._made["drawn"]
 
     def _shape(self) -> Terrain:
         if "shape" not in self._made:
@@ -129,19 +119,17 @@ def fit_over_dem(
     *,
     kappa: float | None = None,
     settings: FitSettings | None = None,
-    most_nodes: int | None = None,
+    most_nodes: int = _DEM_NODES,
 ) -> tuple[DemFit | None, float]:
     """Fit the ground under points over a height model (see `fit_terrain` for the other arguments).
 
     Args:
-        dem: the model. points: float64 (P, 3), local frame. bounds: what the ground must cover.
-        most_nodes: most nodes read from the model.
+        points: float64 (P, 3), local frame. bounds: that it must cover. most_nodes: most nodes read from the model.
 
     Returns:
         The fit, None if the model contradicts the points (or has no heights there); and how far the ground differs
         from the model, the median over nodes with data.
     """
-    most_nodes = most_nodes or _DEM_NODES
     ground = dem.window(bounds, most_nodes)
     if not ground.known.any():
         return None, 0.0
@@ -181,7 +169,7 @@ def fit_over_dem(
     ), off
 
 
-def _difference_share(difference: NDArray[np.float32], known: NDArray[np.bool_], usual_m: float) -> NDArray[np.float32]:
+def _difference_share(difference: Floats, known: Flags, usual_m: float) -> Floats:
     """Share (rows, columns) of the difference from the model to apply: none where it is small around a node.
 
     A surface through points errs by decimetres, most at its border; a model that agrees with it nearly everywhere is
@@ -217,10 +205,20 @@ def _completed(ground: KnownGround, beyond: Terrain | None) -> Terrain:
     from scipy.ndimage import distance_transform_edt, gaussian_filter
 
     other = beyond.height(_nodes(t))
-    seam_m = _DEM_SEAM_M
-    blur = seam_m / 3.0 / t.step_m
+    blur = _DEM_SEAM_M / 3.0 / t.step_m
     gap = gaussian_filter(np.where(known, t.z - other, 0.0), blur, mode="nearest")
     gap /= np.maximum(gaussian_filter(known.astype(np.float64), blur, mode="nearest"), 1e-6)
     away = distance_transform_edt(~known) * t.step_m
-    other += gap * np.clip(1.0 - away / seam_m, 0.0, 1.0)
+    other += gap * np.clip(1.0 - away / _DEM_SEAM_M, 0.0, 1.0)
     return replace(t, z=np.where(known, t.z, other).astype(np.float32))
+
+
+def kernel_mode(values: Array, kernel_m: float) -> float:
+    """Most frequent value: mean shift with a Gaussian kernel from the best of many starts."""
+    starts = np.quantile(values, np.linspace(0.02, 0.98, 49))
+    near = np.exp(-0.5 * ((values[None, :] - starts[:, None]) / kernel_m) ** 2)
+    at = float(starts[near.sum(1).argmax()])
+    for _ in range(20):
+        w = np.exp(-0.5 * ((values - at) / kernel_m) ** 2)
+        at = float((w * values).sum() / w.sum())
+    return at

@@ -1,16 +1,13 @@
 """A common height level for vehicles solved separately: a levelling network of their differences on common ground."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from orthoswarm.model.arrays import Array, Indices
 from orthoswarm.model.robust import MEDIAN_SIGMA, mad_sigma
-
-Array = NDArray[np.float64]
 
 _LEVEL_RADIUS_M: Final = 25.0  # points of two vehicles this near each other, horizontally, are common ground
 _LEVEL_NEIGHBOURS: Final = 3  # points of the other vehicle within that radius whose median height is compared
@@ -23,27 +20,8 @@ _LEVEL_QUANTILE: Final = 0.1  # of many vehicles this quantile stands for the lo
 _LEVEL_MANY_VEHICLES: Final = 10  # more vehicles than this are many
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LevelNetwork:
-    """Corrections that bring vehicles to a common level.
-
-    Attributes:
-        correction_m: float64 (V,), to be added to each vehicle's heights; 0 for vehicles without common ground.
-        sigma_m: float64 (V,), one sigma of each against the mean of its component; NaN without common ground.
-        component: int64 (V,), number of the connected component that each vehicle belongs to.
-        pairs: int64 (E, 2), pairs with enough common ground.
-        residual_m: float64 (E,), residual of the difference in height of the two there.
-    """
-
-    correction_m: Array
-    sigma_m: Array
-    component: NDArray[np.int64]
-    pairs: NDArray[np.int64]
-    residual_m: Array
-
-
-def level_network(ground: Sequence[Array]) -> LevelNetwork:
-    """Level vehicles on each other by their ground points: a least-squares levelling network.
+def level_corrections(ground: Sequence[Array]) -> Array:
+    """Metres to add to the heights of each vehicle, float64 (V,): a least-squares levelling network on common ground.
 
     Each vehicle's datum puts the mode of its own points at the takeoff level. Rubble and bushes raise that mode above
     the ground, so a vehicle's ground can only be too low: where the levels differ little, the vehicle with the lowest
@@ -53,7 +31,8 @@ def level_network(ground: Sequence[Array]) -> LevelNetwork:
     added. Levels are not chained from the first vehicle, which more than doubled the map's error.
 
     Args:
-        ground: for each vehicle float64 (M, 3), its points on the ground, in a common horizontal frame.
+        ground: for each vehicle float64 (M, 3), its points on the ground, in a common horizontal frame. A vehicle
+            without ground in common with others gets 0.
     """
     count = len(ground)
     trees = [cKDTree(g[:, :2]) if len(g) >= _LEVEL_NEIGHBOURS else None for g in ground]
@@ -97,12 +76,13 @@ def _common_difference(a: Array, b: Array, tree_a: cKDTree | None, tree_b: cKDTr
     return d[np.argsort(away, kind="stable")[: max(_LEVEL_LEAST_POINTS, len(d) // 2)]]
 
 
-def _adjust(count: int, edge: NDArray[np.int64], difference: Array, sigma: Array) -> LevelNetwork:
+def _adjust(count: int, edge: Indices, difference: Array, sigma: Array) -> Array:
+    """Corrections (count,) by the differences in height of pairs of vehicles, int64 (E, 2), with their sigmas."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
     graph = coo_matrix((np.ones(len(edge)), (edge[:, 0], edge[:, 1])), (count, count))
-    component = np.asarray(connected_components(graph, directed=False)[1], np.int64)
+    component = connected_components(graph, directed=False)[1]
     normal, rhs = np.zeros((count, count)), np.zeros(count)
     weight = 1.0 / sigma**2
     for (i, j), d, w in zip(edge, difference, weight, strict=True):
@@ -111,23 +91,13 @@ def _adjust(count: int, edge: NDArray[np.int64], difference: Array, sigma: Array
         normal[[i, j], [j, i]] -= w
         rhs[i] += w * d
         rhs[j] -= w * d
-    inverse = np.linalg.pinv(normal, hermitian=True)
-    level = inverse @ rhs
+    level = np.linalg.pinv(normal, hermitian=True) @ rhs
     correction = np.zeros(count)
     for number in np.unique(component):
         members = np.flatnonzero(component == number)
         c = -(level[members] - level[members].mean())
         correction[members] = c - _anchor(c)
-    degree = np.bincount(edge.ravel(), minlength=count)
-    sd = np.where(degree > 0, np.sqrt(np.maximum(np.diag(inverse), 0.0)), np.nan)
-    residual = difference - (level[edge[:, 0]] - level[edge[:, 1]])
-    return LevelNetwork(
-        correction_m=correction,
-        sigma_m=sd,
-        component=component,
-        pairs=edge,
-        residual_m=residual,
-    )
+    return correction
 
 
 def _anchor(correction: Array) -> float:

@@ -6,11 +6,9 @@ on the ground. Cells at the border of the block have 0 and may lie at any height
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel, kernel
-
-Volume = NDArray[np.float32]
+from orthoswarm.model.arrays import Floats, Ints
 
 _FAR = np.float32(1e6)
 """Cost of a height that a cell cannot have; finite, so that sums of it stay numbers."""
@@ -227,9 +225,9 @@ def _pass_on(before, least, cost, here, there, n, small, low, high, scale, step,
 
 
 def semi_global(
-    cost: Volume, gray: Volume, levels: NDArray[np.int32], steps: tuple[np.float32, np.float32, np.float32, np.float32],
+    cost: Floats, gray: Floats, levels: Ints, steps: tuple[np.float32, np.float32, np.float32, np.float32],
     *, aslant: bool = True,
-) -> Volume:  # fmt: skip
+) -> Floats:  # fmt: skip
     """The volume of the sums of path costs from eight directions (Hirschmüller 2008).
 
     A step between two cells costs `high`, and less the more the picture differs between them on the upper one's height

@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel, kernel
+from orthoswarm.compute.robust_kernel import robust_costs, robust_weight
+from orthoswarm.model.arrays import Array, Flags, Ints
 from orthoswarm.model.bounding_box import BoundingBox
-from orthoswarm.mosaic.extent import FLAT_RELIEF_M
-
-Array = NDArray[np.float64]
 
 KAPPA_SPACING_M = 30.0
 """Kappa, the smoothness, is defined as the sigma of second differences between nodes this far apart, metres; for other
@@ -56,51 +55,24 @@ _DRAWN_ON_MAP_FLAT_RELIEF_M: Final = 0.0  # as `_DRAWN_FLAT_RELIEF_M`, with heig
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FitSettings:
-    """Settings of a surface fit: by default those of `config.SurfaceConfig`, others for drawing.
+    """What differs between fits of a surface: by default as for the height prior.
 
     Attributes:
-        step_m: spacing of the nodes.
-        floor_sigma_m: added in squares to every point's own sigma.
-        scale_start_m, scale_end_m: robust scale above the surface in the first and the last solve.
-        below_factor, below_min_m: the scale below the surface is this multiple, but never less than the minimum.
-        solves: number of solves over which the scale shrinks.
-        slope_sigma_m: sigma of first differences.
-        level_ratio: sigma of first differences next to nodes without data, as a multiple of kappa.
-        flat_sd_m: the height prior treats relief of this standard deviation or less as noise.
-        render_flat_sd_m: the same for drawing.
-        held_out_se: choose the smoothest surface whose error at held-out points is within so many standard errors
+        step_m: spacing of the nodes. floor_sigma_m: added in squares to every point's own sigma.
+        render_flat_sd_m: for drawing relief of this standard deviation or less is noise.
+        held_out_se: the smoothest surface is chosen whose error at held-out points is within so many standard errors
             of the best.
     """
 
-    step_m: float
-    floor_sigma_m: float
-    scale_start_m: float
-    scale_end_m: float
-    below_factor: float
-    below_min_m: float
-    solves: int
-    slope_sigma_m: float
-    level_ratio: float
-    flat_sd_m: float
-    render_flat_sd_m: float
-    held_out_se: float
-
-    @classmethod
-    def configured(cls, **changes: Any) -> "FitSettings":
-        """The active configuration with some fields changed."""
-        settings = cls(
-            step_m=_NODE_SPACING_M, floor_sigma_m=_POINT_SIGMA_FLOOR_M, scale_start_m=_ROBUST_START_M,
-            scale_end_m=_ROBUST_END_M, below_factor=_ROBUST_BELOW_FACTOR, below_min_m=_ROBUST_BELOW_LEAST_M,
-            solves=_ROBUST_SOLVES, slope_sigma_m=_SLOPE_SIGMA_M, level_ratio=_OPEN_SLOPE_RATIO,
-            flat_sd_m=FLAT_RELIEF_M, render_flat_sd_m=_DRAWN_FLAT_RELIEF_M,
-            held_out_se=_HOLD_OUT_STANDARD_ERRORS,
-        )  # fmt: skip
-        return replace(settings, **changes)
+    step_m: float = _NODE_SPACING_M
+    floor_sigma_m: float = _POINT_SIGMA_FLOOR_M
+    render_flat_sd_m: float = _DRAWN_FLAT_RELIEF_M
+    held_out_se: float = _HOLD_OUT_STANDARD_ERRORS
 
     @classmethod
     def for_drawing(cls, *, on_map: bool) -> "FitSettings":
         """Settings for the surface that pictures are drawn on; on_map: its points include heights from the map."""
-        drawn = cls.configured(held_out_se=_DRAWN_HOLD_OUT_STANDARD_ERRORS)
+        drawn = cls(held_out_se=_DRAWN_HOLD_OUT_STANDARD_ERRORS)
         if not on_map:
             return drawn
         return replace(drawn, floor_sigma_m=_DRAWN_ON_MAP_SIGMA_FLOOR_M, render_flat_sd_m=_DRAWN_ON_MAP_FLAT_RELIEF_M)
@@ -129,7 +101,7 @@ class _Grid:
         columns, rows = min(column + count, self.columns - 1) - c + 1, min(row + count, self.rows - 1) - r + 1
         return _Grid(self.west + c * self.step, self.south + r * self.step, self.step, max(columns, 3), max(rows, 3))
 
-    def holds(self, points: Array) -> NDArray[np.bool_]:
+    def holds(self, points: Array) -> Flags:
         """Which points (P, 3) lie inside and have a height."""
         c, r = (points[:, 0] - self.west) / self.step, (points[:, 1] - self.south) / self.step
         inside = (c >= 0) & (r >= 0) & (c < self.columns - 1) & (r < self.rows - 1) & np.isfinite(points[:, 2])
@@ -141,10 +113,8 @@ class Surface:
     """Points on a grid of nodes, prepared for solving with any smoothness; "inner" is the shorter side of the grid.
 
     Attributes:
-        columns, rows: number of nodes.
-        cell: int32 (P,), first node of the cell of each point, in the solver's order.
-        share: float64 (P, 2), position within the cell (0 to 1), inner and outer.
-        z: float64 (P,), heights; sigma: their sigma.
+        columns, rows: number of nodes. cell: int32 (P,), first node of the cell of each point, in the solver's order.
+        share: float64 (P, 2), position within the cell (0 to 1), inner and outer. z, sigma: float64 (P,), heights.
         base: float64 (P,), weight of a point on the surface; 0 for points that do not count.
         support: bool (N,), nodes that have data in a cell next to them.
         curvature, slope, level: float64 (N + 8, band + 8), penalties for unit sigma, see `solve_banded`.
@@ -152,12 +122,12 @@ class Surface:
 
     columns: int
     rows: int
-    cell: NDArray[np.int32]
+    cell: Ints
     share: Array
     z: Array
     sigma: Array
     base: Array
-    support: NDArray[np.bool_]
+    support: Flags
     curvature: Array
     slope: Array
     level: Array
@@ -175,7 +145,7 @@ class Surface:
         c, r = np.where(good, c, 0.0), np.where(good, r, 0.0)
         ci, ri = np.floor(c), np.floor(r)
         cell = np.asarray(ri * inner + ci, np.int32)
-        support: NDArray[np.bool_] = np.zeros(inner * outer, np.bool_)
+        support: Flags = np.zeros(inner * outer, np.bool_)
         for k in (0, 1, inner, inner + 1):
             support[cell[good] + k] = True
         size = (inner * outer + 8, 2 * inner + 8)
@@ -198,19 +168,21 @@ class Surface:
         g = nodes.reshape(-1, self.inner)
         return np.ascontiguousarray(g.T) if self.columns > self.rows else g
 
-    def solve(self, kappa: float, base: Array | None = None, solves: int | None = None) -> Array:
+    def solve(self, kappa: float, base: Array | None = None, solves: int = _ROBUST_SOLVES) -> Array:
         """Heights of the nodes (N,), in the solver's order, for one smoothness."""
         s, inner = self.settings, self.inner
         base = self.base if base is None else base
         ratio = s.step_m / KAPPA_SPACING_M
-        slope_sigma = s.slope_sigma_m * min(1.0, kappa / _SLOPE_FULL_KAPPA_M) * ratio
+        slope_sigma = _SLOPE_SIGMA_M * min(1.0, kappa / _SLOPE_FULL_KAPPA_M) * ratio
         kappa *= ratio**2
-        penalty = self.curvature / kappa**2 + self.slope / slope_sigma**2 + self.level / (s.level_ratio * kappa) ** 2
+        penalty = (
+            self.curvature / kappa**2 + self.slope / slope_sigma**2 + self.level / (_OPEN_SLOPE_RATIO * kappa) ** 2
+        )
         band, rhs = np.empty_like(penalty), np.empty(len(self.support))
         start = float(np.median(self.z[base > 0]))
         z, weight = np.full(len(rhs), start), np.empty(len(base))
-        for scale in np.geomspace(s.scale_start_m, s.scale_end_m, solves or s.solves):
-            below = max(s.below_factor * scale, s.below_min_m)
+        for scale in np.geomspace(_ROBUST_START_M, _ROBUST_END_M, solves):
+            below = max(_ROBUST_BELOW_FACTOR * scale, _ROBUST_BELOW_LEAST_M)
             _robust(z, self.cell, self.share, inner, self.z, self.sigma, scale, below, weight)
             _assemble(penalty, self.cell, self.share, inner, self.z - start, base * weight, band, rhs)
             solve_banded(band, 2 * inner, rhs)
@@ -218,10 +190,7 @@ class Surface:
         return z
 
     def choose_kappa(self) -> float:
-        """Choose the smoothest surface whose error at held-out points is about that of the best (settings.held_out_se).
-
-        The best itself would be too rough: it would follow rubble, which is not ground.
-        """
+        """The smoothest surface about as good as the best at held-out points; the best would follow rubble."""
         s = self.settings
         out = np.flatnonzero(self.base > 0)[_HOLD_OUT_EVERY - 1 :: _HOLD_OUT_EVERY]
         if len(out) < _HOLD_OUT_POINTS:
@@ -233,8 +202,8 @@ class Surface:
         for kappa in _KAPPAS_M:
             z = self.solve(kappa, base, _HOLD_OUT_SOLVES)
             e = self.z[out] - _interpolate(z, self.cell[out], self.share[out], self.inner)
-            q = e**2 / (np.where(e > 0, s.scale_end_m, s.below_min_m) ** 2 + self.sigma[out] ** 2)
-            costs.append(q / (1.0 + q))
+            scale2 = np.where(e > 0, _ROBUST_END_M, _ROBUST_BELOW_LEAST_M) ** 2 + self.sigma[out] ** 2
+            costs.append(robust_costs(e**2 / scale2, 1.0))
             mean.append(float(costs[-1].mean()))
             if min(mean[-2:]) > min(mean):  # two rougher surfaces were no better
                 break
@@ -250,7 +219,7 @@ class Nodes:
     west: float
     south: float
     z: Array
-    support: NDArray[np.bool_]
+    support: Flags
     kappa: float
 
 
@@ -261,13 +230,13 @@ def fit_nodes(
     kappa: float | None,
     s: FitSettings,
     *,
-    tile_nodes: int | None = None,
+    tile_nodes: int = _TILE_NODES,
 ) -> Nodes | None:
     """Solve for nodes that cover bounds; None without a point. Large areas in overlapping tiles, blended.
 
-    All tiles use the median smoothness of those with most points. tile_nodes: overrides the configuration, for tests.
+    All tiles use the median smoothness of those with most points. tile_nodes: side of a tile.
     """
-    core, overlap = tile_nodes or _TILE_NODES, _TILE_OVERLAP_NODES
+    core, overlap = tile_nodes, _TILE_OVERLAP_NODES
     grid = _Grid.over(bounds, s.step_m)
     if max(grid.columns, grid.rows) <= core + 3 * overlap:
         surface = Surface.over(points, sigma_z, grid, s)
@@ -289,7 +258,7 @@ def fit_nodes(
         asked = [Surface.over(points[i], sigma_z[i], part, s).choose_kappa() for part, i in fullest]
         kappa = sorted(asked)[len(asked) // 2]
     total, weight = np.zeros((grid.rows, grid.columns)), np.zeros((grid.rows, grid.columns))
-    support: NDArray[np.bool_] = np.zeros((grid.rows, grid.columns), np.bool_)
+    support: Flags = np.zeros((grid.rows, grid.columns), np.bool_)
     for part, inside in tiles:
         surface = Surface.over(points[inside], sigma_z[inside], part, s)
         r, c = round((part.south - grid.south) / s.step_m), round((part.west - grid.west) / s.step_m)
@@ -317,7 +286,7 @@ def _blended(total: Array, weight: Array) -> Array:
     return np.asarray(z[tuple(nearest)])
 
 
-def _interpolate(z: Array, cell: NDArray[np.int32], share: Array, inner: int) -> Array:
+def _interpolate(z: Array, cell: Ints, share: Array, inner: int) -> Array:
     c, r = share[:, 0], share[:, 1]
     low = z[cell] * (1 - c) + z[cell + 1] * c
     return np.asarray(low * (1 - r) + (z[cell + inner] * (1 - c) + z[cell + inner + 1] * c) * r)
@@ -327,13 +296,11 @@ def _interpolate(z: Array, cell: NDArray[np.int32], share: Array, inner: int) ->
 def solve_banded(a, width, x):  # type: ignore[no-untyped-def]
     """Solve a symmetric positive definite banded system in place: Cholesky, eight columns at a time.
 
-    Own kernel, because a threaded LAPACK is slow on small bands and rounds differently with each number of
-    threads.
+    Own kernel, because a threaded LAPACK is slow on small bands and rounds differently with each number of threads.
 
     Args:
         a: float64 (n + 8, width + 8), a[i, k] = A[i, i + k], zero beyond the band and in the last eight rows;
-            overwritten by the factor.
-        width: number of diagonals above the main one.
+            overwritten by the factor. width: number of diagonals above the main one.
         x: float64 (n,), right-hand side; overwritten by the solution.
     """
     n = len(x)
@@ -380,15 +347,14 @@ def _tail(a, row, first, count):  # type: ignore[no-untyped-def]
 
 @in_place_kernel
 def _robust(z, cell, share, inner, height, sigma, above, below, weight):  # type: ignore[no-untyped-def]
-    """Geman-McClure weights of residuals, each scale widened by the point's own sigma."""
+    """Robust weights of the points, each scale widened by the point's own sigma."""
     for m in range(len(cell)):
         i, c, r = cell[m], share[m, 0], share[m, 1]
         low = z[i] * (1.0 - c) + z[i + 1] * c
         high = z[i + inner] * (1.0 - c) + z[i + inner + 1] * c
         e = height[m] - low * (1.0 - r) - high * r
         scale = above if e > 0.0 else below
-        q = 1.0 + e * e / (scale * scale + sigma[m] * sigma[m])
-        weight[m] = 1.0 / (q * q)
+        weight[m] = robust_weight(e * e, scale * scale + sigma[m] * sigma[m])
 
 
 @kernel

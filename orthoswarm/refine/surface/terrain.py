@@ -8,14 +8,14 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.compute.robust_kernel import robust_weights
+from orthoswarm.model.arrays import Array, Flags
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.placement import Terrain
+from orthoswarm.mosaic.extent import FLAT_RELIEF_M
 from orthoswarm.refine.surface.smooth_surface import FitSettings, fit_nodes
-
-Array = NDArray[np.float64]
 
 HALF_MAXIMUM_SIGMAS = 1.1774
 """Half width of a Gaussian at half its maximum, in sigmas: sqrt(2 ln 2)."""
@@ -33,7 +33,6 @@ class TerrainFit:
 
     Attributes:
         terrain: the surface T as fitted (not shrunk).
-        weight: float64 (P,), final robust weight (0 to 1) of each point as ground: 1 on T, near 0 on a roof.
         kappa: smoothness, sigma of the second difference between nodes 30 m apart, metres.
         sd_m: standard deviation of T over nodes with data; median_m: its median there.
         ground_m: level of the ground in the points' datum: median_m where there is relief, else the lower flank of
@@ -45,31 +44,30 @@ class TerrainFit:
     """
 
     terrain: Terrain
-    weight: Array
     kappa: float
     sd_m: float
     median_m: float
     ground_m: float
     points_above_m: float
-    support: NDArray[np.bool_]
-    settings: FitSettings = field(default_factory=FitSettings.configured)
+    support: Flags
+    settings: FitSettings = field(default_factory=FitSettings)
 
     @property
     def shrink(self) -> float:
         """Share of the relief that enters the height prior, 0 to 1; 0 where it cannot be distinguished from noise."""
-        return _shrink(self.sd_m, self.settings.flat_sd_m)
+        return _shrink(self.sd_m, FLAT_RELIEF_M)
 
-    def prior(self, z0_m: float = 0.0) -> Terrain:
+    def prior(self, z0_m: float) -> Terrain:
         """The surface around which point heights are held: shrink (T - median T) + z0, a plane at z0 where flat.
 
         With z0 = level + points_above_m the ground itself is at the level, not the centre of all points.
         """
         return _about(self.terrain, self.median_m, self.shrink, z0_m)
 
-    def rendering(self, ground_offset_m: float = 0.0) -> Terrain:
-        """T shrunk about its own median for rectifying pictures (never about zero), plus an offset."""
+    def rendering(self) -> Terrain:
+        """T shrunk about its own median for rectifying pictures (never about zero)."""
         s = _shrink(self.sd_m, self.settings.render_flat_sd_m)
-        return _about(self.terrain, self.median_m, s, self.median_m + ground_offset_m)
+        return _about(self.terrain, self.median_m, s, self.median_m)
 
 
 def fit_terrain(
@@ -83,19 +81,17 @@ def fit_terrain(
     """Fit the ground under points that lie on it and on things above it.
 
     Bilinear nodes; penalties on second differences (xx, yy, sqrt 2 xy; sigma kappa) and on first differences;
-    Geman-McClure weights with a scale that shrinks over the solves and is wider below than above the surface.
+    robust weights with a scale that shrinks over the solves and is wider below than above the surface.
 
     Args:
-        points: float64 (P, 3), east, north, up in metres.
-        sigma_z: float64 (P,), one sigma of each height.
-        bounds: west, south, east, north that the nodes must cover (points outside are not used).
+        points: float64 (P, 3), east, north, up in metres. sigma_z: float64 (P,), one sigma of each height.
+        bounds: that the nodes must cover (points outside are not used).
         kappa: smoothness; None finds it by hold-out of every fourth point.
-        settings: lengths and scales.
 
     Raises:
         OrthoSwarmError: if no point lies within the bounds.
     """
-    s = settings or FitSettings.configured()
+    s = settings or FitSettings()
     points, sigma_z = np.asarray(points, float).reshape(-1, 3), np.asarray(sigma_z, float)
     nodes = fit_nodes(points, sigma_z, bounds, kappa, s)
     if nodes is None:
@@ -105,16 +101,12 @@ def fit_terrain(
     c, r = (points[:, 0] - nodes.west) / s.step_m, (points[:, 1] - nodes.south) / s.step_m
     used = (c >= 0) & (r >= 0) & (c < columns - 1) & (r < rows - 1) & np.isfinite(points[:, 2]) & (sigma_z > 0)
     above = points[used, 2] - terrain.height(points[used, :2])
-    scale = np.where(above > 0, s.scale_end_m, s.below_min_m)
-    weight = np.zeros(len(points))
-    weight[used] = 1.0 / (1.0 + above**2 / (scale**2 + sigma_z[used] ** 2)) ** 2
     sd, median = float(nodes.z[nodes.support].std()), float(np.median(nodes.z[nodes.support]))
-    flat = _shrink(sd, s.flat_sd_m) == 0.0
+    flat = _shrink(sd, FLAT_RELIEF_M) == 0.0
     ground = lower_flank(points[used, 2], sigma_z[used]) if flat else median
     pull = robust_centre(points[used, 2] - ground if flat else above)
     return TerrainFit(
         terrain=terrain,
-        weight=weight,
         kappa=nodes.kappa,
         sd_m=sd,
         median_m=median,
@@ -159,14 +151,13 @@ def lower_flank(height: Array, sigma: Array | None = None) -> float:
     return centre + float(min(flank + HALF_MAXIMUM_SIGMAS * noise, mode))
 
 
-def robust_centre(x: Array, rounds: int = 20) -> float:
-    """Geman-McClure centre of values, started at their median."""
-    scale_m = _POINTS_CENTRE_SCALE_M
+def robust_centre(x: Array) -> float:
+    """Robust centre of values, started at their median."""
     if len(x) == 0:
         return 0.0
     c = float(np.median(x))
-    for _ in range(rounds):
-        w = 1.0 / (1.0 + ((x - c) / scale_m) ** 2) ** 2
+    for _ in range(20):
+        w = robust_weights(((x - c) / _POINTS_CENTRE_SCALE_M) ** 2, 1.0)
         c = float((w * x).sum() / w.sum())
     return c
 

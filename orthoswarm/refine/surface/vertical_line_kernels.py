@@ -1,6 +1,6 @@
 """Compiled parts of the vertical line locus: choice of pictures, rectified strips, correlation, peaks.
 
-Cameras come as the arrays of a CameraBlock; `plane` is float64 (C, 3): terrain height and slope (east, north) by cell.
+Cameras come as CameraBlock.arrays; `plane` is float64 (C, 3): terrain height and slope (east, north) by cell.
 """
 
 import numpy as np
@@ -19,13 +19,14 @@ def _sees(position, rotation, lens, x, y, z, half_m):  # type: ignore[no-untyped
 
 
 @in_place_kernel
-def choose(  # type: ignore[no-untyped-def]
-    position, rotation, lens_id, lens, key, leg, along, cells, plane, half_m, wished, least, enough, ref, partner
-):
+def choose(cameras, usable, cells, plane, half_m, wished, least, enough, ref, partner):  # type: ignore[no-untyped-def]
     """For each cell the picture nearest to nadir and its partners: those closest to the desired signed baselines.
 
-    least: shortest baseline. enough: below this number of partners, pictures of other legs are added.
+    usable: pictures, their legs and places along these. least: shortest baseline. enough: below this number of
+    partners, pictures of other legs are added.
     """
+    position, rotation, lens_id, lens = cameras
+    key, leg, along = usable
     for c in range(len(cells)):
         x, y, z = cells[c, 0], cells[c, 1], plane[c, 0]
         best, r = np.inf, -1
@@ -55,16 +56,13 @@ def choose(  # type: ignore[no-untyped-def]
                 if not chosen and _sees(position[i], rotation[i], lens[lens_id[i]], x, y, z, half_m):
                     nearest, choice = abs(b - wished[w]), i
             partner[c, w] = choice
-        _fill_from_other_legs(
-            position, rotation, lens_id, lens, key, leg, r, x, y, z, half_m, wished, least, enough, partner[c]
-        )
+        _fill_from_other_legs(cameras, key, leg, r, x, y, z, half_m, wished, least, enough, partner[c])
 
 
 @in_place_kernel
-def _fill_from_other_legs(  # type: ignore[no-untyped-def]
-    position, rotation, lens_id, lens, key, leg, r, x, y, z, half_m, wished, least, enough, partner
-):
+def _fill_from_other_legs(cameras, key, leg, r, x, y, z, half_m, wished, least, enough, partner):  # type: ignore[no-untyped-def]
     """Add the nearest pictures of other legs where the reference's own leg ends before enough partners are found."""
+    position, rotation, lens_id, lens = cameras
     count, reach = 0, 0.0
     for w in range(len(wished)):
         count += partner[w] >= 0
@@ -197,27 +195,10 @@ def _zncc_along(patch, strip, first, last, least_variance, score):  # type: igno
 
 
 @kernel
-def _pair(  # type: ignore[no-untyped-def]
-    position,
-    rotation,
-    lens_id,
-    lens,
-    stack,
-    slot,
-    factor,
-    x,
-    y,
-    plane,
-    r,
-    p,
-    heights,
-    half,
-    step,
-    least_variance,
-    total,
-    seen,
-):
+def _pair(cameras, pictures, x, y, plane, r, p, heights, half, step, least_variance, total, seen):  # type: ignore[no-untyped-def]
     """Add one partner's correlation at each height to `total`, and count it in `seen`."""
+    position, rotation, lens_id, lens = cameras
+    stack, slot, factor = pictures
     n, top = 2 * half + 1, heights[-1]
     cx, cy, cz = position[r]
     px, py, pz = position[p]
@@ -264,33 +245,19 @@ def _pair(  # type: ignore[no-untyped-def]
 
 
 @kernel
-def correlate(  # type: ignore[no-untyped-def]
-    position,
-    rotation,
-    lens_id,
-    lens,
-    stack,
-    slot,
-    factor,
-    cells,
-    plane,
-    ref,
-    partner,
-    heights,
-    half,
-    step,
-    least_variance,
-    curve,
-):
-    """Mean normalised correlation over partners for each cell and height; NaN with fewer than two partners."""
+def correlate(cameras, pictures, cells, plane, ref, partner, heights, half, step, least_variance, curve):  # type: ignore[no-untyped-def]
+    """Mean normalised correlation over partners for each cell and height; NaN with fewer than two partners.
+
+    pictures: uint8 (slots, rows, columns) those in memory, each camera's slot, and by how much each lens's are reduced.
+    """
     total, seen = np.empty(len(heights)), np.empty(len(heights), np.int64)
     for c in range(len(cells)):
         total[:], seen[:] = 0.0, 0
         for k in range(partner.shape[1]):
             if partner[c, k] >= 0:
                 _pair(
-                    position, rotation, lens_id, lens, stack, slot, factor, cells[c, 0], cells[c, 1], plane[c],
-                    ref[c], partner[c, k], heights, half, step, least_variance, total, seen,
+                    cameras, pictures, cells[c, 0], cells[c, 1], plane[c], ref[c], partner[c, k], heights, half, step,
+                    least_variance, total, seen,
                 )  # fmt: skip
         for h in range(len(heights)):
             curve[c, h] = total[h] / seen[h] if seen[h] >= 2 else np.nan

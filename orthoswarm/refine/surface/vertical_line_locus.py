@@ -15,12 +15,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array, Gray, Indices, Ints
 from orthoswarm.model.placement import Terrain
 from orthoswarm.refine.bundle.block_arrays import HEIGHT, WIDTH, CameraBlock, F
+from orthoswarm.refine.features.working_pictures import shrunk
 from orthoswarm.refine.surface import vertical_line_kernels as kernels
 
-Array = NDArray[np.float64]
-Gray = Callable[[int], NDArray[np.uint8]]
+ReadPicture = Callable[[int], Gray]
 
 REFERENCE_HEIGHT_M: Final = 150.0  # flying height for which lengths of patches are stated
 _SWEEP_REACH_M: Final = 9.0  # heights searched above and below the terrain
@@ -52,59 +53,47 @@ class Sweep:
     """Settings of the height search. Lengths in metres, for the reference height above ground; see `at_height`.
 
     Attributes:
-        half: half width of the square patch in samples (7: 15 x 15 samples).
-        step_m: spacing of samples.
-        reach_m: range searched above and below the terrain; height_step_m: step of the heights (peaks are
-            interpolated by a parabola).
-        min_score: least mean normalised correlation.
+        half: half width of the square patch in samples (7: 15 x 15 samples), step_m apart.
+        reach_m: range searched above and below the terrain, in steps of height_step_m. min_score: least correlation.
         rival_m: a second peak farther than this from the best one, above rival_share of it, makes the height
-            ambiguous; infinite switches the test off.
-        sigma_m: one sigma of a height on open ground, for the fit.
+            ambiguous; infinite switches the test off. sigma_m: one sigma of a height on open ground.
         baselines_m: desired distances of the partners, on both sides of the reference.
         spacing_m: only pictures this far apart along a leg are used, to limit decoding.
     """
 
     half: int
     step_m: float
-    reach_m: float
-    height_step_m: float
     min_score: float
-    rival_m: float
-    rival_share: float
     sigma_m: float
-    baselines_m: tuple[float, ...]
-    spacing_m: float
+    reach_m: float = _SWEEP_REACH_M
+    height_step_m: float = _SWEEP_HEIGHT_STEP_M
+    rival_m: float = _SWEEP_RIVAL_M
+    rival_share: float = _SWEEP_RIVAL_SHARE
+    baselines_m: tuple[float, ...] = _SWEEP_BASELINES_M
+    spacing_m: float = _SWEEP_SPACING_M
 
     @classmethod
     def small(cls) -> "Sweep":
         """Small patches, which fit between cars, bushes and houses, so that most of their heights are bare ground."""
-        return cls._with_patch(_SMALL_PATCH_HALF, _SMALL_PATCH_STEP_M, _SMALL_PATCH_SCORE, _SMALL_PATCH_SIGMA_M)
+        return cls(
+            half=_SMALL_PATCH_HALF, step_m=_SMALL_PATCH_STEP_M, min_score=_SMALL_PATCH_SCORE,
+            sigma_m=_SMALL_PATCH_SIGMA_M,
+        )  # fmt: skip
 
     @classmethod
     def large(cls) -> "Sweep":
         """Large patches, for ground with little texture."""
-        return cls._with_patch(_LARGE_PATCH_HALF, _LARGE_PATCH_STEP_M, _LARGE_PATCH_SCORE, _LARGE_PATCH_SIGMA_M)
-
-    @classmethod
-    def _with_patch(cls, half: int, step_m: float, min_score: float, sigma_m: float) -> "Sweep":
         return cls(
-            half=half, step_m=step_m, reach_m=_SWEEP_REACH_M, height_step_m=_SWEEP_HEIGHT_STEP_M,
-            min_score=min_score, rival_m=_SWEEP_RIVAL_M, rival_share=_SWEEP_RIVAL_SHARE, sigma_m=sigma_m,
-            baselines_m=_SWEEP_BASELINES_M, spacing_m=_SWEEP_SPACING_M,
+            half=_LARGE_PATCH_HALF, step_m=_LARGE_PATCH_STEP_M, min_score=_LARGE_PATCH_SCORE,
+            sigma_m=_LARGE_PATCH_SIGMA_M,
         )  # fmt: skip
 
     def at_height(self, height_m: float) -> "Sweep":
         """The same sweep for cameras at another height above ground: all lengths but the reach are scaled."""
         k = height_m / REFERENCE_HEIGHT_M
-        return replace(
-            self,
-            step_m=self.step_m * k,
-            height_step_m=self.height_step_m * k,
-            sigma_m=self.sigma_m * k,
-            baselines_m=tuple(b * k for b in self.baselines_m),
-            spacing_m=self.spacing_m * k,
-            rival_m=self.rival_m * k,
-        )
+        lengths = ("step_m", "height_step_m", "sigma_m", "spacing_m", "rival_m")
+        scaled = {name: getattr(self, name) * k for name in lengths}
+        return replace(self, baselines_m=tuple(b * k for b in self.baselines_m), **scaled)
 
     @property
     def heights(self) -> Array:
@@ -119,39 +108,37 @@ class LocusPoints:
 
     Attributes:
         points: float64 (M, 3), on the reference's ray through the position, so slightly off the position.
-        sigma_z: float64 (M,), one sigma of each height.
-        score: float64 (M,), mean normalised correlation at the peak.
+        sigma_z: float64 (M,), one sigma of each height. score: float64 (M,), mean normalised correlation at the peak.
         cell: int64 (M,), which of the positions each point belongs to, ascending.
     """
 
     points: Array
     sigma_z: Array
     score: Array
-    cell: NDArray[np.int64]
+    cell: Indices
 
 
 def dense_ground(
     cameras: CameraBlock,
-    gray: Gray,
+    gray: ReadPicture,
     cells: Array,
     *,
     terrain: Terrain,
     leg_of_camera: NDArray[np.integer],
     sweeps: Sequence[Sweep] | None = None,
-    slots: int | None = None,
+    slots: int = _SWEEP_PICTURES,
 ) -> LocusPoints:
     """Heights at free positions from correlation between pictures, preferably of one leg.
 
     Args:
-        cameras: cameras of one or several vehicles.
         gray: picture of a camera by its index, uint8 (rows, columns) as its lens says; called in the order of the
             legs, once per picture unless a window of `slots` pictures is too short.
         cells: float64 (C, 2), positions, east and north.
         terrain: surface around which heights are searched; its slope tilts the patches.
         leg_of_camera: int (N,), leg of each camera, -1 for cameras that must not be used.
-        sweeps: applied in order, each to the positions where those before found nothing. Baselines
-            and spacing are the first one's. None: small patches, then large, for the cameras' height above the terrain.
-        slots: pictures in memory at a time (more only if the cells of one reference need more); None: as configured.
+        sweeps: applied in order, each to the positions where those before found nothing. Baselines and spacing are the
+            first one's. None: small patches, then large, for the cameras' height above the terrain.
+        slots: pictures in memory at a time (more only if the cells of one reference need more).
     """
     if sweeps is None:
         height = height_above(cameras, terrain)
@@ -159,21 +146,22 @@ def dense_ground(
     s = sweeps[0]
     cells = np.ascontiguousarray(cells, dtype=np.float64).reshape(-1, 2)
     plane = _planes(terrain, cells, max(_SWEEP_SLOPE_REACH_M, s.half * s.step_m))
-    usable = _usable_cameras(cameras, np.asarray(leg_of_camera), s.spacing_m)
+    leg, camera, along = spaced_cameras(cameras, leg_of_camera, s.spacing_m)
     ref = np.full(len(cells), -1, np.int32)
     found = np.full((len(cells), 3), -1.0)
-    if len(usable.camera) and len(cells):
+    if len(camera) and len(cells):
         wished = np.array([*s.baselines_m, *(-b for b in s.baselines_m)])
         partner = np.full((len(cells), len(wished)), -1, np.int32)
+        least = _SWEEP_LEAST_BASELINE_SHARE * min(s.baselines_m)
         kernels.choose(
-            cameras.position, cameras.rotation, cameras.lens_id, cameras.lens, usable.camera, usable.leg, usable.along,
-            cells, plane, s.half * s.step_m, wished, _SWEEP_LEAST_BASELINE_SHARE * min(s.baselines_m),
-            _SWEEP_PARTNERS, ref, partner,
+            cameras.arrays, (camera, leg, along), cells, plane, s.half * s.step_m, wished, least, _SWEEP_PARTNERS,
+            ref, partner,
         )  # fmt: skip
+        order = np.full(len(cameras), -1, np.int64)
+        order[camera] = np.arange(len(camera))
         _sweep_in_windows(
-            cameras, gray, usable.order, cells, plane, ref=ref, partner=partner, sweeps=sweeps,
-            slots=slots or _SWEEP_PICTURES, found=found,
-        )  # fmt: skip
+            cameras, gray, order, cells, plane, ref=ref, partner=partner, sweeps=sweeps, slots=slots, found=found
+        )
     good = np.flatnonzero(found[:, 1] >= 0.0)
     points = np.empty((len(good), 3))
     kernels.raise_points(cameras.position, ref[good], cells[good], plane[good], found[good, 0], points)
@@ -187,22 +175,9 @@ def height_above(cameras: CameraBlock, terrain: Terrain) -> float:
     return max(1.0, float(np.median(cameras.position[:, 2] - terrain.height(cameras.position[:, :2]))))
 
 
-@dataclass(frozen=True, slots=True)
-class _UsableCameras:
-    """Cameras used as reference or partner, sorted by leg and distance along it.
-
-    Order: rank of every camera, -1 unused.
-    """
-
-    camera: NDArray[np.int32]
-    leg: NDArray[np.int64]
-    along: Array
-    order: NDArray[np.int64]
-
-
 def spaced_cameras(
     cameras: CameraBlock, leg_of_camera: NDArray[np.integer], spacing_m: float
-) -> tuple[NDArray[np.int64], NDArray[np.int32], Array]:
+) -> tuple[Indices, Ints, Array]:
     """Cameras spaced along their legs, and each leg's last one: leg, camera and distance along it, sorted."""
     camera: list[int] = []
     leg: list[int] = []
@@ -224,32 +199,24 @@ def spaced_cameras(
     return np.array(leg, np.int64), np.array(camera, np.int32), np.array(along, np.float64)
 
 
-def _usable_cameras(cameras: CameraBlock, leg_of_camera: NDArray[np.integer], spacing: float) -> _UsableCameras:
-    leg, camera, along = spaced_cameras(cameras, leg_of_camera, spacing)
-    order = np.full(len(cameras), -1, np.int64)
-    order[camera] = np.arange(len(camera))
-    return _UsableCameras(camera, leg, along, order)
-
-
 def _planes(terrain: Terrain, cells: Array, reach: float) -> Array:
     """Height and slope (east, north) of the terrain at positions: float64 (C, 3)."""
     e, n = np.array([reach, 0.0]), np.array([0.0, reach])
     z = terrain.height(cells)
     ge = (terrain.height(cells + e) - terrain.height(cells - e)) / (2 * reach)
     gn = (terrain.height(cells + n) - terrain.height(cells - n)) / (2 * reach)
-    steepest = _SWEEP_STEEPEST
-    return np.stack([z, np.clip(ge, -steepest, steepest), np.clip(gn, -steepest, steepest)], 1)
+    return np.column_stack([z, np.clip(np.column_stack([ge, gn]), -_SWEEP_STEEPEST, _SWEEP_STEEPEST)])
 
 
 def _sweep_in_windows(
     cameras: CameraBlock,
-    gray: Gray,
-    order: NDArray[np.int64],
+    gray: ReadPicture,
+    order: Indices,
     cells: Array,
     plane: Array,
     *,
-    ref: NDArray[np.int32],
-    partner: NDArray[np.int32],
+    ref: Ints,
+    partner: Ints,
     sweeps: Sequence[Sweep],
     slots: int,
     found: Array,
@@ -269,16 +236,14 @@ def _sweep_in_windows(
     slots = max(min(slots, int(order.max()) + 1), *(len(needed) for _, _, needed in groups))
     window = _Window(cameras, gray, _reduction(cameras, plane, ref, min(s.step_m for s in sweeps)), slots)
     factor = window.factor.astype(np.float64)
-    least_variance = _SWEEP_LEAST_VARIANCE
 
-    def search(block: NDArray[np.int64], needed: set[int]) -> None:
+    def search(block: Indices, needed: set[int]) -> None:
         window.hold(sorted(needed, key=lambda camera: int(order[camera])))
         for s in sweeps:
             curve, peak = np.empty((len(block), len(s.heights)), np.float32), np.empty((len(block), 2))
             kernels.correlate(
-                cameras.position, cameras.rotation, cameras.lens_id, cameras.lens, window.stack, window.slot, factor,
-                cells[block], plane[block], ref[block], partner[block], s.heights, s.half, s.step_m,
-                least_variance, curve,
+                cameras.arrays, (window.stack, window.slot, factor), cells[block], plane[block], ref[block],
+                partner[block], s.heights, s.half, s.step_m, _SWEEP_LEAST_VARIANCE, curve,
             )  # fmt: skip
             kernels.peaks(curve, s.heights, s.rival_m, s.rival_share, peak)
             good = peak[:, 1] >= s.min_score
@@ -297,7 +262,7 @@ def _sweep_in_windows(
 class _Window:
     """The pictures in memory, reduced to the needed resolution: a stack, and each camera's slot in it."""
 
-    def __init__(self, cameras: CameraBlock, gray: Gray, factor: NDArray[np.int64], slots: int) -> None:
+    def __init__(self, cameras: CameraBlock, gray: ReadPicture, factor: Indices, slots: int) -> None:
         self.factor = factor
         self.slot = np.full(len(cameras), -1, np.int32)
         sizes = cameras.lens[:, [HEIGHT, WIDTH]].astype(np.int64) // factor[:, None]
@@ -312,23 +277,13 @@ class _Window:
         for camera in wanted:
             if self.slot[camera] < 0:
                 place = self._free.pop()
-                picture = _reduced(self._gray(camera), int(self.factor[self._lens_id[camera]]))
+                picture = shrunk(self._gray(camera), int(self.factor[self._lens_id[camera]]))
                 self.stack[place, : picture.shape[0], : picture.shape[1]] = picture
                 self.slot[camera] = place
 
 
-def _reduction(cameras: CameraBlock, plane: Array, ref: NDArray[np.int32], step: float) -> NDArray[np.int64]:
+def _reduction(cameras: CameraBlock, plane: Array, ref: Ints, step: float) -> Indices:
     """Integer by which each lens's pictures are reduced, so that pixels are not finer than the samples."""
     above = float(np.median(cameras.position[ref[ref >= 0], 2] - plane[ref >= 0, 0]))
     gsd = max(above, 1.0) / cameras.lens[:, F]
     return np.maximum(1, np.floor(step / gsd)).astype(np.int64)
-
-
-def _reduced(picture: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
-    if factor == 1:
-        return picture
-    import cv2
-
-    rows, columns = picture.shape[0] // factor, picture.shape[1] // factor
-    cut = picture[: rows * factor, : columns * factor]
-    return np.asarray(cv2.resize(cut, (columns, rows), interpolation=cv2.INTER_AREA), np.uint8)

@@ -18,7 +18,7 @@ from gcs_plugin.daemon.store.journal import Journal
 from orthoswarm.config import active
 from orthoswarm.model.frame import Fix, Frame
 from orthoswarm.model.geo import LocalGrid
-from orthoswarm.refine.flight.finished_legs import ended_legs
+from orthoswarm.trajectory.legs import ended_legs
 from tests.kit.daemon_kit import Shot, exported, line, serving
 
 GRID = LocalGrid(32631)

@@ -12,7 +12,7 @@ from orthoswarm.config import override
 from orthoswarm.refine.bundle import normal_equations
 from orthoswarm.refine.bundle.adjustment import Adjustment, HeightPrior, MapTies
 from orthoswarm.refine.bundle.banded_solver import factorise, solve_factored
-from orthoswarm.refine.bundle.rotation_vectors import exp_rotation, log_rotation
+from orthoswarm.refine.bundle.block_arrays import exp_rotation, log_rotation
 from orthoswarm.refine.flight.relative_block import first_points
 from tests.kit.swarm_block import make_block
 

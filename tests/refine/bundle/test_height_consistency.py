@@ -18,16 +18,28 @@ from orthoswarm.refine.bundle.height_consistency import (
 )
 from orthoswarm.refine.flight.record_findings import height_findings
 from orthoswarm.refine.flight.sparse_adjustment import solve_sparse, trusted_heights
-from orthoswarm.refine.flight.sparse_start import SparseStart, assemble, read_photo_records
+from orthoswarm.refine.flight.sparse_start import (
+    SparseStart,
+    assemble,
+    group_focal_lengths,
+    lens_per_vehicle,
+    read_photo_records,
+    split_unlike_lenses,
+)
 from orthoswarm.refine.initial.initial_orientation import find_initial_orientation
-from orthoswarm.refine.initial.lens_groups import group_focal_lengths, lens_per_vehicle, split_unlike_lenses
+from orthoswarm.refine.initial.pair_graph import PairGraphBuilder
 from tests.kit.sparse_world import GRID, ORIGIN, World, lawnmower, make_world, without
 
 
 def begin(world: World, frames) -> SparseStart:
     records = read_photo_records(frames, GRID, ORIGIN)
-    start = find_initial_orientation(records, world.pairs, world.features)
-    return assemble(frames, records, world.features, pairs=world.pairs, start=start, damaged={}, tried=len(world.pairs))
+    tried = {(pair.first, pair.second): pair.match for pair in world.pairs}
+    read = lambda frame: np.zeros((1, 1), np.uint8)  # noqa: E731
+    builder = PairGraphBuilder(
+        frames=frames, records=records, read_gray=read, features=list(world.features), tried=tried
+    )
+    start = find_initial_orientation(records, builder.pairs(), world.features)
+    return assemble(builder, records, start)
 
 
 def crosshatch(**options) -> World:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks.accuracy.sigma_truth import warped
-from orthoswarm.refine.bundle.map_distortion import map_distortion_variance
+from orthoswarm.refine.bundle.covariance import map_distortion_variance
 
 HEIGHT_M = 150.0
 NOISE_M = 0.1

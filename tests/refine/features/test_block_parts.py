@@ -17,7 +17,7 @@ from orthoswarm.model.frame import Fix, Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import Leg, PlacedFrame, Solution
 from orthoswarm.refine.bundle.flight_records import read_records
-from orthoswarm.refine.flight.solve_units import merge_units, split_units
+from orthoswarm.refine.flight.vehicle_refinement import merge_units, split_units
 from orthoswarm.refine.flight.weakly_held_pictures import interpolate_weak
 from orthoswarm.trajectory.legs import split_legs
 from orthoswarm.trajectory.separate_places import separate_places

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 from orthoswarm.raster.subpixel_peak import vertex
-from orthoswarm.refine.features.corners import strongest
 from orthoswarm.refine.features.patch_matching import (
     gradients,
     locate,
@@ -15,6 +14,7 @@ from orthoswarm.refine.features.patch_matching import (
     window_of,
 )
 from orthoswarm.refine.features.shift_products import ROWS
+from orthoswarm.refine.features.tracks import strongest
 
 
 @pytest.mark.parametrize(("half", "reach"), [(15, 6), (20, 10), (18, 11), (8, 4), (20, 28)])

@@ -9,11 +9,10 @@ from hypothesis import strategies as st
 
 from orthoswarm.model.angles import wrap_rad
 from orthoswarm.model.camera import fov_rad, rotation_from_angles
-from orthoswarm.refine.flight.sparse_start import read_photo_records
+from orthoswarm.refine.flight.sparse_start import photo_legs, read_photo_records, split_segments
 from orthoswarm.refine.initial.heading import circular_mode
 from orthoswarm.refine.initial.initial_orientation import InitialOrientation, find_initial_orientation
 from orthoswarm.refine.initial.planar_similarity import level_from_nadir, rotation_of
-from orthoswarm.refine.initial.segments import photo_legs, split_segments
 from tests.kit.sparse_world import GRID, ORIGIN, World, lawnmower, make_world, without
 
 

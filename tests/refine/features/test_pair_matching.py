@@ -1,7 +1,6 @@
-"""Features, matches, candidate pairs, overlap and tracks of single photos."""
+"""Features, matches, candidate pairs and tracks of single photos."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -9,11 +8,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from orthoswarm.model.frame import Fix, Frame
-from orthoswarm.refine.features.overlap import forward_overlap
-from orthoswarm.refine.features.pair_matching import Pair, consecutive, match_features, nearby
-from orthoswarm.refine.features.sift_features import Features, detect, reduce_picture, spread
-from orthoswarm.refine.features.track_chaining import build_tracks, thin_tracks
+from orthoswarm.refine.features.pair_matching import (
+    Pair,
+    build_tracks,
+    consecutive,
+    match_features,
+    nearby,
+    thin_tracks,
+)
+from orthoswarm.refine.features.sift_features import SiftFeatures, detect, reduce_picture, spread
 from tests.kit.sparse_world import texture
 
 
@@ -113,9 +116,9 @@ def test_a_thousand_photos_of_one_spot_do_not_make_a_million_pairs():
     assert len(pairs) <= 8000
 
 
-def fake_features(count: int) -> Features:
+def fake_features(count: int) -> SiftFeatures:
     uv = np.stack([np.arange(count), np.arange(count)], 1).astype(np.float32)
-    return Features(
+    return SiftFeatures(
         uv=uv,
         descriptor=np.zeros((count, 128), np.uint8),
         sigma_px=np.ones(count, np.float32),
@@ -171,7 +174,7 @@ def test_points_described_twice_for_two_orientations_are_one_observation():
 def test_thinning_keeps_every_cell_that_was_covered():
     rng = np.random.default_rng(0)
     features = [
-        Features(uv=rng.uniform(0, 100, (400, 2)).astype(np.float32), descriptor=np.zeros((400, 128), np.uint8),
+        SiftFeatures(uv=rng.uniform(0, 100, (400, 2)).astype(np.float32), descriptor=np.zeros((400, 128), np.uint8),
                  sigma_px=np.ones(400, np.float32), width=100, height=100, step_px=1.0) for _ in range(4)
     ]  # fmt: skip
     same = np.stack([np.arange(400)] * 2, 1).astype(np.int32)
@@ -185,38 +188,3 @@ def test_thinning_keeps_every_cell_that_was_covered():
         return set(zip(t.camera.tolist(), at.tolist()))
 
     assert cells(thin) == cells(tracks)
-
-
-@pytest.mark.parametrize(
-    ("step", "low", "high", "dense"), [(40, 0.87, 0.95, True), (120, 0.68, 0.80, False), (220, 0.45, 0.60, False)]
-)
-def test_overlap_is_measured_from_pictures_without_any_tag(step, low, high, dense):
-    ground = texture(5, 500, 2200)
-    frames = [
-        Frame(
-            image=f"{k}.jpg", path=Path(f"{k}.jpg"), vehicle="v", time_s=None, fix=Fix(0.0, 0.0), width=480, height=360
-        )
-        for k in range(6)
-    ]
-    pictures = {f.image: ground[40:400, 40 + k * step : 520 + k * step].copy() for k, f in enumerate(frames)}
-    overlap = forward_overlap(frames, lambda f: pictures[f.image])
-    assert low < overlap.share < high
-    assert overlap.dense == dense
-
-
-def test_overlap_of_unrelated_pictures_is_nothing_and_not_dense():
-    frames = [
-        Frame(
-            image=f"{k}.jpg",
-            path=Path(f"{k}.jpg"),
-            vehicle="v",
-            time_s=1.0 * k,
-            fix=Fix(0.0, 0.0),
-            width=480,
-            height=360,
-        )
-        for k in range(3)
-    ]
-    overlap = forward_overlap(frames, lambda f: texture(10 + int(f.image[0]))[:360, :480])
-    assert overlap.share == 0.0
-    assert not overlap.dense

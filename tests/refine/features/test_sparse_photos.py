@@ -16,18 +16,23 @@ from orthoswarm.refine.bundle.adjustment import Adjustment
 from orthoswarm.refine.bundle.block_arrays import HEIGHT, WIDTH, F
 from orthoswarm.refine.flight.record_findings import runs
 from orthoswarm.refine.flight.sparse_adjustment import solve_sparse
-from orthoswarm.refine.flight.sparse_block import in_reduced_pixels, open_sparse_flight
-from orthoswarm.refine.flight.sparse_joint import open_sparse_flights, own_lenses
+from orthoswarm.refine.flight.sparse_block import in_reduced_pixels, open_sparse_flight, open_sparse_flights, own_lenses
 from orthoswarm.refine.flight.sparse_start import SparseStart, assemble, read_photo_records, sparse_start
 from orthoswarm.refine.initial.initial_orientation import find_initial_orientation
+from orthoswarm.refine.initial.pair_graph import PairGraphBuilder
 from tests.kit.sparse_world import GRID, ORIGIN, World, lawnmower, make_world, texture, without
 
 
-def begin(world: World, frames=None) -> SparseStart:
+def begin(world: World, frames=None, **options) -> SparseStart:
     frames = frames or world.frames
-    records = read_photo_records(frames, GRID, ORIGIN)
-    start = find_initial_orientation(records, world.pairs, world.features)
-    return assemble(frames, records, world.features, pairs=world.pairs, start=start, damaged={}, tried=len(world.pairs))
+    records = read_photo_records(frames, GRID, ORIGIN, **options)
+    tried = {(pair.first, pair.second): pair.match for pair in world.pairs}
+    read = lambda frame: np.zeros((1, 1), np.uint8)  # noqa: E731
+    builder = PairGraphBuilder(
+        frames=frames, records=records, read_gray=read, features=list(world.features), tried=tried
+    )
+    start = find_initial_orientation(records, builder.pairs(), world.features)
+    return assemble(builder, records, start)
 
 
 def crosshatch(**options) -> World:
@@ -150,11 +155,7 @@ def two_vehicles():
 
 def test_vehicles_adjusted_together_share_a_lens_first_and_have_their_own_then():
     world, frames = two_vehicles()
-    records = read_photo_records(frames, GRID, ORIGIN, share_lenses=True)
-    plane = find_initial_orientation(records, world.pairs, world.features)
-    start = assemble(
-        frames, records, world.features, pairs=world.pairs, start=plane, damaged={}, tried=len(world.pairs)
-    )
+    start = begin(world, frames, share_lenses=True)
     assert len(start.cameras.lens) == 1
     assert len(start.plane.tags) == 2
     own = own_lenses(solve_sparse(start), start)
@@ -297,7 +298,7 @@ def test_jwcate_is_one_piece_with_its_tilts_and_lag(real_data):
     start, adjustment, *_ = solved(real_frames(real_data("jwcate_1200")))
     assert np.bincount(start.component).tolist() == [36]
     tilt = np.degrees(np.arccos(-adjustment.cameras.rotation[:, 2, 2]))
-    medians = [float(np.median(tilt[start.segment == s])) for s in range(4)]
+    medians = [float(np.median(tilt[start.records.segment == s])) for s in range(4)]
     assert medians == pytest.approx([0.8, 4.7, 1.0, 9.0], abs=1.0)
     assert any("lag" in w for w in start.warnings)
 

@@ -12,7 +12,7 @@ from orthoswarm.config import override
 from orthoswarm.raster.basemap import Basemap
 from orthoswarm.raster.grey_pictures import GreyPictures
 from orthoswarm.refine.flight.kept_tracks import KeptTracks
-from orthoswarm.refine.strategy.swarm_refiner import Options, SwarmRefiner
+from orthoswarm.refine.strategy.swarm_refiner import RefinerOptions, SwarmRefiner
 from orthoswarm.refine.strategy.vehicle_passes import read_frame
 
 EPSG, ORIGIN = 32631, np.array([500_000.0, 5_000_000.0])
@@ -25,13 +25,13 @@ def scene(tmp_path_factory):
     ground = made_up_ground()
     write_map(ground, folder / "map.tif")
     frames, basemap = made_up_flight(ground, folder, "v1"), Basemap.open(folder / "map.tif", EPSG)
-    return frames, basemap, values(refined(frames, basemap, Options()))
+    return frames, basemap, values(refined(frames, basemap, RefinerOptions()))
 
 
 @pytest.fixture
 def kept(tmp_path):
     """Options that keep tracks and decoded pictures."""
-    return Options(read=GreyPictures(tmp_path, from_colors=False).gray, kept=KeptTracks(tmp_path))
+    return RefinerOptions(read=GreyPictures(tmp_path, from_colors=False).gray, kept=KeptTracks(tmp_path))
 
 
 def refined(frames, basemap, options):
@@ -68,7 +68,7 @@ def test_pictures_that_cannot_be_read_are_remembered(tmp_path, scene, kept):
     torn.write_bytes(frames[6].path.read_bytes()[:400])
     some = [*frames[:6], replace(frames[6], path=torn), *frames[7:]]
     followed(some, kept)
-    assert values(refined(some, basemap, kept)) == values(refined(some, basemap, Options()))
+    assert values(refined(some, basemap, kept)) == values(refined(some, basemap, RefinerOptions()))
 
 
 @pytest.mark.parametrize("change", ["record", "left out", "late", "picture"])
@@ -92,7 +92,7 @@ def test_tracks_of_other_frames_are_not_used(tmp_path, scene, kept, change):
         cv2.imwrite(str(copy), cv2.imread(str(copy))[::-1])
     assert len(followed(now, kept)) == 2
     before.write_bytes(b"of another time")
-    assert values(refined(now, basemap, kept)) == values(refined(now, basemap, Options()))
+    assert values(refined(now, basemap, kept)) == values(refined(now, basemap, RefinerOptions()))
 
 
 def test_what_is_damaged_or_gone_is_made_again(scene, kept):

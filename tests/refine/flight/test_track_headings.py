@@ -10,7 +10,7 @@ from orthoswarm.model.camera import Camera, Lens, rotation_from_angles
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.refine.bundle.block_arrays import Tracks
 from orthoswarm.refine.bundle.flight_records import read_records
-from orthoswarm.refine.flight.track_headings import turns, with_measured_headings
+from orthoswarm.refine.flight.relative_block import turns, with_measured_headings
 from tests.refine.features.test_block_parts import boustrophedon, frame
 
 LENS = Lens(640, 480, 400.0)

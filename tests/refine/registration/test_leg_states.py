@@ -13,7 +13,7 @@ def vehicle(ties, *, on_map=True, carried=False, residual_m=0.3, had_map=True):
     leg = np.repeat(np.arange(len(ties)), 3).astype(np.int32)
     camera = np.repeat(3 * np.arange(len(ties)), ties).astype(np.int32)
     residual = np.full((len(camera), 2), residual_m / np.sqrt(2))
-    frames = [SimpleNamespace(image=f"{k}.jpg") for k in range(len(leg))]
+    frames = [SimpleNamespace(image=f"{k}.jpg", vehicle="v") for k in range(len(leg))]
     flight = SimpleNamespace(leg=leg, frames=frames, adjustment=SimpleNamespace(tie_residual=residual))
     return SimpleNamespace(
         vehicle="v", flight=flight, matches=SimpleNamespace(camera=camera), on_map=on_map, carried=carried,

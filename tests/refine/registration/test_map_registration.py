@@ -11,25 +11,27 @@ from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import rotation_from_angles
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.refine.bundle.block_arrays import CameraBlock
-from orthoswarm.refine.bundle.observation_selection import one_per_cell
 from orthoswarm.refine.features.patch_matching import gradients, locate, template_of, window_of
+from orthoswarm.refine.flight.relative_block import one_per_cell
 from orthoswarm.refine.registration.absolute_orientation import (
     clear_matches,
     edge_displacement,
     mode_shift,
     tie_half_m,
 )
-from orthoswarm.refine.registration.map_heights import map_heights
-from orthoswarm.refine.registration.map_windows import LoadedMap
 from orthoswarm.refine.registration.orientation_correlation import (
+    PEAK_APART_PX,
+    Search,
     Strip,
     by_edges,
-    correlate,
+    correlation,
+    highest,
     orientation_field,
     register,
     stacked,
 )
-from orthoswarm.refine.registration.tie_points import MapMatches, match_points, vote_lean
+from orthoswarm.refine.registration.tie_points import LoadedMap, MapMatches, match_points, vote_lean
+from orthoswarm.refine.strategy.second_pass import map_heights
 from orthoswarm.refine.surface.vehicle_ground import GroundModel
 
 GSD = 0.5
@@ -87,16 +89,7 @@ def pictures_of(world, offset):
 
 def test_a_strip_is_found_although_light_and_dark_changed_places(world):
     cameras, images = pictures_of(world, (17.0, -9.0))
-    found = register(
-        cameras,
-        np.arange(6),
-        lambda i: images[i],
-        basemap=world,
-        origin=np.zeros(2),
-        ground_z=0.0,
-        reach_m=40.0,
-        gsd_m=1.0,
-    )
+    found = register(cameras, np.arange(6), lambda i: images[i], Search(world, np.zeros(2), 40.0, 1.0))
     np.testing.assert_allclose(found.shift, (-17.0, 9.0), atol=0.3)
     assert found.ratio < 0.6
 
@@ -104,19 +97,7 @@ def test_a_strip_is_found_although_light_and_dark_changed_places(world):
 def test_a_map_elsewhere_gives_no_match(world):
     cameras, images = pictures_of(world, (0.0, 0.0))
     away = CameraBlock(cameras.position + np.array([900.0, 0, 0]), cameras.rotation, cameras.lens_id, cameras.lens)
-    assert (
-        register(
-            away,
-            np.arange(6),
-            lambda i: images[i],
-            basemap=world,
-            origin=np.zeros(2),
-            ground_z=0.0,
-            reach_m=60.0,
-            gsd_m=2.0,
-        )
-        is None
-    )
+    assert register(away, np.arange(6), lambda i: images[i], Search(world, np.zeros(2), 60.0, 2.0)) is None
 
 
 def test_correlation_finds_fractions_of_a_pixel():
@@ -124,7 +105,7 @@ def test_correlation_finds_fractions_of_a_pixel():
     moved = cv2.warpAffine(image, np.array([[1, 0, 3.4], [0, 1, -2.7]]), (300, 300))
     inner = orientation_field(image[50:250, 50:250], np.ones((200, 200), bool))
     outer = orientation_field(moved[30:270, 30:270], np.ones((240, 240), bool))
-    column, row, _, ratio = correlate(inner, outer, 20)
+    column, row, _, ratio = highest(correlation(inner, outer, 20), PEAK_APART_PX)
     assert column == pytest.approx(3.4, abs=0.2)
     assert row == pytest.approx(-2.7, abs=0.2)
     assert ratio < 0.5
@@ -344,8 +325,7 @@ def test_larger_patches_are_found_where_most_of_the_ground_looks_different():
 
 @pytest.mark.parametrize(("height_m", "half_m"), [(30.0, 10.0), (150.0, 15.0), (600.0, 20.0)])
 def test_patches_grow_with_the_flying_height_within_limits(height_m, half_m):
-    cameras = SimpleNamespace(position=np.array([[0.0, 0.0, height_m]]))
-    assert tie_half_m(SimpleNamespace(cameras=lambda: cameras)) == pytest.approx(half_m)
+    assert tie_half_m(SimpleNamespace(height_m=height_m)) == pytest.approx(half_m)
 
 
 def test_what_strong_edges_pull_more_is_what_they_pull_texture():
@@ -361,6 +341,7 @@ def test_what_strong_edges_pull_more_is_what_they_pull_texture():
         pictures=SimpleNamespace(size=(320, 320), gray=lambda i: 255 - images[i]),
         best_views=lambda: SimpleNamespace(camera=camera),
         cameras=lambda: cameras,
+        height_m=float(np.median(cameras.position[:, 2])),
     )
     level = SimpleNamespace(height=lambda xy: np.zeros(len(xy)))
     loaded = LoadedMap.load(before, np.zeros(2), BoundingBox(-160.0, -120.0, 160.0, 140.0), GSD)

@@ -7,8 +7,8 @@ import pytest
 
 from orthoswarm.model.geo import local_origin
 from orthoswarm.refine.flight.relative_block import open_flight
+from orthoswarm.refine.registration.absolute_orientation import confirmed
 from orthoswarm.refine.registration.coarse_registration import coarse_fits
-from orthoswarm.refine.registration.confirmed_registration import confirmed
 from orthoswarm.refine.strategy.vehicle_passes import adjust_without_map, read_frame
 from tests.kit.scenes import scene_of, tiny_twin
 

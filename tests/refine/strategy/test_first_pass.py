@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from orthoswarm.model.errors import AdjustmentError
-from orthoswarm.refine.strategy import first_pass, vehicle_passes
+from orthoswarm.refine.strategy import swarm_refiner, vehicle_passes
 from tests.kit.refine import refine_all
 from tests.kit.scenes import scene_of, tiny_twin
 from tests.refine.strategy.test_swarm_refiner import errors
@@ -32,9 +32,9 @@ def opened(monkeypatch):
             raise AdjustmentError("the adjustment is singular")
         return open_together(units, *rest, **named)
 
-    open_together = first_pass.open_sparse_flights
+    open_together = swarm_refiner.open_sparse_flights
     monkeypatch.setattr(vehicle_passes, "adjust_without_map", singular)
-    monkeypatch.setattr(first_pass, "open_sparse_flights", sparse)
+    monkeypatch.setattr(swarm_refiner, "open_sparse_flights", sparse)
     return asked, breaks
 
 

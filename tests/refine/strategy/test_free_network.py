@@ -52,7 +52,7 @@ def test_exact_pairs_and_two_points_give_the_photos_back(seed):
     found = solve_free_network(
         graph_of(scale, centre, pairs), 12, np.full(12, WIDTH), anchors_of(scale, centre, [0, 11])
     )
-    assert found.placed.all() and found.anchor_ok.all()
+    assert found.placed.all()
     assert np.abs(found.centre - centre).max() < 1e-4
     assert np.abs(found.scale / scale - 1.0).max() < 1e-5
 
@@ -66,7 +66,6 @@ def test_a_wrong_point_and_a_wrong_pair_are_overruled_and_the_sigma_is_that_of_t
     graph.centre_second[25] += 400.0
     anchors = anchors_of(scale, centre, [0, 6, 12, 19, 9], wrong=[4])
     found = solve_free_network(graph, 20, np.full(20, WIDTH), anchors)
-    assert found.anchor_ok.tolist() == [True, True, True, True, False]
     error = np.abs(found.centre - centre)
     assert error.max() < 2.0 and np.sqrt((error**2 / (2 * found.sigma_m**2)).mean()) < 1.5
 

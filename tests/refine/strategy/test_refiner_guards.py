@@ -16,10 +16,11 @@ from orthoswarm.refine.bundle.covariance import systematic_tie_offset
 from orthoswarm.refine.bundle.height_consistency import FreeHeight, height_disagreement
 from orthoswarm.refine.flight.relative_block import open_flight
 from orthoswarm.refine.registration.absolute_orientation import leg_corrections
+from orthoswarm.refine.registration.block_state import WorkArea
 from orthoswarm.refine.registration.tie_points import MapMatches
 from orthoswarm.refine.strategy import vehicle_passes
 from orthoswarm.refine.strategy.vehicle_passes import (
-    Options,
+    RefinerOptions,
     adjust_by_schedule,
     adjust_without_map,
     focal_length_ran_away,
@@ -53,11 +54,11 @@ def test_wrong_tracks_at_a_turn_do_not_carry_the_field_of_view_away(made_up, con
     configure({"features": {"flow_chance_share": 0.0}})  # else they are dropped at once
     flight = opened(frames)
     configure({"features": {"flow_chance_share": 0.0}, "strategy": {"schedule": [1e4, 1e4, 100.0, 100.0, 9.0, 9.0]}})
-    adjust_by_schedule(flight, Options().ground(ORIGIN))
+    adjust_by_schedule(flight, RefinerOptions().ground(ORIGIN))
     assert fov_deg(flight) > 90.0 and focal_length_ran_away(flight)
     configure({"features": {"flow_chance_share": 0.0}})
     flight = opened(frames)
-    adjust_by_schedule(flight, Options().ground(ORIGIN))
+    adjust_by_schedule(flight, RefinerOptions().ground(ORIGIN))
     assert not focal_length_ran_away(flight)
     assert fov_deg(flight) == pytest.approx(70.0, abs=0.5)
 
@@ -132,12 +133,12 @@ def test_a_place_on_the_map_that_bends_the_lens_is_not_believed(made_up, monkeyp
         return found
 
     monkeypatch.setattr(vehicle_passes, "orient_on_map", bent)
-    state = refine_alone(frames, epsg=EPSG, origin=ORIGIN, basemap=basemap, options=Options())
+    state = refine_alone(frames, area=WorkArea(EPSG, ORIGIN, basemap), options=RefinerOptions())
     assert not state.on_map and not len(state.matches.point)
     assert fov_deg(state.flight) == pytest.approx(70.0, abs=0.5)
     assert any("is rejected" in warning for warning in state.flight.warnings)
     monkeypatch.setattr(vehicle_passes, "orient_on_map", orient_on_map)
-    state = refine_alone(frames, epsg=EPSG, origin=ORIGIN, basemap=basemap, options=Options())
+    state = refine_alone(frames, area=WorkArea(EPSG, ORIGIN, basemap), options=RefinerOptions())
     assert state.on_map and not any("is rejected" in warning for warning in state.flight.warnings)
 
 

@@ -12,8 +12,8 @@ from orthoswarm.batch.split_legs import legs_as_vehicles
 from orthoswarm.model.camera import Camera, Lens, focal_px, rotation_from_angles
 from orthoswarm.model.geo import GroundGrid, LocalGrid, area_epsg, local_origin
 from orthoswarm.raster.basemap import Basemap
-from orthoswarm.refine.registration.block_state import findings
-from orthoswarm.refine.strategy.swarm_refiner import Options, SwarmRefiner, refine_alone
+from orthoswarm.refine.registration.block_state import WorkArea, findings
+from orthoswarm.refine.strategy.swarm_refiner import RefinerOptions, SwarmRefiner, refine_alone
 from telemetry import load
 from tests.kit.refine import refine_all
 from tests.kit.scenes import scene_of, tiny_twin
@@ -151,7 +151,7 @@ def test_a_map_of_other_ground_leaves_the_flight_in_its_own_frame(scene):
 
     frames = vehicles["uav01"]
     origin = local_origin(grid, frames)
-    state = refine_alone(frames, epsg=grid.epsg, origin=origin, basemap=Elsewhere(), options=Options())
+    state = refine_alone(frames, area=WorkArea(grid.epsg, origin, Elsewhere()), options=RefinerOptions())
     assert not state.on_map
     assert any("no part of this flight was found" in w for w in findings(state))
 

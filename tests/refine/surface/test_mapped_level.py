@@ -9,7 +9,7 @@ from orthoswarm.evaluation.true_cameras import read_truth
 from orthoswarm.export.product_files import frame_row
 from orthoswarm.model.placement import Terrain
 from orthoswarm.mosaic.extent import from_takeoff, solved_level
-from orthoswarm.refine.surface.mapped_level import mapped_ground_level
+from orthoswarm.refine.surface.vehicle_ground import mapped_ground_level
 from tests.kit.refine import refine_all
 from tests.kit.scenes import scene_of, tiny_twin
 

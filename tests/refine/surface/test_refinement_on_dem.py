@@ -12,7 +12,7 @@ from orthoswarm.model.placement import Terrain
 from orthoswarm.mosaic.extent import placed_bounds
 from orthoswarm.mosaic.recorded_pose import recorded_cameras
 from orthoswarm.raster.height_model import HeightModel
-from orthoswarm.refine.strategy.swarm_refiner import Options, SwarmRefiner
+from orthoswarm.refine.strategy.swarm_refiner import RefinerOptions, SwarmRefiner
 from tests.kit.refine import refine_all, through_pickle
 from tests.kit.scenes import scene_of, tiny_twin
 from tests.refine.strategy.test_swarm_refiner import errors
@@ -41,7 +41,7 @@ def options(folder, scene, heights):
         dataset.write((heights + 37.0).astype(np.float32), 1)
     placed = recorded_cameras([f for frames in vehicles.values() for f in frames], grid).placed
     at = [p.camera.position for p in placed]
-    return Options(dem=HeightModel.open(path, grid.epsg, placed_bounds(placed, 0.0, 0.0), at))
+    return RefinerOptions(dem=HeightModel.open(path, grid.epsg, placed_bounds(placed, 0.0, 0.0), at))
 
 
 def off_ground(refined, scene, terrain=None):

@@ -7,9 +7,8 @@ from orthoswarm.config import active
 from orthoswarm.model.placement import Terrain
 from orthoswarm.model.task_runner import serial
 from orthoswarm.refine.features.working_pictures import Pictures
-from orthoswarm.refine.strategy.swarm_refiner import Options
-from orthoswarm.refine.surface.plane_sweep import SweepViews
-from orthoswarm.refine.surface.tall_surfaces import with_tall_surfaces
+from orthoswarm.refine.strategy.swarm_refiner import RefinerOptions
+from orthoswarm.refine.surface.plane_sweep import SweepViews, with_tall_surfaces
 from tests.kit.refine import refine_all, through_pickle
 from tests.refine.surface.hall_flight import GRID, HALF, HEIGHT_M, MIDDLE, ROOF_M, HallFlight, away
 
@@ -43,7 +42,7 @@ def drawn(flight: HallFlight, points: np.ndarray, *, usable: object = True, most
 
 
 def test_a_hall_is_drawn_on_its_roof_up_to_the_edges_and_the_ground_beside_it_on_the_ground(flight, places) -> None:
-    refined = refine_all({"a": flight.frames}, None, GRID, options=Options(read=flight.read))
+    refined = refine_all({"a": flight.frames}, None, GRID, options=RefinerOptions(read=flight.read))
     offset = np.median(
         [p.camera.position - t for p, t in zip(refined.fine[0].placed, flight.cameras.position, strict=True)], axis=0
     )
@@ -54,7 +53,7 @@ def test_a_hall_is_drawn_on_its_roof_up_to_the_edges_and_the_ground_beside_it_on
     assert np.median(np.abs(height[roof] - bare[roof] - ROOF_M)) < 0.5
     assert (np.abs(height[roof] - bare[roof] - ROOF_M) < 1.5).mean() > 0.95
     assert (np.abs(height[beside] - bare[beside]) < 1.5).mean() > 0.95
-    halves = refine_all({"a": flight.frames}, None, GRID, options=Options(read=flight.read), run=through_pickle)
+    halves = refine_all({"a": flight.frames}, None, GRID, options=RefinerOptions(read=flight.read), run=through_pickle)
     np.testing.assert_array_equal(terrain.z, halves.terrain.z)
 
 

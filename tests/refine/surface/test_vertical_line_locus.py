@@ -8,7 +8,8 @@ import pytest
 
 from orthoswarm.model.placement import Terrain
 from orthoswarm.refine.bundle.block_arrays import CameraBlock
-from orthoswarm.refine.surface.ground_offset import draw_positions, kernel_mode, measure_ground_offset
+from orthoswarm.refine.surface.dem_surface import kernel_mode
+from orthoswarm.refine.surface.ground_densification import draw_positions, free_ground
 from orthoswarm.refine.surface.vertical_line_kernels import _leaves
 from orthoswarm.refine.surface.vertical_line_locus import Sweep, dense_ground
 from tests.kit.draped import HEIGHT, WIDTH, Pictures, rig_of
@@ -151,22 +152,16 @@ def test_large_pictures_are_shrunk_to_what_the_sweep_needs():
     assert np.median(np.abs(error)) < 0.2
 
 
-def test_the_offset_is_that_of_the_open_ground(hilly):
+def test_the_open_ground_is_found_below_a_surface_that_lies_above_it(hilly):
     cameras, leg, gray = hilly
     positions = draw_positions(cameras.position[:, :2], 45.0)
     high = Terrain(-300.0, -300.0, 5.0, np.zeros((160, 120), np.float32))
     east, north = np.meshgrid(-300 + 5.0 * np.arange(120), -300 + 5.0 * np.arange(160))
     for offset in (0.0, 0.4):
         surface = Terrain(high.west, high.south, 5.0, (hill(np.stack([east, north], -1)) + offset).astype(np.float32))
-        found = measure_ground_offset(cameras, gray, positions, terrain=surface, leg_of_camera=leg)
-        assert found.count > 200
-        assert found.ground_offset_m == pytest.approx(-offset, abs=0.08)
-
-
-def test_too_few_heights_give_no_offset(hilly):
-    cameras, leg, gray = hilly
-    found = measure_ground_offset(cameras, gray, np.array([[30.0, 90.0]]), terrain=Terrain.flat(3.0), leg_of_camera=leg)
-    assert found.ground_offset_m == 0.0
+        found = free_ground(cameras, gray, positions, surface, leg).points
+        assert len(found) > 200
+        assert kernel_mode(found[:, 2] - surface.height(found[:, :2]), 0.2) == pytest.approx(-offset, abs=0.08)
 
 
 def test_positions_are_drawn_alike_every_time():
