@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 from gcs_plugin.daemon import views
 from gcs_plugin.daemon.airspace.terrain_data import TerrainData
@@ -18,7 +18,6 @@ from gcs_plugin.daemon.fetched_pictures import make_picture_requests
 from gcs_plugin.daemon.flight_coverage.exposure_journal import MESSAGES as EVENT_MESSAGES
 from gcs_plugin.daemon.flight_coverage.exposure_journal import EventRequests, ExposureJournal
 from gcs_plugin.daemon.flight_coverage.live_coverage import LiveCoverage
-from gcs_plugin.daemon.flight_coverage.picture_requests import PictureRequests
 from gcs_plugin.daemon.flight_coverage.picture_views import PictureViews
 from gcs_plugin.daemon.flight_coverage.planned_area import area_source
 from gcs_plugin.daemon.gap_flights import GapFlights
@@ -61,6 +60,13 @@ _FEW: Final = 10  # posted pictures of a vehicle, after which the kernels of a r
 _SOURCES_S: Final = 1.0
 _REPLACED: Final = "dropped: the vehicle's refinement takes its place"
 _log = logging.getLogger(__name__)
+
+
+class Part(Protocol):
+    """What works in threads of its own."""
+
+    def start(self) -> None:
+        """Begin to work."""
 
 
 class Daemon:
@@ -108,9 +114,8 @@ class Daemon:
         self.refused = RefusedPictures(self.events.publish)
         self.console = ConsoleState(self.journal, self.events.publish)
         self.plans = Plans(
-            folder / "plans", settings.dem, lambda: {} if self.links is None else self.links.autopilots(),
-            standing=lambda: {} if self.links is None else self.links.standing(),
-        )  # fmt: skip
+            folder / "plans", settings.dem, lambda: self.links.autopilots(), standing=lambda: self.links.standing()
+        )
 
     def _open_drawing(self) -> None:
         """The map that grows in flight, and how well the area is seen."""
@@ -123,12 +128,12 @@ class Daemon:
             fov_rad=fov, on_area=self._area_changed, anchor=self._anchor, on_rejected=self._rejected,
             on_drawn=lambda placed, quality: self.coverage.add(placed, quality),
         )  # fmt: skip
-        self.exposures = ExposureJournal(self.journal, lambda s: "" if self.links is None else self.links.name_of(s))
+        self.exposures = ExposureJournal(self.journal, lambda system: self.links.name_of(system))
         self.coverage = LiveCoverage(
             self.journal, self.events, views=PictureViews(self.journal, self.store, folder / "solutions", fov),
             source=lambda: area_source(self.console.plan(), self.plans.folder),
             epsg=lambda: None if self.drawer.area is None else self.drawer.area.epsg,
-            vehicles=lambda: [] if self.links is None else self.links.latest, exposures=self.exposures,
+            vehicles=lambda: self.links.latest, exposures=self.exposures,
         )  # fmt: skip
 
     def _open_jobs(self) -> None:
@@ -173,25 +178,17 @@ class Daemon:
         settings = self.settings
         self.posted: Counter[str] = Counter()
         self.poses = LinkPoses()
-        self.links: VehicleLinks | None = None
-        self.takeoffs: Takeoffs | None = None
-        self.terrain: TerrainData | None = None
-        self.picture_requests: PictureRequests | None = None
-        if settings.links:
-            self.links = VehicleLinks(settings, self.journal, self.events, self.jobs, self.poses)
-            self.takeoffs = Takeoffs(self.links, self.plans, self._say)
-            self.links.fleet.subscribe(self.exposures.message, *EVENT_MESSAGES)
-            EventRequests(self.links.fleet)
-            self.picture_requests = make_picture_requests(
-                self.links, settings, journal=self.journal, poses=self.poses, events=self.events,
-                missing=lambda: self.coverage.document["missing_pictures"], add_picture=self.add_picture,
-            )  # fmt: skip
-            if settings.dem is not None:
-                self.terrain = TerrainData(settings.dem, self.links.fleet)
+        self.links = VehicleLinks(settings, self.journal, self.events, self.jobs, self.poses)
+        self.takeoffs = Takeoffs(self.links, self.plans, self._say)
+        self.links.fleet.subscribe(self.exposures.message, *EVENT_MESSAGES)
+        EventRequests(self.links.fleet)
+        self.picture_requests = make_picture_requests(
+            self.links, settings, journal=self.journal, poses=self.poses, events=self.events,
+            missing=lambda: self.coverage.document["missing_pictures"], add_picture=self.add_picture,
+        )  # fmt: skip
+        self.terrain = [] if settings.dem is None else [TerrainData(settings.dem, self.links.fleet)]
         self.tak = TakFeed([settings.tak_address(text) for text in settings.tak], self.exports.places)
-        self.gap_flights = GapFlights(
-            self.coverage, self.plans, self.links, lambda: {} if self.takeoffs is None else self.takeoffs.rows()
-        )
+        self.gap_flights = GapFlights(self.coverage, self.plans, self.links, self.takeoffs.rows)
 
     def _open_sources(self) -> None:
         """Where pictures and poses come from beside the links: folders, videos, CAN buses."""
@@ -203,10 +200,9 @@ class Daemon:
             )
             for v in settings.vehicles if v.pictures
         ]  # fmt: skip
-        fleet = None if self.links is None else self.links.fleet
         self.buses = [
             CanReader(
-                v.id, v.can, poses=self.poses.of(v.id), notify=self._say, fleet=fleet,
+                v.id, v.can, poses=self.poses.of(v.id), notify=self._say, fleet=self.links.fleet,
                 system=v.system or system_in_name(v.id),
             )
             for v in settings.vehicles if v.can
@@ -222,11 +218,9 @@ class Daemon:
         self._watch_what_came_before()
         self.leg_watch.start()
         self.coverage.start()
-        with_links = (self.links, self.terrain, self.picture_requests)
-        tak = [self.tak] if self.settings.tak else []
-        for part in (*with_links, *tak, *self.sources, *self.buses):
-            if part is not None:
-                part.start()
+        parts: list[Part] = [self.links, *self.terrain, self.picture_requests, self.tak, *self.sources, *self.buses]
+        for part in parts:
+            part.start()
 
     def close(self) -> None:
         """Stop; unfinished work continues at the next start."""
@@ -236,9 +230,11 @@ class Daemon:
             bus.close()
         self.leg_watch.close()
         self.tak.close()
-        for part in (self.picture_requests, self.terrain, self.takeoffs, self.links):
-            if part is not None:
-                part.close()
+        self.picture_requests.close()
+        for terrain in self.terrain:
+            terrain.close()
+        self.takeoffs.close()
+        self.links.close()
         self.workers.close()
         self.background.close()
         self.jobs.close()
@@ -331,7 +327,7 @@ class Daemon:
 
     def vehicles(self) -> list[dict[str, Any]]:
         """All vehicles that were heard or that sent pictures, as JSON values."""
-        linked = {} if self.links is None else {row["id"]: row for row in self.links.rows()}
+        linked = {row["id"]: row for row in self.links.rows()}
         return views.vehicle_rows(
             self.journal, self.settings.vehicles, self.sources, linked, buses=self.buses, origins=self.poses.origins()
         )
@@ -457,9 +453,8 @@ class Daemon:
             "refine_started_s": job.detail["refine_started_s"], "refine_ended_s": job.detail["published_s"],
             "layer": job.detail["layer"], "version_before": job.detail["version_before"],
             "version": job.detail["version"], "frames": job.detail["frames"],
+            "still_flying_after": [r["id"] for r in self.links.rows() if r["mission"]["phase"] == "active"],
         }  # fmt: skip
-        if self.links is not None:
-            facts["still_flying_after"] = [r["id"] for r in self.links.rows() if r["mission"]["phase"] == "active"]
         self.journal.write(note_completion(job.vehicle, job.sortie, facts))
         self.events.publish("completion", vehicle=job.vehicle, sortie=job.sortie, **facts)
 
@@ -488,7 +483,7 @@ class Daemon:
     def problems(self) -> list[str]:
         """The present problems, in words."""
         own = (self.drawer.problem, self.drawer.overload, self.jobs.problem, self.tak.problem)
-        linked = [] if self.links is None else self.links.fleet.problems(self.links.name_of)
+        linked = self.links.fleet.problems(self.links.name_of)
         return [text for text in (*own, *linked, *self.refused.problems(), *(s.problem for s in self.sources)) if text]
 
     def _rejected(self, frame: Frame, reason: str, misplaced: bool) -> None:

@@ -21,7 +21,7 @@ class GapFlights:
     """Plans flights over gaps. Nothing is uploaded or started here.
 
     Args:
-        coverage: whose gaps. plans: of the workspace. links: the vehicles, None without links.
+        coverage: whose gaps. plans: of the workspace. links: the vehicles.
         takeoffs: gives a row for each vehicle whose takeoff waits (`Takeoffs.rows`).
     """
 
@@ -29,7 +29,7 @@ class GapFlights:
         self,
         coverage: LiveCoverage,
         plans: Plans,
-        links: VehicleLinks | None,
+        links: VehicleLinks,
         takeoffs: Callable[[], Mapping[str, Mapping[str, Any]]] = dict,
     ) -> None:
         self._coverage, self._plans, self._links, self._takeoffs = coverage, plans, links, takeoffs
@@ -42,7 +42,7 @@ class GapFlights:
         """
         rows: list[dict[str, Any]] = []
         due = [vehicle for vehicle, takeoff in self._takeoffs().items() if "in_s" in takeoff]
-        for row in [] if self._links is None else self._links.rows():
+        for row in self._links.rows():
             seconds = self._coverage.battery.seconds(str(row["id"]), LIMITS.reserve_share)
             rows.append({
                 "id": row["id"], "battery": row["battery"],

@@ -34,8 +34,9 @@ class TakFeed:
         self.problem = ""
 
     def start(self) -> None:
-        """Start sending."""
-        self._thread.start()
+        """Start sending, if there is a receiver."""
+        if self._senders:
+            self._thread.start()
 
     def close(self) -> None:
         """Stop sending."""

@@ -110,7 +110,8 @@ class VehicleLinks:
         self.cancel_takeoff: Callable[[str], str] = lambda _: ""
         self._starting = Counter[int]()
         self.takeoffs: Callable[[], Mapping[str, dict[str, Any]]] = dict
-        self.fleet: Fleet = Fleet(settings.links, key=find_key(), tlog=settings.workspace / "telemetry.tlog")
+        log = settings.workspace / "telemetry.tlog" if settings.links else None
+        self.fleet: Fleet = Fleet(settings.links, key=find_key() if settings.links else None, tlog=log)
         self.fleet.on_event(self._event)
         self.fleet.subscribe(self._message)
         self._fences = Fences(self.fleet)
@@ -181,6 +182,8 @@ class VehicleLinks:
             now = time.monotonic()
             return [self._row(vehicle, now) for _, vehicle in sorted(self.fleet.vehicles.items())]
 
+        if not self.fleet.vehicles:
+            return []
         takeoffs, returns = self.takeoffs(), self._returns.waits()
         return [
             row | {"takeoff": takeoffs.get(row["id"]), "returns_after": returns.get(row["id"])}

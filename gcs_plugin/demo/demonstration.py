@@ -189,7 +189,6 @@ class Served:
 def _fly(daemon: "Daemon", setting: DemoSetting, report: ReportProgress) -> None:
     """Plan, upload, start one after the other, and wait until all have completed."""
     links = daemon.links
-    assert links is not None
     _wait(lambda: sum(row["lat_deg"] is not None for row in links.rows()) == setting.vehicles, 60.0, "the vehicles")
     report("planning", 0, 1)
     starts = [[row["lat_deg"], row["lon_deg"]] for row in links.rows()]

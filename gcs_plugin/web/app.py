@@ -67,9 +67,7 @@ class CoverageRoutes:
 
         `requests`: the pictures that were asked from vehicles, each with `state`, `reason`, `percent`.
         """
-        requests = self._daemon.picture_requests
-        asked = [] if requests is None else requests.rows()
-        return JsonAnswer(self._daemon.coverage.document | {"requests": asked})
+        return JsonAnswer(self._daemon.coverage.document | {"requests": self._daemon.picture_requests.rows()})
 
     async def gaps(self) -> Response:
         """The gaps as GeoJSON, as `orthoswarm coverage` writes them; `orthoswarm plan --gaps` reads them."""
@@ -134,8 +132,7 @@ class HttpRoutes:
 
     async def traffic(self) -> Response:
         """Other aircraft that the vehicles' ADS-B receivers hear."""
-        links = self.daemon.links
-        return JsonAnswer([] if links is None else await self.work(links.traffic.rows))
+        return JsonAnswer(await self.work(self.daemon.links.traffic.rows))
 
     async def frames(
         self,

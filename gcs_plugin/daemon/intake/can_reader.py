@@ -61,7 +61,7 @@ class CanReader:
         *,
         poses: LivePoses,
         notify: Callable[[str], None],
-        fleet: "Fleet | None",
+        fleet: "Fleet",
         system: int | None,
     ) -> None:
         """Make ready to read.
@@ -70,7 +70,7 @@ class CanReader:
             vehicle: id. bus: for example "socketcan:can0", or "mavlink" for the one behind the vehicle's link.
             poses: of the vehicle; receives the bus's poses.
             notify: called with messages for the user.
-            fleet: the links; None without any. system: the vehicle's MAVLink system id, None without.
+            fleet: the vehicles on links. system: the vehicle's MAVLink system id, None without.
 
         Raises:
             InputError: the bus is behind a link, and there is none.
@@ -83,7 +83,7 @@ class CanReader:
         self._heard, self._count = float("-inf"), 0
         run = self._read
         if bus.partition(":")[0] == _TUNNEL:
-            if fleet is None or system is None:
+            if not fleet.hub.sides or system is None:
                 raise InputError(
                     f"the CAN bus of {vehicle} is behind its MAVLink link, and there is none; give --link, and the "
                     f"vehicle's system id in the workspace's orthoswarm.toml where its name is not v1 to v255"
