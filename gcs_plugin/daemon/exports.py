@@ -6,22 +6,35 @@ import os
 import shutil
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
 
+from gcs_plugin.daemon.flight_coverage.live_coverage import LiveCoverage
 from gcs_plugin.daemon.intake.posted_pose import frame_of_row
-from gcs_plugin.daemon.jobs.job_queue import Job
+from gcs_plugin.daemon.jobs.job_queue import ReportProgress
 from gcs_plugin.daemon.jobs.solution_file import read_solution
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
-from gcs_plugin.daemon.jobs.workspace_products import PRODUCTS, ExportTask, placements, writable, write_products
+from gcs_plugin.daemon.jobs.workspace_products import (
+    PRODUCTS,
+    ExportTask,
+    RunFacts,
+    placements,
+    writable,
+    write_products,
+)
 from gcs_plugin.daemon.layers.layers import Area, Layer
+from gcs_plugin.daemon.layers.realtime_layer import Drawer
 from gcs_plugin.daemon.settings import Settings
 from gcs_plugin.daemon.store.console_state import ConsoleState
-from gcs_plugin.daemon.store.journal import Change, Journal, packed, unpacked
+from gcs_plugin.daemon.store.frame_rows import all_frames, frame_number, frame_path
+from gcs_plugin.daemon.store.job_rows import Job
+from gcs_plugin.daemon.store.journal import Change, Journal, no_change
 from gcs_plugin.daemon.store.picture_store import PictureStore
+from gcs_plugin.daemon.store.sortie_rows import coarse_only, placed_sorties
+from gcs_plugin.daemon.views import Views
 from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.export.tactical.places import Place
 from orthoswarm.export.tactical.seen_in import sightings
@@ -58,10 +71,8 @@ class Exports:
     """Exports the workspace to the formats of other programs.
 
     Args:
-        settings: of the daemon. journal, store, layers, console: the workspace's.
-        workers: write the files. area: returns the map's area, None before the first picture.
-        vehicles: returns the rows of /api/vehicles. facts: returns the daemon's facts for the report.
-        cells: returns the picture of the coverage's cells (PNG), empty without an area.
+        layers: by name. drawer: knows the map's area. views: has the vehicles. coverage: its cells and figures are
+            part of the report. workers: write the files. facts: of the daemon, for the report.
     """
 
     def __init__(
@@ -72,31 +83,31 @@ class Exports:
         store: PictureStore,
         layers: Mapping[str, Layer],
         console: ConsoleState,
+        drawer: Drawer,
+        views: Views,
+        coverage: LiveCoverage,
         workers: WorkerPool,
-        area: Callable[[], Area | None],
-        vehicles: Callable[[], list[dict[str, Any]]],
-        facts: Callable[[], dict[str, Any]],
-        cells: Callable[[], bytes],
+        facts: RunFacts,
     ) -> None:
         self._settings, self._journal, self._store = settings, journal, store
         self._layers, self._console, self._workers = layers, console, workers
-        self._area, self._vehicles, self._facts, self._cells = area, vehicles, facts, cells
+        self._drawer, self._views, self._coverage, self._facts = drawer, views, coverage, facts
         self._written: tuple[dict[str, int], dict[str, str]] = ({}, {})  # the layers' versions, and the files of them
 
-    def write(self, job: Job, report: Callable[[float, str], None]) -> Change:
+    def write(self, job: Job, report: ReportProgress) -> Change:
         """The handler of an `export` job; one that nobody asked for writes only what has changed since the last one.
 
         Raises:
             InputError: there is no map yet.
         """
         report(0.05, "writing")
-        area = self._area()
+        area = self._drawer.area
         if area is None:
             raise InputError("there is no map yet; wait for pictures")
         versions = {name: layer.version for name, layer in self._layers.items()}
         if "after" in job.detail and versions == self._written[0]:
             job.detail["note"], job.detail["files"] = "the last one has everything", self._written[1]
-            return lambda db: None
+            return no_change
         with contextlib.ExitStack() as held:  # a replaced generation stays while it is read
             canvases = {name: held.enter_context(layer.reading()) for name, layer in self._layers.items()}
             folders = {name: canvas.path for name, canvas in canvases.items() if canvas is not None}
@@ -106,10 +117,10 @@ class Exports:
                 for find in self._console.finds()
             ]
             places = tuple(self._places(shown))
-            task = replace(task, facts=self._facts(), places=places, cells=self._cells())
+            task = replace(task, facts=self._report_facts(), places=places, cells=self._coverage.png)
             job.detail["files"] = files = self._workers.run(write_products, task)
             self._written = versions, {name: files[name] for name in PRODUCTS}
-        return lambda db: None
+        return no_change
 
     def places(self) -> list[Place]:
         """The finds, and the vehicles with a known position."""
@@ -124,12 +135,10 @@ class Exports:
         find = next((row for row in self._console.finds() if row["id"] == number), None)
         if find is None:
             raise InputError(f"there is no find {number}; see /api/finds")
-        area = self._area()
+        area = self._drawer.area
         rows = [] if area is None else pictures_at(self._task(area), find["lat_deg"], find["lon_deg"])
-        query = "SELECT seq FROM frames WHERE vehicle = ? AND image = ?"
         for row in rows:
-            found = self._journal.one(query, (packed(row["vehicle"]), packed(row["image"])))
-            row["seq"] = None if found is None else found["seq"]
+            row["seq"] = frame_number(self._journal, row["vehicle"], row["image"])
         return rows
 
     def picture(self, seq: int) -> Path:
@@ -138,10 +147,10 @@ class Exports:
         Raises:
             InputError: there is no such picture.
         """
-        row = self._journal.one("SELECT path FROM frames WHERE seq = ?", (seq,)) if 0 <= seq < 2**63 else None
-        if row is None or not self._store.path(row["path"]).is_file():
+        name = frame_path(self._journal, seq)
+        if name is None or not self._store.path(name).is_file():
             raise InputError(f"there is no picture {seq}; see /api/frames")
-        return self._store.path(row["path"])
+        return self._store.path(name)
 
     def picture_view(self, seq: int) -> Path | bytes:
         """The file of a picture, or a JPEG where browsers would show it black or not at all.
@@ -157,17 +166,16 @@ class Exports:
         return bytes(simplejpeg.encode_jpeg(picture_file.read_rgb(path), _VIEW_QUALITY, "RGB"))
 
     def _places(self, finds: list[dict[str, Any]]) -> list[Place]:
-        return places_of(self._settings.workspace.resolve().name, finds, self._vehicles(), time.time())
+        return places_of(self._settings.workspace.resolve().name, finds, self._views.vehicles(), time.time())
+
+    def _report_facts(self) -> dict[str, Any]:
+        covered = self._coverage.document
+        return self._facts.document() | ({} if covered["state"] == "no area" else {"coverage": covered})
 
     def _task(self, area: Area) -> ExportTask:
         """The export task of the workspace, without layers and formats."""
-        rows = self._journal.rows("SELECT * FROM frames ORDER BY vehicle, time, seq")
+        rows = all_frames(self._journal)
         folder, fov_deg = self._settings.workspace / "solutions", self._settings.fov_min_deg
-        solutions = self._journal.rows("SELECT path FROM solutions ORDER BY vehicle, sortie")
-        coarse = self._journal.rows(
-            "SELECT path FROM coarse c WHERE NOT EXISTS (SELECT 1 FROM solutions s WHERE s.vehicle = c.vehicle"
-            " AND s.sortie = c.sortie) ORDER BY vehicle, sortie"
-        )
         return ExportTask(
             workspace=self._settings.workspace,
             formats=(),
@@ -175,9 +183,9 @@ class Exports:
             epsg=area.epsg,
             gsd_m=area.gsd_m,
             frames=[frame_of_row(row, self._store) for row in rows],
-            reasons={(unpacked(r["vehicle"]), unpacked(r["image"])): r["reason"] for r in rows if r["reason"]},
-            coarse=[folder / row["path"] for row in coarse],
-            solutions=[folder / row["path"] for row in solutions],
+            reasons={(row.vehicle, row.image): row.reason for row in rows if row.reason},
+            coarse=[folder / row.path for row in coarse_only(self._journal)],
+            solutions=[folder / row.path for row in placed_sorties(self._journal, "solutions")],
             basemap=self._settings.basemap,
             fov_rad=None if fov_deg is None else math.radians(fov_deg),
         )

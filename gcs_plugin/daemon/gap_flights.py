@@ -1,7 +1,7 @@
 """Flights over missed ground: planned here from the gaps of the coverage, uploaded and started by the operator."""
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, Final
 
 from gcs_plugin.config import LIMITS
@@ -22,17 +22,10 @@ class GapFlights:
 
     Args:
         coverage: whose gaps. plans: of the workspace. links: the vehicles.
-        takeoffs: gives a row for each vehicle whose takeoff waits (`Takeoffs.rows`).
     """
 
-    def __init__(
-        self,
-        coverage: LiveCoverage,
-        plans: Plans,
-        links: VehicleLinks,
-        takeoffs: Callable[[], Mapping[str, Mapping[str, Any]]] = dict,
-    ) -> None:
-        self._coverage, self._plans, self._links, self._takeoffs = coverage, plans, links, takeoffs
+    def __init__(self, coverage: LiveCoverage, plans: Plans, links: VehicleLinks) -> None:
+        self._coverage, self._plans, self._links = coverage, plans, links
 
     def vehicles(self) -> list[dict[str, Any]]:
         """Vehicles that could fly: `id`, `battery` (share left), `minutes` (None: unknown), `busy` (why not now).
@@ -41,13 +34,13 @@ class GapFlights:
         one that may be given the gaps in the air, if the operator says so for this vehicle.
         """
         rows: list[dict[str, Any]] = []
-        due = [vehicle for vehicle, takeoff in self._takeoffs().items() if "in_s" in takeoff]
         for row in self._links.rows():
+            due = "in_s" in (row["takeoff"] or {})
             seconds = self._coverage.battery.seconds(str(row["id"]), LIMITS.reserve_share)
             rows.append({
                 "id": row["id"], "battery": row["battery"],
                 "minutes": None if seconds is None else round(seconds / 60.0, 1),
-                "busy": "it is about to take off; cancel that first" if row["id"] in due else _busy(row),
+                "busy": "it is about to take off; cancel that first" if due else _busy(row),
                 "in_air": self._plans.dem is None and _may_go_on(row),
                 "lat_deg": row["lat_deg"], "lon_deg": row["lon_deg"], "home": row["home"],
             })  # fmt: skip

@@ -5,11 +5,11 @@ import json
 import re
 import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
 from gcs_plugin.links.mavlink import Autopilot
@@ -35,23 +35,26 @@ Place = tuple[float, float]
 """Latitude and longitude in degrees."""
 
 
+class PlannedVehicles(Protocol):
+    """The vehicles on the links."""
+
+    def autopilots(self) -> Mapping[str, str]:
+        """The autopilot of each, by id."""
+
+    def standing(self) -> Mapping[str, Place | str]:
+        """Where each stands, or why that is not known, in words."""
+
+
 class Plans:
     """The plans of a workspace.
 
     Args:
         folder: of all plans. dem: height model that they follow, None for level ground.
-        autopilots: of the vehicles on the links, by id; a plan is made for these unless its request names others.
-        standing: where these stand (latitude and longitude in degrees), or why that is not known, in words.
+        vehicles: on the links; a plan is made for these unless its request names others.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        dem: Path | None = None,
-        autopilots: Callable[[], Mapping[str, str]] = dict,
-        standing: Callable[[], Mapping[str, Place | str]] = dict,
-    ) -> None:
-        self.folder, self.dem, self._autopilots, self._standing = folder, dem, autopilots, standing
+    def __init__(self, folder: Path, dem: Path | None, vehicles: PlannedVehicles) -> None:
+        self.folder, self.dem, self._vehicles = folder, dem, vehicles
         self._bounds: tuple[Path, GeographicBounds] | None = None
 
     def make(self, body: Mapping[str, Any]) -> dict[str, Any]:
@@ -75,7 +78,7 @@ class Plans:
 
     def autopilots_of(self, vehicles: Sequence[str]) -> list[str]:
         """The autopilots of vehicles; ArduPilot for those that were not heard."""
-        known = self._autopilots()
+        known = self._vehicles.autopilots()
         return [known.get(vehicle, "ardupilot") for vehicle in vehicles]
 
     def _starts(self, vehicles: Sequence[str]) -> tuple[list[Place], list[str]]:
@@ -83,7 +86,7 @@ class Plans:
 
         Without vehicles on the links there is nothing to warn of: who flies the plan is not known.
         """
-        known = self._standing()
+        known = self._vehicles.standing()
         places = [known.get(vehicle, "not on the links") for vehicle in vehicles] if known else []
         unknown: dict[str, list[str]] = {}
         for vehicle, place in zip(vehicles, places, strict=False):

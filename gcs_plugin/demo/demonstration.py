@@ -214,7 +214,7 @@ def _fly(daemon: "Daemon", setting: DemoSetting, report: ReportProgress) -> None
 
     def done() -> bool:
         report("flying: pictures on the map", min(daemon.drawer.drawn, photos), photos)
-        return len(daemon.completions()) >= setting.vehicles
+        return len(daemon.views.completions()) >= setting.vehicles
 
     _wait(done, _MOST_S, "the missions' completion")
     report("flying: pictures on the map", photos, photos)
@@ -224,7 +224,7 @@ def _finish(daemon: "Daemon", report: ReportProgress) -> None:
     """Wait until every completion's refinement is on the map, and the products are written."""
 
     def refined() -> bool:
-        rows = daemon.completions()
+        rows = daemon.views.completions()
         report("refining", sum("version" in row for row in rows), len(rows))
         failed = [job for job in daemon.jobs.all() if job.state == "failed" and job.kind != "coarse"]
         if failed:
@@ -233,7 +233,7 @@ def _finish(daemon: "Daemon", report: ReportProgress) -> None:
 
     _wait(refined, 300.0, "the refinement")
     report("products", 0, 1)
-    job = daemon.export(["cog", "gpkg", "mbtiles", "kmz"])
+    job = daemon.requests.export(["cog", "gpkg", "mbtiles", "kmz"])
     _wait(
         lambda: (found := daemon.jobs.find(job.id)) is not None and found.state in ("done", "failed"), 300.0, "export"
     )

@@ -21,6 +21,7 @@ from fastapi import HTTPException, Request, Response
 
 from gcs_plugin.config import COMMAND
 from gcs_plugin.daemon.daemon import Daemon
+from gcs_plugin.daemon.store.daemon_events import CommandDone
 from gcs_plugin.daemon.takeoffs import Takeoffs, names_of
 from gcs_plugin.daemon.vehicles import VehicleLinks
 from gcs_plugin.fleet.commands import URGENT, VERBS, CommandResult, new_id
@@ -148,7 +149,7 @@ class CommandRoutes:
             began = links.clock() - max(0.0, issue.age_s)
             rows = links.commands(verb, names, given_s=began, command_id=issue.id, override=override)
         for row in rows:
-            self._daemon.events.publish("command", **row)
+            self._daemon.events.publish(CommandDone(row))
         return rows
 
     def _upload(self, vehicle: str, issue: Issue, body: dict[str, Any]) -> dict[str, Any]:
@@ -234,7 +235,7 @@ class CommandRoutes:
     def _pause(self, vehicles: list[str], issue: Issue) -> Rows:
         rows = self._daemon.links.commands("pause", vehicles, command_id=issue.id)
         for row in rows:
-            self._daemon.events.publish("command", **row)
+            self._daemon.events.publish(CommandDone(row))
         return rows
 
     def _require_links(self) -> None:

@@ -10,9 +10,10 @@ import sqlite3
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Final
+from pathlib import Path
+from typing import Any, Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +22,18 @@ from gcs_plugin.daemon.flight_coverage.battery_use import BatteryUse
 from gcs_plugin.daemon.flight_coverage.exposure_journal import ExposureJournal
 from gcs_plugin.daemon.flight_coverage.flown_legs import FlownLegs, flies
 from gcs_plugin.daemon.flight_coverage.picture_views import FlawedPictures, Measured, PictureViews
-from gcs_plugin.daemon.flight_coverage.planned_area import AreaSource, CoveredArea, read_covered_area, zone_features
+from gcs_plugin.daemon.flight_coverage.planned_area import (
+    AreaSource,
+    CoveredArea,
+    area_source,
+    read_covered_area,
+    zone_features,
+)
+from gcs_plugin.daemon.layers.realtime_layer import Drawer
+from gcs_plugin.daemon.store.console_state import ConsoleState
+from gcs_plugin.daemon.store.daemon_events import CoverageChanged, PictureDrawn
 from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.daemon.store.frame_rows import last_drawn_arrival
 from gcs_plugin.daemon.store.journal import Journal
 from orthoswarm.coverage.camera_events import missing_by_events
 from orthoswarm.coverage.coverage_files import COLOURS, gap_feature
@@ -34,7 +45,6 @@ from orthoswarm.coverage.view import View
 from orthoswarm.export.product_files import iso_time
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 from orthoswarm.model.geo import GroundGrid, LocalGrid
-from orthoswarm.model.placement import PlacedFrame
 from orthoswarm.raster.picture_quality import PictureQuality
 
 Rows = list[dict[str, Any]]
@@ -89,33 +99,33 @@ _NOTHING: Final = _Result(
 )  # fmt: skip
 
 
+class LinkedVehicles(Protocol):
+    """The vehicles on the links.
+
+    Attributes:
+        latest: their rows, at most half a second old.
+    """
+
+    latest: Rows
+
+
 class LiveCoverage:
     """Updates the coverage.
 
     Args:
-        journal: of the workspace. events: receives changes of the coverage. views: of the workspace's pictures.
-        source: returns the source of the area, None if there is none. epsg: returns the map's grid, None before it
-        exists.
-        vehicles: returns the rows of the vehicles on the links, empty without links.
-        exposures: reported by the vehicles.
+        views: of the workspace's pictures. console, plans: the operator's plan, and the folder of all plans: these say
+            what the area is. drawer: knows the map's grid. vehicles: on the links. exposures: reported by them.
 
     Attributes:
         seconds: duration of the last search for gaps. battery: remaining flight time of the vehicles.
     """
 
     def __init__(
-        self,
-        journal: Journal,
-        events: Events,
-        *,
-        views: PictureViews,
-        source: Callable[[], AreaSource | None],
-        epsg: Callable[[], int | None],
-        vehicles: Callable[[], Rows],
-        exposures: ExposureJournal,
-    ) -> None:
+        self, journal: Journal, events: Events, *, views: PictureViews, console: ConsoleState, plans: Path,
+        drawer: Drawer, vehicles: LinkedVehicles, exposures: ExposureJournal,
+    ) -> None:  # fmt: skip
         self._journal, self._events, self._views = journal, events, views
-        self._source, self._epsg, self._vehicles = source, epsg, vehicles
+        self._console, self._plans, self._drawer, self._vehicles = console, plans, drawer, vehicles
         self._exposures = exposures
         self._fresh: deque[tuple[View, PictureQuality | None]] = deque()
         self._bell, self._stop = threading.Event(), threading.Event()
@@ -140,13 +150,13 @@ class LiveCoverage:
         if self._thread.ident is not None:
             self._thread.join()
 
-    def add(self, placed: PlacedFrame, quality: PictureQuality | None) -> None:
-        """A picture is on the real-time layer with its recorded pose and measured quality; any thread."""
-        self._fresh.append((View.of_frame(placed), quality))
+    def picture_drawn(self, event: PictureDrawn) -> None:
+        """Take a picture that is on the real-time layer; any thread."""
+        self._fresh.append((View.of_frame(event.placed), event.quality))
         self._bell.set()
 
-    def look(self) -> None:
-        """Announce that pictures were placed or the plan has changed; any thread."""
+    def look(self, _: object = None) -> None:
+        """Look now, since pictures were placed; any thread."""
         self._bell.set()
 
     @property
@@ -194,12 +204,12 @@ class LiveCoverage:
     def _take(self) -> bool:
         """Process new data; returns whether anything has changed."""
         changed = self._exposures.write()
-        source = self._source()
+        source = area_source(self._console.plan(), self._plans)
         if source is None or source == self._refused:
             self._fresh.clear()
             gone, self._followed, self._result = self._followed is not None, None, _NOTHING
             return gone
-        epsg = self._epsg()
+        epsg = None if self._drawer.area is None else self._drawer.area.epsg
         here = self._followed
         if here is None or here.source != source or (epsg is not None and here.cover.cells.grid.epsg != epsg):
             here = self._followed = self._begin(source, epsg)
@@ -241,9 +251,9 @@ class LiveCoverage:
             self._put_recorded(here, pictures)
             if self._stop.is_set():
                 break
-        row = self._journal.one("SELECT MAX(arrived) AS last FROM frames WHERE drawn = 1")
-        if row is not None and row["last"] is not None:
-            here.legs.picture_came(row["last"])
+        last_s = last_drawn_arrival(self._journal)
+        if last_s is not None:
+            here.legs.picture_came(last_s)
         return here
 
     def _put_recorded(self, here: _Followed, pictures: Measured) -> bool:
@@ -264,7 +274,7 @@ class LiveCoverage:
 
     def _follow(self, here: _Followed) -> bool:
         """Track the vehicles; returns whether the due cells have changed."""
-        rows = self._vehicles()
+        rows = self._vehicles.latest
         grid = here.covered.area.grid
         for row in rows:
             self.battery.look(row, flies(row), time.monotonic())
@@ -309,7 +319,8 @@ class LiveCoverage:
         self._rest_until = time.monotonic() + _LEAST_PAUSE * (time.thread_time() - cpu)
         published = ("state", "version", "seen_share", "poor_share", "missed_share", "planned_share")
         document = self._result.document
-        self._events.publish("coverage", gaps=len(document["gaps"]), **{key: document[key] for key in published})
+        shown = {key: document[key] for key in published}
+        self._events.publish(CoverageChanged(gaps=len(document["gaps"]), **shown))
 
     def _found(self, here: _Followed) -> _Result:
         cover, grid = here.cover, here.covered.area.grid

@@ -2,10 +2,12 @@
 
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from datetime import datetime
 from typing import Any, Final
 
+from gcs_plugin.daemon.store.daemon_events import FindsChanged, PlanChanged
+from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.journal import Journal
 from orthoswarm.export.product_files import iso_time
 from orthoswarm.model.errors import InputError, OrthoSwarmError
@@ -20,14 +22,10 @@ class OutdatedError(OrthoSwarmError):
 
 
 class ConsoleState:
-    """The plan and the finds, stored in the journal.
+    """The plan and the finds, stored in the journal."""
 
-    Args:
-        journal: stores them. publish: called with an event's kind and fields when they change.
-    """
-
-    def __init__(self, journal: Journal, publish: Callable[..., None]) -> None:
-        self._journal, self._publish = journal, publish
+    def __init__(self, journal: Journal, events: Events) -> None:
+        self._journal, self._events = journal, events
         self._lock = threading.Lock()
 
     def plan(self) -> dict[str, Any]:
@@ -56,7 +54,7 @@ class ConsoleState:
                 raise OutdatedError(f"the plan was changed elsewhere (version {before}); load it and change it again")
             plan = {key: body.get(key) for key in _PLAN_FIELDS} | {"version": before + 1}
             self._journal.remember("console_plan", plan)
-        self._publish("plan", **plan)
+        self._events.publish(PlanChanged(plan))
         return plan
 
     def finds(self) -> list[dict[str, Any]]:
@@ -80,7 +78,7 @@ class ConsoleState:
                 raise InputError(f"there are {_MOST_FINDS} finds; delete some first")
             row = {"id": found["next"], **row}
             self._journal.remember("finds", {"next": found["next"] + 1, "rows": [*found["rows"], row]})
-        self._publish("finds")
+        self._events.publish(FindsChanged())
         return row
 
     def change_find(self, number: int, body: Mapping[str, Any]) -> dict[str, Any] | None:
@@ -107,7 +105,7 @@ class ConsoleState:
             row = before | new | {"version": before["version"] + 1}
             changed = [row if old is before else old for old in rows]
             self._journal.remember("finds", self._finds() | {"rows": changed})
-        self._publish("finds")
+        self._events.publish(FindsChanged())
         return row
 
     def delete_find(self, number: int) -> bool:
@@ -118,7 +116,7 @@ class ConsoleState:
             if len(rows) == len(found["rows"]):
                 return False
             self._journal.remember("finds", found | {"rows": rows})
-        self._publish("finds")
+        self._events.publish(FindsChanged())
         return True
 
 

@@ -9,6 +9,8 @@ import pytest
 
 from gcs_plugin.daemon.intake.can_reader import CanReader
 from gcs_plugin.daemon.settings import Settings, VehicleSettings
+from gcs_plugin.daemon.store.daemon_events import Note
+from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.fleet.fleet import Fleet
 from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.sim.multirotor import Airframe
@@ -249,9 +251,9 @@ def test_a_vehicles_own_bus_comes_through_its_link(tmp_path):
 
 
 def test_a_bus_that_is_not_there_is_said_once_and_tried_again():
-    said = []
-    fleet = Fleet([])
-    reader = CanReader("v1", "socketcan:nothing0", poses=LivePoses("v1"), notify=said.append, fleet=fleet, system=None)
+    said, events, fleet = [], Events(), Fleet([])
+    events.on(Note, said.append)
+    reader = CanReader("v1", "socketcan:nothing0", poses=LivePoses("v1"), events=events, fleet=fleet, system=None)
     reader.start()
     end = time.monotonic() + 120.0
     while not said:
