@@ -34,8 +34,8 @@ from gcs_plugin.daemon.jobs.sortie_refinement import SortieRefinement
 from gcs_plugin.daemon.jobs.tone_balance import ToneBalance
 from gcs_plugin.daemon.jobs.worker_pool import LAST, WorkerPool
 from gcs_plugin.daemon.jobs.workspace_products import RunFacts
-from gcs_plugin.daemon.layers.anchor import Anchors
-from gcs_plugin.daemon.layers.layers import NAMES, Layer
+from gcs_plugin.daemon.layers.anchor import ExpectedPlace
+from gcs_plugin.daemon.layers.layers import NAMES, MapLayer
 from gcs_plugin.daemon.layers.realtime_layer import Drawer
 from gcs_plugin.daemon.layers.web_tiles import TileServer
 from gcs_plugin.daemon.settings import Settings
@@ -106,7 +106,7 @@ class Daemon:
         settings, folder = self.settings, self.settings.workspace
         self.journal = Journal(folder / "journal.db")
         self.store = PictureStore(folder / "pictures")
-        self.layers = {name: Layer(name) for name in NAMES}
+        self.layers = {name: MapLayer(name) for name in NAMES}
         self._trusted = distrust_after_power_cut(self.journal)
         self.tiles = TileServer(self.layers, settings.basemap)
         self.refused = RefusedPictures(self.events)
@@ -148,7 +148,7 @@ class Daemon:
         fov_rad = None if settings.fov_min_deg is None else math.radians(settings.fov_min_deg)
         self.drawer = Drawer(
             self.journal, self.store, self.layers["realtime"], canvases, self.events, gsd_m=settings.gsd_m,
-            fov_rad=fov_rad, anchors=Anchors(self.tiles, self.plans),
+            fov_rad=fov_rad, expected=ExpectedPlace(self.tiles, self.plans),
         )  # fmt: skip
         self.leg_watch = LegWatch(self.events, silent_s=settings.silent_s)
         self.coverage = LiveCoverage(

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypedDict
 
 from gcs_plugin.daemon.flight_coverage.live_coverage import LiveCoverage
 from gcs_plugin.daemon.intake.posted_pose import frame_of_row
@@ -25,15 +25,16 @@ from gcs_plugin.daemon.jobs.workspace_products import (
     writable,
     write_products,
 )
-from gcs_plugin.daemon.layers.layers import Area, Layer
+from gcs_plugin.daemon.layers.layers import MapArea, MapLayer
 from gcs_plugin.daemon.layers.realtime_layer import Drawer
 from gcs_plugin.daemon.settings import Settings
-from gcs_plugin.daemon.store.console_state import ConsoleState
+from gcs_plugin.daemon.store.console_state import ConsoleState, FindRow
 from gcs_plugin.daemon.store.frame_rows import all_frames, frame_number, frame_path
 from gcs_plugin.daemon.store.job_rows import Job
 from gcs_plugin.daemon.store.journal import Change, Journal, no_change
 from gcs_plugin.daemon.store.picture_store import PictureStore
 from gcs_plugin.daemon.store.sortie_rows import coarse_only, placed_sorties
+from gcs_plugin.daemon.vehicle_names import VehicleRow
 from gcs_plugin.daemon.views import Views
 from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.export.tactical.places import Place
@@ -46,6 +47,17 @@ _SHOWN: Final = (".jpg", ".webp", ".bmp")  # by all browsers
 _VIEW_QUALITY: Final = 90
 _zipping: Final = threading.Lock()
 _MOST_SIGHTINGS = 24  # pictures of one place
+
+
+class SightingRow(TypedDict, total=False):
+    """A picture that shows a place, and where in it (pixels); `seq`: its number."""
+
+    vehicle: str
+    image: str
+    column: float
+    row: float
+    stage: str
+    seq: int | None
 
 
 def zipped_folder(folder: Path) -> Path:
@@ -81,7 +93,7 @@ class Exports:
         journal: Journal,
         *,
         store: PictureStore,
-        layers: Mapping[str, Layer],
+        layers: Mapping[str, MapLayer],
         console: ConsoleState,
         drawer: Drawer,
         views: Views,
@@ -113,7 +125,7 @@ class Exports:
             folders = {name: canvas.path for name, canvas in canvases.items() if canvas is not None}
             task = replace(self._task(area), formats=tuple(job.detail["formats"]), canvases=folders)
             shown = [
-                find | {"pictures": [row["image"] for row in pictures_at(task, find["lat_deg"], find["lon_deg"])]}
+                find | FindRow(pictures=[row["image"] for row in pictures_at(task, find["lat_deg"], find["lon_deg"])])
                 for find in self._console.finds()
             ]
             places = tuple(self._places(shown))
@@ -126,7 +138,7 @@ class Exports:
         """The finds, and the vehicles with a known position."""
         return self._places(self._console.finds())
 
-    def find_pictures(self, number: int) -> list[dict[str, Any]]:
+    def find_pictures(self, number: int) -> list[SightingRow]:
         """The pictures that show a find, best first; see `pictures_at`. Each has its `seq`.
 
         Raises:
@@ -165,14 +177,14 @@ class Exports:
 
         return bytes(simplejpeg.encode_jpeg(picture_file.read_rgb(path), _VIEW_QUALITY, "RGB"))
 
-    def _places(self, finds: list[dict[str, Any]]) -> list[Place]:
+    def _places(self, finds: list[FindRow]) -> list[Place]:
         return places_of(self._settings.workspace.resolve().name, finds, self._views.vehicles(), time.time())
 
     def _report_facts(self) -> dict[str, Any]:
         covered = self._coverage.document
         return self._facts.document() | ({} if covered["state"] == "no area" else {"coverage": covered})
 
-    def _task(self, area: Area) -> ExportTask:
+    def _task(self, area: MapArea) -> ExportTask:
         """The export task of the workspace, without layers and formats."""
         rows = all_frames(self._journal)
         folder, fov_deg = self._settings.workspace / "solutions", self._settings.fov_min_deg
@@ -191,9 +203,7 @@ class Exports:
         )
 
 
-def places_of(
-    workspace: str, finds: Iterable[Mapping[str, Any]], vehicles: Iterable[Mapping[str, Any]], now_s: float
-) -> list[Place]:
+def places_of(workspace: str, finds: Iterable[FindRow], vehicles: Iterable[VehicleRow], now_s: float) -> list[Place]:
     """The workspace's finds, and the vehicles with a known position.
 
     Args:
@@ -205,17 +215,18 @@ def places_of(
         Place(
             uid=f"orthoswarm-{workspace}-find-{row['id']}", kind="find", name=_name(row), lat_deg=row["lat_deg"],
             lon_deg=row["lon_deg"], sigma_m=row["sigma_m"], note=writable(row["note"]),
-            time_s=datetime.fromisoformat(row["time"]).timestamp(), pictures=tuple(row.get("pictures", ())),
+            time_s=datetime.fromisoformat(str(row["time"])).timestamp(), pictures=tuple(row.get("pictures", ())),
         )
         for row in finds
     ]  # fmt: skip
     for row in vehicles:
-        if row.get("lat_deg") is None or row.get("lon_deg") is None or "system" not in row:
+        lat, lon = row.get("lat_deg"), row.get("lon_deg")
+        if lat is None or lon is None or "system" not in row:
             continue
         found.append(
             Place(
                 uid=f"orthoswarm-{workspace}-{row['id']}", kind="vehicle", name=row.get("name") or row["id"],
-                lat_deg=row["lat_deg"], lon_deg=row["lon_deg"], time_s=now_s - float(row.get("silent_s") or 0.0),
+                lat_deg=lat, lon_deg=lon, time_s=now_s - float(row.get("silent_s") or 0.0),
                 course_deg=row.get("heading_deg"), speed_m_s=row.get("speed_m_s"),
                 note=(row.get("flight") or {}).get("text", ""),
             )
@@ -223,17 +234,13 @@ def places_of(
     return found
 
 
-def _name(find: Mapping[str, Any]) -> str:
+def _name(find: FindRow) -> str:
     note = writable(find["note"]).strip()
     return note.splitlines()[0][:60] if note else f"Find {find['id']}"
 
 
-def pictures_at(task: ExportTask, lat_deg: float, lon_deg: float) -> list[dict[str, Any]]:
-    """The pictures that show a place, best first, as JSON values: `vehicle`, `image`, `column`, `row`, `stage`.
-
-    Args:
-        task: the workspace's export task. lat_deg, lon_deg: WGS 84.
-    """
+def pictures_at(task: ExportTask, lat_deg: float, lon_deg: float) -> list[SightingRow]:
+    """The pictures that show a place, best first, as JSON values: `vehicle`, `image`, `column`, `row`, `stage`."""
     solutions = [read_solution(path).solution for path in (*task.coarse, *task.solutions)]
     placed, level = placements(task, solutions)
     east, north = (float(v) for v in LocalGrid(task.epsg).to_grid(lat_deg, lon_deg))

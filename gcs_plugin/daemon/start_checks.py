@@ -7,7 +7,7 @@ start can follow its check at once on a slow link too, where reading alone takes
 import time
 from collections.abc import Collection, Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final, TypedDict, cast
 
 from gcs_plugin.config import COMMAND
 from gcs_plugin.daemon.airspace.fences import Fences
@@ -26,18 +26,25 @@ _CHECK_S: Final = 20.0
 _SETTINGS_S: Final = 5.0  # they are asked for thrice in less
 
 
-def red_items(row: Mapping[str, Any], allowed: Collection[str]) -> list[str]:
+class CheckRow(TypedDict):
+    """The check of a vehicle; a red item stops its start unless it is overridden by its name.
+
+    `items`: each with `name` (of `fleet.preflight.ITEMS`), `state` (ok, warning, red) and `reason`.
+    """
+
+    vehicle: str
+    state: str
+    items: list[dict[str, str]]
+
+
+def red_items(row: CheckRow, allowed: Collection[str]) -> list[str]:
     """The red items of a vehicle's row that are not allowed by name, in words."""
     red = [item for item in row["items"] if item["state"] == "red" and item["name"] not in allowed]
     return [f"{item['name']}: {item['reason']}" for item in red]
 
 
 class StartChecks:
-    """Checks vehicles before their start.
-
-    Args:
-        fleet: the vehicles. fences: theirs. names: theirs. waiting: their takeoffs.
-    """
+    """Checks vehicles before their start."""
 
     def __init__(self, fleet: "Fleet", fences: Fences, names: VehicleNames, waiting: WaitingTakeoffs) -> None:
         self._fleet, self._fences, self._names, self._waiting = fleet, fences, names, waiting
@@ -50,16 +57,13 @@ class StartChecks:
         *,
         needs: PlanNeeds = NO_NEEDS,
         reread: bool = True,
-    ) -> list[dict[str, Any]]:
+    ) -> list[CheckRow]:
         """Check vehicles that are to start together; waits for their missions.
 
         Args:
             systems: their names by system id. missions: the plan's. starts: takeoffs in seconds after the first.
             needs: of the plan.
             reread: whether missions that are known and did not change are read all the same.
-
-        Returns:
-            A row per vehicle, see the top of `vehicles`.
         """
         from gcs_plugin.fleet.preflight import preflight_all
         from gcs_plugin.fleet.separation.separation_check import Separation
@@ -86,7 +90,7 @@ class StartChecks:
                 reading=[s for s in systems if self._fleet.reads(s)],
             )
         ).result(_CHECK_S)
-        return [check.document(systems[check.system]) for check in checks]
+        return [cast(CheckRow, check.document(systems[check.system])) for check in checks]
 
     def _hear_settings(self, systems: Collection[int]) -> None:
         """Wait for the settings, asked for again where not told: a lost packet must not let a vehicle start."""

@@ -20,9 +20,6 @@ _log = logging.getLogger(__name__)
 class TakFeed:
     """Sends all vehicles every two seconds, and all finds when one is new or changed and every half minute.
 
-    Args:
-        addresses: the receivers. places: returns the present finds and vehicles.
-
     Attributes:
         problem: why a receiver gets nothing at present, else empty.
     """

@@ -13,7 +13,7 @@ from functools import partial
 from typing import Any, Final
 
 from gcs_plugin.config import COMMAND
-from gcs_plugin.daemon.start_checks import red_items
+from gcs_plugin.daemon.start_checks import CheckRow, red_items
 from gcs_plugin.daemon.vehicles import VehicleLinks
 from gcs_plugin.daemon.web_plans import Plans
 from gcs_plugin.fleet.commands import Order
@@ -30,14 +30,7 @@ _log = logging.getLogger(__name__)
 
 
 class Takeoffs:
-    """Starts the vehicles of one plan at a time.
-
-    Args:
-        links: the vehicles. plans: of the workspace. say: called with problems.
-
-    Attributes:
-        waiting: those that wait for their time.
-    """
+    """Starts the vehicles of one plan at a time."""
 
     def __init__(self, links: VehicleLinks, plans: Plans, say: Callable[[str], None]) -> None:
         self._links, self._plans, self._say, self.waiting = links, plans, say, links.waiting
@@ -54,7 +47,7 @@ class Takeoffs:
         plan: str,
         sortie: int = 1,
         names: Mapping[str, str] | None = None,
-    ) -> list[dict[str, Any]]:
+    ) -> list[CheckRow]:
         """Check a plan's vehicles before their start.
 
         Args:
@@ -74,7 +67,7 @@ class Takeoffs:
         plan: str,
         sortie: int,
         names: Mapping[str, str] | None,
-    ) -> tuple[list[dict[str, Any]], dict[str, Mission]]:
+    ) -> tuple[list[CheckRow], dict[str, Mission]]:
         """The rows of `preflight`, and the plan's missions by vehicle."""
         starts = self._plans.starts(plan, sortie)
         whose = {vehicle: (names or {}).get(vehicle, vehicle) for vehicle in starts}

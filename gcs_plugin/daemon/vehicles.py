@@ -1,23 +1,8 @@
-"""The vehicles on the daemon's links: their state and poses, their sorties, and the jobs after a completion.
+"""The vehicles on the daemon's links: their state and poses, their missions, commands to them, and their check.
 
-A fleet is polled by one thread. State that must survive a restart is written to the journal first, see
-`MissionJournal`.
-
-For the HTTP API and the page, all in JSON values:
-
-- `commands(verb, vehicles)` gives a row a vehicle: `id`, `vehicle`, `command`, `outcome` (`done`, `refused`,
-  `not_sent`, `unknown`), `reason`. Verbs are those of `fleet.commands`; no vehicles named: all on the links at once.
-- `preflight(...)` gives a row a vehicle: `vehicle`, `state` and `items`, each with `name` (of
-  `fleet.preflight.ITEMS`), `state` (`ok`, `warning`, `red`) and `reason`. A red item stops `start` unless it is
-  overridden by its name.
-- `flight_state(vehicle)`, and `flight` in each row of `rows()`: `state` (`on ground`, `taking off`, `on mission`,
-  `paused`, `returning`, `landing`, `holding`, `flying`, `descending`, `lost`, `complete`), `text` (`on mission 7/13`),
-  `item` and `items`.
-- `alarm` in each row of `rows()`: what is wrong with how and where it flies, and what to do; empty if nothing is.
-- `behind` in each row of `rows()`: by how much it is behind its plan, in words; empty if it is not.
-- `fence` in each row of `rows()`: the geofence that the vehicle holds, see `Fences.of`.
-- `clock()` is the monotonic clock by which commands expire: a page that gets it from the event stream can state when
-  its command was given, so that a delayed one is not executed late.
+One thread polls the fleet. State that must survive a restart is written to the journal first, see `MissionJournal`.
+The HTTP API gets JSON values: of vehicles a `VehicleRow` each, of commands a `CommandResult.document`, of checks a
+`CheckRow`.
 """
 
 import logging
@@ -28,12 +13,12 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, cast
 
 from gcs_plugin.daemon.airspace.fences import Fences
 from gcs_plugin.daemon.airspace.traffic import Traffic
 from gcs_plugin.daemon.settings import Settings
-from gcs_plugin.daemon.start_checks import StartChecks, red_items
+from gcs_plugin.daemon.start_checks import CheckRow, StartChecks, red_items
 from gcs_plugin.daemon.store.daemon_events import (
     CommandDone,
     CompletionRefined,
@@ -52,6 +37,7 @@ from gcs_plugin.daemon.store.sortie_rows import (
     vehicle_found,
     vehicle_state,
 )
+from gcs_plugin.daemon.vehicle_names import VehicleRow
 from gcs_plugin.daemon.waiting_takeoffs import WaitingTakeoffs
 from gcs_plugin.fleet.commands import CommandResult
 from gcs_plugin.fleet.separation.returns import Returns
@@ -117,9 +103,6 @@ class MissionJournal:
         """Write a mission's event (started, complete, aborted, suspended, resumed).
 
         A start after a flight opens a sortie; a completion requests the refinement of its sortie.
-
-        Args:
-            name: the vehicle's id. still_flying: ids of the others in the air.
         """
         completion = {"complete_s": event.time_s, "still_flying": list(still_flying)}
         self._journal.write(mission_noted(name, event.kind, vehicle.detector.state(), completion))
@@ -153,7 +136,7 @@ class VehicleLinks:
         self._records: dict[int, _VehicleRecord] = {}
         self._poses = poses
         self._stop, self._silent = threading.Event(), threading.Event()
-        self.latest: list[dict[str, Any]] = []
+        self.latest: list[VehicleRow] = []
         self._starting = Counter[int]()
         log = settings.workspace / "telemetry.tlog" if settings.links else None
         self.fleet: Fleet = Fleet(settings.links, key=find_key() if settings.links else None, tlog=log)
@@ -215,28 +198,24 @@ class VehicleLinks:
         """The autopilot of each vehicle that was heard, by id."""
         return {self.name_of(system): v.autopilot.value for system, v in list(self.fleet.vehicles.items())}
 
-    def rows(self) -> list[dict[str, Any]]:
-        """All vehicles on the links as JSON values.
+    def rows(self) -> list[VehicleRow]:
+        """All vehicles on the links as JSON values."""
 
-        `takeoff` of each is None where none waits or failed; `returns_after` names those that it waits for until it
-        returns, None where it does not wait.
-        """
-
-        def collect() -> list[dict[str, Any]]:
+        def collect() -> list[VehicleRow]:
             now = time.monotonic()
             return [self._row(vehicle, now) for _, vehicle in sorted(self.fleet.vehicles.items())]
 
         if not self.fleet.vehicles:
             return []
         takeoffs, returns = self.waiting.rows(), self._returns.waits()
-        return [
-            row | {"takeoff": takeoffs.get(row["id"]), "returns_after": returns.get(row["id"])}
-            for row in self.fleet.call(collect).result(5.0)
-        ]
+        rows = self.fleet.call(collect).result(5.0)
+        for row in rows:
+            row["takeoff"], row["returns_after"] = takeoffs.get(row["id"]), returns.get(row["id"])
+        return rows
 
     @staticmethod
     def clock() -> float:
-        """Monotonic seconds, by which commands expire."""
+        """Monotonic seconds, by which commands expire: a page that has them says when its command was given."""
         return time.monotonic()
 
     def flight_state(self, vehicle: str) -> dict[str, Any]:
@@ -269,7 +248,7 @@ class VehicleLinks:
             override: names of red preflight items that do not stop a start, by vehicle.
 
         Returns:
-            A row per vehicle, see the top of this module.
+            A row per vehicle: `id`, `vehicle`, `command`, `reason`, `outcome` (done, refused, not_sent, unknown).
 
         Raises:
             InputError: there is no such command.
@@ -325,11 +304,8 @@ class VehicleLinks:
     def return_in_turn(self, command_id: str | None = None) -> list[dict[str, Any]]:
         """Return all vehicles on the links, those whose ways home come near each other one after the other.
 
-        Args:
-            command_id: id of the command; a new one by default.
-
         Returns:
-            A row per vehicle, see the top of this module; one that holds until its turn comes has done as it was told.
+            A row per vehicle, see `commands`; one that holds until its turn comes has done as it was told.
         """
         from gcs_plugin.fleet.commands import new_id
 
@@ -374,7 +350,7 @@ class VehicleLinks:
                     del systems[row["vehicle"]]
         return rows, systems
 
-    def _checked(self, systems: Mapping[str, int]) -> list[dict[str, Any]]:
+    def _checked(self, systems: Mapping[str, int]) -> list[CheckRow]:
         """The check of vehicles that are to start now; a command to stop that comes meanwhile finds them starting."""
         self._starting.update(systems.values())
         try:
@@ -390,7 +366,7 @@ class VehicleLinks:
         starts: Mapping[str, float] | None = None,
         needs: PlanNeeds = NO_NEEDS,
         reread: bool = True,
-    ) -> list[dict[str, Any]]:
+    ) -> list[CheckRow]:
         """Check vehicles before their start; their missions are read from them first.
 
         Args:
@@ -399,9 +375,6 @@ class VehicleLinks:
             starts: takeoff of each in seconds after the first; default all at once.
             needs: of the plan.
             reread: whether missions are read although they were read or written before and nothing changed them since.
-
-        Returns:
-            A row per vehicle, see the top of this module.
 
         Raises:
             OrthoSwarmError: a vehicle was not heard on any link.
@@ -467,7 +440,9 @@ class VehicleLinks:
                 self._missions.found(vehicle, name)
             elif event.kind in ("started", "complete", "aborted", "suspended", "resumed"):
                 flying = [
-                    self.name_of(s) for s, v in sorted(self.fleet.vehicles.items()) if s != event.system and _flies(v)
+                    self.name_of(s)
+                    for s, v in sorted(self.fleet.vehicles.items())
+                    if s != event.system and (v.detector.phase is Phase.ACTIVE or v.flying) and not v.lost
                 ]
                 self._missions.note(event, vehicle, name, flying)
                 self._events.publish(MissionNoted(name, event.kind))
@@ -522,7 +497,7 @@ class VehicleLinks:
             now = {k: v for k, v in row.items() if k not in ("trail", "texts")}
             fresh = now if complete else {k: v for k, v in now.items() if k not in sent or sent[k] != v}
             sent.update(now)
-            always = {key: row[key] for key in ("id", "name", "silent_s")}
+            always = {"id": row["id"], "name": row["name"], "silent_s": row["silent_s"]}
             self._events.publish(VehicleChanged(fresh | always))
 
     def _give_up_silent(self) -> None:
@@ -530,7 +505,9 @@ class VehicleLinks:
         for system, record in list(self._records.items()):
             vehicle = self.fleet.vehicles[system]
             since = record.lost_since
-            if since is None or time.monotonic() - since < self._settings.lost_after_s or not _under_way(vehicle):
+            if since is None or time.monotonic() - since < self._settings.lost_after_s:
+                continue
+            if vehicle.detector.phase not in (Phase.ACTIVE, Phase.SUSPENDED):
                 continue
             given_up = self._missions.give_up(record.id)
             record.lost_since = None  # after that: if the disk is full, it is tried again
@@ -538,9 +515,10 @@ class VehicleLinks:
                 _log.info("%s has been silent for long; what it sent is refined", record.id)
                 self._events.publish(MissionNoted(record.id, "lost"))
 
-    def _row(self, vehicle: "Vehicle", now: float) -> dict[str, Any]:
+    def _row(self, vehicle: "Vehicle", now: float) -> VehicleRow:
         record = self._record(vehicle.system)
-        row = vehicle.summary(now) | {"id": record.id, "name": self.names.title_of(record.id)}
+        row = cast(VehicleRow, vehicle.summary(now))
+        row["id"], row["name"] = record.id, self.names.title_of(record.id)
         near = self.fleet.separation.text(vehicle.system, self.names.name_of)
         row["alarm"] = "; ".join(text for text in (near, vehicle.danger and f"{record.id} {vehicle.danger}") if text)
         row["behind"] = self.fleet.behind(vehicle.system)
@@ -553,11 +531,3 @@ class VehicleLinks:
         row["fence"] = self._fences.of(vehicle.system)
         row["trail"], row["texts"] = record.trail[-_TRAIL:], list(record.texts)
         return row
-
-
-def _under_way(vehicle: "Vehicle") -> bool:
-    return vehicle.detector.phase in (Phase.ACTIVE, Phase.SUSPENDED)
-
-
-def _flies(vehicle: "Vehicle") -> bool:
-    return (vehicle.detector.phase is Phase.ACTIVE or vehicle.flying) and not vehicle.lost

@@ -11,6 +11,7 @@ from gcs_plugin.daemon.layers.web_tiles import TileServer
 from gcs_plugin.daemon.store.frame_rows import FrameRow, arrived_frames, newest_frames
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.daemon.store.sortie_rows import coarse_only, completion_rows, placed_sorties, senders
+from gcs_plugin.daemon.vehicle_names import VehicleRow
 from gcs_plugin.daemon.vehicles import VehicleLinks
 from orthoswarm.export.product_files import iso_time
 from orthoswarm.model.bounding_box import BoundingBox
@@ -19,11 +20,7 @@ from telemetry.live.live_poses import LinkPoses
 
 
 class Views:
-    """The daemon's state as JSON values.
-
-    Args:
-        links, sources, buses, poses: of the vehicles.
-    """
+    """The daemon's state as JSON values."""
 
     def __init__(
         self, journal: Journal, links: VehicleLinks, *, tiles: TileServer, sources: Sequence[PictureSource],
@@ -38,29 +35,33 @@ class Views:
         """Frames in the order of arrival, those that were taken at a time (UTC epoch seconds) or later."""
         return [_frame(row) for row in arrived_frames(self._journal, vehicle, since, limit)]
 
-    def vehicles(self) -> list[dict[str, Any]]:
+    def vehicles(self) -> list[VehicleRow]:
         """All vehicles that were heard, that sent pictures, or that are configured; see the HTTP API."""
         rows = {row["id"]: row for row in self._senders()}
         for heard in self._links.rows():
             rows[heard["id"]] = rows.get(heard["id"], {"sortie": 1, "frames": {}}) | heard
-        for key, part in [("pictures", source) for source in self._sources] + [("can", bus) for bus in self._buses]:
-            waiting = {"id": part.vehicle, "state": "waiting", "frames": {}, "sortie": 1}
-            rows.setdefault(part.vehicle, waiting)[key] = part.document()
+        for source in self._sources:
+            rows.setdefault(source.vehicle, _waiting(source.vehicle))["pictures"] = source.document()
+        for bus in self._buses:
+            rows.setdefault(bus.vehicle, _waiting(bus.vehicle))["can"] = bus.document()
         for vehicle, origin in self._poses.origins().items():
             if vehicle in rows:
                 rows[vehicle]["poses"] = dict(origin)
-        return [row | {"name": self._links.names.title_of(row["id"])} for row in rows.values()]
+        for row in rows.values():
+            row["name"] = self._links.names.title_of(row["id"])
+        return list(rows.values())
 
-    def _senders(self) -> Iterable[dict[str, Any]]:
+    def _senders(self) -> Iterable[VehicleRow]:
         """Vehicles in the journal, with their counts of frames and where the last picture was taken."""
         found, newest = senders(self._journal), newest_frames(self._journal)
         for sender in found:
-            document: dict[str, Any] = {"id": sender.vehicle, "state": "pictures", "sortie": sender.sortie}
+            document: VehicleRow = {"id": sender.vehicle, "state": "pictures", "sortie": sender.sortie}
             document["frames"] = sender.frames
             if sender.last in newest:
                 last = newest[sender.last]
-                document |= {key: last.pose.get(key) for key in ("lat_deg", "lon_deg", "height_m")}
-                document |= {"heading_deg": last.pose.get("yaw_deg"), "last_frame": iso_time(last.time_s)}
+                document["lat_deg"], document["lon_deg"] = last.pose.get("lat_deg"), last.pose.get("lon_deg")
+                document["height_m"], document["heading_deg"] = last.pose.get("height_m"), last.pose.get("yaw_deg")
+                document["last_frame"] = iso_time(last.time_s)
                 document["came_s"] = round(max(0.0, time.time() - last.arrived_s), 1)
             yield document
 
@@ -101,6 +102,10 @@ class Views:
         else:
             rows.append(_layer_row("best", 0, None, None, None))
         return rows
+
+
+def _waiting(vehicle: str) -> VehicleRow:
+    return {"id": vehicle, "state": "waiting", "frames": {}, "sortie": 1}
 
 
 def _frame(row: FrameRow) -> dict[str, Any]:

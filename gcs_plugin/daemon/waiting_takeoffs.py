@@ -2,9 +2,9 @@
 
 import threading
 import time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from gcs_plugin.daemon.vehicle_names import VehicleNames
+from gcs_plugin.daemon.vehicle_names import TakeoffRow, VehicleNames
 from gcs_plugin.fleet.separation.takeoff_schedule import TakeoffSchedule
 
 if TYPE_CHECKING:
@@ -39,13 +39,13 @@ class WaitingTakeoffs:
         """Whether a vehicle's takeoff waits or is being checked. Without the lock: the fleet's thread never waits."""
         return system in self.checking or system in self.schedule.waiting or system in self.about_to
 
-    def rows(self) -> dict[str, dict[str, Any]]:
-        """Vehicle -> `in_s` of a waiting takeoff, or `failed` with the reason."""
+    def rows(self) -> dict[str, TakeoffRow]:
+        """Vehicle -> its takeoff that waits or has failed."""
         now = time.monotonic()
         with self.condition:
             times = self.schedule.waiting.items()
-            waiting = {self.vehicles[s]: {"in_s": round(max(0.0, due - now), 1)} for s, due in times}
-            return {v: {"failed": text} for v, text in self.failed.items()} | waiting
+            rows: dict[str, TakeoffRow] = {v: {"failed": text} for v, text in self.failed.items()}
+            return rows | {self.vehicles[s]: {"in_s": round(max(0.0, due - now), 1)} for s, due in times}
 
     def cancel(self, vehicle: str) -> str:
         """Cancel a takeoff that waits or is being checked; returns that in words, empty if there was none.

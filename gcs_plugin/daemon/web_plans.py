@@ -187,8 +187,7 @@ class Plans:
         Raises:
             InputError: there is no such plan or flight.
         """
-        figures = json.loads((self._path(name) / "plan.json").read_text(encoding="utf-8"))
-        flights = {v["id"]: v["flights"] for v in figures["vehicles"]}
+        flights = self._flights(name)
         starts = {v: float(rows[sortie - 1]["start_s"]) for v, rows in flights.items() if len(rows) >= sortie}
         if not starts:
             most = max(len(rows) for rows in flights.values())
@@ -201,12 +200,15 @@ class Plans:
         Raises:
             InputError: there is no such plan.
         """
-        figures = json.loads((self._path(name) / "plan.json").read_text(encoding="utf-8"))
-        rows = {v["id"]: v["flights"][sortie - 1] for v in figures["vehicles"] if len(v["flights"]) >= sortie}
+        rows = {v: flights[sortie - 1] for v, flights in self._flights(name).items() if len(flights) >= sortie}
         return {
             vehicle: {"start_s": row["start_s"], "time_s": row["time_s"], "height_m": row["takeoff_height_m"]}
             for vehicle, row in rows.items()
         }
+
+    def _flights(self, name: Any) -> dict[str, list[dict[str, Any]]]:
+        figures = json.loads((self._path(name) / "plan.json").read_text(encoding="utf-8"))
+        return {vehicle["id"]: vehicle["flights"] for vehicle in figures["vehicles"]}
 
     def needs(self, name: Any) -> PlanNeeds:
         """What a plan relies on.

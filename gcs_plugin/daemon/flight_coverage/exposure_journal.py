@@ -1,4 +1,6 @@
-"""The exposures that vehicles report on their links, stored in the journal; those that a link has lost are asked for.
+"""Vehicles report on their links when their camera takes a picture: these reports are kept in the journal.
+
+A vehicle is asked again for a report that did not come.
 
 CAMERA_IMAGE_CAPTURED counts the pictures of a camera. A number that is left out was an exposure whose message did not
 come: the camera sends it again on MAV_CMD_REQUEST_MESSAGE with that number (MAVLink camera protocol). ArduPilot's
@@ -98,11 +100,7 @@ class _Camera:
 
 
 class EventRequests:
-    """Asks vehicles' cameras for the events that have not come; runs in the links' thread.
-
-    Args:
-        fleet: the vehicles.
-    """
+    """Asks vehicles' cameras for the events that have not come; runs in the links' thread."""
 
     def __init__(self, fleet: "Fleet") -> None:
         self._fleet = fleet

@@ -10,10 +10,10 @@ import sqlite3
 import threading
 import time
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final, Protocol, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,7 @@ from gcs_plugin.daemon.store.daemon_events import CoverageChanged, PictureDrawn
 from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.frame_rows import last_drawn_arrival
 from gcs_plugin.daemon.store.journal import Journal
+from gcs_plugin.daemon.vehicle_names import VehicleRow
 from orthoswarm.coverage.camera_events import missing_by_events
 from orthoswarm.coverage.coverage_files import COLOURS, gap_feature
 from orthoswarm.coverage.coverage_grid import Cells, CoverageGrid, Shares, State
@@ -47,7 +48,7 @@ from orthoswarm.model.errors import InputError, OrthoSwarmError
 from orthoswarm.model.geo import GroundGrid, LocalGrid
 from orthoswarm.raster.picture_quality import PictureQuality
 
-Rows = list[dict[str, Any]]
+Rows = list[VehicleRow]
 _LOOK_S: Final = 0.5
 _LEAST_PAUSE: Final = 3.0
 """Pause after finding gaps, in multiples of the time that it took: a quarter of one core at most."""
@@ -80,11 +81,46 @@ class _Followed:
     over: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
 
 
+class MissingRow(TypedDict):
+    """A picture that was taken, or should have been, and is not there; `image`: its name, or `event <number>`."""
+
+    vehicle: str
+    image: str
+    after: str
+    cause: str
+    confidence: float
+    time_s: float | None
+
+
+class CoverageDocument(TypedDict, total=False):
+    """What /api/coverage answers: shares of the area by state, gaps with their causes, and what they come from."""
+
+    state: str
+    version: int
+    time: str | None
+    plan: str | None
+    seen_share: float | None
+    poor_share: float | None
+    missed_share: float | None
+    planned_share: float | None
+    recorded: dict[str, float]
+    pictures: dict[str, int]
+    area_m2: float
+    cell_m: float
+    offers: list[dict[str, Any]]
+    legs: dict[str, int]
+    corners: list[list[float]]
+    gaps: list[dict[str, Any]]
+    small_gaps: dict[str, Any]
+    missing_pictures: list[MissingRow]
+    warnings: list[str]
+
+
 @dataclass(frozen=True, slots=True)
 class _Result:
     """The latest result: the API's document, gaps as GeoJSON, the picture of the cells, and the placed pictures."""
 
-    document: dict[str, Any]
+    document: CoverageDocument
     gaps: dict[str, Any]
     png: bytes
     placed: list[View]
@@ -160,7 +196,7 @@ class LiveCoverage:
         self._bell.set()
 
     @property
-    def document(self) -> dict[str, Any]:
+    def document(self) -> CoverageDocument:
         """Shares, and gaps with their causes, as JSON values."""
         return self._result.document
 
@@ -278,8 +314,9 @@ class LiveCoverage:
         grid = here.covered.area.grid
         for row in rows:
             self.battery.look(row, flies(row), time.monotonic())
-            if row.get("lat_deg") is not None and row["armed"]:
-                east, north = grid.to_grid(row["lat_deg"], row["lon_deg"])
+            lat, lon = row.get("lat_deg"), row.get("lon_deg")
+            if lat is not None and lon is not None and row["armed"]:
+                east, north = grid.to_grid(lat, lon)
                 here.legs.pass_by(str(row["id"]), float(east), float(north))
         here.legs.look(rows)
         state = here.legs.state()
@@ -317,10 +354,11 @@ class LiveCoverage:
             self._result = self._found(here)
         self.seconds = time.monotonic() - began
         self._rest_until = time.monotonic() + _LEAST_PAUSE * (time.thread_time() - cpu)
-        published = ("state", "version", "seen_share", "poor_share", "missed_share", "planned_share")
-        document = self._result.document
-        shown = {key: document[key] for key in published}
-        self._events.publish(CoverageChanged(gaps=len(document["gaps"]), **shown))
+        found = self._result.document
+        self._events.publish(CoverageChanged(
+            gaps=len(found["gaps"]), state=found["state"], version=found["version"], seen_share=found["seen_share"],
+            poor_share=found["poor_share"], missed_share=found["missed_share"], planned_share=found["planned_share"],
+        ))  # fmt: skip
 
     def _found(self, here: _Followed) -> _Result:
         cover, grid = here.cover, here.covered.area.grid
@@ -329,9 +367,9 @@ class LiveCoverage:
         features = [gap_feature(gap, grid) for gap in gaps.gaps]
         states = cover.states(self._due)
         placed = [v for v in cover.views if v.placed]
-        document = {
+        document: CoverageDocument = {
             "state": self._state(cover), "version": self._version, "time": iso_time(time.time()),
-            "plan": here.covered.plan, **_shares(cover.shares(self._due)),
+            "plan": here.covered.plan, **_shares(cover.shares(self._due)),  # type: ignore[typeddict-item]
             "recorded": _shares(here.recorded.shares(self._due)),
             "pictures": {"placed": len(placed), "recorded": len(cover.views) - len(placed)},
             "area_m2": cover.cells.area_m2, "cell_m": cover.cells.grid.gsd_m,
@@ -396,7 +434,7 @@ def _is_unseen(ends: NDArray[np.float64], states: NDArray[np.uint8], grid: Groun
     return bool(not below.size or np.isin(below, (State.MISSED, State.PLANNED)).any())
 
 
-def _missing_rows(missing: Sequence[MissingPicture]) -> list[Mapping[str, Any]]:
+def _missing_rows(missing: Sequence[MissingPicture]) -> list[MissingRow]:
     return [
         {"vehicle": m.view.vehicle, "image": m.view.image, "after": m.after, "cause": str(m.cause),
          "confidence": round(m.confidence, 2), "time_s": m.view.time_s}

@@ -9,7 +9,7 @@ import contextlib
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, Protocol
 from urllib.parse import unquote, urlsplit
@@ -17,7 +17,7 @@ from urllib.parse import unquote, urlsplit
 from gcs_plugin.daemon.flight_coverage.file_download import FileRead, FolderList
 from gcs_plugin.daemon.flight_coverage.file_numbers import PictureNames
 from gcs_plugin.daemon.flight_coverage.ftp_talk import FtpTalk, LinkShare
-from gcs_plugin.daemon.flight_coverage.live_coverage import LiveCoverage
+from gcs_plugin.daemon.flight_coverage.live_coverage import LiveCoverage, MissingRow
 from gcs_plugin.daemon.intake.picture_intake import PictureIntake
 from gcs_plugin.daemon.intake.posted_pose import PostedPose, linked_pose
 from gcs_plugin.daemon.store.daemon_events import RequestsChanged
@@ -98,12 +98,7 @@ class Heard(Protocol):
 
 
 class FetchedPictures:
-    """What the requests for pictures need of the workspace.
-
-    Args:
-        poses: of the links, by vehicle and time. coverage: knows which pictures have not arrived.
-        intake: takes a picture into the workspace.
-    """
+    """What the requests for pictures need of the workspace."""
 
     def __init__(
         self, links: Heard, journal: Journal, events: Events, *, poses: LinkPoses, coverage: LiveCoverage,
@@ -374,10 +369,10 @@ class PictureRequests:
             server.urls[int(message.image_index)] = unquote(parts.path)
 
 
-def wanted_pictures(missing: Iterable[Mapping[str, Any]]) -> list[WantedPicture]:
+def wanted_pictures(missing: Iterable[MissingRow]) -> list[WantedPicture]:
     """Those of the coverage's missing pictures that were taken and have not arrived."""
     return [
         WantedPicture(row["vehicle"], int(row["image"].removeprefix("event ")), row["time_s"])
         for row in missing
-        if row["image"].startswith("event ") and row.get("time_s") is not None
+        if row["image"].startswith("event ") and row["time_s"] is not None
     ]

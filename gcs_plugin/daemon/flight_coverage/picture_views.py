@@ -28,11 +28,7 @@ _NO_TIME: Final = 0.0
 
 
 class PictureViews:
-    """Reads views from a workspace.
-
-    Args:
-        journal, store: of the workspace. solutions: folder of the solution files. fov_rad: theta-hat.
-    """
+    """Reads views from a workspace."""
 
     def __init__(self, journal: Journal, store: PictureStore, solutions: Path, fov_rad: float | None) -> None:
         self._journal, self._store, self._folder, self._fov_rad = journal, store, solutions, fov_rad
@@ -53,9 +49,6 @@ class PictureViews:
         """Views placed since the last call, and pictures that a refinement could not place.
 
         A refined sortie replaces its placements in flight. Files that are being replaced are read at the next call.
-
-        Args:
-            epsg: the grid of the map.
         """
         views: list[View] = []
         dropped: list[Key] = []

@@ -50,11 +50,7 @@ def check_bus(bus: str) -> None:
 
 
 class CanReader:
-    """Reads one vehicle's bus in its own thread.
-
-    Attributes:
-        vehicle: id.
-    """
+    """Reads one vehicle's bus in its own thread."""
 
     def __init__(
         self,

@@ -25,11 +25,7 @@ def is_stream(where: str) -> bool:
 
 
 class PictureSource:
-    """Pictures of one vehicle, read in its own thread.
-
-    Args:
-        where: stream or folder. intake: takes them.
-    """
+    """Pictures of one vehicle, read in its own thread."""
 
     def __init__(self, where: str, intake: VehicleIntake) -> None:
         self.vehicle, self.where, self._intake = intake.vehicle, where, intake

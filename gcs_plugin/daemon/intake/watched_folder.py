@@ -44,11 +44,7 @@ Stamp = tuple[int, int]
 
 
 class FolderState:
-    """The files read from a folder, listed in a file of the workspace; started afresh for another journal.
-
-    Args:
-        cache: folder of the file. vehicle, folder: the watched folder.
-    """
+    """The files read from a folder, listed in a file of the workspace; started afresh for another journal."""
 
     def __init__(self, cache: Path, vehicle: str, folder: Path) -> None:
         key = hashlib.sha256(json.dumps([vehicle, str(folder)]).encode()).hexdigest()[:16]

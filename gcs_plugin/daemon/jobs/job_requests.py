@@ -25,11 +25,7 @@ _WATCHED_AGAIN: Final = 2000  # pictures of the last daemon
 
 
 class JobRequests:
-    """Asks for jobs.
-
-    Args:
-        coarse: whether legs are placed in flight.
-    """
+    """Asks for jobs."""
 
     def __init__(self, journal: Journal, jobs: Jobs, *, coarse: bool) -> None:
         self._journal, self._jobs, self._coarse = journal, jobs, coarse

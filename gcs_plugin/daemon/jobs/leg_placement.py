@@ -9,7 +9,7 @@ import logging
 import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from gcs_plugin.daemon.store.journal import Change, Journal, no_change
 from gcs_plugin.daemon.store.kept_pictures import KeptPictures
 from gcs_plugin.daemon.store.picture_store import PictureStore
 from gcs_plugin.daemon.store.sortie_rows import (
+    LegRow,
     PlacedSortie,
     is_complete,
     legs_placed,
@@ -167,7 +168,7 @@ class LegPlacement:
     # -- both -----------------------------------------------------------------------------------------------------
 
     def _publish(
-        self, job: Job, report: ReportProgress, target: Path, solved: SortieResult, legs: list[dict[str, Any]]
+        self, job: Job, report: ReportProgress, target: Path, solved: SortieResult, legs: list[LegRow]
     ) -> Change:
         old = placed_sortie(self.journal, "coarse", job.whose)
         changed = solved.changed

@@ -1,7 +1,6 @@
 """Placed sorties for the jobs that place them: their frames, what the journal keeps of them, and their neighbours."""
 
 from collections.abc import Iterable, Mapping
-from typing import Any
 
 from gcs_plugin.daemon.intake.posted_pose import frame_of_row
 from gcs_plugin.daemon.jobs.solution_file import Bytes, thumbnail_of
@@ -10,7 +9,7 @@ from gcs_plugin.daemon.store.frame_rows import Whose, sortie_frames
 from gcs_plugin.daemon.store.job_rows import Job, job_done
 from gcs_plugin.daemon.store.journal import Change, Journal, all_changes
 from gcs_plugin.daemon.store.picture_store import PictureStore
-from gcs_plugin.daemon.store.sortie_rows import PlacedSortie, SortieDetail, placed_sorties, sortie_refined
+from gcs_plugin.daemon.store.sortie_rows import LegRow, PlacedSortie, SortieDetail, placed_sorties, sortie_refined
 from orthoswarm.export.product_files import finite
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import OrthoSwarmError
@@ -30,11 +29,11 @@ def frames_of(journal: Journal, store: PictureStore, job: Job) -> tuple[list[Fra
     return [frame_of_row(row, store) for row in rows], small
 
 
-def detail_of(solved: SortieResult, legs: Iterable[dict[str, Any]]) -> SortieDetail:
+def detail_of(solved: SortieResult, legs: Iterable[LegRow]) -> SortieDetail:
     """The journal's details of a placed sortie."""
     return {
         "bounds": solved.bounds,
-        "legs": [leg | {key: finite(leg[key]) for key in ("confidence", "sigma_m")} for leg in legs],
+        "legs": [leg | LegRow(confidence=finite(leg["confidence"]), sigma_m=finite(leg["sigma_m"])) for leg in legs],
         "fov_deg": finite(solved.fov_deg), "fov_sigma_deg": finite(solved.fov_sigma_deg),
         "warnings": solved.warnings, "cpu_s": solved.cpu_s, "wall_s": solved.wall_s,
     }  # fmt: skip

@@ -15,7 +15,7 @@ from gcs_plugin.daemon.jobs.job_queue import ReportProgress
 from gcs_plugin.daemon.jobs.solution_file import is_readable
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
 from gcs_plugin.daemon.jobs.worker_tasks import DrawTask, draw
-from gcs_plugin.daemon.layers.layers import Area, Layer, new_name
+from gcs_plugin.daemon.layers.layers import MapArea, MapLayer, new_name
 from gcs_plugin.daemon.layers.realtime_layer import Drawer
 from gcs_plugin.daemon.store.daemon_events import LayerPublished
 from gcs_plugin.daemon.store.event_bus import Events
@@ -49,7 +49,7 @@ class Publisher:
     """
 
     def __init__(
-        self, journal: Journal, layers: dict[str, Layer], workspace: Path, *, drawer: Drawer, events: Events,
+        self, journal: Journal, layers: dict[str, MapLayer], workspace: Path, *, drawer: Drawer, events: Events,
         workers: WorkerPool, trusted: bool,
     ) -> None:  # fmt: skip
         """Remove unfinished files of a killed daemon, and open what it had published.
@@ -123,7 +123,7 @@ class Publisher:
             if path.name not in known:
                 path.unlink(missing_ok=True)
 
-    def area(self) -> Area:
+    def area(self) -> MapArea:
         """The map's area.
 
         Raises:

@@ -37,11 +37,7 @@ _REDRAW_TONE: Final = 0.015
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ToneTask:
-    """The sorties of a layer, to be balanced together.
-
-    Attributes:
-        solutions: their solution files. targets: paths of the new ones.
-    """
+    """The sorties of a layer, to be balanced together."""
 
     solutions: list[Path]
     targets: list[Path]

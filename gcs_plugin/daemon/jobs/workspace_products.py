@@ -270,11 +270,7 @@ def _find(paths: dict[tuple[str, str], Path], row: Mapping[str, Any]) -> Path | 
 
 @dataclass(frozen=True, slots=True)
 class RunFacts:
-    """The daemon's own facts for the report.
-
-    Attributes:
-        started: when the daemon did, UTC epoch seconds. pools: its worker processes.
-    """
+    """The daemon's own facts for the report."""
 
     journal: Journal
     started: float

@@ -44,13 +44,13 @@ class NewestPlan(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Anchors:
+class ExpectedPlace:
     """The location of the map before its first picture."""
 
     tiles: TileServer
     plans: NewestPlan
 
-    def expected(self) -> Anchor | None:
+    def place(self) -> Anchor | None:
         """The basemap, else the newest plan; None if the pictures decide."""
         basemap = self.tiles.basemap
         if basemap is not None:

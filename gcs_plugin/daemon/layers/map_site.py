@@ -11,8 +11,8 @@ from typing import Any, Final
 import numpy as np
 
 from gcs_plugin.daemon.intake.posted_pose import is_position
-from gcs_plugin.daemon.layers.anchor import Anchors
-from gcs_plugin.daemon.layers.layers import Area, Layer, new_name, successor
+from gcs_plugin.daemon.layers.anchor import ExpectedPlace
+from gcs_plugin.daemon.layers.layers import MapArea, MapLayer, new_name, successor
 from gcs_plugin.daemon.store.daemon_events import AreaChanged, DrawingRestarted
 from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.frame_rows import frames_undrawn, poses_after
@@ -45,34 +45,30 @@ class MapSite:
     """
 
     def __init__(
-        self, journal: Journal, layer: Layer, folder: Path, *, gsd_m: float | None, fov_rad: float | None,
-        anchors: Anchors, events: Events,
+        self, journal: Journal, layer: MapLayer, folder: Path, *, gsd_m: float | None, fov_rad: float | None,
+        expected: ExpectedPlace, events: Events,
     ) -> None:  # fmt: skip
         """Continue where the last daemon stopped.
 
         Args:
             layer: the real-time layer. folder: of all layers' canvases.
             gsd_m: ground pixel; from the first pictures if None. fov_rad: theta-hat, see recorded_cameras.
-            anchors: where the map is to lie. events: told when the area changes, and when all is drawn again.
+            expected: where the map is to lie. events: told when the area changes, and when all is drawn again.
         """
         self._journal, self._layer, self._folder, self._events = journal, layer, folder, events
-        self._gsd_m, self._fov_rad, self._anchors = gsd_m, fov_rad, anchors
+        self._gsd_m, self._fov_rad, self._expected = gsd_m, fov_rad, expected
         self._positions: list[tuple[float, float]] = []  # of the journal's frames up to the number `_counted`
         self._counted = 0
-        self.area: Area | None = None
+        self.area: MapArea | None = None
         self.grid: LocalGrid | None = None
         self.mosaic: RealtimeMosaic | None = None
         document = journal.fact("area")
         if document is not None:
-            self.area = Area.from_document(document)
+            self.area = MapArea.from_document(document)
             self._open(journal.fact("realtime"))
 
     def place(self, frame: Frame, drawn: int) -> tuple[Camera, float] | str:
-        """The frame's camera and sigma in metres, after making room for it on the layer; or why it cannot be drawn.
-
-        Args:
-            frame: with a recorded pose. drawn: number of frames drawn since the start.
-        """
+        """The frame's camera and sigma in metres, after making room for it on the layer; or why it cannot be drawn."""
         if not is_position({"lat_deg": frame.fix.lat_deg, "lon_deg": frame.fix.lon_deg}):
             return "its receiver had no fix (the position is 0, 0); nothing tells where it was taken"
         far = self._is_far(frame)
@@ -96,7 +92,7 @@ class MapSite:
             if reason is not None:
                 self.grid = None
                 return reason
-            self._begin(Area.around(self.grid.epsg, float(place[0]), float(place[1]), gsd))
+            self._begin(MapArea.around(self.grid.epsg, float(place[0]), float(place[1]), gsd))
         elif self._gsd_m is None and drawn < _FEW and self._is_other_scale(camera):
             self._begin_again(camera, place)
         return self._with_room(camera) or (camera, placed[0].sigma_m)
@@ -107,7 +103,7 @@ class MapSite:
         A map started elsewhere (by pictures with a wrong position) is started again, as long as nothing was
         solved on it, and all frames are drawn again.
         """
-        fix, anchor = frame.fix, self._anchors.expected()
+        fix, anchor = frame.fix, self._expected.place()
         if anchor is not None and anchor.distance_m(fix.lat_deg, fix.lon_deg) > _FAR_M:
             km = anchor.distance_m(fix.lat_deg, fix.lon_deg) / 1e3
             return f"it lies {km:.0f} km from {anchor.name}; check the receiver, or use a workspace of its own for it"
@@ -118,14 +114,15 @@ class MapSite:
         if away_m <= _FAR_M:
             return None
         wrong = anchor is not None and anchor.distance_m(lat, lon) > _FAR_M
-        if (wrong or (anchor is None and self._is_majority(frame, self.area))) and not self._solved():
+        moves = wrong or (anchor is None and self._is_majority(frame, self.area))
+        if moves and not is_any_placed(self._journal, "solutions", "coarse"):
             self._move_away()
             return None
         return (
             f"it lies {away_m / 1e3:.0f} km from the others; check the receiver, or use a workspace of its own for it"
         )
 
-    def _is_majority(self, frame: Frame, area: Area) -> bool:
+    def _is_majority(self, frame: Frame, area: MapArea) -> bool:
         """Whether more frames lie around this one, too far from the map, than around the map's origin.
 
         All frames of the journal count, drawn or not: while they are drawn again the map would move to and fro.
@@ -143,9 +140,6 @@ class MapSite:
         return sum(
             abs(place[0] - other[0]) <= near_deg and distance_m(*place, *other) <= _FAR_M for other in self._positions
         )
-
-    def _solved(self) -> bool:
-        return is_any_placed(self._journal, "solutions", "coarse")
 
     def _move_away(self) -> None:
         """Drop the map's location: the next frame sets it, and all frames are drawn again."""
@@ -166,7 +160,7 @@ class MapSite:
         assert self.grid is not None
         gsd = default_gsd([camera])
         _log.info("the map's pixel becomes %.3f m; what was drawn is drawn again", gsd)
-        self._begin(Area.around(self.grid.epsg, float(place[0]), float(place[1]), gsd), again=True)
+        self._begin(MapArea.around(self.grid.epsg, float(place[0]), float(place[1]), gsd), again=True)
 
     def _with_room(self, camera: Camera) -> str | None:
         """Extend the layer to a camera's footprint; returns the reason if that is impossible."""
@@ -194,12 +188,12 @@ class MapSite:
 
     # -- the layer ------------------------------------------------------------------------------------------------
 
-    def _begin(self, area: Area, *, again: bool = False) -> None:
+    def _begin(self, area: MapArea, *, again: bool = False) -> None:
         memory_mb = active().compute.live_canvas_mb
         canvas = Canvas.create(self._folder / new_name("realtime"), area.grid, memory_mb=memory_mb)
         self._adopt(area, canvas, again=again)
 
-    def _adopt(self, area: Area, canvas: Canvas, *, again: bool = False) -> None:
+    def _adopt(self, area: MapArea, canvas: Canvas, *, again: bool = False) -> None:
         """Make a canvas the layer, in the journal first."""
         facts = [fact_change("area", area.document()), fact_change("realtime", canvas.path.name)]
         self._journal.write(all_changes(*facts, frames_undrawn if again else no_change))
@@ -227,7 +221,7 @@ class MapSite:
 
 
 @lru_cache(maxsize=8)
-def _origin_of(area: Area) -> tuple[float, float]:
+def _origin_of(area: MapArea) -> tuple[float, float]:
     """Latitude and longitude of an area's origin, degrees."""
     lat, lon = LocalGrid(area.epsg).to_geographic(area.origin)
     return float(lat), float(lon)

@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcs_plugin.daemon.intake.posted_pose import frame_of_row
-from gcs_plugin.daemon.layers.anchor import Anchors
+from gcs_plugin.daemon.layers.anchor import ExpectedPlace
 from gcs_plugin.daemon.layers.draw_queue import DrawQueue, MapDelay, PendingFrame
-from gcs_plugin.daemon.layers.layers import Area, Layer, new_name
+from gcs_plugin.daemon.layers.layers import MapArea, MapLayer, new_name
 from gcs_plugin.daemon.layers.map_site import MapSite
 from gcs_plugin.daemon.store.daemon_events import (
     DrawingRestarted,
@@ -73,13 +73,13 @@ class Drawer:
         self,
         journal: Journal,
         store: PictureStore,
-        layer: Layer,
+        layer: MapLayer,
         folder: Path,
         events: Events,
         *,
         gsd_m: float | None = None,
         fov_rad: float | None = None,
-        anchors: Anchors,
+        expected: ExpectedPlace,
         in_memory: int = _IN_MEMORY,
         late_s: float = _LATE_S,
         look_s: float = _LOOK_S,
@@ -93,7 +93,7 @@ class Drawer:
             events: told what was drawn, and what cannot be.
             gsd_m: ground pixel; from the first pictures if None.
             fov_rad: theta-hat, the field of view to assume; see recorded_cameras.
-            anchors: where the map should lie.
+            expected: where the map should lie.
             in_memory: most frames that wait in memory; the journal has the others.
             late_s: a frame drawn later than this after its arrival is late, seconds.
             look_s: time between looks for late frames, seconds.
@@ -113,7 +113,7 @@ class Drawer:
         self.drawn = self.late = self.put_off = 0
         self.latencies: list[float] = []
         self.problem = ""
-        self._site = MapSite(journal, layer, folder, gsd_m=gsd_m, fov_rad=fov_rad, anchors=anchors, events=events)
+        self._site = MapSite(journal, layer, folder, gsd_m=gsd_m, fov_rad=fov_rad, expected=expected, events=events)
 
     # -- from outside ---------------------------------------------------------------------------------------------
 
@@ -139,7 +139,7 @@ class Drawer:
             self._condition.notify_all()
 
     @property
-    def area(self) -> Area | None:
+    def area(self) -> MapArea | None:
         """The map's area, None before the first frame."""
         return self._site.area
 
@@ -321,7 +321,9 @@ class Drawer:
         quality = _quality(picture)
         if added.reason is None:
             self._events.publish(PictureDrawn(PlacedFrame(frame, camera, "realtime", sigma), quality))
-        return self._report(pending, Drawn(pending.seq, added.reason, sigma, _thumbnail(picture), quality), camera)
+        return self._report(
+            pending, Drawn(pending.seq, added.reason, sigma, thumbnail(picture).tobytes(), quality), camera
+        )
 
     def _report(self, pending: PendingFrame, drawn: Drawn, camera: Camera | None) -> Drawn:
         frame, fix = pending.frame, pending.frame.fix
@@ -360,8 +362,3 @@ def _quality(picture: Bytes) -> PictureQuality | None:
         return picture_quality(picture)
     except ValueError:  # too small to be judged
         return None
-
-
-def _thumbnail(picture: Bytes) -> bytes:
-    """The means of a picture's parts, for gains; see `thumbnail`."""
-    return thumbnail(picture).tobytes()

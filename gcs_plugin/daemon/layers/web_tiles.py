@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pyproj import Transformer
 
-from gcs_plugin.daemon.layers.layers import Layer
+from gcs_plugin.daemon.layers.layers import MapLayer
 from gcs_plugin.daemon.store.daemon_events import AreaChanged
 from gcs_plugin.daemon.store.workspace_lock import open_basemap
 from orthoswarm.canvas.canvas import Canvas
@@ -163,9 +163,6 @@ def encode(tile: Bytes | None, suffix: str) -> bytes:
 class TileServer:
     """Encoded tiles with their ETags; recent ones are cached.
 
-    Args:
-        layers: by name. basemap: its file, or None.
-
     Attributes:
         basemap: on the grid of the map's area, or of its own centre while there is none.
 
@@ -173,7 +170,7 @@ class TileServer:
         InputError: the basemap cannot be used.
     """
 
-    def __init__(self, layers: dict[str, Layer], basemap: Path | None = None) -> None:
+    def __init__(self, layers: dict[str, MapLayer], basemap: Path | None = None) -> None:
         self.layers, self._file = layers, basemap
         self.basemap = None if basemap is None else open_basemap(basemap)
         self._lock = threading.Lock()
@@ -232,7 +229,7 @@ class TileServer:
         """The layers that show in one, uppermost first."""
         return ("fine", "coarse", "realtime") if name == "best" else (name,)
 
-    def _stamp(self, layer: Layer, tile: TileAddress) -> str:
+    def _stamp(self, layer: MapLayer, tile: TileAddress) -> str:
         with layer.reading() as canvas:
             if canvas is None:
                 return "-"

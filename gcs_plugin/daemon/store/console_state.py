@@ -4,7 +4,7 @@ import threading
 import time
 from collections.abc import Mapping
 from datetime import datetime
-from typing import Any, Final
+from typing import Any, Final, TypedDict, cast
 
 from gcs_plugin.daemon.store.daemon_events import FindsChanged, PlanChanged
 from gcs_plugin.daemon.store.event_bus import Events
@@ -15,6 +15,19 @@ from orthoswarm.model.errors import InputError, OrthoSwarmError
 _PLAN_FIELDS: Final = ("area", "settings", "plan", "vehicles")
 _MOST_FINDS: Final = 10_000
 _MOST_NOTE: Final = 10_000  # characters
+
+
+class FindRow(TypedDict, total=False):
+    """A marked find; `time`: ISO 8601; `version` from 1; `pictures`: names of those that show it, for an export."""
+
+    id: int
+    lat_deg: float
+    lon_deg: float
+    sigma_m: float | None
+    note: str
+    time: str | None
+    version: int
+    pictures: list[str]
 
 
 class OutdatedError(OrthoSwarmError):
@@ -57,21 +70,22 @@ class ConsoleState:
         self._events.publish(PlanChanged(plan))
         return plan
 
-    def finds(self) -> list[dict[str, Any]]:
-        """The finds, oldest first: `id`, `lat_deg`, `lon_deg`, `sigma_m`, `note`, `time`, `version` from 1."""
-        return [{"version": 1, **row} for row in self._finds()["rows"]]
+    def finds(self) -> list[FindRow]:
+        """The finds, oldest first."""
+        return [cast(FindRow, {"version": 1, **row}) for row in self._finds()["rows"]]
 
     def _finds(self) -> dict[str, Any]:
         found: dict[str, Any] = self._journal.fact("finds") or {"next": 1, "rows": []}
         return found
 
-    def add_find(self, body: Mapping[str, Any]) -> dict[str, Any]:
+    def add_find(self, body: Mapping[str, Any]) -> FindRow:
         """Add a find; returns it with its id.
 
         Raises:
             InputError: a field is invalid, or there are too many finds.
         """
-        row = _find(body) | {"time": _time_of(body), "version": 1}
+        row = _find(body)
+        row["time"], row["version"] = _time_of(body), 1
         with self._lock:
             found = self._finds()
             if len(found["rows"]) >= _MOST_FINDS:
@@ -81,7 +95,7 @@ class ConsoleState:
         self._events.publish(FindsChanged())
         return row
 
-    def change_find(self, number: int, body: Mapping[str, Any]) -> dict[str, Any] | None:
+    def change_find(self, number: int, body: Mapping[str, Any]) -> FindRow | None:
         """Change a find's place and note, not its time; returns it with its new version, None if it does not exist.
 
         Args:
@@ -102,7 +116,8 @@ class ConsoleState:
                 raise OutdatedError(
                     f"the find was changed elsewhere (version {before['version']}); load it and change it again"
                 )
-            row = before | new | {"version": before["version"] + 1}
+            row = before | new
+            row["version"] = before["version"] + 1
             changed = [row if old is before else old for old in rows]
             self._journal.remember("finds", self._finds() | {"rows": changed})
         self._events.publish(FindsChanged())
@@ -120,7 +135,7 @@ class ConsoleState:
         return True
 
 
-def _find(body: Mapping[str, Any]) -> dict[str, Any]:
+def _find(body: Mapping[str, Any]) -> FindRow:
     """Place and note of a find.
 
     Raises:

@@ -18,15 +18,25 @@ REFINED: Final = ("coarse", "fine")
 """The layers that are published."""
 
 
+class LegRow(TypedDict, total=False):
+    """A placed leg: its pictures, its ends (`line`: longitude and latitude, degrees), how well it lies (or null)."""
+
+    vehicle: str
+    images: list[str]
+    state: str
+    confidence: Any
+    sigma_m: Any
+    line: list[list[float]]
+
+
 class SortieDetail(TypedDict, total=False):
     """What the journal keeps of a placed sortie, as JSON values.
 
-    `bounds`: of its ground, metres. `legs`: with `line`, their ends in degrees. `layer`, and how many pictures were
-    `refined`: of a refined one.
+    `bounds`: of its ground, metres. `layer`, and how many pictures were `refined`: of a refined one.
     """
 
     bounds: Any
-    legs: list[dict[str, Any]]
+    legs: list[LegRow]
     fov_deg: float | None
     fov_sigma_deg: float | None
     warnings: list[str]

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gcs_plugin.daemon.intake.posted_pose import frame_of, parse_pose
-from gcs_plugin.daemon.layers.anchor import Anchors
+from gcs_plugin.daemon.layers.anchor import ExpectedPlace
 from gcs_plugin.daemon.layers.draw_queue import DrawQueue, MapDelay, PendingFrame
-from gcs_plugin.daemon.layers.layers import Layer
+from gcs_plugin.daemon.layers.layers import MapLayer
 from gcs_plugin.daemon.layers.realtime_layer import Drawer
 from gcs_plugin.daemon.layers.web_tiles import TileServer
 from gcs_plugin.daemon.store.daemon_events import FrameReported, Overload, PictureStored
@@ -161,12 +161,21 @@ class RecordedEvents(Events):
 @contextlib.contextmanager
 def drawing(folder, read, **options):
     """A drawer with its journal, a function that sends it a picture, and what it has told."""
-    events, layer = RecordedEvents(), Layer("realtime")
+    events, layer = RecordedEvents(), MapLayer("realtime")
     journal, store = Journal(folder / "journal.db"), PictureStore(folder / "p")
     (folder / "layers").mkdir()
-    anchors = Anchors(TileServer({}), Plans(folder / "plans", None, None))
+    expected = ExpectedPlace(TileServer({}), Plans(folder / "plans", None, None))
     drawer = Drawer(
-        journal, store, layer, folder / "layers", events, gsd_m=0.5, in_memory=12, read=read, anchors=anchors, **options
+        journal,
+        store,
+        layer,
+        folder / "layers",
+        events,
+        gsd_m=0.5,
+        in_memory=12,
+        read=read,
+        expected=expected,
+        **options,
     )
     drawer.start()
     data = jpeg(camera_at())

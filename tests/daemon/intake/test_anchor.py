@@ -5,8 +5,8 @@ import json
 import pytest
 
 from gcs_plugin.daemon.intake.posted_pose import is_position, parse_pose
-from gcs_plugin.daemon.layers.anchor import Anchor, Anchors
-from gcs_plugin.daemon.layers.layers import Layer
+from gcs_plugin.daemon.layers.anchor import Anchor, ExpectedPlace
+from gcs_plugin.daemon.layers.layers import MapLayer
 from gcs_plugin.daemon.layers.map_site import MapSite
 from gcs_plugin.daemon.layers.web_tiles import TileServer
 from gcs_plugin.daemon.store.daemon_events import DrawingRestarted
@@ -70,8 +70,8 @@ def test_a_map_that_was_begun_at_a_wrong_place_moves_once_while_pictures_are_dra
     events.on(DrawingRestarted, lambda event: again.append(1))
     (tmp_path / "layers").mkdir()
     site = MapSite(
-        journal, Layer("realtime"), tmp_path / "layers", gsd_m=0.5, fov_rad=None, events=events,
-        anchors=Anchors(TileServer({}), Plans(tmp_path / "plans", None, None)),
+        journal, MapLayer("realtime"), tmp_path / "layers", gsd_m=0.5, fov_rad=None, events=events,
+        expected=ExpectedPlace(TileServer({}), Plans(tmp_path / "plans", None, None)),
     )  # fmt: skip
     frames = []
     for k, (lat, lon) in enumerate([(10.0, 10.0)] * 2 + [(48.0, 11.0)] * 3):

@@ -181,9 +181,9 @@ class Placed:
         self.solutions = folder
 
     def area(self):
-        from gcs_plugin.daemon.layers.layers import Area
+        from gcs_plugin.daemon.layers.layers import MapArea
 
-        return Area(32631, 0.1, (0.0, 0.0), (0.0, 0.0, 9.0, 9.0))
+        return MapArea(32631, 0.1, (0.0, 0.0), (0.0, 0.0, 9.0, 9.0))
 
 
 def test_a_refinement_that_begins_takes_its_process_and_it_is_done_later(journal, tmp_path):
