@@ -12,7 +12,7 @@ from gcs_plugin.daemon.jobs.solution_file import SolutionFileError, read_solutio
 from gcs_plugin.daemon.store.frame_rows import drawn_frames, rejected_frames
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.daemon.store.picture_store import PictureStore
-from gcs_plugin.daemon.store.sortie_rows import coarse_only, placed_sorties
+from gcs_plugin.daemon.store.sortie_rows import solution_paths
 from orthoswarm.coverage.missing_pictures import Exposure
 from orthoswarm.coverage.picture_flaws import NEIGHBOURS, picture_flaws
 from orthoswarm.coverage.view import NO_FLAW, Flaw, View
@@ -52,26 +52,27 @@ class PictureViews:
         """
         views: list[View] = []
         dropped: list[Key] = []
-        for row in (*coarse_only(self._journal), *placed_sorties(self._journal, "solutions")):
-            key = str(epsg), row.vehicle, row.sortie
-            if self._read.get(key) == row.path:
+        refined = solution_paths(self._journal, "solutions")
+        for whose, path in (solution_paths(self._journal, "coarse") | refined).items():
+            key = str(epsg), *whose
+            if self._read.get(key) == path:
                 continue
             try:
-                found = read_solution(self._folder / row.path)
+                found = read_solution(self._folder / path)
             except SolutionFileError:
                 continue
-            self._read[key] = row.path
+            self._read[key] = path
             solution, ground = found.solution, found.terrain
             half = 0.5 * math.radians(solution.fov_deg)
             # d(f)/f of f = (W/2) / tan(half): d(half) / (sin(half) cos(half))
             focal = math.radians(solution.fov_sigma_deg) / math.sin(2.0 * half)
             focal = focal if math.isfinite(focal) else 0.0
             views += [
-                replace(View.of_frame(p, focal_sigma=focal, ground=ground), vehicle=row.vehicle, placed=True)
+                replace(View.of_frame(p, focal_sigma=focal, ground=ground), vehicle=whose[0], placed=True)
                 for p in solution.placed
             ]
-            if "layer" in row.detail:  # a refined one
-                dropped += [(row.vehicle, image) for image in solution.dropped]
+            if whose in refined:
+                dropped += [(whose[0], image) for image in solution.dropped]
         return views, dropped
 
     def rejected(self) -> list[Exposure]:

@@ -29,6 +29,7 @@ from gcs_plugin.daemon.store.sortie_rows import (
     placed_sorties,
     placements_forgotten,
     shown_sorties,
+    solution_paths,
 )
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.model.bounding_box import BoundingBox
@@ -118,7 +119,7 @@ class Publisher:
         for path in self.folder.iterdir():
             if path.name not in named:
                 shutil.rmtree(path, ignore_errors=True)
-        known = {row.path for table in _TABLES for row in placed_sorties(self.journal, table)}
+        known = {path for table in _TABLES for path in solution_paths(self.journal, table).values()}
         for path in self.solutions.iterdir():
             if path.name not in known:
                 path.unlink(missing_ok=True)

@@ -22,7 +22,7 @@ from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
 from gcs_plugin.daemon.layers.layers import new_name
 from gcs_plugin.daemon.store.job_rows import Job
 from gcs_plugin.daemon.store.journal import Change, Journal, no_change
-from gcs_plugin.daemon.store.sortie_rows import PlacedSortie, placed_sorties, shown_sorties, solution_replaced
+from gcs_plugin.daemon.store.sortie_rows import PlacedSortie, shown_sorties, solution_paths, solution_replaced
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.placement import PlacedFrame, Terrain
 from orthoswarm.mosaic.radiometry import estimate_fields
@@ -142,7 +142,7 @@ class ToneBalance:
         self._preemption.stop()
 
     def _balance(self, job: Job, report: ReportProgress, targets: list[Path]) -> None:
-        refined = {row.whose for row in placed_sorties(self.journal, "solutions")}
+        refined = solution_paths(self.journal, "solutions")
         shown = [row for row in shown_sorties(self.journal, self.layer) if row.whose in refined]
         if len({row.vehicle for row in shown}) < 2:
             job.detail["note"] = "there is one vehicle only"

@@ -17,7 +17,7 @@ from gcs_plugin.daemon.store.daemon_events import AreaChanged, DrawingRestarted
 from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.frame_rows import frames_undrawn, poses_after
 from gcs_plugin.daemon.store.journal import Journal, all_changes, area_forgotten, fact_change, no_change
-from gcs_plugin.daemon.store.sortie_rows import is_any_placed
+from gcs_plugin.daemon.store.sortie_rows import solution_paths
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
@@ -115,7 +115,7 @@ class MapSite:
             return None
         wrong = anchor is not None and anchor.distance_m(lat, lon) > _FAR_M
         moves = wrong or (anchor is None and self._is_majority(frame, self.area))
-        if moves and not is_any_placed(self._journal, "solutions", "coarse"):
+        if moves and not solution_paths(self._journal, "solutions", "coarse"):
             self._move_away()
             return None
         return (
@@ -153,7 +153,7 @@ class MapSite:
         """Whether the map's ground pixel was derived from pictures during the climb."""
         assert self.area is not None
         height = float(camera.position[2])
-        solved = is_any_placed(self._journal, "solutions")
+        solved = bool(solution_paths(self._journal, "solutions"))
         return 10.0 < height < 500.0 and not solved and height / camera.lens.focal_px > _OTHER_GSD * self.area.gsd_m
 
     def _begin_again(self, camera: Camera, place: Any) -> None:

@@ -88,12 +88,9 @@ class Drawer:
         """Continue where the last daemon stopped; `start` begins to draw.
 
         Args:
-            layer: to draw on.
-            folder: of all layers' canvases.
-            events: told what was drawn, and what cannot be.
+            layer: to draw on. folder: of all layers' canvases. expected: where the map should lie.
             gsd_m: ground pixel; from the first pictures if None.
             fov_rad: theta-hat, the field of view to assume; see recorded_cameras.
-            expected: where the map should lie.
             in_memory: most frames that wait in memory; the journal has the others.
             late_s: a frame drawn later than this after its arrival is late, seconds.
             look_s: time between looks for late frames, seconds.
@@ -106,7 +103,7 @@ class Drawer:
         self._delay = MapDelay()
         self._waiting: set[int] = set()
         self._looked = 0.0
-        self._more, self._looking = True, False
+        self._more = True
         self._condition = threading.Condition()
         self._stop = False
         self._thread: threading.Thread | None = None
@@ -154,17 +151,6 @@ class Drawer:
         with self._condition:
             return self._delay.seconds(time.time())
 
-    def wait_idle(self, timeout_s: float) -> bool:
-        """Wait until nothing is left to draw; False after the time-out."""
-        end = time.monotonic() + timeout_s
-        with self._condition:
-            while len(self._queue) or self._waiting or self._more or self._looking:
-                left = end - time.monotonic()
-                if left <= 0 or self._stop:
-                    return False
-                self._condition.wait(left)
-        return True
-
     def wait_drawn(self, vehicle: str, sortie: int | None, timeout_s: float) -> bool:
         """Wait until a sortie's frames are drawn; False after the time-out."""
         end = time.monotonic() + timeout_s
@@ -201,7 +187,7 @@ class Drawer:
             self._events.publish(Problem(problem))
         with self._condition:
             self._waiting = self._queue.seqs()
-            self._more, self._looking = True, False
+            self._more = True
             self._condition.wait(1.0)
 
     def _tell_overload(self) -> None:
@@ -238,11 +224,10 @@ class Drawer:
         with self._condition:
             if not self._more or len(self._queue) > self._in_memory // 2:
                 return
-            self._more, self._looking = False, True
+            self._more = False
         most = self._in_memory + len(self._waiting) + 1
         rows = undrawn_frames(self._journal, most)
         with self._condition:
-            self._looking = False
             self._more = self._more or len(rows) == most
             for row in rows:
                 if row.seq not in self._waiting:

@@ -81,14 +81,15 @@ def placed_sorties(journal: Journal, table: Table) -> list[PlacedSortie]:
     return [_placed(row) for row in journal.rows(f"SELECT * FROM {table} ORDER BY vehicle, sortie")]
 
 
-def is_any_placed(journal: Journal, *tables: Table) -> bool:
-    """Whether any sortie is placed."""
-    return any(journal.one(f"SELECT 1 FROM {table} LIMIT 1") is not None for table in tables)
+def solution_paths(journal: Journal, *tables: Table) -> dict[Whose, str]:
+    """Names of the solution files by vehicle and sortie; of one in several tables that of the last."""
+    rows = [row for table in tables for row in journal.rows(f"SELECT vehicle, sortie, path FROM {table}")]
+    return {(unpacked(row["vehicle"]), int(row["sortie"])): row["path"] for row in rows}
 
 
 def coarse_only(journal: Journal) -> list[PlacedSortie]:
     """The sorties that were placed in flight and are not refined."""
-    refined = {row.whose for row in placed_sorties(journal, "solutions")}
+    refined = solution_paths(journal, "solutions")
     return [row for row in placed_sorties(journal, "coarse") if row.whose not in refined]
 
 

@@ -17,7 +17,7 @@ from gcs_plugin.daemon.layers.realtime_layer import Drawer
 from gcs_plugin.daemon.layers.web_tiles import TileServer
 from gcs_plugin.daemon.store.daemon_events import FrameReported, Overload, PictureStored
 from gcs_plugin.daemon.store.event_bus import Events
-from gcs_plugin.daemon.store.frame_rows import add_frame
+from gcs_plugin.daemon.store.frame_rows import add_frame, undrawn_frames
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.daemon.store.picture_store import PictureStore, frame_key
 from gcs_plugin.daemon.web_plans import Plans
@@ -220,7 +220,7 @@ def test_a_jam_is_told_and_everything_is_drawn_in_the_end(tmp_path):
         assert "safe on the disk" in drawer.overload
         in_time.set()
         may_read.release(100)
-        assert drawer.wait_idle(240)
+        wait_until(lambda: not undrawn_frames(journal, 1))
         rows = journal.rows("SELECT seq, drawn, reason FROM frames")
     order = [event.seq for event in told if isinstance(event, FrameReported)]
     assert [(row["drawn"], row["reason"]) for row in rows] == [(1, None)] * 90
@@ -237,11 +237,11 @@ def test_the_end_of_a_jam_is_told_though_nothing_comes_after_it(tmp_path):
         assert all_came.wait(240)
         return read_rgba(path)
 
-    with drawing(tmp_path, late, late_s=0.0, look_s=60.0) as (drawer, _, send, told):
+    with drawing(tmp_path, late, late_s=0.0, look_s=60.0) as (drawer, journal, send, told):
         for k in range(40):
             send(k, camera_at(5.0 * k))
         all_came.set()
-        assert drawer.wait_idle(240)
+        wait_until(lambda: not undrawn_frames(journal, 1))
         wait_until(lambda: not drawer.overload)
     put_off = [event.put_off for event in told if isinstance(event, Overload)]
     assert put_off[0] > 0 == put_off[-1]

@@ -26,7 +26,7 @@ def test_solutions_of_another_version_are_made_again(workspace, caplog):
     settings, frames = workspace
     with Daemon(settings) as daemon:
         post(daemon, frames)
-        assert daemon.drawer.wait_idle(240.0)
+        assert daemon.drawer.wait_drawn("v1", 1, 240.0)
         complete(daemon)
         (first,) = after_job(daemon, 1)
         assert first.state == "done", first.message
