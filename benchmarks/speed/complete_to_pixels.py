@@ -25,6 +25,7 @@ from benchmarks.speed.daemon_refine import record
 from gcs_plugin.daemon.daemon import Daemon
 from gcs_plugin.daemon.intake.posted_pose import parse_pose
 from gcs_plugin.daemon.settings import Settings
+from gcs_plugin.daemon.store.sortie_rows import present_sortie
 from orthoswarm.compute.workers import prepare_process
 from orthoswarm.model.frame import Frame
 
@@ -37,14 +38,14 @@ def fly(daemon: Daemon, frames: list[Frame], rate_hz: float, stop: threading.Eve
     for k, frame in enumerate(frames):
         if stop.wait(max(0.0, start + k / rate_hz - time.monotonic())):
             return
-        daemon.add_picture(parse_pose(record(frame)), frame.path.read_bytes())
+        daemon.intake.add(parse_pose(record(frame)), frame.path.read_bytes())
 
 
 def complete(daemon: Daemon, vehicle: str) -> dict[str, float]:
     """Complete a vehicle's sortie, as its mission does, and wait for the refined pixels."""
     flight_cpu_s = daemon.background.usage().cpu_s
     asked = time.time()
-    number = daemon.jobs.add("refine", vehicle, daemon.sortie(vehicle), trigger="complete").id
+    number = daemon.jobs.add("refine", vehicle, present_sortie(daemon.journal, vehicle), trigger="complete").id
     while (job := next(job for job in daemon.jobs.all() if job.id == number)).state not in ("done", "failed"):
         time.sleep(0.05)
     if job.state == "failed":

@@ -6,22 +6,36 @@ import os
 import shutil
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypedDict
 
+from gcs_plugin.daemon.flight_coverage.live_coverage import LiveCoverage
 from gcs_plugin.daemon.intake.posted_pose import frame_of_row
-from gcs_plugin.daemon.jobs.job_queue import Job
+from gcs_plugin.daemon.jobs.job_queue import ReportProgress
 from gcs_plugin.daemon.jobs.solution_file import read_solution
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
-from gcs_plugin.daemon.jobs.workspace_products import PRODUCTS, ExportTask, placements, writable, write_products
-from gcs_plugin.daemon.layers.layers import Area, Layer
+from gcs_plugin.daemon.jobs.workspace_products import (
+    PRODUCTS,
+    ExportTask,
+    RunFacts,
+    placements,
+    writable,
+    write_products,
+)
+from gcs_plugin.daemon.layers.layers import MapArea, MapLayer
+from gcs_plugin.daemon.layers.realtime_layer import Drawer
 from gcs_plugin.daemon.settings import Settings
-from gcs_plugin.daemon.store.console_state import ConsoleState
-from gcs_plugin.daemon.store.journal import Change, Journal, packed, unpacked
+from gcs_plugin.daemon.store.console_state import ConsoleState, FindRow
+from gcs_plugin.daemon.store.frame_rows import all_frames, frame_number, frame_path
+from gcs_plugin.daemon.store.job_rows import Job
+from gcs_plugin.daemon.store.journal import Change, Journal, no_change
 from gcs_plugin.daemon.store.picture_store import PictureStore
+from gcs_plugin.daemon.store.sortie_rows import coarse_only, placed_sorties
+from gcs_plugin.daemon.vehicle_names import VehicleRow
+from gcs_plugin.daemon.views import Views
 from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.export.tactical.places import Place
 from orthoswarm.export.tactical.seen_in import sightings
@@ -33,6 +47,17 @@ _SHOWN: Final = (".jpg", ".webp", ".bmp")  # by all browsers
 _VIEW_QUALITY: Final = 90
 _zipping: Final = threading.Lock()
 _MOST_SIGHTINGS = 24  # pictures of one place
+
+
+class SightingRow(TypedDict, total=False):
+    """A picture that shows a place, and where in it (pixels); `seq`: its number."""
+
+    vehicle: str
+    image: str
+    column: float
+    row: float
+    stage: str
+    seq: int | None
 
 
 def zipped_folder(folder: Path) -> Path:
@@ -58,10 +83,8 @@ class Exports:
     """Exports the workspace to the formats of other programs.
 
     Args:
-        settings: of the daemon. journal, store, layers, console: the workspace's.
-        workers: write the files. area: returns the map's area, None before the first picture.
-        vehicles: returns the rows of /api/vehicles. facts: returns the daemon's facts for the report.
-        cells: returns the picture of the coverage's cells (PNG), empty without an area.
+        layers: by name. drawer: knows the map's area. views: has the vehicles. coverage: its cells and figures are
+            part of the report. workers: write the files. facts: of the daemon, for the report.
     """
 
     def __init__(
@@ -70,52 +93,52 @@ class Exports:
         journal: Journal,
         *,
         store: PictureStore,
-        layers: Mapping[str, Layer],
+        layers: Mapping[str, MapLayer],
         console: ConsoleState,
+        drawer: Drawer,
+        views: Views,
+        coverage: LiveCoverage,
         workers: WorkerPool,
-        area: Callable[[], Area | None],
-        vehicles: Callable[[], list[dict[str, Any]]],
-        facts: Callable[[], dict[str, Any]],
-        cells: Callable[[], bytes],
+        facts: RunFacts,
     ) -> None:
         self._settings, self._journal, self._store = settings, journal, store
         self._layers, self._console, self._workers = layers, console, workers
-        self._area, self._vehicles, self._facts, self._cells = area, vehicles, facts, cells
+        self._drawer, self._views, self._coverage, self._facts = drawer, views, coverage, facts
         self._written: tuple[dict[str, int], dict[str, str]] = ({}, {})  # the layers' versions, and the files of them
 
-    def write(self, job: Job, report: Callable[[float, str], None]) -> Change:
+    def write(self, job: Job, report: ReportProgress) -> Change:
         """The handler of an `export` job; one that nobody asked for writes only what has changed since the last one.
 
         Raises:
             InputError: there is no map yet.
         """
         report(0.05, "writing")
-        area = self._area()
+        area = self._drawer.area
         if area is None:
             raise InputError("there is no map yet; wait for pictures")
         versions = {name: layer.version for name, layer in self._layers.items()}
         if "after" in job.detail and versions == self._written[0]:
             job.detail["note"], job.detail["files"] = "the last one has everything", self._written[1]
-            return lambda db: None
+            return no_change
         with contextlib.ExitStack() as held:  # a replaced generation stays while it is read
             canvases = {name: held.enter_context(layer.reading()) for name, layer in self._layers.items()}
             folders = {name: canvas.path for name, canvas in canvases.items() if canvas is not None}
             task = replace(self._task(area), formats=tuple(job.detail["formats"]), canvases=folders)
             shown = [
-                find | {"pictures": [row["image"] for row in pictures_at(task, find["lat_deg"], find["lon_deg"])]}
+                find | FindRow(pictures=[row["image"] for row in pictures_at(task, find["lat_deg"], find["lon_deg"])])
                 for find in self._console.finds()
             ]
             places = tuple(self._places(shown))
-            task = replace(task, facts=self._facts(), places=places, cells=self._cells())
+            task = replace(task, facts=self._report_facts(), places=places, cells=self._coverage.png)
             job.detail["files"] = files = self._workers.run(write_products, task)
             self._written = versions, {name: files[name] for name in PRODUCTS}
-        return lambda db: None
+        return no_change
 
     def places(self) -> list[Place]:
         """The finds, and the vehicles with a known position."""
         return self._places(self._console.finds())
 
-    def find_pictures(self, number: int) -> list[dict[str, Any]]:
+    def find_pictures(self, number: int) -> list[SightingRow]:
         """The pictures that show a find, best first; see `pictures_at`. Each has its `seq`.
 
         Raises:
@@ -124,12 +147,10 @@ class Exports:
         find = next((row for row in self._console.finds() if row["id"] == number), None)
         if find is None:
             raise InputError(f"there is no find {number}; see /api/finds")
-        area = self._area()
+        area = self._drawer.area
         rows = [] if area is None else pictures_at(self._task(area), find["lat_deg"], find["lon_deg"])
-        query = "SELECT seq FROM frames WHERE vehicle = ? AND image = ?"
         for row in rows:
-            found = self._journal.one(query, (packed(row["vehicle"]), packed(row["image"])))
-            row["seq"] = None if found is None else found["seq"]
+            row["seq"] = frame_number(self._journal, row["vehicle"], row["image"])
         return rows
 
     def picture(self, seq: int) -> Path:
@@ -138,10 +159,10 @@ class Exports:
         Raises:
             InputError: there is no such picture.
         """
-        row = self._journal.one("SELECT path FROM frames WHERE seq = ?", (seq,)) if 0 <= seq < 2**63 else None
-        if row is None or not self._store.path(row["path"]).is_file():
+        name = frame_path(self._journal, seq)
+        if name is None or not self._store.path(name).is_file():
             raise InputError(f"there is no picture {seq}; see /api/frames")
-        return self._store.path(row["path"])
+        return self._store.path(name)
 
     def picture_view(self, seq: int) -> Path | bytes:
         """The file of a picture, or a JPEG where browsers would show it black or not at all.
@@ -156,18 +177,17 @@ class Exports:
 
         return bytes(simplejpeg.encode_jpeg(picture_file.read_rgb(path), _VIEW_QUALITY, "RGB"))
 
-    def _places(self, finds: list[dict[str, Any]]) -> list[Place]:
-        return places_of(self._settings.workspace.resolve().name, finds, self._vehicles(), time.time())
+    def _places(self, finds: list[FindRow]) -> list[Place]:
+        return places_of(self._settings.workspace.resolve().name, finds, self._views.vehicles(), time.time())
 
-    def _task(self, area: Area) -> ExportTask:
+    def _report_facts(self) -> dict[str, Any]:
+        covered = self._coverage.document
+        return self._facts.document() | ({} if covered["state"] == "no area" else {"coverage": covered})
+
+    def _task(self, area: MapArea) -> ExportTask:
         """The export task of the workspace, without layers and formats."""
-        rows = self._journal.rows("SELECT * FROM frames ORDER BY vehicle, time, seq")
+        rows = all_frames(self._journal)
         folder, fov_deg = self._settings.workspace / "solutions", self._settings.fov_min_deg
-        solutions = self._journal.rows("SELECT path FROM solutions ORDER BY vehicle, sortie")
-        coarse = self._journal.rows(
-            "SELECT path FROM coarse c WHERE NOT EXISTS (SELECT 1 FROM solutions s WHERE s.vehicle = c.vehicle"
-            " AND s.sortie = c.sortie) ORDER BY vehicle, sortie"
-        )
         return ExportTask(
             workspace=self._settings.workspace,
             formats=(),
@@ -175,17 +195,15 @@ class Exports:
             epsg=area.epsg,
             gsd_m=area.gsd_m,
             frames=[frame_of_row(row, self._store) for row in rows],
-            reasons={(unpacked(r["vehicle"]), unpacked(r["image"])): r["reason"] for r in rows if r["reason"]},
-            coarse=[folder / row["path"] for row in coarse],
-            solutions=[folder / row["path"] for row in solutions],
+            reasons={(row.vehicle, row.image): row.reason for row in rows if row.reason},
+            coarse=[folder / row.path for row in coarse_only(self._journal)],
+            solutions=[folder / row.path for row in placed_sorties(self._journal, "solutions")],
             basemap=self._settings.basemap,
             fov_rad=None if fov_deg is None else math.radians(fov_deg),
         )
 
 
-def places_of(
-    workspace: str, finds: Iterable[Mapping[str, Any]], vehicles: Iterable[Mapping[str, Any]], now_s: float
-) -> list[Place]:
+def places_of(workspace: str, finds: Iterable[FindRow], vehicles: Iterable[VehicleRow], now_s: float) -> list[Place]:
     """The workspace's finds, and the vehicles with a known position.
 
     Args:
@@ -197,17 +215,18 @@ def places_of(
         Place(
             uid=f"orthoswarm-{workspace}-find-{row['id']}", kind="find", name=_name(row), lat_deg=row["lat_deg"],
             lon_deg=row["lon_deg"], sigma_m=row["sigma_m"], note=writable(row["note"]),
-            time_s=datetime.fromisoformat(row["time"]).timestamp(), pictures=tuple(row.get("pictures", ())),
+            time_s=datetime.fromisoformat(str(row["time"])).timestamp(), pictures=tuple(row.get("pictures", ())),
         )
         for row in finds
     ]  # fmt: skip
     for row in vehicles:
-        if row.get("lat_deg") is None or row.get("lon_deg") is None or "system" not in row:
+        lat, lon = row.get("lat_deg"), row.get("lon_deg")
+        if lat is None or lon is None or "system" not in row:
             continue
         found.append(
             Place(
                 uid=f"orthoswarm-{workspace}-{row['id']}", kind="vehicle", name=row.get("name") or row["id"],
-                lat_deg=row["lat_deg"], lon_deg=row["lon_deg"], time_s=now_s - float(row.get("silent_s") or 0.0),
+                lat_deg=lat, lon_deg=lon, time_s=now_s - float(row.get("silent_s") or 0.0),
                 course_deg=row.get("heading_deg"), speed_m_s=row.get("speed_m_s"),
                 note=(row.get("flight") or {}).get("text", ""),
             )
@@ -215,17 +234,13 @@ def places_of(
     return found
 
 
-def _name(find: Mapping[str, Any]) -> str:
+def _name(find: FindRow) -> str:
     note = writable(find["note"]).strip()
     return note.splitlines()[0][:60] if note else f"Find {find['id']}"
 
 
-def pictures_at(task: ExportTask, lat_deg: float, lon_deg: float) -> list[dict[str, Any]]:
-    """The pictures that show a place, best first, as JSON values: `vehicle`, `image`, `column`, `row`, `stage`.
-
-    Args:
-        task: the workspace's export task. lat_deg, lon_deg: WGS 84.
-    """
+def pictures_at(task: ExportTask, lat_deg: float, lon_deg: float) -> list[SightingRow]:
+    """The pictures that show a place, best first, as JSON values: `vehicle`, `image`, `column`, `row`, `stage`."""
     solutions = [read_solution(path).solution for path in (*task.coarse, *task.solutions)]
     placed, level = placements(task, solutions)
     east, north = (float(v) for v in LocalGrid(task.epsg).to_grid(lat_deg, lon_deg))

@@ -1,11 +1,12 @@
 """Flights over missed ground: planned here from the gaps of the coverage, uploaded and started by the operator."""
 
 import json
-from collections.abc import Callable, Mapping
-from typing import Any, Final
+from collections.abc import Mapping
+from typing import Any, Final, TypedDict
 
 from gcs_plugin.config import LIMITS
 from gcs_plugin.daemon.flight_coverage.live_coverage import LiveCoverage
+from gcs_plugin.daemon.vehicle_names import VehicleRow
 from gcs_plugin.daemon.vehicles import VehicleLinks
 from gcs_plugin.daemon.web_plans import Plans
 from orthoswarm.model.earth import distance_m
@@ -17,37 +18,39 @@ _HOME_M_S: Final = 5.0
 """A plan ends where a vehicle in the air began it; from there it still flies home, at least so fast."""
 
 
+class GapFlyer(TypedDict):
+    """A vehicle that could fly over gaps, see `GapFlights.vehicles`."""
+
+    id: str
+    battery: float | None
+    minutes: float | None
+    busy: str
+    in_air: bool
+    lat_deg: float | None
+    lon_deg: float | None
+    home: list[float] | None
+
+
 class GapFlights:
-    """Plans flights over gaps. Nothing is uploaded or started here.
+    """Plans flights over gaps. Nothing is uploaded or started here."""
 
-    Args:
-        coverage: whose gaps. plans: of the workspace. links: the vehicles, None without links.
-        takeoffs: gives a row for each vehicle whose takeoff waits (`Takeoffs.rows`).
-    """
+    def __init__(self, coverage: LiveCoverage, plans: Plans, links: VehicleLinks) -> None:
+        self._coverage, self._plans, self._links = coverage, plans, links
 
-    def __init__(
-        self,
-        coverage: LiveCoverage,
-        plans: Plans,
-        links: VehicleLinks | None,
-        takeoffs: Callable[[], Mapping[str, Mapping[str, Any]]] = dict,
-    ) -> None:
-        self._coverage, self._plans, self._links, self._takeoffs = coverage, plans, links, takeoffs
-
-    def vehicles(self) -> list[dict[str, Any]]:
+    def vehicles(self) -> list[GapFlyer]:
         """Vehicles that could fly: `id`, `battery` (share left), `minutes` (None: unknown), `busy` (why not now).
 
         Minutes are those until the reserve, by what the vehicle's flight so far has cost. `in_air` is true for a busy
         one that may be given the gaps in the air, if the operator says so for this vehicle.
         """
-        rows: list[dict[str, Any]] = []
-        due = [vehicle for vehicle, takeoff in self._takeoffs().items() if "in_s" in takeoff]
-        for row in [] if self._links is None else self._links.rows():
+        rows: list[GapFlyer] = []
+        for row in self._links.rows():
+            due = "in_s" in (row["takeoff"] or {})
             seconds = self._coverage.battery.seconds(str(row["id"]), LIMITS.reserve_share)
             rows.append({
                 "id": row["id"], "battery": row["battery"],
                 "minutes": None if seconds is None else round(seconds / 60.0, 1),
-                "busy": "it is about to take off; cancel that first" if row["id"] in due else _busy(row),
+                "busy": "it is about to take off; cancel that first" if due else _busy(row),
                 "in_air": self._plans.dem is None and _may_go_on(row),
                 "lat_deg": row["lat_deg"], "lon_deg": row["lon_deg"], "home": row["home"],
             })  # fmt: skip
@@ -103,7 +106,7 @@ class GapFlights:
         return min(found), float(altitude), notes
 
 
-def _busy(row: Mapping[str, Any]) -> str:
+def _busy(row: VehicleRow) -> str:
     """Why a vehicle cannot be given another flight now, empty if it can."""
     if row["state"] == "lost":
         return "its link is lost"
@@ -114,13 +117,13 @@ def _busy(row: Mapping[str, Any]) -> str:
     return "" if row["lat_deg"] is not None else "it has no position"
 
 
-def _may_go_on(row: Mapping[str, Any]) -> bool:
+def _may_go_on(row: VehicleRow) -> bool:
     """Whether a vehicle is in the air in a state from which another mission can be begun."""
     ready = row["armed"] and row["state"] == "found" and row["flight"]["state"] in _ON_ITS_WAY
     return bool(ready and row["lat_deg"] is not None and row.get("home"))
 
 
-def _minutes(wanted: Any, known: Mapping[str, Mapping[str, Any]], in_air: Any) -> dict[str, float]:
+def _minutes(wanted: Any, known: Mapping[str, GapFlyer], in_air: Any) -> dict[str, float]:
     """Vehicle -> minutes that it can fly; for one in the air less the way from where it is to its home.
 
     Raises:
@@ -150,7 +153,8 @@ def _minutes(wanted: Any, known: Mapping[str, Mapping[str, Any]], in_air: Any) -
     return chosen
 
 
-def _home_min(row: Mapping[str, Any]) -> float:
+def _home_min(row: GapFlyer) -> float:
     """Minutes home from where a vehicle is."""
-    home_lat, home_lon = row["home"][:2]
-    return distance_m(row["lat_deg"], row["lon_deg"], home_lat, home_lon) / _HOME_M_S / 60.0
+    lat, lon, home = row["lat_deg"], row["lon_deg"], row["home"]
+    assert lat is not None and lon is not None and home is not None  # of one that may go on in the air
+    return distance_m(lat, lon, home[0], home[1]) / _HOME_M_S / 60.0

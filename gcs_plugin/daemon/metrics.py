@@ -5,6 +5,8 @@ import time
 from typing import Final
 
 from gcs_plugin.daemon.daemon import Daemon
+from gcs_plugin.daemon.store.frame_rows import stage_counts
+from gcs_plugin.daemon.store.job_rows import job_counts
 from orthoswarm import __version__
 from orthoswarm.compute.workers import peak_rss_mb
 
@@ -28,9 +30,11 @@ def prometheus(daemon: Daemon, uploads_waiting: int = 0) -> str:
     drawer = daemon.drawer
     metric("info", "gauge", "The program's version.", [({"version": __version__}, 1)])
     single("uptime_seconds", "gauge", "Since the daemon was started.", time.time() - daemon.started)
-    rows = daemon.journal.rows("SELECT stage, COUNT(*) AS n FROM frames GROUP BY stage")
-    metric("frames", "gauge", "Frames in the workspace by stage.", [({"stage": r["stage"]}, r["n"]) for r in rows])
-    single("frames_accepted_total", "counter", "Pictures accepted since the start.", sum(daemon.posted.values()))
+    stages = stage_counts(daemon.journal).items()
+    metric("frames", "gauge", "Frames in the workspace by stage.", [({"stage": stage}, n) for stage, n in stages])
+    single(
+        "frames_accepted_total", "counter", "Pictures accepted since the start.", sum(daemon.intake.accepted.values())
+    )
     single("frames_drawn_total", "counter", "Frames drawn in real time since the start.", drawer.drawn)
     single("frames_late_total", "counter", "Frames drawn later than a second after they came.", drawer.late)
     single("draw_backlog", "gauge", "Frames that wait to be drawn.", drawer.backlog)
@@ -46,9 +50,7 @@ def prometheus(daemon: Daemon, uploads_waiting: int = 0) -> str:
         "layer_version", "gauge", "Grows with every change of a layer.",
         [({"layer": name}, layer.version) for name, layer in daemon.layers.items()],
     )  # fmt: skip
-    counts: dict[tuple[str, str], int] = {}
-    for row in daemon.journal.rows("SELECT kind, state, COUNT(*) AS n FROM jobs GROUP BY kind, state"):
-        counts[row["kind"], row["state"]] = row["n"]
+    counts = job_counts(daemon.journal)
     metric("jobs", "gauge", "Jobs by kind and state.", [({"kind": k, "state": s}, n) for (k, s), n in counts.items()])
     single("journal_commits_total", "counter", "Commits since the start.", daemon.journal.commits)
     metric(
@@ -57,7 +59,10 @@ def prometheus(daemon: Daemon, uploads_waiting: int = 0) -> str:
     )  # fmt: skip
     single("uploads_waiting", "gauge", "Posted pictures that wait for their turn.", uploads_waiting)
     covered = daemon.coverage.document
-    shares = {name: covered[f"{name}_share"] for name in ("seen", "poor", "missed", "planned")}
+    shares = {
+        "seen": covered["seen_share"], "poor": covered["poor_share"], "missed": covered["missed_share"],
+        "planned": covered["planned_share"],
+    }  # fmt: skip
     metric(
         "coverage_share", "gauge", "Share of the planned area by state.",
         [({"state": name}, share) for name, share in shares.items() if share is not None],

@@ -1,12 +1,12 @@
 """The daemon's settings: from flags, and from `orthoswarm.toml` in its workspace."""
 
-import re
 import tomllib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
 from gcs_plugin.daemon.intake.can_reader import check_bus
+from gcs_plugin.daemon.vehicle_names import VehicleNames, system_in_name
 from orthoswarm.export.tactical.tak_sender import TakAddress
 from orthoswarm.model.errors import InputError
 
@@ -99,6 +99,16 @@ class Settings:
     tak: tuple[str, ...] = ()
     tak_certificate: Path | None = None
     tak_authority: Path | None = None
+
+    def names(self) -> VehicleNames:
+        """The vehicles' names."""
+        systems = {v.system: v.id for v in self.vehicles if v.system is not None}
+        return VehicleNames(systems, {v.id: v.name for v in self.vehicles})
+
+    def systems(self) -> dict[str, int]:
+        """The MAVLink system ids of the configured vehicles, by id; of those that have one."""
+        known = {v.id: v.system or system_in_name(v.id) for v in self.vehicles}
+        return {vehicle: system for vehicle, system in known.items() if system is not None}
 
     def tak_address(self, text: str) -> TakAddress:
         """A receiver of Cursor-on-Target events.
@@ -194,9 +204,3 @@ def _vehicle(entry: Any, path: Path) -> VehicleSettings:
         raise InputError(f"the system id of {entry['id']} in {path} is not 1 to 255; correct it")
     texts = (str(entry.get(key, "")) for key in ("name", "pictures", "can"))
     return VehicleSettings(entry["id"], system, *texts)
-
-
-def system_in_name(vehicle: str) -> int | None:
-    """The MAVLink system id that a vehicle's name stands for (v7: 7), None if it is no such name."""
-    found = re.fullmatch(r"v(\d{1,3})", vehicle)
-    return int(found[1]) if found and 1 <= int(found[1]) <= 255 else None

@@ -5,11 +5,14 @@ start can follow its check at once on a slow link too, where reading alone takes
 """
 
 import time
-from collections.abc import Callable, Collection, Mapping
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Collection, Mapping
+from functools import partial
+from typing import TYPE_CHECKING, Final, TypedDict, cast
 
 from gcs_plugin.config import COMMAND
 from gcs_plugin.daemon.airspace.fences import Fences
+from gcs_plugin.daemon.vehicle_names import VehicleNames
+from gcs_plugin.daemon.waiting_takeoffs import WaitingTakeoffs
 from gcs_plugin.mission.items import Mission
 from gcs_plugin.mission.plan_folder import NO_NEEDS, PlanNeeds
 
@@ -23,28 +26,28 @@ _CHECK_S: Final = 20.0
 _SETTINGS_S: Final = 5.0  # they are asked for thrice in less
 
 
-def red_items(row: Mapping[str, Any], allowed: Collection[str]) -> list[str]:
+class CheckRow(TypedDict):
+    """The check of a vehicle; a red item stops its start unless it is overridden by its name.
+
+    `items`: each with `name` (of `fleet.preflight.ITEMS`), `state` (ok, warning, red) and `reason`.
+    """
+
+    vehicle: str
+    state: str
+    items: list[dict[str, str]]
+
+
+def red_items(row: CheckRow, allowed: Collection[str]) -> list[str]:
     """The red items of a vehicle's row that are not allowed by name, in words."""
     red = [item for item in row["items"] if item["state"] == "red" and item["name"] not in allowed]
     return [f"{item['name']}: {item['reason']}" for item in red]
 
 
 class StartChecks:
-    """Checks vehicles before their start.
+    """Checks vehicles before their start."""
 
-    Args:
-        fleet: the vehicles. fences: theirs. name_of: id of a vehicle by its system id.
-        waiting: vehicle -> its takeoff that waits or failed, see `Takeoffs.rows`.
-    """
-
-    def __init__(
-        self,
-        fleet: "Fleet",
-        fences: Fences,
-        name_of: Callable[[int], str],
-        waiting: Callable[[], Mapping[str, Mapping[str, Any]]],
-    ) -> None:
-        self._fleet, self._fences, self._name_of, self._waiting = fleet, fences, name_of, waiting
+    def __init__(self, fleet: "Fleet", fences: Fences, names: VehicleNames, waiting: WaitingTakeoffs) -> None:
+        self._fleet, self._fences, self._names, self._waiting = fleet, fences, names, waiting
 
     def check(
         self,
@@ -54,16 +57,13 @@ class StartChecks:
         *,
         needs: PlanNeeds = NO_NEEDS,
         reread: bool = True,
-    ) -> list[dict[str, Any]]:
+    ) -> list[CheckRow]:
         """Check vehicles that are to start together; waits for their missions.
 
         Args:
             systems: their names by system id. missions: the plan's. starts: takeoffs in seconds after the first.
             needs: of the plan.
             reread: whether missions that are known and did not change are read all the same.
-
-        Returns:
-            A row per vehicle, see the top of `vehicles`.
         """
         from gcs_plugin.fleet.preflight import preflight_all
         from gcs_plugin.fleet.separation.separation_check import SeparationFindings
@@ -84,19 +84,19 @@ class StartChecks:
                 starts,
                 time.monotonic(),
                 needs=needs,
-                name=self._name_of,
+                name=self._names.name_of,
                 separation=separation,
                 zones=self._fences.zones(),
                 reading=[s for s in systems if self._fleet.reads(s)],
             )
         ).result(_CHECK_S)
-        return [check.document(systems[check.system]) for check in checks]
+        return [cast(CheckRow, check.document(systems[check.system])) for check in checks]
 
     def _hear_settings(self, systems: Collection[int]) -> None:
         """Wait for the settings, asked for again where not told: a lost packet must not let a vehicle start."""
         vehicles = {s: self._fleet.vehicles[s] for s in systems}
         again = [s for s, v in vehicles.items() if not v.lost and not v.answers_settings and v.untold]
-        for asked in [self._fleet.call(lambda s=system: self._fleet.ask_settings(s)) for system in again]:  # type: ignore[misc]
+        for asked in [self._fleet.call(partial(self._fleet.ask_settings, system)) for system in again]:
             asked.result(_SOON_S)
         end = time.monotonic() + _SETTINGS_S
         while any(v.answers_settings for v in vehicles.values() if not v.lost) and time.monotonic() < end:
@@ -114,9 +114,11 @@ class StartChecks:
         """How they keep apart from each other and from others, found in this thread: the links' must not wait."""
         from gcs_plugin.fleet.separation.separation_check import flights_of, others_of, separation_of
 
-        rows = self._waiting()
+        rows = self._waiting.rows()
         waits = {
-            s: rows[n]["in_s"] for s in list(self._fleet.vehicles) if "in_s" in rows.get(n := self._name_of(s), ())
+            s: rows[n]["in_s"]
+            for s in list(self._fleet.vehicles)
+            if "in_s" in rows.get(n := self._names.name_of(s), ())
         }
         flights = self._fleet.call(
             lambda: (
@@ -124,13 +126,13 @@ class StartChecks:
                 | flights_of({s: self._fleet.vehicles[s] for s in systems}, missions, stored, starts)
             )
         ).result(_CHECK_S)
-        return separation_of(flights, self._name_of, needs.apart)
+        return separation_of(flights, self._names.name_of, needs.apart)
 
     def _missions(self, systems: Collection[int], *, reread: bool) -> "dict[int, Mission]":
         """The missions that vehicles hold, read again where that was long ago; of those that answer in time."""
         vehicles, now = {s: self._fleet.vehicles[s] for s in systems}, time.monotonic()
         old = [s for s, v in vehicles.items() if v.mission is None or now - v.read_s > COMMAND.read_kept_s]
-        for begun in [self._fleet.call(lambda s=s: self._fleet.read_mission(s)) for s in old if reread]:  # type: ignore[misc]
+        for begun in [self._fleet.call(partial(self._fleet.read_mission, s)) for s in old if reread]:
             begun.result(_SOON_S)
         while any(self._fleet.reads(s) for s in old) and time.monotonic() < now + _READ_S:
             time.sleep(0.02)

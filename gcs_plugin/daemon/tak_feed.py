@@ -20,9 +20,6 @@ _log = logging.getLogger(__name__)
 class TakFeed:
     """Sends all vehicles every two seconds, and all finds when one is new or changed and every half minute.
 
-    Args:
-        addresses: the receivers. places: returns the present finds and vehicles.
-
     Attributes:
         problem: why a receiver gets nothing at present, else empty.
     """
@@ -34,8 +31,9 @@ class TakFeed:
         self.problem = ""
 
     def start(self) -> None:
-        """Start sending."""
-        self._thread.start()
+        """Start sending, if there is a receiver."""
+        if self._senders:
+            self._thread.start()
 
     def close(self) -> None:
         """Stop sending."""

@@ -9,10 +9,11 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Collection, Mapping
+from functools import partial
 from typing import Any, Final
 
 from gcs_plugin.config import COMMAND
-from gcs_plugin.daemon.start_checks import red_items
+from gcs_plugin.daemon.start_checks import CheckRow, red_items
 from gcs_plugin.daemon.vehicles import VehicleLinks
 from gcs_plugin.daemon.web_plans import Plans
 from gcs_plugin.fleet.commands import Order
@@ -29,38 +30,24 @@ _log = logging.getLogger(__name__)
 
 
 class Takeoffs:
-    """Starts the vehicles of one plan at a time.
+    """Starts the vehicles of one plan at a time."""
 
-    Args:
-        links: the vehicles. plans: of the workspace. say: called with problems. clock: monotonic seconds.
-    """
-
-    def __init__(
-        self, links: VehicleLinks, plans: Plans, say: Callable[[str], None], clock: Callable[[], float] = time.monotonic
-    ) -> None:
-        self._links, self._plans, self._say, self._clock = links, plans, say, clock
-        self._condition = threading.Condition()
-        self._schedule = TakeoffSchedule.of({}, clock())
-        self._names: dict[int, str] = {}
-        self._failed: dict[str, str] = {}
-        self._checking: frozenset[int] = frozenset()
+    def __init__(self, links: VehicleLinks, plans: Plans, say: Callable[[str], None]) -> None:
+        self._links, self._plans, self._say, self.waiting = links, plans, say, links.waiting
         self._stops: dict[int, int] = {}
         self._given_s: dict[int, float] = {}
         self._standing: dict[int, Standing] = {}
         self._missions: dict[int, Mission] = {}
         self._needs = NO_NEEDS
         self._allowed: dict[str, Collection[str]] = {}
-        self._about_to: set[int] = set()
         self._closed = False
-        links.cancel_takeoff, links.takeoffs = self.cancel, self.rows
-        links.fleet.takeoff_due = self._due
 
     def preflight(
         self,
         plan: str,
         sortie: int = 1,
         names: Mapping[str, str] | None = None,
-    ) -> list[dict[str, Any]]:
+    ) -> list[CheckRow]:
         """Check a plan's vehicles before their start.
 
         Args:
@@ -80,7 +67,7 @@ class Takeoffs:
         plan: str,
         sortie: int,
         names: Mapping[str, str] | None,
-    ) -> tuple[list[dict[str, Any]], dict[str, Mission]]:
+    ) -> tuple[list[CheckRow], dict[str, Mission]]:
         """The rows of `preflight`, and the plan's missions by vehicle."""
         starts = self._plans.starts(plan, sortie)
         whose = {vehicle: (names or {}).get(vehicle, vehicle) for vehicle in starts}
@@ -121,74 +108,47 @@ class Takeoffs:
                 vehicles was told to stop meanwhile, the check took so long that the start is too old, or it is no
                 longer wanted; none was started.
         """
-        given = self._clock() if given_s is None else min(given_s, self._clock())
+        given = time.monotonic() if given_s is None else min(given_s, time.monotonic())
         starts = self._plans.starts(plan, sortie)
         whose = {vehicle: (names or {}).get(vehicle, vehicle) for vehicle in starts}
-        with self._condition:
-            if self._schedule.waiting or self._checking or self._about_to:
+        with self.waiting.condition:
+            if self.waiting.are_under_way:
                 raise OrthoSwarmError("other takeoffs are under way; pause or rtl a waiting vehicle to cancel its own")
             systems = self._systems(whose)
-            self._checking, stops = frozenset(systems.values()), dict(self._links.fleet.stops)
+            self.waiting.checking, stops = frozenset(systems.values()), dict(self._links.fleet.stops)
             standing = {s: self._links.fleet.vehicles[s].standing for s in systems.values()}
         try:
             missions = self._ready(plan, sortie, names, override or {})
             first = min(starts.values())
             delays = {systems[vehicle]: start_s - first for vehicle, start_s in starts.items()}
             held = {s: self._links.fleet.vehicles[s].mission for s in delays}
-            schedule = TakeoffSchedule.of(delays, self._clock())
+            schedule = TakeoffSchedule.of(delays, time.monotonic())
             needs = self._plans.needs(plan)
-            with self._condition:
+            with self.waiting.condition:
                 if not wanted():
                     raise OrthoSwarmError("the start was cancelled; no vehicle was started")
                 self._still_wanted(given, stops)
-                self._failed.clear()
+                self.waiting.failed.clear()
                 self._standing = standing
                 self._stops, self._given_s = stops, {s: given for s, delay in delays.items() if delay <= 0.0}
-                self._names = {systems[vehicle]: whose[vehicle] for vehicle in starts}
+                self.waiting.vehicles = {systems[vehicle]: whose[vehicle] for vehicle in starts}
                 self._needs = needs
-                self._missions = {system: missions[self._names[system]] for system in systems.values()}
+                self._missions = {system: missions[self.waiting.vehicles[system]] for system in systems.values()}
                 self._allowed = dict(override or {})
-                self._schedule, self._checking = schedule, frozenset()
+                self.waiting.schedule, self.waiting.checking = schedule, frozenset()
         finally:
-            self._checking = frozenset()
+            self.waiting.checking = frozenset()
         threading.Thread(target=self._run, name="takeoffs", daemon=True).start()
         known = {s: mission for s, mission in held.items() if mission is not None}
         threading.Thread(target=self._follow, args=(schedule, known, delays), daemon=True).start()
         return {whose[vehicle]: round(start_s - first, 1) for vehicle, start_s in starts.items()}
 
-    def cancel(self, vehicle: str) -> str:
-        """Cancel a takeoff that waits or is being checked; returns that in words, empty if there was none.
-
-        `Fleet.told_to_stop` makes a start void that is being checked or about to be sent; it is told here again, since
-        a start whose check began after the first time would not see that.
-        """
-        with self._condition:
-            system = next((s for s in self._checking if self._links.name_of(s) == vehicle), None)
-            if system is not None:
-                self._links.fleet.told_to_stop(system)
-                return "the start that was being checked is cancelled"
-            system = next((s for s, name in self._names.items() if name == vehicle), None)
-            if system is not None and system in self._about_to:
-                self._links.fleet.told_to_stop(system)
-                return "its start, which was due now, is cancelled"
-            due = None if system is None else self._schedule.waiting.pop(system, None)
-            self._condition.notify_all()
-        return "" if due is None else f"its takeoff in {max(0.0, due - self._clock()):.0f} s is cancelled"
-
-    def rows(self) -> dict[str, dict[str, Any]]:
-        """Vehicle -> `in_s` of a waiting takeoff, or `failed` with the reason."""
-        now = self._clock()
-        with self._condition:
-            times = self._schedule.waiting.items()
-            waiting = {self._names[s]: {"in_s": round(max(0.0, due - now), 1)} for s, due in times}
-            return {v: {"failed": text} for v, text in self._failed.items()} | waiting
-
     def close(self) -> None:
         """Cancel all waiting takeoffs."""
-        with self._condition:
+        with self.waiting.condition:
             self._closed = True
-            self._schedule.waiting.clear()
-            self._condition.notify_all()
+            self.waiting.schedule.waiting.clear()
+            self.waiting.condition.notify_all()
 
     def _systems(self, whose: Mapping[str, str]) -> dict[str, int]:
         """System ids of the plan's vehicles.
@@ -207,11 +167,11 @@ class Takeoffs:
         Raises:
             OrthoSwarmError: the start is void.
         """
-        told = [s for s in sorted(self._checking) if self._links.fleet.stops.get(s, 0) != stops.get(s, 0)]
+        told = [s for s in sorted(self.waiting.checking) if self._links.fleet.stops.get(s, 0) != stops.get(s, 0)]
         if told:
             who = ", ".join(self._links.name_of(system) for system in told)
             raise OrthoSwarmError(f"{who} was told to stop during the check; no vehicle was started")
-        age_s = self._clock() - given_s
+        age_s = time.monotonic() - given_s
         if age_s > COMMAND.fresh_s:
             raise OrthoSwarmError(
                 f"the check took until {age_s:.0f} s after the start was given, so no vehicle was started; give it"
@@ -243,32 +203,28 @@ class Takeoffs:
             raise OrthoSwarmError(f"{'; '.join(wrong)}; no vehicle was started")
         return missions
 
-    def _due(self, system: int) -> bool:
-        """Whether a vehicle's takeoff waits or is being checked. Without the lock: the fleet's thread never waits."""
-        return system in self._checking or system in self._schedule.waiting or system in self._about_to
-
     def _follow(self, schedule: TakeoffSchedule, missions: Mapping[int, Mission], delays: Mapping[int, float]) -> None:
         """Give a schedule the airspace by which it moves takeoffs; beside it, as many vehicles take seconds."""
         airspace = Airspace.of(missions, apart=self._needs.apart).as_planned(delays)
-        with self._condition:
+        with self.waiting.condition:
             schedule.airspace = airspace
 
     def _run(self) -> None:
         """Start each at its time; ends with the last."""
         while True:
-            with self._condition:
-                due = self._schedule.next_s()
+            with self.waiting.condition:
+                due = self.waiting.schedule.next_s()
                 if due is None:
                     return
-                if due > self._clock():
-                    self._condition.wait(due - self._clock())
+                if due > time.monotonic():
+                    self.waiting.condition.wait(due - time.monotonic())
                     continue
-                ready = self._schedule.due(self._clock())
-                self._about_to.update(ready)
+                ready = self.waiting.schedule.due(time.monotonic())
+                self.waiting.about_to.update(ready)
                 if not ready:  # an earlier start is still undecided
-                    self._condition.wait(_LOOK_S)
+                    self.waiting.condition.wait(_LOOK_S)
             for system in ready:
-                threading.Thread(target=self._start, args=(self._names[system], system), daemon=True).start()
+                threading.Thread(target=self._start, args=(self.waiting.vehicles[system], system), daemon=True).start()
 
     def _start(self, vehicle: str, system: int) -> None:
         """Start one vehicle; if that fails, the waiting ones stay on the ground."""
@@ -276,12 +232,12 @@ class Takeoffs:
         try:
             red = self._red_now(vehicle, system)
             # A later one is given by its planned time: it has just been checked again.
-            order = Order(verb="start", system=system, given_s=self._clock() if given_s is None else given_s)
+            order = Order(verb="start", system=system, given_s=time.monotonic() if given_s is None else given_s)
             order.stops, order.standing, order.mission = stops, self._standing[system], self._missions[system]
             if red:
                 order.end(f"{vehicle} was not started: {red}", Verdict.NOT_SENT)
             else:
-                self._links.fleet.call(lambda: self._order(order))
+                self._links.fleet.call(partial(self._order, order))
             while order.outcome is None and not self._closed:
                 time.sleep(_LOOK_S)
         except Exception as error:  # the links are being closed, or do not answer: nobody else takes off then
@@ -290,13 +246,13 @@ class Takeoffs:
                 self._note(vehicle, system, Outcome(ok=False, text=f"{vehicle} could not be checked and started"))
             return
         finally:
-            self._about_to.discard(system)
+            self.waiting.about_to.discard(system)
         if order.outcome is not None and not self._closed:
             self._note(vehicle, system, order.outcome, order.begun_s)
 
     def _order(self, order: Order) -> None:
         """Send a start; in the fleet's thread, so that nobody finds it neither about to start nor under way."""
-        self._about_to.discard(order.system)
+        self.waiting.about_to.discard(order.system)
         self._links.fleet.order(order)
 
     def _red_now(self, vehicle: str, system: int) -> str:
@@ -310,17 +266,19 @@ class Takeoffs:
 
     def _note(self, vehicle: str, system: int, outcome: Outcome, begun_s: float | None = None) -> None:
         """Apply the outcome of one start to the waiting ones."""
-        with self._condition:
+        with self.waiting.condition:
             if outcome.ok:
-                said = self._schedule.started(system, self._clock(), self._names.__getitem__, begun_s)
+                said = self.waiting.schedule.started(
+                    system, time.monotonic(), self.waiting.vehicles.__getitem__, begun_s
+                )
             else:
-                self._failed[vehicle] = outcome.text
-                held = [self._names[waiter] for waiter in self._schedule.failed(system)]
+                self.waiting.failed[vehicle] = outcome.text
+                held = [self.waiting.vehicles[waiter] for waiter in self.waiting.schedule.failed(system)]
                 for name in held:
-                    self._failed[name] = f"held on the ground, because {vehicle} did not take off"
+                    self.waiting.failed[name] = f"held on the ground, because {vehicle} did not take off"
                 also = f"; {', '.join(held)} stay on the ground" if held else ""
                 said = [f"{vehicle} did not take off: {outcome.text}{also}"]
-            self._condition.notify_all()
+            self.waiting.condition.notify_all()
         for text in said:
             self._say(text)
 

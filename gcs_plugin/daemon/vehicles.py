@@ -1,45 +1,48 @@
-"""The vehicles on the daemon's links: their state and poses, their sorties, and the jobs after a completion.
+"""The vehicles on the daemon's links: their state and poses, their missions, commands to them, and their check.
 
-A fleet is polled by one thread. State that must survive a restart is written to the journal first, see
-`mission_journal`.
-
-For the HTTP API and the page, all in JSON values:
-
-- `commands(verb, vehicles)` gives a row a vehicle: `id`, `vehicle`, `command`, `outcome` (`done`, `refused`,
-  `not_sent`, `unknown`), `reason`. Verbs are those of `fleet.commands`; no vehicles named: all on the links at once.
-- `preflight(...)` gives a row a vehicle: `vehicle`, `state` and `items`, each with `name` (of
-  `fleet.preflight.ITEMS`), `state` (`ok`, `warning`, `red`) and `reason`. A red item stops `start` unless it is
-  overridden by its name.
-- `flight_state(vehicle)`, and `flight` in each row of `rows()`: `state` (`on ground`, `taking off`, `on mission`,
-  `paused`, `returning`, `landing`, `holding`, `flying`, `descending`, `lost`, `complete`), `text` (`on mission 7/13`),
-  `item` and `items`.
-- `alarm` in each row of `rows()`: what is wrong with how and where it flies, and what to do; empty if nothing is.
-- `behind` in each row of `rows()`: by how much it is behind its plan, in words; empty if it is not.
-- `fence` in each row of `rows()`: the geofence that the vehicle holds, see `Fences.of`.
-- `clock()` is the monotonic clock by which commands expire: a page that gets it from the event stream can state when
-  its command was given, so that a delayed one is not executed late.
+One thread polls the fleet. State that must survive a restart is written to the journal first, see `MissionJournal`.
+The HTTP API gets JSON values: of vehicles a `VehicleRow` each, of commands a `CommandResult.document`, of checks a
+`CheckRow`.
 """
 
 import logging
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, cast
 
 from gcs_plugin.daemon.airspace.fences import Fences
 from gcs_plugin.daemon.airspace.traffic import Traffic
-from gcs_plugin.daemon.jobs.job_queue import Jobs
-from gcs_plugin.daemon.mission_journal import MissionJournal
 from gcs_plugin.daemon.settings import Settings
-from gcs_plugin.daemon.start_checks import StartChecks, red_items
+from gcs_plugin.daemon.start_checks import CheckRow, StartChecks, red_items
+from gcs_plugin.daemon.store.daemon_events import (
+    CommandDone,
+    CompletionRefined,
+    JobEnded,
+    MissionNoted,
+    TrafficChanged,
+    VehicleChanged,
+    VehicleReported,
+)
 from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.journal import Journal
+from gcs_plugin.daemon.store.sortie_rows import (
+    completion_refined,
+    mission_noted,
+    sortie_given_up,
+    vehicle_found,
+    vehicle_state,
+)
+from gcs_plugin.daemon.vehicle_names import VehicleRow
+from gcs_plugin.daemon.waiting_takeoffs import WaitingTakeoffs
 from gcs_plugin.fleet.commands import CommandResult
 from gcs_plugin.fleet.separation.returns import Returns
-from gcs_plugin.fleet.separation.separation_watch import apart_text, near_text, number_name
+from gcs_plugin.fleet.separation.separation_watch import apart_text, near_text
+from gcs_plugin.mission.completion import CompletionDetector, Phase
 from gcs_plugin.mission.exchange import Verdict
 from gcs_plugin.mission.plan_folder import NO_NEEDS, PlanNeeds
 from orthoswarm.model.errors import InputError, OrthoSwarmError
@@ -61,7 +64,6 @@ _TRAIL: Final = 600  # positions of a vehicle on the page
 _MOST_TEXTS: Final = 50  # of a vehicle on the page
 _COMPLETE_EVERY: Final = 20  # looks after which all rows are sent, not only changed ones
 _FAULT: Final = 4  # MAV_SEVERITY_WARNING
-_REPLACED: Final = "dropped: the vehicle is complete, its refinement takes its place"
 _log = logging.getLogger(__name__)
 
 
@@ -77,6 +79,39 @@ class _VehicleRecord:
     lost_since: float | None = None
 
 
+class MissionJournal:
+    """The vehicles' missions in the journal: sorties, completions, and the states of the completion detectors.
+
+    A new sortie, a completion with the refinement that it requests, and the detector's state are written in one
+    transaction before they are acted on, so that a restart continues where the last daemon stopped.
+    """
+
+    def __init__(self, journal: Journal) -> None:
+        self._journal = journal
+
+    def found(self, vehicle: "Vehicle", name: str) -> None:
+        """Record a detected vehicle; its detector continues from the state stored by an earlier daemon."""
+        detector = vehicle_state(self._journal, name).get("detector")
+        if detector and detector.get("autopilot") == vehicle.autopilot.value:
+            try:
+                vehicle.detector = CompletionDetector.from_state(detector)
+            except (KeyError, TypeError, ValueError):  # of another version
+                _log.warning("%s: what was known about its mission cannot be read", name)
+        self._journal.write(vehicle_found(name))
+
+    def note(self, event: "FleetEvent", vehicle: "Vehicle", name: str, still_flying: Sequence[str]) -> None:
+        """Write a mission's event (started, complete, aborted, suspended, resumed).
+
+        A start after a flight opens a sortie; a completion requests the refinement of its sortie.
+        """
+        completion = {"complete_s": event.time_s, "still_flying": list(still_flying)}
+        self._journal.write(mission_noted(name, event.kind, vehicle.detector.state(), completion))
+
+    def give_up(self, name: str) -> bool:
+        """Request the refinement of a silent vehicle's incomplete sortie; False if it sent no picture."""
+        return bool(self._journal.write(sortie_given_up(name)))
+
+
 class VehicleLinks:
     """The daemon's fleet.
 
@@ -84,13 +119,10 @@ class VehicleLinks:
         fleet: its vehicles and links.
         traffic: other aircraft that vehicles have heard of.
         latest: the rows of `rows`, at most half a second old.
-        cancel_takeoff: cancels a takeoff that waits or is being checked; returns what it did in words, or "".
-        takeoffs: vehicle -> its takeoff that waits or failed, see `Takeoffs.rows`.
+        waiting: the takeoffs that wait, or are being checked.
     """
 
-    def __init__(
-        self, settings: Settings, journal: Journal, events: Events, jobs: Jobs, poses: "LinkPoses | None" = None
-    ) -> None:
+    def __init__(self, settings: Settings, journal: Journal, events: Events, poses: LinkPoses) -> None:
         """Open the links; the vehicles' poses are stored in `poses`, by their ids.
 
         Raises:
@@ -99,23 +131,22 @@ class VehicleLinks:
         from gcs_plugin.fleet.fleet import Fleet
         from gcs_plugin.links.signing import find_key
 
-        self._settings, self._events, self._jobs = settings, events, jobs
-        self._missions = MissionJournal(journal)
-        self._titles = {v.id: v.name for v in settings.vehicles}
-        self._names = {v.system: v.id for v in settings.vehicles if v.system is not None}
+        self._settings, self._events, self._journal = settings, events, journal
+        self._missions, self.names = MissionJournal(journal), settings.names()
         self._records: dict[int, _VehicleRecord] = {}
-        self._poses = LinkPoses() if poses is None else poses
+        self._poses = poses
         self._stop, self._silent = threading.Event(), threading.Event()
-        self.latest: list[dict[str, Any]] = []
-        self.cancel_takeoff: Callable[[str], str] = lambda _: ""
+        self.latest: list[VehicleRow] = []
         self._starting = Counter[int]()
-        self.takeoffs: Callable[[], Mapping[str, dict[str, Any]]] = dict
-        self.fleet: Fleet = Fleet(settings.links, key=find_key(), tlog=settings.workspace / "telemetry.tlog")
+        log = settings.workspace / "telemetry.tlog" if settings.links else None
+        self.fleet: Fleet = Fleet(settings.links, key=find_key() if settings.links else None, tlog=log)
         self.fleet.on_event(self._event)
         self.fleet.subscribe(self._message)
         self._fences = Fences(self.fleet)
-        self._checks = StartChecks(self.fleet, self._fences, self.name_of, lambda: self.takeoffs())
-        self._returns = Returns(self.fleet, self._give, lambda row: events.publish("command", **row), self.name_of)
+        self.waiting = WaitingTakeoffs(self.fleet, self.names)
+        self.fleet.takeoff_due = self.waiting.is_due
+        self._checks = StartChecks(self.fleet, self._fences, self.names, self.waiting)
+        self._returns = Returns(self.fleet, self._give, self._tell_command, self.names.name_of)
         self.traffic = Traffic()
         self.fleet.subscribe(self.traffic.heard, "ADSB_VEHICLE")
         self._threads = [  # with what ends them: first the one that asks the links
@@ -140,11 +171,8 @@ class VehicleLinks:
     # -- queries ------------------------------------------------------------------------------------------
 
     def name_of(self, system: int) -> str:
-        """The id of a vehicle with a MAVLink system id; no two have the same."""
-        name = number_name(system)
-        if system not in self._names and name in self._names.values():  # the name of another system id
-            return f"system-{system}"
-        return self._names.get(system, name)
+        """The id of a vehicle with a MAVLink system id."""
+        return self.names.name_of(system)
 
     def system_of(self, vehicle: str) -> int:
         """The MAVLink system id of a vehicle, by its id or that number.
@@ -170,26 +198,24 @@ class VehicleLinks:
         """The autopilot of each vehicle that was heard, by id."""
         return {self.name_of(system): v.autopilot.value for system, v in list(self.fleet.vehicles.items())}
 
-    def rows(self) -> list[dict[str, Any]]:
-        """All vehicles on the links as JSON values.
+    def rows(self) -> list[VehicleRow]:
+        """All vehicles on the links as JSON values."""
 
-        `takeoff` of each is None where none waits or failed; `returns_after` names those that it waits for until it
-        returns, None where it does not wait.
-        """
-
-        def collect() -> list[dict[str, Any]]:
+        def collect() -> list[VehicleRow]:
             now = time.monotonic()
             return [self._row(vehicle, now) for _, vehicle in sorted(self.fleet.vehicles.items())]
 
-        takeoffs, returns = self.takeoffs(), self._returns.waits()
-        return [
-            row | {"takeoff": takeoffs.get(row["id"]), "returns_after": returns.get(row["id"])}
-            for row in self.fleet.call(collect).result(5.0)
-        ]
+        if not self.fleet.vehicles:
+            return []
+        takeoffs, returns = self.waiting.rows(), self._returns.waits()
+        rows = self.fleet.call(collect).result(5.0)
+        for row in rows:
+            row["takeoff"], row["returns_after"] = takeoffs.get(row["id"]), returns.get(row["id"])
+        return rows
 
     @staticmethod
     def clock() -> float:
-        """Monotonic seconds, by which commands expire."""
+        """Monotonic seconds, by which commands expire: a page that has them says when its command was given."""
         return time.monotonic()
 
     def flight_state(self, vehicle: str) -> dict[str, Any]:
@@ -201,7 +227,7 @@ class VehicleLinks:
         from gcs_plugin.fleet.flight_state import flight_state
 
         known = self.fleet.vehicles[self.system_of(vehicle)]
-        return self.fleet.call(lambda: flight_state(known).document()).result(_SOON_S)
+        return self.fleet.call(partial(flight_state, known)).result(_SOON_S).document()
 
     def commands(
         self,
@@ -222,7 +248,7 @@ class VehicleLinks:
             override: names of red preflight items that do not stop a start, by vehicle.
 
         Returns:
-            A row per vehicle, see the top of this module.
+            A row per vehicle: `id`, `vehicle`, `command`, `reason`, `outcome` (done, refused, not_sent, unknown).
 
         Raises:
             InputError: there is no such command.
@@ -261,7 +287,7 @@ class VehicleLinks:
             for name, s in systems.items()
         }  # fmt: skip
         for order in orders.values():
-            self.fleet.call(lambda o=order: self.fleet.order(o))  # type: ignore[misc]
+            self.fleet.call(partial(self.fleet.order, order))
         end = time.monotonic() + _OUTCOME_S
         while any(order.outcome is None for order in orders.values()) and not self._stop.is_set():
             if time.monotonic() > end:
@@ -278,11 +304,8 @@ class VehicleLinks:
     def return_in_turn(self, command_id: str | None = None) -> list[dict[str, Any]]:
         """Return all vehicles on the links, those whose ways home come near each other one after the other.
 
-        Args:
-            command_id: id of the command; a new one by default.
-
         Returns:
-            A row per vehicle, see the top of this module; one that holds until its turn comes has done as it was told.
+            A row per vehicle, see `commands`; one that holds until its turn comes has done as it was told.
         """
         from gcs_plugin.fleet.commands import new_id
 
@@ -312,7 +335,7 @@ class VehicleLinks:
                 checked = "its start is cancelled" if self._starting[systems[name]] else ""
                 if checked:
                     self.fleet.told_to_stop(systems[name])  # again, for a check that began after the first time
-                cancelled = self.cancel_takeoff(name) or checked
+                cancelled = self.waiting.cancel(name) or checked
                 under_way = self.fleet.vehicles[systems[name]].armed or self.fleet.starting(systems[name])
                 if cancelled and not under_way:
                     end(name, Verdict.DONE, f"{name} stays on the ground: {cancelled}")
@@ -327,7 +350,7 @@ class VehicleLinks:
                     del systems[row["vehicle"]]
         return rows, systems
 
-    def _checked(self, systems: Mapping[str, int]) -> list[dict[str, Any]]:
+    def _checked(self, systems: Mapping[str, int]) -> list[CheckRow]:
         """The check of vehicles that are to start now; a command to stop that comes meanwhile finds them starting."""
         self._starting.update(systems.values())
         try:
@@ -343,7 +366,7 @@ class VehicleLinks:
         starts: Mapping[str, float] | None = None,
         needs: PlanNeeds = NO_NEEDS,
         reread: bool = True,
-    ) -> list[dict[str, Any]]:
+    ) -> list[CheckRow]:
         """Check vehicles before their start; their missions are read from them first.
 
         Args:
@@ -352,9 +375,6 @@ class VehicleLinks:
             starts: takeoff of each in seconds after the first; default all at once.
             needs: of the plan.
             reread: whether missions are read although they were read or written before and nothing changed them since.
-
-        Returns:
-            A row per vehicle, see the top of this module.
 
         Raises:
             OrthoSwarmError: a vehicle was not heard on any link.
@@ -371,7 +391,7 @@ class VehicleLinks:
         Raises:
             OrthoSwarmError: the vehicle refused, or did not answer.
         """
-        dialogue = self.fleet.call(lambda: begin(self.fleet)).result(10.0)
+        dialogue = self.fleet.call(partial(begin, self.fleet)).result(10.0)
         end = time.monotonic() + timeout_s
         while dialogue.outcome is None:
             if time.monotonic() > end or self._stop.is_set():
@@ -380,6 +400,24 @@ class VehicleLinks:
         if not dialogue.outcome.ok:
             raise OrthoSwarmError(dialogue.outcome.text)
         return dialogue.outcome.text
+
+    def job_ended(self, event: JobEnded) -> None:
+        """Record what the refinement after a completion came to, and who still flew then."""
+        job = event.job
+        refined = job.kind == "refine" and job.state == "done" and job.vehicle is not None
+        if not refined or "published_s" not in job.detail or "beside" in job.detail:
+            return
+        facts = {
+            "refine_started_s": job.detail["refine_started_s"], "refine_ended_s": job.detail["published_s"],
+            "layer": job.detail["layer"], "version_before": job.detail["version_before"],
+            "version": job.detail["version"], "frames": job.detail["frames"],
+            "still_flying_after": [r["id"] for r in self.rows() if r["mission"]["phase"] == "active"],
+        }  # fmt: skip
+        self._journal.write(completion_refined(job.whose, facts))
+        self._events.publish(CompletionRefined({"vehicle": job.vehicle, "sortie": job.sortie, **facts}))
+
+    def _tell_command(self, row: dict[str, Any]) -> None:
+        self._events.publish(CommandDone(row))
 
     # -- what vehicles say (in the fleet's thread) ------------------------------------------------------------------
 
@@ -402,12 +440,12 @@ class VehicleLinks:
                 self._missions.found(vehicle, name)
             elif event.kind in ("started", "complete", "aborted", "suspended", "resumed"):
                 flying = [
-                    self.name_of(s) for s, v in sorted(self.fleet.vehicles.items()) if s != event.system and _flies(v)
+                    self.name_of(s)
+                    for s, v in sorted(self.fleet.vehicles.items())
+                    if s != event.system and (v.detector.phase is Phase.ACTIVE or v.flying) and not v.lost
                 ]
                 self._missions.note(event, vehicle, name, flying)
-                if event.kind == "complete":
-                    self._jobs.drop("coarse", name, _REPLACED)
-                self._jobs.wake()
+                self._events.publish(MissionNoted(name, event.kind))
         except OrthoSwarmError as error:  # the disk is full: flying goes on
             _log.error("%s", error)
         record.lost_since = time.monotonic() if event.kind == "lost" else None
@@ -420,7 +458,7 @@ class VehicleLinks:
         grave = event.kind == "danger" or event.severity <= _FAULT
         if grave or event.kind != "text":
             _log.log(logging.WARNING if grave else logging.INFO, "%s", text)
-        self._events.publish("vehicle_event", **about)
+        self._events.publish(VehicleReported(about))
 
     def _words(self, event: "FleetEvent") -> str:
         """An event in words; one about two vehicles names them as the operator does."""
@@ -428,9 +466,9 @@ class VehicleLinks:
             return event.text
         near = self.fleet.separation.alarms.get(event.pair)
         return (
-            apart_text(event.pair, self.name_of)
+            apart_text(event.pair, self.names.name_of)
             if near is None
-            else near_text(near, self.fleet.separation, self.name_of)
+            else near_text(near, self.fleet.separation, self.names.name_of)
         )
 
     # -- what time asks for -----------------------------------------------------------------------------------------
@@ -443,7 +481,7 @@ class VehicleLinks:
                 self.fleet.call(self._fences.look).result(_SOON_S)
                 self._publish_rows(complete=number % _COMPLETE_EVERY == 0)
                 if self.traffic.changed():
-                    self._events.publish("traffic", rows=self.traffic.rows())
+                    self._events.publish(TrafficChanged(self.traffic.rows()))
                 self._give_up_silent()
             except Exception as error:  # an unexpected state of one vehicle must not end the watch
                 _log.warning("watching vehicles: %s", str(error) or type(error).__name__)
@@ -459,26 +497,29 @@ class VehicleLinks:
             now = {k: v for k, v in row.items() if k not in ("trail", "texts")}
             fresh = now if complete else {k: v for k, v in now.items() if k not in sent or sent[k] != v}
             sent.update(now)
-            always = {key: row[key] for key in ("id", "name", "silent_s")}
-            self._events.publish("vehicle", **fresh | always)
+            always = {"id": row["id"], "name": row["name"], "silent_s": row["silent_s"]}
+            self._events.publish(VehicleChanged(fresh | always))
 
     def _give_up_silent(self) -> None:
         """Refine the incomplete sortie of a vehicle that has been silent for long during its mission."""
         for system, record in list(self._records.items()):
             vehicle = self.fleet.vehicles[system]
             since = record.lost_since
-            if since is None or time.monotonic() - since < self._settings.lost_after_s or not _under_way(vehicle):
+            if since is None or time.monotonic() - since < self._settings.lost_after_s:
+                continue
+            if vehicle.detector.phase not in (Phase.ACTIVE, Phase.SUSPENDED):
                 continue
             given_up = self._missions.give_up(record.id)
             record.lost_since = None  # after that: if the disk is full, it is tried again
             if given_up:
                 _log.info("%s has been silent for long; what it sent is refined", record.id)
-                self._jobs.wake()
+                self._events.publish(MissionNoted(record.id, "lost"))
 
-    def _row(self, vehicle: "Vehicle", now: float) -> dict[str, Any]:
+    def _row(self, vehicle: "Vehicle", now: float) -> VehicleRow:
         record = self._record(vehicle.system)
-        row = vehicle.summary(now) | {"id": record.id, "name": self._titles.get(record.id, "")}
-        near = self.fleet.separation.text(vehicle.system, self.name_of)
+        row = cast(VehicleRow, vehicle.summary(now))
+        row["id"], row["name"] = record.id, self.names.title_of(record.id)
+        near = self.fleet.separation.text(vehicle.system, self.names.name_of)
         row["alarm"] = "; ".join(text for text in (near, vehicle.danger and f"{record.id} {vehicle.danger}") if text)
         row["behind"] = self.fleet.behind(vehicle.system)
         row["yaw_deg"] = row["heading_deg"]
@@ -490,15 +531,3 @@ class VehicleLinks:
         row["fence"] = self._fences.of(vehicle.system)
         row["trail"], row["texts"] = record.trail[-_TRAIL:], list(record.texts)
         return row
-
-
-def _under_way(vehicle: "Vehicle") -> bool:
-    from gcs_plugin.mission.completion import Phase
-
-    return vehicle.detector.phase in (Phase.ACTIVE, Phase.SUSPENDED)
-
-
-def _flies(vehicle: "Vehicle") -> bool:
-    from gcs_plugin.mission.completion import Phase
-
-    return (vehicle.detector.phase is Phase.ACTIVE or vehicle.flying) and not vehicle.lost

@@ -5,11 +5,11 @@ import json
 import re
 import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
 from gcs_plugin.links.mavlink import Autopilot
@@ -36,23 +36,26 @@ Place = tuple[float, float]
 """Latitude and longitude in degrees."""
 
 
+class PlannedVehicles(Protocol):
+    """The vehicles on the links."""
+
+    def autopilots(self) -> Mapping[str, str]:
+        """The autopilot of each, by id."""
+
+    def standing(self) -> Mapping[str, Place | str]:
+        """Where each stands, or why that is not known, in words."""
+
+
 class Plans:
     """The plans of a workspace.
 
     Args:
         folder: of all plans. dem: height model that they follow, None for level ground.
-        autopilots: of the vehicles on the links, by id; a plan is made for these unless its request names others.
-        standing: where these stand (latitude and longitude in degrees), or why that is not known, in words.
+        vehicles: on the links; a plan is made for these unless its request names others.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        dem: Path | None = None,
-        autopilots: Callable[[], Mapping[str, str]] = dict,
-        standing: Callable[[], Mapping[str, Place | str]] = dict,
-    ) -> None:
-        self.folder, self.dem, self._autopilots, self._standing = folder, dem, autopilots, standing
+    def __init__(self, folder: Path, dem: Path | None, vehicles: PlannedVehicles) -> None:
+        self.folder, self.dem, self._vehicles = folder, dem, vehicles
         self._bounds: tuple[Path, GeographicBounds] | None = None
 
     def make(self, body: Mapping[str, Any]) -> dict[str, Any]:
@@ -76,7 +79,7 @@ class Plans:
 
     def autopilots_of(self, vehicles: Sequence[str]) -> list[str]:
         """The autopilots of vehicles; ArduPilot for those that were not heard."""
-        known = self._autopilots()
+        known = self._vehicles.autopilots()
         return [known.get(vehicle, "ardupilot") for vehicle in vehicles]
 
     def _starts(self, vehicles: Sequence[str]) -> tuple[list[Place], list[str]]:
@@ -84,7 +87,7 @@ class Plans:
 
         Without vehicles on the links there is nothing to warn of: who flies the plan is not known.
         """
-        known = self._standing()
+        known = self._vehicles.standing()
         places = [known.get(vehicle, "not on the links") for vehicle in vehicles] if known else []
         unknown: dict[str, list[str]] = {}
         for vehicle, place in zip(vehicles, places, strict=False):
@@ -185,8 +188,7 @@ class Plans:
         Raises:
             InputError: there is no such plan or flight.
         """
-        figures = json.loads((self._path(name) / "plan.json").read_text(encoding="utf-8"))
-        flights = {v["id"]: v["flights"] for v in figures["vehicles"]}
+        flights = self._flights(name)
         starts = {v: float(rows[sortie - 1]["start_s"]) for v, rows in flights.items() if len(rows) >= sortie}
         if not starts:
             most = max(len(rows) for rows in flights.values())
@@ -199,12 +201,15 @@ class Plans:
         Raises:
             InputError: there is no such plan.
         """
-        figures = json.loads((self._path(name) / "plan.json").read_text(encoding="utf-8"))
-        rows = {v["id"]: v["flights"][sortie - 1] for v in figures["vehicles"] if len(v["flights"]) >= sortie}
+        rows = {v: flights[sortie - 1] for v, flights in self._flights(name).items() if len(flights) >= sortie}
         return {
             vehicle: {"start_s": row["start_s"], "time_s": row["time_s"], "height_m": row["takeoff_height_m"]}
             for vehicle, row in rows.items()
         }
+
+    def _flights(self, name: Any) -> dict[str, list[dict[str, Any]]]:
+        figures = json.loads((self._path(name) / "plan.json").read_text(encoding="utf-8"))
+        return {vehicle["id"]: vehicle["flights"] for vehicle in figures["vehicles"]}
 
     def needs(self, name: Any) -> PlanNeeds:
         """What a plan relies on.

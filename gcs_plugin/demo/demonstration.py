@@ -189,7 +189,6 @@ class Served:
 def _fly(daemon: "Daemon", setting: DemoSetting, report: ReportProgress) -> None:
     """Plan, upload, start one after the other, and wait until all have completed."""
     links = daemon.links
-    assert links is not None
     _wait(lambda: sum(row["lat_deg"] is not None for row in links.rows()) == setting.vehicles, 60.0, "the vehicles")
     report("planning", 0, 1)
     starts = [[row["lat_deg"], row["lon_deg"]] for row in links.rows()]
@@ -215,7 +214,7 @@ def _fly(daemon: "Daemon", setting: DemoSetting, report: ReportProgress) -> None
 
     def done() -> bool:
         report("flying: pictures on the map", min(daemon.drawer.drawn, photos), photos)
-        return len(daemon.completions()) >= setting.vehicles
+        return len(daemon.views.completions()) >= setting.vehicles
 
     _wait(done, _MOST_S, "the missions' completion")
     report("flying: pictures on the map", photos, photos)
@@ -225,7 +224,7 @@ def _finish(daemon: "Daemon", report: ReportProgress) -> None:
     """Wait until every completion's refinement is on the map, and the products are written."""
 
     def refined() -> bool:
-        rows = daemon.completions()
+        rows = daemon.views.completions()
         report("refining", sum("version" in row for row in rows), len(rows))
         failed = [job for job in daemon.jobs.all() if job.state == "failed" and job.kind != "coarse"]
         if failed:
@@ -234,7 +233,7 @@ def _finish(daemon: "Daemon", report: ReportProgress) -> None:
 
     _wait(refined, 300.0, "the refinement")
     report("products", 0, 1)
-    job = daemon.export(["cog", "gpkg", "mbtiles", "kmz"])
+    job = daemon.requests.export(["cog", "gpkg", "mbtiles", "kmz"])
     _wait(
         lambda: (found := daemon.jobs.find(job.id)) is not None and found.state in ("done", "failed"), 300.0, "export"
     )

@@ -67,9 +67,7 @@ class CoverageRoutes:
 
         `requests`: the pictures that were asked from vehicles, each with `state`, `reason`, `percent`.
         """
-        requests = self._daemon.picture_requests
-        asked = [] if requests is None else requests.rows()
-        return JsonAnswer(self._daemon.coverage.document | {"requests": asked})
+        return JsonAnswer(self._daemon.coverage.document | {"requests": self._daemon.picture_requests.rows()})
 
     async def gaps(self) -> Response:
         """The gaps as GeoJSON, as `orthoswarm coverage` writes them; `orthoswarm plan --gaps` reads them."""
@@ -130,12 +128,11 @@ class HttpRoutes:
 
     async def vehicles(self) -> Response:
         """Every vehicle that was heard on a link or sent pictures."""
-        return JsonAnswer(await self.work(self.daemon.vehicles))
+        return JsonAnswer(await self.work(self.daemon.views.vehicles))
 
     async def traffic(self) -> Response:
         """Other aircraft that the vehicles' ADS-B receivers hear."""
-        links = self.daemon.links
-        return JsonAnswer([] if links is None else await self.work(links.traffic.rows))
+        return JsonAnswer(await self.work(self.daemon.links.traffic.rows))
 
     async def frames(
         self,
@@ -146,12 +143,12 @@ class HttpRoutes:
         """Frames in the order of their arrival."""
         moment = None if since is None else await self.work(_moment, since)
         most = None if limit is None else min(limit, 2**62)  # larger ones do not fit the journal's integers
-        rows = await self.work(self.daemon.frames, vehicle, moment, most)
+        rows = await self.work(self.daemon.views.frames, vehicle, moment, most)
         return JsonAnswer(rows)
 
     async def layers(self) -> Response:
         """Layers with versions, bounds (west, south, east, north in degrees) and tile addresses."""
-        return JsonAnswer(await self.work(self.daemon.layer_rows))
+        return JsonAnswer(await self.work(self.daemon.views.layers))
 
     async def jobs(self) -> Response:
         """The latest jobs, oldest first."""
@@ -177,7 +174,7 @@ class HttpRoutes:
         vehicle = body.get("vehicle")
         if vehicle is not None and not isinstance(vehicle, str):
             raise HTTPException(422, "vehicle is not text; send the id of a vehicle, or nothing for all")
-        jobs = await self.work(self.daemon.refine, vehicle)
+        jobs = await self.work(self.daemon.requests.refine, vehicle)
         return JsonAnswer([job.document() for job in jobs], status_code=202)
 
     async def export(self, request: Request) -> Response:
@@ -186,7 +183,7 @@ class HttpRoutes:
         formats = body.get("formats", ["cog", "gpkg"])
         if not isinstance(formats, list) or not all(isinstance(name, str) for name in formats):
             raise HTTPException(422, 'formats is not a list of texts; send for example ["mbtiles", "kmz"]')
-        job = await self.work(self.daemon.export, formats)
+        job = await self.work(self.daemon.requests.export, formats)
         return JsonAnswer(job.document(), status_code=202)
 
     async def exported(self, job: int, kind: str) -> Response:
@@ -208,11 +205,11 @@ class HttpRoutes:
 
     async def legs(self) -> Response:
         """The legs of refined vehicles as GeoJSON, with state (matched, carried, failed)."""
-        return JsonAnswer(await self.work(self.daemon.legs))
+        return JsonAnswer(await self.work(self.daemon.views.legs))
 
     async def completions(self) -> Response:
         """Times of vehicles' completions and of their refinements, and the vehicles still flying then."""
-        return JsonAnswer(await self.work(self.daemon.completions))
+        return JsonAnswer(await self.work(self.daemon.views.completions))
 
     async def plan(self, request: Request) -> Response:
         """Plan missions for {"area": GeoJSON, "vehicles": N, "altitude_m": M, "fov_min_deg": D, ...}."""

@@ -21,6 +21,7 @@ from fastapi import HTTPException, Request, Response
 
 from gcs_plugin.config import COMMAND
 from gcs_plugin.daemon.daemon import Daemon
+from gcs_plugin.daemon.store.daemon_events import CommandDone
 from gcs_plugin.daemon.takeoffs import Takeoffs, names_of
 from gcs_plugin.daemon.vehicles import VehicleLinks
 from gcs_plugin.fleet.commands import URGENT, VERBS, CommandResult, new_id
@@ -92,10 +93,11 @@ class CommandRoutes:
         if vehicle == ALL and verb not in _ALL_VERBS:
             raise HTTPException(404, f"all vehicles at once can {', '.join(_ALL_VERBS)}; start a plan, or one vehicle")
         body = await json_body(request)
-        links, issue = self._links(), self._issue(body)
+        self._require_links()
+        issue = self._issue(body)
         task = self._known_task(issue.id, (vehicle, verb))
         if task is None:
-            task = asyncio.ensure_future(in_thread(self._threads, self._carry_out, links, vehicle, verb, issue, body))
+            task = asyncio.ensure_future(in_thread(self._threads, self._carry_out, vehicle, verb, issue, body))
             self._remember(issue.id, (vehicle, verb), task)
         rows = await asyncio.shield(task)
         return JsonAnswer({"id": issue.id, "results": rows} if vehicle == ALL else rows[0])
@@ -131,10 +133,9 @@ class CommandRoutes:
             return Issue(number, -math.inf)  # given to a run of the daemon that has ended
         return Issue(number, now - self._standstill.length_s())
 
-    def _carry_out(
-        self, links: VehicleLinks, vehicle: str, verb: str, issue: Issue, body: dict[str, Any]
-    ) -> Rows:  # fmt: skip
+    def _carry_out(self, vehicle: str, verb: str, issue: Issue, body: dict[str, Any]) -> Rows:
         """Execute a command and publish its outcome; runs in a thread."""
+        links = self._daemon.links
         names = _names(links) if vehicle == ALL else [vehicle]
         late = _late(issue, verb)
         if late is not None:
@@ -142,16 +143,18 @@ class CommandRoutes:
         elif verb == RETURN_VERB:
             rows = links.return_in_turn(command_id=issue.id)
         elif verb == "upload":
-            rows = [self._upload(links, vehicle, issue, body)]
+            rows = [self._upload(vehicle, issue, body)]
         else:
             override = _override(body, vehicle)
             began = links.clock() - max(0.0, issue.age_s)
             rows = links.commands(verb, names, given_s=began, command_id=issue.id, override=override)
         for row in rows:
-            self._daemon.events.publish("command", **row)
+            self._daemon.events.publish(CommandDone(row))
         return rows
 
-    def _upload(self, links: VehicleLinks, vehicle: str, issue: Issue, body: dict[str, Any]) -> dict[str, Any]:
+    def _upload(self, vehicle: str, issue: Issue, body: dict[str, Any]) -> dict[str, Any]:
+        links = self._daemon.links
+
         def result(outcome: Verdict, reason: str) -> dict[str, Any]:
             return CommandResult(issue.id, vehicle, "upload", outcome, reason).document()
 
@@ -174,9 +177,9 @@ class CommandRoutes:
         `reason`), and the plan's `start_s`, `height_m` and `time_s`.
         """
         body = await json_body(request)
-        takeoffs = self._takeoffs()
+        self._require_links()
         sortie, names = names_of(body)
-        rows = await in_thread(self._threads, takeoffs.preflight, number, sortie, names)
+        rows = await in_thread(self._threads, self._daemon.takeoffs.preflight, number, sortie, names)
         flights = await in_thread(self._threads, self._daemon.plans.flights, number, sortie)
         about = {names.get(vehicle, vehicle): flight for vehicle, flight in flights.items()}
         checks = [row | about.get(row["vehicle"], {}) for row in rows]
@@ -191,12 +194,13 @@ class CommandRoutes:
         which the answer was lost can ask again.
         """
         body = await json_body(request)
-        takeoffs, issue, what = self._takeoffs(), self._issue(body), (number, _PLAN)
+        self._require_links()
+        issue, what = self._issue(body), (number, _PLAN)
         sortie, names = names_of(body)
         task = self._known_task(issue.id, what)
         if task is None:
             begin = partial(
-                _begin, takeoffs, issue, number,
+                _begin, self._daemon.takeoffs, issue, number,
                 sortie=sortie, names=names, override=_override(body, ALL),
                 wanted=lambda: issue.id not in self._cancelled,
             )  # fmt: skip
@@ -212,7 +216,7 @@ class CommandRoutes:
         if no vehicle was started.
         """
         issue = self._issue(await json_body(request))
-        links = self._links()
+        self._require_links()
         self._cancelled[issue.id] = None
         while len(self._cancelled) > _REMEMBERED:
             self._cancelled.popitem(last=False)
@@ -225,24 +229,18 @@ class CommandRoutes:
                 seconds = {}
             if seconds:
                 pause = Issue(f"{issue.id}-cancelled", clock_with_sleep())
-                rows = await in_thread(self._threads, self._pause, links, list(seconds), pause)
+                rows = await in_thread(self._threads, self._pause, list(seconds), pause)
         return JsonAnswer({"plan": number, "results": rows})
 
-    def _pause(self, links: VehicleLinks, vehicles: list[str], issue: Issue) -> Rows:
-        rows = links.commands("pause", vehicles, command_id=issue.id)
+    def _pause(self, vehicles: list[str], issue: Issue) -> Rows:
+        rows = self._daemon.links.commands("pause", vehicles, command_id=issue.id)
         for row in rows:
-            self._daemon.events.publish("command", **row)
+            self._daemon.events.publish(CommandDone(row))
         return rows
 
-    def _links(self) -> VehicleLinks:
-        if self._daemon.links is None:
+    def _require_links(self) -> None:
+        if not self._daemon.settings.links:
             raise HTTPException(409, "the daemon has no links; start it with --link")
-        return self._daemon.links
-
-    def _takeoffs(self) -> Takeoffs:
-        if self._daemon.takeoffs is None:
-            raise HTTPException(409, "the daemon has no links; start it with --link")
-        return self._daemon.takeoffs
 
 
 def _begin(

@@ -81,7 +81,7 @@ class UploadRoute:
             pose, data = await self._upload(request)
             async with self._one_at_a_time(pose.vehicle, pose.image):
                 try:
-                    seq, new = await in_thread(self._threads, self._daemon.add_picture, pose, data)
+                    seq, new = await in_thread(self._threads, self._daemon.intake.add, pose, data)
                 except InputError as error:
                     refused.note("picture", str(error), pose.vehicle, pose.image)
                     raise

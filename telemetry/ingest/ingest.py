@@ -6,7 +6,7 @@ photos' angles, and an absolute altitude never becomes a height.
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import closing
 from dataclasses import replace
 from itertools import islice
@@ -264,41 +264,26 @@ def _one_kind(photos: Sequence[Photo], vehicle: str, camera: str, found: Discove
     Args:
         camera: the sensor that is wanted, one of SENSORS; "" for the widest that sees colours.
     """
+    reasons: dict[Path, str] = {}
     sensors = {photo.sensor for photo in photos if photo.sensor}
-    bands = {photo.band.lower() for photo in photos}
     if len(sensors) > 1 or (camera and sensors and camera not in sensors):
         wanted = camera or next(sensor for sensor in SENSORS if sensor in sensors)
         pressed = Counter(photo.path.stem.rpartition("_")[0] for photo in photos)
-        gone = "thermal" if not camera and max(pressed.values()) < 2 else ""
-        keep = [p for p in photos if p.sensor in ("", wanted) or (gone and p.sensor != gone)]
+        beside = {"wide", "zoom"} if not camera and max(pressed.values()) < 2 else {wanted}
         said = f"of each exposure the {wanted} pictures are mapped (--camera)"
-        _leave_out_others(photos, keep, lambda p: f"a picture of the {p.sensor} camera; {said}", vehicle, found, result)
-        photos = keep
-        bands = {photo.band.lower() for photo in photos}
-    if len(bands) < 2:
-        return list(photos)
-    mapped = next((band for band in _BANDS if band in bands), min(bands))
-    what = f"band {mapped}" if mapped else "the colour pictures"
-    keep = [photo for photo in photos if photo.band.lower() == mapped]
-    said = f"of each exposure {what} is mapped"
-    _leave_out_others(
-        photos, keep, lambda p: f"a picture of one spectral band ({p.band or 'colour'}); {said}", vehicle, found, result
-    )
-    return keep
-
-
-def _leave_out_others(
-    photos: Sequence[Photo],
-    keep: Sequence[Photo],
-    why: Callable[[Photo], str],
-    vehicle: str,
-    found: Discovery,
-    result: Survey,
-) -> None:
-    kept = {id(photo) for photo in keep}
-    for photo in photos:
-        if id(photo) not in kept:
-            result.rejected.append(Rejection(found.name(photo.path), why(photo), vehicle, photo.time_s))
+        others = [photo for photo in photos if photo.sensor and photo.sensor not in beside]
+        reasons |= {photo.path: f"a picture of the {photo.sensor} camera; {said}" for photo in others}
+    bands = {photo.band.lower() for photo in photos if photo.path not in reasons}
+    if len(bands) > 1:
+        mapped = next((band for band in _BANDS if band in bands), min(bands))
+        said = f"of each exposure {f'band {mapped}' if mapped else 'the colour pictures'} is mapped"
+        others = [photo for photo in photos if photo.path not in reasons and photo.band.lower() != mapped]
+        reasons |= {
+            photo.path: f"a picture of one spectral band ({photo.band or 'colour'}); {said}" for photo in others
+        }
+    left = [photo for photo in photos if photo.path in reasons]
+    result.rejected += [Rejection(found.name(p.path), reasons[p.path], vehicle, p.time_s) for p in left]
+    return [photo for photo in photos if photo.path not in reasons]
 
 
 def _with_position(photos: Sequence[Photo], vehicle: str, found: Discovery, result: Survey) -> list[Photo]:

@@ -5,7 +5,7 @@ import time
 import numpy as np
 
 from gcs_plugin.daemon.intake.posted_pose import parse_pose
-from gcs_plugin.daemon.jobs.job_queue import new_job
+from gcs_plugin.daemon.store.job_rows import new_job
 from gcs_plugin.daemon.store.journal import packed
 from orthoswarm.model.geo import LocalGrid
 
@@ -23,7 +23,7 @@ def post(daemon, frames, off_m=OFF_M):
             "height_m": frame.fix.height_m, "yaw_deg": float(np.degrees(frame.fix.yaw_rad)), "pitch_deg": -90.0,
             "roll_deg": 0.0,
         }  # fmt: skip
-        daemon.add_picture(parse_pose(pose), frame.path.read_bytes())
+        daemon.intake.add(parse_pose(pose), frame.path.read_bytes())
 
 
 def truth(frame):

@@ -20,17 +20,10 @@ from gcs_plugin.mission.plan_folder import plan_needs
 from gcs_plugin.sim.lossy_radio import NO_FAULTS, Faults
 from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
 from orthoswarm.model.errors import InputError, OrthoSwarmError
+from telemetry.live.live_poses import LinkPoses
 from tests.vehicles.test_fleet_cli import HOME, folder  # noqa: F401
 
 AP, PX4 = Autopilot.ARDUPILOT, Autopilot.PX4
-
-
-class NoJobs:
-    def wake(self):
-        pass
-
-    def drop(self, *_):
-        pass
 
 
 class PlanFolder:
@@ -61,7 +54,7 @@ def open_links(tmp_path):
         opened.append(swarm)
         settings = Settings(workspace=tmp_path, links=tuple(swarm.addresses), vehicles=named)
         journal = Journal(tmp_path / "journal.sqlite")
-        links = VehicleLinks(settings, journal, Events(), NoJobs())
+        links = VehicleLinks(settings, journal, Events(), LinkPoses())
         links.start()
         opened.extend([journal, links])
         return links
@@ -155,9 +148,9 @@ def test_one_that_cannot_take_off_holds_the_others_and_it_is_said(open_links, fo
     assert red == ["separation"] * 3
     vehicles[1].arms = False
     assert takeoffs.begin("plan-1", override=one_path) == {"v1": 0.0, "v2": 4.0, "v3": 8.0}
-    wait(lambda: "failed" in takeoffs.rows().get("v3", {}))
-    assert takeoffs.rows()["v3"]["failed"] == "held on the ground, because v2 did not take off"
-    assert "Check frame class" in takeoffs.rows()["v2"]["failed"]
+    wait(lambda: "failed" in takeoffs.waiting.rows().get("v3", {}))
+    assert takeoffs.waiting.rows()["v3"]["failed"] == "held on the ground, because v2 did not take off"
+    assert "Check frame class" in takeoffs.waiting.rows()["v2"]["failed"]
     assert any("v2 did not take off" in text and "v3 stay on the ground" in text for text in said)
     assert not vehicles[2].flight.armed
     takeoffs.close()
@@ -175,7 +168,7 @@ def test_a_takeoff_that_waits_is_cancelled_by_rtl(open_links, folder):  # noqa: 
     takeoffs.begin("plan-1")
     (row,) = links.commands("rtl", ["v2"])
     assert row["outcome"] == "done" and "is cancelled" in row["reason"]
-    assert "v2" not in takeoffs.rows()
+    assert "v2" not in takeoffs.waiting.rows()
     takeoffs.close()
 
 

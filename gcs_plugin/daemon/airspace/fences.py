@@ -34,11 +34,7 @@ class _Fence:
 
 
 class Fences:
-    """Reads geofences, a few vehicles at once; whatever an operator asks for comes first and breaks the reading off.
-
-    Args:
-        fleet: the vehicles. clock: monotonic seconds.
-    """
+    """Reads geofences, a few vehicles at once; whatever an operator asks for comes first and breaks the reading off."""
 
     def __init__(self, fleet: "Fleet", clock: Callable[[], float] = time.monotonic) -> None:
         self._fleet, self._clock = fleet, clock

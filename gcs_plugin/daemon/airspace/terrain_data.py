@@ -34,11 +34,7 @@ _log = logging.getLogger(__name__)
 
 
 class TerrainData:
-    """Answers vehicles' requests for terrain data.
-
-    Args:
-        dem: the height model. fleet: the vehicles.
-    """
+    """Answers vehicles' requests for terrain data."""
 
     def __init__(self, dem: Path, fleet: "Fleet") -> None:
         self._dem, self._fleet = dem, fleet

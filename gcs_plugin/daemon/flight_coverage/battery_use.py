@@ -1,8 +1,9 @@
 """Remaining flight time of vehicles, from their battery level and its use so far."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
+
+from gcs_plugin.daemon.vehicle_names import VehicleRow
 
 _LEAST_DROP: Final = 0.03  # share of the battery after which its use is known
 _LEAST_S: Final = 60.0  # of flight for that
@@ -25,9 +26,9 @@ class BatteryUse:
     def __init__(self) -> None:
         self._flights: dict[str, _Flight] = {}
 
-    def look(self, row: Mapping[str, Any], flies: bool, now_s: float) -> None:
+    def look(self, row: VehicleRow, flies: bool, now_s: float) -> None:
         """Process a vehicle's state from its link, at a time of any clock in seconds."""
-        vehicle, battery = str(row["id"]), row.get("battery")
+        vehicle, battery = row["id"], row.get("battery")
         if battery is None:
             return
         flight = self._flights.get(vehicle)

@@ -1,31 +1,31 @@
-"""The exposures that vehicles report on their links, stored in the journal; those that a link has lost are asked for.
+"""Vehicles report on their links when their camera takes a picture: these reports are kept in the journal.
+
+A vehicle is asked again for a report that did not come.
 
 CAMERA_IMAGE_CAPTURED counts the pictures of a camera. A number that is left out was an exposure whose message did not
 come: the camera sends it again on MAV_CMD_REQUEST_MESSAGE with that number (MAVLink camera protocol). ArduPilot's
 CAMERA_FEEDBACK cannot be asked for.
 """
 
-import sqlite3
 from collections import deque
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from gcs_plugin.daemon.store.journal import Journal, packed, unpacked
+from gcs_plugin.daemon.store.exposure_rows import Exposed, all_exposures, exposures_added
+from gcs_plugin.daemon.store.journal import Journal
+from gcs_plugin.daemon.vehicle_names import VehicleNames
 from gcs_plugin.links.mavlink import Message, dialect
 from orthoswarm.coverage.camera_events import CameraEvent
 from orthoswarm.model.geo import LocalGrid
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from gcs_plugin.fleet.fleet import Fleet
     from gcs_plugin.fleet.vehicle_state import Vehicle
 
 MESSAGES: Final = ("CAMERA_IMAGE_CAPTURED", "CAMERA_FEEDBACK")
 _AFTER_2001_S: Final = 1e9
-Row = tuple[str, int, float, float | None, float | None]
 _CAPTURED: Final = int(dialect.MAVLINK_MSG_ID_CAMERA_IMAGE_CAPTURED)
 _REQUEST: Final = int(dialect.MAV_CMD_REQUEST_MESSAGE)
 _AT_ONCE: Final = 5  # numbers that are asked for in one go
@@ -36,15 +36,11 @@ _LONGEST_HOLE: Final = 200
 
 
 class ExposureJournal:
-    """Receives camera events in the links' thread and provides them in the coverage's.
+    """Takes camera events from the links' thread; the coverage's thread writes them into the journal and reads them."""
 
-    Args:
-        journal: of the workspace. name_of: returns a vehicle's id for its MAVLink system id.
-    """
-
-    def __init__(self, journal: Journal, name_of: "Callable[[int], str]") -> None:
-        self._journal, self._name_of = journal, name_of
-        self._fresh: deque[Row] = deque()
+    def __init__(self, journal: Journal, names: VehicleNames) -> None:
+        self._journal, self._names = journal, names
+        self._fresh: deque[Exposed] = deque()
         self._kinds: dict[int, str] = {}
         self._boot_s: dict[int, float] = {}
         self._last: dict[int, tuple[int, float]] = {}
@@ -65,7 +61,7 @@ class ExposureJournal:
             return  # a repetition
         self._last[system] = number, time_s
         place = (lat * 1e-7, lon * 1e-7) if lat or lon else (None, None)
-        self._fresh.append((packed(self._name_of(system)), int(number), _utc(time_s, utc_s), *place))
+        self._fresh.append((self._names.name_of(system), int(number), _utc(time_s, utc_s), *place))
 
     def _dated(self, system: int, message: Any, utc_s: float) -> float:
         """When a picture was taken; without a date in it, by the time since boot, since an event may come late."""
@@ -77,23 +73,16 @@ class ExposureJournal:
     def write(self) -> bool:
         """Write the events since the last call; returns whether there were any."""
         rows = [self._fresh.popleft() for _ in range(len(self._fresh))]
-
-        def change(db: sqlite3.Connection) -> None:
-            db.executemany("INSERT OR IGNORE INTO exposures VALUES (?, ?, ?, ?, ?)", rows)
-
         if rows:
-            self._journal.write(change)
+            self._journal.write(exposures_added(rows))
         return bool(rows)
 
     def events(self, grid: LocalGrid) -> list[CameraEvent]:
         """All events in grid coordinates, without heights."""
-        rows = self._journal.rows("SELECT vehicle, number, time, lat, lon FROM exposures ORDER BY vehicle, time")
         found = []
-        for row in rows:
-            place = None
-            if row["lat"] is not None:
-                place = np.array([*grid.to_grid(row["lat"], row["lon"]), 0.0])
-            found.append(CameraEvent(unpacked(row["vehicle"]), int(row["number"]), float(row["time"]), place))
+        for vehicle, number, time_s, lat, lon in all_exposures(self._journal):
+            place = None if lat is None or lon is None else np.array([*grid.to_grid(lat, lon), 0.0])
+            found.append(CameraEvent(vehicle, number, time_s, place))
         return found
 
 
@@ -111,11 +100,7 @@ class _Camera:
 
 
 class EventRequests:
-    """Asks vehicles' cameras for the events that have not come; runs in the links' thread.
-
-    Args:
-        fleet: the vehicles.
-    """
+    """Asks vehicles' cameras for the events that have not come; runs in the links' thread."""
 
     def __init__(self, fleet: "Fleet") -> None:
         self._fleet = fleet

@@ -126,11 +126,7 @@ class _Parts:
 
 
 class FileRead(FtpJob):
-    """Reads a file. What has come stays when the session is lost, and the rest is read in the next one.
-
-    Args:
-        path: on the vehicle.
-    """
+    """Reads a file. What has come stays when the session is lost, and the rest is read in the next one."""
 
     def __init__(self, path: str) -> None:
         super().__init__()

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcs_plugin.daemon.flight_coverage.planned_area import PlannedLegs
+from gcs_plugin.daemon.vehicle_names import VehicleRow
 
 Array = NDArray[np.float64]
 _LEAST_REACH_M: Final = 12.0
@@ -90,7 +91,7 @@ class FlownLegs:
         """Record the arrival of a picture, UTC epoch seconds."""
         self._last_picture_s = time_s
 
-    def look(self, rows: list[dict[str, Any]]) -> None:
+    def look(self, rows: list[VehicleRow]) -> None:
         """Process the vehicles' states (`VehicleLinks.rows`)."""
         for row in rows:
             vehicle = str(row["id"])
@@ -104,7 +105,7 @@ class FlownLegs:
                 if row["state"] != "lost" and not row["armed"]:
                     self.grounded.add(vehicle)
 
-    def all_over(self, rows: list[dict[str, Any]], now_s: float) -> bool:
+    def all_over(self, rows: list[VehicleRow], now_s: float) -> bool:
         """Whether the operation is over: nobody flies, and all legs are finished or no picture came for a minute."""
         if self._last_picture_s is None or any(flies(row) for row in rows):
             return False
@@ -123,7 +124,7 @@ class FlownLegs:
         }
 
 
-def flies(row: Mapping[str, Any]) -> bool:
+def flies(row: VehicleRow) -> bool:
     """Whether a vehicle is on a mission that continues."""
     if row["state"] == "lost" or row["mission"]["phase"] in _MISSION_OVER:
         return False

@@ -10,9 +10,10 @@ import sqlite3
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Final
+from pathlib import Path
+from typing import Any, Final, Protocol, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,9 +22,20 @@ from gcs_plugin.daemon.flight_coverage.battery_use import BatteryUse
 from gcs_plugin.daemon.flight_coverage.exposure_journal import ExposureJournal
 from gcs_plugin.daemon.flight_coverage.flown_legs import FlownLegs, flies
 from gcs_plugin.daemon.flight_coverage.picture_views import FlawedPictures, Measured, PictureViews
-from gcs_plugin.daemon.flight_coverage.planned_area import AreaSource, CoveredArea, read_covered_area, zone_features
+from gcs_plugin.daemon.flight_coverage.planned_area import (
+    AreaSource,
+    CoveredArea,
+    area_source,
+    read_covered_area,
+    zone_features,
+)
+from gcs_plugin.daemon.layers.realtime_layer import Drawer
+from gcs_plugin.daemon.store.console_state import ConsoleState
+from gcs_plugin.daemon.store.daemon_events import CoverageChanged, PictureDrawn
 from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.daemon.store.frame_rows import last_drawn_arrival
 from gcs_plugin.daemon.store.journal import Journal
+from gcs_plugin.daemon.vehicle_names import VehicleRow
 from orthoswarm.coverage.camera_events import missing_by_events
 from orthoswarm.coverage.coverage_files import COLOURS, gap_feature
 from orthoswarm.coverage.coverage_grid import Cells, CellState, CoverageGrid, Shares
@@ -34,10 +46,9 @@ from orthoswarm.coverage.view import View
 from orthoswarm.export.product_files import iso_time
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 from orthoswarm.model.geo import GroundGrid, LocalGrid
-from orthoswarm.model.placement import PlacedFrame
 from orthoswarm.raster.picture_quality import PictureQuality
 
-Rows = list[dict[str, Any]]
+Rows = list[VehicleRow]
 _LOOK_S: Final = 0.5
 _LEAST_PAUSE: Final = 3.0
 """Pause after finding gaps, in multiples of the time that it took: a quarter of one core at most."""
@@ -70,11 +81,46 @@ class _Followed:
     over: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
 
 
+class MissingRow(TypedDict):
+    """A picture that was taken, or should have been, and is not there; `image`: its name, or `event <number>`."""
+
+    vehicle: str
+    image: str
+    after: str
+    cause: str
+    confidence: float
+    time_s: float | None
+
+
+class CoverageDocument(TypedDict, total=False):
+    """What /api/coverage answers: shares of the area by state, gaps with their causes, and what they come from."""
+
+    state: str
+    version: int
+    time: str | None
+    plan: str | None
+    seen_share: float | None
+    poor_share: float | None
+    missed_share: float | None
+    planned_share: float | None
+    recorded: dict[str, float]
+    pictures: dict[str, int]
+    area_m2: float
+    cell_m: float
+    offers: list[dict[str, Any]]
+    legs: dict[str, int]
+    corners: list[list[float]]
+    gaps: list[dict[str, Any]]
+    small_gaps: dict[str, Any]
+    missing_pictures: list[MissingRow]
+    warnings: list[str]
+
+
 @dataclass(frozen=True, slots=True)
 class _Result:
     """The latest result: the API's document, gaps as GeoJSON, the picture of the cells, and the placed pictures."""
 
-    document: dict[str, Any]
+    document: CoverageDocument
     gaps: dict[str, Any]
     png: bytes
     placed: list[View]
@@ -89,33 +135,33 @@ _NOTHING: Final = _Result(
 )  # fmt: skip
 
 
+class LinkedVehicles(Protocol):
+    """The vehicles on the links.
+
+    Attributes:
+        latest: their rows, at most half a second old.
+    """
+
+    latest: Rows
+
+
 class LiveCoverage:
     """Updates the coverage.
 
     Args:
-        journal: of the workspace. events: receives changes of the coverage. views: of the workspace's pictures.
-        source: returns the source of the area, None if there is none. epsg: returns the map's grid, None before it
-        exists.
-        vehicles: returns the rows of the vehicles on the links, empty without links.
-        exposures: reported by the vehicles.
+        views: of the workspace's pictures. console, plans: the operator's plan, and the folder of all plans: these say
+            what the area is. drawer: knows the map's grid. vehicles: on the links. exposures: reported by them.
 
     Attributes:
         seconds: duration of the last search for gaps. battery: remaining flight time of the vehicles.
     """
 
     def __init__(
-        self,
-        journal: Journal,
-        events: Events,
-        *,
-        views: PictureViews,
-        source: Callable[[], AreaSource | None],
-        epsg: Callable[[], int | None],
-        vehicles: Callable[[], Rows],
-        exposures: ExposureJournal,
-    ) -> None:
+        self, journal: Journal, events: Events, *, views: PictureViews, console: ConsoleState, plans: Path,
+        drawer: Drawer, vehicles: LinkedVehicles, exposures: ExposureJournal,
+    ) -> None:  # fmt: skip
         self._journal, self._events, self._views = journal, events, views
-        self._source, self._epsg, self._vehicles = source, epsg, vehicles
+        self._console, self._plans, self._drawer, self._vehicles = console, plans, drawer, vehicles
         self._exposures = exposures
         self._fresh: deque[tuple[View, PictureQuality | None]] = deque()
         self._bell, self._stop = threading.Event(), threading.Event()
@@ -140,17 +186,17 @@ class LiveCoverage:
         if self._thread.ident is not None:
             self._thread.join()
 
-    def add(self, placed: PlacedFrame, quality: PictureQuality | None) -> None:
-        """A picture is on the real-time layer with its recorded pose and measured quality; any thread."""
-        self._fresh.append((View.of_frame(placed), quality))
+    def picture_drawn(self, event: PictureDrawn) -> None:
+        """Take a picture that is on the real-time layer; any thread."""
+        self._fresh.append((View.of_frame(event.placed), event.quality))
         self._bell.set()
 
-    def look(self) -> None:
-        """Announce that pictures were placed or the plan has changed; any thread."""
+    def look(self, _: object = None) -> None:
+        """Look now, since pictures were placed; any thread."""
         self._bell.set()
 
     @property
-    def document(self) -> dict[str, Any]:
+    def document(self) -> CoverageDocument:
         """Shares, and gaps with their causes, as JSON values."""
         return self._result.document
 
@@ -194,12 +240,12 @@ class LiveCoverage:
     def _take(self) -> bool:
         """Process new data; returns whether anything has changed."""
         changed = self._exposures.write()
-        source = self._source()
+        source = area_source(self._console.plan(), self._plans)
         if source is None or source == self._refused:
             self._fresh.clear()
             gone, self._followed, self._result = self._followed is not None, None, _NOTHING
             return gone
-        epsg = self._epsg()
+        epsg = None if self._drawer.area is None else self._drawer.area.epsg
         here = self._followed
         if here is None or here.source != source or (epsg is not None and here.cover.cells.grid.epsg != epsg):
             here = self._followed = self._begin(source, epsg)
@@ -241,9 +287,9 @@ class LiveCoverage:
             self._put_recorded(here, pictures)
             if self._stop.is_set():
                 break
-        row = self._journal.one("SELECT MAX(arrived) AS last FROM frames WHERE drawn = 1")
-        if row is not None and row["last"] is not None:
-            here.legs.picture_came(row["last"])
+        last_s = last_drawn_arrival(self._journal)
+        if last_s is not None:
+            here.legs.picture_came(last_s)
         return here
 
     def _put_recorded(self, here: _Followed, pictures: Measured) -> bool:
@@ -264,12 +310,13 @@ class LiveCoverage:
 
     def _follow(self, here: _Followed) -> bool:
         """Track the vehicles; returns whether the due cells have changed."""
-        rows = self._vehicles()
+        rows = self._vehicles.latest
         grid = here.covered.area.grid
         for row in rows:
             self.battery.look(row, flies(row), time.monotonic())
-            if row.get("lat_deg") is not None and row["armed"]:
-                east, north = grid.to_grid(row["lat_deg"], row["lon_deg"])
+            lat, lon = row.get("lat_deg"), row.get("lon_deg")
+            if lat is not None and lon is not None and row["armed"]:
+                east, north = grid.to_grid(lat, lon)
                 here.legs.pass_by(str(row["id"]), float(east), float(north))
         here.legs.look(rows)
         state = here.legs.state()
@@ -307,9 +354,11 @@ class LiveCoverage:
             self._result = self._found(here)
         self.seconds = time.monotonic() - began
         self._rest_until = time.monotonic() + _LEAST_PAUSE * (time.thread_time() - cpu)
-        published = ("state", "version", "seen_share", "poor_share", "missed_share", "planned_share")
-        document = self._result.document
-        self._events.publish("coverage", gaps=len(document["gaps"]), **{key: document[key] for key in published})
+        found = self._result.document
+        self._events.publish(CoverageChanged(
+            gaps=len(found["gaps"]), state=found["state"], version=found["version"], seen_share=found["seen_share"],
+            poor_share=found["poor_share"], missed_share=found["missed_share"], planned_share=found["planned_share"],
+        ))  # fmt: skip
 
     def _found(self, here: _Followed) -> _Result:
         cover, grid = here.cover, here.covered.area.grid
@@ -318,9 +367,9 @@ class LiveCoverage:
         features = [gap_feature(gap, grid) for gap in gaps.gaps]
         states = cover.states(self._due)
         placed = [v for v in cover.views if v.placed]
-        document = {
+        document: CoverageDocument = {
             "state": self._state(cover), "version": self._version, "time": iso_time(time.time()),
-            "plan": here.covered.plan, **_shares(cover.shares(self._due)),
+            "plan": here.covered.plan, **_shares(cover.shares(self._due)),  # type: ignore[typeddict-item]
             "recorded": _shares(here.recorded.shares(self._due)),
             "pictures": {"placed": len(placed), "recorded": len(cover.views) - len(placed)},
             "area_m2": cover.cells.area_m2, "cell_m": cover.cells.grid.gsd_m,
@@ -385,7 +434,7 @@ def _is_unseen(ends: NDArray[np.float64], states: NDArray[np.uint8], grid: Groun
     return bool(not below.size or np.isin(below, (CellState.MISSED, CellState.PLANNED)).any())
 
 
-def _missing_rows(missing: Sequence[MissingPicture]) -> list[Mapping[str, Any]]:
+def _missing_rows(missing: Sequence[MissingPicture]) -> list[MissingRow]:
     return [
         {"vehicle": m.view.vehicle, "image": m.view.image, "after": m.after, "cause": str(m.cause),
          "confidence": round(m.confidence, 2), "time_s": m.view.time_s}

@@ -9,21 +9,31 @@ import contextlib
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Protocol
 from urllib.parse import unquote, urlsplit
 
 from gcs_plugin.daemon.flight_coverage.file_download import FileRead, FolderList
 from gcs_plugin.daemon.flight_coverage.file_numbers import PictureNames
 from gcs_plugin.daemon.flight_coverage.ftp_talk import FtpTalk, LinkShare
+from gcs_plugin.daemon.flight_coverage.live_coverage import LiveCoverage, MissingRow
+from gcs_plugin.daemon.intake.picture_intake import PictureIntake
+from gcs_plugin.daemon.intake.posted_pose import PostedPose, linked_pose
+from gcs_plugin.daemon.store.daemon_events import RequestsChanged
+from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.daemon.store.exposure_rows import exposure_place, exposure_times
+from gcs_plugin.daemon.store.frame_rows import dated_images, pose_near
+from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.links.file_transfer import payload_of
 from orthoswarm.model.errors import InputError, OrthoSwarmError
+from telemetry.live.live_poses import LinkPoses
 
 if TYPE_CHECKING:
     from gcs_plugin.fleet.fleet import Fleet
     from gcs_plugin.fleet.vehicle_state import Vehicle
 
+_EVENT: Final = "camera event"
 _STEP_S, _LOOK_S = 0.02, 1.0
 _AGAIN_S: Final = 60.0
 _LIST_AGAIN_S, _LIST_AT_LEAST_S = 10.0, 600.0
@@ -76,14 +86,78 @@ class _Server:
     urls: dict[int, str] = field(default_factory=dict)
 
 
+class Heard(Protocol):
+    """The vehicles on the links."""
+
+    def system_of(self, vehicle: str) -> int:
+        """The system id of a vehicle.
+
+        Raises:
+            OrthoSwarmError: it is not on the links.
+        """
+
+
+class FetchedPictures:
+    """What the requests for pictures need of the workspace."""
+
+    def __init__(
+        self, links: Heard, journal: Journal, events: Events, *, poses: LinkPoses, coverage: LiveCoverage,
+        intake: PictureIntake,
+    ) -> None:  # fmt: skip
+        self._links, self._journal, self._events = links, journal, events
+        self._poses, self._coverage, self._intake = poses, coverage, intake
+
+    def system_of(self, vehicle: str) -> int:
+        """The system id of a vehicle.
+
+        Raises:
+            OrthoSwarmError: it is not on the links.
+        """
+        return self._links.system_of(vehicle)
+
+    def wanted(self) -> Iterable[WantedPicture]:
+        """The pictures that were taken and have not arrived."""
+        return wanted_pictures(self._coverage.document["missing_pictures"])
+
+    def names(self, vehicle: str) -> PictureNames:
+        """The names of a vehicle's pictures that have arrived, and how their numbers match its camera events."""
+        return PictureNames.of(dated_images(self._journal, vehicle), exposure_times(self._journal, vehicle))
+
+    def store(self, wanted: WantedPicture, name: str, data: bytes) -> None:
+        """Store a picture with the pose of its link, else with that of its camera event.
+
+        Raises:
+            InputError: it is no picture, or neither pose is known. OrthoSwarmError: the disk is full or missing.
+        """
+        linked = linked_pose(wanted.vehicle, name, wanted.time_s, self._poses.at(wanted.vehicle, wanted.time_s))
+        self._intake.add(linked or self._event_pose(wanted, name), data)
+
+    def changed(self) -> None:
+        """Tell the pages that a request's state has changed."""
+        self._events.publish(RequestsChanged())
+
+    def _event_pose(self, wanted: WantedPicture, name: str) -> PostedPose:
+        """The position of a camera event, with height and angles of the vehicle's picture nearest in time.
+
+        For pictures that the links' poses, which go back some minutes, do not reach.
+
+        Raises:
+            InputError: the event has no position.
+        """
+        place = exposure_place(self._journal, wanted.vehicle, wanted.number, wanted.time_s)
+        if place is None:
+            raise InputError("its camera event has no position, and the link's are too old")
+        near = pose_near(self._journal, wanted.vehicle, wanted.time_s)
+        values = {k: v for k, v in near.items() if k not in ("origin", "damaged", "gps_fix")}
+        values |= {"lat_deg": place[0], "lon_deg": place[1]}
+        return PostedPose(wanted.vehicle, name, wanted.time_s, values, {"position": _EVENT, "time": _EVENT})
+
+
 class PictureRequests:
     """Asks vehicles for their pictures.
 
     Args:
-        fleet: the vehicles. system_of: system id of a vehicle's id; raises OrthoSwarmError for one not on the links.
-        wanted: returns the pictures that have not arrived. names: returns the names of those that have, by vehicle.
-        store: stores a picture, given what was wanted, the file's name and content; raises as `Daemon.add_picture`.
-        changed: called when a request's state has changed, and every two seconds while a picture is read.
+        fleet: the vehicles. workspace: see there.
         folder: of the pictures on the vehicles. most_bytes_s: most of all links together, bytes a second; 0: none.
         clock: monotonic seconds, the fleet's.
     """
@@ -91,18 +165,13 @@ class PictureRequests:
     def __init__(
         self,
         fleet: "Fleet",
+        workspace: FetchedPictures,
         *,
-        system_of: Callable[[str], int],
-        wanted: Callable[[], Iterable[WantedPicture]],
-        names: Callable[[str], PictureNames],
-        store: Callable[[WantedPicture, str, bytes], None],
-        changed: Callable[[], None] = lambda: None,
         folder: str = "/DCIM",
         most_bytes_s: float = 30_000.0,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._fleet, self._system_of, self._wanted, self._names = fleet, system_of, wanted, names
-        self._store, self._changed, self._folder, self._clock = store, changed, folder, clock
+        self._fleet, self._workspace, self._folder, self._clock = fleet, workspace, folder, clock
         self._on = most_bytes_s > 0.0
         self._share = LinkShare(max(1.0, most_bytes_s))
         self._requests: dict[tuple[str, int], _Request] = {}
@@ -140,7 +209,7 @@ class PictureRequests:
                 self._fleet.call(self.step).result(5.0)
                 if self._reading is not None and time.monotonic() - self._told_at > _TELL_S:
                     self._told_at = time.monotonic()
-                    self._changed()
+                    self._workspace.changed()
             except TimeoutError:
                 continue
             except Exception as error:  # an odd answer must not end it
@@ -178,23 +247,23 @@ class PictureRequests:
             request.state, request.reason, request.read = "refused", job.refused, None
         elif request is not None and isinstance(job, FileRead):
             self._store_arrived(request, job.content)
-        self._changed()
+        self._workspace.changed()
 
     def _store_arrived(self, request: _Request, content: bytes) -> None:
         try:
-            self._store(request.wanted, request.path.rpartition("/")[2], content)
+            self._workspace.store(request.wanted, request.path.rpartition("/")[2], content)
         except InputError as error:
             request.state, request.reason = "refused", str(error)
         except OrthoSwarmError as error:  # the disk is full: it is read again when there is room
             request.state, request.reason = "waiting", str(error)
-            self._servers[self._system_of(request.wanted.vehicle)].not_before = self._clock() + _AGAIN_S
+            self._servers[self._workspace.system_of(request.wanted.vehicle)].not_before = self._clock() + _AGAIN_S
         else:
             request.state, request.reason = "arrived", ""
         request.read = None
 
     def _look(self) -> None:
         """Take over what is wanted by now; what is not wanted any more has come some other way."""
-        wanted = {(w.vehicle, w.number): w for w in self._wanted()}
+        wanted = {(w.vehicle, w.number): w for w in self._workspace.wanted()}
         changed = False
         for key in wanted.keys() - self._requests.keys():
             self._requests[key] = _Request(wanted=wanted[key])
@@ -203,7 +272,7 @@ class PictureRequests:
             del self._requests[key]
             changed = True
         if changed:
-            self._changed()
+            self._workspace.changed()
 
     def _begin(self) -> None:
         """Begin to read the oldest waiting picture of a vehicle that can be asked, or first the folder with it."""
@@ -211,7 +280,7 @@ class PictureRequests:
         waiting = [r for r in self._requests.values() if r.state in ("waiting", "refused")]
         for request in sorted(waiting, key=lambda r: (r.state, r.wanted.time_s)):
             try:
-                system = self._system_of(request.wanted.vehicle)
+                system = self._workspace.system_of(request.wanted.vehicle)
             except OrthoSwarmError:
                 continue
             server = self._servers.setdefault(system, _Server())
@@ -227,7 +296,7 @@ class PictureRequests:
                 request.read = request.read or FileRead(request.path)
                 request.state, request.reason = "asked", ""
                 self._converse(request.read, system, server, request)
-                self._changed()
+                self._workspace.changed()
                 return
 
     def _find(self, request: _Request, server: _Server, known: dict[str, PictureNames]) -> bool:
@@ -241,7 +310,7 @@ class PictureRequests:
             if server.files is None or request.listing == server.listings:
                 return False
             if vehicle not in known:
-                known[vehicle] = self._names(vehicle)
+                known[vehicle] = self._workspace.names(vehicle)
             path, reason = known[vehicle].find(number, server.files)
         if path:
             if request.path != path:  # the vehicle has it by now
@@ -250,7 +319,7 @@ class PictureRequests:
         request.listing = server.listings
         if (request.state, request.reason) != ("refused", reason):
             request.state, request.reason = "refused", reason
-            self._changed()
+            self._workspace.changed()
         return False
 
     def _converse(self, job: FileRead | FolderList, system: int, server: _Server, request: _Request | None) -> None:
@@ -264,7 +333,7 @@ class PictureRequests:
         """All waiting requests to a vehicle are refused for one reason; they are tried again later."""
         for request in self._requests.values():
             with contextlib.suppress(OrthoSwarmError):
-                if request.state == "waiting" and self._system_of(request.wanted.vehicle) == system:
+                if request.state == "waiting" and self._workspace.system_of(request.wanted.vehicle) == system:
                     request.state, request.reason, request.path = "refused", reason, ""
         self._servers[system].files = None
 
@@ -300,10 +369,10 @@ class PictureRequests:
             server.urls[int(message.image_index)] = unquote(parts.path)
 
 
-def wanted_pictures(missing: Iterable[Mapping[str, Any]]) -> list[WantedPicture]:
+def wanted_pictures(missing: Iterable[MissingRow]) -> list[WantedPicture]:
     """Those of the coverage's missing pictures that were taken and have not arrived."""
     return [
         WantedPicture(row["vehicle"], int(row["image"].removeprefix("event ")), row["time_s"])
         for row in missing
-        if row["image"].startswith("event ") and row.get("time_s") is not None
+        if row["image"].startswith("event ") and row["time_s"] is not None
     ]

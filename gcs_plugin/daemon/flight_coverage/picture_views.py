@@ -2,16 +2,17 @@
 
 import bisect
 import math
-import sqlite3
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from gcs_plugin.daemon.intake.posted_pose import frame_of_row
 from gcs_plugin.daemon.jobs.solution_file import SolutionFileError, read_solution
-from gcs_plugin.daemon.store.journal import Journal, unpacked
+from gcs_plugin.daemon.store.frame_rows import drawn_frames, rejected_frames
+from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.daemon.store.picture_store import PictureStore
+from gcs_plugin.daemon.store.sortie_rows import solution_paths
 from orthoswarm.coverage.missing_pictures import Exposure
 from orthoswarm.coverage.picture_flaws import NEIGHBOURS, picture_flaws
 from orthoswarm.coverage.view import NO_FLAW, Flaw, View
@@ -27,11 +28,7 @@ _NO_TIME: Final = 0.0
 
 
 class PictureViews:
-    """Reads views from a workspace.
-
-    Args:
-        journal, store: of the workspace. solutions: folder of the solution files. fov_rad: theta-hat.
-    """
+    """Reads views from a workspace."""
 
     def __init__(self, journal: Journal, store: PictureStore, solutions: Path, fov_rad: float | None) -> None:
         self._journal, self._store, self._folder, self._fov_rad = journal, store, solutions, fov_rad
@@ -40,71 +37,51 @@ class PictureViews:
     def recorded(self, grid: LocalGrid) -> Iterator[Measured]:
         """Views of all pictures on the real-time layer as recorded, in chunks, in the order of arrival."""
         last = 0
-        while True:
-            rows = self._journal.rows(
-                "SELECT frames.*, sharpness, contrast, flat_share, saturated_share FROM frames"
-                " LEFT JOIN qualities USING (seq) WHERE drawn = 1 AND reason IS NULL AND seq > ? ORDER BY seq LIMIT ?",
-                (last, _AT_ONCE),
-            )
-            if not rows:
-                return
-            last = int(rows[-1]["seq"])
+        while rows := drawn_frames(self._journal, last, _AT_ONCE):
+            last = rows[-1].seq
             part = []
             for row in rows:
                 placed = recorded_cameras([frame_of_row(row, self._store)], grid, self._fov_rad).placed
-                part += [(View.of_frame(found), _quality(row)) for found in placed]
+                part += [(View.of_frame(found), row.quality) for found in placed]
             yield part
 
     def placed_anew(self, epsg: int) -> tuple[list[View], list[Key]]:
         """Views placed since the last call, and pictures that a refinement could not place.
 
         A refined sortie replaces its placements in flight. Files that are being replaced are read at the next call.
-
-        Args:
-            epsg: the grid of the map.
         """
-        rows: dict[tuple[str, int], tuple[str, Any]] = {}
-        for table in ("coarse", "solutions"):
-            for row in self._journal.rows(f"SELECT vehicle, sortie, path FROM {table}"):
-                rows[row["vehicle"], int(row["sortie"])] = (table, row["path"])
         views: list[View] = []
         dropped: list[Key] = []
-        for (vehicle, sortie), (table, path) in rows.items():
-            if self._read.get((str(epsg), vehicle, sortie)) == path:
+        refined = solution_paths(self._journal, "solutions")
+        for whose, path in (solution_paths(self._journal, "coarse") | refined).items():
+            key = str(epsg), *whose
+            if self._read.get(key) == path:
                 continue
             try:
                 found = read_solution(self._folder / path)
             except SolutionFileError:
                 continue
-            self._read[str(epsg), vehicle, sortie] = path
+            self._read[key] = path
             solution, ground = found.solution, found.terrain
             half = 0.5 * math.radians(solution.fov_deg)
             # d(f)/f of f = (W/2) / tan(half): d(half) / (sin(half) cos(half))
             focal = math.radians(solution.fov_sigma_deg) / math.sin(2.0 * half)
             focal = focal if math.isfinite(focal) else 0.0
-            name = unpacked(vehicle)
             views += [
-                replace(View.of_frame(p, focal_sigma=focal, ground=ground), vehicle=name, placed=True)
+                replace(View.of_frame(p, focal_sigma=focal, ground=ground), vehicle=whose[0], placed=True)
                 for p in solution.placed
             ]
-            if table == "solutions":
-                dropped += [(name, image) for image in solution.dropped]
+            if whose in refined:
+                dropped += [(whose[0], image) for image in solution.dropped]
         return views, dropped
 
     def rejected(self) -> list[Exposure]:
         """Pictures that arrived and could not be used."""
-        rows = self._journal.rows("SELECT vehicle, image, time FROM frames WHERE reason IS NOT NULL AND time NOT NULL")
-        return [Exposure(unpacked(r["vehicle"]), float(r["time"]), unpacked(r["image"])) for r in rows]
+        return [Exposure(*row) for row in rejected_frames(self._journal)]
 
     def forget(self) -> None:
         """Make `placed_anew` return everything again."""
         self._read.clear()
-
-
-def _quality(row: sqlite3.Row) -> PictureQuality | None:
-    if row["sharpness"] is None:
-        return None
-    return PictureQuality(row["sharpness"], row["contrast"], row["flat_share"], row["saturated_share"])
 
 
 class FlawedPictures:

@@ -7,10 +7,11 @@ Through the link the vehicle forwards its bus as CAN_FRAME and CANFD_FRAME messa
 import logging
 import threading
 import time
-from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from gcs_plugin.daemon.stoppable_thread import StoppableThread
+from gcs_plugin.daemon.store.event_bus import Events
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 from telemetry.live.live_poses import LivePoses
 
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from gcs_plugin.fleet.fleet import Fleet
     from gcs_plugin.fleet.vehicle_state import Vehicle
     from gcs_plugin.links.mavlink import Message
+    from telemetry.live.dronecan_bus import CanSource
 
 CAN: Final = "can:"
 """What a source on a CAN bus begins with: can:socketcan:can0, can:slcan:/dev/ttyACM0, can:mavlink."""
@@ -48,11 +50,7 @@ def check_bus(bus: str) -> None:
 
 
 class CanReader:
-    """Reads one vehicle's bus in its own thread.
-
-    Attributes:
-        vehicle: id.
-    """
+    """Reads one vehicle's bus in its own thread."""
 
     def __init__(
         self,
@@ -60,8 +58,8 @@ class CanReader:
         bus: str,
         *,
         poses: LivePoses,
-        notify: Callable[[str], None],
-        fleet: "Fleet | None",
+        events: Events,
+        fleet: "Fleet",
         system: int | None,
     ) -> None:
         """Make ready to read.
@@ -69,8 +67,8 @@ class CanReader:
         Args:
             vehicle: id. bus: for example "socketcan:can0", or "mavlink" for the one behind the vehicle's link.
             poses: of the vehicle; receives the bus's poses.
-            notify: called with messages for the user.
-            fleet: the links; None without any. system: the vehicle's MAVLink system id, None without.
+            events: told when the bus cannot be read.
+            fleet: the vehicles on links. system: the vehicle's MAVLink system id, None without.
 
         Raises:
             InputError: the bus is behind a link, and there is none.
@@ -78,17 +76,17 @@ class CanReader:
         from telemetry.live.dronecan_bus import CanSource
 
         self.vehicle = vehicle
-        self._bus, self._notify, self._state, self._said = bus, notify, "waiting", ""
+        self._bus, self._events, self._state, self._said = bus, events, "waiting", ""
         self._source = CanSource(poses)
         self._heard, self._count = float("-inf"), 0
         run = self._read
         if bus.partition(":")[0] == _TUNNEL:
-            if fleet is None or system is None:
+            if not fleet.hub.sides or system is None:
                 raise InputError(
                     f"the CAN bus of {vehicle} is behind its MAVLink link, and there is none; give --link, and the "
                     f"vehicle's system id in the workspace's orthoswarm.toml where its name is not v1 to v255"
                 )
-            tunnel = _Tunnel(fleet, system, int(bus.partition(":")[2] or 1), self._source.feed)
+            tunnel = _Tunnel(fleet, system, int(bus.partition(":")[2] or 1), self._source)
             run = tunnel.run
         self._thread = StoppableThread(run, f"CAN bus of {vehicle}")
 
@@ -123,15 +121,15 @@ class CanReader:
     def _fail(self, reason: str) -> None:
         """Report a problem once; the connection is retried all the time."""
         if reason != self._said:
-            self._notify(f"the CAN bus of {self.vehicle}: {reason}")
+            self._events.say(f"the CAN bus of {self.vehicle}: {reason}")
         self._state = self._said = reason
 
 
 class _Tunnel:
     """Requests the frames of one of a vehicle's buses, and receives them from its link."""
 
-    def __init__(self, fleet: "Fleet", system: int, bus: int, take: Callable[[Any], None]) -> None:
-        self._fleet, self._system, self._bus, self._take = fleet, system, bus, take
+    def __init__(self, fleet: "Fleet", system: int, bus: int, source: "CanSource") -> None:
+        self._fleet, self._system, self._bus, self._source = fleet, system, bus, source
         fleet.subscribe(self._message, "CAN_FRAME", "CANFD_FRAME")
 
     def run(self, stop: threading.Event) -> None:
@@ -139,11 +137,11 @@ class _Tunnel:
         while not stop.is_set():
             self._fleet.call(self._ask)
             stop.wait(_ASK_S)
-        self._fleet.call(lambda: self._send([self._forward(0)]))
+        self._fleet.call(partial(self._send, [self._forward(0)]))
 
     def _message(self, vehicle: "Vehicle", message: "Message", utc_s: float) -> None:
         if vehicle.system == self._system and message.bus in (self._bus - 1, self._bus):
-            self._take(message)
+            self._source.feed(message)
 
     def _ask(self) -> None:
         from gcs_plugin.links.mavlink import dialect

@@ -2,15 +2,12 @@
 
 import logging
 import threading
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from gcs_plugin.daemon.intake.picture_intake import VehicleIntake
 from gcs_plugin.daemon.intake.posted_pose import PostedPose, pose_values
-from gcs_plugin.daemon.intake.watched_folder import FolderReader, PictureIntake
-from orthoswarm.model.errors import OrthoSwarmError, StorageError
-from telemetry.live.live_poses import LinkPose
+from gcs_plugin.daemon.intake.watched_folder import FolderReader
 from telemetry.samples.sample import Sample
 
 if TYPE_CHECKING:
@@ -21,53 +18,20 @@ _SCHEMES: Final = ("rtsp://", "rtsps://", "rtmp://", "udp://", "tcp://", "srt://
 STREAM_THREAD: Final = "pictures of "
 _log = logging.getLogger(__name__)
 
-PoseAt = Callable[[str, float], LinkPose | None]
-Take = Callable[[PostedPose, bytes], tuple[int, bool]]
-LinkLog = Callable[[str, Path], bool]
-
 
 def is_stream(where: str) -> bool:
     """True for an address of a live stream, False for a folder."""
     return where.lower().startswith(_SCHEMES)
 
 
-class Source:
-    """Pictures of one vehicle, read in its own thread.
+class PictureSource:
+    """Pictures of one vehicle, read in its own thread."""
 
-    Args:
-        vehicle: id.
-        where: stream or folder.
-        take: stores a picture.
-        pose_at: returns the vehicle's pose at a time from its link and bus, for pictures without their own.
-        notify: called with messages for the user.
-        cache: folder for pictures of videos and for the states of folders.
-        on_settled: called with the vehicle when its folder has stopped changing after new pictures.
-        link_log: writes a vehicle's packets into a .tlog; returns False if there are none.
-    """
-
-    def __init__(
-        self, vehicle: str, where: str, *, take: Take, pose_at: PoseAt, notify: Callable[[str], None], cache: Path,
-        link_log: LinkLog = lambda vehicle, out: False, on_settled: Callable[[str], None] = lambda vehicle: None,
-    ) -> None:  # fmt: skip
-        self.vehicle, self.where = vehicle, where
-        self._take, self._pose_at, self._notify = take, pose_at, notify
-        self._stop = threading.Event()
-        self._state, self.taken, self._without_pose = "waiting", 0, 0
-        self._reader: FolderReader | None = None
-        if not is_stream(where):
-            intake = PictureIntake(
-                vehicle=vehicle,
-                keep=self._store,
-                pose_at=partial(pose_at, vehicle),
-                link_log=partial(link_log, vehicle),
-                notify=notify,
-                on_settled=partial(on_settled, vehicle),
-                cache=cache,
-                stop=self._stop,
-            )
-            self._reader = FolderReader(Path(where), intake)
-        run = self._stream if self._reader is None else self._reader.run
-        self._thread = threading.Thread(target=self._guarded, args=(run,), name=STREAM_THREAD + vehicle, daemon=True)
+    def __init__(self, where: str, intake: VehicleIntake) -> None:
+        self.vehicle, self.where, self._intake = intake.vehicle, where, intake
+        self._state, self._without_pose = "waiting", 0
+        self._reader = None if is_stream(where) else FolderReader(Path(where), intake)
+        self._thread = threading.Thread(target=self._guarded, name=STREAM_THREAD + self.vehicle, daemon=True)
 
     @property
     def state(self) -> str:
@@ -91,11 +55,11 @@ class Source:
 
     def stop(self) -> None:
         """Ask it to stop; a wait inside a stream's library ends later."""
-        self._stop.set()
+        self._intake.stop.set()
 
     def close(self, wait_s: float = 5.0) -> bool:
         """Stop reading; returns whether it ended within the time-out."""
-        self._stop.set()
+        self._intake.stop.set()
         if self._thread.ident is not None:
             self._thread.join(wait_s)
         return not self._thread.is_alive()
@@ -103,20 +67,21 @@ class Source:
     def document(self) -> dict[str, Any]:
         """Its state as JSON values, without addresses, which may contain passwords."""
         return {
-            "kind": "stream" if is_stream(self.where) else "folder", "state": self.state, "taken": self.taken,
+            "kind": "stream" if is_stream(self.where) else "folder", "state": self.state, "taken": self._intake.taken,
             "without_pose": self.without_pose,
         }  # fmt: skip
 
-    def _guarded(self, run: Callable[[], None]) -> None:
-        while not self._stop.is_set():
+    def _guarded(self) -> None:
+        stop = self._intake.stop
+        while not stop.is_set():
             try:
                 self._state = "waiting"
-                run()
+                (self._stream if self._reader is None else self._reader.run)()
                 return
             except Exception:  # a broken stream must not end the thread
                 _log.exception("the pictures of %s", self.vehicle)
                 self._state = "failed, tried again"
-                self._stop.wait(2.0)
+                stop.wait(2.0)
 
     # -- a stream -------------------------------------------------------------------------------------------------
 
@@ -127,39 +92,28 @@ class Source:
         def state(text: str) -> None:
             before, self._state = self._state, text.split(":")[0]
             if self._state != before:  # every attempt fails while a camera sends nothing on the ground
-                self._notify(f"the pictures of {self.vehicle}: {self._state}")
+                self._intake.notify(f"the pictures of {self.vehicle}: {self._state}")
 
-        for picture in open_stream(self.where, stop=self._stop, on_state=state, timeout_s=_SILENT_S):
-            self._offer(picture, partial(encode_jpeg, picture.rgb))
+        for picture in open_stream(self.where, stop=self._intake.stop, on_state=state, timeout_s=_SILENT_S):
+            pose = self._pose(picture)
+            if pose is None:
+                self._without_pose += 1
+            else:
+                self._intake.keep(pose, encode_jpeg(picture.rgb))
 
-    def _offer(self, picture: "LivePicture", data: Callable[[], bytes]) -> None:
-        """Store a picture with its own pose, gaps filled from the vehicle's link and bus."""
+    def _pose(self, picture: "LivePicture") -> PostedPose | None:
+        """A picture's own pose, with gaps filled from the vehicle's link and bus; None if its place is not known."""
         name, time_s, origin = f"live-{picture.time_s:.3f}.jpg", picture.time_s, picture.origin
         own = picture.sample if picture.sample is not None else Sample()
         recorded = {"position": own.lat_deg, "height": own.height_m, "angles": own.yaw_deg}
         origins = dict.fromkeys((key for key, value in recorded.items() if value is not None), origin)
         if not own.has_position or own.yaw_deg is None or own.height_m is None:
-            linked = self._pose_at(self.vehicle, time_s)
+            linked = self._intake.pose_at(time_s)
             if linked is not None:
                 own, origins = own.merge(linked.sample), linked.origin | origins
         values = pose_values(own)
         if values is None:
-            self._without_pose += 1
-            return
+            return None
         if picture.damaged:
             values["damaged"] = True
-        self._store(PostedPose(self.vehicle, name, time_s, values, origins), data())
-
-    def _store(self, pose: PostedPose, data: bytes) -> None:
-        """Store a picture; if the disk is full, wait until there is room."""
-        while not self._stop.is_set():
-            try:
-                _, new = self._take(pose, data)
-                self.taken += new
-                return
-            except StorageError as error:
-                self._notify(str(error))
-                self._stop.wait(2.0)
-            except OrthoSwarmError as error:
-                _log.warning("%s of %s: %s", pose.image, self.vehicle, error)
-                return
+        return PostedPose(self.vehicle, name, time_s, values, origins)

@@ -3,15 +3,13 @@
 Poses from files and links take the same form.
 """
 
-import json
-import sqlite3
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
-from gcs_plugin.daemon.store.journal import unpacked
+from gcs_plugin.daemon.store.frame_rows import FrameRow
 from gcs_plugin.daemon.store.picture_store import PictureStore
 from orthoswarm.model.earth import distance_m
 from orthoswarm.model.errors import InputError
@@ -170,9 +168,8 @@ def posted_frame(frame: Frame, vehicle: str, name: str) -> PostedPose:
     return PostedPose(vehicle, name, frame.time_s, values, dict(frame.origin))
 
 
-def frame_of_row(row: sqlite3.Row, store: PictureStore) -> Frame:
+def frame_of_row(row: FrameRow, store: PictureStore) -> Frame:
     """The frame of a journal's row."""
     return frame_of(
-        json.loads(row["pose"]), image=unpacked(row["image"]), path=store.path(row["path"]),
-        vehicle=unpacked(row["vehicle"]), time_s=row["time"], size=(row["width"], row["height"]),
-    )  # fmt: skip
+        row.pose, image=row.image, path=store.path(row.path), vehicle=row.vehicle, time_s=row.time_s, size=row.size
+    )

@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
+from gcs_plugin.daemon.store.daemon_events import PictureRefused, PictureRejected
+from gcs_plugin.daemon.store.event_bus import Events
 from orthoswarm.export.product_files import iso_time
 
 CAUSES: Final = {
@@ -33,11 +35,11 @@ class RefusedPictures:
     """Counts them since the daemon's start; any thread.
 
     Args:
-        publish: called with the fields of an event for each. clock: UTC epoch seconds.
+        events: told of each. clock: UTC epoch seconds.
     """
 
-    def __init__(self, publish: Callable[..., None], clock: Callable[[], float] = time.time) -> None:
-        self._publish, self._clock = publish, clock
+    def __init__(self, events: Events, clock: Callable[[], float] = time.time) -> None:
+        self._events, self._clock = events, clock
         self._lock = threading.Lock()
         self._by_cause: dict[str, _Refusals] = {}
 
@@ -51,7 +53,11 @@ class RefusedPictures:
             before = self._by_cause.get(cause)
             count = 1 if before is None else before.count + 1
             self._by_cause[cause] = _Refusals(count, vehicle, image, reason, self._clock())
-        self._publish("refused", cause=cause, count=count, vehicle=vehicle, image=image, reason=reason)
+        self._events.publish(PictureRefused(cause, count, vehicle, image, reason))
+
+    def picture_rejected(self, event: PictureRejected) -> None:
+        """Count a stored picture that cannot be on the map."""
+        self.note("place" if event.misplaced else "map", event.reason, event.frame.vehicle, event.frame.image)
 
     def note_name_taken(self, vehicle: str, image: str) -> None:
         """Count a picture whose name another one of the vehicle has; the first one stays."""

@@ -12,17 +12,16 @@ import logging
 import os
 import shutil
 import tempfile
-import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from gcs_plugin.daemon.intake.file_complete import is_complete, is_video_complete
-from gcs_plugin.daemon.intake.posted_pose import PostedPose, apart_m, linked_pose, posted_frame
+from gcs_plugin.daemon.intake.picture_intake import VehicleIntake
+from gcs_plugin.daemon.intake.posted_pose import apart_m, linked_pose, posted_frame
 from orthoswarm.model.errors import OrthoSwarmError
-from telemetry.live.live_poses import LinkPose
 
 if TYPE_CHECKING:
     from orthoswarm.model.frame import Frame, Ingest, Rejection
@@ -39,20 +38,13 @@ _REST_S: Final = 5.0
 _AGAIN_S: Final = (20.0, 600.0)
 _NEAR_M: Final = 50.0
 _log = logging.getLogger(__name__)
-PoseAt = Callable[[float], LinkPose | None]
-Keep = Callable[[PostedPose, bytes], None]
-LinkLog = Callable[[Path], bool]
 _HEAD: Final = 1 << 20  # bytes at either end that identify a file
 Stamp = tuple[int, int]
 """Size of a file and time of its last change, nanoseconds."""
 
 
 class FolderState:
-    """The files read from a folder, listed in a file of the workspace; started afresh for another journal.
-
-    Args:
-        cache: folder of the file. vehicle, folder: the watched folder.
-    """
+    """The files read from a folder, listed in a file of the workspace; started afresh for another journal."""
 
     def __init__(self, cache: Path, vehicle: str, folder: Path) -> None:
         key = hashlib.sha256(json.dumps([vehicle, str(folder)]).encode()).hexdigest()[:16]
@@ -139,43 +131,17 @@ class _File:
     stall_reported: bool = False
 
 
-@dataclass(slots=True, kw_only=True)
-class PictureIntake:
-    """The callbacks and folders that a folder's reader needs.
-
-    Attributes:
-        vehicle: id.
-        keep: stores a picture; returns when it is safe.
-        pose_at: returns the vehicle's pose at a time (UTC) from its link.
-        link_log: writes the vehicle's packets so far to a .tlog; returns False if there are none.
-        notify: called with messages for the user.
-        on_settled: called when the folder has stopped changing after new pictures.
-        cache: folder of the workspace for the folder's state, and for pictures of videos until they are stored.
-        stop: set to end.
-    """
-
-    vehicle: str
-    keep: Keep
-    pose_at: PoseAt
-    link_log: LinkLog
-    notify: Callable[[str], None]
-    on_settled: Callable[[], None]
-    cache: Path
-    stop: threading.Event
-
-
 class FolderReader:
     """Reads one folder.
 
     Args:
         folder: to watch, including subfolders; it may appear and disappear.
-        intake: see PictureIntake.
 
     Attributes:
         state: in words. poseless: files that wait for a pose.
     """
 
-    def __init__(self, folder: Path, intake: PictureIntake) -> None:
+    def __init__(self, folder: Path, intake: VehicleIntake) -> None:
         from orthoswarm.raster.picture_file import PICTURE_SUFFIXES
         from telemetry.ingest.discovery import LOG_SUFFIXES, VIDEO_SUFFIXES
 
@@ -229,7 +195,7 @@ class FolderReader:
         self._pair(here, now)
         if self._fresh_at is not None and not self._busy() and now - self._fresh_at > _REST_S:
             self._fresh_at = None
-            self._intake.on_settled()
+            self._intake.settled()
 
     def _scan(self, folder: Path) -> Iterator[tuple[Path, Stamp]]:
         """Files of the wanted kinds with their stamps, by name; unreadable ones are left for the next scan."""

@@ -6,88 +6,39 @@ journal change that also marks it as done. Refinements have their own threads; b
 start only while no refinement waits or runs; drawing a layer again does not wait.
 """
 
-import json
 import logging
-import sqlite3
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any, Final
 
+from gcs_plugin.daemon.store.daemon_events import JobChanged, JobDropped, JobEnded, JobsStop, Problem
 from gcs_plugin.daemon.store.event_bus import Events
-from gcs_plugin.daemon.store.journal import Change, Journal, newest_seq, packed, unpacked
+from gcs_plugin.daemon.store.frame_rows import newest_seq
+from gcs_plugin.daemon.store.job_rows import (
+    Job,
+    find_job,
+    interrupted_jobs_queued,
+    job_ended,
+    job_started,
+    latest_jobs,
+    new_job,
+    open_jobs,
+    queued_jobs,
+    waiting_jobs_dropped,
+)
+from gcs_plugin.daemon.store.journal import Change, Journal, all_changes
 from orthoswarm.model.errors import OrthoSwarmError, StorageError, WorkerStoppedError
 
 _MOST_ATTEMPTS: Final = 3  # of a job whose worker stopped
-_MOST_RESTARTS: Final = 20  # of a job by the daemon's own restarts
 _MOST_LISTED: Final = 1000  # finished jobs
 _BACKGROUND: Final = frozenset({"coarse", "together", "tones", "redraw", "export"})
-_IN_FLIGHT: Final = "(kind = 'coarse' AND json_extract(detail, '$.after') IS NULL)"
-"""A coarse map of a vehicle that still flies, as SQL; one with `after` completes the layer after a refinement."""
-_FIRST: Final = "(kind = 'export' AND json_extract(detail, '$.after') IS 'refine')"
-"""What a refinement has changed is written before anything else is done in the background, as SQL."""
-_PREEMPTED: Final = frozenset({"coarse", "together", "tones"})
-_AFTER_REFINEMENT: Final = _PREEMPTED | {"export"}
+_AFTER_REFINEMENT: Final = _BACKGROUND - {"redraw"}
 """An export that was asked for during a refinement holds its result."""
 _WAITING_THREADS: Final = 2  # beyond those of the workers, for jobs that wait for pictures
 _JOURNAL_AGAIN_S: Final = 1.0
 _log = logging.getLogger(__name__)
-
-
-@dataclass(slots=True, kw_only=True)
-class Job:
-    """One job.
-
-    Attributes:
-        id: number. kind: refine, together, tones, coarse, redraw or export.
-        vehicle: its id, None for all. sortie: its number.
-        state: queued, running, done or failed. progress: 0 to 1. message: the present step, or why it failed.
-        created, started, ended: UTC epoch seconds. attempts: number of starts. detail: JSON values.
-    """
-
-    id: int
-    kind: str
-    vehicle: str | None
-    sortie: int | None
-    state: str
-    progress: float
-    message: str
-    created: float
-    started: float | None
-    ended: float | None
-    attempts: int
-    detail: dict[str, Any] = field(default_factory=dict)
-
-    @classmethod
-    def of(cls, row: sqlite3.Row) -> "Job":
-        """The job of a journal's row."""
-        vehicle = None if row["vehicle"] is None else unpacked(row["vehicle"])
-        return cls(
-            id=row["id"],
-            kind=row["kind"],
-            vehicle=vehicle,
-            sortie=row["sortie"],
-            state=row["state"],
-            progress=row["progress"],
-            message=row["message"],
-            created=row["created"],
-            started=row["started"],
-            ended=row["ended"],
-            attempts=row["attempts"],
-            detail=json.loads(row["detail"]),
-        )
-
-    def document(self) -> dict[str, Any]:
-        """As JSON values."""
-        from orthoswarm.export.product_files import iso_time
-
-        return {
-            "id": self.id, "kind": self.kind, "vehicle": self.vehicle, "sortie": self.sortie, "state": self.state,
-            "progress": round(self.progress, 3), "message": self.message, "created": iso_time(self.created),
-            "started": iso_time(self.started), "ended": iso_time(self.ended), "attempts": self.attempts,
-            "detail": self.detail,
-        }  # fmt: skip
 
 
 class Preempted(Exception):
@@ -99,66 +50,46 @@ ReportProgress = Callable[[float, str], None]
 Handler = Callable[[Job, ReportProgress], Change]
 """Does a job, reporting its progress; returns the change that records its result. The job's end is written with it, in
 one transaction."""
-After = Callable[[Job], None]
 
 
 class Jobs:
     """The queue of jobs.
 
-    Attributes:
-        problem: why a job's end cannot be written at present, else empty.
-
     Args:
-        journal: stores the jobs.
-        events: receives every change.
+        events: hears of every change; see JobChanged, JobDropped, JobEnded.
         handlers: kind -> function that does the job.
         slots: number of refinements computed at once. Two more may be at a step that needs no worker process
             (waiting for a vehicle's last pictures, publishing).
-        on_drop: called with a running job that was cancelled, to abandon its work.
+
+    Attributes:
+        problem: why a job's end cannot be written at present, else empty.
     """
 
-    def __init__(
-        self,
-        journal: Journal,
-        events: Events,
-        handlers: Mapping[str, Handler],
-        slots: int,
-        on_drop: After = lambda _: None,
-    ) -> None:
+    def __init__(self, journal: Journal, events: Events, handlers: Mapping[str, Handler], slots: int) -> None:
         self._journal, self._events, self._handlers = journal, events, handlers
         self._condition = threading.Condition()
         self._running: dict[int, Job] = {}
         self._unwanted: dict[int, str] = {}
-        self._on_drop = on_drop
         self._stop = False
-        self._after: list[After] = []
         self.problem = ""
         self._threads = [
             threading.Thread(target=self._run, args=(False,), name=f"refinement {n}", daemon=True)
             for n in range(max(1, slots) + _WAITING_THREADS)
         ]
         self._threads.append(threading.Thread(target=self._run, args=(True,), name="background jobs", daemon=True))
-        journal.write(_requeue)
-
-    def on_end(self, listener: After) -> None:
-        """Call a function with each job that has ended, in the job's thread."""
-        self._after.append(listener)
+        journal.write(interrupted_jobs_queued)
 
     def start(self) -> None:
         """Start working."""
         for thread in self._threads:
             thread.start()
 
-    @property
-    def stopping(self) -> bool:
-        """True once no more jobs are started."""
-        return self._stop
-
     def give_up(self) -> None:
         """Start no more jobs; errors from now on are due to the shutdown and not failures."""
         with self._condition:
             self._stop = True
             self._condition.notify_all()
+        self._events.publish(JobsStop())
 
     def close(self) -> None:
         """Start no more jobs; running ones are abandoned by their workers and queued again at the next start."""
@@ -177,7 +108,7 @@ class Jobs:
 
     def drop(self, kind: str, vehicle: str, why: str) -> None:
         """Cancel a vehicle's jobs of a kind: waiting ones end at once, a running one is abandoned."""
-        self._journal.write(drop_change(kind, vehicle, why))
+        self._journal.write(waiting_jobs_dropped(kind, vehicle, why))
         with self._condition:
             running = [
                 job
@@ -187,7 +118,7 @@ class Jobs:
             for job in running:
                 self._unwanted[job.id] = why
         for job in running:
-            self._on_drop(job)
+            self._events.publish(JobDropped(job))
 
     def wake(self) -> None:
         """Check the queue again, after a job was put directly into the journal."""
@@ -196,22 +127,17 @@ class Jobs:
 
     def all(self) -> list[Job]:
         """The latest jobs, oldest first."""
-        rows = self._journal.rows("SELECT * FROM jobs ORDER BY id DESC LIMIT ?", (_MOST_LISTED,))
+        found = latest_jobs(self._journal, _MOST_LISTED)
         with self._condition:
-            running = dict(self._running)
-        return [running.get(row["id"]) or Job.of(row) for row in reversed(rows)]
+            return [self._running.get(job.id, job) for job in found]
 
     def find(self, number: int) -> Job | None:
         """A job by its number."""
-        if not 0 < number < 1 << 63:  # SQLite's integers have 64 bits
-            return None
-        row = self._journal.one("SELECT * FROM jobs WHERE id = ?", (number,))
-        return None if row is None else Job.of(row)
+        return find_job(self._journal, number)
 
     def open(self, *kinds: str) -> int:
         """Number of waiting and running jobs of these kinds (all, if none is given), without coarse maps in flight."""
-        query = f"SELECT kind FROM jobs WHERE state IN ('queued', 'running') AND NOT {_IN_FLIGHT}"
-        return sum(not kinds or row["kind"] in kinds for row in self._journal.rows(query))
+        return sum(not kinds or kind in kinds for kind in open_jobs(self._journal))
 
     # -- the threads ----------------------------------------------------------------------------------------------
 
@@ -236,12 +162,11 @@ class Jobs:
 
     def _next(self, background: bool) -> Job | None:
         """Take the next background job, or the next refinement; the jobs of a vehicle run one after the other."""
-        rows = self._journal.rows(f"SELECT * FROM jobs WHERE state = 'queued' ORDER BY NOT {_FIRST}, {_IN_FLIGHT}, id")
+        queued = queued_jobs(self._journal)
         busy = {_lane(job) for job in self._running.values()}
-        refining = any(kind == "refine" for kind, _ in busy) or any(row["kind"] == "refine" for row in rows)
-        for row in rows:
-            job = Job.of(row)
-            if (job.kind in _BACKGROUND) != background or row["id"] in self._running or _lane(job) in busy:
+        refining = any(kind == "refine" for kind, _ in busy) or any(job.kind == "refine" for job in queued)
+        for job in queued:
+            if (job.kind in _BACKGROUND) != background or job.id in self._running or _lane(job) in busy:
                 continue
             if refining and job.kind in _AFTER_REFINEMENT:
                 continue
@@ -253,12 +178,7 @@ class Jobs:
     def _do(self, job: Job) -> None:
         if job.kind == "refine":
             job.detail["newest_seq"] = newest_seq(self._journal)  # pictures that arrive later are late
-        self._journal.write(
-            lambda db: db.execute(
-                "UPDATE jobs SET state = 'running', started = ?, attempts = ?, message = '', detail = ? WHERE id = ?",
-                (job.started, job.attempts, json.dumps(job.detail), job.id),
-            )
-        )
+        self._journal.write(job_started(job))
         self._publish(job)
 
         def progress(share: float, message: str) -> None:
@@ -276,11 +196,10 @@ class Jobs:
                 self._unwanted.pop(job.id, None)
                 self._condition.notify_all()
         self._publish(ended)
-        for listener in self._after:
-            try:
-                listener(ended)
-            except OrthoSwarmError as error:
-                _log.error("after job %d: %s", job.id, error)
+        try:
+            self._events.publish(JobEnded(ended))
+        except OrthoSwarmError as error:
+            _log.error("after job %d: %s", job.id, error)
 
     def _outcome(self, job: Job, progress: ReportProgress) -> tuple[Job, Change] | None:
         """Do a job; returns the ended job and the journal change that records it, None if the daemon stops."""
@@ -289,7 +208,7 @@ class Jobs:
             if self._stop:
                 return None
             ended = replace(job, state="done", progress=1.0, message="", ended=time.time())
-            return ended, _both(change, _ended(ended))
+            return ended, all_changes(change, job_ended(ended))
         except Exception as error:
             if self._stop:  # its worker was stopped
                 return None
@@ -299,7 +218,7 @@ class Jobs:
                 ended = replace(job, state="queued", progress=0.0, started=None, attempts=job.attempts - 1)
             else:
                 ended = _failed(job, error)
-            return ended, _ended(ended)
+            return ended, job_ended(ended)
 
     def _write_end(self, job: Job, change: Change) -> bool:
         """Write a job's end, retrying while the disk is full; False if the daemon stops before that."""
@@ -309,7 +228,7 @@ class Jobs:
             except StorageError as error:
                 if not self.problem:
                     _log.error("the end of job %d (%s) waits: %s", job.id, job.kind, error)
-                    self._events.publish("problem", text=str(error))
+                    self._events.publish(Problem(str(error)))
                 self.problem = str(error)
             else:
                 self.problem = ""
@@ -320,7 +239,7 @@ class Jobs:
                 self._condition.wait(_JOURNAL_AGAIN_S)
 
     def _publish(self, job: Job) -> None:
-        self._events.publish("job", **job.document())
+        self._events.publish(JobChanged(job.document()))
 
 
 def _failed(job: Job, error: Exception) -> Job:
@@ -334,71 +253,6 @@ def _failed(job: Job, error: Exception) -> Job:
     return replace(job, state="failed", message=message, ended=time.time())
 
 
-def new_job(kind: str, vehicle: str | None, sortie: int | None, detail: dict[str, Any]) -> Callable[
-    [sqlite3.Connection], Job
-]:  # fmt: skip
-    """The change that queues a job unless an equal one waits already; its result is the job."""
-    name, text, created = (None if vehicle is None else packed(vehicle)), json.dumps(detail), time.time()
-
-    def change(db: sqlite3.Connection) -> Job:
-        db.row_factory = sqlite3.Row
-        row = db.execute(
-            "SELECT * FROM jobs WHERE kind = ? AND vehicle IS ? AND sortie IS ? AND state = 'queued'"
-            " AND json_remove(detail, '$.newest_seq') = json(?)",
-            (kind, name, sortie, text),
-        ).fetchone()
-        if row is None:
-            number = db.execute(
-                "INSERT INTO jobs (kind, vehicle, sortie, state, created, detail) VALUES (?, ?, ?, 'queued', ?, ?)",
-                (kind, name, sortie, created, text),
-            ).lastrowid
-            row = db.execute("SELECT * FROM jobs WHERE id = ?", (number,)).fetchone()
-        return Job.of(row)
-
-    return change
-
-
-def drop_change(kind: str, vehicle: str, why: str) -> Change:
-    """The change that ends a vehicle's waiting jobs of a kind."""
-    values = (why, time.time(), kind, packed(vehicle))
-
-    def change(db: sqlite3.Connection) -> None:
-        db.execute(
-            "UPDATE jobs SET state = 'done', progress = 1, message = ?, ended = ? WHERE kind = ? AND vehicle = ?"
-            " AND state = 'queued' AND json_extract(detail, '$.after') IS NULL",
-            values,
-        )
-
-    return change
-
-
 def _lane(job: Job) -> tuple[str, str | None]:
     """The lane of a job: of jobs in one lane only one runs at a time."""
     return ("background", None) if job.kind in _BACKGROUND else (job.kind, job.vehicle)
-
-
-def _requeue(db: sqlite3.Connection) -> None:
-    """Queue interrupted jobs again, but only a few times, in case the job itself ended the daemon."""
-    db.execute(
-        "UPDATE jobs SET state = 'failed', message = 'the daemon ended each time that this was tried', ended = ?"
-        " WHERE state = 'running' AND attempts >= ?",
-        (time.time(), _MOST_RESTARTS),
-    )
-    db.execute("UPDATE jobs SET state = 'queued', progress = 0, started = NULL WHERE state = 'running'")
-
-
-def _ended(job: Job) -> Change:
-    values = (job.state, job.progress, job.message, job.ended, job.attempts, json.dumps(job.detail), job.id)
-
-    def change(db: sqlite3.Connection) -> None:
-        db.execute("UPDATE jobs SET state=?, progress=?, message=?, ended=?, attempts=?, detail=? WHERE id=?", values)
-
-    return change
-
-
-def _both(one: Change, other: Change) -> Change:
-    def change(db: sqlite3.Connection) -> None:
-        one(db)
-        other(db)
-
-    return change

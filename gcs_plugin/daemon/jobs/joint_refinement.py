@@ -7,29 +7,27 @@ could not be registered onto the map are registered to their neighbours. The job
 refinement waits, and gives way to any that arrives.
 """
 
-import json
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
-from gcs_plugin.daemon.jobs.job_queue import Job, ReportProgress, new_job
-from gcs_plugin.daemon.jobs.placed_sorties import detail_of, others_near, refined_change, solution_row
+from gcs_plugin.daemon.jobs.job_queue import ReportProgress
+from gcs_plugin.daemon.jobs.placed_sorties import detail_of, others_near, refined_change
 from gcs_plugin.daemon.jobs.preemption import Preemption
 from gcs_plugin.daemon.jobs.publisher import Publisher
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
 from gcs_plugin.daemon.jobs.worker_tasks import JointTask, SortieResult, refine_jointly
 from gcs_plugin.daemon.layers.layers import new_name
-from gcs_plugin.daemon.store.journal import Change, Journal, unpacked
+from gcs_plugin.daemon.store.job_rows import Job, new_job
+from gcs_plugin.daemon.store.journal import Change, Journal, no_change
+from gcs_plugin.daemon.store.sortie_rows import SortieDetail, placed_sortie
 from orthoswarm.model.bounding_box import BoundingBox
 
 
-def together_jobs(journal: Journal, job: Job, box: BoundingBox) -> list[Callable[[Any], Job]]:
+def together_jobs(journal: Journal, job: Job, box: BoundingBox) -> list[Change]:
     """The changes that queue joint refinements after a sortie was refined: of its neighbours, then of itself."""
-    others = others_near(journal, job, box, 0.0)
-    own = [(str(job.vehicle), job.sortie)] if others else []
-    again = [*((unpacked(row["vehicle"]), int(row["sortie"])) for row in others), *own]
+    others = others_near(journal, job.whose, box, 0.0)
+    again = [*(row.whose for row in others), *([job.whose] if others else [])]
     return [new_job("together", vehicle, sortie, {}) for vehicle, sortie in again]
 
 
@@ -39,7 +37,7 @@ class JointRefinement:
 
     Attributes:
         journal, publisher: of the workspace. workers: compute the job; used by nothing else meanwhile.
-        basemap: the map. on_published: called with layer and job when pixels have changed.
+        basemap: the map.
         least_px: pictures that move less, in pixels of the layer, are not drawn again.
     """
 
@@ -48,7 +46,6 @@ class JointRefinement:
     workers: WorkerPool
     basemap: Path | None
     least_px: float
-    on_published: Callable[[str, Job], None] = lambda layer, job: None
     _preemption: Preemption = field(init=False)
 
     def __post_init__(self) -> None:
@@ -66,26 +63,25 @@ class JointRefinement:
             if not published:
                 target.unlink(missing_ok=True)
         job.detail["seconds"] = round(time.monotonic() - began, 3)
-        return lambda db: None
+        return no_change
 
-    def give_up(self) -> None:
+    def give_way(self, _: object = None) -> None:
         """Stop the running job; it is done later."""
         self._preemption.stop()
 
     def _solve(self, job: Job, report: ReportProgress, target: Path) -> bool:
         """Solve and publish; False if nothing changes."""
-        row = solution_row(self.journal, job)
-        if row is None or self.basemap is None or json.loads(row["detail"])["layer"] != "fine":
+        row = placed_sortie(self.journal, "solutions", job.whose)
+        if row is None or self.basemap is None or row.detail["layer"] != "fine":
             return _note(job, "it was not refined on the map")
-        detail = json.loads(row["detail"])
-        bounds = BoundingBox(*detail["bounds"])
-        others = [self.publisher.solutions / other["path"] for other in others_near(self.journal, job, bounds, 0.0)]
+        near = others_near(self.journal, job.whose, row.bounds, 0.0)
+        others = [self.publisher.solutions / other.path for other in near]
         if not others:
             return _note(job, "it has no neighbours")
         report(0.05, f"refining again together with {len(others)} neighbour{'s' * (len(others) > 1)}")
         area = self.publisher.area()
         task = JointTask(
-            before=self.publisher.solutions / row["path"],
+            before=self.publisher.solutions / row.path,
             neighbours=others,
             target=target,
             epsg=area.epsg,
@@ -103,21 +99,21 @@ class JointRefinement:
         if moved_m < self.least_px * area.gsd_m:
             return _note(job, "it agrees with its neighbours already")
         with self.publisher.turn("fine"):
-            now = solution_row(self.journal, job)
-            if now is None or now["path"] != row["path"]:
+            now = placed_sortie(self.journal, "solutions", job.whose)
+            if now is None or now.path != row.path:
                 return _note(job, "it was refined again meanwhile")
             report(0.7, "drawing")
-            self._print(job, target, solved, detail)
-        self.publisher.retire(self.publisher.solutions / row["path"])
-        self.on_published("fine", job)
+            self._print(job, target, solved, row.detail)
+        self.publisher.retire(self.publisher.solutions / row.path)
+        self.publisher.tell("fine", job)
         return True
 
-    def _print(self, job: Job, target: Path, solved: SortieResult, before: dict[str, Any]) -> None:
+    def _print(self, job: Job, target: Path, solved: SortieResult, before: SortieDetail) -> None:
         def change(rejected: dict[str, str]) -> Change:
             return refined_change(job, solved, rejected, target.name, before | detail_of(solved, solved.legs))
 
         job.detail["version_before"], job.detail["version"] = self.publisher.publish(
-            "fine", self.workers, (str(job.vehicle), job.sortie), target=target, changed=solved.changed, change=change
+            "fine", self.workers, job.whose, target=target, changed=solved.changed, change=change
         )
 
 

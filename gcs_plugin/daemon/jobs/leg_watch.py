@@ -6,7 +6,6 @@ It also detects when a vehicle falls silent, which may be the end of a leg, or o
 import logging
 import threading
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -14,13 +13,13 @@ import numpy as np
 
 from gcs_plugin.config import SORTIE
 from gcs_plugin.daemon.stoppable_thread import StoppableThread
+from gcs_plugin.daemon.store.daemon_events import LegsOver, PictureStored, VehicleSilent
+from gcs_plugin.daemon.store.event_bus import Events
 from orthoswarm.model.earth import DEGREE_M
 from orthoswarm.trajectory.legs import ended_legs
 
 _LOOK_S: Final = 0.5
 _log = logging.getLogger(__name__)
-
-Ask = Callable[[str, int, bool], None]
 
 
 @dataclass(slots=True)
@@ -37,21 +36,14 @@ class LegWatch:
     """Watches the paths of all vehicles, in a thread.
 
     Args:
-        ask: called with vehicle, sortie and whether it has fallen silent, when legs are finished.
-        silent: called with vehicle and sortie when a vehicle falls silent, however few pictures it sent before.
+        events: told of finished legs, and of a vehicle that falls silent, however few pictures it sent before.
 
     Attributes:
         silent_s: a vehicle is silent when no picture has arrived for so long, seconds.
     """
 
-    def __init__(
-        self,
-        ask: Ask,
-        silent: Callable[[str, int], None] = lambda vehicle, sortie: None,
-        *,
-        silent_s: float,
-    ) -> None:
-        self._ask, self._silent, self.silent_s = ask, silent, silent_s
+    def __init__(self, events: Events, *, silent_s: float) -> None:
+        self._events, self.silent_s = events, silent_s
         self._lock = threading.Lock()
         self._paths: dict[tuple[str, int], _Path] = {}
         self._thread = StoppableThread(self._run, "legs")
@@ -63,6 +55,13 @@ class LegWatch:
     def close(self) -> None:
         """Stop watching."""
         self._thread.close()
+
+    def picture_stored(self, event: PictureStored) -> None:
+        """Record a picture that has come; one without a position says nothing of the path."""
+        if event.has_fix:
+            frame = event.frame
+            time_s = event.arrived_s if frame.time_s is None else frame.time_s
+            self.add(frame.vehicle, event.sortie, time_s, frame.fix.lat_deg, frame.fix.lon_deg)
 
     def add(self, vehicle: str, sortie: int, time_s: float, lat_deg: float, lon_deg: float) -> None:
         """Record a picture; any thread."""
@@ -98,7 +97,7 @@ class LegWatch:
             if silent:
                 path.heard = 0.0  # reported once
         if silent:
-            self._silent(*key)
+            self._events.publish(VehicleSilent(*key))
         if len(times) < SORTIE.coarse_map_pictures:
             return
         lat, lon = np.array(places).T
@@ -112,4 +111,4 @@ class LegWatch:
             keep = [k for k, t in enumerate(path.times) if t not in past]
             path.times = [path.times[k] for k in keep]
             path.places = [path.places[k] for k in keep]
-        self._ask(key[0], key[1], silent)
+        self._events.publish(LegsOver(*key, silent))

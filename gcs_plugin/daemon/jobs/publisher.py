@@ -4,27 +4,38 @@ Until the last step the map does not change; the last step is one transaction of
 the layer's new generation and all facts that change with it.
 """
 
-import json
 import logging
 import shutil
-import sqlite3
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
+from gcs_plugin.daemon.jobs.job_queue import ReportProgress
 from gcs_plugin.daemon.jobs.solution_file import is_readable
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
 from gcs_plugin.daemon.jobs.worker_tasks import DrawTask, draw
-from gcs_plugin.daemon.layers.layers import Area, Layer, new_name
+from gcs_plugin.daemon.layers.layers import MapArea, MapLayer, new_name
 from gcs_plugin.daemon.layers.realtime_layer import Drawer
-from gcs_plugin.daemon.store.journal import Change, Journal, fact_change, packed, unpacked
+from gcs_plugin.daemon.store.daemon_events import LayerPublished
+from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.daemon.store.frame_rows import Whose
+from gcs_plugin.daemon.store.job_rows import Job
+from gcs_plugin.daemon.store.journal import Change, Journal, all_changes, fact_change, no_change
+from gcs_plugin.daemon.store.sortie_rows import (
+    REFINED,
+    PlacedSortie,
+    Table,
+    placed_sorties,
+    placements_forgotten,
+    shown_sorties,
+    solution_paths,
+)
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import OrthoSwarmError
 
-REFINED = ("coarse", "fine")
+_TABLES: tuple[Table, ...] = ("solutions", "coarse")
 _log = logging.getLogger(__name__)
 
 
@@ -39,27 +50,17 @@ class Publisher:
     """
 
     def __init__(
-        self,
-        journal: Journal,
-        layers: dict[str, Layer],
-        folder: Path,
-        solutions: Path,
-        drawer: Drawer,
-        *,
-        trusted: bool,
-    ) -> None:
+        self, journal: Journal, layers: dict[str, MapLayer], workspace: Path, *, drawer: Drawer, events: Events,
+        workers: WorkerPool, trusted: bool,
+    ) -> None:  # fmt: skip
         """Remove unfinished files of a killed daemon, and open what it had published.
 
         Args:
+            workspace: its folder. workers: draw lost layers again.
             trusted: False after a power cut: canvases are not synced, for speed.
         """
-        self.journal, self.layers, self.folder, self.solutions, self._drawer = (
-            journal,
-            layers,
-            folder,
-            solutions,
-            drawer,
-        )
+        self.journal, self.layers, self._drawer, self._events, self._workers = journal, layers, drawer, events, workers
+        self.folder, self.solutions = workspace / "layers", workspace / "solutions"
         self._turns = {name: threading.Lock() for name in REFINED}
         self.drawing: set[str] = set()
         self.solutions.mkdir(parents=True, exist_ok=True)
@@ -73,7 +74,7 @@ class Publisher:
         """Open the published generation of a layer; False if it cannot be trusted and is dropped."""
         generation = self.journal.fact(layer)
         if generation is None:
-            return not self.shown(layer)
+            return not shown_sorties(self.journal, layer)
         try:
             if not trusted:
                 raise OrthoSwarmError("its last pixels may have been lost in the power cut")
@@ -84,50 +85,32 @@ class Publisher:
             return False
         return True
 
-    def _forget_outdated(self) -> list[tuple[str, int]]:
-        """Drop solution files that cannot be read, and the layers that show them.
-
-        Returns the refined sorties among them.
-        """
+    def _forget_outdated(self) -> list[Whose]:
+        """Forget solutions that cannot be read, with their layers; returns the refined sorties among them."""
         outdated = {
-            table: [row for row in self._rows(table) if not is_readable(self.solutions / row["path"])]
-            for table in ("solutions", "coarse")
+            table: [row for row in placed_sorties(self.journal, table) if not is_readable(self.solutions / row.path)]
+            for table in _TABLES
         }
-        keys = [(row["vehicle"], row["sortie"]) for rows in outdated.values() for row in rows]
-        if not keys:
+        if not any(outdated.values()):
             return []
-
-        def change(db: sqlite3.Connection) -> None:
-            for table, rows in outdated.items():
-                names = [(row["vehicle"], row["sortie"]) for row in rows]
-                db.executemany(f"DELETE FROM {table} WHERE vehicle = ? AND sortie = ?", names)
-            db.executemany(
-                "UPDATE frames SET stage = 'realtime' WHERE vehicle = ? AND sortie = ? AND stage IN ('coarse', 'fine')",
-                keys,
-            )
-            for layer in REFINED:
-                fact_change(layer, None)(db)
-
-        self.journal.write(change)
-        refined = [(unpacked(row["vehicle"]), int(row["sortie"])) for row in outdated["solutions"]]
+        self.journal.write(placements_forgotten(outdated))
+        refined = [row.whose for row in outdated["solutions"]]
         _log.warning(
             "the refined map was made by another version of the program; %d sorties are refined again", len(refined)
         )
         return refined
 
-    def draw_again(self, workers: WorkerPool, report: Callable[[float, str], None]) -> Change:
-        """Draw the lost layers from the solution files; returns the change that records it."""
-        todo = [(layer, key) for layer in self.lost for key in self.shown(layer)]
-        for n, (layer, (vehicle, sortie)) in enumerate(todo):
+    def draw_again(self, _: Job, report: ReportProgress) -> Change:
+        """The handler of `redraw`: draws the lost layers from the solution files."""
+        todo = [(layer, row.whose) for layer in self.lost for row in shown_sorties(self.journal, layer)]
+        for n, (layer, whose) in enumerate(todo):
             with self.turn(layer):
-                row = self.shown(layer).get((vehicle, sortie))
+                row = self.shown(layer, whose)
                 if row is None:
                     continue  # refined, or drawn again, meanwhile
-                report(n / len(todo), f"drawing {unpacked(vehicle)} on {layer}")
-                whose = (unpacked(vehicle), sortie)
-                self.publish(
-                    layer, workers, whose, target=row[0], changed=row[1], change=lambda rejected: lambda db: None
-                )
+                report(n / len(todo), f"drawing {row.vehicle} on {layer}")
+                target = self.solutions / row.path
+                self.publish(layer, self._workers, whose, target=target, changed=row.bounds, change=_as_it_is)
         return fact_change("lost", [])
 
     def sweep(self) -> None:
@@ -136,12 +119,12 @@ class Publisher:
         for path in self.folder.iterdir():
             if path.name not in named:
                 shutil.rmtree(path, ignore_errors=True)
-        known = {row["path"] for table in ("solutions", "coarse") for row in self._rows(table)}
+        known = {path for table in _TABLES for path in solution_paths(self.journal, table).values()}
         for path in self.solutions.iterdir():
             if path.name not in known:
                 path.unlink(missing_ok=True)
 
-    def area(self) -> Area:
+    def area(self) -> MapArea:
         """The map's area.
 
         Raises:
@@ -165,7 +148,7 @@ class Publisher:
         self,
         layer: str,
         workers: WorkerPool,
-        sortie: tuple[str, int | None],
+        whose: Whose,
         *,
         target: Path,
         changed: BoundingBox,
@@ -174,7 +157,7 @@ class Publisher:
         """Draw a placed sortie into the next generation of a layer and publish it; the layer's turn must be held.
 
         Args:
-            layer: coarse or fine. workers: where the work runs. sortie: vehicle and number.
+            layer: coarse or fine. workers: where the work runs.
             target: its solution file. changed: ground whose pixels change.
             change: returns the journal change, given image -> why it could not be drawn.
 
@@ -186,28 +169,24 @@ class Publisher:
         """
         name = new_name(layer)
         try:
-            rejected = workers.run(draw, self._task(layer, name, sortie, target, changed))
-            fact, other = fact_change(layer, name), change(rejected)
-
-            def both(db: sqlite3.Connection) -> None:
-                other(db)
-                fact(db)
-
+            rejected = workers.run(draw, self._task(layer, name, whose, target, changed))
+            stands = all_changes(change(rejected), fact_change(layer, name))
             before = self.layers[layer].version
-            self.journal.write(both)  # here, so that the next drawing starts from it
+            self.journal.write(stands)  # here, so that the next drawing starts from it
         except BaseException:
             shutil.rmtree(self.folder / name, ignore_errors=True)
             raise
         self.layers[layer].replace(Canvas.open(self.folder / name))
         return before, self.layers[layer].version
 
-    def shown(self, layer: str) -> dict[tuple[str, int], tuple[Path, BoundingBox]]:
-        """(vehicle, sortie) -> solution file and bounds of the sorties on a layer; refined ones hide coarse ones."""
-        refined = {(r["vehicle"], r["sortie"]): r for r in self._rows("solutions")}
-        rows = {key: row for key, row in refined.items() if json.loads(row["detail"])["layer"] == layer}
-        if layer == "coarse":
-            rows = {(r["vehicle"], r["sortie"]): r for r in self._rows("coarse")} | rows
-        return {key: (self.solutions / row["path"], _bounds(row)) for key, row in sorted(rows.items())}
+    def tell(self, layer: str, job: Job) -> None:
+        """Tell that a job has changed pixels of a layer."""
+        version = self.layers[layer].version
+        self._events.publish(LayerPublished(layer, version, job.vehicle, job.sortie))
+
+    def shown(self, layer: str, whose: Whose) -> PlacedSortie | None:
+        """A sortie on a layer, None if it is not there."""
+        return next((row for row in shown_sorties(self.journal, layer) if row.whose == whose), None)
 
     def retire(self, path: Path) -> None:
         """Remove a solution file later, as others may be reading it."""
@@ -215,15 +194,15 @@ class Publisher:
         later.daemon = True
         later.start()
 
-    def _task(
-        self, layer: str, name: str, sortie: tuple[str, int | None], target: Path, changed: BoundingBox
-    ) -> DrawTask:
-        mine = (packed(sortie[0]), sortie[1])
-        others = [path for key, (path, box) in self.shown(layer).items() if key != mine and box.overlaps(changed)]
+    def _task(self, layer: str, name: str, whose: Whose, target: Path, changed: BoundingBox) -> DrawTask:
+        others = [
+            self.solutions / row.path
+            for row in shown_sorties(self.journal, layer)
+            if row.whose != whose and row.bounds.overlaps(changed)
+        ]
         canvas = self.layers[layer].canvas
-        old = None if canvas is None else canvas.path
         return DrawTask(
-            old=old,
+            old=None if canvas is None else canvas.path,
             new=self.folder / name,
             grid=self.area().grid,
             solutions=[*others, target],
@@ -231,9 +210,6 @@ class Publisher:
             bounds=changed,
         )
 
-    def _rows(self, table: str) -> list[Any]:
-        return self.journal.rows(f"SELECT * FROM {table} ORDER BY vehicle, sortie")
 
-
-def _bounds(row: Any) -> BoundingBox:
-    return BoundingBox(*json.loads(row["detail"])["bounds"])
+def _as_it_is(_: dict[str, str]) -> Change:
+    return no_change

@@ -1,28 +1,31 @@
 """Refinement of one vehicle's sortie: gather its frames, solve and draw in worker processes, publish at once."""
 
-import json
 import logging
-import sqlite3
+import threading
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from gcs_plugin.config import SORTIE
-from gcs_plugin.daemon.jobs.job_queue import Job, ReportProgress, new_job
+from gcs_plugin.daemon.jobs.job_queue import ReportProgress
 from gcs_plugin.daemon.jobs.joint_refinement import together_jobs
-from gcs_plugin.daemon.jobs.placed_sorties import detail_of, others_near, refined_change, solution_row, sortie_frames
+from gcs_plugin.daemon.jobs.placed_sorties import detail_of, frames_of, others_near, refined_change
 from gcs_plugin.daemon.jobs.publisher import Publisher
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
 from gcs_plugin.daemon.jobs.worker_tasks import FollowTask, SolveTask, SortieResult, follow, near, register_late, solve
 from gcs_plugin.daemon.jobs.workspace_products import PRODUCTS
 from gcs_plugin.daemon.layers.layers import new_name
 from gcs_plugin.daemon.layers.realtime_layer import Drawer
-from gcs_plugin.daemon.store.journal import Change, Journal, late_frames, newest_seq, packed
+from gcs_plugin.daemon.store.daemon_events import JobsStop, LayerNeeded, RefinementBegins
+from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.daemon.store.frame_rows import last_arrivals, late_frames, newest_seq
+from gcs_plugin.daemon.store.job_rows import Job, new_job
+from gcs_plugin.daemon.store.journal import Change, Journal, all_changes, no_change
 from gcs_plugin.daemon.store.kept_pictures import KeptPictures
 from gcs_plugin.daemon.store.picture_store import PictureStore
+from gcs_plugin.daemon.store.sortie_rows import PlacedSortie, placed_sortie
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import OrthoSwarmError
 
@@ -33,6 +36,7 @@ _BEGUN_S: Final = 60.0
 _QUIET_S: Final = 0.7
 _MOST_QUIET_S: Final = 3.0
 _LATE_S: Final = 15.0
+_LOOKED_AT: Final = 8  # pictures whose interval is the usual one
 _log = logging.getLogger(__name__)
 
 
@@ -42,8 +46,8 @@ class SortieRefinement:
 
     Attributes:
         journal, store, kept, publisher: of the workspace. workers: compute the job. drawer: of the real-time layer.
-        basemap: the map, or None. on_published: called with layer and job when pixels have changed.
-        make_way: called with vehicle and layer before the work starts, and before the layer is needed.
+        basemap: the map, or None. events: told before the work starts, and before a layer is needed.
+        stopping: set once the daemon stops.
     """
 
     journal: Journal
@@ -53,16 +57,19 @@ class SortieRefinement:
     workers: WorkerPool
     drawer: Drawer
     basemap: Path | None
-    on_published: Callable[[str, Job], None] = lambda layer, job: None
-    make_way: Callable[[str, str | None], None] = lambda vehicle, layer: None
-    stopped: Callable[[], bool] = lambda: False
+    events: Events
+    stopping: threading.Event = field(default_factory=threading.Event)
+
+    def stop(self, _: JobsStop) -> None:
+        """Wait for nothing any more, as the daemon stops."""
+        self.stopping.set()
 
     def refine(self, job: Job, report: ReportProgress) -> Change:
         """The handler of `refine`."""
         vehicle = str(job.vehicle)
         began = time.monotonic()
         report(0.02, "waiting for the last pictures")
-        self.make_way(vehicle, None)
+        self.events.publish(RefinementBegins(vehicle))
         if job.detail.get("trigger") != "late":
             self._follow(job)
         if job.detail.get("trigger") == "complete":
@@ -90,8 +97,8 @@ class SortieRefinement:
             if not published:
                 target.unlink(missing_ok=True)
         job.detail["seconds"] = round(time.monotonic() - began, 3)
-        self.kept.drop(vehicle, job.sortie)
-        return lambda db: None
+        self.kept.drop(job.whose)
+        return no_change
 
     def _follow(self, job: Job) -> None:
         """Track the pictures that have come, while the last ones come and are drawn; if a process is free.
@@ -100,8 +107,8 @@ class SortieRefinement:
         """
         try:
             area = self.publisher.area()
-            frames, _ = sortie_frames(self.journal, self.store, str(job.vehicle), job.sortie)
-            kept = self.kept.of(str(job.vehicle), job.sortie, frames)
+            frames, _ = frames_of(self.journal, self.store, job)
+            kept = self.kept.of(job.whose, frames)
             task = FollowTask(frames=frames, epsg=area.epsg, origin=area.origin, kept=kept)
             used = None if task.kept is None else self.workers.run_if_free(follow, task)
         except OrthoSwarmError as error:  # the solution will fail, or not, for its own reason
@@ -110,17 +117,17 @@ class SortieRefinement:
             if used is not None:
                 job.detail["follow_cpu_s"] = round(used, 3)
 
-    def _solve(self, job: Job, report: ReportProgress, target: Path) -> tuple[Any, int, SortieResult]:
+    def _solve(self, job: Job, report: ReportProgress, target: Path) -> tuple[PlacedSortie | None, int, SortieResult]:
         """Solve the pictures that have arrived into a new solution file, in the reserved process.
 
         Returns:
-            The row of the solution to which late pictures were registered (None: all were refined), the number of
+            The solution to which late pictures were registered (None: all were refined), the number of
             pictures, and their result.
         """
         job.detail["refine_started_s"] = time.time()
         job.detail["newest_seq"] = newest_seq(self.journal)  # pictures that arrive later are late
         area = self.publisher.area()
-        frames, thumbnails = sortie_frames(self.journal, self.store, str(job.vehicle), job.sortie)
+        frames, thumbnails = frames_of(self.journal, self.store, job)
         before = self._refined_before(job, len(frames))
         report(
             0.05, f"refining {len(frames)} pictures" if before is None else "registering late pictures to the others"
@@ -131,29 +138,34 @@ class SortieRefinement:
             origin=area.origin,
             basemap=self.basemap,
             thumbnails=thumbnails,
-            neighbours=self._neighbours(job, near(frames, area.epsg)),
+            neighbours=[
+                self.publisher.solutions / row.path
+                for row in others_near(self.journal, job.whose, near(frames, area.epsg), _REACH_M)
+            ],
             target=target,
-            before=None if before is None else self.publisher.solutions / before["path"],
-            kept=self.kept.of(str(job.vehicle), job.sortie, frames),
+            before=None if before is None else self.publisher.solutions / before.path,
+            kept=self.kept.of(job.whose, frames),
         )
         return before, len(frames), self.workers.run(solve if before is None else register_late, task)
 
-    def _show(self, job: Job, report: ReportProgress, target: Path, solved: SortieResult, before: Any) -> None:
+    def _show(
+        self, job: Job, report: ReportProgress, target: Path, solved: SortieResult, before: PlacedSortie | None
+    ) -> None:
         """Draw and publish what was solved."""
-        vehicle, layer = str(job.vehicle), "fine" if self.basemap is not None else "coarse"
+        layer = "fine" if self.basemap is not None else "coarse"
         job.detail["layer"] = layer
-        self.make_way(vehicle, layer)
+        self.events.publish(LayerNeeded(layer))
         with self.publisher.turn(layer):
             report(0.7, "drawing")
-            old = solution_row(self.journal, job)
-            shown = self.publisher.shown(layer).get((packed(vehicle), job.sortie or 0))
+            old = placed_sortie(self.journal, "solutions", job.whose)
+            shown = self.publisher.shown(layer, job.whose)
             changed = solved.changed
             if before is None and shown is not None:  # its old ground changes, too
-                changed = BoundingBox.around([changed, shown[1]])
+                changed = BoundingBox.around([changed, shown.bounds])
             job.detail["version_before"], job.detail["version"] = self.publisher.publish(
                 layer,
                 self.workers,
-                (vehicle, job.sortie),
+                job.whose,
                 target=target,
                 changed=changed,
                 change=lambda rejected: self._publish(
@@ -162,8 +174,8 @@ class SortieRefinement:
             )
         job.detail["published_s"] = time.time()
         if old is not None:  # the journal names it no more
-            self.publisher.retire(self.publisher.solutions / old["path"])
-        self.on_published(layer, job)
+            self.publisher.retire(self.publisher.solutions / old.path)
+        self.publisher.tell(layer, job)
 
     # -- the parts ------------------------------------------------------------------------------------------------
 
@@ -171,7 +183,7 @@ class SortieRefinement:
         """Wait a few seconds until the sortie's pictures are drawn, and longer for the first, which begins the map."""
         vehicle, end = str(job.vehicle), time.monotonic() + _BEGUN_S
         drawn = self.drawer.wait_drawn(vehicle, job.sortie, _DRAWN_S)
-        while not drawn and self.drawer.area is None and time.monotonic() < end and not self.stopped():
+        while not drawn and self.drawer.area is None and time.monotonic() < end and not self.stopping.is_set():
             drawn = self.drawer.wait_drawn(vehicle, job.sortie, _QUIET_S)
 
     def _wait_quiet(self, job: Job) -> None:
@@ -180,54 +192,40 @@ class SortieRefinement:
         They are considered complete when none has arrived for longer than the usual interval.
         """
         end = time.monotonic() + _LATE_S
-        while time.monotonic() < end and not self.stopped():
-            rows = self.journal.rows(
-                "SELECT arrived FROM frames WHERE vehicle = ? AND sortie = ? ORDER BY seq DESC LIMIT 8",
-                (packed(str(job.vehicle)), job.sortie),
-            )
-            came = [float(row["arrived"]) for row in rows]
+        while time.monotonic() < end and not self.stopping.is_set():
+            came = last_arrivals(self.journal, str(job.vehicle), job.sortie, _LOOKED_AT)
             apart = max((a - b for a, b in pairwise(came)), default=0.0)
             if came and time.time() - came[0] > min(max(_QUIET_S, apart), _MOST_QUIET_S):
                 return
             time.sleep(0.05)
 
-    def _refined_before(self, job: Job, count: int) -> Any:
+    def _refined_before(self, job: Job, count: int) -> PlacedSortie | None:
         """The refinement to which late pictures are registered; None if all are to be refined."""
         if job.detail.get("trigger") != "late":
             return None
-        row = solution_row(self.journal, job)
-        refined = None if row is None else json.loads(row["detail"]).get("refined")
+        row = placed_sortie(self.journal, "solutions", job.whose)
+        refined = None if row is None else row.detail.get("refined")
         return row if refined is not None and count - refined < SORTIE.again_pictures else None
 
-    def _neighbours(self, job: Job, box: BoundingBox) -> list[Path]:
-        """Solutions of other vehicles nearby."""
-        return [self.publisher.solutions / row["path"] for row in others_near(self.journal, job, box, _REACH_M)]
-
     def _publish(
-        self, job: Job, layer: str, target: Path, *, solved: SortieResult, rejected: dict[str, str], before: Any
-    ) -> Change:
+        self, job: Job, layer: str, target: Path, *, solved: SortieResult, rejected: dict[str, str],
+        before: PlacedSortie | None,
+    ) -> Change:  # fmt: skip
+        detail = detail_of(solved, solved.legs)
         if before is None:
-            count = len(solved.stages) - len(rejected)
-            detail = detail_of(solved, solved.legs) | {"layer": layer, "refined": count}
+            detail |= {"layer": layer, "refined": len(solved.stages) - len(rejected)}
         else:
-            detail = json.loads(before["detail"]) | {"bounds": solved.bounds}
-        stands = refined_change(job, solved, rejected, target.name, detail)
-        then = []
+            detail = before.detail | {"bounds": solved.bounds}
+        then: list[Change] = [refined_change(job, solved, rejected, target.name, detail)]
         if self.basemap is not None:  # the coarse layer shows all of the sortie, too
-            then.append(new_job("coarse", str(job.vehicle), job.sortie, {"after": "refine"}))
+            then.append(new_job("coarse", *job.whose, {"after": "refine"}))
             if before is None:
                 then += together_jobs(self.journal, job, solved.bounds)
         then.append(new_job("tones", None, None, {}))
         then.append(new_job("export", None, None, {"formats": list(PRODUCTS), "after": "refine"}))
-
-        def change(db: sqlite3.Connection) -> None:
-            stands(db)
-            for queue in then:
-                queue(db)
-
-        return change
+        return all_changes(*then)
 
 
 def _nothing_came(job: Job) -> Change:
     job.detail["note"] = "nothing came late"
-    return lambda db: None
+    return no_change

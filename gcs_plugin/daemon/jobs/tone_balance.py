@@ -6,9 +6,7 @@ Once nothing more urgent is to be done, the tones of all are solved together, an
 are drawn again.
 """
 
-import sqlite3
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
@@ -16,13 +14,15 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gcs_plugin.daemon.jobs.job_queue import Job, ReportProgress
+from gcs_plugin.daemon.jobs.job_queue import ReportProgress
 from gcs_plugin.daemon.jobs.preemption import Preemption
 from gcs_plugin.daemon.jobs.publisher import Publisher
 from gcs_plugin.daemon.jobs.solution_file import Bytes, Gain, SolutionFile, read_solution, uniquely_named
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
 from gcs_plugin.daemon.layers.layers import new_name
-from gcs_plugin.daemon.store.journal import Change, Journal, unpacked
+from gcs_plugin.daemon.store.job_rows import Job
+from gcs_plugin.daemon.store.journal import Change, Journal, no_change
+from gcs_plugin.daemon.store.sortie_rows import PlacedSortie, shown_sorties, solution_paths, solution_replaced
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.placement import PlacedFrame, Terrain
 from orthoswarm.mosaic.radiometry import estimate_fields
@@ -37,11 +37,7 @@ _REDRAW_TONE: Final = 0.015
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ToneTask:
-    """The sorties of a layer, to be balanced together.
-
-    Attributes:
-        solutions: their solution files. targets: paths of the new ones.
-    """
+    """The sorties of a layer, to be balanced together."""
 
     solutions: list[Path]
     targets: list[Path]
@@ -116,14 +112,13 @@ class ToneBalance:
 
     Attributes:
         journal, publisher: of the workspace. workers: compute the job; used by nothing else meanwhile.
-        layer: name of the refined layer. on_published: called with layer and job when pixels have changed.
+        layer: name of the refined layer.
     """
 
     journal: Journal
     publisher: Publisher
     workers: WorkerPool
     layer: str
-    on_published: Callable[[str, Job], None] = lambda layer, job: None
     _preemption: Preemption = field(init=False)
 
     def __post_init__(self) -> None:
@@ -140,48 +135,40 @@ class ToneBalance:
             for target in targets:  # of those that were not published
                 target.unlink(missing_ok=True)
         job.detail["seconds"] = round(time.monotonic() - began, 3)
-        return lambda db: None
+        return no_change
 
-    def give_up(self) -> None:
+    def give_way(self, _: object = None) -> None:
         """Stop the running job; it is done later."""
         self._preemption.stop()
 
     def _balance(self, job: Job, report: ReportProgress, targets: list[Path]) -> None:
-        refined = {(r["vehicle"], r["sortie"]) for r in self.journal.rows("SELECT vehicle, sortie FROM solutions")}
-        shown = {key: row for key, row in self.publisher.shown(self.layer).items() if key in refined}
-        if len({vehicle for vehicle, _ in shown}) < 2:
+        refined = solution_paths(self.journal, "solutions")
+        shown = [row for row in shown_sorties(self.journal, self.layer) if row.whose in refined]
+        if len({row.vehicle for row in shown}) < 2:
             job.detail["note"] = "there is one vehicle only"
             return
         report(0.05, f"balancing the tones of {len(shown)} flights")
         targets += [self.publisher.solutions / f"{new_name('solution')}.pickle" for _ in shown]
-        task = ToneTask(solutions=[path for path, _ in shown.values()], targets=list(targets))
+        task = ToneTask(solutions=[self.publisher.solutions / row.path for row in shown], targets=list(targets))
         changes, pictures, cpu_s = self.workers.run(balance_tones, task)
         job.detail |= {"frames": pictures, "tones_changed": round(max(changes), 4), "solve_cpu_s": cpu_s, "drawn": 0}
-        todo = [(key, target) for key, target in zip(shown, task.targets, strict=True) if target.exists()]
-        for n, (key, target) in enumerate(todo):
-            report(0.2 + 0.8 * n / len(todo), f"drawing {unpacked(key[0])}")
-            if self._draw(key, shown[key], target):
+        todo = [(row, target) for row, target in zip(shown, task.targets, strict=True) if target.exists()]
+        for n, (row, target) in enumerate(todo):
+            report(0.2 + 0.8 * n / len(todo), f"drawing {row.vehicle}")
+            if self._draw(row, target):
                 targets.remove(target)
                 job.detail["drawn"] += 1
-                self.on_published(self.layer, job)
+                self.publisher.tell(self.layer, job)
 
-    def _draw(self, key: tuple[str, int], before: tuple[Path, BoundingBox], target: Path) -> bool:
+    def _draw(self, before: PlacedSortie, target: Path) -> bool:
         """Draw and publish a sortie; False if it was refined again meanwhile."""
-        old, ground = before
         with self.publisher.turn(self.layer):
-            if self.publisher.shown(self.layer).get(key, (None,))[0] != old:
+            now = self.publisher.shown(self.layer, before.whose)
+            if now is None or now.path != before.path:
                 return False
-            sortie = (unpacked(key[0]), key[1])
+            stands = solution_replaced(before.whose, target.name)
             self.publisher.publish(
-                self.layer, self.workers, sortie, target=target, changed=ground,
-                change=lambda rejected: _another_file(key, target.name),
-            )  # fmt: skip
-        self.publisher.retire(old)
+                self.layer, self.workers, before.whose, target=target, changed=before.bounds, change=lambda _: stands
+            )
+        self.publisher.retire(self.publisher.solutions / before.path)
         return True
-
-
-def _another_file(key: tuple[str, int], name: str) -> Change:
-    def change(db: sqlite3.Connection) -> None:
-        db.execute("UPDATE solutions SET path = ? WHERE vehicle = ? AND sortie = ?", (name, *key))
-
-    return change

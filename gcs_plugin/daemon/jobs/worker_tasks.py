@@ -7,7 +7,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from gcs_plugin.daemon.jobs.solution_file import (
     visible_ground,
 )
 from gcs_plugin.daemon.layers.layers import drawn_bounds, successor
+from gcs_plugin.daemon.store.sortie_rows import LegRow
 from orthoswarm.batch.refiners import make_refiner
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.compute.threads import on_threads
@@ -84,7 +85,7 @@ class SortieResult:
 
     stages: dict[str, tuple[str, float]]
     dropped: dict[str, str]
-    legs: list[dict[str, Any]]
+    legs: list[LegRow]
     fov_deg: float
     fov_sigma_deg: float
     warnings: list[str]
@@ -309,11 +310,14 @@ def near(frames: Sequence[Frame], epsg: int) -> BoundingBox:
     return BoundingBox.around_points(ground)
 
 
-def _legs(legs: Sequence[Leg], frames: Sequence[Frame]) -> list[dict[str, Any]]:
+def _legs(legs: Sequence[Leg], frames: Sequence[Frame]) -> list[LegRow]:
     """Legs as JSON values, each with the recorded positions of its ends as `line`."""
     at = {frame.image: [frame.fix.lon_deg, frame.fix.lat_deg] for frame in frames}
     lines = [[at[image] for image in dict.fromkeys(leg.images) if image in at] for leg in legs]
-    return [asdict(leg) | ({"line": line} if len(line) == 2 else {}) for leg, line in zip(legs, lines, strict=True)]
+    return [
+        cast(LegRow, asdict(leg) | ({"line": line} if len(line) == 2 else {}))
+        for leg, line in zip(legs, lines, strict=True)
+    ]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

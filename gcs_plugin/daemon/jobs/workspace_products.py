@@ -1,6 +1,7 @@
 """The workspace's products: those of a batch run without seam lines, made in a worker from the journal."""
 
 import json
+import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -10,8 +11,12 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from gcs_plugin.daemon.jobs.solution_file import read_solution
+from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
+from gcs_plugin.daemon.store.job_rows import Job, latest_jobs
+from gcs_plugin.daemon.store.journal import Journal
+from gcs_plugin.daemon.store.sortie_rows import completion_rows
 from orthoswarm.canvas.canvas import Canvas
-from orthoswarm.compute.workers import Usage
+from orthoswarm.compute.workers import Usage, peak_rss_mb
 from orthoswarm.export.forms import FORMS, MapExport
 from orthoswarm.export.tactical import places as place_files
 from orthoswarm.export.tactical.places import Place
@@ -27,6 +32,7 @@ if TYPE_CHECKING:
 FORMATS: Final = tuple(name for name, form in FORMS.items() if form.daemon)
 PRODUCTS: Final = ("cog", "gpkg")
 """The formats that are written without being asked for."""
+_MOST_JOBS: Final = 1000  # the latest ones
 _FILES: Final = {"realtime": "realtime.tif", "coarse": "coarse.tif", "fine": "orthoimage.tif"}
 
 
@@ -243,31 +249,36 @@ def _converted(task: ExportTask, picture: Path, formats: list[str], placed: list
     return {name: FORMS[name].write(what).relative_to(task.workspace).as_posix() for name in formats}
 
 
-def facts_of(
-    jobs: list[dict[str, Any]],
-    completions: list[dict[str, Any]],
-    wall_s: float,
-    *,
-    cpu_s: float,
-    others: Sequence[Usage],
-    rss_mb: float,
-) -> dict[str, Any]:
-    """The daemon's facts for the report: stage timings from its jobs, completions, and resource usage.
+@dataclass(frozen=True, slots=True)
+class RunFacts:
+    """The daemon's own facts for the report."""
 
-    Args:
-        jobs: all, as JSON values. completions: the same.
-        wall_s: since its start. cpu_s, rss_mb: of the daemon's own process. others: of its other processes.
-    """
+    journal: Journal
+    started: float
+    pools: Sequence[WorkerPool]
+
+    def document(self) -> dict[str, Any]:
+        """Stage timings from jobs, completions, and resource usage, as JSON values."""
+        return _facts(
+            latest_jobs(self.journal, _MOST_JOBS), completion_rows(self.journal), time.time() - self.started,
+            [pool.usage() for pool in self.pools],
+        )  # fmt: skip
+
+
+def _facts(
+    jobs: Sequence[Job], completions: list[dict[str, Any]], wall_s: float, others: Sequence[Usage]
+) -> dict[str, Any]:
+    cpu_s = time.process_time()
     stages = [
         {"name": "realtime", "wall_s": wall_s, "cpu_s": cpu_s, "items": 0},  # counted when the report is written
         *(
             {
-                "name": f"{j['detail'].get('layer', 'fine')}: {j['vehicle']}",
-                "wall_s": j["detail"].get("seconds", 0.0),
-                "cpu_s": j["detail"].get("solve_cpu_s", 0.0), "items": j["detail"].get("frames", 0),
+                "name": f"{job.detail.get('layer', 'fine')}: {job.vehicle}",
+                "wall_s": job.detail.get("seconds", 0.0),
+                "cpu_s": job.detail.get("solve_cpu_s", 0.0), "items": job.detail.get("frames", 0),
             }
-            for j in jobs
-            if j["kind"] == "refine" and j["state"] == "done"
+            for job in jobs
+            if job.kind == "refine" and job.state == "done"
         ),
         *_summed("coarse: in flight", "coarse", jobs),
         *_summed("fine: neighbours together", "together", jobs),
@@ -275,14 +286,14 @@ def facts_of(
     ]  # fmt: skip
     document = {
         "stages": stages, "wall_s": wall_s, "cpu_s": cpu_s + sum(other.cpu_s for other in others),
-        "peak_rss_mb": rss_mb + sum(other.peak_rss_mb for other in others), "completions": completions,
+        "peak_rss_mb": peak_rss_mb() + sum(other.peak_rss_mb for other in others), "completions": completions,
     }  # fmt: skip
     return dict(json.loads(json.dumps(document)))
 
 
-def _summed(name: str, kind: str, jobs: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def _summed(name: str, kind: str, jobs: Sequence[Job]) -> list[dict[str, Any]]:
     """The summed timing of all jobs of a kind that placed pictures, if there were any."""
-    details = [j["detail"] for j in jobs if j["kind"] == kind and "frames" in j["detail"]]
+    details = [job.detail for job in jobs if job.kind == kind and "frames" in job.detail]
     if not details:
         return []
     wall, cpu = (sum(d.get(key, 0.0) for d in details) for key in ("seconds", "solve_cpu_s"))

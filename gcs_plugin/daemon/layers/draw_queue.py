@@ -55,11 +55,7 @@ class MapDelay:
 
 
 class DrawQueue:
-    """The queue; it is not thread-safe.
-
-    Args:
-        most: capacity.
-    """
+    """The queue; it is not thread-safe."""
 
     def __init__(self, most: int) -> None:
         self.most = most

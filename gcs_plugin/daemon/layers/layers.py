@@ -34,7 +34,7 @@ _ORIGIN_STEP_M: Final = 16.0
 
 
 @dataclass(frozen=True, slots=True)
-class Area:
+class MapArea:
     """The map's area.
 
     Attributes:
@@ -49,14 +49,14 @@ class Area:
     bounds: BoundingBox
 
     @classmethod
-    def around(cls, epsg: int, east: float, north: float, gsd_m: float) -> "Area":
+    def around(cls, epsg: int, east: float, north: float, gsd_m: float) -> "MapArea":
         """A generous area around the first picture; empty ground costs almost nothing."""
         gsd = _round_gsd(gsd_m)
         half = float(np.clip(_HALF_PX * gsd, *_HALF_M))
         origin = (round(east / _ORIGIN_STEP_M) * _ORIGIN_STEP_M, round(north / _ORIGIN_STEP_M) * _ORIGIN_STEP_M)
         return cls(epsg, gsd, origin, _on_tiles(BoundingBox(east, north, east, north).grown(half), gsd))
 
-    def grown(self, bounds: BoundingBox) -> "Area":
+    def grown(self, bounds: BoundingBox) -> "MapArea":
         """The area extended to the bounds and 1.5 km beyond them.
 
         Raises:
@@ -76,7 +76,7 @@ class Area:
         side = TILE_PX * self.gsd_m
         if wide.width * wide.height > _MOST_TILES * side * side:
             raise OrthoSwarmError("it lies too far from the other pictures for one map; use a workspace of its own")
-        return Area(self.epsg, self.gsd_m, self.origin, wide)
+        return MapArea(self.epsg, self.gsd_m, self.origin, wide)
 
     @property
     def grid(self) -> GroundGrid:
@@ -88,7 +88,7 @@ class Area:
         return asdict(self)
 
     @classmethod
-    def from_document(cls, values: dict[str, Any]) -> "Area":
+    def from_document(cls, values: dict[str, Any]) -> "MapArea":
         """What `document` gave."""
         origin = values["origin"]
         return cls(values["epsg"], values["gsd_m"], (origin[0], origin[1]), BoundingBox(*values["bounds"]))
@@ -108,7 +108,7 @@ def _on_tiles(bounds: BoundingBox, gsd_m: float) -> BoundingBox:
     return BoundingBox(west, south, east, north)
 
 
-class Layer:
+class MapLayer:
     """One layer: at most one canvas at a time, which stays open while it is read.
 
     Attributes:

@@ -3,10 +3,7 @@
 The basemap determines the location, else the newest plan, else the majority of the pictures.
 """
 
-import json
 import logging
-import sqlite3
-from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
@@ -14,9 +11,13 @@ from typing import Any, Final
 import numpy as np
 
 from gcs_plugin.daemon.intake.posted_pose import is_position
-from gcs_plugin.daemon.layers.anchor import Anchor
-from gcs_plugin.daemon.layers.layers import Area, Layer, new_name, successor
-from gcs_plugin.daemon.store.journal import Journal, fact_change
+from gcs_plugin.daemon.layers.anchor import ExpectedPlace
+from gcs_plugin.daemon.layers.layers import MapArea, MapLayer, new_name, successor
+from gcs_plugin.daemon.store.daemon_events import AreaChanged, DrawingRestarted
+from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.daemon.store.frame_rows import frames_undrawn, poses_after
+from gcs_plugin.daemon.store.journal import Journal, all_changes, area_forgotten, fact_change, no_change
+from gcs_plugin.daemon.store.sortie_rows import solution_paths
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
@@ -44,44 +45,30 @@ class MapSite:
     """
 
     def __init__(
-        self,
-        journal: Journal,
-        layer: Layer,
-        folder: Path,
-        *,
-        gsd_m: float | None,
-        fov_rad: float | None,
-        on_area: Callable[[Area], None],
-        anchor: Callable[[], Anchor | None],
-        draw_again: Callable[[], None],
-    ) -> None:
+        self, journal: Journal, layer: MapLayer, folder: Path, *, gsd_m: float | None, fov_rad: float | None,
+        expected: ExpectedPlace, events: Events,
+    ) -> None:  # fmt: skip
         """Continue where the last daemon stopped.
 
         Args:
-            journal: of the workspace. layer: the real-time layer. folder: of all layers' canvases.
+            layer: the real-time layer. folder: of all layers' canvases.
             gsd_m: ground pixel; from the first pictures if None. fov_rad: theta-hat, see recorded_cameras.
-            on_area: called when the area changes. anchor: gives where the map is to lie, None to go by the pictures.
-            draw_again: draws all frames that the journal lists as not drawn.
+            expected: where the map is to lie. events: told when the area changes, and when all is drawn again.
         """
-        self._journal, self._layer, self._folder = journal, layer, folder
-        self._gsd_m, self._fov_rad, self._on_area, self._anchor = gsd_m, fov_rad, on_area, anchor
-        self._draw_again = draw_again
+        self._journal, self._layer, self._folder, self._events = journal, layer, folder, events
+        self._gsd_m, self._fov_rad, self._expected = gsd_m, fov_rad, expected
         self._positions: list[tuple[float, float]] = []  # of the journal's frames up to the number `_counted`
         self._counted = 0
-        self.area: Area | None = None
+        self.area: MapArea | None = None
         self.grid: LocalGrid | None = None
         self.mosaic: RealtimeMosaic | None = None
         document = journal.fact("area")
         if document is not None:
-            self.area = Area.from_document(document)
+            self.area = MapArea.from_document(document)
             self._open(journal.fact("realtime"))
 
     def place(self, frame: Frame, drawn: int) -> tuple[Camera, float] | str:
-        """The frame's camera and sigma in metres, after making room for it on the layer; or why it cannot be drawn.
-
-        Args:
-            frame: with a recorded pose. drawn: number of frames drawn since the start.
-        """
+        """The frame's camera and sigma in metres, after making room for it on the layer; or why it cannot be drawn."""
         if not is_position({"lat_deg": frame.fix.lat_deg, "lon_deg": frame.fix.lon_deg}):
             return "its receiver had no fix (the position is 0, 0); nothing tells where it was taken"
         far = self._is_far(frame)
@@ -105,7 +92,7 @@ class MapSite:
             if reason is not None:
                 self.grid = None
                 return reason
-            self._begin(Area.around(self.grid.epsg, float(place[0]), float(place[1]), gsd))
+            self._begin(MapArea.around(self.grid.epsg, float(place[0]), float(place[1]), gsd))
         elif self._gsd_m is None and drawn < _FEW and self._is_other_scale(camera):
             self._begin_again(camera, place)
         return self._with_room(camera) or (camera, placed[0].sigma_m)
@@ -116,7 +103,7 @@ class MapSite:
         A map started elsewhere (by pictures with a wrong position) is started again, as long as nothing was
         solved on it, and all frames are drawn again.
         """
-        fix, anchor = frame.fix, self._anchor()
+        fix, anchor = frame.fix, self._expected.place()
         if anchor is not None and anchor.distance_m(fix.lat_deg, fix.lon_deg) > _FAR_M:
             km = anchor.distance_m(fix.lat_deg, fix.lon_deg) / 1e3
             return f"it lies {km:.0f} km from {anchor.name}; check the receiver, or use a workspace of its own for it"
@@ -127,21 +114,21 @@ class MapSite:
         if away_m <= _FAR_M:
             return None
         wrong = anchor is not None and anchor.distance_m(lat, lon) > _FAR_M
-        if (wrong or (anchor is None and self._is_majority(frame, self.area))) and not self._solved():
+        moves = wrong or (anchor is None and self._is_majority(frame, self.area))
+        if moves and not solution_paths(self._journal, "solutions", "coarse"):
             self._move_away()
             return None
         return (
             f"it lies {away_m / 1e3:.0f} km from the others; check the receiver, or use a workspace of its own for it"
         )
 
-    def _is_majority(self, frame: Frame, area: Area) -> bool:
+    def _is_majority(self, frame: Frame, area: MapArea) -> bool:
         """Whether more frames lie around this one, too far from the map, than around the map's origin.
 
         All frames of the journal count, drawn or not: while they are drawn again the map would move to and fro.
         """
-        for row in self._journal.rows("SELECT seq, pose FROM frames WHERE seq > ? ORDER BY seq", (self._counted,)):
-            self._counted = int(row["seq"])
-            pose = json.loads(row["pose"])
+        for number, pose in poses_after(self._journal, self._counted):
+            self._counted = number
             if pose.get("lat_deg") is not None and pose.get("lon_deg") is not None and is_position(pose):
                 self._positions.append((pose["lat_deg"], pose["lon_deg"]))
         here = (frame.fix.lat_deg, frame.fix.lon_deg)
@@ -154,20 +141,11 @@ class MapSite:
             abs(place[0] - other[0]) <= near_deg and distance_m(*place, *other) <= _FAR_M for other in self._positions
         )
 
-    def _solved(self) -> bool:
-        query = "SELECT 1 FROM solutions UNION SELECT 1 FROM coarse LIMIT 1"
-        return self._journal.one(query) is not None
-
     def _move_away(self) -> None:
         """Drop the map's location: the next frame sets it, and all frames are drawn again."""
         _log.warning("the map was started at a wrong position; it is started again where most pictures lie")
-
-        def change(db: sqlite3.Connection) -> None:
-            db.execute("UPDATE frames SET drawn = 0")
-            db.execute("DELETE FROM meta WHERE key IN ('area', 'realtime')")
-
-        self._journal.write(change)
-        self._draw_again()
+        self._journal.write(area_forgotten)
+        self._events.publish(DrawingRestarted())
         self.area, self.grid, self.mosaic = None, None, None
         self._layer.replace(None)
 
@@ -175,14 +153,14 @@ class MapSite:
         """Whether the map's ground pixel was derived from pictures during the climb."""
         assert self.area is not None
         height = float(camera.position[2])
-        solved = self._journal.one("SELECT 1 FROM solutions LIMIT 1") is not None
+        solved = bool(solution_paths(self._journal, "solutions"))
         return 10.0 < height < 500.0 and not solved and height / camera.lens.focal_px > _OTHER_GSD * self.area.gsd_m
 
     def _begin_again(self, camera: Camera, place: Any) -> None:
         assert self.grid is not None
         gsd = default_gsd([camera])
         _log.info("the map's pixel becomes %.3f m; what was drawn is drawn again", gsd)
-        self._begin(Area.around(self.grid.epsg, float(place[0]), float(place[1]), gsd), again=True)
+        self._begin(MapArea.around(self.grid.epsg, float(place[0]), float(place[1]), gsd), again=True)
 
     def _with_room(self, camera: Camera) -> str | None:
         """Extend the layer to a camera's footprint; returns the reason if that is impossible."""
@@ -210,29 +188,22 @@ class MapSite:
 
     # -- the layer ------------------------------------------------------------------------------------------------
 
-    def _begin(self, area: Area, *, again: bool = False) -> None:
+    def _begin(self, area: MapArea, *, again: bool = False) -> None:
         memory_mb = active().compute.live_canvas_mb
         canvas = Canvas.create(self._folder / new_name("realtime"), area.grid, memory_mb=memory_mb)
         self._adopt(area, canvas, again=again)
 
-    def _adopt(self, area: Area, canvas: Canvas, *, again: bool = False) -> None:
+    def _adopt(self, area: MapArea, canvas: Canvas, *, again: bool = False) -> None:
         """Make a canvas the layer, in the journal first."""
         facts = [fact_change("area", area.document()), fact_change("realtime", canvas.path.name)]
-
-        def change(db: sqlite3.Connection) -> None:
-            for fact in facts:
-                fact(db)
-            if again:
-                db.execute("UPDATE frames SET drawn = 0")
-
-        self._journal.write(change)
+        self._journal.write(all_changes(*facts, frames_undrawn if again else no_change))
         if again:
-            self._draw_again()
+            self._events.publish(DrawingRestarted())
         self.area = area
         self._layer.replace(canvas)
         self.mosaic = RealtimeMosaic(canvas)
         self.grid = LocalGrid(area.epsg)
-        self._on_area(area)
+        self._events.publish(AreaChanged(area.epsg))
 
     def _open(self, name: str | None) -> None:
         """The canvas that the last daemon drew on; drawn anew from the journal if it is damaged."""
@@ -246,11 +217,11 @@ class MapSite:
         self._layer.replace(canvas)
         self.mosaic = RealtimeMosaic(canvas)
         self.grid = LocalGrid(self.area.epsg)
-        self._on_area(self.area)
+        self._events.publish(AreaChanged(self.area.epsg))
 
 
 @lru_cache(maxsize=8)
-def _origin_of(area: Area) -> tuple[float, float]:
+def _origin_of(area: MapArea) -> tuple[float, float]:
     """Latitude and longitude of an area's origin, degrees."""
     lat, lon = LocalGrid(area.epsg).to_geographic(area.origin)
     return float(lat), float(lon)

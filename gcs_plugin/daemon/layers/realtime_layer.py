@@ -18,17 +18,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcs_plugin.daemon.intake.posted_pose import frame_of_row
-from gcs_plugin.daemon.layers.anchor import Anchor
+from gcs_plugin.daemon.layers.anchor import ExpectedPlace
 from gcs_plugin.daemon.layers.draw_queue import DrawQueue, MapDelay, PendingFrame
-from gcs_plugin.daemon.layers.layers import Area, Layer, new_name
+from gcs_plugin.daemon.layers.layers import MapArea, MapLayer, new_name
 from gcs_plugin.daemon.layers.map_site import MapSite
+from gcs_plugin.daemon.store.daemon_events import (
+    DrawingRestarted,
+    FrameReported,
+    LayerDrawn,
+    Overload,
+    PictureDrawn,
+    PictureRejected,
+    PictureStored,
+    Problem,
+)
 from gcs_plugin.daemon.store.event_bus import Events
-from gcs_plugin.daemon.store.journal import Drawn, Journal, frames_drawn, packed
+from gcs_plugin.daemon.store.frame_rows import (
+    Drawn,
+    frames_drawn,
+    sortie_is_drawn,
+    undrawn_before,
+    undrawn_frames,
+)
+from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.daemon.store.picture_store import PictureStore
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.model.camera import NADIR_PITCH_RAD, Camera, Lens, rotation_from_angles
 from orthoswarm.model.errors import OrthoSwarmError, StorageError
-from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import PlacedFrame
 from orthoswarm.mosaic.realtime import RealtimeMosaic
@@ -40,7 +56,6 @@ _IN_MEMORY: Final = 2000  # frames that wait; the journal has the others
 _AT_ONCE: Final = 16  # pictures drawn between two looks at the queue
 _LATE_S: Final = 1.0
 _LOOK_S: Final = 0.5
-_COLUMNS: Final = "seq, vehicle, image, time, arrived, path, width, height, pose, sortie"
 _log = logging.getLogger(__name__)
 Bytes = NDArray[np.uint8]
 
@@ -58,16 +73,13 @@ class Drawer:
         self,
         journal: Journal,
         store: PictureStore,
-        layer: Layer,
+        layer: MapLayer,
         folder: Path,
         events: Events,
         *,
         gsd_m: float | None = None,
         fov_rad: float | None = None,
-        on_area: Callable[[Area], None] = lambda _: None,
-        anchor: Callable[[], Anchor | None] = lambda: None,
-        on_rejected: Callable[[Frame, str, bool], None] = lambda frame, reason, misplaced: None,
-        on_drawn: Callable[[PlacedFrame, PictureQuality | None], None] = lambda placed, quality: None,
+        expected: ExpectedPlace,
         in_memory: int = _IN_MEMORY,
         late_s: float = _LATE_S,
         look_s: float = _LOOK_S,
@@ -76,18 +88,9 @@ class Drawer:
         """Continue where the last daemon stopped; `start` begins to draw.
 
         Args:
-            journal: of the workspace.
-            store: of the pictures.
-            layer: to draw on.
-            folder: of all layers' canvases.
-            events: receives frames and layer versions.
+            layer: to draw on. folder: of all layers' canvases. expected: where the map should lie.
             gsd_m: ground pixel; from the first pictures if None.
             fov_rad: theta-hat, the field of view to assume; see recorded_cameras.
-            on_area: called in the drawing thread when the area changes.
-            anchor: returns where the map should lie, None to use the pictures.
-            on_rejected: called with each frame that cannot be on the map, the reason, and whether its position is the
-            reason.
-            on_drawn: called with each frame drawn as recorded, and its picture quality (None: too small).
             in_memory: most frames that wait in memory; the journal has the others.
             late_s: a frame drawn later than this after its arrival is late, seconds.
             look_s: time between looks for late frames, seconds.
@@ -95,23 +98,19 @@ class Drawer:
         """
         self._in_memory, self._late_s, self._look_s, self._read = in_memory, late_s, look_s, read
         self._journal, self._store, self._layer, self._folder, self._events = journal, store, layer, folder, events
-        self._on_rejected, self._on_drawn = on_rejected, on_drawn
         self._begun = 0
         self._queue = DrawQueue(self._in_memory)
         self._delay = MapDelay()
         self._waiting: set[int] = set()
         self._looked = 0.0
-        self._more, self._looking = True, False
+        self._more = True
         self._condition = threading.Condition()
         self._stop = False
         self._thread: threading.Thread | None = None
         self.drawn = self.late = self.put_off = 0
         self.latencies: list[float] = []
         self.problem = ""
-        self._site = MapSite(
-            journal, layer, folder, gsd_m=gsd_m, fov_rad=fov_rad, on_area=on_area, anchor=anchor,
-            draw_again=self._draw_anew,
-        )  # fmt: skip
+        self._site = MapSite(journal, layer, folder, gsd_m=gsd_m, fov_rad=fov_rad, expected=expected, events=events)
 
     # -- from outside ---------------------------------------------------------------------------------------------
 
@@ -128,16 +127,16 @@ class Drawer:
         if self._thread is not None:
             self._thread.join()
 
-    def add(self, seq: int, frame: Frame, arrived: float, sortie: int) -> None:
+    def picture_stored(self, event: PictureStored) -> None:
         """Add a frame that is in the journal."""
         with self._condition:
-            self._delay.came(frame.vehicle, arrived)
-            if seq not in self._waiting:
-                self._put(PendingFrame(seq, arrived, sortie, frame))
+            self._delay.came(event.frame.vehicle, event.arrived_s)
+            if event.seq not in self._waiting:
+                self._put(PendingFrame(event.seq, event.arrived_s, event.sortie, event.frame))
             self._condition.notify_all()
 
     @property
-    def area(self) -> Area | None:
+    def area(self) -> MapArea | None:
         """The map's area, None before the first frame."""
         return self._site.area
 
@@ -152,22 +151,10 @@ class Drawer:
         with self._condition:
             return self._delay.seconds(time.time())
 
-    def wait_idle(self, timeout_s: float) -> bool:
-        """Wait until nothing is left to draw; False after the time-out."""
-        end = time.monotonic() + timeout_s
-        with self._condition:
-            while len(self._queue) or self._waiting or self._more or self._looking:
-                left = end - time.monotonic()
-                if left <= 0 or self._stop:
-                    return False
-                self._condition.wait(left)
-        return True
-
     def wait_drawn(self, vehicle: str, sortie: int | None, timeout_s: float) -> bool:
         """Wait until a sortie's frames are drawn; False after the time-out."""
         end = time.monotonic() + timeout_s
-        query = "SELECT 1 FROM frames WHERE drawn = 0 AND vehicle = ? AND sortie IS ? LIMIT 1"
-        while self._journal.one(query, (packed(vehicle), sortie)) is not None:
+        while not sortie_is_drawn(self._journal, vehicle, sortie):
             if time.monotonic() > end or self._stop:
                 return False
             time.sleep(0.05)
@@ -197,10 +184,10 @@ class Drawer:
         if problem != self.problem:
             self.problem = problem
             _log.error("drawing waits: %s", problem)
-            self._events.publish("problem", text=problem)
+            self._events.publish(Problem(problem))
         with self._condition:
             self._waiting = self._queue.seqs()
-            self._more, self._looking = True, False
+            self._more = True
             self._condition.wait(1.0)
 
     def _tell_overload(self) -> None:
@@ -214,16 +201,14 @@ class Drawer:
         if left and now - self._looked < self._look_s:
             return
         self._looked = now
-        query = "SELECT COUNT(*) AS n FROM frames WHERE drawn = 0 AND arrived < ?"
-        row = self._journal.one(query, (time.time() - self._late_s,))
-        before, self.put_off = self.put_off, 0 if row is None else int(row["n"])
+        before, self.put_off = self.put_off, undrawn_before(self._journal, time.time() - self._late_s)
         if bool(before) != bool(self.put_off):
             if self.put_off:
                 _log.warning("%s", self.overload)
             else:
                 _log.info("all pictures are on the map again")
         if before != self.put_off:
-            self._events.publish("overload", put_off=self.put_off, text=self.overload)
+            self._events.publish(Overload(self.put_off, self.overload))
 
     @property
     def overload(self) -> str:
@@ -239,18 +224,17 @@ class Drawer:
         with self._condition:
             if not self._more or len(self._queue) > self._in_memory // 2:
                 return
-            self._more, self._looking = False, True
+            self._more = False
         most = self._in_memory + len(self._waiting) + 1
-        rows = self._journal.rows(f"SELECT {_COLUMNS} FROM frames WHERE drawn = 0 ORDER BY seq LIMIT ?", (most,))
+        rows = undrawn_frames(self._journal, most)
         with self._condition:
-            self._looking = False
             self._more = self._more or len(rows) == most
             for row in rows:
-                if row["seq"] not in self._waiting:
+                if row.seq not in self._waiting:
                     if len(self._queue) >= self._in_memory:
                         self._more = True
                         break
-                    self._put(PendingFrame(row["seq"], row["arrived"], row["sortie"], frame_of_row(row, self._store)))
+                    self._put(PendingFrame(row.seq, row.arrived_s, row.sortie, frame_of_row(row, self._store)))
 
     def _put(self, pending: PendingFrame) -> None:
         self._waiting.add(pending.seq)
@@ -276,7 +260,7 @@ class Drawer:
             self._note(pending, result)
         if done:
             self._journal.write(frames_drawn(done))
-            self._events.publish("layer", layer="realtime", version=self._layer.version)
+            self._events.publish(LayerDrawn("realtime", self._layer.version))
         with self._condition:
             self._waiting.difference_update(seqs)
             self._condition.notify_all()
@@ -290,7 +274,7 @@ class Drawer:
         self.latencies.append(took)
         del self.latencies[:-1000]
 
-    def _draw_anew(self) -> None:
+    def draw_anew(self, _: DrawingRestarted) -> None:
         """All frames are drawn again, by what the journal says."""
         self._begun += 1
         with self._condition:
@@ -304,7 +288,7 @@ class Drawer:
         try:
             place = self._site.place(frame, self.drawn)
             if isinstance(place, str):
-                self._on_rejected(frame, place, True)
+                self._events.publish(PictureRejected(frame, place, True))
                 return self._report(pending, Drawn(pending.seq, place, None), None)
             camera, sigma = place
             picture = self._read(frame.path)
@@ -315,14 +299,16 @@ class Drawer:
             raise
         except OrthoSwarmError as error:
             reason = str(error).replace(frame.path.name, frame.image)  # as its sender calls it, not the store
-            self._on_rejected(frame, reason, False)
+            self._events.publish(PictureRejected(frame, reason, False))
             return self._report(pending, Drawn(pending.seq, reason, None), None)
         except (ValueError, ArithmeticError) as error:
             return self._report(pending, Drawn(pending.seq, f"it cannot be drawn ({error})", None), None)
         quality = _quality(picture)
         if added.reason is None:
-            self._on_drawn(PlacedFrame(frame, camera, "realtime", sigma), quality)
-        return self._report(pending, Drawn(pending.seq, added.reason, sigma, _thumbnail(picture), quality), camera)
+            self._events.publish(PictureDrawn(PlacedFrame(frame, camera, "realtime", sigma), quality))
+        return self._report(
+            pending, Drawn(pending.seq, added.reason, sigma, thumbnail(picture).tobytes(), quality), camera
+        )
 
     def _report(self, pending: PendingFrame, drawn: Drawn, camera: Camera | None) -> Drawn:
         frame, fix = pending.frame, pending.frame.fix
@@ -331,11 +317,11 @@ class Drawer:
             corners = camera.corners()
             if np.isfinite(corners).all():
                 outline = [[float(lon), float(lat)] for lat, lon in grid.to_geographic(corners)]
-        self._events.publish(
-            "frame", seq=drawn.seq, vehicle=frame.vehicle, image=frame.image, sortie=pending.sortie,
+        self._events.publish(FrameReported(
+            seq=drawn.seq, vehicle=frame.vehicle, image=frame.image, sortie=pending.sortie,
             stage="rejected" if drawn.reason else "realtime", reason=drawn.reason, sigma_m=drawn.sigma_m,
             lat_deg=fix.lat_deg, lon_deg=fix.lon_deg, outline=outline,
-        )  # fmt: skip
+        ))  # fmt: skip
         return drawn
 
 
@@ -361,8 +347,3 @@ def _quality(picture: Bytes) -> PictureQuality | None:
         return picture_quality(picture)
     except ValueError:  # too small to be judged
         return None
-
-
-def _thumbnail(picture: Bytes) -> bytes:
-    """The means of a picture's parts, for gains; see `thumbnail`."""
-    return thumbnail(picture).tobytes()

@@ -10,13 +10,16 @@ import math
 import threading
 from collections import OrderedDict
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 from pyproj import Transformer
 
-from gcs_plugin.daemon.layers.layers import Layer
+from gcs_plugin.daemon.layers.layers import MapLayer
+from gcs_plugin.daemon.store.daemon_events import AreaChanged
+from gcs_plugin.daemon.store.workspace_lock import open_basemap
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.earth import WEB_MERCATOR_M
@@ -160,16 +163,24 @@ def encode(tile: Bytes | None, suffix: str) -> bytes:
 class TileServer:
     """Encoded tiles with their ETags; recent ones are cached.
 
-    Args:
-        layers: by name.
+    Attributes:
+        basemap: on the grid of the map's area, or of its own centre while there is none.
+
+    Raises:
+        InputError: the basemap cannot be used.
     """
 
-    def __init__(self, layers: dict[str, Layer]) -> None:
-        self.layers = layers
-        self.basemap: Basemap | None = None
+    def __init__(self, layers: dict[str, MapLayer], basemap: Path | None = None) -> None:
+        self.layers, self._file = layers, basemap
+        self.basemap = None if basemap is None else open_basemap(basemap)
         self._lock = threading.Lock()
         self._cache: OrderedDict[tuple[str, str], bytes] = OrderedDict()
         self._bytes = 0
+
+    def area_changed(self, event: AreaChanged) -> None:
+        """Read the basemap on the area's grid."""
+        if self._file is not None and (self.basemap is None or self.basemap.epsg != event.epsg):
+            self.basemap = Basemap.open(self._file, event.epsg)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -218,7 +229,7 @@ class TileServer:
         """The layers that show in one, uppermost first."""
         return ("fine", "coarse", "realtime") if name == "best" else (name,)
 
-    def _stamp(self, layer: Layer, tile: TileAddress) -> str:
+    def _stamp(self, layer: MapLayer, tile: TileAddress) -> str:
         with layer.reading() as canvas:
             if canvas is None:
                 return "-"

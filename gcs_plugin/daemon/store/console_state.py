@@ -2,10 +2,12 @@
 
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from datetime import datetime
-from typing import Any, Final
+from typing import Any, Final, TypedDict, cast
 
+from gcs_plugin.daemon.store.daemon_events import FindsChanged, PlanChanged
+from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.journal import Journal
 from orthoswarm.export.product_files import iso_time
 from orthoswarm.model.errors import InputError, OrthoSwarmError
@@ -15,19 +17,28 @@ _MOST_FINDS: Final = 10_000
 _MOST_NOTE: Final = 10_000  # characters
 
 
+class FindRow(TypedDict, total=False):
+    """A marked find; `time`: ISO 8601; `version` from 1; `pictures`: names of those that show it, for an export."""
+
+    id: int
+    lat_deg: float
+    lon_deg: float
+    sigma_m: float | None
+    note: str
+    time: str | None
+    version: int
+    pictures: list[str]
+
+
 class OutdatedError(OrthoSwarmError):
     """The plan or a find was changed by another page meanwhile."""
 
 
 class ConsoleState:
-    """The plan and the finds, stored in the journal.
+    """The plan and the finds, stored in the journal."""
 
-    Args:
-        journal: stores them. publish: called with an event's kind and fields when they change.
-    """
-
-    def __init__(self, journal: Journal, publish: Callable[..., None]) -> None:
-        self._journal, self._publish = journal, publish
+    def __init__(self, journal: Journal, events: Events) -> None:
+        self._journal, self._events = journal, events
         self._lock = threading.Lock()
 
     def plan(self) -> dict[str, Any]:
@@ -56,34 +67,35 @@ class ConsoleState:
                 raise OutdatedError(f"the plan was changed elsewhere (version {before}); load it and change it again")
             plan = {key: body.get(key) for key in _PLAN_FIELDS} | {"version": before + 1}
             self._journal.remember("console_plan", plan)
-        self._publish("plan", **plan)
+        self._events.publish(PlanChanged(plan))
         return plan
 
-    def finds(self) -> list[dict[str, Any]]:
-        """The finds, oldest first: `id`, `lat_deg`, `lon_deg`, `sigma_m`, `note`, `time`, `version` from 1."""
-        return [{"version": 1, **row} for row in self._finds()["rows"]]
+    def finds(self) -> list[FindRow]:
+        """The finds, oldest first."""
+        return [cast(FindRow, {"version": 1, **row}) for row in self._finds()["rows"]]
 
     def _finds(self) -> dict[str, Any]:
         found: dict[str, Any] = self._journal.fact("finds") or {"next": 1, "rows": []}
         return found
 
-    def add_find(self, body: Mapping[str, Any]) -> dict[str, Any]:
+    def add_find(self, body: Mapping[str, Any]) -> FindRow:
         """Add a find; returns it with its id.
 
         Raises:
             InputError: a field is invalid, or there are too many finds.
         """
-        row = _find(body) | {"time": _time_of(body), "version": 1}
+        row = _find(body)
+        row["time"], row["version"] = _time_of(body), 1
         with self._lock:
             found = self._finds()
             if len(found["rows"]) >= _MOST_FINDS:
                 raise InputError(f"there are {_MOST_FINDS} finds; delete some first")
             row = {"id": found["next"], **row}
             self._journal.remember("finds", {"next": found["next"] + 1, "rows": [*found["rows"], row]})
-        self._publish("finds")
+        self._events.publish(FindsChanged())
         return row
 
-    def change_find(self, number: int, body: Mapping[str, Any]) -> dict[str, Any] | None:
+    def change_find(self, number: int, body: Mapping[str, Any]) -> FindRow | None:
         """Change a find's place and note, not its time; returns it with its new version, None if it does not exist.
 
         Args:
@@ -104,10 +116,11 @@ class ConsoleState:
                 raise OutdatedError(
                     f"the find was changed elsewhere (version {before['version']}); load it and change it again"
                 )
-            row = before | new | {"version": before["version"] + 1}
+            row = before | new
+            row["version"] = before["version"] + 1
             changed = [row if old is before else old for old in rows]
             self._journal.remember("finds", self._finds() | {"rows": changed})
-        self._publish("finds")
+        self._events.publish(FindsChanged())
         return row
 
     def delete_find(self, number: int) -> bool:
@@ -118,11 +131,11 @@ class ConsoleState:
             if len(rows) == len(found["rows"]):
                 return False
             self._journal.remember("finds", found | {"rows": rows})
-        self._publish("finds")
+        self._events.publish(FindsChanged())
         return True
 
 
-def _find(body: Mapping[str, Any]) -> dict[str, Any]:
+def _find(body: Mapping[str, Any]) -> FindRow:
     """Place and note of a find.
 
     Raises:

@@ -10,15 +10,12 @@ import json
 import queue
 import sqlite3
 import threading
-import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from orthoswarm.model.errors import DiskFullError, OrthoSwarmError, StorageError
-from orthoswarm.raster.picture_quality import PictureQuality
 
 Result = TypeVar("Result")
 
@@ -236,79 +233,37 @@ def fact_change(key: str, value: Any) -> Change:
     return change
 
 
-# -- frames -------------------------------------------------------------------------------------------------------
+def workspace_opened(boot: str, *, trusted: bool) -> Change:
+    """The change at a daemon's start; what was drawn before is drawn again unless it can be trusted."""
 
-
-def add_frame(
-    key: bytes,
-    vehicle: str,
-    image: str,
-    *,
-    time_s: float | None,
-    path: str,
-    size: tuple[int, int],
-    pose: Mapping[str, Any],
-) -> Callable[[sqlite3.Connection], tuple[int, bool]]:
-    """The change that adds a frame to the vehicle's present sortie.
-
-    Its result is the frame's number and whether it is new.
-    """
-    name, arrived = packed(vehicle), time.time()
-    row = (key, name, packed(image), time_s, arrived, path, size[0], size[1], json.dumps(pose), name)
-
-    def change(db: sqlite3.Connection) -> tuple[int, bool]:
-        db.execute("INSERT OR IGNORE INTO vehicles (id) VALUES (?)", (name,))
-        cursor = db.execute(
-            "INSERT OR IGNORE INTO frames (key, vehicle, image, time, arrived, path, width, height, pose, sortie)"
-            " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, (SELECT sortie FROM vehicles WHERE id = ?))",
-            row,
-        )
-        new = cursor.rowcount == 1
-        number = db.execute("SELECT seq FROM frames WHERE key = ?", (key,)).fetchone()[0]
-        return int(number), new
+    def change(db: sqlite3.Connection) -> None:
+        fact_change("boot", boot)(db)
+        fact_change("clean", False)(db)
+        if not trusted:
+            db.execute("UPDATE frames SET drawn = 0")
+            db.execute("DELETE FROM meta WHERE key = 'realtime'")
 
     return change
 
 
-@dataclass(frozen=True, slots=True)
-class Drawn:
-    """The result of drawing a frame in real time.
-
-    Attributes:
-        seq: its number. reason: why it was rejected, None if it was not. sigma_m: its error estimate, metres.
-        thumbnail: bytes of uint8 (12, 16, 3), for balancing gains; None for a picture that was not read.
-        quality: its sharpness and damage, None for a picture that was not read or is too small.
-    """
-
-    seq: int
-    reason: str | None
-    sigma_m: float | None
-    thumbnail: bytes | None = None
-    quality: PictureQuality | None = None
+def area_forgotten(db: sqlite3.Connection) -> None:
+    """The change that drops the map's location; all frames are drawn again."""
+    db.execute("UPDATE frames SET drawn = 0")
+    db.execute("DELETE FROM meta WHERE key IN ('area', 'realtime')")
 
 
-# Jobs of journals that an earlier version wrote have no `newest_seq`; their times stand in for it. Else times decide
-# nothing: a clock that was set back would hide what came since.
-_LATE: Final = """
-SELECT COUNT(*) AS late FROM frames WHERE vehicle = :vehicle AND sortie = :sortie AND reason IS NULL
-    AND seq > COALESCE((SELECT MAX(COALESCE(json_extract(detail, '$.newest_seq'), (SELECT MAX(seq) FROM frames
-            WHERE arrived <= COALESCE(json_extract(jobs.detail, '$.refine_started_s'), jobs.started)))) FROM jobs
-        WHERE kind = 'refine' AND vehicle = :vehicle AND sortie = :sortie AND id != :job), 0)
-    AND (EXISTS (SELECT 1 FROM completions WHERE vehicle = :vehicle AND sortie = :sortie)
-        OR EXISTS (SELECT 1 FROM jobs WHERE kind = 'refine' AND vehicle = :vehicle AND sortie = :sortie
-            AND json_extract(detail, '$.trigger') = 'lost'))
-"""
+def no_change(_: sqlite3.Connection) -> None:
+    """The change that changes nothing."""
 
 
-def newest_seq(journal: Journal) -> int:
-    """The number of the newest frame of all, 0 without one; a refinement notes it as `newest_seq` when it begins."""
-    return int(journal.rows("SELECT COALESCE(MAX(seq), 0) AS newest FROM frames")[0]["newest"])
+def all_changes(*changes: Change) -> Change:
+    """Several changes as one."""
 
+    def change(db: sqlite3.Connection) -> None:
+        for one in changes:
+            one(db)
 
-def late_frames(journal: Journal, vehicle: str, sortie: int | None, job: int = 0) -> int:
-    """Number of frames of a sortie that its last refinement (other than the job's) did not use; 0 while it is flown."""
-    row = journal.rows(_LATE, {"vehicle": packed(vehicle), "sortie": sortie, "job": job})[0]
-    return int(row["late"])
+    return change
 
 
 def wrote_refined(folder: Path) -> bool:
@@ -320,22 +275,3 @@ def wrote_refined(folder: Path) -> bool:
     with contextlib.suppress(sqlite3.Error), contextlib.closing(sqlite3.connect(uri, uri=True, timeout=_BUSY_S)) as db:
         return bool(db.execute(_WROTE_REFINED).fetchone()[0])
     return False  # its daemon is only just making it
-
-
-def frames_drawn(results: Iterable[Drawn]) -> Change:
-    """The change that records frames as drawn in real time; frames refined meanwhile are left unchanged."""
-    done = list(results)
-    rows = [(d.reason, "rejected" if d.reason else "realtime", d.sigma_m, d.seq) for d in done]
-    thumbnails = [(d.seq, d.thumbnail) for d in done if d.thumbnail is not None]
-    qualities = [(d.seq, *astuple(d.quality)) for d in done if d.quality is not None]
-
-    def change(db: sqlite3.Connection) -> None:
-        db.executemany(
-            "UPDATE frames SET drawn = 1, reason = ?, stage = CASE WHEN stage IN ('coarse', 'fine') THEN stage"
-            " ELSE ? END, sigma = CASE WHEN stage IN ('coarse', 'fine') THEN sigma ELSE ? END WHERE seq = ?",
-            rows,
-        )
-        db.executemany("INSERT OR REPLACE INTO thumbnails VALUES (?, ?)", thumbnails)
-        db.executemany("INSERT OR REPLACE INTO qualities VALUES (?, ?, ?, ?, ?)", qualities)
-
-    return change

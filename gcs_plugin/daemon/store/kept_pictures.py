@@ -10,11 +10,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
+from gcs_plugin.daemon.store.frame_rows import Whose
 from orthoswarm.config import active
 from orthoswarm.model.frame import Frame
 from orthoswarm.raster.grey_pictures import stored_bytes
 
-Key = tuple[str, int | None]
 _FREE_MB: Final = 1000.0
 
 
@@ -28,28 +28,27 @@ class KeptPictures:
 
     def __init__(self, folder: Path, free_mb: float = _FREE_MB) -> None:
         self._folder, self._free_mb, self._lock = folder, free_mb, threading.Lock()
-        self._bytes: dict[Key, int] = {}
-        self._names: dict[Key, str] = {}
+        self._bytes: dict[Whose, int] = {}
+        self._names: dict[Whose, str] = {}
         self._made = 0
         shutil.rmtree(folder, ignore_errors=True)
 
-    def of(self, vehicle: str, sortie: int | None, frames: Sequence[Frame]) -> Path | None:
+    def of(self, whose: Whose, frames: Sequence[Frame]) -> Path | None:
         """The folder for a sortie's pictures; None if they would take too much, or it cannot be made.
 
         Args:
             frames: those so far. A vehicle's other sorties are not kept any longer.
         """
-        key = (vehicle, sortie)
         with self._lock:
-            others = [other for other in self._names if other[0] == vehicle and other != key]
+            others = [other for other in self._names if other[0] == whose[0] and other != whose]
         for other in others:
-            self.drop(*other)
-        path = self._reserved(key, stored_bytes(frames))
+            self.drop(other)
+        path = self._reserved(whose, stored_bytes(frames))
         if path is None:
-            self.drop(vehicle, sortie)
+            self.drop(whose)
         return path
 
-    def _reserved(self, key: Key, size: int) -> Path | None:
+    def _reserved(self, key: Whose, size: int) -> Path | None:
         with self._lock:
             self._bytes[key] = max(size, self._bytes.get(key, 0))
             if sum(self._bytes.values()) > active().raster.grey_pictures_mb * 1e6:
@@ -64,11 +63,11 @@ class KeptPictures:
             except OSError:
                 return None
 
-    def drop(self, vehicle: str, sortie: int | None) -> None:
+    def drop(self, whose: Whose) -> None:
         """Remove what is kept of a sortie."""
         with self._lock:
-            self._bytes.pop((vehicle, sortie), None)
-            name = self._names.pop((vehicle, sortie), None)
+            self._bytes.pop(whose, None)
+            name = self._names.pop(whose, None)
         if name is not None:
             with contextlib.suppress(OSError):
                 shutil.rmtree(self._folder / name)

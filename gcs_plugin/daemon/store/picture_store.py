@@ -38,11 +38,7 @@ def picture_size(data: bytes) -> tuple[int, int, str]:
 
 
 class PictureStore:
-    """The folder of pictures: `ab/<64 hexadecimal digits>.jpg`.
-
-    Attributes:
-        folder: made if absent.
-    """
+    """The folder of pictures: `ab/<64 hexadecimal digits>.jpg`."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder

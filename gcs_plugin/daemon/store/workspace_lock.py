@@ -1,16 +1,14 @@
 """Checks at the daemon's start: the workspace's lock, disk space, power cuts, the basemap."""
 
 import contextlib
-import json
 import logging
 import os
 import shutil
-import sqlite3
 import time
 from pathlib import Path
 from typing import Final
 
-from gcs_plugin.daemon.store.journal import Journal
+from gcs_plugin.daemon.store.journal import Journal, workspace_opened
 from orthoswarm.batch.workspace import Workspace
 from orthoswarm.model.errors import DiskFullError, InputError, StorageError
 from orthoswarm.raster.basemap import Basemap
@@ -65,19 +63,11 @@ def distrust_after_power_cut(journal: Journal) -> bool:
         Whether canvases can be trusted.
     """
     boot = _boot_id()
-    clean = journal.fact("clean") or journal.fact("boot") in (None, boot)
-
-    def change(db: sqlite3.Connection) -> None:
-        db.execute("INSERT OR REPLACE INTO meta VALUES ('boot', ?)", (json.dumps(boot),))
-        db.execute("INSERT OR REPLACE INTO meta VALUES ('clean', 'false')")
-        if not clean:
-            db.execute("UPDATE frames SET drawn = 0")
-            db.execute("DELETE FROM meta WHERE key = 'realtime'")
-
-    journal.write(change)
+    clean = bool(journal.fact("clean") or journal.fact("boot") in (None, boot))
+    journal.write(workspace_opened(boot, trusted=clean))
     if not clean:
         _log.warning("the machine was switched off without a shutdown; the real-time layer is drawn again")
-    return bool(clean)
+    return clean
 
 
 def _boot_id() -> str:

@@ -10,12 +10,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gcs_plugin.daemon.intake.posted_pose import frame_of, parse_pose
+from gcs_plugin.daemon.layers.anchor import ExpectedPlace
 from gcs_plugin.daemon.layers.draw_queue import DrawQueue, MapDelay, PendingFrame
-from gcs_plugin.daemon.layers.layers import Layer
+from gcs_plugin.daemon.layers.layers import MapLayer
 from gcs_plugin.daemon.layers.realtime_layer import Drawer
+from gcs_plugin.daemon.layers.web_tiles import TileServer
+from gcs_plugin.daemon.store.daemon_events import FrameReported, Overload, PictureStored
 from gcs_plugin.daemon.store.event_bus import Events
-from gcs_plugin.daemon.store.journal import Journal, add_frame
+from gcs_plugin.daemon.store.frame_rows import add_frame, undrawn_frames
+from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.daemon.store.picture_store import PictureStore, frame_key
+from gcs_plugin.daemon.web_plans import Plans
 from orthoswarm.model.frame import Fix, Frame
 from orthoswarm.raster.picture_file import read_rgba
 from tests.kit.daemon_kit import GRID, SIZE, camera_at, jpeg, pose_of
@@ -149,17 +154,29 @@ class RecordedEvents(Events):
         super().__init__()
         self.told = []
 
-    def publish(self, kind, /, **fields):
-        self.told.append((kind, fields))
+    def publish(self, event):
+        self.told.append(event)
 
 
 @contextlib.contextmanager
 def drawing(folder, read, **options):
     """A drawer with its journal, a function that sends it a picture, and what it has told."""
-    events, layer = RecordedEvents(), Layer("realtime")
+    events, layer = RecordedEvents(), MapLayer("realtime")
     journal, store = Journal(folder / "journal.db"), PictureStore(folder / "p")
     (folder / "layers").mkdir()
-    drawer = Drawer(journal, store, layer, folder / "layers", events, gsd_m=0.5, in_memory=12, read=read, **options)
+    expected = ExpectedPlace(TileServer({}), Plans(folder / "plans", None, None))
+    drawer = Drawer(
+        journal,
+        store,
+        layer,
+        folder / "layers",
+        events,
+        gsd_m=0.5,
+        in_memory=12,
+        read=read,
+        expected=expected,
+        **options,
+    )
     drawer.start()
     data = jpeg(camera_at())
 
@@ -171,7 +188,9 @@ def drawing(folder, read, **options):
             add_frame(key, "v1", pose.image, time_s=float(k), path=path, size=SIZE, pose=pose.values)
         )
         frame = frame_of(pose.values, image=pose.image, path=store.path(path), vehicle="v1", time_s=float(k), size=SIZE)
-        drawer.add(seq, frame, time.time(), 1)
+        drawer.picture_stored(
+            PictureStored(seq=seq, frame=frame, arrived_s=time.time(), sortie=1, has_fix=True, count=1)
+        )
 
     try:
         yield drawer, journal, send, events.told
@@ -201,14 +220,14 @@ def test_a_jam_is_told_and_everything_is_drawn_in_the_end(tmp_path):
         assert "safe on the disk" in drawer.overload
         in_time.set()
         may_read.release(100)
-        assert drawer.wait_idle(240)
+        wait_until(lambda: not undrawn_frames(journal, 1))
         rows = journal.rows("SELECT seq, drawn, reason FROM frames")
-    order = [fields["seq"] for kind, fields in told if kind == "frame"]
+    order = [event.seq for event in told if isinstance(event, FrameReported)]
     assert [(row["drawn"], row["reason"]) for row in rows] == [(1, None)] * 90
     assert sorted(order) == sorted(row["seq"] for row in rows)  # each once
     last_place = {seq for seq in order if (seq - min(order)) // 15 == 5}
     assert min(order.index(seq) for seq in last_place) < 60  # not after all that came before
-    assert any(kind == "overload" and fields["put_off"] > 0 for kind, fields in told)
+    assert any(isinstance(event, Overload) and event.put_off > 0 for event in told)
 
 
 def test_the_end_of_a_jam_is_told_though_nothing_comes_after_it(tmp_path):
@@ -218,11 +237,11 @@ def test_the_end_of_a_jam_is_told_though_nothing_comes_after_it(tmp_path):
         assert all_came.wait(240)
         return read_rgba(path)
 
-    with drawing(tmp_path, late, late_s=0.0, look_s=60.0) as (drawer, _, send, told):
+    with drawing(tmp_path, late, late_s=0.0, look_s=60.0) as (drawer, journal, send, told):
         for k in range(40):
             send(k, camera_at(5.0 * k))
         all_came.set()
-        assert drawer.wait_idle(240)
+        wait_until(lambda: not undrawn_frames(journal, 1))
         wait_until(lambda: not drawer.overload)
-    put_off = [fields["put_off"] for kind, fields in told if kind == "overload"]
+    put_off = [event.put_off for event in told if isinstance(event, Overload)]
     assert put_off[0] > 0 == put_off[-1]

@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gcs_plugin.daemon.store.journal import Journal, add_frame, packed, unpacked
+from gcs_plugin.daemon.store.frame_rows import add_frame
+from gcs_plugin.daemon.store.journal import Journal, packed, unpacked
 from gcs_plugin.daemon.store.picture_store import frame_key
 from orthoswarm.model.errors import OrthoSwarmError
 

@@ -23,6 +23,7 @@ from gcs_plugin.daemon.web_plans import Plans
 from gcs_plugin.web.guard import take_token
 from orthoswarm.model.errors import InputError
 from tests.daemon.faults.test_daemon_crash import check, post_until_gone
+from tests.daemon.on_links import OnLinks
 from tests.kit.daemon_kit import exported, line, serving, start, stop, tile_over
 from tests.kit.sim_cameras import square
 
@@ -342,4 +343,4 @@ def test_a_plan_that_was_not_written_to_its_end_is_not_offered(tmp_path):
     for name, text in (("plan-1", '{"covered_share": 1.0}'), ("plan-2", '{"covered'), ("plan-3", "")):
         (tmp_path / name).mkdir()
         (tmp_path / name / "plan.json").write_text(text)
-    assert [plan["id"] for plan in Plans(tmp_path).all()] == ["plan-1"]
+    assert [plan["id"] for plan in Plans(tmp_path, None, OnLinks()).all()] == ["plan-1"]

@@ -15,6 +15,7 @@ from gcs_plugin.daemon.gap_flights import GapFlights
 from gcs_plugin.daemon.web_plans import Plans
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 from orthoswarm.model.geo import LocalGrid
+from tests.daemon.on_links import OnLinks
 from tests.kit.flown_area import CORNER, EPSG
 
 
@@ -23,7 +24,7 @@ def _row(vehicle: str, doing: str = "on mission", **more: Any) -> dict[str, Any]
     return {
         "id": vehicle, "state": "found", "armed": True, "battery": 0.8, "flight": {"state": doing},
         "mission": {"phase": "active"}, "lat_deg": float(lat), "lon_deg": float(lon),
-        "home": [float(lat), float(lon)],
+        "home": [float(lat), float(lon)], "takeoff": None,
     } | more  # fmt: skip
 
 
@@ -132,7 +133,7 @@ class _Links:
 
 
 def _flights(tmp_path: Path, rows: list[dict[str, Any]], **coverage: Any) -> GapFlights:
-    plans = Plans(tmp_path / "plans")
+    plans = Plans(tmp_path / "plans", None, OnLinks())
     return GapFlights(_Coverage(None, **coverage), plans, _Links(rows))  # type: ignore[arg-type]
 
 
@@ -188,7 +189,6 @@ def test_a_vehicle_in_the_air_gets_another_mission_only_if_that_was_confirmed_fo
 
 
 def test_a_vehicle_whose_takeoff_is_due_gets_no_other_mission(tmp_path: Path) -> None:
-    links = _Links([_landed("v1")])
-    flights = GapFlights(_Coverage(None), Plans(tmp_path / "p"), links, lambda: {"v1": {"in_s": 4.0}})  # type: ignore[arg-type]
+    flights = _flights(tmp_path, [_landed("v1", takeoff={"in_s": 4.0})])
     with pytest.raises(OrthoSwarmError, match="about to take off"):
         flights.plan({"vehicles": {"v1": 9.0}, "altitude_m": 60.0})

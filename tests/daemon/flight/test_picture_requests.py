@@ -20,6 +20,33 @@ def content(number: int, size: int = 20_000) -> bytes:
     return np.random.default_rng(number).integers(0, 256, size, np.uint8).tobytes()
 
 
+class Workspace:
+    """What has arrived of a ground's pictures."""
+
+    def __init__(self, ground, names):
+        self.ground, self.known = ground, names
+
+    def system_of(self, vehicle):
+        if vehicle != "v1":
+            raise OrthoSwarmError("unknown")
+        return 1
+
+    def wanted(self):
+        return list(self.ground.wanted.values())
+
+    def names(self, vehicle):
+        return self.known
+
+    def store(self, wanted, name, data):
+        if self.ground.refusal is not None:
+            raise self.ground.refusal
+        self.ground.stored[name] = data
+        self.ground.wanted.pop(wanted.number, None)
+
+    def changed(self):
+        pass
+
+
 class Ground:
     """A world with one vehicle that has files, and the requests for its pictures."""
 
@@ -32,23 +59,9 @@ class Ground:
         self.stored: dict[str, bytes] = {}
         self.refusal: Exception | None = None
         self.requests = PictureRequests(
-            self.world.fleet, system_of=self._system_of, wanted=lambda: list(self.wanted.values()),
-            names=lambda vehicle: names or PictureNames(), store=self._store, most_bytes_s=most,
-            clock=self.world.clock,
+            self.world.fleet, Workspace(self, names or PictureNames()), most_bytes_s=most, clock=self.world.clock,
         )  # fmt: skip
         self.world.meet()
-
-    @staticmethod
-    def _system_of(vehicle: str) -> int:
-        if vehicle != "v1":
-            raise OrthoSwarmError("unknown")
-        return 1
-
-    def _store(self, wanted: WantedPicture, name: str, data: bytes) -> None:
-        if self.refusal is not None:
-            raise self.refusal
-        self.stored[name] = data
-        self.wanted.pop(wanted.number, None)
 
     def until(self, done, limit_s: float = 120.0) -> bool:
         """Advance time, as the daemon's thread does."""

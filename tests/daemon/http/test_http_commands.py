@@ -16,6 +16,8 @@ import pytest
 
 from gcs_plugin.daemon.intake.refused_pictures import RefusedPictures
 from gcs_plugin.daemon.settings import Settings, VehicleSettings
+from gcs_plugin.daemon.store.daemon_events import PictureRefused
+from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
 from gcs_plugin.web.connections import open_listener
 from gcs_plugin.web.standstill import Standstill
@@ -344,12 +346,13 @@ def test_a_broken_link_and_two_vehicles_of_one_system_id_are_in_health(tmp_path)
 
 
 def test_old_refusals_are_counted_but_no_news():
-    now, events = [0.0], []
-    refused = RefusedPictures(lambda kind, **fields: events.append((kind, fields)), lambda: now[0])
+    now, told, events = [0.0], [], Events()
+    events.on(PictureRefused, told.append)
+    refused = RefusedPictures(events, lambda: now[0])
     refused.note("disk", "the disk is full", "v1", "a.jpg")
     refused.note("disk", "the disk is full", "v1", "b.jpg")
     assert refused.problems() == ["2 pictures refused or not on the map: the disk is full"]
-    assert [fields["image"] for kind, fields in events if kind == "refused"] == ["a.jpg", "b.jpg"]
+    assert [event.image for event in told] == ["a.jpg", "b.jpg"]
     now[0] = 601.0
     assert refused.problems() == []
     assert refused.counts["disk"] == 2

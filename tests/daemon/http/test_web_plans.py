@@ -7,6 +7,7 @@ import pytest
 from gcs_plugin.daemon.web_plans import Plans
 from gcs_plugin.links.mavlink import Autopilot
 from orthoswarm.model.errors import InputError
+from tests.daemon.on_links import OnLinks
 from tests.kit.plan_checks import on_globe
 
 SQUARE = on_globe([(0, 0), (200, 0), (200, 200), (0, 200)])
@@ -23,7 +24,7 @@ BODY = {"area": AREA, "vehicles": 2, "altitude_m": 60, "fov_min_deg": 60}
     ],
 )
 def test_a_plan_is_made_for_the_autopilots_on_the_links_unless_the_request_names_others(asked, made, tmp_path):
-    plans = Plans(tmp_path, autopilots=lambda: {"v2": "px4", "v7": "px4"})
+    plans = Plans(tmp_path, None, OnLinks(kinds={"v2": "px4", "v7": "px4"}))
     figures = plans.make(BODY | asked)
     assert [vehicle["autopilot"] for vehicle in figures["vehicles"]] == made
     assert figures["warnings"] == []
@@ -33,7 +34,7 @@ STANDING = {"v1": SQUARE.shell[0], "v2": SQUARE.shell[1]}
 
 
 def test_a_plan_takes_off_where_its_vehicles_stand(tmp_path):
-    plans = Plans(tmp_path, standing=lambda: STANDING)
+    plans = Plans(tmp_path, None, OnLinks(places=STANDING))
     made = plans.make(BODY)
     assert made["warnings"] == []
     mission = plans.mission({"plan": made["id"]}, "v2", Autopilot.ARDUPILOT)
@@ -48,7 +49,7 @@ def test_a_plan_takes_off_where_its_vehicles_stand(tmp_path):
     ],
 )
 def test_a_plan_says_whose_place_is_not_known_and_that_takeoffs_lie_at_first_lines(standing, said, tmp_path):
-    plans = Plans(tmp_path, standing=lambda: standing)
+    plans = Plans(tmp_path, None, OnLinks(places=standing))
     (warning,) = plans.make(BODY)["warnings"]
     assert said in warning and "where its first line begins" in warning and "plan again" in warning
     assert plans.all()[0]["warnings"] == [warning]  # also for a page that is opened later
@@ -57,7 +58,7 @@ def test_a_plan_says_whose_place_is_not_known_and_that_takeoffs_lie_at_first_lin
 @pytest.mark.parametrize("autopilot", ["betaflight", 4, [], ["px4", None]])
 def test_other_autopilots_are_refused(autopilot, tmp_path):
     with pytest.raises(InputError, match="ardupilot, px4"):
-        Plans(tmp_path).make(BODY | {"autopilot": autopilot})
+        Plans(tmp_path, None, OnLinks()).make(BODY | {"autopilot": autopilot})
     assert not list(tmp_path.iterdir())
 
 
@@ -77,7 +78,7 @@ ZONE = {"type": "Polygon", "coordinates": [[[lon, lat] for lat, lon in [*RING, R
     ids=lambda value: value["type"],
 )
 def test_no_fly_zones_of_any_geojson_are_kept(no_fly, tmp_path):
-    made = Plans(tmp_path).make(BODY | {"no_fly": no_fly})
+    made = Plans(tmp_path, None, OnLinks()).make(BODY | {"no_fly": no_fly})
     assert json.loads((tmp_path / made["id"] / "no-fly.geojson").read_text()) == no_fly  # the planner reads this file
 
 
@@ -94,12 +95,12 @@ def test_no_fly_zones_of_any_geojson_are_kept(no_fly, tmp_path):
 )
 def test_no_fly_zones_that_cannot_be_kept_are_refused(no_fly, tmp_path):
     with pytest.raises(InputError, match="no_fly"):
-        Plans(tmp_path).make(BODY | {"no_fly": no_fly})
+        Plans(tmp_path, None, OnLinks()).make(BODY | {"no_fly": no_fly})
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", [("MultiPolygon", "coordinates"), ("FeatureCollection", "features")])
 def test_no_zones_are_no_zones(kind, tmp_path):
-    made = Plans(tmp_path).make(BODY | {"no_fly": {"type": kind[0], kind[1]: []}})
+    made = Plans(tmp_path, None, OnLinks()).make(BODY | {"no_fly": {"type": kind[0], kind[1]: []}})
     assert not (tmp_path / made["id"] / "no-fly.geojson").exists()

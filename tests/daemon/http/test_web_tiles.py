@@ -9,7 +9,7 @@ from pyproj import Transformer
 from rasterio.transform import from_origin
 
 from gcs_plugin.daemon.jobs.kernel_warmup import made_up_ground, write_map
-from gcs_plugin.daemon.layers.layers import Area, Layer, successor
+from gcs_plugin.daemon.layers.layers import MapArea, MapLayer, successor
 from gcs_plugin.daemon.layers.web_tiles import (
     TileAddress,
     TileServer,
@@ -40,7 +40,7 @@ def drawn(path, area, *cameras):
 
 
 def small_area(gsd=0.5):
-    return Area.around(EPSG, EAST, NORTH, gsd)
+    return MapArea.around(EPSG, EAST, NORTH, gsd)
 
 
 @given(st.integers(12, 22), st.floats(-0.02, 0.02), st.floats(-0.02, 0.02))
@@ -70,7 +70,7 @@ def test_a_tile_shows_the_ground(tmp_path):
 
 
 def test_far_and_empty_tiles_are_transparent(tmp_path):
-    layer = Layer("realtime")
+    layer = MapLayer("realtime")
     layer.replace(drawn(tmp_path / "c", small_area(), camera_at()))
     server = TileServer({"realtime": layer})
     for address in (TileAddress(0, 0, 0), TileAddress(5, 0, 31), TileAddress(19, 1, 1)):
@@ -81,7 +81,7 @@ def test_far_and_empty_tiles_are_transparent(tmp_path):
 
 
 def test_the_etag_changes_with_the_content_and_only_then(tmp_path):
-    layer = Layer("realtime")
+    layer = MapLayer("realtime")
     canvas = drawn(tmp_path / "c", small_area(), camera_at())
     layer.replace(canvas)
     server = TileServer({"realtime": layer})
@@ -135,7 +135,7 @@ def test_a_generation_shares_tiles_but_not_changes(tmp_path):
 
 
 def test_a_layer_is_kept_open_while_it_is_read_and_removed_after(tmp_path):
-    area, layer = small_area(), Layer("fine")
+    area, layer = small_area(), MapLayer("fine")
     layer.replace(drawn(tmp_path / "a", area, camera_at()))
     with layer.reading() as canvas:
         layer.replace(drawn(tmp_path / "b", area, camera_at(50)))
@@ -158,7 +158,7 @@ def test_tiles_of_512_pixels_stay_aligned_when_an_area_grows():
     side = 512 * area.gsd_m
     for a, b in zip(area.bounds, grown.bounds, strict=True):
         assert ((a - b) / side) == pytest.approx(round((a - b) / side), abs=1e-6)
-    assert Area.from_document(grown.document()) == grown
+    assert MapArea.from_document(grown.document()) == grown
 
 
 @settings(max_examples=20)

@@ -5,10 +5,15 @@ import json
 import pytest
 
 from gcs_plugin.daemon.intake.posted_pose import is_position, parse_pose
-from gcs_plugin.daemon.layers.anchor import Anchor
-from gcs_plugin.daemon.layers.layers import Layer
+from gcs_plugin.daemon.layers.anchor import Anchor, ExpectedPlace
+from gcs_plugin.daemon.layers.layers import MapLayer
 from gcs_plugin.daemon.layers.map_site import MapSite
-from gcs_plugin.daemon.store.journal import Journal, add_frame
+from gcs_plugin.daemon.layers.web_tiles import TileServer
+from gcs_plugin.daemon.store.daemon_events import DrawingRestarted
+from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.daemon.store.frame_rows import add_frame
+from gcs_plugin.daemon.store.journal import Journal
+from gcs_plugin.daemon.web_plans import Plans
 from orthoswarm.model.earth import distance_m
 from orthoswarm.model.frame import Fix, Frame
 from tests.kit.daemon_kit import Shot, camera_at, jpeg, line, pose_of, serving, tile_over
@@ -61,11 +66,12 @@ def test_most_pictures_anchor_the_map_and_none_is_lost(tmp_path):
 
 
 def test_a_map_that_was_begun_at_a_wrong_place_moves_once_while_pictures_are_drawn_again(tmp_path):
-    journal, again = Journal(tmp_path / "journal.db"), []
+    journal, again, events = Journal(tmp_path / "journal.db"), [], Events()
+    events.on(DrawingRestarted, lambda event: again.append(1))
     (tmp_path / "layers").mkdir()
     site = MapSite(
-        journal, Layer("realtime"), tmp_path / "layers", gsd_m=0.5, fov_rad=None,
-        on_area=lambda area: None, anchor=lambda: None, draw_again=lambda: again.append(1),
+        journal, MapLayer("realtime"), tmp_path / "layers", gsd_m=0.5, fov_rad=None, events=events,
+        expected=ExpectedPlace(TileServer({}), Plans(tmp_path / "plans", None, None)),
     )  # fmt: skip
     frames = []
     for k, (lat, lon) in enumerate([(10.0, 10.0)] * 2 + [(48.0, 11.0)] * 3):

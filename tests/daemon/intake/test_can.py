@@ -9,6 +9,9 @@ import pytest
 
 from gcs_plugin.daemon.intake.can_reader import CanReader
 from gcs_plugin.daemon.settings import Settings, VehicleSettings
+from gcs_plugin.daemon.store.daemon_events import Note
+from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.fleet.fleet import Fleet
 from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.sim.multirotor import Airframe
 from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
@@ -248,8 +251,9 @@ def test_a_vehicles_own_bus_comes_through_its_link(tmp_path):
 
 
 def test_a_bus_that_is_not_there_is_said_once_and_tried_again():
-    said = []
-    reader = CanReader("v1", "socketcan:nothing0", poses=LivePoses("v1"), notify=said.append, fleet=None, system=None)
+    said, events, fleet = [], Events(), Fleet([])
+    events.on(Note, said.append)
+    reader = CanReader("v1", "socketcan:nothing0", poses=LivePoses("v1"), events=events, fleet=fleet, system=None)
     reader.start()
     end = time.monotonic() + 120.0
     while not said:
@@ -258,6 +262,7 @@ def test_a_bus_that_is_not_there_is_said_once_and_tried_again():
     time.sleep(5.0)  # more than two further attempts
     state = reader.document()
     reader.close()
+    fleet.close()
     assert len(said) == 1
     assert "cannot be opened" in state["state"]
 

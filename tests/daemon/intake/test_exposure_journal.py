@@ -8,6 +8,7 @@ import numpy as np
 
 from gcs_plugin.daemon.flight_coverage.exposure_journal import EventRequests, ExposureJournal
 from gcs_plugin.daemon.store.journal import Journal
+from gcs_plugin.daemon.vehicle_names import VehicleNames
 from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.sim.lossy_radio import Faults
 from gcs_plugin.sim.memory_link import World
@@ -33,7 +34,7 @@ def _captured(number: int, result: int = 1, time_s: float = 0.0) -> Any:
 
 def test_events_are_kept_once_each_and_survive_a_restart(tmp_path: Path) -> None:
     journal = Journal(tmp_path / "journal.db")
-    kept = ExposureJournal(journal, lambda system: f"v{system}")
+    kept = ExposureJournal(journal, VehicleNames({}, {}))
     first, second = SimpleNamespace(system=1), SimpleNamespace(system=2)
     for number in (1, 2, 2, 3):
         kept.message(first, _feedback(number, 1.78e9 + number), 1.78e9 + number + 0.4)  # type: ignore[arg-type]
@@ -43,7 +44,7 @@ def test_events_are_kept_once_each_and_survive_a_restart(tmp_path: Path) -> None
     assert kept.write() and not kept.write()
     journal.close()
     journal = Journal(tmp_path / "journal.db")
-    events = ExposureJournal(journal, lambda system: f"v{system}").events(GRID)
+    events = ExposureJournal(journal, VehicleNames({}, {})).events(GRID)
     journal.close()
     assert [(e.vehicle, e.number, e.time_s) for e in events] == [
         ("v1", 1, 1.78e9 + 1), ("v1", 2, 1.78e9 + 2), ("v1", 3, 1.78e9 + 3), ("v2", 7, 1.78e9 + 0.5),
@@ -80,7 +81,7 @@ def test_events_that_a_bad_link_has_lost_are_asked_for_and_come(tmp_path: Path) 
     vehicle = _Camera(system=1, autopilot=Autopilot.PX4)
     world = World([vehicle], down=Faults(loss=0.3, seed=4), up=Faults(loss=0.2, seed=5))
     journal = Journal(tmp_path / "journal.db")
-    kept = ExposureJournal(journal, lambda system: f"v{system}")
+    kept = ExposureJournal(journal, VehicleNames({}, {}))
     try:
         world.meet()
         world.fleet.subscribe(kept.message, "CAMERA_IMAGE_CAPTURED")

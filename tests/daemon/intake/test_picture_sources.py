@@ -13,14 +13,18 @@ import numpy as np
 import pytest
 
 from gcs_plugin.daemon.intake.file_complete import is_complete, is_video_complete
-from gcs_plugin.daemon.intake.picture_sources import Source
+from gcs_plugin.daemon.intake.picture_intake import LinkLog, VehicleIntake
+from gcs_plugin.daemon.intake.picture_sources import PictureSource
 from gcs_plugin.daemon.intake.posted_pose import frame_of
+from gcs_plugin.daemon.store.daemon_events import Note
+from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.picture_store import frame_key
 from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.links.tlog_writer import TlogWriter, read_tlog, write_link_log
 from gcs_plugin.sim.multirotor import Airframe
 from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
 from telemetry import load
+from telemetry.live.live_poses import LinkPoses
 from telemetry.samples.sample import Sample
 from telemetry.samples.times import ZONE_UNKNOWN
 from telemetry.write.sei_writer import add_sei
@@ -76,14 +80,31 @@ def source_of(served, vehicle):
     return next(row for row in served.get("/api/vehicles").json() if row["id"] == vehicle)["pictures"]
 
 
+class Workspace:
+    """Takes every picture."""
+
+    def __init__(self):
+        self.taken = []
+
+    def add(self, pose, data):
+        self.taken.append(pose)
+        return len(self.taken), True
+
+
+def source_to(workspace, where, said, cache):
+    """A vehicle's source of pictures; what it says is added to a list."""
+    events = Events()
+    events.on(Note, lambda note: said.append(note.text))
+    log = LinkLog(cache / "telemetry.tlog", {})
+    return PictureSource(where, VehicleIntake("v1", workspace, events, poses=LinkPoses(), link_log=log, cache=cache))
+
+
 def test_a_stream_without_pictures_is_told_once(tmp_path):
     """A camera that sends nothing while its drone stands on the ground: each attempt ends, and one is news."""
     said = []
     with socket.create_server(("127.0.0.1", 0)) as camera:
         where = f"tcp://127.0.0.1:{camera.getsockname()[1]}"
-        source = Source(
-            "v1", where, take=lambda *_: (1, True), pose_at=lambda *_: None, notify=said.append, cache=tmp_path
-        )
+        source = source_to(Workspace(), where, said, tmp_path)
         source.start()
         camera.settimeout(120.0)
         for _ in range(3):
@@ -102,11 +123,9 @@ def local_time(folder, count):
 
 
 def test_times_without_a_zone_are_told_once_a_folder(tmp_path):
-    said, taken = [], []
-    source = Source(
-        "v1", str(local_time(tmp_path / "card", 2)), pose_at=lambda *_: None, notify=said.append, cache=tmp_path,
-        take=lambda pose, _: (taken.append(pose), True),
-    )  # fmt: skip
+    said, workspace = [], Workspace()
+    taken = workspace.taken
+    source = source_to(workspace, str(local_time(tmp_path / "card", 2)), said, tmp_path)
     source.start()
     until(lambda: len(taken) == 2)
     (tmp_path / "card" / "late.jpg").write_bytes((tmp_path / "card" / "0.jpg").read_bytes() + b"0")

@@ -11,6 +11,8 @@ from gcs_plugin.daemon.jobs.leg_watch import LegWatch
 from gcs_plugin.daemon.jobs.publisher import Publisher
 from gcs_plugin.daemon.jobs.solution_file import read_solution
 from gcs_plugin.daemon.settings import Settings
+from gcs_plugin.daemon.store.daemon_events import LegsOver, VehicleSilent
+from gcs_plugin.daemon.store.event_bus import Events
 from orthoswarm.model.errors import StorageError
 from tests.kit.made_up import LIMIT_S, after_job, complete, post, truth
 
@@ -41,7 +43,7 @@ def after_all(daemon):
 
 
 def stages(daemon):
-    return {row["image"]: row["stage"] for row in daemon.frames()}
+    return {row["image"]: row["stage"] for row in daemon.views.frames()}
 
 
 @pytest.mark.slow
@@ -54,11 +56,11 @@ def test_a_few_late_pictures_are_laid_beside_the_others_and_many_refined_with_th
     (refined,) = after_job(daemon, 1)
     assert refined.state == "done", refined.message
     assert refined.detail["frames"] == 17
-    note = daemon.completions()
+    note = daemon.views.completions()
     post_at_once(daemon, late)
     (beside,) = after_all(daemon)[1:]
     assert (beside.state, beside.detail["trigger"], beside.detail["beside"]) == ("done", "late", 3)
-    assert daemon.completions() == note  # what the completion led to stays as it was
+    assert daemon.views.completions() == note  # what the completion led to stays as it was
     row = daemon.journal.one("SELECT path FROM solutions")
     placed = {
         p.frame.image: p for p in read_solution(daemon.settings.workspace / "solutions" / row["path"]).solution.placed
@@ -136,7 +138,10 @@ def test_a_vehicle_that_stood_at_one_spot_stays_as_recorded_and_says_so(daemon, 
 
 def test_silence_is_told_however_few_pictures_came():
     asked, silent = [], []
-    watch = LegWatch(lambda *values: asked.append(values), lambda *values: silent.append(values), silent_s=0.2)
+    events = Events()
+    events.on(LegsOver, asked.append)
+    events.on(VehicleSilent, silent.append)
+    watch = LegWatch(events, silent_s=0.2)
     watch.start()
     for count in (1, 2):
         watch.add("v1", 1, 1e9 + count, 48.0, 11.0)
@@ -146,5 +151,5 @@ def test_silence_is_told_however_few_pictures_came():
             time.sleep(0.01)
     time.sleep(0.3)
     watch.close()
-    assert silent == [("v1", 1)] * 2  # once for each silence
+    assert silent == [VehicleSilent("v1", 1)] * 2  # once for each silence
     assert asked == []

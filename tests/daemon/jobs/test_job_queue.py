@@ -11,8 +11,10 @@ from gcs_plugin.cli.main import main
 from gcs_plugin.daemon.jobs.job_queue import Jobs
 from gcs_plugin.daemon.jobs.solution_file import SolutionFile, SolutionFileError, is_readable, read_solution
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
+from gcs_plugin.daemon.store.daemon_events import JobEnded
 from gcs_plugin.daemon.store.event_bus import Events
-from gcs_plugin.daemon.store.journal import Journal, add_frame, late_frames
+from gcs_plugin.daemon.store.frame_rows import add_frame, late_frames
+from gcs_plugin.daemon.store.journal import Journal
 from orthoswarm.config import active, override
 from orthoswarm.model.errors import DiskFullError, OrthoSwarmError, StorageError, WorkerStoppedError
 from orthoswarm.model.placement import Solution
@@ -58,8 +60,9 @@ def test_the_end_of_a_job_is_written_when_the_disk_has_room_again(journal):
         return lambda db: None
 
     ended = []
-    jobs = Jobs(journal, Events(), {"refine": fill}, slots=1)
-    jobs.on_end(lambda job: ended.append((job.kind, job.state, jobs.open("refine"))))
+    events = Events()
+    jobs = Jobs(journal, events, {"refine": fill}, slots=1)
+    events.on(JobEnded, lambda event: ended.append((event.job.kind, event.job.state, jobs.open("refine"))))
     job = jobs.add("refine", "v1", 1)
     jobs.start()
     assert journal.refused.wait(LIMIT_S)
@@ -269,9 +272,9 @@ def test_what_is_late_does_not_depend_on_the_clock(journal, monkeypatch, set_s):
         for image in images:
             journal.write(add_frame(image.encode(), "v1", image, time_s=1e9, path=image, size=(640, 480), pose={}))
 
-    ended = []
-    jobs = Jobs(journal, Events(), {"refine": nothing}, slots=1)
-    jobs.on_end(lambda job: ended.append(job.id))
+    ended, events = [], Events()
+    events.on(JobEnded, lambda event: ended.append(event.job.id))
+    jobs = Jobs(journal, events, {"refine": nothing}, slots=1)
     come("a", "b")
     jobs.add("refine", "v1", 1, trigger="lost")
     jobs.start()

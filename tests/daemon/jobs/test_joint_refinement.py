@@ -77,8 +77,8 @@ def test_the_first_is_solved_again_when_its_neighbour_was_refined(daemon, flight
         _, found = solution(daemon, vehicle)
         assert len(found.placed) == len(frames[vehicle])
         assert np.median(errors(found, frames[vehicle])) < 0.3
-    assert {row["stage"] for row in daemon.frames()} == {"fine"}
-    assert {leg["properties"]["state"] for leg in daemon.legs()["features"]} == {"matched"}
+    assert {row["stage"] for row in daemon.views.frames()} == {"fine"}
+    assert {leg["properties"]["state"] for leg in daemon.views.legs()["features"]} == {"matched"}
     assert not [job for job in daemon.jobs.all() if job.state == "failed"]
     assert sorted(path.name for path in (daemon.settings.workspace / "solutions").glob("solution*.part")) == []
 
@@ -168,10 +168,10 @@ class Rows:
     """A journal that holds two refined sorties at the same place."""
 
     def one(self, query, values):
-        return {"path": "a", "detail": '{"layer": "fine", "bounds": [0, 0, 9, 9]}'}
+        return {"vehicle": values[0], "sortie": 1, "path": "a", "detail": '{"layer": "fine", "bounds": [0, 0, 9, 9]}'}
 
     def rows(self, query):
-        return [{"vehicle": packed(v), "sortie": 1, **self.one("", ())} for v in ("v1", "v2")]
+        return [self.one("", (packed(v),)) for v in ("v1", "v2")]
 
 
 class Placed:
@@ -181,9 +181,9 @@ class Placed:
         self.solutions = folder
 
     def area(self):
-        from gcs_plugin.daemon.layers.layers import Area
+        from gcs_plugin.daemon.layers.layers import MapArea
 
-        return Area(32631, 0.1, (0.0, 0.0), (0.0, 0.0, 9.0, 9.0))
+        return MapArea(32631, 0.1, (0.0, 0.0), (0.0, 0.0, 9.0, 9.0))
 
 
 def test_a_refinement_that_begins_takes_its_process_and_it_is_done_later(journal, tmp_path):
@@ -204,8 +204,8 @@ def test_a_refinement_that_begins_takes_its_process_and_it_is_done_later(journal
     thread = threading.Thread(target=run)
     thread.start()
     assert workers.began.wait(240)
-    work.give_up()
+    work.give_way()
     thread.join(240)
     assert found == ["gave way"]
     assert not list(tmp_path.glob("*.pickle"))
-    work.give_up()  # nothing runs: nothing happens
+    work.give_way()  # nothing runs: nothing happens

@@ -2,14 +2,16 @@
 
 import contextlib
 import os
+import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from gcs_plugin.daemon.daemon import Daemon
-from gcs_plugin.daemon.jobs.placed_sorties import sortie_frames
+from gcs_plugin.daemon.jobs.placed_sorties import frames_of
 from gcs_plugin.daemon.jobs.solution_file import read_solution
 from gcs_plugin.daemon.jobs.worker_tasks import near
 from gcs_plugin.daemon.settings import Settings
@@ -52,7 +54,7 @@ def solutions(daemon):
     """Camera positions and sigmas by picture, as bytes: of the daemon's solution, and of one by the refiner alone."""
     row = daemon.journal.one("SELECT path FROM solutions")
     found = read_solution(daemon.settings.workspace / "solutions" / row["path"]).solution
-    frames, _ = sortie_frames(daemon.journal, daemon.store, "v1", 1)
+    frames, _ = frames_of(daemon.journal, daemon.store, SimpleNamespace(vehicle="v1", sortie=1))
     area = daemon.drawer.area
     basemap = Basemap.open(daemon.settings.basemap, area.epsg, near(frames, area.epsg))
     alone = SwarmRefiner(area.epsg, np.array(area.origin)).refine(frames, [], basemap)
@@ -105,14 +107,15 @@ def test_a_vehicle_that_is_silent_before_it_completes_is_followed_then(tmp_path,
 
 def test_a_picture_that_comes_meanwhile_is_refined_with_the_others(tmp_path, flight):
     with Daemon(settings_of(tmp_path, flight, coarse=False)) as daemon:
-        last, stopped = [flight[0][27:]], daemon.refinement.stopped
+        last = [flight[0][27:]]
 
-        def asked_while_it_waits_for_pictures():
-            if last:
-                post(daemon, last.pop())
-            return stopped()
+        class AskedWhileItWaitsForPictures(threading.Event):
+            def is_set(self):
+                if last:
+                    post(daemon, last.pop())
+                return super().is_set()
 
-        daemon.refinement.stopped = asked_while_it_waits_for_pictures
+        daemon.refinement.stopping = AskedWhileItWaitsForPictures()
         post(daemon, flight[0][:27])
         complete(daemon)
         (job,) = after_job(daemon, 1)
@@ -142,21 +145,21 @@ def test_folders_take_no_more_than_is_allowed_and_one_for_a_vehicle(tmp_path, fl
     kept = KeptPictures(tmp_path / "kept")
     try:
         override({"raster": {"grey_pictures_mb": 240 * 180 * 30 / 1e6}})
-        assert kept.of("v1", 1, frames[:20]) == kept.of("v1", 1, frames)
-        assert kept.of("v2", 1, frames[:3]) is None
-        second = kept.of("v1", 2, frames[:20])
+        assert kept.of(("v1", 1), frames[:20]) == kept.of(("v1", 1), frames)
+        assert kept.of(("v2", 1), frames[:3]) is None
+        second = kept.of(("v1", 2), frames[:20])
         assert second is not None and second.is_dir()
-        assert kept.of("v2", 1, frames[:3]) not in (None, second)
+        assert kept.of(("v2", 1), frames[:3]) not in (None, second)
         assert len(list((tmp_path / "kept").iterdir())) == 2
-        kept.drop("v1", 2)
-        kept.drop("v1", 2)
+        kept.drop(("v1", 2))
+        kept.drop(("v1", 2))
         assert not second.exists()
-        assert kept.of("v2", 1, frames) is not None
+        assert kept.of(("v2", 1), frames) is not None
     finally:
         override({})
 
 
 def test_nothing_is_kept_on_a_disk_that_is_nearly_full(tmp_path, flight):
     kept = KeptPictures(tmp_path / "kept", free_mb=1e12)
-    assert kept.of("v1", 1, flight[0]) is None
+    assert kept.of(("v1", 1), flight[0]) is None
     assert list((tmp_path / "kept").iterdir()) == []

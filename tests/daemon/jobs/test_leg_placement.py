@@ -13,6 +13,7 @@ from gcs_plugin.daemon.jobs.kernel_warmup import made_up_flight, made_up_ground,
 from gcs_plugin.daemon.jobs.leg_placement import MOST, newest_legs
 from gcs_plugin.daemon.jobs.leg_watch import LegWatch
 from gcs_plugin.daemon.jobs.solution_file import read_solution
+from gcs_plugin.daemon.store.daemon_events import JobDropped, LegsOver
 from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.journal import Journal
 from orthoswarm.config import active
@@ -79,11 +80,13 @@ def test_only_the_newest_legs_are_placed_anew():
 def test_a_watch_asks_when_a_leg_is_over_and_when_a_vehicle_falls_silent():
     asked, heard = [], threading.Event()
 
-    def ask(*values):
-        asked.append(values)
+    def ask(event):
+        asked.append((event.vehicle, event.sortie, event.silent))
         heard.set()
 
-    watch = LegWatch(ask, silent_s=3600.0)
+    events = Events()
+    events.on(LegsOver, ask)
+    watch = LegWatch(events, silent_s=3600.0)
     watch.start()
     frames = frames_at(lawn(2, 20))
     for frame in frames[:12]:
@@ -150,7 +153,9 @@ def test_coarse_jobs_of_a_vehicle_are_dropped_when_it_completes(journal):
         assert stop.wait(240)
         raise OSError("its process was taken away")
 
-    jobs = Jobs(journal, Events(), {"coarse": handler}, slots=1, on_drop=lambda job: stop.set())
+    events = Events()
+    events.on(JobDropped, lambda event: stop.set())
+    jobs = Jobs(journal, events, {"coarse": handler}, slots=1)
     jobs.add("coarse", "v1", 1)
     jobs.start()
     assert started.wait(240)

@@ -26,7 +26,7 @@ def test_solutions_of_another_version_are_made_again(workspace, caplog):
     settings, frames = workspace
     with Daemon(settings) as daemon:
         post(daemon, frames)
-        assert daemon.drawer.wait_idle(240.0)
+        assert daemon.drawer.wait_drawn("v1", 1, 240.0)
         complete(daemon)
         (first,) = after_job(daemon, 1)
         assert first.state == "done", first.message
@@ -36,7 +36,7 @@ def test_solutions_of_another_version_are_made_again(workspace, caplog):
     with caplog.at_level(logging.WARNING), Daemon(settings) as daemon:
         _, again = after_job(daemon, 2)
         assert again.state == "done", again.message
-        assert {frame["stage"] for frame in daemon.frames()} == {"fine"}
+        assert {frame["stage"] for frame in daemon.views.frames()} == {"fine"}
         (row,) = daemon.journal.rows("SELECT path FROM solutions")
         made = read_solution(settings.workspace / "solutions" / row["path"])
         assert len(made.solution.placed) == len(frames)

@@ -13,7 +13,6 @@ from gcs_plugin.daemon.jobs.solution_file import SolutionFile, gains_of, read_so
 from gcs_plugin.daemon.jobs.tone_balance import ToneBalance, ToneTask, balance_tones
 from gcs_plugin.daemon.settings import Settings
 from gcs_plugin.daemon.store.journal import packed
-from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.placement import Solution, Terrain
 from orthoswarm.mosaic.render_passes import thumbnail
 from tests.kit import mosaic_scene as scene
@@ -132,7 +131,7 @@ def test_the_daemon_draws_again_what_changes(tmp_path, dark_and_bright):
             for v in flights
         ]
         assert np.log(gains[1].mean() / gains[0].mean()) == pytest.approx(-np.log(0.8), abs=0.03)
-        assert {row["stage"] for row in daemon.frames()} == {"fine"}
+        assert {row["stage"] for row in daemon.views.frames()} == {"fine"}
         assert [job.kind for job in daemon.jobs.all() if job.state == "failed"] == []
 
 
@@ -147,10 +146,8 @@ class Shown:
         self.solutions = folder
 
     def rows(self, query):
-        return [{"vehicle": packed(v), "sortie": 1} for v in ("v1", "v2")]
-
-    def shown(self, layer):
-        return {(packed(v), 1): (self.solutions / v, BoundingBox(0.0, 0.0, 9.0, 9.0)) for v in ("v1", "v2")}
+        detail = '{"layer": "fine", "bounds": [0, 0, 9, 9]}'
+        return [{"vehicle": packed(v), "sortie": 1, "path": v, "detail": detail} for v in ("v1", "v2")]
 
 
 def test_it_gives_way_to_a_refinement_and_leaves_nothing_behind(tmp_path):
@@ -170,6 +167,6 @@ def test_it_gives_way_to_a_refinement_and_leaves_nothing_behind(tmp_path):
     thread = threading.Thread(target=run)
     thread.start()
     assert workers.began.wait(240)
-    work.give_up()
+    work.give_way()
     thread.join(240)
     assert found == ["gave way"] and not list(tmp_path.glob("*.pickle"))

@@ -7,6 +7,7 @@ import pytest
 
 from gcs_plugin.cli.main import main
 from gcs_plugin.daemon.jobs.job_queue import Jobs
+from gcs_plugin.daemon.store.daemon_events import JobEnded
 from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.journal import Journal, wrote_refined
 from tests.kit.daemon_kit import exported, line, serving
@@ -21,8 +22,9 @@ def test_what_a_refinement_has_changed_is_written_before_other_work_and_after_re
         order.append((job.kind, job.vehicle, job.detail.get("after")))
         return lambda db: None
 
-    jobs = Jobs(journal, Events(), dict.fromkeys(("refine", "together", "coarse", "tones", "export"), handler), slots=1)
-    jobs.on_end(lambda job: over.set() if not jobs.open() else None)
+    events, kinds = Events(), ("refine", "together", "coarse", "tones", "export")
+    jobs = Jobs(journal, events, dict.fromkeys(kinds, handler), slots=1)
+    events.on(JobEnded, lambda event: over.set() if not jobs.open() else None)
     jobs.add("export", formats=["kmz"])
     for kind, vehicle in (("coarse", "v1"), ("together", "v1"), ("tones", None)):
         jobs.add(kind, vehicle, **({"after": "refine"} if kind == "coarse" else {}))

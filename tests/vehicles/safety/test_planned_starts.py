@@ -83,11 +83,11 @@ def test_a_command_to_stop_during_the_check_cancels_the_start(open_links, folder
     plans.go_on.set()
     thread.join(120.0)
     assert said == ["v1, v2 was told to stop during the check; no vehicle was started"]
-    assert takeoffs.rows() == {} and not any(v.flight.armed for v in vehicles)
+    assert takeoffs.waiting.rows() == {} and not any(v.flight.armed for v in vehicles)
     takeoffs.close()
 
 
-def test_a_command_to_stop_counts_though_the_check_begins_at_that_moment(open_links, folder):  # noqa: F811
+def test_a_command_to_stop_counts_though_the_check_begins_at_that_moment(open_links, folder, monkeypatch):  # noqa: F811
     """The start copies the numbers of stops between the command's own count and its look at what is being checked."""
     apart(folder, 1, 0.0)
     vehicles = make_swarm(1, home=HOME)
@@ -96,7 +96,7 @@ def test_a_command_to_stop_counts_though_the_check_begins_at_that_moment(open_li
     upload_all(links, folder)
     plans, said = SlowPlans(folder), []
     takeoffs = Takeoffs(links, plans, lambda _: None)
-    cancel = takeoffs.cancel
+    cancel = links.waiting.cancel
 
     def late(vehicle):
         thread.start()
@@ -104,7 +104,7 @@ def test_a_command_to_stop_counts_though_the_check_begins_at_that_moment(open_li
         return cancel(vehicle)
 
     thread = beginning(takeoffs, said)
-    links.cancel_takeoff = late
+    monkeypatch.setattr(links.waiting, "cancel", late)
     (row,) = links.commands("pause")
     assert row["outcome"] == "done" and "cancelled" in row["reason"]
     plans.go_on.set()
@@ -177,8 +177,8 @@ def test_what_has_become_red_until_the_takeoff_holds_the_vehicle_and_the_rest(op
     takeoffs = Takeoffs(links, PlanFolder(folder), said.append)
     takeoffs.begin("plan-1", override=ONE_PATH)
     vehicles[1].ready_s = 1e9  # its filter fails
-    wait(lambda: "failed" in takeoffs.rows().get("v3", {}))
-    assert "v2 was not started: gps: no 3D fix" in takeoffs.rows()["v2"]["failed"]
+    wait(lambda: "failed" in takeoffs.waiting.rows().get("v3", {}))
+    assert "v2 was not started: gps: no 3D fix" in takeoffs.waiting.rows()["v2"]["failed"]
     assert any("v3 stay on the ground" in text for text in said)
     assert not vehicles[1].flight.armed and not vehicles[2].flight.armed
     takeoffs.close()
@@ -202,8 +202,8 @@ def test_a_waiting_vehicle_that_somebody_else_returns_stays_on_the_ground(open_l
     wait(lambda: vehicles[0].flight.motion.up > 4.0)
     for vehicle in vehicles:  # by another station: ours hears of it by the vehicles' messages only
         vehicle.flight.set_mode(vehicle.flight.modes.rtl)
-    wait(lambda: "failed" in takeoffs.rows().get("v2", {}))
-    assert "was put into RTL since its start was given" in takeoffs.rows()["v2"]["failed"]
+    wait(lambda: "failed" in takeoffs.waiting.rows().get("v2", {}))
+    assert "was put into RTL since its start was given" in takeoffs.waiting.rows()["v2"]["failed"]
     wait(lambda: not vehicles[0].flight.armed)
     assert not vehicles[1].flight.armed and any("v2 did not take off" in text for text in said)
     takeoffs.close()
@@ -215,8 +215,8 @@ def test_nobody_follows_one_that_does_not_leave_the_ground(open_links, folder): 
     wait(lambda: first.armed and first.mode == first.modes.mission)
     first.set_mode(first.modes.rtl)
     first.motion.still()  # it is still on the ground
-    wait(lambda: "failed" in takeoffs.rows().get("v2", {}))
-    assert "because v1 did not take off" in takeoffs.rows()["v2"]["failed"]
+    wait(lambda: "failed" in takeoffs.waiting.rows().get("v2", {}))
+    assert "because v1 did not take off" in takeoffs.waiting.rows()["v2"]["failed"]
     assert not vehicles[1].flight.armed
     takeoffs.close()
 
@@ -226,6 +226,6 @@ def test_a_mission_that_somebody_replaces_while_a_takeoff_waits_is_not_flown(ope
     store = vehicles[1].store
     store.items = [*store.items[:3], *(replace(item, z=item.z + 9.0) for item in store.items[3:])]
     store.generation += 1
-    wait(lambda: "failed" in takeoffs.rows().get("v2", {}))
-    assert "mission" in takeoffs.rows()["v2"]["failed"] and not vehicles[1].flight.armed
+    wait(lambda: "failed" in takeoffs.waiting.rows().get("v2", {}))
+    assert "mission" in takeoffs.waiting.rows()["v2"]["failed"] and not vehicles[1].flight.armed
     takeoffs.close()

@@ -12,6 +12,7 @@ import pytest
 
 from tests.kit.daemon_kit import serving
 from tests.kit.page_kit import opened
+from tests.page.conftest import browser  # noqa: F401
 from tests.page.test_command_bar import confirm
 from tests.page.test_operation import COUNT_DONE, ended_done, has_position, until
 from tests.vehicles.autopilots.test_fleet_scenarios import ADDRESSES, charge
@@ -55,7 +56,7 @@ class Watch(threading.Thread):
 
 @pytest.mark.sitl
 @pytest.mark.timeout(1800)
-def test_both_kinds_fly_one_plan_and_return_in_turn(browser, tmp_path):
+def test_both_kinds_fly_one_plan_and_return_in_turn(browser, tmp_path):  # noqa: F811
     if len(ADDRESSES) < 3:
         pytest.skip("ORTHOSWARM_SITL names less than three autopilots")
     for address in ADDRESSES:

@@ -1,0 +1,155 @@
+"""All pictures come into the workspace here: posted, from streams, from folders, and fetched from vehicles."""
+
+import logging
+import threading
+import time
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+from gcs_plugin.daemon.intake.posted_pose import PostedPose, frame_of, linked_pose
+from gcs_plugin.daemon.intake.refused_pictures import RefusedPictures
+from gcs_plugin.daemon.store.daemon_events import CardRead, PictureStored
+from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.daemon.store.frame_rows import add_frame, frame_by_key
+from gcs_plugin.daemon.store.journal import Journal
+from gcs_plugin.daemon.store.picture_store import PictureStore, frame_key, picture_size
+from gcs_plugin.daemon.store.sortie_rows import present_sortie
+from gcs_plugin.daemon.store.workspace_lock import require_space
+from orthoswarm.model.errors import OrthoSwarmError, StorageError
+from telemetry.live.live_poses import LinkPose, LinkPoses
+
+_FULL_S: Final = 2.0
+_log = logging.getLogger(__name__)
+
+
+class PictureIntake:
+    """Stores pictures, and tells of each new one once it is safe.
+
+    Args:
+        store: its folder lies in the workspace. poses: of the links and buses. refused: counts names used twice.
+
+    Attributes:
+        accepted: how many came since the daemon's start, by vehicle.
+    """
+
+    def __init__(
+        self, journal: Journal, store: PictureStore, events: Events, *, poses: LinkPoses, refused: RefusedPictures
+    ) -> None:
+        self._journal, self._store, self._events = journal, store, events
+        self._poses, self._refused = poses, refused
+        self.accepted: Counter[str] = Counter()
+
+    def add(self, pose: PostedPose, data: bytes) -> tuple[int, bool]:
+        """Store a picture; when this returns, it is safe on the disk.
+
+        Returns:
+            The frame's number, and False if it existed already (the first one stays).
+
+        Raises:
+            InputError: the file is not a picture.
+            OrthoSwarmError: the disk is full or missing; nothing was stored.
+        """
+        came = time.time()
+        key = frame_key(pose.vehicle, pose.image)
+        known = frame_by_key(self._journal, key)
+        if known is not None:
+            if not self._store.holds(known[1], data):
+                self._refused.note_name_taken(pose.vehicle, pose.image)
+            return known[0], False
+        width, height, suffix = picture_size(data)
+        pose = self._with_fix(pose)
+        require_space(self._store.folder.parent, len(data))
+        time_s = came if pose.time_s is None else pose.time_s
+        path, size = self._store.put(key, suffix, data), (width, height)
+        values = pose.values | ({"origin": pose.origin} if pose.origin else {})
+        change = add_frame(key, pose.vehicle, pose.image, time_s=time_s, path=path, size=size, pose=values)
+        seq, new = self._journal.write(change)
+        if new:
+            frame = frame_of(
+                values, image=pose.image, path=self._store.path(path), vehicle=pose.vehicle, time_s=time_s, size=size
+            )
+            self.accepted[pose.vehicle] += 1
+            sortie, count = present_sortie(self._journal, pose.vehicle), self.accepted[pose.vehicle]
+            self._events.publish(PictureStored(
+                seq=seq, frame=frame, arrived_s=came, sortie=sortie, has_fix=pose.has_fix, count=count
+            ))  # fmt: skip
+        return seq, new
+
+    def _with_fix(self, pose: PostedPose) -> PostedPose:
+        """The pose; if its receiver had no fix, with the values of the vehicle's link at that time."""
+        if pose.has_fix or pose.time_s is None:
+            return pose
+        linked = linked_pose(pose.vehicle, pose.image, pose.time_s, self._poses.at(pose.vehicle, pose.time_s))
+        if linked is None:
+            return pose
+        without = {k: v for k, v in pose.values.items() if k not in ("lat_deg", "lon_deg", "gps_fix")}
+        return replace(linked, values=linked.values | without, origin=linked.origin | pose.origin)
+
+
+@dataclass(frozen=True, slots=True)
+class LinkLog:
+    """The packets of all vehicles on the links, of this run and earlier ones.
+
+    Attributes:
+        path: the telemetry log; it may be absent. systems: MAVLink system ids by the vehicles' ids.
+    """
+
+    path: Path
+    systems: Mapping[str, int]
+
+    def write(self, vehicle: str, out: Path) -> bool:
+        """Write a vehicle's packets into its own log; False if there are none."""
+        from gcs_plugin.links.tlog_writer import write_link_log
+
+        return vehicle in self.systems and write_link_log(self.path, self.systems[vehicle], out) > 0
+
+
+class VehicleIntake:
+    """One vehicle's pictures on their way into the workspace, from a stream or a folder.
+
+    Args:
+        intake: takes the pictures. poses, link_log: where pictures without a pose get theirs from.
+        cache: folder of the workspace for the folder's state, and for pictures of videos until they are stored.
+
+    Attributes:
+        stop: set to end. taken: number of pictures that were new.
+    """
+
+    def __init__(
+        self, vehicle: str, intake: PictureIntake, events: Events, *, poses: LinkPoses, link_log: LinkLog, cache: Path
+    ) -> None:
+        self.vehicle, self.cache, self.stop, self.taken = vehicle, cache, threading.Event(), 0
+        self._intake, self._events, self._poses, self._link_log = intake, events, poses, link_log
+
+    def keep(self, pose: PostedPose, data: bytes) -> None:
+        """Store a picture; if the disk is full, wait until there is room."""
+        while not self.stop.is_set():
+            try:
+                _, new = self._intake.add(pose, data)
+                self.taken += new
+                return
+            except StorageError as error:
+                self.notify(str(error))
+                self.stop.wait(_FULL_S)
+            except OrthoSwarmError as error:
+                _log.warning("%s of %s: %s", pose.image, self.vehicle, error)
+                return
+
+    def pose_at(self, time_s: float) -> LinkPose | None:
+        """The vehicle's pose at a time (UTC epoch seconds), from its link and bus."""
+        return self._poses.at(self.vehicle, time_s)
+
+    def link_log(self, out: Path) -> bool:
+        """Write the vehicle's packets so far to a .tlog; False if there are none."""
+        return self._link_log.write(self.vehicle, out)
+
+    def notify(self, text: str) -> None:
+        """Tell the operator something."""
+        self._events.say(text)
+
+    def settled(self) -> None:
+        """Tell that the folder has stopped changing after new pictures."""
+        self._events.publish(CardRead(self.vehicle))

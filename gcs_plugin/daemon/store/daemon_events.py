@@ -1,0 +1,308 @@
+"""What has happened, as the daemon's parts tell each other and the pages.
+
+An event with a `page` name goes to the open pages as well, as JSON: `type` and its `values`, which pages and other
+programs rely on. Which part hears which event stands in one table, in `gcs_plugin.daemon.daemon`.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar
+
+from gcs_plugin.daemon.store.job_rows import Job
+from orthoswarm.model.frame import Frame
+from orthoswarm.model.placement import PlacedFrame
+from orthoswarm.raster.picture_quality import PictureQuality
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """Something that has happened."""
+
+    page: ClassVar[str] = ""
+
+    def values(self) -> Mapping[str, Any]:
+        """What pages are told of it, as JSON values."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+
+# -- pictures and the map in flight -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PictureStored(Event):
+    """A picture is safe on the disk and in the journal.
+
+    Attributes:
+        seq: its number. arrived_s: UTC epoch seconds. has_fix: whether it has a valid position.
+        count: how many of this vehicle have come since the daemon's start, with this one.
+    """
+
+    seq: int
+    frame: Frame
+    arrived_s: float
+    sortie: int
+    has_fix: bool
+    count: int
+
+
+@dataclass(frozen=True, slots=True)
+class PictureDrawn(Event):
+    """A picture is on the real-time layer, as recorded; `quality` is None for one that is too small to be judged."""
+
+    placed: PlacedFrame
+    quality: PictureQuality | None
+
+
+@dataclass(frozen=True, slots=True)
+class PictureRejected(Event):
+    """A stored picture cannot be on the map; `misplaced`: because of its position."""
+
+    frame: Frame
+    reason: str
+    misplaced: bool
+
+
+@dataclass(frozen=True, slots=True)
+class AreaChanged(Event):
+    """The map's area began, was extended or moved; `epsg` is its grid."""
+
+    epsg: int
+
+
+@dataclass(frozen=True, slots=True)
+class DrawingRestarted(Event):
+    """All pictures are undrawn again, by the journal."""
+
+
+@dataclass(frozen=True, slots=True)
+class LegsOver(Event):
+    """Legs of a sortie are finished; `silent`: because its vehicle has fallen silent."""
+
+    vehicle: str
+    sortie: int
+    silent: bool
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleSilent(Event):
+    """No picture of a vehicle has come for a while."""
+
+    vehicle: str
+    sortie: int
+
+
+@dataclass(frozen=True, slots=True)
+class CardRead(Event):
+    """A vehicle's folder has stopped changing after new pictures."""
+
+    vehicle: str
+
+
+# -- missions and jobs ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class MissionNoted(Event):
+    """What a vehicle's mission came to is in the journal, with the refinement that it asks for; `kind`: see there."""
+
+    vehicle: str
+    kind: str
+
+
+@dataclass(frozen=True, slots=True)
+class RefinementBegins(Event):
+    """The refinement of a completed sortie begins: what is done in the background gives way."""
+
+    vehicle: str
+
+
+@dataclass(frozen=True, slots=True)
+class LayerNeeded(Event):
+    """A refinement needs a layer: what draws on it in the background gives way."""
+
+    layer: str
+
+
+@dataclass(frozen=True, slots=True)
+class JobDropped(Event):
+    """A running job was cancelled; its work is to be abandoned."""
+
+    job: Job
+
+
+@dataclass(frozen=True, slots=True)
+class JobEnded(Event):
+    """A job's end is in the journal."""
+
+    job: Job
+
+
+@dataclass(frozen=True, slots=True)
+class JobsStop(Event):
+    """The daemon stops: no job is started any more."""
+
+
+# -- what pages are told, too -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Note(Event):
+    """A sentence for the operator."""
+
+    page = "note"
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Problem(Event):
+    """What cannot be written or drawn at present."""
+
+    page = "problem"
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Overload(Event):
+    """How many pictures are put off, and in words."""
+
+    page = "overload"
+    put_off: int
+    text: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FrameReported(Event):
+    """A picture was drawn or rejected; `outline`: its corners, longitude and latitude."""
+
+    page = "frame"
+    seq: int
+    vehicle: str
+    image: str
+    sortie: int
+    stage: str
+    reason: str | None
+    sigma_m: float | None
+    lat_deg: float
+    lon_deg: float
+    outline: list[list[float]] | None
+
+
+@dataclass(frozen=True, slots=True)
+class LayerDrawn(Event):
+    """Pixels of the real-time layer have changed."""
+
+    page = "layer"
+    layer: str
+    version: int
+
+
+@dataclass(frozen=True, slots=True)
+class LayerPublished(Event):
+    """A sortie is on the next generation of a refined layer, which has replaced the one before."""
+
+    page = "layer"
+    layer: str
+    version: int
+    vehicle: str | None
+    sortie: int | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CoverageChanged(Event):
+    """Gaps were looked for again."""
+
+    page = "coverage"
+    gaps: int
+    state: str
+    version: int
+    seen_share: float | None
+    poor_share: float | None
+    missed_share: float | None
+    planned_share: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class RequestsChanged(Event):
+    """A request for a picture on a vehicle has another state."""
+
+    page = "requests"
+
+
+@dataclass(frozen=True, slots=True)
+class FindsChanged(Event):
+    """A find was marked, changed or deleted."""
+
+    page = "finds"
+
+
+@dataclass(frozen=True, slots=True)
+class PictureRefused(Event):
+    """A picture was refused, dropped or left off the map."""
+
+    page = "refused"
+    cause: str
+    count: int
+    vehicle: str
+    image: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class TrafficChanged(Event):
+    """Other aircraft."""
+
+    page = "traffic"
+    rows: list[dict[str, Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class _RowEvent(Event):
+    """An event whose values are those of a row."""
+
+    row: Mapping[str, Any]
+
+    def values(self) -> Mapping[str, Any]:
+        """The row."""
+        return self.row
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleChanged(_RowEvent):
+    """Changed values of a vehicle's row."""
+
+    page = "vehicle"
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleReported(_RowEvent):
+    """An event of the fleet, in words."""
+
+    page = "vehicle_event"
+
+
+@dataclass(frozen=True, slots=True)
+class CommandDone(_RowEvent):
+    """The outcome of a command to a vehicle."""
+
+    page = "command"
+
+
+@dataclass(frozen=True, slots=True)
+class PlanChanged(_RowEvent):
+    """The operator's plan."""
+
+    page = "plan"
+
+
+@dataclass(frozen=True, slots=True)
+class JobChanged(_RowEvent):
+    """A job's state or progress."""
+
+    page = "job"
+
+
+@dataclass(frozen=True, slots=True)
+class CompletionRefined(_RowEvent):
+    """What the refinement after a completion came to."""
+
+    page = "completion"

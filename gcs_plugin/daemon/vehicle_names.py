@@ -1,0 +1,84 @@
+"""What vehicles are called: by their MAVLink system ids, in files and on the map, and by people; and their rows."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, TypedDict
+
+from gcs_plugin.fleet.separation.separation_watch import number_name
+
+
+class TakeoffRow(TypedDict, total=False):
+    """A takeoff that waits (`in_s`: seconds from now), or has failed, and why."""
+
+    in_s: float
+    failed: str
+
+
+class VehicleRow(TypedDict, total=False):
+    """What is known of a vehicle, as JSON values: of one on the links, of one that sent pictures, or of both.
+
+    On the links it has `Vehicle.summary` and more. `alarm`: what is wrong with how and where it flies, and what to do.
+    `behind`: by how much it is behind its plan, in words. `fence`: see `Fences.of`. `takeoff` is null where none waits
+    or failed; `returns_after` names those that it waits for until it returns, null where it does not wait.
+    """
+
+    id: str
+    name: str
+    system: int
+    state: str
+    armed: bool
+    lat_deg: float | None
+    lon_deg: float | None
+    yaw_deg: float | None
+    heading_deg: float | None
+    speed_m_s: float
+    silent_s: float
+    battery: float | None
+    home: list[float] | None
+    flight: dict[str, Any]
+    mission: dict[str, Any]
+    takeoff: TakeoffRow | None
+    returns_after: Any
+    alarm: str
+    behind: str
+    fence: dict[str, Any] | None
+    trail: list[tuple[float, float]]
+    texts: list[dict[str, Any]]
+    sortie: int
+    frames: dict[str, int]
+    height_m: float | None
+    last_frame: str | None
+    came_s: float
+    pictures: dict[str, Any]
+    can: dict[str, Any]
+    poses: dict[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleNames:
+    """The names that the settings give.
+
+    Attributes:
+        systems: id of a vehicle by its MAVLink system id. titles: what people call it, by its id.
+    """
+
+    systems: Mapping[int, str]
+    titles: Mapping[str, str]
+
+    def name_of(self, system: int) -> str:
+        """The id of a vehicle with a MAVLink system id; no two have the same."""
+        name = number_name(system)
+        if system not in self.systems and name in self.systems.values():  # the name of another system id
+            return f"system-{system}"
+        return self.systems.get(system, name)
+
+    def title_of(self, vehicle: str) -> str:
+        """What people call a vehicle, empty if nothing else than its id."""
+        return self.titles.get(vehicle, "")
+
+
+def system_in_name(vehicle: str) -> int | None:
+    """The MAVLink system id that a vehicle's name stands for (v7: 7), None if it is no such name."""
+    found = re.fullmatch(r"v(\d{1,3})", vehicle)
+    return int(found[1]) if found and 1 <= int(found[1]) <= 255 else None
