@@ -238,7 +238,7 @@ def _write_directories(
 ) -> list[_Table]:  # fmt: skip
     """Write header and directories with room for the tile tables; the file is left at the first tile's offset."""
     ghost = b"GDAL_STRUCTURAL_METADATA_SIZE=%06d bytes\n" % len(_STRUCTURE) + _STRUCTURE
-    ghost += bytes(-len(ghost) % 16)
+    ghost += bytes(len(ghost) % 2)  # GDAL's validator wants the first directory at the next even place
     at = len(form.header) + form.word + len(ghost)
     file.write(form.header + struct.pack(form.place, at) + ghost)
     tables = []

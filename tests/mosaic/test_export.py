@@ -73,6 +73,25 @@ def ortho(raster, tmp_path_factory):
     return path
 
 
+@pytest.mark.parametrize(("limit", "head"), [(CLASSIC_BYTES, 8), (1, 16)], ids=["classic", "BigTIFF"])
+def test_a_cog_is_laid_out_as_gdals_validator_wants_it(raster, tmp_path, limit, head):
+    """By validate_cloud_optimized_geotiff.py: directories by size right after the header, small levels' tiles first."""
+    write_cog(raster, tmp_path / "o.tif", classic_bytes=limit)
+    data = (tmp_path / "o.tif").read_bytes()
+    name = b"GDAL_STRUCTURAL_METADATA_SIZE="
+    due = head + len(name + b"000000 bytes\n") + int(data[head + len(name) :][:6])
+    assert data[head:].startswith(name)
+    with rasterio.open(tmp_path / "o.tif") as image:
+        levels = [None, *range(len(image.overviews(1)))]
+        item = {
+            kind: [image.get_tag_item(kind, "TIFF", bidx=1, ovr=k) for k in levels]
+            for kind in ("IFD_OFFSET", "BLOCK_OFFSET_0_0")
+        }
+    directories, tiles = (list(map(int, values)) for values in item.values())
+    assert directories[0] == due + due % 2 and directories == sorted(directories)
+    assert tiles == sorted(tiles, reverse=True) and directories[-1] < tiles[-1]
+
+
 def test_a_cog_holds_the_pixels_and_its_overviews(raster, ortho):
     with rasterio.open(ortho) as image:
         assert image.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
