@@ -21,7 +21,7 @@ from gcs_plugin.fleet.fleet_events import FleetEvent, mission_event
 from gcs_plugin.fleet.going_on import continued, resumed
 from gcs_plugin.fleet.message_rates import Rates, Streams
 from gcs_plugin.fleet.vehicle_state import Vehicle
-from gcs_plugin.links.mavlink import Autopilot, Message
+from gcs_plugin.links.mavlink import Autopilot, Message, is_vehicle
 from gcs_plugin.links.transports import parse_address
 from gcs_plugin.mission.comparison import difference
 from gcs_plugin.mission.completion import CompletionDetector, Phase
@@ -88,6 +88,7 @@ class MavsdkBackend(Backend):
         self.events: list[FleetEvent] = []
         self._own = own
         self._queue: queue.SimpleQueue[tuple[int, JsonMessage]] = queue.SimpleQueue()
+        self._systems: dict[int, tuple[Any, Any]] = {}
         self._crafts: dict[int, _Craft] = {}
         self._mavsdk = Mavsdk(Configuration.create_manual(own.system, own.component, True))
         for link in links:
@@ -195,34 +196,44 @@ class MavsdkBackend(Backend):
         return craft
 
     def look(self) -> None:
-        """Add systems that MAVSDK has discovered."""
-        from mavsdk import Autopilot as Kind
-        from mavsdk.plugins.mavlink_direct import MavlinkDirect
-        from mavsdk.plugins.mission_raw import MissionRaw
+        """Listen to systems that MAVSDK has discovered.
 
-        if self._mavsdk.system_count() == len(self._crafts):
+        Each becomes a vehicle by its own HEARTBEAT: at first MAVSDK may take its autopilot for another, and of what
+        was not heard nobody can say that it is disarmed.
+        """
+        from mavsdk.plugins.mavlink_direct import MavlinkDirect
+
+        if self._mavsdk.system_count() == len(self._systems):
             return
         for system in self._mavsdk.get_systems():
             number = int(system.get_system_id())
-            kind = system.autopilot_type()
-            if number in self._crafts or not system.has_autopilot() or kind == Kind.UNKNOWN:
-                continue
-            autopilot = Autopilot.ARDUPILOT if kind == Kind.ARDUPILOT else Autopilot.PX4
-            address = Address(number)
-            vehicle = Vehicle(
-                address=address,
-                autopilot=autopilot,
-                modes=modes_of(autopilot, int(system.vehicle_type())),
-                detector=CompletionDetector(autopilot=autopilot),
-                streams=Streams(vehicle=address, own=self._own, rates=_RATES.of(autopilot)),
-                heard=time.monotonic(),
-            )
-            craft = _Craft(vehicle, system, MavlinkDirect(system), MissionRaw(system))
-            self._crafts[number] = craft
-            for name in _HEARD:
-                craft.direct.subscribe_message(name, self._listener(number))
-            self._event("found", number, f"was found ({autopilot.value})")
-            self._send(craft, vehicle.streams.start(time.monotonic()))
+            if number not in self._systems:
+                self._systems[number] = system, MavlinkDirect(system)
+                self._systems[number][1].subscribe_message("HEARTBEAT", self._listener(number))
+
+    def _meet(self, number: int, heartbeat: Message) -> _Craft | None:
+        """A vehicle that is new by its heartbeat; None if the message is none."""
+        from mavsdk.plugins.mission_raw import MissionRaw
+
+        address = Address(number)
+        if heartbeat.get_type() != "HEARTBEAT" or not is_vehicle(heartbeat, address.component):
+            return None
+        (system, direct), autopilot = self._systems[number], Autopilot.of(heartbeat)
+        vehicle = Vehicle(
+            address=address,
+            autopilot=autopilot,
+            modes=modes_of(autopilot, int(heartbeat.type)),
+            detector=CompletionDetector(autopilot=autopilot),
+            streams=Streams(vehicle=address, own=self._own, rates=_RATES.of(autopilot)),
+            heard=time.monotonic(),
+        )
+        craft = self._crafts[number] = _Craft(vehicle, system, direct, MissionRaw(system))
+        for name in _HEARD:
+            if name != "HEARTBEAT":
+                direct.subscribe_message(name, self._listener(number))
+        self._event("found", number, f"was found ({autopilot.value})")
+        self._send(craft, vehicle.streams.start(time.monotonic()))
+        return craft
 
     def _listener(self, number: int) -> Callable[[Any, Any], None]:
         def take(message: Any, _data: Any) -> None:  # in MAVSDK's thread
@@ -240,7 +251,9 @@ class MavsdkBackend(Backend):
                 number, message = self._queue.get(timeout=left)
             except queue.Empty:
                 break
-            self._take(self._crafts[number], message, time.monotonic())
+            craft = self._crafts.get(number) or self._meet(number, message)
+            if craft is not None:
+                self._take(craft, message, time.monotonic())
         now = time.monotonic()
         for craft in self._crafts.values():
             self._send(craft, [*craft.vehicle.streams.tick(now), *craft.vehicle.questions.tick(now)])

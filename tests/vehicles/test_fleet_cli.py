@@ -234,6 +234,18 @@ def test_mavsdk_flies_them_too(swarm, folder, capsys):
     assert sorted(e["vehicle"] for e in flown["events"] if e["kind"] == "complete") == ["v1", "v2"]
 
 
+@pytest.mark.parametrize("swarm", [5.0], indirect=True)
+def test_mavsdk_pauses_what_flies_as_soon_as_it_is_seen(swarm, folder, capsys):
+    """MAVSDK knows of it before its state has come: not seen armed is not disarmed."""
+    pytest.importorskip("mavsdk")
+    one = ("--vehicle", "1", "--link", swarm, "--backend", "mavsdk", "--wait", "60", "--json")
+    assert fleet(capsys, "upload", folder, *one)[0] == 0
+    code, said = fleet(capsys, "start", *one)
+    assert code == 0, said["vehicles"][0]["text"]
+    code, said = fleet(capsys, "pause", *one)
+    assert code == 0 and said["vehicles"][0]["outcome"] == "done", said
+
+
 def test_nobody_on_the_link_is_said_with_exit_code_one(capsys):
     code = main(["fleet", "list", "--link", f"udpin:127.0.0.1:{free_port()}", "--wait", "0.3", "--json"])
     captured = capsys.readouterr()
