@@ -19,9 +19,10 @@ demo: $(STAMP)
 	@$(BIN)/orthoswarm demo --out $(DEMO) --median 0.5
 	@echo "The map: $(DEMO)/orthoimage.tif; how it was made: $(DEMO)/report.html"
 
-# Two processes: tests with vehicles, the daemon and the page one after the other in one, those that compute in both.
-# PYTEST="-n 2 --dist loadgroup -m 'not sitl'" runs the slow tests as well (an hour).
-PYTEST ?= -n 2 --dist loadgroup
+# Three processes, on two cores as well: tests with vehicles and the daemon run one after the other in one, those of the
+# page in another, and both mostly wait.
+# PYTEST="-n 3 --dist loadgroup -m 'not sitl'" runs the slow tests as well (an hour).
+PYTEST ?= -n 3 --dist loadgroup
 test: check
 	@$(BIN)/python -m pytest $(PYTEST)
 
