@@ -29,6 +29,7 @@ class Heard:
     places: list = field(default_factory=list)  # (time, latitude, longitude)
     checksum: tuple = (-math.inf, 0)
     obeys_other: list = field(default_factory=list)  # (time, command)
+    ordered: list = field(default_factory=list)  # by us: (time, parameters of a mode)
     count: int = 0
     items: dict = field(default_factory=dict)  # seq -> item
     asked: float | None = None  # for its mission
@@ -121,6 +122,7 @@ class Rules:
         command, p1 = int(message.command), message.param1
         if command == SET_MODE:
             values = tuple(getattr(message, f"param{n}") for n in range(1, 4))
+            self.heard[vehicle.system].ordered.append((self.field.now, values))
             if values == mode_params(vehicle.autopilot, vehicle.flight.modes.mission):
                 self._goes_on(vehicle)
         if command == PAUSE and p1 == 1.0:
@@ -178,11 +180,16 @@ class Rules:
             self._breaks(1, f"{what}, it held another mission all the time since {now - since:.2f} s ago")
 
     def _evidence(self, vehicle, stop):
-        """When a stop was told to the station: by a change of mode, or by the vehicle's answer to the other one."""
+        """When a stop was told to the station: by a change of mode, or by the vehicle's answer to the other one.
+
+        A mode that the station itself had just ordered tells nothing (PX4 stands in HOLD before it is armed).
+        """
         heard = self.heard[vehicle.system]
         changes = [(b[0], b[1]) for a, b in zip(heard.beats, heard.beats[1:]) if a[1] != b[1]]
         sent = stop.at + self.field.delay_s
+        ours = [at for at, mode in heard.ordered if mode == mode_params(vehicle.autopilot, stop.mode)]
         shown = [at for at, mode in changes if at >= sent and mode == stop.mode != stop.was]
+        shown = [at for at in shown if not any(at - CHANGE_S < ordered < at for ordered in ours)]
         shown += [at for at, command in heard.obeys_other if at >= stop.at and command == stop.command]
         return min(shown, default=math.inf)
 
