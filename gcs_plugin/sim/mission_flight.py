@@ -1,32 +1,32 @@
 """A simulated vehicle's flight of its mission: items, camera, and the end as its autopilot does it."""
 
+import enum
 import math
 from collections.abc import Collection
 from dataclasses import dataclass, field
 from random import Random
 from typing import Final
 
-from gcs_plugin.links.mavlink import Autopilot, dialect
+from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.flight_modes import Modes
 from gcs_plugin.mission.items import (
     CHANGE_SPEED,
     DELAY,
     JUMP,
     LAND,
+    LOITER_TIME,
     LOITER_UNLIM,
     RTL,
     TAKEOFF,
     TRIGGER_DISTANCE,
     VTOL_LAND,
+    WAYPOINT,
     MissionItem,
 )
-from gcs_plugin.sim.flight_values import Landed, MissionState, Task
-from gcs_plugin.sim.flight_values import TakenPicture as TakenPicture
 from gcs_plugin.sim.mission_store import MissionStore
-from gcs_plugin.sim.multirotor import STEP_S, Airframe, Chart, VehicleMotion
+from gcs_plugin.sim.multirotor import STEP_S, Airframe, Chart, VehicleMotion, VehiclePose
 from orthoswarm.model.angles import wrap_rad
 
-_LOITER_TIME: Final = int(dialect.MAV_CMD_NAV_LOITER_TIME)
 RTL_HEIGHT_M: Final = 15.0
 _REACHED_M: Final = 1.5
 _FINAL_SINK_M_S, _FINAL_BELOW_M = 0.7, 5.0
@@ -38,19 +38,55 @@ _IDLE_S: Final = {Autopilot.ARDUPILOT: 10.0, Autopilot.PX4: 2.0}
 """Landed by its sticks, it disarms after so long: factory settings of DISARM_DELAY and COM_DISARM_LAND."""
 
 
+class Landed(enum.IntEnum):
+    """MAV_LANDED_STATE."""
+
+    ON_GROUND = 1
+    IN_AIR = 2
+    TAKEOFF = 3
+    LANDING = 4
+
+
+class MissionState(enum.IntEnum):
+    """MISSION_STATE."""
+
+    NONE = 1
+    NOT_STARTED = 2
+    ACTIVE = 3
+    PAUSED = 4
+    COMPLETE = 5
+
+
+class Task(enum.Enum):
+    """The vehicle's present task."""
+
+    STAND = "stand"
+    HOLD = "hold"
+    ITEM = "item"
+    CLIMB_HOME = "climb home"
+    GO_HOME = "go home"
+    DESCEND = "descend"
+    STEERED = "steered"
+
+
+@dataclass(frozen=True, slots=True)
+class TakenPicture:
+    """A picture: its number from 0, seconds since boot, true pose, and place by the receiver (degrees)."""
+
+    index: int
+    time_s: float
+    pose: VehiclePose
+    lat_deg: float
+    lon_deg: float
+
+
 @dataclass(slots=True, kw_only=True)
 class MissionFlight:
     """The flight of one vehicle.
 
     Attributes:
-        autopilot: the dialect; modes: its modes.
-        store: the mission.
-        motion: its position and velocity.
-        mode: custom mode number.
-        armed: motors on. failsafe: it reports one; until it is disarmed.
-        seq: current item; state: MISSION_STATE.
-        landed: MAV_LANDED_STATE.
-        reached: items reached since the last look; texts: texts since then; exposures: all pictures.
+        mode: custom mode number. failsafe: it reports one; until it is disarmed. seq: current item.
+        reached, texts: items reached, and texts, since the last look. exposures: all pictures.
         triggers: how often the camera was triggered; at those in misfires it took no picture.
     """
 
@@ -87,14 +123,9 @@ class MissionFlight:
         cls, autopilot: Autopilot, modes: Modes, *, store: MissionStore, chart: Chart, frame: Airframe, seed: int
     ) -> "MissionFlight":
         """A vehicle standing at home."""
+        motion = VehicleMotion(chart=chart, airframe=frame, random=Random(seed), speed=frame.speed_m_s)
         mode = modes.hold if autopilot is Autopilot.PX4 else 0
-        return cls(
-            autopilot=autopilot,
-            modes=modes,
-            store=store,
-            motion=VehicleMotion(chart=chart, airframe=frame, random=Random(seed), speed=frame.speed_m_s),
-            mode=mode,
-        )
+        return cls(autopilot=autopilot, modes=modes, store=store, motion=motion, mode=mode)
 
     # --- commands ---
 
@@ -353,7 +384,7 @@ class MissionFlight:
         if item.command == LOITER_UNLIM:
             return
         self._waited += STEP_S
-        hold = item.params[0] if item.command in (16, _LOITER_TIME, DELAY) else 0.0
+        hold = item.params[0] if item.command in (WAYPOINT, LOITER_TIME, DELAY) else 0.0
         if self._waited <= hold + self._lost_s(item):
             return
         if item.command == TAKEOFF:
