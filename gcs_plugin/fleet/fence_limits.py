@@ -15,7 +15,7 @@ import numpy as np
 from gcs_plugin.config import LIMITS
 from gcs_plugin.fleet.autopilot_settings import Setting
 from gcs_plugin.links.mavlink import Autopilot
-from gcs_plugin.mission.items import FRAME_TERRAIN, LAND, PLAIN_FRAME, RTL, VTOL_LAND
+from gcs_plugin.mission.items import FRAME_TERRAIN, LANDINGS, RTL
 from gcs_plugin.mission.track import flight_path, heights_m, home_of
 
 if TYPE_CHECKING:
@@ -117,7 +117,7 @@ def _findings(
     if len(points) and limits.top is not None:
         rises_m = LIMITS.fence_px4_rise_m if vehicle.autopilot is Autopilot.PX4 else margin_m
         yield from _over(limits.top, float(points[:, 2].max()), limits, "goes up to {} m", rises_m)
-        if any(i.is_nav and PLAIN_FRAME.get(i.frame, i.frame) == FRAME_TERRAIN for i in mission.items):
+        if any(i.is_nav and i.plain_frame == FRAME_TERRAIN for i in mission.items):
             text = "its mission's heights count from the ground below it"
             text += f"; whether it stays below {limits.top.value:g} m above home ({limits.top.name}) is not known"
             yield FenceFinding(text, beyond=False)
@@ -130,7 +130,7 @@ def _findings(
     if limits.floor is not None:
         low_m, been_above = math.inf, False
         for item, height_m in heights_m(mission):
-            if item.command in (RTL, LAND, VTOL_LAND):
+            if item.command in (RTL, *LANDINGS):
                 continue
             been_above |= height_m >= limits.floor.value + margin_m
             low_m = min(low_m, height_m if been_above else math.inf)

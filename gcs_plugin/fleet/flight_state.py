@@ -12,7 +12,7 @@ from typing import Any, Final, Protocol
 from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.mission.completion import CompletionDetector, Phase
 from gcs_plugin.mission.flight_modes import HOLDS, LANDS, RETURNS, Modes
-from gcs_plugin.mission.items import DELAY, LAND, LOITER_UNLIM, RTL, TAKEOFF, VTOL_LAND, WAYPOINT, Mission
+from gcs_plugin.mission.items import DELAY, LANDINGS, LOITER_TIME, LOITER_UNLIM, RTL, TAKEOFF, WAYPOINT, Mission
 
 STILL_S: Final = 2.5
 """How long a vehicle stands still on its way before that counts as a pause: longer than a turn's stop."""
@@ -22,7 +22,7 @@ _SINKING_S: Final = 1.0
 """How long a vehicle sinks where it should not until that is said: gusts and braking move it for less."""
 _BRAKES_S: Final = 5.0
 """One that was just put into its mode to hold is still slowing down for so long at most: from 15 m/s at 3 m/s2."""
-_TIMED: Final = frozenset({DELAY, LOITER_UNLIM, int(dialect.MAV_CMD_NAV_LOITER_TIME)})
+_TIMED: Final = frozenset({DELAY, LOITER_UNLIM, LOITER_TIME})
 
 
 class Word(enum.Enum):
@@ -118,12 +118,11 @@ class Observed(Protocol):
 def flight_state(vehicle: Observed) -> FlightState:
     """The flight state of a vehicle, as far as its messages show."""
     items = vehicle.mission_total
-    first = 0 if vehicle.autopilot is Autopilot.ARDUPILOT else 1
     word = _word(vehicle)
     mode = vehicle.mode if word in (Word.FLYING, Word.DESCENDING) else ""
     if word is Word.PAUSED and vehicle.way not in (None, vehicle.modes.mission):
         mode = vehicle.modes.name(vehicle.way or 0)
-    return FlightState(word, min(vehicle.mission_seq + first, items), items, mode)
+    return FlightState(word, min(vehicle.mission_seq + 1 - vehicle.autopilot.first_seq, items), items, mode)
 
 
 def danger_of(vehicle: Observed) -> str:
@@ -177,7 +176,7 @@ def _on_mission(vehicle: Observed) -> Word:
     command, waits = _item(vehicle)
     if command == RTL:
         return Word.LANDING if _comes_down(vehicle) else Word.RETURNING
-    if vehicle.landed == "landing" or (command in (LAND, VTOL_LAND) and _comes_down(vehicle)):
+    if vehicle.landed == "landing" or (command in LANDINGS and _comes_down(vehicle)):
         return Word.LANDING
     if vehicle.detector.phase is Phase.COMPLETE:
         return Word.LANDING if _comes_down(vehicle) else Word.HOLDING

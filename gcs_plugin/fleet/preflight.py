@@ -18,7 +18,7 @@ from gcs_plugin.fleet.separation.separation_watch import number_name
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.comparison import difference
 from gcs_plugin.mission.geofence import breach
-from gcs_plugin.mission.items import FRAME_GLOBAL, PLAIN_FRAME
+from gcs_plugin.mission.items import FRAME_GLOBAL
 from gcs_plugin.mission.mission_builder import unflyable
 from gcs_plugin.mission.plan_folder import NO_NEEDS, PlanNeeds
 from gcs_plugin.mission.track import fastest_m_s, flight_seconds, highest_m, takeoff_place
@@ -244,15 +244,12 @@ def _home(vehicle: "Vehicle", mission: "Mission | None", wanted: Wanted) -> Item
 def _off_start(vehicle: "Vehicle", mission: "Mission", wanted: Wanted) -> str:
     """How far a vehicle stands from where its mission takes off, in words; empty if it stands there."""
     first = mission.items[0] if mission.first_seq and mission.items and wanted.mission is not None else None
-    place = takeoff_place(mission)
-    if place is None and first is not None and (first.x or first.y):  # a vehicle's own item 0 is its home
-        place = first.lat_deg, first.lon_deg
+    place = takeoff_place(mission) or (None if first is None else first.place)  # a vehicle's own item 0 is its home
     if place is not None and vehicle.lat_deg is not None and vehicle.lon_deg is not None:
         away = distance_m(vehicle.lat_deg, vehicle.lon_deg, *place)
         if away > LIMITS.start_off_m:
             return f"it stands {away:.0f} m from where its mission takes off"
-    known = first is not None and first.z and PLAIN_FRAME.get(first.frame, first.frame) == FRAME_GLOBAL
-    if known and first is not None and vehicle.alt_m is not None:
+    if first is not None and first.z and first.plain_frame == FRAME_GLOBAL and vehicle.alt_m is not None:
         above = vehicle.alt_m - first.z
         if abs(above) > LIMITS.start_off_height_m:
             return f"it stands {abs(above):.0f} m {'above' if above > 0 else 'below'} where its mission takes off"

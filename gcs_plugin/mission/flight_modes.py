@@ -20,10 +20,8 @@ class Modes:
     """The modes of one kind of vehicle.
 
     Attributes:
-        mission: flies the mission.
         ready: stays put and lets itself be armed, before a mission is started.
         hold: stays where it is in the air, whatever the sticks say.
-        rtl: flies home and lands.
         land: lands where it is; where there is no such mode, rtl.
         names: all that have a name here.
     """

@@ -30,7 +30,6 @@ class FenceZone:
     """A zone that a vehicle must stay inside (inclusion) or outside of (exclusion).
 
     Attributes:
-        kind: which of the two.
         points: longitude and latitude in degrees of a polygon's corners without the closing one, or of a centre.
         radius_m: of a circle, None for a polygon.
     """

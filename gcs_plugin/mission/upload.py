@@ -13,7 +13,7 @@ another ground station is uploading; 15 (cancelled) that the vehicle has waited 
 """
 
 import enum
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 from gcs_plugin.links.mavlink import Autopilot, Message, dialect
@@ -31,7 +31,6 @@ from gcs_plugin.mission.exchange import (
     UNSUPPORTED,
     UNSUPPORTED_FRAME,
     Exchange,
-    Outcome,
     RoundTrip,
     Verdict,
 )
@@ -55,13 +54,8 @@ _SAME_REQUEST_S: Final = 0.03
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """A negative MISSION_ACK.
-
-    Attributes:
-        code: MAV_MISSION_RESULT.
-        item: sequence number of the refused item, None if the complete mission is refused.
-        field: the refused field, empty if none.
-        reason: one sentence without the vehicle's name.
+    """A negative MISSION_ACK: its MAV_MISSION_RESULT, the refused item (None if the whole mission is refused) and field
+    (empty if none), and one sentence without the vehicle's name.
     """
 
     code: int
@@ -87,11 +81,9 @@ class MissionUpload(Exchange):
     """One upload; its outcome is ok only if the mission read back from the vehicle is this one.
 
     Attributes:
-        mission: what to upload.
         patience_s: silence after which it gives up.
         attempts: number of restarts (time-outs of the vehicle, reboots, a different stored mission).
         leave: a change of mode before anything is sent, for a vehicle that would fly items as they arrive.
-        stage: what it is doing.
         refusal: the vehicle's refusal in words, where the outcome is one.
     """
 
@@ -196,15 +188,6 @@ class MissionUpload(Exchange):
     def leaves_mode(self) -> bool:
         """See Exchange."""
         return self.stage is UploadStage.LEAVE
-
-    @property
-    def progress(self) -> float:
-        """Share of the work that is done; sending and reading back count half each."""
-        if self.outcome is not None:
-            return 1.0
-        if self._reading is not None:
-            return 0.5 + 0.5 * self._reading.progress
-        return 0.5 * (self._served + 1) / max(1, len(self.mission))
 
     # --- sending ---
 
@@ -376,19 +359,15 @@ class MissionUpload(Exchange):
         mixture = self._touched and self.mission.autopilot is Autopilot.ARDUPILOT and text != self._mixed
         warning = "; it may now hold a mixture of two missions, so upload again before flying" if mixture else ""
         self._end(False, f"vehicle {self.vehicle.system} {text}{warning}", failure)
-        if self.refusal is not None and self.outcome is not None:
-            refusal = self.refusal
-            self.outcome = Outcome(
-                ok=False, text=self.outcome.text, item=refusal.item, field=refusal.field, code=refusal.code
-            )
+        if (why := self.refusal) is not None and self.outcome is not None:
+            self.outcome = replace(self.outcome, item=why.item, field=why.field, code=why.code)
 
 
 def explain(code: int, mission: Mission, item: int | None) -> Refusal:
     """Put a negative MISSION_ACK into words.
 
     Args:
-        code: MAV_MISSION_RESULT of the acknowledgement.
-        mission: the uploaded mission.
+        code: its MAV_MISSION_RESULT. mission: the uploaded one.
         item: the last item sent, None if the vehicle had not requested one yet.
     """
     if code == DENIED:

@@ -12,14 +12,15 @@ from gcs_plugin.mission.flight_modes import Modes
 from gcs_plugin.mission.items import (
     CHANGE_SPEED,
     DELAY,
+    FRAME_GLOBAL,
     JUMP,
     LAND,
+    LANDINGS,
     LOITER_TIME,
     LOITER_UNLIM,
     RTL,
     TAKEOFF,
     TRIGGER_DISTANCE,
-    VTOL_LAND,
     WAYPOINT,
     MissionItem,
 )
@@ -178,7 +179,7 @@ class MissionFlight:
 
     def start_mission(self) -> str:
         """MISSION_START; returns why not."""
-        first = self._first
+        first = self.autopilot.first_seq
         if len(self.store.items) <= first:
             return "No mission"
         begins = self._next_nav(first)
@@ -213,8 +214,8 @@ class MissionFlight:
         """Jump to an item; ArduPilot's item 0 stands for the beginning."""
         if not 0 <= seq < len(self.store.items):
             return False
-        if seq < self._first:
-            seq, self._jumps = self._first, {}
+        if seq < self.autopilot.first_seq:
+            seq, self._jumps = self.autopilot.first_seq, {}
         if self.state is MissionState.COMPLETE:
             self.state = MissionState.NOT_STARTED
         self.seq, self.paused = seq, False
@@ -279,10 +280,6 @@ class MissionFlight:
         """ArduCopter's modes here in which it does not arm."""
         return {self.modes.mission: "Auto", self.modes.hold: "Brake", self.modes.rtl: "RTL", self.modes.land: "Land"}
 
-    @property
-    def _first(self) -> int:
-        return 1 if self.autopilot is Autopilot.ARDUPILOT else 0
-
     def _next_nav(self, seq: int) -> int | None:
         return next((i for i in range(seq, len(self.store.items)) if self.store.items[i].is_nav), None)
 
@@ -296,13 +293,15 @@ class MissionFlight:
                 self._hold()
             return
         if self.state is not MissionState.COMPLETE:
-            self.state = MissionState.NOT_STARTED if len(self.store.items) > self._first else MissionState.NONE
+            self.state = (
+                MissionState.NOT_STARTED if len(self.store.items) > self.autopilot.first_seq else MissionState.NONE
+            )
         if not self.armed:
             self.seq = 0
 
     def _enter_mission(self) -> None:
         self.state, self.paused, self._reached_any = MissionState.ACTIVE, False, False
-        self._run_from(max(self.seq, self._first))
+        self._run_from(max(self.seq, self.autopilot.first_seq))
 
     def _run_from(self, seq: int) -> None:
         """Execute items up to the next one that is flown."""
@@ -342,7 +341,7 @@ class MissionFlight:
                 self.mode = self.modes.rtl
             self._ends_mission = self.autopilot is Autopilot.ARDUPILOT
             self._go_home()
-        elif item.command in (LAND, VTOL_LAND):
+        elif item.command in LANDINGS:
             self._aim(item)
             self._ends_mission = True
         else:
@@ -358,12 +357,12 @@ class MissionFlight:
             return
         if item.command != TAKEOFF and (item.x or item.y):
             north, east = motion.chart.to_metres(item.lat_deg, item.lon_deg)
-        height = item.z - (motion.chart.alt_m if item.frame in (0, 5) else 0.0)
+        height = item.z - (motion.chart.alt_m if item.plain_frame == FRAME_GLOBAL else 0.0)
         if item.command == TAKEOFF and motion.up > _LIFTED_M:  # it flies: where it stops, and no lower
             motion.stop()
             motion.climb_to(height)
             return
-        stays_high = item.command in (LAND, VTOL_LAND) or not item.has_place
+        stays_high = item.command in LANDINGS or not item.has_place
         # On a leg it keeps to the line, which is what makes the leg straight.
         motion.go((north, east, motion.up if stays_high else height), along_line=bool(self._reached_any))
 
@@ -375,7 +374,7 @@ class MissionFlight:
             self.landed = Landed.IN_AIR
         if horizontal > _REACHED_M or vertical > 1.0:
             return
-        if item.command in (LAND, VTOL_LAND):
+        if item.command in LANDINGS:
             times = self.motion.airframe.times
             self._waited += STEP_S
             if self.motion.target and (times is None or self._waited > times.land_wait_s - _OWN_STOP_S):
@@ -463,7 +462,7 @@ class MissionFlight:
         if motion.up > 0.05:
             return
         in_mission = self.mode == self.modes.mission and self._ends_mission
-        landing = in_mission and self.store.items[self.seq].command in (LAND, VTOL_LAND)
+        landing = in_mission and self.store.items[self.seq].command in LANDINGS
         if in_mission and self.autopilot is Autopilot.ARDUPILOT and not landing:
             self._reach(self.seq)  # RTL is reached, LAND is not
             self._finish()

@@ -17,7 +17,7 @@ from gcs_plugin.mission.exchange import (
     Address,
 )
 from gcs_plugin.mission.geofence import FENCE
-from gcs_plugin.mission.items import FRAME_GLOBAL, JUMP, PLAIN_FRAME, TAKEOFF, WAYPOINT, MissionItem
+from gcs_plugin.mission.items import FRAME_GLOBAL, JUMP, TAKEOFF, WAYPOINT, MissionItem
 from orthoswarm.planning.sorties.flight_time import autopilot_config
 
 _MISSION: Final = dialect.MAV_MISSION_TYPE_MISSION
@@ -177,7 +177,7 @@ class MissionStore:
         if self.autopilot is Autopilot.ARDUPILOT:  # written at once, so that a broken upload leaves a mixture
             self.items[transfer.wanted : transfer.wanted + 1] = [self._as_stored(item, transfer.wanted)]
         else:
-            transfer.items.append(replace(item, frame=PLAIN_FRAME.get(item.frame, item.frame)))
+            transfer.items.append(replace(item, frame=item.plain_frame))
         transfer.wanted, transfer.heard_at = transfer.wanted + 1, now
         if transfer.wanted < transfer.count:
             return self._ask(transfer, now)
@@ -197,8 +197,8 @@ class MissionStore:
         params = (float(int(p1)), 0.0, 0.0, 0.0) if item.command in (WAYPOINT, TAKEOFF) else (p1, p2, p3, p4)
         if not item.has_place:
             return MissionItem(command=item.command, frame=FRAME_GLOBAL, params=params)
-        frame, z = PLAIN_FRAME.get(item.frame, item.frame), round(item.z * 100.0) / 100.0
-        return replace(item, frame=frame, params=params, z=z, autocontinue=True)
+        z = round(item.z * 100.0) / 100.0
+        return replace(item, frame=item.plain_frame, params=params, z=z, autocontinue=True)
 
     def _check(self, item: MissionItem, count: int) -> int:
         """MAV_MISSION_RESULT for an item, in the order in which ArduPilot looks at it."""

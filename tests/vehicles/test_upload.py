@@ -356,12 +356,10 @@ def test_the_last_item_sent_twice_is_an_error_and_yet_a_success():
     uploading = upload(rig, mission)
     while not rig.acks:
         rig.step()
-    last = len(mission) - 1
     rig.down = Channel(faults=Faults())  # the acknowledgement is lost
     rig.answer([dialect.MAVLink_mission_ack_message(255, 190, 1, 0)])
     (outcome,) = rig.run(uploading)
     assert outcome.ok and holds(rig, mission)
-    assert uploading.progress == 1.0 and last > 0
 
 
 @BOTH
@@ -383,7 +381,7 @@ def test_px4_that_has_forgotten_a_transfer_is_asked_for_the_list_again():
     rig, mission = Rig(PX4), make_mission(PX4)
     rig.store.items = list(mission.items)
     reading = rig.join(MissionDownload(VEHICLE))
-    while reading.progress < 0.5:
+    while len(reading._got) < 0.5 * len(mission):
         rig.step()
     rig.store.rebooted()
     (outcome,) = rig.run(reading)

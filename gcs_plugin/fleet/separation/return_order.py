@@ -293,15 +293,11 @@ def _height_known(vehicle: "Vehicle") -> bool:
 def apart(one: Track, other: Track, *, heights: bool = True) -> bool:
     """Whether two vehicles keep a plan's distance or height, also if one is late by the slack of a landing.
 
-    A track of one place is a vehicle that holds there; any other track ends on the ground. heights: whether heights are
+    A track of one place is a vehicle that holds there; any other track ends on the ground. heights: whether both are
     known; if not, only the horizontal distance counts.
     """
-    if not len(one.places) or not len(other.places):
-        return True
-    i, j = near_samples(one.places, other.places, active().planning.separation_m)
-    if heights:
-        level = np.abs(one.places[i, 2] - other.places[j, 2] + one.higher_m(other)) < active().planning.layer_m
-        i, j = i[level], j[level]
+    planned = active().planning
+    i, j = near_samples(one, other, planned.separation_m, planned.layer_m if heights else None)
     if min(len(one.places), len(other.places)) == 1:
         return not len(i)
     slack_s = max(one.autopilot.landing_slack_s, other.autopilot.landing_slack_s)
