@@ -18,14 +18,7 @@ def open_backend(
     key: bytes | None = None,
     tlog: Path | None = None,
 ) -> Backend:
-    """Open links with a backend.
-
-    Args:
-        name: `pymavlink` or `mavsdk`.
-        links: addresses (`links.parse_link`).
-        own: our address.
-        key: signing key (pymavlink only).
-        tlog: telemetry log (pymavlink only).
+    """Open links (`links.parse_link`) with a backend of NAMES; only pymavlink has a signing key and a telemetry log.
 
     Raises:
         InputError: an address is wrong, or the backend lacks an option.

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from gcs_plugin.config import HEARING
 from gcs_plugin.fleet.commands import Order, Verb
 from gcs_plugin.fleet.fleet_events import FleetEvent
-from gcs_plugin.fleet.flight_state import Word, flight_state
+from gcs_plugin.fleet.flight_state import Word, flight_state, summary
 from gcs_plugin.fleet.preflight import Check, preflight_all
 from gcs_plugin.fleet.separation.takeoff_schedule import TakeoffSchedule
 from gcs_plugin.fleet.vehicle_state import Vehicle
@@ -30,8 +30,7 @@ class Backend(abc.ABC):
     """Vehicles on links. Calls block until they are done; a vehicle is changed only by `upload` and `command`.
 
     Attributes:
-        name: for `--backend`.
-        events: all events so far.
+        name: for `--backend`. events: all so far.
     """
 
     name: str
@@ -59,10 +58,6 @@ class Backend(abc.ABC):
     def discover(self, wait_s: float, wanted: Collection[int] = ()) -> list[int]:
         """Wait for vehicles: until all wanted ones are found, without `wanted` until no further one appears.
 
-        Args:
-            wait_s: longest wait, seconds.
-            wanted: system ids; empty for any.
-
         Returns:
             The system ids that were found, in order.
         """
@@ -82,11 +77,7 @@ class Backend(abc.ABC):
         return sorted(self.vehicles())
 
     def hear_states(self, systems: Collection[int], wait_s: float) -> None:
-        """Wait until vehicles have reported what a check before a start looks at: what is not known is not wrong.
-
-        Args:
-            systems: the vehicles. wait_s: longest wait, seconds.
-        """
+        """Wait until vehicles have reported what a check before a start looks at: what is not known is not wrong."""
         end = time.monotonic() + wait_s
         while not all(self.vehicles()[s].ready_to_check for s in systems):
             left = end - time.monotonic()
@@ -101,7 +92,7 @@ class Backend(abc.ABC):
     def summaries(self) -> list[dict[str, Any]]:
         """The state of all vehicles as JSON values."""
         now = time.monotonic()
-        return [vehicle.summary(now) for _, vehicle in sorted(self.vehicles().items())]
+        return [summary(vehicle, now) for _, vehicle in sorted(self.vehicles().items())]
 
     @abc.abstractmethod
     def problems(self) -> list[str]:
@@ -109,30 +100,18 @@ class Backend(abc.ABC):
 
     @abc.abstractmethod
     def upload(self, missions: Mapping[int, Mission], report: Report) -> dict[int, Outcome]:
-        """Upload missions to all vehicles at the same time, and read them back.
+        """Upload missions, by system id, to all vehicles at the same time, and read them back.
 
-        Args:
-            missions: by system id.
-            report: called with a name of the step, the number of finished vehicles and their total.
+        `report` is called with a name of the step, the number of finished vehicles and their total.
         """
 
     @abc.abstractmethod
     def stored(self, systems: Collection[int], report: Report) -> dict[int, Mission | None]:
-        """Download the missions of vehicles, all at the same time; None for a vehicle that does not answer.
-
-        Args:
-            systems: system ids.
-            report: as for `upload`.
-        """
+        """Download the missions of vehicles, all at the same time; None for a vehicle that does not answer."""
 
     @abc.abstractmethod
     def zones(self, systems: Collection[int], report: Report) -> dict[int, "tuple[FenceZone, ...]"]:
-        """Download the zones of geofences; without those of vehicles that do not answer.
-
-        Args:
-            systems: system ids.
-            report: as for `upload`.
-        """
+        """Download the zones of geofences; without those of vehicles that do not answer."""
 
     def check(
         self,
@@ -145,13 +124,7 @@ class Backend(abc.ABC):
         needs: PlanNeeds = NO_NEEDS,
         zones: "Mapping[int, tuple[FenceZone, ...]] | None" = None,
     ) -> list[Check]:
-        """Preflight check of vehicles with their present telemetry.
-
-        Args:
-            systems: the vehicles. missions: of the plan. stored: missions downloaded from the vehicles.
-            starts: takeoffs in seconds after the first. legal_height_m: legal height limit, metres.
-            needs: of the plan. zones: of the geofences that were read.
-        """
+        """Preflight check of vehicles with their present telemetry; for the values see `preflight_all`."""
         vehicles = {s: self.vehicle(s) for s in systems}
         return preflight_all(
             vehicles, missions, stored, starts, time.monotonic(),
@@ -201,7 +174,6 @@ class Backend(abc.ABC):
     def pump(self, seconds: float) -> None:
         """Process messages of vehicles for at most so many seconds."""
 
-    @abc.abstractmethod
     def watch(self, systems: Collection[int], seconds: float, report: Callable[[FleetEvent], None]) -> bool:
         """Follow missions until each has ended and no vehicle flies home any more, for at most so many seconds.
 
@@ -210,17 +182,28 @@ class Backend(abc.ABC):
         Returns:
             True if all have ended.
         """
+        end, reported = time.monotonic() + seconds, 0
+        while True:
+            for event in self.events[reported:]:
+                if event.system in systems or not systems:
+                    report(event)
+            reported = len(self.events)
+            ended = {event.system for event in self.events if event.kind in ("complete", "aborted")}
+            vehicles = self.vehicles()
+            followed = set(systems) or set(vehicles)
+            if followed and followed <= ended and not any(_comes_home(v) for s, v in vehicles.items() if s in followed):
+                return True
+            if time.monotonic() >= end:
+                return False
+            self.look()
+            self.pump(0.2)
 
     @abc.abstractmethod
     def close(self) -> None:
         """Close the links."""
 
 
-ENDED = ("complete", "aborted")
-
-
-def coming_home(vehicle: Vehicle) -> bool:
-    """Whether a vehicle flies home or lands."""
+def _comes_home(vehicle: Vehicle) -> bool:
     return flight_state(vehicle).word in (Word.RETURNING, Word.LANDING)
 
 
@@ -255,7 +238,7 @@ def command_all(
             for cancelled in schedule.failed(system):
                 ended.add(cancelled)
                 text = f"vehicle {cancelled} stays on the ground, because vehicle {system} did not take off"
-                unsent = type(order)(verb="start", system=cancelled, given_s=time.monotonic(), id=order.id)
+                unsent = Order(verb="start", system=cancelled, given_s=time.monotonic(), id=order.id)
                 orders[cancelled] = unsent.end(text, Verdict.NOT_SENT)
                 say(text)
     return orders

@@ -1,11 +1,10 @@
 """The default backend: our own links and MAVLink protocols, with pymavlink for messages; for many vehicles."""
 
-import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
-from gcs_plugin.backends.backend import ENDED, Backend, Report, coming_home
+from gcs_plugin.backends.backend import Backend, Report
 from gcs_plugin.fleet.commands import Order
 from gcs_plugin.fleet.fleet import Fleet
 from gcs_plugin.fleet.fleet_events import FleetEvent
@@ -13,7 +12,6 @@ from gcs_plugin.fleet.separation.separation_watch import number_name
 from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.mavlink import Message
 from gcs_plugin.links.transports import Link
-from gcs_plugin.mission.completion import Phase
 from gcs_plugin.mission.download import MissionDownload
 from gcs_plugin.mission.exchange import Address, Exchange, Outcome
 from gcs_plugin.mission.geofence import FenceZone, zones_of
@@ -94,23 +92,6 @@ class DirectBackend(Backend):
         """Poll the fleet."""
         self.fleet.poll(seconds)
 
-    def watch(self, systems: Collection[int], seconds: float, report: Callable[[FleetEvent], None]) -> bool:
-        """Poll and report events until all missions have ended and nobody flies home."""
-        end, reported = time.monotonic() + seconds, 0
-        while True:
-            for event in self.events[reported:]:
-                if event.system in systems or not systems:
-                    report(event)
-            reported = len(self.events)
-            ended = {event.system for event in self.events if event.kind in ENDED}
-            followed = set(systems) or set(self.fleet.vehicles)
-            vehicles = [v for s, v in self.fleet.vehicles.items() if s in followed]
-            if followed and followed <= ended and not any(map(coming_home, vehicles)):
-                return True
-            if time.monotonic() >= end:
-                return False
-            self.fleet.poll(0.2)
-
     def close(self) -> None:
         """Close the fleet."""
         self.fleet.close()
@@ -136,8 +117,3 @@ class DirectBackend(Backend):
                     outcomes[system] = job.outcome
             report(what, len(outcomes), len(begin))
         return outcomes
-
-    @property
-    def flying(self) -> list[int]:
-        """Vehicles that fly a mission."""
-        return [s for s, v in self.fleet.vehicles.items() if v.detector.phase is Phase.ACTIVE]

@@ -24,13 +24,10 @@ _name: Final = "vehicle {}".format
 
 
 class InTurn:
-    """A return in turn (`fleet.separation.returns`) that says what happens.
+    """A return in turn (`fleet.separation.returns`) that says what happens, a line at a time.
 
     Attributes:
         orders: the last command to each vehicle.
-
-    Args:
-        backend: of the vehicles. say: called with each line of progress.
     """
 
     def __init__(self, backend: Backend, say: Say) -> None:
@@ -48,10 +45,8 @@ class InTurn:
     def run(self, systems: Collection[int], seconds: float) -> None:
         """Send vehicles home in turn, until nobody waits any more; for at most so many seconds.
 
-        Those that wait when this ends, also by an exception, are left holding.
-
-        Args:
-            systems: their system ids. All that the backend hears are kept apart from.
+        Those that wait when this ends, also by an exception, are left holding. All that the backend hears are kept
+        apart from.
         """
         end = time.monotonic() + seconds
         self._read_last_items()

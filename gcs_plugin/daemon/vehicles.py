@@ -476,8 +476,10 @@ class VehicleLinks:
                 self._jobs.wake()
 
     def _row(self, vehicle: "Vehicle", now: float) -> dict[str, Any]:
+        from gcs_plugin.fleet.flight_state import summary
+
         record = self._record(vehicle.system)
-        row = vehicle.summary(now) | {"id": record.id, "name": self._titles.get(record.id, "")}
+        row = summary(vehicle, now) | {"id": record.id, "name": self._titles.get(record.id, "")}
         near = self.fleet.separation.text(vehicle.system, self.name_of)
         row["alarm"] = "; ".join(text for text in (near, vehicle.danger and f"{record.id} {vehicle.danger}") if text)
         row["behind"] = self.fleet.behind(vehicle.system)

@@ -20,13 +20,10 @@ _ON_THE_WAY_S = 1.0
 
 
 class Dialogues:
-    """All dialogues of a fleet.
+    """All dialogues of a fleet that are under way (`jobs`).
 
     Args:
-        vehicles: by system id. hub: the links. clock: monotonic seconds. signed: whether this station has a key.
-
-    Attributes:
-        jobs: those under way.
+        vehicles: by system id. clock: monotonic seconds. signed: whether this station has a key.
     """
 
     def __init__(
@@ -50,35 +47,34 @@ class Dialogues:
 
     def busy(self, system: int) -> bool:
         """True while a dialogue with this vehicle is active that somebody waits for."""
-        return any(job.vehicle.system == system and not _in_background(job) for job in self.jobs)
+        return any(not _in_background(job) for job in self._with(system))
 
     def talks(self, system: int) -> bool:
         """True while any dialogue with this vehicle is active."""
-        return any(job.vehicle.system == system for job in self.jobs)
+        return bool(self._with(system))
 
     def reads(self, system: int) -> bool:
         """True while this vehicle's mission is being read."""
-        return any(
-            job.vehicle.system == system and isinstance(job, MissionDownload) and job.list_type == MISSION
-            for job in self.jobs
-        )
+        return any(isinstance(job, MissionDownload) and job.list_type == MISSION for job in self._with(system))
 
     def starting(self, system: int) -> bool:
         """True while a start of this vehicle is under way, or is being broken off."""
-        return any(job.vehicle.system == system and isinstance(job, (Start, BreakOff)) for job in self.jobs)
+        return any(isinstance(job, (Start, BreakOff)) for job in self._with(system))
+
+    def _with(self, system: int) -> "list[Exchange]":
+        return [job for job in self.jobs if job.vehicle.system == system]
 
     def end_background(self, system: int) -> None:
         """End what nobody waits for, in favour of what somebody asks for."""
-        for job in self.jobs:
-            if job.vehicle.system == system and _in_background(job):
+        for job in self._with(system):
+            if _in_background(job):
                 job.cancel("another request came in between")
         self._reap()
 
     def make_way(self, system: int) -> None:
         """End an active command for a newer one (an upload may continue, unless it still changes the mode)."""
-        for job in self.jobs:
-            moves = not isinstance(job, (MissionUpload, MissionDownload)) or job.leaves_mode
-            if job.vehicle.system == system and moves:
+        for job in self._with(system):
+            if not isinstance(job, (MissionUpload, MissionDownload)) or job.leaves_mode:
                 job.cancel("another command came in between")
         self._reap()
 
@@ -109,10 +105,8 @@ class Dialogues:
     ) -> bool:
         """Send to a vehicle; returns whether a link accepted it.
 
-        Args:
-            system: the vehicle. messages: what to send.
-            everywhere: on every route on which it was heard recently, not only on the best.
-            expires: time after which a waiting message is dropped.
+        `everywhere`: on every route on which it was heard recently, not only on the best. A message that still waits at
+        `expires` is dropped.
         """
         vehicle = self._vehicles.get(system)
         if vehicle is None or not messages:

@@ -20,9 +20,9 @@ from gcs_plugin.fleet.commands import URGENT, Order, Verb
 from gcs_plugin.fleet.dialogues import Dialogues
 from gcs_plugin.fleet.fleet_events import FleetEvent
 from gcs_plugin.fleet.going_on import continued, resumed
+from gcs_plugin.fleet.heard_messages import MESSAGE_IDS
 from gcs_plugin.fleet.link_hub import Hub
-from gcs_plugin.fleet.message_rates import Rates, default_rates
-from gcs_plugin.fleet.reception import MESSAGE_IDS, Handler, Reception
+from gcs_plugin.fleet.reception import Handler, Reception
 from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.mavlink import Autopilot, Message
 from gcs_plugin.links.packets import Packet
@@ -66,7 +66,6 @@ class Fleet:
         links: Iterable[Link | str],
         *,
         own: Address = GROUND_STATION,
-        rates: Rates | None = None,
         key: bytes | None = None,
         tlog: Path | None = None,
         remembered: Mapping[int, Mapping[str, Any]] | None = None,
@@ -78,13 +77,10 @@ class Fleet:
         Args:
             links: links or their addresses (`links.parse_link`).
             own: our address; different from that of another ground station.
-            rates: message rates to request; by default 10 Hz of position and attitude.
             key: signing key; with it only signed packets are accepted.
             tlog: telemetry log to append to.
-            remembered: result of `memory` before a restart of this program, so that no completion is missed or
-            repeated.
-            clock: monotonic seconds.
-            wall: UTC epoch seconds.
+            remembered: result of `memory` before a restart of this program: no completion is missed or repeated.
+            clock: monotonic seconds. wall: UTC epoch seconds.
 
         Raises:
             InputError: a link cannot be opened.
@@ -103,7 +99,6 @@ class Fleet:
             self.hub,
             dialogues=self._dialogues,
             own=own,
-            rates=rates or default_rates(),
             remembered=remembered or {},
             event=self._publish,
             wall=wall,
@@ -211,9 +206,8 @@ class Fleet:
             raise OrthoSwarmError(f"vehicle {system} is flying its mission; pause it or let it return first")
         if mission.autopilot is not vehicle.autopilot:
             kind = vehicle.autopilot.value
-            raise OrthoSwarmError(
-                f"vehicle {system} is {kind}, but the mission was built for {mission.autopilot.value}"
-            )
+            text = f"vehicle {system} is {kind}, but the mission was built for {mission.autopilot.value}"
+            raise OrthoSwarmError(text)
         vehicle.mission = None
         vehicle.detector.uploaded(None)
         # In AUTO, even paused, ArduPilot flies the item that is stored under the current number: a new RTL at once.
@@ -292,8 +286,7 @@ class Fleet:
     def problems(self, name_of: Callable[[int], str]) -> list[str]:
         """Broken links, rejected packets, vehicles that sign and those that share a system id; from any thread.
 
-        Args:
-            name_of: the id of a vehicle by its system id.
+        `name_of` gives the id of a vehicle by its system id.
         """
         hub, vehicles = self.hub, list(self.vehicles.values())
         problems = [f"{side.link.name}: {side.link.problem}" for side in hub.sides if side.link.problem]
@@ -363,11 +356,7 @@ class Fleet:
         return goes_on or {"rtl": vehicle.pilot.rtl, "land": vehicle.pilot.land}[verb]()
 
     def _goes_on(self, vehicle: Vehicle, verb: Verb) -> Exchange:
-        """See `going_on`.
-
-        Raises:
-            OrthoSwarmError: there is nothing to go on with.
-        """
+        """See `going_on`; raises OrthoSwarmError if there is nothing to go on with."""
         told_s = self._clock() - self._told_home.get(vehicle.system, -math.inf)
         if verb == "resume" and told_s < _PAUSE_SHOWS_S:  # its mode may be older
             raise OrthoSwarmError(f"vehicle {vehicle.system} was told to return or land just now; it is not resumed")

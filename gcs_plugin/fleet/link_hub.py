@@ -40,12 +40,7 @@ Sink = Callable[[Side, Peer, Packet, float, float], None]
 
 
 class Hub:
-    """The links of a ground station.
-
-    Attributes:
-        own: our address.
-        sides: the links.
-    """
+    """The links (`sides`) of a ground station."""
 
     def __init__(
         self,
@@ -62,12 +57,10 @@ class Hub:
 
         Args:
             links: links or their addresses.
-            own: our address.
             sink: called with the link's side, the peer, the packet, the clock's time and UTC seconds of its arrival.
             key: signing key; with it only signed packets are accepted.
             tlog: telemetry log to append to.
-            clock: monotonic seconds.
-            wall: UTC epoch seconds.
+            clock: monotonic seconds. wall: UTC epoch seconds.
         """
         self.own, self._sink, self._clock, self._wall = own, sink, clock, wall
         opened = _make_links(links)

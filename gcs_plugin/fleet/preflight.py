@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 from gcs_plugin.config import LIMITS
 from gcs_plugin.fleet.autopilot_settings import Setting
 from gcs_plugin.fleet.fence_limits import fence_findings, fence_limits, in_all_zones
-from gcs_plugin.fleet.message_rates import GPS_RAW_INT
+from gcs_plugin.fleet.heard_messages import MESSAGE_IDS
 from gcs_plugin.fleet.separation.separation_check import SeparationFindings, flights_of, separation_of
 from gcs_plugin.fleet.separation.separation_watch import number_name
 from gcs_plugin.links.mavlink import Autopilot
@@ -54,13 +54,7 @@ class Level(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """One item of a check.
-
-    Attributes:
-        name: one of ITEMS.
-        level: its result.
-        reason: the finding in words.
-    """
+    """One item of a check: its name (one of ITEMS), its result, and the finding in words."""
 
     name: str
     level: Level
@@ -73,12 +67,7 @@ class Item:
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """The check of one vehicle.
-
-    Attributes:
-        system: the vehicle.
-        items: in the order of ITEMS.
-    """
+    """The check of one vehicle: its items in the order of ITEMS."""
 
     system: int
     items: tuple[Item, ...]
@@ -109,9 +98,8 @@ class Wanted:
         stored: the mission just read from the vehicle, None to use the known one.
         needs: what the plan relies on.
         legal_height_m: height above takeoff that may be flown without asking.
-        near: finding of the separation check about this vehicle, empty if none.
+        near: whom it comes too near, in words. unexamined: why that could not be examined; empty if it was.
         zones: of the geofence that it holds, None if that has not been read.
-        unexamined: why its separation from others could not be examined, empty if it was.
         reading: its mission is still being read from it.
     """
 
@@ -127,11 +115,7 @@ class Wanted:
 
 
 def preflight(vehicle: "Vehicle", wanted: Wanted, now: float) -> Check:
-    """Check one vehicle before its start.
-
-    Args:
-        vehicle: its state in the fleet. wanted: what it is to fly. now: the fleet's clock.
-    """
+    """Check one vehicle before its start, at a time of the fleet's clock."""
     mission = wanted.mission or wanted.stored or vehicle.mission
     items = (
         _link(vehicle, now), _gps(vehicle, now), _ekf(vehicle), _home(vehicle, mission, wanted), _prearm(vehicle, now),
@@ -162,14 +146,11 @@ def preflight_all(
     Args:
         vehicles: by system id, as the fleet knows them.
         missions: the plan's; a vehicle without one flies its stored mission.
-        stored: what was read from the vehicles just now.
-        starts: takeoffs in seconds after the first; default 0.
-        now: the fleet's clock.
-        needs, legal_height_m: see Wanted.
+        stored: what was read from the vehicles just now. reading: vehicles whose missions are still being read.
+        starts: takeoffs in seconds after the first; default 0. now: the fleet's clock.
+        needs, legal_height_m: see Wanted. zones: of the geofences that were read.
         name: name of a vehicle by its system id.
-        zones: of the geofences that were read.
         separation: of them from each other and from others, where that was examined before.
-        reading: vehicles whose missions are still being read.
     """
     if separation is None:
         separation = separation_of(flights_of(vehicles, missions, stored, starts), name, needs.apart)
@@ -205,7 +186,7 @@ def _link(vehicle: "Vehicle", now: float) -> Item:
 
 def _gps(vehicle: "Vehicle", now: float) -> Item:
     count = vehicle.satellites
-    if (age_s := vehicle.streams.age_s(GPS_RAW_INT, now) or 0.0) > LIMITS.old_s:
+    if (age_s := vehicle.streams.age_s(MESSAGE_IDS["GPS_RAW_INT"], now) or 0.0) > LIMITS.old_s:
         return Item("gps", Level.RED, f"it has not reported its receiver's state for {age_s:.0f} s")
     if vehicle.gps_fix < 3:
         return Item("gps", Level.RED, f"no 3D fix ({count if count != _UNKNOWN_SATELLITES else 0} satellites)")
@@ -319,16 +300,13 @@ def _fence(vehicle: "Vehicle", mission: "Mission | None", zones: "Sequence[Fence
     if limits.unsaid:
         return Item("fence", Level.WARNING, "it keeps a geofence but has not said all its limits; check again")
     lossy = vehicle.route is not None and vehicle.route.loss > LIMITS.lossy_share
-    if lossy and not limits.any and not limits.unsaid and _may_switch_fence_on(vehicle):
+    # ArduPilot has not said when it switches its geofence on; older versions do not say it.
+    unknown = vehicle.autopilot is Autopilot.ARDUPILOT and Setting.FENCE_AUTO not in vehicle.settings
+    if lossy and unknown and not limits.any:
         text = "its geofence is off; whether it switches that on as it arms may have been lost on its link"
         return Item("fence", Level.WARNING, f"{text}; look at FENCE_AUTOENABLE")
     text = "its mission keeps to its geofence" if zones or limits.any else "it has no geofence"
     return Item("fence", Level.OK, f"{text}; zones in it were not read" if zones is None else text)
-
-
-def _may_switch_fence_on(vehicle: "Vehicle") -> bool:
-    """Whether ArduPilot has not said when it switches its geofence on; older versions do not say it."""
-    return vehicle.autopilot is Autopilot.ARDUPILOT and Setting.FENCE_AUTO not in vehicle.settings
 
 
 def _height(mission: "Mission | None", wanted: Wanted) -> Item:

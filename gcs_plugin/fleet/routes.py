@@ -131,10 +131,9 @@ class Route:
 
 @dataclass(slots=True)
 class Routes:
-    """All routes to one vehicle.
+    """All routes to one vehicle, by link and peer.
 
     Attributes:
-        known: by link and peer.
         best: the one that carries commands, None before the first packet.
         claimants: addresses of the vehicles that share the system id; empty for a single one.
     """

@@ -111,11 +111,7 @@ class Command(Exchange):
 
 @dataclass(slots=True)
 class GoOn(Command):
-    """A command to go on with a mission; it ends where the vehicle is seen to be sent home, or to land, meanwhile.
-
-    Attributes:
-        modes: the autopilot's. was: the mode that it was in.
-    """
+    """A command to go on with a mission, void if the vehicle changes from its mode (`was`) to a return or landing."""
 
     modes: Modes = field(kw_only=True)
     was: int = field(kw_only=True)

@@ -382,9 +382,8 @@ class Lateness:
     """One flight of a mission, compared with its times.
 
     Attributes:
-        mission: what is flown.
-        late_s: how far it is behind, seconds of its own clock; negative: ahead. Where its plan stands still, too, that
-            is only known to be more than something, so what was known before stays.
+        late_s: how far it is behind, seconds of its own clock; negative: ahead. While its plan waits in one place,
+            every moment of that fits where the vehicle is: this is kept then unless it must be more.
         behind: True while it is later than plans allow for.
     """
 

@@ -54,9 +54,7 @@ _SAME_REQUEST_S: Final = 0.03
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """A negative MISSION_ACK: its MAV_MISSION_RESULT, the refused item (None if the whole mission is refused) and field
-    (empty if none), and one sentence without the vehicle's name.
-    """
+    """A negative MISSION_ACK (`code`), and why in one sentence without the vehicle's name."""
 
     code: int
     item: int | None

@@ -175,7 +175,7 @@ class MissionStore:
             self._transfer = None
             return [self._ack(sender, code)]
         if self.autopilot is Autopilot.ARDUPILOT:  # written at once, so that a broken upload leaves a mixture
-            self.items[transfer.wanted : transfer.wanted + 1] = [self._as_stored(item, transfer.wanted)]
+            self._write(transfer.wanted, self._as_stored(item, transfer.wanted))
         else:
             transfer.items.append(replace(item, frame=item.plain_frame))
         transfer.wanted, transfer.heard_at = transfer.wanted + 1, now
@@ -188,6 +188,9 @@ class MissionStore:
         self._transfer, self.stored_at = None, now
         self.generation += 1
         return [self._ack(sender, ACCEPTED)]
+
+    def _write(self, seq: int, item: MissionItem) -> None:
+        self.items[seq : seq + 1] = [item]
 
     def _as_stored(self, item: MissionItem, seq: int) -> MissionItem:
         """An item as ArduPilot returns it: see `mission.comparison`."""

@@ -110,8 +110,8 @@ class ReturnOrder:
         One whose way is not known returns at once: nothing is known that would be better for it. So does one whose
         link is lost or whose battery must not wait; a lost one has its turn once more when it is heard and still holds.
         One that no longer holds as it did follows another command, of a remote control or another station.
-        Where some are in each other's way alone and nothing moves, the one that the fewest others stand in the way of
-        sets out.
+        Vehicles that wait only for each other would wait for ever: while nothing moves, the one of them that waits for
+        the fewest sets out.
 
         Args:
             aloft: all vehicles in the air, see `aloft_of`.
@@ -143,7 +143,7 @@ class ReturnOrder:
                 ready.append(system)
                 moving.add(system)
                 stay.discard(system)
-        # In each other's way alone. One that is held by somebody, or flies a mission, is never flown into.
+        # Of these one sets out; not of those that wait for a vehicle outside this order, which need not give way.
         mutual = [s for s, others in self.waits.items() if self.waits.keys() >= set(others)]
         if mutual and not moving:
             ready.append(min(mutual, key=lambda s: (len(self.waits[s]), left.index(s))))
@@ -191,11 +191,7 @@ class ReturnOrder:
 
 
 def aloft_of(vehicles: "Mapping[int, Vehicle]", now: float) -> dict[int, Aloft]:
-    """The vehicles in the air, by system id; in the fleet's thread.
-
-    Args:
-        vehicles: by system id. now: the fleet's clock.
-    """
+    """The vehicles in the air, by system id, at a time of the fleet's clock; in the fleet's thread."""
     known = {s: v for s, v in vehicles.items() if v.flying}
     places = (place for v in known.values() if (place := _place(v)) is not None)
     origin = next(places, (0.0, 0.0))
@@ -253,7 +249,7 @@ def way_home(vehicle: "Vehicle", origin: tuple[float, float]) -> Track | None:
 
 
 def return_height_m(vehicle: "Vehicle", away_m: float) -> float:
-    """The height above home at which a vehicle flies home, from where it is (ArduCopter's mode_rtl.cpp, PX4's rtl.cpp).
+    """The height above home at which a vehicle flies home (ArduCopter's mode_rtl.cpp, PX4's rtl.cpp).
 
     Args:
         vehicle: in the air. away_m: its distance from home.
@@ -291,7 +287,7 @@ def _height_known(vehicle: "Vehicle") -> bool:
 
 
 def apart(one: Track, other: Track, *, heights: bool = True) -> bool:
-    """Whether two vehicles keep a plan's distance or height, also if one is late by the slack of a landing.
+    """Whether two vehicles keep a plan's distance or height, also where either is late by the slack of a landing.
 
     A track of one place is a vehicle that holds there; any other track ends on the ground. heights: whether both are
     known; if not, only the horizontal distance counts.

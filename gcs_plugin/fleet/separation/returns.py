@@ -68,13 +68,10 @@ class Returns:
         self._thread: threading.Thread | None = None
 
     def begin(self, systems: Mapping[str, int], number: str) -> Rows:
-        """Return vehicles in turn; answers once each was told to return or to hold.
-
-        Args:
-            systems: system ids by the vehicles' ids. number: of the command.
+        """Return vehicles in turn, by system ids of their ids; answers once each was told to return or to hold.
 
         Returns:
-            A row a vehicle, as for a command. One that does not acknowledge that it is to hold is sent home.
+            A row a vehicle, as for a command (`number`). One that does not acknowledge that it is to hold is sent home.
         """
         with self._lock:  # an earlier order ends; what others command from now on comes before this one
             self._order, self._waits = None, {}

@@ -42,11 +42,7 @@ class TimedFlight:
 
 @dataclass(frozen=True, slots=True)
 class SeparationFindings:
-    """Findings by system id, in words.
-
-    Attributes:
-        near: whom a vehicle comes too near. unexamined: what could not be examined.
-    """
+    """By system id, in words: whom a vehicle comes too near, and what could not be examined."""
 
     near: Mapping[int, str] = field(default_factory=dict)
     unexamined: Mapping[int, str] = field(default_factory=dict)
@@ -66,11 +62,7 @@ def flights_of(
 
 
 def others_of(vehicles: "Mapping[int, Vehicle]", waiting: Mapping[int, float]) -> dict[int, TimedFlight]:
-    """The flights of other vehicles: of those in the air, and of those whose takeoff waits.
-
-    Args:
-        vehicles: the others. waiting: seconds until the takeoff of those that wait.
-    """
+    """The flights of other vehicles: of those in the air, and of those whose takeoff waits for so many seconds."""
     found = {}
     for s, vehicle in vehicles.items():
         if s in waiting:
@@ -87,9 +79,7 @@ def separation_of(
 ) -> SeparationFindings:
     """Which vehicles come too near each other; takes a second or more for a large swarm.
 
-    Args:
-        flights: by system id. name: of a vehicle by its system id.
-        apart: how far apart the plan keeps its own vehicles, None for the default, which holds for all others.
+    `apart`: how far apart the plan keeps its own vehicles, None for the default, which holds for all others.
     """
     known = {s: flight for s, flight in flights.items() if flight.mission is not None}
     found: dict[int, list[str]] = {}

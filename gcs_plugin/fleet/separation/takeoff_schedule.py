@@ -17,11 +17,9 @@ _MOVED_S: Final = 0.5
 
 @dataclass(slots=True)
 class TakeoffSchedule:
-    """Takeoffs under way.
+    """Takeoffs under way: start times of the waiting and of the flying vehicles, on the caller's clock.
 
     Attributes:
-        waiting: start time of each waiting vehicle, on the caller's clock.
-        flown: start time of each flying vehicle.
         airspace: their missions; None where they are not known, then times are only kept, not moved.
     """
 
