@@ -3,7 +3,7 @@
 import abc
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from gcs_plugin.config import HEARING
 from gcs_plugin.fleet.commands import Order, Verb
@@ -14,13 +14,11 @@ from gcs_plugin.fleet.separation.takeoff_schedule import TakeoffSchedule
 from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.mavlink import Autopilot, Message
 from gcs_plugin.mission.exchange import Outcome, Verdict
+from gcs_plugin.mission.geofence import FenceZone
 from gcs_plugin.mission.items import Mission
 from gcs_plugin.mission.plan_folder import NO_NEEDS, PlanNeeds
-
-if TYPE_CHECKING:
-    from gcs_plugin.mission.geofence import FenceZone
-    from gcs_plugin.mission.start_dialogue import Standing
-    from gcs_plugin.mission.track import Airspace
+from gcs_plugin.mission.start_dialogue import Standing
+from gcs_plugin.mission.track import Airspace
 
 Report = Callable[[str, int, int], None]
 Say = Callable[[str], None]
@@ -110,7 +108,7 @@ class Backend(abc.ABC):
         """Download the missions of vehicles, all at the same time; None for a vehicle that does not answer."""
 
     @abc.abstractmethod
-    def zones(self, systems: Collection[int], report: Report) -> dict[int, "tuple[FenceZone, ...]"]:
+    def zones(self, systems: Collection[int], report: Report) -> dict[int, tuple[FenceZone, ...]]:
         """Download the zones of geofences; without those of vehicles that do not answer."""
 
     def check(
@@ -122,7 +120,7 @@ class Backend(abc.ABC):
         legal_height_m: float,
         *,
         needs: PlanNeeds = NO_NEEDS,
-        zones: "Mapping[int, tuple[FenceZone, ...]] | None" = None,
+        zones: Mapping[int, tuple[FenceZone, ...]] | None = None,
     ) -> list[Check]:
         """Preflight check of vehicles with their present telemetry; for the values see `preflight_all`."""
         vehicles = {s: self.vehicle(s) for s in systems}
@@ -144,9 +142,9 @@ class Backend(abc.ABC):
         verb: Verb,
         delays: Mapping[int, float],
         say: Say,
-        airspace: "Airspace | None" = None,
+        airspace: Airspace | None = None,
         *,
-        standing: "Mapping[int, Standing] | None" = None,
+        standing: Mapping[int, Standing] | None = None,
         missions: "Mapping[int, Mission] | None" = None,
         pump: Callable[[float], None] | None = None,
     ) -> dict[int, Order]:
@@ -212,7 +210,7 @@ def command_all(
     begin: Callable[[int], Order],
     pump: Callable[[float], None],
     say: Say,
-    airspace: "Airspace | None",
+    airspace: Airspace | None,
 ) -> dict[int, Order]:
     """Send one command to each vehicle at its time and wait for all outcomes; see `Backend.command`."""
     schedule = TakeoffSchedule.of(delays, time.monotonic(), airspace)

@@ -5,16 +5,14 @@ import threading
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import Any, Final, TypeVar
 
 from gcs_plugin.backends.backend import Backend, Say
 from gcs_plugin.fleet.commands import CommandResult, Order, Verb, new_id
 from gcs_plugin.fleet.separation.returns import Returns
+from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.mavlink import Message
 from gcs_plugin.mission.exchange import Outcome, Verdict
-
-if TYPE_CHECKING:
-    from gcs_plugin.fleet.vehicle_state import Vehicle
 
 Result = TypeVar("Result")
 
@@ -79,7 +77,7 @@ class InTurn:
     # -- what returns ask of the vehicles -----------------------------------------------------------------------------
 
     @property
-    def vehicles(self) -> "Mapping[int, Vehicle]":
+    def vehicles(self) -> Mapping[int, Vehicle]:
         """The backend's."""
         return self._backend.vehicles()
 

@@ -1,13 +1,11 @@
 """What happens to the vehicles of a fleet, as values and in words."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.mission.completion import MissionEvent
 from gcs_plugin.mission.flight_modes import HOLDS
-
-if TYPE_CHECKING:
-    from gcs_plugin.fleet.vehicle_state import Vehicle
 
 _WORDS: Final = {
     MissionEvent.STARTED: "has started its mission",
@@ -43,7 +41,7 @@ class FleetEvent:
     severity: int = 6
 
 
-def mission_event(event: MissionEvent, vehicle: "Vehicle") -> tuple[str, str]:
+def mission_event(event: MissionEvent, vehicle: Vehicle) -> tuple[str, str]:
     """Kind and words of what has happened to a vehicle's mission."""
     if event is MissionEvent.ABORTED:
         flown = vehicle.detector.flown
@@ -53,7 +51,7 @@ def mission_event(event: MissionEvent, vehicle: "Vehicle") -> tuple[str, str]:
     return event.value, _WORDS[event]
 
 
-def _left(vehicle: "Vehicle") -> str:
+def _left(vehicle: Vehicle) -> str:
     """Why a vehicle is off its mission, as far as its mode tells; that may come a second later than its mission's."""
     if vehicle.failsafe:
         return "has left its mission in a failsafe"

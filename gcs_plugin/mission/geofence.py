@@ -3,13 +3,10 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import Any, Final, Literal
 
 from gcs_plugin.links.mavlink import dialect
-from gcs_plugin.mission.items import MissionItem
-
-if TYPE_CHECKING:
-    from gcs_plugin.mission.items import Mission
+from gcs_plugin.mission.items import Mission, MissionItem
 
 _ROUNDING_M: Final = 0.5
 """A way along the edge of a zone may lie so far on the wrong side: places are rounded."""
@@ -45,7 +42,7 @@ class FenceZone:
         return {"kind": self.kind, "center": list(self.points[0]), "radius_m": self.radius_m}
 
 
-def breach(mission: "Mission", zones: "Sequence[FenceZone]", *, in_all: bool = False) -> str:
+def breach(mission: Mission, zones: "Sequence[FenceZone]", *, in_all: bool = False) -> str:
     """Where a mission leaves the zones it must stay inside of, or enters others, in words; empty if it keeps to them.
 
     Args:

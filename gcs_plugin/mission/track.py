@@ -11,7 +11,7 @@ wind, or a speed that it does not reach, is where others do not expect it.
 import math
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import KW_ONLY, dataclass, field, replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,14 +27,13 @@ from gcs_plugin.mission.items import (
     RTL,
     TAKEOFFS,
     WAYPOINT,
+    Mission,
+    MissionItem,
 )
 from orthoswarm.config import active
 from orthoswarm.config.autopilot import AutopilotConfig
 from orthoswarm.model.earth import DEGREE_M
 from orthoswarm.model.plan import Apart
-
-if TYPE_CHECKING:
-    from gcs_plugin.mission.items import Mission, MissionItem
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -98,7 +97,7 @@ class Track:
         return start_slack_s(self.pad(radius_m), self.autopilot)
 
 
-def flight_path(mission: "Mission", origin: tuple[float, float]) -> tuple[Array, Array, float]:
+def flight_path(mission: Mission, origin: tuple[float, float]) -> tuple[Array, Array, float]:
     """The points of a mission, float64 (n, 3): east, north, height in metres; the wait before each, s; speed in m/s.
 
     Args:
@@ -134,7 +133,7 @@ def flight_path(mission: "Mission", origin: tuple[float, float]) -> tuple[Array,
     return np.array(points, float).reshape(-1, 3), before, speed
 
 
-def _flown(mission: "Mission") -> "Iterator[MissionItem]":
+def _flown(mission: Mission) -> Iterator[MissionItem]:
     """The items in the order in which they are flown, with jumps carried out."""
     items, seq, jumped = mission.items, mission.first_seq, dict[int, int]()
     for _ in range(_MOST_FLOWN):
@@ -151,7 +150,7 @@ def _flown(mission: "Mission") -> "Iterator[MissionItem]":
         seq += 1
 
 
-def track_of(mission: "Mission", origin: tuple[float, float]) -> Track:
+def track_of(mission: Mission, origin: tuple[float, float]) -> Track:
     """A mission as positions over time."""
     from orthoswarm.planning.sorties.flight_time import Motion
 
@@ -163,31 +162,31 @@ def track_of(mission: "Mission", origin: tuple[float, float]) -> Track:
     return Track(motion.places(points, waits, STEP_S), motion.autopilot)
 
 
-def _autopilot_of(mission: "Mission") -> AutopilotConfig:
+def _autopilot_of(mission: Mission) -> AutopilotConfig:
     from orthoswarm.planning.sorties.flight_time import autopilot_config
 
     return autopilot_config(mission.autopilot.value)
 
 
-def flight_seconds(mission: "Mission") -> float:
+def flight_seconds(mission: Mission) -> float:
     """Duration of a mission by the planner's model, seconds."""
     home = home_of(mission)
     return 0.0 if home is None else STEP_S * max(0, len(track_of(mission, home).places) - 1)
 
 
-def fastest_m_s(mission: "Mission") -> float | None:
+def fastest_m_s(mission: Mission) -> float | None:
     """The greatest speed that a mission asks for, None if it leaves that to the vehicle."""
     speeds = [item.params[1] for item in mission.items if item.command == CHANGE_SPEED and item.params[1] > 0.0]
     return max(speeds, default=None)
 
 
-def heights_m(mission: "Mission") -> "list[tuple[MissionItem, float]]":
+def heights_m(mission: Mission) -> list[tuple[MissionItem, float]]:
     """The items of a mission that have a place, each with its height above takeoff, metres."""
     base = _ground_m(mission)
     return [(i, _height_m(i, base)) for i in mission.items[mission.first_seq :] if i.is_nav and i.has_place]
 
 
-def highest_m(mission: "Mission") -> float | None:
+def highest_m(mission: Mission) -> float | None:
     """The greatest height above takeoff in a mission, None if it contains none."""
     return max((height for _, height in heights_m(mission)), default=None)
 
@@ -231,7 +230,7 @@ class Airspace:
     @classmethod
     def of(
         cls,
-        missions: Mapping[int, "Mission"],
+        missions: Mapping[int, Mission],
         levels_m: Mapping[int, float] | None = None,
         apart: Apart | None = None,
     ) -> "Airspace":
@@ -348,25 +347,25 @@ def near_samples(one: Track, other: Track, distance_m: float, height_m: float | 
     return i[near], j[near]
 
 
-def takeoff_place(mission: "Mission") -> tuple[float, float] | None:
+def takeoff_place(mission: Mission) -> tuple[float, float] | None:
     """The place that the takeoff of a mission states, degrees; None if it states none."""
     flown = mission.items[mission.first_seq :]
     return next((item.place for item in flown if item.command in TAKEOFFS and item.place), None)
 
 
-def home_of(mission: "Mission") -> tuple[float, float] | None:
+def home_of(mission: Mission) -> tuple[float, float] | None:
     """Where a mission takes off, degrees: its takeoff's place, ArduPilot's item 0, or the first waypoint."""
     home = mission.items[: mission.first_seq]
     places = [takeoff_place(mission), *(i.place for i in home), *(i.place for i in mission.items if i.has_place)]
     return next(filter(None, places), None)
 
 
-def _height_m(item: "MissionItem", base_m: float) -> float:
+def _height_m(item: MissionItem, base_m: float) -> float:
     """Height of an item above takeoff, which lies at `base_m` above the sea; metres."""
     return item.z - (base_m if item.plain_frame == FRAME_GLOBAL else 0.0)
 
 
-def _ground_m(mission: "Mission") -> float:
+def _ground_m(mission: Mission) -> float:
     """The level of the takeoff above the sea, for items that say their altitude that way."""
     return mission.items[0].z if mission.first_seq and mission.items else 0.0
 
@@ -387,7 +386,7 @@ class Lateness:
         behind: True while it is later than plans allow for.
     """
 
-    mission: "Mission"
+    mission: Mission
     late_s: float = field(default=0.0, init=False)
     behind: bool = field(default=False, init=False)
     _track: Track | None = field(default=None, init=False)

@@ -10,7 +10,7 @@ import math
 import time
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
@@ -18,14 +18,12 @@ from gcs_plugin.config import LIMITS, RETURN
 from gcs_plugin.fleet.autopilot_settings import Setting
 from gcs_plugin.fleet.fence_limits import fence_limits
 from gcs_plugin.fleet.flight_state import Word, flight_state
+from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.flight_modes import why_no_missions
 from gcs_plugin.mission.track import STEP_S, Array, Track, metres, near_samples
 from orthoswarm.config import active
 from orthoswarm.model.earth import distance_m
-
-if TYPE_CHECKING:
-    from gcs_plugin.fleet.vehicle_state import Vehicle
 
 _GOES_HOME: Final = frozenset({Word.RETURNING, Word.LANDING})
 
@@ -190,7 +188,7 @@ class ReturnOrder:
         return vehicle.goes_home or self._clock() - self._sent.get(system, -math.inf) < RETURN.shows_s
 
 
-def aloft_of(vehicles: "Mapping[int, Vehicle]", now: float) -> dict[int, Aloft]:
+def aloft_of(vehicles: Mapping[int, Vehicle], now: float) -> dict[int, Aloft]:
     """The vehicles in the air, by system id, at a time of the fleet's clock; in the fleet's thread."""
     known = {s: v for s, v in vehicles.items() if v.flying}
     places = (place for v in known.values() if (place := _place(v)) is not None)
@@ -210,20 +208,20 @@ def aloft_of(vehicles: "Mapping[int, Vehicle]", now: float) -> dict[int, Aloft]:
     }
 
 
-def _hold(vehicle: "Vehicle") -> Hold:
+def _hold(vehicle: Vehicle) -> Hold:
     """A pause leaves ArduPilot in AUTO or GUIDED, or in the mode that holds; one that cannot hover circles in that."""
     modes, circles = vehicle.modes, bool(why_no_missions(vehicle.kind))
     paused = vehicle.custom_mode in (modes.mission, modes.ready, modes.hold)
     return Hold(vehicle.mode, None if circles else _place(vehicle), paused, circles or vehicle.still_s > 0.0)
 
 
-def _goes_home(vehicle: "Vehicle") -> bool:
+def _goes_home(vehicle: Vehicle) -> bool:
     """Whether its mode shows that it returns or lands. On a mission that is not known one that sinks may do neither."""
     unknown = vehicle.mission is None and vehicle.custom_mode == vehicle.modes.mission
     return not unknown and flight_state(vehicle).word in _GOES_HOME
 
 
-def way_home(vehicle: "Vehicle", origin: tuple[float, float]) -> Track | None:
+def way_home(vehicle: Vehicle, origin: tuple[float, float]) -> Track | None:
     """Where a vehicle is from now on if it is told to return, or does; None where its home or place is not known.
 
     Args:
@@ -248,7 +246,7 @@ def way_home(vehicle: "Vehicle", origin: tuple[float, float]) -> Track | None:
     return Track(motion.places(points[kept], None, STEP_S), motion.autopilot, vehicle.home_alt_m)
 
 
-def return_height_m(vehicle: "Vehicle", away_m: float) -> float:
+def return_height_m(vehicle: Vehicle, away_m: float) -> float:
     """The height above home at which a vehicle flies home (ArduCopter's mode_rtl.cpp, PX4's rtl.cpp).
 
     Args:
@@ -266,7 +264,7 @@ def return_height_m(vehicle: "Vehicle", away_m: float) -> float:
     return max(climbed_m, min(least_m, limit_m))
 
 
-def _return_speed_m_s(vehicle: "Vehicle") -> float:
+def _return_speed_m_s(vehicle: Vehicle) -> float:
     """The speed at which a vehicle flies home, metres per second."""
     back, mission = vehicle.settings.get(Setting.RETURN_SPEED), vehicle.settings.get(Setting.SPEED)
     if back is not None and back.value > 0.0:
@@ -276,7 +274,7 @@ def _return_speed_m_s(vehicle: "Vehicle") -> float:
     return RETURN.ardupilot_m_s if mission is None else mission.value
 
 
-def _height_known(vehicle: "Vehicle") -> bool:
+def _height_known(vehicle: Vehicle) -> bool:
     """Whether the height of its way home is known: it has told its return height, or it is landing."""
     how = vehicle.settings.get(Setting.RETURN_TYPE)
     told = Setting.RETURN_HEIGHT in vehicle.settings and not (how is not None and how.returns)
@@ -300,13 +298,13 @@ def apart(one: Track, other: Track, *, heights: bool = True) -> bool:
     return not bool((np.abs(i - j) <= slack_s / STEP_S).any())
 
 
-def _place(vehicle: "Vehicle") -> tuple[float, float] | None:
+def _place(vehicle: Vehicle) -> tuple[float, float] | None:
     """Latitude and longitude in degrees, None if they are not known."""
     known = vehicle.lat_deg is not None and vehicle.lon_deg is not None
     return (vehicle.lat_deg or 0.0, vehicle.lon_deg or 0.0) if known else None
 
 
-def _point(vehicle: "Vehicle", origin: tuple[float, float]) -> Array:
+def _point(vehicle: Vehicle, origin: tuple[float, float]) -> Array:
     """East, north, height in metres, float64 (1, 3); no place at all if it is not known."""
     place = _place(vehicle)
     if place is None:

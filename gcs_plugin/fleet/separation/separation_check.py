@@ -7,16 +7,14 @@ the levels of their homes (`Airspace`). What cannot be followed so is said: it w
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from gcs_plugin.fleet.flight_state import Word, flight_state
 from gcs_plugin.fleet.separation.separation_watch import number_name
+from gcs_plugin.fleet.vehicle_state import Vehicle
+from gcs_plugin.mission.items import Mission
 from gcs_plugin.mission.track import STEP_S, Airspace, home_of, metres, track_of
-
-if TYPE_CHECKING:
-    from gcs_plugin.fleet.vehicle_state import Vehicle
-    from gcs_plugin.mission.items import Mission
-    from orthoswarm.model.plan import Apart
+from orthoswarm.model.plan import Apart
 
 _PLANNED_SHARE: Final = 0.95
 """Share of the distance that counts between missions of one plan, which was made with other samples."""
@@ -33,7 +31,7 @@ class TimedFlight:
         examined: whether the vehicle is asked about; others are there only to be kept apart from.
     """
 
-    mission: "Mission | None"
+    mission: Mission | None
     start_s: float
     alt_m: float | None = None
     planned: bool = False
@@ -49,9 +47,9 @@ class SeparationFindings:
 
 
 def flights_of(
-    vehicles: "Mapping[int, Vehicle]",
-    missions: "Mapping[int, Mission]",
-    stored: "Mapping[int, Mission]",
+    vehicles: Mapping[int, Vehicle],
+    missions: Mapping[int, Mission],
+    stored: Mapping[int, Mission],
     starts: Mapping[int, float],
 ) -> dict[int, TimedFlight]:
     """The flights of vehicles that are to start; arguments as for `preflight_all`."""
@@ -61,7 +59,7 @@ def flights_of(
     }
 
 
-def others_of(vehicles: "Mapping[int, Vehicle]", waiting: Mapping[int, float]) -> dict[int, TimedFlight]:
+def others_of(vehicles: Mapping[int, Vehicle], waiting: Mapping[int, float]) -> dict[int, TimedFlight]:
     """The flights of other vehicles: of those in the air, and of those whose takeoff waits for so many seconds."""
     found = {}
     for s, vehicle in vehicles.items():
@@ -75,7 +73,7 @@ def others_of(vehicles: "Mapping[int, Vehicle]", waiting: Mapping[int, float]) -
 
 
 def separation_of(
-    flights: Mapping[int, TimedFlight], name: Callable[[int], str] = number_name, apart: "Apart | None" = None
+    flights: Mapping[int, TimedFlight], name: Callable[[int], str] = number_name, apart: Apart | None = None
 ) -> SeparationFindings:
     """Which vehicles come too near each other; takes a second or more for a large swarm.
 
@@ -102,7 +100,7 @@ def separation_of(
 
 @lru_cache(maxsize=8)
 def _conflicts(
-    flights: tuple[tuple[int, TimedFlight], ...], apart: "Apart | None"
+    flights: tuple[tuple[int, TimedFlight], ...], apart: Apart | None
 ) -> tuple[tuple[int, int, float, float], ...]:
     """Both vehicles, the time and the distance; the same flights are asked about again and again before a start."""
     about = dict(flights)
@@ -118,7 +116,7 @@ def _conflicts(
     return tuple(row for row in found if about[row[0]].examined or about[row[1]].examined)
 
 
-def _elapsed_s(vehicle: "Vehicle", mission: "Mission") -> float:
+def _elapsed_s(vehicle: Vehicle, mission: Mission) -> float:
     """For how long a vehicle has been on its mission, from where it is."""
     origin = home_of(mission)
     if origin is None or vehicle.lat_deg is None or vehicle.lon_deg is None:
