@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from gcs_plugin.backends.backend import Backend
+from gcs_plugin.backends.backend import Backend, DirectBackend
 from gcs_plugin.mission.exchange import GROUND_STATION, Address
 from orthoswarm.model.errors import InputError
 
@@ -24,8 +24,6 @@ def open_backend(
         InputError: an address is wrong, or the backend lacks an option.
     """
     if name == "pymavlink":
-        from gcs_plugin.backends.direct import DirectBackend
-
         return DirectBackend(links, own=own, key=key, tlog=tlog)
     if name == "mavsdk":
         from gcs_plugin.backends.mavsdk import MavsdkBackend

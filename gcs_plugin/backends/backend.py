@@ -1,24 +1,31 @@
-"""The interface between the command line and vehicles, independent of the MAVLink library."""
+"""Vehicles as the command line sees them: the interface, and the default backend, our own links and protocols."""
 
 import abc
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 from gcs_plugin.config import HEARING
 from gcs_plugin.fleet.commands import Order, Verb
+from gcs_plugin.fleet.fleet import Fleet
 from gcs_plugin.fleet.fleet_events import FleetEvent
 from gcs_plugin.fleet.flight_state import Word, flight_state, summary
 from gcs_plugin.fleet.preflight import Check, preflight_all
+from gcs_plugin.fleet.separation.separation_watch import number_name
 from gcs_plugin.fleet.separation.takeoff_schedule import TakeoffSchedule
 from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.mavlink import Autopilot, Message
-from gcs_plugin.mission.exchange import Outcome, Verdict
-from gcs_plugin.mission.geofence import FenceZone
-from gcs_plugin.mission.items import Mission
+from gcs_plugin.links.transports import Link
+from gcs_plugin.mission.download import MissionDownload
+from gcs_plugin.mission.exchange import Address, Exchange, Outcome, Verdict
+from gcs_plugin.mission.geofence import FenceZone, zones_of
+from gcs_plugin.mission.items import Mission, MissionItem
 from gcs_plugin.mission.plan_folder import NO_NEEDS, PlanNeeds
 from gcs_plugin.mission.start_dialogue import Standing
 from gcs_plugin.mission.track import Airspace
+from orthoswarm.model.errors import OrthoSwarmError
 
 Report = Callable[[str, int, int], None]
 Say = Callable[[str], None]
@@ -148,13 +155,11 @@ class Backend(abc.ABC):
         missions: "Mapping[int, Mission] | None" = None,
         pump: Callable[[float], None] | None = None,
     ) -> dict[int, Order]:
-        """Send a command to vehicles and wait for the outcome of each.
+        """Send a command to vehicles, each so many seconds from now, and wait for the outcome of each.
 
         A failed start cancels the takeoffs that are still due; a late one delays them.
 
         Args:
-            verb: the command.
-            delays: seconds from now for each system id.
             say: called at once with each outcome and its consequences.
             airspace: the missions that are started, so that takeoffs that are still due can be delayed.
             standing, missions: of a start, what the vehicles were when it was given, and what was checked.
@@ -240,3 +245,103 @@ def command_all(
                 orders[cancelled] = unsent.end(text, Verdict.NOT_SENT)
                 say(text)
     return orders
+
+
+class DirectBackend(Backend):
+    """A backend over `Fleet`, which is polled during each call."""
+
+    name = "pymavlink"
+
+    def __init__(
+        self,
+        links: Iterable[Link | str],
+        *,
+        own: Address,
+        key: bytes | None = None,
+        tlog: Path | None = None,
+    ) -> None:
+        self.fleet = Fleet(links, own=own, key=key, tlog=tlog)
+        self.events: list[FleetEvent] = []
+        self.fleet.on_event(self.events.append)
+
+    def vehicles(self) -> Mapping[int, Vehicle]:
+        """The fleet's vehicles."""
+        return self.fleet.vehicles
+
+    def vehicle(self, system: int) -> Vehicle:
+        """One of them."""
+        return self.fleet.vehicle(system)
+
+    def is_known(self, vehicle: Vehicle) -> bool:
+        """Whether it has answered what the fleet asks at first."""
+        return vehicle.reported and bool(vehicle.landed)
+
+    def problems(self) -> list[str]:
+        """See `Fleet.problems`."""
+        return self.fleet.problems(number_name)
+
+    def upload(self, missions: Mapping[int, Mission], report: Report) -> dict[int, Outcome]:
+        """All uploads at the same time."""
+        begin = {s: (lambda s=s, m=m: self.fleet.upload(s, m)) for s, m in missions.items()}
+        return self._run(begin, "upload", report)
+
+    def stored(self, systems: Collection[int], report: Report) -> dict[int, Mission | None]:
+        """All downloads at the same time."""
+        items = self._downloaded(self.fleet.download, systems, report)
+        return {s: Mission(self.fleet.vehicles[s].autopilot, items[s]) if s in items else None for s in systems}
+
+    def zones(self, systems: Collection[int], report: Report) -> dict[int, tuple[FenceZone, ...]]:
+        """All downloads at the same time."""
+        found = self._downloaded(self.fleet.read_fence, systems, report)
+        return {system: tuple(zones_of(items)) for system, items in found.items()}
+
+    def _downloaded(
+        self, download: Callable[[int], MissionDownload], systems: Collection[int], report: Report
+    ) -> dict[int, tuple[MissionItem, ...]]:
+        """The lists that vehicles give, without those that do not."""
+        jobs: dict[int, MissionDownload] = {}
+
+        def begin(system: int) -> Exchange:
+            jobs[system] = download(system)
+            return jobs[system]
+
+        self._run({system: partial(begin, system) for system in systems}, "read", report)
+        return {system: tuple(job.items) for system, job in jobs.items() if job.items is not None}
+
+    def order(self, order: Order) -> Order:
+        """Give a command."""
+        return self.fleet.order(order)
+
+    def send(self, system: int, messages: Sequence[Message]) -> None:
+        """Send on the vehicle's best link."""
+        self.fleet.send(system, messages)
+
+    def pump(self, seconds: float) -> None:
+        """Poll the fleet."""
+        self.fleet.poll(seconds)
+
+    def close(self) -> None:
+        """Close the fleet."""
+        self.fleet.close()
+
+    def _run(
+        self,
+        begin: Mapping[int, Callable[[], Exchange]],
+        what: str,
+        report: Report,
+    ) -> dict[int, Outcome]:
+        """Begin all exchanges and poll until each has ended."""
+        outcomes: dict[int, Outcome] = {}
+        jobs: dict[int, Exchange] = {}
+        for system, start in begin.items():
+            try:
+                jobs[system] = start()
+            except OrthoSwarmError as error:
+                outcomes[system] = Outcome(ok=False, text=str(error))
+        while len(outcomes) < len(begin):
+            self.fleet.poll(0.2)
+            for system, job in jobs.items():
+                if job.outcome is not None and system not in outcomes:
+                    outcomes[system] = job.outcome
+            report(what, len(outcomes), len(begin))
+        return outcomes

@@ -251,33 +251,29 @@ class Fleet:
         return self._dialogues.reads(system)
 
     def _read(self, vehicle: Vehicle, list_type: int = MISSION) -> MissionDownload:
-        window = AT_ONCE[vehicle.autopilot]
-        job = MissionDownload(
-            vehicle.address, self.own, patience_s=_READ_S, list_type=list_type, background=True, window=window
-        )
-        return self.begin(job)
+        to, window = vehicle.address, AT_ONCE[vehicle.autopilot]
+        background = MissionDownload(to, self.own, _READ_S, list_type=list_type, background=True, window=window)
+        return self.begin(background)
 
     def start(self, system: int) -> Exchange:
         """Start a vehicle's mission from the beginning, see `mission.start_dialogue`."""
-        exchange = self._start(Order(verb="start", system=system, given_s=self._clock()))
-        exchange.expires = self._clock() + COMMAND.fresh_s
-        return self.begin(exchange)
+        return self._now(self._start(Order(verb="start", system=system, given_s=self._clock())))
 
     def pause(self, system: int) -> Exchange:
         """Make a vehicle hold its position."""
-        return self._now("pause", system)
+        return self._now(self._dialogue("pause", system))
 
     def resume(self, system: int) -> Exchange:
         """Make a vehicle continue what was paused: its mission, or its way home."""
-        return self._now("resume", system)
+        return self._now(self._dialogue("resume", system))
 
     def rtl(self, system: int) -> Exchange:
         """Make a vehicle fly home and land."""
-        return self._now("rtl", system)
+        return self._now(self._dialogue("rtl", system))
 
     def land(self, system: int) -> Exchange:
         """Make a vehicle land at its position."""
-        return self._now("land", system)
+        return self._now(self._dialogue("land", system))
 
     def memory(self) -> dict[int, dict[str, Any]]:
         """State of each vehicle's mission, as JSON values by system id; for `remembered` after a restart."""
@@ -322,22 +318,13 @@ class Fleet:
             raise OrthoSwarmError(f"vehicle {system} {why}")
         return vehicle
 
-    def _now(self, verb: Verb, system: int) -> Exchange:
-        """A command given now.
-
-        Raises:
-            OrthoSwarmError: it cannot be given.
-        """
-        exchange = self._dialogue(verb, system)
+    def _now(self, exchange: Exchange) -> Exchange:
+        """Begin what is asked for now."""
         exchange.expires = self._clock() + COMMAND.fresh_s
         return self.begin(exchange)
 
     def _dialogue(self, verb: Verb, system: int) -> Exchange:
-        """The dialogue for a command, not started yet.
-
-        Raises:
-            OrthoSwarmError: it cannot be given.
-        """
+        """The dialogue for a command, not started yet; raises OrthoSwarmError where it cannot be given."""
         vehicle = self._known(system) if verb in URGENT else self.vehicle(system)
         sure = not vehicle.claimants and self._clock() - vehicle.heard < _SURE_S
         starting = self._dialogues.starting(system)

@@ -19,16 +19,13 @@ Pair = tuple[int, int]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FleetEvent:
-    """Something that happened to a vehicle.
+    """Something that happened to a vehicle, with UTC epoch seconds, in one sentence.
 
     Attributes:
         kind: `found`, `lost`, `regained`, `rebooted`, `link` (commands go another way), `conflict` (several vehicles
             with one system id), `single` (no longer), `near` (too near another vehicle), `apart` (no longer), `behind`
             (later on its mission than plans allow for), `caught_up` (no longer), `danger` (`Vehicle.danger`), `safe`
             (no longer), `text`, or a mission's `started`, `suspended`, `resumed`, `complete`, `aborted`.
-        system: system id.
-        time_s: UTC epoch seconds.
-        text: one sentence.
         pair: the two that `near` and `apart` are about.
         severity: of a `text`, MAVLink's MAV_SEVERITY (0 emergency ... 6 information).
     """

@@ -92,9 +92,7 @@ def key_from(text: bytes) -> bytes:
 def find_key(path: Path | None = None, environment: Mapping[str, str] = os.environ) -> bytes | None:
     """The signing key from a file, else from the environment; None where nothing is set.
 
-    Args:
-        path: key file, before ORTHOSWARM_SIGNING_KEY_FILE and ORTHOSWARM_SIGNING_KEY of the environment.
-        environment: the environment.
+    A named file counts before ORTHOSWARM_SIGNING_KEY_FILE, that before ORTHOSWARM_SIGNING_KEY.
 
     Raises:
         InputError: the file cannot be read, or the key is empty.

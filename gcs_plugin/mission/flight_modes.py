@@ -17,13 +17,12 @@ def _px4(main: int, sub: int = 0) -> int:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Modes:
-    """The modes of one kind of vehicle.
+    """The modes of one kind of vehicle, and all that have a name here.
 
     Attributes:
         ready: stays put and lets itself be armed, before a mission is started.
         hold: stays where it is in the air, whatever the sticks say.
         land: lands where it is; where there is no such mode, rtl.
-        names: all that have a name here.
     """
 
     mission: int

@@ -45,9 +45,7 @@ class FenceZone:
 def breach(mission: Mission, zones: "Sequence[FenceZone]", *, in_all: bool = False) -> str:
     """Where a mission leaves the zones it must stay inside of, or enters others, in words; empty if it keeps to them.
 
-    Args:
-        mission: the mission. zones: of the vehicle.
-        in_all: it must be in all inclusion zones, not just in any of them.
+    `in_all`: it must be in all inclusion zones, not just in any of them.
     """
     from shapely import LineString, Point, Polygon, intersection_all, union_all
 
@@ -77,8 +75,7 @@ def breach(mission: Mission, zones: "Sequence[FenceZone]", *, in_all: bool = Fal
 def zones_of(items: Sequence[MissionItem]) -> list[FenceZone]:
     """The zones of a fence list; return points and polygons that are not complete are left out.
 
-    Args:
-        items: as downloaded. A polygon is a row of vertices that each state how many it has (param1).
+    A polygon is a row of vertices that each state how many it has (param1).
     """
     zones: list[FenceZone] = []
     k = 0

@@ -100,8 +100,7 @@ class Track:
 def flight_path(mission: Mission, origin: tuple[float, float]) -> tuple[Array, Array, float]:
     """The points of a mission, float64 (n, 3): east, north, height in metres; the wait before each, s; speed in m/s.
 
-    Args:
-        mission: the mission. origin: latitude and longitude in degrees of east 0, north 0.
+    The origin of east and north is a latitude and longitude in degrees.
     """
     points: list[tuple[float, float, float]] = []
     waits: dict[int, float] = {}
@@ -290,8 +289,7 @@ class Airspace:
     ) -> list[tuple[int, int, float, float]]:
         """Pairs that come too close with these starts: both vehicles, time on the starts' clock, distance in metres.
 
-        Args:
-            starts: takeoffs, seconds. but_among: pairs of these are left out.
+        Pairs of `but_among` are left out.
         """
         systems = sorted(set(starts) & set(self.tracks))
         found = []
@@ -406,11 +404,7 @@ class Lateness:
         return self._track.autopilot.schedule_slack_s if self._track is not None else float("inf")
 
     def look(self, time_s: float, lat_deg: float, lon_deg: float, height_m: float) -> None:
-        """Compare a position.
-
-        Args:
-            time_s: on the vehicle's clock. lat_deg, lon_deg: where it is. height_m: over its takeoff.
-        """
+        """Compare a position at a time of the vehicle's clock, seconds; degrees, and metres over its takeoff."""
         track = self._track
         if track is None or len(track.places) < 2:
             return

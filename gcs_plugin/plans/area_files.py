@@ -58,9 +58,10 @@ def read_shapes(path: Path, name: str | None = None) -> tuple[Shapes, list[Ring]
     if promised != kind:
         raise InputError(f"{name} is {promised} by its name but holds {kind}; rename it or give the right file")
     if kind == "a GeoPackage":
-        return read_geopackage(path, name), []
-    if kind == "a zipped shapefile":
-        return read_zipped_shapefile(path, name), []
+        return _shapes(str(path), name), []
+    if kind == "a zipped shapefile":  # in whatever folder of it
+        found = [_shapes(f"/vsizip/{{{path}}}/{info.filename}", name) for info in _inside(path, name, ".shp")]
+        return Shapes(tuple(p for s in found for p in s.polygons), tuple(line for s in found for line in s.lines)), []
     text = _text(path, name)
     if kind == "GeoJSON":
         return parse_geojson(text, name), []
@@ -164,37 +165,12 @@ def _is_mission(text: str, name: str) -> bool:
     return isinstance(document, dict) and document.get("fileType") == "Plan"
 
 
-def read_geopackage(path: Path, name: str) -> Shapes:
-    """Polygons and lines of all layers of a GeoPackage.
-
-    Args:
-        path: the file. name: how to call it in an error.
-
-    Raises:
-        InputError: OGR cannot read it, it says no coordinate system, or its coordinates are of no use.
-    """
-    return _shapes(str(path), name)
-
-
-def read_zipped_shapefile(path: Path, name: str) -> Shapes:
-    """Polygons and lines of the shapefiles in a ZIP, in whatever folder.
-
-    Args:
-        path: the ZIP. name: how to call it in an error.
-
-    Raises:
-        InputError: OGR cannot read it, a `.prj` is missing, or its coordinates are of no use.
-    """
-    with zipfile.ZipFile(path) as archive:
-        inside = [entry for entry in archive.namelist() if entry.lower().endswith(".shp")]
-    found = [_shapes(f"/vsizip/{{{path}}}/{entry}", name) for entry in inside]
-    return Shapes(
-        tuple(polygon for shapes in found for polygon in shapes.polygons),
-        tuple(line for shapes in found for line in shapes.lines),
-    )
-
-
 def _shapes(source: str, name: str) -> Shapes:
+    """Polygons and lines of all layers of a file that OGR reads.
+
+    Raises:
+        InputError: it cannot, the file says no coordinate system, or its coordinates are of no use.
+    """
     from pyogrio import list_layers
     from pyogrio.errors import DataLayerError, DataSourceError, FeatureError, FieldError, GeometryError
     from pyogrio.raw import read

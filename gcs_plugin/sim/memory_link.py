@@ -18,12 +18,7 @@ from gcs_plugin.sim.simulated_vehicle import SimVehicle
 
 @dataclass(slots=True)
 class VirtualClock:
-    """A clock that is set by hand.
-
-    Attributes:
-        now: seconds.
-        utc_0: UTC epoch seconds at 0.
-    """
+    """A clock in seconds that is set by hand; utc_0: UTC epoch seconds at 0."""
 
     now: float = 0.0
     utc_0: float = 1_700_000_000.0
@@ -38,12 +33,7 @@ class VirtualClock:
 
 
 class SimLink(Link):
-    """A link to simulated vehicles, each a separate peer.
-
-    Attributes:
-        vehicles: the vehicles.
-        up: from the ground to the vehicles; down: back.
-    """
+    """A link to simulated vehicles, each a separate peer: up from the ground to the vehicles, and down."""
 
     def __init__(
         self, vehicles: Sequence[SimVehicle], clock: VirtualClock, up: Faults = NO_FAULTS, down: Faults = NO_FAULTS
@@ -94,15 +84,7 @@ class SimLink(Link):
 
 
 class World:
-    """Simulated vehicles and a fleet that watches them, stepped together in virtual time.
-
-    Attributes:
-        vehicles: by system id.
-        fleet: the ground station.
-        clock: the time of both.
-        events: of the fleet.
-        link: the radio between them.
-    """
+    """Simulated vehicles, by system id, and a fleet that watches them, stepped together in virtual time."""
 
     def __init__(
         self, vehicles: Sequence[SimVehicle], up: Faults = NO_FAULTS, down: Faults = NO_FAULTS, **options: Any

@@ -247,11 +247,7 @@ def way_home(vehicle: Vehicle, origin: tuple[float, float]) -> Track | None:
 
 
 def return_height_m(vehicle: Vehicle, away_m: float) -> float:
-    """The height above home at which a vehicle flies home (ArduCopter's mode_rtl.cpp, PX4's rtl.cpp).
-
-    Args:
-        vehicle: in the air. away_m: its distance from home.
-    """
+    """The height above home at which it returns from so far away, metres (ArduCopter's mode_rtl.cpp, PX4's rtl.cpp)."""
     said = vehicle.settings.get
     height, climb, cone = said(Setting.RETURN_HEIGHT), said(Setting.RETURN_CLIMB), said(Setting.RETURN_CONE)
     if vehicle.autopilot is not Autopilot.ARDUPILOT:

@@ -19,7 +19,7 @@ class Near:
     """Two vehicles that are too near each other, or will be.
 
     Attributes:
-        one: system id. other: system id of the one that should be paused.
+        other: the one that should be paused.
         metres: horizontal distance. height_m: difference in height.
         ahead_s: in how many seconds, if both fly straight on; 0 for now.
         silent: vehicles of the two that do not report where they are, so that it is not known whether they are near.

@@ -53,9 +53,7 @@ class TakeoffSchedule:
     def started(self, system: int, now: float, name: Callable[[int], str], begun: float | None = None) -> list[str]:
         """A vehicle has taken off; returns the changes for others, in words.
 
-        Args:
-            system: its id. now: the time, on the caller's clock. name: of a vehicle, from its system id.
-            begun: when it began its mission, which is earlier, by its climb; default now.
+        `begun`: when it began its mission, which is earlier, by its climb; default now.
         """
         begun = now if begun is None else begun
         self._undecided.pop(system, None)
