@@ -293,11 +293,11 @@ class MavsdkBackend(Backend):
                 wrong = f"vehicle {system} could not be read back {refused}; upload again before flying"
                 continue
             found = difference(mission, stored.items)
-            if found is None:
+            if not found:
                 return Outcome(ok=True, text=f"vehicle {system} holds the mission: {len(mission)} items, read back")
             if refused:
-                return Outcome(ok=False, text=f"vehicle {system} refused the mission {refused}; {found.text}")
-            wrong = f"vehicle {system} holds another mission than was sent: {found.text}; upload again before flying"
+                return Outcome(ok=False, text=f"vehicle {system} refused the mission {refused}; {found}")
+            wrong = f"vehicle {system} holds another mission than was sent: {found}; upload again before flying"
         return Outcome(ok=False, text=wrong)
 
     def _write(self, craft: _Craft, mission: Mission) -> str:

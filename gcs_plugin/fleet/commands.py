@@ -3,7 +3,7 @@
 import itertools
 import os
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 from gcs_plugin.config import COMMAND
 from gcs_plugin.mission.exchange import Outcome, Verdict
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from gcs_plugin.mission.start_dialogue import Standing
 
 Verb = Literal["start", "pause", "resume", "continue", "rtl", "land"]
-VERBS: Final[tuple[Verb, ...]] = ("start", "pause", "resume", "continue", "rtl", "land")
+VERBS: Final[tuple[Verb, ...]] = get_args(Verb)
 """`resume` ends a pause, whatever was paused; `continue` goes on with a mission that was left, for a return, too."""
 URGENT: Final[frozenset[str]] = frozenset({"pause", "rtl", "land"})
 """Commands that bring a flight to its end: no doubt about identity or link ever blocks them."""

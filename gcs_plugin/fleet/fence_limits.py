@@ -94,9 +94,8 @@ def in_all_zones(vehicle: Vehicle) -> bool:
 
 def fence_findings(vehicle: Vehicle, mission: Mission, limits: FenceLimits) -> list[FenceFinding]:
     """Where a mission goes near the limits of a geofence or beyond them; those beyond come first."""
-    place = None if vehicle.lat_deg is None or vehicle.lon_deg is None else (vehicle.lat_deg, vehicle.lon_deg)
     # On the ground its home is set where it stands as it arms.
-    home = (vehicle.home if vehicle.flying else place) or home_of(mission)
+    home = (vehicle.home if vehicle.flying else vehicle.place) or home_of(mission)
     if home is None:
         return []
     points, _, _ = flight_path(mission, home)

@@ -53,8 +53,7 @@ def continued(vehicle: Vehicle) -> Exchange:
 
 def _on_its_way(vehicle: Vehicle) -> bool:
     """Whether one that was only seen holding stands on the way to its mission's present item."""
-    mission, lat, lon = vehicle.mission, vehicle.lat_deg, vehicle.lon_deg
-    if vehicle.had_failsafe or mission is None or lat is None or lon is None:
+    if vehicle.had_failsafe or vehicle.mission is None or vehicle.place is None:
         return False
-    away_m = off_leg_m(mission, vehicle.mission_seq, (lat, lon))
+    away_m = off_leg_m(vehicle.mission, vehicle.mission_seq, vehicle.place)
     return away_m is not None and away_m < _ON_WAY_M

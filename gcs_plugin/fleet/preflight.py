@@ -209,9 +209,9 @@ def _home(vehicle: Vehicle, mission: Mission | None, wanted: Wanted) -> Item:
         return Item("home", Level.RED, f"{off}; plan from where it stands, or put it there")
     if vehicle.home is None:
         return Item("home", Level.WARNING, "not set yet; it is set when the vehicle arms")
-    if vehicle.lat_deg is None or vehicle.lon_deg is None:
+    if vehicle.place is None:
         return Item("home", Level.WARNING, "set, but the vehicle does not report its position")
-    away = distance_m(vehicle.lat_deg, vehicle.lon_deg, *vehicle.home[:2])
+    away = distance_m(*vehicle.place, *vehicle.home)
     if away > _HOME_M and not vehicle.flying:
         return Item("home", Level.WARNING, f"home is {away:.0f} m away from where it stands")
     return Item("home", Level.OK, "set")
@@ -221,8 +221,8 @@ def _off_start(vehicle: Vehicle, mission: Mission, wanted: Wanted) -> str:
     """How far a vehicle stands from where its mission takes off, in words; empty if it stands there."""
     first = mission.items[0] if mission.first_seq and mission.items and wanted.mission is not None else None
     place = takeoff_place(mission) or (None if first is None else first.place)  # a vehicle's own item 0 is its home
-    if place is not None and vehicle.lat_deg is not None and vehicle.lon_deg is not None:
-        away = distance_m(vehicle.lat_deg, vehicle.lon_deg, *place)
+    if place is not None and vehicle.place is not None:
+        away = distance_m(*vehicle.place, *place)
         if away > LIMITS.start_off_m:
             return f"it stands {away:.0f} m from where its mission takes off"
     if first is not None and first.z and first.plain_frame == FRAME_GLOBAL and vehicle.alt_m is not None:
@@ -272,8 +272,8 @@ def _mission(vehicle: Vehicle, wanted: Wanted) -> Item:
         return Item("mission", Level.RED, wrong)
     if wanted.mission is not None:
         found = difference(wanted.mission, held.items)
-        if found is not None:
-            return Item("mission", Level.RED, f"it does not hold this plan's mission ({found.text}); upload the plan")
+        if found:
+            return Item("mission", Level.RED, f"it does not hold this plan's mission ({found}); upload the plan")
         return Item("mission", Level.OK, "holds this plan's mission")
     return Item("mission", Level.OK, f"holds a mission of {len(held)} items")
 

@@ -278,12 +278,12 @@ class Reception:
             if watched.behind:
                 self._event("caught_up", vehicle, "is no longer behind its plan: it has ended its mission")
             return
-        if over or phase is Phase.SUSPENDED or mission is None or vehicle.lat_deg is None or vehicle.lon_deg is None:
+        if over or phase is Phase.SUSPENDED or mission is None or vehicle.place is None:
             return
         if watched is None:
             watched = self._lateness[vehicle.system] = Lateness(mission)
         was = watched.behind
-        watched.look(vehicle.time_boot_s, vehicle.lat_deg, vehicle.lon_deg, vehicle.height_m)
+        watched.look(vehicle.time_boot_s, *vehicle.place, vehicle.height_m)
         if watched.behind and not was:
             self._event("behind", vehicle, self.behind(vehicle.system))
         elif was and not watched.behind:

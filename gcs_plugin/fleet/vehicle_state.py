@@ -174,6 +174,11 @@ class Vehicle:
         """True if it is armed and, as far as is known, off the ground."""
         return self.armed and (self.in_air or (not self.landed and self.height_m > 1.5))
 
+    @property
+    def place(self) -> tuple[float, float] | None:
+        """Where it is, latitude and longitude in degrees; None if that is not known."""
+        return None if self.lat_deg is None or self.lon_deg is None else (self.lat_deg, self.lon_deg)
+
     def place_age_s(self, now: float) -> float:
         """Seconds since it reported where it is, or since it was heard, if that is longer ago."""
         return max(now - self.heard, self.streams.age_s(MESSAGE_IDS["GLOBAL_POSITION_INT"], now) or 0.0)
@@ -206,8 +211,7 @@ class Vehicle:
     @property
     def standing(self) -> Standing:
         """What a start that is given now relies on."""
-        placed = not self.flying and self.lat_deg is not None and self.lon_deg is not None
-        place = (self.lat_deg or 0.0, self.lon_deg or 0.0) if placed else None
+        place = None if self.flying else self.place
         return Standing(mode=self.custom_mode, armed=self.armed, place=place, touched=self.touched)
 
     def changed_since(self, then: Standing) -> str:
@@ -311,8 +315,8 @@ class Vehicle:
 
     def _heartbeat(self, m: Message) -> None:
         was, self.armed = self.armed, bool(m.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
-        if self.armed and not was and self.lat_deg is not None and self.lon_deg is not None and not self.in_air:
-            self.launch = self.lat_deg, self.lon_deg
+        if self.armed and not was and self.place is not None and not self.in_air:
+            self.launch = self.place
         changed = self.armed != was or self.custom_mode != int(m.custom_mode)
         self.touched += changed
         self.custom_mode, self.failsafe = int(m.custom_mode), int(m.system_status) in _CRITICAL
@@ -336,14 +340,14 @@ class Vehicle:
         self.velocity_m_s = (m.vx / 100.0, m.vy / 100.0, m.vz / 100.0)
         self.heading_rad = None if m.hdg == 65535 else math.radians(m.hdg / 100.0)
         self.time_boot_s = m.time_boot_ms / 1e3
-        if self.velocity_m_s[2] < _SINKS_M_S:
-            self._sinks_since = None
-        elif self._sinks_since is None or self._sinks_since > self.time_boot_s:
-            self._sinks_since = self.time_boot_s
-        if math.hypot(*self.velocity_m_s[:2]) > _STILL_M_S[0] or abs(self.velocity_m_s[2]) > _STILL_M_S[1]:
-            self._still_since = None
-        elif self._still_since is None or self._still_since > self.time_boot_s:
-            self._still_since = self.time_boot_s
+        moves = math.hypot(*self.velocity_m_s[:2]) > _STILL_M_S[0] or abs(self.velocity_m_s[2]) > _STILL_M_S[1]
+        self._sinks_since = self._since(self._sinks_since, self.velocity_m_s[2] >= _SINKS_M_S)
+        self._still_since = self._since(self._still_since, not moves)
+
+    def _since(self, before: float | None, holds: bool) -> float | None:
+        """Since when something holds on its clock, which may have gone back; None if it does not."""
+        now = self.time_boot_s
+        return None if not holds else now if before is None or before > now else before
 
     def _attitude(self, m: Message) -> None:
         self.roll_rad, self.pitch_rad, self.yaw_rad = m.roll, m.pitch, m.yaw

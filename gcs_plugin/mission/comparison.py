@@ -7,7 +7,6 @@ item 0 is its home. PX4 turns degrees into doubles and back.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from gcs_plugin.mission.items import (
     CHANGE_SPEED,
@@ -33,23 +32,15 @@ _PLACE_E7 = 2
 _ALTITUDE_M = 0.011
 
 
-@dataclass(frozen=True, slots=True)
-class Difference:
-    """Where two missions differ: the first item, None if the number of items differs, and what, in words."""
-
-    item: int | None
-    text: str
-
-
-def difference(mission: Mission, stored: Sequence[MissionItem]) -> Difference | None:
-    """The first relevant difference between a mission and the one stored in a vehicle, None if there is none."""
+def difference(mission: Mission, stored: Sequence[MissionItem]) -> str:
+    """The first relevant difference between a mission and the one stored in a vehicle, in words; empty if none."""
     if len(stored) != len(mission):
-        return Difference(None, f"{len(stored)} items are stored, not {len(mission)}")
+        return f"{len(stored)} items are stored, not {len(mission)}"
     for seq in range(mission.first_seq, len(stored)):
         text = _item_difference(mission.items[seq], stored[seq])
         if text:
-            return Difference(seq, f"item {seq} ({mission.items[seq].name}): {text}")
-    return None
+            return f"item {seq} ({mission.items[seq].name}): {text}"
+    return ""
 
 
 def _item_difference(sent: MissionItem, stored: MissionItem) -> str:

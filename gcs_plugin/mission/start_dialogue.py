@@ -90,8 +90,8 @@ class Expected:
         """Why the stored mission is not flown, in words; empty if it is the one."""
         if why := unflyable(stored.items, self.autopilot, in_air=self.in_air):
             return why
-        found = None if self.mission is None else difference(self.mission, stored.items)
-        return "" if found is None else f"no longer holds the mission that was checked ({found.text}); check it again"
+        found = "" if self.mission is None else difference(self.mission, stored.items)
+        return f"no longer holds the mission that was checked ({found}); check it again" if found else ""
 
 
 @dataclass(slots=True, kw_only=True)

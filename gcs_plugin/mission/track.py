@@ -305,9 +305,7 @@ class Airspace:
     def next_start(self, system: int, earliest_s: float, others: Mapping[int, float]) -> float:
         """The first time, not before `earliest_s`, at which a vehicle stays separated from others with fixed times.
 
-        Args:
-            system: the vehicle. earliest_s: on the clock of the others' starts.
-            others: the starts of those in the air, or of those that wait.
+        `others` are the starts of those in the air, or of those that wait, on one clock.
         """
         start = earliest_s
         known = {other: at for other, at in others.items() if other != system and other in self.tracks}

@@ -321,14 +321,14 @@ class MissionUpload(Exchange):
             self._reading, self.stage, self._clears = None, UploadStage.CLEAR, 0
             return messages + self._clear(now)
         wrong = difference(self.mission, reading.items)
-        if wrong is None:
+        if not wrong:
             self.stage = UploadStage.DONE
             self._end(True, f"vehicle {self.vehicle.system} holds the mission: {len(self.mission)} items, read back")
             return messages
         if self._doubt is not None:
             return messages + self._nack(self._doubt, now)
         self._mixtures += 1
-        self._mixed = f"holds another mission than was sent: {wrong.text}; upload again before flying"
+        self._mixed = f"holds another mission than was sent: {wrong}; upload again before flying"
         if self._mixtures >= _MIXTURES:
             self._fail(self._mixed)
         else:

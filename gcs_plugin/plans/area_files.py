@@ -90,11 +90,7 @@ def read_fences(path: Path) -> tuple[Fence, ...]:
 
 
 def _kind(path: Path, name: str) -> str:
-    """What a file is by its content.
-
-    Raises:
-        InputError: it cannot be read, is too large, or is nothing known.
-    """
+    """What a file is by its content; InputError if it cannot be read, is too large, or is nothing known."""
     try:
         if path.stat().st_size > _LARGEST_BYTES:
             raise InputError(f"{name} is larger than {_LARGEST_BYTES // 1_000_000} MB; give a simpler outline")
@@ -124,11 +120,7 @@ def _kind(path: Path, name: str) -> str:
 
 
 def _inside(path: Path, name: str, suffix: str) -> list[zipfile.ZipInfo]:
-    """The files in a ZIP with a suffix.
-
-    Raises:
-        InputError: it is broken, or unpacks to too much.
-    """
+    """The files in a ZIP with a suffix; InputError if it is broken, or unpacks to too much."""
     try:
         with zipfile.ZipFile(path) as archive:
             found = archive.infolist()
@@ -140,11 +132,7 @@ def _inside(path: Path, name: str, suffix: str) -> list[zipfile.ZipInfo]:
 
 
 def _text(path: Path, name: str) -> str:
-    """The text of a file, of a KMZ's first KML.
-
-    Raises:
-        InputError: it is not text.
-    """
+    """The text of a file, of a KMZ's first KML; InputError if it is not text."""
     try:
         data = path.read_bytes()
         if data.startswith(b"PK\x03\x04"):
@@ -197,11 +185,7 @@ def _shapes(source: str, name: str) -> Shapes:
 
 
 def _transformer(crs: str | None, name: str) -> "Transformer":
-    """From a coordinate system to longitude and latitude of WGS 84.
-
-    Raises:
-        InputError: the system is not said, or not known.
-    """
+    """From a coordinate system to longitude and latitude of WGS 84; InputError if it is not said, or not known."""
     from pyproj import Transformer
     from pyproj.exceptions import CRSError
 

@@ -397,7 +397,7 @@ class SimVehicle:
     def _position(self) -> Message | None:
         motion = self.flight.motion
         lat, lon = motion.chart.to_degrees(*motion.seen)
-        if not self._has_fix and self.autopilot is Autopilot.PX4:
+        if not self._has_fix and self.autopilot is Autopilot.PX4:  # PX4 says nothing, ArduCopter 0, 0
             return None
         if not self._has_fix:
             return dialect.MAVLink_global_position_int_message(self._boot_ms, 0, 0, 0, 0, 0, 0, 0, 65535)

@@ -191,8 +191,7 @@ class ReturnOrder:
 def aloft_of(vehicles: Mapping[int, Vehicle], now: float) -> dict[int, Aloft]:
     """The vehicles in the air, by system id, at a time of the fleet's clock; in the fleet's thread."""
     known = {s: v for s, v in vehicles.items() if v.flying}
-    places = (place for v in known.values() if (place := _place(v)) is not None)
-    origin = next(places, (0.0, 0.0))
+    origin = next((v.place for v in known.values() if v.place is not None), (0.0, 0.0))
     return {
         s: Aloft(
             place=Track(_point(v, origin), level_m=v.home_alt_m),
@@ -212,7 +211,7 @@ def _hold(vehicle: Vehicle) -> Hold:
     """A pause leaves ArduPilot in AUTO or GUIDED, or in the mode that holds; one that cannot hover circles in that."""
     modes, circles = vehicle.modes, bool(why_no_missions(vehicle.kind))
     paused = vehicle.custom_mode in (modes.mission, modes.ready, modes.hold)
-    return Hold(vehicle.mode, None if circles else _place(vehicle), paused, circles or vehicle.still_s > 0.0)
+    return Hold(vehicle.mode, None if circles else vehicle.place, paused, circles or vehicle.still_s > 0.0)
 
 
 def _goes_home(vehicle: Vehicle) -> bool:
@@ -229,7 +228,7 @@ def way_home(vehicle: Vehicle, origin: tuple[float, float]) -> Track | None:
     """
     from orthoswarm.planning.sorties.flight_time import Motion, autopilot_config
 
-    home, place = vehicle.home or vehicle.launch, _place(vehicle)
+    home, place = vehicle.home or vehicle.launch, vehicle.place
     if home is None or place is None:
         return None
     here, there = metres(*place, origin), metres(*home, origin)
@@ -294,15 +293,8 @@ def apart(one: Track, other: Track, *, heights: bool = True) -> bool:
     return not bool((np.abs(i - j) <= slack_s / STEP_S).any())
 
 
-def _place(vehicle: Vehicle) -> tuple[float, float] | None:
-    """Latitude and longitude in degrees, None if they are not known."""
-    known = vehicle.lat_deg is not None and vehicle.lon_deg is not None
-    return (vehicle.lat_deg or 0.0, vehicle.lon_deg or 0.0) if known else None
-
-
 def _point(vehicle: Vehicle, origin: tuple[float, float]) -> Array:
     """East, north, height in metres, float64 (1, 3); no place at all if it is not known."""
-    place = _place(vehicle)
-    if place is None:
+    if vehicle.place is None:
         return np.zeros((0, 3))
-    return np.array([(*metres(*place, origin), vehicle.height_m)])
+    return np.array([(*metres(*vehicle.place, origin), vehicle.height_m)])

@@ -119,7 +119,6 @@ def _conflicts(
 def _elapsed_s(vehicle: Vehicle, mission: Mission) -> float:
     """For how long a vehicle has been on its mission, from where it is."""
     origin = home_of(mission)
-    if origin is None or vehicle.lat_deg is None or vehicle.lon_deg is None:
+    if origin is None or vehicle.place is None:
         return 0.0
-    place = (*metres(vehicle.lat_deg, vehicle.lon_deg, origin), vehicle.height_m)
-    return track_of(mission, origin).elapsed_s(place)
+    return track_of(mission, origin).elapsed_s((*metres(*vehicle.place, origin), vehicle.height_m))
