@@ -16,11 +16,7 @@ _ON_THE_WAY_S = 1.0
 
 
 class Dialogues:
-    """All dialogues of a fleet that are under way (`jobs`).
-
-    Args:
-        vehicles: by system id. clock: monotonic seconds. signed: whether this station has a key.
-    """
+    """All dialogues of a fleet that are under way (`jobs`); `signed`: whether this station has a key."""
 
     def __init__(self, vehicles: Mapping[int, Vehicle], hub: Hub, clock: Callable[[], float], *, signed: bool) -> None:
         self._vehicles, self._hub, self._clock, self._signed = vehicles, hub, clock, signed

@@ -47,7 +47,6 @@ class Reception:
 
     Args:
         vehicles: by system id; found vehicles are added.
-        dialogues: those under way.
         remembered: states of detectors before a restart of this program, by system id.
         event: called with each event. wall: UTC epoch seconds.
 

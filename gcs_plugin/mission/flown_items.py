@@ -27,7 +27,6 @@ class FlownItems:
     Attributes:
         places: item -> latitude and longitude in degrees, of those that are flown between takeoff and landing.
         lines: items that end a line on which pictures are taken; without a camera's trigger, all places.
-        reached: items.
     """
 
     places: dict[int, tuple[float, float]]

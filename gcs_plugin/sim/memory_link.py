@@ -7,8 +7,9 @@ from typing import Any
 
 from gcs_plugin.fleet.fleet import Fleet
 from gcs_plugin.fleet.fleet_events import FleetEvent
-from gcs_plugin.links.mavlink import Message, dialect
+from gcs_plugin.links.mavlink import Message
 from gcs_plugin.links.packets import Framer
+from gcs_plugin.links.signing import Packer
 from gcs_plugin.links.transports import NEVER, Link, Peer
 from gcs_plugin.mission.completion import MissionEvent
 from gcs_plugin.mission.exchange import Address, Exchange, Outcome
@@ -42,7 +43,7 @@ class SimLink(Link):
         self.vehicles, self._clock = list(vehicles), clock
         self.up: Channel[tuple[int, bytes]] = Channel(faults=up)
         self.down: Channel[tuple[int, bytes]] = Channel(faults=down)
-        self._packers = [dialect.MAVLink(None, vehicle.system, 1) for vehicle in self.vehicles]
+        self._packers = [Packer(vehicle.system, 1) for vehicle in self.vehicles]
         self._framers = [Framer() for _ in self.vehicles]
 
     def open(self, selector: selectors.BaseSelector, now: float) -> None:
@@ -76,11 +77,9 @@ class SimLink(Link):
         yield from self.down.take(now)
 
     def _say(self, peer: int, messages: Sequence[Message], now: float) -> None:
-        packer = self._packers[peer]
         for message in messages:
-            raw = message.pack(packer)
+            raw = self._packers[peer].pack(message, self._clock.utc())
             self.down.put((peer, raw), now, len(raw))
-            packer.seq = (packer.seq + 1) & 0xFF
 
 
 class World:

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field, replace
 from random import Random
 from typing import Any, Final
 
-from gcs_plugin.links.mavlink import Autopilot, Message, dialect
+from gcs_plugin.links.mavlink import Autopilot, Message
 from gcs_plugin.links.packets import Framer
-from gcs_plugin.links.signing import Signing
+from gcs_plugin.links.signing import Packer, Signing
 from gcs_plugin.links.transports import Link, TcpLink, UdpLink, parse_link
 from gcs_plugin.mission.exchange import Address
 from gcs_plugin.sim.lossy_radio import NO_FAULTS, Channel, Faults
@@ -31,7 +31,7 @@ class _End:
     vehicles: list[SimVehicle]
     up: Channel[bytes]
     down: Channel[bytes]
-    packers: dict[int, Any]
+    packers: dict[int, Packer]
     signing: Signing | None
     framers: dict[Any, Framer] = field(default_factory=dict)
 
@@ -78,10 +78,8 @@ class SimSwarm:
         for number, group in enumerate(groups):
             link = _open(address, number)
             seeded = [Channel[bytes](faults=replace(faults, seed=faults.seed + 2 * number)) for faults in (up, down)]
-            packers = {vehicle.system: dialect.MAVLink(None, vehicle.system, 1) for vehicle in group}
-            for packer in packers.values():
-                packer.signing.secret_key, packer.signing.sign_outgoing = key, key is not None
             signing = Signing(key) if key else None
+            packers = {vehicle.system: Packer(vehicle.system, 1, signing) for vehicle in group}
             end = _End(link=link, vehicles=group, up=seeded[0], down=seeded[1], packers=packers, signing=signing)
             self._ends.append(end)
             self._by_link[link] = end
@@ -164,12 +162,8 @@ class SimSwarm:
         if not messages:
             return
         muted = self._muted.get(vehicle.system, 0.0) > now
-        packer = end.packers[vehicle.system]
         for message in messages:
-            if end.signing is not None:
-                packer.signing.timestamp = end.signing.next_timestamp(time.time())
-            raw = message.pack(packer)
-            packer.seq = (packer.seq + 1) & 0xFF
+            raw = end.packers[vehicle.system].pack(message, time.time())
             if muted:
                 continue
             if end.down.faults.any:

@@ -72,15 +72,12 @@ class Aloft:
 
 
 class ReturnOrder:
-    """Which of some vehicles may return now.
+    """Which of some vehicles, all in the air, may return now.
 
     Attributes:
         waits: vehicles that hold until their way is free, and whom each waits for (nobody before the first look).
         left: those that at the last look were found to follow another command, and what shows that, in words.
         heard_again: those that were lost, were heard again by the last look, and wait: nothing has told them to hold.
-
-    Args:
-        systems: the vehicles, all in the air. clock: monotonic seconds.
     """
 
     def __init__(self, systems: Collection[int], clock: Callable[[], float] = time.monotonic) -> None:
@@ -221,11 +218,7 @@ def _goes_home(vehicle: Vehicle) -> bool:
 
 
 def way_home(vehicle: Vehicle, origin: tuple[float, float]) -> Track | None:
-    """Where a vehicle is from now on if it is told to return, or does; None where its home or place is not known.
-
-    Args:
-        vehicle: in the air. origin: latitude and longitude in degrees of east 0, north 0.
-    """
+    """Where a vehicle in the air is from now on if it returns; None where its home or place is not known."""
     from orthoswarm.planning.sorties.flight_time import Motion, autopilot_config
 
     home, place = vehicle.home or vehicle.launch, vehicle.place
