@@ -19,7 +19,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from gcs_plugin.plans.gap_area import gap_area, read_gaps
+from gcs_plugin.plans.plan_request import gap_area, read_gaps
 from orthoswarm.coverage.camera_events import CameraEvent, missing_by_events
 from orthoswarm.coverage.coverage_files import write_gaps
 from orthoswarm.coverage.coverage_grid import Cells, CellState, CoverageGrid

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from gcs_plugin.backends.backend import Backend
+from gcs_plugin.backends.backend import Backend, DirectBackend
 from gcs_plugin.mission.exchange import GROUND_STATION, Address
 from orthoswarm.model.errors import InputError
 
@@ -18,21 +18,12 @@ def open_backend(
     key: bytes | None = None,
     tlog: Path | None = None,
 ) -> Backend:
-    """Open links with a backend.
-
-    Args:
-        name: `pymavlink` or `mavsdk`.
-        links: addresses (`links.parse_link`).
-        own: our address.
-        key: signing key (pymavlink only).
-        tlog: telemetry log (pymavlink only).
+    """Open links (`links.parse_link`) with a backend of NAMES; only pymavlink has a signing key and a telemetry log.
 
     Raises:
         InputError: an address is wrong, or the backend lacks an option.
     """
     if name == "pymavlink":
-        from gcs_plugin.backends.direct import DirectBackend
-
         return DirectBackend(links, own=own, key=key, tlog=tlog)
     if name == "mavsdk":
         from gcs_plugin.backends.mavsdk import MavsdkBackend

@@ -5,16 +5,14 @@ import threading
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import Any, Final, TypeVar
 
 from gcs_plugin.backends.backend import Backend, Say
 from gcs_plugin.fleet.commands import CommandResult, Order, Verb, new_id
 from gcs_plugin.fleet.separation.returns import Returns
+from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.mavlink import Message
 from gcs_plugin.mission.exchange import Outcome, Verdict
-
-if TYPE_CHECKING:
-    from gcs_plugin.fleet.vehicle_state import Vehicle
 
 Result = TypeVar("Result")
 
@@ -24,13 +22,10 @@ _name: Final = "vehicle {}".format
 
 
 class InTurn:
-    """A return in turn (`fleet.separation.returns`) that says what happens.
+    """A return in turn (`fleet.separation.returns`) that says what happens, a line at a time.
 
     Attributes:
         orders: the last command to each vehicle.
-
-    Args:
-        backend: of the vehicles. say: called with each line of progress.
     """
 
     def __init__(self, backend: Backend, say: Say) -> None:
@@ -48,10 +43,8 @@ class InTurn:
     def run(self, systems: Collection[int], seconds: float) -> None:
         """Send vehicles home in turn, until nobody waits any more; for at most so many seconds.
 
-        Those that wait when this ends, also by an exception, are left holding.
-
-        Args:
-            systems: their system ids. All that the backend hears are kept apart from.
+        Those that wait when this ends, also by an exception, are left holding. All that the backend hears are kept
+        apart from.
         """
         end = time.monotonic() + seconds
         self._read_last_items()
@@ -84,7 +77,7 @@ class InTurn:
     # -- what returns ask of the vehicles -----------------------------------------------------------------------------
 
     @property
-    def vehicles(self) -> "Mapping[int, Vehicle]":
+    def vehicles(self) -> Mapping[int, Vehicle]:
         """The backend's."""
         return self._backend.vehicles()
 

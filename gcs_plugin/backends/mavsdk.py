@@ -14,14 +14,15 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from gcs_plugin.backends.backend import ENDED, Backend, Report, coming_home
+from gcs_plugin.backends.backend import Backend, Report
 from gcs_plugin.config import HEARING
 from gcs_plugin.fleet.commands import URGENT, Order, Verb
 from gcs_plugin.fleet.fleet_events import FleetEvent, mission_event
 from gcs_plugin.fleet.going_on import continued, resumed
-from gcs_plugin.fleet.message_rates import Rates, Streams
+from gcs_plugin.fleet.heard_messages import HEARD, MESSAGE_IDS, rates_of
+from gcs_plugin.fleet.message_rates import Streams
 from gcs_plugin.fleet.vehicle_state import Vehicle
-from gcs_plugin.links.mavlink import Autopilot, Message, is_vehicle
+from gcs_plugin.links.mavlink import AUTOPILOT_COMPONENT, Autopilot, Message, is_vehicle
 from gcs_plugin.links.transports import parse_address
 from gcs_plugin.mission.comparison import difference
 from gcs_plugin.mission.completion import CompletionDetector, Phase
@@ -32,13 +33,12 @@ from gcs_plugin.mission.items import Mission, MissionItem
 from gcs_plugin.mission.start_dialogue import Expected, start_mission
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 
-_HEARD: Final = (
-    "HEARTBEAT", "COMMAND_ACK", "MISSION_CURRENT", "MISSION_ITEM_REACHED", "EXTENDED_SYS_STATE", "STATUSTEXT",
-    "GLOBAL_POSITION_INT", "SYS_STATUS", "GPS_RAW_INT", "CAMERA_FEEDBACK", "CAMERA_IMAGE_CAPTURED",
-    "EKF_STATUS_REPORT", "ESTIMATOR_STATUS", "HOME_POSITION", "PARAM_VALUE",
-    "BATTERY_STATUS",
-)  # fmt: skip
-_RATES: Final = Rates({33: 2.0, 42: 2.0, 245: 1.0, 1: 1.0, 24: 1.0}, {193: 1.0, 230: 1.0, 147: 1.0, 242: 0.2})
+# What pictures get their poses from: a telemetry log, of which there is none.
+_POSES: Final = frozenset(
+    MESSAGE_IDS[name] for name in ("ATTITUDE", "SYSTEM_TIME", "GIMBAL_DEVICE_ATTITUDE_STATUS", "DISTANCE_SENSOR")
+)
+_NAMES: Final = [name for name, kind in MESSAGE_IDS.items() if kind in HEARD.keys() - _POSES]
+_MOST_HZ: Final = 2.0
 _ATTEMPTS: Final = 4  # uploads until what is stored agrees
 
 
@@ -165,26 +165,12 @@ class MavsdkBackend(Backend):
         self._send(self._craft(system), messages)
 
     def watch(self, systems: Collection[int], seconds: float, report: Callable[[FleetEvent], None]) -> bool:
-        """Report events until all missions have ended and nobody flies home."""
+        """Read missions that are not known, whose last items decide how they end, and follow them."""
         for system in systems or list(self._crafts):
             detector = self._craft(system).vehicle.detector
             if not detector.knows and (mission := self._read(system)) is not None:
                 detector.knows_mission(mission)
-        end, reported = time.monotonic() + seconds, 0
-        while True:
-            for event in self.events[reported:]:
-                if event.system in systems or not systems:
-                    report(event)
-            reported = len(self.events)
-            followed = set(systems) or set(self._crafts)
-            ended = {event.system for event in self.events if event.kind in ENDED}
-            crafts = [craft for s, craft in self._crafts.items() if s in followed]
-            if followed and followed <= ended and not any(coming_home(craft.vehicle) for craft in crafts):
-                return True
-            if time.monotonic() >= end:
-                return False
-            self.look()
-            self.pump(0.2)
+        return super().watch(systems, seconds, report)
 
     # --- vehicles ---
 
@@ -219,16 +205,17 @@ class MavsdkBackend(Backend):
         if heartbeat.get_type() != "HEARTBEAT" or not is_vehicle(heartbeat, address.component):
             return None
         (system, direct), autopilot = self._systems[number], Autopilot.of(heartbeat)
+        rates = {k: hz for k, hz in rates_of(autopilot, _MOST_HZ).items() if k not in _POSES}
         vehicle = Vehicle(
             address=address,
             autopilot=autopilot,
             modes=modes_of(autopilot, int(heartbeat.type)),
             detector=CompletionDetector(autopilot=autopilot),
-            streams=Streams(vehicle=address, own=self._own, rates=_RATES.of(autopilot)),
+            streams=Streams(vehicle=address, own=self._own, rates=rates),
             heard=time.monotonic(),
         )
         craft = self._crafts[number] = _Craft(vehicle, system, direct, MissionRaw(system))
-        for name in _HEARD:
+        for name in _NAMES:
             if name != "HEARTBEAT":
                 direct.subscribe_message(name, self._listener(number))
         self._event("found", number, f"was found ({autopilot.value})")
@@ -237,10 +224,9 @@ class MavsdkBackend(Backend):
 
     def _listener(self, number: int) -> Callable[[Any, Any], None]:
         def take(message: Any, _data: Any) -> None:  # in MAVSDK's thread
-            if message.component_id == number_of_autopilot and message.system_id == number:
+            if message.component_id == AUTOPILOT_COMPONENT and message.system_id == number:
                 self._queue.put((number, JsonMessage(json.loads(message.fields_json))))
 
-        number_of_autopilot = Address(number).component
         return take
 
     def pump(self, seconds: float) -> None:
@@ -320,11 +306,11 @@ class MavsdkBackend(Backend):
                 wrong = f"vehicle {system} could not be read back {refused}; upload again before flying"
                 continue
             found = difference(mission, stored.items)
-            if found is None:
+            if not found:
                 return Outcome(ok=True, text=f"vehicle {system} holds the mission: {len(mission)} items, read back")
             if refused:
-                return Outcome(ok=False, text=f"vehicle {system} refused the mission {refused}; {found.text}")
-            wrong = f"vehicle {system} holds another mission than was sent: {found.text}; upload again before flying"
+                return Outcome(ok=False, text=f"vehicle {system} refused the mission {refused}; {found}")
+            wrong = f"vehicle {system} holds another mission than was sent: {found}; upload again before flying"
         return Outcome(ok=False, text=wrong)
 
     def _write(self, craft: _Craft, mission: Mission) -> str:
@@ -375,10 +361,8 @@ class MavsdkBackend(Backend):
             if not vehicle.armed and not vehicle.lost:
                 raise OrthoSwarmError(f"vehicle {vehicle.system} is not armed, so there is nothing to pause")
             return vehicle.pilot.pause(held=vehicle.custom_mode == vehicle.modes.hold)
-        if verb == "resume":
-            return resumed(vehicle)
-        if verb == "continue":
-            return continued(vehicle)
+        if verb in ("resume", "continue"):
+            return resumed(vehicle) if verb == "resume" else continued(vehicle)
         return vehicle.pilot.rtl() if verb == "rtl" else vehicle.pilot.land()
 
     def _start(self, vehicle: Vehicle, order: Order) -> Exchange:

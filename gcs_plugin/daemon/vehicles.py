@@ -516,8 +516,10 @@ class VehicleLinks:
                 self._events.publish(MissionNoted(record.id, "lost"))
 
     def _row(self, vehicle: "Vehicle", now: float) -> VehicleRow:
+        from gcs_plugin.fleet.flight_state import summary
+
         record = self._record(vehicle.system)
-        row = cast(VehicleRow, vehicle.summary(now))
+        row = cast(VehicleRow, summary(vehicle, now))
         row["id"], row["name"] = record.id, self.names.title_of(record.id)
         near = self.fleet.separation.text(vehicle.system, self.names.name_of)
         row["alarm"] = "; ".join(text for text in (near, vehicle.danger and f"{record.id} {vehicle.danger}") if text)

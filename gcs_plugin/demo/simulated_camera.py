@@ -17,7 +17,7 @@ from orthoswarm.twin.imaging.sensor import Sensor
 from telemetry.samples.sample import Sample
 
 if TYPE_CHECKING:
-    from gcs_plugin.sim.flight_values import TakenPicture
+    from gcs_plugin.sim.mission_flight import TakenPicture
     from orthoswarm.twin.imaging.ray_marching import PreparedScene
     from orthoswarm.twin.site import Site
 

@@ -185,13 +185,7 @@ class Questions:
 
     A few are asked for at a time, because ArduPilot drops those that it has no room for (20, GCS_Param.cpp). What has
     not been answered is asked for again: a question or its answer may be lost. An autopilot says nothing about a name
-    that it does not have.
-
-    Args:
-        address: of the vehicle. autopilot: its dialect.
-
-    Attributes:
-        asked: it has been asked for them.
+    that it does not have. `asked`: it has been asked for them.
     """
 
     address: Address

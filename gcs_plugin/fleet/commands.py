@@ -3,7 +3,7 @@
 import itertools
 import os
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal, get_args
 
 from gcs_plugin.config import COMMAND
 from gcs_plugin.mission.exchange import Outcome, Verdict
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from gcs_plugin.mission.start_dialogue import Standing
 
 Verb = Literal["start", "pause", "resume", "continue", "rtl", "land"]
-VERBS: Final[tuple[Verb, ...]] = ("start", "pause", "resume", "continue", "rtl", "land")
+VERBS: Final[tuple[Verb, ...]] = get_args(Verb)
 """`resume` ends a pause, whatever was paused; `continue` goes on with a mission that was left, for a return, too."""
 URGENT: Final[frozenset[str]] = frozenset({"pause", "rtl", "land"})
 """Commands that bring a flight to its end: no doubt about identity or link ever blocks them."""
@@ -35,8 +35,6 @@ class CommandResult:
         id: of the command; a command to several vehicles has one id.
         vehicle: its name: v1, or as the operator calls it.
         command: one of VERBS, or `upload`.
-        outcome: DONE: the vehicle acknowledged it. REFUSED: it or the station said no. NOT_SENT: nothing left the
-            station. UNKNOWN: it was sent but not answered.
         reason: one sentence; if not done, the reason and what to do.
     """
 
@@ -59,12 +57,10 @@ class Order:
     """One command to one vehicle, under way or ended.
 
     Attributes:
-        verb: the command. system: the vehicle's system id.
         given_s: when it was given (the fleet's monotonic clock); it is not sent later than COMMAND.fresh_s after that.
         stops: of a start, `Fleet.stops` (0 if none) when it was given: a pause, RTL or land since then makes it void.
         standing: of a start, what the vehicle was when it was given; it is not started if that has changed since.
         mission: of a start, the mission that was checked; it is not started with another one.
-        id: of the command.
         exchange: the dialogue with the vehicle, None if none was started.
     """
 

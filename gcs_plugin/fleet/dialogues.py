@@ -2,36 +2,23 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
+from gcs_plugin.fleet.link_hub import Hub
+from gcs_plugin.fleet.vehicle_state import Vehicle
+from gcs_plugin.links.mavlink import Message
 from gcs_plugin.mission.download import MissionDownload
-from gcs_plugin.mission.exchange import MISSION, NEVER, Verdict
+from gcs_plugin.mission.exchange import MISSION, NEVER, Exchange, Verdict
 from gcs_plugin.mission.items import Mission
 from gcs_plugin.mission.start_dialogue import BreakOff, Start
 from gcs_plugin.mission.upload import MissionUpload
-
-if TYPE_CHECKING:
-    from gcs_plugin.fleet.link_hub import Hub
-    from gcs_plugin.fleet.vehicle_state import Vehicle
-    from gcs_plugin.links.mavlink import Message
-    from gcs_plugin.mission.exchange import Exchange
 
 _ON_THE_WAY_S = 1.0
 
 
 class Dialogues:
-    """All dialogues of a fleet.
+    """All dialogues of a fleet that are under way (`jobs`); `signed`: whether this station has a key."""
 
-    Args:
-        vehicles: by system id. hub: the links. clock: monotonic seconds. signed: whether this station has a key.
-
-    Attributes:
-        jobs: those under way.
-    """
-
-    def __init__(
-        self, vehicles: "Mapping[int, Vehicle]", hub: "Hub", clock: Callable[[], float], *, signed: bool
-    ) -> None:
+    def __init__(self, vehicles: Mapping[int, Vehicle], hub: Hub, clock: Callable[[], float], *, signed: bool) -> None:
         self._vehicles, self._hub, self._clock, self._signed = vehicles, hub, clock, signed
         self.jobs: list[Exchange] = []
 
@@ -40,7 +27,7 @@ class Dialogues:
         """The earliest deadline of all dialogues."""
         return min((job.deadline for job in self.jobs), default=NEVER)
 
-    def begin(self, job: "Exchange") -> None:
+    def begin(self, job: Exchange) -> None:
         """Start one."""
         self.jobs.append(job)
         vehicle = self._vehicles.get(job.vehicle.system)
@@ -50,35 +37,34 @@ class Dialogues:
 
     def busy(self, system: int) -> bool:
         """True while a dialogue with this vehicle is active that somebody waits for."""
-        return any(job.vehicle.system == system and not _in_background(job) for job in self.jobs)
+        return any(not _in_background(job) for job in self._with(system))
 
     def talks(self, system: int) -> bool:
         """True while any dialogue with this vehicle is active."""
-        return any(job.vehicle.system == system for job in self.jobs)
+        return bool(self._with(system))
 
     def reads(self, system: int) -> bool:
         """True while this vehicle's mission is being read."""
-        return any(
-            job.vehicle.system == system and isinstance(job, MissionDownload) and job.list_type == MISSION
-            for job in self.jobs
-        )
+        return any(isinstance(job, MissionDownload) and job.list_type == MISSION for job in self._with(system))
 
     def starting(self, system: int) -> bool:
         """True while a start of this vehicle is under way, or is being broken off."""
-        return any(job.vehicle.system == system and isinstance(job, (Start, BreakOff)) for job in self.jobs)
+        return any(isinstance(job, (Start, BreakOff)) for job in self._with(system))
+
+    def _with(self, system: int) -> list[Exchange]:
+        return [job for job in self.jobs if job.vehicle.system == system]
 
     def end_background(self, system: int) -> None:
         """End what nobody waits for, in favour of what somebody asks for."""
-        for job in self.jobs:
-            if job.vehicle.system == system and _in_background(job):
+        for job in self._with(system):
+            if _in_background(job):
                 job.cancel("another request came in between")
         self._reap()
 
     def make_way(self, system: int) -> None:
         """End an active command for a newer one (an upload may continue, unless it still changes the mode)."""
-        for job in self.jobs:
-            moves = not isinstance(job, (MissionUpload, MissionDownload)) or job.leaves_mode
-            if job.vehicle.system == system and moves:
+        for job in self._with(system):
+            if not isinstance(job, (MissionUpload, MissionDownload)) or job.leaves_mode:
                 job.cancel("another command came in between")
         self._reap()
 
@@ -89,7 +75,7 @@ class Dialogues:
                 self._drive(job, job.tick(now))
         self._reap()
 
-    def feed(self, vehicle: "Vehicle", message: "Message", now: float) -> None:
+    def feed(self, vehicle: Vehicle, message: Message, now: float) -> None:
         """Pass a message of a vehicle's autopilot to its dialogues."""
         if not self.jobs:
             return
@@ -98,21 +84,19 @@ class Dialogues:
                 self._drive(job, job.feed(message, now))
         self._reap()
 
-    def rebooted(self, vehicle: "Vehicle", now: float) -> None:
+    def rebooted(self, vehicle: Vehicle, now: float) -> None:
         """A vehicle has rebooted."""
         for job in list(self.jobs):
             if job.vehicle == vehicle.address and job.outcome is None:
                 self._drive(job, job.rebooted(now))
 
     def send(
-        self, system: int, messages: "Sequence[Message]", *, everywhere: bool = False, expires: float = NEVER
+        self, system: int, messages: Sequence[Message], *, everywhere: bool = False, expires: float = NEVER
     ) -> bool:
         """Send to a vehicle; returns whether a link accepted it.
 
-        Args:
-            system: the vehicle. messages: what to send.
-            everywhere: on every route on which it was heard recently, not only on the best.
-            expires: time after which a waiting message is dropped.
+        `everywhere`: on every route on which it was heard recently, not only on the best. A message that still waits at
+        `expires` is dropped.
         """
         vehicle = self._vehicles.get(system)
         if vehicle is None or not messages:
@@ -123,7 +107,7 @@ class Dialogues:
                 accepted |= self._hub.send(route.side, route.peer, message, expires)
         return accepted
 
-    def _drive(self, job: "Exchange", messages: "Sequence[Message]") -> None:
+    def _drive(self, job: Exchange, messages: Sequence[Message]) -> None:
         """Send a dialogue's messages, and report to it which ones a link accepted.
 
         Repeated commands, and commands to a vehicle that is lost or has several claimants, are sent on every route.
@@ -144,7 +128,7 @@ class Dialogues:
         if any(job.outcome is not None for job in self.jobs):
             self.jobs = [job for job in self.jobs if job.outcome is None]
 
-    def _explain(self, job: "Exchange") -> None:
+    def _explain(self, job: Exchange) -> None:
         """Explain a silence: a signing vehicle ignores a station without its key."""
         outcome, vehicle = job.outcome, self._vehicles.get(job.vehicle.system)
         if outcome is None or outcome.verdict is not Verdict.UNKNOWN or vehicle is None:
@@ -153,7 +137,7 @@ class Dialogues:
             why = f"vehicle {vehicle.system} signs its messages and does not listen to a station without its key"
             job.outcome = replace(outcome, text=f"{why}; give it with --signing-key")
 
-    def _note_mission(self, job: "Exchange") -> None:
+    def _note_mission(self, job: Exchange) -> None:
         vehicle = self._vehicles.get(job.vehicle.system)
         if vehicle is None:
             return
@@ -180,5 +164,5 @@ class Dialogues:
             vehicle.detector.knows_mission(mission)
 
 
-def _in_background(job: "Exchange") -> bool:
+def _in_background(job: Exchange) -> bool:
     return isinstance(job, MissionDownload) and job.background

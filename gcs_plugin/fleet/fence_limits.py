@@ -8,20 +8,16 @@ place beyond GF_MAX_HOR_DIST or GF_MAX_VER_DIST, whatever GF_ACTION says (missio
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
 from gcs_plugin.config import LIMITS
-from gcs_plugin.fleet.autopilot_settings import Setting
+from gcs_plugin.fleet.autopilot_settings import Setting, SetTo
+from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.mavlink import Autopilot
-from gcs_plugin.mission.items import FRAME_TERRAIN, LAND, PLAIN_FRAME, RTL, VTOL_LAND
+from gcs_plugin.mission.items import FRAME_TERRAIN, LANDINGS, RTL, Mission
 from gcs_plugin.mission.track import flight_path, heights_m, home_of
-
-if TYPE_CHECKING:
-    from gcs_plugin.fleet.autopilot_settings import SetTo
-    from gcs_plugin.fleet.vehicle_state import Vehicle
-    from gcs_plugin.mission.items import Mission
 
 _TOP, _CIRCLE, _FLOOR = 1 << 0, 1 << 1, 1 << 3
 _ANY_ZONE: Final = 1 << 1
@@ -41,9 +37,9 @@ class FenceLimits:
         unsaid: it keeps a geofence, but has not told all of its limits.
     """
 
-    radius: "SetTo | None" = None
-    top: "SetTo | None" = None
-    floor: "SetTo | None" = None
+    radius: SetTo | None = None
+    top: SetTo | None = None
+    floor: SetTo | None = None
     margin_m: float = LIMITS.fence_margin_m
     does: str = ""
     unsaid: bool = False
@@ -62,7 +58,7 @@ class FenceFinding:
     beyond: bool
 
 
-def fence_limits(vehicle: "Vehicle") -> FenceLimits | None:
+def fence_limits(vehicle: Vehicle) -> FenceLimits | None:
     """The limits of a vehicle's geofence, None if it has not told whether it keeps one."""
     said = vehicle.settings.get
     radius, top = said(Setting.FENCE_RADIUS), said(Setting.FENCE_TOP)
@@ -90,26 +86,23 @@ def fence_limits(vehicle: "Vehicle") -> FenceLimits | None:
     )
 
 
-def in_all_zones(vehicle: "Vehicle") -> bool:
+def in_all_zones(vehicle: Vehicle) -> bool:
     """Whether a vehicle must be in all inclusion zones of its geofence: ArduPilot, unless it is set up otherwise."""
     options = vehicle.settings.get(Setting.FENCE_OPTIONS)
     return vehicle.autopilot is Autopilot.ARDUPILOT and not (options is not None and int(options.value) & _ANY_ZONE)
 
 
-def fence_findings(vehicle: "Vehicle", mission: "Mission", limits: FenceLimits) -> list[FenceFinding]:
+def fence_findings(vehicle: Vehicle, mission: Mission, limits: FenceLimits) -> list[FenceFinding]:
     """Where a mission goes near the limits of a geofence or beyond them; those beyond come first."""
-    place = None if vehicle.lat_deg is None or vehicle.lon_deg is None else (vehicle.lat_deg, vehicle.lon_deg)
     # On the ground its home is set where it stands as it arms.
-    home = (vehicle.home if vehicle.flying else place) or home_of(mission)
+    home = (vehicle.home if vehicle.flying else vehicle.place) or home_of(mission)
     if home is None:
         return []
     points, _, _ = flight_path(mission, home)
     return sorted(_findings(vehicle, mission, limits, points), key=lambda finding: not finding.beyond)
 
 
-def _findings(
-    vehicle: "Vehicle", mission: "Mission", limits: FenceLimits, points: np.ndarray
-) -> Iterator[FenceFinding]:
+def _findings(vehicle: Vehicle, mission: Mission, limits: FenceLimits, points: np.ndarray) -> Iterator[FenceFinding]:
     """The findings about a path, float64 (n, 3): east and north of home and height above it, metres."""
     margin_m = limits.margin_m
     if len(points) and limits.radius is not None:
@@ -117,7 +110,7 @@ def _findings(
     if len(points) and limits.top is not None:
         rises_m = LIMITS.fence_px4_rise_m if vehicle.autopilot is Autopilot.PX4 else margin_m
         yield from _over(limits.top, float(points[:, 2].max()), limits, "goes up to {} m", rises_m)
-        if any(i.is_nav and PLAIN_FRAME.get(i.frame, i.frame) == FRAME_TERRAIN for i in mission.items):
+        if any(i.is_nav and i.plain_frame == FRAME_TERRAIN for i in mission.items):
             text = "its mission's heights count from the ground below it"
             text += f"; whether it stays below {limits.top.value:g} m above home ({limits.top.name}) is not known"
             yield FenceFinding(text, beyond=False)
@@ -130,7 +123,7 @@ def _findings(
     if limits.floor is not None:
         low_m, been_above = math.inf, False
         for item, height_m in heights_m(mission):
-            if item.command in (RTL, LAND, VTOL_LAND):
+            if item.command in (RTL, *LANDINGS):
                 continue
             been_above |= height_m >= limits.floor.value + margin_m
             low_m = min(low_m, height_m if been_above else math.inf)
@@ -141,7 +134,7 @@ def _findings(
 
 
 def _over(
-    limit: "SetTo", most_m: float, limits: FenceLimits, goes: str, near_m: float | None = None
+    limit: SetTo, most_m: float, limits: FenceLimits, goes: str, near_m: float | None = None
 ) -> Iterator[FenceFinding]:
     """What a mission that goes up to so many metres does at a limit, if anything."""
     margin_m = limits.margin_m if near_m is None else near_m
@@ -156,6 +149,6 @@ def _over(
     yield FenceFinding(f"{text}; {advice}", beyond=beyond and bool(limits.does))
 
 
-def _some(limit: "SetTo") -> "SetTo | None":
+def _some(limit: SetTo) -> SetTo | None:
     """PX4's limits; 0 is none."""
     return limit if limit.value > 0.0 else None

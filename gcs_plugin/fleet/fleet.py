@@ -20,9 +20,9 @@ from gcs_plugin.fleet.commands import URGENT, Order, Verb
 from gcs_plugin.fleet.dialogues import Dialogues
 from gcs_plugin.fleet.fleet_events import FleetEvent
 from gcs_plugin.fleet.going_on import continued, resumed
+from gcs_plugin.fleet.heard_messages import MESSAGE_IDS
 from gcs_plugin.fleet.link_hub import Hub
-from gcs_plugin.fleet.message_rates import Rates, default_rates
-from gcs_plugin.fleet.reception import MESSAGE_IDS, Handler, Reception
+from gcs_plugin.fleet.reception import Handler, Reception
 from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.mavlink import Autopilot, Message
 from gcs_plugin.links.packets import Packet
@@ -66,7 +66,6 @@ class Fleet:
         links: Iterable[Link | str],
         *,
         own: Address = GROUND_STATION,
-        rates: Rates | None = None,
         key: bytes | None = None,
         tlog: Path | None = None,
         remembered: Mapping[int, Mapping[str, Any]] | None = None,
@@ -78,13 +77,10 @@ class Fleet:
         Args:
             links: links or their addresses (`links.parse_link`).
             own: our address; different from that of another ground station.
-            rates: message rates to request; by default 10 Hz of position and attitude.
             key: signing key; with it only signed packets are accepted.
             tlog: telemetry log to append to.
-            remembered: result of `memory` before a restart of this program, so that no completion is missed or
-            repeated.
-            clock: monotonic seconds.
-            wall: UTC epoch seconds.
+            remembered: result of `memory` before a restart of this program: no completion is missed or repeated.
+            clock: monotonic seconds. wall: UTC epoch seconds.
 
         Raises:
             InputError: a link cannot be opened.
@@ -103,7 +99,6 @@ class Fleet:
             self.hub,
             dialogues=self._dialogues,
             own=own,
-            rates=rates or default_rates(),
             remembered=remembered or {},
             event=self._publish,
             wall=wall,
@@ -211,9 +206,8 @@ class Fleet:
             raise OrthoSwarmError(f"vehicle {system} is flying its mission; pause it or let it return first")
         if mission.autopilot is not vehicle.autopilot:
             kind = vehicle.autopilot.value
-            raise OrthoSwarmError(
-                f"vehicle {system} is {kind}, but the mission was built for {mission.autopilot.value}"
-            )
+            text = f"vehicle {system} is {kind}, but the mission was built for {mission.autopilot.value}"
+            raise OrthoSwarmError(text)
         vehicle.mission = None
         vehicle.detector.uploaded(None)
         # In AUTO, even paused, ArduPilot flies the item that is stored under the current number: a new RTL at once.
@@ -257,33 +251,29 @@ class Fleet:
         return self._dialogues.reads(system)
 
     def _read(self, vehicle: Vehicle, list_type: int = MISSION) -> MissionDownload:
-        window = AT_ONCE[vehicle.autopilot]
-        job = MissionDownload(
-            vehicle.address, self.own, patience_s=_READ_S, list_type=list_type, background=True, window=window
-        )
-        return self.begin(job)
+        to, window = vehicle.address, AT_ONCE[vehicle.autopilot]
+        background = MissionDownload(to, self.own, _READ_S, list_type=list_type, background=True, window=window)
+        return self.begin(background)
 
     def start(self, system: int) -> Exchange:
         """Start a vehicle's mission from the beginning, see `mission.start_dialogue`."""
-        exchange = self._start(Order(verb="start", system=system, given_s=self._clock()))
-        exchange.expires = self._clock() + COMMAND.fresh_s
-        return self.begin(exchange)
+        return self._now(self._start(Order(verb="start", system=system, given_s=self._clock())))
 
     def pause(self, system: int) -> Exchange:
         """Make a vehicle hold its position."""
-        return self._now("pause", system)
+        return self._now(self._dialogue("pause", system))
 
     def resume(self, system: int) -> Exchange:
         """Make a vehicle continue what was paused: its mission, or its way home."""
-        return self._now("resume", system)
+        return self._now(self._dialogue("resume", system))
 
     def rtl(self, system: int) -> Exchange:
         """Make a vehicle fly home and land."""
-        return self._now("rtl", system)
+        return self._now(self._dialogue("rtl", system))
 
     def land(self, system: int) -> Exchange:
         """Make a vehicle land at its position."""
-        return self._now("land", system)
+        return self._now(self._dialogue("land", system))
 
     def memory(self) -> dict[int, dict[str, Any]]:
         """State of each vehicle's mission, as JSON values by system id; for `remembered` after a restart."""
@@ -292,8 +282,7 @@ class Fleet:
     def problems(self, name_of: Callable[[int], str]) -> list[str]:
         """Broken links, rejected packets, vehicles that sign and those that share a system id; from any thread.
 
-        Args:
-            name_of: the id of a vehicle by its system id.
+        `name_of` gives the id of a vehicle by its system id.
         """
         hub, vehicles = self.hub, list(self.vehicles.values())
         problems = [f"{side.link.name}: {side.link.problem}" for side in hub.sides if side.link.problem]
@@ -329,22 +318,13 @@ class Fleet:
             raise OrthoSwarmError(f"vehicle {system} {why}")
         return vehicle
 
-    def _now(self, verb: Verb, system: int) -> Exchange:
-        """A command given now.
-
-        Raises:
-            OrthoSwarmError: it cannot be given.
-        """
-        exchange = self._dialogue(verb, system)
+    def _now(self, exchange: Exchange) -> Exchange:
+        """Begin what is asked for now."""
         exchange.expires = self._clock() + COMMAND.fresh_s
         return self.begin(exchange)
 
     def _dialogue(self, verb: Verb, system: int) -> Exchange:
-        """The dialogue for a command, not started yet.
-
-        Raises:
-            OrthoSwarmError: it cannot be given.
-        """
+        """The dialogue for a command, not started yet; raises OrthoSwarmError where it cannot be given."""
         vehicle = self._known(system) if verb in URGENT else self.vehicle(system)
         sure = not vehicle.claimants and self._clock() - vehicle.heard < _SURE_S
         starting = self._dialogues.starting(system)
@@ -363,11 +343,7 @@ class Fleet:
         return goes_on or {"rtl": vehicle.pilot.rtl, "land": vehicle.pilot.land}[verb]()
 
     def _goes_on(self, vehicle: Vehicle, verb: Verb) -> Exchange:
-        """See `going_on`.
-
-        Raises:
-            OrthoSwarmError: there is nothing to go on with.
-        """
+        """See `going_on`; raises OrthoSwarmError if there is nothing to go on with."""
         told_s = self._clock() - self._told_home.get(vehicle.system, -math.inf)
         if verb == "resume" and told_s < _PAUSE_SHOWS_S:  # its mode may be older
             raise OrthoSwarmError(f"vehicle {vehicle.system} was told to return or land just now; it is not resumed")

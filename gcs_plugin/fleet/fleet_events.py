@@ -1,13 +1,11 @@
 """What happens to the vehicles of a fleet, as values and in words."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.mission.completion import MissionEvent
 from gcs_plugin.mission.flight_modes import HOLDS
-
-if TYPE_CHECKING:
-    from gcs_plugin.fleet.vehicle_state import Vehicle
 
 _WORDS: Final = {
     MissionEvent.STARTED: "has started its mission",
@@ -21,16 +19,13 @@ Pair = tuple[int, int]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FleetEvent:
-    """Something that happened to a vehicle.
+    """Something that happened to a vehicle, with UTC epoch seconds, in one sentence.
 
     Attributes:
         kind: `found`, `lost`, `regained`, `rebooted`, `link` (commands go another way), `conflict` (several vehicles
             with one system id), `single` (no longer), `near` (too near another vehicle), `apart` (no longer), `behind`
             (later on its mission than plans allow for), `caught_up` (no longer), `danger` (`Vehicle.danger`), `safe`
             (no longer), `text`, or a mission's `started`, `suspended`, `resumed`, `complete`, `aborted`.
-        system: system id.
-        time_s: UTC epoch seconds.
-        text: one sentence.
         pair: the two that `near` and `apart` are about.
         severity: of a `text`, MAVLink's MAV_SEVERITY (0 emergency ... 6 information).
     """
@@ -43,7 +38,7 @@ class FleetEvent:
     severity: int = 6
 
 
-def mission_event(event: MissionEvent, vehicle: "Vehicle") -> tuple[str, str]:
+def mission_event(event: MissionEvent, vehicle: Vehicle) -> tuple[str, str]:
     """Kind and words of what has happened to a vehicle's mission."""
     if event is MissionEvent.ABORTED:
         flown = vehicle.detector.flown
@@ -53,7 +48,7 @@ def mission_event(event: MissionEvent, vehicle: "Vehicle") -> tuple[str, str]:
     return event.value, _WORDS[event]
 
 
-def _left(vehicle: "Vehicle") -> str:
+def _left(vehicle: Vehicle) -> str:
     """Why a vehicle is off its mission, as far as its mode tells; that may come a second later than its mission's."""
     if vehicle.failsafe:
         return "has left its mission in a failsafe"

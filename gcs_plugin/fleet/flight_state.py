@@ -7,12 +7,15 @@ remote control's throttle is low. So a word that means standing still is said on
 import enum
 import math
 from dataclasses import dataclass
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
-from gcs_plugin.links.mavlink import Autopilot, dialect
-from gcs_plugin.mission.completion import CompletionDetector, Phase
-from gcs_plugin.mission.flight_modes import HOLDS, LANDS, RETURNS, Modes
-from gcs_plugin.mission.items import DELAY, LAND, LOITER_UNLIM, RTL, TAKEOFF, VTOL_LAND, WAYPOINT, Mission
+from gcs_plugin.config import HEARING
+from gcs_plugin.fleet.heard_messages import MESSAGE_IDS
+from gcs_plugin.fleet.vehicle_state import Vehicle
+from gcs_plugin.links.mavlink import dialect
+from gcs_plugin.mission.completion import Phase
+from gcs_plugin.mission.flight_modes import HOLDS, LANDS, RETURNS
+from gcs_plugin.mission.items import DELAY, LANDINGS, LOITER_TIME, LOITER_UNLIM, RTL, TAKEOFF, WAYPOINT
 
 STILL_S: Final = 2.5
 """How long a vehicle stands still on its way before that counts as a pause: longer than a turn's stop."""
@@ -22,7 +25,7 @@ _SINKING_S: Final = 1.0
 """How long a vehicle sinks where it should not until that is said: gusts and braking move it for less."""
 _BRAKES_S: Final = 5.0
 """One that was just put into its mode to hold is still slowing down for so long at most: from 15 m/s at 3 m/s2."""
-_TIMED: Final = frozenset({DELAY, LOITER_UNLIM, int(dialect.MAV_CMD_NAV_LOITER_TIME)})
+_TIMED: Final = frozenset({DELAY, LOITER_UNLIM, LOITER_TIME})
 
 
 class Word(enum.Enum):
@@ -46,7 +49,6 @@ class FlightState:
     """The flight state of a vehicle.
 
     Attributes:
-        word: the state.
         item: the current mission item, from 1. items: their number; both 0 if unknown.
         mode: the flight mode that it moves in without its mission; of a pause, the one that it interrupted if that was
             not the mission.
@@ -70,63 +72,17 @@ class FlightState:
         return {"state": self.word.value, "text": self.text, "item": self.item, "items": self.items}
 
 
-class Observed(Protocol):
-    """The needed state of a vehicle; see vehicle_state.Vehicle."""
-
-    autopilot: Autopilot
-    modes: Modes
-    detector: CompletionDetector
-    lost: bool
-    armed: bool
-    custom_mode: int
-    velocity_m_s: tuple[float, float, float]
-    height_m: float
-    landed: str
-    mission: Mission | None
-    mission_seq: int
-    mission_state: int
-    mission_total: int
-    paused_in_mission: bool
-    way: int | None
-    failsafe: bool
-
-    @property
-    def severe_text(self) -> str:
-        """The last text in which its autopilot reported a fault in this flight, empty if none."""
-
-    @property
-    def mode(self) -> str:
-        """Its mode in words."""
-
-    @property
-    def flying(self) -> bool:
-        """True if it is armed and, as far as is known, off the ground."""
-
-    @property
-    def still_s(self) -> float:
-        """For how long it has been stationary, seconds."""
-
-    @property
-    def in_mode_s(self) -> float:
-        """For how long it has been in its mode, seconds."""
-
-    @property
-    def sinks_s(self) -> float:
-        """For how long it has been sinking, seconds."""
-
-
-def flight_state(vehicle: Observed) -> FlightState:
+def flight_state(vehicle: Vehicle) -> FlightState:
     """The flight state of a vehicle, as far as its messages show."""
     items = vehicle.mission_total
-    first = 0 if vehicle.autopilot is Autopilot.ARDUPILOT else 1
     word = _word(vehicle)
     mode = vehicle.mode if word in (Word.FLYING, Word.DESCENDING) else ""
     if word is Word.PAUSED and vehicle.way not in (None, vehicle.modes.mission):
         mode = vehicle.modes.name(vehicle.way or 0)
-    return FlightState(word, min(vehicle.mission_seq + first, items), items, mode)
+    return FlightState(word, min(vehicle.mission_seq + 1 - vehicle.autopilot.first_seq, items), items, mode)
 
 
-def danger_of(vehicle: Observed) -> str:
+def danger_of(vehicle: Vehicle) -> str:
     """What endangers a vehicle in the air by itself, and what to do, in words; empty if nothing does."""
     if vehicle.lost or not vehicle.flying:
         return ""
@@ -138,7 +94,7 @@ def danger_of(vehicle: Observed) -> str:
     return f"says: {vehicle.severe_text}" if vehicle.severe_text else ""
 
 
-def _word(vehicle: Observed) -> Word:
+def _word(vehicle: Vehicle) -> Word:
     if vehicle.lost:
         return Word.LOST
     if not vehicle.flying:
@@ -163,7 +119,7 @@ def _word(vehicle: Observed) -> Word:
     return Word.PAUSED if _interrupted(vehicle) else Word.HOLDING
 
 
-def _interrupted(vehicle: Observed) -> bool:
+def _interrupted(vehicle: Vehicle) -> bool:
     """Whether one that holds was under way: on a return, or between the ends of its mission."""
     if vehicle.detector.phase is Phase.SUSPENDED:
         return True
@@ -173,11 +129,11 @@ def _interrupted(vehicle: Observed) -> bool:
     return begun and vehicle.custom_mode == vehicle.modes.hold and vehicle.detector.phase is Phase.IDLE
 
 
-def _on_mission(vehicle: Observed) -> Word:
+def _on_mission(vehicle: Vehicle) -> Word:
     command, waits = _item(vehicle)
     if command == RTL:
         return Word.LANDING if _comes_down(vehicle) else Word.RETURNING
-    if vehicle.landed == "landing" or (command in (LAND, VTOL_LAND) and _comes_down(vehicle)):
+    if vehicle.landed == "landing" or (command in LANDINGS and _comes_down(vehicle)):
         return Word.LANDING
     if vehicle.detector.phase is Phase.COMPLETE:
         return Word.LANDING if _comes_down(vehicle) else Word.HOLDING
@@ -187,7 +143,7 @@ def _on_mission(vehicle: Observed) -> Word:
     return Word.PAUSED if vehicle.paused_in_mission or still else Word.ON_MISSION
 
 
-def _item(vehicle: Observed) -> tuple[int | None, bool]:
+def _item(vehicle: Vehicle) -> tuple[int | None, bool]:
     """The present item's command, and whether it lets the vehicle wait; None where the mission is not known."""
     mission = vehicle.mission
     if mission is None or not 0 <= vehicle.mission_seq < len(mission.items):
@@ -196,6 +152,59 @@ def _item(vehicle: Observed) -> tuple[int | None, bool]:
     return item.command, item.command in _TIMED or (item.command == WAYPOINT and item.params[0] > 0.0)
 
 
-def _comes_down(vehicle: Observed) -> bool:
+def _comes_down(vehicle: Vehicle) -> bool:
     sinks = vehicle.velocity_m_s[2] > _SINKS_M_S and math.hypot(*vehicle.velocity_m_s[:2]) < _SLOW_M_S
     return vehicle.landed == "landing" or sinks
+
+
+def summary(vehicle: Vehicle, now: float) -> dict[str, Any]:
+    """The state of a vehicle as JSON values, for `fleet list --json` and the web map.
+
+    `battery_s` and `gps_s` are the whole seconds since when the battery's state and the receiver's (`gps_fix`,
+    `satellites`) have not been reported: 0 while they come, None if they never came. `faults` are those of its
+    stream: `lost_share` of its packets lately, `damaged` packets of its link, `impossible` messages, both dropped.
+    """
+    return {
+        "id": vehicle.id,
+        "system": vehicle.system,
+        "autopilot": vehicle.autopilot.value,
+        "link": vehicle.route.side.link.name if vehicle.route else "",
+        "state": "lost" if vehicle.lost else "conflict" if vehicle.claimants else "found",
+        "links": [route.address for route in vehicle.routes.fresh(now)],
+        "claimants": list(vehicle.claimants),
+        "flight": flight_state(vehicle).document(),
+        "silent_s": round(now - vehicle.heard, 1),
+        "armed": vehicle.armed,
+        "mode": vehicle.mode,
+        "landed": vehicle.landed,
+        "lat_deg": vehicle.lat_deg,
+        "lon_deg": vehicle.lon_deg,
+        "height_m": round(vehicle.height_m, 2),
+        "alt_m": None if vehicle.alt_m is None else round(vehicle.alt_m, 1),
+        "heading_deg": None if vehicle.heading_rad is None else round(math.degrees(vehicle.heading_rad), 1),
+        "speed_m_s": round(math.hypot(*vehicle.velocity_m_s[:2]), 2),
+        "battery": vehicle.battery,
+        "battery_s": _old_s(vehicle.battery_age_s(now)),
+        "gps_s": _old_s(vehicle.streams.age_s(MESSAGE_IDS["GPS_RAW_INT"], now)),
+        "gps_fix": vehicle.gps_fix,
+        "satellites": vehicle.satellites,
+        "mission": {
+            "phase": vehicle.detector.phase.value,
+            "item": vehicle.mission_seq,
+            "items": vehicle.mission_total,
+        },
+        "photos": vehicle.photos,
+        "home": None if vehicle.home is None else [round(vehicle.home[0], 7), round(vehicle.home[1], 7)],
+        "received": vehicle.received,
+        "missed": vehicle.missed,
+        "faults": {
+            "lost_share": round(vehicle.route.loss, 2) if vehicle.route else 0.0,
+            "damaged": vehicle.route.damaged if vehicle.route else 0,
+            "impossible": vehicle.impossible,
+        },
+    }
+
+
+def _old_s(age_s: float | None) -> int | None:
+    """The age of a value in whole seconds, 0 while it is renewed: rows change, and are sent, only if it matters."""
+    return None if age_s is None else 0 if age_s < HEARING.lost_s else int(age_s)

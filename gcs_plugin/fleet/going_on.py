@@ -1,20 +1,18 @@
 """Going on after a pause: a return stays a return, a landing a landing; a mission that was left is another command."""
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from gcs_plugin.fleet.flight_state import Word, flight_state
+from gcs_plugin.fleet.vehicle_state import Vehicle
+from gcs_plugin.mission.exchange import Exchange
 from gcs_plugin.mission.flight_modes import HOLDS, LANDS, RETURNS
 from gcs_plugin.mission.flown_items import off_leg_m
 from orthoswarm.model.errors import OrthoSwarmError
 
-if TYPE_CHECKING:
-    from gcs_plugin.fleet.vehicle_state import Vehicle
-    from gcs_plugin.mission.exchange import Exchange
-
 _ON_WAY_M: Final = 15.0  # one that holds no farther from the way to its item was held on it: vehicles brake in less
 
 
-def resumed(vehicle: "Vehicle") -> "Exchange":
+def resumed(vehicle: Vehicle) -> Exchange:
     """The dialogue that lets a vehicle go on with what was paused.
 
     Raises:
@@ -41,7 +39,7 @@ def resumed(vehicle: "Vehicle") -> "Exchange":
     return pilot.go_on(vehicle.custom_mode)
 
 
-def continued(vehicle: "Vehicle") -> "Exchange":
+def continued(vehicle: Vehicle) -> Exchange:
     """The dialogue that lets a vehicle go on with its mission, whatever it left it for; the caller has checked that.
 
     Raises:
@@ -53,10 +51,9 @@ def continued(vehicle: "Vehicle") -> "Exchange":
     return vehicle.pilot.go_on(vehicle.custom_mode)
 
 
-def _on_its_way(vehicle: "Vehicle") -> bool:
+def _on_its_way(vehicle: Vehicle) -> bool:
     """Whether one that was only seen holding stands on the way to its mission's present item."""
-    mission, lat, lon = vehicle.mission, vehicle.lat_deg, vehicle.lon_deg
-    if vehicle.had_failsafe or mission is None or lat is None or lon is None:
+    if vehicle.had_failsafe or vehicle.mission is None or vehicle.place is None:
         return False
-    away_m = off_leg_m(mission, vehicle.mission_seq, (lat, lon))
+    away_m = off_leg_m(vehicle.mission, vehicle.mission_seq, vehicle.place)
     return away_m is not None and away_m < _ON_WAY_M

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from gcs_plugin.links.mavlink import Message, dialect
 from gcs_plugin.links.packets import Framer, Packet
-from gcs_plugin.links.signing import Signing
+from gcs_plugin.links.signing import Packer, Signing
 from gcs_plugin.links.tlog_writer import TlogWriter
 from gcs_plugin.links.transports import Link, Peer, parse_link
 from gcs_plugin.mission.exchange import NEVER, Address
@@ -30,7 +30,7 @@ class Side:
     """One link and its state."""
 
     link: Link
-    packer: Any
+    packer: Packer
     signing: Signing | None
     framers: dict[Peer, Framer] = field(default_factory=dict)
     peers: dict[Peer, float] = field(default_factory=dict)
@@ -40,12 +40,7 @@ Sink = Callable[[Side, Peer, Packet, float, float], None]
 
 
 class Hub:
-    """The links of a ground station.
-
-    Attributes:
-        own: our address.
-        sides: the links.
-    """
+    """The links (`sides`) of a ground station."""
 
     def __init__(
         self,
@@ -62,12 +57,10 @@ class Hub:
 
         Args:
             links: links or their addresses.
-            own: our address.
             sink: called with the link's side, the peer, the packet, the clock's time and UTC seconds of its arrival.
             key: signing key; with it only signed packets are accepted.
             tlog: telemetry log to append to.
-            clock: monotonic seconds.
-            wall: UTC epoch seconds.
+            clock: monotonic seconds. wall: UTC epoch seconds.
         """
         self.own, self._sink, self._clock, self._wall = own, sink, clock, wall
         opened = _make_links(links)
@@ -82,11 +75,8 @@ class Hub:
         self.sides: list[Side] = []
         self._by_link: dict[Link, Side] = {}
         for link in opened:
-            packer = dialect.MAVLink(None, own.system, own.component)
-            side = Side(link, packer, Signing(key, link_id=len(self.sides)) if key else None)
-            if side.signing is not None:
-                packer.signing.secret_key, packer.signing.sign_outgoing = key, True
-                packer.signing.link_id = side.signing.link_id
+            signing = Signing(key, link_id=len(self.sides)) if key else None
+            side = Side(link, Packer(own.system, own.component, signing), signing)
             self.sides.append(side)
             self._by_link[link] = side
             link.open(self._selector, clock())
@@ -137,11 +127,8 @@ class Hub:
         Returns:
             Whether the link accepted it.
         """
-        packer, utc = side.packer, self._wall()
-        if side.signing is not None:
-            packer.signing.timestamp = side.signing.next_timestamp(utc)
-        raw = message.pack(packer)
-        packer.seq = (packer.seq + 1) & 0xFF
+        utc = self._wall()
+        raw = side.packer.pack(message, utc)
         accepted = side.link.send(peer, raw, expires)
         if self._tlog is not None:
             self._tlog.write(utc, raw)

@@ -4,11 +4,13 @@ Each message is asked for by MAV_CMD_SET_MESSAGE_INTERVAL: ArduPilot sends nothi
 everything. Acknowledgements do not say which message they are about, so one is asked for at a time.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
-from gcs_plugin.links.mavlink import Autopilot, Message, dialect
-from gcs_plugin.mission.exchange import Address
+from gcs_plugin.fleet.heard_messages import HEARD
+from gcs_plugin.links.mavlink import Message, dialect
+from gcs_plugin.mission.exchange import Address, command_long
 
 _COMMAND: Final = int(dialect.MAV_CMD_SET_MESSAGE_INTERVAL)
 _ANSWER_S: Final = 0.7
@@ -16,66 +18,6 @@ _TRIES: Final = 4  # requests for one stream
 _CHECK_S: Final = 1.0
 _WINDOW_S: Final = 5.0
 _BACKOFF_S: Final = (3.0, 60.0)
-
-GLOBAL_POSITION_INT: Final = int(dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT)
-ATTITUDE: Final = int(dialect.MAVLINK_MSG_ID_ATTITUDE)
-GPS_RAW_INT: Final = int(dialect.MAVLINK_MSG_ID_GPS_RAW_INT)
-SYS_STATUS: Final = int(dialect.MAVLINK_MSG_ID_SYS_STATUS)
-BATTERY_STATUS: Final = int(dialect.MAVLINK_MSG_ID_BATTERY_STATUS)
-_EKF: Final = int(dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT)
-_ESTIMATOR: Final = int(dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS)
-# Each autopilot's message about its filter. ArduPilot's SYS_STATUS shows its first battery, PX4's the emptiest one.
-_ARDUPILOT_ONLY: Final = frozenset({_EKF, BATTERY_STATUS})
-_PX4_ONLY: Final = frozenset({_ESTIMATOR})
-_CHECKED: Final = (GPS_RAW_INT, SYS_STATUS, BATTERY_STATUS, _EKF, _ESTIMATOR)
-"""What a check before a start looks at."""
-
-
-@dataclass(frozen=True, slots=True)
-class Rates:
-    """Requested rates, message id -> Hz.
-
-    Attributes:
-        wanted: requested until received.
-        optional: requested once, and again if they stop; vehicles without a gimbal do not have its attitude.
-    """
-
-    wanted: dict[int, float]
-    optional: dict[int, float] = field(default_factory=dict)
-
-    def of(self, autopilot: Autopilot) -> "Rates":
-        """The rates of the messages that an autopilot has.
-
-        ArduPilot answers a request for a message that it does not have with a text to all stations.
-        """
-        foreign = _PX4_ONLY if autopilot is Autopilot.ARDUPILOT else _ARDUPILOT_ONLY
-        wanted, optional = ({k: hz for k, hz in r.items() if k not in foreign} for r in (self.wanted, self.optional))
-        return Rates(wanted, optional)
-
-
-def default_rates() -> Rates:
-    """Position and attitude at 10 Hz, the state of the mission at 2 Hz, the rest at 1 Hz."""
-    pose_hz = 10.0
-    return Rates(
-        {
-            GLOBAL_POSITION_INT: pose_hz,
-            ATTITUDE: pose_hz,
-            int(dialect.MAVLINK_MSG_ID_MISSION_CURRENT): 2.0,
-            int(dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE): 1.0,
-            int(dialect.MAVLINK_MSG_ID_SYSTEM_TIME): 1.0,
-            GPS_RAW_INT: 1.0,
-            SYS_STATUS: 1.0,
-        },
-        {
-            int(dialect.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS): pose_hz,
-            # Only from a rangefinder that states its limits: a height from a coarse terrain map is worse than none.
-            int(dialect.MAVLINK_MSG_ID_DISTANCE_SENSOR): 2.0,
-            int(dialect.MAVLINK_MSG_ID_HOME_POSITION): 0.2,
-            _EKF: 1.0,
-            _ESTIMATOR: 1.0,
-            BATTERY_STATUS: 1.0,  # of one battery after the other
-        },
-    )
 
 
 @dataclass(slots=True, kw_only=True)
@@ -93,14 +35,14 @@ class Streams:
     """Keeps the streams of one vehicle running. Not a dialogue that ends, so driven by `seen`, `acknowledged`, `tick`.
 
     Attributes:
-        vehicle: whom to ask; own: who asks.
+        vehicle: whom to ask; own: who asks. rates: what to ask for, message id -> Hz.
         deadline: when `tick` wants to be called.
         refused: messages that the vehicle does not have.
     """
 
     vehicle: Address
     own: Address
-    rates: Rates
+    rates: Mapping[int, float]
     deadline: float = 0.0
     refused: set[int] = field(default_factory=set)
     _streams: dict[int, _Stream] = field(default_factory=dict)
@@ -116,19 +58,18 @@ class Streams:
 
     def start(self, now: float) -> list[Message]:
         """Request everything (again after a reboot, or when a vehicle is found again)."""
-        wanted = {**self.rates.wanted, **self.rates.optional}
         before = self._streams
         self._streams = {
             kind: _Stream(
                 hz=hz,
-                optional=kind in self.rates.optional,
+                optional=HEARD[kind].optional,
                 again_at=now + _BACKOFF_S[0],
                 last=before[kind].last if kind in before else None,
             )
-            for kind, hz in wanted.items()
+            for kind, hz in self.rates.items()
         }
         self.refused.clear()
-        self._queue, self._asking, self._window = list(wanted), None, now
+        self._queue, self._asking, self._window = list(self.rates), None, now
         return self._next(now)
 
     def seen(self, kind: int, now: float) -> None:
@@ -146,8 +87,8 @@ class Streams:
     @property
     def ready_to_check(self) -> bool:
         """True once each message that a check before a start looks at has come, or was refused."""
-        asked = {kind: self._streams[kind] for kind in _CHECKED if kind in self._streams}
-        return all(stream.last is not None or kind in self.refused for kind, stream in asked.items())
+        asked = [kind for kind in self._streams if HEARD[kind].checked]
+        return all(self._streams[kind].last is not None or kind in self.refused for kind in asked)
 
     def acknowledged(self, message: Message, now: float) -> list[Message]:
         """Process a COMMAND_ACK."""
@@ -168,8 +109,7 @@ class Streams:
 
     def ask_clock(self) -> Message:
         """A request for the vehicle's clock, once a second, for a link besides the one in use."""
-        kind, to = float(dialect.MAVLINK_MSG_ID_SYSTEM_TIME), self.vehicle
-        return dialect.MAVLink_command_long_message(to.system, to.component, _COMMAND, 0, kind, 1e6, 0, 0, 0, 0, 0)
+        return command_long(self.vehicle, _COMMAND, dialect.MAVLINK_MSG_ID_SYSTEM_TIME, 1e6)
 
     def _next(self, now: float) -> list[Message]:
         self._tries = 0
@@ -184,14 +124,7 @@ class Streams:
         assert kind is not None
         self._tries += 1
         self.deadline = now + _ANSWER_S
-        stream = self._streams[kind]
-        to = self.vehicle
-        interval_us = 1e6 / stream.hz if stream.hz > 0 else -1.0
-        return [
-            dialect.MAVLink_command_long_message(
-                to.system, to.component, _COMMAND, 0, float(kind), interval_us, 0, 0, 0, 0, 0
-            )
-        ]
+        return [command_long(self.vehicle, _COMMAND, kind, 1e6 / self._streams[kind].hz)]
 
     def _look(self, now: float) -> None:
         """Queue requests for messages that have stopped or whose rate another ground station has changed."""

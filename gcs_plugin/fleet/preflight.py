@@ -7,29 +7,24 @@ pre-arm checks, its filter) is included here, so that no vehicle takes off while
 import enum
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from gcs_plugin.config import LIMITS
-from gcs_plugin.fleet.autopilot_settings import Setting
+from gcs_plugin.fleet.autopilot_settings import Setting, SetTo
 from gcs_plugin.fleet.fence_limits import fence_findings, fence_limits, in_all_zones
-from gcs_plugin.fleet.message_rates import GPS_RAW_INT
+from gcs_plugin.fleet.heard_messages import MESSAGE_IDS
 from gcs_plugin.fleet.separation.separation_check import SeparationFindings, flights_of, separation_of
 from gcs_plugin.fleet.separation.separation_watch import number_name
+from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.comparison import difference
-from gcs_plugin.mission.geofence import breach
-from gcs_plugin.mission.items import FRAME_GLOBAL, PLAIN_FRAME
+from gcs_plugin.mission.geofence import FenceZone, breach
+from gcs_plugin.mission.items import FRAME_GLOBAL, Mission
 from gcs_plugin.mission.mission_builder import unflyable
 from gcs_plugin.mission.plan_folder import NO_NEEDS, PlanNeeds
 from gcs_plugin.mission.track import fastest_m_s, flight_seconds, highest_m, takeoff_place
 from orthoswarm.config import active
 from orthoswarm.model.earth import distance_m
-
-if TYPE_CHECKING:
-    from gcs_plugin.fleet.autopilot_settings import SetTo
-    from gcs_plugin.fleet.vehicle_state import Vehicle
-    from gcs_plugin.mission.geofence import FenceZone
-    from gcs_plugin.mission.items import Mission
 
 ITEMS: Final = (
     "link", "gps", "ekf", "home", "pre-arm", "battery", "mission", "fence", "height", "return", "failsafe", "speed",
@@ -54,13 +49,7 @@ class Level(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """One item of a check.
-
-    Attributes:
-        name: one of ITEMS.
-        level: its result.
-        reason: the finding in words.
-    """
+    """One item of a check: its name (one of ITEMS), its result, and the finding in words."""
 
     name: str
     level: Level
@@ -73,12 +62,7 @@ class Item:
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """The check of one vehicle.
-
-    Attributes:
-        system: the vehicle.
-        items: in the order of ITEMS.
-    """
+    """The check of one vehicle: its items in the order of ITEMS."""
 
     system: int
     items: tuple[Item, ...]
@@ -109,29 +93,24 @@ class Wanted:
         stored: the mission just read from the vehicle, None to use the known one.
         needs: what the plan relies on.
         legal_height_m: height above takeoff that may be flown without asking.
-        near: finding of the separation check about this vehicle, empty if none.
+        near: whom it comes too near, in words. unexamined: why that could not be examined; empty if it was.
         zones: of the geofence that it holds, None if that has not been read.
-        unexamined: why its separation from others could not be examined, empty if it was.
         reading: its mission is still being read from it.
     """
 
-    mission: "Mission | None" = None
-    stored: "Mission | None" = None
+    mission: Mission | None = None
+    stored: Mission | None = None
     needs: PlanNeeds = NO_NEEDS
     legal_height_m: float = LIMITS.legal_height_m
     near: str = ""
     _: KW_ONLY
     unexamined: str = ""
-    zones: "Sequence[FenceZone] | None" = None
+    zones: Sequence[FenceZone] | None = None
     reading: bool = False
 
 
-def preflight(vehicle: "Vehicle", wanted: Wanted, now: float) -> Check:
-    """Check one vehicle before its start.
-
-    Args:
-        vehicle: its state in the fleet. wanted: what it is to fly. now: the fleet's clock.
-    """
+def preflight(vehicle: Vehicle, wanted: Wanted, now: float) -> Check:
+    """Check one vehicle before its start, at a time of the fleet's clock."""
     mission = wanted.mission or wanted.stored or vehicle.mission
     items = (
         _link(vehicle, now), _gps(vehicle, now), _ekf(vehicle), _home(vehicle, mission, wanted), _prearm(vehicle, now),
@@ -144,9 +123,9 @@ def preflight(vehicle: "Vehicle", wanted: Wanted, now: float) -> Check:
 
 
 def preflight_all(
-    vehicles: "Mapping[int, Vehicle]",
-    missions: "Mapping[int, Mission]",
-    stored: "Mapping[int, Mission]",
+    vehicles: Mapping[int, Vehicle],
+    missions: Mapping[int, Mission],
+    stored: Mapping[int, Mission],
     starts: Mapping[int, float],
     now: float,
     *,
@@ -154,7 +133,7 @@ def preflight_all(
     legal_height_m: float = LIMITS.legal_height_m,
     name: Callable[[int], str] = number_name,
     separation: SeparationFindings | None = None,
-    zones: "Mapping[int, Sequence[FenceZone]] | None" = None,
+    zones: Mapping[int, Sequence[FenceZone]] | None = None,
     reading: Collection[int] = (),
 ) -> list[Check]:
     """Check vehicles that are to start together.
@@ -162,14 +141,11 @@ def preflight_all(
     Args:
         vehicles: by system id, as the fleet knows them.
         missions: the plan's; a vehicle without one flies its stored mission.
-        stored: what was read from the vehicles just now.
-        starts: takeoffs in seconds after the first; default 0.
-        now: the fleet's clock.
-        needs, legal_height_m: see Wanted.
+        stored: what was read from the vehicles just now. reading: vehicles whose missions are still being read.
+        starts: takeoffs in seconds after the first; default 0. now: the fleet's clock.
+        needs, legal_height_m: see Wanted. zones: of the geofences that were read.
         name: name of a vehicle by its system id.
-        zones: of the geofences that were read.
         separation: of them from each other and from others, where that was examined before.
-        reading: vehicles whose missions are still being read.
     """
     if separation is None:
         separation = separation_of(flights_of(vehicles, missions, stored, starts), name, needs.apart)
@@ -193,7 +169,7 @@ def red_text(checks: Sequence[Check], overridden: Mapping[int, Iterable[str]]) -
     return {system: "; ".join(f"{i.name}: {i.reason}" for i in items) for system, items in found.items() if items}
 
 
-def _link(vehicle: "Vehicle", now: float) -> Item:
+def _link(vehicle: Vehicle, now: float) -> Item:
     age = now - vehicle.heard
     if vehicle.claimants:
         return Item("link", Level.RED, f"several vehicles use its system id: {', '.join(vehicle.claimants)}")
@@ -203,9 +179,9 @@ def _link(vehicle: "Vehicle", now: float) -> Item:
     return Item("link", level, f"heard {age:.1f} s ago")
 
 
-def _gps(vehicle: "Vehicle", now: float) -> Item:
+def _gps(vehicle: Vehicle, now: float) -> Item:
     count = vehicle.satellites
-    if (age_s := vehicle.streams.age_s(GPS_RAW_INT, now) or 0.0) > LIMITS.old_s:
+    if (age_s := vehicle.streams.age_s(MESSAGE_IDS["GPS_RAW_INT"], now) or 0.0) > LIMITS.old_s:
         return Item("gps", Level.RED, f"it has not reported its receiver's state for {age_s:.0f} s")
     if vehicle.gps_fix < 3:
         return Item("gps", Level.RED, f"no 3D fix ({count if count != _UNKNOWN_SATELLITES else 0} satellites)")
@@ -219,7 +195,7 @@ def _gps(vehicle: "Vehicle", now: float) -> Item:
     return Item("gps", level, "3D fix" if count == _UNKNOWN_SATELLITES else f"3D fix, {count} satellites")
 
 
-def _ekf(vehicle: "Vehicle") -> Item:
+def _ekf(vehicle: Vehicle) -> Item:
     if vehicle.ekf_ok is None:
         return Item("ekf", Level.WARNING, "it does not report its position filter")
     if not vehicle.ekf_ok:
@@ -227,39 +203,36 @@ def _ekf(vehicle: "Vehicle") -> Item:
     return Item("ekf", Level.OK, "position filter is running")
 
 
-def _home(vehicle: "Vehicle", mission: "Mission | None", wanted: Wanted) -> Item:
+def _home(vehicle: Vehicle, mission: Mission | None, wanted: Wanted) -> Item:
     off = _off_start(vehicle, mission, wanted) if mission is not None and not vehicle.flying else ""
     if off:
         return Item("home", Level.RED, f"{off}; plan from where it stands, or put it there")
     if vehicle.home is None:
         return Item("home", Level.WARNING, "not set yet; it is set when the vehicle arms")
-    if vehicle.lat_deg is None or vehicle.lon_deg is None:
+    if vehicle.place is None:
         return Item("home", Level.WARNING, "set, but the vehicle does not report its position")
-    away = distance_m(vehicle.lat_deg, vehicle.lon_deg, *vehicle.home[:2])
+    away = distance_m(*vehicle.place, *vehicle.home)
     if away > _HOME_M and not vehicle.flying:
         return Item("home", Level.WARNING, f"home is {away:.0f} m away from where it stands")
     return Item("home", Level.OK, "set")
 
 
-def _off_start(vehicle: "Vehicle", mission: "Mission", wanted: Wanted) -> str:
+def _off_start(vehicle: Vehicle, mission: Mission, wanted: Wanted) -> str:
     """How far a vehicle stands from where its mission takes off, in words; empty if it stands there."""
     first = mission.items[0] if mission.first_seq and mission.items and wanted.mission is not None else None
-    place = takeoff_place(mission)
-    if place is None and first is not None and (first.x or first.y):  # a vehicle's own item 0 is its home
-        place = first.lat_deg, first.lon_deg
-    if place is not None and vehicle.lat_deg is not None and vehicle.lon_deg is not None:
-        away = distance_m(vehicle.lat_deg, vehicle.lon_deg, *place)
+    place = takeoff_place(mission) or (None if first is None else first.place)  # a vehicle's own item 0 is its home
+    if place is not None and vehicle.place is not None:
+        away = distance_m(*vehicle.place, *place)
         if away > LIMITS.start_off_m:
             return f"it stands {away:.0f} m from where its mission takes off"
-    known = first is not None and first.z and PLAIN_FRAME.get(first.frame, first.frame) == FRAME_GLOBAL
-    if known and first is not None and vehicle.alt_m is not None:
+    if first is not None and first.z and first.plain_frame == FRAME_GLOBAL and vehicle.alt_m is not None:
         above = vehicle.alt_m - first.z
         if abs(above) > LIMITS.start_off_height_m:
             return f"it stands {abs(above):.0f} m {'above' if above > 0 else 'below'} where its mission takes off"
     return ""
 
 
-def _prearm(vehicle: "Vehicle", now: float) -> Item:
+def _prearm(vehicle: Vehicle, now: float) -> Item:
     if vehicle.armed:
         return Item("pre-arm", Level.OK, "armed")
     if vehicle.prearm_ok is None:
@@ -270,7 +243,7 @@ def _prearm(vehicle: "Vehicle", now: float) -> Item:
     return Item("pre-arm", Level.OK, "its own checks passed")
 
 
-def _battery(vehicle: "Vehicle", mission: "Mission | None", endurance_s: float, now: float) -> Item:
+def _battery(vehicle: Vehicle, mission: Mission | None, endurance_s: float, now: float) -> Item:
     left = vehicle.battery
     if (age_s := vehicle.battery_age_s(now) or 0.0) > LIMITS.old_s:
         return Item("battery", Level.RED, f"it has not reported its battery for {age_s:.0f} s")
@@ -288,7 +261,7 @@ def _battery(vehicle: "Vehicle", mission: "Mission | None", endurance_s: float, 
     return Item("battery", Level.OK, text)
 
 
-def _mission(vehicle: "Vehicle", wanted: Wanted) -> Item:
+def _mission(vehicle: Vehicle, wanted: Wanted) -> Item:
     held = wanted.stored or vehicle.mission
     if wanted.reading:
         return Item("mission", Level.RED, "its mission is still being read from it; wait")
@@ -299,13 +272,13 @@ def _mission(vehicle: "Vehicle", wanted: Wanted) -> Item:
         return Item("mission", Level.RED, wrong)
     if wanted.mission is not None:
         found = difference(wanted.mission, held.items)
-        if found is not None:
-            return Item("mission", Level.RED, f"it does not hold this plan's mission ({found.text}); upload the plan")
+        if found:
+            return Item("mission", Level.RED, f"it does not hold this plan's mission ({found}); upload the plan")
         return Item("mission", Level.OK, "holds this plan's mission")
     return Item("mission", Level.OK, f"holds a mission of {len(held)} items")
 
 
-def _fence(vehicle: "Vehicle", mission: "Mission | None", zones: "Sequence[FenceZone] | None") -> Item:
+def _fence(vehicle: Vehicle, mission: Mission | None, zones: Sequence[FenceZone] | None) -> Item:
     limits = fence_limits(vehicle)
     if mission is None:
         return Item("fence", Level.OK, "no mission to compare with its geofence")
@@ -322,19 +295,16 @@ def _fence(vehicle: "Vehicle", mission: "Mission | None", zones: "Sequence[Fence
     if limits.unsaid:
         return Item("fence", Level.WARNING, "it keeps a geofence but has not said all its limits; check again")
     lossy = vehicle.route is not None and vehicle.route.loss > LIMITS.lossy_share
-    if lossy and not limits.any and not limits.unsaid and _may_switch_fence_on(vehicle):
+    # ArduPilot has not said when it switches its geofence on; older versions do not say it.
+    unknown = vehicle.autopilot is Autopilot.ARDUPILOT and Setting.FENCE_AUTO not in vehicle.settings
+    if lossy and unknown and not limits.any:
         text = "its geofence is off; whether it switches that on as it arms may have been lost on its link"
         return Item("fence", Level.WARNING, f"{text}; look at FENCE_AUTOENABLE")
     text = "its mission keeps to its geofence" if zones or limits.any else "it has no geofence"
     return Item("fence", Level.OK, f"{text}; zones in it were not read" if zones is None else text)
 
 
-def _may_switch_fence_on(vehicle: "Vehicle") -> bool:
-    """Whether ArduPilot has not said when it switches its geofence on; older versions do not say it."""
-    return vehicle.autopilot is Autopilot.ARDUPILOT and Setting.FENCE_AUTO not in vehicle.settings
-
-
-def _height(mission: "Mission | None", wanted: Wanted) -> Item:
+def _height(mission: Mission | None, wanted: Wanted) -> Item:
     top = highest_m(mission) if mission is not None else None
     if top is None:
         return Item("height", Level.OK, "no height above takeoff in its mission")
@@ -344,7 +314,7 @@ def _height(mission: "Mission | None", wanted: Wanted) -> Item:
     return Item("height", Level.OK, f"goes up to {top:.0f} m")
 
 
-def _return(vehicle: "Vehicle", needed_m: float | None) -> Item:
+def _return(vehicle: Vehicle, needed_m: float | None) -> Item:
     found, how = vehicle.settings.get(Setting.RETURN_HEIGHT), vehicle.settings.get(Setting.RETURN_TYPE)
     least = None if needed_m is None else f"the ground on its way needs {needed_m:.0f} m"
     other = "" if how is None or not how.returns else f"it returns {how.returns} ({how.name} is {how.value:g})"
@@ -365,14 +335,14 @@ def _return(vehicle: "Vehicle", needed_m: float | None) -> Item:
     return Item("return", Level.OK, _way_home(found))
 
 
-def _way_home(height: "SetTo") -> str:
+def _way_home(height: SetTo) -> str:
     """At what height a vehicle flies home, in words."""
     if not height.value:
         return f"flies home at the height at which it is ({height.name} is 0)"
     return f"flies home {height.value:g} m above home, or higher where it is higher ({height.name})"
 
 
-def _too_low(vehicle: "Vehicle", needed_m: float) -> str:
+def _too_low(vehicle: Vehicle, needed_m: float) -> str:
     """Why a straight way home is lower than the ground needs, in words; empty if it is not, or not known to be."""
     found, least = vehicle.settings.get(Setting.RETURN_HEIGHT), f"the ground on its way needs {needed_m:.0f} m"
     if found is not None and found.value < needed_m:
@@ -387,7 +357,7 @@ def _too_low(vehicle: "Vehicle", needed_m: float) -> str:
     return f"{text}; set {limits.top.name} to {needed_m + limits.margin_m:.0f}"
 
 
-def _failsafe(vehicle: "Vehicle") -> Item:
+def _failsafe(vehicle: Vehicle) -> Item:
     low, alone = (vehicle.settings.get(s) for s in (Setting.LOW_BATTERY, Setting.NO_STATION))
     spared = vehicle.settings.get(Setting.NO_STATION_EXCEPT)
     if vehicle.flying and vehicle.had_failsafe:
@@ -417,7 +387,7 @@ def _separation(wanted: Wanted) -> Item:
     return Item("separation", Level.OK, "keeps apart")
 
 
-def _speed(vehicle: "Vehicle", mission: "Mission | None") -> Item:
+def _speed(vehicle: Vehicle, mission: Mission | None) -> Item:
     asked = fastest_m_s(mission) if mission is not None else None
     if asked is None:
         return Item("speed", Level.OK, "its mission leaves the speed to it")

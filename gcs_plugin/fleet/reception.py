@@ -11,37 +11,30 @@ from gcs_plugin.config import HEARING
 from gcs_plugin.fleet.dialogues import Dialogues
 from gcs_plugin.fleet.fleet_events import FleetEvent, Pair, mission_event
 from gcs_plugin.fleet.flight_state import danger_of
+from gcs_plugin.fleet.heard_messages import HEARD, MESSAGE_IDS, Heard, rates_of
 from gcs_plugin.fleet.link_hub import Hub, Side
-from gcs_plugin.fleet.message_rates import Rates, Streams
+from gcs_plugin.fleet.message_rates import Streams
 from gcs_plugin.fleet.routes import LongText, Route
 from gcs_plugin.fleet.separation.separation_watch import SeparationWatch, apart_text, near_text
-from gcs_plugin.fleet.telemetry_check import possible
 from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.mavlink import Autopilot, Message, dialect, has_place, is_vehicle
 from gcs_plugin.links.packets import Packet
 from gcs_plugin.links.transports import Peer
 from gcs_plugin.mission.completion import RELEVANT, CompletionDetector, MissionEvent, Phase
-from gcs_plugin.mission.exchange import Address
+from gcs_plugin.mission.exchange import Address, command_long
 from gcs_plugin.mission.flight_modes import modes_of
 from gcs_plugin.mission.track import Lateness
 
 Handler = Callable[[Vehicle, Message, float], None]
 
 _ASK_WHY_S: Final = 10.0
-MESSAGE_IDS: Final = {kind.msgname: number for number, kind in dialect.mavlink_map.items()}
-_HEARTBEAT, _ACK, _TEXT = MESSAGE_IDS["HEARTBEAT"], MESSAGE_IDS["COMMAND_ACK"], MESSAGE_IDS["STATUSTEXT"]
+_HEARTBEAT, _ACK, _TEXT, _POSITION = (
+    MESSAGE_IDS[name] for name in ("HEARTBEAT", "COMMAND_ACK", "STATUSTEXT", "GLOBAL_POSITION_INT")
+)
 _DETECTED: Final = frozenset(MESSAGE_IDS[name] for name in RELEVANT)
 _REQUESTS: Final = frozenset({MESSAGE_IDS["MISSION_REQUEST"], MESSAGE_IDS["MISSION_REQUEST_INT"]})
-_BOOT_CLOCKS: Final = frozenset({MESSAGE_IDS["GLOBAL_POSITION_INT"], MESSAGE_IDS["SYSTEM_TIME"]})
-# Late packets of these are out of date.
-_STATES: Final = frozenset({_HEARTBEAT, MESSAGE_IDS["MISSION_CURRENT"], MESSAGE_IDS["EXTENDED_SYS_STATE"]})
-# State that is sent periodically: on a second link it may be late, so only the link in use counts.
-_REPEATED: Final = frozenset({
-    *_STATES, MESSAGE_IDS["GLOBAL_POSITION_INT"], MESSAGE_IDS["ATTITUDE"], MESSAGE_IDS["SYS_STATUS"],
-    MESSAGE_IDS["GPS_RAW_INT"], MESSAGE_IDS["EKF_STATUS_REPORT"], MESSAGE_IDS["ESTIMATOR_STATUS"],
-    MESSAGE_IDS["BATTERY_STATUS"],
-})  # fmt: skip
-_POSITION: Final = MESSAGE_IDS["GLOBAL_POSITION_INT"]
+_BOOT_CLOCKS: Final = frozenset({_POSITION, MESSAGE_IDS["SYSTEM_TIME"]})
+_OTHER: Final = Heard()
 _SAME_TEXT_S: Final = 1.5
 _OVERTAKEN: Final = 64  # packets of its sender that a late one may be behind
 _PART: Final = 50  # characters of a STATUSTEXT
@@ -54,8 +47,6 @@ class Reception:
 
     Args:
         vehicles: by system id; found vehicles are added.
-        hub: the links. dialogues: those under way. own: our address.
-        rates: message rates to request.
         remembered: states of detectors before a restart of this program, by system id.
         event: called with each event. wall: UTC epoch seconds.
 
@@ -65,11 +56,11 @@ class Reception:
     """
 
     def __init__(
-        self, vehicles: dict[int, Vehicle], hub: Hub, *, dialogues: Dialogues, own: Address, rates: Rates,
+        self, vehicles: dict[int, Vehicle], hub: Hub, *, dialogues: Dialogues, own: Address,
         remembered: Mapping[int, Mapping[str, Any]], event: Callable[[FleetEvent], None], wall: Callable[[], float],
     ) -> None:  # fmt: skip
         self._vehicles, self._hub, self._dialogues, self._own = vehicles, hub, dialogues, own
-        self._rates, self._remembered, self._publish, self._wall = rates, dict(remembered), event, wall
+        self._remembered, self._publish, self._wall = dict(remembered), event, wall
         self._counters: dict[tuple[Side, Peer, int, int], int] = {}
         self._said: dict[tuple[int, str], tuple[float, Route]] = {}
         self._lateness: dict[int, Lateness] = {}
@@ -78,12 +69,7 @@ class Reception:
         self.taps: list[Callable[[Packet, float], None]] = []
 
     def packet(self, side: Side, peer: Peer, packet: Packet, now: float, utc: float) -> None:
-        """Process a packet.
-
-        Args:
-            side: its link. peer: its sender there. packet: the packet.
-            now: monotonic seconds. utc: UTC epoch seconds.
-        """
+        """Process a packet of a peer on a link (`side`); now: monotonic seconds, utc: UTC epoch seconds."""
         for listener in self.taps:
             listener(packet, utc)
         vehicle = self._vehicles.get(packet.system)
@@ -91,20 +77,21 @@ class Reception:
             vehicle = self._found(packet, now)
             if vehicle is None:
                 return
-        kind = packet.kind
+        kind, how = packet.kind, HEARD.get(packet.kind, _OTHER)
         late, lost = self._count(vehicle, (side, peer, packet.system, packet.component), packet.seq, now)
-        if not possible(packet.message):
+        if not how.possible(packet.message):
             vehicle.impossible += 1
             return
         vehicle.signs |= packet.signed
         if packet.component == vehicle.address.component:
             vehicle.heard = now  # a camera or companion that is heard says nothing about it
-            route = self._route(vehicle, side, peer, now)
+            route, taken_over = vehicle.routes.heard(side, peer, now)
+            if taken_over:
+                self._taken_over(vehicle, now)
             route.counted(lost)
-            repeated = kind in _REPEATED and vehicle.routes.stale(route, now)
-            self._autopilot_says(
-                vehicle, route, kind, message=packet.message, now=now, stale=repeated or (late and kind in _STATES)
-            )
+            repeated = how.repeated and vehicle.routes.stale(route, now)
+            stale = repeated or (late and how.overtaken)
+            self._autopilot_says(vehicle, route, kind, message=packet.message, now=now, stale=stale)
             if repeated:
                 return
         elif kind in _PHOTOS:
@@ -130,14 +117,8 @@ class Reception:
         self._counters[counter] = seq
         return False, lost
 
-    def _route(self, vehicle: Vehicle, side: Side, peer: Peer, now: float) -> Route:
-        """The route of a packet; streams use the active route."""
-        route, taken_over = vehicle.routes.heard(side, peer, now)
-        if taken_over:
-            self._taken_over(vehicle, now)
-        return route
-
     def _taken_over(self, vehicle: Vehicle, now: float) -> None:
+        """Another route carries commands and streams from now on."""
         if vehicle.route is not None:
             self._event("link", vehicle, f"is commanded over {vehicle.route.address} from now on")
         self._dialogues.send(vehicle.system, vehicle.streams.start(now))
@@ -181,7 +162,7 @@ class Reception:
             self._tell(vehicle, route, now)
 
     def _tell(self, vehicle: Vehicle, route: Route, now: float) -> None:
-        """Pass on what has arrived of a text: all of it, or its last part is lost, or was as long as those before."""
+        """Pass on a text of which no more parts are expected, with a mark for those that were lost."""
         text = route.text
         if text is not None and not text.told:
             text.told = True
@@ -208,7 +189,7 @@ class Reception:
             autopilot=autopilot,
             modes=modes_of(autopilot, heartbeat.type),
             detector=CompletionDetector(autopilot=autopilot),
-            streams=Streams(vehicle=address, own=self._own, rates=self._rates.of(autopilot)),
+            streams=Streams(vehicle=address, own=self._own, rates=rates_of(autopilot)),
             heard=now,
             kind=int(heartbeat.type),
         )
@@ -270,9 +251,7 @@ class Reception:
         if vehicle.prearm_ok is not False or vehicle.armed or now < vehicle.ask_why_at or vehicle.prearm_texts(now):
             return
         vehicle.ask_why_at = now + _ASK_WHY_S
-        to, command = vehicle.address, dialect.MAV_CMD_RUN_PREARM_CHECKS
-        ask = dialect.MAVLink_command_long_message(to.system, to.component, command, 0, 0, 0, 0, 0, 0, 0, 0)
-        self._dialogues.send(vehicle.system, [ask])
+        self._dialogues.send(vehicle.system, [command_long(vehicle.address, dialect.MAV_CMD_RUN_PREARM_CHECKS)])
 
     def _watch_separation(self, now: float) -> None:
         new, ended = self.separation.look(self._vehicles.values(), now)
@@ -298,12 +277,12 @@ class Reception:
             if watched.behind:
                 self._event("caught_up", vehicle, "is no longer behind its plan: it has ended its mission")
             return
-        if over or phase is Phase.SUSPENDED or mission is None or vehicle.lat_deg is None or vehicle.lon_deg is None:
+        if over or phase is Phase.SUSPENDED or mission is None or vehicle.place is None:
             return
         if watched is None:
             watched = self._lateness[vehicle.system] = Lateness(mission)
         was = watched.behind
-        watched.look(vehicle.time_boot_s, vehicle.lat_deg, vehicle.lon_deg, vehicle.height_m)
+        watched.look(vehicle.time_boot_s, *vehicle.place, vehicle.height_m)
         if watched.behind and not was:
             self._event("behind", vehicle, self.behind(vehicle.system))
         elif was and not watched.behind:

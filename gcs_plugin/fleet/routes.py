@@ -55,8 +55,7 @@ class LongText:
 
     Attributes:
         number: that its parts have in common, 0 for a text in one message.
-        severity: MAV_SEVERITY. begun: when the first part came (the fleet's clock).
-        parts: as far as they have arrived, by their place; told: it was passed on.
+        begun: when the first part came (the fleet's clock). told: it was passed on.
     """
 
     number: int
@@ -73,15 +72,13 @@ class LongText:
 
 @dataclass(slots=True, kw_only=True)
 class Route:
-    """A route on which a vehicle is heard.
+    """A route on which a vehicle is heard: a sender on a link.
 
     Attributes:
-        side: the link; peer: the sender on it.
         heard: time of the last packet (the fleet's clock).
         loss: share of packets lost recently, from the sender's counter.
         boot: the vehicle's start on that clock, from its own counter; None before the first position.
         boot_at: when that was computed; asked_at: when its clock was asked for.
-        clock: watches the counter.
         text: the autopilot's last text on it.
     """
 
@@ -131,10 +128,9 @@ class Route:
 
 @dataclass(slots=True)
 class Routes:
-    """All routes to one vehicle.
+    """All routes to one vehicle, by link and peer.
 
     Attributes:
-        known: by link and peer.
         best: the one that carries commands, None before the first packet.
         claimants: addresses of the vehicles that share the system id; empty for a single one.
     """

@@ -3,17 +3,16 @@
 import math
 from collections import deque
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Final
 
-from gcs_plugin.config import HEARING
 from gcs_plugin.fleet.autopilot_settings import CHECKED, NEWER, PARAMETERS, Questions, Setting, SetTo, answer
-from gcs_plugin.fleet.flight_state import flight_state
-from gcs_plugin.fleet.message_rates import BATTERY_STATUS, GLOBAL_POSITION_INT, GPS_RAW_INT, SYS_STATUS, Streams
+from gcs_plugin.fleet.heard_messages import MESSAGE_IDS
+from gcs_plugin.fleet.message_rates import Streams
 from gcs_plugin.fleet.routes import Route, Routes
 from gcs_plugin.links.mavlink import Autopilot, Message, dialect, has_place
 from gcs_plugin.mission.command_dialogues import Pilot
 from gcs_plugin.mission.completion import CompletionDetector
-from gcs_plugin.mission.exchange import Address
+from gcs_plugin.mission.exchange import Address, command_long
 from gcs_plugin.mission.flight_modes import HOLDS, Modes, modes_of
 from gcs_plugin.mission.items import Mission
 from gcs_plugin.mission.start_dialogue import MOVED_M, Standing, mission_id, others_command
@@ -42,15 +41,12 @@ class Vehicle:
     """One vehicle.
 
     Attributes:
-        address: its system and autopilot's component id.
-        autopilot: its dialect; modes: its modes.
-        detector: follows its mission.
         streams: keeps its messages coming.
         routes: the ways on which it is heard, and whether several vehicles use its system id.
-        lost: True while it is silent.
         signs: True once it was heard to sign its messages.
-        heard: when it was heard last (the fleet's clock).
-        lat_deg: latitude, None before the first position; lon_deg: longitude.
+        heard: when it was heard last (the fleet's clock). lost: True while it is silent.
+        kind: MAV_TYPE.
+        lat_deg, lon_deg: None before the first position.
         reported: True once it has sent a position message, if only to say that it has no position.
         height_m: above takeoff. alt_m: above the sea, None before the first position.
         velocity_m_s: north, east, down. heading_rad: clockwise from north, None if it does not know.
@@ -71,8 +67,7 @@ class Vehicle:
         impossible: number of messages with values out of range, which were dropped.
         ekf_ok: whether its filter has an absolute position; None if not reported.
         prearm_ok: whether its pre-arm checks have passed; None if not reported.
-        home: latitude and longitude of its home in degrees, None before it is set.
-        home_alt_m: altitude of its home above the sea, None before it is set.
+        home: latitude and longitude of its home in degrees; home_alt_m: altitude above the sea; None before it is set.
         ask_why_at: when it may be asked again why it would not arm (the fleet's clock).
         pace: seconds of its clock in one of ours; 1 but for a simulation that runs fast or slow.
         launch: where it armed last, latitude and longitude in degrees.
@@ -179,9 +174,14 @@ class Vehicle:
         """True if it is armed and, as far as is known, off the ground."""
         return self.armed and (self.in_air or (not self.landed and self.height_m > 1.5))
 
+    @property
+    def place(self) -> tuple[float, float] | None:
+        """Where it is, latitude and longitude in degrees; None if that is not known."""
+        return None if self.lat_deg is None or self.lon_deg is None else (self.lat_deg, self.lon_deg)
+
     def place_age_s(self, now: float) -> float:
         """Seconds since it reported where it is, or since it was heard, if that is longer ago."""
-        return max(now - self.heard, self.streams.age_s(GLOBAL_POSITION_INT, now) or 0.0)
+        return max(now - self.heard, self.streams.age_s(MESSAGE_IDS["GLOBAL_POSITION_INT"], now) or 0.0)
 
     @property
     def route(self) -> Route | None:
@@ -211,8 +211,7 @@ class Vehicle:
     @property
     def standing(self) -> Standing:
         """What a start that is given now relies on."""
-        placed = not self.flying and self.lat_deg is not None and self.lon_deg is not None
-        place = (self.lat_deg or 0.0, self.lon_deg or 0.0) if placed else None
+        place = None if self.flying else self.place
         return Standing(mode=self.custom_mode, armed=self.armed, place=place, touched=self.touched)
 
     def changed_since(self, then: Standing) -> str:
@@ -239,9 +238,9 @@ class Vehicle:
 
     def battery_age_s(self, now: float) -> float | None:
         """Seconds since its batteries were reported, of several the longest time; None before that."""
-        others_s = self.streams.age_s(BATTERY_STATUS, now) if len(self._batteries) > 1 else None
-        ages = [age_s for age_s in (self.streams.age_s(SYS_STATUS, now), others_s) if age_s is not None]
-        return max(ages, default=None)
+        told = ("SYS_STATUS", "BATTERY_STATUS") if len(self._batteries) > 1 else ("SYS_STATUS",)
+        ages = [self.streams.age_s(MESSAGE_IDS[name], now) for name in told]
+        return max((age_s for age_s in ages if age_s is not None), default=None)
 
     def restarted(self) -> None:
         """Forget what it was set up with: it may have been set up anew, and with other batteries."""
@@ -284,10 +283,7 @@ class Vehicle:
 
     def home_question(self) -> Message:
         """A request for where its home is, which it says every few seconds only."""
-        to, command = self.address, dialect.MAV_CMD_REQUEST_MESSAGE
-        return dialect.MAVLink_command_long_message(
-            to.system, to.component, command, 0, dialect.MAVLINK_MSG_ID_HOME_POSITION, 0, 0, 0, 0, 0, 0
-        )
+        return command_long(self.address, dialect.MAV_CMD_REQUEST_MESSAGE, dialect.MAVLINK_MSG_ID_HOME_POSITION)
 
     @property
     def pilot(self) -> Pilot:
@@ -315,59 +311,12 @@ class Vehicle:
         if handler is not None:
             handler(self, message)
 
-    def summary(self, now: float) -> dict[str, Any]:
-        """Its state as JSON values, for `fleet list --json` and the web map.
-
-        `battery_s` and `gps_s` are the whole seconds since when the battery's state and the receiver's (`gps_fix`,
-        `satellites`) have not been reported: 0 while they come, None if they never came. `faults` are those of its
-        stream: `lost_share` of its packets lately, `damaged` packets of its link, `impossible` messages, both dropped.
-        """
-        return {
-            "id": self.id,
-            "system": self.system,
-            "autopilot": self.autopilot.value,
-            "link": self.route.side.link.name if self.route else "",
-            "state": "lost" if self.lost else "conflict" if self.claimants else "found",
-            "links": [route.address for route in self.routes.fresh(now)],
-            "claimants": list(self.claimants),
-            "flight": flight_state(self).document(),
-            "silent_s": round(now - self.heard, 1),
-            "armed": self.armed,
-            "mode": self.mode,
-            "landed": self.landed,
-            "lat_deg": self.lat_deg,
-            "lon_deg": self.lon_deg,
-            "height_m": round(self.height_m, 2),
-            "alt_m": None if self.alt_m is None else round(self.alt_m, 1),
-            "heading_deg": None if self.heading_rad is None else round(math.degrees(self.heading_rad), 1),
-            "speed_m_s": round(math.hypot(*self.velocity_m_s[:2]), 2),
-            "battery": self.battery,
-            "battery_s": _old_s(self.battery_age_s(now)),
-            "gps_s": _old_s(self.streams.age_s(GPS_RAW_INT, now)),
-            "gps_fix": self.gps_fix,
-            "satellites": self.satellites,
-            "mission": {
-                "phase": self.detector.phase.value,
-                "item": self.mission_seq,
-                "items": self.mission_total,
-            },
-            "photos": self.photos,
-            "home": None if self.home is None else [round(self.home[0], 7), round(self.home[1], 7)],
-            "received": self.received,
-            "missed": self.missed,
-            "faults": {
-                "lost_share": round(self.route.loss, 2) if self.route else 0.0,
-                "damaged": self.route.damaged if self.route else 0,
-                "impossible": self.impossible,
-            },
-        }
-
     # --- one method for each message ---
 
     def _heartbeat(self, m: Message) -> None:
         was, self.armed = self.armed, bool(m.base_mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
-        if self.armed and not was and self.lat_deg is not None and self.lon_deg is not None and not self.in_air:
-            self.launch = self.lat_deg, self.lon_deg
+        if self.armed and not was and self.place is not None and not self.in_air:
+            self.launch = self.place
         changed = self.armed != was or self.custom_mode != int(m.custom_mode)
         self.touched += changed
         self.custom_mode, self.failsafe = int(m.custom_mode), int(m.system_status) in _CRITICAL
@@ -391,14 +340,14 @@ class Vehicle:
         self.velocity_m_s = (m.vx / 100.0, m.vy / 100.0, m.vz / 100.0)
         self.heading_rad = None if m.hdg == 65535 else math.radians(m.hdg / 100.0)
         self.time_boot_s = m.time_boot_ms / 1e3
-        if self.velocity_m_s[2] < _SINKS_M_S:
-            self._sinks_since = None
-        elif self._sinks_since is None or self._sinks_since > self.time_boot_s:
-            self._sinks_since = self.time_boot_s
-        if math.hypot(*self.velocity_m_s[:2]) > _STILL_M_S[0] or abs(self.velocity_m_s[2]) > _STILL_M_S[1]:
-            self._still_since = None
-        elif self._still_since is None or self._still_since > self.time_boot_s:
-            self._still_since = self.time_boot_s
+        moves = math.hypot(*self.velocity_m_s[:2]) > _STILL_M_S[0] or abs(self.velocity_m_s[2]) > _STILL_M_S[1]
+        self._sinks_since = self._since(self._sinks_since, self.velocity_m_s[2] >= _SINKS_M_S)
+        self._still_since = self._since(self._still_since, not moves)
+
+    def _since(self, before: float | None, holds: bool) -> float | None:
+        """Since when something holds on its clock, which may have gone back; None if it does not."""
+        now = self.time_boot_s
+        return None if not holds else now if before is None or before > now else before
 
     def _attitude(self, m: Message) -> None:
         self.roll_rad, self.pitch_rad, self.yaw_rad = m.roll, m.pitch, m.yaw
@@ -465,26 +414,21 @@ class Vehicle:
         self.photos += len(self._pictures) - known
 
 
-def _old_s(age_s: float | None) -> int | None:
-    """The age of a value in whole seconds, 0 while it is renewed: rows change, and are sent, only if it matters."""
-    return None if age_s is None else 0 if age_s < HEARING.lost_s else int(age_s)
-
-
 _HANDLERS: Final = {
-    int(dialect.MAVLINK_MSG_ID_HEARTBEAT): Vehicle._heartbeat,
-    int(dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT): Vehicle._position,
-    int(dialect.MAVLINK_MSG_ID_ATTITUDE): Vehicle._attitude,
-    int(dialect.MAVLINK_MSG_ID_MISSION_CURRENT): Vehicle._mission_current,
-    int(dialect.MAVLINK_MSG_ID_COMMAND_ACK): Vehicle._acknowledged,
-    int(dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE): Vehicle._extended,
-    int(dialect.MAVLINK_MSG_ID_SYSTEM_TIME): Vehicle._system_time,
-    int(dialect.MAVLINK_MSG_ID_GPS_RAW_INT): Vehicle._gps,
-    int(dialect.MAVLINK_MSG_ID_SYS_STATUS): Vehicle._power,
-    BATTERY_STATUS: Vehicle._battery,
-    int(dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT): Vehicle._filter,
-    int(dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS): Vehicle._filter,
-    int(dialect.MAVLINK_MSG_ID_HOME_POSITION): Vehicle._home,
-    int(dialect.MAVLINK_MSG_ID_PARAM_VALUE): Vehicle._parameter,
-    int(dialect.MAVLINK_MSG_ID_CAMERA_FEEDBACK): Vehicle._photo,
-    int(dialect.MAVLINK_MSG_ID_CAMERA_IMAGE_CAPTURED): Vehicle._photo,
+    MESSAGE_IDS["HEARTBEAT"]: Vehicle._heartbeat,
+    MESSAGE_IDS["GLOBAL_POSITION_INT"]: Vehicle._position,
+    MESSAGE_IDS["ATTITUDE"]: Vehicle._attitude,
+    MESSAGE_IDS["MISSION_CURRENT"]: Vehicle._mission_current,
+    MESSAGE_IDS["COMMAND_ACK"]: Vehicle._acknowledged,
+    MESSAGE_IDS["EXTENDED_SYS_STATE"]: Vehicle._extended,
+    MESSAGE_IDS["SYSTEM_TIME"]: Vehicle._system_time,
+    MESSAGE_IDS["GPS_RAW_INT"]: Vehicle._gps,
+    MESSAGE_IDS["SYS_STATUS"]: Vehicle._power,
+    MESSAGE_IDS["BATTERY_STATUS"]: Vehicle._battery,
+    MESSAGE_IDS["EKF_STATUS_REPORT"]: Vehicle._filter,
+    MESSAGE_IDS["ESTIMATOR_STATUS"]: Vehicle._filter,
+    MESSAGE_IDS["HOME_POSITION"]: Vehicle._home,
+    MESSAGE_IDS["PARAM_VALUE"]: Vehicle._parameter,
+    MESSAGE_IDS["CAMERA_FEEDBACK"]: Vehicle._photo,
+    MESSAGE_IDS["CAMERA_IMAGE_CAPTURED"]: Vehicle._photo,
 }

@@ -54,6 +54,11 @@ class Autopilot(enum.Enum):
         """The dialect that a HEARTBEAT announces; all but ArduPilot are treated like PX4."""
         return cls.ARDUPILOT if heartbeat.autopilot == dialect.MAV_AUTOPILOT_ARDUPILOTMEGA else cls.PX4
 
+    @property
+    def first_seq(self) -> int:
+        """Sequence number of the first item of a mission that is flown: 1 on ArduPilot, whose item 0 is home."""
+        return 1 if self is Autopilot.ARDUPILOT else 0
+
 
 def is_autopilot(heartbeat: Message) -> bool:
     """True for the HEARTBEAT of a flight controller; cameras, companions and ground stations send others."""

@@ -28,16 +28,20 @@ def checksum(data: bytes) -> int:
     return _MIRROR8[mirrored >> 8] | (_MIRROR8[mirrored & 0xFF] << 8)
 
 
+def packet_bytes(data: Any, at: int) -> int:
+    """Length of the packet that begins at a place, by its first three bytes; 0 where none does."""
+    if data[at] == V2_MARKER:
+        return int(data[at + 1]) + 12 + (SIGNATURE_BYTES if data[at + 2] & SIGNED else 0)
+    return int(data[at + 1]) + 8 if data[at] == V1_MARKER else 0
+
+
 @dataclass(slots=True, kw_only=True)
 class Packet:
     """One complete packet with a correct checksum.
 
     Attributes:
-        raw: its bytes as received, signature included.
-        system: system id of the sender; component: its component id.
-        seq: the sender's packet counter, 0 to 255.
-        kind: message id.
-        signed: True if it carries a signature (not yet checked).
+        raw: its bytes as received, signature included (not yet checked).
+        system, component: ids of the sender; seq: its packet counter, 0 to 255. kind: message id.
     """
 
     raw: bytes
@@ -106,16 +110,13 @@ class Framer:
         packets: list[Packet] = []
         at, end = 0, len(data)
         while at < end:
-            marker = data[at]
-            if marker not in (V2_MARKER, V1_MARKER):
+            if data[at] not in (V2_MARKER, V1_MARKER):
                 following = [i for i in (data.find(V2_MARKER, at), data.find(V1_MARKER, at)) if i >= 0]
                 at = min(following, default=end)
                 continue
             if end - at < 3:
                 break
-            size = data[at + 1] + (12 if marker == V2_MARKER else 8)
-            if marker == V2_MARKER and data[at + 2] & SIGNED:
-                size += SIGNATURE_BYTES
+            size = packet_bytes(data, at)
             if end - at < size:
                 break
             packet = self._check(data[at : at + size])

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from gcs_plugin.links.mavlink import dialect
+from gcs_plugin.links.mavlink import Message, dialect
 from gcs_plugin.links.packets import Packet
 from orthoswarm.model.errors import InputError
 
@@ -77,6 +77,24 @@ class Signing:
         return True
 
 
+class Packer:
+    """Makes packets of messages: counts them and, with `signing`, signs them."""
+
+    def __init__(self, system: int, component: int, signing: Signing | None = None) -> None:
+        self._mav, self._signing = dialect.MAVLink(None, system, component), signing
+        if signing is not None:
+            self._mav.signing.secret_key, self._mav.signing.sign_outgoing = signing.key, True
+            self._mav.signing.link_id = signing.link_id
+
+    def pack(self, message: Message, utc_s: float) -> bytes:
+        """The next packet, sent at a time in UTC epoch seconds."""
+        if self._signing is not None:
+            self._mav.signing.timestamp = self._signing.next_timestamp(utc_s)
+        raw = bytes(message.pack(self._mav))
+        self._mav.seq = (self._mav.seq + 1) & 0xFF
+        return raw
+
+
 def key_from(text: bytes) -> bytes:
     """The 32 bytes of a key: as they are, as 64 hex digits, or the SHA-256 of a passphrase, as other stations do it."""
     if len(text) == 32:
@@ -92,9 +110,7 @@ def key_from(text: bytes) -> bytes:
 def find_key(path: Path | None = None, environment: Mapping[str, str] = os.environ) -> bytes | None:
     """The signing key from a file, else from the environment; None where nothing is set.
 
-    Args:
-        path: key file, before ORTHOSWARM_SIGNING_KEY_FILE and ORTHOSWARM_SIGNING_KEY of the environment.
-        environment: the environment.
+    A named file counts before ORTHOSWARM_SIGNING_KEY_FILE, that before ORTHOSWARM_SIGNING_KEY.
 
     Raises:
         InputError: the file cannot be read, or the key is empty.

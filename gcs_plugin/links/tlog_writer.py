@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO, Final
 
-from gcs_plugin.links.packets import Framer, Packet
+from gcs_plugin.links.packets import V2_MARKER, Framer, Packet, packet_bytes
 
 _TIME = struct.Struct(">Q")
 _STEP: Final = 8  # bytes of the time before each packet of a tlog
@@ -44,26 +44,20 @@ def read_tlog(path: Path) -> Iterator[tuple[float, Packet]]:
     """Time of arrival (UTC epoch seconds) and packet, one after the other; broken stretches are skipped."""
     data = path.read_bytes()
     at, end = 0, len(data)
-    while at + 16 <= end:
-        marker = data[at + 8]
-        size = data[at + 9] + (12 if marker == 0xFD else 8)
-        if marker == 0xFD and data[at + 10] & 1:
-            size += 13
-        found = Framer().feed(data[at + 8 : at + 8 + size]) if marker in (0xFD, 0xFE) else []
+    while at + _STEP + 8 <= end:
+        size = packet_bytes(data, at + _STEP)
+        found = Framer().feed(data[at + _STEP : at + _STEP + size])
         if found:
             yield _TIME.unpack_from(data, at)[0] / 1e6, found[0]
-            at += 8 + size
+            at += _STEP + size
         else:
             at += 1
 
 
 def write_link_log(log: Path, system: int, out: Path) -> int:
-    """Copy a vehicle's packets, undecoded, from a telemetry log into its own.
+    """Copy a vehicle's packets, undecoded, from a telemetry log, which may still grow, into its own.
 
-    Args:
-        log: `telemetry.tlog` of the workspace; it may still grow.
-        system: the vehicle's MAVLink system id.
-        out: written completely or not at all.
+    `out` is written completely or not at all.
 
     Returns:
         Number of packets; 0 if there is no log.
@@ -78,21 +72,15 @@ def write_link_log(log: Path, system: int, out: Path) -> int:
     with log.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data, part.open("wb") as copy:
         at, end = 0, len(data)
         while at + _STEP + 8 <= end:
-            mark = data[at + _STEP]
-            if mark == 0xFD:
-                size = _STEP + 12 + data[at + _STEP + 1] + (13 if data[at + _STEP + 2] & 1 else 0)
-                sender = data[at + _STEP + 5]
-            elif mark == 0xFE:
-                size = _STEP + 8 + data[at + _STEP + 1]
-                sender = data[at + _STEP + 3]
-            else:  # an incomplete record after a power cut
+            size = packet_bytes(data, at + _STEP)
+            if not size:  # an incomplete record after a power cut
                 at += 1
                 continue
-            if at + size > end:
+            if at + _STEP + size > end:
                 break
-            if sender == system:
-                copy.write(data[at : at + size])
+            if data[at + _STEP + (5 if data[at + _STEP] == V2_MARKER else 3)] == system:
+                copy.write(data[at : at + _STEP + size])
                 count += 1
-            at += size
+            at += _STEP + size
     os.replace(part, out)
     return count

@@ -13,9 +13,8 @@ import selectors
 import socket
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import partial
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from gcs_plugin.links.outgoing import Pending, Stream
 from orthoswarm.model.errors import InputError
@@ -35,12 +34,10 @@ EXAMPLES: Final = "udpin:0.0.0.0:14550, udpout:192.168.1.7:14550, tcp:127.0.0.1:
 
 
 class Link(abc.ABC):
-    """One link.
+    """One link, named as the user wrote it.
 
     Attributes:
-        name: as the user wrote it.
-        problem: why it does not work at present, empty if it does.
-        dropped: packets that could not be sent.
+        problem: why it does not work at present, empty if it does. dropped: packets that could not be sent.
     """
 
     def __init__(self, name: str) -> None:
@@ -58,14 +55,9 @@ class Link(abc.ABC):
 
     @abc.abstractmethod
     def send(self, peer: Peer, data: bytes, expires: float = NEVER) -> bool:
-        """Send to a peer, or drop the packet if that would block.
+        """Send one packet to a peer, or drop it if that would block; returns False if it was dropped at once.
 
-        Args:
-            peer: to whom. data: one packet.
-            expires: monotonic seconds after which it is dropped if still waiting.
-
-        Returns:
-            False where it was dropped at once.
+        One that still waits at `expires` (monotonic seconds) is dropped then.
         """
 
     @abc.abstractmethod
@@ -392,15 +384,8 @@ _KINDS: Final = {"udp": "udpin", "udpin": "udpin", "udpout": "udpout", "tcp": "t
 _BAUD: Final = 57600  # of a serial link, MAVLink's usual
 
 
-@dataclass(frozen=True, slots=True)
-class LinkAddress:
-    """The parsed address of a link.
-
-    Attributes:
-        kind: `udpin`, `udpout`, `tcpin`, `tcpout` or `serial`.
-        host: host, or the device of a serial line.
-        port: port, or the baud rate of a serial line.
-    """
+class LinkAddress(NamedTuple):
+    """The parsed address of a link: `udpin`, `udpout`, `tcpin`, `tcpout` or `serial`, with its device and baud rate."""
 
     kind: str
     host: str

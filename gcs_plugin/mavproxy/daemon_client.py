@@ -15,28 +15,20 @@ _TIMEOUT_S: Final = 240.0
 
 
 class Client:
-    """Talks to the daemon.
-
-    Attributes:
-        url: its address without a slash at the end. token: what commands need.
-    """
+    """Talks to the daemon at a url (no slash at the end); commands need its token."""
 
     def __init__(self, url: str = "http://127.0.0.1:8650", token: str = "") -> None:
         self.url, self.token = url.rstrip("/"), token
 
     def ask(self, path: str, body: dict[str, Any] | None = None) -> Any:
-        """The JSON answer of a route; a POST if there is a body.
-
-        Raises:
-            RuntimeError: the daemon refused, or is not there, with a sentence for the user.
-        """
+        """The JSON answer of a route; errors as of `fetch`."""
         try:
             return json.loads(self.fetch(path, body))
         except ValueError:
             raise RuntimeError(f"what answers at {self.url} is not a daemon; use 'orthoswarm connect'") from None
 
     def fetch(self, path: str, body: dict[str, Any] | None = None) -> bytes:
-        """The answer of a route as it is.
+        """The answer of a route as it is; a POST if there is a body.
 
         Raises:
             RuntimeError: the daemon refused, or is not there, with a sentence for the user.
@@ -77,11 +69,7 @@ def _vehicle(row: dict[str, Any]) -> str:
 
 
 class Commands:
-    """The module's commands: words in, lines for the console out.
-
-    Args:
-        client: the daemon.
-    """
+    """The module's commands: words in, lines for the console out."""
 
     def __init__(self, client: Client) -> None:
         self.client = client

@@ -27,12 +27,11 @@ Pixels = NDArray[np.uint8]
 
 
 class Mosaic(SlipObject):  # type: ignore[misc]
-    """A picture on the map.
+    """A picture on the map, of a version of the layer.
 
     Args:
         rgba: uint8 (rows, columns, 4), rows along Web Mercator's north-south.
         north, west, south, east: of its outer edges, degrees.
-        version: of the layer.
     """
 
     def __init__(self, rgba: Pixels, *, north: float, west: float, south: float, east: float, version: int) -> None:

@@ -23,11 +23,7 @@ _END_S: Final = 60.0
 
 
 class Feed:
-    """Passes packets between MAVProxy's links and one daemon.
-
-    Args:
-        mpstate: MAVProxy's state; its main loop reads the socket.
-        host: where the daemon's link listens. port: on which port.
+    """Passes packets between MAVProxy's links, whose main loop reads the socket, and a daemon whose link listens there.
 
     Attributes:
         down: packets to the daemon. up: packets to vehicles.
@@ -79,9 +75,6 @@ class Feed:
 class Child:
     """A daemon that was started from the console and ends with it, however the console ends (`--end-with-input`).
 
-    Args:
-        workspace: of the daemon. flags: more for `orthoswarm serve`.
-
     Attributes:
         url: of its page. token: what commands need. port: of its link.
 
@@ -115,8 +108,7 @@ class Child:
     def close(self, wait_s: float = 3.0) -> None:
         """End it as Ctrl-C does; what is under way goes on at the next start.
 
-        Args:
-            wait_s: how long to wait for its end; MAVProxy stands still meanwhile. Then it ends by itself.
+        MAVProxy stands still meanwhile, so after `wait_s` it ends by itself.
         """
         if self.running:
             self._process.terminate()

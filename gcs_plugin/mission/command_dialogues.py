@@ -7,7 +7,7 @@ from typing import Final
 
 from gcs_plugin.config import COMMAND
 from gcs_plugin.links.mavlink import Autopilot, Message, dialect, is_autopilot
-from gcs_plugin.mission.exchange import NEVER, Address, Exchange, Outcome, Verdict
+from gcs_plugin.mission.exchange import NEVER, Address, Exchange, Outcome, Verdict, command_long
 from gcs_plugin.mission.flight_modes import LANDS, RETURNS, Modes, mode_params
 
 _ACCEPTED: Final = int(dialect.MAV_RESULT_ACCEPTED)
@@ -24,9 +24,7 @@ class Command(Exchange):
     """One COMMAND_LONG, repeated until it is acknowledged or expires.
 
     Attributes:
-        command: MAV_CMD.
-        params: parameters 1 to 7, missing ones 0.
-        verb: what it does, for messages: "arm".
+        command: MAV_CMD. verb: what it does, for messages: "arm".
         insist_s: how long the command is repeated after refusals. repeat_s: time between repetitions without an answer.
         patience_s: silence after which it gives up, if it does not expire before.
         reasons: the vehicle's texts meanwhile.
@@ -60,7 +58,7 @@ class Command(Exchange):
             text = str(message.text).strip("\x00 ")
             if text and text not in self.reasons:
                 self.reasons = [*self.reasons[-2:], text]
-        if kind != "COMMAND_ACK" or message.command != self.command or not self._meant(message):
+        if kind != "COMMAND_ACK" or message.command != self.command or not self._for_us(message):
             return []
         self._heard = now
         result = int(message.result)
@@ -86,10 +84,6 @@ class Command(Exchange):
             return []
         return self._send(now)
 
-    def _meant(self, message: Message) -> bool:
-        # Autopilots that do not fill the target leave 0.
-        return message.target_system in (0, self.own.system) and message.target_component in (0, self.own.component)
-
     def _expired(self, now: float) -> None:
         name = f"vehicle {self.vehicle.system}"
         if self.delivered:
@@ -105,10 +99,8 @@ class Command(Exchange):
 
     def _send(self, now: float) -> list[Message]:
         self.deadline = now + self.repeat_s
-        values = (*self.params, *(0.0,) * 7)[:7]
-        confirmation, self._sent = min(self._sent, 255), self._sent + 1
-        to = self.vehicle
-        return [dialect.MAVLink_command_long_message(to.system, to.component, self.command, confirmation, *values)]
+        again, self._sent = min(self._sent, 255), self._sent + 1
+        return [command_long(self.vehicle, self.command, *self.params, confirmation=again)]
 
     def _refuse(self, result: int) -> None:
         entry = dialect.enums["MAV_RESULT"].get(result)
@@ -119,11 +111,7 @@ class Command(Exchange):
 
 @dataclass(slots=True)
 class GoOn(Command):
-    """A command to go on with a mission; it ends where the vehicle is seen to be sent home, or to land, meanwhile.
-
-    Attributes:
-        modes: the autopilot's. was: the mode that it was in.
-    """
+    """A command to go on with a mission, void if the vehicle changes from its mode (`was`) to a return or landing."""
 
     modes: Modes = field(kw_only=True)
     was: int = field(kw_only=True)
@@ -142,11 +130,7 @@ class GoOn(Command):
 
 @dataclass(slots=True)
 class Several(Exchange):
-    """Dialogues one after the other; subclasses decide what the end of one means.
-
-    Attributes:
-        steps: the dialogues.
-    """
+    """Dialogues one after the other; subclasses decide what the end of one means."""
 
     steps: list[Exchange] = field(kw_only=True)
     _at: int = field(default=0, init=False)
@@ -166,11 +150,6 @@ class Several(Exchange):
     def rebooted(self, now: float) -> list[Message]:
         """Tell the present one."""
         return self._follow(self.steps[self._at].rebooted(now), now) if self.outcome is None else []
-
-    @property
-    def progress(self) -> float:
-        """Share of the steps that are done."""
-        return 1.0 if self.outcome is not None else self._at / len(self.steps)
 
     def _follow(self, messages: list[Message], now: float) -> list[Message]:
         while (outcome := self.steps[self._at].outcome) is not None:
@@ -243,12 +222,7 @@ class Either(Several):
 
 @dataclass(frozen=True, slots=True)
 class Pilot:
-    """Makes the commands for one vehicle.
-
-    Attributes:
-        vehicle: its address; own: ours.
-        autopilot: its dialect; modes: its modes.
-    """
+    """Makes the commands for one vehicle; `own` is our address."""
 
     vehicle: Address
     own: Address

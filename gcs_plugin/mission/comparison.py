@@ -7,16 +7,13 @@ item 0 is its home. PX4 turns degrees into doubles and back.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
-from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.items import (
     CHANGE_SPEED,
     DELAY,
     JUMP,
     LAND,
     LOITER_UNLIM,
-    PLAIN_FRAME,
     RTL,
     TAKEOFF,
     TRIGGER_DISTANCE,
@@ -35,29 +32,15 @@ _PLACE_E7 = 2
 _ALTITUDE_M = 0.011
 
 
-@dataclass(frozen=True, slots=True)
-class Difference:
-    """Where two missions differ.
-
-    Attributes:
-        item: sequence number of the first difference, None if the number of items differs.
-        text: what differs, in words.
-    """
-
-    item: int | None
-    text: str
-
-
-def difference(mission: Mission, stored: Sequence[MissionItem]) -> Difference | None:
-    """The first relevant difference between a mission and the one stored in a vehicle, None if there is none."""
+def difference(mission: Mission, stored: Sequence[MissionItem]) -> str:
+    """The first relevant difference between a mission and the one stored in a vehicle, in words; empty if none."""
     if len(stored) != len(mission):
-        return Difference(None, f"{len(stored)} items are stored, not {len(mission)}")
-    start = 1 if mission.autopilot is Autopilot.ARDUPILOT else 0
-    for seq in range(start, len(stored)):
+        return f"{len(stored)} items are stored, not {len(mission)}"
+    for seq in range(mission.first_seq, len(stored)):
         text = _item_difference(mission.items[seq], stored[seq])
         if text:
-            return Difference(seq, f"item {seq} ({mission.items[seq].name}): {text}")
-    return None
+            return f"item {seq} ({mission.items[seq].name}): {text}"
+    return ""
 
 
 def _item_difference(sent: MissionItem, stored: MissionItem) -> str:
@@ -69,7 +52,7 @@ def _item_difference(sent: MissionItem, stored: MissionItem) -> str:
             return f"param{index + 1} is {theirs:g} instead of {ours:g}"
     if not sent.has_place:
         return ""
-    if PLAIN_FRAME.get(sent.frame, sent.frame) != PLAIN_FRAME.get(stored.frame, stored.frame):
+    if sent.plain_frame != stored.plain_frame:
         return f"its frame is {stored.frame} instead of {sent.frame}"
     if abs(sent.x - stored.x) > _PLACE_E7 or abs(sent.y - stored.y) > _PLACE_E7:
         return (

@@ -66,8 +66,6 @@ class CompletionDetector:
     """Tracks one vehicle's mission; feed it every message of the vehicle's autopilot in order of arrival.
 
     Attributes:
-        autopilot: the vehicle's dialect.
-        phase: state of the mission.
         seq: the current item as last reported, None before.
         total: reported number of items, without ArduPilot's home; None if not reported.
         armed: None before the first heartbeat.
@@ -110,7 +108,7 @@ class CompletionDetector:
         self.flown = None if mission is None else FlownItems.of(mission)
         self._learned.clear()
         self._learned_count = 0
-        self.total = None if mission is None else len(mission) - self._first_seq
+        self.total = None if mission is None else len(mission) - self.autopilot.first_seq
         self._new_total = None
         self._restart(hot=bool(self.armed))
 
@@ -122,11 +120,11 @@ class CompletionDetector:
                 self._replaced()
             self.flown = flown
             if self._midway:  # stored in flight: what lies before its present item was not flown
-                self.flown.current(self._first_seq)
+                self.flown.current(self.autopilot.first_seq)
             if self.seq is not None and self.phase is not Phase.IDLE:
                 self.flown.current(self.seq)
         self._commands = commands
-        self.total, self._new_total = len(mission) - self._first_seq, None
+        self.total, self._new_total = len(mission) - self.autopilot.first_seq, None
 
     @property
     def knows(self) -> bool:
@@ -197,7 +195,7 @@ class CompletionDetector:
     def final_seq(self) -> int | None:
         """Sequence number of the last item that is flown, None where nothing is known about the mission."""
         if self._commands is not None:
-            return final_nav(self._commands, self._first_seq)
+            return final_nav(self._commands, self.autopilot.first_seq)
         if self.total:
             return self.total if self.autopilot is Autopilot.ARDUPILOT else self.total - 1
         return None
@@ -205,7 +203,7 @@ class CompletionDetector:
     @property
     def ending(self) -> Ending:
         """How the mission ends, as far as it is known."""
-        return Ending.UNKNOWN if self._commands is None else ending_of(self._commands, self._first_seq)
+        return Ending.UNKNOWN if self._commands is None else ending_of(self._commands, self.autopilot.first_seq)
 
     def state(self) -> dict[str, Any]:
         """Its state as JSON values, so that a restarted program can continue."""
@@ -226,10 +224,6 @@ class CompletionDetector:
         restored["flown"] = None if flown is None else FlownItems.from_state(flown)
         restored["_untold"] = [MissionEvent(event) for event in values.get("_untold", ())]
         return cls(**restored)
-
-    @property
-    def _first_seq(self) -> int:
-        return 1 if self.autopilot is Autopilot.ARDUPILOT else 0
 
     @property
     def _at_final(self) -> bool:
@@ -349,7 +343,7 @@ class CompletionDetector:
         if self.flown is not None:
             self.flown = FlownItems(places=self.flown.places, lines=self.flown.lines)
             if not self._joined:  # else it may have flown a part before it was heard
-                self.flown.current(self._first_seq)
+                self.flown.current(self.autopilot.first_seq)
             self.flown.current(self.seq or 0)
         return [MissionEvent.STARTED]
 
@@ -413,4 +407,4 @@ class CompletionDetector:
         count = self._learned_count
         if count and len(self._learned) == count and max(self._learned) == count - 1:
             self._commands = [self._learned[seq] for seq in range(count)]
-            self.total = count - self._first_seq
+            self.total = count - self.autopilot.first_seq

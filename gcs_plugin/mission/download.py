@@ -75,11 +75,8 @@ class MissionDownload(Exchange):
             return []
         if now - self._heard_at > self.patience_s:
             why = ", another ground station is using it" if self._refused == DENIED else ""
-            self._end(
-                False,
-                f"vehicle {self.vehicle.system} did not send its mission{why}; check the link",
-                Verdict.UNKNOWN,
-            )
+            text = f"vehicle {self.vehicle.system} did not send its mission{why}; check the link"
+            self._end(False, text, Verdict.UNKNOWN)
             return []
         self._trip.missed()
         self._unanswered += 1
@@ -94,13 +91,6 @@ class MissionDownload(Exchange):
     def mission_type(self) -> int:
         """See Exchange."""
         return self.list_type
-
-    @property
-    def progress(self) -> float:
-        """Share of the items received."""
-        if self.outcome is not None:
-            return 1.0
-        return len(self._got) / self._count if self._count else 0.0
 
     def _restart(self, now: float) -> list[Message]:
         self._count = None

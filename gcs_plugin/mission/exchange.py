@@ -1,8 +1,7 @@
 """A dialogue with one vehicle as a state machine: messages and the time go in, messages come out.
 
-The caller (the fleet, or a test with its own clock) calls `start` once, `feed` for each message of
-the vehicle's autopilot, and `tick` at `deadline` at the latest, sends the returned messages, and stops when `outcome`
-is set.
+The caller (the fleet, or a test with its own clock) calls `start` once, `feed` for each message of the vehicle's
+autopilot, and `tick` at `deadline` at the latest, sends the returned messages, and stops when `outcome` is set.
 Times are seconds of any clock that does not go backwards. Nothing here waits, so one thread serves a hundred vehicles.
 """
 
@@ -58,12 +57,10 @@ class Outcome:
     """How an exchange ended.
 
     Attributes:
-        ok: True if the vehicle has done it.
         text: one sentence for the user.
-        item: sequence number of the mission item that a vehicle refused, None if it is about something else.
-        field: the field of that item, empty if none.
-        code: the vehicle's MAV_MISSION_RESULT, None without a refusal.
-        failure: kind of failure, None without one.
+        item, field, code: of a refused mission: the item's sequence number (None if it is about something else), its
+            field (empty if none), and the vehicle's MAV_MISSION_RESULT.
+        failure: kind of failure, if it is not ok.
     """
 
     ok: bool
@@ -79,13 +76,18 @@ class Outcome:
         return Verdict.DONE if self.ok else self.failure
 
 
+def command_long(to: Address, command: int, *params: float, confirmation: int = 0) -> Message:
+    """A COMMAND_LONG; parameters that are not given are 0."""
+    values = (*params, *(0.0,) * 7)[:7]
+    return dialect.MAVLink_command_long_message(to.system, to.component, command, confirmation, *values)
+
+
 @dataclass(slots=True)
 class Exchange(abc.ABC):
     """The common part of all dialogues.
 
     Attributes:
-        vehicle: its address.
-        own: our address; replies to others are ignored.
+        vehicle: its address. own: our address; replies to others are ignored.
         outcome: None until it has ended.
         deadline: when `tick` wants to be called next.
         expires: after this time nothing that starts the command may be sent.
@@ -142,16 +144,10 @@ class Exchange(abc.ABC):
         """Whether a transfer of a mission is still changing the vehicle's mode."""
         return False
 
-    @property
-    def progress(self) -> float:
-        """How far it is, 0 to 1."""
-        return 0.0 if self.outcome is None else 1.0
-
     def _for_us(self, message: Message) -> bool:
-        return message.target_system in (self.own.system, BROADCAST) and message.target_component in (
-            self.own.component,
-            BROADCAST,
-        )
+        """Whether an answer is; autopilots that do not fill the target leave 0, as those do that say it to all."""
+        ours = message.target_system in (self.own.system, BROADCAST)
+        return ours and message.target_component in (self.own.component, BROADCAST)
 
     def _mission_kind(self, message: Message) -> str:
         """The type of a message of the mission protocol that is meant for us while this is under way, else empty."""

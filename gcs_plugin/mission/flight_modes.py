@@ -17,15 +17,12 @@ def _px4(main: int, sub: int = 0) -> int:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Modes:
-    """The modes of one kind of vehicle.
+    """The modes of one kind of vehicle, and all that have a name here.
 
     Attributes:
-        mission: flies the mission.
         ready: stays put and lets itself be armed, before a mission is started.
         hold: stays where it is in the air, whatever the sticks say.
-        rtl: flies home and lands.
         land: lands where it is; where there is no such mode, rtl.
-        names: all that have a name here.
     """
 
     mission: int

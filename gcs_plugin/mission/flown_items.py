@@ -10,14 +10,14 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Final
 
-from gcs_plugin.mission.items import LAND, TAKEOFF, TRIGGER_DISTANCE, VTOL_LAND, VTOL_TAKEOFF, Mission
+from gcs_plugin.mission.items import LANDINGS, TAKEOFFS, TRIGGER_DISTANCE, Mission
 from gcs_plugin.mission.track import home_of, metres
 
 _CLAIMED_M: Final = 30.0  # corners are rounded by less than that
 _NEAR_M: Final = 15.0  # autopilots round corners by up to 10 m (PX4's NAV_ACC_RAD), receivers err by some metres
 _SILENT_S: Final = 2.0  # between two positions: what happened in between was not seen
 _FASTEST_M_S: Final = 25.0  # no multirotor on a survey flies faster
-_ENDS: Final = frozenset({TAKEOFF, VTOL_TAKEOFF, LAND, VTOL_LAND})
+_ENDS: Final = frozenset({*TAKEOFFS, *LANDINGS})
 
 
 @dataclass(slots=True, kw_only=True)
@@ -27,7 +27,6 @@ class FlownItems:
     Attributes:
         places: item -> latitude and longitude in degrees, of those that are flown between takeoff and landing.
         lines: items that end a line on which pictures are taken; without a camera's trigger, all places.
-        reached: items.
     """
 
     places: dict[int, tuple[float, float]]
@@ -47,8 +46,8 @@ class FlownItems:
         """None of a mission's items reached."""
         places, lines, triggers = dict[int, tuple[float, float]](), list[int](), False
         for seq, item in enumerate(mission.items[mission.first_seq :], mission.first_seq):
-            if item.is_nav and item.has_place and item.command not in _ENDS and (item.x or item.y):
-                places[seq] = item.lat_deg, item.lon_deg
+            if item.is_nav and item.has_place and item.command not in _ENDS and item.place is not None:
+                places[seq] = item.place
                 lines += [seq] if triggers else []
             elif item.command == TRIGGER_DISTANCE:
                 triggers = item.params[0] > 0.0
@@ -142,10 +141,9 @@ class FlownItems:
 
 def off_leg_m(mission: Mission, seq: int, place: tuple[float, float]) -> float | None:
     """How far a place (degrees) is from the way to a mission's item, metres; None where the item has no place."""
-    places = {
-        s: (i.lat_deg, i.lon_deg) for s, i in enumerate(mission.items) if i.is_nav and i.has_place and (i.x or i.y)
-    }
-    takeoff = seq < len(mission) and mission.items[seq].command in (TAKEOFF, VTOL_TAKEOFF)
+    placed = {s: i.place for s, i in enumerate(mission.items) if i.is_nav and i.has_place}
+    places = {s: spot for s, spot in placed.items() if spot is not None}
+    takeoff = seq < len(mission) and mission.items[seq].command in TAKEOFFS
     end = home_of(mission) if takeoff else places.get(seq)
     if end is None:
         return None

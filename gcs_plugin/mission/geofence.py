@@ -3,13 +3,10 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import Any, Final, Literal
 
 from gcs_plugin.links.mavlink import dialect
-from gcs_plugin.mission.items import MissionItem
-
-if TYPE_CHECKING:
-    from gcs_plugin.mission.items import Mission
+from gcs_plugin.mission.items import Mission, MissionItem
 
 _ROUNDING_M: Final = 0.5
 """A way along the edge of a zone may lie so far on the wrong side: places are rounded."""
@@ -30,7 +27,6 @@ class FenceZone:
     """A zone that a vehicle must stay inside (inclusion) or outside of (exclusion).
 
     Attributes:
-        kind: which of the two.
         points: longitude and latitude in degrees of a polygon's corners without the closing one, or of a centre.
         radius_m: of a circle, None for a polygon.
     """
@@ -46,12 +42,10 @@ class FenceZone:
         return {"kind": self.kind, "center": list(self.points[0]), "radius_m": self.radius_m}
 
 
-def breach(mission: "Mission", zones: "Sequence[FenceZone]", *, in_all: bool = False) -> str:
+def breach(mission: Mission, zones: "Sequence[FenceZone]", *, in_all: bool = False) -> str:
     """Where a mission leaves the zones it must stay inside of, or enters others, in words; empty if it keeps to them.
 
-    Args:
-        mission: the mission. zones: of the vehicle.
-        in_all: it must be in all inclusion zones, not just in any of them.
+    `in_all`: it must be in all inclusion zones, not just in any of them.
     """
     from shapely import LineString, Point, Polygon, intersection_all, union_all
 
@@ -81,8 +75,7 @@ def breach(mission: "Mission", zones: "Sequence[FenceZone]", *, in_all: bool = F
 def zones_of(items: Sequence[MissionItem]) -> list[FenceZone]:
     """The zones of a fence list; return points and polygons that are not complete are left out.
 
-    Args:
-        items: as downloaded. A polygon is a row of vertices that each state how many it has (param1).
+    A polygon is a row of vertices that each state how many it has (param1).
     """
     zones: list[FenceZone] = []
     k = 0

@@ -3,7 +3,7 @@
 import enum
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from gcs_plugin.links.mavlink import Autopilot, Message, command_name, dialect
 
@@ -20,14 +20,15 @@ LAND = int(dialect.MAV_CMD_NAV_LAND)
 TAKEOFF = int(dialect.MAV_CMD_NAV_TAKEOFF)
 VTOL_LAND = int(dialect.MAV_CMD_NAV_VTOL_LAND)
 VTOL_TAKEOFF = int(dialect.MAV_CMD_NAV_VTOL_TAKEOFF)
+TAKEOFFS = (TAKEOFF, VTOL_TAKEOFF)
+LANDINGS = (LAND, VTOL_LAND)
 DELAY = int(dialect.MAV_CMD_NAV_DELAY)
 JUMP = int(dialect.MAV_CMD_DO_JUMP)
 CHANGE_SPEED = int(dialect.MAV_CMD_DO_CHANGE_SPEED)
 TRIGGER_DISTANCE = int(dialect.MAV_CMD_DO_SET_CAM_TRIGG_DIST)
 
 _NAV_LAST = int(dialect.MAV_CMD_NAV_LAST)
-# The _INT frames of MISSION_ITEM_INT mean the same as the plain ones; autopilots answer with the plain ones.
-PLAIN_FRAME = {5: 0, 6: 3, 11: 10}
+_PLAIN_FRAME = {5: 0, 6: 3, 11: 10}
 DEG_E7 = 1e7
 
 
@@ -36,11 +37,9 @@ class MissionItem:
     """One item as it travels; its place in the list is its sequence number.
 
     Attributes:
-        command: MAV_CMD.
-        frame: MAV_FRAME of x, y, z.
+        command: MAV_CMD. frame: MAV_FRAME of x, y, z.
         params: param1 to param4, NaN where the command leaves the choice to the vehicle.
-        x: latitude in 1e-7 degrees for a command with a place, else param5.
-        y: longitude in 1e-7 degrees for a command with a place, else param6.
+        x, y: latitude and longitude in 1e-7 degrees for a command with a place, else param5 and param6.
         z: altitude in metres of the frame, else param7.
     """
 
@@ -64,14 +63,8 @@ class MissionItem:
         frame: int = FRAME_RELATIVE,
     ) -> "MissionItem":
         """An item at a place; the height is above the takeoff level unless the frame says otherwise."""
-        return cls(
-            command=command,
-            frame=frame,
-            params=params,
-            x=round(lat_deg * DEG_E7),
-            y=round(lon_deg * DEG_E7),
-            z=height_m,
-        )
+        x, y = round(lat_deg * DEG_E7), round(lon_deg * DEG_E7)
+        return cls(command=command, frame=frame, params=params, x=x, y=y, z=height_m)
 
     @classmethod
     def do(cls, command: int, *params: float) -> "MissionItem":
@@ -89,6 +82,16 @@ class MissionItem:
         """True where x, y, z are latitude, longitude and altitude."""
         entry = dialect.enums["MAV_CMD"].get(self.command)
         return bool(entry is not None and entry.has_location and self.frame != FRAME_MISSION)
+
+    @property
+    def plain_frame(self) -> int:
+        """Its frame; the _INT frames mean the same as the plain ones, with which autopilots answer."""
+        return _PLAIN_FRAME.get(self.frame, self.frame)
+
+    @property
+    def place(self) -> tuple[float, float] | None:
+        """Latitude and longitude in degrees, of an item with a place; None where both are 0: where the vehicle is."""
+        return (self.lat_deg, self.lon_deg) if self.x or self.y else None
 
     @property
     def lat_deg(self) -> float:
@@ -117,25 +120,14 @@ class MissionItem:
     @classmethod
     def of(cls, message: Message) -> "MissionItem":
         """The item in a MISSION_ITEM_INT, or in a MISSION_ITEM with its degrees in floats."""
+        params = (float(message.param1), float(message.param2), float(message.param3), float(message.param4))
+        on, z = bool(message.autocontinue), float(message.z)
+        item = cls(command=message.command, frame=message.frame, params=params, z=z, autocontinue=on)
         x, y = message.x, message.y
         if message.get_type() == "MISSION_ITEM":
-            placed = message.frame != FRAME_MISSION and dialect.enums["MAV_CMD"].get(message.command) is not None
-            scale = DEG_E7 if placed and dialect.enums["MAV_CMD"][message.command].has_location else 1.0
-            x, y = round(_finite(x) * scale), round(_finite(y) * scale)
-        params = (float(message.param1), float(message.param2), float(message.param3), float(message.param4))
-        return cls(
-            command=message.command,
-            frame=message.frame,
-            params=params,
-            x=int(x),
-            y=int(y),
-            z=float(message.z),
-            autocontinue=bool(message.autocontinue),
-        )
-
-
-def _finite(value: float) -> float:
-    return value if math.isfinite(value) else 0.0
+            scale = DEG_E7 if item.has_place else 1.0
+            x, y = (round((value if math.isfinite(value) else 0.0) * scale) for value in (x, y))
+        return replace(item, x=int(x), y=int(y))
 
 
 class Ending(enum.Enum):
@@ -153,7 +145,6 @@ class Mission:
     """A mission for one vehicle, item by item as it goes on the wire.
 
     Attributes:
-        autopilot: the dialect that it is built for.
         items: all items; for ArduPilot item 0 is home (the vehicle overwrites it), for PX4 it is flown.
         name: for messages to the user.
     """
@@ -167,8 +158,8 @@ class Mission:
 
     @property
     def first_seq(self) -> int:
-        """Sequence number of the first item that is flown: 1 on ArduPilot, 0 on PX4."""
-        return 1 if self.autopilot is Autopilot.ARDUPILOT else 0
+        """Sequence number of the first item that is flown."""
+        return self.autopilot.first_seq
 
     @property
     def final_seq(self) -> int | None:

@@ -21,8 +21,8 @@ from gcs_plugin.mission.items import (
     LAND,
     LOITER_TIME,
     TAKEOFF,
+    TAKEOFFS,
     TRIGGER_DISTANCE,
-    VTOL_TAKEOFF,
     WAYPOINT,
     Mission,
     MissionItem,
@@ -42,7 +42,6 @@ def build_mission(
     """The mission for one autopilot of items without home.
 
     Args:
-        autopilot: the dialect.
         items: what is flown, in order.
         home: latitude, longitude (degrees) and altitude (metres) of home; only ArduPilot's item 0 needs it, and the
             vehicle overwrites it with its own.
@@ -55,8 +54,8 @@ def build_mission(
     if not flown:
         raise InputError(f"{name or 'the mission'} has no items; plan one with: orthoswarm plan")
     if autopilot is Autopilot.ARDUPILOT:
-        place = home or _first_place(flown) or (0.0, 0.0, 0.0)
-        flown.insert(0, MissionItem.at(WAYPOINT, place[0], place[1], place[2], frame=FRAME_GLOBAL))
+        first = next((item.place for item in flown if item.has_place and item.place), (0.0, 0.0))
+        flown.insert(0, MissionItem.at(WAYPOINT, *(home or (*first, 0.0)), frame=FRAME_GLOBAL))
     mission = Mission(autopilot, tuple(flown), name)
     _check(mission)
     return mission
@@ -64,11 +63,10 @@ def build_mission(
 
 def unflyable(items: Sequence[MissionItem], autopilot: Autopilot, *, in_air: bool) -> str:
     """Why a stored mission cannot be started, in words; empty if it can."""
-    first = 1 if autopilot is Autopilot.ARDUPILOT else 0
-    flown = [item for item in items[first:] if item.is_nav]
+    flown = [item for item in items[autopilot.first_seq :] if item.is_nav]
     if not flown:
         return "has no mission; upload one first"
-    if not in_air and flown[0].command not in (TAKEOFF, VTOL_TAKEOFF):
+    if not in_air and flown[0].command not in TAKEOFFS:
         return f"has a mission that begins with {flown[0].name} instead of a takeoff; upload one that takes off"
     return ""
 
@@ -95,7 +93,8 @@ def _wire(item: mission_files.FileItem, autopilot: Autopilot) -> MissionItem:
         # its param5 to 7 are unused; files may have leftovers of other items there
         if item.command == TRIGGER_DISTANCE:
             placed = MissionItem.do(item.command, *item.params)
-    params = [_for(value, autopilot) for value in placed.params]
+    unset = 0.0 if autopilot is Autopilot.ARDUPILOT else math.nan  # one object: missions read twice are equal
+    params = [unset if math.isnan(value) else value for value in placed.params]
     if autopilot is Autopilot.PX4 and item.command in _WITH_YAW and not params[3]:
         params[3] = math.nan
     if autopilot is Autopilot.PX4 and item.command == JUMP:
@@ -105,19 +104,6 @@ def _wire(item: mission_files.FileItem, autopilot: Autopilot) -> MissionItem:
     return replace(
         placed, params=(params[0], params[1], params[2], params[3]), frame=frame, z=z, autocontinue=item.autocontinue
     )
-
-
-def _for(value: float, autopilot: Autopilot) -> float:
-    if not math.isnan(value):
-        return value
-    return 0.0 if autopilot is Autopilot.ARDUPILOT else math.nan  # one object: missions read twice are equal
-
-
-def _first_place(items: Sequence[MissionItem]) -> tuple[float, float, float] | None:
-    for item in items:
-        if item.has_place and (item.x or item.y):
-            return item.lat_deg, item.lon_deg, 0.0
-    return None
 
 
 def _check(mission: Mission) -> None:

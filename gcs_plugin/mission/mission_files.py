@@ -35,12 +35,10 @@ class FileItem:
     """One mission item, free of any autopilot's numbering.
 
     Attributes:
-        command: MAV_CMD.
         frame: MAV_FRAME; 3 = heights above home.
         params: params 1 to 4; NaN where the autopilot chooses.
         lat_deg: latitude in degrees (param 5), 0 for commands without a position; lon_deg longitude (param 6).
         alt_m: height in metres in the item's frame (param 7).
-        autocontinue: go on to the next item by itself.
     """
 
     command: int
@@ -59,14 +57,13 @@ class FileItem:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MissionFile:
-    """A mission file's content.
+    """A mission file's content; all outlines and lines are (latitude, longitude) in degrees.
 
     Attributes:
         items: the items in order, home not among them.
         home: latitude, longitude (degrees) and altitude (metres) of home, None if not in the file.
-        surveys: outlines of survey items, each a ring of (latitude, longitude) in degrees.
-        polylines: centre lines of corridor items, (latitude, longitude) in degrees.
-        no_fly: rings of exclusion fences, (latitude, longitude) in degrees. fences: all fences, of both kinds.
+        surveys: outlines of survey items. polylines: centre lines of corridor items.
+        no_fly: rings of exclusion fences. fences: all fences, of both kinds.
         speed_m_s: speed set in the file, or None.
     """
 
@@ -220,14 +217,8 @@ def waypoints_text(items: Sequence[FileItem], home: tuple[float, float, float]) 
     A parameter that PX4 is to choose is "nan", which QGroundControl (Qt's toDouble) and MAVProxy (Python's float) read
     as such; a 0 would turn its nose north.
     """
-    first = FileItem(
-        command=NAV_WAYPOINT,
-        frame=FRAME_GLOBAL,
-        params=(0.0, 0.0, 0.0, 0.0),
-        lat_deg=home[0],
-        lon_deg=home[1],
-        alt_m=home[2],
-    )
+    lat, lon, alt = home
+    first = FileItem(command=NAV_WAYPOINT, frame=FRAME_GLOBAL, lat_deg=lat, lon_deg=lon, alt_m=alt)
     lines = ["QGC WPL 110"]
     for number, item in enumerate([first, *items]):
         params = "\t".join(f"{p:.8g}" for p in item.params)
@@ -238,11 +229,7 @@ def waypoints_text(items: Sequence[FileItem], home: tuple[float, float, float]) 
 
 
 def parse_mission(text: str, name: str = "the file") -> MissionFile:
-    """Read a `.plan` or a `.waypoints` file, distinguished by content.
-
-    Args:
-        text: the file's content.
-        name: how to call the file in an error.
+    """Read a `.plan` or a `.waypoints` file, distinguished by content; `name` is how to call the file in an error.
 
     Raises:
         InputError: it is neither, or a field is missing or no number.
@@ -320,7 +307,9 @@ def _parse_plan(document: Mapping[str, Any]) -> MissionFile:
     fences = [
         Fence(inclusion=bool(p.get("inclusion", True)), points=_ring(p["polygon"])) for p in fence.get("polygons") or []
     ]
-    fences += [_read_circle(c["circle"], bool(c.get("inclusion", True))) for c in fence.get("circles") or []]
+    for c in fence.get("circles") or []:
+        inside, circle = bool(c.get("inclusion", True)), c["circle"]
+        fences.append(Fence(inclusion=inside, points=_ring([circle["center"]]), radius_m=float(circle["radius"])))
     no_fly = [f.points if f.radius_m is None else _around(f) for f in fences if not f.inclusion]
     home = mission.get("plannedHomePosition")
     speed = mission.get("hoverSpeed") or mission.get("cruiseSpeed")
@@ -368,10 +357,6 @@ def _ring(points: Iterable[Sequence[float]]) -> tuple[LatLon, ...]:
     for lat, lon in ring:
         _check_position(lat, lon, "a polygon", True)
     return ring
-
-
-def _read_circle(circle: Mapping[str, Any], inclusion: bool) -> Fence:
-    return Fence(inclusion=inclusion, points=_ring([circle["center"]]), radius_m=float(circle["radius"]))
 
 
 def _around(circle: Fence) -> tuple[LatLon, ...]:

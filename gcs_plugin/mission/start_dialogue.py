@@ -16,7 +16,7 @@ from gcs_plugin.links.mavlink import Autopilot, Message, dialect, has_place, is_
 from gcs_plugin.mission.command_dialogues import Command, InOrder, Pilot, Several
 from gcs_plugin.mission.comparison import difference
 from gcs_plugin.mission.download import AT_ONCE, MissionDownload
-from gcs_plugin.mission.exchange import Address, Exchange, Outcome, Verdict
+from gcs_plugin.mission.exchange import Address, Exchange, Outcome, Verdict, command_long
 from gcs_plugin.mission.flight_modes import Modes, mode_params
 from gcs_plugin.mission.items import Mission
 from gcs_plugin.mission.mission_builder import unflyable
@@ -61,7 +61,6 @@ class Standing:
     """What a vehicle was when its start was given; it must still be that when it is armed.
 
     Attributes:
-        mode: its custom mode. armed: whether it was armed.
         place: latitude and longitude in degrees, None if it was not known, or in the air.
         touched: how often others had changed it or commanded it, as far as its messages show (`Vehicle.touched`).
     """
@@ -77,7 +76,7 @@ class Expected:
     """What a vehicle is to hold.
 
     Attributes:
-        autopilot: its dialect. in_air: whether it is started in the air.
+        in_air: whether it is started in the air.
         mission: the mission that was checked; None for whatever it holds that can be flown.
         known_id: the vehicle's own checksum of that mission, 0 if it has told none.
     """
@@ -91,8 +90,8 @@ class Expected:
         """Why the stored mission is not flown, in words; empty if it is the one."""
         if why := unflyable(stored.items, self.autopilot, in_air=self.in_air):
             return why
-        found = None if self.mission is None else difference(self.mission, stored.items)
-        return "" if found is None else f"no longer holds the mission that was checked ({found.text}); check it again"
+        found = "" if self.mission is None else difference(self.mission, stored.items)
+        return f"no longer holds the mission that was checked ({found}); check it again" if found else ""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -100,10 +99,9 @@ class LastLook(Exchange):
     """Waits until a vehicle shows, all within a second, what the next command relies on; else says what is not so.
 
     Attributes:
-        modes: the autopilot's. mode: what it must be in; was: what it may still be in, by a heartbeat of before.
+        mode: what it must be in; was: what it may still be in, by a heartbeat of before.
         armed: whether it must be armed.
-        place: where it must stand, None where that does not matter.
-        expected: what it must hold, None where that does not matter.
+        place: where it must stand; expected: what it must hold; None where that does not matter.
         mission: what it holds, once that was read here.
     """
 
@@ -177,13 +175,11 @@ class LastLook(Exchange):
 
     def _ask_state(self, now: float) -> list[Message]:
         """Its state comes once a second or less often, on a slow link: what it would tell is asked for."""
-        self._ask_at, to, ask = now + _OFTEN_S, self.vehicle, dialect.MAV_CMD_REQUEST_MESSAGE
+        self._ask_at = now + _OFTEN_S
         kinds = [dialect.MAVLINK_MSG_ID_HEARTBEAT]
         if now - self._fix > FRESH_S:
             kinds.append(dialect.MAVLINK_MSG_ID_GLOBAL_POSITION_INT)
-        return [
-            dialect.MAVLink_command_long_message(to.system, to.component, ask, 0, kind, *(0.0,) * 6) for kind in kinds
-        ]
+        return [command_long(self.vehicle, dialect.MAV_CMD_REQUEST_MESSAGE, kind) for kind in kinds]
 
     def _state(self, mode: int, armed: bool, now: float) -> None:
         late = now - self._began < _OVERTAKEN_S and self._beat < self._began
@@ -236,8 +232,7 @@ class Guarded(Exchange):
     """Looks, and gives an order within a second; if the vehicle refuses or does not answer, both again.
 
     Attributes:
-        look: what it must be. order: the command. obeyed: its mode, and whether it is armed, once it has obeyed.
-        mission: what it was seen to hold.
+        obeyed: its mode, and whether it is armed, once it has obeyed. mission: what it was seen to hold.
     """
 
     look: LastLook = field(kw_only=True)
@@ -324,7 +319,7 @@ class TakesOff(Exchange):
     """Waits until a vehicle flies its mission, and has left the ground; sends nothing.
 
     Attributes:
-        modes: the autopilot's. climbs: whether it stands, so that it has to climb.
+        climbs: whether it stands, so that it has to climb.
         begun_s: when it was first seen on its mission, on the caller's clock.
     """
 
@@ -371,8 +366,7 @@ class TakesOff(Exchange):
 class OrUndo(Several):
     """A step, and a dialogue that undoes the previous one if the vehicle refuses this step; the refusal is the outcome.
 
-    Attributes:
-        undone: text added if undoing succeeded; left: if it failed.
+    `undone` is added to its text if undoing succeeded, `left` if it failed.
     """
 
     undone: str = field(kw_only=True)
@@ -394,11 +388,7 @@ class OrUndo(Several):
 
 @dataclass(slots=True)
 class Start(InOrder):
-    """The steps of a start; it is broken off by `BreakOff` only.
-
-    Attributes:
-        arm: the step that arms. takes_off: the last step.
-    """
+    """The steps of a start, of which `arm` arms and `takes_off` is the last; it is broken off by `BreakOff` only."""
 
     arm: Guarded = field(kw_only=True)
     takes_off: TakesOff = field(kw_only=True)
@@ -443,13 +433,10 @@ def start_mission(pilot: Pilot, standing: Standing, expected: Expected, *, reads
 
 @dataclass(slots=True)
 class BreakOff(Exchange):
-    """Ends a start whose commands may still be on their way: disarms, and changes the mode, again and again.
+    """Ends a start whose commands may still be on their way: disarms, and changes to a mode, again and again.
 
     The disarming is not forced, so a vehicle that has left the ground refuses it and obeys the change of mode. An
     acknowledgement may be that of the start, so it ends only when the vehicle's state shows it for `_SETTLED_S`.
-
-    Attributes:
-        modes: the autopilot's; mode: the one to end in. autopilot: its dialect.
     """
 
     autopilot: Autopilot = field(kw_only=True)
@@ -496,13 +483,11 @@ class BreakOff(Exchange):
 
     def _send(self, now: float) -> list[Message]:
         self.deadline = now + _REPEAT_S
-        again, self._sent, to = min(self._sent, 255), self._sent + 1, self.vehicle
-        mode = (*mode_params(self.autopilot, self.mode), *(0.0,) * 7)[:7]
+        again, self._sent = min(self._sent, 255), self._sent + 1
+        mode = mode_params(self.autopilot, self.mode)
         return [
-            dialect.MAVLink_command_long_message(
-                to.system, to.component, dialect.MAV_CMD_COMPONENT_ARM_DISARM, again, *(0.0,) * 7
-            ),
-            dialect.MAVLink_command_long_message(to.system, to.component, dialect.MAV_CMD_DO_SET_MODE, again, *mode),
+            command_long(self.vehicle, dialect.MAV_CMD_COMPONENT_ARM_DISARM, confirmation=again),
+            command_long(self.vehicle, dialect.MAV_CMD_DO_SET_MODE, *mode, confirmation=again),
         ]
 
 

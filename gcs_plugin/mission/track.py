@@ -11,7 +11,7 @@ wind, or a speed that it does not reach, is where others do not expect it.
 import math
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import KW_ONLY, dataclass, field, replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,22 +22,18 @@ from gcs_plugin.mission.items import (
     DELAY,
     FRAME_GLOBAL,
     JUMP,
-    LAND,
+    LANDINGS,
     LOITER_TIME,
-    PLAIN_FRAME,
     RTL,
-    TAKEOFF,
-    VTOL_LAND,
-    VTOL_TAKEOFF,
+    TAKEOFFS,
     WAYPOINT,
+    Mission,
+    MissionItem,
 )
 from orthoswarm.config import active
 from orthoswarm.config.autopilot import AutopilotConfig
 from orthoswarm.model.earth import DEGREE_M
 from orthoswarm.model.plan import Apart
-
-if TYPE_CHECKING:
-    from gcs_plugin.mission.items import Mission, MissionItem
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -56,11 +52,11 @@ _AHEAD_S: Final = 30.0
 _OFF_M: Final = 15.0
 """A vehicle that is farther from its way is not on it: it was paused, sent elsewhere, or blown off."""
 _STANDS_S: Final = 3.0
-"""Longer in one place a plan stands still; at the slowest of a turn it takes less for `_AS_NEAR_M` either way."""
+"""A plan that stays within `_AS_NEAR_M` of one place for longer waits there; the slowest turn takes less."""
 _STILL_BEHIND: Final = 0.5
 """One that is behind is so until it is late by less than this share of what is allowed: words must not come and go."""
 _AS_NEAR_M: Final = 1.0
-"""Places so much farther than the nearest one count as well: where it stands still, many moments have one place."""
+"""Moments of the plan whose places are so little farther from the vehicle than the nearest one fit it as well."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,11 +97,10 @@ class Track:
         return start_slack_s(self.pad(radius_m), self.autopilot)
 
 
-def flight_path(mission: "Mission", origin: tuple[float, float]) -> tuple[Array, Array, float]:
+def flight_path(mission: Mission, origin: tuple[float, float]) -> tuple[Array, Array, float]:
     """The points of a mission, float64 (n, 3): east, north, height in metres; the wait before each, s; speed in m/s.
 
-    Args:
-        mission: the mission. origin: latitude and longitude in degrees of east 0, north 0.
+    The origin of east and north is a latitude and longitude in degrees.
     """
     points: list[tuple[float, float, float]] = []
     waits: dict[int, float] = {}
@@ -123,11 +118,10 @@ def flight_path(mission: "Mission", origin: tuple[float, float]) -> tuple[Array,
             points.append(points[-1])
             waits[len(points) - 1] = item.params[0]
         elif item.is_nav and item.has_place:
-            height = item.z - (base if PLAIN_FRAME.get(item.frame, item.frame) == FRAME_GLOBAL else 0.0)
-            place = (item.lat_deg, item.lon_deg) if item.x or item.y else home
+            height, place = _height_m(item, base), item.place or home
             if place is None:
                 continue
-            if item.command in (LAND, VTOL_LAND) and points:
+            if item.command in LANDINGS and points:
                 points.append((*metres(*place, origin), points[-1][2]))
                 height = 0.0
             points.append((*metres(*place, origin), height))
@@ -138,7 +132,7 @@ def flight_path(mission: "Mission", origin: tuple[float, float]) -> tuple[Array,
     return np.array(points, float).reshape(-1, 3), before, speed
 
 
-def _flown(mission: "Mission") -> "Iterator[MissionItem]":
+def _flown(mission: Mission) -> Iterator[MissionItem]:
     """The items in the order in which they are flown, with jumps carried out."""
     items, seq, jumped = mission.items, mission.first_seq, dict[int, int]()
     for _ in range(_MOST_FLOWN):
@@ -155,65 +149,56 @@ def _flown(mission: "Mission") -> "Iterator[MissionItem]":
         seq += 1
 
 
-def track_of(mission: "Mission", origin: tuple[float, float]) -> Track:
+def track_of(mission: Mission, origin: tuple[float, float]) -> Track:
     """A mission as positions over time."""
     from orthoswarm.planning.sorties.flight_time import Motion
 
     points, waits, speed = flight_path(mission, origin)
     if len(points) < 2:
         return Track(points)
-    motion = Motion(speed_m_s=speed, autopilot=_autopilot_of(mission), lands=_lands(mission))
+    end = next((item.command for item in mission.items if item.command in (RTL, *LANDINGS)), RTL)
+    motion = Motion(speed_m_s=speed, autopilot=_autopilot_of(mission), lands=end != RTL)
     return Track(motion.places(points, waits, STEP_S), motion.autopilot)
 
 
-def _lands(mission: "Mission") -> bool:
-    """It ends with LAND, not with a return to launch."""
-    ends = [item.command for item in mission.items if item.command in (RTL, LAND, VTOL_LAND)]
-    return bool(ends) and ends[0] != RTL
-
-
-def _autopilot_of(mission: "Mission") -> AutopilotConfig:
+def _autopilot_of(mission: Mission) -> AutopilotConfig:
     from orthoswarm.planning.sorties.flight_time import autopilot_config
 
     return autopilot_config(mission.autopilot.value)
 
 
-def flight_seconds(mission: "Mission") -> float:
+def flight_seconds(mission: Mission) -> float:
     """Duration of a mission by the planner's model, seconds."""
     home = home_of(mission)
     return 0.0 if home is None else STEP_S * max(0, len(track_of(mission, home).places) - 1)
 
 
-def fastest_m_s(mission: "Mission") -> float | None:
+def fastest_m_s(mission: Mission) -> float | None:
     """The greatest speed that a mission asks for, None if it leaves that to the vehicle."""
     speeds = [item.params[1] for item in mission.items if item.command == CHANGE_SPEED and item.params[1] > 0.0]
     return max(speeds, default=None)
 
 
-def heights_m(mission: "Mission") -> "list[tuple[MissionItem, float]]":
+def heights_m(mission: Mission) -> list[tuple[MissionItem, float]]:
     """The items of a mission that have a place, each with its height above takeoff, metres."""
     base = _ground_m(mission)
-    return [
-        (item, item.z - (base if PLAIN_FRAME.get(item.frame, item.frame) == FRAME_GLOBAL else 0.0))
-        for item in mission.items[mission.first_seq :]
-        if item.is_nav and item.has_place
-    ]
+    return [(i, _height_m(i, base)) for i in mission.items[mission.first_seq :] if i.is_nav and i.has_place]
 
 
-def highest_m(mission: "Mission") -> float | None:
+def highest_m(mission: Mission) -> float | None:
     """The greatest height above takeoff in a mission, None if it contains none."""
     return max((height for _, height in heights_m(mission)), default=None)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Approaches:
-    """Pairs of samples of two flights that are too near each other.
+    """Pairs of samples of two flights that are too near each other, arrays (n,).
 
     Attributes:
-        delay: int64 (n,), by how many samples the second flight must start later for the pair to be at one time.
-        at: int64 (n,), sample of the first flight. distance_m: float64 (n,), horizontal distance.
-        at_start: bool (n,), both are around a start that they share.
-        start_slack_s: float64 (n,), seconds off schedule that a plan allows there.
+        delay: by how many samples the second flight must start later for the pair to be at one time.
+        at: sample of the first flight. distance_m: horizontal distance.
+        at_start: both are around a start that they share.
+        start_slack_s: seconds off schedule that a plan allows there.
     """
 
     delay: Ints
@@ -230,39 +215,36 @@ class Airspace:
     Attributes:
         tracks: by system id.
         distance_m, height_m, slack_s: how far apart, or at what other height, and how many seconds off schedule.
-        launch_s: time between takeoffs at one start.
         in_turn: around a start that they share, vehicles keep apart in height, too; if not, by `launch_s` alone.
     """
 
     tracks: dict[int, Track]
     _: KW_ONLY
-    distance_m: float = field(default_factory=lambda: active().planning.separation_m)
-    height_m: float = field(default_factory=lambda: active().planning.layer_m)
-    slack_s: float = field(default_factory=lambda: active().ardupilot.schedule_slack_s)
-    launch_s: float = field(default_factory=lambda: active().planning.launch_s)
+    distance_m: float
+    height_m: float
+    slack_s: float
     in_turn: bool = False
     _found: dict[tuple[int, int], "_Approaches"] = field(default_factory=dict, repr=False)
 
     @classmethod
     def of(
         cls,
-        missions: Mapping[int, "Mission"],
+        missions: Mapping[int, Mission],
         levels_m: Mapping[int, float] | None = None,
         apart: Apart | None = None,
     ) -> "Airspace":
         """Of missions by system id.
 
         Args:
-            missions: the missions. levels_m: altitudes of the takeoffs above the sea, metres, where they are known.
+            levels_m: altitudes of the takeoffs above the sea, metres, where they are known.
             apart: how far apart they are to be, None for the default of plans.
         """
         origin = next((home for mission in missions.values() if (home := home_of(mission))), (0.0, 0.0))
         levels = levels_m or {}
         tracks = {s: replace(track_of(mission, origin), level_m=levels.get(s)) for s, mission in missions.items()}
         slack_s = max((_autopilot_of(mission).schedule_slack_s for mission in missions.values()), default=0.0)
-        if apart is None:
-            return cls(tracks, slack_s=slack_s)
-        return cls(tracks, distance_m=apart.distance_m, height_m=apart.height_m, slack_s=slack_s)
+        keeps = apart or Apart(active().planning.separation_m, active().planning.layer_m)
+        return cls(tracks, distance_m=keeps.distance_m, height_m=keeps.height_m, slack_s=slack_s)
 
     def meeting(self, one: int, other: int, later_s: float) -> tuple[float, float] | None:
         """When (seconds after the first one's start) and how close two vehicles come if the other starts later.
@@ -285,21 +267,16 @@ class Airspace:
         """All moments of two flights too near each other, found once; they meet for some delays of the other."""
         known = self._found.get((one, other))
         if known is None:
-            a, b = self.tracks[one].places, self.tracks[other].places
-            i, j = near_samples(a, b, self.distance_m) if len(a) and len(b) else (np.zeros(0, np.int64),) * 2
-            higher = self.tracks[one].higher_m(self.tracks[other])
-            counted = np.abs(a[i, 2] - b[j, 2] + higher) < self.height_m - _HAIR_M
-            i, j = i[counted], j[counted]
+            first, second, radius_m = self.tracks[one], self.tracks[other], self._pad_m()
+            i, j = near_samples(first, second, self.distance_m, self.height_m - _HAIR_M)
             at_start, start_slack_s = np.zeros(len(i), bool), np.zeros(len(i))
             if self._share_a_start(one, other):
-                first, second, radius_m = self.tracks[one], self.tracks[other], self._pad_m()
                 at_start = first.pad(radius_m)[i] & second.pad(radius_m)[j]
                 start_slack_s = np.maximum(first.pad_slack_s(radius_m)[i], second.pad_slack_s(radius_m)[j])
-            distance_m = np.hypot(*(a[i, :2] - b[j, :2]).T)
-            known = _Approaches(
+            distance_m = np.hypot(*(first.places[i, :2] - second.places[j, :2]).T)
+            known = self._found[one, other] = _Approaches(
                 delay=i - j, at=i, distance_m=distance_m, at_start=at_start, start_slack_s=start_slack_s
             )
-            self._found[one, other] = known
         return known
 
     def as_planned(self, starts: Mapping[int, float]) -> "Airspace":
@@ -312,8 +289,7 @@ class Airspace:
     ) -> list[tuple[int, int, float, float]]:
         """Pairs that come too close with these starts: both vehicles, time on the starts' clock, distance in metres.
 
-        Args:
-            starts: takeoffs, seconds. but_among: pairs of these are left out.
+        Pairs of `but_among` are left out.
         """
         systems = sorted(set(starts) & set(self.tracks))
         found = []
@@ -329,9 +305,7 @@ class Airspace:
     def next_start(self, system: int, earliest_s: float, others: Mapping[int, float]) -> float:
         """The first time, not before `earliest_s`, at which a vehicle stays separated from others with fixed times.
 
-        Args:
-            system: the vehicle. earliest_s: on the clock of the others' starts.
-            others: the starts of those in the air, or of those that wait.
+        `others` are the starts of those in the air, or of those that wait, on one clock.
         """
         start = earliest_s
         known = {other: at for other, at in others.items() if other != system and other in self.tracks}
@@ -340,7 +314,7 @@ class Airspace:
         return start
 
     def _too_near(self, one: int, other: int, later_s: float) -> bool:
-        launches = self._share_a_start(one, other) and abs(later_s) < self.launch_s
+        launches = self._share_a_start(one, other) and abs(later_s) < active().planning.launch_s
         return launches or self.meeting(one, other, later_s) is not None
 
     def _pad_m(self) -> float:
@@ -352,38 +326,42 @@ class Airspace:
         return bool(len(a) and len(b) and np.hypot(*(a[0, :2] - b[0, :2])) < self._pad_m())
 
 
-def near_samples(a: Array, b: Array, distance_m: float) -> tuple[Ints, Ints]:
-    """Pairs of samples (n, 3), (m, 3) in the air that are less than a horizontal distance apart: their numbers."""
+def near_samples(one: Track, other: Track, distance_m: float, height_m: float | None) -> tuple[Ints, Ints]:
+    """Numbers of the samples of two flights in the air that are nearer horizontally and, unless None, in height."""
     from scipy.spatial import cKDTree
 
+    a, b = one.places, other.places
     flying_a, flying_b = (np.flatnonzero(places[:, 2] > active().planning.on_ground_m) for places in (a, b))
     if not len(flying_a) or not len(flying_b):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     found = cKDTree(a[flying_a, :2]).query_ball_tree(cKDTree(b[flying_b, :2]), distance_m)
     i = np.repeat(flying_a, [len(row) for row in found])
     j = flying_b[np.fromiter((k for row in found for k in row), np.int64)]
-    nearer = np.hypot(*(a[i, :2] - b[j, :2]).T) < distance_m
-    return i[nearer], j[nearer]
+    near = np.hypot(*(a[i, :2] - b[j, :2]).T) < distance_m
+    if height_m is not None:
+        near &= np.abs(a[i, 2] - b[j, 2] + one.higher_m(other)) < height_m
+    return i[near], j[near]
 
 
-def takeoff_place(mission: "Mission") -> tuple[float, float] | None:
+def takeoff_place(mission: Mission) -> tuple[float, float] | None:
     """The place that the takeoff of a mission states, degrees; None if it states none."""
-    for item in mission.items[mission.first_seq :]:
-        if item.command in (TAKEOFF, VTOL_TAKEOFF) and (item.x or item.y):
-            return item.lat_deg, item.lon_deg
-    return None
+    flown = mission.items[mission.first_seq :]
+    return next((item.place for item in flown if item.command in TAKEOFFS and item.place), None)
 
 
-def home_of(mission: "Mission") -> tuple[float, float] | None:
+def home_of(mission: Mission) -> tuple[float, float] | None:
     """Where a mission takes off, degrees: its takeoff's place, ArduPilot's item 0, or the first waypoint."""
-    if (place := takeoff_place(mission)) is not None:
-        return place
-    if mission.first_seq and mission.items and (mission.items[0].x or mission.items[0].y):
-        return mission.items[0].lat_deg, mission.items[0].lon_deg
-    return next(((i.lat_deg, i.lon_deg) for i in mission.items if i.has_place and (i.x or i.y)), None)
+    home = mission.items[: mission.first_seq]
+    places = [takeoff_place(mission), *(i.place for i in home), *(i.place for i in mission.items if i.has_place)]
+    return next(filter(None, places), None)
 
 
-def _ground_m(mission: "Mission") -> float:
+def _height_m(item: MissionItem, base_m: float) -> float:
+    """Height of an item above takeoff, which lies at `base_m` above the sea; metres."""
+    return item.z - (base_m if item.plain_frame == FRAME_GLOBAL else 0.0)
+
+
+def _ground_m(mission: Mission) -> float:
     """The level of the takeoff above the sea, for items that say their altitude that way."""
     return mission.items[0].z if mission.first_seq and mission.items else 0.0
 
@@ -399,13 +377,12 @@ class Lateness:
     """One flight of a mission, compared with its times.
 
     Attributes:
-        mission: what is flown.
-        late_s: how far it is behind, seconds of its own clock; negative: ahead. Where its plan stands still, too, that
-            is only known to be more than something, so what was known before stays.
+        late_s: how far it is behind, seconds of its own clock; negative: ahead. While its plan waits in one place,
+            every moment of that fits where the vehicle is: this is kept then unless it must be more.
         behind: True while it is later than plans allow for.
     """
 
-    mission: "Mission"
+    mission: Mission
     late_s: float = field(default=0.0, init=False)
     behind: bool = field(default=False, init=False)
     _track: Track | None = field(default=None, init=False)
@@ -425,11 +402,7 @@ class Lateness:
         return self._track.autopilot.schedule_slack_s if self._track is not None else float("inf")
 
     def look(self, time_s: float, lat_deg: float, lon_deg: float, height_m: float) -> None:
-        """Compare a position.
-
-        Args:
-            time_s: on the vehicle's clock. lat_deg, lon_deg: where it is. height_m: over its takeoff.
-        """
+        """Compare a position at a time of the vehicle's clock, seconds; degrees, and metres over its takeoff."""
         track = self._track
         if track is None or len(track.places) < 2:
             return

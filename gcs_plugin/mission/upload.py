@@ -13,7 +13,7 @@ another ground station is uploading; 15 (cancelled) that the vehicle has waited 
 """
 
 import enum
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 from gcs_plugin.links.mavlink import Autopilot, Message, dialect
@@ -31,7 +31,6 @@ from gcs_plugin.mission.exchange import (
     UNSUPPORTED,
     UNSUPPORTED_FRAME,
     Exchange,
-    Outcome,
     RoundTrip,
     Verdict,
 )
@@ -55,14 +54,7 @@ _SAME_REQUEST_S: Final = 0.03
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """A negative MISSION_ACK.
-
-    Attributes:
-        code: MAV_MISSION_RESULT.
-        item: sequence number of the refused item, None if the complete mission is refused.
-        field: the refused field, empty if none.
-        reason: one sentence without the vehicle's name.
-    """
+    """A negative MISSION_ACK (`code`), and why in one sentence without the vehicle's name."""
 
     code: int
     item: int | None
@@ -87,11 +79,9 @@ class MissionUpload(Exchange):
     """One upload; its outcome is ok only if the mission read back from the vehicle is this one.
 
     Attributes:
-        mission: what to upload.
         patience_s: silence after which it gives up.
         attempts: number of restarts (time-outs of the vehicle, reboots, a different stored mission).
         leave: a change of mode before anything is sent, for a vehicle that would fly items as they arrive.
-        stage: what it is doing.
         refusal: the vehicle's refusal in words, where the outcome is one.
     """
 
@@ -196,15 +186,6 @@ class MissionUpload(Exchange):
     def leaves_mode(self) -> bool:
         """See Exchange."""
         return self.stage is UploadStage.LEAVE
-
-    @property
-    def progress(self) -> float:
-        """Share of the work that is done; sending and reading back count half each."""
-        if self.outcome is not None:
-            return 1.0
-        if self._reading is not None:
-            return 0.5 + 0.5 * self._reading.progress
-        return 0.5 * (self._served + 1) / max(1, len(self.mission))
 
     # --- sending ---
 
@@ -340,14 +321,14 @@ class MissionUpload(Exchange):
             self._reading, self.stage, self._clears = None, UploadStage.CLEAR, 0
             return messages + self._clear(now)
         wrong = difference(self.mission, reading.items)
-        if wrong is None:
+        if not wrong:
             self.stage = UploadStage.DONE
             self._end(True, f"vehicle {self.vehicle.system} holds the mission: {len(self.mission)} items, read back")
             return messages
         if self._doubt is not None:
             return messages + self._nack(self._doubt, now)
         self._mixtures += 1
-        self._mixed = f"holds another mission than was sent: {wrong.text}; upload again before flying"
+        self._mixed = f"holds another mission than was sent: {wrong}; upload again before flying"
         if self._mixtures >= _MIXTURES:
             self._fail(self._mixed)
         else:
@@ -376,19 +357,15 @@ class MissionUpload(Exchange):
         mixture = self._touched and self.mission.autopilot is Autopilot.ARDUPILOT and text != self._mixed
         warning = "; it may now hold a mixture of two missions, so upload again before flying" if mixture else ""
         self._end(False, f"vehicle {self.vehicle.system} {text}{warning}", failure)
-        if self.refusal is not None and self.outcome is not None:
-            refusal = self.refusal
-            self.outcome = Outcome(
-                ok=False, text=self.outcome.text, item=refusal.item, field=refusal.field, code=refusal.code
-            )
+        if (why := self.refusal) is not None and self.outcome is not None:
+            self.outcome = replace(self.outcome, item=why.item, field=why.field, code=why.code)
 
 
 def explain(code: int, mission: Mission, item: int | None) -> Refusal:
     """Put a negative MISSION_ACK into words.
 
     Args:
-        code: MAV_MISSION_RESULT of the acknowledgement.
-        mission: the uploaded mission.
+        code: its MAV_MISSION_RESULT. mission: the uploaded one.
         item: the last item sent, None if the vehicle had not requested one yet.
     """
     if code == DENIED:

@@ -63,9 +63,10 @@ def read_shapes(path: Path, name: str | None = None) -> tuple[Shapes, list[Ring]
     if promised != kind:
         raise InputError(f"{name} is {promised} by its name but holds {kind}; rename it or give the right file")
     if kind == "a GeoPackage":
-        return read_geopackage(path, name), []
-    if kind == "a zipped shapefile":
-        return read_zipped_shapefile(path, name), []
+        return _shapes(str(path), name), []
+    if kind == "a zipped shapefile":  # in whatever folder of it
+        inside = _inside(path, name, ".shp")
+        return Shapes.joined([_shapes(f"/vsizip/{{{path}}}/{info.filename}", name) for info in inside]), []
     texts = _texts(path, name)
     if kind == "GeoJSON":
         return parse_geojson(texts[0], name), []
@@ -124,11 +125,7 @@ def read_fences(path: Path, *, no_fly: bool) -> tuple[Fence, ...]:
 
 
 def _kind(path: Path, name: str) -> str:
-    """What a file is by its content.
-
-    Raises:
-        InputError: it cannot be read, is too large, or is nothing known.
-    """
+    """What a file is by its content; InputError if it cannot be read, is too large, or is nothing known."""
     try:
         if path.stat().st_size > _LARGEST_BYTES:
             raise InputError(f"{name} is larger than {_LARGEST_BYTES // 1_000_000} MB; give a simpler outline")
@@ -158,11 +155,7 @@ def _kind(path: Path, name: str) -> str:
 
 
 def _inside(path: Path, name: str, suffix: str) -> list[zipfile.ZipInfo]:
-    """The files in a ZIP with a suffix.
-
-    Raises:
-        InputError: it is broken, or unpacks to too much.
-    """
+    """The files in a ZIP with a suffix; InputError if it is broken, or unpacks to too much."""
     try:
         with zipfile.ZipFile(path) as archive:
             found = archive.infolist()
@@ -212,32 +205,12 @@ def _is_mission(text: str, name: str) -> bool:
     return isinstance(document, dict) and document.get("fileType") == "Plan"
 
 
-def read_geopackage(path: Path, name: str) -> Shapes:
-    """Polygons and lines of all layers of a GeoPackage.
-
-    Args:
-        path: the file. name: how to call it in an error.
-
-    Raises:
-        InputError: OGR cannot read it, it says no coordinate system, or its coordinates are of no use.
-    """
-    return _shapes(str(path), name)
-
-
-def read_zipped_shapefile(path: Path, name: str) -> Shapes:
-    """Polygons and lines of the shapefiles in a ZIP, in whatever folder.
-
-    Args:
-        path: the ZIP. name: how to call it in an error.
-
-    Raises:
-        InputError: OGR cannot read it, a `.prj` is missing, or its coordinates are of no use.
-    """
-    inside = [entry.filename for entry in _inside(path, name, ".shp")]
-    return Shapes.joined([_shapes(f"/vsizip/{{{path}}}/{entry}", name) for entry in inside])
-
-
 def _shapes(source: str, name: str) -> Shapes:
+    """Polygons and lines of all layers of a file that OGR reads.
+
+    Raises:
+        InputError: it cannot, the file says no coordinate system, or its coordinates are of no use.
+    """
     from pyogrio import list_layers
     from pyogrio.errors import DataLayerError, DataSourceError, FeatureError, FieldError, GeometryError
     from pyogrio.raw import read
@@ -273,11 +246,7 @@ def _parts(geometries: Any) -> list[Any]:
 
 
 def _transformer(crs: str | None, name: str) -> "Transformer":
-    """From a coordinate system to longitude and latitude of WGS 84.
-
-    Raises:
-        InputError: the system is not said, or not known.
-    """
+    """From a coordinate system to longitude and latitude of WGS 84; InputError if it is not said, or not known."""
     from pyproj import Transformer
     from pyproj.exceptions import CRSError
 

@@ -15,7 +15,7 @@ import numpy as np
 import shapely
 
 from gcs_plugin.mission.mission_files import Autopilot, plan_text, sortie_items, waypoints_text
-from gcs_plugin.plans.plan_request import PlanRequest
+from gcs_plugin.plans.plan_request import PlanRequest, sortie_path
 from orthoswarm.coverage.gaps import PlannedFlight
 from orthoswarm.model.angles import wrap_deg
 from orthoswarm.model.errors import InputError
@@ -58,7 +58,7 @@ def report(
     """The plan's figures as JSON: per vehicle and altogether.
 
     Args:
-        plan: the plan. autopilots: of its vehicles, in turn. fov_min_deg: field of view that it was made for.
+        autopilots: of its vehicles, in turn. fov_min_deg: field of view that it was made for.
         endurance_min: flight time of a full battery that it was made for, None if nobody said it.
     """
     return {
@@ -274,17 +274,13 @@ def write_folder(folder: Path, files: Mapping[str, str | bytes]) -> None:
         for old in _missions(folder):
             if old.name not in files:
                 old.unlink()
-        for name in _report_last(files):
+        # The report names the missions that are ours, so it goes last (an earlier one still names the old ones).
+        for name in sorted(files, key=lambda name: name == REPORT):
             os.replace(temporary / name, folder / name)
     except OSError as error:
         raise InputError(f"{folder} cannot be written ({error.strerror}); name another folder with --out") from None
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
-
-
-def _report_last(names: Mapping[str, Any]) -> Sequence[str]:
-    """The report names the missions that are ours, so it goes last (an earlier one still names the old ones)."""
-    return sorted(names, key=lambda name: name == REPORT)
 
 
 def _missions(folder: Path) -> list[Path]:
@@ -300,19 +296,15 @@ def _own_missions(folder: Path) -> set[str]:
 
 
 def plan_picture(plan: Plan, area: Area | None) -> bytes:
-    """The plan as a PNG.
+    """The plan as a PNG; the area is None along given lines.
 
     Legs are thick, ways thin and dashed, starts dots, gaps red crosses; axes are metres from the lower left corner.
-
-    Args:
-        plan: what is drawn.
-        area: ground and no-fly zones; None along given lines.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     grid = LocalGrid(plan.epsg)
-    paths = {v.number: [_path(s, grid) for s in v.sorties] for v in plan.vehicles}
+    paths = {v.number: [sortie_path(s, grid) for s in v.sorties] for v in plan.vehicles}
     everything = np.concatenate([p for rows in paths.values() for p in rows])
     if area is not None:
         west, south, east, north = area.ground.bounds
@@ -356,12 +348,6 @@ def _title(plan: Plan) -> str:
     )
 
 
-def _path(sortie: Sortie, grid: LocalGrid) -> Any:
-    lat = [sortie.home_lat_deg, *(w.lat_deg for w in sortie.waypoints)]
-    lon = [sortie.home_lon_deg, *(w.lon_deg for w in sortie.waypoints)]
-    return grid.to_grid(lat, lon)
-
-
 def _middle(sortie: Sortie, path: Any) -> Any:
     """The middle of the longest leg."""
     ends = [k for k, point in enumerate(sortie.waypoints, start=1) if point.camera is False]
@@ -397,10 +383,7 @@ def _colour(index: int, count: int) -> Any:
 
 
 def read_planned_flight(folder: Path, grid: LocalGrid) -> PlannedFlight:
-    """Legs and footprint of a folder that `orthoswarm plan` wrote (plan.json, all.geojson).
-
-    Args:
-        folder: the plan's folder. grid: in which the legs are wanted.
+    """Legs and footprint of a folder that `orthoswarm plan` wrote (plan.json, all.geojson), in metres of a grid.
 
     Raises:
         InputError: the folder is not a plan's.

@@ -1,8 +1,10 @@
 """A plan from the values that a user gives, on the command line or over HTTP, with the ground below and its fences."""
 
+import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,15 +14,15 @@ from numpy.typing import NDArray
 
 from gcs_plugin.mission.mission_files import Autopilot
 from gcs_plugin.plans.area_files import read_fences, read_shapes, read_zones
-from gcs_plugin.plans.gap_area import gap_area, read_gaps
 from orthoswarm.config import active
+from orthoswarm.coverage.missing_pictures import Cause
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid, area_epsg
 from orthoswarm.model.placement import Terrain
 from orthoswarm.model.plan import End, Fence, Plan, Sortie
 from orthoswarm.planning.area.area import Area, make_area
-from orthoswarm.planning.area.shape_files import Polygon, Ring, Shapes, counted
+from orthoswarm.planning.area.shape_files import Polygon, Ring, Shapes, counted, parse_geojson
 from orthoswarm.planning.lines.candidates import Method
 from orthoswarm.planning.lines.line_spacing import Footprint, footprint
 from orthoswarm.planning.planner import plan_area, plan_gaps, plan_lines
@@ -46,6 +48,13 @@ _BESIDE_STEPS: Final = 2.0
 DEM_MARGIN_M: Final = 50.0  # a height model is read so far beyond the places that are asked for (some of its nodes)
 _ROUNDING_M: Final = 0.5
 """A path along an edge of the fence may lie so far outside: rounding and the grid's scale."""
+_MARGIN = {Cause.POOR: 0.08, Cause.NARROW_LENS: 0.06}
+_USUAL_MARGIN = 0.04
+"""Margins as shares of a picture's width, larger where positions or the lens were in doubt."""
+_MERGE = 0.25
+"""Gaps nearer to each other than half a picture's width (a quarter on each side) are flown as one."""
+_SMALLEST = 0.001
+"""Gaps smaller than this share of a picture are left out."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -157,8 +166,7 @@ class PlanRequest:
 def make_plan(request: PlanRequest, progress: Callable[[str], None] = lambda _: None) -> tuple[Plan, Area | None]:
     """The plan that a request asks for, and its area (None along lines without no-fly zones).
 
-    Args:
-        request: what to plan. progress: called with what is being done.
+    `progress` is called with what is being done.
 
     Raises:
         InputError: a file or a value is of no use, or a flight would leave an inclusion fence.
@@ -184,19 +192,7 @@ def _made(request: PlanRequest, progress: Callable[[str], None]) -> tuple[Plan, 
     no_fly += _no_fly_rings(request)
     if shapes.areas and not request.follow:
         area = make_area(shapes.areas, no_fly)
-
-        def cover(above_m: float, foot: Footprint, heights: FlightHeights | None) -> Plan:
-            return plan_area(
-                area,
-                request.vehicles,
-                above_m,
-                foot,
-                method=request.method,
-                options=options,
-                progress=progress,
-                heights=heights,
-            )
-
+        cover = partial(plan_area, area, request.vehicles, method=request.method, options=options, progress=progress)
         plan = _over_ground(request, cover, area.ground, area.grid)
         return replace(plan, warnings=(*_not_flown(request.area, shapes), *plan.warnings)), area
     if not shapes.lines:
@@ -207,19 +203,7 @@ def _made(request: PlanRequest, progress: Callable[[str], None]) -> tuple[Plan, 
     points = np.concatenate(shapes.lines)
     grid = LocalGrid(area_epsg(points[:, 0], points[:, 1])) if zones is None else zones.grid
     paths = shapely.MultiLineString([grid.to_grid(line[:, 0], line[:, 1]) for line in shapes.lines])
-
-    def follow(above_m: float, foot: Footprint, heights: FlightHeights | None) -> Plan:
-        return plan_lines(
-            shapes.lines,
-            request.vehicles,
-            above_m,
-            foot,
-            no_fly=zones,
-            options=options,
-            progress=progress,
-            heights=heights,
-        )
-
+    follow = partial(plan_lines, shapes.lines, request.vehicles, no_fly=zones, options=options, progress=progress)
     plan = _over_ground(request, follow, paths, grid)
     return replace(plan, warnings=(*_not_flown(request.area, shapes, lines=True), *plan.warnings)), zones
 
@@ -243,19 +227,23 @@ def _not_flown(path: Path, shapes: Shapes, *, lines: bool = False) -> list[str]:
 
 def _over_ground(
     request: PlanRequest,
-    make: Callable[[float, Footprint, FlightHeights | None], Plan],
+    cover: Callable[..., Plan],
     wanted: shapely.Geometry,
     grid: LocalGrid,
 ) -> Plan:
     """The plan over the height model of a request, or over level ground without one.
 
     Args:
-        request: as given. make: plans with a footprint and the height that it belongs to.
+        request: as given. cover: plans at a height above ground, with its footprint and the `heights` of the flights.
         wanted: what is to be flown over, metres of the grid.
 
     Raises:
-        InputError: the height model cannot be used, there is no start, or as `make`.
+        InputError: the height model cannot be used, there is no start, or as `cover`.
     """
+
+    def make(above_m: float, foot: Footprint, heights: FlightHeights | None) -> Plan:
+        return cover(above_m, foot, heights=heights)
+
     if request.dem is None:
         return make(request.altitude_m, _footprint(request, request.altitude_m), None)
     _footprint(request, request.altitude_m)  # refuses what means nothing before the model is read
@@ -263,9 +251,8 @@ def _over_ground(
         raise InputError("give --start with --dem: heights of a mission count from the takeoff point")
     starts = np.array(request.starts, float)
     ground = read_ground(request.dem, wanted, grid, grid.to_grid(starts[:, 0], starts[:, 1]))
-    tolerance_m = request.height_tolerance_m
-    if tolerance_m is None:
-        tolerance_m = _TOLERANCE * request.altitude_m
+    usual_m = _TOLERANCE * request.altitude_m
+    tolerance_m = usual_m if request.height_tolerance_m is None else request.height_tolerance_m
     without = sorted(set(request.autopilots) - WITH_TERRAIN)
     by_vehicle = request.terrain_items and not without
     plan = plan_over_relief(
@@ -299,12 +286,7 @@ def _gap_plan(request: PlanRequest, options: PlanOptions, progress: Callable[[st
     no_fly = _no_fly_rings(request)
     nominal = _footprint(request, request.altitude_m)
     target = gap_area(read_gaps(request.area), no_fly, nominal, request.fly_not_arrived)
-
-    def cover(above_m: float, foot: Footprint, heights: FlightHeights | None) -> Plan:
-        return plan_gaps(
-            target.area, request.vehicles, above_m, foot, options=options, progress=progress, heights=heights
-        )
-
+    cover = partial(plan_gaps, target.area, request.vehicles, options=options, progress=progress)
     plan = _over_ground(request, cover, target.area.ground, target.area.grid)
     return replace(plan, warnings=(*target.notes, *plan.warnings)), target.area
 
@@ -416,9 +398,6 @@ def refuse_outside(plan: Plan, fences: Sequence[Fence], autopilots: Sequence[Aut
 
     An ArduPilot must stay inside all of them (unless FENCE_OPTIONS says otherwise), a PX4 inside any.
 
-    Args:
-        plan: with flights around the exclusion fences. fences: of all kinds. autopilots: that fly it.
-
     Raises:
         InputError: a flight leaves them, or they have no ground in common.
     """
@@ -431,7 +410,7 @@ def refuse_outside(plan: Plan, fences: Sequence[Fence], autopilots: Sequence[Aut
     if inside.is_empty:
         raise InputError("the inclusion fences have no ground in common, where ArduPilot could fly; leave one of them")
     for vehicle in plan.vehicles:
-        outside_m = max(_farthest_m(_path(sortie, grid), inside) for sortie in vehicle.sorties)
+        outside_m = max(_farthest_m(sortie_path(sortie, grid), inside) for sortie in vehicle.sorties)
         if outside_m > _ROUNDING_M:
             raise InputError(
                 f"{vehicle.id} would fly up to {outside_m:.0f} m outside the inclusion fence; move the start or the "
@@ -447,14 +426,114 @@ def _shape(fence: Fence, grid: LocalGrid) -> Geometry:
     return shapely.make_valid(shapely.Polygon(points))
 
 
-def _path(sortie: Sortie, grid: LocalGrid) -> Geometry:
-    """A flight on the map, in grid metres."""
+def sortie_path(sortie: Sortie, grid: LocalGrid) -> NDArray[np.float64]:
+    """A flight on the map, home first: east and north (n, 2) in grid metres."""
     home = (sortie.home_lat_deg, sortie.home_lon_deg)
     places = np.array([home, *((point.lat_deg, point.lon_deg) for point in sortie.waypoints)], float)
-    return shapely.LineString(grid.to_grid(*places.T))
+    return grid.to_grid(*places.T)
 
 
-def _farthest_m(path: Geometry, inside: Geometry) -> float:
+def _farthest_m(path: NDArray[np.float64], inside: Geometry) -> float:
     """How far a path gets outside, metres."""
-    outside = shapely.get_coordinates(path.difference(inside))
+    outside = shapely.get_coordinates(shapely.LineString(path).difference(inside))
     return float(shapely.distance(shapely.points(outside), inside).max(initial=0.0))
+
+
+@dataclass(frozen=True, slots=True)
+class ReadGap:
+    """A gap from a file: its polygon on the globe and why it was missed (None if the file does not say)."""
+
+    polygon: Polygon
+    cause: Cause | None
+
+
+@dataclass(frozen=True, slots=True)
+class GapTarget:
+    """What a gap flight aims at: the area with no-fly zones, and what was left out, in words."""
+
+    area: Area
+    notes: tuple[str, ...]
+
+
+def read_gaps(path: Path) -> list[ReadGap]:
+    """Gaps of a GeoJSON of polygons, with the property `cause` as `orthoswarm coverage` writes it.
+
+    Raises:
+        InputError: it cannot be read or holds no polygon.
+    """
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror}); give the gaps.geojson of a coverage") from None
+    except ValueError as error:
+        raise InputError(f"{path} is not valid JSON ({error}); give the gaps.geojson of a coverage") from None
+    features = document.get("features") if isinstance(document, dict) else None
+    if not isinstance(features, list):
+        raise InputError(f"{path} is not a GeoJSON feature collection; give the gaps.geojson of a coverage")
+    if not features:
+        raise InputError(f"{path} holds no gap: all of the area was seen, so there is nothing to fly")
+    known = {str(cause): cause for cause in Cause}
+    gaps = []
+    for feature in features:
+        cause = known.get(str(((feature or {}).get("properties") or {}).get("cause")))
+        gaps += [ReadGap(polygon, cause) for polygon in _polygons(feature, path)]
+    if not gaps:
+        raise InputError(f"{path} holds no polygon; give the gaps.geojson of a coverage")
+    return gaps
+
+
+def gap_area(gaps: Sequence[ReadGap], no_fly: Sequence[Ring], foot: Footprint, fly_not_arrived: bool) -> GapTarget:
+    """The ground that a gap flight must see: gaps merged, and grown by the margin of their cause.
+
+    Args:
+        no_fly: rings (n, 2), latitude and longitude in degrees. foot: footprint of the camera.
+        fly_not_arrived: also gaps whose pictures were taken, but have not arrived.
+
+    Raises:
+        InputError: nothing is left to fly.
+    """
+    places = np.concatenate([g.polygon.shell for g in gaps])
+    grid = LocalGrid(area_epsg(places[:, 0], places[:, 1]))
+    zones = [make_area([Polygon(zone)], (), grid).ground for zone in no_fly]
+    forbidden = shapely.union_all(zones)
+    notes: list[str] = []
+    if not zones:
+        notes.append(
+            "no no-fly zone is known: a file of gaps does not hold those of the first plan, give them with --no-fly"
+        )
+    waiting = [] if fly_not_arrived else [g for g in gaps if g.cause is Cause.NOT_ARRIVED]
+    if waiting:
+        notes.append(
+            f"{len(waiting)} gaps are not flown, since their pictures were taken and have not arrived: copy them from "
+            "the card, or fly them all the same with --fly-not-arrived"
+        )
+    skip = set(map(id, waiting))
+    grown = [_grown(gap, grid, foot) for gap in gaps if id(gap) not in skip]
+    merged = shapely.union_all(grown).buffer(_MERGE * foot.width_m).buffer(-_MERGE * foot.width_m)
+    hidden = float(shapely.union_all(grown).intersection(forbidden).area)
+    if hidden >= 1.0:
+        notes.append(f"{hidden:.0f} square metres of the gaps lie in no-fly zones and are not flown")
+    parts = [p for p in shapely.get_parts(merged.difference(forbidden)) if p.geom_type == "Polygon"]
+    least = _SMALLEST * foot.width_m * foot.height_m
+    flown = [p for p in parts if p.area >= least]
+    if len(flown) < len(parts):
+        notes.append(f"{len(parts) - len(flown)} gaps smaller than {least:.1f} square metres are not flown")
+    if not flown:
+        raise InputError("; ".join(["no gap is left to fly", *notes]))
+    return GapTarget(Area(grid, shapely.MultiPolygon(flown), shapely.MultiPolygon(_parts(forbidden))), tuple(notes))
+
+
+def _parts(geometry: Geometry) -> list[Geometry]:
+    return [p for p in shapely.get_parts(shapely.get_parts(geometry)) if p.geom_type == "Polygon"]
+
+
+def _grown(gap: ReadGap, grid: LocalGrid, foot: Footprint) -> Geometry:
+    """A gap in grid metres with its margin; steps of cells at its border are smoothed away."""
+    rings = [grid.to_grid(r[:, 0], r[:, 1]) for r in (gap.polygon.shell, *gap.polygon.holes)]
+    margin = foot.width_m * (_USUAL_MARGIN if gap.cause is None else _MARGIN.get(gap.cause, _USUAL_MARGIN))
+    return shapely.Polygon(rings[0], rings[1:]).buffer(0).buffer(margin).simplify(0.25 * margin)
+
+
+def _polygons(feature: Mapping[str, Any], path: Path) -> Sequence[Polygon]:
+    """The polygons of one feature. They are made of the steps of cells, and simplified later: any number of corners."""
+    return parse_geojson(json.dumps(feature), str(path), any_size=True).polygons

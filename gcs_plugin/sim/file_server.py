@@ -10,11 +10,9 @@ from gcs_plugin.links.file_transfer import MOST_DATA, FtpPayload, Nak, Opcode, f
 
 @dataclass(slots=True, kw_only=True)
 class FileServer:
-    """Answers requests.
+    """Answers requests for files: path (`/DCIM/IMG_0001.JPG`) -> content.
 
-    Attributes:
-        files: path (`/DCIM/IMG_0001.JPG`) -> content. has_crc: False for a server without CALC_FILE_CRC32.
-        served: number of bytes sent.
+    `has_crc` is False for a server without CALC_FILE_CRC32; `served` counts the bytes sent.
     """
 
     files: dict[str, bytes] = field(default_factory=dict)

@@ -3,7 +3,6 @@
 import heapq
 import itertools
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from random import Random
 from typing import Final, Generic, TypeVar
@@ -45,16 +44,10 @@ NO_FAULTS: Final = Faults()
 
 @dataclass(slots=True, kw_only=True)
 class Channel(Generic[Cargo]):
-    """One direction of a link.
-
-    Attributes:
-        faults: what it does.
-        lost: number of lost packets; sent: number of packets sent.
-    """
+    """One direction of a link; `lost` counts its lost packets."""
 
     faults: Faults
     lost: int = 0
-    sent: int = 0
     _random: Random = field(init=False)
     _free_at: float = 0.0
     _queue: list[tuple[float, int, Cargo]] = field(default_factory=list)
@@ -66,7 +59,6 @@ class Channel(Generic[Cargo]):
 
     def put(self, cargo: Cargo, now: float, size: int = 0) -> None:
         """Send a packet of so many bytes."""
-        self.sent += 1
         faults, random = self.faults, self._random
         if random.random() < faults.loss or any(start <= now < end for start, end in faults.silent):
             self.lost += 1
@@ -86,8 +78,3 @@ class Channel(Generic[Cargo]):
         while self._queue and self._queue[0][0] <= now:
             arrived.append(heapq.heappop(self._queue)[2])
         return arrived
-
-    def drain(self, now: float, deliver: Callable[[Cargo], None]) -> None:
-        """Hand each packet that has arrived to a function."""
-        for cargo in self.take(now):
-            deliver(cargo)

@@ -7,8 +7,9 @@ from typing import Any
 
 from gcs_plugin.fleet.fleet import Fleet
 from gcs_plugin.fleet.fleet_events import FleetEvent
-from gcs_plugin.links.mavlink import Message, dialect
+from gcs_plugin.links.mavlink import Message
 from gcs_plugin.links.packets import Framer
+from gcs_plugin.links.signing import Packer
 from gcs_plugin.links.transports import NEVER, Link, Peer
 from gcs_plugin.mission.completion import MissionEvent
 from gcs_plugin.mission.exchange import Address, Exchange, Outcome
@@ -18,12 +19,7 @@ from gcs_plugin.sim.simulated_vehicle import SimVehicle
 
 @dataclass(slots=True)
 class VirtualClock:
-    """A clock that is set by hand.
-
-    Attributes:
-        now: seconds.
-        utc_0: UTC epoch seconds at 0.
-    """
+    """A clock in seconds that is set by hand; utc_0: UTC epoch seconds at 0."""
 
     now: float = 0.0
     utc_0: float = 1_700_000_000.0
@@ -38,12 +34,7 @@ class VirtualClock:
 
 
 class SimLink(Link):
-    """A link to simulated vehicles, each a separate peer.
-
-    Attributes:
-        vehicles: the vehicles.
-        up: from the ground to the vehicles; down: back.
-    """
+    """A link to simulated vehicles, each a separate peer: up from the ground to the vehicles, and down."""
 
     def __init__(
         self, vehicles: Sequence[SimVehicle], clock: VirtualClock, up: Faults = NO_FAULTS, down: Faults = NO_FAULTS
@@ -52,7 +43,7 @@ class SimLink(Link):
         self.vehicles, self._clock = list(vehicles), clock
         self.up: Channel[tuple[int, bytes]] = Channel(faults=up)
         self.down: Channel[tuple[int, bytes]] = Channel(faults=down)
-        self._packers = [dialect.MAVLink(None, vehicle.system, 1) for vehicle in self.vehicles]
+        self._packers = [Packer(vehicle.system, 1) for vehicle in self.vehicles]
         self._framers = [Framer() for _ in self.vehicles]
 
     def open(self, selector: selectors.BaseSelector, now: float) -> None:
@@ -86,23 +77,13 @@ class SimLink(Link):
         yield from self.down.take(now)
 
     def _say(self, peer: int, messages: Sequence[Message], now: float) -> None:
-        packer = self._packers[peer]
         for message in messages:
-            raw = message.pack(packer)
+            raw = self._packers[peer].pack(message, self._clock.utc())
             self.down.put((peer, raw), now, len(raw))
-            packer.seq = (packer.seq + 1) & 0xFF
 
 
 class World:
-    """Simulated vehicles and a fleet that watches them, stepped together in virtual time.
-
-    Attributes:
-        vehicles: by system id.
-        fleet: the ground station.
-        clock: the time of both.
-        events: of the fleet.
-        link: the radio between them.
-    """
+    """Simulated vehicles, by system id, and a fleet that watches them, stepped together in virtual time."""
 
     def __init__(
         self, vehicles: Sequence[SimVehicle], up: Faults = NO_FAULTS, down: Faults = NO_FAULTS, **options: Any

@@ -1,32 +1,33 @@
 """A simulated vehicle's flight of its mission: items, camera, and the end as its autopilot does it."""
 
+import enum
 import math
 from collections.abc import Collection
 from dataclasses import dataclass, field
 from random import Random
 from typing import Final
 
-from gcs_plugin.links.mavlink import Autopilot, dialect
+from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.flight_modes import Modes
 from gcs_plugin.mission.items import (
     CHANGE_SPEED,
     DELAY,
+    FRAME_GLOBAL,
     JUMP,
     LAND,
+    LANDINGS,
+    LOITER_TIME,
     LOITER_UNLIM,
     RTL,
     TAKEOFF,
     TRIGGER_DISTANCE,
-    VTOL_LAND,
+    WAYPOINT,
     MissionItem,
 )
-from gcs_plugin.sim.flight_values import Landed, MissionState, Task
-from gcs_plugin.sim.flight_values import TakenPicture as TakenPicture
 from gcs_plugin.sim.mission_store import MissionStore
-from gcs_plugin.sim.multirotor import STEP_S, Airframe, Chart, VehicleMotion
+from gcs_plugin.sim.multirotor import STEP_S, Airframe, Chart, VehicleMotion, VehiclePose
 from orthoswarm.model.angles import wrap_rad
 
-_LOITER_TIME: Final = int(dialect.MAV_CMD_NAV_LOITER_TIME)
 RTL_HEIGHT_M: Final = 15.0
 _REACHED_M: Final = 1.5
 _FINAL_SINK_M_S, _FINAL_BELOW_M = 0.7, 5.0
@@ -38,19 +39,55 @@ _IDLE_S: Final = {Autopilot.ARDUPILOT: 10.0, Autopilot.PX4: 2.0}
 """Landed by its sticks, it disarms after so long: factory settings of DISARM_DELAY and COM_DISARM_LAND."""
 
 
+class Landed(enum.IntEnum):
+    """MAV_LANDED_STATE."""
+
+    ON_GROUND = 1
+    IN_AIR = 2
+    TAKEOFF = 3
+    LANDING = 4
+
+
+class MissionState(enum.IntEnum):
+    """MISSION_STATE."""
+
+    NONE = 1
+    NOT_STARTED = 2
+    ACTIVE = 3
+    PAUSED = 4
+    COMPLETE = 5
+
+
+class Task(enum.Enum):
+    """The vehicle's present task."""
+
+    STAND = "stand"
+    HOLD = "hold"
+    ITEM = "item"
+    CLIMB_HOME = "climb home"
+    GO_HOME = "go home"
+    DESCEND = "descend"
+    STEERED = "steered"
+
+
+@dataclass(frozen=True, slots=True)
+class TakenPicture:
+    """A picture: its number from 0, seconds since boot, true pose, and place by the receiver (degrees)."""
+
+    index: int
+    time_s: float
+    pose: VehiclePose
+    lat_deg: float
+    lon_deg: float
+
+
 @dataclass(slots=True, kw_only=True)
 class MissionFlight:
     """The flight of one vehicle.
 
     Attributes:
-        autopilot: the dialect; modes: its modes.
-        store: the mission.
-        motion: its position and velocity.
-        mode: custom mode number.
-        armed: motors on. failsafe: it reports one; until it is disarmed.
-        seq: current item; state: MISSION_STATE.
-        landed: MAV_LANDED_STATE.
-        reached: items reached since the last look; texts: texts since then; exposures: all pictures.
+        mode: custom mode number. failsafe: it reports one; until it is disarmed. seq: current item.
+        reached, texts: items reached, and texts, since the last look. exposures: all pictures.
         triggers: how often the camera was triggered; at those in misfires it took no picture.
     """
 
@@ -87,14 +124,9 @@ class MissionFlight:
         cls, autopilot: Autopilot, modes: Modes, *, store: MissionStore, chart: Chart, frame: Airframe, seed: int
     ) -> "MissionFlight":
         """A vehicle standing at home."""
+        motion = VehicleMotion(chart=chart, airframe=frame, random=Random(seed), speed=frame.speed_m_s)
         mode = modes.hold if autopilot is Autopilot.PX4 else 0
-        return cls(
-            autopilot=autopilot,
-            modes=modes,
-            store=store,
-            motion=VehicleMotion(chart=chart, airframe=frame, random=Random(seed), speed=frame.speed_m_s),
-            mode=mode,
-        )
+        return cls(autopilot=autopilot, modes=modes, store=store, motion=motion, mode=mode)
 
     # --- commands ---
 
@@ -147,7 +179,7 @@ class MissionFlight:
 
     def start_mission(self) -> str:
         """MISSION_START; returns why not."""
-        first = self._first
+        first = self.autopilot.first_seq
         if len(self.store.items) <= first:
             return "No mission"
         begins = self._next_nav(first)
@@ -182,8 +214,8 @@ class MissionFlight:
         """Jump to an item; ArduPilot's item 0 stands for the beginning."""
         if not 0 <= seq < len(self.store.items):
             return False
-        if seq < self._first:
-            seq, self._jumps = self._first, {}
+        if seq < self.autopilot.first_seq:
+            seq, self._jumps = self.autopilot.first_seq, {}
         if self.state is MissionState.COMPLETE:
             self.state = MissionState.NOT_STARTED
         self.seq, self.paused = seq, False
@@ -248,10 +280,6 @@ class MissionFlight:
         """ArduCopter's modes here in which it does not arm."""
         return {self.modes.mission: "Auto", self.modes.hold: "Brake", self.modes.rtl: "RTL", self.modes.land: "Land"}
 
-    @property
-    def _first(self) -> int:
-        return 1 if self.autopilot is Autopilot.ARDUPILOT else 0
-
     def _next_nav(self, seq: int) -> int | None:
         return next((i for i in range(seq, len(self.store.items)) if self.store.items[i].is_nav), None)
 
@@ -265,13 +293,15 @@ class MissionFlight:
                 self._hold()
             return
         if self.state is not MissionState.COMPLETE:
-            self.state = MissionState.NOT_STARTED if len(self.store.items) > self._first else MissionState.NONE
+            self.state = (
+                MissionState.NOT_STARTED if len(self.store.items) > self.autopilot.first_seq else MissionState.NONE
+            )
         if not self.armed:
             self.seq = 0
 
     def _enter_mission(self) -> None:
         self.state, self.paused, self._reached_any = MissionState.ACTIVE, False, False
-        self._run_from(max(self.seq, self._first))
+        self._run_from(max(self.seq, self.autopilot.first_seq))
 
     def _run_from(self, seq: int) -> None:
         """Execute items up to the next one that is flown."""
@@ -311,7 +341,7 @@ class MissionFlight:
                 self.mode = self.modes.rtl
             self._ends_mission = self.autopilot is Autopilot.ARDUPILOT
             self._go_home()
-        elif item.command in (LAND, VTOL_LAND):
+        elif item.command in LANDINGS:
             self._aim(item)
             self._ends_mission = True
         else:
@@ -327,12 +357,12 @@ class MissionFlight:
             return
         if item.command != TAKEOFF and (item.x or item.y):
             north, east = motion.chart.to_metres(item.lat_deg, item.lon_deg)
-        height = item.z - (motion.chart.alt_m if item.frame in (0, 5) else 0.0)
+        height = item.z - (motion.chart.alt_m if item.plain_frame == FRAME_GLOBAL else 0.0)
         if item.command == TAKEOFF and motion.up > _LIFTED_M:  # it flies: where it stops, and no lower
             motion.stop()
             motion.climb_to(height)
             return
-        stays_high = item.command in (LAND, VTOL_LAND) or not item.has_place
+        stays_high = item.command in LANDINGS or not item.has_place
         # On a leg it keeps to the line, which is what makes the leg straight.
         motion.go((north, east, motion.up if stays_high else height), along_line=bool(self._reached_any))
 
@@ -344,7 +374,7 @@ class MissionFlight:
             self.landed = Landed.IN_AIR
         if horizontal > _REACHED_M or vertical > 1.0:
             return
-        if item.command in (LAND, VTOL_LAND):
+        if item.command in LANDINGS:
             times = self.motion.airframe.times
             self._waited += STEP_S
             if self.motion.target and (times is None or self._waited > times.land_wait_s - _OWN_STOP_S):
@@ -353,7 +383,7 @@ class MissionFlight:
         if item.command == LOITER_UNLIM:
             return
         self._waited += STEP_S
-        hold = item.params[0] if item.command in (16, _LOITER_TIME, DELAY) else 0.0
+        hold = item.params[0] if item.command in (WAYPOINT, LOITER_TIME, DELAY) else 0.0
         if self._waited <= hold + self._lost_s(item):
             return
         if item.command == TAKEOFF:
@@ -432,7 +462,7 @@ class MissionFlight:
         if motion.up > 0.05:
             return
         in_mission = self.mode == self.modes.mission and self._ends_mission
-        landing = in_mission and self.store.items[self.seq].command in (LAND, VTOL_LAND)
+        landing = in_mission and self.store.items[self.seq].command in LANDINGS
         if in_mission and self.autopilot is Autopilot.ARDUPILOT and not landing:
             self._reach(self.seq)  # RTL is reached, LAND is not
             self._finish()

@@ -17,7 +17,7 @@ from gcs_plugin.mission.exchange import (
     Address,
 )
 from gcs_plugin.mission.geofence import FENCE
-from gcs_plugin.mission.items import FRAME_GLOBAL, JUMP, PLAIN_FRAME, TAKEOFF, WAYPOINT, MissionItem
+from gcs_plugin.mission.items import FRAME_GLOBAL, JUMP, TAKEOFF, WAYPOINT, MissionItem
 from orthoswarm.planning.sorties.flight_time import autopilot_config
 
 _MISSION: Final = dialect.MAV_MISSION_TYPE_MISSION
@@ -46,8 +46,6 @@ class MissionStore:
     """A vehicle's stored mission, and the protocol that changes it.
 
     Attributes:
-        autopilot: the dialect.
-        home: ArduPilot's item 0.
         items: the stored mission; for ArduPilot item 0 is home.
         fence: the items of its geofence, which can be read only.
         generation: rises whenever an upload or a clear has ended, so that the flight logic can notice.
@@ -140,11 +138,6 @@ class MissionStore:
                 return []
         return [self._ack(to, UNSUPPORTED, FENCE)]
 
-    @property
-    def receiving(self) -> bool:
-        """True in the middle of an upload."""
-        return self._transfer is not None
-
     def _count(self, count: int, sender: Address, now: float) -> list[Message]:
         transfer = self._transfer
         if transfer is not None and transfer.partner != sender:
@@ -184,7 +177,7 @@ class MissionStore:
         if self.autopilot is Autopilot.ARDUPILOT:  # written at once, so that a broken upload leaves a mixture
             self._write(transfer.wanted, self._as_stored(item, transfer.wanted))
         else:
-            transfer.items.append(replace(item, frame=PLAIN_FRAME.get(item.frame, item.frame)))
+            transfer.items.append(replace(item, frame=item.plain_frame))
         transfer.wanted, transfer.heard_at = transfer.wanted + 1, now
         if transfer.wanted < transfer.count:
             return self._ask(transfer, now)
@@ -203,21 +196,12 @@ class MissionStore:
         """An item as ArduPilot returns it: see `mission.comparison`."""
         if seq == 0:
             return self.home
-        params = tuple(_stored_parameter(value) for value in item.params)
-        if item.command in (WAYPOINT, TAKEOFF):
-            params = (float(int(params[0])), 0.0, 0.0, 0.0)
+        p1, p2, p3, p4 = (0.0 if math.isnan(value) else float(value) for value in item.params)
+        params = (float(int(p1)), 0.0, 0.0, 0.0) if item.command in (WAYPOINT, TAKEOFF) else (p1, p2, p3, p4)
         if not item.has_place:
-            return MissionItem(
-                command=item.command, frame=FRAME_GLOBAL, params=(params[0], params[1], params[2], params[3])
-            )
-        return MissionItem(
-            command=item.command,
-            frame=PLAIN_FRAME.get(item.frame, item.frame),
-            params=(params[0], params[1], params[2], params[3]),
-            x=item.x,
-            y=item.y,
-            z=round(item.z * 100.0) / 100.0,
-        )
+            return MissionItem(command=item.command, frame=FRAME_GLOBAL, params=params)
+        z = round(item.z * 100.0) / 100.0
+        return replace(item, frame=item.plain_frame, params=params, z=z, autocontinue=True)
 
     def _check(self, item: MissionItem, count: int) -> int:
         """MAV_MISSION_RESULT for an item, in the order in which ArduPilot looks at it."""
@@ -242,8 +226,3 @@ class MissionStore:
 
     def _ack(self, to: Address, code: int, kind: int = 0) -> Message:
         return dialect.MAVLink_mission_ack_message(to.system, to.component, code, kind)
-
-
-def _stored_parameter(value: float) -> float:
-    """A parameter as ArduPilot stores it (NaN becomes 0)."""
-    return 0.0 if math.isnan(value) else float(value)

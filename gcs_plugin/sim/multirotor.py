@@ -31,11 +31,7 @@ _LIFT_M_S2: Final = 1.5  # greatest change of its rate of climb
 
 @dataclass(frozen=True, slots=True)
 class Chart:
-    """Metres around a point of the ellipsoid WGS 84.
-
-    Attributes:
-        lat_deg: latitude of the origin; lon_deg: longitude; alt_m: altitude of height 0.
-    """
+    """Metres around a point of the ellipsoid WGS 84 (degrees); `alt_m` is the altitude of height 0."""
 
     lat_deg: float
     lon_deg: float
@@ -63,14 +59,7 @@ class Chart:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VehiclePose:
-    """The true pose of a vehicle.
-
-    Attributes:
-        time_s: seconds since its boot.
-        lat_deg: latitude; lon_deg: longitude.
-        height_m: above home; alt_m: above sea level.
-        yaw_rad: of the airframe, with pitch_rad and roll_rad.
-    """
+    """The true pose of the airframe, so many seconds after its boot; height above home, altitude above the sea."""
 
     time_s: float
     lat_deg: float
@@ -143,7 +132,6 @@ class VehicleMotion:
     """The state of motion of one vehicle, advanced in steps of STEP_S.
 
     Attributes:
-        chart: around home.
         north: true position with east and up; velocities vn, ve, vu.
         speed: present cruise speed, m/s.
         climb_m_s: present rate of climb; gathers_m_s2: greatest gain of speed, less as it sets off.

@@ -5,13 +5,13 @@ import selectors
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from random import Random
 from typing import Any, Final
 
-from gcs_plugin.links.mavlink import Autopilot, Message, dialect
+from gcs_plugin.links.mavlink import Autopilot, Message
 from gcs_plugin.links.packets import Framer
-from gcs_plugin.links.signing import Signing
+from gcs_plugin.links.signing import Packer, Signing
 from gcs_plugin.links.transports import Link, TcpLink, UdpLink, parse_link
 from gcs_plugin.mission.exchange import Address
 from gcs_plugin.sim.lossy_radio import NO_FAULTS, Channel, Faults
@@ -31,7 +31,7 @@ class _End:
     vehicles: list[SimVehicle]
     up: Channel[bytes]
     down: Channel[bytes]
-    packers: dict[int, Any]
+    packers: dict[int, Packer]
     signing: Signing | None
     framers: dict[Any, Framer] = field(default_factory=dict)
 
@@ -39,9 +39,7 @@ class _End:
 class SimSwarm:
     """Runs simulated vehicles on their own links, in a thread (`with SimSwarm(...)`) or in the caller's (`run`).
 
-    Attributes:
-        vehicles: by system id.
-        speed: vehicle seconds in a second.
+    `speed` is in vehicle seconds in a second.
     """
 
     def __init__(
@@ -59,15 +57,11 @@ class SimSwarm:
         """Open the links.
 
         Args:
-            vehicles: the vehicles.
             address: `udpout:HOST:PORT`, each vehicle from a port of its own to a ground station there, or
                 `tcpin:HOST:PORT`, the vehicles serving PORT, PORT + 1 and so on (0: any free ones).
             together: True for all on one link, as behind a router or a radio.
-            speed: vehicle seconds in a second.
-            up: faults from the ground to the vehicles, in vehicle time.
-            down: faults back.
-            key: signing key.
-            clock: real seconds.
+            speed: vehicle seconds in a second. clock: real seconds.
+            up: faults from the ground to the vehicles, in vehicle time; down: faults back.
 
         Raises:
             InputError: a link cannot be opened, or is of another kind.
@@ -83,22 +77,10 @@ class SimSwarm:
         groups = [list(vehicles)] if together else [[vehicle] for vehicle in vehicles]
         for number, group in enumerate(groups):
             link = _open(address, number)
-            seeded = [
-                Faults(loss=f.loss, duplicate=f.duplicate, delay_s=f.delay_s, silent=f.silent, seed=f.seed + 2 * number)
-                for f in (up, down)
-            ]
-            packers = {vehicle.system: dialect.MAVLink(None, vehicle.system, 1) for vehicle in group}
-            for packer in packers.values():
-                packer.signing.secret_key, packer.signing.sign_outgoing = key, key is not None
+            seeded = [Channel[bytes](faults=replace(faults, seed=faults.seed + 2 * number)) for faults in (up, down)]
             signing = Signing(key) if key else None
-            end = _End(
-                link=link,
-                vehicles=group,
-                up=Channel(faults=seeded[0]),
-                down=Channel(faults=seeded[1]),
-                packers=packers,
-                signing=signing,
-            )
+            packers = {vehicle.system: Packer(vehicle.system, 1, signing) for vehicle in group}
+            end = _End(link=link, vehicles=group, up=seeded[0], down=seeded[1], packers=packers, signing=signing)
             self._ends.append(end)
             self._by_link[link] = end
             link.open(self._selector, self._began)
@@ -180,12 +162,8 @@ class SimSwarm:
         if not messages:
             return
         muted = self._muted.get(vehicle.system, 0.0) > now
-        packer = end.packers[vehicle.system]
         for message in messages:
-            if end.signing is not None:
-                packer.signing.timestamp = end.signing.next_timestamp(time.time())
-            raw = message.pack(packer)
-            packer.seq = (packer.seq + 1) & 0xFF
+            raw = end.packers[vehicle.system].pack(message, time.time())
             if muted:
                 continue
             if end.down.faults.any:
@@ -229,10 +207,8 @@ def make_swarm(
     """Vehicles 1 to count, standing in rows of ten beside home.
 
     Args:
-        count: how many, up to 250.
         autopilots: dialects, taken in turn.
-        home: latitude, longitude (degrees), altitude (metres) of the first.
-        spacing_m: distance between neighbours.
+        home: latitude, longitude (degrees), altitude (metres) of the first; spacing_m: between neighbours.
         airframe: what they can do. as_flown: they take the times of real autopilots.
         seed: varies their receivers' errors and, a little, their headings.
         boot_utc_s: UTC of their boot; now unless said.
@@ -245,11 +221,12 @@ def make_swarm(
     swarm = []
     for number in range(count):
         lat, lon = chart.to_degrees(spacing_m * (number // 10), spacing_m * (number % 10))
+        autopilot, frame = autopilots[number % len(autopilots)], airframe or Airframe()
         vehicle = SimVehicle(
             system=number + 1,
-            autopilot=autopilots[number % len(autopilots)],
+            autopilot=autopilot,
             home=(lat, lon, home[2]),
-            airframe=_airframe(airframe or Airframe(), autopilots[number % len(autopilots)], as_flown),
+            airframe=frame.as_flown(autopilot_config(autopilot.value)) if as_flown else frame,
             boot_utc_s=utc,
             seed=seed,
             **options,
@@ -257,7 +234,3 @@ def make_swarm(
         vehicle.flight.motion.yaw = random.uniform(-0.3, 0.3)
         swarm.append(vehicle)
     return swarm
-
-
-def _airframe(frame: Airframe, autopilot: Autopilot, as_flown: bool) -> Airframe:
-    return frame.as_flown(autopilot_config(autopilot.value)) if as_flown else frame

@@ -6,23 +6,21 @@ as a ground station is there. Both answer commands and missions as measured (doc
 
 import heapq
 import math
+import struct
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Final
+from typing import Any, Final
 
 from gcs_plugin.links.file_transfer import payload_of
 from gcs_plugin.links.mavlink import Autopilot, Message, dialect
 from gcs_plugin.mission.exchange import Address
 from gcs_plugin.mission.flight_modes import modes_of
 from gcs_plugin.mission.items import FRAME_GLOBAL, WAYPOINT, MissionItem
-from gcs_plugin.sim.factory_parameters import factory_parameters, parameter_answer
 from gcs_plugin.sim.file_server import FileServer
-from gcs_plugin.sim.flight_values import Landed, MissionState, TakenPicture
-from gcs_plugin.sim.mission_flight import MissionFlight
+from gcs_plugin.sim.mission_flight import RTL_HEIGHT_M, Landed, MissionFlight, MissionState, TakenPicture
 from gcs_plugin.sim.mission_store import MissionStore
 from gcs_plugin.sim.multirotor import STEP_S, Airframe, Chart, VehiclePose
-from gcs_plugin.sim.sent_messages import MissionCurrent, bytes_of, severity_of
 
 _OK, _REJECTED, _DENIED, _UNSUPPORTED, _FAILED = (
     int(dialect.MAV_RESULT_ACCEPTED), int(dialect.MAV_RESULT_TEMPORARILY_REJECTED), int(dialect.MAV_RESULT_DENIED),
@@ -44,6 +42,20 @@ _BATTERY: Final = int(dialect.MAVLINK_MSG_ID_BATTERY_STATUS)
 _LEFT_GROUND_M: Final = 0.2
 _PX4_TOP_M_S: Final = 12.0  # factory setting
 _HOME: Final = (47.397742, 8.545594, 488.0)
+_WPNAV_SPEED_M_S: Final = 10.0
+"""ArduCopter flies faster if it is asked to and can."""
+
+
+class _MissionCurrent(dialect.MAVLink_mission_current_message):  # type: ignore[misc]
+    """The message with the checksum of the mission, which PX4 sends and this version of the dialect does not know."""
+
+    mission_id = 0
+
+    def pack(self, mav: Any, force_mavlink1: bool = False) -> bytes:
+        """Its bytes."""
+        known = self.unpacker.pack(self.seq, self.total, self.mission_state, self.mission_mode)
+        more = struct.pack("<I", self.mission_id) if self.mission_id else b""
+        return bytes(self._pack(mav, self.crc_extra, known + more, force_mavlink1=force_mavlink1))
 
 
 @dataclass(slots=True, kw_only=True)
@@ -51,10 +63,8 @@ class SimVehicle:
     """One simulated vehicle; drive it with `handle` and `advance`, in seconds since its boot.
 
     Attributes:
-        system: system id.
-        autopilot: dialect. kind: MAV_TYPE that it reports; it flies as a multirotor in any case.
+        kind: MAV_TYPE that it reports; it flies as a multirotor in any case.
         home: latitude, longitude (degrees), altitude (metres).
-        airframe: its performance.
         boot_utc_s: UTC epoch seconds of its boot; its clock runs with the time that it is given.
         ready_s: when its filter has a position, so that it can be armed; its receiver has a fix before that.
         seed: of its receiver's errors.
@@ -63,7 +73,6 @@ class SimVehicle:
         tx_bytes_s: capacity of its radio. Streams beyond that are skipped, as ArduPilot does; heartbeats and answers
             are sent first.
         files: what it serves over MAVLink FTP; None for one without.
-        on_exposure: called at each picture.
         withheld: ids of messages that it does not stream, whatever rate it is asked for.
         used_s: for how long its motors have used its battery, seconds.
         second_battery: what is left in a second one, 0 to 1; None for one without.
@@ -109,7 +118,7 @@ class SimVehicle:
         """Stand at home with an empty store."""
         if self.autopilot is Autopilot.PX4:
             self.airframe = replace(self.airframe, top_m_s=min(self.airframe.top_m_s, _PX4_TOP_M_S))
-        self.parameters = factory_parameters(self.autopilot, self.airframe.top_m_s)
+        self.parameters = _factory_parameters(self.autopilot, self.airframe.top_m_s)
         home = MissionItem.at(WAYPOINT, *self.home, frame=FRAME_GLOBAL)
         items = [home] if self.autopilot is Autopilot.ARDUPILOT else []
         self.store = MissionStore(autopilot=self.autopilot, home=home, items=items)
@@ -181,7 +190,7 @@ class SimVehicle:
             request = payload_of(message)
             return [] if request is None else [self.files.answer(request).message(sender.system, sender.component)]
         if kind == "PARAM_REQUEST_READ":
-            return parameter_answer(self.parameters, str(message.param_id).strip("\x00"), self.autopilot)
+            return _parameter_answer(self.parameters, str(message.param_id).strip("\x00"), self.autopilot)
         if kind == "MISSION_SET_CURRENT":
             self.flight.set_current(int(message.seq))
         if kind in ("COMMAND_LONG", "COMMAND_INT"):
@@ -298,7 +307,7 @@ class SimVehicle:
             if hz > 0.0:
                 heapq.heappush(self._due, (max(at + 1.0 / hz, now - 1.0), kind))
                 message = None if kind in self.withheld else _MAKERS[kind](self)
-                if message is not None and (kind == _HEARTBEAT or self._tx_room >= bytes_of(message)):
+                if message is not None and (kind == _HEARTBEAT or self._tx_room >= _bytes_of(message)):
                     self._spend([message], now)
                     messages.append(message)
         return messages
@@ -307,7 +316,7 @@ class SimVehicle:
         """Charge messages to the radio's capacity."""
         if self.tx_bytes_s < math.inf:
             self._tx_room = min(_TX_BUFFER, self._tx_room + self.tx_bytes_s * (now - self._tx_at))
-            self._tx_room -= sum(bytes_of(message) for message in messages)
+            self._tx_room -= sum(_bytes_of(message) for message in messages)
             self._tx_at = now
 
     def _stream(self, kind: int, hz: float) -> None:
@@ -338,7 +347,7 @@ class SimVehicle:
 
     def _text_parts(self, text: str) -> list[Message]:
         """A text in messages of 50 characters; several have a number in common."""
-        data, severity = text.encode(), severity_of(text)
+        data, severity = text.encode(), _severity_of(text)
         if len(data) <= 50:
             return [dialect.MAVLink_statustext_message(severity, data)]
         self._long_texts = self._long_texts % 0xFFFF + 1
@@ -358,24 +367,9 @@ class SimVehicle:
         lat, lon = round(exposure.lat_deg * 1e7), round(exposure.lon_deg * 1e7)
         if self.autopilot is Autopilot.ARDUPILOT:
             roll, pitch, yaw = (math.degrees(a) for a in (pose.roll_rad, pose.pitch_rad, pose.yaw_rad))
-            return [
-                dialect.MAVLink_camera_feedback_message(
-                    utc_us,
-                    1,
-                    0,
-                    exposure.index,
-                    lat,
-                    lon,
-                    pose.alt_m,
-                    pose.height_m,
-                    roll,
-                    pitch,
-                    yaw % 360.0,
-                    0.0,
-                    0,
-                    0,
-                )
-            ]
+            heights, angles = (pose.alt_m, pose.height_m), (roll, pitch, yaw % 360.0)
+            about = (utc_us, 1, 0, exposure.index, lat, lon)
+            return [dialect.MAVLink_camera_feedback_message(*about, *heights, *angles, 0.0, 0, 0)]
         boot_ms, index = int(exposure.time_s * 1e3), exposure.index
         turn = list(pose.quaternion)
         alt, rel = round(pose.alt_m * 1e3), round(pose.height_m * 1e3)
@@ -403,16 +397,15 @@ class SimVehicle:
     def _position(self) -> Message | None:
         motion = self.flight.motion
         lat, lon = motion.chart.to_degrees(*motion.seen)
-        if not self._has_fix:  # PX4 says nothing, ArduCopter 0, 0
-            return None if self.autopilot is Autopilot.PX4 else self._nowhere()
+        if not self._has_fix and self.autopilot is Autopilot.PX4:  # PX4 says nothing, ArduCopter 0, 0
+            return None
+        if not self._has_fix:
+            return dialect.MAVLink_global_position_int_message(self._boot_ms, 0, 0, 0, 0, 0, 0, 0, 65535)
         heading = round(math.degrees(motion.yaw) % 360.0 * 100.0) % 36000
         return dialect.MAVLink_global_position_int_message(
             self._boot_ms, round(lat * 1e7), round(lon * 1e7), round((motion.chart.alt_m + motion.up) * 1e3),
             round(motion.up * 1e3), round(motion.vn * 100), round(motion.ve * 100), round(-motion.vu * 100), heading,
         )  # fmt: skip
-
-    def _nowhere(self) -> Message:
-        return dialect.MAVLink_global_position_int_message(self._boot_ms, 0, 0, 0, 0, 0, 0, 0, 65535)
 
     def _attitude(self) -> Message:
         motion = self.flight.motion
@@ -422,7 +415,7 @@ class SimVehicle:
         flight, count = self.flight, len(self.store.items)
         total = count - 1 if self.autopilot is Autopilot.ARDUPILOT else count
         mode = 1 if flight.mode == flight.modes.mission else 2
-        message = MissionCurrent(flight.seq, max(0, total), int(flight.state), mode)
+        message = _MissionCurrent(flight.seq, max(0, total), int(flight.state), mode)
         if self.autopilot is Autopilot.PX4 and count:
             message.mission_id = zlib.crc32(repr(self.store.items).encode())
         return message
@@ -496,3 +489,40 @@ _MAKERS: Final[dict[int, Callable[[SimVehicle], Message | None]]] = {
     int(dialect.MAVLINK_MSG_ID_SYS_STATUS): SimVehicle._power,
     int(dialect.MAVLINK_MSG_ID_HOME_POSITION): SimVehicle._home,
 }
+
+
+def _bytes_of(message: Message) -> int:
+    """Its size on the radio: MAVLink 2's frame, unsigned."""
+    return int(message.unpacker.size) + 12
+
+
+def _severity_of(text: str) -> int:
+    """MAV_SEVERITY of a text, as autopilots say it."""
+    bad = text.startswith(("Arm:", "PreArm:", "Preflight", "Auto:", "No mission", "Mission start", "Takeoff waypoint"))
+    usual = dialect.MAV_SEVERITY_WARNING if "failsafe" in text.lower() else dialect.MAV_SEVERITY_INFO
+    return int(dialect.MAV_SEVERITY_CRITICAL if bad else usual)
+
+
+def _factory_parameters(autopilot: Autopilot, top_m_s: float) -> dict[str, float]:
+    """What a ground station asks for, as it leaves the factory; integers are those that the autopilot keeps as such."""
+    if autopilot is Autopilot.PX4:
+        return {
+            "MPC_XY_VEL_MAX": top_m_s, "RTL_RETURN_ALT": RTL_HEIGHT_M, "RTL_TYPE": 0, "NAV_DLL_ACT": 0,
+            "GF_MAX_HOR_DIST": 0.0, "GF_MAX_VER_DIST": 0.0,
+        }  # fmt: skip
+    return {
+        "WPNAV_SPEED": 100.0 * _WPNAV_SPEED_M_S, "RTL_ALT": 100.0 * RTL_HEIGHT_M, "RTL_ALT_TYPE": 0, "FS_GCS_ENABLE": 0,
+        "FENCE_ENABLE": 0, "FENCE_AUTOENABLE": 0, "FENCE_TYPE": 7, "FENCE_ACTION": 1, "FENCE_RADIUS": 300.0,
+        "FENCE_ALT_MAX": 100.0, "FENCE_ALT_MIN": -10.0, "FENCE_MARGIN": 2.0,
+    }  # fmt: skip
+
+
+def _parameter_answer(known: Mapping[str, float], name: str, autopilot: Autopilot) -> list[Message]:
+    """The value of a parameter; an autopilot does not answer about one that it has not."""
+    if name not in known:
+        return []
+    value, kind = known[name], int(dialect.MAV_PARAM_TYPE_REAL32)
+    if isinstance(value, int):
+        kind = int(dialect.MAV_PARAM_TYPE_INT32)
+        value = struct.unpack("<f", struct.pack("<i", value))[0] if autopilot is Autopilot.PX4 else value
+    return [dialect.MAVLink_param_value_message(name.encode(), value, kind, len(known), 0)]

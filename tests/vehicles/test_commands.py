@@ -9,7 +9,7 @@ import pytest
 
 from gcs_plugin.fleet.commands import Order
 from gcs_plugin.fleet.fleet import Fleet
-from gcs_plugin.fleet.flight_state import flight_state
+from gcs_plugin.fleet.flight_state import flight_state, summary
 from gcs_plugin.fleet.link_hub import Hub
 from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.links.transports import TcpLink
@@ -307,7 +307,7 @@ def test_impossible_values_do_not_leave_the_fleet(make_world, number):
     world = make_world(SimVehicle(system=1, autopilot=AP))
     world.meet()
     vehicle, seen = world.fleet.vehicles[1], []
-    before = vehicle.summary(world.clock.now)
+    before = summary(vehicle, world.clock.now)
     message = impossible()[number]
     world.fleet.subscribe(lambda v, m, utc: seen.append(m), message.get_type())
     world.vehicles[1]._rates = {}
@@ -316,7 +316,7 @@ def test_impossible_values_do_not_leave_the_fleet(make_world, number):
     world.link._say(0, [message], world.clock.now)
     world.wait(0.1)
     assert seen == [] and vehicle.impossible == 1
-    after = vehicle.summary(world.clock.now)
+    after = summary(vehicle, world.clock.now)
     for key in ("lat_deg", "lon_deg", "height_m", "gps_fix", "photos", "heading_deg"):
         assert after[key] == before[key]
 
@@ -407,7 +407,7 @@ def test_px4_is_returning_and_not_complete_while_it_flies_home(make_world):
     assert world.until(lambda: "complete" in world.kinds(1), 300.0)  # its refinement may begin
     vehicle = world.fleet.vehicles[1]
     assert vehicle.flying and flight_state(vehicle).word.value == "returning"
-    assert vehicle.summary(world.clock.now)["flight"]["state"] == "returning"
+    assert summary(vehicle, world.clock.now)["flight"]["state"] == "returning"
     world.until(lambda: not vehicle.armed, 200.0)
     assert flight_state(vehicle).word.value == "complete"
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 
 from gcs_plugin.cli.main import main
+from gcs_plugin.fleet.flight_state import summary
 from gcs_plugin.fleet.preflight import ITEMS, Level, Wanted, preflight, preflight_all, red_text
 from gcs_plugin.fleet.separation.takeoff_schedule import TakeoffSchedule
 from gcs_plugin.links.mavlink import Autopilot, dialect
@@ -373,7 +374,7 @@ def test_the_emptiest_of_two_batteries_counts(make_world):
     world.vehicles[1].second_battery = 0.05
     world.wait(6.0)
     state, why = levels(world)
-    assert vehicle.summary(world.clock.now)["battery"] == pytest.approx(0.05)
+    assert summary(vehicle, world.clock.now)["battery"] == pytest.approx(0.05)
     assert state["battery"] is Level.RED and "5 % left in its battery 2" in why["battery"]
     world.vehicles[1].withheld.add(int(dialect.MAVLINK_MSG_ID_BATTERY_STATUS))
     world.wait(20.0)

@@ -112,7 +112,7 @@ def upload(rig, mission, own=GROUND_STATION, **options):
 
 
 def holds(rig, mission):
-    return difference(mission, rig.store.items) is None
+    return not difference(mission, rig.store.items)
 
 
 @BOTH
@@ -356,12 +356,10 @@ def test_the_last_item_sent_twice_is_an_error_and_yet_a_success():
     uploading = upload(rig, mission)
     while not rig.acks:
         rig.step()
-    last = len(mission) - 1
     rig.down = Channel(faults=Faults())  # the acknowledgement is lost
     rig.answer([dialect.MAVLink_mission_ack_message(255, 190, 1, 0)])
     (outcome,) = rig.run(uploading)
     assert outcome.ok and holds(rig, mission)
-    assert uploading.progress == 1.0 and last > 0
 
 
 @BOTH
@@ -375,7 +373,7 @@ def test_a_download_over_a_bad_link_is_complete(autopilot):
         reading = rig.join(MissionDownload(VEHICLE))
         (outcome,) = rig.run(reading)
         assert outcome.ok
-        assert difference(mission, reading.items) is None
+        assert not difference(mission, reading.items)
 
 
 def test_px4_that_has_forgotten_a_transfer_is_asked_for_the_list_again():
@@ -383,11 +381,11 @@ def test_px4_that_has_forgotten_a_transfer_is_asked_for_the_list_again():
     rig, mission = Rig(PX4), make_mission(PX4)
     rig.store.items = list(mission.items)
     reading = rig.join(MissionDownload(VEHICLE))
-    while reading.progress < 0.5:
+    while len(reading._got) < 0.5 * len(mission):
         rig.step()
     rig.store.rebooted()
     (outcome,) = rig.run(reading)
-    assert outcome.ok and difference(mission, reading.items) is None
+    assert outcome.ok and not difference(mission, reading.items)
 
 
 def test_an_empty_vehicle_has_no_items():
@@ -418,7 +416,7 @@ def test_a_difference_that_matters_in_flight_is_found(word):
     stored = list(mission.items)
     stored[2] = DIFFERENCES[word](stored[2])
     found = difference(mission, stored)
-    assert found.item == 2 and word in found.text
+    assert found.startswith("item 2 (") and word in found
 
 
 def above_ground(autopilot):
@@ -433,7 +431,7 @@ def test_heights_above_the_ground_are_stored_by_ardupilot_and_verified():
     (outcome,) = rig.run(upload(rig, mission))
     assert outcome.ok and sum(i.frame == FRAME_TERRAIN for i in rig.store.items) >= 2
     home = [replace(i, frame=FRAME_RELATIVE) if i.frame == FRAME_TERRAIN else i for i in rig.store.items]
-    assert "frame" in difference(mission, home).text  # a vehicle that took them for heights over home is found out
+    assert "frame" in difference(mission, home)  # a vehicle that took them for heights over home is found out
 
 
 def test_heights_above_the_ground_are_refused_by_px4_in_words():
@@ -447,5 +445,5 @@ def test_rounding_by_the_autopilot_is_no_difference():
     stored = [
         replace(item, x=item.x + 1, z=item.z - 0.004, frame=0 if item.frame == 2 else 3) for item in mission.items
     ]
-    assert difference(mission, stored) is None
-    assert difference(mission, stored[:-1]).item is None
+    assert not difference(mission, stored)
+    assert "items are stored" in difference(mission, stored[:-1])

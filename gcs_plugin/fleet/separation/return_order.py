@@ -10,7 +10,7 @@ import math
 import time
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
@@ -18,14 +18,12 @@ from gcs_plugin.config import LIMITS, RETURN
 from gcs_plugin.fleet.autopilot_settings import Setting
 from gcs_plugin.fleet.fence_limits import fence_limits
 from gcs_plugin.fleet.flight_state import Word, flight_state
+from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.flight_modes import why_no_missions
 from gcs_plugin.mission.track import STEP_S, Array, Track, metres, near_samples
 from orthoswarm.config import active
 from orthoswarm.model.earth import distance_m
-
-if TYPE_CHECKING:
-    from gcs_plugin.fleet.vehicle_state import Vehicle
 
 _GOES_HOME: Final = frozenset({Word.RETURNING, Word.LANDING})
 
@@ -74,15 +72,12 @@ class Aloft:
 
 
 class ReturnOrder:
-    """Which of some vehicles may return now.
+    """Which of some vehicles, all in the air, may return now.
 
     Attributes:
         waits: vehicles that hold until their way is free, and whom each waits for (nobody before the first look).
         left: those that at the last look were found to follow another command, and what shows that, in words.
         heard_again: those that were lost, were heard again by the last look, and wait: nothing has told them to hold.
-
-    Args:
-        systems: the vehicles, all in the air. clock: monotonic seconds.
     """
 
     def __init__(self, systems: Collection[int], clock: Callable[[], float] = time.monotonic) -> None:
@@ -110,8 +105,8 @@ class ReturnOrder:
         One whose way is not known returns at once: nothing is known that would be better for it. So does one whose
         link is lost or whose battery must not wait; a lost one has its turn once more when it is heard and still holds.
         One that no longer holds as it did follows another command, of a remote control or another station.
-        Where some are in each other's way alone and nothing moves, the one that the fewest others stand in the way of
-        sets out.
+        Vehicles that wait only for each other would wait for ever: while nothing moves, the one of them that waits for
+        the fewest sets out.
 
         Args:
             aloft: all vehicles in the air, see `aloft_of`.
@@ -143,7 +138,7 @@ class ReturnOrder:
                 ready.append(system)
                 moving.add(system)
                 stay.discard(system)
-        # In each other's way alone. One that is held by somebody, or flies a mission, is never flown into.
+        # Of these one sets out; not of those that wait for a vehicle outside this order, which need not give way.
         mutual = [s for s, others in self.waits.items() if self.waits.keys() >= set(others)]
         if mutual and not moving:
             ready.append(min(mutual, key=lambda s: (len(self.waits[s]), left.index(s))))
@@ -190,15 +185,10 @@ class ReturnOrder:
         return vehicle.goes_home or self._clock() - self._sent.get(system, -math.inf) < RETURN.shows_s
 
 
-def aloft_of(vehicles: "Mapping[int, Vehicle]", now: float) -> dict[int, Aloft]:
-    """The vehicles in the air, by system id; in the fleet's thread.
-
-    Args:
-        vehicles: by system id. now: the fleet's clock.
-    """
+def aloft_of(vehicles: Mapping[int, Vehicle], now: float) -> dict[int, Aloft]:
+    """The vehicles in the air, by system id, at a time of the fleet's clock; in the fleet's thread."""
     known = {s: v for s, v in vehicles.items() if v.flying}
-    places = (place for v in known.values() if (place := _place(v)) is not None)
-    origin = next(places, (0.0, 0.0))
+    origin = next((v.place for v in known.values() if v.place is not None), (0.0, 0.0))
     return {
         s: Aloft(
             place=Track(_point(v, origin), level_m=v.home_alt_m),
@@ -214,28 +204,24 @@ def aloft_of(vehicles: "Mapping[int, Vehicle]", now: float) -> dict[int, Aloft]:
     }
 
 
-def _hold(vehicle: "Vehicle") -> Hold:
+def _hold(vehicle: Vehicle) -> Hold:
     """A pause leaves ArduPilot in AUTO or GUIDED, or in the mode that holds; one that cannot hover circles in that."""
     modes, circles = vehicle.modes, bool(why_no_missions(vehicle.kind))
     paused = vehicle.custom_mode in (modes.mission, modes.ready, modes.hold)
-    return Hold(vehicle.mode, None if circles else _place(vehicle), paused, circles or vehicle.still_s > 0.0)
+    return Hold(vehicle.mode, None if circles else vehicle.place, paused, circles or vehicle.still_s > 0.0)
 
 
-def _goes_home(vehicle: "Vehicle") -> bool:
+def _goes_home(vehicle: Vehicle) -> bool:
     """Whether its mode shows that it returns or lands. On a mission that is not known one that sinks may do neither."""
     unknown = vehicle.mission is None and vehicle.custom_mode == vehicle.modes.mission
     return not unknown and flight_state(vehicle).word in _GOES_HOME
 
 
-def way_home(vehicle: "Vehicle", origin: tuple[float, float]) -> Track | None:
-    """Where a vehicle is from now on if it is told to return, or does; None where its home or place is not known.
-
-    Args:
-        vehicle: in the air. origin: latitude and longitude in degrees of east 0, north 0.
-    """
+def way_home(vehicle: Vehicle, origin: tuple[float, float]) -> Track | None:
+    """Where a vehicle in the air is from now on if it returns; None where its home or place is not known."""
     from orthoswarm.planning.sorties.flight_time import Motion, autopilot_config
 
-    home, place = vehicle.home or vehicle.launch, _place(vehicle)
+    home, place = vehicle.home or vehicle.launch, vehicle.place
     if home is None or place is None:
         return None
     here, there = metres(*place, origin), metres(*home, origin)
@@ -252,12 +238,8 @@ def way_home(vehicle: "Vehicle", origin: tuple[float, float]) -> Track | None:
     return Track(motion.places(points[kept], None, STEP_S), motion.autopilot, vehicle.home_alt_m)
 
 
-def return_height_m(vehicle: "Vehicle", away_m: float) -> float:
-    """The height above home at which a vehicle flies home, from where it is (ArduCopter's mode_rtl.cpp, PX4's rtl.cpp).
-
-    Args:
-        vehicle: in the air. away_m: its distance from home.
-    """
+def return_height_m(vehicle: Vehicle, away_m: float) -> float:
+    """The height above home at which it returns from so far away, metres (ArduCopter's mode_rtl.cpp, PX4's rtl.cpp)."""
     said = vehicle.settings.get
     height, climb, cone = said(Setting.RETURN_HEIGHT), said(Setting.RETURN_CLIMB), said(Setting.RETURN_CONE)
     if vehicle.autopilot is not Autopilot.ARDUPILOT:
@@ -270,7 +252,7 @@ def return_height_m(vehicle: "Vehicle", away_m: float) -> float:
     return max(climbed_m, min(least_m, limit_m))
 
 
-def _return_speed_m_s(vehicle: "Vehicle") -> float:
+def _return_speed_m_s(vehicle: Vehicle) -> float:
     """The speed at which a vehicle flies home, metres per second."""
     back, mission = vehicle.settings.get(Setting.RETURN_SPEED), vehicle.settings.get(Setting.SPEED)
     if back is not None and back.value > 0.0:
@@ -280,7 +262,7 @@ def _return_speed_m_s(vehicle: "Vehicle") -> float:
     return RETURN.ardupilot_m_s if mission is None else mission.value
 
 
-def _height_known(vehicle: "Vehicle") -> bool:
+def _height_known(vehicle: Vehicle) -> bool:
     """Whether the height of its way home is known: it has told its return height, or it is landing."""
     how = vehicle.settings.get(Setting.RETURN_TYPE)
     told = Setting.RETURN_HEIGHT in vehicle.settings and not (how is not None and how.returns)
@@ -291,32 +273,21 @@ def _height_known(vehicle: "Vehicle") -> bool:
 
 
 def apart(one: Track, other: Track, *, heights: bool = True) -> bool:
-    """Whether two vehicles keep a plan's distance or height, also if one is late by the slack of a landing.
+    """Whether two vehicles keep a plan's distance or height, also where either is late by the slack of a landing.
 
-    A track of one place is a vehicle that holds there; any other track ends on the ground. heights: whether heights are
+    A track of one place is a vehicle that holds there; any other track ends on the ground. heights: whether both are
     known; if not, only the horizontal distance counts.
     """
-    if not len(one.places) or not len(other.places):
-        return True
-    i, j = near_samples(one.places, other.places, active().planning.separation_m)
-    if heights:
-        level = np.abs(one.places[i, 2] - other.places[j, 2] + one.higher_m(other)) < active().planning.layer_m
-        i, j = i[level], j[level]
+    planned = active().planning
+    i, j = near_samples(one, other, planned.separation_m, planned.layer_m if heights else None)
     if min(len(one.places), len(other.places)) == 1:
         return not len(i)
     slack_s = max(one.autopilot.landing_slack_s, other.autopilot.landing_slack_s)
     return not bool((np.abs(i - j) <= slack_s / STEP_S).any())
 
 
-def _place(vehicle: "Vehicle") -> tuple[float, float] | None:
-    """Latitude and longitude in degrees, None if they are not known."""
-    known = vehicle.lat_deg is not None and vehicle.lon_deg is not None
-    return (vehicle.lat_deg or 0.0, vehicle.lon_deg or 0.0) if known else None
-
-
-def _point(vehicle: "Vehicle", origin: tuple[float, float]) -> Array:
+def _point(vehicle: Vehicle, origin: tuple[float, float]) -> Array:
     """East, north, height in metres, float64 (1, 3); no place at all if it is not known."""
-    place = _place(vehicle)
-    if place is None:
+    if vehicle.place is None:
         return np.zeros((0, 3))
-    return np.array([(*metres(*place, origin), vehicle.height_m)])
+    return np.array([(*metres(*vehicle.place, origin), vehicle.height_m)])

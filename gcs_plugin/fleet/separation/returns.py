@@ -6,17 +6,14 @@ import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar
+from typing import Any, Final, Protocol, TypeVar
 
 from gcs_plugin.config import RETURN
-from gcs_plugin.fleet.commands import CommandResult, new_id
+from gcs_plugin.fleet.commands import CommandResult, Verb, new_id
 from gcs_plugin.fleet.separation.return_order import Aloft, ReturnOrder, aloft_of
+from gcs_plugin.fleet.vehicle_state import Vehicle
+from gcs_plugin.links.mavlink import Message
 from gcs_plugin.mission.exchange import Verdict
-
-if TYPE_CHECKING:
-    from gcs_plugin.fleet.commands import Verb
-    from gcs_plugin.fleet.vehicle_state import Vehicle
-    from gcs_plugin.links.mavlink import Message
 
 VERB: Final = "return"
 _ANSWER_S: Final = 5.0
@@ -32,13 +29,13 @@ class Station(Protocol):
     """The vehicles as one thread hears them: `fleet.Fleet`, or what stands for it."""
 
     @property
-    def vehicles(self) -> "Mapping[int, Vehicle]":
+    def vehicles(self) -> Mapping[int, Vehicle]:
         """By system id."""
 
     def call(self, work: Callable[[], Result]) -> "Future[Result]":
         """Run a function in that thread; from any thread."""
 
-    def send(self, system: int, messages: "Sequence[Message]") -> None:
+    def send(self, system: int, messages: Sequence[Message]) -> None:
         """Send messages to a vehicle without waiting for answers; in that thread."""
 
 
@@ -55,7 +52,7 @@ class Returns:
     def __init__(
         self,
         fleet: Station,
-        command: Callable[["Verb", Collection[str]], Rows],
+        command: Callable[[Verb, Collection[str]], Rows],
         publish: Callable[[dict[str, Any]], None],
         name_of: Callable[[int], str],
     ) -> None:
@@ -68,13 +65,10 @@ class Returns:
         self._thread: threading.Thread | None = None
 
     def begin(self, systems: Mapping[str, int], number: str) -> Rows:
-        """Return vehicles in turn; answers once each was told to return or to hold.
-
-        Args:
-            systems: system ids by the vehicles' ids. number: of the command.
+        """Return vehicles in turn, by system ids of their ids; answers once each was told to return or to hold.
 
         Returns:
-            A row a vehicle, as for a command. One that does not acknowledge that it is to hold is sent home.
+            A row a vehicle, as for a command (`number`). One that does not acknowledge that it is to hold is sent home.
         """
         with self._lock:  # an earlier order ends; what others command from now on comes before this one
             self._order, self._waits = None, {}
@@ -231,7 +225,7 @@ class Returns:
     def _aloft(self) -> dict[int, Aloft]:
         return self._fleet.call(lambda: aloft_of(self._fleet.vehicles, time.monotonic())).result(_ANSWER_S)
 
-    def _told(self, verb: "Verb", names: Collection[str], systems: Mapping[str, int]) -> dict[str, dict[str, Any]]:
+    def _told(self, verb: Verb, names: Collection[str], systems: Mapping[str, int]) -> dict[str, dict[str, Any]]:
         """The rows of vehicles that are given a command, unless somebody has given them another one meanwhile."""
         with self._lock:
             free = [name for name in names if systems[name] not in self._told_else]

@@ -7,16 +7,14 @@ the levels of their homes (`Airspace`). What cannot be followed so is said: it w
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from gcs_plugin.fleet.flight_state import Word, flight_state
 from gcs_plugin.fleet.separation.separation_watch import number_name
+from gcs_plugin.fleet.vehicle_state import Vehicle
+from gcs_plugin.mission.items import Mission
 from gcs_plugin.mission.track import STEP_S, Airspace, home_of, metres, track_of
-
-if TYPE_CHECKING:
-    from gcs_plugin.fleet.vehicle_state import Vehicle
-    from gcs_plugin.mission.items import Mission
-    from orthoswarm.model.plan import Apart
+from orthoswarm.model.plan import Apart
 
 _PLANNED_SHARE: Final = 0.95
 """Share of the distance that counts between missions of one plan, which was made with other samples."""
@@ -33,7 +31,7 @@ class TimedFlight:
         examined: whether the vehicle is asked about; others are there only to be kept apart from.
     """
 
-    mission: "Mission | None"
+    mission: Mission | None
     start_s: float
     alt_m: float | None = None
     planned: bool = False
@@ -42,20 +40,16 @@ class TimedFlight:
 
 @dataclass(frozen=True, slots=True)
 class SeparationFindings:
-    """Findings by system id, in words.
-
-    Attributes:
-        near: whom a vehicle comes too near. unexamined: what could not be examined.
-    """
+    """By system id, in words: whom a vehicle comes too near, and what could not be examined."""
 
     near: Mapping[int, str] = field(default_factory=dict)
     unexamined: Mapping[int, str] = field(default_factory=dict)
 
 
 def flights_of(
-    vehicles: "Mapping[int, Vehicle]",
-    missions: "Mapping[int, Mission]",
-    stored: "Mapping[int, Mission]",
+    vehicles: Mapping[int, Vehicle],
+    missions: Mapping[int, Mission],
+    stored: Mapping[int, Mission],
     starts: Mapping[int, float],
 ) -> dict[int, TimedFlight]:
     """The flights of vehicles that are to start; arguments as for `preflight_all`."""
@@ -65,12 +59,8 @@ def flights_of(
     }
 
 
-def others_of(vehicles: "Mapping[int, Vehicle]", waiting: Mapping[int, float]) -> dict[int, TimedFlight]:
-    """The flights of other vehicles: of those in the air, and of those whose takeoff waits.
-
-    Args:
-        vehicles: the others. waiting: seconds until the takeoff of those that wait.
-    """
+def others_of(vehicles: Mapping[int, Vehicle], waiting: Mapping[int, float]) -> dict[int, TimedFlight]:
+    """The flights of other vehicles: of those in the air, and of those whose takeoff waits for so many seconds."""
     found = {}
     for s, vehicle in vehicles.items():
         if s in waiting:
@@ -83,13 +73,11 @@ def others_of(vehicles: "Mapping[int, Vehicle]", waiting: Mapping[int, float]) -
 
 
 def separation_of(
-    flights: Mapping[int, TimedFlight], name: Callable[[int], str] = number_name, apart: "Apart | None" = None
+    flights: Mapping[int, TimedFlight], name: Callable[[int], str] = number_name, apart: Apart | None = None
 ) -> SeparationFindings:
     """Which vehicles come too near each other; takes a second or more for a large swarm.
 
-    Args:
-        flights: by system id. name: of a vehicle by its system id.
-        apart: how far apart the plan keeps its own vehicles, None for the default, which holds for all others.
+    `apart`: how far apart the plan keeps its own vehicles, None for the default, which holds for all others.
     """
     known = {s: flight for s, flight in flights.items() if flight.mission is not None}
     found: dict[int, list[str]] = {}
@@ -112,7 +100,7 @@ def separation_of(
 
 @lru_cache(maxsize=8)
 def _conflicts(
-    flights: tuple[tuple[int, TimedFlight], ...], apart: "Apart | None"
+    flights: tuple[tuple[int, TimedFlight], ...], apart: Apart | None
 ) -> tuple[tuple[int, int, float, float], ...]:
     """Both vehicles, the time and the distance; the same flights are asked about again and again before a start."""
     about = dict(flights)
@@ -128,10 +116,9 @@ def _conflicts(
     return tuple(row for row in found if about[row[0]].examined or about[row[1]].examined)
 
 
-def _elapsed_s(vehicle: "Vehicle", mission: "Mission") -> float:
+def _elapsed_s(vehicle: Vehicle, mission: Mission) -> float:
     """For how long a vehicle has been on its mission, from where it is."""
     origin = home_of(mission)
-    if origin is None or vehicle.lat_deg is None or vehicle.lon_deg is None:
+    if origin is None or vehicle.place is None:
         return 0.0
-    place = (*metres(vehicle.lat_deg, vehicle.lon_deg, origin), vehicle.height_m)
-    return track_of(mission, origin).elapsed_s(place)
+    return track_of(mission, origin).elapsed_s((*metres(*vehicle.place, origin), vehicle.height_m))

@@ -3,14 +3,12 @@
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import KW_ONLY, dataclass, field, replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from gcs_plugin.config import ALARM, HEARING, LIMITS
+from gcs_plugin.fleet.vehicle_state import Vehicle
 from orthoswarm.config import active
 from orthoswarm.model.earth import DEGREE_M, distance_m
-
-if TYPE_CHECKING:
-    from gcs_plugin.fleet.vehicle_state import Vehicle
 
 _LOOK_S: Final = 0.5
 """Step in which the next seconds are looked at."""
@@ -21,7 +19,7 @@ class Near:
     """Two vehicles that are too near each other, or will be.
 
     Attributes:
-        one: system id. other: system id of the one that should be paused.
+        other: the one that should be paused.
         metres: horizontal distance. height_m: difference in height.
         ahead_s: in how many seconds, if both fly straight on; 0 for now.
         silent: vehicles of the two that do not report where they are, so that it is not known whether they are near.
@@ -59,7 +57,7 @@ class SeparationWatch:
     height_m: float = field(default_factory=lambda: active().planning.layer_m)
     alarms: dict[tuple[int, int], Near] = field(default_factory=dict)
 
-    def look(self, vehicles: "Iterable[Vehicle]", now: float) -> tuple[list[Near], list[tuple[int, int]]]:
+    def look(self, vehicles: Iterable[Vehicle], now: float) -> tuple[list[Near], list[tuple[int, int]]]:
         """Compare all pairs; returns new or newly unknown alarms, and the pairs whose alarm is over.
 
         The alarm of a pair stays while one of the two that flew does not report its place (it is not heard, or its
@@ -99,12 +97,12 @@ class SeparationWatch:
                 return near_text(near, self, name)
         return ""
 
-    def _reach(self, vehicle: "Vehicle") -> float:
+    def _reach(self, vehicle: Vehicle) -> float:
         """Half the distance from which two vehicles can come too near in the time that is looked ahead, metres."""
         return 0.5 * ALARM.over_share * self.distance_m + ALARM.ahead_s * math.hypot(*vehicle.velocity_m_s[:2])
 
     def _meeting(
-        self, apart: tuple[float, float, float], one: "Vehicle", other: "Vehicle", over: float
+        self, apart: tuple[float, float, float], one: Vehicle, other: Vehicle, over: float
     ) -> tuple[float, float, float] | None:
         """Distance, difference in height and when, where they are nearest while too near; None if they never are.
 
@@ -121,7 +119,7 @@ class SeparationWatch:
                 met.append((metres, height, ahead))
         return min(met, default=None)
 
-    def _at_start(self, one: "Vehicle", other: "Vehicle", ahead_s: float) -> bool:
+    def _at_start(self, one: Vehicle, other: Vehicle, ahead_s: float) -> bool:
         """Both are above a start that they share, so many seconds ahead."""
         reach = active().planning.pad_distances * self.distance_m
         if one.launch is None or other.launch is None or distance_m(*one.launch, *other.launch) > reach:
@@ -150,13 +148,13 @@ def apart_text(pair: tuple[int, int], name: Callable[[int], str] = number_name) 
     return f"{name(pair[0])} and {name(pair[1])} are apart again"
 
 
-def _proposal(one: "Vehicle", other: "Vehicle") -> tuple[int, int]:
+def _proposal(one: Vehicle, other: Vehicle) -> tuple[int, int]:
     """Which vehicle should be paused: the faster of the two, as it approaches the other."""
     fast, slow = sorted((one, other), key=lambda v: -math.hypot(*v.velocity_m_s[:2]))
     return slow.system, fast.system
 
 
-def _height_differences(one: "Vehicle", other: "Vehicle") -> list[float]:
+def _height_differences(one: Vehicle, other: Vehicle) -> list[float]:
     """How much higher `one` is, metres: above the two takeoffs, and above the sea where these seem to differ in height.
 
     Heights above one takeoff are by barometer and good to a metre; altitudes err by several metres, more than lies
@@ -171,11 +169,11 @@ def _height_differences(one: "Vehicle", other: "Vehicle") -> list[float]:
     return differences
 
 
-def _place(vehicle: "Vehicle", ahead_s: float) -> tuple[float, float]:
+def _place(vehicle: Vehicle, ahead_s: float) -> tuple[float, float]:
     """Latitude and longitude so many seconds ahead, degrees."""
     lat, lon, (north, east, _) = vehicle.lat_deg or 0.0, vehicle.lon_deg or 0.0, vehicle.velocity_m_s
     return lat + ahead_s * north / DEGREE_M, lon + ahead_s * east / (DEGREE_M * math.cos(math.radians(lat)))
 
 
-def _metres(vehicle: "Vehicle", shrink: float) -> tuple[float, float]:
+def _metres(vehicle: Vehicle, shrink: float) -> tuple[float, float]:
     return (vehicle.lat_deg or 0.0) * DEGREE_M, (vehicle.lon_deg or 0.0) * DEGREE_M * shrink

@@ -17,11 +17,9 @@ _MOVED_S: Final = 0.5
 
 @dataclass(slots=True)
 class TakeoffSchedule:
-    """Takeoffs under way.
+    """Takeoffs under way: start times of the waiting and of the flying vehicles, on the caller's clock.
 
     Attributes:
-        waiting: start time of each waiting vehicle, on the caller's clock.
-        flown: start time of each flying vehicle.
         airspace: their missions; None where they are not known, then times are only kept, not moved.
     """
 
@@ -55,9 +53,7 @@ class TakeoffSchedule:
     def started(self, system: int, now: float, name: Callable[[int], str], begun: float | None = None) -> list[str]:
         """A vehicle has taken off; returns the changes for others, in words.
 
-        Args:
-            system: its id. now: the time, on the caller's clock. name: of a vehicle, from its system id.
-            begun: when it began its mission, which is earlier, by its climb; default now.
+        `begun`: when it began its mission, which is earlier, by its climb; default now.
         """
         begun = now if begun is None else begun
         self._undecided.pop(system, None)

@@ -44,7 +44,7 @@ class LossyLink(Link):
 
     def tick(self, now):
         self.link.tick(now)
-        self.up.drain(now, lambda cargo: self.link.send(*cargo))
+        self._pass_on(now)
 
     def greet(self):
         return self.link.greet()
@@ -56,15 +56,19 @@ class LossyLink(Link):
     def send(self, peer, data, expires=math.inf):
         now = time.monotonic()
         self.up.put((peer, data), now, len(data))
-        self.up.drain(now, lambda cargo: self.link.send(*cargo))
+        self._pass_on(now)
         return True
 
     def receive(self, source, events, now):
         if source is not self:
             for cargo in self.link.receive(source, events, now):
                 self.down.put(cargo, now, len(cargo[1]))
-        self.up.drain(now, lambda cargo: self.link.send(*cargo))
+        self._pass_on(now)
         yield from self.down.take(now)
+
+    def _pass_on(self, now):
+        for cargo in self.up.take(now):
+            self.link.send(*cargo)
 
 
 class _Renamed:

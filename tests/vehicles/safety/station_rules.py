@@ -165,16 +165,16 @@ class Rules:
             return
         begun, ended, items = heard.read
         read = ended >= now - LOOK_S
-        wrong = difference(given.mission, items) if read else None
-        if wrong is not None:
-            self._breaks(1, f"{what}, it was read to hold another mission: {wrong.text}")
+        wrong = difference(given.mission, items) if read else ""
+        if wrong:
+            self._breaks(1, f"{what}, it was read to hold another mission: {wrong}")
         checked = now - heard.checksum[0] <= LOOK_S and heard.checksum[1] != 0
         if not read and not checked:
             self._breaks(1, f"{what}, its mission was not read in the last second")
             return
         since = (begun if read else heard.checksum[0]) - 2 * delay - 0.05
         held = vehicle.held_since(since)
-        same = any(difference(given.mission, list(items)) is None for items in held)
+        same = any(not difference(given.mission, list(items)) for items in held)
         sums = {zlib.crc32(repr(list(items)).encode()) for items in held}
         if not same or (not read and heard.checksum[1] not in sums):
             self._breaks(1, f"{what}, it held another mission all the time since {now - since:.2f} s ago")

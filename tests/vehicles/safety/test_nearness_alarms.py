@@ -4,6 +4,7 @@ import math
 
 import pytest
 
+from gcs_plugin.fleet.flight_state import summary
 from gcs_plugin.fleet.preflight import Level, Wanted, preflight
 from gcs_plugin.fleet.separation.separation_watch import SeparationWatch
 from gcs_plugin.links.mavlink import Autopilot, dialect
@@ -80,7 +81,7 @@ def test_battery_and_receiver_are_asked_for_again_and_have_an_age(make_world, au
     world.meet()
     world.wait(5.0)
     vehicle, number = world.fleet.vehicles[1], int(getattr(dialect, f"MAVLINK_MSG_ID_{kind}"))
-    assert vehicle.summary(world.clock.now)[age] == 0
+    assert summary(vehicle, world.clock.now)[age] == 0
     silence = dialect.MAVLink_command_long_message(1, 1, 511, 0, float(number), -1.0, 0, 0, 0, 0, 0)
 
     def silent():  # another ground station wants none, again and again
@@ -88,12 +89,12 @@ def test_battery_and_receiver_are_asked_for_again_and_have_an_age(make_world, au
         return False
 
     world.until(silent, 20.0, 0.1)
-    row = vehicle.summary(world.clock.now)
+    row = summary(vehicle, world.clock.now)
     assert row[age] >= 18 and row["silent_s"] < 2.0
     check = preflight(vehicle, Wanted(), world.clock.now)
     assert any(item.name == age.removesuffix("_s") and "has not reported" in item.reason for item in check.red())
     world.wait(30.0)
-    assert vehicle.summary(world.clock.now)[age] == 0
+    assert summary(vehicle, world.clock.now)[age] == 0
 
 
 @BOTH

@@ -3,6 +3,7 @@
 import pytest
 
 from gcs_plugin.fleet.fleet import Fleet
+from gcs_plugin.fleet.flight_state import summary
 from gcs_plugin.fleet.preflight import Level, Wanted, preflight
 from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.mission.exchange import Address
@@ -65,7 +66,7 @@ def test_the_faults_of_a_stream_are_counted_for_who_watches_its_link(make_world)
     world = make_world(SimVehicle(system=1))
     world.meet()
     none = {"lost_share": 0.0, "damaged": 0, "impossible": 0}
-    assert world.fleet.vehicles[1].summary(world.clock.now)["faults"] == none
+    assert summary(world.fleet.vehicles[1], world.clock.now)["faults"] == none
     sender = dialect.MAVLink(None, 1, 1)
     say(world, sender, dialect.MAVLink_global_position_int_message(1000, 950_000_000, 85_000_000, 0, 0, 0, 0, 0, 0))
     damaged = bytearray(heartbeat(int(dialect.MAV_TYPE_QUADROTOR), ARDUPILOT).pack(sender))
@@ -73,7 +74,7 @@ def test_the_faults_of_a_stream_are_counted_for_who_watches_its_link(make_world)
     for _ in range(2):
         world.link.down.put((0, bytes(damaged)), world.clock.now)
     world.wait(1.0)
-    faults = world.fleet.vehicles[1].summary(world.clock.now)["faults"]
+    faults = summary(world.fleet.vehicles[1], world.clock.now)["faults"]
     assert (faults["damaged"], faults["impossible"]) == (2, 1)
 
 
