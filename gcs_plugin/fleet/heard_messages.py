@@ -17,7 +17,7 @@ _FAST_M_S: Final = 300.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Heard:
+class HeardMessage:
     """How a message is heard.
 
     Attributes:
@@ -80,29 +80,29 @@ def _gimbal(m: Message) -> bool:
 
 
 _HEARD: Final = {
-    "HEARTBEAT": Heard(repeated=True, overtaken=True),
-    "GLOBAL_POSITION_INT": Heard(hz=10.0, repeated=True, possible=_position),
-    "ATTITUDE": Heard(hz=10.0, repeated=True, possible=_attitude),
-    "MISSION_CURRENT": Heard(hz=2.0, repeated=True, overtaken=True),
-    "EXTENDED_SYS_STATE": Heard(hz=1.0, repeated=True, overtaken=True),
-    "SYSTEM_TIME": Heard(hz=1.0),
-    "GPS_RAW_INT": Heard(hz=1.0, repeated=True, checked=True, possible=_gps),
-    "SYS_STATUS": Heard(hz=1.0, repeated=True, checked=True),
-    "GIMBAL_DEVICE_ATTITUDE_STATUS": Heard(hz=10.0, optional=True, possible=_gimbal),
+    "HEARTBEAT": HeardMessage(repeated=True, overtaken=True),
+    "GLOBAL_POSITION_INT": HeardMessage(hz=10.0, repeated=True, possible=_position),
+    "ATTITUDE": HeardMessage(hz=10.0, repeated=True, possible=_attitude),
+    "MISSION_CURRENT": HeardMessage(hz=2.0, repeated=True, overtaken=True),
+    "EXTENDED_SYS_STATE": HeardMessage(hz=1.0, repeated=True, overtaken=True),
+    "SYSTEM_TIME": HeardMessage(hz=1.0),
+    "GPS_RAW_INT": HeardMessage(hz=1.0, repeated=True, checked=True, possible=_gps),
+    "SYS_STATUS": HeardMessage(hz=1.0, repeated=True, checked=True),
+    "GIMBAL_DEVICE_ATTITUDE_STATUS": HeardMessage(hz=10.0, optional=True, possible=_gimbal),
     # Only from a rangefinder that states its limits: a height from a coarse terrain map is worse than none.
-    "DISTANCE_SENSOR": Heard(hz=2.0, optional=True),
-    "HOME_POSITION": Heard(hz=0.2, optional=True, possible=_home),
+    "DISTANCE_SENSOR": HeardMessage(hz=2.0, optional=True),
+    "HOME_POSITION": HeardMessage(hz=0.2, optional=True, possible=_home),
     # Each autopilot's message about its filter.
-    "EKF_STATUS_REPORT": Heard(hz=1.0, optional=True, only=Autopilot.ARDUPILOT, repeated=True, checked=True),
-    "ESTIMATOR_STATUS": Heard(hz=1.0, optional=True, only=Autopilot.PX4, repeated=True, checked=True),
+    "EKF_STATUS_REPORT": HeardMessage(hz=1.0, optional=True, only=Autopilot.ARDUPILOT, repeated=True, checked=True),
+    "ESTIMATOR_STATUS": HeardMessage(hz=1.0, optional=True, only=Autopilot.PX4, repeated=True, checked=True),
     # Of one battery after the other. ArduPilot's SYS_STATUS shows its first battery, PX4's the emptiest one.
-    "BATTERY_STATUS": Heard(hz=1.0, optional=True, only=Autopilot.ARDUPILOT, repeated=True, checked=True),
-    "COMMAND_ACK": Heard(),
-    "STATUSTEXT": Heard(),
-    "MISSION_ITEM_REACHED": Heard(),
-    "PARAM_VALUE": Heard(),
-    "CAMERA_FEEDBACK": Heard(possible=_feedback),
-    "CAMERA_IMAGE_CAPTURED": Heard(possible=_captured),
+    "BATTERY_STATUS": HeardMessage(hz=1.0, optional=True, only=Autopilot.ARDUPILOT, repeated=True, checked=True),
+    "COMMAND_ACK": HeardMessage(),
+    "STATUSTEXT": HeardMessage(),
+    "MISSION_ITEM_REACHED": HeardMessage(),
+    "PARAM_VALUE": HeardMessage(),
+    "CAMERA_FEEDBACK": HeardMessage(possible=_feedback),
+    "CAMERA_IMAGE_CAPTURED": HeardMessage(possible=_captured),
 }
 HEARD: Final = {MESSAGE_IDS[name]: how for name, how in _HEARD.items()}
 """By message id; in this order they are asked for."""

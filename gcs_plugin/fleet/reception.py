@@ -11,7 +11,7 @@ from gcs_plugin.config import HEARING
 from gcs_plugin.fleet.dialogues import Dialogues
 from gcs_plugin.fleet.fleet_events import FleetEvent, Pair, mission_event
 from gcs_plugin.fleet.flight_state import danger_of
-from gcs_plugin.fleet.heard_messages import HEARD, MESSAGE_IDS, Heard, rates_of
+from gcs_plugin.fleet.heard_messages import HEARD, MESSAGE_IDS, HeardMessage, rates_of
 from gcs_plugin.fleet.link_hub import Hub, Side
 from gcs_plugin.fleet.message_rates import Streams
 from gcs_plugin.fleet.routes import LongText, Route
@@ -34,7 +34,7 @@ _HEARTBEAT, _ACK, _TEXT, _POSITION = (
 _DETECTED: Final = frozenset(MESSAGE_IDS[name] for name in RELEVANT)
 _REQUESTS: Final = frozenset({MESSAGE_IDS["MISSION_REQUEST"], MESSAGE_IDS["MISSION_REQUEST_INT"]})
 _BOOT_CLOCKS: Final = frozenset({_POSITION, MESSAGE_IDS["SYSTEM_TIME"]})
-_OTHER: Final = Heard()
+_OTHER: Final = HeardMessage()
 _SAME_TEXT_S: Final = 1.5
 _OVERTAKEN: Final = 64  # packets of its sender that a late one may be behind
 _PART: Final = 50  # characters of a STATUSTEXT
