@@ -65,7 +65,8 @@ class FlownItems:
         self._at_s, self._here = time_s, (lat_deg, lon_deg)
         if not counts:
             return False
-        near = {s for s in self._claimed if s not in self.places or _metres(self._here, self.places[s]) < _CLAIMED_M}
+        reach_m = _CLAIMED_M + (silent_s * _FASTEST_M_S if silent_s > _SILENT_S else 0.0)  # it has flown on since
+        near = {s for s in self._claimed if s not in self.places or _metres(self._here, self.places[s]) < reach_m}
         elsewhere, self._claimed = len(near) < len(set(self._claimed)), []
         self.reached |= near
         # Of places near each other it may pass several before the next MISSION_CURRENT is heard.
