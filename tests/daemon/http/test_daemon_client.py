@@ -97,4 +97,4 @@ def test_the_mavproxy_module_says_what_runs_and_what_to_type(served, running, mo
         said(module, capsys, "orthoswarm feed")
     else:
         module.typed(["refine"])
-        said(module, capsys, "say serve to start one")
+        said(module, capsys, "start one with 'orthoswarm serve'")
