@@ -1,7 +1,8 @@
 """The ground station: command line, links, missions, daemon."""
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING
+
+from orthoswarm.model.lazy_names import on_first_use
 
 if TYPE_CHECKING:
     from gcs_plugin.fleet.fleet import Fleet
@@ -22,19 +23,14 @@ __all__ = [
     "write_plan",
 ]
 
-_WHERE: Final = {
-    "fleet.fleet": ("Fleet",),
-    "fleet.fleet_events": ("FleetEvent",),
-    "mission.items": ("Mission", "MissionItem"),
-    "mission.mission_builder": ("read_mission",),
-    "plans.plan_files": ("write_plan",),
-    "plans.plan_request": ("PlanRequest", "make_plan"),
-}
-
-
-def __getattr__(name: str) -> Any:
-    """Import on first use, so that importing the package is fast."""
-    for module, names in _WHERE.items():
-        if name in names:
-            return getattr(import_module(f"gcs_plugin.{module}"), name)
-    raise AttributeError(f"module 'gcs_plugin' has no attribute '{name}'")
+__getattr__ = on_first_use(
+    __name__,
+    {
+        "fleet.fleet": ("Fleet",),
+        "fleet.fleet_events": ("FleetEvent",),
+        "mission.items": ("Mission", "MissionItem"),
+        "mission.mission_builder": ("read_mission",),
+        "plans.plan_files": ("write_plan",),
+        "plans.plan_request": ("PlanRequest", "make_plan"),
+    },
+)

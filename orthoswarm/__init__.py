@@ -4,8 +4,9 @@ Arrays and value types in and out; no sockets, no web, no clock. `__all__` is wh
 `telemetry` and `gcs_plugin` (docs/api.md); other names may change.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING
+
+from orthoswarm.model.lazy_names import on_first_use
 
 if TYPE_CHECKING:
     from orthoswarm.batch.make_map import make_map
@@ -33,21 +34,16 @@ __all__ = [
     "make_map",
 ]
 
-_WHERE: Final = {
-    "batch.make_map": ("make_map",),
-    "batch.run_state": ("MapOptions",),
-    "evaluation.checkpoints": ("evaluate_checkpoints",),
-    "evaluation.orthoimage": ("evaluate_ortho",),
-    "model.errors": ("InputError", "OrthoSwarmError"),
-    "model.frame": ("Fix", "Frame", "Ingest", "Rejection"),
-    "model.plan": ("Plan",),
-    "model.task_runner": ("Progress",),
-}
-
-
-def __getattr__(name: str) -> Any:
-    """Import on first use, so that importing the package is fast."""
-    for module, names in _WHERE.items():
-        if name in names:
-            return getattr(import_module(f"orthoswarm.{module}"), name)
-    raise AttributeError(f"module 'orthoswarm' has no attribute '{name}'")
+__getattr__ = on_first_use(
+    __name__,
+    {
+        "batch.make_map": ("make_map",),
+        "batch.run_state": ("MapOptions",),
+        "evaluation.checkpoints": ("evaluate_checkpoints",),
+        "evaluation.orthoimage": ("evaluate_ortho",),
+        "model.errors": ("InputError", "OrthoSwarmError"),
+        "model.frame": ("Fix", "Frame", "Ingest", "Rejection"),
+        "model.plan": ("Plan",),
+        "model.task_runner": ("Progress",),
+    },
+)

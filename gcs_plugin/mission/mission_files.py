@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
-from orthoswarm.model.earth import DEGREE_M
+from orthoswarm.model.earth import ring_around
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.plan import Fence, Plan, Sortie, Waypoint
 
@@ -24,6 +24,7 @@ DO_CHANGE_SPEED, DO_SET_CAM_TRIGG_DIST = 178, 206
 _FLOWN = (NAV_WAYPOINT, NAV_SPLINE)
 _GROUND_SPEED = 1.0  # MAV_CMD_DO_CHANGE_SPEED's kind
 _HIGHEST_M = 20_000.0
+_CORNERS = 32  # of the polygon around a circular fence
 _WITH_POSITION = {*range(16, 20), 21, 22, 31, 82, 84, 85, 94}
 _FIRMWARE: dict[Autopilot, int] = {"ardupilot": 3, "px4": 12}
 _MULTIROTOR = 2  # MAV_TYPE
@@ -310,7 +311,8 @@ def _parse_plan(document: Mapping[str, Any]) -> MissionFile:
     for c in fence.get("circles") or []:
         inside, circle = bool(c.get("inclusion", True)), c["circle"]
         fences.append(Fence(inclusion=inside, points=_ring([circle["center"]]), radius_m=float(circle["radius"])))
-    no_fly = [f.points if f.radius_m is None else _around(f) for f in fences if not f.inclusion]
+    out = [f for f in fences if not f.inclusion]
+    no_fly = [f.points if f.radius_m is None else ring_around(*f.points[0], f.radius_m, _CORNERS) for f in out]
     home = mission.get("plannedHomePosition")
     speed = mission.get("hoverSpeed") or mission.get("cruiseSpeed")
     return MissionFile(
@@ -357,12 +359,3 @@ def _ring(points: Iterable[Sequence[float]]) -> tuple[LatLon, ...]:
     for lat, lon in ring:
         _check_position(lat, lon, "a polygon", True)
     return ring
-
-
-def _around(circle: Fence) -> tuple[LatLon, ...]:
-    """A circular fence as a 32-gon around it."""
-    assert circle.radius_m is not None
-    (lat, lon), radius = circle.points[0], circle.radius_m / math.cos(math.pi / 32)
-    north, east = DEGREE_M, DEGREE_M * math.cos(math.radians(lat))
-    angles = [2.0 * math.pi * k / 32 for k in range(32)]
-    return tuple((lat + radius * math.cos(a) / north, lon + radius * math.sin(a) / east) for a in angles)

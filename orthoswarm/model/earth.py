@@ -27,3 +27,11 @@ def on_sphere(lat_deg: ArrayLike, lon_deg: ArrayLike) -> NDArray[np.float64]:
     """Places as x, y, z from the Earth's middle, metres, float64 (N, 3), for straight distances anywhere."""
     lat, lon = np.radians(np.asarray(lat_deg, np.float64)), np.radians(np.asarray(lon_deg, np.float64))
     return MEAN_RADIUS_M * np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=-1)
+
+
+def ring_around(lat_deg: float, lon_deg: float, radius_m: float, corners: int) -> tuple[tuple[float, float], ...]:
+    """Corners, latitude and longitude in degrees, of a regular polygon around a circle."""
+    north = radius_m / math.cos(math.pi / corners) / DEGREE_M
+    east = north / math.cos(math.radians(lat_deg))
+    angles = [2.0 * math.pi * k / corners for k in range(corners)]
+    return tuple((lat_deg + north * math.cos(a), lon_deg + east * math.sin(a)) for a in angles)

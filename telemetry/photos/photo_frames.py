@@ -61,35 +61,31 @@ def settle_positions(photos: Sequence[Photo], vehicle: str, name: Callable[[Path
 
     Where all of a vehicle's photos contradict themselves, nothing tells, and what was read first stays.
     """
-    by_tags = [p for p in photos if p.origin.get("position", "").startswith(("EXIF", "XMP"))]
-    two = [(photo, photo.other_position) for photo in by_tags if photo.other_position is not None]
+    places = [(float(photo.lat_deg or 0.0), float(photo.lon_deg or 0.0)) for photo in photos]
+    by_tags = [photo.origin.get("position", "").startswith(("EXIF", "XMP")) for photo in photos]
+    rows = list(zip(photos, places, (p.other_position if tags else None for p, tags in zip(photos, by_tags))))
+    two = [(photo, place, other) for photo, place, other in rows if other is not None]
     if not two:
         return []
-    sure = [p for p in photos if p.lat_deg is not None and (p.other_position is None or p not in by_tags)]
-    apart_m = max(distance_m(p.lat_deg or 0.0, p.lon_deg or 0.0, *other) for p, other in two)
+    sure = [place for _, place, other in rows if other is None]
     changed = 0
-    for photo, other in two if sure else []:
-        place, usual = (photo.lat_deg or 0.0, photo.lon_deg or 0.0), _median_place(sure)
-        if distance_m(*other, *usual) < distance_m(*place, *usual):
-            (photo.lat_deg, photo.lon_deg), changed = other, changed + 1
-            photo.origin["position"] = "the tags that fit the other photos"
     if sure:
+        lat, lon = np.median(np.array(sure), axis=0)
+        for photo, place, other in two:
+            if distance_m(*other, lat, lon) < distance_m(*place, lat, lon):
+                (photo.lat_deg, photo.lon_deg), changed = other, changed + 1
+                photo.origin["position"] = "the tags that fit the other photos"
         took = f"{plural(changed, 'position')} of these are taken from the tags that fit the other photos"
-    elif all(mirrored((p.lat_deg or 0.0, p.lon_deg or 0.0), other) for p, other in two):
+    elif all(mirrored(place, other) for _, place, other in two):
         took = "their hemispheres are taken from XMP"
     else:
         took = "nothing tells which is right: give a geo.txt"
+    apart_m = max(distance_m(*place, *other) for _, place, other in two)
     text = (
         f"the tags of {plural(len(two), 'photo')} state two places, up to {metres(apart_m)} apart "
         f"({name(two[0][0].path)} first); {took}"
     )
     return [Finding("position-contradicts", text, vehicle)]
-
-
-def _median_place(photos: Sequence[Photo]) -> tuple[float, float]:
-    places = np.array([(p.lat_deg, p.lon_deg) for p in photos], dtype=np.float64)
-    lat, lon = np.median(places, axis=0)
-    return float(lat), float(lon)
 
 
 def frame_without_position(photo: Photo, vehicle: str, image: str) -> Frame:

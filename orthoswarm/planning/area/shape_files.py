@@ -18,7 +18,7 @@ import shapely
 from numpy.typing import NDArray
 
 from orthoswarm.config import active
-from orthoswarm.model.earth import DEGREE_M
+from orthoswarm.model.earth import ring_around
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid, area_epsg
 
@@ -53,10 +53,7 @@ class Circle:
         """A polygon around it, `beyond_m` larger."""
         radius = self.radius_m + beyond_m
         corners = max(32, math.ceil(math.pi / math.sqrt(2.0 * _ROUND_M / radius)))
-        angles = 2.0 * math.pi * np.arange(corners) / corners
-        north = radius / math.cos(math.pi / corners) / DEGREE_M
-        east = north / math.cos(math.radians(self.lat_deg))
-        return Polygon(np.column_stack([self.lat_deg + north * np.cos(angles), self.lon_deg + east * np.sin(angles)]))
+        return Polygon(np.array(ring_around(self.lat_deg, self.lon_deg, radius, corners)))
 
 
 @dataclass(frozen=True, slots=True)
