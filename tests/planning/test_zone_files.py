@@ -96,7 +96,7 @@ KML_POLYGON = (
     ("name", "text", "words"),
     [
         ("z.json", json.dumps({"type": "GeometryCollection", "geometries": [POLYGON, CENTRE]}), "a point"),
-        ("z.json", json.dumps({"type": "GeometryCollection", "geometries": [POLYGON, LINE, LINE]}), "2 of: line"),
+        ("z.json", json.dumps({"type": "GeometryCollection", "geometries": [POLYGON, LINE, LINE]}), "holds 2 lines,"),
         ("z.json", json.dumps({"type": "Feature", "properties": {}, "geometry": None}), "a feature without a shape"),
         ("z.kml", KML.format("Point", KML_POLYGON.format("")), "a point"),
         ("z.kml", KML.format("LineString", KML_POLYGON.format("")), "a line"),
@@ -118,7 +118,7 @@ def test_a_line_with_a_width_is_a_strip(tmp_path):
 def test_what_is_switched_off_is_not_flown_but_kept_out_of(tmp_path):
     (tmp_path / "z.kml").write_text(f"<kml><Folder>{KML_POLYGON.format('<visibility>0</visibility>')}</Folder></kml>")
     shapes, _ = read_shapes(tmp_path / "z.kml")
-    assert not shapes.areas and shapes.left == ("a polygon that is switched off",)
+    assert not shapes.areas and shapes.left == ("a polygon switched off in the file",)
     assert len(read_zones(tmp_path / "z.kml")[0].polygons) == 1
 
 

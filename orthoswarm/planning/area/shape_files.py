@@ -83,7 +83,7 @@ class Shapes:
     def left(self) -> tuple[str, ...]:
         """What of the file no area or line is made of, in words."""
         hidden = len(self.hidden)
-        return (*self.unused, *counted({"polygon that is switched off": hidden} if hidden else {}))
+        return (*self.unused, *counted({"polygon switched off in the file": hidden} if hidden else {}))
 
     @classmethod
     def joined(cls, parts: Sequence["Shapes"]) -> "Shapes":
@@ -189,8 +189,9 @@ _NOUNS = {"Point": "point", "MultiPoint": "group of points", "": "feature withou
 
 
 def counted(nouns: Mapping[str, int]) -> tuple[str, ...]:
-    """Things and how many of them, in words."""
-    return tuple(f"{count} of: {noun}" if count > 1 else f"a {noun}" for noun, count in nouns.items())
+    """Things and how many of them, in words; the first word of a noun is what is counted."""
+    words = ((count, *noun.partition(" ")) for noun, count in nouns.items())
+    return tuple(f"{n} {head}s{gap}{rest}" if n > 1 else f"a {head}{gap}{rest}" for n, head, gap, rest in words)
 
 
 def _circle(lat: float, lon: float, radius: Any, name: str) -> Circle:
@@ -274,7 +275,7 @@ def parse_kml(text: str | bytes, name: str = "the KML file") -> Shapes:
             if shown:
                 lines += [ring(_numbers(c, name), name, 2) for c in _coordinates(node)]
             else:
-                unused["line that is switched off in the file"] += 1
+                unused["line switched off in the file"] += 1
         elif _tag(node) in _KML_NOUNS:
             unused[_KML_NOUNS[_tag(node)]] += 1
         waiting += [(n, shown) for n in reversed(node) if _tag(node) != "Polygon" or _tag(n) == "Polygon"]
@@ -283,8 +284,8 @@ def parse_kml(text: str | bytes, name: str = "the KML file") -> Shapes:
 
 
 _KML_NOUNS = {
-    "Point": "point", "Track": "recorded track", "MultiTrack": "recorded track", "Model": "model",
-    "GroundOverlay": "picture overlay", "NetworkLink": "link to another file",
+    "Point": "point", "Track": "track", "MultiTrack": "track", "Model": "model",
+    "GroundOverlay": "overlay of a picture", "NetworkLink": "link to another file",
 }  # fmt: skip
 
 
