@@ -129,11 +129,14 @@ class StartChecks:
         return separation_of(flights, self._names.name_of, needs.apart)
 
     def _missions(self, systems: Collection[int], *, reread: bool) -> "dict[int, Mission]":
-        """The missions that vehicles hold, read again where that was long ago; of those that answer in time."""
+        """The missions that vehicles hold, read again where that was long ago; of those that answer in time.
+
+        One that is being read anyway, as after an upload, is waited for too.
+        """
         vehicles, now = {s: self._fleet.vehicles[s] for s in systems}, time.monotonic()
         old = [s for s, v in vehicles.items() if v.mission is None or now - v.read_s > COMMAND.read_kept_s]
         for begun in [self._fleet.call(partial(self._fleet.read_mission, s)) for s in old if reread]:
             begun.result(_SOON_S)
-        while any(self._fleet.reads(s) for s in old) and time.monotonic() < now + _READ_S:
+        while any(self._fleet.reads(s) for s in systems) and time.monotonic() < now + _READ_S:
             time.sleep(0.02)
         return {s: v.mission for s, v in vehicles.items() if v.mission is not None and not self._fleet.reads(s)}

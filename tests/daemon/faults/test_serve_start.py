@@ -35,5 +35,5 @@ def test_the_workspace_is_readable_for_its_owner_only(tmp_path):
         with serving(workspace) as served:
             assert served.send(line(1)[0]).status_code == 201
             assert workspace.stat().st_mode & 0o077 == 0
-            loose = [path for path in workspace.rglob("*.jpg") if path.stat().st_mode & 0o077]
-            assert loose == []
+        loose = [path for path in workspace.rglob("*.jpg") if path.stat().st_mode & 0o077]
+        assert loose == []

@@ -296,7 +296,7 @@ def test_mirafiori_scale_holds_without_lens_tags(real_data):
 @pytest.mark.slow
 def test_jwcate_is_one_piece_with_its_tilts_and_lag(real_data):
     start, adjustment, *_ = solved(real_frames(real_data("jwcate_1200")))
-    assert np.bincount(start.component).tolist() == [36]
+    assert np.bincount(start.plane.component).tolist() == [36]
     tilt = np.degrees(np.arccos(-adjustment.cameras.rotation[:, 2, 2]))
     medians = [float(np.median(tilt[start.records.segment == s])) for s in range(4)]
     assert medians == pytest.approx([0.8, 4.7, 1.0, 9.0], abs=1.0)
