@@ -11,12 +11,13 @@ import zipfile
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 import shapely
 
 from gcs_plugin.mission.mission_files import parse_mission
+from orthoswarm.model.coordinate_system import to_degrees
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.plan import Fence
 from orthoswarm.planning.area.shape_files import (
@@ -29,9 +30,6 @@ from orthoswarm.planning.area.shape_files import (
     refuse_many_corners,
     ring,
 )
-
-if TYPE_CHECKING:
-    from pyproj import Transformer
 
 _KINDS: Final = {
     ".geojson": "GeoJSON",
@@ -224,13 +222,12 @@ def _shapes(source: str, name: str) -> Shapes:
     except (DataSourceError, DataLayerError, FeatureError, FieldError, GeometryError, shapely.GEOSException):
         needs = "a shapefile's ZIP needs .shp, .shx, .dbf and .prj"
         raise InputError(f"{name} is damaged or incomplete; export it again ({needs})") from None
-    to_degrees = {crs: _transformer(crs, name) for crs, _ in parts}  # made once: it takes as long as a thousand points
     for crs, part in parts:
         if part.geom_type == "Polygon" and not part.is_empty:
-            shell, *holes = [_degrees(r.coords, to_degrees[crs], name) for r in (part.exterior, *part.interiors)]
+            shell, *holes = [_degrees(r.coords, crs, name) for r in (part.exterior, *part.interiors)]
             polygons.append(Polygon(shell, tuple(holes)))
         elif part.geom_type == "LineString" and not part.is_empty:
-            lines.append(_degrees(part.coords, to_degrees[crs], name, 2))
+            lines.append(_degrees(part.coords, crs, name, 2))
         else:
             unused["feature without a shape" if part.is_empty else part.geom_type.lower()] += 1
     refuse_many_corners([*polygons, *lines], name)
@@ -245,21 +242,13 @@ def _parts(geometries: Any) -> list[Any]:
     ]
 
 
-def _transformer(crs: str | None, name: str) -> "Transformer":
-    """From a coordinate system to longitude and latitude of WGS 84; InputError if it is not said, or not known."""
-    from pyproj import Transformer
-    from pyproj.exceptions import CRSError
-
+def _degrees(points: object, crs: str | None, name: str, least: int = 3) -> Ring:
+    """A ring or line in latitude and longitude of WGS 84; InputError if its coordinate system is not known."""
     if crs is None:
         raise InputError(f"{name} does not say its coordinate system; export it in WGS 84 (EPSG:4326), with its .prj")
-    try:
-        return Transformer.from_crs(crs, 4326, always_xy=True)
-    except CRSError:
-        raise InputError(f"{name} has an unknown coordinate system; export it in WGS 84 (EPSG:4326)") from None
-
-
-def _degrees(points: object, to_degrees: "Transformer", name: str, least: int = 3) -> Ring:
-    """A ring or line in latitude and longitude of WGS 84."""
     array = np.asarray(points, dtype=np.float64)[:, :2]
-    lon, lat = to_degrees.transform(array[:, 0], array[:, 1])
-    return ring(np.column_stack([lat, lon]), name, least)
+    try:
+        lon_lat, _ = to_degrees(crs, array[:, 0], array[:, 1])
+    except InputError as error:
+        raise InputError(f"{name}: {error}; or export it in WGS 84 (EPSG:4326)") from None
+    return ring(lon_lat[:, ::-1], name, least)
