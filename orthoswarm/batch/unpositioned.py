@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from orthoswarm.batch.run_state import RunContext
 from orthoswarm.config import active
 from orthoswarm.evaluation.checkpoints import read_checkpoints
+from orthoswarm.evaluation.misread_points import require_places
 from orthoswarm.model.frame import Frame, Ingest
 from orthoswarm.raster.picture_file import read_gray, reduction
 from orthoswarm.refine.strategy.unpositioned_photos import place_unpositioned
@@ -23,6 +24,7 @@ def with_control_positions(run: RunContext, ingest: Ingest) -> Ingest:
     options = run.options
     assert options.control is not None
     points = read_checkpoints(options.control, options.pixel_scale)
+    require_places((point.name, point.surveyed) for point in points)
     tasks = run.workers.map
     placed = place_unpositioned(
         ingest.unpositioned, ingest.frames, points, read_gray=_reduced, run=tasks, progress=run.progress

@@ -1,11 +1,12 @@
 """`orthoswarm coverage`: which ground of an area the pictures of a flight cover well, what was missed, and why."""
 
 import argparse
-import json
 import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from orthoswarm.model.json_values import json_text
 
 if TYPE_CHECKING:
     from orthoswarm.coverage.camera_events import CameraEvent
@@ -83,7 +84,7 @@ def run(args: argparse.Namespace) -> int:
         draw_cells(args.out / "coverage.png", cover, gaps, ortho)
         write_json(args.out / "coverage.json", figures)
     if args.json:
-        print(json.dumps(figures))
+        print(json_text(figures))
     else:
         _print(figures, args.out)
     return 0
