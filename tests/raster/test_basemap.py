@@ -385,3 +385,50 @@ def test_threads_and_processes_share_a_map(gray_tif):
     with ThreadPoolExecutor(4) as pool:
         for gray, _ in pool.map(lambda _: basemap.gray(AREA, 0.5), range(12)):
             np.testing.assert_array_equal(gray, first)
+
+
+SENTINELS = {
+    "float": (np.float32, -9999.0, {}),
+    "least float": (np.float32, np.finfo(np.float32).min, {}),
+    "uint16": (np.uint16, 65535, {}),
+    "int16": (np.int16, -32768, {}),
+    "uint16, zero": (np.uint16, 0, {}),
+    "white": (np.uint8, 255, {}),
+    "plain grey": (np.uint8, 204, {}),
+    "black, JPEG": (np.uint8, 0, {"compress": "JPEG", "tiled": True, "jpeg_quality": 70}),
+    "white, JPEG": (np.uint8, 255, {"compress": "JPEG", "tiled": True, "jpeg_quality": 70}),
+}
+
+
+@pytest.mark.parametrize("epsg", [EPSG, 3857])
+@pytest.mark.parametrize("kind", SENTINELS)
+def test_empty_pixels_that_nobody_declared_are_no_ground_and_take_no_contrast(tmp_path, kind, epsg):
+    dtype, empty, profile = SENTINELS[kind]
+    if epsg == EPSG:
+        affine = PLAIN
+    else:
+        (x,), (y,) = rasterio.warp.transform(f"EPSG:{EPSG}", "EPSG:3857", [EAST - 20], [NORTH + 20])
+        affine = from_origin(x, y, 0.6, 0.6)
+    values = picture(affine, 600, 600, epsg)
+    values = (values * (20 if dtype in (np.uint16, np.int16) else 1)).astype(dtype)
+    at = rasterio.warp.transform(f"EPSG:{EPSG}", f"EPSG:{epsg}", [EAST + 100.0], [NORTH - 100.0])
+    column = int((at[0][0] - affine.c) / affine.a)
+    values[:, :column] = empty
+    basemap = Basemap.open(write(tmp_path / "m.tif", values, affine, epsg, **profile), EPSG, AREA)
+    for gsd in (0.4, 1.1):
+        gray, valid = basemap.gray(AREA, gsd)
+        assert 0.4 < valid.mean() < 0.51
+        border = valid & np.roll(~valid, 1, axis=1)
+        assert gray[valid].std() > 25.0 and len(np.unique(gray[valid].round())) > 90
+        want = expected(AREA, gsd)
+        shown = np.corrcoef(gray[valid], want[valid])[0, 1]
+        fringe = np.corrcoef(gray[border], want[border])[0, 1]
+        assert shown > 0.99 and fringe > 0.9
+
+
+def test_a_drawn_map_is_shown_whole_and_dark_water_is_ground(tmp_path):
+    drawn = np.kron(np.random.default_rng(1).integers(1, 9, (25, 25)) * 25, np.ones((20, 20))).astype(np.uint8)
+    assert Basemap.open(write(tmp_path / "d.tif", drawn, PLAIN), EPSG, AREA).gray(AREA, 0.4)[1].all()
+    water = picture(PLAIN, 500, 500).round().astype(np.uint8)
+    water[:, :250] = np.random.default_rng(2).integers(2, 9, (500, 250))
+    assert Basemap.open(write(tmp_path / "w.tif", water, PLAIN), EPSG, AREA).gray(AREA, 0.4)[1].all()
