@@ -50,6 +50,18 @@ def to_degrees(system: str, x: ArrayLike, y: ArrayLike) -> tuple[Array, str]:
     return np.stack([np.asarray(lon, float), np.asarray(lat, float)], axis=-1), doubt
 
 
+def require_datum(system: str, name: str) -> None:
+    """Refuse what is in a system whose datum is not known.
+
+    Raises:
+        InputError: with the name of the file.
+    """
+    try:
+        _transformer(system)
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from None
+
+
 @lru_cache(maxsize=64)
 def _transformer(system: str) -> tuple[Any, str]:
     """PROJ's transformer of a system to degrees, and a doubt about its datum; InputError as above."""

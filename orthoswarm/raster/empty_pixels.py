@@ -56,8 +56,8 @@ def _apart(values: NDArray[np.float64], spike: float) -> float | None:
     rest = values[values > spike]
     if not len(rest):
         return None
-    low, high = np.percentile(rest, _BULK_PERCENT)
-    spread = max(float(high - low), 1e-6 * abs(float(high)), 1e-12)
+    low, high = (float(v) for v in np.percentile(rest, _BULK_PERCENT))
+    spread = max(high - low, 1e-6 * abs(high), 1e-12)
     if low - spike <= _APART * spread:
         return None
     return max(0.5 * low + 0.5 * spike, low - spread)  # what is between is mixed of both
@@ -111,9 +111,9 @@ def _patches(values: NDArray[Any], colour: Sequence[float], noise: int, reduced:
     if noise:
         core &= cv2.blur(off, (_COLLAR_PX, _COLLAR_PX), borderType=cv2.BORDER_REPLICATE) <= _NOISE_MEAN
     if not core.any():
-        return core
+        return np.zeros(near.shape, bool)
     margin = max(_BLURRED_PX, round(_RINGING_PX / max(reduced, 1.0))) if off[core].any() else _BLURRED_PX
-    return cv2.dilate(core.astype(np.uint8), _square(_COLLAR_PX + 2 * margin), borderValue=0).astype(bool)
+    return np.asarray(cv2.dilate(core.astype(np.uint8), _square(_COLLAR_PX + 2 * margin), borderValue=0)) > 0
 
 
 def _least(band: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
+from orthoswarm.model.coordinate_system import require_datum
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.raster.empty_pixels import blank, fills, range_of_ground
@@ -86,10 +87,6 @@ class RasterMap:
         key = (os.getpid(), level)
         if key not in handles:
             options: dict[str, Any] = {} if level is None else {"OVERVIEW_LEVEL": level}
-            if self._path.suffix.lower() == ".mbtiles":
-                # Bounds that cut a pixel move the whole map by up to half of one: GDAL takes them as the corner, and
-                # whole pixels from there.
-                options["USE_BOUNDS"] = "NO"
             # Of a local map side files are looked for one by one (world file, .aux.xml, .msk, .ovr) without listing its
             # folder, which may hold thousands of photos; asking a store for each of them would take seconds.
             side_files = "EMPTY_DIR" if is_stored(self._path) else "TRUE"
@@ -324,6 +321,7 @@ def _crs_of(source: Any, path: Path) -> Any:
             f"the basemap {path.name} has no coordinate system (CRS); georeference it, for example with QGIS, or give "
             "another map"
         )
+    require_datum(crs.to_wkt(), f"the basemap {path.name}")
     return crs
 
 
