@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from orthoswarm.config import active
 from orthoswarm.export.atomic_file import write_file
 from orthoswarm.export.footprint_layer import write_footprints
+from orthoswarm.export.json_values import finite, json_text
 from orthoswarm.model.angles import wrap_deg
 from orthoswarm.model.camera import Camera, Lens, angles_from_rotation, ground_jacobian
 from orthoswarm.model.frame import Frame, Rejection
 from orthoswarm.model.geo import LocalGrid
-from orthoswarm.model.json_values import finite, json_text
 from orthoswarm.model.placement import PlacedFrame, Solution
 from orthoswarm.mosaic.footprint import footprint
 from orthoswarm.mosaic.takeoff_altitude import TakeoffLevel, height_sigma_m, takeoff_levels

@@ -1,9 +1,12 @@
 """Map tiles in web Mercator, of a folder or an MBTiles file, read in windows on the area's grid."""
 
-from collections.abc import Sequence
+import sqlite3
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import closing, contextmanager
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +17,8 @@ from orthoswarm.model.earth import WEB_MERCATOR_M
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.raster.empty_pixels import blank
-from orthoswarm.raster.tile_store import is_whole, no_tiles, open_tiles, placeholders
+from orthoswarm.raster.map_check import UnreadableMapError
+from orthoswarm.stores.local_copies import local_file
 
 Bytes = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
@@ -23,7 +27,14 @@ _MARGIN_M: Final = 5000.0  # tiles this far from the flight belong to the map th
 _COARSEST_M: Final = 40.0  # pixels of a zoom level that a flight can be laid on at all
 _COVERS_SHARE: Final = 0.5  # of what any level shows of the flight: a level with less is a rest of a download
 _LEVELS: Final = 3  # a hole is filled from so many levels on either side; eight times coarser is no map of its place
-_MOST_COMPARED: Final = 20_000  # tiles that are looked at for placeholders (time)
+_MOST_COMPARED: Final = 10_000  # tiles that are looked at for placeholders (time)
+Tiles = dict[tuple[int, int], Any]
+"""Column and row of a zoom level -> what `TileSource.read` needs to find the tile."""
+Ranges = Callable[[int], tuple[int, int, int, int]]
+"""Zoom -> first and last column, first and last row (from the north), inclusive."""
+
+_SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".webp")
+_PART_BYTES: Final = 256  # of a tile's middle, by which tiles of one size are compared
 Place = tuple[int, int, int]
 """Zoom, column, and row from the north."""
 
@@ -42,20 +53,19 @@ class TileMap:
     def __init__(self, path: Path, epsg: int, near: BoundingBox | None) -> None:
         self._path = path
         self._epsg = epsg
-        self._store = open_tiles(path)
+        self._source = _Folder(path) if path.is_dir() else _Mbtiles(path)
         around = None if near is None else near.grown(max(_MARGIN_M, near.width, near.height))
-        levels = self._store.tiles(None if around is None else lambda zoom: self._tile_range(around, zoom))
+        levels = self._source.tiles(None if around is None else lambda zoom: self._tile_range(around, zoom))
         self._tiles: dict[Place, Any] = {(z, c, r): key for z, tiles in levels.items() for (c, r), key in tiles.items()}
         if not self._tiles:
-            raise no_tiles(path)
+            raise InputError(f"{path} holds no map tiles z/x/y.png (or jpg, webp); give a map")
         zooms = sorted(levels)
-        if near is not None and self._rows_from_south(near, zooms[-1]):
+        if near is not None and self._rows_from_south(near, zooms):
             self._tiles = {(z, c, 2**z - 1 - r): key for (z, c, r), key in self._tiles.items()}
-        flown = [place for place in self._tiles if near is None or self._is_within(place, near)]
-        if len(flown) <= _MOST_COMPARED:
-            lacking = placeholders(self._store, [self._tiles[place] for place in flown])
-            flown = [place for place in flown if self._tiles[place] not in lacking]
-            self._tiles = {place: key for place, key in self._tiles.items() if key not in lacking}
+        compared = next((p for p in (self._within(around), self._within(near)) if len(p) <= _MOST_COMPARED), [])
+        lacking = _placeholders(self._source, [self._tiles[place] for place in compared])
+        self._tiles = {place: key for place, key in self._tiles.items() if key not in lacking}
+        flown = self._within(near)
         self._size = self._tile_size(flown)
         self._zoom = zooms[-1] if near is None else self._covering(near, zooms, flown)
         self._zooms = [z for z in zooms if self._zoom - _LEVELS <= z <= self._zoom]
@@ -66,7 +76,7 @@ class TileMap:
     def _tile_size(self, places: Sequence[Place]) -> int:
         """Pixels of a tile's side, of the finest that can be decoded."""
         for place in sorted(places, reverse=True):
-            tile = _decode(self._store.read(self._tiles[place]))
+            tile = _decode(self._source.read(self._tiles[place]))
             if tile is not None:
                 return len(tile)
         if places:
@@ -88,10 +98,16 @@ class TileMap:
         per_metre = np.diff(self._mercator(np.array([[x, y], [x + 100.0, y]])), axis=0)
         return float(WEB_MERCATOR_M / 2**zoom / self._size / np.hypot(*per_metre[0]) * 100.0)
 
-    def _is_within(self, place: Place, bounds: BoundingBox) -> bool:
-        zoom, column, row = place
-        left, right, top, bottom = self._tile_range(bounds, zoom)
-        return left <= column <= right and top <= row <= bottom
+    def _within(self, bounds: BoundingBox | None) -> list[Place]:
+        """The tiles of all levels that bounds need; all tiles if None."""
+        if bounds is None:
+            return list(self._tiles)
+        ranges = {zoom: self._tile_range(bounds, zoom) for zoom in {place[0] for place in self._tiles}}
+        return [
+            (z, c, r)
+            for z, c, r in self._tiles
+            if ranges[z][0] <= c <= ranges[z][1] and ranges[z][2] <= r <= ranges[z][3]
+        ]
 
     def _mercator(self, east_north: NDArray[np.float64]) -> NDArray[np.float64]:
         x, y = _transformer(self._epsg).transform(east_north[:, 0], east_north[:, 1])
@@ -113,18 +129,20 @@ class TileMap:
         row = np.floor((WEB_MERCATOR_M / 2 - xy[:, 1]) / side)
         return int(column.min()), int(column.max()), int(row.min()), int(row.max())
 
-    def _rows_from_south(self, near: BoundingBox, zoom: int) -> bool:
-        """True if the area has tiles of a level only when rows count from the south."""
-        left, right, top, bottom = self._tile_range(near, zoom)
-        flip = 2**zoom - 1
-        rows = [r for z, c, r in self._tiles if z == zoom and left <= c <= right]
-        return not any(top <= r <= bottom for r in rows) and any(top <= flip - r <= bottom for r in rows)
+    def _rows_from_south(self, near: BoundingBox, zooms: Sequence[int]) -> bool:
+        """True if the area has tiles only when rows count from the south."""
+        ranges = {zoom: self._tile_range(near, zoom) for zoom in zooms}
+        rows = [(*ranges[z][2:], r, 2**z - 1 - r) for z, c, r in self._tiles if ranges[z][0] <= c <= ranges[z][1]]
+        return not any(top <= r <= bottom for top, bottom, r, _ in rows) and any(
+            top <= flipped <= bottom for top, bottom, _, flipped in rows
+        )
 
     def _ground_bounds(self, around: BoundingBox | None) -> BoundingBox:
         """Bounds of the used tiles in the grid, those within some kilometres of the area."""
-        used = [place for place in self._tiles if place[0] in self._zooms]
-        if around is not None:
-            used = [place for place in used if self._is_within(place, around)] or used
+        used = [place for place in self._within(around) if place[0] in self._zooms]
+        used = used or [place for place in self._tiles if place[0] in self._zooms]
+        if not used:
+            raise InputError(f"the tiles of {self._path} are placeholders without a map; download them again")
         z, c, r = np.array(used, float).T
         side = WEB_MERCATOR_M / 2.0**z
         x = np.array([(c * side).min(), ((c + 1.0) * side).max()]) - WEB_MERCATOR_M / 2
@@ -194,7 +212,7 @@ class TileMap:
         if key is None:
             return None
         if place not in decoded:
-            decoded[place] = _decode(self._store.read(key))
+            decoded[place] = _decode(self._source.read(key))
         return decoded[place]
 
     def _part_of_coarser(self, place: Place, decoded: dict[Place, Bytes | None]) -> Bytes | None:
@@ -240,7 +258,7 @@ def _decode(data: bytes) -> Bytes | None:
     """A tile as RGBA uint8 (size, size, 4); None if it is damaged, cut short, or of one colour."""
     import cv2
 
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data and is_whole(data) else None
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data and _is_whole(data) else None
     if image is None or (image == image[0, 0]).all():
         return None
     if image.dtype == np.uint16:
@@ -248,3 +266,111 @@ def _decode(data: bytes) -> Bytes | None:
     if image.ndim == 2:
         return np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2RGBA))
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGBA if image.shape[2] == 3 else cv2.COLOR_BGRA2RGBA))
+
+
+class TileSource(Protocol):
+    """A set of tiles."""
+
+    def tiles(self, near: Ranges | None) -> dict[int, Tiles]:
+        """Zoom -> its tiles, rows as the set counts them; where the set is large, only those of ranges."""
+
+    def read(self, key: Any) -> bytes:
+        """The content of a tile."""
+
+    def signature(self, key: Any) -> tuple[int, bytes]:
+        """Length and a part of a tile, by which two that are alike are found."""
+
+
+def _placeholders(source: TileSource, keys: Iterable[Any]) -> set[Any]:
+    """Tiles that stand for what a server did not have: two photographs are never alike, these are."""
+    signatures = {key: source.signature(key) for key in keys}
+    count = Counter(signatures.values())
+    return {key for key, signature in signatures.items() if count[signature] > 1 or not signature[0]}
+
+
+def _is_whole(data: bytes) -> bool:
+    """Whether a tile was downloaded to its end; a half one is decoded into a picture with a plain rest."""
+    if data.startswith(b"\xff\xd8"):
+        return b"\xff\xd9" in data[-1024:]
+    if data.startswith(b"\x89PNG"):
+        return b"IEND" in data[-64:]
+    if data.startswith(b"RIFF"):
+        return len(data) >= 8 + int.from_bytes(data[4:8], "little")
+    return True
+
+
+class _Folder:
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def tiles(self, near: Ranges | None) -> dict[int, Tiles]:
+        zooms = sorted(int(p.name) for p in self._path.iterdir() if p.is_dir() and p.name.isdigit())
+        found = {zoom: dict(self._level(zoom)) for zoom in zooms}
+        return {zoom: tiles for zoom, tiles in found.items() if tiles}
+
+    def _level(self, zoom: int) -> Iterator[tuple[tuple[int, int], Path]]:
+        for column in (self._path / str(zoom)).iterdir():
+            if column.name.isdigit() and column.is_dir():
+                for file in column.iterdir():
+                    if file.stem.isdigit() and file.suffix.lower() in _SUFFIXES:
+                        yield (int(column.name), int(file.stem)), file
+
+    def read(self, key: Path) -> bytes:
+        return key.read_bytes()
+
+    def signature(self, key: Path) -> tuple[int, bytes]:
+        size = key.stat().st_size
+        with key.open("rb") as file:
+            file.seek(size // 2)
+            return size, file.read(_PART_BYTES)
+
+
+class _Mbtiles:
+    """Rows are counted from the north, although the file counts them from the south."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    @contextmanager
+    def _query(self, text: str, *values: int) -> Iterator[sqlite3.Cursor]:
+        uri = local_file(self._path).absolute().as_uri() + "?mode=ro"
+        try:
+            with closing(sqlite3.connect(uri, uri=True)) as file:
+                yield file.execute(text, values)
+        except (sqlite3.Error, OSError):
+            raise UnreadableMapError(
+                f"the basemap {self._path.name} cannot be read as a map; give a GeoTIFF, COG, MBTiles or XYZ folder"
+            ) from None
+
+    def tiles(self, near: Ranges | None) -> dict[int, Tiles]:
+        with self._query("SELECT zoom_level, min(tile_column), max(tile_column), min(tile_row), max(tile_row)"
+                         " FROM tiles GROUP BY zoom_level") as rows:  # fmt: skip
+            extents = {zoom: extent for zoom, *extent in rows}
+        found = {zoom: self._level(zoom, near) for zoom in extents}
+        if any(found.values()):
+            return {zoom: tiles for zoom, tiles in found.items() if tiles}
+        # Nothing is near: the corners tell how far away the map is.
+        return {zoom: {(c, 2**zoom - 1 - r): (zoom, c, r) for c, r in ((c0, r0), (c1, r1))}
+                for zoom, (c0, c1, r0, r1) in extents.items()}  # fmt: skip
+
+    def _level(self, zoom: int, near: Ranges | None) -> Tiles:
+        last = 2**zoom - 1
+        left, right, top, bottom = (0, last, 0, last) if near is None else near(zoom)
+        text = (
+            "SELECT tile_column, tile_row FROM tiles WHERE zoom_level = ? AND tile_column BETWEEN ? AND ?"
+            " AND (tile_row BETWEEN ? AND ? OR tile_row BETWEEN ? AND ?)"
+        )
+        with self._query(text, zoom, left, right, last - bottom, last - top, top, bottom) as rows:
+            return {(c, last - r): (zoom, c, r) for c, r in rows}
+
+    def read(self, key: tuple[int, int, int]) -> bytes:
+        return self._value("tile_data", key)[0] or b""
+
+    def signature(self, key: tuple[int, int, int]) -> tuple[int, bytes]:
+        size, part = self._value(f"length(tile_data), substr(tile_data, length(tile_data) / 2, {_PART_BYTES})", key)
+        return int(size or 0), part or b""
+
+    def _value(self, what: str, key: tuple[int, int, int]) -> Any:
+        text = f"SELECT {what} FROM tiles WHERE zoom_level = ? AND tile_column = ? AND tile_row = ?"
+        with self._query(text, *key) as rows:
+            return rows.fetchone() or (None, None)

@@ -535,3 +535,12 @@ def test_a_map_of_an_ellipsoid_without_a_datum_is_refused(tmp_path):
     crs = CRS.from_string("+proj=utm +zone=33 +ellps=bessel +units=m")
     with pytest.raises(InputError, match=r"m.tif: .* but no datum"):
         Basemap.open(write(tmp_path / "m.tif", gray, PLAIN, crs=crs), EPSG, AREA)
+
+
+def test_tiles_of_placeholders_alone_are_refused(tmp_path):
+    web_tiles(tmp_path, 18)
+    sign = cv2.imencode(".png", np.random.default_rng(1).integers(0, 255, (256, 256, 3), np.uint8))[1].tobytes()
+    for file in tmp_path.rglob("*.png"):
+        file.write_bytes(sign)
+    with pytest.raises(InputError, match="placeholders without a map"):
+        Basemap.open(tmp_path, EPSG, AREA)

@@ -9,8 +9,8 @@ from typing import Any, Final, Literal, TypedDict
 from gcs_plugin.daemon.store.frame_rows import Whose
 from gcs_plugin.daemon.store.job_rows import new_job
 from gcs_plugin.daemon.store.journal import Change, Journal, fact_change, packed, unpacked
+from orthoswarm.export.json_values import finite
 from orthoswarm.model.bounding_box import BoundingBox
-from orthoswarm.model.json_values import finite
 
 Table = Literal["solutions", "coarse"]
 """Where placed sorties are: the refined ones, and those in flight (or beside a refined one, on the coarse layer)."""

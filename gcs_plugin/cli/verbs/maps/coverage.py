@@ -6,7 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from orthoswarm.model.json_values import json_text
+from orthoswarm.export.json_values import json_text
 
 if TYPE_CHECKING:
     from orthoswarm.coverage.camera_events import CameraEvent

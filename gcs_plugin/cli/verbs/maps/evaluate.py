@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from orthoswarm.model.json_values import json_text
+from orthoswarm.export.json_values import json_text
 
 if TYPE_CHECKING:
     from orthoswarm.evaluation.displacement import Accuracy

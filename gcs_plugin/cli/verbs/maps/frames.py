@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from orthoswarm.model.json_values import json_text
+from orthoswarm.export.json_values import json_text
 
 if TYPE_CHECKING:
     from orthoswarm.model.frame import Frame

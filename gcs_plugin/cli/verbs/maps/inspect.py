@@ -4,8 +4,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from orthoswarm.export.json_values import json_text
 from orthoswarm.model.angles import wrap_deg
-from orthoswarm.model.json_values import json_text
 from orthoswarm.stores.addresses import path_of
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gcs_plugin.cli.configuration import add_config, read_config
-from orthoswarm.model.json_values import json_text
+from orthoswarm.export.json_values import json_text
 from orthoswarm.stores.addresses import address_of, path_of
 
 if TYPE_CHECKING:

@@ -3,7 +3,7 @@
 import json
 import math
 
-from orthoswarm.model.json_values import finite, json_text
+from orthoswarm.export.json_values import finite, json_text
 
 
 def test_what_is_no_number_is_null():
