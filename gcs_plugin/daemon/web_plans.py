@@ -24,6 +24,7 @@ _NAME: Final = re.compile(r"[0-9a-z][0-9a-z-]{0,63}\Z")
 _NUMBERS: Final = (
     "altitude_m", "fov_min_deg", "speed_m_s", "endurance_min", "side_overlap", "forward_overlap", "separation_m",
     "clearance_m", "height_tolerance_m", "wait_min", "wind_m_s", "wind_from_deg",
+    "gimbal_pitch_deg",
 )  # fmt: skip
 _MOST_NUMBER: Final = 1e6  # in a request
 _NO_FLY_FILE: Final = "no-fly.geojson"
@@ -273,6 +274,8 @@ def _values(body: Mapping[str, Any]) -> dict[str, Any]:
             if not isinstance(body[key], str) or body[key] not in choices:
                 raise InputError(f"{key} is none of {', '.join(choices)}; choose one")
             values[key] = body[key]
+    if body.get("gimbal_pitch_deg", 0.0) is None:
+        values["gimbal_pitch_deg"] = None
     values["autopilots"] = _autopilots(body.get("autopilot", "ardupilot"))
     if "terrain_items" in body:
         values["terrain_items"] = body["terrain_items"] is True

@@ -19,7 +19,7 @@ from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.comparison import difference
 from gcs_plugin.mission.geofence import FenceZone, breach
-from gcs_plugin.mission.items import FRAME_GLOBAL, Mission
+from gcs_plugin.mission.items import FRAME_GLOBAL, GIMBAL_PITCH, MOUNT_CONTROL, TRIGGER_DISTANCE, Mission
 from gcs_plugin.mission.mission_builder import unflyable
 from gcs_plugin.mission.plan_folder import NO_NEEDS, PlanNeeds
 from gcs_plugin.mission.track import fastest_m_s, flight_seconds, highest_m, takeoff_place
@@ -28,7 +28,7 @@ from orthoswarm.model.earth import distance_m
 
 ITEMS: Final = (
     "link", "gps", "ekf", "home", "pre-arm", "battery", "mission", "fence", "height", "return", "failsafe", "speed",
-    "separation",
+    "gimbal", "separation",
 )  # fmt: skip
 CONTINUED: Final = frozenset({"link", "gps", "ekf", "battery", "mission", "fence", "failsafe"})
 """Those that count before a vehicle in the air goes on with a mission that it has left."""
@@ -36,6 +36,7 @@ _LINK_S: Final = (2.0, 5.0)
 _SATELLITES: Final = (6, 10)
 _HOME_M: Final = 50.0
 _SAME_M_S: Final = 0.05
+_AIMED_DEG: Final = 10.0  # a camera so far off still photographs the ground of its line
 _UNKNOWN_SATELLITES: Final = 255
 
 
@@ -117,7 +118,7 @@ def preflight(vehicle: Vehicle, wanted: Wanted, now: float) -> Check:
         _battery(vehicle, mission, wanted.needs.endurance_s or LIMITS.endurance_s, now), _mission(vehicle, wanted),
         _fence(vehicle, mission, wanted.zones), _height(mission, wanted),
         _return(vehicle, wanted.needs.return_height_m), _failsafe(vehicle), _speed(vehicle, mission),
-        _separation(wanted),
+        _gimbal(vehicle, mission), _separation(wanted),
     )  # fmt: skip
     return Check(vehicle.system, items)
 
@@ -385,6 +386,23 @@ def _separation(wanted: Wanted) -> Item:
         text += f"; alarms come below {usual.separation_m:g} m and {usual.layer_m:g} m"
         return Item("separation", Level.WARNING, text)
     return Item("separation", Level.OK, "keeps apart")
+
+
+def _gimbal(vehicle: Vehicle, mission: Mission | None) -> Item:
+    looks_deg = vehicle.gimbal_pitch_deg
+    items = mission.items if mission is not None else ()
+    turned = [item.params[0] for item in items if item.command in (MOUNT_CONTROL, GIMBAL_PITCH)]
+    if looks_deg is None:
+        text = "its camera must look down by itself" if not turned else "its mission turns one down if there is one"
+        return Item("gimbal", Level.OK, f"it reports no gimbal: {text}")
+    looks = f"its gimbal is at {looks_deg:.0f} degrees (-90 is down)"
+    there = abs(looks_deg - (turned[0] if turned else -90.0)) <= _AIMED_DEG
+    if turned and (there or not vehicle.flying):
+        return Item("gimbal", Level.OK, f"{looks}; its mission turns it to {turned[0]:.0f}")
+    if there or not any(item.command == TRIGGER_DISTANCE for item in items):
+        return Item("gimbal", Level.OK, looks)
+    why = f"not at {turned[0]:.0f} as its mission says" if turned else "and its mission does not turn it down"
+    return Item("gimbal", Level.WARNING, f"{looks}, {why}; turn it, or plan with --gimbal-pitch")
 
 
 def _speed(vehicle: Vehicle, mission: Mission | None) -> Item:

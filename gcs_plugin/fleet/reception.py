@@ -39,7 +39,9 @@ _SAME_TEXT_S: Final = 1.5
 _OVERTAKEN: Final = 64  # packets of its sender that a late one may be behind
 _PART: Final = 50  # characters of a STATUSTEXT
 _PARTS_S: Final = 1.5  # its parts are sent one after the other
-_PHOTOS: Final = frozenset({MESSAGE_IDS["CAMERA_FEEDBACK"], MESSAGE_IDS["CAMERA_IMAGE_CAPTURED"]})
+_OF_PARTS: Final = frozenset(
+    MESSAGE_IDS[name] for name in ("CAMERA_FEEDBACK", "CAMERA_IMAGE_CAPTURED", "GIMBAL_DEVICE_ATTITUDE_STATUS")
+)
 
 
 class Reception:
@@ -94,7 +96,7 @@ class Reception:
             self._autopilot_says(vehicle, route, kind, message=packet.message, now=now, stale=stale)
             if repeated:
                 return
-        elif kind in _PHOTOS:
+        elif kind in _OF_PARTS:
             vehicle.update(packet.message)
         if kind == _POSITION and not has_place(packet.message):
             return

@@ -63,6 +63,7 @@ class Vehicle:
         failsafe: whether it reports one (MAV_STATE_CRITICAL, MAV_STATE_EMERGENCY). had_failsafe: in this flight, ever.
         unbegun: it was given that mission here and has not begun it.
         photos: pictures that it has reported.
+        gimbal_pitch_deg: where its gimbal looks, -90 straight down, 0 the horizon; None if it reports none.
         received: packets; missed: packets lost according to its counters.
         impossible: number of messages with values out of range, which were dropped.
         ekf_ok: whether its filter has an absolute position; None if not reported.
@@ -121,6 +122,7 @@ class Vehicle:
     mission_total: int = 0
     paused_in_mission: bool = False
     photos: int = 0
+    gimbal_pitch_deg: float | None = None
     received: int = 0
     missed: int = 0
     impossible: int = 0
@@ -407,6 +409,12 @@ class Vehicle:
             self.settings[found[0]] = found[1]
             self.questions.answered(found[0])
 
+    def _gimbal(self, m: Message) -> None:
+        w, x, y, z = m.q
+        self.gimbal_pitch_deg = math.degrees(
+            math.asin(min(1.0, max(-1.0, 2.0 * (w * y - z * x) / math.hypot(*m.q) ** 2)))
+        )
+
     def _photo(self, m: Message) -> None:
         index = m.img_idx if m.get_type() == "CAMERA_FEEDBACK" else m.image_index
         known = len(self._pictures)
@@ -429,6 +437,7 @@ _HANDLERS: Final = {
     MESSAGE_IDS["ESTIMATOR_STATUS"]: Vehicle._filter,
     MESSAGE_IDS["HOME_POSITION"]: Vehicle._home,
     MESSAGE_IDS["PARAM_VALUE"]: Vehicle._parameter,
+    MESSAGE_IDS["GIMBAL_DEVICE_ATTITUDE_STATUS"]: Vehicle._gimbal,
     MESSAGE_IDS["CAMERA_FEEDBACK"]: Vehicle._photo,
     MESSAGE_IDS["CAMERA_IMAGE_CAPTURED"]: Vehicle._photo,
 }

@@ -11,9 +11,11 @@ from collections.abc import Sequence
 from gcs_plugin.mission.items import (
     CHANGE_SPEED,
     DELAY,
+    GIMBAL_PITCH,
     JUMP,
     LAND,
     LOITER_UNLIM,
+    MOUNT_CONTROL,
     RTL,
     TAKEOFF,
     TRIGGER_DISTANCE,
@@ -27,6 +29,7 @@ from gcs_plugin.mission.items import (
 _DECISIVE: dict[int, tuple[int, ...]] = {
     WAYPOINT: (0,), TAKEOFF: (), RTL: (), LAND: (), VTOL_LAND: (), LOITER_UNLIM: (),
     DELAY: (0, 1, 2, 3), JUMP: (0, 1), CHANGE_SPEED: (0, 1), TRIGGER_DISTANCE: (0,),
+    MOUNT_CONTROL: (0, 1, 2), GIMBAL_PITCH: (0, 1),
 }  # fmt: skip
 _PLACE_E7 = 2
 _ALTITUDE_M = 0.011

@@ -3,7 +3,7 @@
 ArduPilot's item 0 is home, which it overwrites: a list without it loses its takeoff. PX4's item 0 is flown: a list with
 home in front is refused at MISSION_START. ArduPilot refuses NaN in a parameter; PX4 reads a yaw of 0 as "turn north",
 so there it is NaN: nose along the path. A jump's target in files counts from home, as ArduPilot does; PX4's is one
-less.
+less. A gimbal is turned by other commands in each (`mission_files.gimbal_items`).
 """
 
 import math
@@ -50,7 +50,8 @@ def build_mission(
     Raises:
         InputError: nothing to fly, an invalid position, or more items than the autopilot can store.
     """
-    flown = [_wire(item, autopilot) for item in items]
+    spoken: mission_files.Autopilot = "px4" if autopilot is Autopilot.PX4 else "ardupilot"
+    flown = [_wire(item, autopilot) for item in mission_files.with_gimbal_items_of(spoken, items)]
     if not flown:
         raise InputError(f"{name or 'the mission'} has no items; plan one with: orthoswarm plan")
     if autopilot is Autopilot.ARDUPILOT:

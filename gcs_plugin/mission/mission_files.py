@@ -20,7 +20,11 @@ LatLon = tuple[float, float]
 
 FRAME_GLOBAL, FRAME_MISSION, FRAME_GLOBAL_RELATIVE, FRAME_TERRAIN = 0, 2, 3, 10
 NAV_WAYPOINT, NAV_LOITER_TIME, NAV_RTL, NAV_LAND, NAV_TAKEOFF, NAV_SPLINE = 16, 19, 20, 21, 22, 82
-DO_CHANGE_SPEED, DO_SET_CAM_TRIGG_DIST = 178, 206
+DO_JUMP, DO_CHANGE_SPEED, DO_SET_CAM_TRIGG_DIST = 177, 178, 206
+DO_MOUNT_CONTROL, DO_GIMBAL_MANAGER_PITCHYAW, DO_GIMBAL_MANAGER_CONFIGURE = 205, 1000, 1001
+_ANGLES = 2.0  # MAV_MOUNT_MODE_MAVLINK_TARGETING: a DO_MOUNT_CONTROL's angles count
+_LEVEL_LOCKED = 12.0  # GIMBAL_MANAGER_FLAGS: roll and pitch count from the horizon, the yaw follows the airframe
+_ITSELF, _AS_IT_IS = -2.0, -1.0  # of DO_GIMBAL_MANAGER_CONFIGURE: who is to be in control
 _FLOWN = (NAV_WAYPOINT, NAV_SPLINE)
 _GROUND_SPEED = 1.0  # MAV_CMD_DO_CHANGE_SPEED's kind
 _HIGHEST_M = 20_000.0
@@ -125,6 +129,7 @@ def sortie_items(plan: Plan, sortie: Sortie, autopilot: Autopilot) -> tuple[File
     items = [
         nav(NAV_TAKEOFF, sortie.home_lat_deg, sortie.home_lon_deg, sortie.takeoff_height_m),
         FileItem(command=DO_CHANGE_SPEED, params=(_GROUND_SPEED, plan.speed_m_s, -1.0, 0.0)),
+        *([] if plan.gimbal_pitch_deg is None else gimbal_items(plan.gimbal_pitch_deg, autopilot)),
     ]
     for point in sortie.waypoints:
         if by_vehicle and point.between:
@@ -142,6 +147,51 @@ def sortie_items(plan: Plan, sortie: Sortie, autopilot: Autopilot) -> tuple[File
     else:  # a plain waypoint last: both autopilots then report the mission as complete
         items.append(fly_to(sortie.waypoints[-1]))
     return tuple(items)
+
+
+def gimbal_items(pitch_deg: float, autopilot: Autopilot) -> list[FileItem]:
+    """Items that turn a vehicle's gimbal to a pitch, degrees; one without a gimbal flies on.
+
+    ArduPilot takes DO_MOUNT_CONTROL in all versions. Before 4.6 it turns the nose of a vehicle whose gimbal has no yaw
+    to the north until the next waypoint begins, so this stands before a mission's first waypoint, never on a leg.
+
+    PX4 levels the gimbal where a mission is paused, and of the items before it repeats only those of the gimbal
+    manager; these need the control of the gimbal, which a mission takes for the autopilot itself.
+    """
+    if autopilot == "ardupilot":
+        return [FileItem(command=DO_MOUNT_CONTROL, params=(pitch_deg, 0.0, 0.0, 0.0), alt_m=_ANGLES)]
+    claim, aim = (_ITSELF, _ITSELF, _AS_IT_IS, _AS_IT_IS), (pitch_deg, 0.0, math.nan, math.nan)
+    return [
+        FileItem(command=DO_GIMBAL_MANAGER_CONFIGURE, params=claim),
+        FileItem(command=DO_GIMBAL_MANAGER_PITCHYAW, params=aim, lat_deg=_LEVEL_LOCKED),
+    ]
+
+
+def with_gimbal_items_of(autopilot: Autopilot, items: Iterable[FileItem]) -> list[FileItem]:
+    """Items whose pitch of a gimbal stands in one autopilot's words, whichever they were written for.
+
+    ArduPilot refuses a mission that asks for control of a gimbal. What else a mission does with it stays.
+    """
+    new, begins = list[FileItem](), list[int]()
+    mount, manager = (DO_MOUNT_CONTROL, _ANGLES, 0.0), (DO_GIMBAL_MANAGER_PITCHYAW, 0.0, _LEVEL_LOCKED)
+    foreign = mount if autopilot == "px4" else manager
+    for item in items:
+        begins.append(len(new))
+        pitch_deg, yaw_deg = item.params[0], item.params[2 if item.command == DO_MOUNT_CONTROL else 1]
+        pitches = yaw_deg == 0.0 and (item.command, item.alt_m, item.lat_deg) == foreign
+        if pitches:
+            new += gimbal_items(pitch_deg, autopilot)
+        elif autopilot == "px4" or item.command != DO_GIMBAL_MANAGER_CONFIGURE:
+            new.append(item)
+    return [_jumps_to(item, begins) for item in new]
+
+
+def _jumps_to(item: FileItem, begins: Sequence[int]) -> FileItem:
+    """An item; a jump leads to where its target, counted from home, begins now."""
+    target = item.params[0] - 1.0
+    if item.command != DO_JUMP or not 0.0 <= target < len(begins):
+        return item
+    return replace(item, params=(begins[int(target)] + 1.0, *item.params[1:]))
 
 
 def plan_text(

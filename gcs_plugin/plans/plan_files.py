@@ -77,6 +77,7 @@ def report(
         "epsg": plan.epsg,
         "autopilot": autopilots[0] if len(set(autopilots)) == 1 else "mixed",
         "end": plan.end,
+        "gimbal_pitch_deg": plan.gimbal_pitch_deg,
         "endurance_min": endurance_min,
         "separation": plan.separation,
         "separation_m": None if plan.apart is None else plan.apart.distance_m,

@@ -41,6 +41,7 @@ WITH_TERRAIN: Final = frozenset({"ardupilot"})
 RELIEFS: Final = ("auto", "follow", "level")
 ENDS: Final = ("rtl", "land", "hover")
 _MOST_LAYERS: Final = 12.0  # of ways out and home
+_STILL_DOWN_DEG: Final = 5.0  # a picture shifts by less than a tenth of the height
 _TOLERANCE: Final = 0.1
 """Of the height above ground, as a share of it."""
 Geometry = Any  # shapely has no type information here
@@ -84,6 +85,7 @@ class PlanRequest:
             level, or whichever is done sooner. height_tolerance_m: of the height above ground, None for a tenth of it.
             terrain_items: mission items state heights above the ground where the autopilot knows such (ArduPilot).
         wind_m_s, wind_from_deg: wind and where it comes from, clockwise from north; the speed is that through the air.
+        gimbal_pitch_deg: to which missions turn the camera's gimbal, -90 straight down; None to leave it alone.
     """
 
     area: Path
@@ -117,6 +119,7 @@ class PlanRequest:
     terrain_items: bool = False
     wind_m_s: float = 0.0
     wind_from_deg: float = 0.0
+    gimbal_pitch_deg: float | None = -90.0
 
     def _motion(self) -> Motion:
         if not 0.0 <= self.wind_m_s < math.inf or not math.isfinite(self.wind_from_deg):
@@ -172,6 +175,9 @@ def make_plan(request: PlanRequest, progress: Callable[[str], None] = lambda _: 
     Raises:
         InputError: a file or a value is of no use, or a flight would leave an inclusion fence.
     """
+    pitch_deg = request.gimbal_pitch_deg
+    if pitch_deg is not None and not -90.0 <= pitch_deg <= 0.0:
+        raise InputError(f"the gimbal's pitch is {pitch_deg:g} degrees; give -90 (straight down) to 0 (the horizon)")
     plan, area, no_fly = _made(request, progress)
     fences = no_fly.fences
     no_fly.refuse_beyond(plan)
@@ -181,7 +187,11 @@ def make_plan(request: PlanRequest, progress: Callable[[str], None] = lambda _: 
         fences += zone_fences(area, fences)
     if area is not None:
         area = replace(area, circles_wider_m=no_fly.circles_wider_m)
-    return replace(plan, fences=tuple(fences), warnings=(*no_fly.notes, *plan.warnings)), area
+    notes = [*no_fly.notes]
+    if pitch_deg is not None and pitch_deg + 90.0 > _STILL_DOWN_DEG:
+        notes.append(f"what is covered is reckoned for a camera that looks straight down, not {pitch_deg:g} degrees")
+    plan = replace(plan, fences=tuple(fences), gimbal_pitch_deg=pitch_deg, warnings=(*notes, *plan.warnings))
+    return plan, area
 
 
 def _made(request: PlanRequest, progress: Callable[[str], None]) -> tuple[Plan, Area | None, NoFly]:

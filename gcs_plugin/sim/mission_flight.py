@@ -13,11 +13,14 @@ from gcs_plugin.mission.items import (
     CHANGE_SPEED,
     DELAY,
     FRAME_GLOBAL,
+    GIMBAL_CLAIM,
+    GIMBAL_PITCH,
     JUMP,
     LAND,
     LANDINGS,
     LOITER_TIME,
     LOITER_UNLIM,
+    MOUNT_CONTROL,
     RTL,
     TAKEOFF,
     TRIGGER_DISTANCE,
@@ -88,6 +91,7 @@ class MissionFlight:
     Attributes:
         mode: custom mode number. failsafe: it reports one; until it is disarmed. seq: current item.
         reached, texts: items reached, and texts, since the last look. exposures: all pictures.
+        gimbal_pitch_deg: where its gimbal looks, -90 straight down; None without one.
         triggers: how often the camera was triggered; at those in misfires it took no picture.
     """
 
@@ -106,6 +110,7 @@ class MissionFlight:
     exposures: list[TakenPicture] = field(default_factory=list)
     triggers: int = 0
     misfires: Collection[int] = ()
+    gimbal_pitch_deg: float | None = None
     time_s: float = 0.0
     paused: bool = False
     _task: Task = Task.STAND
@@ -118,6 +123,7 @@ class MissionFlight:
     _generation: int = 0
     _steered: tuple[float, float, float] = (0.0, 0.0, 0.0)
     _cruise_m_s: float | None = None
+    _in_control: bool = False
 
     @classmethod
     def make(
@@ -324,10 +330,19 @@ class MissionFlight:
                 self._last_photo = self.motion.seen
         elif item.command == CHANGE_SPEED and item.params[1] > 0.0:
             self.motion.speed = self.motion.airframe.held_m_s(item.params[1])
+        elif self.gimbal_pitch_deg is not None and self._may_turn(item):
+            self.gimbal_pitch_deg = item.params[0]
+        elif item.command == GIMBAL_CLAIM:
+            self._in_control = True
         elif item.command == JUMP and self._jumps.get(seq, 0) < item.params[1]:
             self._jumps[seq] = self._jumps.get(seq, 0) + 1
             return int(item.params[0])
         return None
+
+    def _may_turn(self, item: MissionItem) -> bool:
+        """Whether an item turns its gimbal; PX4 ignores a manager's command before it was given control."""
+        px4 = self.autopilot is Autopilot.PX4
+        return item.command == MOUNT_CONTROL or (item.command == GIMBAL_PITCH and (self._in_control or not px4))
 
     def _begin(self, item: MissionItem) -> None:
         lifts = item.command == TAKEOFF or (self.autopilot is Autopilot.PX4 and item.command not in (RTL, LAND))

@@ -17,7 +17,7 @@ from gcs_plugin.mission.exchange import (
     Address,
 )
 from gcs_plugin.mission.geofence import FENCE
-from gcs_plugin.mission.items import FRAME_GLOBAL, JUMP, TAKEOFF, WAYPOINT, MissionItem
+from gcs_plugin.mission.items import FRAME_GLOBAL, GIMBAL_CLAIM, JUMP, TAKEOFF, WAYPOINT, MissionItem
 from orthoswarm.planning.sorties.flight_time import autopilot_config
 
 _MISSION: Final = dialect.MAV_MISSION_TYPE_MISSION
@@ -25,7 +25,7 @@ _FRAMES: Final = frozenset({0, 2, 3, 5, 6, 10, 11})
 _FRAMES_PX4: Final = _FRAMES - {10, 11}
 _COMMANDS: Final = frozenset({
     16, 17, 18, 19, 20, 21, 22, 82, 84, 85, 92, 93, 94, 112, 114, 115, 177, 178, 179, 181, 183, 189, 195, 197, 201, 203,
-    205, 206, 207, 210, 212, 218, 222, 530, 2000, 2001, 2500, 2501,
+    205, 206, 207, 210, 212, 218, 222, 530, 1000, 2000, 2001, 2500, 2501,
 })  # fmt: skip
 # (requests again after, gives up after) seconds without an item.
 _TIMING: Final = {Autopilot.ARDUPILOT: (1.0, 8.0), Autopilot.PX4: (0.25, 5.0)}
@@ -206,7 +206,7 @@ class MissionStore:
     def _check(self, item: MissionItem, count: int) -> int:
         """MAV_MISSION_RESULT for an item, in the order in which ArduPilot looks at it."""
         ardupilot = self.autopilot is Autopilot.ARDUPILOT
-        if item.command not in _COMMANDS:
+        if item.command not in _COMMANDS and (ardupilot or item.command != GIMBAL_CLAIM):
             return UNSUPPORTED
         if item.frame not in (_FRAMES if ardupilot else _FRAMES_PX4):
             return UNSUPPORTED_FRAME

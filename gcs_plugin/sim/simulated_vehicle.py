@@ -39,6 +39,7 @@ _BATTERY_S: Final = 1800.0  # with its motors on; what stands on the ground uses
 _EKF: Final = int(dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT)
 _ESTIMATOR: Final = int(dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS)
 _BATTERY: Final = int(dialect.MAVLINK_MSG_ID_BATTERY_STATUS)
+_GIMBAL: Final = int(dialect.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS)
 _LEFT_GROUND_M: Final = 0.2
 _PX4_TOP_M_S: Final = 12.0  # factory setting
 _HOME: Final = (47.397742, 8.545594, 488.0)
@@ -210,7 +211,8 @@ class SimVehicle:
         flight, p1, p2, p3 = self.flight, message.param1, message.param2, message.param3
         match message.command:
             case dialect.MAV_CMD_SET_MESSAGE_INTERVAL:
-                foreign = (_EKF, _BATTERY) if self.autopilot is Autopilot.PX4 else (_ESTIMATOR,)
+                foreign = [_EKF, _BATTERY] if self.autopilot is Autopilot.PX4 else [_ESTIMATOR]
+                foreign += [_GIMBAL] if flight.gimbal_pitch_deg is None else []
                 if int(p1) not in _MAKERS or int(p1) in foreign:
                     return _FAILED if self.autopilot is Autopilot.ARDUPILOT else _DENIED
                 self._stream(int(p1), 1e6 / p2 if p2 > 0 else 0.0)
@@ -466,6 +468,15 @@ class SimVehicle:
         flags = 0x33F if self._ready else 0xA7
         return dialect.MAVLink_ekf_status_report_message(flags, 0.0, 0.0, 0.0, 0.0, 0.0)
 
+    def _gimbal(self) -> Message | None:
+        pitch_deg = self.flight.gimbal_pitch_deg
+        if pitch_deg is None:
+            return None
+        half = math.radians(pitch_deg) / 2.0
+        q = [math.cos(half), 0.0, math.sin(half), 0.0]
+        flags = dialect.GIMBAL_DEVICE_FLAGS_ROLL_LOCK | dialect.GIMBAL_DEVICE_FLAGS_PITCH_LOCK
+        return dialect.MAVLink_gimbal_device_attitude_status_message(0, 0, self._boot_ms, flags, q, 0.0, 0.0, 0.0, 0)
+
     def _home(self) -> Message | None:
         if not self._has_fix:
             return None
@@ -479,6 +490,7 @@ _MAKERS: Final[dict[int, Callable[[SimVehicle], Message | None]]] = {
     _EKF: SimVehicle._filter,
     _ESTIMATOR: SimVehicle._filter,
     _BATTERY: SimVehicle._battery,
+    _GIMBAL: SimVehicle._gimbal,
     _HEARTBEAT: SimVehicle._heartbeat,
     _POSITION: SimVehicle._position,
     _ATTITUDE: SimVehicle._attitude,

@@ -202,6 +202,7 @@ class Plan:
         over_ground: how it lies over the height model, None without one.
         fences: geofences that vehicles are to hold while they fly it.
         apart: how far apart vehicles are at any time, horizontally or in height; None where that is not known.
+        gimbal_pitch_deg: to which missions turn the gimbal, -90 straight down; None where they leave it alone.
     """
 
     method: str
@@ -221,6 +222,7 @@ class Plan:
     over_ground: OverGround | None = None
     fences: tuple[Fence, ...] = ()
     apart: Apart | None = None
+    gimbal_pitch_deg: float | None = None
 
     @property
     def makespan_s(self) -> float:

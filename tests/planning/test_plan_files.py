@@ -177,6 +177,26 @@ def test_the_trigger_follows_a_legs_first_waypoint_and_stops_at_its_last():
     assert before == [(47.001, 9.001), (47.002, 9.001), (47.002, 9.002), (47.001, 9.002)]
 
 
+@pytest.mark.parametrize(
+    ("autopilot", "turning"),
+    [
+        ("ardupilot", [(205, [-60.0, 0.0, 0.0, 0.0, 0.0, 0.0, 2.0])]),
+        ("px4", [(1001, [-2.0, -2.0, -1.0, -1.0, 0.0, 0.0, 0.0]), (1000, [-60.0, 0.0, None, None, 12.0, 0.0, 0.0])]),
+    ],
+)
+def test_a_mission_turns_the_gimbal_before_its_first_waypoint_in_its_autopilots_words(autopilot, turning):
+    plain, aimed = small_plan(), replace(small_plan(), gimbal_pitch_deg=-60.0)
+    document = json.loads(mission_files(aimed, [autopilot])["v1.plan"])
+    jsonschema.validate(document, PLAN)
+    items = document["mission"]["items"]
+    count = 2 + len(turning)
+    assert [(item["command"], item["params"]) for item in items[2:count]] == turning
+    assert all(item["frame"] == 2 for item in items[2:count]) and items[count]["command"] == NAV_WAYPOINT
+    without = json.loads(mission_files(plain, [autopilot])["v1.plan"])["mission"]["items"]
+    rest = [{**item, "doJumpId": 0} for item in items[:2] + items[count:]]
+    assert rest == [{**item, "doJumpId": 0} for item in without]
+
+
 def test_waypoint_files_begin_with_home_and_have_twelve_columns():
     lines = mission_files(small_plan(), ["ardupilot"])["v1.waypoints"].splitlines()
     assert lines[0] == "QGC WPL 110"

@@ -12,7 +12,7 @@ import pytest
 import shapely
 
 from gcs_plugin.cli.main import main
-from gcs_plugin.cli.verbs.vehicles.plan import configure
+from gcs_plugin.cli.verbs.vehicles.plan import _pitch, configure
 from gcs_plugin.plans.plan_request import PlanRequest
 from tests.kit.plan_checks import GRID, ORIGIN, crossed, fly, on_globe, seen_by, to_metres, write_geojson
 from tests.planning.test_plan_files import survey_plan
@@ -44,6 +44,7 @@ def test_the_defaults_of_the_command_are_those_of_a_request(tmp_path):
     configure(parser)
     args = parser.parse_args(["area.geojson", "--vehicles", "3", *FLAGS, "--out", "out"])
     request = PlanRequest(area=args.area, vehicles=3, altitude_m=60.0, fov_min_deg=60.0)
+    assert _pitch(args.gimbal_pitch) == request.gimbal_pitch_deg
     stated = (args.separation, args.height_step, args.side_overlap, args.forward_overlap, args.run_in, args.swap)
     assert stated == (
         request.separation_m, request.height_step_m, request.side_overlap, request.forward_overlap, request.run_in_m,
@@ -245,6 +246,8 @@ def test_bad_areas_get_one_sentence_and_no_files(name, tmp_path, capsys):
         ["--no-fly", "nowhere.geojson"],
         ["--method", "spiral"],
         ["--altitude", "high"],
+        ["--gimbal-pitch", "down"],
+        ["--gimbal-pitch", "-120"],
     ],
 )
 def test_bad_arguments_get_one_sentence_and_no_files(flags, area, tmp_path, capsys):
@@ -312,6 +315,18 @@ def test_the_end_and_the_autopilot_are_as_asked(area, tmp_path):
         if end != "hover":
             home, over = ([float(v) for v in row[8:10]] for row in (rows[0], rows[-2]))
             assert np.hypot(*(to_metres([home])[0] - to_metres([over])[0])) < 0.1
+
+
+def test_missions_turn_the_gimbal_down_unless_it_is_to_be_left_alone(area, tmp_path, capsys):
+    for pitch, params in ((None, [-90.0]), ("-70", [-70.0]), ("none", [])):
+        out = tmp_path / f"at{pitch}"
+        flags = [] if pitch is None else ["--gimbal-pitch", pitch]
+        assert plan(area, "--vehicles", 1, *FLAGS, *flags, "--out", out, "--json") == 0
+        figures = json.loads(capsys.readouterr().out)
+        items = json.loads((out / "v1.plan").read_text())["mission"]["items"]
+        assert [item["params"][0] for item in items if item["command"] == 205] == params
+        assert figures["gimbal_pitch_deg"] == (params[0] if params else None)
+        assert any("straight down" in text for text in figures["warnings"]) == (pitch == "-70")
 
 
 def test_help_is_quick_and_shows_an_example():

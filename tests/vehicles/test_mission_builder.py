@@ -10,10 +10,12 @@ from gcs_plugin.links.mavlink import Autopilot, command_name, dialect
 from gcs_plugin.links.packets import Framer
 from gcs_plugin.mission import mission_files
 from gcs_plugin.mission.items import (
+    GIMBAL_CLAIM,
     JUMP,
     LAND,
     LOITER_TIME,
     LOITER_UNLIM,
+    MOUNT_CONTROL,
     RTL,
     TAKEOFF,
     TRIGGER_DISTANCE,
@@ -33,7 +35,7 @@ AP, PX4 = Autopilot.ARDUPILOT, Autopilot.PX4
 BOTH = pytest.mark.parametrize("autopilot", [AP, PX4])
 
 
-def make_plan(end="rtl"):
+def make_plan(end="rtl", gimbal_pitch_deg=None):
     points = (
         Waypoint(lat_deg=47.398, lon_deg=8.5456, height_m=60.0, camera=True),
         Waypoint(lat_deg=47.400, lon_deg=8.5456, height_m=60.0, camera=False),
@@ -67,6 +69,7 @@ def make_plan(end="rtl"):
         gaps=(),
         separation="",
         warnings=(),
+        gimbal_pitch_deg=gimbal_pitch_deg,
     )
 
 
@@ -131,7 +134,7 @@ def test_the_last_nav_item_decides_the_ending():
 @pytest.mark.parametrize("written_for", ["ardupilot", "px4"])
 @BOTH
 def test_a_file_of_either_kind_becomes_the_same_mission(tmp_path, autopilot, written_for, suffix):
-    plan = make_plan()
+    plan = make_plan(gimbal_pitch_deg=-90.0)
     sortie = plan.vehicles[0].sorties[0]
     items = mission_files.sortie_items(plan, sortie, written_for)
     home = (sortie.home_lat_deg, sortie.home_lon_deg, 0.0)
@@ -145,6 +148,26 @@ def test_a_file_of_either_kind_becomes_the_same_mission(tmp_path, autopilot, wri
     assert repr(read.items) == repr(made.items)  # NaN equals NaN here
 
 
+@BOTH
+def test_a_jump_leads_to_the_same_place_where_a_gimbal_takes_more_or_fewer_items(autopilot):
+    fly = mission_files.FileItem(command=WAYPOINT, frame=3, lat_deg=47.4, lon_deg=8.5, alt_m=60.0)
+    target = mission_files.FileItem(command=WAYPOINT, frame=3, lat_deg=47.5, lon_deg=8.5, alt_m=60.0)
+    for written_for in ("ardupilot", "px4"):
+        aim = mission_files.gimbal_items(-90.0, written_for)
+        jump = mission_files.FileItem(command=JUMP, params=(2.0 + len(aim), 1.0, 0.0, 0.0))
+        items = build_mission(autopilot, [fly, *aim, target, jump]).items
+        assert items[int(items[-1].params[0])].lat_deg == pytest.approx(47.5)
+
+
+def test_what_else_a_mission_does_with_a_gimbal_stays():
+    aside = mission_files.FileItem(command=MOUNT_CONTROL, params=(-45.0, 0.0, 30.0, 0.0), alt_m=2.0)
+    free = mission_files.FileItem(command=GIMBAL_CLAIM, params=(-3.0, -3.0, -1.0, -1.0))
+    fly = mission_files.FileItem(command=WAYPOINT, frame=3, lat_deg=47.4, lon_deg=8.5, alt_m=60.0)
+    assert [item.command for item in build_mission(PX4, [fly, aside, free]).items] == [16, MOUNT_CONTROL, GIMBAL_CLAIM]
+    # ArduPilot refuses a mission that asks for control
+    assert [item.command for item in build_mission(AP, [fly, aside, free]).items] == [16, 16, MOUNT_CONTROL]
+
+
 @pytest.mark.parametrize("command", [WAYPOINT, TAKEOFF, LAND, LOITER_TIME])
 def test_a_yaw_of_0_is_none_for_px4(command):
     item = mission_files.FileItem(command=command, frame=3, lat_deg=47.4, lon_deg=8.5, alt_m=60.0)
@@ -154,7 +177,7 @@ def test_a_yaw_of_0_is_none_for_px4(command):
 
 @BOTH
 def test_a_vehicle_stores_what_is_built(autopilot):
-    plan = make_plan()
+    plan = make_plan(gimbal_pitch_deg=-90.0)
     mission = sortie_mission(plan, plan.vehicles[0].sorties[0], autopilot)
     store = MissionStore(autopilot=autopilot, home=MissionItem(command=WAYPOINT))
     assert all(store._check(item, len(mission)) == 0 for item in mission.items)

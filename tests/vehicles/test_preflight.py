@@ -20,8 +20,10 @@ from gcs_plugin.sim.multirotor import Chart
 from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
 from orthoswarm.model.earth import distance_m
+from tests.kit.missions import sortie_mission
 from tests.kit.servers.ports import free_port
 from tests.vehicles.test_fleet_cli import HOME, fleet, folder  # noqa: F401
+from tests.vehicles.test_mission_builder import make_plan
 from tests.vehicles.test_sim import mission
 
 AP, PX4 = Autopilot.ARDUPILOT, Autopilot.PX4
@@ -112,6 +114,48 @@ def test_missions_that_cross_without_a_plan_are_red(make_world):
     assert "comes within 0 m from v2" in red_text(checks, {})[1]
     apart = preflight_all(dict(world.fleet.vehicles), {}, missions, {2: 60.0}, world.clock.now)
     assert red_text(apart, {}) == {}
+
+
+@BOTH
+def test_a_mission_turns_the_gimbal_down_and_the_check_says_where_it_looks(make_world, autopilot):
+    sim = SimVehicle(system=1, autopilot=autopilot)
+    sim.flight.gimbal_pitch_deg = 0.0
+    world = make_world(sim)
+    world.meet()
+    plain, aimed = (
+        sortie_mission(plan, plan.vehicles[0].sorties[0], autopilot)
+        for plan in (make_plan(), make_plan(gimbal_pitch_deg=-90.0))
+    )
+    world.wait(4.0)
+    state, why = levels(world, Wanted(plain))
+    assert state["gimbal"] is Level.WARNING and "at 0 degrees" in why["gimbal"] and "--gimbal-pitch" in why["gimbal"]
+    assert world.finish(world.fleet.upload(1, aimed))[0].ok
+    state, why = levels(world, Wanted(aimed))
+    assert state["gimbal"] is Level.OK and "turns it to -90" in why["gimbal"]
+    assert world.finish(world.fleet.start(1))[0].ok
+    assert world.until(lambda: sim.flight.triggers > 0, 200.0)
+    world.wait(1.0)
+    assert sim.flight.gimbal_pitch_deg == -90.0
+    assert world.fleet.vehicles[1].gimbal_pitch_deg == pytest.approx(-90.0, abs=0.1)
+    sim.flight.gimbal_pitch_deg = -20.0  # by hand
+    world.wait(1.0)
+    state, why = levels(world, Wanted(aimed))
+    assert state["gimbal"] is Level.WARNING and "not at -90 as its mission says" in why["gimbal"]
+
+
+@BOTH
+def test_a_vehicle_without_a_gimbal_flies_the_same_mission(make_world, autopilot):
+    sim = SimVehicle(system=1, autopilot=autopilot)
+    world = make_world(sim)
+    world.meet()
+    plan = make_plan(gimbal_pitch_deg=-90.0)
+    aimed = sortie_mission(plan, plan.vehicles[0].sorties[0], autopilot)
+    assert world.finish(world.fleet.upload(1, aimed))[0].ok
+    state, why = levels(world, Wanted(aimed))
+    assert state["gimbal"] is Level.OK and "no gimbal" in why["gimbal"]
+    assert world.finish(world.fleet.start(1))[0].ok
+    assert world.until(lambda: "complete" in world.kinds(1), 400.0)
+    assert sim.flight.triggers > 10
 
 
 # -- times --------------------------------------------------------------------------------------------------------

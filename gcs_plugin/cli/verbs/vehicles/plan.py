@@ -79,6 +79,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     camera.add_argument("--side-overlap", type=float, default=0.4, metavar="SHARE", help="between lines (default 0.4)")
     camera.add_argument("--forward-overlap", type=float, default=0.8, metavar="SHARE", help="along lines (default 0.8)")
     camera.add_argument("--aspect", default="4:3", metavar="W:H", help="picture's width to height (default 4:3)")
+    gimbal_help = "pitch to which missions turn the gimbal, or none (default -90, straight down)"
+    camera.add_argument("--gimbal-pitch", default="-90", metavar="DEG", help=gimbal_help)
     safety = parser.add_argument_group("safety")
     safety.add_argument("--no-fly", type=Path, action="append", default=[], metavar="FILE", help="further no-fly zones")
     safety.add_argument(
@@ -145,6 +147,7 @@ def _request(args: argparse.Namespace) -> "PlanRequest":
         side_overlap=args.side_overlap,
         forward_overlap=args.forward_overlap,
         aspect=_aspect(args.aspect),
+        gimbal_pitch_deg=_pitch(args.gimbal_pitch),
         clearance_m=args.clearance,
         separation_m=args.separation,
         height_step_m=args.height_step,
@@ -171,6 +174,13 @@ def _aspect(text: str) -> float:
         return float(width) / float(height or 1.0)
     except (ValueError, ZeroDivisionError):
         raise InputError(f"the aspect ratio '{text}' is not of the form W:H; give it as 4:3") from None
+
+
+def _pitch(text: str) -> float | None:
+    try:
+        return None if text == "none" else float(text)
+    except ValueError:
+        raise InputError(f"the gimbal's pitch '{text}' is no number; give degrees (-90 is down), or none") from None
 
 
 def _position(text: str) -> tuple[float, float]:
