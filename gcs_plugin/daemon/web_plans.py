@@ -277,8 +277,14 @@ def _values(body: Mapping[str, Any]) -> dict[str, Any]:
     if body.get("gimbal_pitch_deg", 0.0) is None:
         values["gimbal_pitch_deg"] = None
     values["autopilots"] = _autopilots(body.get("autopilot", "ardupilot"))
-    if "terrain_items" in body:
-        values["terrain_items"] = body["terrain_items"] is True
+    for key in ("terrain_items", "cross"):
+        if key in body:
+            values[key] = body[key] is True
+    if (heading := body.get("heading")) is not None:
+        number = isinstance(heading, int | float) and not isinstance(heading, bool) and abs(heading) <= _MOST_NUMBER
+        if not number and heading not in ("wind", "longest"):
+            raise InputError("heading is no number, wind or longest; send degrees clockwise from north")
+        values["heading"] = float(heading) if number else heading
     starts = body.get("starts", [])
     if not isinstance(starts, list) or not all(_is_position(start) for start in starts):
         raise InputError("starts is not a list of [latitude, longitude]; send one")

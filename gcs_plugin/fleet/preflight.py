@@ -36,7 +36,7 @@ _LINK_S: Final = (2.0, 5.0)
 _SATELLITES: Final = (6, 10)
 _HOME_M: Final = 50.0
 _SAME_M_S: Final = 0.05
-_AIMED_DEG: Final = 10.0  # a camera so far off still photographs the ground of its line
+_AIMED_DEG: Final = 20.0  # one without stabilisation leans by up to 15 degrees with its airframe (ArduCopter, 6 m/s)
 _UNKNOWN_SATELLITES: Final = 255
 
 

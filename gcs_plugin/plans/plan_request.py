@@ -28,7 +28,7 @@ from orthoswarm.planning.lines.candidates import Method
 from orthoswarm.planning.lines.line_spacing import Footprint, footprint
 from orthoswarm.planning.planner import plan_area, plan_gaps, plan_lines
 from orthoswarm.planning.relief_plan import GroundBelow, Relief, plan_over_relief
-from orthoswarm.planning.sorties.assignment import PlanOptions
+from orthoswarm.planning.sorties.assignment import Heading, PlanOptions
 from orthoswarm.planning.sorties.deconfliction import Separation
 from orthoswarm.planning.sorties.flight_heights import FlightHeights
 from orthoswarm.planning.sorties.flight_time import Motion, autopilot_config
@@ -85,6 +85,7 @@ class PlanRequest:
             level, or whichever is done sooner. height_tolerance_m: of the height above ground, None for a tenth of it.
             terrain_items: mission items state heights above the ground where the autopilot knows such (ArduPilot).
         wind_m_s, wind_from_deg: wind and where it comes from, clockwise from north; the speed is that through the air.
+        heading: direction of the lines over an area, as in PlanOptions. cross: cover it again by lines across these.
         gimbal_pitch_deg: to which missions turn the camera's gimbal, -90 straight down; None to leave it alone.
     """
 
@@ -119,6 +120,8 @@ class PlanRequest:
     terrain_items: bool = False
     wind_m_s: float = 0.0
     wind_from_deg: float = 0.0
+    heading: Heading | None = None
+    cross: bool = False
     gimbal_pitch_deg: float | None = -90.0
 
     def _motion(self) -> Motion:
@@ -164,6 +167,8 @@ class PlanRequest:
             most_items=min(autopilot_config(name).most_items for name in self.autopilots),
             run_in_m=self.run_in_m,
             wait_s=60.0 * self.wait_min,
+            heading=self.heading,
+            cross=self.cross,
         )
 
 
@@ -199,10 +204,17 @@ def _made(request: PlanRequest, progress: Callable[[str], None]) -> tuple[Plan, 
     options = request.flight_options()
     options.check()
     progress("area")
+    directed = request.heading is not None or request.cross
+    if directed and request.method == "tmstc":
+        raise InputError("tmstc lays lines in two directions; use columns or bcd with --heading or --cross")
     if request.gaps:
+        if directed:
+            raise InputError("gaps are flown in the direction that suits each; leave out --heading and --cross")
         return _gap_plan(request, options, progress)
     shapes, rings, fences = read_shapes(request.area)
     covers = bool(shapes.areas) and not request.follow
+    if directed and not covers:
+        raise InputError("lines that are followed have their own direction; leave out --heading and --cross")
     if not covers and not shapes.lines:
         left = ", ".join(shapes.left)
         what = "line" if shapes.areas else f"polygon and no line, only {left}" if left else "polygon and no line"

@@ -111,7 +111,7 @@ def plan_area(
         swarm,
         foot,
         method=method,
-        motion=options.motion,
+        options=options,
         router=router,
         reach_m=min(foot.reach_m, 2.0 * clearance_m),
     )
@@ -140,14 +140,22 @@ def _clearance_m(options: PlanOptions, foot: Footprint) -> float:
 
 
 def _best_work(
-    area: Area, swarm: Swarm, foot: Footprint, *, method: Method, motion: Motion, router: Router, reach_m: float
+    area: Area, swarm: Swarm, foot: Footprint, *, method: Method, options: PlanOptions, router: Router, reach_m: float
 ) -> Work:
     """The fairest and shortest work among the method's candidates."""
     field = Field(coarser(area, _OUTLINE_SPACINGS * foot.spacing_m), router.obstacles)
     best: Work | None = None
     most = 0
     for candidate in candidates(
-        field, swarm.vehicles, foot, method=method, turn_m=motion.turn_m, router=router, reach_m=reach_m
+        field,
+        swarm.vehicles,
+        foot,
+        method=method,
+        turn_m=options.motion.turn_m,
+        router=router,
+        reach_m=reach_m,
+        sweep_rad=_sweep_rad(area, options),
+        cross=options.cross,
     ):
         most = max(most, candidate.stretches)
         if candidate.stretches >= swarm.vehicles:
@@ -161,6 +169,20 @@ def _best_work(
         f"{swarm.vehicles} vehicles are more than this area has lines for; "
         f"use {most} or fewer, or fly lower so that lines lie closer"
     )
+
+
+def _sweep_rad(area: Area, options: PlanOptions) -> float | None:
+    """Direction of the sweep, across the lines, from grid east, counter-clockwise; None where it is free."""
+    heading = options.heading
+    if heading is None:
+        return None
+    if heading == "longest":
+        corners = shapely.get_coordinates(shapely.minimum_rotated_rectangle(area.ground))
+        east, north = max(np.diff(corners[:3], axis=0), key=lambda side: float(np.hypot(*side)))
+        return float(np.arctan2(-east, north) % np.pi)
+    azimuth = np.arctan2(*options.motion.wind_m_s) if heading == "wind" else np.radians(heading)
+    middle = area.grid.to_geographic(shapely.get_coordinates(area.ground.centroid)[0])
+    return float((area.grid.convergence_rad(*middle) - azimuth) % np.pi)
 
 
 def plan_gaps(

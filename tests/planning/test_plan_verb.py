@@ -247,6 +247,12 @@ def test_bad_areas_get_one_sentence_and_no_files(name, tmp_path, capsys):
         ["--method", "spiral"],
         ["--altitude", "high"],
         ["--gimbal-pitch", "down"],
+        ["--heading", "up"],
+        ["--heading", "nan"],
+        ["--heading", "400"],
+        ["--heading", "wind"],
+        ["--heading", "30", "--method", "tmstc"],
+        ["--cross", "--method", "tmstc"],
         ["--gimbal-pitch", "-120"],
     ],
 )

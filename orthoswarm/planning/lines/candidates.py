@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Final, Literal, get_args
 
 import numpy as np
@@ -40,9 +41,25 @@ class LineCandidate:
     legs: Array
     stretches: int
 
+    def then(self, other: "LineCandidate") -> "LineCandidate":
+        """The lines of this one, and then those of another, from the end that is nearer."""
+        back = other.legs[::-1, ::-1]
+        far, near = (float(np.hypot(*(legs[0, 0] - self.legs[-1, 1]))) for legs in (other.legs, back))
+        legs = np.concatenate([self.legs, back if near < far else other.legs])
+        return LineCandidate(legs, self.stretches + other.stretches)
+
 
 def candidates(
-    field: Field, vehicles: int, foot: Footprint, *, method: Method, turn_m: float, router: Router, reach_m: float
+    field: Field,
+    vehicles: int,
+    foot: Footprint,
+    *,
+    method: Method,
+    turn_m: float,
+    router: Router,
+    reach_m: float,
+    sweep_rad: float | None = None,
+    cross: bool = False,
 ) -> Iterator[LineCandidate]:
     """Ways to lay lines, the most promising directions first; none where the area is all within obstacles.
 
@@ -54,8 +71,17 @@ def candidates(
         turn_m: what a turn costs, in metres.
         router: measures ways around obstacles.
         reach_m: how far pictures count beyond a leg's ends when looking for gaps.
+        sweep_rad: direction of the sweep, across the lines, from grid east, counter-clockwise; None to try several.
+        cross: each is followed by lines across its own.
     """
-    angles = rank_directions(field, foot, turn_m, vehicles)
+    lay = partial(candidates, field, vehicles, foot, method=method, turn_m=turn_m, router=router, reach_m=reach_m)
+    if cross:
+        angles = rank_directions(field, foot, turn_m, vehicles) if sweep_rad is None else [sweep_rad]
+        for angle in angles[: _TRIES[method]]:
+            across = next(lay(sweep_rad=angle + 0.5 * np.pi), None)
+            yield from (one.then(across) for one in lay(sweep_rad=angle) if across is not None)
+        return
+    angles = rank_directions(field, foot, turn_m, vehicles) if sweep_rad is None else [sweep_rad]
     if method == "tmstc":  # a grid looks the same after a right angle
         quarter = [a % (0.5 * np.pi) for a in angles]
         angles = [a for k, a in enumerate(quarter) if not any(abs(a - b) < _SAME_GRID_RAD for b in quarter[:k])]

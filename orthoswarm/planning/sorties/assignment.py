@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,7 @@ from orthoswarm.planning.sorties.flight_time import Motion
 from orthoswarm.planning.sorties.workload_split import Limits, Row, cut, share, sorties
 
 Array = NDArray[np.float64]
+Heading = float | Literal["wind", "longest"]
 
 MOST_VEHICLES = 250  # MAVLink system ids
 _FARTHEST_M = 100_000.0
@@ -64,6 +65,9 @@ class PlanOptions:
         run_in_m: straight flight in line with a leg before its first picture, so that the vehicle is out of its turn.
         wait_s: how long a vehicle stays at the end of its last flight's last leg before it comes home, as far as its
             endurance allows.
+        heading: of an area's lines, degrees clockwise from true north, along the wind, or along its longest side; None
+            for the directions that are done soonest.
+        cross: cover an area a second time by lines across the first.
     """
 
     motion: Motion = field(default_factory=Motion)
@@ -77,6 +81,8 @@ class PlanOptions:
     most_items: int = field(default_factory=lambda: active().ardupilot.most_items)
     run_in_m: float = 0.0
     wait_s: float = 0.0
+    heading: Heading | None = None
+    cross: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "motion", replace(self.motion, lands=self.end == "land"))
@@ -117,6 +123,10 @@ class PlanOptions:
             raise InputError(f"the wait is {self.wait_s / 60:g} min; give 0 to {_LONGEST_WAIT_S / 60:g}")
         if self.wait_s and self.end == "hover":
             raise InputError("a vehicle that hovers at the end needs no wait; let it end with rtl or land")
+        if self.heading == "wind" and not wind:
+            raise InputError("lines along the wind need one; give it with --wind-m-s and --wind-from")
+        if not isinstance(self.heading, str | None) and not abs(self.heading) <= 360.0:
+            raise InputError(f"the heading of the lines is {self.heading:g}; give degrees from 0 to 360")
         for name in ("clearance", "separation", "height step"):
             if not math.isfinite(positive[name][0]):
                 raise InputError(f"the {name} is not finite; give a number of metres")

@@ -38,6 +38,7 @@ KEYS = (
     "side_overlap", "forward_overlap", "separation_m", "clearance_m",
     "method", "autopilot", "end", "starts", "settings", "version",
     "wait_min", "wind_m_s", "wind_from_deg", "relief", "height_tolerance_m", "terrain_items", "in_air",
+    "heading", "cross", "gimbal_pitch_deg",
     "fly_not_arrived", "lat_deg", "lon_deg", "sigma_m", "note", "image", "time",
     "height_m", "yaw_deg", "pitch_deg", "roll_deg", "gps_fix", "type", "coordinates", "geometry", "features",
 )  # fmt: skip

@@ -6,6 +6,7 @@ import pytest
 
 from gcs_plugin.daemon.web_plans import Plans
 from gcs_plugin.links.mavlink import Autopilot
+from gcs_plugin.mission.items import MOUNT_CONTROL
 from orthoswarm.model.errors import InputError
 from tests.daemon.on_links import OnLinks
 from tests.kit.plan_checks import on_globe
@@ -28,6 +29,22 @@ def test_a_plan_is_made_for_the_autopilots_on_the_links_unless_the_request_names
     figures = plans.make(BODY | asked)
     assert [vehicle["autopilot"] for vehicle in figures["vehicles"]] == made
     assert figures["warnings"] == []
+
+
+def test_a_request_leaves_the_gimbal_alone_and_gives_lines_a_direction(tmp_path):
+    plans = Plans(tmp_path, None, OnLinks(kinds={}))
+    photos = {}
+    for asked in ({}, {"heading": 90, "cross": True}, {"heading": "longest", "gimbal_pitch_deg": None}):
+        made = plans.make(BODY | asked)
+        photos[made["id"]] = sum(vehicle["photos"] for vehicle in made["vehicles"])
+        assert made["gimbal_pitch_deg"] == asked.get("gimbal_pitch_deg", -90.0)
+        mission = plans.mission({"plan": made["id"]}, "v1", Autopilot.ARDUPILOT)
+        assert (MOUNT_CONTROL in [item.command for item in mission.items]) == ("gimbal_pitch_deg" not in asked)
+    first, crossed, _ = photos.values()
+    assert crossed > 1.8 * first
+    for wrong in ("up", 10**400, True, [30]):
+        with pytest.raises(InputError, match="heading is no number, wind or longest"):
+            plans.make(BODY | {"heading": wrong})
 
 
 STANDING = {"v1": SQUARE.shell[0], "v2": SQUARE.shell[1]}

@@ -12,6 +12,7 @@ from orthoswarm.model.errors import InputError
 if TYPE_CHECKING:
     from gcs_plugin.plans.plan_request import PlanRequest
     from orthoswarm.model.plan import Plan
+    from orthoswarm.planning.sorties.assignment import Heading
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -43,6 +44,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("--fov-min", type=float, metavar="DEG", help="smallest horizontal field of view in the swarm")
     add("--out", type=Path, required=True, metavar="DIR", help="folder for missions, report and picture")
     add("--method", choices=["columns", "bcd", "tmstc"], default="bcd", help="how to lay lines (default bcd)")
+    heading_help = "of the lines: degrees from true north, along the wind, or along the area's longest side"
+    add("--heading", metavar="DEG|wind|longest", help=heading_help)
+    add("--cross", action="store_true", help="cover the area a second time by lines across the first")
     autopilot_help = "for mission format and flight times; again for vehicles in turn (default ardupilot)"
     add("--autopilot", action="append", choices=["ardupilot", "px4"], help=autopilot_help)
     add_config(parser)
@@ -134,6 +138,8 @@ def _request(args: argparse.Namespace) -> "PlanRequest":
         fov_min_deg=args.fov_min if args.map is None else _fov_of_map(args.map, args.dem is None),
         no_fly=args.no_fly,
         method=args.method,
+        heading=_heading(args.heading),
+        cross=args.cross,
         autopilots=args.autopilot or ["ardupilot"],
         end=args.end,
         starts=[_position(text) for text in args.start],
@@ -174,6 +180,14 @@ def _aspect(text: str) -> float:
         return float(width) / float(height or 1.0)
     except (ValueError, ZeroDivisionError):
         raise InputError(f"the aspect ratio '{text}' is not of the form W:H; give it as 4:3") from None
+
+
+def _heading(text: str | None) -> "Heading | None":
+    named: dict[str | None, Heading | None] = {None: None, "wind": "wind", "longest": "longest"}
+    try:
+        return named[text] if text is None or text in named else float(text)
+    except ValueError:
+        raise InputError(f"the heading '{text}' is no number; give degrees from north, wind or longest") from None
 
 
 def _pitch(text: str) -> float | None:
