@@ -397,7 +397,9 @@ def _gimbal(vehicle: Vehicle, mission: Mission | None) -> Item:
         return Item("gimbal", Level.OK, f"it reports no gimbal: {text}")
     looks = f"its gimbal is at {looks_deg:.0f} degrees (-90 is down)"
     there = abs(looks_deg - (turned[0] if turned else -90.0)) <= _AIMED_DEG
-    if turned and (there or not vehicle.flying):
+    # PX4 levels it whenever it leaves a mission, and turns it again.
+    rests = vehicle.autopilot is Autopilot.PX4 and vehicle.custom_mode != vehicle.modes.mission
+    if turned and (there or rests or not vehicle.flying):
         return Item("gimbal", Level.OK, f"{looks}; its mission turns it to {turned[0]:.0f}")
     if there or not any(item.command == TRIGGER_DISTANCE for item in items):
         return Item("gimbal", Level.OK, looks)

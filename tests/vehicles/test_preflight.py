@@ -141,6 +141,9 @@ def test_a_mission_turns_the_gimbal_down_and_the_check_says_where_it_looks(make_
     world.wait(1.0)
     state, why = levels(world, Wanted(aimed))
     assert state["gimbal"] is Level.WARNING and "not at -90 as its mission says" in why["gimbal"]
+    assert world.finish(world.fleet.pause(1))[0].ok
+    world.wait(3.0)  # PX4 levels it there and turns it again as it goes on
+    assert levels(world, Wanted(aimed))[0]["gimbal"] is (Level.OK if autopilot is PX4 else Level.WARNING)
 
 
 @BOTH
