@@ -54,7 +54,7 @@ export const english = {
   "preflight.refused": "No vehicle was started: {why}", "preflight.started": "Started: {list}", "preflight.takeoff": "{name} in {time}",
   "preflight.ok": "OK", "preflight.warning": "Watch", "preflight.red": "Red", "preflight.state.ok": "ready", "preflight.state.warning": "ready, look at the warnings", "preflight.state.red": "not ready",
   "preflight.allow": "Allow \"{item}\" for {name}, I take responsibility", "preflight.item.link": "Link", "preflight.item.gps": "Satellite positioning", "preflight.item.ekf": "Position filter", "preflight.item.home": "Home", "preflight.item.pre-arm": "Autopilot's own checks",
-  "preflight.item.battery": "Battery", "preflight.item.mission": "Mission", "preflight.item.fence": "Geofence", "preflight.item.height": "Height", "preflight.item.return": "Way home", "preflight.item.failsafe": "Failsafe", "preflight.item.speed": "Speed", "preflight.item.separation": "Separation",
+  "preflight.item.battery": "Battery", "preflight.item.mission": "Mission", "preflight.item.fence": "Geofence", "preflight.item.height": "Height", "preflight.item.return": "Way home", "preflight.item.failsafe": "Failsafe", "preflight.item.speed": "Speed", "preflight.item.gimbal": "Gimbal", "preflight.item.separation": "Separation",
 
   "area.title": "Area", "area.none": "Draw the area to be mapped, or open its file.", "area.files": "GeoJSON, KML, KMZ, zipped shapefile, GeoPackage or QGroundControl .plan; a file can also be dropped anywhere on the page.", "area.outline": "The outline", "area.hole": "No-fly zone {n}",
   "area.few": "{which} needs {n} more {n|corner|corners}.", "area.crosses": "{which} crosses itself: drag a corner so that its edges do not cross.", "area.ready": "{size}. Drag corners to change it.",
