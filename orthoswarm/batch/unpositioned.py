@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.batch.run_state import RunContext
-from orthoswarm.config import active
 from orthoswarm.evaluation.checkpoints import read_checkpoints
 from orthoswarm.model.frame import Frame, Ingest
+from orthoswarm.raster.grey_pictures import WORK_WIDTH_PX
 from orthoswarm.raster.picture_file import read_gray, reduction
 from orthoswarm.refine.strategy.unpositioned_photos import place_unpositioned
 
@@ -45,7 +45,7 @@ def with_control_positions(run: RunContext, ingest: Ingest) -> Ingest:
 
 
 def _reduced(frame: Frame) -> NDArray[np.uint8]:
-    return read_gray(frame.path, reduction(frame.width, frame.height, active().features.work_width_px))
+    return read_gray(frame.path, reduction(frame.width, frame.height, WORK_WIDTH_PX))
 
 
 def _in_order(frames: list[Frame], ingest: Ingest) -> list[Frame]:

@@ -8,31 +8,16 @@ from pathlib import Path
 from typing import Any
 
 from orthoswarm.config.autopilot import ArduPilotConfig, Px4Config
-from orthoswarm.config.compute import ComputeConfig
 from orthoswarm.config.mapping import (
-    ControlConfig,
-    CoverageConfig,
-    IngestConfig,
+    ComputeConfig,
     MatchersConfig,
     MosaicConfig,
-    RadiometryConfig,
     RasterConfig,
     StereoConfig,
+    StrategyConfig,
 )
 from orthoswarm.config.planning import PlanningConfig
 from orthoswarm.config.ranges import numbers_in, range_of, rises
-from orthoswarm.config.refiner import (
-    BundleConfig,
-    FeaturesConfig,
-    FlightConfig,
-    InitialConfig,
-    PaperConfig,
-    RecordsConfig,
-    RegistrationConfig,
-    StrategyConfig,
-    SurfaceConfig,
-)
-from orthoswarm.config.stores import StoresConfig
 from orthoswarm.model.errors import InputError
 
 Overrides = Mapping[str, Mapping[str, Any]]
@@ -43,28 +28,15 @@ Overrides = Mapping[str, Mapping[str, Any]]
 class Config:
     """The thresholds of all stages."""
 
-    records: RecordsConfig = field(default_factory=RecordsConfig)
-    features: FeaturesConfig = field(default_factory=FeaturesConfig)
-    initial: InitialConfig = field(default_factory=InitialConfig)
-    bundle: BundleConfig = field(default_factory=BundleConfig)
-    flight: FlightConfig = field(default_factory=FlightConfig)
-    surface: SurfaceConfig = field(default_factory=SurfaceConfig)
-    registration: RegistrationConfig = field(default_factory=RegistrationConfig)
-    strategy: StrategyConfig = field(default_factory=StrategyConfig)
-    ingest: IngestConfig = field(default_factory=IngestConfig)
-    mosaic: MosaicConfig = field(default_factory=MosaicConfig)
-    radiometry: RadiometryConfig = field(default_factory=RadiometryConfig)
-    raster: RasterConfig = field(default_factory=RasterConfig)
-    stereo: StereoConfig = field(default_factory=StereoConfig)
     planning: PlanningConfig = field(default_factory=PlanningConfig)
     ardupilot: ArduPilotConfig = field(default_factory=ArduPilotConfig)
     px4: Px4Config = field(default_factory=Px4Config)
-    coverage: CoverageConfig = field(default_factory=CoverageConfig)
-    control: ControlConfig = field(default_factory=ControlConfig)
+    strategy: StrategyConfig = field(default_factory=StrategyConfig)
     matchers: MatchersConfig = field(default_factory=MatchersConfig)
-    paper: PaperConfig = field(default_factory=PaperConfig)
+    mosaic: MosaicConfig = field(default_factory=MosaicConfig)
+    stereo: StereoConfig = field(default_factory=StereoConfig)
+    raster: RasterConfig = field(default_factory=RasterConfig)
     compute: ComputeConfig = field(default_factory=ComputeConfig)
-    stores: StoresConfig = field(default_factory=StoresConfig)
 
 
 _DEFAULT = Config()

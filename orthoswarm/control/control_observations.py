@@ -11,8 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
-from orthoswarm.evaluation.checkpoints import RECEIVERS_LOCAL_SIGMA_M, Checkpoint
+from orthoswarm.evaluation.checkpoints import POINTING_SIGMA_PX, RECEIVERS_LOCAL_SIGMA_M, SURVEY_SIGMA_M, Checkpoint
 from orthoswarm.evaluation.photo_names import photo_named
 from orthoswarm.evaluation.point_rays import Ray, RayPoint, intersect_rays
 from orthoswarm.model.errors import InputError
@@ -80,7 +79,6 @@ def in_photos(
         points: surveyed points. placed: photos of one frame of reference. terrain: ground below them.
         grid: the area's. on_map: whether that frame is the basemap.
     """
-    config = active().control
     images = {p.frame.image: p for p in placed}
     out = []
     for point in points:
@@ -92,7 +90,7 @@ def in_photos(
         place = intersect_rays(rays, level, _HEIGHT_SIGMA_M).place
         met = intersect_rays(rays, float(terrain.height(place)), _HEIGHT_SIGMA_M)
         gsd = float(np.median([(p.camera.position[2] - level) / p.camera.lens.focal_px for p, _ in photos]))
-        pointing = config.pointing_sigma_px * gsd / np.sqrt(len(photos))
+        pointing = POINTING_SIGMA_PX * gsd / np.sqrt(len(photos))
         bent = float(np.median([p.sigma_m for p, _ in photos])) if on_map else RECEIVERS_LOCAL_SIGMA_M
         sigma = float(np.linalg.norm([_survey_sigma(point), pointing, bent, met.contradiction]))
         surveyed, stated = _in_grid(point.surveyed, grid), point.sigma_m > 0.0
@@ -134,12 +132,12 @@ def _ray(placed: PlacedFrame, pixel: Array, camera_sigma_m: float) -> Ray:
     camera = placed.camera
     below = float(camera.position[2]) - 1.0
     away = np.array([*camera.to_ground(pixel, below), below]) - camera.position
-    pixel_rad = active().control.pointing_sigma_px / camera.lens.focal_px
+    pixel_rad = POINTING_SIGMA_PX / camera.lens.focal_px
     return Ray(placed.frame.image, camera.position, away / np.linalg.norm(away), pixel_rad, camera_sigma_m)
 
 
 def _survey_sigma(point: Checkpoint) -> float:
-    return point.sigma_m or active().control.survey_sigma_m
+    return point.sigma_m or SURVEY_SIGMA_M
 
 
 def _in_grid(lon_lat: Array, grid: LocalGrid) -> Array:

@@ -68,6 +68,7 @@ Blend = Literal["none", "seam"]
 _STAGING = "staging"
 _UNCHANGED = uniform(np.ones(3))
 
+_PICTURES_PER_TASK: Final = 64  # pictures that a task reads, or copies to previews: its overhead is small then
 _COMPLETENESS_CELLS: Final = 1_000_000
 """The share of the ground that was drawn is measured on about so many cells at most, of 64 pixels at most (for its
 time)."""
@@ -245,9 +246,8 @@ def _by_picture(jobs: Sequence["_Job"]) -> Iterator[tuple[Path, list[tuple[int, 
 def _sample_tasks(jobs: Sequence["_Job"], read: Read, parts: PictureParts | None) -> Iterator[SampleTask]:
     """The pictures in groups, with what is needed to draw them."""
     pictures = list(_by_picture(jobs))
-    size = active().compute.pictures_per_task
-    for start in range(0, len(pictures), size):
-        some = pictures[start : start + size]
+    for start in range(0, len(pictures), _PICTURES_PER_TASK):
+        some = pictures[start : start + _PICTURES_PER_TASK]
         own: list[list[int]] = [
             [i for _, shares in some for n, i in shares if n == number] for number in range(len(jobs))
         ]
@@ -368,7 +368,7 @@ class _Job:
         rows = np.array([previews.row[self.frames[i].frame.image] for i in index], np.int32)
         missing = np.nonzero(unwritten(previews.path, rows))[0]
         pictures = [(self.frames[int(index[m])].frame.path, int(rows[m])) for m in missing]
-        n = active().compute.pictures_per_task
+        n = _PICTURES_PER_TASK
         tasks = (PreviewTask(previews.path, pictures[k : k + n], read) for k in range(0, len(pictures), n))
         for _ in self.run(preview_pass, tasks):
             pass

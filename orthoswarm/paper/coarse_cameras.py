@@ -7,7 +7,6 @@ from typing import Final
 
 import numpy as np
 
-from orthoswarm.config import active
 from orthoswarm.matchers import picture_matcher
 from orthoswarm.model.arrays import Array, Ints
 from orthoswarm.model.camera import focal_px
@@ -22,6 +21,7 @@ from orthoswarm.refine.features.working_pictures import Pictures
 from orthoswarm.refine.strategy.vehicle_passes import START_FOV_DEG
 
 RECEIVER_SIGMA_M: Final = 3.0  # sigma of the bias of a receiver, an axis, metres, which no line reduces
+_SCALE_PAIRS: Final = 40  # matched pairs a vehicle, about (cost)
 _UNKNOWN_FOV_SIGMA_DEG: Final = 10.0  # sigma of a field of view that could not be measured
 
 
@@ -67,7 +67,7 @@ class CoarseVehicle:
 
 def coarse_vehicle(frames: Sequence[Frame], *, epsg: int, origin: Array, options: CoarseOptions) -> CoarseVehicle:
     """Coarse cameras of one vehicle (one lens) in the local frame: III.C from legs to Eq. 4."""
-    began, config = process_time(), active().paper
+    began = process_time()
     records = read_records(frames, LocalGrid(epsg), origin)
     pictures = Pictures(frames, lambda f: read_gray(f.path))
     leg = find_legs(records)
@@ -87,7 +87,7 @@ def coarse_vehicle(frames: Sequence[Frame], *, epsg: int, origin: Array, options
     for k, line in enumerate(lines):
         members = np.flatnonzero(leg == k)
         along = line.along(records.position[members, :2])
-        share = max(SCALE_LEAST_PAIRS, round(config.scale_pairs * len(members) / max(int((leg >= 0).sum()), 1)))
+        share = max(SCALE_LEAST_PAIRS, round(_SCALE_PAIRS * len(members) / max(int((leg >= 0).sum()), 1)))
         tasks += choose_pairs(along, position[members, 2], tilt[members], members, share)
     warnings = []
     found = None

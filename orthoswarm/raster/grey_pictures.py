@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 import cv2
 import numpy as np
@@ -15,6 +16,7 @@ from orthoswarm.raster.picture_file import read_gray, read_rgb, reduction
 
 Bytes = NDArray[np.uint8]
 _SHAPE = np.dtype("<i4")
+WORK_WIDTH_PX: Final = 960  # longer side of the pictures on which corners are followed
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,4 +93,4 @@ def _luma(picture: Bytes) -> Bytes:
 
 
 def _factor(width: int, height: int) -> int:
-    return reduction(width, height, active().features.work_width_px)
+    return reduction(width, height, WORK_WIDTH_PX)

@@ -28,6 +28,11 @@ _UNIQUE_PERCENT: Final = 10  # least cost of the second best match over the best
 _SPECKLE_PX: Final = 60  # smaller regions of alike disparity are false matches: OpenCV recommends 50-200
 _DISPARITY_SIGMA_PX: Final = 0.25  # 68 % of single pairs' heights are within 0.24 of it at a base of 0.25, 0.22 at 0.7
 _TALLEST_HEIGHTS: Final = 0.45  # the highest searched, over the camera's height above ground, where `tallest_m` is more
+_SMOOTHNESS: Final = (8.0, 32.0)
+"""Penalty of a disparity that differs by one, and by more, times the block's area: OpenCV's recommendation."""
+_WIDE_PX: Final = 128
+"""Pairs with a search range of more disparities are matched at half size first, to find those that occur: for fewer the
+time saved is less than what it takes."""
 _WIDE_REGION_PX: Final = 400  # where more disparities are matched: least region at half size (40 x 40) ...
 _WIDE_MARGIN: Final = 0.15  # ... with this share of their range to either side, and 2 pixels at half size
 
@@ -193,7 +198,7 @@ def _disparities(left: Gray, right: Gray, valid: NDArray[np.bool_], count: int) 
         left, right: rectified. valid: where the left one has content. count: disparities that may occur.
     """
     least = 0
-    if count > active().stereo.wide_px:
+    if count > _WIDE_PX:
         least, count = _occurring(left, right, valid, count)
     return _matched(left, right, least, count)
 
@@ -226,11 +231,10 @@ def _whole_steps(disparities: float) -> int:
 
 def _matched(left: Gray, right: Gray, least: int, count: int) -> NDArray[np.float32]:
     """`_disparities` among `count` ones from `least` on."""
-    c = active().stereo
     area, last = _BLOCK_PX**2, least + count
     matcher = cv2.StereoSGBM.create(
-        minDisparity=least, numDisparities=count, blockSize=_BLOCK_PX, P1=int(c.smoothness[0] * area),
-        P2=int(c.smoothness[1] * area), disp12MaxDiff=1, uniquenessRatio=_UNIQUE_PERCENT,
+        minDisparity=least, numDisparities=count, blockSize=_BLOCK_PX, P1=int(_SMOOTHNESS[0] * area),
+        P2=int(_SMOOTHNESS[1] * area), disp12MaxDiff=1, uniquenessRatio=_UNIQUE_PERCENT,
         speckleWindowSize=_SPECKLE_PX, speckleRange=1, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     )  # fmt: skip
     pads = (0, 0, last, 0, cv2.BORDER_REPLICATE)  # the matcher leaves out as many columns as the largest disparity

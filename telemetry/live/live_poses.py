@@ -13,8 +13,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from orthoswarm.config import active
 from orthoswarm.model.angles import wrap_deg
+from orthoswarm.model.frame import TAGGED_TILT_SIGMA, UNSTATED_SIGMA_M
 from telemetry.formats.log.mavlink_poses import ExposureEvent, MavlinkPoses, fixed_camera
 from telemetry.samples.sample import CAMERA_ANGLES, FLIGHT_ANGLES, Sample
 
@@ -178,9 +178,8 @@ class LivePoses:
         """
         if sample.time_s is None:
             return
-        unstated = active().records
-        metres = sigma or unstated.position_sigma_m
-        degrees = sigma or math.degrees(unstated.tagged_tilt_sigma)
+        metres = sigma or UNSTATED_SIGMA_M
+        degrees = sigma or math.degrees(TAGGED_TILT_SIGMA)
         with self._lock:
             if sample.has_position:
                 self._position.add(source, sample, metres)

@@ -11,8 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
-from orthoswarm.model.frame import Frame
+from orthoswarm.model.frame import THETA_HAT_DEG, Frame
 from telemetry.photos.photo_tags import Photo
 from telemetry.samples.course import Straight, ground_track, straight_legs
 from telemetry.samples.findings import Finding, metres, plural
@@ -172,7 +171,7 @@ def _spacing(frames: Sequence[Frame], ground: Array, legs: Sequence[Straight]) -
     step = np.concatenate([np.hypot(*np.diff(ground[g.first : g.last + 1], axis=0).T) for g in legs])
     usual = float(np.median(step))
     first = frames[0]
-    fov_rad = first.fov_hint_rad or math.radians(active().records.theta_hat_deg)
+    fov_rad = first.fov_hint_rad or math.radians(THETA_HAT_DEG)
     footprint = 2.0 * height * math.tan(0.5 * fov_rad) * first.height / first.width
     if usual < 0.1 * height:
         text = (

@@ -12,11 +12,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from orthoswarm.config import active
 from orthoswarm.model.earth import distance_m
 from orthoswarm.stores.addresses import is_stored
 from orthoswarm.stores.listing import StoredFile, known
 from orthoswarm.stores.local_copies import expect
+from orthoswarm.stores.requests import CONNECTIONS
 from telemetry.formats.photo import exif, xmp
 from telemetry.formats.photo.makernotes import parse_dji
 from telemetry.formats.photo.picture_container import Container, NotAPicture, read_container
@@ -146,7 +146,7 @@ def _read_chunk(chunk: _Chunk) -> list[Photo | Unreadable | None]:
     if not any(map(is_stored, chunk.paths)):
         return list(map(_tags_or_reason, chunk.paths))
     expect(chunk.stored)
-    with ThreadPoolExecutor(active().stores.connections) as pool:  # a request mostly waits for the network
+    with ThreadPoolExecutor(CONNECTIONS) as pool:  # a request mostly waits for the network
         return list(pool.map(_tags_or_reason, chunk.paths))
 
 

@@ -7,7 +7,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from telemetry.samples.course import local_metres
 from telemetry.samples.findings import Finding, metres, plural
 from telemetry.samples.sample import Sample
@@ -15,6 +14,9 @@ from telemetry.samples.sample import Sample
 Array = NDArray[np.float64]
 
 TIME_RESOLUTION_S: Final = 1.0  # times of positions may be off by this: many are written in whole seconds
+FASTEST_M_S: Final = 128.6
+"""No aircraft that takes pictures flies faster over ground: 250 knots, the limit below 10,000 feet (14 CFR 91.117(a));
+small drones may fly 44.7 m/s (14 CFR 107.51(a))."""
 _WILD_MOST_SHARE: Final = 0.1  # positions that cannot be reached are wild up to this share of all
 _WILD_MOST_PIECES: Final = 10_000  # a track broken at more places has wrong times, not wild positions
 _LONGEST_REPEAT_S: Final = 30.0  # a receiver may repeat a fix for so long, during which it flies on
@@ -79,7 +81,7 @@ def wild_fixes(times_s: Sequence[float | None], places: Sequence[tuple[float, fl
 
 def _flyable(t0: Array, a: Array, t1: Array, b: Array) -> NDArray[np.bool_]:
     """Whether an aircraft can fly from places `a` (N, 2), metres, at times `t0` to places `b` at `t1`."""
-    reach = active().ingest.fastest_m_s * (t1 - t0 + TIME_RESOLUTION_S)
+    reach = FASTEST_M_S * (t1 - t0 + TIME_RESOLUTION_S)
     return np.asarray(np.hypot(b[..., 0] - a[..., 0], b[..., 1] - a[..., 1]) <= reach)
 
 
@@ -107,7 +109,7 @@ def doubtful_finding(count: int, of_what: str) -> Finding:
     """The finding on positions that cannot be reached and are used all the same, being too many; see `wild_fixes`."""
     text = (
         f"{count} of {of_what} cannot be reached by any aircraft from those before and after "
-        f"({active().ingest.fastest_m_s:.0f} m/s); so many are hardly wild, and all are used: they are of several "
+        f"({FASTEST_M_S:.0f} m/s); so many are hardly wild, and all are used: they are of several "
         "flights, or their times are wrong; check them, and read each flight by itself"
     )
     return Finding("positions-unreachable", text)
@@ -133,6 +135,6 @@ def without_wild_fixes(
     text = (
         f"{plural(len(wild), 'position')} of {source} {lie} up to {metres(found.away_m)} away from those before and "
         "after, farther than any aircraft flies in that time "
-        f"({active().ingest.fastest_m_s:.0f} m/s); {they_are} not used"
+        f"({FASTEST_M_S:.0f} m/s); {they_are} not used"
     )
     return sound, [Finding("wild-fix", text)]

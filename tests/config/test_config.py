@@ -17,8 +17,8 @@ def _defaults():
     override({})
 
 
-def theta_hat(_):
-    return active().records.theta_hat_deg
+def tallest(_):
+    return active().stereo.tallest_m
 
 
 def test_every_threshold_says_what_it_is():
@@ -59,13 +59,13 @@ def test_no_module_reads_the_values_when_it_is_imported():
 
 def test_a_file_overrides_defaults_and_workers_follow(tmp_path):
     file = tmp_path / "config.toml"
-    file.write_text("[records]\ntheta_hat_deg = 55\n")
+    file.write_text("[stereo]\ntallest_m = 55\n")
     override(read_overrides(file))
-    assert active().records.theta_hat_deg == 55.0 and overridden() == {"records": {"theta_hat_deg": 55}}
+    assert active().stereo.tallest_m == 55.0 and overridden() == {"stereo": {"tallest_m": 55}}
     with Processes(3) as pool:
-        assert set(pool.map(theta_hat, range(20))) == {55.0}
-    file.write_text("[records]\ntheta_hat_deg = 55\n", encoding="utf-8-sig")  # as Windows' Notepad writes it
-    assert read_overrides(file) == {"records": {"theta_hat_deg": 55}}
+        assert set(pool.map(tallest, range(20))) == {55.0}
+    file.write_text("[stereo]\ntallest_m = 55\n", encoding="utf-8-sig")  # as Windows' Notepad writes it
+    assert read_overrides(file) == {"stereo": {"tallest_m": 55}}
     override({})
     assert active() == Config()
 
@@ -74,10 +74,10 @@ def test_a_file_overrides_defaults_and_workers_follow(tmp_path):
     ("text", "says"),
     [
         ("[nothing]\na = 1\n", r"no settings \[nothing\]"),
-        ("records = 3\n", "write it as a table"),
-        ("[records]\nnothing = 1\n", "no setting records.nothing"),
-        ("[records]\ntheta_hat_deg = 'wide'\n", "another kind"),
-        ("[records\n", "not a TOML file"),
+        ("stereo = 3\n", "write it as a table"),
+        ("[stereo]\nnothing = 1\n", "no setting stereo.nothing"),
+        ("[stereo]\ntallest_m = 'wide'\n", "another kind"),
+        ("[stereo\n", "not a TOML file"),
     ],
 )
 def test_what_is_wrong_with_a_file_is_said_and_changes_nothing(text, says, tmp_path):
@@ -92,24 +92,15 @@ def test_what_is_wrong_with_a_file_is_said_and_changes_nothing(text, says, tmp_p
     ("stage", "line", "allowed"),
     [
         ("strategy", "area_pictures = 0", "a number of at least 1"),
-        ("compute", "pictures_per_task = -3", "a number of at least 1"),
-        ("compute", "pictures_per_task = 3000000000", "at most 2147483647"),
-        ("coverage", "cell_m = 0.0", "a number above 0"),
-        ("coverage", "cell_m = nan", "a number above 0"),
-        ("coverage", "cell_m = inf", "a number above 0"),
-        ("coverage", f"cell_m = 1{'0' * 400}", "a number above 0"),
-        ("coverage", "blurred_share = 1.2", "a number of at least 0 and at most 1"),
-        ("coverage", "oblique_deg = 400", "a number above 0 and at most 360"),
-        ("records", "usual_overlap = 1", "a number of at least 0 and below 1"),
-        ("initial", "default_fov_deg = 180", "a number above 0 and below 180"),
+        ("stereo", "partners = -3", "a number of at least 1"),
+        ("stereo", "partners = 3000000000", "at most 2147483647"),
+        ("stereo", "depth_m = 0.0", "a number above 0"),
+        ("stereo", "depth_m = nan", "a number above 0"),
+        ("stereo", "depth_m = inf", "a number above 0"),
+        ("stereo", f"depth_m = 1{'0' * 400}", "a number above 0"),
+        ("planning", "in_turn_share = 1.2", "a number of at least 0 and at most 1"),
         ("planning", "launch_s = -1", "a number of at least 0"),
         ("ardupilot", "speed_share = 0", "a number above 0"),
-        ("mosaic", "most_off_nadir_deg = 120", "below 90"),
-        ("records", "usual_heights_m = [50, -1]", "numbers above 0"),
-        ("records", "usual_heights_m = [150, 50]", "the smaller number first"),
-        ("raster", "stretch_percent = [1, 101]", "numbers of at least 0 and at most 100"),
-        ("records", "usual_heights_m = [50, 'far']", "another kind"),
-        ("records", "usual_heights_m = [50]", "another kind"),
     ],
 )
 def test_a_number_out_of_range_is_refused_and_the_range_said(stage, line, allowed, tmp_path):
@@ -123,11 +114,10 @@ def test_a_number_out_of_range_is_refused_and_the_range_said(stage, line, allowe
 @pytest.mark.parametrize(
     ("stage", "name", "value"),
     [
+        ("planning", "in_turn_share", 0),
+        ("planning", "in_turn_share", 1),
         ("planning", "launch_s", 0),  # "none of it", said of the field
-        ("raster", "stretch_percent", (0.0, 100.0)),
         ("ardupilot", "speed_share", 1.001),
-        ("coverage", "blurred_share", 0),
-        ("coverage", "blurred_share", 1),
     ],
 )
 def test_a_number_at_the_end_of_its_range_is_taken(stage, name, value):
@@ -145,7 +135,7 @@ def test_every_default_is_in_its_own_range():
 def test_mosaic_refuses_a_bad_configuration_before_it_begins(tmp_path, capsys):
     file = tmp_path / "config.toml"
     for text, key in (
-        ("[records]\nnothing = 1\n", "nothing"),
+        ("[stereo]\nnothing = 1\n", "nothing"),
         ("[strategy]\narea_pictures = 0\n", "area_pictures = 0"),
     ):
         file.write_text(text)
@@ -158,58 +148,8 @@ def test_the_report_says_what_was_changed(tmp_path, tmp_path_factory):
 
     folder = tiny_twin(tmp_path_factory, 1, every=10)
     file = tmp_path / "config.toml"
-    file.write_text("[records]\ntheta_hat_deg = 80.0\n")
+    file.write_text("[stereo]\ntallest_m = 80.0\n")
     flags = ["--until", "realtime", "--config", str(file), "--out", str(tmp_path / "out"), "--workers", "1"]
     assert main(["mosaic", str(folder / "photos"), *flags]) == 0
     report = json.loads((tmp_path / "out" / "report.json").read_text())
-    assert report["config"] == {"records": {"theta_hat_deg": 80.0}}
-
-
-def drawn_share(tmp_path, tmp_path_factory, name, text):
-    """Share of the real-time map that is drawn, with a configuration, and what the report says was changed."""
-    import rasterio
-
-    from tests.kit.scenes import tiny_twin
-
-    folder = tiny_twin(tmp_path_factory, 1, every=10)
-    file = tmp_path / f"{name}.toml"
-    file.write_text(text)
-    out = tmp_path / name
-    flags = ["--until", "realtime", "--config", str(file), "--out", str(out), "--workers", "1", "--gsd", "1"]
-    assert main(["mosaic", str(folder / "photos"), *flags]) == 0
-    with rasterio.open(out / "realtime.tif") as raster:
-        area = float((raster.read(4) > 0).sum()) * raster.res[0] ** 2
-    return area, json.loads((out / "report.json").read_text())["config"]
-
-
-def test_an_override_of_the_drawing_draws_otherwise(tmp_path, tmp_path_factory):
-    """Ground that is seen farther than 20 degrees from straight down is left out when the file says so."""
-    usual, changed = drawn_share(tmp_path, tmp_path_factory, "usual", "")
-    assert usual > 0 and changed == {}
-    steep, changed = drawn_share(tmp_path, tmp_path_factory, "steep", "[mosaic]\nmost_off_nadir_deg = 20\n")
-    assert changed == {"mosaic": {"most_off_nadir_deg": 20}}
-    assert 0 < steep < 0.6 * usual
-
-
-def states_of_legs(tmp_path, tmp_path_factory, name, text):
-    """States of the legs after a refinement with a configuration, and what the report says was changed."""
-    from tests.kit.scenes import tiny_twin
-
-    folder = tiny_twin(tmp_path_factory, 1)
-    file = tmp_path / f"{name}.toml"
-    file.write_text(text)
-    out = tmp_path / name
-    flags = ["--basemap", str(folder / "basemap.tif"), "--config", str(file), "--out", str(out), "--workers", "1"]
-    assert main(["mosaic", str(folder / "photos"), *flags, "--gsd", "1"]) == 0
-    report = json.loads((out / "report.json").read_text())
-    return {leg["state"] for leg in report["legs"]}, report["config"]
-
-
-@pytest.mark.slow
-def test_an_override_of_the_registration_registers_otherwise(tmp_path, tmp_path_factory):
-    """With a limit of evidence that nothing can pass the flight is not taken to lie on the map."""
-    states, changed = states_of_legs(tmp_path, tmp_path_factory, "usual", "")
-    assert "matched" in states and changed == {}
-    states, changed = states_of_legs(tmp_path, tmp_path_factory, "strict", "[registration]\nfalse_matches = 1e-300\n")
-    assert changed == {"registration": {"false_matches": 1e-300}}
-    assert states == {"failed"}
+    assert report["config"] == {"stereo": {"tallest_m": 80.0}}

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from orthoswarm.model.camera import Lens
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import Terrain
+from orthoswarm.stereo import rectified_pair
 from orthoswarm.stereo.picture_pairs import choose_pairs
 from orthoswarm.stereo.rectified_pair import PairPoints, PairView, match_pair
 from orthoswarm.stereo.surface_cells import cell_heights, merge_heights
@@ -45,7 +46,7 @@ def slab(east_north):
     return np.where(p.max(-1) < 8.0, 20.0, 0.0)
 
 
-def test_of_a_wide_search_range_only_what_occurs_is_searched(monkeypatch, configure):
+def test_of_a_wide_search_range_only_what_occurs_is_searched(monkeypatch):
     large = Lens(960, 720, 540.0)
     flight = Flight().take(camera(lens=large), slab).take(camera(east=45.0, lens=large), slab)
     searched = []
@@ -53,7 +54,7 @@ def test_of_a_wide_search_range_only_what_occurs_is_searched(monkeypatch, config
     monkeypatch.setattr(cv2.StereoSGBM, "create", lambda **how: searched.append(how["numDisparities"]) or create(**how))
     found = match_pair(view(flight, 0), view(flight, 1), FLAT).points
     half, narrow = searched
-    configure({"stereo": {"wide_px": 10_000}})
+    monkeypatch.setattr(rectified_pair, "_WIDE_PX", 10_000)
     whole = match_pair(view(flight, 0), view(flight, 1), FLAT).points
     assert half < 0.6 * searched[-1] and narrow < 0.7 * searched[-1]
     assert len(found) > 0.98 * len(whole)

@@ -6,12 +6,12 @@ from typing import Final
 
 import numpy as np
 
-from orthoswarm.config import active
 from orthoswarm.model.arrays import Array, Flags, Indices, Ints
 from orthoswarm.model.placement import MapWindow
 from orthoswarm.raster.map_cache import TiledMap
 from orthoswarm.refine.flight.relative_block import FlightBlock
 from orthoswarm.refine.registration.orientation_correlation import (
+    COARSE_REACH_M,
     Match,
     Search,
     by_learning,
@@ -55,10 +55,9 @@ def coarse_fits(flight: FlightBlock, basemap: MapWindow, origin: Array) -> Itera
 
     Strips of each leg near their records; then one shift for all strips together; then strips within a wider search.
     """
-    config = active().registration
     gsd = float(np.clip(picture_width_m(flight) / _STRIP_ACROSS_PX, *_STRIP_GSD_M))
     tiles = TiledMap(basemap, gsd)
-    near, far = config.coarse_reach_m
+    near, far = COARSE_REACH_M
     for find, reach_m in ((_fit_within, near), (_fit_together, near), (_fit_within, far)):
         fit = find(flight, Search(tiles, origin, reach_m, gsd))
         if fit is not None:

@@ -21,6 +21,9 @@ OrientationField = NDArray[np.complex64]
 Found = tuple[float, float, float, float]
 """Column and row of a shift from the centre, pixels, peak, and ratio of second peak to peak."""
 
+COARSE_REACH_M: Final = (60.0, 150.0)
+"""How far strips are searched: first, and where that is refuted (receivers without corrections are within the
+first)."""
 _STRIP_MOST_PX: Final = 4_000_000  # larger strips are not correlated (memory)
 _STRIP_FARTHEST_HEIGHTS: Final = 4.0
 """A picture that looks farther than so many flying heights and the next field is left out: horizon."""

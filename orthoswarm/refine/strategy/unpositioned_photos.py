@@ -11,8 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from orthoswarm.config import active
-from orthoswarm.evaluation.checkpoints import Checkpoint
+from orthoswarm.evaluation.checkpoints import SURVEY_SIGMA_M, Checkpoint
 from orthoswarm.evaluation.photo_names import photo_named
 from orthoswarm.model.arrays import Array, Ints
 from orthoswarm.model.frame import SURVEYED, Frame
@@ -125,7 +124,7 @@ def _anchors(
             mark.check_inside(frame.width, frame.height)
             pixel = complex(mark.column - 0.5 * (frame.width - 1), -(mark.row - 0.5 * (frame.height - 1)))
             sigma_px = FREE_PAIR_SHARE * frame.width
-            rows.append((number[name], pixel, ground, point.sigma_m or active().control.survey_sigma_m, sigma_px))
+            rows.append((number[name], pixel, ground, point.sigma_m or SURVEY_SIGMA_M, sigma_px))
     sigma = records.gps_sigma()
     for k in range(known, len(frames)):  # below the camera is the middle of the level picture
         sigma_px = _FREE_NADIR_SHARE * frames[k].width

@@ -199,21 +199,21 @@ def test_who_waits_for_a_process_is_released_when_the_daemon_stops():
     assert found == ["the daemon is stopping; start it again"]
 
 
-def _theta_hat(_):
-    return active().records.theta_hat_deg
+def _tallest(_):
+    return active().stereo.tallest_m
 
 
 def test_worker_processes_have_the_daemons_configuration(tmp_path, capsys):
     """As `serve --config` sets it; a file that is wrong is refused before anything is served."""
     config = tmp_path / "config.toml"
-    config.write_text("[records]\ntheta_hat_deg = 'wide'\n")
+    config.write_text("[stereo]\ntallest_m = 'wide'\n")
     assert main(["serve", "--workspace", str(tmp_path / "w"), "--config", str(config)]) == 2
     assert "another kind" in capsys.readouterr().err
-    config.write_text("[records]\ntheta_hat_deg = 55\n")
+    config.write_text("[stereo]\ntallest_m = 55\n")
     pool = WorkerPool(1)
     try:
         use_config(config)
-        assert pool.run(_theta_hat, 0) == 55.0
+        assert pool.run(_tallest, 0) == 55.0
     finally:
         override({})
         pool.close()
