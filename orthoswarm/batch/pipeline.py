@@ -28,7 +28,6 @@ from orthoswarm.batch.unpositioned import with_control_positions
 from orthoswarm.batch.workspace import Workspace, run_key
 from orthoswarm.compute.stage_times import Clock
 from orthoswarm.compute.workers import Workers, usage_of
-from orthoswarm.config import override
 from orthoswarm.control.control_observations import check_control
 from orthoswarm.evaluation.checkpoints import Checkpoint, read_checkpoints
 from orthoswarm.evaluation.independent_points import shared_points, shared_warning
@@ -97,7 +96,6 @@ def run(
     """
     if options.basemap is not None and not exists(options.basemap):
         raise InputError(f"the basemap {address_of(options.basemap)} does not exist; check the path")
-    override(options.config)
     with Workspace(out) as space:
         context = RunContext(
             out=out,
@@ -214,8 +212,12 @@ def _realtime(run: RunContext, state: RunState) -> list[PlacedFrame]:
     if run.options.until != "realtime":
         images = [p.frame.image for p in state.recorded.placed]
         state.previews = PreviewFile.create(run.space.file("previews"), images)
-        state.pictures = GreyPictures.create(run.space.file("pictures"), state.ingest.frames)
-        state.parts = PictureParts.create(run.space.file("parts"), len(images))
+        state.pictures = GreyPictures.create(
+            run.space.file("pictures"), state.ingest.frames, run.options.config.raster.grey_pictures_mb
+        )
+        state.parts = PictureParts.create(
+            run.space.file("parts"), len(images), run.options.config.raster.picture_parts_mb
+        )
     known = run.space.recall("realtime")
     if known is not None and product_file(run.out, REALTIME) is not None:
         stats, stage = known

@@ -22,7 +22,6 @@ from uuid import uuid4
 
 from orthoswarm import __version__
 from orthoswarm.compute.workers import Usage, peak_rss_mb, prepare_process
-from orthoswarm.config import overridden, override
 from orthoswarm.model.errors import InputError, RunInterruptedError
 from orthoswarm.model.task_runner import Continued, whole
 
@@ -167,7 +166,7 @@ class Cluster:
         return known
 
     def _submit(self, function: Callable[[Any], Any], item: Any) -> _SentTask:
-        payload = pickle.dumps((function, item, overridden(), self._begin), pickle.HIGHEST_PROTOCOL)
+        payload = pickle.dumps((function, item, self._begin), pickle.HIGHEST_PROTOCOL)
         return _SentTask(payload, self._sent(payload), self._client)
 
     def _sent(self, payload: bytes) -> Any:
@@ -299,8 +298,7 @@ def _short(error: BaseException) -> str:
 def _work(payload: bytes) -> _PickledOutcome:
     """Runs on a worker."""
     prepare_process()
-    function, item, config, beginning = pickle.loads(payload)
-    override(config)
+    function, item, beginning = pickle.loads(payload)
     if beginning is not None:
         beginning.once()
     raised = False

@@ -69,25 +69,27 @@ class Roma:
 
     Attributes:
         network: something with `match(image, image)`, `sample(warp, certainty)` and `to_pixel_coordinates`.
+        device: where it runs, see `network_device`.
     """
 
     network: Any
+    device: str = "auto"
 
     @classmethod
-    def make(cls) -> "Roma":
+    def make(cls, device: str) -> "Roma":
         """A matcher with the weights of this machine.
 
         Raises:
             UnavailableError: if the package or the weights are missing.
         """
-        return cls(_network(network_device()))
+        return cls(_network(network_device(device)), device)
 
     def match(self, patch: Floats, valid: Mask, window: Floats, known: Mask, reach: int) -> Matches:
         """See MapMatcher."""
         from PIL import Image
 
         first, second = (Image.fromarray(np.clip(g, 0, 255).astype(np.uint8)).convert("RGB") for g in (patch, window))
-        warp, certainty = self.network.match(first, second, device=network_device())
+        warp, certainty = self.network.match(first, second, device=network_device(self.device))
         found, sure = self.network.sample(warp, certainty, num=_SAMPLES)
         a, b = self.network.to_pixel_coordinates(found, *patch.shape, *window.shape)
         a, b = (t.detach().cpu().numpy().astype(np.float64) - 0.5 for t in (a, b))  # its pixel corners are integers

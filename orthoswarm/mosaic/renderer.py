@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.canvas.tile_store import Key
-from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import GroundGrid
@@ -110,6 +109,7 @@ class Seams:
     Attributes:
         previews: of all its frames; those that are missing are made first.
         blend: "seam" mixes the two pictures over a few pixels at each seam, "none" takes every pixel from one.
+        feather_px: half the width of the transition that "seam" makes, pixels.
         level: take out the steps of tone that are left at the seams, see seams.leveling; over all tiles that are drawn,
             so not together with `Layer.bounds`.
     """
@@ -117,6 +117,7 @@ class Seams:
     previews: PreviewFile
     blend: Blend = "seam"
     level: bool = False
+    feather_px: int = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -331,7 +332,8 @@ class _Job:
         self.near_seams = FrameWindows(self.run(feather_pass, self.feather_tasks()) if first else ())
 
     def feather_tasks(self) -> Iterator[FeatherTask]:
-        width = active().mosaic.feather_px
+        assert self.seams is not None
+        width = self.seams.feather_px
         yield from (FeatherTask(self.place, key, width) for key in self.place.store().existing())
 
     def finish(self) -> None:
@@ -340,7 +342,7 @@ class _Job:
             return
         keys = list(self.place.store().existing())
         leveling = self.leveling(keys) if self.seams.level else None
-        width = active().mosaic.feather_px if self.seams.blend == "seam" else 0
+        width = self.seams.feather_px if self.seams.blend == "seam" else 0
         tasks = (FinishTask(self.place, k, None if leveling is None else leveling.of_tile(k), width) for k in keys)
         for _ in self.run(finish_pass, tasks):
             pass

@@ -31,11 +31,12 @@ class CoarseOptions:
 
     Attributes:
         fov_start_rad: first guess, which places the orthogonal centre; also the result where nothing can be matched.
-        matcher: name of the picture matcher; None for the best available.
+        matcher: name of the picture matcher; None for the best available. device: where it runs.
     """
 
     fov_start_rad: float = field(default_factory=lambda: float(np.radians(START_FOV_DEG)))
     matcher: str | None = None
+    device: str = "auto"
 
 
 @dataclass(slots=True, kw_only=True)
@@ -92,7 +93,7 @@ def coarse_vehicle(frames: Sequence[Frame], *, epsg: int, origin: Array, options
     warnings = []
     found = None
     if records.has_height.any():
-        matcher = picture_matcher(options.matcher)
+        matcher = picture_matcher(options.matcher, options.device)
         found = estimate_fov(tasks, pictures.gray, rotation, size=pictures.size, start_rad=start, matcher=matcher)
     if found is None:
         warnings.append(f"the field of view could not be measured; {np.degrees(start):.0f} degrees are used")

@@ -82,10 +82,11 @@ class PatchOptions:
     """Options of the matching of patches.
 
     Attributes:
-        matcher: name of the map matcher; None for the best available.
+        matcher: name of the map matcher; None for the best available. device: where it runs.
     """
 
     matcher: str | None = None
+    device: str = "auto"
 
 
 def match_patch(task: PatchTask, *, basemap: MapWindow, origin: Array, options: PatchOptions) -> PatchFit:
@@ -108,7 +109,7 @@ def match_patch(task: PatchTask, *, basemap: MapWindow, origin: Array, options: 
             if not known.any():
                 break
             consistent = HeightFilter(task.cameras, own, there)
-            matcher = map_matcher(options.matcher)
+            matcher = map_matcher(options.matcher, options.device)
             found = register(patch, valid, window, known=known, reach=reach, matcher=matcher, keep=consistent)
             if found is not None and found.share >= TRUSTED_SHARE and len(found.matches) >= LEAST_TILES:
                 homography = in_metres(found.homography, own, there, centre)

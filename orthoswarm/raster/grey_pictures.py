@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.model.frame import Frame
 from orthoswarm.raster.packed_records import records
 from orthoswarm.raster.picture_file import read_gray, read_rgb, reduction
@@ -35,13 +34,13 @@ class GreyPictures:
     from_colors: bool = True
 
     @classmethod
-    def create(cls, folder: Path, frames: Iterable[Frame]) -> "GreyPictures | None":
+    def create(cls, folder: Path, frames: Iterable[Frame], most_mb: float) -> "GreyPictures | None":
         """A store for these frames, with what an earlier run left in the folder.
 
         Returns:
-            None where it would take more than `grey_pictures_mb` megabytes, or the folder cannot be made.
+            None where it would take more than `most_mb` megabytes, or the folder cannot be made.
         """
-        if stored_bytes(frames) > active().raster.grey_pictures_mb * 1e6:
+        if stored_bytes(frames) > most_mb * 1e6:
             return None
         try:
             folder.mkdir(exist_ok=True)

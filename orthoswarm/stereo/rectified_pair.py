@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
+from orthoswarm.config.mapping import StereoConfig
 from orthoswarm.model.camera import Camera
 from orthoswarm.model.placement import Terrain
 
@@ -81,16 +81,16 @@ class PairPoints:
     sigma_m: Array
 
 
-def match_pair(first: PairView, second: PairView, terrain: Terrain) -> PairPoints:
+def match_pair(first: PairView, second: PairView, terrain: Terrain, config: StereoConfig) -> PairPoints:
     """Ground points of two overlapping pictures, with the sigmas of their heights.
 
     Args:
-        first, second: the pictures. terrain: ground around which heights are searched.
+        first, second: the pictures. terrain: ground around which heights are searched. config: how far.
 
     Returns:
         The points of all consistent matches, none if the pictures overlap too little.
     """
-    frame = _common_frame(first, second, terrain)
+    frame = _common_frame(first, second, terrain, config)
     if frame is None:
         return PairPoints(np.zeros((0, 3)), np.zeros(0))
     left, valid_left = _resampled(first, frame, 0)
@@ -111,9 +111,8 @@ def match_pair(first: PairView, second: PairView, terrain: Terrain) -> PairPoint
     return PairPoints(points, along * depth / total)
 
 
-def _common_frame(left: PairView, right: PairView, terrain: Terrain) -> _Rectified | None:
+def _common_frame(left: PairView, right: PairView, terrain: Terrain, config: StereoConfig) -> _Rectified | None:
     """The rectified frame: the first picture's extent, on the rows that both have, with the heights' disparities."""
-    c = active().stereo
     first, second = left.camera, right.camera
     base = second.position - first.position
     base_m = float(np.linalg.norm(base))
@@ -130,8 +129,8 @@ def _common_frame(left: PairView, right: PairView, terrain: Terrain) -> _Rectifi
     top, bottom = max(low[1], two[:, 1].min() * focal), min(high[1], two[:, 1].max() * focal)
     width, height = int(np.ceil(high[0] - low[0])) + 1, int(np.ceil(bottom - top)) + 1
     ground = _levels(first, terrain)
-    above = min(c.tallest_m, _TALLEST_HEIGHTS * (float(first.position[2]) - ground[1]))
-    depths = [_depths(first, axes, ground[0] - c.depth_m), _depths(first, axes, ground[1] + above)]
+    above = min(config.tallest_m, _TALLEST_HEIGHTS * (float(first.position[2]) - ground[1]))
+    depths = [_depths(first, axes, ground[0] - config.depth_m), _depths(first, axes, ground[1] + above)]
     if height < 4 * _BLOCK_PX or not min(d.min() for d in depths) > 0.0:
         return None
     disparity = focal * base_m / np.concatenate(depths)

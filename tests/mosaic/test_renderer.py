@@ -361,7 +361,7 @@ def fields(frame):
 def test_pictures_are_drawn_again_from_their_kept_parts_without_being_read(tmp_path, gsd_m):
     flight = scene.survey(1, scene.hills, scene.small_lens(k1=-0.05))
     terrain, grid = scene.terrain_of(scene.hills), scene.grid(260.0, gsd_m)
-    parts = PictureParts.create(tmp_path / "parts", len(flight.frames))
+    parts = PictureParts.create(tmp_path / "parts", len(flight.frames), 2000.0)
     images, read = [], []
 
     def counted(path):
@@ -381,7 +381,7 @@ def test_pictures_are_drawn_again_from_their_kept_parts_without_being_read(tmp_p
 
 def test_a_picture_of_which_more_is_wanted_than_was_kept_is_read(tmp_path):
     flight = scene.survey(1)
-    few, parts = flight.frames[::2], PictureParts.create(tmp_path / "parts", len(flight.frames))
+    few, parts = flight.frames[::2], PictureParts.create(tmp_path / "parts", len(flight.frames), 2000.0)
     images = []
     for name, frames, store in (("all", flight.frames, parts), ("few", few, parts), ("whole", few, None)):
         with Canvas.create(tmp_path / name, scene.grid(260.0), plane="frame", tile_px=128) as canvas:

@@ -53,17 +53,16 @@ def test_the_defaults_of_the_command_are_those_of_a_request(tmp_path):
 
 def test_thresholds_of_a_file_are_used_and_stand_in_the_report(area, tmp_path, capsys):
     config = tmp_path / "config.toml"
-    config.write_text("[planning]\nmost_corners = 6\n")
-    assert plan(area, "--vehicles", 2, *FLAGS, "--out", tmp_path / "out", "--config", config) == 2
-    assert "at most 6" in capsys.readouterr().err
-    config.write_text("[planning]\nclearance_m = 3\n")
+    config.write_text("[planning]\nlaunch_s = 40\n[ardupilot]\ntakeoff_s = 9\nhome_wait_s = 0\n")
     assert plan(area, "--vehicles", 2, *FLAGS, "--out", tmp_path / "out", "--config", config, "--json") == 0
-    assert json.loads(capsys.readouterr().out)["config"] == {"planning": {"clearance_m": 3}}
+    assert json.loads(capsys.readouterr().out)["config"] == {
+        "planning": {"launch_s": 40.0}, "ardupilot": {"takeoff_s": 9.0, "home_wait_s": 0.0}
+    }  # fmt: skip
     assert plan(area, "--vehicles", 2, *FLAGS, "--out", tmp_path / "again", "--json") == 0
     assert "config" not in json.loads(capsys.readouterr().out)
     config.write_text("[planning]\nclearance = 3\n")
     assert plan(area, "--vehicles", 2, *FLAGS, "--out", tmp_path / "none", "--config", config) == 2
-    assert "no setting planning.clearance;" in capsys.readouterr().err and not (tmp_path / "none").exists()
+    assert "no setting planning.clearance, or no longer" in capsys.readouterr().err and not (tmp_path / "none").exists()
 
 
 @pytest.mark.parametrize("method", ["columns", "bcd", "tmstc"])

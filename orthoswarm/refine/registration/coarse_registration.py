@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -87,7 +88,7 @@ def _fit_within(flight: FlightBlock, search: Search) -> CoarseFit | None:
     return CoarseFit(_smooth(matches, inlier, len(cameras)), matches, inlier, float(inlier.mean()))
 
 
-def learned_fit(flight: FlightBlock, basemap: MapWindow, origin: Array) -> CoarseFit | None:
+def learned_fit(flight: FlightBlock, basemap: MapWindow, origin: Array, device: str) -> CoarseFit | None:
     """Registration by learned matching of a few strips, where correlation found no consensus; None without one."""
     cameras = flight.cameras()
     gsd = float(np.clip(picture_width_m(flight) / _LEARNED_ACROSS_PX, *_LEARNED_GSD_M))
@@ -95,7 +96,9 @@ def learned_fit(flight: FlightBlock, basemap: MapWindow, origin: Array) -> Coars
     search = Search(TiledMap(basemap, gsd), origin, _LEARNED_REACH_M, gsd)
     spread = np.linspace(0, len(windows) - 1, _LEARNED_STRIPS).round().astype(int)
     chosen = [windows[k] for k in np.unique(spread)]
-    found = [register(cameras, index, flight.pictures.gray, search, by_learning) for index in chosen]
+    found = [
+        register(cameras, index, flight.pictures.gray, search, partial(by_learning, device=device)) for index in chosen
+    ]
     matches = [m for m in found if m is not None]
     if len(matches) < 2:
         return None

@@ -273,11 +273,14 @@ def stacked(strips: Sequence[Strip]) -> tuple[Array, float, float] | None:
     return offset + gsd * np.array([column, -row]), z, ratio
 
 
-def by_learning(strip: Strip) -> Found | None:
-    """Where a strip lies on the map by learned matching, some seconds a strip: for strips whose edges do not agree."""
+def by_learning(strip: Strip, device: str) -> Found | None:
+    """Where a strip lies on the map by learned matching, some seconds a strip: for strips whose edges do not agree.
+
+    device: where the network runs.
+    """
     from orthoswarm.matchers.second_opinion import second_opinion
 
-    shift = second_opinion(strip.gray, strip.valid, strip.ground, known=strip.known, reach=strip.reach)
+    shift = second_opinion(strip.gray, strip.valid, strip.ground, known=strip.known, reach=strip.reach, device=device)
     return None if shift is None else (float(shift[0]), float(shift[1]), 1.0, 0.0)
 
 

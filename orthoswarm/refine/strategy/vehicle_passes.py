@@ -95,12 +95,14 @@ class RefinerOptions:
         fov_start_rad: field of view to start from where the tags hint at none.
         dem: given height model, None to find the ground. read: reads a frame's grey picture; picklable.
         kept: where tracks are kept for a refinement of the same pictures, None if they are not.
+        device: where networks run.
     """
 
     fov_start_rad: float = field(default_factory=lambda: float(np.radians(START_FOV_DEG)))
     dem: HeightModel | None = None
     read: ReadGray = field(default_factory=lambda: read_frame)
     kept: KeptTracks | None = None
+    device: str = "auto"
 
     def ground(self, origin: Array) -> GroundModel:
         """The ground before any picture is used, in the local frame: level, or the given height model."""
@@ -214,7 +216,7 @@ def register_on_map(state: VehicleState, area: WorkArea, *, learned: bool = True
     if basemap is not None and not is_coarse(flight, basemap):
         state.unfound = not _onto_map(state, coarse_fits(flight, basemap, origin), basemap, origin, watch)
         if state.unfound and learned:
-            _onto_map_by_learning(state, learned_fit(flight, basemap, origin), basemap, origin, watch)
+            _onto_map_by_learning(state, learned_fit(flight, basemap, origin, area.device), basemap, origin, watch)
     flight.pictures.drop()
     watch.add_to(state.timings)
 
@@ -332,7 +334,7 @@ def learned_registration(state: VehicleState, area: WorkArea) -> CoarseFit | Non
     PyTorch and the network take 400 MB of a process's memory: one process serves all flights, one after the other.
     """
     watch = Stopwatch()
-    fit = None if area.basemap is None else learned_fit(state.flight, area.basemap, area.origin)
+    fit = None if area.basemap is None else learned_fit(state.flight, area.basemap, area.origin, area.device)
     state.flight.pictures.drop()
     watch.lap("coarse registration")
     watch.add_to(state.timings)

@@ -6,13 +6,13 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gcs_plugin.cli.configuration import add_config, read_config
+from gcs_plugin.cli.configuration import add_config
 from orthoswarm.stores.addresses import address_of, path_of
 
 if TYPE_CHECKING:
     from orthoswarm.batch.pipeline import MapOptions
     from orthoswarm.compute.workers import Workers
-    from orthoswarm.config import Overrides
+    from orthoswarm.config import Config
     from orthoswarm.model.frame import Ingest
 
 _REASONS = 5  # printed; all are in the report
@@ -117,7 +117,6 @@ def run(args: argparse.Namespace) -> int:
     from gcs_plugin.cli.progress import ProgressBars
     from orthoswarm.batch import pipeline
     from orthoswarm.batch.workspace import VIDEO, missing, unmake
-    from orthoswarm.config import override
     from orthoswarm.matchers.network_device import require_device
     from orthoswarm.model.errors import InputError
     from orthoswarm.stores.addresses import is_stored
@@ -128,8 +127,7 @@ def run(args: argparse.Namespace) -> int:
     _check(args)
     options = _options(args)
 
-    override(options.config)  # before workers are started, which have their own values
-    require_device()
+    require_device(options.config.matchers.device)
 
     def load(progress: pipeline.Progress) -> "Ingest":
         reading = telemetry.LoadOptions(
@@ -194,16 +192,18 @@ def _options(args: argparse.Namespace) -> "MapOptions":
         pixel_scale=args.pixel_scale,
         covariance=args.covariance,
         tiles=args.tiles,
-        config=_overrides(args),
+        config=_config(args),
     )
 
 
-def _overrides(args: argparse.Namespace) -> "Overrides":
-    """What differs from the defaults: the file of --config, and flags over it."""
-    values = read_config(args.config)
-    if args.device is None:
-        return values
-    return {**values, "matchers": {**values.get("matchers", {}), "device": args.device}}
+def _config(args: argparse.Namespace) -> "Config":
+    """The settings: those of the file of --config, and flags over them."""
+    from dataclasses import replace
+
+    from orthoswarm.config import read_config
+
+    config = read_config(args.config)
+    return config if args.device is None else replace(config, matchers=replace(config.matchers, device=args.device))
 
 
 def _pools(args: argparse.Namespace, out: Path) -> "tuple[Workers, Workers | None]":

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gcs_plugin.cli.configuration import add_config, use_config
+from gcs_plugin.cli.configuration import add_config
 from orthoswarm.model.errors import InputError
 
 if TYPE_CHECKING:
@@ -95,12 +95,11 @@ def run(args: argparse.Namespace) -> int:
     from gcs_plugin.plans.plan_files import check_folder, write_plan
     from gcs_plugin.plans.plan_request import make_plan
 
-    changed = use_config(args.config)
     check_folder(args.out)
     request = _request(args)
     plan, area = make_plan(request, _say)
     _say("files")
-    figures = write_plan(args.out, plan, area, request, settings=changed)
+    figures = write_plan(args.out, plan, area, request)
     _say("")
     if args.json:
         print(json.dumps(figures))
@@ -114,6 +113,7 @@ def run(args: argparse.Namespace) -> int:
 def _request(args: argparse.Namespace) -> "PlanRequest":
     """The plan request of the arguments."""
     from gcs_plugin.plans.plan_request import PlanRequest
+    from orthoswarm.config import read_config
 
     if (args.area is None) == (args.gaps is None):
         raise InputError("give either an AREA or --gaps GAPS.geojson")
@@ -150,6 +150,7 @@ def _request(args: argparse.Namespace) -> "PlanRequest":
         height_step_m=args.height_step,
         ceiling_m=args.ceiling,
         follow=args.follow,
+        config=read_config(args.config),
     )
 
 
