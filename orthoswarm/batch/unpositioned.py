@@ -11,6 +11,7 @@ from orthoswarm.config import active
 from orthoswarm.evaluation.checkpoints import read_checkpoints
 from orthoswarm.model.frame import Frame, Ingest
 from orthoswarm.raster.picture_file import read_gray, reduction
+from orthoswarm.refine.flight.record_findings import NAMED_MOST
 from orthoswarm.refine.strategy.unpositioned_photos import place_unpositioned
 
 
@@ -24,17 +25,19 @@ def with_control_positions(run: RunContext, ingest: Ingest) -> Ingest:
     assert options.control is not None
     points = read_checkpoints(options.control, options.pixel_scale)
     tasks = run.workers.map
-    placed = place_unpositioned(
+    placed, left = place_unpositioned(
         ingest.unpositioned, ingest.frames, points, read_gray=_reduced, run=tasks, progress=run.progress
     )
     names = {frame.image for frame in placed}
-    left = len(ingest.unpositioned) - len(placed)
     said = [f"{len(placed)} photos without a position were placed by control points"] if placed else []
-    if left:
-        said.append(
-            f"{left} photos without a position could not be placed: two control points must be seen in them or in "
-            "photos that overlap with them"
-        )
+    said += [
+        f"{len(block)} photos without a position ({_first_of(block)}) lie right to each other, but nothing tells "
+        "where on the ground: two control points, some way apart, must be seen in them; they are left out"
+        for block in left
+    ]
+    alone = len(ingest.unpositioned) - len(placed) - sum(map(len, left))
+    if alone:
+        said.append(f"{alone} photos without a position show nothing that other photos show, and are left out")
     return replace(
         ingest,
         frames=_in_order([*ingest.frames, *placed], ingest),
@@ -42,6 +45,11 @@ def with_control_positions(run: RunContext, ingest: Ingest) -> Ingest:
         warnings=[*ingest.warnings, *said],
         unpositioned=[f for f in ingest.unpositioned if f.image not in names],
     )
+
+
+def _first_of(images: list[str]) -> str:
+    more = f" and {len(images) - NAMED_MOST} more" if len(images) > NAMED_MOST else ""
+    return ", ".join(images[:NAMED_MOST]) + more
 
 
 def _reduced(frame: Frame) -> NDArray[np.uint8]:

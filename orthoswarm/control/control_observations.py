@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from orthoswarm.config import active
 from orthoswarm.evaluation.checkpoints import RECEIVERS_LOCAL_SIGMA_M, Checkpoint
-from orthoswarm.evaluation.photo_names import photo_named
+from orthoswarm.evaluation.photo_names import photo_named, photos_named
 from orthoswarm.evaluation.point_rays import Ray, RayPoint, intersect_rays
 from orthoswarm.model.errors import InputError
+from orthoswarm.model.frame import Ingest
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import PlacedFrame, Terrain
 
@@ -71,6 +72,16 @@ def check_control(
             )
 
 
+def absent_marks(points: Iterable[Checkpoint], ingest: Ingest) -> list[str]:
+    """A warning about points that are marked in photos which are not there, if there are any."""
+    known = {f.image for f in ingest.frames} | {r.image for r in ingest.rejected}
+    absent = [(p.name, m.image) for p in points for m in p.marks if not photos_named(known, m.image)]
+    if not absent:
+        return []
+    name, image = absent[0]
+    return [f"marks of control points in photos that are not here: {len(absent)}, the first of {name} in {image}"]
+
+
 def in_photos(
     points: Sequence[Checkpoint], placed: Sequence[PlacedFrame], terrain: Terrain, grid: LocalGrid, on_map: bool
 ) -> list[ControlObservation]:
@@ -94,7 +105,8 @@ def in_photos(
         gsd = float(np.median([(p.camera.position[2] - level) / p.camera.lens.focal_px for p, _ in photos]))
         pointing = config.pointing_sigma_px * gsd / np.sqrt(len(photos))
         bent = float(np.median([p.sigma_m for p, _ in photos])) if on_map else RECEIVERS_LOCAL_SIGMA_M
-        sigma = float(np.linalg.norm([_survey_sigma(point), pointing, bent, met.contradiction]))
+        parts = [_survey_sigma(point), pointing, bent, met.contradiction, _leaning_m(rays)]
+        sigma = float(np.linalg.norm(parts))
         surveyed, stated = _in_grid(point.surveyed, grid), point.sigma_m > 0.0
         out.append(ControlObservation(point.name, met.place, surveyed, sigma, stated, rays=met))
     return out
@@ -127,6 +139,14 @@ def _photos(point: Checkpoint, images: dict[str, PlacedFrame]) -> list[tuple[Pla
         mark.check_inside(frame.width, frame.height)
         out.append((images[name], np.array([mark.column, mark.row])))
     return out
+
+
+def _leaning_m(rays: Sequence[Ray]) -> float:
+    """Sigma of a point of one photo by the height that nothing else tells, metres; 0 where rays meet."""
+    if len(rays) > 1:
+        return 0.0
+    east, north, up = rays[0].direction
+    return _HEIGHT_SIGMA_M * float(np.hypot(east, north) / max(abs(up), 1e-3))
 
 
 def _ray(placed: PlacedFrame, pixel: Array, camera_sigma_m: float) -> Ray:

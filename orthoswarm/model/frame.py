@@ -70,6 +70,11 @@ class Frame:
     damaged: bool = False
     ambiguous: bool = False
 
+    @property
+    def has_own_position(self) -> bool:
+        """Whether a receiver says its position, and not control points."""
+        return self.origin.get("position") != SURVEYED
+
     def __deepcopy__(self, memo: dict[int, object]) -> "Frame":
         """Itself: nobody changes a frame."""
         return self

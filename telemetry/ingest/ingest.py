@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Final
 
 from orthoswarm.model.earth import distance_m
-from orthoswarm.model.errors import InputError
 from orthoswarm.model.frame import Ingest, Rejection
 from orthoswarm.model.task_runner import Progress
 from orthoswarm.stores.local_copies import local_file
@@ -37,7 +36,7 @@ from telemetry.samples.findings import Finding, metres, plural
 from telemetry.samples.unreadable import Unreadable, read_or_reason
 from telemetry.samples.wild_fixes import doubtful_finding, wild_fixes
 
-__all__ = ["LoadOptions", "SourceInfo", "Survey", "load", "require_frames", "survey"]
+__all__ = ["LoadOptions", "SourceInfo", "Survey", "load", "survey"]
 
 _BANDS = ("", "green", "red", "blue", "nir", "red edge", "rededge")
 """Spectral bands by how well they show the ground; "" is a colour picture."""
@@ -378,18 +377,3 @@ def _merge_tables(
             photo.origin["angles"] = kind
             photo.yaw_is_stated |= angles[0] is not None
     return vehicle
-
-
-def require_frames(ingest: Ingest) -> None:
-    """Raise an error with the reason if there is nothing to map.
-
-    Raises:
-        InputError: no frame came out of the inputs.
-    """
-    if ingest.frames:
-        return
-    if not ingest.rejected:
-        raise InputError("no picture was found in the input; name a folder of photos or a video")
-    reasons = Counter(rejection.reason for rejection in ingest.rejected)
-    reason, count = reasons.most_common(1)[0]
-    raise InputError(f"none of the {plural(len(ingest.rejected), 'picture')} can be used; {count} because {reason}")

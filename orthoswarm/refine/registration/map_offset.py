@@ -14,7 +14,7 @@ import numpy as np
 
 from orthoswarm.config import active
 from orthoswarm.model.arrays import Array
-from orthoswarm.model.frame import SURVEYED, Frame
+from orthoswarm.model.frame import Frame
 from orthoswarm.model.placement import PlacedFrame
 from orthoswarm.refine.bundle.covariance import RECEIVER_COMMON_SIGMA_M
 
@@ -128,11 +128,7 @@ def measure_control_offset(
 def _measured(recorded: Sequence[PlacedFrame], refined: Sequence[PlacedFrame], found_m: float) -> MapOffset | None:
     """Frames against their records; `found_m`: how well the place of the frames itself is known, metres."""
     config = active().registration
-    before = {
-        (p.frame.vehicle, p.frame.image): p.camera.nadir
-        for p in recorded
-        if p.frame.origin.get("position") != SURVEYED  # which is no receiver's
-    }
+    before = {(p.frame.vehicle, p.frame.image): p.camera.nadir for p in recorded if p.frame.has_own_position}
     moved: dict[str, list[Array]] = {}
     stated: dict[str, list[float]] = {}
     for p in refined:

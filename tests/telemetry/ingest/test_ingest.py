@@ -8,8 +8,9 @@ import pytest
 
 import telemetry
 from orthoswarm.model.errors import InputError
+from orthoswarm.mosaic.recorded_pose import nothing_to_map
 from telemetry.ingest import copied_photos
-from telemetry.ingest.ingest import LoadOptions, load, require_frames, survey
+from telemetry.ingest.ingest import LoadOptions, load, survey
 from tests.telemetry.ingest.test_photos import gps_exif, jpeg
 
 
@@ -110,7 +111,7 @@ def test_a_missing_input_and_no_input_are_errors(tmp_path):
     with pytest.raises(InputError):
         load([])
     with pytest.raises(InputError, match="no picture"):
-        require_frames(load([tmp_path]))
+        raise nothing_to_map(load([tmp_path]))
 
 
 @pytest.mark.parametrize("again", ["itself", "link"])
