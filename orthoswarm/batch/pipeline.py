@@ -24,7 +24,7 @@ from orthoswarm.batch.run_state import (
     is_written,
 )
 from orthoswarm.batch.split_legs import legs_as_vehicles
-from orthoswarm.batch.unpositioned import with_control_positions
+from orthoswarm.batch.unpositioned import with_found_positions
 from orthoswarm.batch.workspace import Workspace, run_key
 from orthoswarm.compute.stage_times import Clock
 from orthoswarm.compute.workers import Workers, usage_of
@@ -147,8 +147,9 @@ def _load(run: RunContext, load: Load) -> RunState:
     except OSError as error:  # pictures of videos are written
         raise disk_error(error, run.out) from None
     ingest = in_one_area(ingest)
-    if run.options.control is not None and ingest.unpositioned:
-        ingest = with_control_positions(run, ingest)
+    beside = bool(ingest.frames) and run.options.until != "realtime"  # photos that may tell where others were taken
+    if ingest.unpositioned and (beside or run.options.control is not None):
+        ingest = with_found_positions(run, ingest)
     if not ingest.frames:
         raise nothing_to_map(ingest)
     grid = area_grid(ingest.frames)

@@ -6,6 +6,8 @@ from pathlib import Path
 
 SURVEYED = "surveyed points"
 """Source (`Frame.origin`) of positions that control points gave."""
+BY_OTHERS = "photos beside it"
+"""Source of positions that other photos of the same ground gave."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,8 +74,8 @@ class Frame:
 
     @property
     def has_own_position(self) -> bool:
-        """Whether a receiver says its position, and not control points."""
-        return self.origin.get("position") != SURVEYED
+        """Whether a receiver says its position, and not control points or other photos."""
+        return self.origin.get("position") not in (SURVEYED, BY_OTHERS)
 
     def __deepcopy__(self, memo: dict[int, object]) -> "Frame":
         """Itself: nobody changes a frame."""

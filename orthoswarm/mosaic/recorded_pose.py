@@ -217,6 +217,6 @@ def nothing_to_map(ingest: Ingest) -> OrthoSwarmError:
         return InputError("no picture was found in the input; name a folder of photos or a video")
     reason, count = Counter(r.reason for r in ingest.rejected).most_common(1)[0]
     said = f"none of the {len(ingest.rejected)} pictures can be used; {count} of them: {reason}"
-    if not any(r.lacks_position for r in ingest.rejected):
+    if not ingest.unpositioned:
         return InputError(said)
     return OrthoSwarmError(f"{said}, or mark at least two surveyed points in them (--control)")

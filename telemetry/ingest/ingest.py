@@ -33,6 +33,7 @@ from telemetry.photos.maker_angles import Angles
 from telemetry.photos.photo_frames import frame_without_position, frames_of, settle_positions
 from telemetry.photos.photo_tags import SENSORS, Photo, read_photos
 from telemetry.samples.findings import Finding, metres, plural
+from telemetry.samples.held_fixes import LOST_SIGMA_M, held_fixes, is_one_fix, matters, stated_sigma_m
 from telemetry.samples.unreadable import Unreadable, read_or_reason
 from telemetry.samples.wild_fixes import doubtful_finding, wild_fixes
 
@@ -42,6 +43,11 @@ _BANDS = ("", "green", "red", "blue", "nir", "red edge", "rededge")
 """Spectral bands by how well they show the ground; "" is a colour picture."""
 
 _CONTRADICTION_M: Final = 500.0  # table that puts a photo so far from its tags, or from another table, contradicts them
+
+
+_NOT_MEASURED: Final = (
+    "the picture has no position: its receiver stood still; put a geo.txt next to it, or give its log as well"
+)
 
 
 def load(inputs: Sequence[Path], *, progress: Progress | None = None, options: LoadOptions | None = None) -> Ingest:
@@ -315,6 +321,7 @@ def _where_it_can_be(
     """
     if clock_went_back(photos) or any(SHIFTED in p.origin.get("time", "") for p in photos):
         return list(photos)
+    photos = _measured(photos, vehicle, found, source, result)
     wild = wild_fixes([p.time_s for p in photos], [(p.lat_deg or 0.0, p.lon_deg or 0.0) for p in photos])
     if wild.doubtful:
         source.findings.append(replace(doubtful_finding(wild.doubtful, plural(len(photos), "photo")), vehicle=vehicle))
@@ -333,6 +340,31 @@ def _where_it_can_be(
     for i in wild.indices:
         _leave_out(photos[i], vehicle, found.name(photos[i].path), reason, result)
     return [photo for i, photo in enumerate(photos) if i not in set(wild.indices)]
+
+
+def _measured(
+    photos: Sequence[Photo], vehicle: str, found: Discovery, source: SourceInfo, result: Survey
+) -> list[Photo]:
+    """Photos whose receiver measured; others lie between those before and after, or are left out without a position."""
+    places = [(p.lat_deg or 0.0, p.lon_deg or 0.0) for p in photos]
+    held = held_fixes([p.time_s for p in photos], places)
+    lost = set(range(len(photos))) if is_one_fix(places) else set()
+    if lost:
+        text = f"all {len(photos)} photos tell one place to the last digit: the receiver stood still, it is not used"
+        source.findings.append(Finding("position-held", text, vehicle))
+    for i, lat, lon, sigma in zip(held.index, held.lat_deg.tolist(), held.lon_deg.tolist(), held.sigma_m.tolist()):
+        if sigma > LOST_SIGMA_M:
+            lost.add(i)
+            continue
+        photos[i].lat_deg, photos[i].lon_deg = lat, lon
+        photos[i].position_sigma_m = stated_sigma_m(photos[i].position_sigma_m, sigma)
+        photos[i].origin["position"] = "between the photos before and after, as the receiver stood still"
+    if matters(held):
+        whose = f"{plural(len(photos), 'photo')} ({found.name(photos[held.index[0]].path)} first)"
+        source.findings.append(replace(held.finding(whose), vehicle=vehicle))
+    for i in sorted(lost):
+        _leave_out(photos[i], vehicle, found.name(photos[i].path), _NOT_MEASURED, result)
+    return [photo for i, photo in enumerate(photos) if i not in lost]
 
 
 def _merge_tables(

@@ -147,3 +147,24 @@ def test_a_kites_photos_are_a_map_and_no_heap(real_data, tmp_path):
     assert report["control"]["points"] == 2 and report["control"]["residual_rms_m"] < 1.0
     assert any("img_3015.jpg" in w and "not here" in w for w in report["warnings"])
     assert not any("one spot" in w or "receivers say" in w for w in report["warnings"])
+
+
+@pytest.mark.slow
+def test_photos_of_a_receiver_that_froze_are_placed_by_the_photos_beside_them(tmp_path):
+    scene = Scene()
+    shots = legs(count=2, photos=8)
+    frozen = shots[10]
+    told = [
+        replace(s, recorded=tuple(np.add((frozen.east, frozen.north), frozen.recorded) - (s.east, s.north)))
+        if k > 10
+        else s
+        for k, s in enumerate(shots)
+    ]
+    scene.fly(tmp_path / "photos", told)
+    out = tmp_path / "out"
+    assert mosaic(tmp_path, "photos", out) == 0
+    rows = {r["image"]: r for r in map(json.loads, (out / "frames.jsonl").read_text().splitlines())}
+    assert all(rows[f"DJI_{k:04d}.JPG"]["stage"] != "rejected" for k in range(16))
+    assert max(scene.error_m(rows[f"DJI_{k:04d}.JPG"], shots[k]) for k in range(11, 16)) < 3.0
+    report = json.loads((out / "report.json").read_text())
+    assert any("were placed by the photos beside them" in w for w in report["warnings"])

@@ -15,8 +15,8 @@ from orthoswarm.config import active
 from orthoswarm.evaluation.checkpoints import Checkpoint
 from orthoswarm.evaluation.photo_names import photo_named
 from orthoswarm.model.arrays import Array, Ints
-from orthoswarm.model.camera import angles_from_rotation, fov_rad
-from orthoswarm.model.frame import SURVEYED, Frame
+from orthoswarm.model.camera import angles_from_rotation
+from orthoswarm.model.frame import BY_OTHERS, SURVEYED, Frame
 from orthoswarm.model.geo import LocalGrid, area_epsg
 from orthoswarm.model.task_runner import Progress, Run
 from orthoswarm.refine.features.working_pictures import ReadGray
@@ -77,7 +77,10 @@ def place_unpositioned(
     anchors = replace(anchors, pixel=level_pixels(anchors.pixel, anchors.photo, records, shape))
     network = solve_free_network(graph, len(frames), records.width, anchors)
     left = [[frames[k].image for k in part] for part in network.left]
-    return PlacedPhotos(_placed(photos, network, records, shape, grid=grid, origin=origin), left)
+    found = _placed(photos, network, records, shape, grid=grid, origin=origin)
+    source = SURVEYED if points else BY_OTHERS
+    told = {"position": source, "height": source, "angles": source}
+    return PlacedPhotos([replace(frame, origin={**frame.origin, **told}) for frame in found], left)
 
 
 def _each_its_own_tilt(records: PhotoRecords, without: int) -> PhotoRecords:
@@ -165,10 +168,11 @@ def _placed(
     grid: LocalGrid,
     origin: Array,
 ) -> list[Frame]:
-    """The placed photos with a fix from the network (position, height above the ground, angles) and its lens."""
+    """The placed photos with a fix from the network: position, angles, and the height where a tag tells the lens."""
     out = []
     yaw, pitch, roll = angles_from_rotation(rotation_of(-np.angle(network.scale), shape.level))
-    focal = np.exp(shape.log_focal[records.lens])
+    # Scales give the height over the focal length: without a tag neither is known.
+    focal = np.where(np.isfinite(records.fov_hint), np.exp(shape.log_focal), np.nan)[records.lens]
     for k, frame in enumerate(photos):
         if not network.placed[k]:
             continue
@@ -179,12 +183,11 @@ def _placed(
             frame.fix,
             lat_deg=lat,
             lon_deg=lon,
-            height_m=float(abs(network.scale[k]) * focal[k]),
+            height_m=float(abs(network.scale[k]) * focal[k]) if np.isfinite(focal[k]) else None,
             yaw_rad=float(yaw[k] + grid.convergence_rad(lat, lon)),
             pitch_rad=float(pitch[k]),
             roll_rad=float(roll[k]),
             position_sigma_m=float(np.hypot(network.sigma_m[k], leaning)),
         )
-        origin_of = {**frame.origin, "position": SURVEYED, "height": SURVEYED, "angles": SURVEYED}
-        out.append(replace(frame, fix=fix, origin=origin_of, fov_hint_rad=fov_rad(float(focal[k]), frame.width)))
+        out.append(replace(frame, fix=fix))
     return out
