@@ -25,6 +25,7 @@ from orthoswarm.config import active
 from orthoswarm.evaluation.independent_points import Surveyed, control_of_report, shared_points
 from orthoswarm.evaluation.photo_names import photo_named
 from orthoswarm.evaluation.point_rays import Ray, RayPoint, intersect_rays
+from orthoswarm.evaluation.system_names import proposed_code
 from orthoswarm.model.camera import Lens, focal_px
 from orthoswarm.model.earth import distance_m
 from orthoswarm.model.errors import InputError
@@ -351,9 +352,9 @@ def _transformer(system: str, name: str) -> Any:
     try:
         return pyproj.Transformer.from_crs(projection_of(system) or system, _GRID, always_xy=True)
     except pyproj.exceptions.CRSError:
-        raise InputError(
-            f"{name}: '{system[:60]}' is not a coordinate system; write EPSG:32617 or a PROJ string"
-        ) from None
+        proposed = proposed_code(system)
+        wanted = f"if it is {proposed}, write that code" if proposed else "write EPSG:32617 or a PROJ string"
+        raise InputError(f"{name}: '{system[:60]}' is not a coordinate system; {wanted}") from None
 
 
 def _placed(grid: LocalGrid, lon_lat: Array) -> Array:

@@ -31,7 +31,7 @@ from telemetry.ingest.video_ingest import read_videos
 from telemetry.photos.flight_checks import flight_findings, times_without_zone
 from telemetry.photos.maker_angles import Angles
 from telemetry.photos.photo_frames import frame_without_position, frames_of, settle_positions
-from telemetry.photos.photo_tags import SENSORS, Photo, read_photos
+from telemetry.photos.photo_tags import SENSORS, Photo, read_photos, with_sidecar
 from telemetry.samples.findings import Finding, metres, plural
 from telemetry.samples.held_fixes import LOST_SIGMA_M, held_fixes, is_one_fix, matters, stated_sigma_m
 from telemetry.samples.unreadable import Unreadable, read_or_reason
@@ -103,11 +103,30 @@ def survey(inputs: Sequence[Path], *, progress: Progress | None = None, options:
                 _photo_folder(folder, own, found, tables=tables, logs=logs, result=result, options=options)
             if folder.videos or folder.subtitles:
                 read_videos(folder, found, logs, options=options, progress=progress, result=result)
-    result.findings += _logs_apart(found, logs)
+    result.findings += [*_logs_apart(found, logs), *_unread(found, needed=bool(result.unpositioned))]
     if not result.sources and not result.rejected:
         result.findings.append(Finding("nothing", "no picture was found in the inputs"))
     result.findings += times_without_zone(frame for source in result.sources for frame in source.frames)
     return result
+
+
+def _unread(found: Discovery, *, needed: bool) -> list[Finding]:
+    """What is said about files beside pictures that may hold their positions; needed: some pictures have none."""
+    files: dict[str, list[Path]] = {}
+    for folder in found.folders:
+        for path in folder.unread:
+            files.setdefault(path.suffix.lower(), []).append(path)
+    if not files or not any(folder.pictures or folder.videos for folder in found.folders):
+        return []
+    named = [
+        found.name(paths[0]) + (f" and {len(paths) - 1} more {suffix}" if paths[1:] else "")
+        for suffix, paths in sorted(files.items())
+    ]
+    text = (
+        f"not read, though it may hold positions: {', '.join(named)}; convert a track to GPX or NMEA, positions of "
+        "photos to a geo.txt or CSV"
+    )
+    return [Finding("side-file-unread", text, note=not needed)]
 
 
 def _logs_apart(found: Discovery, logs: Sequence[LogSource]) -> list[Finding]:
@@ -236,6 +255,8 @@ def _photo_folder(
         if isinstance(photo, Unreadable):
             result.rejected.append(Rejection(name, str(photo), folder.vehicle))
             continue
+        if path in folder.sidecars:
+            photo = _with_sidecar(photo, folder.sidecars[path], found, source)
         vehicle = _merge_tables(photo, path, tables, moved_m) or folder.vehicle
         groups.setdefault(vehicle, []).append(photo)
     if moved_m:
@@ -259,6 +280,15 @@ def _photo_folder(
     source.counts["frames"] = len(source.frames)
     if seen:
         result.sources.append(source)
+
+
+def _with_sidecar(photo: Photo, sidecar: Path, found: Discovery, source: SourceInfo) -> Photo:
+    """A photo with the tags of an XMP file beside it; as it is, with a finding, if that cannot be read."""
+    try:
+        return with_sidecar(photo.path, local_file(sidecar))
+    except (OSError, Unreadable) as error:
+        source.findings.append(Finding("unreadable", f"{found.name(sidecar)} is not used: {error}"))
+        return photo
 
 
 def _one_kind(photos: Sequence[Photo], vehicle: str, camera: str, found: Discovery, result: Survey) -> list[Photo]:

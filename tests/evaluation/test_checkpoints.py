@@ -199,3 +199,17 @@ def test_a_mark_that_the_others_contradict_is_left_out_and_told(tmp_path, capsys
     assert "contradict each other" in result.findings[0] and result.miss_m[0] > 1.0
     assert main(["evaluate", str(out), "--checkpoints", str(table)]) == 0
     assert "contradict each other" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name,code", [("PUWG1992", "EPSG:2180"), ("Lambert93", "EPSG:2154"), ("NZTM", "EPSG:2193")])
+def test_the_code_of_a_system_that_is_called_otherwise_is_proposed(tmp_path, name, code):
+    (tmp_path / "gcp_list.txt").write_text(f"{name}\n634676 485344 112 242.0 256.9 a.jpg\n")
+    with pytest.raises(InputError, match=f"if it is {code} .*, write that code"):
+        read_checkpoints(tmp_path / "gcp_list.txt")
+
+
+def test_of_a_name_that_fits_several_systems_or_none_nothing_is_proposed(tmp_path):
+    for name in ("Poland", "xyzzy"):
+        (tmp_path / "gcp_list.txt").write_text(f"{name}\n634676 485344 112 242.0 256.9 a.jpg\n")
+        with pytest.raises(InputError, match="write EPSG:32617 or a PROJ string"):
+            read_checkpoints(tmp_path / "gcp_list.txt")
