@@ -60,9 +60,9 @@ def _left_out(count: int, blocks: list[list[str]]) -> list[str]:
 
 
 def _beside(ingest: Ingest) -> tuple[list[Frame], list[Frame]]:
-    """Photos without a position of flights that have some, and the photos with a position next to them in time."""
-    flights = {frame.vehicle for frame in ingest.frames}
-    photos = [frame for frame in ingest.unpositioned if frame.vehicle in flights]
+    """Photos without a position, of a size that their flight's others have, and those with one next to them in time."""
+    flights = {(frame.vehicle, frame.width, frame.height) for frame in ingest.frames}
+    photos = [f for f in ingest.unpositioned if (f.vehicle, f.width, f.height) in flights]
     lost = {frame.image for frame in photos}
     near: dict[str, Frame] = {}
     for vehicle in {frame.vehicle for frame in photos}:

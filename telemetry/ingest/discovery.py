@@ -29,6 +29,7 @@ UNREAD_SUFFIXES = frozenset(
 _UNREAD_PICTURES = frozenset({".heic", ".heif", ".avif"})
 _TABLES = frozenset({".txt", ".csv"})
 _SUBTITLES = frozenset({".srt"})
+_COPY = "a copy of another photo in its folder"
 _ALREADY = "which is in the input already"
 _OTHER_NAME = f"the same file as one of another name, {_ALREADY}"
 
@@ -164,14 +165,19 @@ def discover(inputs: Sequence[Path], exclude: Sequence[Path] = ()) -> Discovery:
         folder.pictures.sort(key=lambda path: natural_key(path.name))
     ordered = [folders[path] for path in sorted(folders, key=lambda p: natural_key(str(p)))]
     copies = copies_among([path for folder in ordered for path in folder.pictures])
+    for folder in ordered if copies.within else ():
+        folder.pictures = [path for path in folder.pictures if path not in copies.within]
     _name_vehicles(ordered, root)
     pictures = [(file, *why) for file, why in left_out.items() if file.suffix.lower() in PICTURE_SUFFIXES]
     left = [entry for entry in pictures if entry[0] not in sorted_in]
+    left += [(copy, _COPY, first.name) for copy, first in copies.within.items()]
     if unreadable and not ordered and not left:
         path, why = next(iter(unreadable.items()))
         raise InputError(f"no picture was found, and the folder {path} cannot be read ({why}); check its permissions")
     apart = _far_from_pictures(tops, ordered)
-    return Discovery(root, ordered, left, _video_vehicles(ordered, root), apart, unreadable=unreadable, copies=copies)
+    return Discovery(
+        root, ordered, left, _video_vehicles(ordered, root), apart, unreadable=unreadable, copies=copies.elsewhere
+    )
 
 
 def _twice(folder: Path, root: Path) -> str:

@@ -26,6 +26,7 @@ from telemetry.ingest.log_choice import LogSource
 from telemetry.ingest.log_ingest import add_logs, read_logs
 from telemetry.ingest.photo_order import SHIFTED, clock_went_back, in_order
 from telemetry.ingest.side_files import read_control_points
+from telemetry.ingest.strangers import strangers
 from telemetry.ingest.survey import LoadOptions, SourceInfo, Survey
 from telemetry.ingest.video_ingest import read_videos
 from telemetry.photos.flight_checks import flight_findings, times_without_zone
@@ -270,6 +271,7 @@ def _photo_folder(
         photos.sort(key=lambda p: math.inf if p.time_s is None else p.time_s)
         add_logs(photos, folder.path, vehicle, logs=logs, findings=source.findings, workers=options.workers)
         photos = _one_kind(photos, vehicle, options.camera, found, result)
+        photos = _of_the_flight(photos, vehicle, found, result)
         photos = _with_position(photos, vehicle, found, result)
         photos = in_order(photos, vehicle, source.findings)
         source.findings += settle_positions(photos, vehicle, found.name)
@@ -319,6 +321,16 @@ def _one_kind(photos: Sequence[Photo], vehicle: str, camera: str, found: Discove
     left = [photo for photo in photos if photo.path in reasons]
     result.rejected += [Rejection(found.name(p.path), reasons[p.path], vehicle, p.time_s) for p in left]
     return [photo for photo in photos if photo.path not in reasons]
+
+
+def _of_the_flight(photos: Sequence[Photo], vehicle: str, found: Discovery, result: Survey) -> list[Photo]:
+    """Photos without strangers, which are rejected."""
+    odd = strangers(photos)
+    result.rejected += [
+        Rejection(found.name(photos[i].path), why, vehicle, photos[i].time_s, detail=detail)
+        for i, (why, detail) in odd.items()
+    ]
+    return [photo for i, photo in enumerate(photos) if i not in odd]
 
 
 def _with_position(photos: Sequence[Photo], vehicle: str, found: Discovery, result: Survey) -> list[Photo]:

@@ -35,6 +35,7 @@ _ONE_FIX_LEAST: Final = 5  # fewer photos may be taken while a receiver with a f
 _FORETOLD_LONGEST_S: Final = 30.0  # receivers foretell for so long
 _TURN_M_S2: Final = 3.0  # acceleration in turns of small drones: a way bends away from its chord by it
 _ASTRAY_SHARE: Final = 0.6  # sigma of a way that nobody saw, to the next measured fix: a right angle is 1.5 of it off
+_FASTEST_M_S: Final = 100.0  # steps of times that were rounded to one second
 _AROUND: Final = 3  # steps before and after by which the speed around a fix is told
 
 
@@ -164,14 +165,13 @@ def _mark_foretold(times: Array, ground: Array, speed: Array, news_m: float) -> 
     pace = _over(way, lasted)
     around = _around(pace)
     coarse_s = 1.0 if np.all(times == np.round(times)) else 0.0  # times in whole seconds
-    off = (
-        step[1:]
-        - step[:-1] * np.divide(lasted[1:], lasted[:-1], out=np.ones(len(t) - 2), where=lasted[:-1] > 0.0)[:, None]
-    )
+    longer = np.divide(lasted[1:], lasted[:-1], out=np.ones(len(t) - 2), where=lasted[:-1] > 0.0)
+    off = step[1:] - step[:-1] * longer[:, None]
     ahead = step[1:] / np.maximum(way[1:], 1e-9)[:, None]
     across, along = np.abs(ahead[:, 0] * off[:, 1] - ahead[:, 1] * off[:, 0]), np.abs((ahead * off).sum(axis=1))
     exact_m = _FORETOLD_SHARE * float(np.median(across))
-    foretold = (across <= exact_m) & (along <= exact_m + coarse_s * pace[1:]) & (way[1:] > 0.0) & (exact_m > 0.0)
+    rounded_m = exact_m + coarse_s * np.minimum(pace[1:], _FASTEST_M_S)
+    foretold = (across <= exact_m) & (along <= rounded_m) & (way[1:] > 0.0) & (exact_m > 0.0)
     for k in np.flatnonzero((pace > _FASTER * around) & (way > news_m) & (around > 0.0)).tolist():
         j = k
         while j >= 2 and foretold[j - 2] and t[k] - t[j] < _FORETOLD_LONGEST_S:

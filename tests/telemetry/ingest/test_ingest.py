@@ -151,7 +151,7 @@ def test_photos_of_one_size_are_read_beyond_their_beginnings_only_if_these_are_a
         for i in range(8):  # the first four begin alike
             path = photo(tmp_path / folder / f"{i}.JPG", second=i + 10 * (folder == "v2" and i >= 4))
             path.write_bytes(path.read_bytes() + bytes(300_000) + folder.encode())
-    assert not copied_photos.copies_among(sorted(tmp_path.rglob("*.JPG")))
+    assert copied_photos.copies_among(sorted(tmp_path.rglob("*.JPG"))) == ({}, {})
     assert sorted(set(asked)) == [0, copied_photos._SAMPLES] and asked.count(copied_photos._SAMPLES) == 8
 
 
