@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from orthoswarm.config import active
 from orthoswarm.model.earth import DEGREE_M, MEAN_RADIUS_M, distance_m
+from orthoswarm.model.frame import Frame
 from telemetry.samples.course import local_metres
 from telemetry.samples.findings import Finding, metres, plural
 from telemetry.samples.sample import Sample
@@ -238,6 +239,17 @@ def without_held_fixes(
         else:
             sound[placed[n]] = replace(own, lat_deg=lat, lon_deg=lon, sigma_m=stated_sigma_m(own.sigma_m, sigma))
     return sound, [held.finding(source)] if matters(held) else []
+
+
+def measured_frames(frames: Sequence[Frame]) -> list[Frame]:
+    """One flight's frames, those with held fixes between measured ones, with the sigma of that however large it is."""
+    held = held_fixes([f.time_s for f in frames], [(f.fix.lat_deg, f.fix.lon_deg) for f in frames])
+    sound = list(frames)
+    for n, lat, lon, sigma in zip(held.index, held.lat_deg.tolist(), held.lon_deg.tolist(), held.sigma_m.tolist()):
+        fix = frames[n].fix
+        stated = stated_sigma_m(fix.position_sigma_m, sigma)
+        sound[n] = replace(frames[n], fix=replace(fix, lat_deg=lat, lon_deg=lon, position_sigma_m=stated))
+    return sound
 
 
 def stated_sigma_m(own: float | None, held: float) -> float | None:

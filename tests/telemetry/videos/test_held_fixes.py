@@ -6,9 +6,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from orthoswarm.model.frame import Fix, Frame
 from telemetry.ingest.ingest import LoadOptions, load, survey
 from telemetry.live.live_poses import LivePoses
-from telemetry.samples.held_fixes import LOST_SIGMA_M, held_fixes
+from telemetry.samples.held_fixes import LOST_SIGMA_M, held_fixes, measured_frames
 from telemetry.samples.sample import Sample
 from telemetry.samples.wild_fixes import sound_positions
 from telemetry.write.sei_writer import add_sei
@@ -230,3 +231,22 @@ def test_a_flight_that_tells_one_place_to_the_last_digit_has_none(tmp_path):
     found = load([tmp_path])
     assert not found.frames and len(found.unpositioned) == 6
     assert any("all 6 photos tell one place to the last digit" in w for w in found.warnings)
+
+
+def test_frames_that_came_live_are_refined_from_where_they_flew(tmp_path):
+    """As companions and watched folders post them, one by one: later ones tell that the receiver stood still."""
+    truth = flown()[:40]
+    frames = []
+    for k in range(len(truth)):
+        east, north_m = truth[15] if 15 <= k < 24 else truth[k]
+        fix = Fix(47.5 + north_m * METRE, 8.25 + east * METRE / np.cos(np.radians(47.5)), 80.0)
+        frames.append(
+            Frame(
+                image=f"{k}.jpg", path=tmp_path / f"{k}.jpg", vehicle="v1", time_s=1.7e9 + 2.0 * k, fix=fix, width=64,
+                height=48,
+            )
+        )  # fmt: skip
+    sound = measured_frames(frames)
+    assert [a is b for a, b in zip(frames, sound)] == [not 15 < k < 24 for k in range(40)]
+    away = [(f.fix.lat_deg - 47.5) / METRE - t[1] for f, t in zip(sound, truth)]
+    assert np.abs(away).max() < 2.0 and sound[19].fix.position_sigma_m > LOST_SIGMA_M
