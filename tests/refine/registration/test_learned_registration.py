@@ -35,6 +35,7 @@ def blind(monkeypatch):
     return asked
 
 
+@pytest.mark.slow
 def test_a_flight_that_only_learned_matching_finds_is_mapped_as_well(scene, blind):
     vehicles, grid, basemap, truth = scene
     steps = []
