@@ -21,9 +21,9 @@ TRACK_SUFFIXES: Final = frozenset({".gpx", ".nmea", ".nma"})
 _MAX_GAP_S: Final = 10.0
 """Fixes so far apart are interpolated between (chosen): loggers write one in some seconds, or where the way bends."""
 _DAY_S: Final = 86_400.0
-_POINT = re.compile(r"<(?:\w+:)?trkpt\b([^>]*[^>/])>(.*?)</(?:\w+:)?trkpt\s*>", re.DOTALL)
+_POINT = re.compile(r"<(?:\w+:)?trkpt\b([^>]{0,1000}[^>/])>(.{0,2000}?)</(?:\w+:)?trkpt\s*>", re.DOTALL)
 _ATTRIBUTE = re.compile(r"""\b(lat|lon)\s*=\s*["']\s*([^"']*?)\s*["']""")
-_CHILD = re.compile(r"<(?:\w+:)?(time|ele)\b[^>]*>\s*([^<]*?)\s*<")
+_CHILD = re.compile(r"<(?:\w+:)?(time|ele)\b[^>]{0,100}>([^<]{0,99})")
 _SENTENCE = re.compile(r"\$([A-Z]{2})(RMC|GGA|GNS|ZDA),([^*$\r\n]*)(?:\*([0-9A-Fa-f]{2}))?")
 
 
@@ -60,7 +60,7 @@ def _gpx(log: FlightLog, text: str) -> int:
     """Add the points of all tracks; returns how many have no time."""
     undated = 0
     for attributes, body in _POINT.findall(text):
-        place, said = dict(_ATTRIBUTE.findall(attributes)), dict(_CHILD.findall(body + "<"))
+        place, said = dict(_ATTRIBUTE.findall(attributes)), dict(_CHILD.findall(body))
         moment = parse_time(said.get("time", ""))
         lat, lon = _number(place.get("lat", "")), _number(place.get("lon", ""))
         if moment is None:
