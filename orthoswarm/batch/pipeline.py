@@ -194,7 +194,8 @@ def _control_points(
     points = read_checkpoints(options.control, options.pixel_scale)
     check_control(points, recorded.placed, grid, basemap is not None)
     shared = shared_points(checks, points, options.checkpoints.name if options.checkpoints else "")
-    return points, [*absent_marks(points, ingest), *shared_warning(shared, len(checks))]
+    doubts = dict.fromkeys(f"control points: {point.doubt}" for point in points if point.doubt)
+    return points, [*absent_marks(points, ingest), *doubts, *shared_warning(shared, len(checks))]
 
 
 def _height_model(run: RunContext, path: Path, grid: LocalGrid, recorded: Recorded) -> HeightModel | None:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from orthoswarm.batch.run_state import RunContext
 from orthoswarm.config import active
 from orthoswarm.evaluation.checkpoints import Checkpoint, read_checkpoints
+from orthoswarm.evaluation.misread_points import require_places
 from orthoswarm.model.frame import Frame, Ingest
 from orthoswarm.raster.picture_file import read_gray, reduction
 from orthoswarm.refine.flight.record_findings import NAMED_MOST
@@ -29,6 +30,7 @@ def with_found_positions(run: RunContext, ingest: Ingest) -> Ingest:
     photos, positioned, points = ingest.unpositioned, ingest.frames, list[Checkpoint]()
     if options.control is not None:
         points = read_checkpoints(options.control, options.pixel_scale)
+        require_places((point.name, point.surveyed) for point in points)
     else:
         photos, positioned = _beside(ingest)
     tasks = run.workers.map

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from orthoswarm.config import active
 from orthoswarm.evaluation.checkpoints import RECEIVERS_LOCAL_SIGMA_M, Checkpoint
+from orthoswarm.evaluation.misread_points import FARTHEST_M, misplaced
 from orthoswarm.evaluation.photo_names import photo_named, photos_named
 from orthoswarm.evaluation.point_rays import Ray, RayPoint, intersect_rays
 from orthoswarm.model.errors import InputError
@@ -23,7 +24,6 @@ from orthoswarm.model.placement import PlacedFrame, Terrain
 Array = NDArray[np.float64]
 
 _HEIGHT_SIGMA_M: Final = 2.0  # sigma of a point's height over the solved terrain below it
-FARTHEST_M: Final = 1000.0  # control points farther from every photo than this belong elsewhere
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,13 +63,14 @@ def check_control(
             "names of the images"
         )
     nadirs = np.array([p.camera.nadir for p in recorded])
+    elsewhere = []
     for point in seen:
-        away = float(np.hypot(*(nadirs - _in_grid(point.surveyed, grid)).T).min())
-        if away > FARTHEST_M:
-            raise InputError(
-                f"control point {point.name} lies {away / 1000:,.0f} km from the nearest photo; check its coordinates "
-                "and their coordinate system"
-            )
+        if not np.hypot(*(nadirs - _in_grid(point.surveyed, grid)).T).min() <= FARTHEST_M:  # infinite for no place
+            own = [placed.camera.nadir for placed, _ in _photos(point, images)] or nadirs
+            shown = grid.to_geographic(np.median(own, axis=0))[::-1] if point.on_map is None else point.on_map
+            elsewhere.append((point.name, point.written, point.surveyed, shown))
+    if elsewhere:
+        raise InputError(f"of the control points, {misplaced(elsewhere)}")
 
 
 def absent_marks(points: Iterable[Checkpoint], ingest: Ingest) -> list[str]:

@@ -201,6 +201,8 @@ def _table_findings(path: Path, table: PoseTable, pictures: Sequence[str]) -> li
     if table.useless:
         text = f"{plural(table.useless, 'line')} of {path.name} hold no valid position; they are not used"
         findings.append(Finding("table-lines", text))
+    if table.doubt:
+        findings.append(Finding("table-datum", f"{path.name}: {table.doubt}"))
     if table.refused:
         text = (
             f"{plural(table.refused, 'cell')} of {path.name} cannot be read as the values that their titles name, "

@@ -10,7 +10,7 @@ from gcs_plugin.daemon.store.job_rows import Job, job_done
 from gcs_plugin.daemon.store.journal import Change, Journal, all_changes
 from gcs_plugin.daemon.store.picture_store import PictureStore
 from gcs_plugin.daemon.store.sortie_rows import LegRow, PlacedSortie, SortieDetail, placed_sorties, sortie_refined
-from orthoswarm.export.product_files import finite
+from orthoswarm.export.json_values import finite
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.frame import Frame

@@ -4,6 +4,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from orthoswarm.export.json_values import json_text
+
 if TYPE_CHECKING:
     from orthoswarm.model.frame import Frame
 
@@ -29,7 +31,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Extract the pictures."""
-    import json
     import sys
     import tempfile
     from contextlib import suppress
@@ -79,8 +80,7 @@ def run(args: argparse.Namespace) -> int:
             "rejected": [{"image": r.image, "reason": r.text} for r in found.rejected],
             "warnings": found.warnings,
         }
-        json.dump(document, sys.stdout, indent=1, ensure_ascii=False)
-        print()
+        print(json_text(document, 1))
     else:
         for warning in found.warnings:
             print(f"! {warning}", file=sys.stderr)
