@@ -19,10 +19,10 @@ demo: $(STAMP)
 	@$(BIN)/orthoswarm demo --out $(DEMO) --median 0.5
 	@echo "The map: $(DEMO)/orthoimage.tif; how it was made: $(DEMO)/report.html"
 
-# Three processes, on two cores as well: tests with vehicles and the daemon run one after the other in one, those of the
-# page in another, and both mostly wait.
-# PYTEST="-n 3 --dist loadgroup -m 'not sitl'" runs the slow tests as well (an hour).
-PYTEST ?= -n 3 --dist loadgroup
+# Four processes, on two cores as well: tests with vehicles, of the daemon and of the page run one after the other in one
+# each, and mostly wait.
+# PYTEST="-n 4 --dist loadgroup -m 'not sitl'" runs the slow tests as well (an hour).
+PYTEST ?= -n 4 --dist loadgroup
 test: check
 	@$(BIN)/python -m pytest $(PYTEST)
 

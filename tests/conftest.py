@@ -20,6 +20,7 @@ settings.load_profile("unhurried")
 
 ROOT = Path(__file__).resolve().parent.parent
 ROOMS_IN_REAL_TIME = {"vehicles", "daemon", "page", "cli"}
+ROOMS_WITH_PROCESSES = {"daemon", "page"}  # browsers and daemons work beside the tests, which mostly wait for them
 IN_REAL_TIME = re.compile(r"\b(SimSwarm|serving|standing|subprocess|socket|threading|time\.sleep)\b")
 """What files name that wait for vehicles, servers or browsers: they run one after the other (see the Makefile)."""
 
@@ -45,7 +46,8 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
             file = nodeid.split("::")[0]
             if not waits(file):
                 return file
-            return "page" if file.startswith("tests/page") else "real time"
+            room = file.split("/")[1]
+            return room if room in ROOMS_WITH_PROCESSES else "vehicles"
 
     return ByPlace(config, log) if config.getvalue("dist") == "loadgroup" else None
 

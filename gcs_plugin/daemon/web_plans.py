@@ -15,7 +15,7 @@ from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.items import Mission
 from gcs_plugin.mission.plan_folder import PlanNeeds, plan_needs
-from gcs_plugin.plans.area_files import refuse_no_zones
+from gcs_plugin.plans.no_fly import refuse_no_zones
 from gcs_plugin.plans.plan_request import AUTOPILOTS, ENDS, METHODS, RELIEFS, PlanRequest, make_plan
 from orthoswarm.config import DEFAULT, Config
 from orthoswarm.model.errors import InputError
@@ -247,7 +247,7 @@ def _zones(no_fly: Any) -> Mapping[str, Any] | None:
         return None
     if not isinstance(no_fly, dict):
         raise InputError("no_fly is not GeoJSON; send the polygons of the no-fly zones, or nothing")
-    shapes = parse_geojson(json.dumps(no_fly), "no_fly")
+    shapes = parse_geojson(json.dumps(no_fly), "no_fly", any_size=True)
     refuse_no_zones(shapes, "no_fly")
     return no_fly if shapes.areas else None
 

@@ -9,14 +9,14 @@ import re
 import warnings
 import zipfile
 from collections import Counter
-from dataclasses import replace
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import shapely
 
 from gcs_plugin.mission.mission_files import parse_mission
+from orthoswarm.model.coordinate_system import to_degrees
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.plan import Fence
 from orthoswarm.planning.area.shape_files import (
@@ -29,9 +29,6 @@ from orthoswarm.planning.area.shape_files import (
     refuse_many_corners,
     ring,
 )
-
-if TYPE_CHECKING:
-    from pyproj import Transformer
 
 _KINDS: Final = {
     ".geojson": "GeoJSON",
@@ -48,11 +45,20 @@ _SHAPEFILE: Final = b"\x00\x00\x27\x0a"
 _SQLITE: Final = b"SQLite format 3\0"
 
 
-def read_shapes(path: Path, name: str | None = None) -> tuple[Shapes, list[Ring]]:
-    """The shapes of a file, and rings of its exclusion fences; what the file is decides its content.
+class AreaFile(NamedTuple):
+    """What a file holds: its shapes, rings of its exclusion fences, and all its fences (missions have them)."""
+
+    shapes: Shapes
+    no_fly: list[Ring]
+    fences: tuple[Fence, ...] = ()
+
+
+def read_shapes(path: Path, name: str | None = None, *, any_size: bool = False) -> AreaFile:
+    """The content of a file; what it is decides how it is read.
 
     Args:
         path: the file. name: how to call it in an error; its path unless said.
+        any_size: also more corners than the configuration allows, for files of which a part is used.
 
     Raises:
         InputError: it cannot be read, or its name promises something else.
@@ -63,65 +69,24 @@ def read_shapes(path: Path, name: str | None = None) -> tuple[Shapes, list[Ring]
     if promised != kind:
         raise InputError(f"{name} is {promised} by its name but holds {kind}; rename it or give the right file")
     if kind == "a GeoPackage":
-        return _shapes(str(path), name), []
+        return AreaFile(_shapes(str(path), name, any_size), [])
     if kind == "a zipped shapefile":  # in whatever folder of it
         inside = _inside(path, name, ".shp")
-        return Shapes.joined([_shapes(f"/vsizip/{{{path}}}/{info.filename}", name) for info in inside]), []
+        return AreaFile(
+            Shapes.joined([_shapes(f"/vsizip/{{{path}}}/{info.filename}", name, any_size) for info in inside]), []
+        )
     texts = _texts(path, name)
     if kind == "GeoJSON":
-        return parse_geojson(texts[0], name), []
+        return AreaFile(parse_geojson(texts[0], name, any_size=any_size), [])
     if kind in ("KML", "KMZ"):
-        return Shapes.joined([parse_kml(text, name) for text in texts]), []
+        return AreaFile(Shapes.joined([parse_kml(text, name, any_size=any_size) for text in texts]), [])
     mission = parse_mission(texts[0], name)
     polygons = tuple(Polygon(ring(survey, name)) for survey in mission.surveys)
     lines = tuple(ring(line, name, 2) for line in (mission.polylines or mission.lines()))
-    return Shapes(polygons, lines), [ring(zone, name) for zone in mission.no_fly]
-
-
-def read_zones(path: Path) -> tuple[Shapes, list[Ring]]:
-    """What vehicles are to keep out of, by a no-fly file: all of it, also what is switched off there.
-
-    Raises:
-        InputError: the file cannot be read, or holds anything that no vehicle could be kept out of.
-    """
-    shapes, fences = read_shapes(path)
-    refuse_no_zones(shapes, str(path), mission=bool(fences))
-    shapes = replace(shapes, polygons=shapes.polygons + shapes.hidden, hidden=())
-    if not shapes.areas and not fences:
-        raise InputError(f"{path} holds no polygon to keep out of; give a polygon with --no-fly")
-    return shapes, fences
-
-
-def refuse_no_zones(shapes: Shapes, name: str, *, mission: bool = False) -> None:
-    """Refuse shapes of which a part would be passed over as no-fly zones; a mission's lines are flown.
-
-    Raises:
-        InputError: there are such shapes.
-    """
-    count = 0 if mission else len(shapes.lines)
-    left = [*shapes.unused, *counted({"line": count} if count else {})]
-    if left:
-        raise InputError(
-            f"{name} holds {', '.join(left)}, which no vehicle could be kept out of; draw each zone as a polygon, or "
-            "give a point its radius_m and a line its width_m, in metres"
-        )
-
-
-def read_fences(path: Path, *, no_fly: bool) -> tuple[Fence, ...]:
-    """The geofences of a QGroundControl `.plan`; of a no-fly file of another kind, its circles.
-
-    Raises:
-        InputError: it cannot be read, or a polygon has fewer than three corners.
-    """
-    name = str(path)
-    if _kind(path, name) != "a mission":
-        circles = read_shapes(path)[0].circles if no_fly else ()
-        return tuple(Fence(inclusion=False, points=((c.lat_deg, c.lon_deg),), radius_m=c.radius_m) for c in circles)
-    fences = parse_mission(_texts(path, name)[0], name).fences
-    for fence in fences:
+    for fence in mission.fences:
         if fence.radius_m is None:
             ring(fence.points, name)
-    return fences
+    return AreaFile(Shapes(polygons, lines), [ring(zone, name) for zone in mission.no_fly], mission.fences)
 
 
 def _kind(path: Path, name: str) -> str:
@@ -205,7 +170,7 @@ def _is_mission(text: str, name: str) -> bool:
     return isinstance(document, dict) and document.get("fileType") == "Plan"
 
 
-def _shapes(source: str, name: str) -> Shapes:
+def _shapes(source: str, name: str, any_size: bool) -> Shapes:
     """Polygons and lines of all layers of a file that OGR reads.
 
     Raises:
@@ -224,16 +189,16 @@ def _shapes(source: str, name: str) -> Shapes:
     except (DataSourceError, DataLayerError, FeatureError, FieldError, GeometryError, shapely.GEOSException):
         needs = "a shapefile's ZIP needs .shp, .shx, .dbf and .prj"
         raise InputError(f"{name} is damaged or incomplete; export it again ({needs})") from None
-    to_degrees = {crs: _transformer(crs, name) for crs, _ in parts}  # made once: it takes as long as a thousand points
     for crs, part in parts:
         if part.geom_type == "Polygon" and not part.is_empty:
-            shell, *holes = [_degrees(r.coords, to_degrees[crs], name) for r in (part.exterior, *part.interiors)]
+            shell, *holes = [_degrees(r.coords, crs, name) for r in (part.exterior, *part.interiors)]
             polygons.append(Polygon(shell, tuple(holes)))
         elif part.geom_type == "LineString" and not part.is_empty:
-            lines.append(_degrees(part.coords, to_degrees[crs], name, 2))
+            lines.append(_degrees(part.coords, crs, name, 2))
         else:
             unused["feature without a shape" if part.is_empty else part.geom_type.lower()] += 1
-    refuse_many_corners([*polygons, *lines], name)
+    if not any_size:
+        refuse_many_corners([*polygons, *lines], name)
     return Shapes(tuple(polygons), tuple(lines), unused=counted(unused))
 
 
@@ -245,21 +210,13 @@ def _parts(geometries: Any) -> list[Any]:
     ]
 
 
-def _transformer(crs: str | None, name: str) -> "Transformer":
-    """From a coordinate system to longitude and latitude of WGS 84; InputError if it is not said, or not known."""
-    from pyproj import Transformer
-    from pyproj.exceptions import CRSError
-
+def _degrees(points: object, crs: str | None, name: str, least: int = 3) -> Ring:
+    """A ring or line in latitude and longitude of WGS 84; InputError if its coordinate system is not known."""
     if crs is None:
         raise InputError(f"{name} does not say its coordinate system; export it in WGS 84 (EPSG:4326), with its .prj")
-    try:
-        return Transformer.from_crs(crs, 4326, always_xy=True)
-    except CRSError:
-        raise InputError(f"{name} has an unknown coordinate system; export it in WGS 84 (EPSG:4326)") from None
-
-
-def _degrees(points: object, to_degrees: "Transformer", name: str, least: int = 3) -> Ring:
-    """A ring or line in latitude and longitude of WGS 84."""
     array = np.asarray(points, dtype=np.float64)[:, :2]
-    lon, lat = to_degrees.transform(array[:, 0], array[:, 1])
-    return ring(np.column_stack([lat, lon]), name, least)
+    try:
+        lon_lat, _ = to_degrees(crs, array[:, 0], array[:, 1])
+    except InputError as error:
+        raise InputError(f"{name}: {error}; or export it in WGS 84 (EPSG:4326)") from None
+    return ring(lon_lat[:, ::-1], name, least)

@@ -133,12 +133,16 @@ def _vehicle(vehicle: VehiclePlan, autopilot: Autopilot) -> dict[str, Any]:
 
 
 def geojson(plan: Plan, area: Area | None) -> str:
-    """One GeoJSON of everything: area, no-fly zones, legs, ways between them, starts and gaps."""
+    """One GeoJSON of everything: area, no-fly zones, legs, ways between them, starts and gaps.
+
+    `circles_wider_m` of a no-fly zone: by how much circles in it are larger than in the file that they are from.
+    """
     features: list[dict[str, Any]] = []
     if area is not None:
         for kind, geometry in (("area", area.ground), ("no-fly zone", area.no_fly)):
+            said = {"circles_wider_m": area.circles_wider_m} if geometry is area.no_fly and area.circles_wider_m else {}
             features += [
-                _feature("Polygon", rings, kind=kind) for part in geometry.geoms for rings in _rings(area, part)
+                _feature("Polygon", rings, kind=kind, **said) for part in geometry.geoms for rings in _rings(area, part)
             ]
     for vehicle in plan.vehicles:
         for index, sortie in enumerate(vehicle.sorties):
@@ -332,7 +336,12 @@ def plan_picture(plan: Plan, area: Area | None) -> bytes:
         axes.plot(*(grid.to_grid(gap.lat_deg, gap.lon_deg) - corner), "x", color="red", markersize=5)
     axes.set_xlabel("metres east")
     axes.set_ylabel("metres north")
-    axes.set_title(_title(plan), fontsize=9)
+    wider = (
+        ""
+        if area is None or not area.circles_wider_m
+        else (f"\nred: no-fly zones, circles with {area.circles_wider_m:g} m around them")
+    )
+    axes.set_title(_title(plan) + wider, fontsize=9)
     figure.tight_layout()
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")

@@ -13,7 +13,8 @@ import shapely
 from numpy.typing import NDArray
 
 from gcs_plugin.mission.mission_files import Autopilot
-from gcs_plugin.plans.area_files import read_fences, read_shapes, read_zones
+from gcs_plugin.plans.area_files import read_shapes
+from gcs_plugin.plans.no_fly import NoFly, read_no_fly
 from orthoswarm.config import DEFAULT, Config
 from orthoswarm.coverage.missing_pictures import Cause
 from orthoswarm.model.bounding_box import BoundingBox
@@ -176,41 +177,46 @@ def make_plan(request: PlanRequest, progress: Callable[[str], None] = lambda _: 
     Raises:
         InputError: a file or a value is of no use, or a flight would leave an inclusion fence.
     """
-    plan, area = _made(request, progress)
-    fences = [] if request.gaps else [*read_fences(request.area, no_fly=False)]
-    fences += [fence for path in request.no_fly for fence in read_fences(path, no_fly=True)]
+    plan, area, no_fly = _made(request, progress)
+    fences = no_fly.fences
+    no_fly.refuse_beyond(plan)
     refuse_outside(plan, fences, request.autopilots)
     # Nearer to a zone a vehicle would break its fence by the errors of its receiver alone, and turn back or stop.
     if area is not None and (request.clearance_m or 0.0) >= BESIDE_M:
         fences += zone_fences(area, fences)
-    return replace(plan, fences=tuple(fences)), area
+    if area is not None:
+        area = replace(area, circles_wider_m=no_fly.circles_wider_m)
+    return replace(plan, fences=tuple(fences), warnings=(*no_fly.notes, *plan.warnings)), area
 
 
-def _made(request: PlanRequest, progress: Callable[[str], None]) -> tuple[Plan, Area | None]:
-    """The plan and its area, without fences; see `make_plan`."""
+def _made(request: PlanRequest, progress: Callable[[str], None]) -> tuple[Plan, Area | None, NoFly]:
+    """The plan without fences, its area, and its no-fly zones and fences; see `make_plan`."""
     options = request.flight_options()
     options.check()
     progress("area")
     if request.gaps:
         return _gap_plan(request, options, progress)
-    shapes, no_fly = read_shapes(request.area)
-    no_fly += _no_fly_rings(request)
-    if shapes.areas and not request.follow:
-        area = make_area(shapes.areas, no_fly)
-        cover = partial(plan_area, area, request.vehicles, method=request.method, options=options, progress=progress)
-        plan = _over_ground(request, cover, area.ground, area.grid)
-        return replace(plan, warnings=(*_not_flown(request.area, shapes), *plan.warnings)), area
-    if not shapes.lines:
+    shapes, rings, fences = read_shapes(request.area)
+    covers = bool(shapes.areas) and not request.follow
+    if not covers and not shapes.lines:
         left = ", ".join(shapes.left)
         what = "line" if shapes.areas else f"polygon and no line, only {left}" if left else "polygon and no line"
         raise InputError(f"{request.area} holds no {what}; draw one in it")
-    zones: Area | None = _zones_only(shapes.lines, no_fly) if no_fly else None
+    no_fly = _no_fly(request, [polygon.shell for polygon in shapes.areas] if covers else shapes.lines)
+    rings += no_fly.rings
+    no_fly = replace(no_fly, fences=[*fences, *no_fly.fences])
+    if covers:
+        area = make_area(shapes.areas, rings)
+        cover = partial(plan_area, area, request.vehicles, method=request.method, options=options, progress=progress)
+        plan = _over_ground(request, cover, area.ground, area.grid)
+        return replace(plan, warnings=(*_not_flown(request.area, shapes), *plan.warnings)), area, no_fly
+    zones: Area | None = _zones_only(shapes.lines, rings) if rings else None
     points = np.concatenate(shapes.lines)
     grid = LocalGrid(area_epsg(points[:, 0], points[:, 1])) if zones is None else zones.grid
     paths = shapely.MultiLineString([grid.to_grid(line[:, 0], line[:, 1]) for line in shapes.lines])
     follow = partial(plan_lines, shapes.lines, request.vehicles, no_fly=zones, options=options, progress=progress)
     plan = _over_ground(request, follow, paths, grid)
-    return replace(plan, warnings=(*_not_flown(request.area, shapes, lines=True), *plan.warnings)), zones
+    return replace(plan, warnings=(*_not_flown(request.area, shapes, lines=True), *plan.warnings)), zones, no_fly
 
 
 def _not_flown(path: Path, shapes: Shapes, *, lines: bool = False) -> list[str]:
@@ -285,29 +291,23 @@ def _footprint(request: PlanRequest, above_m: float) -> Footprint:
     return foot.turned(request.flight_options().motion.crab_rad)
 
 
-def _gap_plan(request: PlanRequest, options: PlanOptions, progress: Callable[[str], None]) -> tuple[Plan, Area]:
-    """A plan over the gaps of a coverage, and the ground that it aims at."""
+def _gap_plan(request: PlanRequest, options: PlanOptions, progress: Callable[[str], None]) -> tuple[Plan, Area, NoFly]:
+    """A plan over the gaps of a coverage, the ground that it aims at, and its no-fly zones."""
     if request.endurance_min is None and not request.endurances_min:
         raise InputError("say with --endurance how many minutes the batteries last: a gap flight must not guess it")
-    no_fly = _no_fly_rings(request)
+    gaps = read_gaps(request.area)
+    no_fly = _no_fly(request, [gap.polygon.shell for gap in gaps])
     nominal = _footprint(request, request.altitude_m)
-    target = gap_area(read_gaps(request.area), no_fly, nominal, request.fly_not_arrived)
+    target = gap_area(gaps, no_fly.rings, nominal, request.fly_not_arrived)
     cover = partial(plan_gaps, target.area, request.vehicles, options=options, progress=progress)
     plan = _over_ground(request, cover, target.area.ground, target.area.grid)
-    return replace(plan, warnings=(*target.notes, *plan.warnings)), target.area
+    return replace(plan, warnings=(*target.notes, *plan.warnings)), target.area, no_fly
 
 
-def _no_fly_rings(request: PlanRequest) -> list[Ring]:
-    """Rings of all no-fly files: their polygons' outlines, exclusion fences, and polygons around circles.
-
-    Circles become fences of the vehicles, so flights keep the distance at which receivers do not break a fence.
-    """
-    beyond_m = max(0.0, BESIDE_M - (request.clearance_m or 0.0))
-    rings: list[Ring] = []
-    for path in request.no_fly:
-        zones, fences = read_zones(path)
-        rings += [*(p.shell for p in zones.polygons), *(c.polygon(beyond_m).shell for c in zones.circles), *fences]
-    return rings
+def _no_fly(request: PlanRequest, flown: Sequence[Ring]) -> NoFly:
+    """The no-fly zones of a request near the rings or lines that are flown over, and near its starts."""
+    starts = np.array(request.starts, float).reshape(-1, 2)
+    return read_no_fly(request.no_fly, np.concatenate([*flown, starts]), request.clearance_m)
 
 
 def _zones_only(lines: tuple[Ring, ...], no_fly: list[Ring]) -> Area:

@@ -64,7 +64,7 @@ def area_of(data: bytes, name: str) -> dict[str, Any]:
         suffix = PurePath(name).suffix.lower()
         path = Path(folder) / f"area{suffix if suffix.isascii() and suffix[1:].isalnum() else ''}"
         path.write_bytes(data)
-        shapes, zones = read_shapes(path, name)
+        shapes, zones, _ = read_shapes(path, name)
     return {
         "polygons": [[_closed(ring) for ring in (polygon.shell, *polygon.holes)] for polygon in shapes.areas],
         "lines": [[[lon, lat] for lat, lon in line.tolist()] for line in shapes.lines],

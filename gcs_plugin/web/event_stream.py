@@ -6,7 +6,6 @@ past. So heartbeats also carry a clock that nobody sets, and the run of the daem
 
 import asyncio
 import contextlib
-import json
 import os
 import time
 from typing import Any, Final
@@ -16,6 +15,7 @@ from fastapi import WebSocket, WebSocketDisconnect
 from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.web.standstill import clock_with_sleep
 from orthoswarm import __version__
+from orthoswarm.export.json_values import json_text
 
 HEARTBEAT_S: Final = 1.0
 RUN: Final = os.urandom(6).hex()
@@ -37,17 +37,17 @@ async def stream_events(socket: WebSocket, events: Events) -> None:
     gone = asyncio.ensure_future(_until_gone(socket))
     news = asyncio.ensure_future(subscription.get())
     try:
-        await socket.send_text(_text({"type": "hello", "version": __version__} | clocks()))
+        await socket.send_text(json_text({"type": "hello", "version": __version__} | clocks()))
         due = time.monotonic() + HEARTBEAT_S
         while not gone.done():
             wait_s = max(0.0, due - time.monotonic())
             await asyncio.wait({news, gone}, timeout=wait_s, return_when=asyncio.FIRST_COMPLETED)
             if time.monotonic() >= due:
-                await socket.send_text(_text({"type": "heartbeat"} | clocks()))
+                await socket.send_text(json_text({"type": "heartbeat"} | clocks()))
                 due = time.monotonic() + HEARTBEAT_S
             if news.done():
                 for event in news.result():
-                    await socket.send_text(_text(event))
+                    await socket.send_text(json_text(event))
                 news = asyncio.ensure_future(subscription.get())
     except (WebSocketDisconnect, RuntimeError):
         pass
@@ -55,10 +55,6 @@ async def stream_events(socket: WebSocket, events: Events) -> None:
         gone.cancel()
         news.cancel()
         events.unsubscribe(subscription)
-
-
-def _text(event: dict[str, Any]) -> str:
-    return json.dumps(event)
 
 
 async def _until_gone(socket: WebSocket) -> None:

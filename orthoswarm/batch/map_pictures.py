@@ -239,7 +239,8 @@ def _copy_coarse(run: RunContext, state: RunState) -> None:
     else:
         copy_tiled(run.out, ORTHOIMAGE, COARSE)
     moved = state.control is not None and state.control.by_receivers is not None
-    if run.options.basemap is None and not moved:
+    received = any(frame.has_own_position for frame in state.ingest.frames)
+    if run.options.basemap is None and received and not moved:
         state.warnings.append("there is no basemap: the orthoimage lies where the drones' receivers say")
 
 

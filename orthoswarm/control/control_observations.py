@@ -12,16 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.evaluation.checkpoints import POINTING_SIGMA_PX, RECEIVERS_LOCAL_SIGMA_M, SURVEY_SIGMA_M, Checkpoint
-from orthoswarm.evaluation.photo_names import photo_named
+from orthoswarm.evaluation.misread_points import FARTHEST_M, misplaced
+from orthoswarm.evaluation.photo_names import photo_named, photos_named
 from orthoswarm.evaluation.point_rays import Ray, RayPoint, intersect_rays
 from orthoswarm.model.errors import InputError
+from orthoswarm.model.frame import Ingest
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import PlacedFrame, Terrain
 
 Array = NDArray[np.float64]
 
 _HEIGHT_SIGMA_M: Final = 2.0  # sigma of a point's height over the solved terrain below it
-FARTHEST_M: Final = 1000.0  # control points farther from every photo than this belong elsewhere
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,13 +62,24 @@ def check_control(
             "names of the images"
         )
     nadirs = np.array([p.camera.nadir for p in recorded])
+    elsewhere = []
     for point in seen:
-        away = float(np.hypot(*(nadirs - _in_grid(point.surveyed, grid)).T).min())
-        if away > FARTHEST_M:
-            raise InputError(
-                f"control point {point.name} lies {away / 1000:,.0f} km from the nearest photo; check its coordinates "
-                "and their coordinate system"
-            )
+        if not np.hypot(*(nadirs - _in_grid(point.surveyed, grid)).T).min() <= FARTHEST_M:  # infinite for no place
+            own = [placed.camera.nadir for placed, _ in _photos(point, images)] or nadirs
+            shown = grid.to_geographic(np.median(own, axis=0))[::-1] if point.on_map is None else point.on_map
+            elsewhere.append((point.name, point.written, point.surveyed, shown))
+    if elsewhere:
+        raise InputError(f"of the control points, {misplaced(elsewhere)}")
+
+
+def absent_marks(points: Iterable[Checkpoint], ingest: Ingest) -> list[str]:
+    """A warning about points that are marked in photos which are not there, if there are any."""
+    known = {f.image for f in ingest.frames} | {r.image for r in ingest.rejected}
+    absent = [(p.name, m.image) for p in points for m in p.marks if not photos_named(known, m.image)]
+    if not absent:
+        return []
+    name, image = absent[0]
+    return [f"marks of control points in photos that are not here: {len(absent)}, the first of {name} in {image}"]
 
 
 def in_photos(
@@ -92,7 +104,8 @@ def in_photos(
         gsd = float(np.median([(p.camera.position[2] - level) / p.camera.lens.focal_px for p, _ in photos]))
         pointing = POINTING_SIGMA_PX * gsd / np.sqrt(len(photos))
         bent = float(np.median([p.sigma_m for p, _ in photos])) if on_map else RECEIVERS_LOCAL_SIGMA_M
-        sigma = float(np.linalg.norm([_survey_sigma(point), pointing, bent, met.contradiction]))
+        parts = [_survey_sigma(point), pointing, bent, met.contradiction, _leaning_m(rays)]
+        sigma = float(np.linalg.norm(parts))
         surveyed, stated = _in_grid(point.surveyed, grid), point.sigma_m > 0.0
         out.append(ControlObservation(point.name, met.place, surveyed, sigma, stated, rays=met))
     return out
@@ -125,6 +138,14 @@ def _photos(point: Checkpoint, images: dict[str, PlacedFrame]) -> list[tuple[Pla
         mark.check_inside(frame.width, frame.height)
         out.append((images[name], np.array([mark.column, mark.row])))
     return out
+
+
+def _leaning_m(rays: Sequence[Ray]) -> float:
+    """Sigma of a point of one photo by the height that nothing else tells, metres; 0 where rays meet."""
+    if len(rays) > 1:
+        return 0.0
+    east, north, up = rays[0].direction
+    return _HEIGHT_SIGMA_M * float(np.hypot(east, north) / max(abs(up), 1e-3))
 
 
 def _ray(placed: PlacedFrame, pixel: Array, camera_sigma_m: float) -> Ray:

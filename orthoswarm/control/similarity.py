@@ -11,7 +11,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.control.control_observations import FARTHEST_M, ControlObservation
+from orthoswarm.control.control_observations import ControlObservation
+from orthoswarm.evaluation.misread_points import FARTHEST_M
 from orthoswarm.evaluation.point_rays import MISTAKE_PROBABILITY
 from orthoswarm.model.plane_similarity import Similarity
 

@@ -22,12 +22,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.evaluation.independent_points import Surveyed, control_of_report, shared_points
+from orthoswarm.evaluation.misread_points import FARTHEST_M, Coordinates, away_m, doubts, misplaced
 from orthoswarm.evaluation.photo_names import photo_named
 from orthoswarm.evaluation.point_rays import Ray, RayPoint, intersect_rays
 from orthoswarm.model.camera import Lens, focal_px
-from orthoswarm.model.earth import distance_m
+from orthoswarm.model.coordinate_system import to_degrees
 from orthoswarm.model.errors import InputError
-from orthoswarm.model.geo import LocalGrid, projection_of
+from orthoswarm.model.geo import LocalGrid, area_epsg
 
 Array = NDArray[np.float64]
 
@@ -36,7 +37,6 @@ STANDARD_COUNT = 30
 _SAME_PLACE_M = 0.02
 """Lines of one point may round its coordinates differently."""
 _DECIMAL_COMMA = re.compile(r"^([-+]?\d+),(\d+)$")
-_GRID = "+proj=longlat +datum=WGS84 +no_defs"
 
 SURVEY_SIGMA_M: Final = 0.05
 """Sigma of a surveyed position, an axis, where its file states none: a network receiver's. Where there are enough
@@ -77,6 +77,7 @@ class Checkpoint:
         name: of the point. surveyed: float64 (2,), longitude and latitude (WGS 84).
         sigma_m: of the survey, an axis; 0 where it is not stated.
         marks: where photos show it. on_map: longitude and latitude at which the orthoimage shows it.
+        written: its coordinates as the table has them. doubt: what is uncertain about their datum, "" if nothing is.
     """
 
     name: str
@@ -84,6 +85,9 @@ class Checkpoint:
     sigma_m: float = 0.0
     marks: list[Mark] = field(default_factory=list)
     on_map: Array | None = None
+    _: KW_ONLY
+    written: Coordinates | None = None
+    doubt: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,10 +98,11 @@ class CheckpointAccuracy:
         names: of the points that could be measured.
         error: float64 (n, 2), map minus survey, east and north, metres.
         survey_m: root mean square of the survey's own horizontal error, metres.
-        unused: names of the points that no mapped photo shows.
+        unused: names of the points that no mapped photo shows, and of those that lie elsewhere.
         how: `photos`, `orthoimage` or both.
         control: names of the points that were left out because they had placed the map.
-        findings: marks that contradict each other, in plain words.
+        findings: marks that contradict each other, points that cannot be where they are said to be, and what is
+            uncertain about their datum, in plain words.
         miss_m: root mean square by which the rays of each point miss it, metres; None where it was measured on the
             orthoimage.
     """
@@ -175,7 +180,7 @@ def evaluate_checkpoints(
         control: points that placed the map and do not count, None to read them from report.json.
 
     Raises:
-        InputError: if the table cannot be read, or no point of it can be measured.
+        InputError: if the table cannot be read, no point of it can be measured, or all lie elsewhere.
     """
     folder = out if out.is_dir() else out.parent
     every = read_checkpoints(table, pixel_scale)
@@ -184,8 +189,9 @@ def evaluate_checkpoints(
     views = _Views.read(folder, ground_z_m) if any(p.marks for p in points) else None
     grid = LocalGrid(views.epsg if views else _epsg(points))
     names, errors, sigmas, unused, how = [], [], [], [], set()
-    findings: list[str] = []
+    findings = list(dict.fromkeys(f"points: {point.doubt}" for point in points if point.doubt))
     misses: list[float | None] = []
+    elsewhere: list[tuple[str, Coordinates | None, Array, Array]] = []
     for point in points:
         met = views.point(point.marks) if views else None
         if met is not None:
@@ -198,16 +204,26 @@ def evaluate_checkpoints(
         else:
             unused.append(point.name)
             continue
+        seen = grid.to_geographic(found)[::-1]
+        if away_m(point.surveyed, seen) > FARTHEST_M:
+            elsewhere.append((point.name, point.written, point.surveyed, seen))
+            continue
         names.append(point.name)
         misses.append(None if met is None else met.miss_m)
         errors.append(found - _placed(grid, point.surveyed))
         sigmas.append(point.sigma_m)
+    if elsewhere and not names:
+        raise InputError(f"{table.name}: {misplaced(elsewhere)}")
     if not names:
         raise InputError(
             f"none of the {len(points)} points of {table.name} is seen in a mapped photo; check the names of the images"
         )
     survey = float(np.sqrt(2.0 * np.mean(np.square(sigmas))))
     measured_in = " and ".join(sorted(how))
+    if elsewhere:
+        unused += [name for name, *_ in elsewhere]
+        findings.append(f"points: {misplaced(elsewhere)}")
+    findings += doubts(names, np.array(errors))
     return CheckpointAccuracy(
         names, np.array(errors), survey, unused, measured_in, control=shared, findings=findings, miss_m=misses
     )
@@ -258,7 +274,7 @@ class _Scale:
 
 def _gcp_list(lines: Sequence[str], name: str, scale: _Scale) -> list[Checkpoint]:
     """ODM's gcp_list.txt; lines with the same coordinates, and name if there are names, are one point."""
-    to_geographic = _transformer(lines[0].strip(), name)
+    system = lines[0].strip()
     points: list[Checkpoint] = []
     for number, line in enumerate(lines[1:], 2):
         words = line.split()
@@ -269,7 +285,9 @@ def _gcp_list(lines: Sequence[str], name: str, scale: _Scale) -> list[Checkpoint
         except (ValueError, IndexError):
             raise InputError(f"{name}, line {number}: expected 'east north height column row image [name]'") from None
         key = words[6] if len(words) > 6 else f"{words[0]} {words[1]}"
-        point = Checkpoint(key, np.array(to_geographic.transform(east, north)))
+        written = Coordinates(east, north, system)
+        place, doubt = _in_degrees(written, name)
+        point = Checkpoint(key, place, written=written, doubt=doubt)
         point.marks.append(scale.mark(image, column, row))
         points.append(point)
     return _merged(points)
@@ -299,7 +317,8 @@ def _merged(lines: Iterable[Checkpoint]) -> list[Checkpoint]:
     for line in lines:
         same_name = places.setdefault(line.name, [])
         known = next(
-            (p for p in same_name if distance_m(*p.surveyed[::-1], *line.surveyed[::-1]) <= _SAME_PLACE_M), None
+            (p for p in same_name if p.written == line.written or away_m(p.surveyed, line.surveyed) <= _SAME_PLACE_M),
+            None,
         )
         if known is None:
             same_name.append(line)
@@ -314,25 +333,29 @@ def _merged(lines: Iterable[Checkpoint]) -> list[Checkpoint]:
 
 
 def _csv_row(cells: Mapping[str, str], name: str, scale: _Scale) -> Checkpoint:
-    surveyed = _position(cells, "", name)
-    if surveyed is None:
+    written = _coordinates(cells, "")
+    if written is None:
         raise KeyError("it has no coordinates")
-    point = Checkpoint(
-        cells.get("name") or f"{surveyed[1]:.7f} {surveyed[0]:.7f}", surveyed, _number(cells.get("sigma_m") or "0"),
-        on_map=_position(cells, "map_", name),
-    )  # fmt: skip
+    sigma_m = _number(cells.get("sigma_m") or "0")
+    if sigma_m < 0.0:
+        raise ValueError(f"sigma_m is {sigma_m:g}, but cannot be less than 0")
+    surveyed, doubt = _in_degrees(written, name)
+    shown = _coordinates(cells, "map_")
+    on_map = None if shown is None else _in_degrees(shown, name)[0]
+    title = cells.get("name") or f"{surveyed[1]:.7f} {surveyed[0]:.7f}"
+    point = Checkpoint(title, surveyed, sigma_m, on_map=on_map, written=written, doubt=doubt)
     if cells.get("image"):
         point.marks.append(scale.mark(cells["image"], _number(cells["column"]), _number(cells["row"])))
     return point
 
 
-def _position(cells: Mapping[str, str], prefix: str, name: str) -> Array | None:
-    """Longitude and latitude by a row's columns with a prefix; None where they are not there."""
+def _coordinates(cells: Mapping[str, str], prefix: str) -> Coordinates | None:
+    """A place by a row's columns with a prefix; None where they are not there."""
     if cells.get(f"{prefix}lat_deg") and cells.get(f"{prefix}lon_deg"):
-        return np.array([_number(cells[f"{prefix}lon_deg"]), _number(cells[f"{prefix}lat_deg"])])
+        return Coordinates(_number(cells[f"{prefix}lon_deg"]), _number(cells[f"{prefix}lat_deg"]), "EPSG:4326")
     if cells.get(f"{prefix}east_m") and cells.get(f"{prefix}north_m"):
-        system = _transformer(f"EPSG:{int(cells['epsg'])}", name)
-        return np.array(system.transform(_number(cells[f"{prefix}east_m"]), _number(cells[f"{prefix}north_m"])))
+        system = f"EPSG:{int(cells['epsg'])}"
+        return Coordinates(_number(cells[f"{prefix}east_m"]), _number(cells[f"{prefix}north_m"]), system)
     return None
 
 
@@ -347,16 +370,12 @@ def _number(text: str) -> float:
     return value
 
 
-def _transformer(system: str, name: str) -> Any:
-    """To longitude and latitude, from a coordinate system as ODM and users write it."""
-    import pyproj
-
+def _in_degrees(written: Coordinates, name: str) -> tuple[Array, str]:
+    """Longitude and latitude (2,) of coordinates as ODM and users write them, and a doubt about their datum."""
     try:
-        return pyproj.Transformer.from_crs(projection_of(system) or system, _GRID, always_xy=True)
-    except pyproj.exceptions.CRSError:
-        raise InputError(
-            f"{name}: '{system[:60]}' is not a coordinate system; write EPSG:32617 or a PROJ string"
-        ) from None
+        return to_degrees(written.system, written.x, written.y)
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from None
 
 
 def _placed(grid: LocalGrid, lon_lat: Array) -> Array:
@@ -364,9 +383,7 @@ def _placed(grid: LocalGrid, lon_lat: Array) -> Array:
 
 
 def _epsg(points: Iterable[Checkpoint]) -> int:
-    from orthoswarm.model.geo import area_epsg
-
-    at = [p.surveyed for p in points]
+    at = [p.surveyed if p.on_map is None else p.on_map for p in points]
     return area_epsg([float(p[1]) for p in at], [float(p[0]) for p in at])
 
 

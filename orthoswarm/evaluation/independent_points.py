@@ -4,7 +4,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Protocol
 
-from orthoswarm.model.earth import distance_m
+import numpy as np
+
+from orthoswarm.evaluation.misread_points import away_m
 from orthoswarm.model.errors import InputError
 
 _SAME_PLACE_M: Final = 0.05  # checkpoint within this distance of a control point is that point (as surveys differ) ...
@@ -76,6 +78,5 @@ def shared_warning(shared: Sequence[str], count: int) -> list[str]:
 
 
 def _same(point: Surveyed, other: Surveyed) -> bool:
-    (lon, lat), (other_lon, other_lat) = point.surveyed, other.surveyed
-    away = distance_m(float(lat), float(lon), float(other_lat), float(other_lon))
+    away = away_m(np.asarray(point.surveyed), np.asarray(other.surveyed))
     return away <= (_SAME_NAME_M if point.name == other.name else _SAME_PLACE_M)

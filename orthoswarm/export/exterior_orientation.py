@@ -23,6 +23,7 @@ Row = Mapping[str, Any]
 Find = Callable[[Row], Path | None]
 """Returns the picture file of a row, None if it is missing."""
 Tell = Callable[[int, int], None]
+_UNKNOWN_SIGMA_M: Final = 10.0  # stated for a picture of which no error is known: a receiver's in a bad place
 _MOST_STEM: Final = 120  # characters; file systems take names of 255 bytes
 
 
@@ -69,6 +70,11 @@ def placed_rows(rows: Iterable[Row]) -> list[Row]:
     if not placed:
         raise InputError("the map has no placed picture to export; make it again")
     return placed
+
+
+def stated_sigma_m(row: Row) -> float:
+    """One sigma of a picture's place, metres, as other programs need it: never nothing and never zero."""
+    return max(float(row["sigma_m"] or _UNKNOWN_SIGMA_M), 0.01)
 
 
 def oriented_pictures(rows: Iterable[Row]) -> list[OrientedPicture]:

@@ -5,7 +5,16 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from orthoswarm.export.atomic_file import atomic_write
-from orthoswarm.export.exterior_orientation import Find, Row, Tell, camera_of, link_pictures, placed_rows, unique_names
+from orthoswarm.export.exterior_orientation import (
+    Find,
+    Row,
+    Tell,
+    camera_of,
+    link_pictures,
+    placed_rows,
+    stated_sigma_m,
+    unique_names,
+)
 from orthoswarm.export.opensfm_folder import brown_camera
 from orthoswarm.model.errors import InputError
 
@@ -47,7 +56,7 @@ def write_odm(rows: Iterable[Row], find: Find, folder: Path, *, progress: Tell |
 
 def _line(name: str, row: Row) -> str:
     camera = row["camera"]
-    sigma = max(float(row["sigma_m"]), 0.01)
+    sigma = stated_sigma_m(row)
     up, up_sigma = ("altitude_m", "altitude_sigma_m") if "altitude_m" in camera else ("height_m", "height_sigma_m")
     vertical = max(float(camera.get(up_sigma, 2.0 * sigma)), 0.01)  # a map of an earlier version has none
     return (

@@ -21,6 +21,7 @@ from orthoswarm.export.exterior_orientation import (
     by_lens,
     link_oriented,
     oriented_pictures,
+    stated_sigma_m,
 )  # fmt: skip
 from orthoswarm.model.camera import Lens
 from orthoswarm.model.geo import LocalGrid
@@ -118,5 +119,5 @@ def _shot(picture: OrientedPicture, camera: str, centre: Array, rotation: Array)
         "camera": camera,
         "orientation": 1,
         "gps_position": centre.tolist(),
-        "gps_dop": max(float(picture.row["sigma_m"]), 0.01),
+        "gps_dop": stated_sigma_m(picture.row),
     }

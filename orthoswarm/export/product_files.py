@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from orthoswarm.export.atomic_file import write_file
 from orthoswarm.export.footprint_layer import write_footprints
+from orthoswarm.export.json_values import finite, json_text
 from orthoswarm.model.angles import wrap_deg
 from orthoswarm.model.camera import Camera, Lens, angles_from_rotation, ground_jacobian
 from orthoswarm.model.frame import Frame, Rejection
@@ -216,7 +217,7 @@ def write_frames(
                 row["camera"] |= _vertical(one, levels.get(one.frame.vehicle))
                 if covariance and (of_pose := pose_covariance(one, z)) is not None:
                     row["camera"]["covariance"] = [[float(f"{v:.6g}") for v in line] for line in of_pose]
-            yield json.dumps(row, ensure_ascii=False) + "\n"
+            yield json_text(row) + "\n"
 
     write_file(out / "frames.jsonl", lines())
     outlines = ((describe_frame(p), footprint(p.camera, z, inset_px=-0.5)) for p in placed)
@@ -286,15 +287,10 @@ def image_root(frames: Sequence[Frame]) -> str | None:
     return None
 
 
-def finite(value: float) -> float | None:
-    """A number that JSON can hold; None for NaN and infinity."""
-    return float(value) if math.isfinite(value) else None
-
-
 def write_json(path: Path, document: Mapping[str, Any]) -> None:
     """Write one JSON document that appears when it is complete.
 
     Raises:
         OrthoSwarmError: if the disk is full or the folder cannot be written.
     """
-    write_file(path, json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+    write_file(path, json_text(document, 1) + "\n")

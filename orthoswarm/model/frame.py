@@ -7,6 +7,8 @@ from typing import Final
 
 SURVEYED = "surveyed points"
 """Source (`Frame.origin`) of positions that control points gave."""
+BY_OTHERS = "photos beside it"
+"""Source of positions that other photos of the same ground gave."""
 THETA_HAT_DEG: Final = 70.0
 """Horizontal field of view where nothing is known: below that of most drones' cameras (paper III.B)."""
 DEFAULT_HEIGHT_M: Final = 80.0
@@ -84,6 +86,11 @@ class Frame:
     origin: dict[str, str] = field(default_factory=dict, compare=False)
     damaged: bool = False
     ambiguous: bool = False
+
+    @property
+    def has_own_position(self) -> bool:
+        """Whether a receiver says its position, and not control points or other photos."""
+        return self.origin.get("position") not in (SURVEYED, BY_OTHERS)
 
     def __deepcopy__(self, memo: dict[int, object]) -> "Frame":
         """Itself: nobody changes a frame."""

@@ -4,7 +4,6 @@ Grid coordinates are (east, north) in metres of a WGS 84 / UTM zone; the grid's 
 is taken as 1. Latitudes and longitudes are degrees here, at the edge, and nowhere further in.
 """
 
-import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
@@ -46,22 +45,6 @@ def area_epsg(lat_deg: ArrayLike, lon_deg: ArrayLike) -> int:
     offset = wrap_deg(lon - mean)
     median = wrap_deg(float(mean) + float(np.median(offset)))
     return utm_epsg(float(np.median(lat)), float(median))
-
-
-def projection_of(line: str) -> str | None:
-    """The coordinate system that a line of a text file names, as text for PROJ; None where it names none.
-
-    "EPSG:32632", a PROJ string, or "WGS84 UTM 32N" as OpenDroneMap writes it.
-    """
-    text = line.strip()
-    if re.fullmatch(r"EPSG:\d{4,6}", text, re.IGNORECASE):
-        return text.upper()
-    if "+proj" in text or "+init" in text:
-        return text
-    match = re.fullmatch(r"WGS\s*84\s*/?\s*UTM\s*(?:zone)?\s*(\d{1,2})\s*([NS])", text, re.IGNORECASE)
-    if match and 1 <= int(match[1]) <= 60:
-        return f"EPSG:{(32600 if match[2].upper() == 'N' else 32700) + int(match[1])}"
-    return None
 
 
 @dataclass(frozen=True)

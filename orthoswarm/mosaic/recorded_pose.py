@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from orthoswarm.model.camera import NADIR_PITCH_RAD, Camera, Lens, focal_px, rotation_from_angles
 from orthoswarm.model.earth import on_sphere
-from orthoswarm.model.errors import InputError
+from orthoswarm.model.errors import InputError, OrthoSwarmError
 from orthoswarm.model.frame import (
     DEFAULT_HEIGHT_M,
     TAGGED_TILT_SIGMA,
@@ -217,9 +217,12 @@ def _far_from_others(frame: Frame, away_km: float) -> Rejection:
     return Rejection(frame.image, reason, frame.vehicle, frame.time_s, detail=where)
 
 
-def nothing_to_map(ingest: Ingest) -> str:
-    """Why inputs without a single frame cannot be mapped, one sentence."""
+def nothing_to_map(ingest: Ingest) -> OrthoSwarmError:
+    """Why inputs without a single frame cannot be mapped: wrong inputs, or pictures that lack their positions."""
     if not ingest.rejected:
-        return "no picture was found in the input; name a folder of photos or a video"
+        return InputError("no picture was found in the input; name a folder of photos or a video")
     reason, count = Counter(r.reason for r in ingest.rejected).most_common(1)[0]
-    return f"none of the {len(ingest.rejected)} pictures can be used; {count} of them: {reason}"
+    said = f"none of the {len(ingest.rejected)} pictures can be used; {count} of them: {reason}"
+    if not ingest.unpositioned:
+        return InputError(said)
+    return OrthoSwarmError(f"{said}, or mark at least two surveyed points in them (--control)")

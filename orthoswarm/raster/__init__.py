@@ -1,1 +1,1 @@
-"""Rasters and pictures in and out: the basemap, height models, tile folders, picture files, resampling."""
+"""Rasters and pictures in and out: the basemap, height models, map tiles, picture files, resampling."""

@@ -16,7 +16,7 @@ from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.raster.gdal_map import RasterMap, luma
 from orthoswarm.raster.map_check import sample_windows
-from orthoswarm.raster.tile_folder import TileFolder
+from orthoswarm.raster.tile_map import TileMap
 from orthoswarm.stores.addresses import address_of
 from orthoswarm.stores.listing import exists
 
@@ -56,7 +56,8 @@ class Basemap:
     @cached_property
     def _source(self) -> _Source:
         """The open map; a copy in another process opens its own at its first use, where an error can be reported."""
-        kind = TileFolder if self.path.is_dir() else RasterMap
+        is_tiles = self.path.is_dir() or self.path.suffix.lower() == ".mbtiles"
+        kind = TileMap if is_tiles else RasterMap
         return kind(self.path, self.epsg, self._near)
 
     @classmethod

@@ -4,8 +4,9 @@ import os
 import threading
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,8 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.model.bounding_box import BoundingBox
+from orthoswarm.model.coordinate_system import require_datum
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import GroundGrid
+from orthoswarm.raster.empty_pixels import blank, fills, range_of_ground
 from orthoswarm.raster.kept_ranges import STRETCH_PERCENT
 from orthoswarm.raster.map_check import UnreadableMapError, ends_early
 from orthoswarm.raster.resampling import resample
@@ -28,9 +31,9 @@ Mask = NDArray[np.bool_]
 os.environ.setdefault("GDAL_CACHEMAX", "64")
 
 _MAP_PIXELS_AT_ONCE: Final = 8_000_000  # pixels of a map read at once (memory)
-_COLLAR_PX: Final = 15
-"""Plain black or plain white squares of at least this side, pixels, in a map without a mask are its collar and no
-ground."""
+_CUBIC_PX: Final = 2  # pixels on either side that cubic interpolation mixes
+_SAMPLE_SIDE: Final = 6  # windows a side of the lattice that is searched for plain fill ...
+_SAMPLE_PX: Final = 48  # ... and their side, pixels
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,8 +44,9 @@ class _Stretch:
     high: NDArray[np.float32]
 
     def apply(self, data: NDArray[Any]) -> Bytes:
-        low, scale = self.low[:, None, None], (255.0 / (self.high - self.low))[:, None, None]
-        return np.clip(np.nan_to_num((data.astype(np.float32) - low) * scale) + 0.5, 0, 255).astype(np.uint8)
+        low, high = self.low[:, None, None], self.high[:, None, None]
+        inside = np.clip(np.nan_to_num(data.astype(np.float32)), low, high)
+        return np.asarray((inside - low) * (255.0 / (high - low)) + 0.5).astype(np.uint8)
 
 
 class RasterMap:
@@ -71,6 +75,7 @@ class RasterMap:
         self._affine = _affine_of(source)
         self._aligned = t.b == 0 and t.d == 0 and t.a > 0 > t.e and self._crs.to_epsg() == epsg
         eight_bit = all(source.dtypes[b - 1] == "uint8" for b in self._bands)
+        self._ground, self._area = (-np.inf, np.inf), near or self.bounds
         with self._reading():
             self._stretch = None if eight_bit or self._palette is not None else self._limits(epsg)
 
@@ -82,10 +87,6 @@ class RasterMap:
         key = (os.getpid(), level)
         if key not in handles:
             options: dict[str, Any] = {} if level is None else {"OVERVIEW_LEVEL": level}
-            if self._path.suffix.lower() == ".mbtiles":
-                # Bounds that cut a pixel move the whole map by up to half of one: GDAL takes them as the corner, and
-                # whole pixels from there.
-                options["USE_BOUNDS"] = "NO"
             # Of a local map side files are looked for one by one (world file, .aux.xml, .msk, .ovr) without listing its
             # folder, which may hold thousands of photos; asking a store for each of them would take seconds.
             side_files = "EMPTY_DIR" if is_stored(self._path) else "TRUE"
@@ -134,12 +135,65 @@ class RasterMap:
                 parts = [self._read_aligned(part, gray) for part in self._bands_of(grid)]
                 return parts[0] if len(parts) == 1 else _below_each_other(parts)
             data, valid = self._warp(grid)
-        if self._opaque:
-            valid &= ~_blank(data)
+        ratio = grid.gsd_m / self.native_gsd_m
+        valid &= self._shown(data, ratio, mixed_px=int(np.ceil(_CUBIC_PX / min(ratio, 1.0))))
         return self._eight_bit(data), valid
 
     def _eight_bit(self, data: NDArray[Any]) -> Bytes:
         return self._stretch.apply(data) if self._stretch is not None else np.asarray(data, np.uint8)
+
+    def _shown(self, data: NDArray[Any], reduced: float, mixed_px: int) -> Mask:
+        """Where values (bands, rows, columns) can be ground, bool (rows, columns).
+
+        Args:
+            reduced: pixels of the map to one of these. mixed_px: pixels beside empty ones that are mixed with them.
+        """
+        import cv2
+
+        shown = self._in_range(data)
+        if mixed_px and not shown.all():
+            side = 2 * mixed_px + 1
+            shown = cv2.erode(shown.astype(np.uint8), np.ones((side, side), np.uint8)).astype(bool)
+        if self._opaque:
+            shown &= ~blank(data, self._fills, reduced)
+        return shown
+
+    def _in_range(self, data: NDArray[Any]) -> Mask:
+        low, high = self._ground
+        if data.dtype.kind != "f" and low == -np.inf and high == np.inf:
+            return np.ones(data.shape[1:], bool)
+        return np.asarray(((data > low) & (data < high)).all(axis=0))  # not true of what is no number
+
+    @cached_property
+    def _fills(self) -> list[tuple[float, ...]]:
+        """Colours in which the map is plain without being ground, besides black and white."""
+        low, high = self._ground
+        return [colour for colour in fills(self._samples()) if low < min(colour) and max(colour) < high]
+
+    def _samples(self) -> Iterator[NDArray[Any]]:
+        """Windows of the map at its own resolution, spread over the area."""
+        from rasterio.windows import Window
+
+        source = self._open()
+        for c, r in self._lattice(self._area):
+            left = min(max(c - _SAMPLE_PX // 2, 0), max(source.width - _SAMPLE_PX, 0))
+            top = min(max(r - _SAMPLE_PX // 2, 0), max(source.height - _SAMPLE_PX, 0))
+            size = min(_SAMPLE_PX, source.width), min(_SAMPLE_PX, source.height)
+            with suppress(self._error):  # what is damaged is told where it is needed
+                yield source.read(self._bands, window=Window(left, top, *size))
+
+    def _lattice(self, bounds: BoundingBox) -> Iterator[tuple[int, int]]:
+        """Columns and rows of the map at places spread over bounds, those inside it."""
+        from rasterio.warp import transform
+
+        west, south, east, north = bounds
+        share = (np.arange(_SAMPLE_SIDE) + 0.5) / _SAMPLE_SIDE
+        x, y = (v.ravel() for v in np.meshgrid(west + share * (east - west), south + share * (north - south)))
+        inverse, source = ~self._affine, self._open()
+        for place in zip(*transform(f"EPSG:{self._epsg}", self._crs, x, y), strict=True):
+            column, row = (int(v) if np.isfinite(v) else -1 for v in _apply(inverse, *place))
+            if 0 <= column < source.width and 0 <= row < source.height:
+                yield column, row
 
     def _level(self, grid: GroundGrid) -> int | None:
         """The overview to read from; at least twice finer than needed, since its resampling method is unknown."""
@@ -174,9 +228,10 @@ class RasterMap:
             return np.zeros((bands, grid.height, grid.width), np.uint8), np.zeros((grid.height, grid.width), bool)
         window = Window(c0, r0, c1 - c0, r1 - r0)
         data = source.read(self._bands, window=window)
-        valid = ~_blank(data) if self._opaque else source.dataset_mask(window=window) > 127
-        if data.dtype.kind == "f":
-            valid &= np.isfinite(data).all(axis=0)
+        reduced = t.a / self._affine.a
+        valid = self._shown(data, reduced, mixed_px=int(reduced > 1.0))
+        if not self._opaque:
+            valid &= source.dataset_mask(window=window) > 127
         data = self._eight_bit(data)
         if gray:
             data = luma(data)
@@ -207,10 +262,7 @@ class RasterMap:
             bands = vrt.read([*self._bands, self._alpha or vrt.count])
         full = 255 if self._alpha is None else _alpha_range(source.dtypes[self._alpha - 1])
         valid = bands[-1] > 0.5 * full
-        data = bands[:-1]
-        if data.dtype.kind == "f":
-            valid &= np.isfinite(data).all(axis=0)
-        return data, valid
+        return bands[:-1], valid
 
     def _read_palette(self, grid: GroundGrid) -> tuple[Bytes, Mask]:
         """Read a palette map three times finer and average the colours, as palette numbers cannot be averaged."""
@@ -231,7 +283,11 @@ class RasterMap:
         """Percentiles of the map near the area, from about half a million pixels."""
         west, south, east, north = self.bounds
         side = max(self.native_gsd_m, float(np.sqrt((east - west) * (north - south) / 5e5)))
-        data, valid = self._warp(GroundGrid.around(epsg, self.bounds, side))
+        data, valid = self._warp(GroundGrid.around(epsg, self.bounds, side), nearest=True)
+        if data.dtype.kind == "f":
+            valid &= np.isfinite(data).all(axis=0)
+        self._ground = range_of_ground(data[:, valid].ravel())
+        valid &= self._in_range(data)
         low, high = np.zeros(len(data), np.float32), np.ones(len(data), np.float32)
         for i, band in enumerate(data):
             values = band[valid]
@@ -265,6 +321,7 @@ def _crs_of(source: Any, path: Path) -> Any:
             f"the basemap {path.name} has no coordinate system (CRS); georeference it, for example with QGIS, or give "
             "another map"
         )
+    require_datum(crs.to_wkt(), f"the basemap {path.name}")
     return crs
 
 
@@ -337,24 +394,6 @@ def _ring(width: int, height: int) -> list[tuple[float, float]]:
 
 def _alpha_range(dtype: str) -> float:
     return float(np.iinfo(dtype).max) if np.dtype(dtype).kind in "iu" else 1.0
-
-
-def _blank(values: NDArray[Any]) -> Mask:
-    """Uniformly black or white patches of a map without a mask: its collar, whose edges would be false features."""
-    import cv2
-
-    side = _COLLAR_PX
-    box = np.ones((side, side), np.uint8)
-    wider = np.ones((side + 4, side + 4), np.uint8)  # interpolation blurs a collar's edge by two pixels
-    out = np.zeros(values.shape[1:], bool)
-    for value in (0, 255) if values.dtype == np.uint8 else (0,):
-        flat = values[0] == value
-        for band in values[1:]:
-            flat &= band == value
-        if np.count_nonzero(flat) >= side**2:
-            core = cv2.erode(flat.astype(np.uint8), box, borderValue=1)
-            out |= cv2.dilate(core, wider, borderValue=0).astype(bool)
-    return out
 
 
 def _short(error: Exception) -> str:

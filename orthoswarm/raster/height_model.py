@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthoswarm.model.bounding_box import BoundingBox
+from orthoswarm.model.coordinate_system import require_datum
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.placement import Terrain
 from orthoswarm.stores.addresses import address_of
@@ -262,6 +263,7 @@ def _on_area(
     with dataset:
         if dataset.crs is None:
             raise InputError(f"{name} has no CRS; assign one (gdal_edit.py -a_srs EPSG:...) and try again")
+        require_datum(dataset.crs.to_wkt(), name)
         if dataset.count > 1 and dataset.dtypes[0] == "uint8":
             raise InputError(f"{name} is a picture ({dataset.count} bands of 8 bit), not heights; give a DEM by --dem")
         try:

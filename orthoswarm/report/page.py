@@ -335,7 +335,9 @@ def _verdict(report: Mapping[str, Any], placed: Sequence[PlacedFrame], shifts: M
 
 def _expected(sigma_m: Sequence[float]) -> str:
     """One sigma of a place on the map, and how it differs from picture to picture."""
-    low, usual, high = np.quantile(sigma_m, [0.05, 0.5, 0.95]) if sigma_m else [math.nan] * 3
+    if not sigma_m:
+        return "an unknown distance"
+    low, usual, high = np.quantile(sigma_m, [0.05, 0.5, 0.95])
     text = f"{usual:.2f} m (one sigma an axis"
     if f"{low:.2f}" != f"{high:.2f}":
         text += f"; {low:.2f} to {high:.2f} m in nine of ten pictures"

@@ -111,6 +111,18 @@ def read_photo(path: Path) -> Photo | None:
     return tags_of(path, container)
 
 
+def with_sidecar(path: Path, sidecar: Path) -> Photo:
+    """The tags of a photo and of an XMP file beside it, which counts where both state something.
+
+    Raises:
+        NotAPicture: the photo is not readable. OSError: the other file is not.
+    """
+    container = read_container(path)
+    with sidecar.open("rb") as handle:
+        container.xmp = container.xmp[: xmp.MAX_PACKET - 1] + b"\n" + handle.read(xmp.MAX_PACKET)
+    return tags_of(path, container)
+
+
 def read_photos(
     paths: Sequence[Path], *, workers: int = 4, run: Run | None = None, progress: Callable[[int], None] | None = None
 ) -> Generator[Photo | Unreadable | None, None, None]:
@@ -210,13 +222,15 @@ def _xmp_position(found: xmp.Properties) -> tuple[float, float] | None:
     lat = xmp.number(found, *(f"{p}:{n}" for p in _POSITION_PREFIXES for n in ("GpsLatitude", "Latitude")))
     lon_names = ("GpsLongitude", "GpsLongtitude", "Longitude")
     lon = xmp.number(found, *(f"{p}:{n}" for p in _POSITION_PREFIXES for n in lon_names))
+    if lat is None or lon is None:
+        lat, lon = xmp.degrees(found, "exif:GPSLatitude"), xmp.degrees(found, "exif:GPSLongitude")
     return (lat, lon) if lat is not None and lon is not None and is_position(lat, lon) else None
 
 
 def _heights(photo: Photo, tags: exif.Exif, found: xmp.Properties) -> None:
     photo.altitude_m = exif.gps_altitude(tags.gps)
     if photo.altitude_m is None:
-        photo.altitude_m = xmp.number(found, "drone-dji:AbsoluteAltitude")
+        photo.altitude_m = xmp.number(found, "drone-dji:AbsoluteAltitude", "exif:GPSAltitude")
     ground = xmp.number(found, "Camera:AboveGroundAltitude")
     if ground is not None and 0.0 < ground < _MOST_HEIGHT_M:
         photo.height_m, photo.height_is_ground = ground, True

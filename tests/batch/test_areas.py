@@ -205,6 +205,7 @@ def test_vehicles_stand_in_their_order_whatever_areas_they_are_in(flight, tmp_pa
     assert [v["id"] for v in report["vehicles"]] == ["w0", "w1", "w2", "w3"]
 
 
+@pytest.mark.slow
 def test_areas_do_not_depend_on_the_number_of_workers(flight, mapped, tmp_path):
     workers = Processes(2)
     try:
@@ -215,6 +216,7 @@ def test_areas_do_not_depend_on_the_number_of_workers(flight, mapped, tmp_path):
         assert (tmp_path / "out" / name).read_bytes() == (mapped[0] / name).read_bytes()
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_goes_on_with_its_area_and_solves_no_vehicle_again(flight, mapped, tmp_path, monkeypatch):
     stored, remember = [], Workspace.remember
 

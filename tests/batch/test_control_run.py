@@ -134,3 +134,20 @@ def test_control_points_of_elsewhere_are_refused_before_the_work(flight, tmp_pat
     assert main(["mosaic", str(flight / "photos"), "--out", str(out), "--control", str(table)]) == 2
     assert "coordinate system" in capsys.readouterr().err
     assert not (out / "orthoimage.tif").exists()
+
+
+def test_exchanged_coordinates_are_told_and_the_map_is_made(flight, tmp_path, capsys):
+    lines = [line.split(",") for line in (flight / "check.csv").read_text().splitlines()]
+    table = tmp_path / "swapped.csv"
+    table.write_text("\n".join(",".join([name, lon, lat, *rest]) if k else ",".join([name, lat, lon, *rest])
+                               for k, (name, lat, lon, *rest) in enumerate(lines)))  # fmt: skip
+    report = mosaic(flight, tmp_path / "out", "--checkpoints", table, "--until", "coarse")
+    assert report["checkpoints"] is None
+    assert any("two coordinates exchanged" in warning for warning in report["warnings"])
+    assert "two coordinates exchanged" in capsys.readouterr().err
+    for name in ("report.json", "frames.jsonl"):
+        text = (tmp_path / "out" / name).read_text()
+        assert "NaN" not in text and "Infinity" not in text
+    options = ["--out", str(tmp_path / "no"), "--control", str(table)]
+    assert main(["mosaic", str(flight / "photos"), *options]) == 2
+    assert "two coordinates exchanged" in capsys.readouterr().err

@@ -122,6 +122,7 @@ def test_a_mosaic_on_a_full_disk_says_so_and_goes_on_when_there_is_room(small_di
         assert whole(disk / "out" / name)
 
 
+@pytest.mark.slow
 def test_a_daemon_on_a_full_disk_refuses_pictures_and_takes_them_when_there_is_room(small_disk):
     disk = small_disk(120)
     shots = line(12)
@@ -169,6 +170,7 @@ def test_a_folder_whose_daemon_has_no_room_is_read_when_there_is(small_disk, pho
         assert {row["image"] for row in rows} == {path.name for path in sorted(photos.iterdir())[:5]}
 
 
+@pytest.mark.slow
 def test_a_daemon_does_not_begin_on_a_full_disk_without_a_word(small_disk):
     disk = small_disk(8)
     (disk / "w").mkdir()

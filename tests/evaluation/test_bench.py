@@ -55,6 +55,7 @@ def test_scaling_counts_vehicles_and_pictures_and_draws_both_figures(tiny, tmp_p
     assert json.loads((out / "tiny-swarm-1x20.json").read_text())["refine"] == "swarm"  # the report itself
 
 
+@pytest.mark.slow
 def test_a_method_that_fails_is_a_row_with_its_message(tiny, tmp_path):
     (tmp_path / "set" / "photos").mkdir(parents=True)
     row = accuracy.measure(tmp_path / "set", "swarm", tmp_path / "map", 1, False)

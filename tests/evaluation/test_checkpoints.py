@@ -199,3 +199,103 @@ def test_a_mark_that_the_others_contradict_is_left_out_and_told(tmp_path, capsys
     assert "contradict each other" in result.findings[0] and result.miss_m[0] > 1.0
     assert main(["evaluate", str(out), "--checkpoints", str(table)]) == 0
     assert "contradict each other" in capsys.readouterr().out
+
+
+def rewritten(path: Path, header: str, turned) -> Path:
+    """The points of `gcp_list` under another header, their two coordinates turned by a function of east and north."""
+    _, *rows = gcp_list(path).read_text().splitlines()
+    lines = [header]
+    for row in rows:
+        east, north, rest = row.split(" ", 2)
+        x, y = turned(float(east), float(north))
+        lines.append(f"{x:.9f} {y:.9f} {rest}")
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def degrees(east, north):
+    lat, lon = LocalGrid(EPSG).to_geographic([east, north]).tolist()
+    return lon, lat
+
+
+@pytest.mark.parametrize(
+    ("header", "turned", "said"),
+    [
+        ("EPSG:4326", lambda e, n: degrees(e, n)[::-1], "two coordinates exchanged"),
+        ("WGS84 UTM 32N", lambda e, n: (n, e), "two coordinates exchanged"),
+        ("WGS84 UTM 32S", lambda e, n: (e, n), "EPSG:32632 instead of WGS84 UTM 32S"),
+        ("EPSG:32633", lambda e, n: (e, n), "EPSG:32632 instead of EPSG:32633"),
+        ("EPSG:32632", degrees, "EPSG:4326 instead of EPSG:32632"),
+        ("EPSG:4326", lambda e, n: (-degrees(e, n)[0], degrees(e, n)[1]), "a minus before its longitude"),
+        ("EPSG:32632", lambda e, n: (e + 40_000.0, n), "check their coordinates"),
+    ],
+)
+def test_points_elsewhere_are_refused_with_what_was_meant(tmp_path, header, turned, said, capsys):
+    out, table = product(tmp_path / "out"), rewritten(tmp_path / "gcp.txt", header, turned)
+    assert main(["evaluate", str(out), "--checkpoints", str(table), "--json"]) == 2
+    told = capsys.readouterr()
+    assert said in told.err and told.out == "" and "inf" not in told.err
+
+
+def test_one_point_elsewhere_is_told_and_the_others_are_measured(tmp_path):
+    table = gcp_list(tmp_path / "gcp.txt")
+    table.write_text(table.read_text().replace(f"{points()[2, 1]:.4f}", f"{points()[2, 1] + 70_000.0:.4f}"))
+    result = evaluate_checkpoints(product(tmp_path / "out"), table)
+    assert np.abs(result.error).max() < 0.01
+    assert result.unused == ["gcp2"] and "70 km" in " ".join(result.findings)
+
+
+def test_a_point_that_stands_out_and_a_shift_of_all_are_told(tmp_path):
+    table = gcp_list(tmp_path / "gcp.txt")
+    table.write_text(table.read_text().replace(f"{points()[2, 1]:.4f}", f"{points()[2, 1] + 70.0:.4f}"))
+    assert any("point gcp2" in f and "70 m" in f for f in evaluate_checkpoints(product(tmp_path / "a"), table).findings)
+    moved = evaluate_checkpoints(product(tmp_path / "b", (60.0, 75.0)), gcp_list(tmp_path / "gcp.txt"))
+    assert any("another datum" in finding for finding in moved.findings)
+
+
+@pytest.mark.parametrize(
+    "system", ["+proj=utm +zone=32 +ellps=bessel +units=m +no_defs", "+proj=utm +zone=32 +ellps=intl +units=m"]
+)
+def test_an_ellipsoid_without_a_datum_is_refused(tmp_path, system):
+    table = rewritten(tmp_path / "gcp.txt", system, lambda e, n: (e, n))
+    with pytest.raises(InputError, match=r"names the ellipsoid .* but no datum"):
+        evaluate_checkpoints(product(tmp_path / "out"), table)
+
+
+@pytest.mark.parametrize(
+    ("system", "said"),
+    [
+        ("+proj=utm +zone=32 +ellps=WGS84 +units=m", "WGS 84 is assumed"),
+        ("EPSG:31468", "to 3 m only"),
+        ("EPSG:25832", ""),
+        ("EPSG:32632+5773", ""),
+    ],
+)
+def test_what_is_not_known_of_a_datum_is_told(tmp_path, system, said):
+    table = tmp_path / "points.csv"
+    east, north = (4_468_500.0, 5_333_000.0) if system == "EPSG:31468" else (EAST, NORTH)
+    table = tmp_path / "gcp.txt"
+    table.write_text(f"{system}\n{east} {north} 0 10 10 a.jpg\n")
+    (point,) = read_checkpoints(table)
+    assert said in point.doubt and bool(said) == bool(point.doubt)
+
+
+def test_a_negative_sigma_is_refused(tmp_path):
+    table = tmp_path / "points.csv"
+    table.write_text("name,lat_deg,lon_deg,sigma_m,map_lat_deg,map_lon_deg\na,48,11,-0.1,48,11\n")
+    with pytest.raises(InputError, match="cannot be less than 0"):
+        read_checkpoints(table)
+
+
+@pytest.mark.parametrize("name,code", [("PUWG1992", "EPSG:2180"), ("Lambert93", "EPSG:2154"), ("NZTM", "EPSG:2193")])
+def test_the_code_of_a_system_that_is_called_otherwise_is_proposed(tmp_path, name, code):
+    (tmp_path / "gcp_list.txt").write_text(f"{name}\n634676 485344 112 242.0 256.9 a.jpg\n")
+    with pytest.raises(InputError, match=f"if it is {code} .*, write that code"):
+        read_checkpoints(tmp_path / "gcp_list.txt")
+
+
+def test_of_a_name_that_fits_several_systems_or_none_nothing_is_proposed(tmp_path):
+    for name in ("Poland", "xyzzy"):
+        (tmp_path / "gcp_list.txt").write_text(f"{name}\n634676 485344 112 242.0 256.9 a.jpg\n")
+        with pytest.raises(InputError, match="write EPSG:32617 or a PROJ string"):
+            read_checkpoints(tmp_path / "gcp_list.txt")

@@ -124,14 +124,16 @@ class Served:
         self.process.wait(120)
 
     def until(self, path: str, done, limit_s=300.0):
-        """Poll an address until something is so; gives its last JSON."""
-        end = time.monotonic() + limit_s
+        """Poll an address until something is so; gives its last JSON. It gives up when nothing changes for a time."""
+        before, end = None, 0.0
         while True:
             value = self.get(path).json()
             if done(value):
                 return value
+            if (now := (value, self.get("/api/jobs").json())) != before:
+                before, end = now, time.monotonic() + limit_s
             if time.monotonic() > end:
-                raise AssertionError(f"{path} is still {value}; jobs {self.get('/api/jobs').text}")
+                raise AssertionError(f"{path} is still {now[0]}; jobs {now[1]}")
             time.sleep(0.1)
 
     def take_off(self, vehicle: str, limit_s: float = 400.0) -> None:

@@ -162,3 +162,9 @@ def test_a_large_file_is_read_in_another_process_so_that_the_server_answers_othe
     assert posted(large) == wanted
     with pytest.raises(InputError, match="this process"):
         posted(circle(20))
+
+
+def test_an_area_of_an_ellipsoid_without_a_datum_is_refused(tmp_path):
+    path = written(tmp_path, "area.gpkg", "+proj=utm +zone=32 +ellps=bessel +units=m", "GPKG")
+    with pytest.raises(InputError, match="no datum"):
+        area_of(path.read_bytes(), "area.gpkg")

@@ -66,6 +66,7 @@ def star_polygons(draw):
     return shell, holes, radius
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(
     star_polygons(),
@@ -256,6 +257,7 @@ def test_vehicles_stay_apart_even_off_schedule(method, vehicles, start):
         assert np.diff(begins).min() >= apart.launch_s - 1e-6
 
 
+@pytest.mark.slow
 def test_many_vehicles_share_a_large_area():
     side = 3163.0
     plan = plan_area(

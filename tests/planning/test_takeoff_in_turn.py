@@ -65,6 +65,7 @@ def test_vehicles_of_one_start_keep_apart_in_height_as_they_take_off_and_land(au
     assert not any("beside each other" in warning for warning in plan.warnings)
 
 
+@pytest.mark.slow
 def test_where_it_would_take_too_long_they_take_off_beside_each_other_and_the_plan_says_so():
     plan, options = planned(24, [start_at(-60.0, 200.0)])
     assert "take off and land 5 s after each other" in plan.separation
@@ -76,6 +77,7 @@ def test_where_it_would_take_too_long_they_take_off_beside_each_other_and_the_pl
     assert own.warnings == () and pairs_that_met(own, options, (0.0,)) == set()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("vehicles", [5, 24])
 def test_taking_off_in_turn_is_tried_no_further_than_it_can_win(vehicles, monkeypatch):
     placed, place = [], deconfliction._Sky.place

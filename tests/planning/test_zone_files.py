@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 import shapely
 
-from gcs_plugin.plans.area_files import read_shapes, read_zones
-from gcs_plugin.plans.plan_files import read_planned_flight, write_plan
+from gcs_plugin.plans import area_files
+from gcs_plugin.plans.area_files import read_shapes
+from gcs_plugin.plans.no_fly import Reach, read_no_fly, read_zones
+from gcs_plugin.plans.plan_files import geojson, read_planned_flight, write_plan
 from gcs_plugin.plans.plan_request import PlanRequest, make_plan
 from orthoswarm.model.errors import InputError
 from orthoswarm.planning.area.area import make_area
@@ -117,7 +119,7 @@ def test_a_line_with_a_width_is_a_strip(tmp_path):
 
 def test_what_is_switched_off_is_not_flown_but_kept_out_of(tmp_path):
     (tmp_path / "z.kml").write_text(f"<kml><Folder>{KML_POLYGON.format('<visibility>0</visibility>')}</Folder></kml>")
-    shapes, _ = read_shapes(tmp_path / "z.kml")
+    shapes, *_ = read_shapes(tmp_path / "z.kml")
     assert not shapes.areas and shapes.left == ("a polygon switched off in the file",)
     assert len(read_zones(tmp_path / "z.kml")[0].polygons) == 1
 
@@ -156,3 +158,68 @@ def test_a_plan_across_the_date_line_is_cut_there(tmp_path):
     assert sum(f["properties"].get("kind") == "area" for f in features) == 2
     legs = read_planned_flight(tmp_path / "out", area.grid).legs
     assert np.linalg.norm(legs[:, 1] - legs[:, 0], axis=1).max() < 500.0
+
+
+def national(count: int, extra=()) -> dict:
+    """An ED-269 file of a country: circles every 12 km, a fourth of them polygons of 80 corners."""
+    zones = []
+    for k in range(count):
+        lat, lon = 45.0 + 0.11 * (k // 70), 4.0 + 0.15 * (k % 70)
+        if k % 4:
+            shape = {"type": "Circle", "center": [lon, lat], "radius": 500.0}
+        else:
+            turn = np.linspace(0.0, 2.0 * np.pi, 81)
+            ring = np.column_stack([lon + 0.01 * np.cos(turn), lat + 0.01 * np.sin(turn)])
+            ring[-1] = ring[0]
+            shape = {"type": "Polygon", "coordinates": [ring.tolist()]}
+        zones.append({"identifier": f"X{k}", "geometry": [{"uomDimensions": "M", "horizontalProjection": shape}]})
+    return {"title": "a country", "features": [*zones, *extra]}
+
+
+def test_of_a_national_file_the_zones_near_the_flights_are_used_and_the_others_counted(tmp_path, monkeypatch):
+    (tmp_path / "area.json").write_text(json.dumps(small_area(47.4, 8.5, north_m=600.0, east_m=600.0)))
+    document = national(3000, ZONES["ED-269"]["features"])
+    (tmp_path / "zones.json").write_text(json.dumps(document))
+    parsed = []
+    read = area_files.parse_geojson
+    monkeypatch.setattr(area_files, "parse_geojson", lambda *a, **k: parsed.append(a[1]) or read(*a, **k))
+    request = PlanRequest(
+        area=tmp_path / "area.json", vehicles=1, altitude_m=60.0, fov_min_deg=60.0, no_fly=[tmp_path / "zones.json"]
+    )
+    plan, area = make_plan(request)
+    assert len(parsed) == 2  # each file once
+    assert any(fence.points == ((47.4, 8.5),) for fence in plan.fences) and len(plan.fences) < 5
+    [note] = [w for w in plan.warnings if "zones.json" in w]
+    assert f"{3001 - len(plan.fences)} zones far from the flights" in note
+    zone = shapely.Point(area.grid.to_grid(47.4, 8.5)).buffer(150.0)
+    flown = np.array([(p.lat_deg, p.lon_deg) for s in plan.vehicles[0].sorties for p in s.waypoints])
+    assert shapely.LineString(area.grid.to_grid(*flown.T)).distance(zone) > 9.0
+    [drawn] = [f for f in json.loads(geojson(plan, area))["features"] if f["properties"]["kind"] == "no-fly zone"][:1]
+    assert drawn["properties"]["circles_wider_m"] == 10.0
+
+
+def test_zones_beside_the_date_line_and_around_it_are_near(tmp_path):
+    reach = Reach(np.array([[-16.8, 179.998], [-16.797, -179.998]]))
+    across = np.array([[-16.8, 179.99], [-16.8, -179.99], [-16.79, -179.99]])
+    assert reach.touches(across) and reach.touches(np.array([[-16.8, -179.96]]))
+    assert not reach.touches(np.array([[-16.8, -179.9]])) and reach.touches(np.array([[-16.8, -179.9]]), 10_000.0)
+    assert not Reach(np.array([[47.0, 8.0], [47.1, 8.1]])).touches(across)
+
+
+def test_a_way_to_where_zones_were_not_used_is_refused(tmp_path):
+    (tmp_path / "area.json").write_text(json.dumps(small_area(47.4, 8.5, north_m=300.0, east_m=300.0)))
+    (tmp_path / "zones.json").write_text(json.dumps(national(500, ZONES["ED-269"]["features"])))
+    request = PlanRequest(area=tmp_path / "area.json", vehicles=1, altitude_m=60.0, fov_min_deg=60.0)
+    plan, _ = make_plan(request)
+    flown = np.array([[48.4, 8.5], [48.41, 8.51]])
+    with pytest.raises(InputError, match="farther than the zones that were used"):
+        read_no_fly([tmp_path / "zones.json"], flown, None).refuse_beyond(plan)
+    near = np.array([[47.4, 8.5], [47.41, 8.51]])
+    read_no_fly([tmp_path / "zones.json"], near, None).refuse_beyond(plan)
+
+
+def test_aixm_is_named_with_what_to_do(tmp_path):
+    text = '<message:AIXMBasicMessage xmlns:message="http://www.aixm.aero/schema/5.1.1/message"/>'
+    (tmp_path / "zones.xml").write_text(text)
+    with pytest.raises(InputError, match=r"is AIXM.*convert them"):
+        read_zones(tmp_path / "zones.xml")

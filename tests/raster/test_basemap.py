@@ -2,6 +2,7 @@
 
 import contextlib
 import pickle
+import shutil
 import sqlite3
 from concurrent.futures import ThreadPoolExecutor
 
@@ -385,3 +386,161 @@ def test_threads_and_processes_share_a_map(gray_tif):
     with ThreadPoolExecutor(4) as pool:
         for gray, _ in pool.map(lambda _: basemap.gray(AREA, 0.5), range(12)):
             np.testing.assert_array_equal(gray, first)
+
+
+SENTINELS = {
+    "float": (np.float32, -9999.0, {}),
+    "least float": (np.float32, np.finfo(np.float32).min, {}),
+    "uint16": (np.uint16, 65535, {}),
+    "int16": (np.int16, -32768, {}),
+    "uint16, zero": (np.uint16, 0, {}),
+    "white": (np.uint8, 255, {}),
+    "plain grey": (np.uint8, 204, {}),
+    "black, JPEG": (np.uint8, 0, {"compress": "JPEG", "tiled": True, "jpeg_quality": 70}),
+    "white, JPEG": (np.uint8, 255, {"compress": "JPEG", "tiled": True, "jpeg_quality": 70}),
+}
+
+
+@pytest.mark.parametrize("epsg", [EPSG, 3857])
+@pytest.mark.parametrize("kind", SENTINELS)
+def test_empty_pixels_that_nobody_declared_are_no_ground_and_take_no_contrast(tmp_path, kind, epsg):
+    dtype, empty, profile = SENTINELS[kind]
+    if epsg == EPSG:
+        affine = PLAIN
+    else:
+        (x,), (y,) = rasterio.warp.transform(f"EPSG:{EPSG}", "EPSG:3857", [EAST - 20], [NORTH + 20])
+        affine = from_origin(x, y, 0.6, 0.6)
+    values = picture(affine, 600, 600, epsg)
+    values = (values * (20 if dtype in (np.uint16, np.int16) else 1)).astype(dtype)
+    at = rasterio.warp.transform(f"EPSG:{EPSG}", f"EPSG:{epsg}", [EAST + 100.0], [NORTH - 100.0])
+    column = int((at[0][0] - affine.c) / affine.a)
+    values[:, :column] = empty
+    basemap = Basemap.open(write(tmp_path / "m.tif", values, affine, epsg, **profile), EPSG, AREA)
+    for gsd in (0.4, 1.1):
+        gray, valid = basemap.gray(AREA, gsd)
+        assert 0.4 < valid.mean() < 0.51
+        border = valid & np.roll(~valid, 1, axis=1)
+        assert gray[valid].std() > 25.0 and len(np.unique(gray[valid].round())) > 90
+        want = expected(AREA, gsd)
+        shown = np.corrcoef(gray[valid], want[valid])[0, 1]
+        fringe = np.corrcoef(gray[border], want[border])[0, 1]
+        assert shown > 0.99 and fringe > 0.9
+
+
+def test_a_drawn_map_is_shown_whole_and_dark_water_is_ground(tmp_path):
+    drawn = np.kron(np.random.default_rng(1).integers(1, 9, (25, 25)) * 25, np.ones((20, 20))).astype(np.uint8)
+    assert Basemap.open(write(tmp_path / "d.tif", drawn, PLAIN), EPSG, AREA).gray(AREA, 0.4)[1].all()
+    water = picture(PLAIN, 500, 500).round().astype(np.uint8)
+    water[:, :250] = np.random.default_rng(2).integers(2, 9, (500, 250))
+    assert Basemap.open(write(tmp_path / "w.tif", water, PLAIN), EPSG, AREA).gray(AREA, 0.4)[1].all()
+
+
+def mbtiles_of(folder, path):
+    with contextlib.closing(sqlite3.connect(path)) as file, file:
+        file.execute("CREATE TABLE tiles (zoom_level INT, tile_column INT, tile_row INT, tile_data BLOB)")
+        for tile in (t for t in folder.rglob("*") if t.is_file()):
+            zoom, column, row = (int(part) for part in (tile.parts[-3], tile.parts[-2], tile.stem))
+            file.execute("INSERT INTO tiles VALUES (?, ?, ?, ?)", (zoom, column, 2**zoom - 1 - row, tile.read_bytes()))
+    return path
+
+
+def kept(folder, zoom, share):
+    """Remove the tiles of a level but a share of them, those of the west."""
+    columns = sorted((folder / str(zoom)).iterdir())
+    for column in columns[round(share * len(columns)) :]:
+        shutil.rmtree(column)
+
+
+def lacking(folder, zoom, how):
+    """Spoil the eastern half of a level."""
+    columns = sorted((folder / str(zoom)).iterdir())
+    for number, file in enumerate(f for column in columns[len(columns) // 2 :] for f in sorted(column.iterdir())):
+        if how == "placeholders":
+            sign = np.full((256, 256, 3), 204, np.uint8)
+            cv2.putText(sign, "no data yet", (20, 120), cv2.FONT_HERSHEY_SIMPLEX, 1.0, (90, 90, 90), 2)
+            cv2.imwrite(str(file), sign)
+        elif how == "one colour":
+            cv2.imwrite(str(file), np.full((256, 256, 3), 100 + number, np.uint8))
+        elif how == "half downloads":
+            file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+        elif how == "pages":
+            file.write_text(f"<html>429 {number}</html>")
+        else:
+            file.unlink()
+
+
+@pytest.mark.parametrize("mbtiles", [False, True])
+@pytest.mark.parametrize("suffix", ["jpg", "png", "webp"])
+@pytest.mark.parametrize("how", ["placeholders", "one colour", "half downloads", "pages", "none"])
+def test_what_the_finest_level_lacks_comes_from_the_others(tmp_path, how, suffix, mbtiles):
+    folder = tmp_path / "xyz"
+    for zoom in (18, 19):
+        web_tiles(folder, zoom, suffix)
+    lacking(folder, 19, how)
+    path = mbtiles_of(folder, tmp_path / "m.mbtiles") if mbtiles else folder
+    basemap = Basemap.open(path, EPSG, AREA)
+    for gsd in (0.3, 0.8):
+        assert_same_ground(basemap, gsd, tolerance=6.0)
+
+
+def test_a_level_that_shows_a_corner_of_the_flight_is_not_the_map(tmp_path):
+    for zoom in (18, 19, 21):
+        web_tiles(tmp_path, zoom)
+    kept(tmp_path, 21, 0.3)
+    basemap = Basemap.open(tmp_path, EPSG, AREA)
+    assert basemap.native_gsd_m == pytest.approx(0.2, rel=0.02)
+    for gsd in (0.1, 0.3, 0.8):
+        assert_same_ground(basemap, gsd, tolerance=6.0)
+
+
+def test_a_finest_level_of_another_town_is_not_the_map(tmp_path):
+    web_tiles(tmp_path, 18)
+    web_tiles(tmp_path, 20)
+    (tmp_path / "20").rename(tmp_path / "away")
+    for column in (tmp_path / "away").iterdir():
+        column.rename(tmp_path / "away" / f"{int(column.name) + 4000}0")
+    for column in (tmp_path / "away").iterdir():
+        column.rename(tmp_path / "away" / column.name[:-1])
+    (tmp_path / "away").rename(tmp_path / "20")
+    assert_same_ground(Basemap.open(tmp_path, EPSG, AREA), 0.5, tolerance=6.0)
+
+
+def test_a_coarse_level_whose_tiles_are_missing_is_made_of_finer_ones(tmp_path):
+    for zoom in (17, 18, 19):
+        web_tiles(tmp_path, zoom)
+    lacking(tmp_path, 17, "none")
+    lacking(tmp_path, 18, "none")
+    assert_same_ground(Basemap.open(tmp_path, EPSG, AREA), 1.4, tolerance=6.0)
+
+
+def test_black_around_tiles_of_jpeg_is_not_ground(tmp_path):
+    web_tiles(tmp_path, 19, "jpg")
+    columns = sorted((tmp_path / "19").iterdir())
+    for file in columns[1].iterdir():
+        tile = cv2.imread(str(file))
+        tile[:, :128] = 0
+        cv2.imwrite(str(file), tile)
+    shutil.rmtree(columns[0])
+    area = BoundingBox(EAST, NORTH - 160, EAST + 160, NORTH)
+    _, valid = Basemap.open(tmp_path, EPSG, AREA).gray(area, 0.4)
+    side = 2 * np.pi * 6378137.0 / 2**19
+    edge = (int(columns[1].name) + 0.5) * side - 2**18 * side
+    _, (y,) = rasterio.warp.transform(f"EPSG:{EPSG}", "EPSG:3857", [EAST], [NORTH - 80])
+    (east,), _ = rasterio.warp.transform("EPSG:3857", f"EPSG:{EPSG}", [edge], [y])
+    assert valid.mean() == pytest.approx(1 - (east - EAST) / 160, abs=0.06)
+
+
+def test_a_map_of_an_ellipsoid_without_a_datum_is_refused(tmp_path):
+    gray = picture(PLAIN, 500, 500).round().astype(np.uint8)
+    crs = CRS.from_string("+proj=utm +zone=33 +ellps=bessel +units=m")
+    with pytest.raises(InputError, match=r"m.tif: .* but no datum"):
+        Basemap.open(write(tmp_path / "m.tif", gray, PLAIN, crs=crs), EPSG, AREA)
+
+
+def test_tiles_of_placeholders_alone_are_refused(tmp_path):
+    web_tiles(tmp_path, 18)
+    sign = cv2.imencode(".png", np.random.default_rng(1).integers(0, 255, (256, 256, 3), np.uint8))[1].tobytes()
+    for file in tmp_path.rglob("*.png"):
+        file.write_bytes(sign)
+    with pytest.raises(InputError, match="placeholders without a map"):
+        Basemap.open(tmp_path, EPSG, AREA)

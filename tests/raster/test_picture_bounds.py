@@ -51,6 +51,7 @@ def test_a_small_file_with_a_huge_picture_is_refused(tmp_path, read):
         read(jpeg_that_says(tmp_path / "big.jpg", 40_000, 30_000))
 
 
+@pytest.mark.slow
 def test_refusing_takes_no_memory(tmp_path):
     png_bomb(tmp_path / "bomb.png")
     code = (

@@ -11,6 +11,7 @@ import shapely
 from numpy.typing import NDArray
 
 from gcs_plugin.plans.area_files import read_shapes
+from gcs_plugin.plans.no_fly import Reach
 from gcs_plugin.plans.plan_files import read_planned_flight
 from orthoswarm.coverage.gaps import PlannedFlight
 from orthoswarm.model.errors import InputError
@@ -97,8 +98,12 @@ def read_covered_area(source: AreaSource, grid: LocalGrid | None) -> CoveredArea
     except (OSError, ValueError, KeyError) as error:
         raise InputError(f"{source.plan.name} cannot be read ({error}); plan again") from None
     zones = source.plan / "no-fly.geojson"
-    shells = [p.shell for p in read_shapes(zones)[0].areas] if zones.is_file() else []
-    area = make_area(parse_geojson(text, source.plan.name).areas, shells, grid)
+    polygons = parse_geojson(text, source.plan.name).areas
+    shells = []
+    if zones.is_file() and polygons:
+        flown = np.concatenate([p.shell for p in polygons])
+        shells = [p.shell for p in Reach(flown).near(read_shapes(zones, any_size=True).shapes).areas]
+    area = make_area(polygons, shells, grid)
     flight = read_planned_flight(source.plan, area.grid)
     names = dict(source.names)
     rows = [f["properties"] for f in features if f["properties"].get("kind") == "leg"]

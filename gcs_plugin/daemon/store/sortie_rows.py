@@ -9,7 +9,7 @@ from typing import Any, Final, Literal, TypedDict
 from gcs_plugin.daemon.store.frame_rows import Whose
 from gcs_plugin.daemon.store.job_rows import new_job
 from gcs_plugin.daemon.store.journal import Change, Journal, fact_change, packed, unpacked
-from orthoswarm.export.product_files import finite
+from orthoswarm.export.json_values import finite
 from orthoswarm.model.bounding_box import BoundingBox
 
 Table = Literal["solutions", "coarse"]

@@ -29,11 +29,13 @@ class Area:
         grid: UTM grid of the area.
         ground: shapely (Multi)Polygon in grid metres, no-fly zones taken out.
         no_fly: shapely (Multi)Polygon in grid metres, perhaps empty: the polygons' holes and further zones.
+        circles_wider_m: so much outside a circle that its polygon in `no_fly` is drawn around lies that.
     """
 
     grid: LocalGrid
     ground: Geometry
     no_fly: Geometry
+    circles_wider_m: float = 0.0
 
     @property
     def size_m2(self) -> float:

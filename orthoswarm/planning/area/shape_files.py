@@ -251,8 +251,8 @@ def _lat_lon(positions: Sequence[Sequence[float]]) -> list[tuple[float, float]]:
     return [(float(p[1]), float(p[0])) for p in positions]
 
 
-def parse_kml(text: str | bytes, name: str = "the KML file") -> Shapes:
-    """Polygons and lines of a KML text (OGC KML 2.x; any namespace).
+def parse_kml(text: str | bytes, name: str = "the KML file", *, any_size: bool = False) -> Shapes:
+    """Polygons and lines of a KML text (OGC KML 2.x; any namespace); any_size: see `parse_geojson`.
 
     Raises:
         InputError: no XML, no KML, or coordinates that are not longitude and latitude.
@@ -261,6 +261,11 @@ def parse_kml(text: str | bytes, name: str = "the KML file") -> Shapes:
         root = ElementTree.fromstring(_with_name_spaces(text))
     except (ElementTree.ParseError, ValueError) as error:
         raise InputError(f"{name} is not valid XML ({error}); export it again") from None
+    if _tag(root).lower().startswith("aixm"):
+        raise InputError(
+            f"{name} is AIXM, which is not read; get the zones as ED-269, ED-318, GeoJSON or KML, or convert them "
+            "(ogr2ogr -f GeoJSON, or QGIS) and compare their circles and arcs"
+        )
     if _tag(root) not in ("kml", "Document", "Folder", "Placemark"):
         raise InputError(f"{name} is XML but no KML (its root is '{_tag(root)}'); export a polygon as KML")
     polygons, hidden, lines, unused = list[Polygon](), list[Polygon](), list[Ring](), Counter[str]()
@@ -283,7 +288,8 @@ def parse_kml(text: str | bytes, name: str = "the KML file") -> Shapes:
         elif _tag(node) in _KML_NOUNS:
             unused[_KML_NOUNS[_tag(node)]] += 1
         waiting += [(n, shown) for n in reversed(node) if _tag(node) != "Polygon" or _tag(n) == "Polygon"]
-    refuse_many_corners([*polygons, *hidden, *lines], name)
+    if not any_size:
+        refuse_many_corners([*polygons, *hidden, *lines], name)
     return Shapes(tuple(polygons), tuple(lines), hidden=tuple(hidden), unused=counted(unused))
 
 

@@ -9,7 +9,6 @@ from typing import Any, Final
 import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse.csgraph import shortest_path
 
 from orthoswarm.compute.jit import kernel
 from orthoswarm.model.errors import InputError
@@ -96,6 +95,8 @@ class Router:
         self._hops: Array = np.empty((0, 0))
         self._before: NDArray[np.int32] = np.empty((0, 0), np.int32)
         if len(self._corners):
+            from scipy.sparse.csgraph import shortest_path  # not at the start of a station, which it holds up
+
             sight = self._sight(self._corners, self._corners)
             self._hops, self._before = shortest_path(
                 np.where(np.isfinite(sight), sight, 0.0), directed=False, return_predecessors=True

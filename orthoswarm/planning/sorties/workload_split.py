@@ -11,7 +11,6 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
 from orthoswarm.compute.jit import kernel
 from orthoswarm.planning.lines.detours import Router
@@ -220,6 +219,8 @@ def share(
         cuts = _evenly(row, nothing, nothing, motion, free, own=False, returns=returns, single=False)
         if cuts is None:
             return None
+        from scipy.optimize import linear_sum_assignment  # not at the start of a station, which it holds up
+
         ways = out[kind][:, cuts[:-1]] + home[kind][:, cuts[1:] - 1]
         who, piece = linear_sum_assignment(ways)
         order[piece] = who

@@ -427,22 +427,29 @@ def confirmed(
         ground = load_map(flight, basemap, origin, map_gsd(flight, basemap))
         matches = first_ties(flight, surface, ground)
         tests += 1  # each test is one more chance to agree
-        chance = _false_matches_log10(flight, matches, tie_half_m(flight)) + np.log10(tests)
+        chance = evidence_log10(flight, matches, tie_half_m(flight)) + np.log10(tests)
         if chance > limit:  # a few photos have room for a few patches of this size only: more and smaller ones
             half_m, tests = _EVIDENCE_SMALL_HALF_M, tests + 1
-            chance = _false_matches_log10(flight, small_ties(flight, surface, ground, half_m), half_m) + np.log10(tests)
+            chance = evidence_log10(flight, small_ties(flight, surface, ground, half_m), half_m) + np.log10(tests)
         if chance <= limit:
             return ConfirmedFit(fit, ground, matches, float(10.0**chance))
         flight.adjustment = before.copy()
     return None
 
 
-def _false_matches_log10(flight: FlightBlock, matches: MapMatches, half_m: float) -> float:
+def evidence_log10(
+    flight: FlightBlock, matches: MapMatches, half_m: float, reach_m: float = FIRST_TIE_REACH_M
+) -> float:
+    """Decimal logarithm of the expected number of false matches behind a flight's tie points.
+
+    Args:
+        matches: its tie points. half_m: half the side of what was compared. reach_m: how far each was searched.
+    """
     return false_matches_log10(
         flight.adjustment.points[matches.point, :2],
         matches.shift,
         matches.camera.astype(float),
         leg=flight.leg[matches.camera],
-        reach_m=FIRST_TIE_REACH_M,
+        reach_m=reach_m,
         patch_m=2.0 * half_m,
     )

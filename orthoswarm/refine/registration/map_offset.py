@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from orthoswarm.model.arrays import Array
-from orthoswarm.model.frame import SURVEYED, Frame
+from orthoswarm.model.frame import Frame
 from orthoswarm.model.placement import PlacedFrame
 from orthoswarm.refine.bundle.covariance import RECEIVER_BIAS_SIGMA_M, RECEIVER_COMMON_SIGMA_M
 
@@ -126,11 +126,7 @@ def measure_control_offset(
 
 def _measured(recorded: Sequence[PlacedFrame], refined: Sequence[PlacedFrame], found_m: float) -> MapOffset | None:
     """Frames against their records; `found_m`: how well the place of the frames itself is known, metres."""
-    before = {
-        (p.frame.vehicle, p.frame.image): p.camera.nadir
-        for p in recorded
-        if p.frame.origin.get("position") != SURVEYED  # which is no receiver's
-    }
+    before = {(p.frame.vehicle, p.frame.image): p.camera.nadir for p in recorded if p.frame.has_own_position}
     moved: dict[str, list[Array]] = {}
     stated: dict[str, list[float]] = {}
     for p in refined:

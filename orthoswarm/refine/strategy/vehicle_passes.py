@@ -39,11 +39,20 @@ from orthoswarm.refine.flight.relative_block import (
     weigh_records,
 )
 from orthoswarm.refine.flight.sparse_block import open_sparse_flight
-from orthoswarm.refine.registration.absolute_orientation import add_links, confirmed, orient_on_map, working_gsd
+from orthoswarm.refine.registration.absolute_orientation import (
+    TIE_REACH_M,
+    add_links,
+    confirmed,
+    evidence_log10,
+    orient_on_map,
+    tie_half_m,
+    working_gsd,
+)
 from orthoswarm.refine.registration.block_state import Stopwatch, VehicleState, WorkArea
 from orthoswarm.refine.registration.coarse_map import is_coarse
 from orthoswarm.refine.registration.coarse_registration import CoarseFit, coarse_fits, learned_fit
 from orthoswarm.refine.registration.map_offset import had_corrections
+from orthoswarm.refine.registration.tie_points import MapMatches
 from orthoswarm.refine.strategy.joined_vehicles import TAKEOFF_LEVEL_SIGMA_M
 from orthoswarm.refine.surface.dem_surface import LocalDem
 from orthoswarm.refine.surface.vehicle_ground import GroundModel, fit_surface
@@ -77,8 +86,11 @@ _SCHEDULE: Final = (100.0, 100.0, 100.0, 100.0, 9.0, 9.0)
 """Robust scales of the steps without a map, squared, of normalised residuals. Starts are near enough for 10 sigmas
 (recorded poses, focal length by optical flow); two first steps at 1e4 gave the same accuracy on 31 runs of small
 flights and on 1,017 photos, and wrong tracks could carry the focal length away (docs/method.md)."""
-_MAP_FOV_SIGMAS: Final = 6.0  # a registration that changes the field of view by more sigmas is rejected ...
+_MAP_FOV_SIGMAS: Final = 6.0  # a registration that changes the field of view by more sigmas is doubted ...
 _MAP_FOV_DEG: Final = 4.0  # ... and by more than this
+_NEW_EVIDENCE: Final = 2.0
+"""A doubted registration is right if the tie points of the flight as it then lies speak for it so many times as much
+as the first ones (logarithms). A wrong lens tag of 30 photos (73 instead of 41 degrees): 10^-124 after 10^-8."""
 _LEG_LINK_STEPS: Final = 6  # steps of a flight without a map once its legs are linked to each other
 _NO_HEIGHT_SHARE: Final = 0.03  # sigma of focal lengths without a height, a share (15 flights: 2.5 % rms)
 _ONE_WAY_FOV_SIGMA_DEG: Final = 5.0  # the same for photos on one straight line (11 such legs: 5.6 rms)
@@ -366,7 +378,8 @@ def _onto_map(
     """Register a flight at the first coarse registration that tie points confirm.
 
     The flight stays as it was where none is confirmed, or where the confirmed one would need another field of view than
-    its pictures alone gave. Returns whether one was confirmed.
+    its pictures alone gave and its new tie points do not prove that: tags may have misled the pictures, no tag makes
+    the map agree. Returns whether one was confirmed.
     """
     flight = state.flight
     before, ground_alone, sigma = flight.adjustment.copy(), state.surface, state.fov_sigma_deg
@@ -377,7 +390,8 @@ def _onto_map(
     settled = orient_on_map(flight, found.ground, found.matches, state.surface)
     alone_deg, now_deg = (field_of_view_deg(a, flight) for a in (before, flight.adjustment))
     known_deg = float(np.hypot(sigma, level_sigma_deg(flight, ground_alone)))
-    if abs(now_deg - alone_deg) > max(_MAP_FOV_SIGMAS * known_deg, _MAP_FOV_DEG):
+    doubted = abs(now_deg - alone_deg) > max(_MAP_FOV_SIGMAS * known_deg, _MAP_FOV_DEG)
+    if doubted and not _proven(flight, settled.matches, found.false_matches):
         flight.adjustment = before
         flight.warnings.append(
             f"on the map its field of view would be {now_deg:.0f} degrees, by its own pictures it is {alone_deg:.0f}: "
@@ -390,6 +404,16 @@ def _onto_map(
     state.on_map, state.confidence, state.false_matches = True, found.fit.confidence, found.false_matches
     watch.lap("ties and absolute")
     return True
+
+
+def _proven(flight: FlightBlock, matches: MapMatches, false_matches: float) -> bool:
+    """Whether new tie points of a flight that lies on the map speak for its place more than the first ones did.
+
+    Args:
+        matches: the new ones. false_matches: expected number of false matches behind the first.
+    """
+    first = float(np.log10(max(false_matches, float(np.finfo(float).tiny))))
+    return evidence_log10(flight, matches, tie_half_m(flight), TIE_REACH_M) <= _NEW_EVIDENCE * first
 
 
 def level_sigma_deg(flight: FlightBlock, surface: GroundModel) -> float:

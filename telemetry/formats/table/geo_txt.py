@@ -11,8 +11,8 @@ Angles of 0 0 0 stand for unknown ones. Source: OpenDroneMap's documentation, "I
 import math
 from pathlib import Path
 
+from orthoswarm.model.coordinate_system import projection_of, to_degrees
 from orthoswarm.model.errors import InputError
-from orthoswarm.model.geo import projection_of
 from telemetry.formats.table.pose_table import PoseTable, as_path, decoded, pitch_by_value, read_text, words_of_name
 from telemetry.samples.sample import Sample, is_position
 
@@ -67,18 +67,14 @@ def to_geographic(table: PoseTable, projection: str, path: Path) -> None:
     """Turn coordinates of a projection (x in lon_deg, y in lat_deg) into degrees; impossible ones become None.
 
     Raises:
-        InputError: the projection is not understood.
+        InputError: the projection is not understood, or has no datum.
     """
-    from pyproj import CRS, Transformer
-    from pyproj.exceptions import ProjError
-
+    x_y = [[math.nan if v is None else v for v in (r.lon_deg, r.lat_deg)] for r in table.values()]
     try:
-        transformer = Transformer.from_crs(CRS.from_user_input(projection), 4326, always_xy=True)
-        x_y = [[math.nan if v is None else v for v in (r.lon_deg, r.lat_deg)] for r in table.values()]
-        lon, lat = transformer.transform([x for x, _ in x_y], [y for _, y in x_y])
-    except ProjError as error:
-        raise InputError(f"{path.name}: the projection '{projection}' is not understood ({error})") from None
-    for row, x, y in zip(table.values(), lon, lat, strict=True):
+        places, table.doubt = to_degrees(projection, [x for x, _ in x_y], [y for _, y in x_y])
+    except InputError as error:
+        raise InputError(f"{path.name}: {error}") from None
+    for row, (x, y) in zip(table.values(), places, strict=True):
         if is_position(y, x):
             row.lon_deg, row.lat_deg = float(x), float(y)
         else:

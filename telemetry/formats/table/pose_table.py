@@ -21,11 +21,13 @@ class PoseTable(dict[str, Sample]):
     Attributes:
         useless: number of lines that name a picture without a valid position.
         refused: number of cells that were not understood; first_refused: the first of them.
+        doubt: what is uncertain about the datum of its positions, "" if nothing is.
     """
 
     useless: int = 0
     refused: int = 0
     first_refused: str = ""
+    doubt: str = ""
 
     def refuse(self, cell: str) -> None:
         """Count a cell that is not understood."""

@@ -71,6 +71,7 @@ def kill_again_and_again(workspace, kills, seed, count=60):
     return len(acknowledged)
 
 
+@pytest.mark.slow
 def test_nothing_acknowledged_is_lost_when_it_is_killed(tmp_path):
     assert kill_again_and_again(tmp_path / "w", kills=2, seed=int(time.time()), count=30) == 60
 

@@ -129,6 +129,7 @@ def _is_in_the_report(served: Served, workspace: Path, coverage: dict) -> None:
     assert np.array_equal(shown, np.asarray(cells))
 
 
+@pytest.mark.slow
 def test_a_blurred_picture_is_seen_poorly(served: Served) -> None:
     plan, legs = _plan(served)
     shots = _shots(legs["v1"], "v1", plan["footprint_m"][1] * 0.75)

@@ -52,6 +52,7 @@ def start(served, vehicle):
     assert answer.status_code == 200 and answer.json()["outcome"] == "done", answer.text
 
 
+@pytest.mark.slow
 def test_completion_starts_the_refinement_while_the_others_fly(flown):
     served, cameras, workspace = flown
     served.until("/api/vehicles", lambda rows: sum(r.get("lat_deg") is not None for r in rows) == 2)

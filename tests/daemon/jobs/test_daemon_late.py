@@ -79,6 +79,7 @@ def test_a_few_late_pictures_are_laid_beside_the_others_and_many_refined_with_th
     assert not [job for job in daemon.jobs.all() if job.state == "failed"]
 
 
+@pytest.mark.slow
 def test_a_refinement_that_cannot_be_published_leaves_the_former_one(daemon, flight, monkeypatch):
     """Its file stays, as the journal names it, and the new file is not left behind."""
     frames, _ = flight

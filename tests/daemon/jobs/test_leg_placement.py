@@ -1,5 +1,6 @@
 """The coarse layer in flight: legs are noticed, placed and drawn as they finish; completion takes their place."""
 
+import math
 import threading
 import time
 
@@ -12,10 +13,14 @@ from gcs_plugin.daemon.jobs.job_queue import Jobs, Preempted
 from gcs_plugin.daemon.jobs.kernel_warmup import made_up_flight, made_up_ground, write_map
 from gcs_plugin.daemon.jobs.leg_placement import MOST, newest_legs
 from gcs_plugin.daemon.jobs.leg_watch import LegWatch
+from gcs_plugin.daemon.jobs.placed_sorties import detail_of
 from gcs_plugin.daemon.jobs.solution_file import read_solution
+from gcs_plugin.daemon.jobs.worker_tasks import SortieResult
 from gcs_plugin.daemon.store.daemon_events import JobDropped, LegsOver
 from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.journal import Journal
+from gcs_plugin.daemon.store.sortie_rows import LegRow
+from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.frame import Fix, Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.trajectory.legs import LEG_REACH, ended_legs
@@ -287,3 +292,15 @@ def test_pictures_that_do_not_hold_together_leave_the_real_time_map_alone(tmp_pa
         assert (jobs[-1]["kind"], jobs[-1]["state"]) == ("coarse", "done")
         assert jobs[-1]["detail"]["note"]
         assert not layer_named("coarse")(served.get("/api/layers").json())
+
+
+def test_an_earlier_leg_without_a_confidence_stays_so():
+    box = BoundingBox(0.0, 0.0, 1.0, 1.0)
+    solved = SortieResult(
+        stages={}, dropped={}, legs=[], fov_deg=math.nan, fov_sigma_deg=1.0, warnings=[], bounds=box, changed=box,
+        cpu_s=0.0, wall_s=0.0,
+    )  # fmt: skip
+    legs = [LegRow(confidence=None, sigma_m=None), LegRow(confidence=math.nan, sigma_m=2.0)]
+    detail = detail_of(solved, legs)
+    assert detail["legs"] == [{"confidence": None, "sigma_m": None}, {"confidence": None, "sigma_m": 2.0}]
+    assert detail["fov_deg"] is None

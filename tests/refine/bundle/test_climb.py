@@ -56,6 +56,7 @@ def test_pictures_of_the_climb_do_not_cost_a_flight_its_scale(scene, tmp_path):
     assert np.median(errors(own, truth, grid)) < 0.3
 
 
+@pytest.mark.slow
 def test_heights_that_leave_those_around_them_are_as_doubtful_as_they_differ(scene):
     vehicles, grid, _, _ = scene
     frames = [replace(f, fix=replace(f.fix, height_m=90.0)) for f in vehicles["uav01"]]

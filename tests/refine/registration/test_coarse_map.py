@@ -33,6 +33,7 @@ def on_map(twin, scene, folder, gsd_m, change=right, vehicles=None):
     return refine_all(vehicles or given, Basemap.open(folder / "map.tif", grid.epsg), grid).fine
 
 
+@pytest.mark.slow
 def test_all_vehicles_are_shifted_onto_a_coarse_map_together(twin, scene, tmp_path):
     _, grid, truth = scene
     solutions = on_map(twin, scene, tmp_path, 7.0)

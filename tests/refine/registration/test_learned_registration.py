@@ -26,7 +26,7 @@ def blind(monkeypatch):
     def first(flight, basemap, origin):
         return () if flight.frames[0].vehicle == LOST else by_edges(flight, basemap, origin)
 
-    def second(flight, basemap, origin):
+    def second(flight, basemap, origin, _device):
         asked.append(flight.frames[0].vehicle)
         return next(by_edges(flight, basemap, origin))
 
@@ -35,6 +35,7 @@ def blind(monkeypatch):
     return asked
 
 
+@pytest.mark.slow
 def test_a_flight_that_only_learned_matching_finds_is_mapped_as_well(scene, blind):
     vehicles, grid, basemap, truth = scene
     steps = []

@@ -23,6 +23,7 @@ def flight_on_map(tmp_path_factory):
     return flight, surface, basemap, origin, next(coarse_fits(flight, basemap, origin))
 
 
+@pytest.mark.slow
 def test_refused_guesses_count_as_chances_to_agree(flight_on_map):
     flight, surface, basemap, origin, right = flight_on_map
     alone = flight.adjustment.copy()

@@ -50,6 +50,7 @@ def test_photos_that_do_not_hold_together_with_others_are_matched_by_vehicle(sce
         assert np.median(errors(solution, truth, grid)) < 0.5
 
 
+@pytest.mark.slow
 def test_a_vehicle_that_cannot_be_refined_stays_where_its_receiver_says(scene, opened):
     vehicles, grid, basemap, truth = scene
     _, breaks = opened

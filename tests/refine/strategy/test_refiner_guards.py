@@ -130,7 +130,8 @@ def test_a_place_on_the_map_that_bends_the_lens_is_not_believed(made_up, monkeyp
     def bent(flight, *args):
         found = orient_on_map(flight, *args)
         flight.adjustment.cameras.lens[:, 0] *= 0.7
-        return found
+        shift = np.random.default_rng(3).uniform(-5.0, 5.0, found.matches.shift.shape)
+        return replace(found, matches=replace(found.matches, shift=shift))
 
     monkeypatch.setattr(vehicle_passes, "orient_on_map", bent)
     state = refine_alone(frames, area=WorkArea(EPSG, ORIGIN, basemap), options=RefinerOptions())
@@ -140,6 +141,26 @@ def test_a_place_on_the_map_that_bends_the_lens_is_not_believed(made_up, monkeyp
     monkeypatch.setattr(vehicle_passes, "orient_on_map", orient_on_map)
     state = refine_alone(frames, area=WorkArea(EPSG, ORIGIN, basemap), options=RefinerOptions())
     assert state.on_map and not any("is rejected" in warning for warning in state.flight.warnings)
+
+
+def test_a_place_that_its_new_tie_points_prove_is_believed_whatever_tags_made_of_the_lens(made_up, monkeypatch):
+    frames, basemap = made_up
+    field_of_view_deg, confirmed = vehicle_passes.field_of_view_deg, vehicle_passes.confirmed
+    misled = []
+
+    def by_tags(adjustment, flight):
+        return field_of_view_deg(adjustment, flight) + (12.0 if adjustment is not flight.adjustment else 0.0)
+
+    def on_map(*args):
+        misled.append(True)
+        monkeypatch.setattr(vehicle_passes, "field_of_view_deg", by_tags)  # of the adjustment before, which is kept
+        return confirmed(*args)
+
+    monkeypatch.setattr(vehicle_passes, "confirmed", on_map)
+    state = refine_alone(frames, area=WorkArea(EPSG, ORIGIN, basemap), options=RefinerOptions())
+    assert misled and state.on_map and len(state.matches.point)
+    assert fov_deg(state.flight) == pytest.approx(70.0, abs=0.5)
+    assert not any("is rejected" in warning for warning in state.flight.warnings)
 
 
 def legs_and_matches(seed=0):

@@ -206,6 +206,7 @@ def test_a_vehicle_of_unreadable_pictures_is_dropped_with_reasons(scene, tmp_pat
     assert not solution.placed and set(solution.dropped) == {f.image for f in frames}
 
 
+@pytest.mark.slow
 def test_one_sparse_flight_after_the_other_comes_onto_the_map(real_data):
     """Eighteen photos, a leg each as a vehicle of its own, as they complete."""
     frames = load([real_data("brighton_beach_1600")]).frames

@@ -37,6 +37,7 @@ def test_the_level_is_that_of_the_open_ground_below_the_cameras(slope):
     assert mapped_ground_level(None, camera, [points]) == 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("relief_m", "bar_m"), [(0.0, 0.25), (8.0, 0.4)])
 def test_homographies_are_right_on_the_stated_plane(tmp_path_factory, relief_m, bar_m):
     """Over the whole picture, against the true cameras and the plane of that height over takeoff."""

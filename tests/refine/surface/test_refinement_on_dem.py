@@ -81,6 +81,7 @@ def test_a_right_model_gives_the_ground_and_the_map_is_as_good(scene, without, t
     np.testing.assert_array_equal(refined.terrain.z, processes.terrain.z)
 
 
+@pytest.mark.slow
 def test_the_ground_is_known_before_the_map_is_used(scene, without):
     (ground,) = {id(s.terrain): s.terrain for s in without.coarse}.values()
     for solution in without.fine:  # each vehicle on a level of its own

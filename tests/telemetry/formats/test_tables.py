@@ -138,3 +138,12 @@ def test_a_time_that_cannot_be_one_is_left_out(tmp_path, written):
     (row,) = read_pose_csv(tmp_path / "poses.csv").values()
     assert row.time_s is None
     assert row.lat_deg == 47.5
+
+
+def test_positions_of_an_ellipsoid_without_a_datum_are_not_used_and_a_weak_datum_is_told(tmp_path):
+    jpeg(tmp_path / "a.jpg")
+    geo = tmp_path / "geo.txt"
+    geo.write_text("+proj=longlat +ellps=bessel +no_defs\na.jpg 8.25 47.5 512\n")
+    assert any("but no datum" in warning for warning in load([tmp_path]).warnings)
+    geo.write_text("EPSG:4314\na.jpg 8.25 47.5 512\n")  # DHDN
+    assert any("to 3 m only" in warning for warning in load([tmp_path]).warnings)

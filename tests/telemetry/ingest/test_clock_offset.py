@@ -110,6 +110,7 @@ def test_a_straight_flight_gives_no_offset():
     assert offset_by_turning(np.arange(0, 100, 0.25), np.zeros(400), Timeline(rows)) is None
 
 
+@pytest.mark.slow
 def test_a_video_beside_a_log_is_placed_by_how_its_pictures_turn(real_data, tmp_path):
     """Pictures of a textured ground under the logged flight, the video's clock unknown."""
     cv2 = pytest.importorskip("cv2")

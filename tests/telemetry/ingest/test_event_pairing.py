@@ -29,6 +29,7 @@ def uneven(count: int, seed: int) -> np.ndarray:
     return 1.7e9 + np.cumsum(gaps)
 
 
+@pytest.mark.slow
 @given(
     seed=st.integers(0, 1000),
     count=st.integers(12, 80),
@@ -184,6 +185,7 @@ def test_photos_with_their_own_fields_keep_them(real_data, tmp_path):
 BY_PICTURES = [(0.3, 0.0, 0.5), (0.7, 0.3, 0.5)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("interval", "missing", "least"), BY_PICTURES)
 def test_pictures_tell_where_whole_seconds_do_not(real_data, tmp_path, interval, missing, least):
     ground = ground_of(real_data("autzen") / "autzen_ortho_0.3m_utm10.tif")
@@ -218,6 +220,7 @@ def test_a_log_that_contradicts_the_pictures_does_not_decide_anything():
     assert scored(flown, motion).wrong_unmarked == 0
 
 
+@pytest.mark.slow
 def test_a_mission_that_was_flown_twice_is_paired_flight_by_flight(real_data, tmp_path):
     """The second log alone fits the photos of both flights; only the clock of the first tells which are its own."""
     poses = {}
@@ -236,6 +239,7 @@ def test_a_mission_that_was_flown_twice_is_paired_flight_by_flight(real_data, tm
         assert frame.fix.lat_deg == pytest.approx(poses[frame.image].lat_deg, abs=1e-9) and not frame.ambiguous
 
 
+@pytest.mark.slow
 def test_photos_that_fit_a_log_in_two_ways_and_in_one_have_no_event_get_no_place(real_data, tmp_path):
     """A mission flown twice, the second log alone: its events may be those of either flight, at other legs, too."""
     for name, later in (("swarm_v1.tlog", 0), ("copter_cam_rtl_1x.BIN", 100)):
@@ -252,6 +256,7 @@ def test_photos_that_fit_a_log_in_two_ways_and_in_one_have_no_event_get_no_place
     assert any("in more than one way" in warning for warning in found.warnings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_photos_of_three_flights_are_paired_with_the_log_of_each(seed):
     """A log lasts a minute, the photos an hour: the last flight begins far after the first photo."""

@@ -73,6 +73,7 @@ def lossy(path, whole, seed, count=2):
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("codec", ["libx264", "libx265"])
 def test_no_smeared_picture_of_a_live_stream_passes_as_sound(tmp_path, codec):
     whole = moving_video(tmp_path / "whole.ts", codec)

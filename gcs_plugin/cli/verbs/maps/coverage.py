@@ -1,11 +1,12 @@
 """`orthoswarm coverage`: which ground of an area the pictures of a flight cover well, what was missed, and why."""
 
 import argparse
-import json
 import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from orthoswarm.export.json_values import json_text
 
 if TYPE_CHECKING:
     from orthoswarm.coverage.camera_events import CameraEvent
@@ -59,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
         if value is not None and not 0.0 < value < 1000.0:
             raise InputError(f"{name} is {value:g}; give metres larger than 0")
     flown = read_map(args.map)
-    shapes, fences = read_shapes(args.area)
+    shapes, fences, _ = read_shapes(args.area)
     if not shapes.areas:
         raise InputError(f"{args.area} holds no polygon; draw the area that was to be mapped")
     area = make_area(shapes.areas, fences, LocalGrid(flown.epsg))
@@ -83,7 +84,7 @@ def run(args: argparse.Namespace) -> int:
         draw_cells(args.out / "coverage.png", cover, gaps, ortho)
         write_json(args.out / "coverage.json", figures)
     if args.json:
-        print(json.dumps(figures))
+        print(json_text(figures))
     else:
         _print(figures, args.out)
     return 0

@@ -1,11 +1,12 @@
 """`orthoswarm evaluate`: an orthoimage against a reference or surveyed points, placed frames against true cameras."""
 
 import argparse
-import json
 import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
+
+from orthoswarm.export.json_values import json_text
 
 if TYPE_CHECKING:
     from orthoswarm.evaluation.displacement import Accuracy
@@ -85,7 +86,7 @@ def run(args: argparse.Namespace) -> int:
 
         figures |= evaluate_checkpoints(args.ortho, args.checkpoints, args.pixel_scale).figures()
     if args.json:
-        print(json.dumps(figures))
+        print(json_text(figures))
     else:
         _print(figures)
     return 0

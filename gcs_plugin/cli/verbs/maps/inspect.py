@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from orthoswarm.export.json_values import json_text
 from orthoswarm.model.angles import wrap_deg
 from orthoswarm.stores.addresses import path_of
 
@@ -33,9 +34,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Read the inputs and print the summary."""
-    import json
-    import sys
-
     from gcs_plugin.cli.progress import ProgressBars
     from orthoswarm.compute.workers import prepare_process
 
@@ -51,8 +49,7 @@ def run(args: argparse.Namespace) -> int:
         draw_tracks(found, args.picture)
         document["picture"] = str(args.picture)
     if args.json:
-        json.dump(document, sys.stdout, indent=1, ensure_ascii=False)
-        print()
+        print(json_text(document, 1))
     else:
         _tell(document)
     return 0 if document["sources"] or document["rejected"] else 1

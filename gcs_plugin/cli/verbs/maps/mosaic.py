@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gcs_plugin.cli.configuration import add_config, given
+from orthoswarm.export.json_values import json_text
 from orthoswarm.stores.addresses import address_of, path_of
 
 if TYPE_CHECKING:
@@ -113,8 +114,6 @@ def run(args: argparse.Namespace) -> int:
     # Objects of tens of thousands of photos live to the end: collecting garbage among them would cost a tenth of the
     # time.
     gc.set_threshold(100_000, 50, 50)
-    import json
-    import sys
     from functools import partial
 
     import telemetry
@@ -168,8 +167,7 @@ def run(args: argparse.Namespace) -> int:
                 each.close()
         unmake(folders)
     if args.json:
-        json.dump(report, sys.stdout, indent=1, ensure_ascii=False)
-        print()
+        print(json_text(report, 1))
     else:
         _tell(report, args.out)
     return 0

@@ -1,0 +1,27 @@
+"""Numbers and documents that every reader of JSON understands: NaN and infinity are null."""
+
+import json
+import math
+from collections.abc import Mapping
+from typing import Any
+
+
+def finite(value: float | None) -> float | None:
+    """A number that JSON can hold; None for none, NaN and infinity."""
+    return None if value is None or not math.isfinite(value) else float(value)
+
+
+def json_text(document: Any, indent: int | None = None) -> str:
+    """A document as JSON in which numbers that are not finite are null."""
+    try:
+        return json.dumps(document, indent=indent, ensure_ascii=False, allow_nan=False)
+    except ValueError:
+        return json.dumps(_with_nulls(document), indent=indent, ensure_ascii=False, allow_nan=False)
+
+
+def _with_nulls(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _with_nulls(v) for key, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_with_nulls(v) for v in value]
+    return finite(value) if isinstance(value, float) else value

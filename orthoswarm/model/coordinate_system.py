@@ -1,0 +1,139 @@
+"""Coordinates of any system that a file may name, as longitude and latitude of WGS 84.
+
+Between two datums PROJ takes, where it knows no better, the degrees of the one for those of the other ("ballpark"): a
+hundred metres in many countries. That is never done here, but where the ellipsoid is that of WGS 84 itself.
+"""
+
+import re
+from functools import lru_cache
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from orthoswarm.model.errors import InputError
+
+Array = NDArray[np.float64]
+
+_TOLD_M: Final = 1.0  # PROJ states 1 m where datums are the same but for the drift of continents: ETRS89
+_GEOCENTRIC_AXIS_M: Final = 6378137.0  # semi-major axis of WGS 84 and GRS 80, the ellipsoids of today's datums
+_SOUTH_BANDS: Final = "CDEFGHJKLMS"
+"""Letters behind a UTM zone that mean the south: bands of MGRS, and S, which nearly everybody writes for south."""
+_OTHER_NAMES: Final = {
+    "puwg1992": 2180, "pl1992": 2180, "uklad1992": 2180, "lambert93": 2154, "nztm": 2193, "bng": 27700, "osgb": 27700,
+    "osgb36": 27700, "rdnew": 28992, "rd": 28992, "itm": 2157, "lv95": 2056, "lv03": 21781, "sweref99": 3006,
+    **{f"puwg2000s{zone}": 2171 + zone for zone in range(5, 9)},
+    **{f"puwg2000strefa{zone}": 2171 + zone for zone in range(5, 9)},
+}  # fmt: skip
+"""What EPSG's own list does not have, letters and digits alone."""
+_LEAST_LETTERS: Final = 4  # shorter names fit anything
+
+
+def to_degrees(system: str, x: ArrayLike, y: ArrayLike) -> tuple[Array, str]:
+    """Longitude and latitude of points of a system, and what is uncertain about them.
+
+    Args:
+        system: its EPSG code, a PROJ string, WKT, or "WGS84 UTM 32N". x, y: (...,), east and north.
+
+    Returns:
+        Degrees, float64 (..., 2), not finite where there is no such place; one sentence without its end, "" if the
+        datums differ by no more than 1 m from what is known.
+
+    Raises:
+        InputError: the system is not known, or only its ellipsoid is.
+    """
+    from pyproj.exceptions import ProjError
+
+    transformer, doubt = _transformer(system)
+    lon, lat = transformer.transform(np.asarray(x, float), np.asarray(y, float))
+    try:
+        used = transformer.get_last_used_operation()
+    except ProjError:  # of degrees into the same degrees PROJ remembers none
+        used = transformer
+    if used.accuracy > _TOLD_M:
+        doubt = (
+            f"coordinates in '{system[:60]}' are turned into WGS 84 to {used.accuracy:.0f} m only (no better table of "
+            "the datum is here); give them in WGS 84 where that matters"
+        )
+    return np.stack([np.asarray(lon, float), np.asarray(lat, float)], axis=-1), doubt
+
+
+def require_datum(system: str, name: str) -> None:
+    """Refuse what is in a system whose datum is not known.
+
+    Raises:
+        InputError: with the name of the file.
+    """
+    try:
+        _transformer(system)
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from None
+
+
+@lru_cache(maxsize=64)
+def _transformer(system: str) -> tuple[Any, str]:
+    """PROJ's transformer of a system to degrees, and a doubt about its datum; InputError as above."""
+    from pyproj import CRS, Transformer
+    from pyproj.exceptions import CRSError, ProjError
+
+    try:
+        crs = CRS.from_user_input(projection_of(system) or system)
+    except CRSError:
+        proposed = _proposed_code(system)
+        wanted = f"if it is {proposed}, write that code" if proposed else "write EPSG:32617 or a PROJ string"
+        raise InputError(f"'{system[:60]}' is not a coordinate system; {wanted}") from None
+    crs = crs.sub_crs_list[0] if crs.is_compound else crs
+    try:
+        return Transformer.from_crs(crs, 4326, always_xy=True, allow_ballpark=False), ""
+    except ProjError:
+        ellipsoid = crs.ellipsoid
+    if ellipsoid is None or ellipsoid.semi_major_metre != _GEOCENTRIC_AXIS_M:
+        shape = "no ellipsoid" if ellipsoid is None else f"the ellipsoid {ellipsoid.name}"
+        raise InputError(
+            f"'{system[:60]}' names {shape} but no datum, which leaves its places open by some 100 m; write the EPSG "
+            "code, or +datum or +towgs84 in the PROJ string"
+        )
+    return Transformer.from_crs(crs, 4326, always_xy=True), f"'{system[:60]}' names no datum; WGS 84 is assumed"
+
+
+def projection_of(line: str) -> str | None:
+    """The coordinate system that a line of a text file names, as text for PROJ; None where it names none.
+
+    "EPSG:32632", also with a vertical one ("EPSG:32632+5773"), a PROJ string, or "WGS84 UTM 32N" as OpenDroneMap
+    writes it.
+    """
+    text = line.strip()
+    if re.fullmatch(r"EPSG:\d{4,6}(\+\d{4,6})?", text, re.IGNORECASE):
+        return text.upper()
+    if match := re.search(r"\+init=(epsg:\d+)", text, re.IGNORECASE):
+        return match[1].upper()
+    if "+proj" in text:
+        return text
+    if re.fullmatch(r"WGS\s*84(\s+longlat)?", text, re.IGNORECASE):
+        return "EPSG:4326"
+    match = re.fullmatch(r"WGS\s*84\s*/?\s*UTM\s*(?:zone)?\s*(\d{1,2})\s*([C-HJ-NP-X])", text, re.IGNORECASE)
+    if match and 1 <= int(match[1]) <= 60:
+        return f"EPSG:{(32700 if match[2].upper() in _SOUTH_BANDS else 32600) + int(match[1])}"
+    return None
+
+
+def _proposed_code(name: str) -> str | None:
+    """The system that a name may stand for, as "EPSG:2180 (ETRF2000-PL / CS92)"; None if no or several ones fit."""
+    import pyproj
+    from pyproj.database import query_crs_info
+    from pyproj.enums import PJType
+
+    wanted = _plain(name)
+    code = _OTHER_NAMES.get(wanted)
+    if code is not None:
+        return f"EPSG:{code} ({pyproj.CRS.from_epsg(code).name})"
+    if len(wanted) < _LEAST_LETTERS:
+        return None
+    known = query_crs_info("EPSG", [PJType.PROJECTED_CRS, PJType.GEOGRAPHIC_2D_CRS])
+    fit = [info for info in known if wanted in _plain(info.name)]
+    exact = [info for info in fit if _plain(info.name).endswith(wanted)] if len(fit) > 1 else fit
+    return f"EPSG:{exact[0].code} ({exact[0].name})" if len(exact) == 1 else None
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[^a-z0-9]", "", name.lower())
