@@ -39,7 +39,7 @@ class WildFixes:
 def wild_fixes(times_s: Sequence[float | None], places: Sequence[tuple[float, float]]) -> WildFixes:
     """The fixes that are not part of the longest track that can be flown.
 
-    The track is cut where the next fix is farther away than an aircraft flies in between (`fastest_m_s`); of the pieces
+    The track is cut where the next fix is farther away than an aircraft flies in between (`FASTEST_M_S`); of the pieces
     those are kept that can be flown one after the other and hold most fixes. If the others are more than a few, they
     are no wild fixes but another flight, or the times are wrong: then there are none, and their number is `doubtful`.
 
