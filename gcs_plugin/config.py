@@ -1,7 +1,7 @@
 """Numbers that steer several places of the ground station, or that an operator wants to know: one dataclass a subject.
 
 They belong to the safety of a flight and are not overridden; the distances that vehicles keep are a plan's
-(`orthoswarm.config.planning`). What only one module uses (a polling period, a buffer) stands at its top.
+(`orthoswarm.model.plan.APART`). What only one module uses (a polling period, a buffer) stands at its top.
 """
 
 from dataclasses import dataclass
@@ -47,7 +47,7 @@ class FlightLimits:
     second, and are asked for again three seconds after they stop (chosen)."""
     start_off_m: float = 15.0
     """How far from its mission's takeoff a vehicle may stand, metres: as far as vehicles may be from a start that they
-    share in a plan (`planning.pad_distances` separation distances)."""
+    share in a plan (`PAD_DISTANCES` separation distances)."""
     start_off_height_m: float = 15.0
     """The same in height above the sea, where both are known, metres: receivers err by 5 m in height, global height
     models by up to 10 m (SRTM, Copernicus: 90 % within 4 to 9 m)."""

@@ -11,7 +11,6 @@ import pytest
 from hypothesis import settings
 
 from orthoswarm.compute.workers import prepare_process
-from orthoswarm.config import override
 
 prepare_process()  # before numpy comes: sums depend on the number of BLAS threads, and so would results
 
@@ -74,10 +73,3 @@ def real_data():
 def golden_poses():
     path = Path(__file__).parent / "data" / "golden_poses.json"
     return json.loads(path.read_text())["poses"]
-
-
-@pytest.fixture
-def configure():
-    """A function that puts values in the place of configured ones (stage -> field -> value) until the test ends."""
-    yield override
-    override({})

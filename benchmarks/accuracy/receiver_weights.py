@@ -12,7 +12,7 @@ import json
 
 import numpy as np
 
-from orthoswarm.config import active
+from orthoswarm.refine.bundle.covariance import DRIFT_MEAN_SHARE, RECEIVER_BIAS_SIGMA_M
 
 DRIFT_M = 0.1
 """Largest drift a photo, metres."""
@@ -21,13 +21,13 @@ DRAWS = 20_000
 
 def errors(vehicles: int, photos: int, bias_m: float) -> dict[str, float]:
     """Median errors by way of weighing."""
-    random, config = np.random.default_rng(0), active()
+    random = np.random.default_rng(0)
     end = random.uniform(-DRIFT_M, DRIFT_M, (DRAWS, vehicles, 2)) * (photos - 1)
     mean = 0.5 * end + random.normal(0.0, bias_m, end.shape)
     seen = end**2 / 12.0  # variance of an even drift about its mean: what pictures show
-    known = config.registration.receiver_bias_sigma_m**2
-    by_axis = known + config.bundle.drift_mean_share * seen
-    by_vehicle = known + config.bundle.drift_mean_share * seen.mean(axis=2, keepdims=True)
+    known = RECEIVER_BIAS_SIGMA_M**2
+    by_axis = known + DRIFT_MEAN_SHARE * seen
+    by_vehicle = known + DRIFT_MEAN_SHARE * seen.mean(axis=2, keepdims=True)
     out = {}
     for name, variance in (("alike", np.ones_like(seen)), ("by_vehicle", by_vehicle), ("by_axis", by_axis)):
         weight = np.broadcast_to(1.0 / variance, mean.shape)
@@ -40,7 +40,7 @@ def main() -> None:
     """Print a line for each kind of flight."""
     argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     for vehicles, photos in ((2, 60), (4, 60), (6, 30), (3, 339)):
-        for bias_m in (0.0, active().registration.receiver_bias_sigma_m):
+        for bias_m in (0.0, RECEIVER_BIAS_SIGMA_M):
             row = {"vehicles": vehicles, "photos": photos, "bias_m": bias_m}
             print(json.dumps({**row, **errors(vehicles, photos, bias_m)}), flush=True)
 

@@ -34,10 +34,9 @@ from rasterio.vrt import WarpedVRT
 import telemetry
 from benchmarks.accuracy.sigma_truth import share, write_map
 from orthoswarm.batch.refiners import make_refiner
-from orthoswarm.config import active
 from orthoswarm.control.control_observations import in_photos
 from orthoswarm.control.ground_control import place_on_control
-from orthoswarm.evaluation.checkpoints import read_checkpoints
+from orthoswarm.evaluation.checkpoints import SURVEY_SIGMA_M, read_checkpoints
 from orthoswarm.evaluation.displacement import FieldSettings, displacement_field
 from orthoswarm.evaluation.photo_names import photo_named
 from orthoswarm.model.frame import Frame
@@ -119,7 +118,7 @@ def at_points(photos, table, pixel_scale):
     for frame in frames:
         vehicles.setdefault(frame.vehicle, []).append(frame)
     refined = make_refiner("swarm", grid.epsg, local_origin(grid, frames)).refine_batch(vehicles, None)
-    points, survey_m = read_checkpoints(table, pixel_scale), active().control.survey_sigma_m
+    points, survey_m = read_checkpoints(table, pixel_scale), SURVEY_SIGMA_M
     for count in range(len(points)):
         error, sigma = [], []
         for chosen in combinations(points, count):

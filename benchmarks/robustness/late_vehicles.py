@@ -16,8 +16,9 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from orthoswarm.config.active import override
-from orthoswarm.config.autopilot import ArduPilotConfig
+from orthoswarm.config import DEFAULT
+from orthoswarm.config.autopilot import AutopilotTimes
+from orthoswarm.config.planning import PLANNING
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.plan import Plan
 from orthoswarm.planning.area.area import Area
@@ -25,7 +26,7 @@ from orthoswarm.planning.lines.line_spacing import footprint
 from orthoswarm.planning.planner import plan_area
 from orthoswarm.planning.sorties.assignment import PlanOptions
 from orthoswarm.planning.sorties.deconfliction import Separation
-from orthoswarm.planning.sorties.flight_time import Motion, autopilot_config
+from orthoswarm.planning.sorties.flight_time import Motion
 
 Array = NDArray[np.float64]
 
@@ -40,7 +41,7 @@ STEP_S, GROUND_M, PAD_M = 0.25, 2.0, 15.0
 
 def constant_speed() -> Motion:
     """A vehicle that loses time in turns alone, as plans assumed once."""
-    turns = ArduPilotConfig(acceleration_m_s2=2.5, corner_m_s=0.0)
+    turns = AutopilotTimes(acceleration_m_s2=2.5, corner_m_s=0.0)
     times = replace(turns, takeoff_s=0.0, set_off_s=0.0, height_change_s=0.0, home_wait_s=0.0, landing_m_s=1.5)
     return Motion(autopilot=times)
 
@@ -66,7 +67,7 @@ def flown_tracks(plan: Plan, names: Sequence[str], left_s: list[Array]) -> list[
         path = np.column_stack([east_north[[0, 0, *range(1, len(places))]], np.zeros(len(places) + 1)])
         path[1:, 2] = [sortie.takeoff_height_m, *(w.height_m for w in sortie.waypoints)]
         path = np.vstack([path, [*path[0, :2], 0.0]])
-        motion = Motion(autopilot=autopilot_config(name))
+        motion = Motion(autopilot=DEFAULT.times(name))
         passed = motion.times(path)
         times, path = motion.course(path)
         behind = np.interp(times, passed[[0, 1, 3, -3, -2, -1]], [0.0, *left])
@@ -100,12 +101,10 @@ def main() -> None:
     parser.add_argument("--side", type=float, default=890.0, metavar="M", help="of the square area (default 890)")
     parser.add_argument("--seeds", type=int, default=10, help="flights of each plan (default 10)")
     parser.add_argument(
-        "--in-turn-share", type=float, metavar="X",
+        "--in-turn-share", type=float, metavar="X", default=PLANNING.in_turn_share,
         help="take off and land in turn if it takes at most so much longer (-1 never, 99 always; default as plans do)",
     )  # fmt: skip
     args = parser.parse_args()
-    if args.in_turn_share is not None:
-        override({"planning": {"in_turn_share": args.in_turn_share}})
     grid = LocalGrid(32632)
     corner = np.array([[0, 0], [args.side, 0], [args.side, args.side], [0, args.side]]) + CORNER
     area = Area(grid, shapely.Polygon(corner), shapely.MultiPolygon())
@@ -116,7 +115,7 @@ def main() -> None:
         for where, starts in (("own", []), ("one", [(float(start[0]), float(start[1]))])):
             for fleet, kinds in (("ArduCopter", ["ardupilot"]), ("PX4", ["px4"]), ("mixed", ["ardupilot", "px4"])):
                 names = [kinds[k % len(kinds)] for k in range(vehicles)]
-                for model, options in plans_of(kinds, starts):
+                for model, options in plans_of(kinds, starts, args.in_turn_share):
                     plan = plan_area(area, vehicles, 60.0, footprint(60.0, np.radians(75.0)), options=options)
                     homes = [(v.sorties[0].home_lat_deg, v.sorties[0].home_lon_deg) for v in plan.vehicles]
                     places = grid.to_grid(*np.array(homes).T) - CORNER
@@ -134,20 +133,23 @@ def main() -> None:
                     )
 
 
-def plans_of(kinds: Sequence[str], starts: list[tuple[float, float]]) -> list[tuple[str, PlanOptions]]:
+def plans_of(
+    kinds: Sequence[str], starts: list[tuple[float, float]], share: float = PLANNING.in_turn_share
+) -> list[tuple[str, PlanOptions]]:
     """Plans to compare: their name, and the options of the flights."""
-    times = [autopilot_config(kind) for kind in kinds]
+    times = [DEFAULT.times(kind) for kind in kinds]
     slack_s = max(t.schedule_slack_s for t in times)
+    apart = Separation(slack_s=slack_s, in_turn_share=share)
     slowest = Motion(autopilot=min(times, key=lambda t: t.acceleration_m_s2))
     return [
         *(
             (f"constant speed, {allowed:g} s", PlanOptions(motion=constant_speed(), starts=starts, separation=apart))
             for allowed in (3.0, 20.0)
-            for apart in [Separation(slack_s=allowed)]
+            for apart in [Separation(slack_s=allowed, in_turn_share=share)]
         ),
         (
             f"autopilots' times, {slack_s:g} s",
-            PlanOptions(motion=slowest, autopilots=times, starts=starts, separation=Separation(slack_s=slack_s)),
+            PlanOptions(motion=slowest, autopilots=times, starts=starts, separation=apart),
         ),
     ]
 

@@ -105,6 +105,8 @@ def _seeds() -> dict[str, tuple[list[bytes], Reader]]:
             file(read_pose_csv, "poses.csv"),
         ),
         "MRK": ([made(write_mrk, "a.MRK")], file(read_log, "a.MRK")),
+        "GPX": ([test_reader_fuzz.GPX], file(read_log, "a.gpx")),
+        "NMEA": ([test_reader_fuzz.NMEA], file(read_log, "a.nmea")),
         "pos": ([made(write_pos, "a.pos")], file(read_log, "a.pos")),
         "ULog": (
             [made(lambda path: test_flight_logs.ulog(path, seconds=1, events=1), "a.ulg")], file(read_log, "a.ulg")

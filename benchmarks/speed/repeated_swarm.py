@@ -19,6 +19,7 @@ from rasterio.windows import Window
 import telemetry
 from orthoswarm.batch.pipeline import MapOptions, run
 from orthoswarm.compute.workers import prepare_process, workers
+from orthoswarm.config import config_of
 from orthoswarm.model.frame import Frame, Ingest
 from orthoswarm.model.geo import LocalGrid
 
@@ -93,7 +94,7 @@ def main() -> None:
         ]
         return Ingest(frames, list(once.rejected), list(once.warnings))
 
-    config = {} if args.area_pictures is None else {"strategy": {"area_pictures": args.area_pictures}}
+    config = config_of({} if args.area_pictures is None else {"strategy": {"area_pictures": args.area_pictures}})
     pool, said = workers(args.workers), set()
 
     def progress(what: str, done: int, count: int) -> None:

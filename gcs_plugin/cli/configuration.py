@@ -1,39 +1,17 @@
-"""`--config`, the same for every verb that has it: thresholds of any stage other than their defaults."""
+"""Arguments that fill a dataclass, and `--config`, the same for every verb that has it."""
 
 import argparse
+from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from orthoswarm.config import Overrides
+from typing import Any
 
 
 def add_config(parser: argparse.ArgumentParser) -> None:
     """Add the argument."""
-    parser.add_argument(
-        "--config", type=Path, metavar="FILE.toml", help="thresholds of any stage other than their defaults"
-    )
+    parser.add_argument("--config", type=Path, metavar="FILE.toml", help="settings other than usual (docs/usage.md)")
 
 
-def read_config(path: Path | None) -> "Overrides":
-    """The overrides of the file, none without one.
-
-    Raises:
-        InputError: the file cannot be read, or holds something else.
-    """
-    from orthoswarm.config import read_overrides
-
-    return {} if path is None else read_overrides(path)
-
-
-def use_config(path: Path | None) -> "Overrides":
-    """Put the file's overrides in force in this process, before anything reads a value; returns them.
-
-    Raises:
-        InputError: the file cannot be read, or holds something else.
-    """
-    from orthoswarm.config import override
-
-    values = read_config(path)
-    override(values)
-    return values
+def given(args: argparse.Namespace, options: type[Any]) -> dict[str, Any]:
+    """The arguments that are fields of a dataclass; without those that were not given, for which it has defaults."""
+    values = {field.name: getattr(args, field.name, None) for field in fields(options)}
+    return {name: value for name, value in values.items() if value is not None}

@@ -118,7 +118,7 @@ class Daemon:
         self.poses = LinkPoses()
         self.links = VehicleLinks(settings, self.journal, self.events, self.poses)
         fleet = self.links.fleet
-        self.plans = Plans(settings.workspace / "plans", settings.dem, self.links)
+        self.plans = Plans(settings.workspace / "plans", settings.dem, self.links, settings.config)
         self.takeoffs = Takeoffs(self.links, self.plans, self.events.say)
         self.exposures = ExposureJournal(self.journal, self.links.names)
         fleet.subscribe(self.exposures.message, *EVENT_MESSAGES)
@@ -149,6 +149,7 @@ class Daemon:
         self.drawer = Drawer(
             self.journal, self.store, self.layers["realtime"], canvases, self.events, gsd_m=settings.gsd_m,
             fov_rad=fov_rad, expected=ExpectedPlace(self.tiles, self.plans),
+            canvas_mb=settings.config.compute.live_canvas_mb,
         )  # fmt: skip
         self.leg_watch = LegWatch(self.events, silent_s=settings.silent_s)
         self.coverage = LiveCoverage(
@@ -173,7 +174,11 @@ class Daemon:
             trusted=self._trusted,
         )  # fmt: skip
         shared: dict[str, Any] = {"journal": self.journal, "publisher": publisher}
-        one = shared | {"store": self.store, "kept": KeptPictures(folder / "kept"), "basemap": settings.basemap}
+        config = settings.config
+        one = shared | {
+            "store": self.store, "kept": KeptPictures(folder / "kept", config.raster.grey_pictures_mb),
+            "basemap": settings.basemap, "device": config.matchers.device,
+        }  # fmt: skip
         self.coarse = LegPlacement(workers=self.background, **one)
         self.refinement = SortieRefinement(workers=self.workers, drawer=self.drawer, events=self.events, **one)
         self.together = JointRefinement(

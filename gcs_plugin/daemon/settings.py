@@ -7,6 +7,7 @@ from typing import Any, Final
 
 from gcs_plugin.daemon.intake.can_reader import check_bus
 from gcs_plugin.daemon.vehicle_names import VehicleNames, system_in_name
+from orthoswarm.config import DEFAULT, Config
 from orthoswarm.export.tactical.tak_sender import TakAddress
 from orthoswarm.model.errors import InputError
 
@@ -77,6 +78,7 @@ class Settings:
             that are asked for over MAVLink FTP, 0 for none.
         tak: receivers of Cursor-on-Target events, see `tak_address`. tak_certificate: PEM file with this station's
             certificate and key for TLS. tak_authority: PEM file of the server's certificate authority.
+        config: the settings of the stages (`--config`).
     """
 
     workspace: Path
@@ -99,6 +101,7 @@ class Settings:
     tak: tuple[str, ...] = ()
     tak_certificate: Path | None = None
     tak_authority: Path | None = None
+    config: Config = DEFAULT
 
     def names(self) -> VehicleNames:
         """The vehicles' names."""

@@ -126,7 +126,7 @@ class StartChecks:
                 | flights_of({s: self._fleet.vehicles[s] for s in systems}, missions, stored, starts)
             )
         ).result(_CHECK_S)
-        return separation_of(flights, self._names.name_of, needs.apart)
+        return separation_of(flights, self._names.name_of, needs)
 
     def _missions(self, systems: Collection[int], *, reread: bool) -> "dict[int, Mission]":
         """The missions that vehicles hold, read again where that was long ago; of those that answer in time.

@@ -205,7 +205,7 @@ class Takeoffs:
 
     def _follow(self, schedule: TakeoffSchedule, missions: Mapping[int, Mission], delays: Mapping[int, float]) -> None:
         """Give a schedule the airspace by which it moves takeoffs; beside it, as many vehicles take seconds."""
-        airspace = Airspace.of(missions, apart=self._needs.apart).as_planned(delays)
+        airspace = Airspace.of(missions, needs=self._needs).as_planned(delays)
         with self.waiting.condition:
             schedule.airspace = airspace
 

@@ -17,6 +17,7 @@ from gcs_plugin.mission.items import Mission
 from gcs_plugin.mission.plan_folder import PlanNeeds, plan_needs
 from gcs_plugin.plans.no_fly import refuse_no_zones
 from gcs_plugin.plans.plan_request import AUTOPILOTS, ENDS, METHODS, RELIEFS, PlanRequest, make_plan
+from orthoswarm.config import DEFAULT, Config
 from orthoswarm.model.errors import InputError
 from orthoswarm.planning.area.shape_files import parse_geojson
 
@@ -52,11 +53,11 @@ class Plans:
 
     Args:
         folder: of all plans. dem: height model that they follow, None for level ground.
-        vehicles: on the links; a plan is made for these unless its request names others.
+        vehicles: on the links; a plan is made for these unless its request names others. config: margins and times.
     """
 
-    def __init__(self, folder: Path, dem: Path | None, vehicles: PlannedVehicles) -> None:
-        self.folder, self.dem, self._vehicles = folder, dem, vehicles
+    def __init__(self, folder: Path, dem: Path | None, vehicles: PlannedVehicles, config: Config = DEFAULT) -> None:
+        self.folder, self.dem, self._vehicles, self._config = folder, dem, vehicles, config
         self._bounds: tuple[Path, GeographicBounds] | None = None
 
     def make(self, body: Mapping[str, Any]) -> dict[str, Any]:
@@ -139,7 +140,7 @@ class Plans:
                 no_fly = [path / _NO_FLY_FILE]
                 no_fly[0].write_text(json.dumps(zones), encoding="utf-8")
             with closing(WorkerPool(1)) as pool:
-                request = PlanRequest(area=path / name, no_fly=no_fly, dem=self.dem, **values)
+                request = PlanRequest(area=path / name, no_fly=no_fly, dem=self.dem, config=self._config, **values)
                 figures: dict[str, Any] = pool.run(partial(plan_into, notes=notes), request)
         except BaseException:
             shutil.rmtree(path, ignore_errors=True)

@@ -23,8 +23,8 @@ from gcs_plugin.mission.items import FRAME_GLOBAL, GIMBAL_PITCH, MOUNT_CONTROL, 
 from gcs_plugin.mission.mission_builder import unflyable
 from gcs_plugin.mission.plan_folder import NO_NEEDS, PlanNeeds
 from gcs_plugin.mission.track import fastest_m_s, flight_seconds, highest_m, takeoff_place
-from orthoswarm.config import active
 from orthoswarm.model.earth import distance_m
+from orthoswarm.model.plan import APART
 
 ITEMS: Final = (
     "link", "gps", "ekf", "home", "pre-arm", "battery", "mission", "fence", "height", "return", "failsafe", "speed",
@@ -149,7 +149,7 @@ def preflight_all(
         separation: of them from each other and from others, where that was examined before.
     """
     if separation is None:
-        separation = separation_of(flights_of(vehicles, missions, stored, starts), name, needs.apart)
+        separation = separation_of(flights_of(vehicles, missions, stored, starts), name, needs)
     return [
         preflight(
             vehicle,
@@ -379,11 +379,11 @@ def _separation(wanted: Wanted) -> Item:
         return Item("separation", Level.RED, wanted.near)
     if wanted.unexamined:
         return Item("separation", Level.WARNING, f"not examined: {wanted.unexamined}")
-    apart, usual = wanted.needs.apart, active().planning
-    less = apart is not None and (apart.distance_m < usual.separation_m or apart.height_m < usual.layer_m)
+    apart = wanted.needs.apart
+    less = apart is not None and (apart.distance_m < APART.distance_m or apart.height_m < APART.height_m)
     if wanted.mission is not None and apart is not None and less:
         text = f"its plan keeps its vehicles only {apart.distance_m:g} m apart, or {apart.height_m:g} m in height"
-        text += f"; alarms come below {usual.separation_m:g} m and {usual.layer_m:g} m"
+        text += f"; alarms come below {APART.distance_m:g} m and {APART.height_m:g} m"
         return Item("separation", Level.WARNING, text)
     return Item("separation", Level.OK, "keeps apart")
 

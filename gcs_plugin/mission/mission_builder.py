@@ -27,7 +27,7 @@ from gcs_plugin.mission.items import (
     Mission,
     MissionItem,
 )
-from orthoswarm.config import active
+from orthoswarm.config.autopilot import ARDUPILOT
 from orthoswarm.model.errors import InputError
 
 _WITH_YAW: Final = frozenset({WAYPOINT, TAKEOFF, LAND, LOITER_TIME})
@@ -109,7 +109,7 @@ def _wire(item: mission_files.FileItem, autopilot: Autopilot) -> MissionItem:
 
 def _check(mission: Mission) -> None:
     name = mission.name or "the mission"
-    most = active().ardupilot.most_items
+    most = ARDUPILOT.most_items
     if mission.autopilot is Autopilot.ARDUPILOT and len(mission) > most:
         raise InputError(f"{name} has {len(mission)} items, ArduPilot holds {most}; plan more sorties or vehicles")
     for seq, item in enumerate(mission.items):

@@ -1,11 +1,13 @@
 """The folder of a plan: the mission file and takeoff time of each vehicle."""
 
+import contextlib
 import json
 import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from orthoswarm.config import DEFAULT, Config, config_of
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.plan import Apart
 
@@ -61,11 +63,13 @@ class PlanNeeds:
         return_height_m: above takeoff, from which a straight way home passes over the ground and what stands on it;
             None for a plan that was made without a height model.
         apart: how far apart it keeps its vehicles; None where it does not say that.
+        config: what it was made with, times of flight among it.
     """
 
     endurance_s: float | None = None
     return_height_m: float | None = None
     apart: Apart | None = None
+    config: Config = DEFAULT
 
 
 NO_NEEDS: Final = PlanNeeds()
@@ -80,10 +84,14 @@ def plan_needs(folder: Path) -> PlanNeeds:
         apart = [document.get("separation_m"), document.get("height_step_m")]
     except (OSError, ValueError, AttributeError):
         return PlanNeeds()
+    config = DEFAULT
+    with contextlib.suppress(InputError):  # of another version, with settings that this one does not have
+        config = config_of(document.get("config", {}))
     return PlanNeeds(
         endurance_s=60.0 * minutes if isinstance(minutes, int | float) and minutes > 0 else None,
         return_height_m=float(height_m) if isinstance(height_m, int | float) else None,
         apart=Apart(*map(float, apart)) if all(isinstance(m, int | float) and m > 0 for m in apart) else None,
+        config=config,
     )
 
 

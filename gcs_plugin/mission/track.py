@@ -30,10 +30,12 @@ from gcs_plugin.mission.items import (
     Mission,
     MissionItem,
 )
-from orthoswarm.config import active
-from orthoswarm.config.autopilot import AutopilotConfig
+from gcs_plugin.mission.plan_folder import NO_NEEDS, PlanNeeds
+from orthoswarm.config import DEFAULT, Config
+from orthoswarm.config.autopilot import ARDUPILOT, AutopilotTimes
+from orthoswarm.config.planning import PLANNING
 from orthoswarm.model.earth import DEGREE_M
-from orthoswarm.model.plan import Apart
+from orthoswarm.model.plan import APART, ON_GROUND_M, PAD_DISTANCES
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -70,7 +72,7 @@ class Track:
     """
 
     places: Array
-    autopilot: AutopilotConfig = field(default_factory=lambda: active().ardupilot)
+    autopilot: AutopilotTimes = ARDUPILOT
     level_m: float | None = None
 
     def higher_m(self, other: "Track") -> float:
@@ -149,22 +151,17 @@ def _flown(mission: Mission) -> Iterator[MissionItem]:
         seq += 1
 
 
-def track_of(mission: Mission, origin: tuple[float, float]) -> Track:
-    """A mission as positions over time."""
+def track_of(mission: Mission, origin: tuple[float, float], config: Config = DEFAULT) -> Track:
+    """A mission as positions over time, by the autopilots' times of a configuration."""
     from orthoswarm.planning.sorties.flight_time import Motion
 
+    times = config.times(mission.autopilot.value)
     points, waits, speed = flight_path(mission, origin)
     if len(points) < 2:
-        return Track(points)
+        return Track(points, times)
     end = next((item.command for item in mission.items if item.command in (RTL, *LANDINGS)), RTL)
-    motion = Motion(speed_m_s=speed, autopilot=_autopilot_of(mission), lands=end != RTL)
+    motion = Motion(speed_m_s=speed, autopilot=times, lands=end != RTL)
     return Track(motion.places(points, waits, STEP_S), motion.autopilot)
-
-
-def _autopilot_of(mission: Mission) -> AutopilotConfig:
-    from orthoswarm.planning.sorties.flight_time import autopilot_config
-
-    return autopilot_config(mission.autopilot.value)
 
 
 def flight_seconds(mission: Mission) -> float:
@@ -224,6 +221,7 @@ class Airspace:
     height_m: float
     slack_s: float
     in_turn: bool = False
+    launch_s: float = PLANNING.launch_s
     _found: dict[tuple[int, int], "_Approaches"] = field(default_factory=dict, repr=False)
 
     @classmethod
@@ -231,20 +229,23 @@ class Airspace:
         cls,
         missions: Mapping[int, Mission],
         levels_m: Mapping[int, float] | None = None,
-        apart: Apart | None = None,
+        needs: PlanNeeds = NO_NEEDS,
     ) -> "Airspace":
         """Of missions by system id.
 
         Args:
             levels_m: altitudes of the takeoffs above the sea, metres, where they are known.
-            apart: how far apart they are to be, None for the default of plans.
+            needs: of their plan: how far apart they are to be, and with which times of flight.
         """
         origin = next((home for mission in missions.values() if (home := home_of(mission))), (0.0, 0.0))
         levels = levels_m or {}
-        tracks = {s: replace(track_of(mission, origin), level_m=levels.get(s)) for s, mission in missions.items()}
-        slack_s = max((_autopilot_of(mission).schedule_slack_s for mission in missions.values()), default=0.0)
-        keeps = apart or Apart(active().planning.separation_m, active().planning.layer_m)
-        return cls(tracks, distance_m=keeps.distance_m, height_m=keeps.height_m, slack_s=slack_s)
+        tracks = {
+            s: replace(track_of(mission, origin, needs.config), level_m=levels.get(s))
+            for s, mission in missions.items()
+        }
+        slack_s = max((track.autopilot.schedule_slack_s for track in tracks.values()), default=0.0)
+        keeps, launch_s = needs.apart or APART, needs.config.planning.launch_s
+        return cls(tracks, distance_m=keeps.distance_m, height_m=keeps.height_m, slack_s=slack_s, launch_s=launch_s)
 
     def meeting(self, one: int, other: int, later_s: float) -> tuple[float, float] | None:
         """When (seconds after the first one's start) and how close two vehicles come if the other starts later.
@@ -314,12 +315,12 @@ class Airspace:
         return start
 
     def _too_near(self, one: int, other: int, later_s: float) -> bool:
-        launches = self._share_a_start(one, other) and abs(later_s) < active().planning.launch_s
+        launches = self._share_a_start(one, other) and abs(later_s) < self.launch_s
         return launches or self.meeting(one, other, later_s) is not None
 
     def _pad_m(self) -> float:
         """Radius about a start that vehicles share."""
-        return active().planning.pad_distances * self.distance_m
+        return PAD_DISTANCES * self.distance_m
 
     def _share_a_start(self, one: int, other: int) -> bool:
         a, b = self.tracks[one].places, self.tracks[other].places
@@ -331,7 +332,7 @@ def near_samples(one: Track, other: Track, distance_m: float, height_m: float | 
     from scipy.spatial import cKDTree
 
     a, b = one.places, other.places
-    flying_a, flying_b = (np.flatnonzero(places[:, 2] > active().planning.on_ground_m) for places in (a, b))
+    flying_a, flying_b = (np.flatnonzero(places[:, 2] > ON_GROUND_M) for places in (a, b))
     if not len(flying_a) or not len(flying_b):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     found = cKDTree(a[flying_a, :2]).query_ball_tree(cKDTree(b[flying_b, :2]), distance_m)

@@ -11,12 +11,12 @@ from typing import Final
 import numpy as np
 
 from gcs_plugin.plans.area_files import AreaFile, read_shapes
-from orthoswarm.config import active
 from orthoswarm.model.angles import wrap_deg
 from orthoswarm.model.earth import DEGREE_M
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.plan import Fence, Plan
 from orthoswarm.planning.area.shape_files import Ring, Shapes, counted
+from orthoswarm.planning.sorties.flight_heights import BESIDE_M
 
 _REACH_M: Final = 5000.0  # zones farther from the area and the starts than this, and than their own extent, are far
 
@@ -91,7 +91,7 @@ def read_no_fly(paths: Sequence[Path], flown: Ring, clearance_m: float | None) -
         InputError: a file cannot be read, or holds anything that no vehicle could be kept out of.
     """
     reach, rings, fences, notes, round_ = Reach(flown), list[Ring](), list[Fence](), list[str](), False
-    beyond_m = max(0.0, active().planning.beside_m - (clearance_m or 0.0))
+    beyond_m = max(0.0, BESIDE_M - (clearance_m or 0.0))
     for path in paths:
         file = read_zones(path)
         near = reach.near(file.shapes)

@@ -16,6 +16,7 @@ import shapely
 
 from gcs_plugin.mission.mission_files import Autopilot, plan_text, sortie_items, waypoints_text
 from gcs_plugin.plans.plan_request import PlanRequest, sortie_path
+from orthoswarm.config import changes
 from orthoswarm.coverage.gaps import PlannedFlight
 from orthoswarm.model.angles import wrap_deg
 from orthoswarm.model.errors import InputError
@@ -214,21 +215,20 @@ def write_plan(
     *,
     notes: Sequence[str] = (),
     picture: bool = True,
-    settings: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Write a plan's folder: missions, `all.geojson`, `plan.json`, `plan.png`; returns the content of `plan.json`.
 
     Args:
         folder: missions of an earlier plan in it are replaced. plan, area: as `make_plan` gives them for the request.
-        notes: warnings before the plan's own. picture: whether `plan.png` is drawn. settings: those that were changed.
+        notes: warnings before the plan's own. picture: whether `plan.png` is drawn.
 
     Raises:
         InputError: the folder cannot be written, or holds other missions.
     """
     figures = report(plan, request.autopilots, request.fov_min_deg, request.endurance_min)
     figures["warnings"] = [*notes, *figures["warnings"]]
-    if settings:
-        figures["config"] = {stage: dict(values) for stage, values in settings.items()}
+    if changed := changes(request.config):
+        figures["config"] = changed
     files: dict[str, str | bytes] = dict(mission_files(plan, request.autopilots))
     files["all.geojson"] = geojson(plan, area)
     files["plan.json"] = json.dumps(figures, indent=1) + "\n"

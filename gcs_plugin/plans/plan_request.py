@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from gcs_plugin.mission.mission_files import Autopilot
 from gcs_plugin.plans.area_files import read_shapes
 from gcs_plugin.plans.no_fly import NoFly, read_no_fly
-from orthoswarm.config import active
+from orthoswarm.config import DEFAULT, Config
 from orthoswarm.coverage.missing_pictures import Cause
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid, area_epsg
 from orthoswarm.model.placement import Terrain
-from orthoswarm.model.plan import End, Fence, Plan, Sortie
+from orthoswarm.model.plan import APART, End, Fence, Plan, Sortie
 from orthoswarm.planning.area.area import Area, make_area
 from orthoswarm.planning.area.shape_files import Polygon, Ring, Shapes, counted, parse_geojson
 from orthoswarm.planning.lines.candidates import Method
@@ -30,8 +30,8 @@ from orthoswarm.planning.planner import plan_area, plan_gaps, plan_lines
 from orthoswarm.planning.relief_plan import GroundBelow, Relief, plan_over_relief
 from orthoswarm.planning.sorties.assignment import Heading, PlanOptions
 from orthoswarm.planning.sorties.deconfliction import Separation
-from orthoswarm.planning.sorties.flight_heights import FlightHeights
-from orthoswarm.planning.sorties.flight_time import Motion, autopilot_config
+from orthoswarm.planning.sorties.flight_heights import BESIDE_M, FlightHeights
+from orthoswarm.planning.sorties.flight_time import Motion
 from orthoswarm.raster.height_model import DEM_MOST_NODES, HeightModel
 
 AUTOPILOTS: Final[tuple[Autopilot, ...]] = ("ardupilot", "px4")
@@ -87,6 +87,7 @@ class PlanRequest:
         wind_m_s, wind_from_deg: wind and where it comes from, clockwise from north; the speed is that through the air.
         heading: direction of the lines over an area, as in PlanOptions. cross: cover it again by lines across these.
         gimbal_pitch_deg: to which missions turn the camera's gimbal, -90 straight down; None to leave it alone.
+        config: margins, and times of flight of the autopilots.
     """
 
     area: Path
@@ -108,8 +109,8 @@ class PlanRequest:
     forward_overlap: float = 0.8
     aspect: float = 4.0 / 3.0
     clearance_m: float | None = None
-    separation_m: float = field(default_factory=lambda: active().planning.separation_m)
-    height_step_m: float = field(default_factory=lambda: active().planning.layer_m)
+    separation_m: float = APART.distance_m
+    height_step_m: float = APART.height_m
     ceiling_m: float | None = None
     follow: bool = False
     gaps: bool = False
@@ -123,6 +124,7 @@ class PlanRequest:
     heading: Heading | None = None
     cross: bool = False
     gimbal_pitch_deg: float | None = -90.0
+    config: Config = DEFAULT
 
     def _motion(self) -> Motion:
         if not 0.0 <= self.wind_m_s < math.inf or not math.isfinite(self.wind_from_deg):
@@ -131,7 +133,7 @@ class PlanRequest:
             )
         to = math.radians(self.wind_from_deg + 180.0)
         wind = (self.wind_m_s * math.sin(to), self.wind_m_s * math.cos(to)) if self.wind_m_s else (0.0, 0.0)
-        autopilot = min(map(autopilot_config, self.autopilots), key=lambda times: times.acceleration_m_s2)
+        autopilot = min(map(self.config.times, self.autopilots), key=lambda times: times.acceleration_m_s2)
         if self.speed_m_s is None:
             return Motion(wind_m_s=wind, autopilot=autopilot)
         return Motion(self.speed_m_s, wind_m_s=wind, autopilot=autopilot)
@@ -151,7 +153,7 @@ class PlanRequest:
         layers = int(min(_MOST_LAYERS, (ceiling - self.altitude_m) / step + 1e-9)) if step > 0 else 0
         return PlanOptions(
             motion=self._motion(),
-            autopilots=[autopilot_config(name) for name in self.autopilots],
+            autopilots=[self.config.times(name) for name in self.autopilots],
             end=self.end,
             starts=list(self.starts),
             endurance_s=math.inf if self.endurance_min is None else 60.0 * self.endurance_min,
@@ -162,13 +164,16 @@ class PlanRequest:
                 height_m=step,
                 layers=layers,
                 swap_s=60.0 * self.swap_min,
-                slack_s=max(autopilot_config(name).schedule_slack_s for name in self.autopilots),
+                slack_s=max(self.config.times(name).schedule_slack_s for name in self.autopilots),
+                launch_s=self.config.planning.launch_s,
+                in_turn_share=self.config.planning.in_turn_share,
             ),
-            most_items=min(autopilot_config(name).most_items for name in self.autopilots),
+            most_items=min(self.config.times(name).most_items for name in self.autopilots),
             run_in_m=self.run_in_m,
             wait_s=60.0 * self.wait_min,
             heading=self.heading,
             cross=self.cross,
+            quickest_s=self.config.planning.quickest_s,
         )
 
 
@@ -188,7 +193,7 @@ def make_plan(request: PlanRequest, progress: Callable[[str], None] = lambda _: 
     no_fly.refuse_beyond(plan)
     refuse_outside(plan, fences, request.autopilots)
     # Nearer to a zone a vehicle would break its fence by the errors of its receiver alone, and turn back or stop.
-    if area is not None and (request.clearance_m or 0.0) >= active().planning.beside_m:
+    if area is not None and (request.clearance_m or 0.0) >= BESIDE_M:
         fences += zone_fences(area, fences)
     if area is not None:
         area = replace(area, circles_wider_m=no_fly.circles_wider_m)
@@ -279,6 +284,7 @@ def _over_ground(
         raise InputError("give --start with --dem: heights of a mission count from the takeoff point")
     starts = np.array(request.starts, float)
     ground = read_ground(request.dem, wanted, grid, grid.to_grid(starts[:, 0], starts[:, 1]))
+    ground = replace(ground, least_above_m=request.config.planning.least_above_ground_m)
     usual_m = _TOLERANCE * request.altitude_m
     tolerance_m = usual_m if request.height_tolerance_m is None else request.height_tolerance_m
     without = sorted(set(request.autopilots) - WITH_TERRAIN)
@@ -347,9 +353,8 @@ def read_ground(dem: Path, wanted: shapely.Geometry, grid: LocalGrid, starts: ND
     """
     points = np.concatenate([shapely.get_coordinates(wanted), starts])
     bounds = BoundingBox.around_points(points, DEM_MARGIN_M)
-    most, beside_m = DEM_MOST_NODES, active().planning.beside_m
     model = HeightModel.open(dem, grid.epsg, bounds, np.empty((0, 3)))
-    found = model.window(bounds, most)
+    found = model.window(bounds, DEM_MOST_NODES)
     terrain = found.terrain
     # One step around the outline, too: a small area may lie between nodes.
     within = _nodes_in(wanted.buffer(terrain.step_m), terrain)
@@ -359,7 +364,7 @@ def read_ground(dem: Path, wanted: shapely.Geometry, grid: LocalGrid, starts: ND
             f"{dem} has no heights on a part of the area or of the ways to it; give a height model without holes there"
         )
     zero = np.float32(terrain.height(starts).min())
-    highest = model.highest(bounds, beside_m, _BESIDE_STEPS, most)
+    highest = model.highest(bounds, BESIDE_M, _BESIDE_STEPS, DEM_MOST_NODES)
     highest = replace(highest, z=highest.z - zero)
     way_m = float(highest.z[_nodes_in(hull, highest)].max())
     z = terrain.z - zero
@@ -378,7 +383,7 @@ def _nodes_in(outline: shapely.Geometry, terrain: Terrain) -> NDArray[np.bool_]:
 
 def return_height_m(ground: GroundBelow) -> float:
     """Height above takeoff, whole metres, at which a straight way home passes over all ground and what stands on it."""
-    return float(math.ceil(ground.way_m + active().planning.least_above_ground_m))
+    return float(math.ceil(ground.way_m + ground.least_above_m))
 
 
 def relief_notes(plan: Plan, ground: GroundBelow) -> list[str]:
@@ -396,7 +401,7 @@ def relief_notes(plan: Plan, ground: GroundBelow) -> list[str]:
     return [
         f"the ground of the area lies {ground.low_m:.0f} to {ground.high_m:.0f} m over takeoff: {how}, "
         f"{over.least_m:.0f} to {over.most_m:.0f} m above ground, {over.way_least_m:.0f} m or more above the highest "
-        f"within {active().planning.beside_m:g} m; side overlap {100 * over.side_overlap[0]:.0f} % or "
+        f"within {BESIDE_M:g} m; side overlap {100 * over.side_overlap[0]:.0f} % or "
         f"more on 95 % of the legs, forward overlap at least {100 * over.forward_overlap:.0f} %",
         f"a vehicle that turns home by itself flies straight back: set its return height (ArduPilot RTL_ALT, "
         f"RTL_ALT_M from 4.7 on; PX4 RTL_RETURN_ALT) to {return_height_m(ground):.0f} m or more",

@@ -18,7 +18,7 @@ from gcs_plugin.mission.exchange import (
 )
 from gcs_plugin.mission.geofence import FENCE
 from gcs_plugin.mission.items import FRAME_GLOBAL, GIMBAL_CLAIM, JUMP, TAKEOFF, WAYPOINT, MissionItem
-from orthoswarm.planning.sorties.flight_time import autopilot_config
+from orthoswarm.config import DEFAULT
 
 _MISSION: Final = dialect.MAV_MISSION_TYPE_MISSION
 _FRAMES: Final = frozenset({0, 2, 3, 5, 6, 10, 11})
@@ -146,7 +146,7 @@ class MissionStore:
             return self._ask(transfer, now) if transfer.wanted == 0 else [self._ack(sender, ERROR)]
         if self._sent_to is not None and now - self._sent_at < _TIMING[Autopilot.PX4][1]:
             return [self._ack(sender, ERROR)]  # PX4 is still handing its mission out
-        if count > autopilot_config(self.autopilot.value).most_items:
+        if count > DEFAULT.times(self.autopilot.value).most_items:
             return [self._ack(sender, NO_SPACE)]
         if count == 0:
             self.items = []

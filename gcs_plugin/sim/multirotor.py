@@ -15,7 +15,7 @@ from typing import Final
 
 import numpy as np
 
-from orthoswarm.config.autopilot import AutopilotConfig
+from orthoswarm.config.autopilot import AutopilotTimes
 from orthoswarm.model.angles import wrap_rad
 from orthoswarm.model.earth import EQUATOR_RADIUS_M
 from orthoswarm.planning.sorties import flight_time as planner
@@ -107,9 +107,9 @@ class Airframe:
     gps_sigma_m: float = 0.0
     gps_tau_s: float = 60.0
     top_m_s: float = math.inf
-    times: AutopilotConfig | None = None
+    times: AutopilotTimes | None = None
 
-    def as_flown(self, times: AutopilotConfig) -> "Airframe":
+    def as_flown(self, times: AutopilotTimes) -> "Airframe":
         """The same vehicle with the times of a real autopilot, and its rates of climb and descent."""
         usual = planner.Motion()
         return replace(self, climb_m_s=usual.climb_m_s, sink_m_s=usual.descent_m_s, times=times)

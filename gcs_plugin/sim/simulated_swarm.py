@@ -17,8 +17,8 @@ from gcs_plugin.mission.exchange import Address
 from gcs_plugin.sim.lossy_radio import NO_FAULTS, Channel, Faults
 from gcs_plugin.sim.multirotor import Airframe, Chart
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
+from orthoswarm.config import DEFAULT
 from orthoswarm.model.errors import InputError
-from orthoswarm.planning.sorties.flight_time import autopilot_config
 
 _TICK_S: Final = 0.02
 
@@ -226,7 +226,7 @@ def make_swarm(
             system=number + 1,
             autopilot=autopilot,
             home=(lat, lon, home[2]),
-            airframe=frame.as_flown(autopilot_config(autopilot.value)) if as_flown else frame,
+            airframe=frame.as_flown(DEFAULT.times(autopilot.value)) if as_flown else frame,
             boot_utc_s=utc,
             seed=seed,
             **options,

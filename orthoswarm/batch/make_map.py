@@ -6,7 +6,6 @@ from typing import Any
 
 from orthoswarm.batch.pipeline import MapOptions, run
 from orthoswarm.compute.workers import prepare_process, workers
-from orthoswarm.config import overridden, override
 from orthoswarm.model.frame import Frame, Ingest
 from orthoswarm.model.task_runner import Progress
 
@@ -38,11 +37,9 @@ def make_map(
     """
     prepare_process()
     ingest = frames if isinstance(frames, Ingest) else Ingest(list(frames), [], [])
-    options, before = options or MapOptions(), overridden()
-    override(options.config)  # before workers are started, which have their own values
+    options = options or MapOptions()
     pool = workers(processes)
     try:
         return run(lambda _: ingest, out, options, pool, progress or (lambda *_: None))
     finally:
         pool.close()
-        override(before)

@@ -10,7 +10,6 @@ import numpy as np
 from orthoswarm.batch.run_state import COARSE, ORTHOIMAGE, SEAMLINES, RunContext, RunState
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.compute.workers import trim_memory
-from orthoswarm.config import active
 from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.export.catalog.tiled_raster import copy_tiled, in_tiles, product_file, remove_tiles, write_tiled
 from orthoswarm.export.cog import write_cog
@@ -191,7 +190,14 @@ def draw(
 
 def _seams(run: RunContext, state: RunState) -> Seams | None:
     """How the seams of the orthoimage are chosen."""
-    return None if state.previews is None else Seams(state.previews, run.options.blend, level=run.options.gains)
+    if state.previews is None:
+        return None
+    return Seams(
+        state.previews,
+        run.options.blend,
+        level=run.options.gains,
+        feather_px=run.options.config.mosaic.feather_px,
+    )
 
 
 def _canvas(run: RunContext, name: str, placed: Sequence[PlacedFrame], terrain: Terrain, state: RunState) -> Canvas:
@@ -202,9 +208,8 @@ def _canvas(run: RunContext, name: str, placed: Sequence[PlacedFrame], terrain: 
         reason = rejection(placed[0].camera, low, state.gsd_m) if placed else "there is none"
         raise OrthoSwarmError(f"no picture can be drawn: {reason}")
     grid = GroundGrid.around(state.grid.epsg, placed_bounds(usable, low, high), state.gsd_m)
-    return Canvas.create(
-        run.space.scratch(name.removesuffix(".tif")), grid, plane="frame", memory_mb=active().compute.canvas_mb
-    )
+    folder, memory_mb = run.space.scratch(name.removesuffix(".tif")), run.options.config.compute.canvas_mb
+    return Canvas.create(folder, grid, plane="frame", memory_mb=memory_mb)
 
 
 def _write(run: RunContext, canvas: Canvas, name: str, placed: Sequence[PlacedFrame]) -> None:
@@ -234,7 +239,8 @@ def _copy_coarse(run: RunContext, state: RunState) -> None:
     else:
         copy_tiled(run.out, ORTHOIMAGE, COARSE)
     moved = state.control is not None and state.control.by_receivers is not None
-    if run.options.basemap is None and not moved:
+    received = any(frame.has_own_position for frame in state.ingest.frames)
+    if run.options.basemap is None and received and not moved:
         state.warnings.append("there is no basemap: the orthoimage lies where the drones' receivers say")
 
 

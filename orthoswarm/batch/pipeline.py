@@ -24,17 +24,17 @@ from orthoswarm.batch.run_state import (
     is_written,
 )
 from orthoswarm.batch.split_legs import legs_as_vehicles
-from orthoswarm.batch.unpositioned import with_control_positions
+from orthoswarm.batch.unpositioned import with_found_positions
 from orthoswarm.batch.workspace import Workspace, run_key
 from orthoswarm.compute.stage_times import Clock
 from orthoswarm.compute.workers import Workers, usage_of
-from orthoswarm.config import override
-from orthoswarm.control.control_observations import check_control
+from orthoswarm.control.control_observations import absent_marks, check_control
 from orthoswarm.evaluation.checkpoints import Checkpoint, read_checkpoints
 from orthoswarm.evaluation.independent_points import shared_points, shared_warning
 from orthoswarm.export.atomic_file import disk_error
 from orthoswarm.export.catalog.tiled_raster import product_file
 from orthoswarm.model.errors import InputError, OrthoSwarmError
+from orthoswarm.model.frame import Ingest
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import PlacedFrame, Terrain
 from orthoswarm.model.task_runner import Progress
@@ -90,14 +90,14 @@ def run(
         The content of report.json.
 
     Raises:
-        InputError: if the inputs have no picture with a position, or the basemap cannot be used.
+        InputError: if the inputs have no picture, or the basemap cannot be used.
+        OrthoSwarmError: if nothing tells where the pictures were taken.
         OrthoSwarmError: if nothing could be made, or the refinement failed by an error of the program: then the
             real-time picture, the frames as recorded and the report with the error exist, but no orthoimage, which
             would look like a refined one.
     """
     if options.basemap is not None and not exists(options.basemap):
         raise InputError(f"the basemap {address_of(options.basemap)} does not exist; check the path")
-    override(options.config)
     with Workspace(out) as space:
         context = RunContext(
             out=out,
@@ -145,10 +145,11 @@ def _load(run: RunContext, load: Load) -> RunState:
     except OSError as error:  # pictures of videos are written
         raise disk_error(error, run.out) from None
     ingest = in_one_area(ingest)
-    if run.options.control is not None and ingest.unpositioned:
-        ingest = with_control_positions(run, ingest)
+    beside = bool(ingest.frames) and run.options.until != "realtime"  # photos that may tell where others were taken
+    if ingest.unpositioned and (beside or run.options.control is not None):
+        ingest = with_found_positions(run, ingest)
     if not ingest.frames:
-        raise InputError(nothing_to_map(ingest))
+        raise nothing_to_map(ingest)
     grid = area_grid(ingest.frames)
     if run.options.split_legs:
         ingest = replace(ingest, frames=legs_as_vehicles(ingest.frames, grid))
@@ -165,7 +166,7 @@ def _load(run: RunContext, load: Load) -> RunState:
         warnings += partial_cover(basemap, recorded.placed)
     dem = None if run.options.dem is None else _height_model(run, run.options.dem, grid, recorded)
     rejected = {r.image: r for r in (*ingest.rejected, *recorded.rejected)}
-    control, said = _control_points(run, grid, recorded, basemap)
+    control, said = _control_points(run, ingest, grid, recorded, basemap)
     warnings += said
     return RunState(
         ingest=ingest,
@@ -181,7 +182,7 @@ def _load(run: RunContext, load: Load) -> RunState:
 
 
 def _control_points(
-    run: RunContext, grid: LocalGrid, recorded: Recorded, basemap: Basemap | None
+    run: RunContext, ingest: Ingest, grid: LocalGrid, recorded: Recorded, basemap: Basemap | None
 ) -> tuple[list[Checkpoint], list[str]]:
     """Read the points of --control, and warnings; refuse unusable ones and those of --checkpoints before the work."""
     options = run.options
@@ -192,7 +193,7 @@ def _control_points(
     check_control(points, recorded.placed, grid, basemap is not None)
     shared = shared_points(checks, points, options.checkpoints.name if options.checkpoints else "")
     doubts = dict.fromkeys(f"control points: {point.doubt}" for point in points if point.doubt)
-    return points, [*doubts, *shared_warning(shared, len(checks))]
+    return points, [*absent_marks(points, ingest), *doubts, *shared_warning(shared, len(checks))]
 
 
 def _height_model(run: RunContext, path: Path, grid: LocalGrid, recorded: Recorded) -> HeightModel | None:
@@ -215,8 +216,12 @@ def _realtime(run: RunContext, state: RunState) -> list[PlacedFrame]:
     if run.options.until != "realtime":
         images = [p.frame.image for p in state.recorded.placed]
         state.previews = PreviewFile.create(run.space.file("previews"), images)
-        state.pictures = GreyPictures.create(run.space.file("pictures"), state.ingest.frames)
-        state.parts = PictureParts.create(run.space.file("parts"), len(images))
+        state.pictures = GreyPictures.create(
+            run.space.file("pictures"), state.ingest.frames, run.options.config.raster.grey_pictures_mb
+        )
+        state.parts = PictureParts.create(
+            run.space.file("parts"), len(images), run.options.config.raster.picture_parts_mb
+        )
     known = run.space.recall("realtime")
     if known is not None and product_file(run.out, REALTIME) is not None:
         stats, stage = known

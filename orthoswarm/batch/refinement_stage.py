@@ -13,7 +13,6 @@ from orthoswarm.batch.run_state import RunContext, RunState
 from orthoswarm.batch.swarm_areas import SolvedArea, divide
 from orthoswarm.compute.stage_times import Clock, Stage
 from orthoswarm.compute.workers import trim_memory
-from orthoswarm.config import active
 from orthoswarm.control.ground_control import place_on_control
 from orthoswarm.model.errors import OrthoSwarmError, RunInterruptedError
 from orthoswarm.model.frame import Frame
@@ -114,8 +113,9 @@ def _refined(run: RunContext, frames: Sequence[Frame], state: RunState) -> Refin
 
 def _call_refiner(run: RunContext, frames: Sequence[Frame], state: RunState) -> Refinement:
     refiner = make_refiner(
-        run.options.refine, state.grid.epsg, local_origin(state.grid, frames), state.dem, state.pictures
-    )
+        run.options.refine, state.grid.epsg, local_origin(state.grid, frames), state.dem, state.pictures,
+        device=run.options.config.matchers.device,
+    )  # fmt: skip
     vehicles: dict[str, list[Frame]] = {}
     for frame in frames:
         vehicles.setdefault(frame.vehicle, []).append(frame)
@@ -123,7 +123,7 @@ def _call_refiner(run: RunContext, frames: Sequence[Frame], state: RunState) -> 
     # Vehicles that were refined with a map that was lost later are not the same as those without it.
     lost = state.basemap is None and run.options.basemap is not None
     label = "vehicle without map" if lost else "vehicle"
-    areas = _areas(vehicles, state)
+    areas = _areas(vehicles, state, run.options.config.strategy.area_pictures)
     if len(areas) > 1:
         return refine_by_area(run, refiner, vehicles, basemap, areas=areas, grid=state.grid, label=label)
     refinement = refiner.refine_batch(vehicles, basemap, run.space.remembering(label, run.workers.map), run.progress)
@@ -136,11 +136,11 @@ def _call_refiner(run: RunContext, frames: Sequence[Frame], state: RunState) -> 
     return refinement
 
 
-def _areas(vehicles: Mapping[str, Sequence[Frame]], state: RunState) -> list[SolvedArea]:
-    """The areas that the vehicles are solved in."""
+def _areas(vehicles: Mapping[str, Sequence[Frame]], state: RunState, most_pictures: int) -> list[SolvedArea]:
+    """The areas of no more than so many pictures that the vehicles are solved in."""
     at = {p.frame.image: p.camera.position for p in state.recorded.placed}
     paths = {vehicle: np.array([at[frame.image] for frame in frames]) for vehicle, frames in vehicles.items()}
-    return divide(paths, active().strategy.area_pictures)
+    return divide(paths, most_pictures)
 
 
 def _append_carried(solutions: list[Solution], carried: Sequence[PlacedFrame]) -> None:

@@ -7,6 +7,7 @@ from dataclasses import asdict
 from typing import Any
 
 from orthoswarm.batch.run_state import COARSE, ORTHOIMAGE, PRODUCTS, REALTIME, SEAMLINES, RunContext, RunState
+from orthoswarm.config import changes
 from orthoswarm.evaluation.checkpoints import evaluate_checkpoints
 from orthoswarm.evaluation.independent_points import control_rows
 from orthoswarm.export.catalog.tiled_raster import remove_collection, remove_product, tiles_of
@@ -119,7 +120,7 @@ def _report(
         "control_offset_m": None if state.control_offset is None else state.control_offset.document(),
         "control": None if state.control is None else state.control.document(),
         "until": run.options.until,
-        "config": {stage: dict(values) for stage, values in run.options.config.items()},
+        "config": changes(run.options.config),
         "map_lean_m_per_m": list(solutions[0].map_lean) if solutions else [0.0, 0.0],
         "root": image_root(state.ingest.frames),
         **({"equation_5": dict(refinement.equation_5)} if refinement and refinement.equation_5 else {}),

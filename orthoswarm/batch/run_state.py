@@ -12,7 +12,7 @@ from orthoswarm.batch.refiners import RefinerName
 from orthoswarm.batch.workspace import Workspace
 from orthoswarm.compute.stage_times import Clock
 from orthoswarm.compute.workers import Workers
-from orthoswarm.config import Overrides
+from orthoswarm.config import DEFAULT, Config
 from orthoswarm.control.ground_control import GroundControl
 from orthoswarm.evaluation.checkpoints import Checkpoint
 from orthoswarm.export.catalog.tiled_raster import FOLDER, Tiles, is_tile_or_collection
@@ -75,7 +75,7 @@ class MapOptions:
             as of evaluation.checkpoints). pixel_scale: pixels of the photos to one of those in which they were marked.
         covariance: write the covariance of each camera's position and rotation to frames.jsonl.
         tiles: write rasters in tiles with a STAC collection: "yes", "no", or "auto" by their pixels.
-        config: thresholds that replace the defaults.
+        config: the settings of the stages.
     """
 
     basemap: Path | None = None
@@ -94,7 +94,7 @@ class MapOptions:
     pixel_scale: float = 1.0
     covariance: bool = False
     tiles: Tiles = "auto"
-    config: Overrides = field(default_factory=dict)
+    config: Config = DEFAULT
 
 
 @dataclass(slots=True, kw_only=True)

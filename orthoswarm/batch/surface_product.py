@@ -44,7 +44,8 @@ def make_surface(
     try:
         with run.clock.stage("final: surface", len(placed)):
             model = surface_model(
-                placed, terrain, state.grid.epsg, run.space.scratch("surface"), run=run.drawers.map,
+                placed, terrain, state.grid.epsg, run.space.scratch("surface"), config=run.options.config.stereo,
+                run=run.drawers.map,
                 progress=partial(run.progress, "matching the surface"),
             )  # fmt: skip
             write_surface(path, model, altitude, common_m)

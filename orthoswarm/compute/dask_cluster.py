@@ -22,7 +22,6 @@ from uuid import uuid4
 
 from orthoswarm import __version__
 from orthoswarm.compute.workers import Usage, peak_rss_mb, prepare_process
-from orthoswarm.config import active, overridden, override
 from orthoswarm.model.errors import InputError, RunInterruptedError
 from orthoswarm.model.task_runner import Continued, whole
 
@@ -31,6 +30,9 @@ _SAMPLES = 100
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
+_CONNECT_S: Final = 20.0  # to reach a scheduler
+_POLL_S: Final = 1.0  # how often the workers are counted while a result is awaited
+_PATIENCE_S: Final = 120.0  # a cluster without workers is given up after so long: machines restart within that
 _CLUSTER_QUEUE_PER_WORKER: Final = 3  # items sent to a cluster for each worker, so that none waits for the network
 
 
@@ -83,8 +85,7 @@ class Cluster:
         shared: files and folders that every worker must see under the same path, with what is in them.
         written: a folder that every worker must write to under the same path; None for none.
         begin: called in each worker before its first task, also in one that comes later.
-        patience_s: how long to wait for a worker to come back when all are gone, and for a scheduler; None for the
-            configuration's.
+        patience_s: how long to wait for a worker to come back when all are gone, and for a scheduler.
 
     Raises:
         InputError: if there is no scheduler, no worker, another version of OrthoSwarm on a worker, or a worker that
@@ -95,7 +96,7 @@ class Cluster:
         self,
         address: str,
         shared: Sequence[Path] = (),
-        patience_s: float | None = None,
+        patience_s: float = _PATIENCE_S,
         *,
         written: Path | None = None,
         begin: Callable[[], None] | None = None,
@@ -105,7 +106,7 @@ class Cluster:
         self._written = written and written.absolute()
         self._begin = None if begin is None else _Beginning(uuid4().hex, begin)
         self._client = _connect(address)
-        self._patience_s = active().compute.cluster_patience_s if patience_s is None else patience_s
+        self._patience_s = patience_s
         self._cpu_s: dict[str, float] = {}
         self._rss_mb: dict[str, float] = {}
         self._first_cpu_s: dict[str, float] = {}
@@ -165,7 +166,7 @@ class Cluster:
         return known
 
     def _submit(self, function: Callable[[Any], Any], item: Any) -> _SentTask:
-        payload = pickle.dumps((function, item, overridden(), self._begin), pickle.HIGHEST_PROTOCOL)
+        payload = pickle.dumps((function, item, self._begin), pickle.HIGHEST_PROTOCOL)
         return _SentTask(payload, self._sent(payload), self._client)
 
     def _sent(self, payload: bytes) -> Any:
@@ -193,7 +194,7 @@ class Cluster:
             try:
                 if queue[0].future is None:
                     raise CancelledError
-                outcome: _PickledOutcome = queue[0].future.result(timeout=active().compute.cluster_poll_s)
+                outcome: _PickledOutcome = queue[0].future.result(timeout=_POLL_S)
                 return outcome
             except Late:
                 if self._workers():
@@ -229,7 +230,7 @@ class Cluster:
             try:
                 self._client = _connect(self._address)
                 while not self._workers() and time.monotonic() < end:
-                    time.sleep(active().compute.cluster_poll_s)
+                    time.sleep(_POLL_S)
                 self._check()
                 return
             except (InputError, OSError) as error:
@@ -237,7 +238,7 @@ class Cluster:
                     raise ClusterLostError(
                         f"the cluster was lost ({error}); run the same command again to go on when it is back"
                     ) from None
-                time.sleep(active().compute.cluster_poll_s)
+                time.sleep(_POLL_S)
 
     def _account(self, outcome: _PickledOutcome) -> Any:
         """A task's value or error, after adding up what its process has used."""
@@ -285,7 +286,7 @@ def _connect(address: str) -> Any:
     # States of vehicles are megabytes large and must be sent; Dask would warn about each.
     dask.config.set({"distributed.admin.large-graph-warning-threshold": "1 GB"})
     try:
-        return Client(address, timeout=active().compute.cluster_connect_s, set_as_default=False)
+        return Client(address, timeout=_CONNECT_S, set_as_default=False)
     except (OSError, ValueError) as error:  # no route, wrong form
         raise InputError(f"there is no Dask scheduler at {address} ({_short(error)}); check the address") from None
 
@@ -297,8 +298,7 @@ def _short(error: BaseException) -> str:
 def _work(payload: bytes) -> _PickledOutcome:
     """Runs on a worker."""
     prepare_process()
-    function, item, config, beginning = pickle.loads(payload)
-    override(config)
+    function, item, beginning = pickle.loads(payload)
     if beginning is not None:
         beginning.once()
     raised = False

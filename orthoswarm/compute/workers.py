@@ -30,7 +30,6 @@ from multiprocessing.context import BaseContext, SpawnContext
 from types import TracebackType
 from typing import Any, Final, Generic, Protocol, TypeVar
 
-from orthoswarm.config import Overrides, overridden, override
 from orthoswarm.model.errors import WorkerStoppedError
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.task_runner import Continued, whole
@@ -236,7 +235,7 @@ class Processes:
 
     def _submitted(self, function: Callable[[Any], Any], item: Any) -> "Future[_Outcome[Any]]":
         try:
-            return self._started().submit(_measured, function, item, overridden())
+            return self._started().submit(_measured, function, item)
         except BrokenProcessPool as error:  # told at its item's turn, as if the task had begun
             failed: Future[_Outcome[Any]] = Future()
             failed.set_exception(error)
@@ -321,8 +320,7 @@ def _continued(queue: "Iterable[_Place[Result]]") -> "_Place[Result] | None":
     return next((place for place in queue if place.continuation is not None), None)
 
 
-def _measured(function: Callable[[Item], Result], item: Item, config: Overrides) -> _Outcome[Result]:
-    override(config)
+def _measured(function: Callable[[Item], Result], item: Item) -> _Outcome[Result]:
     value = _tidily(function, item)
     return _Outcome(value, os.getpid(), time.process_time(), peak_rss_mb())
 

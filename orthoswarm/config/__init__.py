@@ -1,16 +1,14 @@
 """What a user may set: one frozen dataclass a stage, each field with unit, meaning and source.
 
-`active()` gives the values in force. `--config FILE.toml` of `orthoswarm mosaic`, `plan` and `serve` overrides
-them, a table a stage:
+`--config FILE.toml` of `orthoswarm mosaic`, `plan` and `serve` has a table a stage:
 
-    [features]
-    cell_px = 60
+    [stereo]
+    tallest_m = 120
 
-A number outside its range (`ranges`) is refused.
-
-All other thresholds are constants beside their use.
+A number outside its range (`ranges`) is refused. Whoever needs a setting is handed its stage as an argument; all other
+thresholds are constants beside their use.
 """
 
-from orthoswarm.config.active import Config, Overrides, active, overridden, override, read_overrides
+from orthoswarm.config.settings import DEFAULT, Config, changes, config_of, read_config
 
-__all__ = ["Config", "Overrides", "active", "overridden", "override", "read_overrides"]
+__all__ = ["DEFAULT", "Config", "changes", "config_of", "read_config"]

@@ -11,12 +11,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
-from orthoswarm.evaluation.checkpoints import RECEIVERS_LOCAL_SIGMA_M, Checkpoint
+from orthoswarm.evaluation.checkpoints import POINTING_SIGMA_PX, RECEIVERS_LOCAL_SIGMA_M, SURVEY_SIGMA_M, Checkpoint
 from orthoswarm.evaluation.misread_points import FARTHEST_M, misplaced
-from orthoswarm.evaluation.photo_names import photo_named
+from orthoswarm.evaluation.photo_names import photo_named, photos_named
 from orthoswarm.evaluation.point_rays import Ray, RayPoint, intersect_rays
 from orthoswarm.model.errors import InputError
+from orthoswarm.model.frame import Ingest
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import PlacedFrame, Terrain
 
@@ -72,6 +72,16 @@ def check_control(
         raise InputError(f"of the control points, {misplaced(elsewhere)}")
 
 
+def absent_marks(points: Iterable[Checkpoint], ingest: Ingest) -> list[str]:
+    """A warning about points that are marked in photos which are not there, if there are any."""
+    known = {f.image for f in ingest.frames} | {r.image for r in ingest.rejected}
+    absent = [(p.name, m.image) for p in points for m in p.marks if not photos_named(known, m.image)]
+    if not absent:
+        return []
+    name, image = absent[0]
+    return [f"marks of control points in photos that are not here: {len(absent)}, the first of {name} in {image}"]
+
+
 def in_photos(
     points: Sequence[Checkpoint], placed: Sequence[PlacedFrame], terrain: Terrain, grid: LocalGrid, on_map: bool
 ) -> list[ControlObservation]:
@@ -81,7 +91,6 @@ def in_photos(
         points: surveyed points. placed: photos of one frame of reference. terrain: ground below them.
         grid: the area's. on_map: whether that frame is the basemap.
     """
-    config = active().control
     images = {p.frame.image: p for p in placed}
     out = []
     for point in points:
@@ -93,9 +102,10 @@ def in_photos(
         place = intersect_rays(rays, level, _HEIGHT_SIGMA_M).place
         met = intersect_rays(rays, float(terrain.height(place)), _HEIGHT_SIGMA_M)
         gsd = float(np.median([(p.camera.position[2] - level) / p.camera.lens.focal_px for p, _ in photos]))
-        pointing = config.pointing_sigma_px * gsd / np.sqrt(len(photos))
+        pointing = POINTING_SIGMA_PX * gsd / np.sqrt(len(photos))
         bent = float(np.median([p.sigma_m for p, _ in photos])) if on_map else RECEIVERS_LOCAL_SIGMA_M
-        sigma = float(np.linalg.norm([_survey_sigma(point), pointing, bent, met.contradiction]))
+        parts = [_survey_sigma(point), pointing, bent, met.contradiction, _leaning_m(rays)]
+        sigma = float(np.linalg.norm(parts))
         surveyed, stated = _in_grid(point.surveyed, grid), point.sigma_m > 0.0
         out.append(ControlObservation(point.name, met.place, surveyed, sigma, stated, rays=met))
     return out
@@ -130,17 +140,25 @@ def _photos(point: Checkpoint, images: dict[str, PlacedFrame]) -> list[tuple[Pla
     return out
 
 
+def _leaning_m(rays: Sequence[Ray]) -> float:
+    """Sigma of a point of one photo by the height that nothing else tells, metres; 0 where rays meet."""
+    if len(rays) > 1:
+        return 0.0
+    east, north, up = rays[0].direction
+    return _HEIGHT_SIGMA_M * float(np.hypot(east, north) / max(abs(up), 1e-3))
+
+
 def _ray(placed: PlacedFrame, pixel: Array, camera_sigma_m: float) -> Ray:
     """The ray of a pixel."""
     camera = placed.camera
     below = float(camera.position[2]) - 1.0
     away = np.array([*camera.to_ground(pixel, below), below]) - camera.position
-    pixel_rad = active().control.pointing_sigma_px / camera.lens.focal_px
+    pixel_rad = POINTING_SIGMA_PX / camera.lens.focal_px
     return Ray(placed.frame.image, camera.position, away / np.linalg.norm(away), pixel_rad, camera_sigma_m)
 
 
 def _survey_sigma(point: Checkpoint) -> float:
-    return point.sigma_m or active().control.survey_sigma_m
+    return point.sigma_m or SURVEY_SIGMA_M
 
 
 def _in_grid(lon_lat: Array, grid: LocalGrid) -> Array:

@@ -27,6 +27,8 @@ _BORDER_M: Final = 0.5
 root-mean-square radius changes by this, one sigma: one or two points shift them, more points turn and scale them, too.
 Measured on 172 photos where receivers say (radius 54 m) by five control points, each choice of two of them placing the
 other three: with 0.05, 0.5 and 1.5 m these are 0.72, 0.75 and 0.99 m off (three points: 0.68, 0.67 and 0.73 m)."""
+_FREE_BORDER_SHARE: Final = 0.1
+"""... and as a share of that radius where no receiver says anything: the points alone turn and scale such a block."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +101,7 @@ def place_on_control(
             observations += on_basemap(points, grid, map_gsd_m)
         if observations:
             nadirs = np.array([p.camera.nadir for p in own])
-            fits[on_map] = fit_similarity(observations, nadirs, _BORDER_M)
+            fits[on_map] = fit_similarity(observations, nadirs, _border_m(own, nadirs))
     result = GroundControl(fits.get(True), fits.get(False), _warnings(fits, placed))
     if not fits:
         return refinement, result
@@ -120,6 +122,12 @@ def place_on_control(
     fine = [solution(s) for s in refinement.fine]
     ground = None if refinement.terrain is None else moved_terrain(refinement.terrain, main.similarity, level)
     return replace(refinement, fine=fine, terrain=ground), result
+
+
+def _border_m(placed: Sequence[PlacedFrame], nadirs: Array) -> float:
+    if any(p.stage == "fine" or p.frame.has_own_position for p in placed):
+        return _BORDER_M
+    return max(_FREE_BORDER_SHARE * float(np.sqrt(nadirs.var(axis=0).sum())), _BORDER_M)
 
 
 def _restated(legs: Sequence[Leg], placed: Sequence[PlacedFrame]) -> list[Leg]:

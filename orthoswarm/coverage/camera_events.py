@@ -12,7 +12,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.coverage.missing_pictures import Cause, Exposure, MissingPicture, missing_pictures
 from orthoswarm.coverage.view import View
 
@@ -20,6 +19,7 @@ Array = NDArray[np.float64]
 
 _MATCH_SHARE: Final = 0.45  # a picture's event is within this share of the usual time between them (below a half)
 _LEAST_MATCHED: Final = 0.5  # share of a vehicle's pictures that must have an event: else its clocks disagree
+_SURE: Final = 0.95  # confidence of a cause that camera events show
 _BORROWED_LENS: Final = 0.6  # confidence in what a vehicle has seen of which no picture has arrived
 
 
@@ -86,8 +86,7 @@ def missing_by_events(
         matched = [replace(p.view, time_s=e.time_s) for p, e in zip(waiting, without, strict=True) if p is not None]
         holes = missing_pictures([*timed, *matched], files)
         found += [
-            h if h.cause is Cause.REJECTED else replace(h, cause=Cause.NOT_TRIGGERED, confidence=active().coverage.sure)
-            for h in holes
+            h if h.cause is Cause.REJECTED else replace(h, cause=Cause.NOT_TRIGGERED, confidence=_SURE) for h in holes
         ]
     for vehicle in sorted(set(by_vehicle) - set(rows)):
         found += _none_arrived(vehicle, by_vehicle[vehicle], views)
@@ -128,4 +127,4 @@ def _not_arrived(event: CameraEvent, timed: Sequence[View]) -> MissingPicture | 
     before = max(0, int(np.searchsorted(times, event.time_s)) - 1)
     place = np.array([*event.position[:2], near.position[2]])
     view = near.moved_to(place, f"event {event.number}", event.time_s)
-    return MissingPicture(view, timed[before].image, Cause.NOT_ARRIVED, active().coverage.sure)
+    return MissingPicture(view, timed[before].image, Cause.NOT_ARRIVED, _SURE)

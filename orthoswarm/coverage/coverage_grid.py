@@ -18,7 +18,6 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.coverage.painting import UNSEEN, paint
 from orthoswarm.coverage.view import Flaw, View
 from orthoswarm.model.bounding_box import BoundingBox
@@ -35,6 +34,8 @@ Due = bool | NDArray[np.bool_]
 
 _ROWS_AT_ONCE = 64
 
+_CELL_M: Final = 1.0  # side of the cells where none is asked for
+_OBLIQUE_DEG: Final = 45.0  # ground that is seen farther from straight down is seen obliquely
 _MOST_CELLS: Final = 60_000_000  # areas with more cells are refused, or need larger ones (memory)
 
 
@@ -75,8 +76,8 @@ class Cells:
     excluded: NDArray[np.bool_]
 
     @classmethod
-    def of_area(cls, epsg: int, ground: Geometry, no_fly: Geometry = None, cell_m: float | None = None) -> "Cells":
-        """Cells of at most `cell_m` (None: as configured) over shapely (Multi)Polygons in the grid of `epsg`.
+    def of_area(cls, epsg: int, ground: Geometry, no_fly: Geometry = None, cell_m: float = _CELL_M) -> "Cells":
+        """Cells of at most `cell_m` over shapely (Multi)Polygons in the grid of `epsg`.
 
         Raises:
             InputError: the area is empty, or would have more than `_MOST_CELLS`.
@@ -85,8 +86,7 @@ class Cells:
 
         if ground.is_empty:
             raise InputError("the area is empty; draw it as a polygon with some ground")
-        config, bounds = active().coverage, BoundingBox(*ground.bounds)
-        cell_m = config.cell_m if cell_m is None else cell_m
+        bounds = BoundingBox(*ground.bounds)
         if bounds.width * bounds.height > _MOST_CELLS * cell_m * cell_m:
             side = math.ceil(math.sqrt(bounds.width * bounds.height / _MOST_CELLS) * 10) / 10
             raise InputError(f"the area has too many cells of {cell_m:g} m; use --cell {side:g} or a smaller area")
@@ -239,7 +239,7 @@ class CoverageGrid:
 
 def _descents() -> tuple[float, float]:
     """Cosines of the largest off-nadir angle that is not oblique, and of the largest that sees the ground at all."""
-    return math.cos(math.radians(active().coverage.oblique_deg)), least_descent()
+    return math.cos(math.radians(_OBLIQUE_DEG)), least_descent()
 
 
 def _union(boxes: Sequence[Box]) -> Box:

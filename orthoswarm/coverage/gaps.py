@@ -3,12 +3,11 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.coverage.coverage_grid import Cells, CellState, CoverageGrid, Due
 from orthoswarm.coverage.missing_pictures import Cause, MissingPicture
 from orthoswarm.coverage.painting import UNSEEN
@@ -18,6 +17,7 @@ Geometry = Any
 Array = NDArray[np.float64]
 _CAUSES = tuple(Cause)
 _NONE = 255
+_SMALLEST_GAP_M2: Final = 4.0  # smaller gaps are only counted
 _BY_IMPORTANCE = (Flaw.DAMAGED, Flaw.BLURRED, Flaw.HAZE, Flaw.POSITION, Flaw.COARSE, Flaw.OBLIQUE, Flaw.EDGE)
 
 
@@ -123,7 +123,7 @@ def find_gaps(
         explained.enter(missed & below_legs(cover.cells, plan, plan.legs), Cause.NOT_FLOWN, 0.9)
         explained.enter(missed, Cause.NOT_PLANNED, 0.9)
     explained.enter(missed, Cause.NOT_FLOWN, 0.5)
-    return _polygons(cover, explained, vehicles, active().coverage.smallest_gap_m2)
+    return _polygons(cover, explained, vehicles, _SMALLEST_GAP_M2)
 
 
 def _is_narrow(fov_rad: float, focal_sigma: float, planned_rad: float) -> bool:

@@ -6,11 +6,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.coverage.view import Flaw
 from orthoswarm.raster.picture_quality import PictureQuality
 
 NEIGHBOURS: Final = 15  # pictures before and after with whose median one is compared
+_BLURRED_SHARE: Final = 0.5  # blurred: less than this share of their sharpness
 _FAINT_SHARE: Final = 0.25  # haze: less than this share of their contrast ...
 _LEAST_CONTRAST: Final = 4.0  # ... or less than this ...
 _SATURATED_SHARE: Final = 0.5  # ... or more than this share of the pixels saturated
@@ -25,7 +25,6 @@ def picture_flaws(qualities: Sequence[PictureQuality | None]) -> list[Flaw]:
     one single value exceeds their median by a tenth. The thresholds are ours; sharpness over a wood and over a lake
     differs by less.
     """
-    config = active().coverage
     flaws = [Flaw(0)] * len(qualities)
     measured = [i for i, q in enumerate(qualities) if q is not None]
     if not measured:
@@ -34,7 +33,7 @@ def picture_flaws(qualities: Sequence[PictureQuality | None]) -> list[Flaw]:
     sharp, contrast, flat, bright = np.array(rows, float).T
     usual_sharp, usual_contrast, usual_flat = (_running_median(v) for v in (sharp, contrast, flat))
     for k, i in enumerate(measured):
-        if sharp[k] < config.blurred_share * usual_sharp[k]:
+        if sharp[k] < _BLURRED_SHARE * usual_sharp[k]:
             flaws[i] |= Flaw.BLURRED
         if contrast[k] < max(_LEAST_CONTRAST, _FAINT_SHARE * usual_contrast[k]) or bright[k] > _SATURATED_SHARE:
             flaws[i] |= Flaw.HAZE

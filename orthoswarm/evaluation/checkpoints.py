@@ -21,7 +21,6 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.evaluation.independent_points import Surveyed, control_of_report, shared_points
 from orthoswarm.evaluation.misread_points import FARTHEST_M, Coordinates, away_m, doubts, misplaced
 from orthoswarm.evaluation.photo_names import photo_named
@@ -39,6 +38,10 @@ _SAME_PLACE_M = 0.02
 """Lines of one point may round its coordinates differently."""
 _DECIMAL_COMMA = re.compile(r"^([-+]?\d+),(\d+)$")
 
+SURVEY_SIGMA_M: Final = 0.05
+"""Sigma of a surveyed position, an axis, where its file states none: a network receiver's. Where there are enough
+points to see how far they really scatter, that counts instead if it is more."""
+POINTING_SIGMA_PX: Final = 1.0  # sigma of a point's place in a photo; photos of a point count as independent
 RECEIVERS_LOCAL_SIGMA_M: Final = 0.4
 """How far a block without a map is bent besides shift, turn and scale, one sigma an axis. Measured on the same photos:
 0.31 m are left at five points after four unknowns; 73 to 80 % of the points that took no part lie within one stated
@@ -438,7 +441,6 @@ class _Views:
         position = np.array([*place, float(camera["height_m"])])
         away = ground - position
         # The sigma of photos that lie where receivers say has mostly what is common to all of them.
-        config = active().control
         own = RECEIVERS_LOCAL_SIGMA_M if row["stage"] == "coarse" else row.get("sigma_m")
-        pixel_rad = config.pointing_sigma_px / focal
+        pixel_rad = POINTING_SIGMA_PX / focal
         return Ray(row["image"], position, away / np.linalg.norm(away), pixel_rad, float(own or 0.0))

@@ -14,7 +14,6 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.export.atomic_file import write_file
 from orthoswarm.export.footprint_layer import write_footprints
 from orthoswarm.export.json_values import finite, json_text
@@ -22,7 +21,7 @@ from orthoswarm.model.angles import wrap_deg
 from orthoswarm.model.camera import Camera, Lens, angles_from_rotation, ground_jacobian
 from orthoswarm.model.frame import Frame, Rejection
 from orthoswarm.model.geo import LocalGrid
-from orthoswarm.model.placement import PlacedFrame, Solution
+from orthoswarm.model.placement import STATED_SIGMA_FACTOR, PlacedFrame, Solution
 from orthoswarm.mosaic.footprint import footprint
 from orthoswarm.mosaic.takeoff_altitude import TakeoffLevel, height_sigma_m, takeoff_levels
 from orthoswarm.stores.addresses import address_of
@@ -172,7 +171,7 @@ def pose_covariance(placed: PlacedFrame, ground_z_m: float) -> Array | None:
         float64 (6, 6) of east, north, up (metres) and rotation about the camera's own axes right, down and forward
         (radians); None where the adjustment gives none.
     """
-    config, camera = active().bundle, placed.camera
+    camera = placed.camera
     if placed.pose_covariance is None:
         return None
     covariance = placed.pose_covariance.astype(np.float64)
@@ -180,7 +179,7 @@ def pose_covariance(placed: PlacedFrame, ground_z_m: float) -> Array | None:
     j = ground_jacobian(camera.rotation, height, OBLIQUE_AXIS_DOWN)
     if j is None or not math.isfinite(placed.sigma_m):
         return covariance
-    variance = (placed.sigma_m / config.stated_sigma_factor) ** 2
+    variance = (placed.sigma_m / STATED_SIGMA_FACTOR) ** 2
     own = float(np.trace(j @ covariance @ j.T)) / 2
     if own > variance:
         return covariance * (variance / own)

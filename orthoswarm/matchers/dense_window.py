@@ -30,17 +30,19 @@ _WINDOW_MARGIN_CELLS: Final = 12  # cells around them that it is given as well: 
 
 @dataclass(frozen=True, slots=True)
 class XFeatWindow:
-    """Patch to map by dense XFeat descriptors."""
+    """Patch to map by dense XFeat descriptors; device: where its network runs, see `network_device`."""
+
+    device: str = "auto"
 
     @classmethod
-    def make(cls) -> "XFeatWindow":
+    def make(cls, device: str) -> "XFeatWindow":
         """A matcher whose weights are known to be there.
 
         Raises:
             UnavailableError: if they are not.
         """
         weight_files.require("xfeat")
-        return cls()
+        return cls(device)
 
     def match(self, patch: Floats, valid: Mask, window: Floats, known: Mask, reach: int) -> Matches:
         """See MapMatcher."""
@@ -49,8 +51,8 @@ class XFeatWindow:
         if steps < 1 or min(rows, cols) < _WINDOW_LEAST_SIDE:
             return Matches.none()
         spare = reach - steps * CELL_PX  # cells of both on one grid
-        own, own_ok = _described(patch, valid)
-        other, other_ok = _described(window[spare:, spare:], known[spare:, spare:])
+        own, own_ok = _described(patch, valid, self.device)
+        other, other_ok = _described(window[spare:, spare:], known[spare:, spare:], self.device)
         own, own_ok = own[:, :rows, :cols], own_ok[:rows, :cols]
         height, width = rows + 2 * steps, cols + 2 * steps
         if other.shape[1] < height or other.shape[2] < width or not own_ok.any():
@@ -100,7 +102,7 @@ class XFeatWindow:
         return Matches(a, np.asarray(b, np.float64), sure)
 
 
-def _described(gray: Floats, valid: Mask) -> tuple[Any, Mask]:
+def _described(gray: Floats, valid: Mask, device: str) -> tuple[Any, Mask]:
     """Unit descriptors (64, rows, columns) of cells, on the network's device, and which cells are mostly valid."""
     import cv2
     import torch
@@ -109,11 +111,11 @@ def _described(gray: Floats, valid: Mask) -> tuple[Any, Mask]:
     image = np.clip(filled, 0, 255).astype(np.uint8)
     rows, cols = gray.shape[0] // CELL_PX, gray.shape[1] // CELL_PX
     side = _WINDOW_PART_CELLS
-    dense = torch.zeros((64, rows, cols), device=network_device())
+    dense = torch.zeros((64, rows, cols), device=network_device(device))
     with torch.inference_mode():
         for r in range(0, rows, side):
             for c in range(0, cols, side):
-                part = _part(image, r, c)
+                part = _part(image, r, c, device)
                 dense[:, r : r + side, c : c + side] = part[:, : rows - r, : cols - c]
     share = cv2.resize(
         valid[: rows * CELL_PX, : cols * CELL_PX].astype(np.float32), (cols, rows), interpolation=cv2.INTER_AREA
@@ -121,7 +123,7 @@ def _described(gray: Floats, valid: Mask) -> tuple[Any, Mask]:
     return dense[:, :rows, :cols], share > _WINDOW_VALID_SHARE
 
 
-def _part(image: Gray, row: int, column: int) -> Any:
+def _part(image: Gray, row: int, column: int, device: str) -> Any:
     """Unit descriptors (64, <= n, <= n) of n x n cells; in parts, since the network's memory grows with the image."""
     import torch
 
@@ -129,6 +131,6 @@ def _part(image: Gray, row: int, column: int) -> Any:
     r0, c0 = max(0, row - margin), max(0, column - margin)
     r1, c1 = row + side + margin, column + side + margin
     cut = image[r0 * CELL_PX : r1 * CELL_PX, c0 * CELL_PX : c1 * CELL_PX]
-    found = extractor("xfeat").net(padded_tensor(cut, _STRIDE))[0]
+    found = extractor("xfeat", device).net(padded_tensor(cut, _STRIDE, device))[0]
     found = found[0, :, row - r0 : row - r0 + side, column - c0 : column - c0 + side]
     return torch.nn.functional.normalize(found, dim=0)

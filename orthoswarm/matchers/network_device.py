@@ -2,7 +2,6 @@
 
 from typing import TYPE_CHECKING
 
-from orthoswarm.config import active
 from orthoswarm.matchers.matcher import UnavailableError
 from orthoswarm.model.errors import InputError
 
@@ -13,15 +12,14 @@ DEVICES = ("auto", "cpu", "cuda")
 """What may be asked for."""
 
 
-def network_device() -> "torch.device":
-    """The device in force: the one asked for, with "auto" CUDA where torch sees a card, else the CPU.
+def network_device(wanted: str = "auto") -> "torch.device":
+    """The device asked for, with "auto" CUDA where torch sees a card, else the CPU.
 
     Raises:
         UnavailableError: CUDA was asked for and torch sees no card, or there is no device of that name.
     """
     import torch
 
-    wanted = active().matchers.device
     if wanted not in DEVICES:
         raise UnavailableError(f"there is no device '{wanted}'; choose one of {', '.join(DEVICES)}")
     card = torch.cuda.is_available()
@@ -32,15 +30,15 @@ def network_device() -> "torch.device":
     return torch.device("cuda" if card and wanted != "cpu" else "cpu")
 
 
-def require_device() -> None:
+def require_device(wanted: str) -> None:
     """Refuse a device that was asked for and is not there, before a run begins; "auto" and "cpu" cost no import.
 
     Raises:
         InputError: what `network_device` says.
     """
-    if active().matchers.device in ("auto", "cpu"):
+    if wanted in ("auto", "cpu"):
         return
     try:
-        network_device()
+        network_device(wanted)
     except UnavailableError as error:
         raise InputError(str(error)) from None

@@ -8,6 +8,7 @@ that returns a PictureMatcher or a MapMatcher:
 """
 
 from collections.abc import Callable
+from functools import partial
 from importlib.metadata import entry_points
 from typing import Any
 
@@ -21,62 +22,60 @@ MAP_ORDER = ("xfeat-window", "cfog")
 """Default matcher of patches on the map: the first of these that is available."""
 
 
-def _learned(kind: Any) -> PictureMatcher:
+def _learned(kind: Any, device: str) -> PictureMatcher:
     from orthoswarm.matchers.sparse_learned import Learned
 
-    return Learned.make(kind)
+    return Learned.make(kind, device)
 
 
-def _sift() -> PictureMatcher:
+def _sift(_: str) -> PictureMatcher:
     from orthoswarm.matchers.sift import Sift
 
     return Sift()
 
 
-def _window() -> MapMatcher:
+def _window(device: str) -> MapMatcher:
     from orthoswarm.matchers.dense_window import XFeatWindow
 
-    return XFeatWindow.make()
+    return XFeatWindow.make(device)
 
 
-def _cfog() -> MapMatcher:
+def _cfog(_: str) -> MapMatcher:
     from orthoswarm.matchers.cfog import Cfog
 
     return Cfog()
 
 
-def _roma() -> MapMatcher:
+def _roma(device: str) -> MapMatcher:
     from orthoswarm.matchers.roma import Roma
 
-    return Roma.make()
+    return Roma.make(device)
 
 
-PICTURE: dict[str, Callable[[], PictureMatcher]] = {
-    "xfeat": lambda: _learned("xfeat"),
-    "disk": lambda: _learned("disk"),
-    "aliked": lambda: _learned("aliked"),
+PICTURE: dict[str, Callable[[str], PictureMatcher]] = {
+    **{kind: partial(_learned, kind) for kind in ("xfeat", "disk", "aliked")},
     "sift": _sift,
 }
-MAP: dict[str, Callable[[], MapMatcher]] = {"xfeat-window": _window, "cfog": _cfog, "roma": _roma}
+MAP: dict[str, Callable[[str], MapMatcher]] = {"xfeat-window": _window, "cfog": _cfog, "roma": _roma}
 
 
-def picture_matcher(name: str | None = None) -> PictureMatcher:
-    """A matcher of pictures by name; without a name the first available of PICTURE_ORDER.
+def picture_matcher(name: str | None = None, device: str = "auto") -> PictureMatcher:
+    """A matcher of pictures by name; without a name the first available of PICTURE_ORDER, on a `network_device`.
 
     Raises:
         InputError: if the name is unknown, or its weights or packages are missing.
     """
-    matcher: PictureMatcher = _get(name, PICTURE, PICTURE_ORDER)
+    matcher: PictureMatcher = _get(name, PICTURE, PICTURE_ORDER, device)
     return matcher
 
 
-def map_matcher(name: str | None = None) -> MapMatcher:
-    """A matcher of patches on the map by name; without a name the first available of MAP_ORDER.
+def map_matcher(name: str | None = None, device: str = "auto") -> MapMatcher:
+    """A matcher of patches on the map by name; without a name the first available of MAP_ORDER, on a `network_device`.
 
     Raises:
         InputError: if the name is unknown, or its weights or packages are missing.
     """
-    matcher: MapMatcher = _get(name, MAP, MAP_ORDER)
+    matcher: MapMatcher = _get(name, MAP, MAP_ORDER, device)
     return matcher
 
 
@@ -85,7 +84,7 @@ def available() -> dict[str, str]:
     out = {}
     for name, make in {**PICTURE, **MAP, **_added()}.items():
         try:
-            make()
+            make("auto")
             out[name] = ""
         except UnavailableError as error:
             out[name] = str(error)
@@ -94,20 +93,20 @@ def available() -> dict[str, str]:
     return out
 
 
-def _added() -> dict[str, Callable[[], Any]]:
+def _added() -> dict[str, Callable[[str], Any]]:
     """Matchers of other packages."""
     return {point.name: _entry(point) for point in entry_points(group=GROUP)}
 
 
-def _entry(point: Any) -> Callable[[], Any]:
-    return lambda: point.load()()
+def _entry(point: Any) -> Callable[[str], Any]:
+    return lambda _: point.load()()
 
 
-def _get(name: str | None, own: dict[str, Any], order: tuple[str, ...]) -> Any:
+def _get(name: str | None, own: dict[str, Any], order: tuple[str, ...], device: str) -> Any:
     if name is None:
         for candidate in order:
             try:
-                return own[candidate]()
+                return own[candidate](device)
             except UnavailableError:
                 continue
         raise InputError(f"no matcher is available; one of {', '.join(order)} is needed")
@@ -115,6 +114,6 @@ def _get(name: str | None, own: dict[str, Any], order: tuple[str, ...]) -> Any:
     if name not in known:
         raise InputError(f"there is no matcher '{name}'; choose one of {', '.join(sorted(known))}")
     try:
-        return known[name]()
+        return known[name](device)
     except UnavailableError as error:
         raise InputError(f"the matcher '{name}' cannot be used: {error}") from None

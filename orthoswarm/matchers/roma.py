@@ -12,11 +12,13 @@ from typing import Any, Final
 
 import numpy as np
 
-from orthoswarm.config import active
 from orthoswarm.matchers.matcher import Floats, Mask, Matches, UnavailableError
 from orthoswarm.matchers.network_device import network_device
 from orthoswarm.matchers.sparse_learned import read_state
 
+_SAMPLES: Final = 4000  # matches drawn from the dense warp (cost)
+_COARSE_PX: Final = 560  # side of the picture of the coarse match (Edstedt et al., CVPR 2024)
+_FINE_PX: Final = 864  # side of the picture of the refinement (the same)
 _ROMA_CERTAINTY: Final = 0.3  # least certainty of a match
 
 
@@ -38,8 +40,8 @@ def load(state: dict[str, Any], backbone: dict[str, Any], device: Any) -> Any:
 
     on_gpu = device.type == "cuda"
     options = {
-        "coarse_res": active().matchers.roma_coarse_px,
-        "upsample_res": active().matchers.roma_fine_px,
+        "coarse_res": _COARSE_PX,
+        "upsample_res": _FINE_PX,
         "amp_dtype": torch.float16 if on_gpu else torch.float32,
         "use_custom_corr": on_gpu and find_spec("local_corr") is not None,  # a CUDA extension of its own
     }
@@ -67,26 +69,28 @@ class Roma:
 
     Attributes:
         network: something with `match(image, image)`, `sample(warp, certainty)` and `to_pixel_coordinates`.
+        device: where it runs, see `network_device`.
     """
 
     network: Any
+    device: str = "auto"
 
     @classmethod
-    def make(cls) -> "Roma":
+    def make(cls, device: str) -> "Roma":
         """A matcher with the weights of this machine.
 
         Raises:
             UnavailableError: if the package or the weights are missing.
         """
-        return cls(_network(network_device()))
+        return cls(_network(network_device(device)), device)
 
     def match(self, patch: Floats, valid: Mask, window: Floats, known: Mask, reach: int) -> Matches:
         """See MapMatcher."""
         from PIL import Image
 
         first, second = (Image.fromarray(np.clip(g, 0, 255).astype(np.uint8)).convert("RGB") for g in (patch, window))
-        warp, certainty = self.network.match(first, second, device=network_device())
-        found, sure = self.network.sample(warp, certainty, num=active().matchers.roma_samples)
+        warp, certainty = self.network.match(first, second, device=network_device(self.device))
+        found, sure = self.network.sample(warp, certainty, num=_SAMPLES)
         a, b = self.network.to_pixel_coordinates(found, *patch.shape, *window.shape)
         a, b = (t.detach().cpu().numpy().astype(np.float64) - 0.5 for t in (a, b))  # its pixel corners are integers
         score = sure.detach().cpu().numpy().astype(np.float64)

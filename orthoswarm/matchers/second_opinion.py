@@ -15,7 +15,14 @@ TRUSTED_SHARE: Final = 0.35  # least share of tiles that agree. By chance a tile
 
 
 def second_opinion(
-    patch: Floats, valid: Mask, window: Floats, *, known: Mask, reach: int, matcher: MapMatcher | None = None
+    patch: Floats,
+    valid: Mask,
+    window: Floats,
+    *,
+    known: Mask,
+    reach: int,
+    matcher: MapMatcher | None = None,
+    device: str = "auto",
 ) -> tuple[float, float] | None:
     """Position of a rectified strip of pictures on the map by learned matching.
 
@@ -25,14 +32,14 @@ def second_opinion(
         window: float32 (h + 2 reach, w + 2 reach), the map at the same pixel size.
         known: bool, where the map has ground.
         reach: largest shift from the prior, pixels; the networks work best at 0.3 to 1 m per pixel.
-        matcher: None for the first available (CFOG without weights).
+        matcher: None for the first available (CFOG without weights). device: where that runs, see `network_device`.
 
     Returns:
         Shift (column, row) of the strip's middle from the prior, pixels; None where too few tiles agree.
     """
     if matcher is None:
         try:
-            matcher = _default()
+            matcher = _default(device)
         except InputError:
             return None
     found = register(patch, valid, window, known=known, reach=reach, matcher=matcher)
@@ -46,5 +53,5 @@ def second_opinion(
 
 
 @lru_cache(maxsize=1)
-def _default() -> MapMatcher:
-    return map_matcher()
+def _default(device: str) -> MapMatcher:
+    return map_matcher(device=device)

@@ -40,9 +40,9 @@ def read_state(name: str) -> dict[str, Any]:
     return state
 
 
-def extractor(kind: Kind) -> Any:
-    """A network that finds and describes keypoints, in evaluation mode, on `network_device()`."""
-    return _extractor(kind, network_device())
+def extractor(kind: Kind, device: str) -> Any:
+    """A network that finds and describes keypoints, in evaluation mode, on `network_device(device)`."""
+    return _extractor(kind, network_device(device))
 
 
 @lru_cache(maxsize=3)
@@ -62,9 +62,9 @@ def _extractor(kind: Kind, device: Any) -> Any:
     return model.to(device).eval()
 
 
-def glue(kind: Kind) -> Any:
-    """The LightGlue network for a kind of keypoints, in evaluation mode, on `network_device()`."""
-    return _glue(kind, network_device())
+def glue(kind: Kind, device: str) -> Any:
+    """The LightGlue network for a kind of keypoints, in evaluation mode, on `network_device(device)`."""
+    return _glue(kind, network_device(device))
 
 
 @lru_cache(maxsize=3)
@@ -91,14 +91,14 @@ def _glue(kind: Kind, device: Any) -> Any:
     return model.to(device).eval()
 
 
-def padded_tensor(gray: Gray, stride: int, channels: int = 1) -> Any:
+def padded_tensor(gray: Gray, stride: int, device: str, channels: int = 1) -> Any:
     """A picture as a float tensor (1, channels, H, W), 0 to 1, padded with its edge to multiples of a stride."""
     import torch
 
     rows, cols = gray.shape
     pad = ((0, -rows % stride), (0, -cols % stride))
     image = np.pad(gray, pad, mode="edge").astype(np.float32) / 255.0
-    return torch.from_numpy(image)[None, None].expand(1, channels, -1, -1).to(network_device())
+    return torch.from_numpy(image)[None, None].expand(1, channels, -1, -1).to(network_device(device))
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,13 +106,14 @@ class Learned:
     """Keypoints of one network, matched by LightGlue.
 
     Attributes:
-        kind: which network.
+        kind: which network. device: where it runs, see `network_device`.
     """
 
     kind: Kind = "xfeat"
+    device: str = "auto"
 
     @classmethod
-    def make(cls, kind: Kind) -> "Learned":
+    def make(cls, kind: Kind, device: str) -> "Learned":
         """A matcher whose weights are known to be there.
 
         Raises:
@@ -120,7 +121,7 @@ class Learned:
         """
         weight_files.require(_EXTRACTOR[kind])
         weight_files.require(_MATCHER[kind])
-        return cls(kind)
+        return cls(kind, device)
 
     def match(self, a: Gray, b: Gray) -> Matches:
         """See PictureMatcher."""
@@ -130,7 +131,7 @@ class Learned:
             one, two = self._features(a), self._features(b)
             if min(one["keypoints"].shape[1], two["keypoints"].shape[1]) < _LEARNED_LEAST_KEYPOINTS:
                 return Matches.none()
-            found = glue(self.kind)({"image0": one, "image1": two})
+            found = glue(self.kind, self.device)({"image0": one, "image1": two})
         pairs = found["matches"][0].cpu().numpy()
         score = found["scores"][0].cpu().numpy().astype(np.float64)
         first = one["keypoints"][0].cpu().numpy().astype(np.float64)
@@ -142,8 +143,8 @@ class Learned:
 
         count = _LEARNED_KEYPOINTS
         rows, cols = gray.shape
-        image = padded_tensor(gray, _STRIDE[self.kind], 1 if self.kind == "xfeat" else 3)
-        model = extractor(self.kind)
+        image = padded_tensor(gray, _STRIDE[self.kind], self.device, 1 if self.kind == "xfeat" else 3)
+        model = extractor(self.kind, self.device)
         if self.kind == "xfeat":
             found = model.detectAndCompute(image, top_k=count, detection_threshold=_LEARNED_DETECTION)[0]
             points, descriptors = found["keypoints"], found["descriptors"]

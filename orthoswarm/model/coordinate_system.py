@@ -19,6 +19,14 @@ _TOLD_M: Final = 1.0  # PROJ states 1 m where datums are the same but for the dr
 _GEOCENTRIC_AXIS_M: Final = 6378137.0  # semi-major axis of WGS 84 and GRS 80, the ellipsoids of today's datums
 _SOUTH_BANDS: Final = "CDEFGHJKLMS"
 """Letters behind a UTM zone that mean the south: bands of MGRS, and S, which nearly everybody writes for south."""
+_OTHER_NAMES: Final = {
+    "puwg1992": 2180, "pl1992": 2180, "uklad1992": 2180, "lambert93": 2154, "nztm": 2193, "bng": 27700, "osgb": 27700,
+    "osgb36": 27700, "rdnew": 28992, "rd": 28992, "itm": 2157, "lv95": 2056, "lv03": 21781, "sweref99": 3006,
+    **{f"puwg2000s{zone}": 2171 + zone for zone in range(5, 9)},
+    **{f"puwg2000strefa{zone}": 2171 + zone for zone in range(5, 9)},
+}  # fmt: skip
+"""What EPSG's own list does not have, letters and digits alone."""
+_LEAST_LETTERS: Final = 4  # shorter names fit anything
 
 
 def to_degrees(system: str, x: ArrayLike, y: ArrayLike) -> tuple[Array, str]:
@@ -71,7 +79,9 @@ def _transformer(system: str) -> tuple[Any, str]:
     try:
         crs = CRS.from_user_input(projection_of(system) or system)
     except CRSError:
-        raise InputError(f"'{system[:60]}' is not a coordinate system; write EPSG:32617 or a PROJ string") from None
+        proposed = _proposed_code(system)
+        wanted = f"if it is {proposed}, write that code" if proposed else "write EPSG:32617 or a PROJ string"
+        raise InputError(f"'{system[:60]}' is not a coordinate system; {wanted}") from None
     crs = crs.sub_crs_list[0] if crs.is_compound else crs
     try:
         return Transformer.from_crs(crs, 4326, always_xy=True, allow_ballpark=False), ""
@@ -105,3 +115,25 @@ def projection_of(line: str) -> str | None:
     if match and 1 <= int(match[1]) <= 60:
         return f"EPSG:{(32700 if match[2].upper() in _SOUTH_BANDS else 32600) + int(match[1])}"
     return None
+
+
+def _proposed_code(name: str) -> str | None:
+    """The system that a name may stand for, as "EPSG:2180 (ETRF2000-PL / CS92)"; None if no or several ones fit."""
+    import pyproj
+    from pyproj.database import query_crs_info
+    from pyproj.enums import PJType
+
+    wanted = _plain(name)
+    code = _OTHER_NAMES.get(wanted)
+    if code is not None:
+        return f"EPSG:{code} ({pyproj.CRS.from_epsg(code).name})"
+    if len(wanted) < _LEAST_LETTERS:
+        return None
+    known = query_crs_info("EPSG", [PJType.PROJECTED_CRS, PJType.GEOGRAPHIC_2D_CRS])
+    fit = [info for info in known if wanted in _plain(info.name)]
+    exact = [info for info in fit if _plain(info.name).endswith(wanted)] if len(fit) > 1 else fit
+    return f"EPSG:{exact[0].code} ({exact[0].name})" if len(exact) == 1 else None
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[^a-z0-9]", "", name.lower())

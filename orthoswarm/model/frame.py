@@ -3,9 +3,26 @@
 from collections.abc import Iterable
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
+from typing import Final
 
 SURVEYED = "surveyed points"
 """Source (`Frame.origin`) of positions that control points gave."""
+BY_OTHERS = "photos beside it"
+"""Source of positions that other photos of the same ground gave."""
+THETA_HAT_DEG: Final = 70.0
+"""Horizontal field of view where nothing is known: below that of most drones' cameras (paper III.B)."""
+DEFAULT_HEIGHT_M: Final = 80.0
+"""Height above ground where no photo records one, until pictures give the scale. Measured on two flights at 90 m with
+positions only, with 60, 80 and 100 m: error of the map 0.147, 0.142, 0.145 m (95 %: 0.51, 0.51, 0.48), heights off by
+3.3, 2.8, 2.8 m."""
+UNSTATED_SIGMA_M: Final = 1.5
+"""Sigma of a horizontal position, an axis, whose source states none; receivers' drift has its own prior. Measured: 0.57
+m on a real flight with a map (18 photos), whose real-time ground points lie within one stated sigma in 97 % of the axes
+(2 of 2 sigmas: all); 0.5, 1.5 and 3 m give 43 real photos without tags the same place on their control points (0.593,
+0.593, 0.594 m rms). Drifting receivers exceed it (9 m, simulated)."""
+TAGGED_TILT_SIGMA: Final = 0.03
+"""Error of the ground point at a photo's centre through its recorded attitude, as a share of the height: 1.7
+degrees."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +86,11 @@ class Frame:
     origin: dict[str, str] = field(default_factory=dict, compare=False)
     damaged: bool = False
     ambiguous: bool = False
+
+    @property
+    def has_own_position(self) -> bool:
+        """Whether a receiver says its position, and not control points or other photos."""
+        return self.origin.get("position") not in (SURVEYED, BY_OTHERS)
 
     def __deepcopy__(self, memo: dict[int, object]) -> "Frame":
         """Itself: nobody changes a frame."""

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
-from typing import Any, Literal, Protocol
+from typing import Any, Final, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,10 @@ from orthoswarm.model.task_runner import Run, serial
 Array = NDArray[np.float64]
 Stage = Literal["realtime", "coarse", "fine"]
 LegState = Literal["matched", "carried", "failed"]
+STATED_SIGMA_FACTOR: Final = 1.25
+"""The stated sigma is this times the sigma of an axis, to stand between both meanings of "the error" of a point on the
+ground: of Gaussian errors 79 and 98.8 % of each axis lie within one and two of it, and 54 and 95.6 % of their
+lengths."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,7 @@ become mission items of a dialect is the ground station's business.
 """
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 End = Literal["rtl", "land", "hover"]
 
@@ -178,6 +178,13 @@ class Apart(NamedTuple):
 
     distance_m: float
     height_m: float
+
+
+APART: Final = Apart(10.0, 5.0)
+"""What vehicles keep where a plan says nothing else: receivers err by 3 m; the layers of ways out and home."""
+ON_GROUND_M: Final = 2.0  # up to this height over its takeoff a vehicle stands on the ground
+PAD_DISTANCES: Final = 1.5
+"""Radius about a start that vehicles share, in separation distances; in it they take off and land in turn."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -8,24 +8,26 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from orthoswarm.config import active
 from orthoswarm.model.camera import Camera, Lens
 from orthoswarm.mosaic.kernels.lens_arrays import INNER, OUTER, lens_row
 
 Array = NDArray[np.float64]
 
+MOST_OFF_NADIR_DEG: Final = 75.0
+"""Ground that is seen farther from straight down is not drawn: a pixel there is smeared over more than 15 times its
+size at nadir."""
 _MOST_MAGNIFICATION: Final = 16.0
 """A picture whose ground pixel is more than so many times the map's is none of this flight."""
 
 
 def tan_limit() -> float:
     """Tangent of the greatest angle off nadir at which ground is drawn."""
-    return float(np.tan(np.radians(active().mosaic.most_off_nadir_deg)))
+    return float(np.tan(np.radians(MOST_OFF_NADIR_DEG)))
 
 
 def least_descent() -> float:
     """Smallest descent of a ray per unit of depth that is drawn: on level ground a straight line below the horizon."""
-    return float(np.cos(np.radians(active().mosaic.most_off_nadir_deg)))
+    return float(np.cos(np.radians(MOST_OFF_NADIR_DEG)))
 
 
 def default_gsd(cameras: Sequence[Camera], ground_z_m: float = 0.0) -> float:

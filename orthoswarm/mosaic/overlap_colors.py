@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel
 from orthoswarm.compute.threads import on_threads
-from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import Camera, Lens
 from orthoswarm.model.geo import GroundGrid
@@ -42,6 +41,7 @@ _BESIDE_SEAM: Final = 0.35  # how far beside a seam, towards each picture's nadi
 _RATIOS_PER_PICTURE: Final = 48  # most ratios a picture at and beside seams, besides neighbours' (cost)
 _NEIGHBOURS: Final = 6  # nearest pictures with which each is compared; with 2 or 3 a lawn's steps stay
 _NEIGHBOUR_PLACES: Final = ((0.2, 0.5, 0.8), (0.3, 0.7))  # that grid: shares of a picture's width, and of its height
+_RATIOS_AT_ONCE: Final = 65_536  # places whose colours are compared at once (memory)
 _LABEL_CELLS: Final = 64  # cells across a picture on which the seams for this comparison are found (cost)
 _LABEL_MOST_CELLS: Final = 2_000_000  # most of these cells in a map; they grow beyond it (memory)
 
@@ -200,7 +200,6 @@ def _compared(
     """The samples at places whose colour both frames show."""
     west, north = (float(v) for v in shots.position[:, :2].mean(0))
     position, rotation = shots.about(west, north)
-    at_once = active().compute.ratios_at_once
 
     def compare(some: _Meetings) -> OverlapColors:
         count = len(some.a)
@@ -218,9 +217,9 @@ def _compared(
 
     names = "a", "b", "ground"
     parts = (
-        _Meetings(*(np.ascontiguousarray(getattr(kind, name)[first : first + at_once]) for name in names))
+        _Meetings(*(np.ascontiguousarray(getattr(kind, name)[first : first + _RATIOS_AT_ONCE]) for name in names))
         for kind in meetings
-        for first in range(0, max(1, len(kind.a)), at_once)
+        for first in range(0, max(1, len(kind.a)), _RATIOS_AT_ONCE)
     )
     places = sum(len(kind.a) for kind in meetings)
     all_ = OverlapColors(

@@ -12,17 +12,27 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.model.camera import NADIR_PITCH_RAD, Camera, Lens, focal_px, rotation_from_angles
 from orthoswarm.model.earth import on_sphere
-from orthoswarm.model.errors import InputError
-from orthoswarm.model.frame import Frame, Ingest, Rejection
+from orthoswarm.model.errors import InputError, OrthoSwarmError
+from orthoswarm.model.frame import (
+    DEFAULT_HEIGHT_M,
+    TAGGED_TILT_SIGMA,
+    THETA_HAT_DEG,
+    UNSTATED_SIGMA_M,
+    Frame,
+    Ingest,
+    Rejection,
+)
 from orthoswarm.model.geo import LocalGrid, area_epsg
 from orthoswarm.model.placement import PlacedFrame
 from orthoswarm.trajectory.courses import MOVED_M, course
 
 Array = NDArray[np.float64]
 
+_USUAL_HEIGHTS_M: Final = (50.0, 150.0)
+"""Heights between which mapping flights are flown: where the photos' spacing gives a height."""
+_USUAL_OVERLAP: Final = 0.75  # forward overlap as flight planners propose it: it makes spacing a height
 _FAR_M: Final = 20_000.0  # a position this far from the median of its set cannot be true: no small drone flies farther
 _FAR_SPREADS: Final = 10.0  # ... and so many times the median distance: a set may be larger than that
 _LARGEST_AREA_M: Final = 100_000.0  # no position lies farther from where most are, however they spread
@@ -169,28 +179,24 @@ def _lens(frame: Frame, fov_rad: float | None) -> Lens:
         return Lens(frame.width, frame.height, focal_px(frame.fov_hint_rad, frame.width))
     # theta-hat belongs to the longer side, so that a portrait picture of the same camera has the same focal length
     long_side = max(frame.width, frame.height)
-    return Lens(
-        frame.width, frame.height, focal_px(fov_rad or float(np.radians(active().records.theta_hat_deg)), long_side)
-    )
+    return Lens(frame.width, frame.height, focal_px(fov_rad or float(np.radians(THETA_HAT_DEG)), long_side))
 
 
 def usual_height(ground: Array, lenses: Sequence[Lens]) -> float:
     """The height at which consecutive photos would overlap as usual, for a vehicle without recorded heights, metres."""
-    config = active().records
     if len(ground) < 3:
-        return config.default_height_m
+        return DEFAULT_HEIGHT_M
     step = float(np.median(np.hypot(*np.diff(ground, axis=0).T)))
     short = float(np.median([min(lens.width, lens.height) / lens.focal_px for lens in lenses]))
     if step <= MOVED_M:
-        return config.default_height_m
-    return float(np.clip(step / (1.0 - config.usual_overlap) / short, *config.usual_heights_m))
+        return DEFAULT_HEIGHT_M
+    return float(np.clip(step / (1.0 - _USUAL_OVERLAP) / short, *_USUAL_HEIGHTS_M))
 
 
 def _sigma(frame: Frame, camera: Camera) -> float:
     """One sigma of the ground point at the photo's centre, metres."""
-    config = active().records
-    position = frame.fix.position_sigma_m or config.position_sigma_m
-    share = _UNTAGGED_TILT_SIGMA if frame.fix.pitch_rad is None else config.tagged_tilt_sigma
+    position = frame.fix.position_sigma_m or UNSTATED_SIGMA_M
+    share = _UNTAGGED_TILT_SIGMA if frame.fix.pitch_rad is None else TAGGED_TILT_SIGMA
     return float(np.hypot(position, share * float(camera.position[2])))
 
 
@@ -211,9 +217,12 @@ def _far_from_others(frame: Frame, away_km: float) -> Rejection:
     return Rejection(frame.image, reason, frame.vehicle, frame.time_s, detail=where)
 
 
-def nothing_to_map(ingest: Ingest) -> str:
-    """Why inputs without a single frame cannot be mapped, one sentence."""
+def nothing_to_map(ingest: Ingest) -> OrthoSwarmError:
+    """Why inputs without a single frame cannot be mapped: wrong inputs, or pictures that lack their positions."""
     if not ingest.rejected:
-        return "no picture was found in the input; name a folder of photos or a video"
+        return InputError("no picture was found in the input; name a folder of photos or a video")
     reason, count = Counter(r.reason for r in ingest.rejected).most_common(1)[0]
-    return f"none of the {len(ingest.rejected)} pictures can be used; {count} of them: {reason}"
+    said = f"none of the {len(ingest.rejected)} pictures can be used; {count} of them: {reason}"
+    if not ingest.unpositioned:
+        return InputError(said)
+    return OrthoSwarmError(f"{said}, or mark at least two surveyed points in them (--control)")

@@ -7,13 +7,12 @@ import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.canvas.tile_store import Key, Tile, TileStore
-from orthoswarm.config import active
 from orthoswarm.model.errors import OrthoSwarmError, RunInterruptedError
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import Terrain
@@ -36,6 +35,7 @@ Read = Callable[[Path], Bytes]
 
 THUMBNAIL = (12, 16)
 """Rows and columns of a picture's thumbnail."""
+_TILES_MB: Final = 64.0  # memory that a drawing task keeps of the tiles that it writes
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,8 +55,7 @@ class TilePlace:
         return self._store(self.folder / "seams")
 
     def _store(self, folder: Path) -> TileStore:
-        memory_mb = active().compute.tile_store_mb
-        return TileStore(folder, tile_px=self.tile_px, dtype=np.int32, memory_mb=memory_mb)
+        return TileStore(folder, tile_px=self.tile_px, dtype=np.int32, memory_mb=_TILES_MB)
 
     def corner(self, key: Key) -> tuple[float, float]:
         """West and north of a tile."""

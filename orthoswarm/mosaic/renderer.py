@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.canvas.tile_store import Key
-from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import GroundGrid
@@ -68,6 +67,7 @@ Blend = Literal["none", "seam"]
 _STAGING = "staging"
 _UNCHANGED = uniform(np.ones(3))
 
+_PICTURES_PER_TASK: Final = 64  # pictures that a task reads, or copies to previews: its overhead is small then
 _COMPLETENESS_CELLS: Final = 1_000_000
 """The share of the ground that was drawn is measured on about so many cells at most, of 64 pixels at most (for its
 time)."""
@@ -109,6 +109,7 @@ class Seams:
     Attributes:
         previews: of all its frames; those that are missing are made first.
         blend: "seam" mixes the two pictures over a few pixels at each seam, "none" takes every pixel from one.
+        feather_px: half the width of the transition that "seam" makes, pixels.
         level: take out the steps of tone that are left at the seams, see seams.leveling; over all tiles that are drawn,
             so not together with `Layer.bounds`.
     """
@@ -116,6 +117,7 @@ class Seams:
     previews: PreviewFile
     blend: Blend = "seam"
     level: bool = False
+    feather_px: int = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -245,9 +247,8 @@ def _by_picture(jobs: Sequence["_Job"]) -> Iterator[tuple[Path, list[tuple[int, 
 def _sample_tasks(jobs: Sequence["_Job"], read: Read, parts: PictureParts | None) -> Iterator[SampleTask]:
     """The pictures in groups, with what is needed to draw them."""
     pictures = list(_by_picture(jobs))
-    size = active().compute.pictures_per_task
-    for start in range(0, len(pictures), size):
-        some = pictures[start : start + size]
+    for start in range(0, len(pictures), _PICTURES_PER_TASK):
+        some = pictures[start : start + _PICTURES_PER_TASK]
         own: list[list[int]] = [
             [i for _, shares in some for n, i in shares if n == number] for number in range(len(jobs))
         ]
@@ -331,7 +332,8 @@ class _Job:
         self.near_seams = FrameWindows(self.run(feather_pass, self.feather_tasks()) if first else ())
 
     def feather_tasks(self) -> Iterator[FeatherTask]:
-        width = active().mosaic.feather_px
+        assert self.seams is not None
+        width = self.seams.feather_px
         yield from (FeatherTask(self.place, key, width) for key in self.place.store().existing())
 
     def finish(self) -> None:
@@ -340,7 +342,7 @@ class _Job:
             return
         keys = list(self.place.store().existing())
         leveling = self.leveling(keys) if self.seams.level else None
-        width = active().mosaic.feather_px if self.seams.blend == "seam" else 0
+        width = self.seams.feather_px if self.seams.blend == "seam" else 0
         tasks = (FinishTask(self.place, k, None if leveling is None else leveling.of_tile(k), width) for k in keys)
         for _ in self.run(finish_pass, tasks):
             pass
@@ -368,7 +370,7 @@ class _Job:
         rows = np.array([previews.row[self.frames[i].frame.image] for i in index], np.int32)
         missing = np.nonzero(unwritten(previews.path, rows))[0]
         pictures = [(self.frames[int(index[m])].frame.path, int(rows[m])) for m in missing]
-        n = active().compute.pictures_per_task
+        n = _PICTURES_PER_TASK
         tasks = (PreviewTask(previews.path, pictures[k : k + n], read) for k in range(0, len(pictures), n))
         for _ in self.run(preview_pass, tasks):
             pass

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
+from orthoswarm.model.frame import UNSTATED_SIGMA_M
 from orthoswarm.model.placement import PlacedFrame
 from orthoswarm.model.robust import mad_sigma
 from orthoswarm.trajectory.near_paths import NearPaths
@@ -77,7 +77,6 @@ def takeoff_levels(placed: Sequence[PlacedFrame]) -> dict[str, TakeoffLevel]:
 
 def _common_level(vehicles: Sequence[Sequence[PlacedFrame]]) -> TakeoffLevel | None:
     """The level of a block, each vehicle counting once; None where no photo has an altitude."""
-    config = active()
     levels, stated, scatter = [], [], []
     for own in vehicles:
         found = _recorded_levels(own)
@@ -85,7 +84,7 @@ def _common_level(vehicles: Sequence[Sequence[PlacedFrame]]) -> TakeoffLevel | N
             continue
         levels.append(float(np.median(found[0])))
         scatter.append(mad_sigma(found[0] - levels[-1]))
-        across = np.where(np.isfinite(found[1]), found[1], config.records.position_sigma_m)
+        across = np.where(np.isfinite(found[1]), found[1], UNSTATED_SIGMA_M)
         stated.append(_VERTICAL_SIGMAS * float(np.median(across)))
     if not levels:
         return None

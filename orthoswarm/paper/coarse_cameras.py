@@ -7,7 +7,6 @@ from typing import Final
 
 import numpy as np
 
-from orthoswarm.config import active
 from orthoswarm.matchers import picture_matcher
 from orthoswarm.model.arrays import Array, Ints
 from orthoswarm.model.camera import focal_px
@@ -22,6 +21,7 @@ from orthoswarm.refine.features.working_pictures import Pictures
 from orthoswarm.refine.strategy.vehicle_passes import START_FOV_DEG
 
 RECEIVER_SIGMA_M: Final = 3.0  # sigma of the bias of a receiver, an axis, metres, which no line reduces
+_SCALE_PAIRS: Final = 40  # matched pairs a vehicle, about (cost)
 _UNKNOWN_FOV_SIGMA_DEG: Final = 10.0  # sigma of a field of view that could not be measured
 
 
@@ -31,11 +31,12 @@ class CoarseOptions:
 
     Attributes:
         fov_start_rad: first guess, which places the orthogonal centre; also the result where nothing can be matched.
-        matcher: name of the picture matcher; None for the best available.
+        matcher: name of the picture matcher; None for the best available. device: where it runs.
     """
 
     fov_start_rad: float = field(default_factory=lambda: float(np.radians(START_FOV_DEG)))
     matcher: str | None = None
+    device: str = "auto"
 
 
 @dataclass(slots=True, kw_only=True)
@@ -67,7 +68,7 @@ class CoarseVehicle:
 
 def coarse_vehicle(frames: Sequence[Frame], *, epsg: int, origin: Array, options: CoarseOptions) -> CoarseVehicle:
     """Coarse cameras of one vehicle (one lens) in the local frame: III.C from legs to Eq. 4."""
-    began, config = process_time(), active().paper
+    began = process_time()
     records = read_records(frames, LocalGrid(epsg), origin)
     pictures = Pictures(frames, lambda f: read_gray(f.path))
     leg = find_legs(records)
@@ -87,12 +88,12 @@ def coarse_vehicle(frames: Sequence[Frame], *, epsg: int, origin: Array, options
     for k, line in enumerate(lines):
         members = np.flatnonzero(leg == k)
         along = line.along(records.position[members, :2])
-        share = max(SCALE_LEAST_PAIRS, round(config.scale_pairs * len(members) / max(int((leg >= 0).sum()), 1)))
+        share = max(SCALE_LEAST_PAIRS, round(_SCALE_PAIRS * len(members) / max(int((leg >= 0).sum()), 1)))
         tasks += choose_pairs(along, position[members, 2], tilt[members], members, share)
     warnings = []
     found = None
     if records.has_height.any():
-        matcher = picture_matcher(options.matcher)
+        matcher = picture_matcher(options.matcher, options.device)
         found = estimate_fov(tasks, pictures.gray, rotation, size=pictures.size, start_rad=start, matcher=matcher)
     if found is None:
         warnings.append(f"the field of view could not be measured; {np.degrees(start):.0f} degrees are used")

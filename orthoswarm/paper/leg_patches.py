@@ -6,7 +6,6 @@ from typing import Final
 
 import numpy as np
 
-from orthoswarm.config import active
 from orthoswarm.matchers import Matches, map_matcher
 from orthoswarm.matchers.matcher import Mask
 from orthoswarm.matchers.patch_registration import Registration, apply, register
@@ -21,6 +20,7 @@ from orthoswarm.refine.bundle.block_arrays import WIDTH, CameraBlock, F
 from orthoswarm.refine.features.working_pictures import Pictures
 from orthoswarm.refine.registration.orientation_correlation import strip_mosaic
 
+_PATCH_SEARCH_M: Final = (30.0, 70.0)  # search radius of the first and the second attempt
 _PATCH_GSD_M: Final = (0.3, 1.0)  # range of a patch's ground sampling distance: what suits learned matchers
 _PATCH_MOST_PX: Final = 3_000_000  # most pixels of a patch; longer legs are drawn coarser (memory)
 _PATCH_MOST_SEARCH_PX: Final = 240  # largest search radius (cost)
@@ -82,16 +82,16 @@ class PatchOptions:
     """Options of the matching of patches.
 
     Attributes:
-        matcher: name of the map matcher; None for the best available.
+        matcher: name of the map matcher; None for the best available. device: where it runs.
     """
 
     matcher: str | None = None
+    device: str = "auto"
 
 
 def match_patch(task: PatchTask, *, basemap: MapWindow, origin: Array, options: PatchOptions) -> PatchFit:
     """Register one leg on the map."""
     began, clock = process_time(), perf_counter()
-    config = active().paper
     pictures = Pictures(task.frames, lambda f: read_gray(f.path), 10_000, cache_mb=8.0)
     centre = task.cameras.position[:, :2].mean(axis=0)
     gsd = patch_gsd(task.cameras, basemap.native_gsd_m)
@@ -103,13 +103,13 @@ def match_patch(task: PatchTask, *, basemap: MapWindow, origin: Array, options: 
         own = GroundGrid(
             epsg=basemap.epsg, west=west, north=north, gsd_m=gsd, width=patch.shape[1], height=patch.shape[0]
         )
-        for reach_m in config.patch_search_m:
+        for reach_m in _PATCH_SEARCH_M:
             reach = min(int(np.ceil(reach_m / gsd)), _PATCH_MOST_SEARCH_PX)
             window, known, there = map_window(basemap, origin, own, reach)
             if not known.any():
                 break
             consistent = HeightFilter(task.cameras, own, there)
-            matcher = map_matcher(options.matcher)
+            matcher = map_matcher(options.matcher, options.device)
             found = register(patch, valid, window, known=known, reach=reach, matcher=matcher, keep=consistent)
             if found is not None and found.share >= TRUSTED_SHARE and len(found.matches) >= LEAST_TILES:
                 homography = in_metres(found.homography, own, there, centre)

@@ -8,7 +8,6 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid, area_epsg
 from orthoswarm.model.plan import Apart, Gap, OverGround, Plan, Sortie, VehiclePlan, Waypoint
@@ -35,6 +34,7 @@ Progress = Callable[[str], None]
 _OUTLINE_SPACINGS: Final = 0.05  # the outline of an area with many corners is at most twice so many spacings outside it
 _FAIR_ENOUGH: Final = 1.25  # from here on the plan says that it is uneven
 _BETTER_SHARE: Final = 0.99  # a later candidate must be better by this factor
+_CLEARANCE_M: Final = 1.0  # distance that is kept from no-fly zones where none is asked for ...
 _CLEARANCE_WIDTHS: Final = 0.125  # at most so many widths of a picture from no-fly zones
 _LEAST_CLEARANCE_M: Final = 0.1  # least clearance, however narrow a picture is
 
@@ -65,7 +65,7 @@ class _Over:
         """How the flights lie over the height model, None without one.
 
         Raises:
-            InputError: lower than 20 m above it.
+            InputError: lower than `heights.least_above_m` above it.
         """
         if self.heights.ground is None:
             return None
@@ -122,7 +122,7 @@ def plan_area(
     gaps = tuple(_gap(p, area.grid) for p in planned_coverage.pieces(left))
     seen = 1.0 - float(left.area) / area.size_m2
     warnings = _warnings(schedule, best, foot, options)
-    if seen < active().planning.complete_share:
+    if seen < planned_coverage.COMPLETE_SHARE:
         warnings.append(
             f"only {100 * seen:.2f} % of the area is covered and {len(gaps)} gaps are left: this plan is not complete; "
             "reduce the clearance or the no-fly zones, or fly lower"
@@ -134,8 +134,7 @@ def plan_area(
 
 def _clearance_m(options: PlanOptions, foot: Footprint) -> float:
     """Distance from no-fly zones: that of the user, or a default that leaves small pictures no gaps."""
-    config = active().planning
-    usual = min(config.clearance_m, _CLEARANCE_WIDTHS * foot.width_m)
+    usual = min(_CLEARANCE_M, _CLEARANCE_WIDTHS * foot.width_m)
     return options.clearance_m or max(_LEAST_CLEARANCE_M, usual)
 
 
@@ -289,7 +288,7 @@ def plan_lines(
             f"no stretch of the line is as long as two picture distances ({2 * foot.trigger_m:.0f} m); "
             "fly lower or draw longer lines"
         )
-    clearance = options.clearance_m or active().planning.clearance_m
+    clearance = options.clearance_m or _CLEARANCE_M
     router = Router(make_obstacles(no_fly.no_fly, clearance) if no_fly else shapely.MultiPolygon())
     if router.blocked(legs[:, 0], legs[:, 1]).any() or router.inside(legs.reshape(-1, 2)).any():
         raise InputError("a line crosses a no-fly zone; redraw the line or the zone")
@@ -310,7 +309,7 @@ def plan_lines(
 def _warnings(schedule: Schedule, work: Work, foot: Footprint, options: PlanOptions) -> list[str]:
     result = []
     every_s = foot.trigger_m / options.motion.speed_m_s
-    if every_s < active().planning.quickest_s:
+    if every_s < options.quickest_s:
         result.append(
             f"a picture every {every_s:.2f} s is more than most cameras take; fly slower or higher, or with less "
             "forward overlap"

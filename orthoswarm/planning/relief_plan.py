@@ -1,22 +1,24 @@
 """A plan over a height model: legs at constant height above ground, or all at one height, whichever is done sooner."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import Final, Literal
 
 import numpy as np
 
-from orthoswarm.config import active
+from orthoswarm.config.planning import PLANNING
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.placement import Terrain
 from orthoswarm.model.plan import Plan
 from orthoswarm.planning.lines.line_spacing import Footprint
+from orthoswarm.planning.lines.planned_coverage import COMPLETE_SHARE
 from orthoswarm.planning.sorties.flight_heights import FlightHeights, GroundHeights, LevelHeights
 
 Relief = Literal["auto", "follow", "level"]
 MakePlan = Callable[[float, Footprint, FlightHeights], Plan]
 """Plans with a footprint, the height above level ground that it belongs to, and the flights' heights."""
 
+_BY_VEHICLE_M: Final = 1.0  # how near a vehicle that follows the terrain by itself is taken to keep its height
 _CLOSER_SHARE: Final = 0.93  # on slopes lines are laid lower by this, each round, until all is covered
 _CLOSER_ROUNDS: Final = 4  # most such rounds (time)
 
@@ -26,9 +28,10 @@ class GroundBelow:
     """The ground below a plan, metres over the lowest takeoff.
 
     Attributes:
-        terrain: its heights. highest: the highest ground up to `beside_m` from each place.
+        terrain: its heights. highest: the highest ground up to `BESIDE_M` from each place.
         low_m: lowest ground of the area; high_m: highest.
         way_m: highest ground of the area, of the ways to it, and beside them.
+        least_above_m: least height of a flight over the highest ground below it.
     """
 
     terrain: Terrain
@@ -36,6 +39,8 @@ class GroundBelow:
     low_m: float
     high_m: float
     way_m: float
+    _: KW_ONLY
+    least_above_m: float = PLANNING.least_above_ground_m
 
 
 def plan_over_relief(
@@ -61,9 +66,9 @@ def plan_over_relief(
         by_vehicle: the vehicle keeps its height above the ground by a model of its own; the plan counts on 1 m.
 
     Raises:
-        InputError: lower than `least_above_ground_m` above the ground, or as `make`.
+        InputError: lower than `ground.least_above_m` above the ground, or as `make`.
     """
-    kept_above_m = active().planning.least_above_ground_m
+    kept_above_m = ground.least_above_m
     if not 0.0 < tolerance_m <= 0.5 * above_m:
         raise InputError(
             f"the tolerance of the height above ground is {tolerance_m:g} m; give more than 0 and at most half of "
@@ -86,17 +91,24 @@ def plan_over_relief(
                 f"{above_m:g} m above ground, less a tolerance of {tolerance_m:g} m, are less than the "
                 f"{kept_above_m:g} m that must be kept; give a larger --altitude"
             )
-        kept_m = min(tolerance_m, active().planning.by_vehicle_m) if by_vehicle else tolerance_m
+        kept_m = min(tolerance_m, _BY_VEHICLE_M) if by_vehicle else tolerance_m
         heights = GroundHeights(
             ground=ground.terrain,
             highest=ground.highest,
             above_m=above_m,
             tolerance_m=kept_m,
             by_vehicle=by_vehicle,
+            least_above_m=kept_above_m,
         )
         plans.append(_closely_enough(make, lens, heights, least_m))
     if relief != "follow" and level_fits:
-        level = LevelHeights(level_m, ground=ground.terrain, highest=ground.highest, nominal_m=above_m)
+        level = LevelHeights(
+            level_m,
+            ground=ground.terrain,
+            highest=ground.highest,
+            nominal_m=above_m,
+            least_above_m=kept_above_m,
+        )
         plans.append(_closely_enough(make, lens, level, level_m - ground.high_m))
     return min(plans, key=lambda plan: (not _complete(plan), plan.makespan_s))
 
@@ -116,4 +128,4 @@ def _closely_enough(make: MakePlan, lens: Callable[[float], Footprint], heights:
 
 
 def _complete(plan: Plan) -> bool:
-    return plan.covered_share is None or plan.covered_share >= active().planning.complete_share
+    return plan.covered_share is None or plan.covered_share >= COMPLETE_SHARE

@@ -13,12 +13,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.coordinate_system import require_datum
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.raster.empty_pixels import blank, fills, range_of_ground
+from orthoswarm.raster.kept_ranges import STRETCH_PERCENT
 from orthoswarm.raster.map_check import UnreadableMapError, ends_early
 from orthoswarm.raster.resampling import resample
 from orthoswarm.stores.addresses import is_stored
@@ -292,7 +292,7 @@ class RasterMap:
         for i, band in enumerate(data):
             values = band[valid]
             if values.size:
-                low[i], high[i] = np.percentile(values.astype(np.float64), active().raster.stretch_percent)
+                low[i], high[i] = np.percentile(values.astype(np.float64), STRETCH_PERCENT)
             if not high[i] > low[i]:
                 high[i] = low[i] + 1.0
         return _Stretch(low, high)

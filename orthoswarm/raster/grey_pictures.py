@@ -3,18 +3,19 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.model.frame import Frame
 from orthoswarm.raster.packed_records import records
 from orthoswarm.raster.picture_file import read_gray, read_rgb, reduction
 
 Bytes = NDArray[np.uint8]
 _SHAPE = np.dtype("<i4")
+WORK_WIDTH_PX: Final = 960  # longer side of the pictures on which corners are followed
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,13 +34,13 @@ class GreyPictures:
     from_colors: bool = True
 
     @classmethod
-    def create(cls, folder: Path, frames: Iterable[Frame]) -> "GreyPictures | None":
+    def create(cls, folder: Path, frames: Iterable[Frame], most_mb: float) -> "GreyPictures | None":
         """A store for these frames, with what an earlier run left in the folder.
 
         Returns:
-            None where it would take more than `grey_pictures_mb` megabytes, or the folder cannot be made.
+            None where it would take more than `most_mb` megabytes, or the folder cannot be made.
         """
-        if stored_bytes(frames) > active().raster.grey_pictures_mb * 1e6:
+        if stored_bytes(frames) > most_mb * 1e6:
             return None
         try:
             folder.mkdir(exist_ok=True)
@@ -91,4 +92,4 @@ def _luma(picture: Bytes) -> Bytes:
 
 
 def _factor(width: int, height: int) -> int:
-    return reduction(width, height, active().features.work_width_px)
+    return reduction(width, height, WORK_WIDTH_PX)

@@ -11,24 +11,24 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
-
 Range = tuple[float, float]
 
 FILE: Final = "ranges.json"
+STRETCH_PERCENT: Final = (0.5, 99.5)
+"""Percentiles of a map or pictures of more than 8 bits that become 0 and 255 (usual in GIS: 2 and 98, which clips
+roofs)."""
 _MARGIN: Final = 0.1
 """Share of its width by which a range grows beyond a picture that leaves it: so it grows seldom (chosen)."""
 _DEPTH_FULL: Final = 32768.0
-"""16-bit pictures whose upper values (`stretch_percent`) reach this use all bits: 256 of their levels become one.
+"""16-bit pictures whose upper values (`STRETCH_PERCENT`) reach this use all bits: 256 of their levels become one.
 Others, with 10 to 14 bits, are stretched like maps (half of the range)."""
 _DEPTH_VALUES: Final = 20_000  # about so many values of each of them (for its time)
 
 
 def limits(pictures: list[NDArray[np.uint16]]) -> Range | None:
     """Values that become 0 and 255 in pictures; None where they use all 16 bits."""
-    config = active().raster
     values = [picture.ravel()[:: max(1, picture.size // _DEPTH_VALUES)] for picture in pictures]
-    low, high = np.percentile(np.concatenate(values).astype(np.float64), config.stretch_percent)
+    low, high = np.percentile(np.concatenate(values).astype(np.float64), STRETCH_PERCENT)
     return (float(low), float(max(high, low + 1.0))) if high < _DEPTH_FULL else None
 
 

@@ -8,7 +8,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.raster.packed_records import records
 
 Bytes = NDArray[np.uint8]
@@ -75,13 +74,16 @@ class PictureParts:
     most_bytes: int
 
     @classmethod
-    def create(cls, folder: Path, pictures: int) -> "PictureParts | None":
-        """A store for so many pictures, with what an earlier run left in the folder; None if it cannot be made."""
+    def create(cls, folder: Path, pictures: int, most_mb: float) -> "PictureParts | None":
+        """A store for so many pictures, with what an earlier run left in the folder; None if it cannot be made.
+
+        most_mb: megabytes that all parts may take together.
+        """
         try:
             folder.mkdir(exist_ok=True)
         except OSError:
             return None
-        return cls(folder, int(active().raster.picture_parts_mb * 1e6 / max(1, pictures)))
+        return cls(folder, int(most_mb * 1e6 / max(1, pictures)))
 
     def get(self, path: Path, needs: Box) -> Part | None:
         """What was kept of a picture; None if nothing was, or not all that is needed."""

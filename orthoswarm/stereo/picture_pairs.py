@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from orthoswarm.config import active
 from orthoswarm.model.camera import Camera
 from orthoswarm.model.placement import PlacedFrame, Terrain
 
@@ -23,13 +22,12 @@ _LEAST_OVERLAP: Final = 0.4  # least share of a picture's footprint that the oth
 _MOST_TURN_DEG: Final = 40.0  # angle between the two lines of sight at most
 
 
-def choose_pairs(frames: Sequence[PlacedFrame], terrain: Terrain) -> list[tuple[int, int]]:
+def choose_pairs(frames: Sequence[PlacedFrame], terrain: Terrain, partners: int) -> list[tuple[int, int]]:
     """Pairs (i, j), i < j, of indices of frames, each once, in order.
 
-    Each frame takes the few partners whose base over the height is nearest (in its logarithm) to the best one; lenses
+    Each frame takes the `partners` whose base over the height is nearest (in its logarithm) to the best one; lenses
     and vehicles may differ. Weak and damaged pictures take no part.
     """
-    c = active().stereo
     position = np.array([p.camera.position for p in frames]).reshape(-1, 3)
     sight = np.array([p.camera.rotation[:, 2] for p in frames]).reshape(-1, 3)
     height = position[:, 2] - terrain.height(position[:, :2])
@@ -48,7 +46,7 @@ def choose_pairs(frames: Sequence[PlacedFrame], terrain: Terrain) -> list[tuple[
         order = np.lexsort((near, np.round(np.abs(np.log(base / _BEST_BASE)), 6)))
         used = 0
         for j in near[order].tolist():
-            if used == c.partners:
+            if used == partners:
                 break
             if _overlap(frames[i].camera, frames[j].camera, terrain) >= _LEAST_OVERLAP:
                 pairs.add((min(i, j), max(i, j)))

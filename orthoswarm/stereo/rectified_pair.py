@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
+from orthoswarm.config.mapping import StereoConfig
 from orthoswarm.model.camera import Camera
 from orthoswarm.model.placement import Terrain
 
@@ -28,6 +28,11 @@ _UNIQUE_PERCENT: Final = 10  # least cost of the second best match over the best
 _SPECKLE_PX: Final = 60  # smaller regions of alike disparity are false matches: OpenCV recommends 50-200
 _DISPARITY_SIGMA_PX: Final = 0.25  # 68 % of single pairs' heights are within 0.24 of it at a base of 0.25, 0.22 at 0.7
 _TALLEST_HEIGHTS: Final = 0.45  # the highest searched, over the camera's height above ground, where `tallest_m` is more
+_SMOOTHNESS: Final = (8.0, 32.0)
+"""Penalty of a disparity that differs by one, and by more, times the block's area: OpenCV's recommendation."""
+_WIDE_PX: Final = 128
+"""Pairs with a search range of more disparities are matched at half size first, to find those that occur: for fewer the
+time saved is less than what it takes."""
 _WIDE_REGION_PX: Final = 400  # where more disparities are matched: least region at half size (40 x 40) ...
 _WIDE_MARGIN: Final = 0.15  # ... with this share of their range to either side, and 2 pixels at half size
 
@@ -76,16 +81,16 @@ class PairPoints:
     sigma_m: Array
 
 
-def match_pair(first: PairView, second: PairView, terrain: Terrain) -> PairPoints:
+def match_pair(first: PairView, second: PairView, terrain: Terrain, config: StereoConfig) -> PairPoints:
     """Ground points of two overlapping pictures, with the sigmas of their heights.
 
     Args:
-        first, second: the pictures. terrain: ground around which heights are searched.
+        first, second: the pictures. terrain: ground around which heights are searched. config: how far.
 
     Returns:
         The points of all consistent matches, none if the pictures overlap too little.
     """
-    frame = _common_frame(first, second, terrain)
+    frame = _common_frame(first, second, terrain, config)
     if frame is None:
         return PairPoints(np.zeros((0, 3)), np.zeros(0))
     left, valid_left = _resampled(first, frame, 0)
@@ -106,9 +111,8 @@ def match_pair(first: PairView, second: PairView, terrain: Terrain) -> PairPoint
     return PairPoints(points, along * depth / total)
 
 
-def _common_frame(left: PairView, right: PairView, terrain: Terrain) -> _Rectified | None:
+def _common_frame(left: PairView, right: PairView, terrain: Terrain, config: StereoConfig) -> _Rectified | None:
     """The rectified frame: the first picture's extent, on the rows that both have, with the heights' disparities."""
-    c = active().stereo
     first, second = left.camera, right.camera
     base = second.position - first.position
     base_m = float(np.linalg.norm(base))
@@ -125,8 +129,8 @@ def _common_frame(left: PairView, right: PairView, terrain: Terrain) -> _Rectifi
     top, bottom = max(low[1], two[:, 1].min() * focal), min(high[1], two[:, 1].max() * focal)
     width, height = int(np.ceil(high[0] - low[0])) + 1, int(np.ceil(bottom - top)) + 1
     ground = _levels(first, terrain)
-    above = min(c.tallest_m, _TALLEST_HEIGHTS * (float(first.position[2]) - ground[1]))
-    depths = [_depths(first, axes, ground[0] - c.depth_m), _depths(first, axes, ground[1] + above)]
+    above = min(config.tallest_m, _TALLEST_HEIGHTS * (float(first.position[2]) - ground[1]))
+    depths = [_depths(first, axes, ground[0] - config.depth_m), _depths(first, axes, ground[1] + above)]
     if height < 4 * _BLOCK_PX or not min(d.min() for d in depths) > 0.0:
         return None
     disparity = focal * base_m / np.concatenate(depths)
@@ -193,7 +197,7 @@ def _disparities(left: Gray, right: Gray, valid: NDArray[np.bool_], count: int) 
         left, right: rectified. valid: where the left one has content. count: disparities that may occur.
     """
     least = 0
-    if count > active().stereo.wide_px:
+    if count > _WIDE_PX:
         least, count = _occurring(left, right, valid, count)
     return _matched(left, right, least, count)
 
@@ -226,11 +230,10 @@ def _whole_steps(disparities: float) -> int:
 
 def _matched(left: Gray, right: Gray, least: int, count: int) -> NDArray[np.float32]:
     """`_disparities` among `count` ones from `least` on."""
-    c = active().stereo
     area, last = _BLOCK_PX**2, least + count
     matcher = cv2.StereoSGBM.create(
-        minDisparity=least, numDisparities=count, blockSize=_BLOCK_PX, P1=int(c.smoothness[0] * area),
-        P2=int(c.smoothness[1] * area), disp12MaxDiff=1, uniquenessRatio=_UNIQUE_PERCENT,
+        minDisparity=least, numDisparities=count, blockSize=_BLOCK_PX, P1=int(_SMOOTHNESS[0] * area),
+        P2=int(_SMOOTHNESS[1] * area), disp12MaxDiff=1, uniquenessRatio=_UNIQUE_PERCENT,
         speckleWindowSize=_SPECKLE_PX, speckleRange=1, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
     )  # fmt: skip
     pads = (0, 0, last, 0, cv2.BORDER_REPLICATE)  # the matcher leaves out as many columns as the largest disparity

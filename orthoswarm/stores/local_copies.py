@@ -5,6 +5,7 @@ used a moment ago; a copy that went away between two uses is fetched again.
 """
 
 import contextlib
+import math
 import os
 import threading
 import time
@@ -12,19 +13,26 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping
 from hashlib import blake2b
 from pathlib import Path
+from typing import Final
 
-from orthoswarm.config import active
-from orthoswarm.model.errors import RunInterruptedError, StorageError
+from orthoswarm.model.errors import InputError, RunInterruptedError, StorageError
 from orthoswarm.stores.addresses import address_of, is_stored
 from orthoswarm.stores.listing import StoredFile, known, look_up, remember
-from orthoswarm.stores.requests import StoreRequestError, request
+from orthoswarm.stores.requests import CONNECTIONS, StoreRequestError, request
 
 FOLDER_VARIABLE = "ORTHOSWARM_CACHE"
 """Environment variable that names another folder for copies than the user's cache folder."""
+SIZE_VARIABLE = "ORTHOSWARM_CACHE_MB"
+"""Environment variable that gives another size of that folder, megabytes: each machine has its own disk."""
+_CACHE_MB: Final = 8000.0  # a flight of 500 photos of 12 megapixels takes 3 GB
 _COMPARE_VARIABLE = "ORTHOSWARM_COMPARE_FROM"
 """Environment variable that tells the processes of a run when it began, epoch seconds."""
 _SLACK = 16  # the cache may exceed its size by a 16th for each process that writes to it
 _ABANDONED_S = 86_400.0
+_TRUST_S: Final = 600.0
+"""A copy that was made or compared with its store in this run, and no longer ago, is used without asking, seconds: a
+request takes some 20 ms, and a picture is read two to four times in a run."""
+_HELD_S: Final = 600.0  # a copy used no longer ago is not removed: another process may be about to open it
 _added = 0
 _lock = threading.Lock()
 
@@ -37,7 +45,11 @@ def compare_from_now() -> None:
     """Compare each copy with its store before it is used: a run begins, and files may have been replaced.
 
     It concerns this process and those that it starts from now on.
+
+    Raises:
+        InputError: the environment gives no size for the cache.
     """
+    cache_bytes()
     os.environ[_COMPARE_VARIABLE] = str(time.time())
 
 
@@ -65,6 +77,22 @@ def cache_folder() -> Path:
     return Path(os.environ.get(FOLDER_VARIABLE) or Path.home() / ".cache" / "orthoswarm")
 
 
+def cache_bytes() -> float:
+    """How much copies may take on this machine.
+
+    Raises:
+        InputError: the environment gives no number above 0.
+    """
+    said = os.environ.get(SIZE_VARIABLE) or _CACHE_MB
+    try:
+        limit = 1e6 * float(said)
+    except ValueError:
+        limit = math.nan
+    if not limit > 0.0:
+        raise InputError(f"{SIZE_VARIABLE} is {said}, which is no size; give megabytes, for example 8000")
+    return limit
+
+
 def local_file(path: Path) -> Path:
     """A local file with the content of a file, under the same name; the path itself if it is local.
 
@@ -82,7 +110,7 @@ def copy_ahead(paths: Iterable[Path]) -> None:
     """Begin to copy those of these files that lie in stores: they will be read soon, in this order."""
     stored = [path for path in paths if is_stored(path)]
     if stored:
-        _ahead.announce(stored, active().stores.connections)
+        _ahead.announce(stored, CONNECTIONS)
 
 
 def _copied(path: Path) -> Path:
@@ -91,7 +119,7 @@ def _copied(path: Path) -> Path:
     now = time.time()
     with contextlib.suppress(FileNotFoundError):
         state = copy.stat()
-        trusted = state.st_mtime >= max(now - active().stores.cache_trust_s, _compared_from())
+        trusted = state.st_mtime >= max(now - _TRUST_S, _compared_from())
         if trusted or _is_current(path, copy):  # times of the copy: of its last use, of its last comparison
             os.utime(copy, (now, state.st_mtime if trusted else now))
             return copy
@@ -168,8 +196,7 @@ def content(path: Path) -> bytes:
 
 def clear_old_copies() -> None:
     """Remove copies used least recently until the cache is within its size."""
-    config = active().stores
-    limit, now = config.cache_mb * 1e6, time.time()
+    limit, now = cache_bytes(), time.time()
     copies: list[tuple[float, int, Path]] = []
     for folder in _folders(cache_folder() / "copies"):
         with contextlib.suppress(OSError):
@@ -182,7 +209,7 @@ def clear_old_copies() -> None:
                 part.unlink()
     total = sum(size for _, size, _ in copies)
     for used, size, copy in sorted(copies):
-        if total <= limit or now - used < config.held_s:
+        if total <= limit or now - used < _HELD_S:
             return
         with contextlib.suppress(OSError):
             copy.unlink()
@@ -242,7 +269,7 @@ def _fetch(path: Path, copy: Path) -> None:
             part.unlink()
     with _lock:
         _added += size
-        full = _added * _SLACK > active().stores.cache_mb * 1e6
+        full = _added * _SLACK > cache_bytes()
         _added = 0 if full else _added
     if full:
         clear_old_copies()

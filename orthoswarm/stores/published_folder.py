@@ -12,18 +12,19 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import closing
 from hashlib import blake2b
 from pathlib import Path
+from typing import Final
 from uuid import uuid4
 
-from orthoswarm.config import active
 from orthoswarm.model.errors import InputError, OrthoSwarmError, RunInterruptedError
 from orthoswarm.model.task_runner import Progress
 from orthoswarm.stores.addresses import address_of
 from orthoswarm.stores.listing import list_folder
 from orthoswarm.stores.local_copies import cache_folder
-from orthoswarm.stores.requests import NotStoredError, request
+from orthoswarm.stores.requests import CONNECTIONS, NotStoredError, request
 
 _LAST = "report.json"
 _RECORD = ".uploaded"
+_PART_BYTES: Final = 16 << 20  # files are uploaded in parts (S3 allows 5 MB to 5 GB, 10,000 parts a file)
 
 
 class PublishedFolder:
@@ -94,7 +95,7 @@ class PublishedFolder:
             OrthoSwarmError: when those that were under way have ended, if a file cannot be uploaded.
         """
         failed: BaseException | None = None
-        with ThreadPoolExecutor(active().stores.connections) as pool:
+        with ThreadPoolExecutor(CONNECTIONS) as pool:
             try:
                 sending = [pool.submit(self._send, name) for name in names]
                 for each in as_completed(sending):
@@ -112,8 +113,8 @@ class PublishedFolder:
             raise failed
 
     def _send(self, name: str) -> str:
-        local, size = str(self.local / name), active().stores.part_mb << 20
-        request(self.address / name, lambda system, key: system.put_file(local, key, chunksize=size))
+        local = str(self.local / name)
+        request(self.address / name, lambda system, key: system.put_file(local, key, chunksize=_PART_BYTES))
         return name
 
     def _remove(self, name: str) -> None:

@@ -6,15 +6,17 @@ import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Protocol
+from typing import Final, Protocol
 
-from orthoswarm.config import active
 from orthoswarm.stores.addresses import is_stored
 from orthoswarm.stores.listing import known, look_up
 from orthoswarm.stores.local_copies import local_file
 from orthoswarm.stores.requests import request
 
 _BLOCK = 1 << 16
+_WHOLE_BYTES: Final = 512 * 1024
+"""A file of no more is fetched as a whole when its tags are read, since it is needed later anyhow: its transfer takes
+no longer than a second request."""
 
 
 class Parts(Protocol):
@@ -94,7 +96,7 @@ def open_parts(path: Path) -> Iterator[Parts]:
     """
     if is_stored(path):
         size = (known(path) or look_up(path)).size
-        if size is not None and size > active().stores.whole_kb * 1024:
+        if size is not None and size > _WHOLE_BYTES:
             yield _StoredParts(path, size)
             return
         path = local_file(path)

@@ -19,10 +19,9 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 from urllib.parse import quote
 
-from orthoswarm.config import active
 from orthoswarm.model.errors import InputError, OrthoSwarmError, RunInterruptedError
 from orthoswarm.stores.addresses import address_of, split_stored
 
@@ -48,6 +47,15 @@ _LOGGED_OUT_CODES = frozenset(
 )
 _BUSY = frozenset({429, 502, 503, 504})
 """Statuses by which a store says that it, or what stands before it, cannot serve anybody now."""
+CONNECTIONS: Final = 16
+"""Requests at once of a process that reads tags, copies or uploads: a request mostly waits for the network."""
+_ATTEMPTS: Final = 5  # at a request that fails: with the waits below a store may be away for some seconds
+_FIRST_WAIT_S: Final = 0.5  # before the second attempt; each further one is twice as long (usual for S3) ...
+_LONGEST_WAIT_S: Final = 10.0  # ... up to this
+_BUSY_S: Final = 60.0
+"""So long a store may answer that it has too much to do before the run ends, seconds: S3 takes some ten seconds to some
+minutes to spread a prefix that suddenly gets many requests."""
+_TIMEOUT_S: Final = 30.0  # longest silence of a store within a request
 _file_systems: dict[tuple[str, int], Any] = {}
 
 
@@ -95,7 +103,7 @@ def request(path: Path, what: Callable[[Any, str], T]) -> T:
     Raises:
         NotStoredError, StoreRequestError, StoreLostError, StoreAccessError: see above.
     """
-    config, (scheme, key) = active().stores, split_stored(path)
+    scheme, key = split_stored(path)
     if scheme.startswith("http"):
         key = f"{scheme}://{quote(key, safe='/:@')}"
     began, attempt = time.monotonic(), 1
@@ -106,14 +114,14 @@ def request(path: Path, what: Callable[[Any, str], T]) -> T:
             _raise_final(path, error)
             status = _status(error)
             if status in _BUSY:
-                if time.monotonic() - began > config.busy_s:
+                if time.monotonic() - began > _BUSY_S:
                     raise StoreLostError(
                         f"the store of {address_of(path)} has too much to do (status {status}) for "
-                        f"{config.busy_s:.0f} s; run the same command again later to go on"
+                        f"{_BUSY_S:.0f} s; run the same command again later to go on"
                     ) from None
-            elif attempt >= config.attempts:
+            elif attempt >= _ATTEMPTS:
                 _raise_spent(path, error, attempt)
-        time.sleep(min(config.first_wait_s * 2 ** (attempt - 1), config.longest_wait_s))
+        time.sleep(min(_FIRST_WAIT_S * 2 ** (attempt - 1), _LONGEST_WAIT_S))
         attempt += 1
 
 
@@ -136,15 +144,14 @@ def _connected(scheme: str) -> Any:
 
 def _settings(scheme: str) -> dict[str, Any]:
     """Nothing that is listed is kept by fsspec; silence is bounded; attempts are counted here."""
-    limit = active().stores.timeout_s
     settings: dict[str, Any] = {"use_listings_cache": False, "skip_instance_cache": True}
     if scheme == "s3":
         retries = {"max_attempts": 1, "mode": "standard"}
-        settings["config_kwargs"] = {"read_timeout": limit, "connect_timeout": limit, "retries": retries}
+        settings["config_kwargs"] = {"read_timeout": _TIMEOUT_S, "connect_timeout": _TIMEOUT_S, "retries": retries}
     else:
         import aiohttp
 
-        bounds = aiohttp.ClientTimeout(total=None, sock_connect=limit, sock_read=limit)
+        bounds = aiohttp.ClientTimeout(total=None, sock_connect=_TIMEOUT_S, sock_read=_TIMEOUT_S)
         settings |= {"requests_timeout": bounds} if scheme == "gs" else {"client_kwargs": {"timeout": bounds}}
     return settings
 

@@ -5,11 +5,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.model.angles import wrap_rad
 from orthoswarm.model.arrays import Array, Ints
 
 PAUSE_S: Final = 60.0  # photos farther apart in time do not follow each other: the vehicle did something else between
+LEG_REACH: Final = 3
+"""Frames before and after a frame between which the bend of the path is measured: one is noise."""
 _LEG_TURN_DEG: Final = 35.0  # least bend of the path at the corner between two legs
 _LEG_FEWEST: Final = 3  # fewer frames are not a leg
 _LEG_JUMP_STEPS: Final = 6.0  # a step of more than so many median steps and the next field ends a leg ...
@@ -27,8 +28,7 @@ def split_legs(position: Array, time_s: Array | None = None) -> Ints:
         position: float64 (N, 2) or (N, 3), smoothed or recorded positions in flying order, metres.
         time_s: float64 (N,) or None; a longer gap than `PAUSE_S` ends a leg.
     """
-    config = active().records
-    reach, turn_rad = config.leg_reach, float(np.radians(_LEG_TURN_DEG))
+    turn_rad = float(np.radians(_LEG_TURN_DEG))
     n = len(position)
     leg = np.full(n, -1, np.int32)
     if n < 2:
@@ -37,7 +37,7 @@ def split_legs(position: Array, time_s: Array | None = None) -> Ints:
     breaks = _breaks(position, time_s)
     corner = np.zeros(n, bool)
     for i in range(n):
-        near = slice(max(0, i - reach + 1), i + reach)
+        near = slice(max(0, i - LEG_REACH + 1), i + LEG_REACH)
         corner[i] = bend[i] > turn_rad and bend[i] == bend[near].max()
     first, number = 0, 0
     for i in range(n + 1):
@@ -52,9 +52,9 @@ def split_legs(position: Array, time_s: Array | None = None) -> Ints:
 def _bend(position: Array) -> Array:
     """Angle between the way to a frame and the way from it, over some frames; 0 at the ends and where it hovers."""
     n = len(position)
-    i, reach = np.arange(n), active().records.leg_reach
-    ahead = position[np.minimum(i + reach, n - 1), :2] - position[:, :2]
-    behind = position[:, :2] - position[np.maximum(i - reach, 0), :2]
+    i = np.arange(n)
+    ahead = position[np.minimum(i + LEG_REACH, n - 1), :2] - position[:, :2]
+    behind = position[:, :2] - position[np.maximum(i - LEG_REACH, 0), :2]
     moving = (np.hypot(*ahead.T) > 1e-6) & (np.hypot(*behind.T) > 1e-6)
     turn = wrap_rad(np.arctan2(ahead[:, 0], ahead[:, 1]) - np.arctan2(behind[:, 0], behind[:, 1]))
     return np.where(moving, np.abs(turn), 0.0)
@@ -101,7 +101,7 @@ def ended_legs(position: Array, time_s: Array | None = None, *, over: bool = Fal
     if n < 2:
         return []
     # so many frames after a leg's end neither its corner nor its frames can change any more, see `split_legs`
-    settled = 2 * active().records.leg_reach
+    settled = 2 * LEG_REACH
     leg = split_legs(position, time_s)
     ends = []
     for k in range(int(leg.max()) + 1):

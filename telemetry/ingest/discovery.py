@@ -13,16 +13,23 @@ from orthoswarm.raster.picture_file import PICTURE_SUFFIXES
 from orthoswarm.stores.addresses import address_of, is_stored
 from orthoswarm.stores.listing import exists, is_file, list_folder
 from telemetry.formats.log.can_log import SUFFIXES as CAN_LOGS
+from telemetry.formats.log.receiver_track import TRACK_SUFFIXES
 from telemetry.ingest.copied_photos import copies_among
 
 VIDEO_SUFFIXES = frozenset(
     {".mp4", ".mov", ".m4v", ".ts", ".m2ts", ".mts", ".mpg", ".mpeg", ".mkv", ".flv", ".avi"}
     | {".h264", ".264", ".avc", ".h265", ".265", ".hevc", ".webm"}
 )
-LOG_SUFFIXES = frozenset({".tlog", ".bin", ".ulg", ".pos", ".mrk"}) | CAN_LOGS
+LOG_SUFFIXES = frozenset({".tlog", ".bin", ".ulg", ".pos", ".mrk"}) | CAN_LOGS | TRACK_SUFFIXES
+UNREAD_SUFFIXES = frozenset(
+    {".fit", ".tcx", ".igc", ".kml", ".kmz", ".plt", ".ubx", ".sbf", ".obs", ".rnx", ".rtk", ".dat", ".bag", ".mcap"}
+    | {".json", ".geojson", ".xml", ".gpkg", ".shp", ".xlsx", ".ods", ".xmp"}
+)
+"""Files that may hold positions or times of pictures, and are not read."""
 _UNREAD_PICTURES = frozenset({".heic", ".heif", ".avif"})
-_SIDECARS = frozenset({".txt", ".csv"})
+_TABLES = frozenset({".txt", ".csv"})
 _SUBTITLES = frozenset({".srt"})
+_COPY = "a copy of another photo in its folder"
 _ALREADY = "which is in the input already"
 _OTHER_NAME = f"the same file as one of another name, {_ALREADY}"
 
@@ -34,6 +41,7 @@ class Folder:
     Attributes:
         path: of the folder. vehicle: id of the vehicle whose photos it contains.
         pictures: files with a picture's suffix; videos; logs; subtitles (SRT); tables (text and CSV), in natural order.
+        sidecars: XMP beside pictures. unread: other files that may say something about pictures.
     """
 
     path: Path
@@ -43,6 +51,19 @@ class Folder:
     logs: list[Path] = field(default_factory=list)
     subtitles: list[Path] = field(default_factory=list)
     tables: list[Path] = field(default_factory=list)
+    sidecars: dict[Path, Path] = field(default_factory=dict)
+    unread: list[Path] = field(default_factory=list)
+
+    def take_sidecars(self) -> None:
+        """Match XMP files with the pictures that they are named like: `DJI_0001.xmp` or `DJI_0001.JPG.xmp`."""
+        files = {path.name.lower(): path for path in self.unread if path.suffix.lower() == ".xmp"}
+        for picture in self.pictures if files else ():
+            names = f"{picture.name}.xmp".lower(), f"{picture.stem}.xmp".lower()
+            own = next((files[name] for name in names if name in files), None)
+            if own is not None:
+                self.sidecars[picture] = own
+        used = set(self.sidecars.values())
+        self.unread = [path for path in self.unread if path not in used]
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,17 +161,23 @@ def discover(inputs: Sequence[Path], exclude: Sequence[Path] = ()) -> Discovery:
             sorted_in.add(file)
             _sort_in(file, folders, explicit=not walked)
     for folder in folders.values():
+        folder.take_sidecars()
         folder.pictures.sort(key=lambda path: natural_key(path.name))
     ordered = [folders[path] for path in sorted(folders, key=lambda p: natural_key(str(p)))]
     copies = copies_among([path for folder in ordered for path in folder.pictures])
+    for folder in ordered if copies.within else ():
+        folder.pictures = [path for path in folder.pictures if path not in copies.within]
     _name_vehicles(ordered, root)
     pictures = [(file, *why) for file, why in left_out.items() if file.suffix.lower() in PICTURE_SUFFIXES]
     left = [entry for entry in pictures if entry[0] not in sorted_in]
+    left += [(copy, _COPY, first.name) for copy, first in copies.within.items()]
     if unreadable and not ordered and not left:
         path, why = next(iter(unreadable.items()))
         raise InputError(f"no picture was found, and the folder {path} cannot be read ({why}); check its permissions")
     apart = _far_from_pictures(tops, ordered)
-    return Discovery(root, ordered, left, _video_vehicles(ordered, root), apart, unreadable=unreadable, copies=copies)
+    return Discovery(
+        root, ordered, left, _video_vehicles(ordered, root), apart, unreadable=unreadable, copies=copies.elsewhere
+    )
 
 
 def _twice(folder: Path, root: Path) -> str:
@@ -227,7 +254,8 @@ def _sort_in(file: Path, folders: dict[Path, Folder], *, explicit: bool) -> None
         (VIDEO_SUFFIXES, folder.videos),
         (LOG_SUFFIXES, folder.logs),
         (_SUBTITLES, folder.subtitles),
-        (_SIDECARS, folder.tables),
+        (_TABLES, folder.tables),
+        (UNREAD_SUFFIXES if not explicit else frozenset(), folder.unread),
     )
     for suffixes, where in kinds:
         if suffix in suffixes:

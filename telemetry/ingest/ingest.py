@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Final
 
 from orthoswarm.model.earth import distance_m
-from orthoswarm.model.errors import InputError
 from orthoswarm.model.frame import Ingest, Rejection
 from orthoswarm.model.task_runner import Progress
 from orthoswarm.stores.local_copies import local_file
@@ -27,22 +26,29 @@ from telemetry.ingest.log_choice import LogSource
 from telemetry.ingest.log_ingest import add_logs, read_logs
 from telemetry.ingest.photo_order import SHIFTED, clock_went_back, in_order
 from telemetry.ingest.side_files import read_control_points
+from telemetry.ingest.strangers import strangers
 from telemetry.ingest.survey import LoadOptions, SourceInfo, Survey
 from telemetry.ingest.video_ingest import read_videos
 from telemetry.photos.flight_checks import flight_findings, times_without_zone
 from telemetry.photos.maker_angles import Angles
 from telemetry.photos.photo_frames import frame_without_position, frames_of, settle_positions
-from telemetry.photos.photo_tags import SENSORS, Photo, read_photos
+from telemetry.photos.photo_tags import SENSORS, Photo, read_photos, with_sidecar
 from telemetry.samples.findings import Finding, metres, plural
+from telemetry.samples.held_fixes import LOST_SIGMA_M, held_fixes, is_one_fix, matters, stated_sigma_m
 from telemetry.samples.unreadable import Unreadable, read_or_reason
 from telemetry.samples.wild_fixes import doubtful_finding, wild_fixes
 
-__all__ = ["LoadOptions", "SourceInfo", "Survey", "load", "require_frames", "survey"]
+__all__ = ["LoadOptions", "SourceInfo", "Survey", "load", "survey"]
 
 _BANDS = ("", "green", "red", "blue", "nir", "red edge", "rededge")
 """Spectral bands by how well they show the ground; "" is a colour picture."""
 
 _CONTRADICTION_M: Final = 500.0  # table that puts a photo so far from its tags, or from another table, contradicts them
+
+
+_NOT_MEASURED: Final = (
+    "the picture has no position: its receiver stood still; put a geo.txt next to it, or give its log as well"
+)
 
 
 def load(inputs: Sequence[Path], *, progress: Progress | None = None, options: LoadOptions | None = None) -> Ingest:
@@ -98,11 +104,30 @@ def survey(inputs: Sequence[Path], *, progress: Progress | None = None, options:
                 _photo_folder(folder, own, found, tables=tables, logs=logs, result=result, options=options)
             if folder.videos or folder.subtitles:
                 read_videos(folder, found, logs, options=options, progress=progress, result=result)
-    result.findings += _logs_apart(found, logs)
+    result.findings += [*_logs_apart(found, logs), *_unread(found, needed=bool(result.unpositioned))]
     if not result.sources and not result.rejected:
         result.findings.append(Finding("nothing", "no picture was found in the inputs"))
     result.findings += times_without_zone(frame for source in result.sources for frame in source.frames)
     return result
+
+
+def _unread(found: Discovery, *, needed: bool) -> list[Finding]:
+    """What is said about files beside pictures that may hold their positions; needed: some pictures have none."""
+    files: dict[str, list[Path]] = {}
+    for folder in found.folders:
+        for path in folder.unread:
+            files.setdefault(path.suffix.lower(), []).append(path)
+    if not files or not any(folder.pictures or folder.videos for folder in found.folders):
+        return []
+    named = [
+        found.name(paths[0]) + (f" and {len(paths) - 1} more {suffix}" if paths[1:] else "")
+        for suffix, paths in sorted(files.items())
+    ]
+    text = (
+        f"not read, though it may hold positions: {', '.join(named)}; convert a track to GPX or NMEA, positions of "
+        "photos to a geo.txt or CSV"
+    )
+    return [Finding("side-file-unread", text, note=not needed)]
 
 
 def _logs_apart(found: Discovery, logs: Sequence[LogSource]) -> list[Finding]:
@@ -233,6 +258,8 @@ def _photo_folder(
         if isinstance(photo, Unreadable):
             result.rejected.append(Rejection(name, str(photo), folder.vehicle))
             continue
+        if path in folder.sidecars:
+            photo = _with_sidecar(photo, folder.sidecars[path], found, source)
         vehicle = _merge_tables(photo, path, tables, moved_m) or folder.vehicle
         groups.setdefault(vehicle, []).append(photo)
     if moved_m:
@@ -246,6 +273,7 @@ def _photo_folder(
         photos.sort(key=lambda p: math.inf if p.time_s is None else p.time_s)
         add_logs(photos, folder.path, vehicle, logs=logs, findings=source.findings, workers=options.workers)
         photos = _one_kind(photos, vehicle, options.camera, found, result)
+        photos = _of_the_flight(photos, vehicle, found, result)
         photos = _with_position(photos, vehicle, found, result)
         photos = in_order(photos, vehicle, source.findings)
         source.findings += settle_positions(photos, vehicle, found.name)
@@ -256,6 +284,15 @@ def _photo_folder(
     source.counts["frames"] = len(source.frames)
     if seen:
         result.sources.append(source)
+
+
+def _with_sidecar(photo: Photo, sidecar: Path, found: Discovery, source: SourceInfo) -> Photo:
+    """A photo with the tags of an XMP file beside it; as it is, with a finding, if that cannot be read."""
+    try:
+        return with_sidecar(photo.path, local_file(sidecar))
+    except (OSError, Unreadable) as error:
+        source.findings.append(Finding("unreadable", f"{found.name(sidecar)} is not used: {error}"))
+        return photo
 
 
 def _one_kind(photos: Sequence[Photo], vehicle: str, camera: str, found: Discovery, result: Survey) -> list[Photo]:
@@ -288,6 +325,16 @@ def _one_kind(photos: Sequence[Photo], vehicle: str, camera: str, found: Discove
     return [photo for photo in photos if photo.path not in reasons]
 
 
+def _of_the_flight(photos: Sequence[Photo], vehicle: str, found: Discovery, result: Survey) -> list[Photo]:
+    """Photos without strangers, which are rejected."""
+    odd = strangers(photos)
+    result.rejected += [
+        Rejection(found.name(photos[i].path), why, vehicle, photos[i].time_s, detail=detail)
+        for i, (why, detail) in odd.items()
+    ]
+    return [photo for i, photo in enumerate(photos) if i not in odd]
+
+
 def _with_position(photos: Sequence[Photo], vehicle: str, found: Discovery, result: Survey) -> list[Photo]:
     """Keep photos with a position; the others are rejected, with the reason, and listed for surveyed points."""
     placed = []
@@ -318,6 +365,7 @@ def _where_it_can_be(
     """
     if clock_went_back(photos) or any(SHIFTED in p.origin.get("time", "") for p in photos):
         return list(photos)
+    photos = _measured(photos, vehicle, found, source, result)
     wild = wild_fixes([p.time_s for p in photos], [(p.lat_deg or 0.0, p.lon_deg or 0.0) for p in photos])
     if wild.doubtful:
         source.findings.append(replace(doubtful_finding(wild.doubtful, plural(len(photos), "photo")), vehicle=vehicle))
@@ -336,6 +384,31 @@ def _where_it_can_be(
     for i in wild.indices:
         _leave_out(photos[i], vehicle, found.name(photos[i].path), reason, result)
     return [photo for i, photo in enumerate(photos) if i not in set(wild.indices)]
+
+
+def _measured(
+    photos: Sequence[Photo], vehicle: str, found: Discovery, source: SourceInfo, result: Survey
+) -> list[Photo]:
+    """Photos whose receiver measured; others lie between those before and after, or are left out without a position."""
+    places = [(p.lat_deg or 0.0, p.lon_deg or 0.0) for p in photos]
+    held = held_fixes([p.time_s for p in photos], places)
+    lost = set(range(len(photos))) if is_one_fix(places) else set()
+    if lost:
+        text = f"all {len(photos)} photos tell one place to the last digit: the receiver stood still, it is not used"
+        source.findings.append(Finding("position-held", text, vehicle))
+    for i, lat, lon, sigma in zip(held.index, held.lat_deg.tolist(), held.lon_deg.tolist(), held.sigma_m.tolist()):
+        if sigma > LOST_SIGMA_M:
+            lost.add(i)
+            continue
+        photos[i].lat_deg, photos[i].lon_deg = lat, lon
+        photos[i].position_sigma_m = stated_sigma_m(photos[i].position_sigma_m, sigma)
+        photos[i].origin["position"] = "between the photos before and after, as the receiver stood still"
+    if matters(held):
+        whose = f"{plural(len(photos), 'photo')} ({found.name(photos[held.index[0]].path)} first)"
+        source.findings.append(replace(held.finding(whose), vehicle=vehicle))
+    for i in sorted(lost):
+        _leave_out(photos[i], vehicle, found.name(photos[i].path), _NOT_MEASURED, result)
+    return [photo for i, photo in enumerate(photos) if i not in lost]
 
 
 def _merge_tables(
@@ -380,18 +453,3 @@ def _merge_tables(
             photo.origin["angles"] = kind
             photo.yaw_is_stated |= angles[0] is not None
     return vehicle
-
-
-def require_frames(ingest: Ingest) -> None:
-    """Raise an error with the reason if there is nothing to map.
-
-    Raises:
-        InputError: no frame came out of the inputs.
-    """
-    if ingest.frames:
-        return
-    if not ingest.rejected:
-        raise InputError("no picture was found in the input; name a folder of photos or a video")
-    reasons = Counter(rejection.reason for rejection in ingest.rejected)
-    reason, count = reasons.most_common(1)[0]
-    raise InputError(f"none of the {plural(len(ingest.rejected), 'picture')} can be used; {count} because {reason}")

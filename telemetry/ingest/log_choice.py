@@ -10,8 +10,8 @@ from typing import Final
 
 import numpy as np
 
-from orthoswarm.config import active
 from orthoswarm.model.earth import MEAN_RADIUS_M, distance_m
+from orthoswarm.model.frame import UNSTATED_SIGMA_M
 from telemetry.formats.log.log_data import FlightLog
 from telemetry.ingest.survey import SourceInfo
 from telemetry.samples.findings import Finding
@@ -132,7 +132,7 @@ def bettered(log: FlightLog, bus: FlightLog) -> tuple[FlightLog, list[str]] | No
     distance = apart_m(log, bus)
     if distance is None or distance > BUS_SAME_VEHICLE_M:
         return None
-    track, unstated_m = bus.timeline(), active().records.position_sigma_m
+    track, unstated_m = bus.timeline(), UNSTATED_SIGMA_M
     sigmas_m = log.position_sigma_m or unstated_m, unstated_m
     samples = [_placed(sample, track, *sigmas_m) for sample in log.samples]
     events = [replace(event, sample=_placed(event.sample, track, *sigmas_m)) for event in log.events]

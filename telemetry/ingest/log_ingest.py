@@ -26,7 +26,7 @@ from telemetry.photos.photo_tags import Photo
 from telemetry.samples.course import Placed, local_metres
 from telemetry.samples.findings import Finding, plural
 from telemetry.samples.unreadable import Unreadable, read_or_reason
-from telemetry.samples.wild_fixes import without_wild_fixes
+from telemetry.samples.wild_fixes import sound_positions
 
 _BUS = "DroneCAN"
 _SEVERAL_WAYS = (
@@ -68,13 +68,13 @@ def read_logs(found: Discovery, result: Survey) -> list[LogSource]:
 
 
 def _drop_wild_fixes(log: FlightLog) -> list[Finding]:
-    """Take the wild fixes out of a log's track and exposures."""
-    log.samples, found = without_wild_fixes(log.samples, [s.time_s for s in log.samples], log.path.name)
+    """Take the wild fixes, and those that were not measured, out of a log's track and exposures."""
+    log.samples, found = sound_positions(log.samples, [s.time_s for s in log.samples], log.path.name)
     exposures = [replace(event.sample, time_s=event.time_s) for event in log.events]
-    sound, more = without_wild_fixes(exposures, [s.time_s for s in exposures], f"the exposures of {log.path.name}")
+    sound, more = sound_positions(exposures, [s.time_s for s in exposures], f"the exposures of {log.path.name}")
     log.events = [
-        event if sample.has_position == event.sample.has_position else replace(event, sample=sample)
-        for event, sample in zip(log.events, sound, strict=True)
+        event if now is was else replace(event, sample=now)
+        for event, was, now in zip(log.events, exposures, sound, strict=True)
     ]
     return found + more
 

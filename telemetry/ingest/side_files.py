@@ -31,8 +31,6 @@ def read_control_points(path: Path) -> ControlPoints | None:
         lines = path.read_text("utf-8", "replace").splitlines()
     except OSError:
         return None
-    if not lines or not ("+proj" in lines[0] or "EPSG" in lines[0].upper() or "UTM" in lines[0].upper()):
-        return None
     points: dict[tuple[float, float], float] = {}
     images, widest, rows = set(), 0.0, 0
     for line in lines[1:]:

@@ -30,7 +30,7 @@ from telemetry.photos.photo_frames import frames_of
 from telemetry.samples.findings import Finding, plural
 from telemetry.samples.sample import Sample
 from telemetry.samples.unreadable import Unreadable, read_or_reason, reason_of
-from telemetry.samples.wild_fixes import without_wild_fixes
+from telemetry.samples.wild_fixes import sound_positions
 from telemetry.videos.extraction import decoded, extract
 from telemetry.videos.picture_choice import luma
 from telemetry.videos.picture_poses import Poses
@@ -181,7 +181,7 @@ def _lone_subtitles(path: Path, name: str, result: Survey) -> None:
     source.counts["samples"] = len(cues.cues)
     samples = [cue.sample for cue in cues.cues if cue.sample is not None]
     times = [cue.start_s for cue in cues.cues if cue.sample is not None]
-    source.tracks[path.stem], wild = without_wild_fixes(samples, times, path.name)
+    source.tracks[path.stem], wild = sound_positions(samples, times, path.name)
     source.findings += wild
     source.shown[path.stem] = 0
 

@@ -10,12 +10,13 @@ import threading
 import time
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
-from orthoswarm.config import active
 from orthoswarm.model.angles import wrap_deg
+from orthoswarm.model.frame import TAGGED_TILT_SIGMA, UNSTATED_SIGMA_M
 from telemetry.formats.log.mavlink_poses import ExposureEvent, MavlinkPoses, fixed_camera
+from telemetry.samples.held_fixes import LOST_SIGMA_M, FixNews
 from telemetry.samples.sample import CAMERA_ANGLES, FLIGHT_ANGLES, Sample
 
 MAVLINK: Final = "MAVLink"
@@ -138,6 +139,7 @@ class LivePoses:
         self._mavlink = MavlinkPoses()
         self._arrival_offset: float | None = None
         self._lock = threading.Lock()
+        self._news: dict[str, FixNews] = {}
         self._position = _Sources(_POSITION, keep_s)
         self._flight = _Sources(FLIGHT_ANGLES, keep_s)
         self._camera = _Sources(CAMERA_ANGLES, keep_s)
@@ -166,24 +168,34 @@ class LivePoses:
         if isinstance(found, ExposureEvent):
             return self._event(found, arrival_s)
         found.time_s = self._utc(found.time_s or 0.0, arrival_s)
-        self.add(found, sigma=self._mavlink.position_sigma_m if found.has_position else None)
+        if found.has_position:
+            speed = math.hypot(message.vx, message.vy) / 100.0
+            self.add(found, sigma=self._mavlink.position_sigma_m, speed_m_s=speed)
+        else:
+            self.add(found)
         return None
 
-    def add(self, sample: Sample, *, source: str = MAVLINK, sigma: float | None = None) -> None:
-        """Add a sample, whose time is UTC.
+    def add(
+        self, sample: Sample, *, source: str = MAVLINK, sigma: float | None = None, speed_m_s: float | None = None
+    ) -> None:
+        """Add a sample, whose time is UTC; a position that its source only repeats gets older, and then is none.
 
         Args:
             source: its sender.
             sigma: one sigma stated by the source, metres for a position, degrees for angles; None if not stated.
+            speed_m_s: over the ground, as the source states it.
         """
         if sample.time_s is None:
             return
-        unstated = active().records
-        metres = sigma or unstated.position_sigma_m
-        degrees = sigma or math.degrees(unstated.tagged_tilt_sigma)
+        metres = sigma or UNSTATED_SIGMA_M
+        degrees = sigma or math.degrees(TAGGED_TILT_SIGMA)
         with self._lock:
             if sample.has_position:
-                self._position.add(source, sample, metres)
+                held_m = self._news.setdefault(source, FixNews()).hear(sample.time_s, sample.place, speed_m_s)
+                if held_m <= LOST_SIGMA_M:
+                    metres = math.hypot(metres, held_m)
+                    aged = replace(sample, sigma_m=metres) if held_m > UNSTATED_SIGMA_M else sample
+                    self._position.add(source, aged, metres)
             if sample.height_m is not None:
                 (self._ground if sample.height_is_ground else self._height).add(source, sample, metres)
             if sample.flight_yaw_deg is not None:
@@ -237,7 +249,8 @@ class LivePoses:
         own = event.sample
         own.vehicle, own.time_s = self.vehicle, event.time_s
         around = self.read(event.time_s)
-        if around.origin.get("position", MAVLINK) != MAVLINK:
+        held = MAVLINK in self._news and self._news[MAVLINK].held_m > UNSTATED_SIGMA_M
+        if held or around.origin.get("position", MAVLINK) != MAVLINK:
             own.lat_deg = own.lon_deg = own.altitude_m = own.sigma_m = None
         if not self.has_gimbal:
             own = fixed_camera(own)

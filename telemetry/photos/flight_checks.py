@@ -6,21 +6,22 @@ Nothing is changed here; most findings are notes, not errors.
 import math
 import re
 from collections.abc import Iterable, Sequence
+from datetime import UTC, datetime
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
-from orthoswarm.model.frame import Frame
+from orthoswarm.model.frame import THETA_HAT_DEG, Frame
 from telemetry.photos.photo_tags import Photo
 from telemetry.samples.course import Straight, ground_track, straight_legs
 from telemetry.samples.findings import Finding, metres, plural
-from telemetry.samples.times import ZONE_UNKNOWN
+from telemetry.samples.times import YEAR_2000_S, ZONE_UNKNOWN
 
 Array = NDArray[np.float64]
 
 _OUTLYING_POSITION_M: Final = 100.0  # a photo farther from those beside it (and 15 steps) has a wrong position
+OTHER_DAY_S: Final = 43_200.0  # photos farther apart in time than half a day are of another day
 _LOW_SHARE: Final = 0.4  # a few photos lower than this share of the usual height are reported
 
 
@@ -103,6 +104,7 @@ def _times(frames: Sequence[Frame], ground: Array) -> list[Finding]:
         hours = float(step.max()) / 3600
         text = (
             f"the times jump {plural(jumps, 'time')} (by up to {hours:.1f} h): several flights or a clock that was set"
+            f"{_days(times)}"
         )
         found.append(Finding("time-gap", text))
     numbers = [number_of(f.image) for f in frames]
@@ -116,6 +118,16 @@ def _times(frames: Sequence[Frame], ground: Array) -> list[Finding]:
             )
             found.append(Finding("time-order", text))
     return found
+
+
+def _days(times: Array) -> str:
+    """What is said about photos of several days: what is drawn may have changed in between."""
+    known = np.sort(times[times > YEAR_2000_S])
+    days = [d for d in np.split(known, np.flatnonzero(np.diff(known) > OTHER_DAY_S) + 1) if len(d)]
+    if len(days) < 2:
+        return ""
+    named = ", ".join(f"{len(day)} of {datetime.fromtimestamp(float(day[0]), UTC):%Y-%m-%d}" for day in days)
+    return f" ({named}); if the ground changed in between, map each day by itself"
 
 
 def number_of(image: str) -> int | None:
@@ -172,7 +184,7 @@ def _spacing(frames: Sequence[Frame], ground: Array, legs: Sequence[Straight]) -
     step = np.concatenate([np.hypot(*np.diff(ground[g.first : g.last + 1], axis=0).T) for g in legs])
     usual = float(np.median(step))
     first = frames[0]
-    fov_rad = first.fov_hint_rad or math.radians(active().records.theta_hat_deg)
+    fov_rad = first.fov_hint_rad or math.radians(THETA_HAT_DEG)
     footprint = 2.0 * height * math.tan(0.5 * fov_rad) * first.height / first.width
     if usual < 0.1 * height:
         text = (

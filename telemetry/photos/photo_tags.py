@@ -12,11 +12,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from orthoswarm.config import active
 from orthoswarm.model.earth import distance_m
 from orthoswarm.stores.addresses import is_stored
 from orthoswarm.stores.listing import StoredFile, known
 from orthoswarm.stores.local_copies import expect
+from orthoswarm.stores.requests import CONNECTIONS
 from telemetry.formats.photo import exif, xmp
 from telemetry.formats.photo.makernotes import parse_dji
 from telemetry.formats.photo.picture_container import Container, NotAPicture, read_container
@@ -111,6 +111,18 @@ def read_photo(path: Path) -> Photo | None:
     return tags_of(path, container)
 
 
+def with_sidecar(path: Path, sidecar: Path) -> Photo:
+    """The tags of a photo and of an XMP file beside it, which counts where both state something.
+
+    Raises:
+        NotAPicture: the photo is not readable. OSError: the other file is not.
+    """
+    container = read_container(path)
+    with sidecar.open("rb") as handle:
+        container.xmp = container.xmp[: xmp.MAX_PACKET - 1] + b"\n" + handle.read(xmp.MAX_PACKET)
+    return tags_of(path, container)
+
+
 def read_photos(
     paths: Sequence[Path], *, workers: int = 4, run: Run | None = None, progress: Callable[[int], None] | None = None
 ) -> Generator[Photo | Unreadable | None, None, None]:
@@ -146,7 +158,7 @@ def _read_chunk(chunk: _Chunk) -> list[Photo | Unreadable | None]:
     if not any(map(is_stored, chunk.paths)):
         return list(map(_tags_or_reason, chunk.paths))
     expect(chunk.stored)
-    with ThreadPoolExecutor(active().stores.connections) as pool:  # a request mostly waits for the network
+    with ThreadPoolExecutor(CONNECTIONS) as pool:  # a request mostly waits for the network
         return list(pool.map(_tags_or_reason, chunk.paths))
 
 
@@ -210,13 +222,15 @@ def _xmp_position(found: xmp.Properties) -> tuple[float, float] | None:
     lat = xmp.number(found, *(f"{p}:{n}" for p in _POSITION_PREFIXES for n in ("GpsLatitude", "Latitude")))
     lon_names = ("GpsLongitude", "GpsLongtitude", "Longitude")
     lon = xmp.number(found, *(f"{p}:{n}" for p in _POSITION_PREFIXES for n in lon_names))
+    if lat is None or lon is None:
+        lat, lon = xmp.degrees(found, "exif:GPSLatitude"), xmp.degrees(found, "exif:GPSLongitude")
     return (lat, lon) if lat is not None and lon is not None and is_position(lat, lon) else None
 
 
 def _heights(photo: Photo, tags: exif.Exif, found: xmp.Properties) -> None:
     photo.altitude_m = exif.gps_altitude(tags.gps)
     if photo.altitude_m is None:
-        photo.altitude_m = xmp.number(found, "drone-dji:AbsoluteAltitude")
+        photo.altitude_m = xmp.number(found, "drone-dji:AbsoluteAltitude", "exif:GPSAltitude")
     ground = xmp.number(found, "Camera:AboveGroundAltitude")
     if ground is not None and 0.0 < ground < _MOST_HEIGHT_M:
         photo.height_m, photo.height_is_ground = ground, True

@@ -7,17 +7,19 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from telemetry.samples.course import local_metres
 from telemetry.samples.findings import Finding, metres, plural
+from telemetry.samples.held_fixes import without_held_fixes
 from telemetry.samples.sample import Sample
 
 Array = NDArray[np.float64]
 
 TIME_RESOLUTION_S: Final = 1.0  # times of positions may be off by this: many are written in whole seconds
+FASTEST_M_S: Final = 128.6
+"""No aircraft that takes pictures flies faster over ground: 250 knots, the limit below 10,000 feet (14 CFR 91.117(a));
+small drones may fly 44.7 m/s (14 CFR 107.51(a))."""
 _WILD_MOST_SHARE: Final = 0.1  # positions that cannot be reached are wild up to this share of all
 _WILD_MOST_PIECES: Final = 10_000  # a track broken at more places has wrong times, not wild positions
-_LONGEST_REPEAT_S: Final = 30.0  # a receiver may repeat a fix for so long, during which it flies on
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +39,7 @@ class WildFixes:
 def wild_fixes(times_s: Sequence[float | None], places: Sequence[tuple[float, float]]) -> WildFixes:
     """The fixes that are not part of the longest track that can be flown.
 
-    The track is cut where the next fix is farther away than an aircraft flies in between (`fastest_m_s`); of the pieces
+    The track is cut where the next fix is farther away than an aircraft flies in between (`FASTEST_M_S`); of the pieces
     those are kept that can be flown one after the other and hold most fixes. If the others are more than a few, they
     are no wild fixes but another flight, or the times are wrong: then there are none, and their number is `doubtful`.
 
@@ -58,10 +60,7 @@ def wild_fixes(times_s: Sequence[float | None], places: Sequence[tuple[float, fl
         return WildFixes([], doubtful=len(first) - 1)
     if len(first) == 1:
         return WildFixes([])
-    new = np.concatenate([[True], np.any(np.diff(ground, axis=0) != 0.0, axis=1)])
-    since = times[np.maximum.accumulate(np.where(new, np.arange(len(order)), 0))]  # a fix that is repeated may be old
-    since = np.maximum(since, times - _LONGEST_REPEAT_S)
-    kept = _longest_track(first, last, since, times, ground)
+    kept = _longest_track(first, last, times, ground)
     if len(kept) == len(first):
         return WildFixes([])
     pieces = [np.arange(a, b + 1) for k, (a, b) in enumerate(zip(first, last, strict=True)) if k not in kept]
@@ -79,19 +78,17 @@ def wild_fixes(times_s: Sequence[float | None], places: Sequence[tuple[float, fl
 
 def _flyable(t0: Array, a: Array, t1: Array, b: Array) -> NDArray[np.bool_]:
     """Whether an aircraft can fly from places `a` (N, 2), metres, at times `t0` to places `b` at `t1`."""
-    reach = active().ingest.fastest_m_s * (t1 - t0 + TIME_RESOLUTION_S)
+    reach = FASTEST_M_S * (t1 - t0 + TIME_RESOLUTION_S)
     return np.asarray(np.hypot(b[..., 0] - a[..., 0], b[..., 1] - a[..., 1]) <= reach)
 
 
-def _longest_track(
-    first: NDArray[np.int64], last: NDArray[np.int64], since: Array, times: Array, ground: Array
-) -> set[int]:
+def _longest_track(first: NDArray[np.int64], last: NDArray[np.int64], times: Array, ground: Array) -> set[int]:
     """Pieces (from index `first` to `last`) that can be flown one after the other and hold most fixes together."""
     best = (last - first + 1).astype(np.float64)
     before = np.full(len(first), -1)
     for k in range(1, len(first)):
         ends = last[:k]
-        score = np.where(_flyable(since[ends], ground[ends], times[first[k]], ground[first[k]]), best[:k], 0.0)
+        score = np.where(_flyable(times[ends], ground[ends], times[first[k]], ground[first[k]]), best[:k], 0.0)
         i = int(np.argmax(score))
         if score[i] > 0.0:
             best[k] += score[i]
@@ -107,32 +104,34 @@ def doubtful_finding(count: int, of_what: str) -> Finding:
     """The finding on positions that cannot be reached and are used all the same, being too many; see `wild_fixes`."""
     text = (
         f"{count} of {of_what} cannot be reached by any aircraft from those before and after "
-        f"({active().ingest.fastest_m_s:.0f} m/s); so many are hardly wild, and all are used: they are of several "
+        f"({FASTEST_M_S:.0f} m/s); so many are hardly wild, and all are used: they are of several "
         "flights, or their times are wrong; check them, and read each flight by itself"
     )
     return Finding("positions-unreachable", text)
 
 
-def without_wild_fixes(
+def sound_positions(
     samples: Sequence[Sample], times_s: Sequence[float | None], source: str
 ) -> tuple[list[Sample], list[Finding]]:
-    """One flight's samples whose wild fixes have no position any more, and a finding if there are any.
+    """One flight's samples without positions that were not measured (`held_fixes`) or are wild, and findings on them.
 
     Args:
         times_s: of the samples, in one clock. source: name of the file, for the message.
     """
+    samples, told = without_held_fixes(samples, times_s, source)
     placed = [i for i, sample in enumerate(samples) if sample.has_position]
     found = wild_fixes([times_s[i] for i in placed], [samples[i].place for i in placed])
     if found.doubtful:
-        return list(samples), [doubtful_finding(found.doubtful, f"{plural(len(placed), 'position')} of {source}")]
+        doubtful = doubtful_finding(found.doubtful, f"{plural(len(placed), 'position')} of {source}")
+        return samples, [*told, doubtful]
     if not found.indices:
-        return list(samples), []
+        return samples, told
     wild = {placed[i] for i in found.indices}
     sound = [replace(s, lat_deg=None, lon_deg=None) if i in wild else s for i, s in enumerate(samples)]
     lie, they_are = ("lie", "they are") if len(wild) > 1 else ("lies", "it is")
     text = (
         f"{plural(len(wild), 'position')} of {source} {lie} up to {metres(found.away_m)} away from those before and "
         "after, farther than any aircraft flies in that time "
-        f"({active().ingest.fastest_m_s:.0f} m/s); {they_are} not used"
+        f"({FASTEST_M_S:.0f} m/s); {they_are} not used"
     )
-    return sound, [Finding("wild-fix", text)]
+    return sound, [*told, Finding("wild-fix", text)]

@@ -6,7 +6,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from orthoswarm.config import active
 from orthoswarm.model.angles import wrap_deg
 from orthoswarm.model.earth import MEAN_RADIUS_M
 from telemetry.photos.photo_frames import LEAST_HEIGHT_M
@@ -14,6 +13,9 @@ from telemetry.samples.sample import Sample
 from telemetry.videos.picture_poses import Poses
 from telemetry.videos.video_file import VideoScan
 
+_VIDEO_HEIGHT_SHARE: Final = 0.04
+"""Distance between the pictures used of a video, as a share of the height: 96 % overlap at 60 degrees."""
+_VIDEO_EVERY_S: Final = 0.5  # time between them where no height is known
 _VIDEO_EARLY: Final = 0.8  # from this share of that distance on, pictures are candidates, of which the sharpest is used
 _VIDEO_LATE: Final = 1.2  # to this share
 _VIDEO_CANDIDATES: Final = 6  # candidates at most (memory)
@@ -90,16 +92,15 @@ class Picker:
 
     def _progress(self, new: DecodedPicture, last: DecodedPicture) -> float:
         """Distance of a picture from the last selected one, in units of the spacing."""
-        config = active().ingest
         seconds = abs(new.video_s - last.video_s)
         if self._every_s is not None and self._every_m is None:
             return seconds / max(self._every_s, 1e-6)
         metres = _distance_m(new.sample, last.sample)
         spacing = self._every_m
         if spacing is None and new.sample is not None and new.sample.height_m is not None:
-            spacing = config.video_height_share * max(new.sample.height_m, 5.0)
+            spacing = _VIDEO_HEIGHT_SHARE * max(new.sample.height_m, 5.0)
         if metres is None or spacing is None:
-            return seconds / (self._every_s or config.video_every_s)
+            return seconds / (self._every_s or _VIDEO_EVERY_S)
         by_time = seconds / self._every_s if self._every_s else 0.0
         return max(metres / max(spacing, 1e-6), by_time)
 

@@ -18,7 +18,7 @@ from telemetry.formats.video import srt
 from telemetry.samples.findings import Finding, plural
 from telemetry.samples.sample import Sample
 from telemetry.samples.timeline import Timeline
-from telemetry.samples.wild_fixes import without_wild_fixes
+from telemetry.samples.wild_fixes import sound_positions
 from telemetry.videos.video_file import VideoScan, square_size
 
 Array = NDArray[np.float64]
@@ -216,7 +216,7 @@ class Poses:
 
     def _sound(self, name: str, rows: list[tuple[float, Sample]]) -> list[tuple[float, Sample]]:
         """Samples of one recording over video time, without positions that cannot be flown."""
-        samples, wild = without_wild_fixes(
+        samples, wild = sound_positions(
             [s for _, s in rows], [t if t == t else s.time_s for t, s in rows], f"{self._scan.path.name} ({name})"
         )
         self.findings += wild

@@ -13,6 +13,7 @@ from orthoswarm.batch.pipeline import PRODUCTS, MapOptions, run
 from orthoswarm.batch.swarm_areas import divide
 from orthoswarm.batch.workspace import Workspace
 from orthoswarm.compute.workers import Processes, Serial
+from orthoswarm.config import DEFAULT, config_of
 from orthoswarm.control.area_adjustment import AreaTie, adjust_areas
 from orthoswarm.model.errors import AdjustmentError
 from orthoswarm.model.placement import Terrain
@@ -22,7 +23,7 @@ from orthoswarm.trajectory.near_paths import near_paths
 from telemetry import LoadOptions, load
 from tests.kit.scene import Scene, legs
 
-IN_AREAS = {"strategy": {"area_pictures": 40}}
+IN_AREAS = config_of({"strategy": {"area_pictures": 40}})
 """The flight of four vehicles with 16 pictures each is divided into two areas."""
 
 
@@ -158,7 +159,7 @@ def test_a_run_in_areas_has_all_products_and_its_pictures_lie_as_in_one(flight, 
     assert {p.name for p in out.iterdir()} == set(PRODUCTS)
     assert [v["id"] for v in report["vehicles"]] == ["v0", "v1", "v2", "v3"]
     assert all(leg["state"] == "matched" for leg in report["legs"])
-    make(folder, tmp_path / "one", config={})
+    make(folder, tmp_path / "one", config=DEFAULT)
     ours, theirs = errors_m(scene, shots, out), errors_m(scene, shots, tmp_path / "one")
     assert np.median(ours) < 1.2 * np.median(theirs) + 0.02 and ours.max() < 1.5
 
@@ -189,7 +190,7 @@ def test_an_area_that_cannot_be_refined_lies_where_its_receivers_say(flight, tmp
 def test_without_a_map_areas_are_moved_onto_each_other(flight, tmp_path):
     scene, shots, folder = flight
     make(folder, tmp_path / "areas", basemap=False)
-    make(folder, tmp_path / "one", basemap=False, config={})
+    make(folder, tmp_path / "one", basemap=False, config=DEFAULT)
     ours, theirs = errors_m(scene, shots, tmp_path / "areas"), errors_m(scene, shots, tmp_path / "one")
     assert np.median(ours) < 1.2 * np.median(theirs) + 0.3
 

@@ -14,6 +14,7 @@ import pytest
 
 pytest.importorskip("distributed", reason="needs the extra 'cluster'")
 
+from orthoswarm.compute import dask_cluster
 from orthoswarm.compute.dask_cluster import Cluster, ClusterLostError
 from orthoswarm.compute.workers import Processes, Serial
 from orthoswarm.model.errors import InputError, OrthoSwarmError
@@ -116,8 +117,8 @@ def test_a_worker_without_the_shared_folder_mounted_is_refused(tmp_path, empty):
     assert not list((tmp_path / "out").iterdir())
 
 
-def test_a_wrong_address_is_one_sentence(configure):
-    configure({"compute": {"cluster_connect_s": 0.5}})
+def test_a_wrong_address_is_one_sentence(monkeypatch):
+    monkeypatch.setattr(dask_cluster, "_CONNECT_S", 0.5)
     with pytest.raises(InputError, match=r"no Dask scheduler at tcp://127\.0\.0\.1:9"):
         Cluster("tcp://127.0.0.1:9")
     for address in ("nonsense:::", "scheduler", "tcp://10.0.0.1"):
@@ -194,8 +195,9 @@ def slowly(folder, n):
     return n * n
 
 
-def test_a_scheduler_that_dies_and_comes_back_loses_nothing(tmp_path, configure):
-    configure({"compute": {"cluster_connect_s": 30.0, "cluster_poll_s": 0.2}})
+def test_a_scheduler_that_dies_and_comes_back_loses_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr(dask_cluster, "_CONNECT_S", 30.0)
+    monkeypatch.setattr(dask_cluster, "_POLL_S", 0.2)
     with Loopback(tmp_path) as both:
         both.begin(1)
         with Cluster(both.address, patience_s=120.0) as cluster:
@@ -210,11 +212,12 @@ def test_a_scheduler_that_dies_and_comes_back_loses_nothing(tmp_path, configure)
     assert found == [n * n for n in range(40)]
 
 
-def test_a_scheduler_that_stays_away_is_one_sentence(tmp_path, configure):
+def test_a_scheduler_that_stays_away_is_one_sentence(tmp_path, monkeypatch):
     with Loopback(tmp_path) as both:
         both.begin(1)
         with Cluster(both.address, patience_s=1.0) as cluster:
-            configure({"compute": {"cluster_connect_s": 0.5, "cluster_poll_s": 0.2}})  # once it is connected
+            monkeypatch.setattr(dask_cluster, "_CONNECT_S", 0.5)  # once it is connected
+            monkeypatch.setattr(dask_cluster, "_POLL_S", 0.2)
             results = cluster.map(partial(slowly, tmp_path), range(40))
             next(results)
             both.close()

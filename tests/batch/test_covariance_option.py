@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 
 from gcs_plugin.cli.main import main
-from orthoswarm.config import active
 from orthoswarm.export.product_files import pose_covariance
 from orthoswarm.model.camera import Camera, Lens, ground_jacobian, rotation_from_angles
 from orthoswarm.model.frame import Fix, Frame
-from orthoswarm.model.placement import PlacedFrame
+from orthoswarm.model.placement import STATED_SIGMA_FACTOR, PlacedFrame
 from tests.kit.scene import Scene, legs
 
 
@@ -61,7 +60,7 @@ def test_the_ground_below_has_the_stated_error(sigma_m, tilt_deg):
     covariance = pose_covariance(placed, 5.0)
     j = ground_jacobian(placed.camera.rotation, 80.0, 0.2)
     on_ground = np.trace(j @ covariance @ j.T) / 2
-    assert np.sqrt(on_ground) * active().bundle.stated_sigma_factor == pytest.approx(sigma_m, rel=1e-6)
+    assert np.sqrt(on_ground) * STATED_SIGMA_FACTOR == pytest.approx(sigma_m, rel=1e-6)
     assert np.linalg.eigvalsh(covariance).min() > 0.0
 
 

@@ -6,9 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from orthoswarm.config import active
 from orthoswarm.model.camera import Camera, angles_from_rotation, rotation_from_angles
-from orthoswarm.model.frame import Fix, Frame
+from orthoswarm.model.frame import TAGGED_TILT_SIGMA, THETA_HAT_DEG, UNSTATED_SIGMA_M, Fix, Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.mosaic.recorded_pose import area_grid, recorded_cameras
 from orthoswarm.refine.flight.unsolved_pictures import few_of_their_kind, hovering_vehicles, place_by_neighbours
@@ -42,7 +41,7 @@ def test_what_is_recorded_is_taken():
     np.testing.assert_allclose(placed.camera.position, [*np.add(MIDDLE, (10, 20)), 77.0], atol=1e-6)
     fix = placed.frame.fix
     assert yaw_of(placed) == pytest.approx(0.5 - float(GRID.convergence_rad(fix.lat_deg, fix.lon_deg)))
-    assert placed.camera.lens.fov_rad == pytest.approx(np.radians(active().records.theta_hat_deg))
+    assert placed.camera.lens.fov_rad == pytest.approx(np.radians(THETA_HAT_DEG))
     assert placed.stage == "realtime" and not made.warnings and not made.rejected
     assert area_grid([placed.frame]).epsg == 32632
 
@@ -83,10 +82,8 @@ def test_missing_heights_come_from_the_others_or_the_spacing():
     # 20 m steps at 75 % overlap: the picture's short side is 80 m of ground
     assert made.placed[0].camera.position[2] == pytest.approx(80 * made.placed[0].camera.lens.focal_px / 300)
     assert any("no photo has a height" in w for w in made.warnings)
-    records, height = active().records, made.placed[0].camera.position[2]
-    assert made.placed[0].sigma_m == pytest.approx(
-        np.hypot(records.position_sigma_m, records.tagged_tilt_sigma * height)
-    )
+    height = made.placed[0].camera.position[2]
+    assert made.placed[0].sigma_m == pytest.approx(np.hypot(UNSTATED_SIGMA_M, TAGGED_TILT_SIGMA * height))
 
 
 def test_a_position_that_cannot_be_is_left_out():

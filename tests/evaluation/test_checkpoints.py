@@ -285,3 +285,17 @@ def test_a_negative_sigma_is_refused(tmp_path):
     table.write_text("name,lat_deg,lon_deg,sigma_m,map_lat_deg,map_lon_deg\na,48,11,-0.1,48,11\n")
     with pytest.raises(InputError, match="cannot be less than 0"):
         read_checkpoints(table)
+
+
+@pytest.mark.parametrize("name,code", [("PUWG1992", "EPSG:2180"), ("Lambert93", "EPSG:2154"), ("NZTM", "EPSG:2193")])
+def test_the_code_of_a_system_that_is_called_otherwise_is_proposed(tmp_path, name, code):
+    (tmp_path / "gcp_list.txt").write_text(f"{name}\n634676 485344 112 242.0 256.9 a.jpg\n")
+    with pytest.raises(InputError, match=f"if it is {code} .*, write that code"):
+        read_checkpoints(tmp_path / "gcp_list.txt")
+
+
+def test_of_a_name_that_fits_several_systems_or_none_nothing_is_proposed(tmp_path):
+    for name in ("Poland", "xyzzy"):
+        (tmp_path / "gcp_list.txt").write_text(f"{name}\n634676 485344 112 242.0 256.9 a.jpg\n")
+        with pytest.raises(InputError, match="write EPSG:32617 or a PROJ string"):
+            read_checkpoints(tmp_path / "gcp_list.txt")

@@ -15,6 +15,7 @@ import shapely
 from pyproj import Transformer
 
 from gcs_plugin.cli.main import main
+from orthoswarm.export.catalog import tiled_raster
 from orthoswarm.export.catalog.stac_collection import write_collection
 from orthoswarm.export.catalog.tiled_raster import in_tiles, product_file, write_tiled
 from orthoswarm.export.product_files import iso_time, write_frames
@@ -36,11 +37,12 @@ def maps(tmp_path_factory):
     for vehicle in ("a", "b c"):
         scene.fly(top / "photos" / vehicle, legs(count=2, photos=5))
     basemap = scene.basemap(top / "before.tif")
-    (top / "small.toml").write_text("[raster]\ntile_px = 512\n")
-    for name, how in (("one", "no"), ("tiled", "yes")):
-        asked = ["--gsd", "0.15", "--workers", "1", "--config", str(top / "small.toml"), "--tiles", how]
-        assert main(["mosaic", str(top / "photos"), "--basemap", str(basemap), "--out", str(top / name), *asked]) == 0
-    return top
+    with pytest.MonkeyPatch.context() as smaller:
+        smaller.setattr(tiled_raster, "_TILE_PX", 512)
+        for name, how in (("one", "no"), ("tiled", "yes")):
+            asked = ["--gsd", "0.15", "--workers", "1", "--tiles", how, "--out", str(top / name)]
+            assert main(["mosaic", str(top / "photos"), "--basemap", str(basemap), *asked]) == 0
+        yield top
 
 
 def documents(folder):
@@ -106,8 +108,8 @@ class Painted:
         return np.full((row1 - row0, col1 - col0, 4), 255, np.uint8)
 
 
-def test_vehicles_and_times_are_those_of_the_footprints(tmp_path, configure):
-    configure({"raster": {"tile_px": 512}})
+def test_vehicles_and_times_are_those_of_the_footprints(tmp_path, monkeypatch):
+    monkeypatch.setattr(tiled_raster, "_TILE_PX", 512)
     level = 2.0
     flight = mosaic_scene.survey(0, lens=mosaic_scene.small_lens(k1=-0.05))
     placed = [replace(p, frame=replace(p.frame, time_s=1e9 + k)) for k, p in enumerate(flight.frames)]
@@ -180,7 +182,7 @@ def test_a_run_in_the_other_form_replaces_the_rasters(maps, tmp_path):
     assert [p.name for p in (folder / "tiles").rglob("*")] == ["mine.txt"]
 
 
-def test_large_rasters_come_in_tiles_where_nothing_is_said(configure):
+def test_large_rasters_come_in_tiles_where_nothing_is_said(monkeypatch):
     assert not in_tiles("auto", (0, 60_000, 512, 60_512)) and in_tiles("auto", (0, 65_000, 0, 65_000))
-    configure({"raster": {"one_file_px": 1e6}})
+    monkeypatch.setattr(tiled_raster, "_ONE_FILE_PX", 1e6)
     assert in_tiles("auto", (0, 2000, 0, 2000)) and not in_tiles("no", (0, 2000, 0, 2000))

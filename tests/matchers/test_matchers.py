@@ -3,7 +3,16 @@
 import numpy as np
 import pytest
 
-from orthoswarm.matchers import Matches, available, map_matcher, picture_matcher, registry, second_opinion, weight_files
+from orthoswarm.matchers import (
+    Matches,
+    available,
+    map_matcher,
+    picture_matcher,
+    registry,
+    roma,
+    second_opinion,
+    weight_files,
+)
 from orthoswarm.matchers.cfog import Cfog, correlate, features
 from orthoswarm.matchers.matcher import UnavailableError
 from orthoswarm.matchers.patch_registration import apply, magsac, plausible, register, robust_shift
@@ -187,8 +196,8 @@ class FakeRoma:
         return found[:, :2], found[:, 2:]
 
 
-def test_romas_matches_are_on_pixel_centres_and_within_reach(ground, configure):
-    configure({"matchers": {"roma_samples": 200}})
+def test_romas_matches_are_on_pixel_centres_and_within_reach(ground, monkeypatch):
+    monkeypatch.setattr(roma, "_SAMPLES", 200)
     found = Roma(FakeRoma()).match(*case(ground[0]), REACH)
     assert 100 < len(found) < 180 and found.score.min() >= 0.3
     assert found.b - found.a == pytest.approx(np.tile([9.0 + REACH, -13 + REACH], (len(found), 1)))

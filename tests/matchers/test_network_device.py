@@ -14,25 +14,22 @@ torch = pytest.importorskip("torch")
 @pytest.mark.parametrize(("card", "name", "kind"), [
     (False, "auto", "cpu"), (False, "cpu", "cpu"), (True, "auto", "cuda"), (True, "cpu", "cpu"), (True, "cuda", "cuda"),
 ])  # fmt: skip
-def test_the_device_asked_for_is_used(monkeypatch, configure, card, name, kind):
+def test_the_device_asked_for_is_used(monkeypatch, card, name, kind):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: card)
-    configure({"matchers": {"device": name}})
-    require_device()
-    assert network_device().type == kind
+    require_device(name)
+    assert network_device(name).type == kind
 
 
 @pytest.mark.parametrize(("name", "words"), [("cuda", "sees no CUDA card"), ("gpu0", "no device 'gpu0'")])
-def test_a_device_that_is_not_there_is_refused(monkeypatch, configure, name, words):
+def test_a_device_that_is_not_there_is_refused(monkeypatch, name, words):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    configure({"matchers": {"device": name}})
     with pytest.raises(UnavailableError, match=words):
-        network_device()
+        network_device(name)
     with pytest.raises(InputError, match=words):
-        require_device()
+        require_device(name)
 
 
-def test_mosaic_refuses_it_before_it_writes(monkeypatch, configure, tmp_path, capsys):
-    configure({"matchers": {"device": "auto"}})  # and puts back what the command changes
+def test_mosaic_refuses_it_before_it_writes(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     (tmp_path / "photos").mkdir()
     assert main(["mosaic", str(tmp_path / "photos"), "--out", str(tmp_path / "map"), "--device", "cuda"]) == 2
@@ -41,15 +38,14 @@ def test_mosaic_refuses_it_before_it_writes(monkeypatch, configure, tmp_path, ca
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA card")
-def test_a_card_finds_what_the_cpu_finds(configure):
+def test_a_card_finds_what_the_cpu_finds():
     from orthoswarm.matchers import picture_matcher
 
     rng = np.random.default_rng(1)
     scene = (rng.random((40, 52)) * 255).astype(np.uint8).repeat(8, 0).repeat(8, 1)
     found = {}
     for name in ("cpu", "cuda"):
-        configure({"matchers": {"device": name}})
-        found[name] = picture_matcher("xfeat").match(scene[:256, :320], scene[20:276, 30:350])
+        found[name] = picture_matcher("xfeat", name).match(scene[:256, :320], scene[20:276, 30:350])
     shifts = {name: np.median(each.b - each.a, axis=0) for name, each in found.items()}
     assert len(found["cuda"]) > 50
     assert np.abs(shifts["cuda"] - shifts["cpu"]).max() < 0.02

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from orthoswarm.matchers import roma
 from orthoswarm.matchers.network_device import network_device
 from orthoswarm.matchers.roma import Roma, load
 from orthoswarm.matchers.sparse_learned import read_state
@@ -34,8 +35,9 @@ def files(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_roma_is_made_of_its_weight_files_and_matches(files, configure):
-    configure({"matchers": {"roma_coarse_px": COARSE_PX, "roma_fine_px": UPSAMPLE_PX, "roma_samples": 500}})
+def test_roma_is_made_of_its_weight_files_and_matches(files, monkeypatch):
+    for name, value in {"_COARSE_PX": COARSE_PX, "_FINE_PX": UPSAMPLE_PX, "_SAMPLES": 500}.items():
+        monkeypatch.setattr(roma, name, value)
     network = load(read_state("roma"), read_state("roma-dinov2"), network_device())
     window = np.random.default_rng(0).uniform(0, 255, (200, 240)).astype(np.float32)
     patch = window[20:180, 20:220]

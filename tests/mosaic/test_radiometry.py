@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from orthoswarm.canvas.canvas import Canvas
-from orthoswarm.config import override
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import Terrain
+from orthoswarm.mosaic import overlap_colors, radiometry
 from orthoswarm.mosaic.radiometry import estimate_fields, tone_warning, uniform
 from orthoswarm.mosaic.render_passes import thumbnail
 from orthoswarm.mosaic.renderer import render
@@ -81,7 +81,7 @@ def test_a_vehicle_follows_those_that_are_drawn_already():
     assert np.abs((found + truth)[late]).mean() < 0.35 * np.abs(truth[late]).mean()  # no common factor is free now
 
 
-def test_a_dark_flight_that_meets_another_at_a_corner_takes_its_tone():
+def test_a_dark_flight_that_meets_another_at_a_corner_takes_its_tone(monkeypatch):
     rng = np.random.default_rng(4)
     flight, drawn = scene.Flight(), {}
     for line in range(8):  # the second vehicle's half lies north-east of the first one's
@@ -98,11 +98,9 @@ def test_a_dark_flight_that_meets_another_at_a_corner_takes_its_tone():
                 drawn[flight.frames[-1].frame.image] = uniform(1.0 / gain)
     small = thumbnails_of(flight)
     found = middle(estimate_fields(flight.frames, small, FLAT, held=drawn))
-    override({"radiometry": {"reweightings": 20, "solver_tolerance": 1e-6, "solver_steps": 1000}})
-    try:
-        exact = middle(estimate_fields(flight.frames, small, FLAT, held=drawn))
-    finally:
-        override({})
+    for name, value in {"_REWEIGHTINGS": 20, "_SOLVER_TOLERANCE": 1e-6, "_SOLVER_STEPS": 1000}.items():
+        monkeypatch.setattr(radiometry, name, value)
+    exact = middle(estimate_fields(flight.frames, small, FLAT, held=drawn))
     assert np.abs(np.log(found / exact)).max() < 0.005  # half a grey level of 100
     assert np.abs(np.log(0.75 * exact[64:])).mean() < 0.1  # of 0.29
 
@@ -182,11 +180,12 @@ def test_the_result_does_not_depend_on_the_number_of_threads(threads):
     assert all(np.array_equal(alone[image], shared[image]) for image in alone)
 
 
-def test_fields_evaluated_few_at_a_time_are_the_same(configure):
+def test_fields_evaluated_few_at_a_time_are_the_same(monkeypatch):
     flight = scene.survey(4, scene.hills)
     small, ground = thumbnails_of(flight), scene.terrain_of(scene.hills)
     at_once = estimate_fields(flight.frames, small, ground)
-    configure({"compute": {"fields_at_once": 5, "ratios_at_once": 100}})
+    monkeypatch.setattr(radiometry, "_FIELDS_AT_ONCE", 5)
+    monkeypatch.setattr(overlap_colors, "_RATIOS_AT_ONCE", 100)
     few = estimate_fields(flight.frames, small, ground)
     assert all(np.array_equal(at_once[image], few[image]) for image in at_once)
 

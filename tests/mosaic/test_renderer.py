@@ -9,11 +9,11 @@ import pytest
 
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.compute.threads import on_threads
-from orthoswarm.config import override
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import Lens
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.placement import Terrain
+from orthoswarm.mosaic import renderer
 from orthoswarm.mosaic.kernels.drawn_heights import heights
 from orthoswarm.mosaic.kernels.pixel_sampling import UNIT, cubic_weights
 from orthoswarm.mosaic.kernels.render_arrays import LATTICE_PX, crop
@@ -234,17 +234,14 @@ def test_bounds_renew_only_the_tiles_they_touch(canvas):
     assert 0.95 < stats.covered_share <= 1.0
 
 
-def test_threads_give_the_same_picture(tmp_path):
+def test_threads_give_the_same_picture(tmp_path, monkeypatch):
     flight = scene.survey(12)
     pictures, stats = [], []
-    try:
-        override({"compute": {"pictures_per_task": 2}})
-        for name, run in (("one", serial), ("three", partial(on_threads, count=3))):
-            with Canvas.create(tmp_path / name, scene.grid(260.0), plane="frame", tile_px=64) as canvas:
-                stats.append(render(flight.frames, FLAT, canvas, read=flight.read, run=run))
-                pictures.append(whole(canvas))
-    finally:
-        override({})
+    monkeypatch.setattr(renderer, "_PICTURES_PER_TASK", 2)
+    for name, run in (("one", serial), ("three", partial(on_threads, count=3))):
+        with Canvas.create(tmp_path / name, scene.grid(260.0), plane="frame", tile_px=64) as canvas:
+            stats.append(render(flight.frames, FLAT, canvas, read=flight.read, run=run))
+            pictures.append(whole(canvas))
     assert (pictures[0] == pictures[1]).all()
     assert pictures[0].any()
     assert stats[0].pixels.tolist() == stats[1].pixels.tolist()
@@ -364,7 +361,7 @@ def fields(frame):
 def test_pictures_are_drawn_again_from_their_kept_parts_without_being_read(tmp_path, gsd_m):
     flight = scene.survey(1, scene.hills, scene.small_lens(k1=-0.05))
     terrain, grid = scene.terrain_of(scene.hills), scene.grid(260.0, gsd_m)
-    parts = PictureParts.create(tmp_path / "parts", len(flight.frames))
+    parts = PictureParts.create(tmp_path / "parts", len(flight.frames), 2000.0)
     images, read = [], []
 
     def counted(path):
@@ -384,7 +381,7 @@ def test_pictures_are_drawn_again_from_their_kept_parts_without_being_read(tmp_p
 
 def test_a_picture_of_which_more_is_wanted_than_was_kept_is_read(tmp_path):
     flight = scene.survey(1)
-    few, parts = flight.frames[::2], PictureParts.create(tmp_path / "parts", len(flight.frames))
+    few, parts = flight.frames[::2], PictureParts.create(tmp_path / "parts", len(flight.frames), 2000.0)
     images = []
     for name, frames, store in (("all", flight.frames, parts), ("few", few, parts), ("whole", few, None)):
         with Canvas.create(tmp_path / name, scene.grid(260.0), plane="frame", tile_px=128) as canvas:

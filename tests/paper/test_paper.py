@@ -11,7 +11,7 @@ from orthoswarm.matchers.matcher import Matches
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import Camera, Lens, focal_px, rotation_from_angles
 from orthoswarm.model.geo import GroundGrid, local_origin
-from orthoswarm.paper import PaperOptions, PaperRefiner
+from orthoswarm.paper import PaperOptions, PaperRefiner, coarse_cameras, leg_patches
 from orthoswarm.paper.coarse_cameras import CoarseOptions
 from orthoswarm.paper.ground_scale import choose_pairs, field_of_view, gaussian, metres_per_pixel, orthogonal_centre
 from orthoswarm.paper.leg_cameras import carried_shift, fit_camera, pixel_grid
@@ -28,9 +28,10 @@ BIAS = (6.0, -4.0)
 
 
 @pytest.fixture(autouse=True)
-def _small(configure):
+def _small(monkeypatch):
     """Fewer pairs and a shorter search than usual: the scenes are small."""
-    configure({"paper": {"scale_pairs": 9, "patch_search_m": (25.0, 25.0)}})
+    monkeypatch.setattr(coarse_cameras, "_SCALE_PAIRS", 9)
+    monkeypatch.setattr(leg_patches, "_PATCH_SEARCH_M", (25.0, 25.0))
 
 
 # -- III.C --------------------------------------------------------------------------------------------------------

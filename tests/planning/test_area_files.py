@@ -12,10 +12,9 @@ import shapely
 from fastapi import Request
 
 from gcs_plugin.web.areas import area_of, read_area
-from orthoswarm.config import active
 from orthoswarm.model.errors import InputError
 from orthoswarm.planning.area.area import make_area
-from orthoswarm.planning.area.shape_files import Polygon, parse_geojson
+from orthoswarm.planning.area.shape_files import MOST_CORNERS, Polygon, parse_geojson
 
 RING = [[8.544, 47.397], [8.547, 47.397], [8.547, 47.399], [8.544, 47.399], [8.544, 47.397]]
 HOLE = [[8.545, 47.3975], [8.546, 47.3975], [8.546, 47.398], [8.545, 47.3975]]
@@ -113,14 +112,14 @@ def circle(corners, east_deg=0.0):
 
 
 def test_an_outline_with_too_many_corners_is_refused_before_it_is_compared_with_itself():
-    most = active().planning.most_corners
+    most = MOST_CORNERS
     assert len(area_of(circle(most), "a.geojson")["polygons"][0][0]) == most + 1
     with pytest.raises(InputError, match=rf"a.geojson has {most + 1} corners; simplify it to at most {most}"):
         area_of(circle(most + 1), "a.geojson")
 
 
 def test_areas_and_zones_that_are_used_together_are_counted_together():
-    half = active().planning.most_corners // 2 + 1
+    half = MOST_CORNERS // 2 + 1
     one, other = (parse_geojson(circle(half, east)).polygons[0] for east in (0.0, 0.1))
     assert make_area([one]).size_m2 > 0
     with pytest.raises(InputError, match=r"the area with its no-fly zones has \d+ corners"):

@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthoswarm.planning.sorties.flight_time import Motion, autopilot_config
+from orthoswarm.config import DEFAULT
+from orthoswarm.planning.sorties.flight_time import Motion
 
 SLOW = (1.0, 3.0, 5.0, 10.0, 15.0)
 
@@ -45,10 +46,10 @@ FLIGHTS = {
 def test_times_are_those_of_real_flights(name):
     points, flown_s = FLIGHTS[name]
     autopilot = name.partition(" ")[0]
-    times = Motion(autopilot=autopilot_config(autopilot)).times(np.array(points, float))
+    times = Motion(autopilot=DEFAULT.times(autopilot)).times(np.array(points, float))
     allowed_s = {"ardupilot": 3.0, "px4": 7.0}[autopilot]
     assert np.abs(times - flown_s).max() < allowed_s
-    assert allowed_s < autopilot_config(autopilot).schedule_slack_s
+    assert allowed_s < DEFAULT.times(autopilot).schedule_slack_s
 
 
 def lines(length, height, last):
@@ -77,7 +78,7 @@ SPEEDS = {
 @pytest.mark.parametrize("name", SPEEDS)
 def test_times_hold_at_other_speeds_however_many_turns_there_are(name):
     autopilot, speed, points, flown_s, allowed_s = SPEEDS[name]
-    motion = Motion(speed, autopilot=autopilot_config(autopilot), lands=True)
+    motion = Motion(speed, autopilot=DEFAULT.times(autopilot), lands=True)
     times = motion.times(np.array(points, float))
     assert np.abs(times - flown_s).max() < allowed_s
     assert replace(motion, lands=False).times(np.array(points, float))[-1] > times[-1] + 5.0
@@ -113,7 +114,7 @@ SET_OFF = {
 def test_a_vehicle_is_where_real_ones_were_as_it_climbs_and_sets_off(name):
     """They climb slowly at first or at last, stand still above their start, and gather speed."""
     speed, height, flown, allowed_m = SET_OFF[name]
-    motion = Motion(speed, autopilot=autopilot_config(name.partition(",")[0]))
+    motion = Motion(speed, autopilot=DEFAULT.times(name.partition(",")[0]))
     places = motion.places(np.array(lines(300, height, 2), float), None, 0.1)
     for seconds, away, up in flown:
         place = places[round(seconds / 0.1)]
@@ -125,7 +126,7 @@ def test_a_vehicle_is_where_a_real_one_was_as_it_comes_home():
     """An ArduCopter at 10 m/s from 40 m: it slows down and waits above home, and comes down slowly at last."""
     flown = [(104.0, 40.0), (110.0, 40.0), (113.0, 40.0), (116.0, 38.3), (119.0, 34.0), (128.0, 20.3), (137.0, 9.4),
              (146.0, 4.9), (155.0, 0.4)]  # fmt: skip
-    places = Motion(autopilot=autopilot_config("ardupilot")).places(np.array(lines(299, 40, 2), float), None, 0.1)
+    places = Motion(autopilot=DEFAULT.times("ardupilot")).places(np.array(lines(299, 40, 2), float), None, 0.1)
     for seconds, up in flown:
         place = places[round(seconds / 0.1)]
         assert place[2] == pytest.approx(up, abs=2.0), seconds
@@ -141,7 +142,7 @@ def test_a_vehicle_is_where_a_real_one_was_as_it_comes_home():
 )
 def test_a_course_keeps_to_the_path_and_its_times(points, autopilot, speed, lands, wait_at):
     path = np.array([(0.0, 0.0, 0.0), (0.0, 0.0, 50.0), *points, (0.0, 0.0, 40.0), (0.0, 0.0, 0.0)])
-    motion = Motion(speed, autopilot=autopilot_config(autopilot), lands=lands)
+    motion = Motion(speed, autopilot=DEFAULT.times(autopilot), lands=lands)
     waits = np.zeros(len(path))
     waits[min(wait_at, len(path) - 2)] = 7.0
     times, places = motion.course(path, waits)
@@ -156,7 +157,7 @@ def test_a_course_keeps_to_the_path_and_its_times(points, autopilot, speed, land
 
 @pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
 def test_a_turn_takes_no_more_than_a_stop_and_the_less_the_slower(autopilot):
-    config = autopilot_config(autopilot)
+    config = DEFAULT.times(autopilot)
     shares = [Motion(v, autopilot=config).turn_s(np.array(math.pi)) / Motion(v, autopilot=config).stop_s for v in SLOW]
     assert shares == sorted(shares) and shares[-1] <= 1.0
     assert Motion(0.5 * config.corner_m_s or 1.0, autopilot=config).turn_s(np.array(0.0)) == 0.0
@@ -169,14 +170,14 @@ def test_a_turn_takes_no_more_than_a_stop_and_the_less_the_slower(autopilot):
 )
 def test_times_grow_along_a_path_and_are_never_shorter_than_at_constant_speed(points, autopilot, speed):
     path = np.array([(0.0, 0.0, 0.0), (0.0, 0.0, 50.0), *points])
-    times = Motion(speed, autopilot=autopilot_config(autopilot)).times(path)
+    times = Motion(speed, autopilot=DEFAULT.times(autopilot)).times(path)
     steps = np.diff(path, axis=0)
     assert (np.diff(times) >= np.hypot(steps[:, 0], steps[:, 1]) / speed - 1e-9).all()
 
 
 @pytest.mark.parametrize("autopilot", ["ardupilot", "px4"])
 def test_a_landing_takes_longer_the_higher_it_begins(autopilot):
-    motion = Motion(autopilot=autopilot_config(autopilot))
+    motion = Motion(autopilot=DEFAULT.times(autopilot))
     low, high = (motion.times(np.array([[0, 0, 0], [0, 0, h], [99, 0, h], [0, 0, h], [0, 0, 0]]))[-1] for h in (30, 60))
     assert high - low == pytest.approx(30 / motion.climb_m_s + 30 / motion.descent_m_s)
     assert motion.landing_s(60.0) > 0.0

@@ -1,6 +1,5 @@
 """`orthoswarm plan` from the command line: products, formats of the area, and refusals that leave nothing behind."""
 
-import argparse
 import json
 import os
 import subprocess
@@ -12,8 +11,6 @@ import pytest
 import shapely
 
 from gcs_plugin.cli.main import main
-from gcs_plugin.cli.verbs.vehicles.plan import _pitch, configure
-from gcs_plugin.plans.plan_request import PlanRequest
 from tests.kit.plan_checks import GRID, ORIGIN, crossed, fly, on_globe, seen_by, to_metres, write_geojson
 from tests.planning.test_plan_files import survey_plan
 
@@ -38,33 +35,18 @@ def kml_of(polygon):
     return f'<?xml version="1.0"?><kml xmlns="http://www.opengis.net/kml/2.2"><Document>{polygon_text}</Document></kml>'
 
 
-def test_the_defaults_of_the_command_are_those_of_a_request(tmp_path):
-    """The page and MAVProxy plan with a request's own defaults; the command states its defaults in its help."""
-    parser = argparse.ArgumentParser()
-    configure(parser)
-    args = parser.parse_args(["area.geojson", "--vehicles", "3", *FLAGS, "--out", "out"])
-    request = PlanRequest(area=args.area, vehicles=3, altitude_m=60.0, fov_min_deg=60.0)
-    assert _pitch(args.gimbal_pitch) == request.gimbal_pitch_deg
-    stated = (args.separation, args.height_step, args.side_overlap, args.forward_overlap, args.run_in, args.swap)
-    assert stated == (
-        request.separation_m, request.height_step_m, request.side_overlap, request.forward_overlap, request.run_in_m,
-        request.swap_min,
-    )  # fmt: skip
-
-
 def test_thresholds_of_a_file_are_used_and_stand_in_the_report(area, tmp_path, capsys):
     config = tmp_path / "config.toml"
-    config.write_text("[planning]\nmost_corners = 6\n")
-    assert plan(area, "--vehicles", 2, *FLAGS, "--out", tmp_path / "out", "--config", config) == 2
-    assert "at most 6" in capsys.readouterr().err
-    config.write_text("[planning]\nclearance_m = 3\n")
+    config.write_text("[planning]\nlaunch_s = 40\n[ardupilot]\ntakeoff_s = 9\nhome_wait_s = 0\n")
     assert plan(area, "--vehicles", 2, *FLAGS, "--out", tmp_path / "out", "--config", config, "--json") == 0
-    assert json.loads(capsys.readouterr().out)["config"] == {"planning": {"clearance_m": 3}}
+    assert json.loads(capsys.readouterr().out)["config"] == {
+        "planning": {"launch_s": 40.0}, "ardupilot": {"takeoff_s": 9.0, "home_wait_s": 0.0}
+    }  # fmt: skip
     assert plan(area, "--vehicles", 2, *FLAGS, "--out", tmp_path / "again", "--json") == 0
     assert "config" not in json.loads(capsys.readouterr().out)
     config.write_text("[planning]\nclearance = 3\n")
     assert plan(area, "--vehicles", 2, *FLAGS, "--out", tmp_path / "none", "--config", config) == 2
-    assert "no setting planning.clearance;" in capsys.readouterr().err and not (tmp_path / "none").exists()
+    assert "no setting planning.clearance, or no longer" in capsys.readouterr().err and not (tmp_path / "none").exists()
 
 
 @pytest.mark.parametrize("method", ["columns", "bcd", "tmstc"])

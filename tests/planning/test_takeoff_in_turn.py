@@ -8,13 +8,14 @@ import pytest
 
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.track import Airspace
+from orthoswarm.config import DEFAULT
 from orthoswarm.planning.area.area import make_area
 from orthoswarm.planning.lines.line_spacing import footprint
 from orthoswarm.planning.planner import plan_area
 from orthoswarm.planning.sorties import deconfliction
 from orthoswarm.planning.sorties.assignment import PlanOptions
 from orthoswarm.planning.sorties.deconfliction import Separation
-from orthoswarm.planning.sorties.flight_time import Motion, autopilot_config
+from orthoswarm.planning.sorties.flight_time import Motion
 from tests.kit.missions import sortie_mission
 from tests.kit.plan_checks import on_globe
 from tests.planning.test_plan_coverage import CONCAVE, HOLE, positions, start_at
@@ -24,7 +25,7 @@ AREA = make_area([on_globe(CONCAVE, [HOLE])])
 
 
 def planned(vehicles, starts, autopilot="ardupilot", end="rtl"):
-    times = autopilot_config(autopilot)
+    times = DEFAULT.times(autopilot)
     options = PlanOptions(
         motion=Motion(autopilot=times), starts=starts, end=end, separation=Separation(slack_s=times.schedule_slack_s)
     )
@@ -78,7 +79,7 @@ def test_where_it_would_take_too_long_they_take_off_beside_each_other_and_the_pl
 
 @pytest.mark.slow
 @pytest.mark.parametrize("vehicles", [5, 24])
-def test_taking_off_in_turn_is_tried_no_further_than_it_can_win(vehicles, monkeypatch, configure):
+def test_taking_off_in_turn_is_tried_no_further_than_it_can_win(vehicles, monkeypatch):
     placed, place = [], deconfliction._Sky.place
 
     def count(sky, *args):
@@ -93,7 +94,7 @@ def test_taking_off_in_turn_is_tried_no_further_than_it_can_win(vehicles, monkey
         assert "in turn" in plan.separation
     else:
         assert beside == vehicles and in_turn < vehicles
-    configure({"planning": {"orders_tried_share": 0.0}})
+    monkeypatch.setattr(deconfliction, "_ORDERS_TRIED_SHARE", 0.0)
     monkeypatch.setattr(deconfliction._Placing, "soonest_s", 0.0)
     whole, _ = planned(vehicles, [start_at(-60.0, 200.0)])
     assert whole.vehicles == plan.vehicles

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from orthoswarm.config import override
 from orthoswarm.model.frame import Fix, Frame
 from orthoswarm.raster.grey_pictures import GreyPictures
 from orthoswarm.raster.picture_file import PictureError, read_gray, read_rgb
@@ -25,7 +24,7 @@ def _photo(folder: Path, width: int, height: int) -> Frame:
 
 
 def _store(tmp_path: Path, *photos: Frame) -> GreyPictures:
-    store = GreyPictures.create(tmp_path / "pictures", photos)
+    store = GreyPictures.create(tmp_path / "pictures", photos, 100.0)
     assert store is not None
     return store
 
@@ -81,9 +80,5 @@ def test_a_damaged_picture_is_refused_as_without_a_store(tmp_path: Path, photo: 
 
 
 def test_more_pictures_than_the_disk_is_meant_for_are_not_stored(tmp_path: Path, photo: Frame) -> None:
-    try:
-        override({"raster": {"grey_pictures_mb": 0.1}})
-        assert GreyPictures.create(tmp_path / "pictures", [photo] * 2) is None
-        assert GreyPictures.create(tmp_path / "pictures", [photo]) is not None
-    finally:
-        override({})
+    assert GreyPictures.create(tmp_path / "pictures", [photo] * 2, 0.1) is None
+    assert GreyPictures.create(tmp_path / "pictures", [photo], 0.1) is not None

@@ -13,7 +13,7 @@ PATH = Path("photos/a.jpg")
 
 
 def test_a_part_comes_back_with_a_border_and_nothing_beyond_it(tmp_path):
-    parts = PictureParts.create(tmp_path / "parts", 1)
+    parts = PictureParts.create(tmp_path / "parts", 1, 2000.0)
     parts.keep(PATH, PICTURE, DRAWN)
     part = parts.get(PATH, replace(DRAWN, left=14))
     assert part.corner == (12, 2)  # a tenth of 80 pixels around it
@@ -24,7 +24,7 @@ def test_a_part_comes_back_with_a_border_and_nothing_beyond_it(tmp_path):
 
 
 def test_what_is_too_large_unfinished_or_of_another_file_is_not_there(tmp_path):
-    parts = PictureParts.create(tmp_path / "parts", 1)
+    parts = PictureParts.create(tmp_path / "parts", 1, 2000.0)
     assert parts.get(PATH, DRAWN) is None
     replace(parts, most_bytes=1000).keep(PATH, PICTURE, DRAWN)
     assert not any(parts.folder.iterdir())
@@ -36,5 +36,5 @@ def test_what_is_too_large_unfinished_or_of_another_file_is_not_there(tmp_path):
 
 
 def test_more_pictures_have_smaller_parts(tmp_path):
-    few, many = (PictureParts.create(tmp_path / str(n), n) for n in (1_000, 30_000))
+    few, many = (PictureParts.create(tmp_path / str(n), n, 2000.0) for n in (1_000, 30_000))
     assert few.most_bytes // many.most_bytes == 30

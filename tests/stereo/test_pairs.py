@@ -8,15 +8,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from orthoswarm.config import DEFAULT
 from orthoswarm.model.camera import Lens
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import Terrain
+from orthoswarm.stereo import rectified_pair
 from orthoswarm.stereo.picture_pairs import choose_pairs
 from orthoswarm.stereo.rectified_pair import PairPoints, PairView, match_pair
 from orthoswarm.stereo.surface_cells import cell_heights, merge_heights
 from tests.kit.mosaic_scene import EAST, NORTH, Flight, camera, hills, terrain_of
 
 FLAT = Terrain.flat()
+STEREO = DEFAULT.stereo
 LENS = Lens(240, 180, 135.0, k1=-0.08, k2=0.01, cx=2.0, cy=-1.5)
 
 
@@ -31,7 +34,7 @@ def test_heights_of_a_pair_are_true_for_all_headings_and_tilts(yaws, towards):
     flight = Flight()
     flight.take(camera(yaw_deg=yaws[0], pitch_deg=-86.0, roll_deg=3.0, lens=LENS), hills)
     flight.take(camera(*towards, height=103.0, yaw_deg=yaws[1], roll_deg=-4.0, lens=LENS), hills)
-    found = match_pair(view(flight, 0), view(flight, 1), terrain_of(lambda p: 0.0 * p[..., 0]))
+    found = match_pair(view(flight, 0), view(flight, 1), terrain_of(lambda p: 0.0 * p[..., 0]), STEREO)
     assert len(found.points) > 0.3 * 240 * 180
     error = found.points[:, 2] - hills(found.points[:, :2])
     assert abs(np.median(error)) < 0.5  # a pixel is 0.74 m, the waves of this ground are long
@@ -45,16 +48,16 @@ def slab(east_north):
     return np.where(p.max(-1) < 8.0, 20.0, 0.0)
 
 
-def test_of_a_wide_search_range_only_what_occurs_is_searched(monkeypatch, configure):
+def test_of_a_wide_search_range_only_what_occurs_is_searched(monkeypatch):
     large = Lens(960, 720, 540.0)
     flight = Flight().take(camera(lens=large), slab).take(camera(east=45.0, lens=large), slab)
     searched = []
     create = cv2.StereoSGBM.create
     monkeypatch.setattr(cv2.StereoSGBM, "create", lambda **how: searched.append(how["numDisparities"]) or create(**how))
-    found = match_pair(view(flight, 0), view(flight, 1), FLAT).points
+    found = match_pair(view(flight, 0), view(flight, 1), FLAT, STEREO).points
     half, narrow = searched
-    configure({"stereo": {"wide_px": 10_000}})
-    whole = match_pair(view(flight, 0), view(flight, 1), FLAT).points
+    monkeypatch.setattr(rectified_pair, "_WIDE_PX", 10_000)
+    whole = match_pair(view(flight, 0), view(flight, 1), FLAT, STEREO).points
     assert half < 0.6 * searched[-1] and narrow < 0.7 * searched[-1]
     assert len(found) > 0.98 * len(whole)
     top = np.abs(found[:, :2] - (EAST + 30.0, NORTH)).max(1) < 5.0
@@ -64,7 +67,7 @@ def test_of_a_wide_search_range_only_what_occurs_is_searched(monkeypatch, config
 
 def test_pictures_without_overlap_give_no_points():
     flight = Flight().take(camera(lens=LENS)).take(camera(east=900.0, lens=LENS))
-    assert len(match_pair(view(flight, 0), view(flight, 1), FLAT).points) == 0
+    assert len(match_pair(view(flight, 0), view(flight, 1), FLAT, STEREO).points) == 0
 
 
 def test_pairs_have_a_sufficient_base_and_similar_views():
@@ -75,7 +78,7 @@ def test_pairs_have_a_sufficient_base_and_similar_views():
     flight.take(camera(east=30.0, north=10.0), weak=True)
     damaged = replace(flight.frames[5], frame=replace(flight.frames[5].frame, damaged=True))
     flight.frames[5] = damaged
-    pairs = choose_pairs(flight.frames, FLAT)
+    pairs = choose_pairs(flight.frames, FLAT, STEREO.partners)
     assert pairs == sorted(set(pairs)) and all(i < j for i, j in pairs)
     used = {k for pair in pairs for k in pair}
     assert used == set(range(12)) - {5}
@@ -84,8 +87,8 @@ def test_pairs_have_a_sufficient_base_and_similar_views():
 
 
 def test_a_single_picture_or_none_makes_no_pair():
-    assert choose_pairs([], FLAT) == []
-    assert choose_pairs(Flight().take(camera()).frames, FLAT) == []
+    assert choose_pairs([], FLAT, STEREO.partners) == []
+    assert choose_pairs(Flight().take(camera()).frames, FLAT, STEREO.partners) == []
 
 
 def test_a_pair_gives_each_cell_the_median_of_its_points():

@@ -9,9 +9,8 @@ import pytest
 
 from gcs_plugin.cli.main import main
 from orthoswarm.batch.pipeline import is_written
-from orthoswarm.config import active
 from orthoswarm.model.errors import InputError
-from orthoswarm.stores import requests
+from orthoswarm.stores import local_copies, published_folder, requests
 from orthoswarm.stores.addresses import path_of
 from orthoswarm.stores.listing import list_folder
 from orthoswarm.stores.local_copies import cache_folder, clear_old_copies, content, local_file
@@ -45,7 +44,7 @@ def site(tmp_path_factory):
 
 
 @pytest.fixture
-def store(server, monkeypatch, tmp_path, configure):
+def store(server, monkeypatch, tmp_path):
     """A proxy before the server that this process uses, with an empty cache of its own; quick to give up."""
     kind, address = server
     proxy = FaultyProxy(address, kind)
@@ -56,7 +55,7 @@ def store(server, monkeypatch, tmp_path, configure):
     }.items():
         monkeypatch.setenv(name, value)
     requests._file_systems.clear()
-    configure({"stores": {"first_wait_s": 0.01}})
+    monkeypatch.setattr(requests, "_FIRST_WAIT_S", 0.01)
     yield proxy
     proxy.close()
     requests._file_systems.clear()
@@ -96,20 +95,12 @@ def test_the_same_map_as_from_folders(bucket, site, tmp_path):
     assert not list((cache_folder() / "maps").glob("*"))  # nothing stays on this machine but copies
 
 
-@pytest.fixture
-def hasty(tmp_path):
-    """A configuration for the command that repeats requests at once."""
-    path = tmp_path / "hasty.toml"
-    path.write_text("[stores]\nfirst_wait_s = 0.01\n")
-    return str(path)
-
-
-def test_photos_that_fail_are_left_out_and_the_others_mapped(bucket, store, site, tmp_path, hasty):
+def test_photos_that_fail_are_left_out_and_the_others_mapped(bucket, store, site, tmp_path):
     address = bucket(site)
     bad = {"DJI_0001.JPG": 404, "DJI_0003.JPG": 500, "DJI_0005.JPG": 403}
     store.fault = lambda method, path: next((s for n, s in bad.items() if n in path and method == "GET"), None)
     out = tmp_path / "out"
-    asked = ["--gsd", "0.5", "--workers", "1", "--config", hasty]
+    asked = ["--gsd", "0.5", "--workers", "1"]
     assert main(["mosaic", f"{address}/site/photos", "--out", str(out), *asked]) == 0
     rows = [json.loads(line) for line in (out / "frames.jsonl").read_text().splitlines()]
     reasons = {row["image"][-12:]: row["reason"] for row in rows if row["stage"] == "rejected"}
@@ -127,22 +118,23 @@ def test_a_request_that_fails_now_and_then_is_repeated(bucket, store, site):
     assert sum("DJI_0000" in p and m == "GET" for m, p in store.seen) >= 3
 
 
-def test_a_silent_store_is_given_up(bucket, store, site, configure):
+def test_a_silent_store_is_given_up(bucket, store, site, monkeypatch):
     address = bucket(site)
-    configure({"stores": {"first_wait_s": 0.01, "timeout_s": 1.0, "attempts": 2}})
+    monkeypatch.setattr(requests, "_TIMEOUT_S", 1.0)
+    monkeypatch.setattr(requests, "_ATTEMPTS", 2)
     requests._file_systems.clear()
     store.fault = lambda method, path: 20.0
     with pytest.raises(StoreRequestError, match="in 2 attempts"):
         content(path_of(f"{address}/site/photos/a/DJI_0000.JPG"))
 
 
-def test_a_store_that_is_gone_ends_the_run_in_one_sentence(store, monkeypatch, capsys, tmp_path, hasty):
+def test_a_store_that_is_gone_ends_the_run_in_one_sentence(store, monkeypatch, capsys, tmp_path):
     monkeypatch.setenv(store.kind.endpoint, f"http://127.0.0.1:{free_port()}")
     requests._file_systems.clear()
     flood = f"{store.kind.scheme}://flood"
     with pytest.raises(StoreLostError, match="cannot be reached"):
         content(path_of(f"{flood}/a.jpg"))
-    assert main(["mosaic", f"{flood}/photos", "--out", str(tmp_path / "out"), "--config", hasty]) == 1
+    assert main(["mosaic", f"{flood}/photos", "--out", str(tmp_path / "out")]) == 1
     assert len(capsys.readouterr().err.strip().splitlines()) == 1
 
 
@@ -200,8 +192,8 @@ def test_products_of_an_earlier_run_are_removed_and_other_files_stay(bucket, tmp
     assert left == sorted(["realtime.tif", "report.json", tiles[0], *others])
 
 
-def test_a_large_file_goes_up_in_parts(bucket, store, tmp_path, configure):
-    configure({"stores": {"part_mb": 5}})
+def test_a_large_file_goes_up_in_parts(bucket, store, tmp_path, monkeypatch):
+    monkeypatch.setattr(published_folder, "_PART_BYTES", 5 << 20)
     address = path_of(bucket()) / "map"
     out = PublishedFolder(address)
     out.local.mkdir(parents=True)
@@ -214,7 +206,7 @@ def test_a_large_file_goes_up_in_parts(bucket, store, tmp_path, configure):
     assert content(address / "a.tif") == data
 
 
-def test_tags_of_a_large_photo_are_read_from_its_ends(bucket, store, site, tmp_path, configure):
+def test_tags_of_a_large_photo_are_read_from_its_ends(bucket, store, site, tmp_path):
     from telemetry import load
 
     folder = tmp_path / "large"
@@ -247,24 +239,32 @@ def test_tables_and_logs_in_a_store_are_used(bucket, tmp_path):
     ) == 3
 
 
-def test_the_cache_stays_within_its_size(bucket, site, configure):
+def test_the_cache_stays_within_its_size(bucket, site, monkeypatch):
     address = bucket(site)
     paths = [p for p in list_folder(path_of(address)) if p.suffix == ".JPG"]
     size = sum(len(content(p)) for p in paths)
-    configure({"stores": {"cache_mb": size / 2 / 1e6, "held_s": 0.0}})
+    monkeypatch.setenv("ORTHOSWARM_CACHE_MB", str(size / 2 / 1e6))
+    monkeypatch.setattr(local_copies, "_HELD_S", 0.0)
     clear_old_copies()
     left = list((cache_folder() / "copies").glob("*/*.JPG"))
     assert 0 < sum(p.stat().st_size for p in left) <= size / 2
     assert [len(content(p)) for p in paths]  # those that went are fetched again
 
 
-def test_a_file_that_changed_in_its_store_is_fetched_again(bucket, configure):
+def test_a_size_of_the_cache_that_is_none_is_refused_before_the_run(tmp_path, monkeypatch, capsys):
+    for said in ("much", "-1", "nan"):
+        monkeypatch.setenv("ORTHOSWARM_CACHE_MB", said)
+        assert main(["mosaic", "s3://flood/photos", "--out", str(tmp_path / "out")]) == 2
+        assert f"ORTHOSWARM_CACHE_MB is {said}, which is no size; give megabytes" in capsys.readouterr().err
+
+
+def test_a_file_that_changed_in_its_store_is_fetched_again(bucket, monkeypatch):
     path = path_of(bucket()) / "a.txt"
     system = requests.file_system(path)
     system.pipe_file("/".join(path.parts[2:]), b"one")
     assert content(path) == b"one"
     system.pipe_file("/".join(path.parts[2:]), b"two")
-    configure({"stores": {"cache_trust_s": 0.0}})
+    monkeypatch.setattr(local_copies, "_TRUST_S", 0.0)
     assert content(path) == b"two" and content(path) == b"two"
     system.rm_file("/".join(path.parts[2:]))
     with pytest.raises(NotStoredError):
@@ -331,4 +331,3 @@ def test_missing_packages_are_named(monkeypatch, capsys, tmp_path):
     monkeypatch.setitem(sys.modules, "fsspec", None)
     with pytest.raises(InputError, match="pip install"):
         content(path_of("gs://flood/a.jpg"))
-    assert active().stores.attempts == 5

@@ -10,7 +10,7 @@ import pytest
 from gcs_plugin.cli.main import main
 from orthoswarm.batch.refiners import REFINERS
 from orthoswarm.model.errors import RunInterruptedError
-from orthoswarm.stores import local_copies, requests
+from orthoswarm.stores import local_copies, ranges, requests
 from orthoswarm.stores.addresses import path_of
 from orthoswarm.stores.listing import list_folder, look_up
 from orthoswarm.stores.local_copies import CacheFullError, cache_folder, content
@@ -31,14 +31,14 @@ def server():
 
 
 @pytest.fixture
-def store(server, monkeypatch, tmp_path, configure):
+def store(server, monkeypatch, tmp_path):
     """A proxy before the server, with an empty cache."""
     proxy = FaultyProxy(server, S3)
     cache = {S3.endpoint: proxy.address, "ORTHOSWARM_CACHE": str(tmp_path / "cache")}
     for name, value in {**S3.environment, **cache}.items():
         monkeypatch.setenv(name, value)
     requests._file_systems.clear()
-    configure({"stores": {"first_wait_s": 0.01}})
+    monkeypatch.setattr(requests, "_FIRST_WAIT_S", 0.01)
     yield proxy
     proxy.close()
     requests._file_systems.clear()
@@ -56,10 +56,9 @@ def photos(store, tmp_path):
 
 
 @pytest.fixture
-def hasty(tmp_path):
-    path = tmp_path / "hasty.toml"
-    path.write_text("[stores]\nfirst_wait_s = 0.01\nbusy_s = 0.5\n")
-    return ["--config", str(path)]
+def hasty(monkeypatch):
+    """Gives up soon on a store that is busy."""
+    monkeypatch.setattr(requests, "_BUSY_S", 0.5)
 
 
 def after(requests_count, fault):
@@ -83,7 +82,7 @@ def after(requests_count, fault):
     ],
 )
 def test_what_concerns_all_photos_ends_the_run_which_goes_on(store, photos, tmp_path, capsys, hasty, fault, code, said):
-    command = ["mosaic", photos, "--out", str(tmp_path / "out"), *QUICK, *hasty]
+    command = ["mosaic", photos, "--out", str(tmp_path / "out"), *QUICK]
     store.fault = after(5, fault)
     assert main(command) == code
     assert said in capsys.readouterr().err
@@ -92,11 +91,11 @@ def test_what_concerns_all_photos_ends_the_run_which_goes_on(store, photos, tmp_
     assert json.loads((tmp_path / "out" / "report.json").read_text())["frames"]["used"] == 10
 
 
-def test_a_store_that_has_too_much_to_do_for_a_moment_is_waited_for(store, photos, configure):
+def test_a_store_that_has_too_much_to_do_for_a_moment_is_waited_for(store, photos, monkeypatch):
     failures = iter([503, 429] * 6)
     store.fault = lambda method, path: next(failures, None) if method == "GET" else None
     assert content(path_of(f"{photos}/a/DJI_0000.JPG"))
-    configure({"stores": {"first_wait_s": 0.01, "busy_s": 0.1}})
+    monkeypatch.setattr(requests, "_BUSY_S", 0.1)
     store.fault = lambda method, path: 503
     with pytest.raises(StoreLostError, match="too much to do"):
         content(path_of(f"{photos}/a/DJI_0001.JPG"))
@@ -111,16 +110,17 @@ def test_a_cache_without_room_ends_the_run(store, photos, tmp_path, monkeypatch)
     assert isinstance(caught.value, RunInterruptedError)
 
 
-@pytest.mark.parametrize("whole_kb", [0, 512])
-def test_photos_and_a_map_that_were_replaced_are_not_taken_from_the_cache(store, photos, tmp_path, whole_kb):
-    (tmp_path / "large.toml").write_text(f"[stores]\nwhole_kb = {whole_kb}\n")
-    options = [*QUICK, "--config", str(tmp_path / "large.toml")]
+@pytest.mark.parametrize("whole_bytes", [0, 512 * 1024])
+def test_photos_and_a_map_that_were_replaced_are_not_taken_from_the_cache(
+    store, photos, tmp_path, monkeypatch, whole_bytes
+):
+    monkeypatch.setattr(ranges, "_WHOLE_BYTES", whole_bytes)
     system = requests.file_system(path_of(photos))
-    assert main(["mosaic", photos, "--out", str(tmp_path / "first"), *options]) == 0
+    assert main(["mosaic", photos, "--out", str(tmp_path / "first"), *QUICK]) == 0
     Scene(seed=5).fly(tmp_path / "photos" / "a", legs(count=2, photos=5))
     system.put(f"{tmp_path / 'photos'}/", photos.removeprefix("s3://"), recursive=True)
-    assert main(["mosaic", photos, "--out", str(tmp_path / "second"), *options]) == 0
-    assert main(["mosaic", str(tmp_path / "photos"), "--out", str(tmp_path / "local"), *options]) == 0
+    assert main(["mosaic", photos, "--out", str(tmp_path / "second"), *QUICK]) == 0
+    assert main(["mosaic", str(tmp_path / "photos"), "--out", str(tmp_path / "local"), *QUICK]) == 0
     first, second, local = ((tmp_path / out / "coarse.tif").read_bytes() for out in ("first", "second", "local"))
     assert first != second and second == local
 
@@ -140,7 +140,7 @@ def test_another_process_compares_a_copy_that_a_listing_contradicts(store, photo
 
 def test_an_upload_that_fails_is_repeated_without_the_work_and_holds_the_folder(store, photos, tmp_path, capsys, hasty):
     out = f"{photos.rpartition('/')[0]}/my map"
-    command = ["mosaic", photos, "--out", out, "--tiles", "yes", *QUICK, *hasty]
+    command = ["mosaic", photos, "--out", out, "--tiles", "yes", *QUICK]
     others = []
 
     def fault(method, path):

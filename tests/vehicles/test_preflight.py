@@ -19,6 +19,7 @@ from gcs_plugin.sim.lossy_radio import Faults
 from gcs_plugin.sim.multirotor import Chart
 from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
+from orthoswarm.config import config_of
 from orthoswarm.model.earth import distance_m
 from tests.kit.missions import sortie_mission
 from tests.kit.servers.ports import free_port
@@ -185,6 +186,14 @@ def test_the_next_start_keeps_every_pair_apart():
     for off in (-3.0, 0.0, 3.0):
         assert airspace.conflicts({1: 0.0, 2: start + off, 3: 0.0}) == [] or off != 0.0
     assert airspace.next_start(3, 0.0, {1: 0.0, 2: 0.0}) == 0.0
+
+
+def test_a_plan_is_flown_by_the_times_that_it_was_made_with():
+    missions = {1: line(AP, 40, 60), 2: line(AP, 40, 60, home_east=80.0)}
+    config = config_of({"ardupilot": {"takeoff_s": 22.6, "schedule_slack_s": 2.0}})
+    usual, own = Airspace.of(missions), Airspace.of(missions, needs=PlanNeeds(config=config))
+    assert (usual.slack_s, own.slack_s) == (10.0, 2.0)
+    assert len(own.tracks[1].places) == len(usual.tracks[1].places) + 40  # each of half a second
 
 
 def test_one_that_is_late_moves_those_that_wait():

@@ -22,8 +22,8 @@ from gcs_plugin.mission.track import STEP_S, track_of
 from gcs_plugin.sim.memory_link import VirtualClock, World
 from gcs_plugin.sim.multirotor import Airframe
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
+from orthoswarm.config import DEFAULT
 from orthoswarm.model.earth import distance_m
-from orthoswarm.planning.sorties.flight_time import autopilot_config
 
 FLIGHTS = Path(__file__).parents[1] / "data" / "flights"
 
@@ -250,7 +250,7 @@ def test_plans_and_simulated_vehicles_are_where_a_real_one_was_around_its_start(
     begins = int(np.argmax(track[:, 2] > 0.3))
     planned = [rows[a:b] - [rows[a, 0], 0.0, 0.0] for a, b in ((begins, left), (back, len(rows)))]
 
-    frame = Airframe().as_flown(autopilot_config(autopilot.value))
+    frame = Airframe().as_flown(DEFAULT.times(autopilot.value))
     with World([SimVehicle(system=1, autopilot=autopilot, home=(*places[0], 500.0), airframe=frame)]) as world:
         world.meet()
         assert world.finish(world.fleet.upload(1, mission))[0].ok

@@ -25,7 +25,7 @@ from gcs_plugin.sim.lossy_radio import Channel, Faults
 from gcs_plugin.sim.memory_link import World
 from gcs_plugin.sim.multirotor import Airframe, Chart
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
-from orthoswarm.planning.sorties.flight_time import autopilot_config
+from orthoswarm.config import DEFAULT
 
 AP, PX4 = Autopilot.ARDUPILOT, Autopilot.PX4
 BOTH = pytest.mark.parametrize("autopilot", [AP, PX4])
@@ -402,7 +402,7 @@ def test_a_vehicle_as_flown_is_where_its_plan_has_it_around_its_start(autopilot)
     items += [at(TAKEOFF, 0, 0, 40.0, autopilot), MissionItem.do(CHANGE_SPEED, 1, 10)]
     items += [at(WAYPOINT, *corner, 40.0, autopilot) for corner in ((0, 150), (40, 150), (40, 0), (0, 0))]
     mission = Mission(autopilot, (*items, MissionItem.do(RTL)))
-    sim = SimVehicle(system=1, autopilot=autopilot, airframe=Airframe().as_flown(autopilot_config(autopilot.value)))
+    sim = SimVehicle(system=1, autopilot=autopilot, airframe=Airframe().as_flown(DEFAULT.times(autopilot.value)))
     world = make_world([sim])
     world.meet()
     assert world.finish(world.fleet.upload(1, mission))[0].ok
@@ -449,7 +449,7 @@ def test_a_vehicle_as_flown_takes_the_times_of_its_autopilot(autopilot, end):
         assert world.until(lambda: not sim.flight.armed, 600.0)
         return world.clock.now - begun
 
-    times = autopilot_config(autopilot.value)
+    times = DEFAULT.times(autopilot.value)
     planned = flight_seconds(mission)
     assert flown_s(Airframe().as_flown(times)) == pytest.approx(planned, abs=0.5 * times.schedule_slack_s)
     assert flown_s(Airframe()) < planned - times.schedule_slack_s

@@ -51,7 +51,7 @@ class LegPlacement:
 
     Attributes:
         journal, store, kept, publisher: of the workspace. workers: compute the job; used by nothing else meanwhile.
-        basemap: the map, or None.
+        basemap: the map, or None. device: where networks run.
     """
 
     journal: Journal
@@ -60,6 +60,7 @@ class LegPlacement:
     publisher: Publisher
     workers: WorkerPool
     basemap: Path | None
+    device: str = "auto"
     _preemption: Preemption = field(init=False)
 
     def __post_init__(self) -> None:
@@ -117,6 +118,7 @@ class LegPlacement:
             target=target,
             before=None if before is None else self.publisher.solutions / before.path,
             kept=kept,
+            device=self.device,
         )
         solved = self.workers.run(place, task)
         job.detail |= {"frames": len(frames), "solve_cpu_s": round(solved.cpu_s, 3), "legs": len(solved.legs)}

@@ -14,6 +14,7 @@ from orthoswarm.export.json_values import finite
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.frame import Frame
+from telemetry.samples.held_fixes import measured_frames
 
 
 def frames_of(journal: Journal, store: PictureStore, job: Job) -> tuple[list[Frame], dict[str, Bytes]]:
@@ -26,7 +27,7 @@ def frames_of(journal: Journal, store: PictureStore, job: Job) -> tuple[list[Fra
     if not rows:
         raise OrthoSwarmError(f"{job.vehicle} has no pictures that could be drawn; check its camera and its poses")
     small = {row.image: thumbnail_of(row.thumbnail) for row in rows if row.thumbnail is not None}
-    return [frame_of_row(row, store) for row in rows], small
+    return measured_frames([frame_of_row(row, store) for row in rows]), small
 
 
 def detail_of(solved: SortieResult, legs: Iterable[LegRow]) -> SortieDetail:

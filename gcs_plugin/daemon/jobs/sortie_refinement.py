@@ -47,7 +47,7 @@ class SortieRefinement:
     Attributes:
         journal, store, kept, publisher: of the workspace. workers: compute the job. drawer: of the real-time layer.
         basemap: the map, or None. events: told before the work starts, and before a layer is needed.
-        stopping: set once the daemon stops.
+        device: where networks run. stopping: set once the daemon stops.
     """
 
     journal: Journal
@@ -58,6 +58,7 @@ class SortieRefinement:
     drawer: Drawer
     basemap: Path | None
     events: Events
+    device: str = "auto"
     stopping: threading.Event = field(default_factory=threading.Event)
 
     def stop(self, _: JobsStop) -> None:
@@ -109,7 +110,7 @@ class SortieRefinement:
             area = self.publisher.area()
             frames, _ = frames_of(self.journal, self.store, job)
             kept = self.kept.of(job.whose, frames)
-            task = FollowTask(frames=frames, epsg=area.epsg, origin=area.origin, kept=kept)
+            task = FollowTask(frames=frames, epsg=area.epsg, origin=area.origin, kept=kept, device=self.device)
             used = None if task.kept is None else self.workers.run_if_free(follow, task)
         except OrthoSwarmError as error:  # the solution will fail, or not, for its own reason
             _log.debug("the tracks of %s: %s", job.vehicle, error)
@@ -145,6 +146,7 @@ class SortieRefinement:
             target=target,
             before=None if before is None else self.publisher.solutions / before.path,
             kept=self.kept.of(job.whose, frames),
+            device=self.device,
         )
         return before, len(frames), self.workers.run(solve if before is None else register_late, task)
 

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from orthoswarm.compute.workers import Usage, prepare_worker, spawn_context
-from orthoswarm.config import Overrides, overridden, override
 from orthoswarm.model.errors import OrthoSwarmError, WorkerStoppedError
 
 Result = TypeVar("Result")
@@ -63,7 +62,7 @@ class WorkerPool:
             if self._pool is None:
                 context = spawn_context()
                 self._pool = ProcessPoolExecutor(
-                    self.count, mp_context=context, initializer=_prepare, initargs=(self._nice, overridden())
+                    self.count, mp_context=context, initializer=_prepare, initargs=(self._nice,)
                 )
             try:
                 return self._pool.submit(function, item)
@@ -157,9 +156,8 @@ def _end(pool: ProcessPoolExecutor) -> list[Any]:
     return processes
 
 
-def _prepare(nice: int, overrides: Overrides) -> None:
-    """Prepare a worker of low priority, with the daemon's configuration."""
-    override(overrides)
+def _prepare(nice: int) -> None:
+    """Prepare a worker of low priority."""
     if hasattr(os, "nice"):
         os.nice(nice)
     prepare_worker()

@@ -47,12 +47,14 @@ class FollowTask:
     Attributes:
         frames: of one sortie, in order of time. epsg, origin: the area's grid.
         kept: folder with what is kept of its pictures until it is refined, None if nothing is.
+        device: where networks run.
     """
 
     frames: list[Frame]
     epsg: int
     origin: tuple[float, float]
     kept: Path | None = None
+    device: str = "auto"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -153,9 +155,10 @@ def _options(task: FollowTask) -> "RefinerOptions":
     from orthoswarm.refine.flight.kept_tracks import KeptTracks
     from orthoswarm.refine.strategy.swarm_refiner import RefinerOptions
 
+    options = RefinerOptions(device=task.device)
     if task.kept is None:
-        return RefinerOptions()
-    return RefinerOptions(read=GreyPictures(task.kept, from_colors=False).gray, kept=KeptTracks(task.kept))
+        return options
+    return replace(options, read=GreyPictures(task.kept, from_colors=False).gray, kept=KeptTracks(task.kept))
 
 
 def register_late(task: SolveTask) -> SortieResult:

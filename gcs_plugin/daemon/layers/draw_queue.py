@@ -11,9 +11,8 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Final
 
-from orthoswarm.config import active
 from orthoswarm.model.earth import DEGREE_M
-from orthoswarm.model.frame import Frame
+from orthoswarm.model.frame import DEFAULT_HEIGHT_M, Frame
 
 LEVELS: Final = 8  # of spacing, the coarsest first
 _STEP_SHARE: Final = 0.06  # of the height above ground: distance of pictures on the finest level
@@ -108,7 +107,7 @@ class DrawQueue:
     def _cell(self, frame: Frame) -> tuple[int, int]:
         fix = frame.fix
         if self._step_m == 0.0:  # the first frame sets the scale
-            self._step_m = max(0.5, _STEP_SHARE * (fix.height_m or active().records.default_height_m))
+            self._step_m = max(0.5, _STEP_SHARE * (fix.height_m or DEFAULT_HEIGHT_M))
             self._east_m = DEGREE_M * max(0.05, math.cos(math.radians(fix.lat_deg)))
         return (
             int(fix.lat_deg * DEGREE_M / self._step_m // 1),

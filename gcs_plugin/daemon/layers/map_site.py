@@ -19,7 +19,6 @@ from gcs_plugin.daemon.store.frame_rows import frames_undrawn, poses_after
 from gcs_plugin.daemon.store.journal import Journal, all_changes, area_forgotten, fact_change, no_change
 from gcs_plugin.daemon.store.sortie_rows import solution_paths
 from orthoswarm.canvas.canvas import Canvas
-from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import Camera
 from orthoswarm.model.earth import DEGREE_M, distance_m
@@ -46,7 +45,7 @@ class MapSite:
 
     def __init__(
         self, journal: Journal, layer: MapLayer, folder: Path, *, gsd_m: float | None, fov_rad: float | None,
-        expected: ExpectedPlace, events: Events,
+        expected: ExpectedPlace, events: Events, memory_mb: float,
     ) -> None:  # fmt: skip
         """Continue where the last daemon stopped.
 
@@ -54,9 +53,10 @@ class MapSite:
             layer: the real-time layer. folder: of all layers' canvases.
             gsd_m: ground pixel; from the first pictures if None. fov_rad: theta-hat, see recorded_cameras.
             expected: where the map is to lie. events: told when the area changes, and when all is drawn again.
+            memory_mb: what the canvas keeps of its tiles.
         """
         self._journal, self._layer, self._folder, self._events = journal, layer, folder, events
-        self._gsd_m, self._fov_rad, self._expected = gsd_m, fov_rad, expected
+        self._gsd_m, self._fov_rad, self._expected, self._memory_mb = gsd_m, fov_rad, expected, memory_mb
         self._positions: list[tuple[float, float]] = []  # of the journal's frames up to the number `_counted`
         self._counted = 0
         self.area: MapArea | None = None
@@ -181,16 +181,14 @@ class MapSite:
             return str(error)
         old = self._layer.canvas
         name = new_name("realtime")
-        memory_mb = active().compute.live_canvas_mb
-        path = self._folder / name
+        path, memory_mb = self._folder / name, self._memory_mb
         self._adopt(area, successor(old, path, area.grid, "orthogonality", share=True, memory_mb=memory_mb))
         return None
 
     # -- the layer ------------------------------------------------------------------------------------------------
 
     def _begin(self, area: MapArea, *, again: bool = False) -> None:
-        memory_mb = active().compute.live_canvas_mb
-        canvas = Canvas.create(self._folder / new_name("realtime"), area.grid, memory_mb=memory_mb)
+        canvas = Canvas.create(self._folder / new_name("realtime"), area.grid, memory_mb=self._memory_mb)
         self._adopt(area, canvas, again=again)
 
     def _adopt(self, area: MapArea, canvas: Canvas, *, again: bool = False) -> None:
@@ -209,7 +207,7 @@ class MapSite:
         """The canvas that the last daemon drew on; drawn anew from the journal if it is damaged."""
         assert self.area is not None
         try:
-            canvas = Canvas.open(self._folder / str(name), memory_mb=active().compute.live_canvas_mb)
+            canvas = Canvas.open(self._folder / str(name), memory_mb=self._memory_mb)
         except (OrthoSwarmError, OSError):
             _log.warning("the real-time layer is damaged and is drawn again")
             self._begin(self.area, again=True)

@@ -80,6 +80,7 @@ class Drawer:
         gsd_m: float | None = None,
         fov_rad: float | None = None,
         expected: ExpectedPlace,
+        canvas_mb: float,
         in_memory: int = _IN_MEMORY,
         late_s: float = _LATE_S,
         look_s: float = _LOOK_S,
@@ -89,7 +90,7 @@ class Drawer:
 
         Args:
             layer: to draw on. folder: of all layers' canvases. expected: where the map should lie.
-            gsd_m: ground pixel; from the first pictures if None.
+            gsd_m: ground pixel; from the first pictures if None. canvas_mb: memory that the layer keeps of its tiles.
             fov_rad: theta-hat, the field of view to assume; see recorded_cameras.
             in_memory: most frames that wait in memory; the journal has the others.
             late_s: a frame drawn later than this after its arrival is late, seconds.
@@ -110,7 +111,16 @@ class Drawer:
         self.drawn = self.late = self.put_off = 0
         self.latencies: list[float] = []
         self.problem = ""
-        self._site = MapSite(journal, layer, folder, gsd_m=gsd_m, fov_rad=fov_rad, expected=expected, events=events)
+        self._site = MapSite(
+            journal,
+            layer,
+            folder,
+            gsd_m=gsd_m,
+            fov_rad=fov_rad,
+            expected=expected,
+            events=events,
+            memory_mb=canvas_mb,
+        )
 
     # -- from outside ---------------------------------------------------------------------------------------------
 

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Final
 
 from gcs_plugin.daemon.store.frame_rows import Whose
-from orthoswarm.config import active
 from orthoswarm.model.frame import Frame
 from orthoswarm.raster.grey_pictures import stored_bytes
 
@@ -19,15 +18,15 @@ _FREE_MB: Final = 1000.0
 
 
 class KeptPictures:
-    """A folder for each sortie that is not refined yet; all together at most `grey_pictures_mb` megabytes.
+    """A folder for each sortie that is not refined yet; all together at most `most_mb` megabytes.
 
     Args:
-        folder: emptied, as another version of the program may have written what is in there.
+        folder: emptied, as another version of the program may have written what is in there. most_mb: of all sorties.
         free_mb: nothing is kept where less is free on the disk, megabytes: new pictures need it more.
     """
 
-    def __init__(self, folder: Path, free_mb: float = _FREE_MB) -> None:
-        self._folder, self._free_mb, self._lock = folder, free_mb, threading.Lock()
+    def __init__(self, folder: Path, most_mb: float, free_mb: float = _FREE_MB) -> None:
+        self._folder, self._most_mb, self._free_mb, self._lock = folder, most_mb, free_mb, threading.Lock()
         self._bytes: dict[Whose, int] = {}
         self._names: dict[Whose, str] = {}
         self._made = 0
@@ -51,7 +50,7 @@ class KeptPictures:
     def _reserved(self, key: Whose, size: int) -> Path | None:
         with self._lock:
             self._bytes[key] = max(size, self._bytes.get(key, 0))
-            if sum(self._bytes.values()) > active().raster.grey_pictures_mb * 1e6:
+            if sum(self._bytes.values()) > self._most_mb * 1e6:
                 return None
             if key not in self._names:
                 self._made += 1

@@ -22,8 +22,9 @@ from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.flight_modes import why_no_missions
 from gcs_plugin.mission.track import STEP_S, Array, Track, metres, near_samples
-from orthoswarm.config import active
+from orthoswarm.config import DEFAULT
 from orthoswarm.model.earth import distance_m
+from orthoswarm.model.plan import APART, ON_GROUND_M
 
 _GOES_HOME: Final = frozenset({Word.RETURNING, Word.LANDING})
 
@@ -219,7 +220,7 @@ def _goes_home(vehicle: Vehicle) -> bool:
 
 def way_home(vehicle: Vehicle, origin: tuple[float, float]) -> Track | None:
     """Where a vehicle in the air is from now on if it returns; None where its home or place is not known."""
-    from orthoswarm.planning.sorties.flight_time import Motion, autopilot_config
+    from orthoswarm.planning.sorties.flight_time import Motion
 
     home, place = vehicle.home or vehicle.launch, vehicle.place
     if home is None or place is None:
@@ -229,12 +230,10 @@ def way_home(vehicle: Vehicle, origin: tuple[float, float]) -> Track | None:
     lands = flight_state(vehicle).word is Word.LANDING and _goes_home(vehicle)
     if lands:  # where it is, or above its home already
         there, least_m = here, vehicle.height_m
-    top = max(vehicle.height_m, least_m, active().planning.on_ground_m)
+    top = max(vehicle.height_m, least_m, ON_GROUND_M)
     points = np.array([(*here, vehicle.height_m), (*here, top), (*there, top), (*there, 0.0)])
     kept = np.linalg.norm(np.diff(points, axis=0, prepend=points[:1] - 1.0), axis=1) > 0.0
-    motion = Motion(
-        speed_m_s=_return_speed_m_s(vehicle), autopilot=autopilot_config(vehicle.autopilot.value), lands=lands
-    )
+    motion = Motion(speed_m_s=_return_speed_m_s(vehicle), autopilot=DEFAULT.times(vehicle.autopilot.value), lands=lands)
     return Track(motion.places(points[kept], None, STEP_S), motion.autopilot, vehicle.home_alt_m)
 
 
@@ -278,8 +277,7 @@ def apart(one: Track, other: Track, *, heights: bool = True) -> bool:
     A track of one place is a vehicle that holds there; any other track ends on the ground. heights: whether both are
     known; if not, only the horizontal distance counts.
     """
-    planned = active().planning
-    i, j = near_samples(one, other, planned.separation_m, planned.layer_m if heights else None)
+    i, j = near_samples(one, other, APART.distance_m, APART.height_m if heights else None)
     if min(len(one.places), len(other.places)) == 1:
         return not len(i)
     slack_s = max(one.autopilot.landing_slack_s, other.autopilot.landing_slack_s)

@@ -13,8 +13,8 @@ from gcs_plugin.fleet.flight_state import Word, flight_state
 from gcs_plugin.fleet.separation.separation_watch import number_name
 from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.mission.items import Mission
+from gcs_plugin.mission.plan_folder import NO_NEEDS, PlanNeeds
 from gcs_plugin.mission.track import STEP_S, Airspace, home_of, metres, track_of
-from orthoswarm.model.plan import Apart
 
 _PLANNED_SHARE: Final = 0.95
 """Share of the distance that counts between missions of one plan, which was made with other samples."""
@@ -73,15 +73,15 @@ def others_of(vehicles: Mapping[int, Vehicle], waiting: Mapping[int, float]) -> 
 
 
 def separation_of(
-    flights: Mapping[int, TimedFlight], name: Callable[[int], str] = number_name, apart: Apart | None = None
+    flights: Mapping[int, TimedFlight], name: Callable[[int], str] = number_name, needs: PlanNeeds = NO_NEEDS
 ) -> SeparationFindings:
     """Which vehicles come too near each other; takes a second or more for a large swarm.
 
-    `apart`: how far apart the plan keeps its own vehicles, None for the default, which holds for all others.
+    `needs`: of the plan, by which it keeps its own vehicles apart; what is usual holds for all others.
     """
     known = {s: flight for s, flight in flights.items() if flight.mission is not None}
     found: dict[int, list[str]] = {}
-    for one, other, at, apart_m in _conflicts(tuple(sorted(known.items())), apart):
+    for one, other, at, apart_m in _conflicts(tuple(sorted(known.items())), needs):
         for mine, theirs in ((one, other), (other, one)):
             if flights[mine].examined:
                 found.setdefault(mine, []).append(f"{apart_m:.0f} m from {name(theirs)} after {max(0.0, at):.0f} s")
@@ -100,7 +100,7 @@ def separation_of(
 
 @lru_cache(maxsize=8)
 def _conflicts(
-    flights: tuple[tuple[int, TimedFlight], ...], apart: Apart | None
+    flights: tuple[tuple[int, TimedFlight], ...], needs: PlanNeeds
 ) -> tuple[tuple[int, int, float, float], ...]:
     """Both vehicles, the time and the distance; the same flights are asked about again and again before a start."""
     about = dict(flights)
@@ -110,7 +110,7 @@ def _conflicts(
     in_plan = {s for s, flight in flights if flight.planned}
     found = Airspace.of(missions, levels).conflicts(starts, but_among=in_plan)
     # By what the plan's own autopilots are off schedule and as far apart as it was made for.
-    plan = Airspace.of({s: mission for s, mission in missions.items() if s in in_plan}, levels, apart)
+    plan = Airspace.of({s: mission for s, mission in missions.items() if s in in_plan}, levels, needs)
     plan = replace(plan, distance_m=_PLANNED_SHARE * plan.distance_m, slack_s=plan.slack_s - STEP_S, _found={})
     found += plan.conflicts({s: start for s, start in starts.items() if s in in_plan})
     return tuple(row for row in found if about[row[0]].examined or about[row[1]].examined)

@@ -7,8 +7,8 @@ from typing import Final
 
 from gcs_plugin.config import ALARM, HEARING, LIMITS
 from gcs_plugin.fleet.vehicle_state import Vehicle
-from orthoswarm.config import active
 from orthoswarm.model.earth import DEGREE_M, distance_m
+from orthoswarm.model.plan import APART, PAD_DISTANCES
 
 _LOOK_S: Final = 0.5
 """Step in which the next seconds are looked at."""
@@ -53,8 +53,8 @@ class SeparationWatch:
         alarms: pairs that are too near now or soon, by their system ids in order.
     """
 
-    distance_m: float = field(default_factory=lambda: active().planning.separation_m)
-    height_m: float = field(default_factory=lambda: active().planning.layer_m)
+    distance_m: float = APART.distance_m
+    height_m: float = APART.height_m
     alarms: dict[tuple[int, int], Near] = field(default_factory=dict)
 
     def look(self, vehicles: Iterable[Vehicle], now: float) -> tuple[list[Near], list[tuple[int, int]]]:
@@ -121,7 +121,7 @@ class SeparationWatch:
 
     def _at_start(self, one: Vehicle, other: Vehicle, ahead_s: float) -> bool:
         """Both are above a start that they share, so many seconds ahead."""
-        reach = active().planning.pad_distances * self.distance_m
+        reach = PAD_DISTANCES * self.distance_m
         if one.launch is None or other.launch is None or distance_m(*one.launch, *other.launch) > reach:
             return False
         return all(distance_m(*_place(v, ahead_s), *(v.launch or (0.0, 0.0))) < reach for v in (one, other))

@@ -10,17 +10,20 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Final, Literal
 from xml.sax.saxutils import escape
 
 from pyproj import CRS
 
-from orthoswarm.config import active
 from orthoswarm.export.atomic_file import atomic_write, write_file
 from orthoswarm.export.cog import PixelSource, write_cog
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.geo import GroundGrid
 
+_ONE_FILE_PX: Final = 4e9
+"""A map of more pixels is written in tiles where the user does not say how: 40 square kilometres at 0.1 m; as one file
+it has some 10 GB, which web servers, object storage and copying by radio handle badly."""
+_TILE_PX: Final = 8192  # side of a tile, a multiple of 512: some 100 MB a file
 FOLDER = "tiles"
 """Folder of all tiles and of the collection, within the map's."""
 COLLECTION = "collection.json"
@@ -46,7 +49,7 @@ def is_tile_or_collection(name: str) -> bool:
 def in_tiles(wanted: Tiles, window: tuple[int, int, int, int]) -> bool:
     """Whether rows and columns (row0, row1, col0, col1) of a raster are to be written in tiles."""
     row0, row1, col0, col1 = window
-    return wanted == "yes" or (wanted == "auto" and (row1 - row0) * (col1 - col0) > active().raster.one_file_px)
+    return wanted == "yes" or (wanted == "auto" and (row1 - row0) * (col1 - col0) > _ONE_FILE_PX)
 
 
 def product_file(folder: Path, name: str) -> Path | None:
@@ -100,7 +103,7 @@ def write_tiled(
     Raises:
         OrthoSwarmError: if the disk is full or the folder cannot be written.
     """
-    side, grid = active().raster.tile_px, source.grid
+    side, grid = _TILE_PX, source.grid
     row0, row1, col0, col1 = window
     filled = {
         (r, c)
@@ -163,7 +166,7 @@ def _touched(
 
 def _placed_tiles(folder: Path, name: str, raster: GroundGrid) -> Iterator[RasterTile]:
     """The tiles in a raster's folder, placed on its grid."""
-    side = active().raster.tile_px
+    side = _TILE_PX
     for path in sorted(_tiles(folder, name).glob("*.tif")):
         if found := _NAME.fullmatch(path.name):
             row, column = int(found[1]) * side, int(found[2]) * side
@@ -195,10 +198,11 @@ def _document(raster: GroundGrid, tiles: Iterable[RasterTile], stem: str) -> str
         + " </VRTRasterBand>\n"
         for n, colour in enumerate(("Red", "Green", "Blue", "Alpha"), 1)
     )
-    side, step = active().raster.tile_px, repr(raster.gsd_m)
+    step = repr(raster.gsd_m)
     wkt = escape(CRS.from_epsg(raster.epsg).to_wkt("WKT1_GDAL"))
     return (
-        f'<VRTDataset rasterXSize="{raster.width}" rasterYSize="{raster.height}">\n <!-- tiles of {side} pixels -->\n'
+        f'<VRTDataset rasterXSize="{raster.width}" rasterYSize="{raster.height}">\n'
+        f" <!-- tiles of {_TILE_PX} pixels -->\n"
         f' <SRS dataAxisToSRSAxisMapping="1,2">{wkt}</SRS>\n'
         f" <GeoTransform>{raster.west!r}, {step}, 0.0, {raster.north!r}, 0.0, -{step}</GeoTransform>\n"
         f"{bands}</VRTDataset>\n"

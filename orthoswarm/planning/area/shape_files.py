@@ -10,19 +10,22 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, Final
 from xml.etree import ElementTree
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.model.earth import ring_around
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid, area_epsg
 
 Ring = NDArray[np.float64]
+MOST_CORNERS: Final = 50_000
+"""Areas, zones and lines with more corners are refused. Whether an outline crosses itself can take the square of their
+number: 13 s for a star of so many, four times that for one of twice as many (measured); a circle of so many is planned
+in a minute."""
 _ROUND_M = 0.2  # a circle's polygon lies so far outside it at most
 _MOST_RADIUS_M = 100_000.0
 _FOOT_M = 0.3048
@@ -130,13 +133,14 @@ def refuse_many_corners(shapes: Iterable[Polygon | Ring], name: str) -> None:
         shapes: polygons and lines that are used together. name: how to call them in an error.
 
     Raises:
-        InputError: they have more corners than the configuration allows.
+        InputError: they have more than `MOST_CORNERS`.
     """
-    most = active().planning.most_corners
     rings = (ring for s in shapes for ring in ((s.shell, *s.holes) if isinstance(s, Polygon) else (s,)))
     count = sum(map(len, rings))
-    if count > most:
-        raise InputError(f"{name} has {count} corners; simplify it to at most {most}, for example with QGIS's Simplify")
+    if count > MOST_CORNERS:
+        raise InputError(
+            f"{name} has {count} corners; simplify it to at most {MOST_CORNERS}, for example with QGIS's Simplify"
+        )
 
 
 def parse_geojson(text: str, name: str = "the GeoJSON file", *, any_size: bool = False) -> Shapes:

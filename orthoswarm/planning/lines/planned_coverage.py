@@ -6,7 +6,6 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.planning.lines.detours import Router
 from orthoswarm.planning.lines.line_spacing import Footprint
 from orthoswarm.planning.lines.sweep_lines import Field, Turned, strip_legs
@@ -14,6 +13,8 @@ from orthoswarm.planning.lines.sweep_lines import Field, Turned, strip_legs
 Geometry = Any
 Array = NDArray[np.float64]
 
+COMPLETE_SHARE: Final = 0.999  # share of an area from which on a plan covers it
+_TARGET_SHARE: Final = 0.9996  # share up to which gaps are mended: above the other for errors of the flight
 _REPAIR_ROUNDS: Final = 5  # most rounds of mending (for its time)
 _REPAIR_PLACES: Final = 8  # places in the order of legs where one that mends a gap is tried (time)
 _CRUMB_M2: Final = 0.5  # smaller gaps are none: rounding of outlines
@@ -85,9 +86,9 @@ def mend(field: Field, legs: Array, foot: Footprint, *, router: Router, reach_m:
     ways = router.each(legs[:-1, 1], legs[1:, 0])
     for _ in range(_REPAIR_ROUNDS):
         left = missed(field.ground, legs, foot.width_m, reach_m)
-        if left.area <= (1.0 - active().planning.target_share) * field.ground.area:
+        if left.area <= (1.0 - _TARGET_SHARE) * field.ground.area:
             break
-        excess, added = left.area - (1.0 - active().planning.target_share) * field.ground.area, False
+        excess, added = left.area - (1.0 - _TARGET_SHARE) * field.ground.area, False
         for gap in pieces(left):
             if excess <= 0.0 or any(h.contains(gap.centroid) for h in hopeless):
                 continue

@@ -9,8 +9,8 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
-from orthoswarm.config.autopilot import AutopilotConfig
+from orthoswarm.config.autopilot import ARDUPILOT, AutopilotTimes
+from orthoswarm.config.planning import PLANNING
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.plan import End
@@ -36,6 +36,7 @@ _MOST_WIND = 0.8  # of the speed through the air
 _FAIR_BALANCE: Final = 1.15  # the longest sortie over the mean up to which a division is fair
 _UNFAIR_BALANCE: Final = 1.22  # ... and from which on it is priced steeply
 _BALANCE_PRICES: Final = (2.0, 6.0)  # prices of what the balance is above either, in shares of the longest sortie
+_ENDURANCE_SPARE: Final = 1.05  # where an endurance is too short, so many times what is needed is asked for
 _ITEMS_A_LEG: Final = 4  # mission items of a leg: two ends, camera on and off
 _SPARE_ITEMS: Final = 40  # mission items kept for ways, takeoff and landing
 _LEAST_LEG_TRIGGERS: Final = 4.0  # legs are no shorter than so many picture distances, if endurance allows
@@ -68,21 +69,23 @@ class PlanOptions:
         heading: of an area's lines, degrees clockwise from true north, along the wind, or along its longest side; None
             for the directions that are done soonest.
         cross: cover an area a second time by lines across the first.
+        quickest_s: shortest time between pictures without a warning.
     """
 
     motion: Motion = field(default_factory=Motion)
-    autopilots: Sequence[AutopilotConfig] = ()
+    autopilots: Sequence[AutopilotTimes] = ()
     end: End = "rtl"
     starts: Sequence[tuple[float, float]] = ()
     endurance_s: float = float("inf")
     endurances_s: Sequence[float] = ()
     clearance_m: float | None = None
     separation: Separation = field(default_factory=Separation)
-    most_items: int = field(default_factory=lambda: active().ardupilot.most_items)
+    most_items: int = ARDUPILOT.most_items
     run_in_m: float = 0.0
     wait_s: float = 0.0
     heading: Heading | None = None
     cross: bool = False
+    quickest_s: float = PLANNING.quickest_s
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "motion", replace(self.motion, lands=self.end == "land"))
@@ -326,7 +329,7 @@ class Swarm:
         start, part = np.unravel_index(np.argmax(far), far.shape)
         home = row.parts[part, 0] if starts is None else places[start]
         needed = self._flight(row.parts[part][None], home, top, top).time_s(self._options.motion)
-        asked_for = active().planning.endurance_spare * needed
+        asked_for = _ENDURANCE_SPARE * needed
         return InputError(
             f"the endurance of {endurance_s / 60:.1f} min is too short: the farthest line needs about "
             f"{math.ceil(asked_for / 6) / 10:.1f} min; start nearer, fly faster or lower, or use larger batteries"

@@ -9,14 +9,16 @@ would take too long, only some time after each other, because they stand some me
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel, kernel
-from orthoswarm.config import active
+from orthoswarm.config.autopilot import ARDUPILOT
+from orthoswarm.config.planning import PLANNING
+from orthoswarm.model.plan import APART, ON_GROUND_M, PAD_DISTANCES
 from orthoswarm.planning.sorties.flight_path import Flight
 from orthoswarm.planning.sorties.flight_time import Motion, start_slack_s
 
@@ -24,6 +26,8 @@ Array = NDArray[np.float64]
 Maker = Callable[[float, float], Flight]
 
 _STEP_S: Final = 0.5  # time step in which flights are compared (for its time)
+_ORDERS_TRIED_SHARE: Final = 2.0 / 3.0
+"""Where a smaller share of the vehicles has its turn in time, another order of them does not help."""
 _LAYER_PRICE_S: Final = 3.0  # price of each further height layer, in seconds of delay
 
 
@@ -39,19 +43,21 @@ class Separation:
             what their autopilots need there (`takeoff_slack_s`, `landing_slack_s`), at most this.
         launch_s: time between takeoffs, and between landings, at one start.
         swap_s: time on the ground between a vehicle's sorties.
+        in_turn_share: vehicles of one start take off and land in turn if all takes at most so much longer by that.
     """
 
-    distance_m: float = field(default_factory=lambda: active().planning.separation_m)
-    height_m: float = field(default_factory=lambda: active().planning.layer_m)
+    distance_m: float = APART.distance_m
+    height_m: float = APART.height_m
     layers: int = 4
-    slack_s: float = field(default_factory=lambda: active().ardupilot.schedule_slack_s)
-    launch_s: float = field(default_factory=lambda: active().planning.launch_s)
+    slack_s: float = ARDUPILOT.schedule_slack_s
+    launch_s: float = PLANNING.launch_s
     swap_s: float = 120.0
+    in_turn_share: float = PLANNING.in_turn_share
 
     @property
     def pad_m(self) -> float:
         """Radius about a start that vehicles share, metres."""
-        return active().planning.pad_distances * self.distance_m
+        return PAD_DISTANCES * self.distance_m
 
 
 @dataclass(frozen=True)
@@ -115,7 +121,7 @@ def _sampled(flight: Flight, motion: Motion, apart: Separation) -> _Track:
         at = 3 + flight.last_leg_end
         track, waits = np.insert(track, at, track[at - 1], axis=0), np.insert(waits, at, flight.wait_s)
     places = motion.places(track, waits, _step_s())
-    flying = np.flatnonzero(places[:, 2] > flight.home_z_m + active().planning.on_ground_m)
+    flying = np.flatnonzero(places[:, 2] > flight.home_z_m + ON_GROUND_M)
     places = np.ascontiguousarray(places[flying[0] : flying[-1] + 1])
     pad = np.hypot(*(places[:, :2] - flight.home).T) < apart.pad_m
     slack = np.ceil(np.minimum(start_slack_s(pad, motion.autopilot), apart.slack_s) / _step_s()).astype(np.int64)
@@ -307,7 +313,7 @@ def separate(sorties: Sequence[Sequence[Maker]], motions: Sequence[Motion], apar
         return Schedule(usual.slots)
     # In turn, flights that are home before others come home are worth as much as long ones that start early.
     in_turn = [usual, _Placing(sorties, motions, apart, shortest_first=True)]
-    most = 1.0 + active().planning.in_turn_share
+    most = 1.0 + apart.in_turn_share
     best = _soonest(in_turn, most * usual.soonest_s)
     if best is not None:
         return Schedule(best.slots)
@@ -326,7 +332,7 @@ def _soonest(ways: "Sequence[_Placing]", limit_s: float) -> "_Placing | None":
     for way in ways:
         if way.place_within(limit_s if best is None else min(limit_s, best.done_s)):
             best = way
-        elif way.placed_share < active().planning.orders_tried_share:
+        elif way.placed_share < _ORDERS_TRIED_SHARE:
             break
     return best
 

@@ -10,13 +10,16 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
+from orthoswarm.config.planning import PLANNING
 from orthoswarm.model.placement import Terrain
 
 Array = NDArray[np.float64]
 
 _SAME_M = 0.01
 
+BESIDE_M: Final = 10.0
+"""Ground up to so far beside a flight counts as ground below it: 8 m by which receivers err (GPS SPS Performance
+Standard 2020, 95 %) and 2 m by which a vehicle may pass a waypoint (ArduCopter's WPNAV_RADIUS)."""
 _PROFILE_FINEST_M: Final = 1.0  # least distance of the places at which the ground below a flight is read (for its time)
 _PROFILE_COARSEST_M: Final = 10.0  # greatest distance of them (slopes of up to 45 degrees)
 
@@ -33,9 +36,10 @@ class LevelHeights:
     Attributes:
         z_m: height of the legs.
         ground: heights of the ground, None where only the height above takeoff counts. highest: the highest ground
-            up to `beside_m` from each place.
+            up to `BESIDE_M` from each place.
         nominal_m: height above the ground that was asked for, None for z_m.
         follows: False, as heights do not follow the ground. by_vehicle: False, likewise.
+        least_above_m: what flights keep over the highest ground.
     """
 
     z_m: float
@@ -45,6 +49,7 @@ class LevelHeights:
     nominal_m: float | None = None
     follows: bool = False
     by_vehicle: bool = False
+    least_above_m: float = PLANNING.least_above_ground_m
 
     @property
     def above_m(self) -> float:
@@ -68,10 +73,10 @@ class LevelHeights:
 class GroundHeights:
     """A constant height above the ground within a tolerance, on straight pieces as long as that allows.
 
-    Beside ground that is much higher a flight is higher than that: `least_above_ground_m` above it.
+    Beside ground that is much higher a flight is higher than that: `least_above_m` above it.
 
     Attributes:
-        ground: heights of the ground. highest: the highest ground up to `beside_m` from each place.
+        ground: heights of the ground. highest: the highest ground up to `BESIDE_M` from each place.
         above_m: height above the ground. tolerance_m: largest difference from it.
         follows: True, as heights follow the ground.
         by_vehicle: the vehicle itself keeps its height above the ground, so that points put in for their height are no
@@ -84,6 +89,7 @@ class GroundHeights:
     tolerance_m: float
     follows: bool = True
     by_vehicle: bool = False
+    least_above_m: float = PLANNING.least_above_ground_m
     _known: dict[tuple[float, ...], Array] = field(default_factory=dict, repr=False, compare=False)
 
     def ground_at(self, place: Array) -> float:
@@ -103,7 +109,7 @@ class GroundHeights:
             reach = math.sqrt(2.0) * self.step_m
             around = places[..., None, :] + reach * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
             floor = np.asarray(self.highest.height(around), np.float64).max(axis=-1)
-            low = np.maximum(low, floor + active().planning.least_above_ground_m)
+            low = np.maximum(low, floor + self.least_above_m)
         return np.maximum(nominal, low), low, np.maximum(high, low)
 
     @property

@@ -2,13 +2,12 @@
 
 import itertools
 import math
-from dataclasses import KW_ONLY, dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
-from orthoswarm.config.autopilot import AutopilotConfig
+from orthoswarm.config.autopilot import ARDUPILOT, AutopilotTimes
 from orthoswarm.model.angles import wrap_rad
 
 Array = NDArray[np.float64]
@@ -36,7 +35,7 @@ class Motion:
     climb_m_s: float = 2.5
     descent_m_s: float = 1.5
     wind_m_s: tuple[float, float] = (0.0, 0.0)
-    autopilot: AutopilotConfig = field(default_factory=lambda: active().ardupilot)
+    autopilot: AutopilotTimes = ARDUPILOT
     lands: bool = False
 
     @property
@@ -185,7 +184,7 @@ class Motion:
         return self.autopilot.land_wait_s if self.lands else self.autopilot.home_wait_s
 
 
-def start_slack_s(near_start: NDArray[np.bool_], autopilot: AutopilotConfig) -> Array:
+def start_slack_s(near_start: NDArray[np.bool_], autopilot: AutopilotTimes) -> Array:
     """Seconds off schedule that a plan allows a flight around a start that vehicles share, float64 (n,).
 
     Args:
@@ -193,11 +192,6 @@ def start_slack_s(near_start: NDArray[np.bool_], autopilot: AutopilotConfig) -> 
     """
     takes_off = np.arange(len(near_start)) < np.argmin(near_start)
     return np.where(takes_off, autopilot.takeoff_slack_s, autopilot.landing_slack_s)
-
-
-def autopilot_config(name: str) -> AutopilotConfig:
-    """What is known of an autopilot's times: of PX4 if its name is `px4`, otherwise of ArduCopter."""
-    return active().px4 if name == "px4" else active().ardupilot
 
 
 def angles(points: Array) -> Array:

@@ -7,12 +7,11 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.placement import Terrain
 from orthoswarm.model.plan import OverGround
 from orthoswarm.planning.lines.line_spacing import Footprint
-from orthoswarm.planning.sorties.flight_heights import FlightHeights, profile_step_m
+from orthoswarm.planning.sorties.flight_heights import BESIDE_M, FlightHeights, profile_step_m
 from orthoswarm.planning.sorties.flight_path import Flight
 
 Geometry = Any
@@ -86,7 +85,7 @@ def over_ground(flights: Sequence[Flight], heights: FlightHeights, foot: Footpri
         flights: of all vehicles. heights: by which they were made, with a ground. foot, foot_above_m: see `swaths`.
 
     Raises:
-        InputError: a leg or a way is lower than `least_above_ground_m` above the ground, or above that beside it.
+        InputError: a leg or a way is lower than `heights.least_above_m` above the ground, or above that beside it.
     """
     ground, highest = heights.ground, heights.highest
     assert ground is not None and highest is not None
@@ -101,10 +100,10 @@ def over_ground(flights: Sequence[Flight], heights: FlightHeights, foot: Footpri
             overlaps.append(1.0 - foot.spacing_m / np.maximum(width, 1e-9))
     above, overlap = np.concatenate(on_legs), np.concatenate(overlaps)
     least = float(np.concatenate(on_ways).min())
-    least_above_m = active().planning.least_above_ground_m
+    least_above_m = heights.least_above_m
     if least < least_above_m - 0.01:
         raise InputError(
-            f"the flight would be {least:.0f} m above the highest ground within {active().planning.beside_m:g} m, "
+            f"the flight would be {least:.0f} m above the highest ground within {BESIDE_M:g} m, "
             f"and {least_above_m:g} m must be kept; give --altitude "
             f"{np.ceil(heights.above_m + least_above_m - least):.0f} or more"
         )

@@ -6,11 +6,10 @@ from typing import Final
 
 import numpy as np
 
-from orthoswarm.config import active
 from orthoswarm.model.angles import wrap_rad
 from orthoswarm.model.arrays import Array, Flags
 from orthoswarm.model.camera import rotation_from_angles
-from orthoswarm.model.frame import Frame
+from orthoswarm.model.frame import DEFAULT_HEIGHT_M, Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.trajectory.courses import course
 
@@ -87,7 +86,7 @@ def read_records(frames: Sequence[Frame], grid: LocalGrid, origin: Array) -> Fli
     yaw = column([f.fix.yaw_rad for f in frames]) - grid.convergence_rad(lat, lon)
     pitch, roll = column([f.fix.pitch_rad for f in frames]), column([f.fix.roll_rad for f in frames])
     has_height, has_yaw, has_tilt = np.isfinite(height), np.isfinite(yaw), np.isfinite(pitch)
-    filled = float(np.median(height[has_height])) if has_height.any() else active().records.default_height_m
+    filled = float(np.median(height[has_height])) if has_height.any() else DEFAULT_HEIGHT_M
     position = np.column_stack([xy, np.where(has_height, height, filled)])
     time, timed = _times(frames)
     return FlightRecords(

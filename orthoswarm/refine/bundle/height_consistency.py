@@ -11,10 +11,12 @@ from typing import Final
 
 import numpy as np
 
-from orthoswarm.config import active
 from orthoswarm.model.arrays import Array, Flags
 from orthoswarm.refine.bundle.adjustment import Adjustment
 
+UNKNOWN_HEIGHT_SIGMA_M: Final = 30.0
+"""Sigma of a sortie's common height offset where no height was recorded or it is not trusted."""
+_AT_REST_SHARE: Final = 0.03  # a focal length that still moves by this share in three steps is not at rest
 _CONTRADICTION_SIGMAS: Final = 4.0  # a recorded height is contradicted by an offset of so many of its sigmas ...
 _CONTRADICTION_SHARE: Final = 0.15
 """... and this share of the height: distortion and principal point of real lenses, as far as they are not modelled,
@@ -32,7 +34,7 @@ def offsets_without_height_prior(adjustment: Adjustment) -> tuple[Array, Array]:
     layout, models = adjustment.layout, adjustment.priors.models
     at = np.array([o + 3 for o in layout.offset])
     prior = np.array([1.0 / max(m.height_sigma, 1e-9) ** 2 for m in models])
-    less = np.maximum(prior - active().bundle.unknown_height_sigma_m ** -2, 0.0)
+    less = np.maximum(prior - UNKNOWN_HEIGHT_SIGMA_M**-2, 0.0)
     without = adjustment.information.copy()
     without[at, at] -= less
     pull = np.zeros(layout.size)
@@ -44,14 +46,13 @@ def offsets_without_height_prior(adjustment: Adjustment) -> tuple[Array, Array]:
 
 def contradicted_heights(adjustment: Adjustment) -> Flags:
     """Groups whose recorded heights the pictures contradict significantly, bool (G,)."""
-    config = active().bundle
     sigma = np.array([m.height_sigma for m in adjustment.priors.models])
-    if (sigma >= config.unknown_height_sigma_m).all() or not adjustment.information.size:
+    if (sigma >= UNKNOWN_HEIGHT_SIGMA_M).all() or not adjustment.information.size:
         return np.zeros(len(sigma), bool)
     offset, offset_sigma = offsets_without_height_prior(adjustment)
     total = np.hypot(offset_sigma, sigma)
     limit = np.maximum(_CONTRADICTION_SIGMAS * total, _CONTRADICTION_SHARE * _height(adjustment))
-    return np.asarray((np.abs(offset) > limit) & (sigma < config.unknown_height_sigma_m), np.bool_)
+    return np.asarray((np.abs(offset) > limit) & (sigma < UNKNOWN_HEIGHT_SIGMA_M), np.bool_)
 
 
 def predicted_height_offset(adjustment: Adjustment) -> tuple[float, float]:
@@ -70,8 +71,9 @@ def release_heights(adjustment: Adjustment) -> Flags:
     wrong = contradicted_heights(adjustment)
     if wrong.any():
         p = adjustment.priors
-        sigma_m = active().bundle.unknown_height_sigma_m
-        models = [replace(m, height_sigma=sigma_m) if w else m for m, w in zip(p.models, wrong, strict=True)]
+        models = [
+            replace(m, height_sigma=UNKNOWN_HEIGHT_SIGMA_M) if w else m for m, w in zip(p.models, wrong, strict=True)
+        ]
         adjustment.priors = replace(p, models=tuple(models))
     return wrong
 
@@ -94,7 +96,7 @@ class FreeHeight:
     @property
     def converged(self) -> bool:
         """Whether the focal length has stopped changing."""
-        return bool(np.ptp(np.log(self.focal_px[-3:])) < active().strategy.at_rest_share)
+        return bool(np.ptp(np.log(self.focal_px[-3:])) < _AT_REST_SHARE)
 
     @property
     def refutes_record(self) -> bool:
@@ -111,9 +113,8 @@ class FreeHeight:
 
 def height_disagreement(adjustment: Adjustment) -> float:
     """Significant difference of recorded heights that have a prior from the pictures, as a share of the height."""
-    config = active().bundle
     sigma = np.array([m.height_sigma for m in adjustment.priors.models])
-    known = sigma < config.unknown_height_sigma_m
+    known = sigma < UNKNOWN_HEIGHT_SIGMA_M
     if not known.any() or not adjustment.information.size:
         return 0.0
     offset, offset_sigma = offsets_without_height_prior(adjustment)

@@ -11,10 +11,10 @@ from typing import Final
 import cv2
 import numpy as np
 
-from orthoswarm.config import active
 from orthoswarm.model.angles import wrap_rad
 from orthoswarm.model.arrays import Array, Complex, Gray, Indices, Ints
 from orthoswarm.model.camera import fov_rad
+from orthoswarm.model.frame import DEFAULT_HEIGHT_M
 from orthoswarm.model.robust import mad_sigma
 from orthoswarm.refine.bundle.flight_records import FlightRecords
 
@@ -77,7 +77,7 @@ def calibrate(
     h0 = float(np.median(records.position[:, 2]))
     usable = h0 > _CALIBRATION_LEAST_HEIGHT_M and bool(records.has_height.any())
     if not usable:
-        h0 = active().records.default_height_m
+        h0 = DEFAULT_HEIGHT_M
     rotation = records.rotation()
     legs = [np.flatnonzero(leg == k) for k in range(int(leg.max()) + 1)] if len(leg) else []
     per_leg = max(_CALIBRATION_PAIRS_PER_LEG, _CALIBRATION_PAIRS // max(len(legs), 1))

@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel, kernel
-from orthoswarm.config import active
 from orthoswarm.model.arrays import Array, Flags, Floats, Gray, Indices
 from orthoswarm.refine.bundle.block_arrays import Tracks
 from orthoswarm.refine.features import klt
@@ -51,6 +50,12 @@ _HOMOGRAPHY_PX: Final = 3.0  # flow within this distance agrees with a homograph
 _HOMOGRAPHY_SHARE: Final = 0.4  # least share of the flow that must agree
 _HOMOGRAPHY_LEAST: Final = 12  # fewest corners that must agree
 _PYRAMID_WINDOW_PX: Final = 21  # window of the flow over several octaves (OpenCV's default)
+CELL_PX: Final = 80
+"""One corner is followed in each cell of this size, working pixels: about 48 in a picture of 640 x 480. Spread matters
+more than strength: the strongest corners sit on glints (over water such flights failed by 11 m)."""
+_FLOW_CHANCE_SHARE: Final = 0.1
+"""Share of the corners that agree where pictures show different ground (textures of noise: 0.09 in the middle; past
+holes of flights in simulation 0.10 at most, where the ground is the same 0.25 or more, usually 0.6)."""
 _PYRAMID_OCTAVES: Final = 4  # octaves below the full picture of that flow: it reaches some 16 windows
 _ORB_CORNERS: Final = 1000  # ORB corners (Rublee et al. 2011) of a turn that nobody recorded
 _ORB_LEAST: Final = 30  # fewest ORB matches that must agree
@@ -88,7 +93,7 @@ class _Flow:
 class Tracker:
     """Tracks corners, at most one a cell of `cell_px` working pixels: `add` pictures in order, then read `tracks`."""
 
-    cell_px: int = field(default_factory=lambda: active().features.cell_px)
+    cell_px: int = CELL_PX
     _live: _Live = field(default_factory=_Live)
     _gray: Gray | None = None
     _half: Gray | None = None
@@ -187,7 +192,7 @@ class Tracker:
 
     def _flow(self, gray: Gray, half: Gray, predicted: Array) -> _Flow:
         """Flow of the live tracks from the predicted positions, without outliers."""
-        config, count = active().features, len(self._live.uv)
+        count = len(self._live.uv)
         guess, found, good = np.empty((count, 2), np.float32), np.empty((count, 2), np.float32), np.zeros(count, bool)
         limits = _KLT_ROUNDS[:2], _KLT_LEAST_TEXTURE, _KLT_STEP_PX, _KLT_MISMATCH, _KLT_NOISE_VARIANCE
         klt.track(
@@ -196,7 +201,7 @@ class Tracker:
         )  # fmt: skip
         kept, expected = _gate(
             guess, found, good, *gray.shape, _FLOW_INSIDE_PX, _FLOW_LEAST, _FLOW_MEDIAN_LIMIT_PX,
-            _FLOW_GATE_PX, config.flow_chance_share,
+            _FLOW_GATE_PX, _FLOW_CHANCE_SHARE,
         )  # fmt: skip
         return _Flow(good, found, kept, expected)
 

@@ -8,14 +8,15 @@ from typing import Any, Final
 import cv2
 import numpy as np
 
-from orthoswarm.config import active
 from orthoswarm.model.arrays import Gray
 from orthoswarm.model.frame import Frame
+from orthoswarm.raster.grey_pictures import WORK_WIDTH_PX
 from orthoswarm.raster.picture_file import PictureError
 
 ReadGray = Callable[[Frame], Gray]
 """Returns a photo's grey values, uint8 (rows, columns), at any size; may raise PictureError."""
 
+_CACHE_MB: Final = 160.0  # memory that a vehicle's refinement keeps of its pictures at working scale
 _SMALL_WIDTH_PX: Final = 160  # columns of the reduced pictures that stay in memory
 
 
@@ -28,10 +29,8 @@ class Pictures:
     """
 
     def __init__(
-        self, frames: Sequence[Frame], read: ReadGray, work_width: int | None = None, cache_mb: float | None = None
+        self, frames: Sequence[Frame], read: ReadGray, work_width: int = WORK_WIDTH_PX, cache_mb: float = _CACHE_MB
     ) -> None:
-        cache_mb = cache_mb or active().compute.working_pictures_mb
-        work_width = work_width or active().features.work_width_px
         self._frames, self._read = frames, read
         width, height = frames[0].width, frames[0].height
         self.scale = max(1.0, max(width, height) / work_width)

@@ -1,6 +1,6 @@
 """Tracks of a vehicle's pictures, kept on disk so that a refinement that follows need not make them again.
 
-They are found by a digest of all that they depend on, so those of other records, pictures or settings are never used.
+They are found by a digest of all that they depend on, so those of other records or pictures are never used.
 """
 
 import contextlib
@@ -10,14 +10,15 @@ import pickle
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
-from orthoswarm.config import active
 from orthoswarm.model.arrays import Array, Gray
 from orthoswarm.model.frame import Frame
 from orthoswarm.refine.bundle.block_arrays import Tracks
 from orthoswarm.refine.features.flow_calibration import Calibration
 
 _SUFFIX = ".tracks"
+_MOST_KEPT: Final = 8  # stretches whose tracks are kept for a refinement that follows, 7 MB each
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,8 +45,8 @@ class KeptTracks:
     folder: Path
 
     def file(self, frames: Sequence[Frame], epsg: int, origin: Array, fov_start: float) -> Path:
-        """Where the tracks of a flight are kept, by the frames' records, names, sizes and files, and the settings."""
-        asked = (frames, [_state(frame.path) for frame in frames], epsg, origin.tolist(), fov_start, active())
+        """Where the tracks of a flight are kept, by the frames' records, names, sizes and files."""
+        asked = (frames, [_state(frame.path) for frame in frames], epsg, origin.tolist(), fov_start)
         return self.folder / (hashlib.sha256(repr(asked).encode()).hexdigest() + _SUFFIX)
 
     def read(self, file: Path) -> Followed | None:
@@ -63,7 +64,7 @@ class KeptTracks:
             part.write_bytes(pickle.dumps(followed, pickle.HIGHEST_PROTOCOL))
             part.replace(file)
             there = sorted(self.folder.glob(f"*{_SUFFIX}"), key=lambda path: path.stat().st_mtime_ns)
-            for old in there[: -active().flight.kept_tracks]:
+            for old in there[:-_MOST_KEPT]:
                 old.unlink()
         except OSError:  # the disk is full: what is needed more is written there next
             with contextlib.suppress(OSError):

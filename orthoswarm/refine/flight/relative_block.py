@@ -7,18 +7,18 @@ from typing import Final
 
 import numpy as np
 
-from orthoswarm.config import active
 from orthoswarm.model.angles import wrap_rad
 from orthoswarm.model.arrays import Array, Flags, Indices, Ints
-from orthoswarm.model.frame import Frame
+from orthoswarm.model.frame import UNSTATED_SIGMA_M, Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.robust import mad_sigma, mad_sigmas
 from orthoswarm.refine.bundle.adjustment import Adjustment
 from orthoswarm.refine.bundle.block_arrays import K1, CameraBlock, F, Tracks, log_rotation
 from orthoswarm.refine.bundle.flight_records import FlightRecords, read_records
+from orthoswarm.refine.bundle.height_consistency import UNKNOWN_HEIGHT_SIGMA_M
 from orthoswarm.refine.bundle.priors import DRIFT_SIGMA_M, HEIGHT_OFFSET_SIGMA_M, LAG_SIGMA_S, GroupPriors, Priors
 from orthoswarm.refine.features.flow_calibration import Calibration, calibrate
-from orthoswarm.refine.features.tracks import follow, predicted_homography
+from orthoswarm.refine.features.tracks import CELL_PX, follow, predicted_homography
 from orthoswarm.refine.features.working_pictures import Pictures, ReadGray
 from orthoswarm.refine.flight.kept_tracks import Followed, KeptTracks
 from orthoswarm.trajectory.legs import leads_one_way, split_legs
@@ -54,6 +54,7 @@ _STRONG_LENS_SIGMA: Final = (0.3, 0.3, 0.2, 0.3)  # sigma of log f, k1, k2, k3 o
 PRINCIPAL_POINT_SHARE: Final = 0.012  # sigma of the principal point of lenses solved in full, in picture widths
 _HEADING_REACH_PHOTOS: Final = 7  # heading that was not recorded follows from those of so many photos before and after
 _HEADING_LEAST_CORNERS: Final = 10  # fewest tracked corners that tell how far a photo is turned from the one before
+FIRST_HEIGHT_SIGMA_M: Final = 0.5  # sigma of a recorded height to begin with
 INLIER_WEIGHT: Final = 0.5  # an observation counts as an inlier from this robust weight on
 
 
@@ -195,7 +196,6 @@ def weigh_records(flight: FlightBlock) -> None:
 
     Positions that scatter more than their sigmas get larger sigmas, too. Heights with a loose prior keep it.
     """
-    c = active().flight
     adj = flight.adjustment
     p = adj.priors
     height = adj.cameras.position[:, 2] - p.position[:, 2]
@@ -204,7 +204,7 @@ def weigh_records(flight: FlightBlock) -> None:
     turn = np.clip(_step_sigma(attitude), *np.radians(_ATTITUDE_SIGMA_RANGE_DEG))
     sigma = p.position_sigma.copy()
     if flight.calibration.trusted_height:
-        sigma[:, 2] = np.where(sigma[:, 2] > c.first_height_sigma_m, sigma[:, 2], z)
+        sigma[:, 2] = np.where(sigma[:, 2] > FIRST_HEIGHT_SIGMA_M, sigma[:, 2], z)
     off = adj.position_residuals()[:, :2] / np.maximum(sigma[:, :2], 1e-9)
     sigma[:, :2] *= max(1.0, mad_sigma(off))
     known = np.column_stack([flight.records.has_tilt, flight.records.has_tilt, flight.records.has_yaw])
@@ -247,8 +247,7 @@ def _track(records: FlightRecords, pictures: Pictures, calibration: Calibration)
         return predicted_homography(rotation[i - 1], rotation[i], calibration.height_m, step, matrix)
 
     few = len(rotation) < FEW_PHOTOS
-    cell_px = active().features.cell_px
-    return follow(len(rotation), pictures.gray, prediction, cell_px=cell_px // 2 if few else cell_px)
+    return follow(len(rotation), pictures.gray, prediction, cell_px=CELL_PX // 2 if few else CELL_PX)
 
 
 def _begin(records: FlightRecords, pictures: Pictures, calibration: Calibration, tracks: Tracks) -> Adjustment:
@@ -260,12 +259,11 @@ def _begin(records: FlightRecords, pictures: Pictures, calibration: Calibration,
     lens = np.array([[calibration.focal_px, 0, 0, 0, 0, 0, width, height]], float)
     cameras = CameraBlock(position.copy(), rotation.copy(), np.zeros(n, np.int32), lens)
     stated = np.maximum(records.position_sigma, _STATED_POSITION_FLOOR_M)
-    horizontal = np.where(np.isfinite(records.position_sigma), stated, active().records.position_sigma_m)
+    horizontal = np.where(np.isfinite(records.position_sigma), stated, UNSTATED_SIGMA_M)
     tilt = np.where(records.has_tilt, np.radians(_TILT_SIGMA_DEG), np.radians(_FREE_TILT_SIGMA_DEG))
     yaw = np.where(records.has_yaw, np.radians(_YAW_SIGMA_DEG), np.radians(_FREE_YAW_SIGMA_DEG))
-    usual = active().bundle
     model = GroupPriors(
-        height_sigma=HEIGHT_OFFSET_SIGMA_M if calibration.trusted_height else usual.unknown_height_sigma_m,
+        height_sigma=HEIGHT_OFFSET_SIGMA_M if calibration.trusted_height else UNKNOWN_HEIGHT_SIGMA_M,
         lag_sigma=LAG_SIGMA_S if records.timed else _UNTIMED_LAG_SIGMA_S,
         drift_sigma=DRIFT_SIGMA_M if not np.isfinite(records.position_sigma).all() else 0.0,
     )
@@ -299,16 +297,15 @@ def height_prior(records: FlightRecords, calibration: Calibration) -> tuple[Arra
     difference, and the pictures decide. A spike, at which no vehicle arrives in the time that it has, also gets the
     others' height.
     """
-    c = active().flight
     z = records.position[:, 2]
     if not calibration.trusted_height:
-        return np.full(len(z), calibration.height_m), np.full(len(z), c.first_height_sigma_m)
+        return np.full(len(z), calibration.height_m), np.full(len(z), FIRST_HEIGHT_SIGMA_M)
     reach = _HEIGHT_REACH_PHOTOS
     smooth = np.array([np.median(z[max(0, i - reach) : i + reach + 1]) for i in range(len(z))])
     off = np.abs(z - smooth)
     leaps = off > _HEIGHT_LEAP_M
     spikes = leaps & ~_climbed_to(records)
-    return np.where(spikes, smooth, z), np.where(leaps, off, c.first_height_sigma_m)
+    return np.where(spikes, smooth, z), np.where(leaps, off, FIRST_HEIGHT_SIGMA_M)
 
 
 def _climbed_to(records: FlightRecords) -> Flags:

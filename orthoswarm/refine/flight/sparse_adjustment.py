@@ -10,12 +10,11 @@ from typing import Final
 
 import numpy as np
 
-from orthoswarm.config import active
 from orthoswarm.model.arrays import Flags
 from orthoswarm.model.robust import mad_sigma, mad_sigmas
 from orthoswarm.refine.bundle.adjustment import Adjustment, HeightPrior
 from orthoswarm.refine.bundle.block_arrays import K1, WIDTH, F, log_rotation
-from orthoswarm.refine.bundle.height_consistency import release_heights
+from orthoswarm.refine.bundle.height_consistency import UNKNOWN_HEIGHT_SIGMA_M, release_heights
 from orthoswarm.refine.bundle.priors import HEIGHT_OFFSET_SIGMA_M, LAG_SIGMA_S, GroupPriors, Priors, bias_axes
 from orthoswarm.refine.flight.relative_block import PRINCIPAL_POINT_SHARE, first_points
 from orthoswarm.refine.flight.sparse_start import SparseStart
@@ -92,7 +91,7 @@ def trusted_heights(adjustment: Adjustment, start: SparseStart) -> Flags:
     """Photos whose recorded heights the final adjustment used, bool (N,)."""
     p = adjustment.priors
     sigma = np.array([model.height_sigma for model in p.models])
-    return np.asarray(start.height_known & (sigma < active().bundle.unknown_height_sigma_m)[p.group])
+    return np.asarray(start.height_known & (sigma < UNKNOWN_HEIGHT_SIGMA_M)[p.group])
 
 
 def _converged_m(adjustment: Adjustment) -> float:
@@ -138,12 +137,11 @@ def _models(start: SparseStart) -> tuple[GroupPriors, ...]:
     for s in range(int(start.records.segment.max()) + 1):
         rows = start.records.segment == s
         stated = np.isfinite(start.records.position_sigma[rows]).mean() > 0.5
-        usual = active().bundle
         offset = _SPARSE_STATED_OFFSET_SIGMA_M if stated else HEIGHT_OFFSET_SIGMA_M
         models.append(
             GroupPriors(
                 bias_sigma=(bx, by, bz),
-                height_sigma=offset if start.height_known[rows].mean() > 0.5 else usual.unknown_height_sigma_m,
+                height_sigma=offset if start.height_known[rows].mean() > 0.5 else UNKNOWN_HEIGHT_SIGMA_M,
                 lag_sigma=_SPARSE_STATED_LAG_SIGMA_S if stated else LAG_SIGMA_S,
                 drift_sigma=0.0 if stated else _SPARSE_DRIFT_SIGMA_M,
                 drift_bend=_SPARSE_DRIFT_BEND_M,

@@ -12,7 +12,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from orthoswarm.config import active
 from orthoswarm.model.arrays import Array
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.frame import Frame
@@ -22,6 +21,8 @@ from orthoswarm.mosaic.recorded_pose import hint_lone_photos, recorded_cameras
 from orthoswarm.refine.flight.unsolved_pictures import RefinableSplit, place_by_neighbours, split_refinable
 from orthoswarm.trajectory.separate_places import separate_places
 
+LONGEST_UNIT_PHOTOS: Final = 600
+"""Longer flights are solved in stretches that hold each other as neighbours, so that cost and memory stay bounded."""
 _OWN_UNIT_PHOTOS: Final = 6  # fewer photos of another camera name but the same size stay with the vehicle's main camera
 _UNIT_GAP_M: Final = 500.0
 """Groups of photos at least so far apart are solved like different vehicles: they show no common ground, so what places
@@ -124,7 +125,7 @@ def split_units(vehicles: Mapping[str, Sequence[Frame]]) -> list[list[Frame]]:
             groups.setdefault((frame.camera, frame.width, frame.height), []).append(frame)
         for group in _absorb(groups):
             for there in _by_place(group):
-                parts = max(1, int(np.ceil(len(there) / active().flight.longest_unit_photos)))
+                parts = max(1, int(np.ceil(len(there) / LONGEST_UNIT_PHOTOS)))
                 edges = np.linspace(0, len(there), parts + 1).round().astype(int)
                 units += [there[a:b] for a, b in pairwise(edges.tolist())]
     return units

@@ -26,6 +26,7 @@ FREE_PAIR_SHARE: Final = 0.02  # sigma of the match centres of two level photos,
 _FREE_SCALE_SIGMA: Final = 0.02  # ... and of scales and turns from the similarity's, radians or relative
 _FREE_SCHEDULE: Final = (400.0, 400.0, 100.0, 100.0, 36.0, 9.0, 9.0, 9.0)  # robust schedule of that network
 _ANCHOR_APART_SIGMAS: Final = 10.0  # two surveyed points turn and scale such photos if they lie so many sigmas apart
+_AGREE_SHARE: Final = 0.5  # fewest pairs that agree with a part's solution: with fewer it is a heap, not a block
 _ANCHOR_MOST: Final = 60  # so many observations of the ground take part in the search for their common similarity
 
 
@@ -57,34 +58,42 @@ class FreeNetwork:
     Attributes:
         scale: complex (N,), a of each photo: metres per pixel times exp(-i yaw). centre: complex (N,), t: below the
             camera. sigma_m: float64 (N,), one sigma of the centre, an axis. placed: bool (N,).
+        left: photos that pairs connect, but that could not be placed, the largest part first.
     """
 
     scale: Complex
     centre: Complex
     sigma_m: Array
     placed: Flags
+    left: list[Ints]
 
 
 def solve_free_network(graph: PairGraph, count: int, width: Array, anchors: Anchors) -> FreeNetwork:
-    """Place photos by their pairs and anchors; connected parts without two anchors at different points are not placed.
+    """Place photos by their pairs and anchors.
+
+    A connected part is not placed without two anchors at different points that agree with it, as most pairs must.
 
     count: N photos. width: float64 (N,), columns of the pictures.
     """
     scale, centre = np.zeros(count, np.complex128), np.zeros(count, np.complex128)
     sigma, placed = np.full(count, np.inf), np.zeros(count, bool)
+    left: list[Ints] = []
     for members in _parts(graph, count):
         inside = np.isin(graph.first, members)
         held = np.flatnonzero(np.isin(anchors.photo, members))
         a, t = _chained(graph, inside, members, count)
         datum = _datum(a, t, anchors, held)
-        if datum is None:
+        part = None
+        if datum is not None:
+            turn, shift = datum
+            a, t = np.asarray(turn * a), np.asarray(turn * t + shift)
+            part = _adjusted(graph.take(inside), members, anchors.take(held), a=a, t=t, width=width)
+        if part is None:
+            left.append(members)
             continue
-        turn, shift = datum
-        a, t = np.asarray(turn * a), np.asarray(turn * t + shift)
-        part = _adjusted(graph.take(inside), members, anchors.take(held), a=a, t=t, width=width)
         scale[members], centre[members], sigma[members] = part
         placed[members] = True
-    return FreeNetwork(scale=scale, centre=centre, sigma_m=sigma, placed=placed)
+    return FreeNetwork(scale=scale, centre=centre, sigma_m=sigma, placed=placed, left=left)
 
 
 def _parts(graph: PairGraph, count: int) -> list[Ints]:
@@ -128,8 +137,7 @@ def _datum(a: Complex, t: Complex, anchors: Anchors, held: NDArray[np.intp]) -> 
     for i in range(len(held)):
         for j in range(i + 1, len(held)):
             apart = ground[j] - ground[i]
-            near = abs(apart) <= _ANCHOR_APART_SIGMAS * np.hypot(sigma[i], sigma[j])
-            if near or abs(shown[j] - shown[i]) < 1e-12:
+            if _near(apart, sigma[i], sigma[j]) or abs(shown[j] - shown[i]) < 1e-12:
                 continue
             turn = complex(apart / (shown[j] - shown[i]))
             shift = complex(ground[i] - turn * shown[i])
@@ -139,10 +147,19 @@ def _datum(a: Complex, t: Complex, anchors: Anchors, held: NDArray[np.intp]) -> 
     return None if best is None else (best[1], best[2])
 
 
+def _near(apart: complex, one_sigma_m: float, other_sigma_m: float) -> bool:
+    """Whether two points of the ground are too near to each other to turn and scale photos."""
+    return bool(abs(apart) <= _ANCHOR_APART_SIGMAS * np.hypot(one_sigma_m, other_sigma_m))
+
+
 def _adjusted(
     graph: PairGraph, members: Ints, anchors: Anchors, *, a: Complex, t: Complex, width: Array
-) -> tuple[Complex, Complex, Array]:
-    """The robust adjustment of a part: a, t and the sigma of t of its members."""
+) -> tuple[Complex, Complex, Array] | None:
+    """The robust adjustment of a part: a, t and the sigma of t of its members; None if the observations do not agree.
+
+    Sigmas grow with the photos' own scale, so a part that contradicts itself can shrink to one point: most of its
+    pairs, or all anchors but one, are outliers then.
+    """
     n, pairs = len(members), len(graph)
     at = np.full(len(a), -1)
     at[members] = np.arange(n)
@@ -156,8 +173,17 @@ def _adjusted(
         factor = splu((matrix.conj().T @ diags(weight) @ matrix).tocsc())
         step = factor.solve(matrix.conj().T @ (weight * rhs))
         log_a, t = log_a + step[:n], t + step[n:]
+    held = anchors.take(np.flatnonzero(squared[2 * pairs :] <= _FREE_SCHEDULE[-1]))
+    if (together <= _FREE_SCHEDULE[-1]).mean() < _AGREE_SHARE or not _spread(held):
+        return None
     variance = np.diag(factor.solve(np.eye(2 * n, dtype=np.complex128)))[n:].real
     return np.exp(log_a), t, np.sqrt(np.maximum(variance, 0.0))
+
+
+def _spread(anchors: Anchors) -> bool:
+    """Whether some anchors lie far enough from the first one to turn and scale photos."""
+    ground, sigma = anchors.ground, anchors.sigma_m
+    return any(not _near(g - ground[0], s, sigma[0]) for g, s in zip(ground, sigma, strict=True))
 
 
 def _rows(

@@ -9,9 +9,9 @@ from typing import Final
 
 import numpy as np
 
-from orthoswarm.config import active
 from orthoswarm.model.arrays import Array, Complex, Flags, Indices, Ints
 from orthoswarm.model.camera import NADIR_PITCH_RAD, rotation_from_angles
+from orthoswarm.model.frame import UNSTATED_SIGMA_M
 from orthoswarm.refine.features.sift_features import SiftFeatures
 from orthoswarm.trajectory.legs import PAUSE_S
 
@@ -57,9 +57,9 @@ class PhotoRecords:
         return len(self.position)
 
     def gps_sigma(self) -> Array:
-        """One sigma of the recorded positions in metres, (N,): as stated (with a floor), else as configured."""
+        """One sigma of the recorded positions in metres, (N,): as stated (with a floor), else as usual."""
         stated = np.hypot(self.position_sigma, _STATED_SIGMA_FLOOR_M)
-        return np.asarray(np.where(np.isfinite(stated), stated, active().records.position_sigma_m))
+        return np.asarray(np.where(np.isfinite(stated), stated, UNSTATED_SIGMA_M))
 
     def velocity(self) -> Complex:
         """Ground velocity, complex (N,) m/s, from the neighbours in the segment; 0 at turns and where unknown."""

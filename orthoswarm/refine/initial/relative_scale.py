@@ -8,9 +8,9 @@ from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import spsolve
 
 from orthoswarm.compute.robust_kernel import robust_widening
-from orthoswarm.config import active
 from orthoswarm.model.arrays import Array, Flags, Ints
 from orthoswarm.model.camera import fov_rad
+from orthoswarm.model.frame import DEFAULT_HEIGHT_M
 from orthoswarm.refine.initial.planar_similarity import PairGraph, PhotoRecords
 
 _HINT_FOV_DEG: Final = (30.0, 120.0)  # fields of view of lenses that exist
@@ -23,6 +23,7 @@ _SCALE_LENS_PAIRS: Final = 3  # with fewer such pairs of a lens, all its pairs c
 _SCALE_SEGMENT_PAIRS: Final = 5  # from so many such pairs on a segment has a scale of its own
 _SCALE_SCHEDULE: Final = (100.0, 25.0, 9.0, 9.0)  # robust schedule of the photos' relative scales
 _ZOOM_SIGMA: Final = 0.02  # relative sigma of the zoom between two photos by relief
+_DEFAULT_FOV_DEG: Final = 75.0  # field of view where no tag gives one: the middle of drones' cameras
 _ZOOM_MISFIT_SIGMAS: Final = 3.0  # ... and so many times the misfit over the spread, by the root of matches
 _RELATIVE_HEIGHT_SIGMA: Final = 0.03  # relative sigma of a recorded height within its segment
 _RELATIVE_LEVEL_SIGMA: Final = 0.15  # the same of a photo without one: about as level as its segment
@@ -77,7 +78,6 @@ def first_scale(graph: PairGraph, records: PhotoRecords, lens_of: Ints, focal: A
     Args:
         lens_of: int32 (S,), lens of each segment. focal: float64 (L,), pixels, as known so far.
     """
-    default_m = active().records.default_height_m
     i, j = graph.first, graph.second
     way = np.abs(records.position[j] - records.position[i])
     shift = np.abs(graph.centre_first - np.conj(graph.turn) * graph.centre_second)
@@ -85,7 +85,7 @@ def first_scale(graph: PairGraph, records: PhotoRecords, lens_of: Ints, focal: A
     same &= shift > _SCALE_LEAST_SHIFT_SHARE * records.width[i]
     straight = same & (graph.turn.real > _SCALE_TURN_COSINE)
     by_lens, measured = np.full(len(focal), np.nan), np.zeros(len(focal), bool)
-    recorded = recorded_heights(records, np.full(len(lens_of), default_m)).segment
+    recorded = recorded_heights(records, np.full(len(lens_of), DEFAULT_HEIGHT_M)).segment
     for k in range(len(focal)):
         mine = records.lens[i] == k
         rows = np.flatnonzero(straight & mine)
@@ -94,7 +94,7 @@ def first_scale(graph: PairGraph, records: PhotoRecords, lens_of: Ints, focal: A
             by_lens[k], measured[k] = weighted_median(way[rows] / shift[rows], way[rows]), True
         else:
             high = recorded[(lens_of == k) & np.isfinite(recorded)]
-            by_lens[k] = (float(np.median(high)) if len(high) else default_m) / focal[k]
+            by_lens[k] = (float(np.median(high)) if len(high) else DEFAULT_HEIGHT_M) / focal[k]
     metres = by_lens[lens_of]
     for s in range(len(lens_of)):
         rows = np.flatnonzero(straight & (records.segment[i] == s) & (records.segment[j] == s))
@@ -144,12 +144,11 @@ def focal_by_height(records: PhotoRecords, heights: RecordedHeights, metres: Arr
 
 def focal_by_hint(records: PhotoRecords) -> tuple[Array, Array]:
     """Log focal length (pixels) of each lens from its tags or the default, and its sigma; both float64 (L,)."""
-    config = active().initial
     narrowest, widest = np.radians(_HINT_FOV_DEG)
     width = np.array([records.width[records.lens == k][0] for k in range(len(records.fov_hint))])
     with np.errstate(invalid="ignore"):
         good = (records.fov_hint > narrowest) & (records.fov_hint < widest)
-    view = np.where(good, records.fov_hint, float(np.radians(config.default_fov_deg)))
+    view = np.where(good, records.fov_hint, float(np.radians(_DEFAULT_FOV_DEG)))
     return np.log(0.5 * width / np.tan(0.5 * view)), np.where(good, _HINT_SIGMA, _DEFAULT_FOV_SIGMA)
 
 

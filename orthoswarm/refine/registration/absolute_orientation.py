@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.compute.robust_kernel import robust_weights
-from orthoswarm.config import active
 from orthoswarm.model.arrays import Array, Flags, Indices, Ints
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.placement import MapWindow
@@ -19,8 +18,8 @@ from orthoswarm.model.robust import mad_sigma
 from orthoswarm.refine.bundle.adjustment import TRACK_ROBUST_C, Adjustment, MapTies
 from orthoswarm.refine.flight.relative_block import BestViews, FlightBlock, one_per_cell
 from orthoswarm.refine.registration.coarse_registration import CoarseFit, shift_cameras
-from orthoswarm.refine.registration.map_evidence import false_matches_log10
-from orthoswarm.refine.registration.tie_points import LoadedMap, MapMatches, link_legs, match_points
+from orthoswarm.refine.registration.map_evidence import FALSE_MATCHES, false_matches_log10
+from orthoswarm.refine.registration.tie_points import LINK_CELL_M, LoadedMap, MapMatches, link_legs, match_points
 from orthoswarm.refine.surface.ground_densification import refit_ground
 from orthoswarm.refine.surface.vehicle_ground import GroundModel
 
@@ -43,6 +42,8 @@ TIE_HALF_PX: Final = 8  # ... and at least so many pixels
 TIE_REACH_PX: Final = 4  # least search, pixels, where a search in metres is less
 FIRST_TIE_REACH_M: Final = 14.0  # search for a tie point after the coarse registration, to each side
 TIE_REACH_M: Final = 5.0  # the same once the flight lies on the map
+_FIRST_TIE_CELL_M: Final = 50.0  # one tie point a leg in each cell of this size, after the coarse registration (cost)
+_TIE_CELL_M: Final = 30.0  # the same once the flight lies on the map (cost)
 _FIRST_TIE_CELL_SPARSE_M: Final = 25.0  # first ties of photos matched in pairs: one in each cell of this size
 _TIE_CELL_SPARSE_M: Final = 15.0  # later ties of photos matched in pairs: one in each cell of this size
 _TIE_PEAK: Final = 0.2  # least correlation of a tie point
@@ -293,7 +294,7 @@ def add_links(flight: FlightBlock, gsd_m: float) -> int:
     candidates = np.flatnonzero(flight.leg >= 0)
     if len(np.unique(flight.leg[candidates])) < 2:
         return 0
-    seen, chosen = linkable_points(flight, active().registration.link_cell_m)
+    seen, chosen = linkable_points(flight, LINK_CELL_M)
     camera, point, uv = link_legs(
         adj.cameras,
         adj.points,
@@ -322,7 +323,7 @@ def linkable_points(flight: FlightBlock, cell_m: float, pictures: Flags | None =
 
 def first_ties(flight: FlightBlock, surface: GroundModel, ground: LoadedMap) -> MapMatches:
     """Tie points of a flight that the coarse registration put on the map within some metres."""
-    cell_m = _FIRST_TIE_CELL_SPARSE_M if flight.sparse else active().registration.first_tie_cell_m
+    cell_m = _FIRST_TIE_CELL_SPARSE_M if flight.sparse else _FIRST_TIE_CELL_M
     return clear_matches(tie_matches(flight, surface, ground, cell_m=cell_m, reach_m=FIRST_TIE_REACH_M))
 
 
@@ -370,7 +371,7 @@ def _second_round(
     flight: FlightBlock, ground: LoadedMap, surface: GroundModel, rounds: int, pictures: Flags | None = None
 ) -> tuple[GroundModel, MapTies, MapMatches]:
     """New tie points, compared on the ground as the caller has just fitted it, and steps with them."""
-    cell_m = _TIE_CELL_SPARSE_M if flight.sparse else active().registration.tie_cell_m
+    cell_m = _TIE_CELL_SPARSE_M if flight.sparse else _TIE_CELL_M
     found = tie_matches(flight, surface, ground, cell_m=cell_m, reach_m=TIE_REACH_M, pictures=pictures)
     matches = clear_matches(found)
     matches = replace(matches, shift=matches.shift - edge_displacement(flight, surface, ground, matches))
@@ -420,8 +421,7 @@ def confirmed(
 ) -> ConfirmedFit | None:
     """The first registration that tie points confirm; the cameras then lie there, else where they were."""
     before = flight.adjustment.copy()
-    config = active().registration
-    limit, tests = np.log10(config.false_matches), 0
+    limit, tests = np.log10(FALSE_MATCHES), 0
     for fit in fits:
         shift_cameras(flight, fit.correction)
         ground = load_map(flight, basemap, origin, map_gsd(flight, basemap))

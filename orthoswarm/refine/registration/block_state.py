@@ -35,11 +35,15 @@ _LEG_AGREES_M: Final = 1.2  # a tie point whose residual is below this agrees wi
 
 @dataclass(frozen=True, slots=True)
 class WorkArea:
-    """Where vehicles are refined: the grid, the origin (2,) of the local frame, and the map on the grid, or None."""
+    """Where vehicles are refined: the grid, the origin (2,) of the local frame, and the map on the grid, or None.
+
+    device: where networks run.
+    """
 
     epsg: int
     origin: Array
     basemap: MapWindow | None
+    device: str = "auto"
 
     @property
     def grid(self) -> LocalGrid:

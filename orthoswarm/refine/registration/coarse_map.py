@@ -15,13 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
-from orthoswarm.config import active
 from orthoswarm.model.arrays import Array, Flags, Floats
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import MapWindow
 from orthoswarm.refine.flight.relative_block import FlightBlock
+from orthoswarm.refine.registration.map_evidence import FALSE_MATCHES
 from orthoswarm.refine.registration.orientation_correlation import (
+    COARSE_REACH_M,
     PEAK_APART_PX,
     STRIP_BORDER_PX,
     STRIP_FEWEST_EDGES,
@@ -79,12 +80,12 @@ def shift_on_coarse_map(
     flights: Sequence[FlightBlock], basemap: MapWindow, origin: Array, ground_z: float
 ) -> CoarseMapShift | None:
     """Where vehicles that make one block lie on a coarse map, None if it shows no such place; ground_z: their level."""
-    config, gsd = active().registration, basemap.native_gsd_m / _STEP
+    gsd = basemap.native_gsd_m / _STEP
     drawn = _mosaic(flights, ground_z, gsd)
     if drawn is None:
         return None
     grey, valid, west, north = drawn
-    reach = int(np.ceil(config.coarse_reach_m[0] / gsd))
+    reach = int(np.ceil(COARSE_REACH_M[0] / gsd))
     rows, columns = (n + 2 * reach for n in grey.shape)
     left, top = origin[0] + west - reach * gsd, origin[1] + north + reach * gsd
     bounds = BoundingBox(left, top - rows * gsd, left + columns * gsd, top)
@@ -100,7 +101,7 @@ def shift_on_coarse_map(
     rest = without_peak(score, PEAK_APART_PX)
     z = (peak - float(rest.mean())) / max(float(rest.std()), 1e-9)
     false_matches = float(np.exp(np.log(score.size) + log_ndtr(-z)))
-    if false_matches > config.false_matches:
+    if false_matches > FALSE_MATCHES:
         return None
     spread = _jackknife(moving, fixed, reach)
     grid = GroundGrid.around(basemap.epsg, bounds, gsd)

@@ -2,16 +2,17 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 import numpy as np
 
-from orthoswarm.config import active
 from orthoswarm.model.arrays import Array, Flags, Indices, Ints
 from orthoswarm.model.placement import MapWindow
 from orthoswarm.raster.map_cache import TiledMap
 from orthoswarm.refine.flight.relative_block import FlightBlock
 from orthoswarm.refine.registration.orientation_correlation import (
+    COARSE_REACH_M,
     Match,
     Search,
     by_learning,
@@ -55,10 +56,9 @@ def coarse_fits(flight: FlightBlock, basemap: MapWindow, origin: Array) -> Itera
 
     Strips of each leg near their records; then one shift for all strips together; then strips within a wider search.
     """
-    config = active().registration
     gsd = float(np.clip(picture_width_m(flight) / _STRIP_ACROSS_PX, *_STRIP_GSD_M))
     tiles = TiledMap(basemap, gsd)
-    near, far = config.coarse_reach_m
+    near, far = COARSE_REACH_M
     for find, reach_m in ((_fit_within, near), (_fit_together, near), (_fit_within, far)):
         fit = find(flight, Search(tiles, origin, reach_m, gsd))
         if fit is not None:
@@ -88,7 +88,7 @@ def _fit_within(flight: FlightBlock, search: Search) -> CoarseFit | None:
     return CoarseFit(_smooth(matches, inlier, len(cameras)), matches, inlier, float(inlier.mean()))
 
 
-def learned_fit(flight: FlightBlock, basemap: MapWindow, origin: Array) -> CoarseFit | None:
+def learned_fit(flight: FlightBlock, basemap: MapWindow, origin: Array, device: str) -> CoarseFit | None:
     """Registration by learned matching of a few strips, where correlation found no consensus; None without one."""
     cameras = flight.cameras()
     gsd = float(np.clip(picture_width_m(flight) / _LEARNED_ACROSS_PX, *_LEARNED_GSD_M))
@@ -96,7 +96,9 @@ def learned_fit(flight: FlightBlock, basemap: MapWindow, origin: Array) -> Coars
     search = Search(TiledMap(basemap, gsd), origin, _LEARNED_REACH_M, gsd)
     spread = np.linspace(0, len(windows) - 1, _LEARNED_STRIPS).round().astype(int)
     chosen = [windows[k] for k in np.unique(spread)]
-    found = [register(cameras, index, flight.pictures.gray, search, by_learning) for index in chosen]
+    found = [
+        register(cameras, index, flight.pictures.gray, search, partial(by_learning, device=device)) for index in chosen
+    ]
     matches = [m for m in found if m is not None]
     if len(matches) < 2:
         return None

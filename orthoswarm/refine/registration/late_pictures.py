@@ -14,13 +14,12 @@ import cv2
 import numpy as np
 
 from orthoswarm.compute.robust_kernel import robust_weights
-from orthoswarm.config import active
 from orthoswarm.model.arrays import Array, Gray
 from orthoswarm.model.camera import Camera, Lens
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
-from orthoswarm.model.placement import PlacedFrame, Solution, Terrain
+from orthoswarm.model.placement import STATED_SIGMA_FACTOR, PlacedFrame, Solution, Terrain
 from orthoswarm.mosaic.recorded_pose import recorded_cameras
 from orthoswarm.refine.flight.unsolved_pictures import place_by_neighbours
 
@@ -176,7 +175,7 @@ def _fitted(guess: PlacedFrame, seen: Sequence[tuple[Array, Array]], near: Seque
     away = np.array([p.camera.nadir for p in near])[source].mean(0) - camera.nadir
     neighbour_sigma_m = float(np.median([p.sigma_m for p in near]))
     leaning = _CORNER_HEIGHT_M * float(np.hypot(*away)) / float(camera.position[2] - ground[agree, 2].mean())
-    own = active().bundle.stated_sigma_factor * float(np.sqrt(len(near)))
+    own = STATED_SIGMA_FACTOR * float(np.sqrt(len(near)))
     own *= centre_sigma(camera, uv[agree], ground[agree], scale)
     return PlacedFrame(guess.frame, camera, near[0].stage, float(np.linalg.norm([neighbour_sigma_m, leaning, own])))
 

@@ -15,6 +15,9 @@ from scipy.special import bdtrc
 
 from orthoswarm.model.arrays import Array, Ints
 
+FALSE_MATCHES: Final = 1e-4
+"""A flight is taken to lie on the map if a map of other ground would show an agreement as good as the one found so many
+times only (expected number of false matches); measured by benchmarks/robustness/wrong_maps.py."""
 _EVIDENCE_FEWEST: Final = 4  # fewest tie points of a leg or a flight: fewer agree with themselves alone
 _EVIDENCE_PAIRS: Final = 400  # most lines through two tie points that are tried in a group (for its time)
 _EVIDENCE_TOLERANCES_M: Final = (0.7, 1.5, 3.0)  # distances within which tie points agree on a place on the map

@@ -12,11 +12,10 @@ from typing import Final
 
 import numpy as np
 
-from orthoswarm.config import active
 from orthoswarm.model.arrays import Array
-from orthoswarm.model.frame import SURVEYED, Frame
+from orthoswarm.model.frame import Frame
 from orthoswarm.model.placement import PlacedFrame
-from orthoswarm.refine.bundle.covariance import RECEIVER_COMMON_SIGMA_M
+from orthoswarm.refine.bundle.covariance import RECEIVER_BIAS_SIGMA_M, RECEIVER_COMMON_SIGMA_M
 
 _CORRECTED_SIGMA_M: Final = 0.5  # a position that states at most this sigma was corrected (RTK, PPK)
 _CORRECTED_FLOOR_M: Final = 0.05  # corrected positions are not trusted better than this: antenna offset, base station
@@ -127,12 +126,7 @@ def measure_control_offset(
 
 def _measured(recorded: Sequence[PlacedFrame], refined: Sequence[PlacedFrame], found_m: float) -> MapOffset | None:
     """Frames against their records; `found_m`: how well the place of the frames itself is known, metres."""
-    config = active().registration
-    before = {
-        (p.frame.vehicle, p.frame.image): p.camera.nadir
-        for p in recorded
-        if p.frame.origin.get("position") != SURVEYED  # which is no receiver's
-    }
+    before = {(p.frame.vehicle, p.frame.image): p.camera.nadir for p in recorded if p.frame.has_own_position}
     moved: dict[str, list[Array]] = {}
     stated: dict[str, list[float]] = {}
     for p in refined:
@@ -149,7 +143,7 @@ def _measured(recorded: Sequence[PlacedFrame], refined: Sequence[PlacedFrame], f
     for vehicle in used:
         mean, spread = _mean(np.array(moved[vehicle]))
         means.append(mean)
-        own = max(accuracy[vehicle], _CORRECTED_FLOOR_M) if corrected else config.receiver_bias_sigma_m
+        own = max(accuracy[vehicle], _CORRECTED_FLOOR_M) if corrected else RECEIVER_BIAS_SIGMA_M
         sigmas.append(np.hypot(own, spread))
     offset, sigma = _together(np.array(means), np.array(sigmas))
     common = 0.0 if corrected else RECEIVER_COMMON_SIGMA_M

@@ -14,7 +14,6 @@ from typing import Final
 import cv2
 import numpy as np
 
-from orthoswarm.config import active
 from orthoswarm.model.arrays import Array, Flags, Floats, Gray, Indices, Ints
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.geo import GroundGrid
@@ -26,7 +25,7 @@ from orthoswarm.refine.registration.absolute_orientation import linkable_points,
 from orthoswarm.refine.registration.block_state import VehicleState, WorkArea, lies_on_map
 from orthoswarm.refine.registration.coarse_registration import CoarseFit, coarse_fits, picture_width_m, shift_cameras
 from orthoswarm.refine.registration.orientation_correlation import strip_mosaic
-from orthoswarm.refine.registration.tie_points import LINK_REACH_PX, link_legs
+from orthoswarm.refine.registration.tie_points import LINK_CELL_M, LINK_REACH_PX, link_legs
 from orthoswarm.refine.surface.vehicle_ground import fit_surface
 
 _BLOCK_PX = 512
@@ -104,7 +103,7 @@ def link_to_fixed(
     adj = flight.adjustment
     n = len(adj.cameras)
     joint = CameraBlock.joined([adj.cameras, fixed.cameras])
-    seen, chosen = linkable_points(flight, cell_m or active().registration.link_cell_m, pictures)
+    seen, chosen = linkable_points(flight, cell_m or LINK_CELL_M, pictures)
     leg = np.concatenate([flight.leg, int(flight.leg.max()) + 1 + fixed.vehicle]).astype(np.int32)
     candidates = np.arange(n, len(joint))
 
@@ -265,7 +264,7 @@ def _linked(state: VehicleState, fit: CoarseFit, others: list[VehicleState]) -> 
     fixed = fixed_cameras_near(state, others)
     if fixed is None:
         return False
-    cell_m = min(active().registration.link_cell_m, _UNFOUND_CELL_SHARE * picture_width_m(flight))
+    cell_m = min(LINK_CELL_M, _UNFOUND_CELL_SHARE * picture_width_m(flight))
     found = link_to_fixed(flight, fixed, working_gsd(flight), reach_px=_UNFOUND_REACH_PX, cell_m=cell_m)
     if found < _UNFOUND_FEWEST:
         return False

@@ -21,6 +21,9 @@ OrientationField = NDArray[np.complex64]
 Found = tuple[float, float, float, float]
 """Column and row of a shift from the centre, pixels, peak, and ratio of second peak to peak."""
 
+COARSE_REACH_M: Final = (60.0, 150.0)
+"""How far strips are searched: first, and where that is refuted (receivers without corrections are within the
+first)."""
 _STRIP_MOST_PX: Final = 4_000_000  # larger strips are not correlated (memory)
 _STRIP_FARTHEST_HEIGHTS: Final = 4.0
 """A picture that looks farther than so many flying heights and the next field is left out: horizon."""
@@ -270,11 +273,14 @@ def stacked(strips: Sequence[Strip]) -> tuple[Array, float, float] | None:
     return offset + gsd * np.array([column, -row]), z, ratio
 
 
-def by_learning(strip: Strip) -> Found | None:
-    """Where a strip lies on the map by learned matching, some seconds a strip: for strips whose edges do not agree."""
+def by_learning(strip: Strip, device: str) -> Found | None:
+    """Where a strip lies on the map by learned matching, some seconds a strip: for strips whose edges do not agree.
+
+    device: where the network runs.
+    """
     from orthoswarm.matchers.second_opinion import second_opinion
 
-    shift = second_opinion(strip.gray, strip.valid, strip.ground, known=strip.known, reach=strip.reach)
+    shift = second_opinion(strip.gray, strip.valid, strip.ground, known=strip.known, reach=strip.reach, device=device)
     return None if shift is None else (float(shift[0]), float(shift[1]), 1.0, 0.0)
 
 

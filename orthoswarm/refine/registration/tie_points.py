@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import kernel
 from orthoswarm.compute.robust_kernel import robust_weights
-from orthoswarm.config import active
 from orthoswarm.model.arrays import Array, Flags, Gray, Indices, Ints
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.geo import GroundGrid
@@ -39,6 +38,8 @@ _LEAN_SCALE: Final = 4.0  # robust scale of the vote (2 sigmas)
 _LEAN_MOST: Final = 1.0  # largest lean, metres of shift a metre of height (45 degrees)
 _LEAN_OVER_NONE: Final = 1.5  # a lean must have so many times the sum of weights that no lean has
 _LEAN_LEAST_SHARE: Final = 0.25  # ... and at least this mean weight
+LINK_CELL_M: Final = 40.0  # one point a leg in each cell of this size is sought in other legs (cost)
+_LINK_PICTURES: Final = 3  # most other legs in which a point is observed, one picture each (cost)
 _LINK_HALF_PX: Final = 15  # half a patch
 LINK_REACH_PX: Final = 6  # how far it is searched
 _LINK_MARGIN_PX: Final = 12.0  # points nearer to a picture's border are not searched in it, working pixels
@@ -226,7 +227,7 @@ def link_legs(
         camera: (P,) reference picture of each point. leg: (N,) of each camera. candidates: cameras that may be linked.
         most: other legs in which a point is observed, None: as configured. reach: search in pixels.
     """
-    most, half = most or active().registration.link_pictures, _LINK_HALF_PX
+    most, half = most or _LINK_PICTURES, _LINK_HALF_PX
     floor = np.float32(_GRADIENT_FLOOR)
     chosen = chosen[np.argsort(camera[chosen], kind="stable")]
     _, number = np.unique(leg, return_inverse=True)

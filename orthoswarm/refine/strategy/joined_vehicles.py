@@ -13,8 +13,8 @@ from typing import Final
 import numpy as np
 
 from orthoswarm.compute.robust_kernel import robust_weights
-from orthoswarm.config import active
 from orthoswarm.model.arrays import Array
+from orthoswarm.model.placement import STATED_SIGMA_FACTOR
 from orthoswarm.model.plane_similarity import Similarity
 from orthoswarm.model.task_runner import Run
 from orthoswarm.refine.bundle.covariance import RECEIVER_COMMON_SIGMA_M
@@ -103,7 +103,7 @@ def _back_to_receivers(out: list[VehicleState], block: Block) -> None:
         )
         away = (((similarity.moved(now[:, :2]) - alone[:, :2]) / sigma_m) ** 2).sum(axis=1)
         counts = robust_weights(away, POSITION_ROBUST_C)
-    level_m, factor = _level_m(out, block), active().bundle.stated_sigma_factor
+    level_m, factor = _level_m(out, block), STATED_SIGMA_FACTOR
     for k in block:
         placed = np.hypot(similarity.sigma_m(out[k].flight.cameras().position[:, :2]), RECEIVER_COMMON_SIGMA_M)
         out[k] = replace(_moved(out[k], similarity, level_m), datum_sigma_m=factor * placed)

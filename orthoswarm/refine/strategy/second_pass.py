@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from orthoswarm.config import active
 from orthoswarm.export.product_files import OBLIQUE_AXIS_DOWN
 from orthoswarm.model.arrays import Array, Flags, Floats, Ints
 from orthoswarm.model.camera import fov_rad
@@ -60,6 +59,7 @@ contain."""
 _SECOND_STEPS: Final = 4  # steps of the second pass without a map
 _OBLIQUE_CELL_M: Final = 5.0  # at least this far apart, however small the picture
 _OBLIQUE_SLOPE: Final = 0.35  # horizontal distance over height from which on a view counts as oblique: 19 degrees
+_OBLIQUE_CELL_SHARE: Final = 0.06  # distance of the positions, as a share of the flying height (cost)
 _OBLIQUE_HALF_M: Final = 10.0  # half a patch: smaller than a tie point's
 _OBLIQUE_REACH_M: Final = 6.0  # how far a patch is searched
 _OBLIQUE_ACROSS_M: Final = 0.6  # what is found lies this near to the line of sight, metres, or is another place
@@ -226,9 +226,8 @@ def map_heights(
 
 def _positions(flight: FlightBlock, height_m: float, own: NDArray[np.integer], others: Array) -> Array:
     """Centres (K, 2) of cells that own cameras see obliquely and no other vehicle sees more steeply."""
-    config = active().registration
     path, reach = flight.cameras().position[:, :2], sight_reach(flight)
-    cell = max(config.oblique_cell_share * height_m, _OBLIQUE_CELL_M)
+    cell = max(_OBLIQUE_CELL_SHARE * height_m, _OBLIQUE_CELL_M)
     cells = cells_near(path, cell, reach + cell)
     mine, _ = cKDTree(path[own]).query(cells)
     keep = (mine > _OBLIQUE_SLOPE * height_m) & (mine < reach)

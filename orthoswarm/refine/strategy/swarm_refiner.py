@@ -71,7 +71,7 @@ class SwarmRefiner(UnitRefiner):
         return self._beside_held_others([place(unit) for unit in units], others, basemap)
 
     def _area(self, basemap: MapWindow | None) -> WorkArea:
-        return WorkArea(self.epsg, self.origin, basemap)
+        return WorkArea(self.epsg, self.origin, basemap, self.options.device)
 
     def follow(self, frames: Sequence[Frame]) -> None:
         """Track a vehicle's pictures and keep that (`RefinerOptions.kept`), for `refine` of the same frames."""

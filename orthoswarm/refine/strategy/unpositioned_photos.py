@@ -7,15 +7,15 @@ refiner then adjusts these photos like all others.
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
-from orthoswarm.config import active
-from orthoswarm.evaluation.checkpoints import Checkpoint
+from orthoswarm.evaluation.checkpoints import SURVEY_SIGMA_M, Checkpoint
 from orthoswarm.evaluation.photo_names import photo_named
 from orthoswarm.model.arrays import Array, Ints
-from orthoswarm.model.frame import SURVEYED, Frame
+from orthoswarm.model.camera import angles_from_rotation
+from orthoswarm.model.frame import BY_OTHERS, SURVEYED, Frame
 from orthoswarm.model.geo import LocalGrid, area_epsg
 from orthoswarm.model.task_runner import Progress, Run
 from orthoswarm.refine.features.working_pictures import ReadGray
@@ -23,14 +23,21 @@ from orthoswarm.refine.flight.sparse_start import read_photo_records
 from orthoswarm.refine.initial.free_network import FREE_PAIR_SHARE, Anchors, FreeNetwork, solve_free_network
 from orthoswarm.refine.initial.initial_orientation import shape_of
 from orthoswarm.refine.initial.pair_graph import PairGraphBuilder
-from orthoswarm.refine.initial.planar_similarity import PhotoRecords
+from orthoswarm.refine.initial.planar_similarity import PhotoRecords, rotation_of
 from orthoswarm.refine.initial.relative_scale import focal_by_hint
-from orthoswarm.refine.initial.tilt_and_lens import PairMatches, level_pixels, similarities
+from orthoswarm.refine.initial.tilt_and_lens import PairMatches, TiltAndLens, level_pixels, similarities
 
 _FREE_NADIR_SHARE: Final = 0.05
 """The ground straight below such a photo lies so far from where its level picture has it, sigma as a share of its
 width: tilts of three degrees at a field of view of 60."""
 _FREE_MOST_PAIRS: Final = 40_000  # most pairs tried where nothing tells overlaps: 280 photos, two minutes of CPU
+
+
+class PlacedPhotos(NamedTuple):
+    """Photos with the positions that were found, and images that show ground in common but could not be placed."""
+
+    frames: list[Frame]
+    left: list[list[str]]
 
 
 def place_unpositioned(
@@ -41,8 +48,8 @@ def place_unpositioned(
     read_gray: ReadGray,
     run: Run,
     progress: Progress | None = None,
-) -> list[Frame]:
-    """Give photos the positions that surveyed points and other photos tell; those that could be placed come back.
+) -> PlacedPhotos:
+    """Give photos the positions and angles that surveyed points and other photos tell.
 
     Args:
         photos: without positions (their latitude and longitude are NaN), of a vehicle in order of time.
@@ -51,24 +58,35 @@ def place_unpositioned(
     """
     grid = _grid(positioned, points)
     if not photos or grid is None:
-        return []
+        return PlacedPhotos([], [])
     middle = _middle(positioned, points)
     origin = grid.to_grid(*middle)
     frames = [*(replace(f, fix=replace(f.fix, lat_deg=middle[0], lon_deg=middle[1])) for f in photos), *positioned]
-    records = read_photo_records(frames, grid, origin)
+    records = _each_its_own_tilt(read_photo_records(frames, grid, origin), len(photos))
     builder = PairGraphBuilder(frames=frames, records=records, read_gray=read_gray, run=run, progress=progress)
     builder.detect_all()
     builder.try_pairs(candidate_pairs(len(photos), len(frames)))
     pairs = builder.pairs()
     if not pairs:
-        return []
+        return PlacedPhotos([], [])
     matches = PairMatches.of(pairs, builder.features)
     shape = shape_of(matches, records, *focal_by_hint(records))
     graph = similarities(matches, records, shape)
     anchors = _anchors(frames, records, points, grid=grid, origin=origin, known=len(photos))
     anchors = replace(anchors, pixel=level_pixels(anchors.pixel, anchors.photo, records, shape))
     network = solve_free_network(graph, len(frames), records.width, anchors)
-    return _placed(photos, network, grid=grid, origin=origin)
+    left = [[frames[k].image for k in part] for part in network.left]
+    found = _placed(photos, network, records, shape, grid=grid, origin=origin)
+    source = SURVEYED if points else BY_OTHERS
+    told = {"position": source, "height": source, "angles": source}
+    return PlacedPhotos([replace(frame, origin={**frame.origin, **told}) for frame in found], left)
+
+
+def _each_its_own_tilt(records: PhotoRecords, without: int) -> PhotoRecords:
+    """The records with a segment for each of the first `without` photos: nothing says that a gimbal held them alike."""
+    alone = np.arange(without, dtype=np.int32)
+    others = np.unique(records.segment[without:], return_inverse=True)[1].astype(np.int32)
+    return replace(records, segment=np.r_[alone, without + others])
 
 
 def candidate_pairs(without: int, count: int) -> Ints:
@@ -125,7 +143,7 @@ def _anchors(
             mark.check_inside(frame.width, frame.height)
             pixel = complex(mark.column - 0.5 * (frame.width - 1), -(mark.row - 0.5 * (frame.height - 1)))
             sigma_px = FREE_PAIR_SHARE * frame.width
-            rows.append((number[name], pixel, ground, point.sigma_m or active().control.survey_sigma_m, sigma_px))
+            rows.append((number[name], pixel, ground, point.sigma_m or SURVEY_SIGMA_M, sigma_px))
     sigma = records.gps_sigma()
     for k in range(known, len(frames)):  # below the camera is the middle of the level picture
         sigma_px = _FREE_NADIR_SHARE * frames[k].width
@@ -140,18 +158,35 @@ def _anchors(
     )
 
 
-def _placed(photos: Sequence[Frame], network: FreeNetwork, *, grid: LocalGrid, origin: Array) -> list[Frame]:
-    """The placed photos with a fix from the network."""
+def _placed(
+    photos: Sequence[Frame],
+    network: FreeNetwork,
+    records: PhotoRecords,
+    shape: TiltAndLens,
+    *,
+    grid: LocalGrid,
+    origin: Array,
+) -> list[Frame]:
+    """The placed photos with a fix from the network: position, angles, and the height where a tag tells the lens."""
     out = []
+    yaw, pitch, roll = angles_from_rotation(rotation_of(-np.angle(network.scale), shape.level))
+    # Scales give the height over the focal length: without a tag neither is known.
+    focal = np.where(np.isfinite(records.fov_hint), np.exp(shape.log_focal), np.nan)[records.lens]
     for k, frame in enumerate(photos):
         if not network.placed[k]:
             continue
         centre = network.centre[k]
         lat, lon = (float(v) for v in grid.to_geographic(origin + np.array([centre.real, centre.imag])))
-        yaw = float(-np.angle(network.scale[k]) + grid.convergence_rad(lat, lon))
         leaning = _FREE_NADIR_SHARE * frame.width * abs(network.scale[k])
-        sigma_m = float(np.hypot(network.sigma_m[k], leaning))
-        fix = replace(frame.fix, lat_deg=lat, lon_deg=lon, yaw_rad=yaw, position_sigma_m=sigma_m)
-        origin_of = {**frame.origin, "position": SURVEYED, "angles": SURVEYED}
-        out.append(replace(frame, fix=fix, origin=origin_of))
+        fix = replace(
+            frame.fix,
+            lat_deg=lat,
+            lon_deg=lon,
+            height_m=float(abs(network.scale[k]) * focal[k]) if np.isfinite(focal[k]) else None,
+            yaw_rad=float(yaw[k] + grid.convergence_rad(lat, lon)),
+            pitch_rad=float(pitch[k]),
+            roll_rad=float(roll[k]),
+            position_sigma_m=float(np.hypot(network.sigma_m[k], leaning)),
+        )
+        out.append(replace(frame, fix=fix))
     return out

@@ -6,9 +6,8 @@ from typing import Final
 import numpy as np
 from scipy.spatial import cKDTree
 
-from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
-from orthoswarm.model.placement import Terrain
+from orthoswarm.model.placement import STATED_SIGMA_FACTOR, Terrain
 from orthoswarm.model.task_runner import Run, serial
 from orthoswarm.refine.flight.weakly_held_pictures import weakly_held
 from orthoswarm.refine.registration.block_state import VehicleState
@@ -97,7 +96,7 @@ def map_distortion_sigma(states: Sequence[VehicleState]) -> float:
     if not found:
         return 0.0
     variance, ties = np.array(found, float).T
-    return active().bundle.stated_sigma_factor * float(np.sqrt(variance @ ties / max(ties.sum(), 1.0)))
+    return STATED_SIGMA_FACTOR * float(np.sqrt(variance @ ties / max(ties.sum(), 1.0)))
 
 
 def mapped_level(states: Sequence[VehicleState], terrain: Terrain | None) -> float:

@@ -7,13 +7,13 @@ from typing import Final
 
 import numpy as np
 
-from orthoswarm.config import active
 from orthoswarm.model.arrays import Array, Gray
 from orthoswarm.model.camera import fov_rad
 from orthoswarm.model.errors import AdjustmentError
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.placement import MapWindow
 from orthoswarm.model.task_runner import Continued, whole
+from orthoswarm.raster.grey_pictures import WORK_WIDTH_PX
 from orthoswarm.raster.height_model import HeightModel
 from orthoswarm.raster.picture_file import read_gray, reduction
 from orthoswarm.refine.bundle.adjustment import TIE_ROBUST_C, TRACK_ROBUST_C, Adjustment
@@ -82,6 +82,10 @@ _WIDEST_FOV_DEG: Final = 137.0  # ... or above this; a little above the widest t
 _REST_STEPS: Final = 3  # steps after which a contradiction must still be there
 _FREE_STEPS: Final = 6  # steps of a round without the recorded heights
 _FREE_ROUNDS: Final = 4  # rounds without the recorded heights at most
+_SCHEDULE: Final = (100.0, 100.0, 100.0, 100.0, 9.0, 9.0)
+"""Robust scales of the steps without a map, squared, of normalised residuals. Starts are near enough for 10 sigmas
+(recorded poses, focal length by optical flow); two first steps at 1e4 gave the same accuracy on 31 runs of small
+flights and on 1,017 photos, and wrong tracks could carry the focal length away (docs/method.md)."""
 _MAP_FOV_SIGMAS: Final = 6.0  # a registration that changes the field of view by more sigmas is doubted ...
 _MAP_FOV_DEG: Final = 4.0  # ... and by more than this
 _NEW_EVIDENCE: Final = 2.0
@@ -103,12 +107,14 @@ class RefinerOptions:
         fov_start_rad: field of view to start from where the tags hint at none.
         dem: given height model, None to find the ground. read: reads a frame's grey picture; picklable.
         kept: where tracks are kept for a refinement of the same pictures, None if they are not.
+        device: where networks run.
     """
 
     fov_start_rad: float = field(default_factory=lambda: float(np.radians(START_FOV_DEG)))
     dem: HeightModel | None = None
     read: ReadGray = field(default_factory=lambda: read_frame)
     kept: KeptTracks | None = None
+    device: str = "auto"
 
     def ground(self, origin: Array) -> GroundModel:
         """The ground before any picture is used, in the local frame: level, or the given height model."""
@@ -119,7 +125,7 @@ class RefinerOptions:
 
 def read_frame(frame: Frame) -> Gray:
     """A frame's grey picture, reduced while it is decoded where it is larger than what the refinement works on."""
-    return read_gray(frame.path, reduction(frame.width, frame.height, active().features.work_width_px))
+    return read_gray(frame.path, reduction(frame.width, frame.height, WORK_WIDTH_PX))
 
 
 def refine_alone(frames: Sequence[Frame], *, area: WorkArea, options: RefinerOptions) -> VehicleState:
@@ -222,7 +228,7 @@ def register_on_map(state: VehicleState, area: WorkArea, *, learned: bool = True
     if basemap is not None and not is_coarse(flight, basemap):
         state.unfound = not _onto_map(state, coarse_fits(flight, basemap, origin), basemap, origin, watch)
         if state.unfound and learned:
-            _onto_map_by_learning(state, learned_fit(flight, basemap, origin), basemap, origin, watch)
+            _onto_map_by_learning(state, learned_fit(flight, basemap, origin, area.device), basemap, origin, watch)
     flight.pictures.drop()
     watch.add_to(state.timings)
 
@@ -278,8 +284,8 @@ def focal_length_ran_away(flight: FlightBlock) -> bool:
 
 
 def adjust_by_schedule(flight: FlightBlock, surface: GroundModel) -> GroundModel:
-    """Adjust a tracked flight by the steps of `strategy.schedule`; returns the ground fitted to its points."""
-    schedule = list(active().strategy.schedule)
+    """Adjust a tracked flight by the steps of `_SCHEDULE`; returns the ground fitted to its points."""
+    schedule = list(_SCHEDULE)
     wide, narrow = (_FIRST_GROUND_SIGMA_M, _FIRST_GROUND_ROBUST_C), (_GROUND_SIGMA_M, _GROUND_ROBUST_C)
     for k, c in enumerate(schedule):
         prior = wide if k < _FIRST_STEPS else narrow
@@ -340,7 +346,7 @@ def learned_registration(state: VehicleState, area: WorkArea) -> CoarseFit | Non
     PyTorch and the network take 400 MB of a process's memory: one process serves all flights, one after the other.
     """
     watch = Stopwatch()
-    fit = None if area.basemap is None else learned_fit(state.flight, area.basemap, area.origin)
+    fit = None if area.basemap is None else learned_fit(state.flight, area.basemap, area.origin, area.device)
     state.flight.pictures.drop()
     watch.lap("coarse registration")
     watch.add_to(state.timings)

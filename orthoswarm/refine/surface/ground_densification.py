@@ -6,7 +6,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.model.arrays import Array, Flags
 from orthoswarm.model.placement import Terrain
 from orthoswarm.refine.bundle.block_arrays import CameraBlock
@@ -24,6 +23,8 @@ from orthoswarm.refine.surface.vertical_line_locus import (
 )
 
 _FREE_POSITIONS: Final = 900  # free positions where the ground is measured (0.05 s)
+HIGH_FROM_M: Final = 6.0  # cells without ground are searched for what stands high from this height over it on ...
+HIGH_TO_SHARE: Final = 0.25  # ... up to this share of the flying height
 _FREE_SPREAD_M: Final = 100.0  # half side of the square about each camera for them at reference height
 _FREE_REACH_M: Final = 3.0  # heights searched there above and below the surface
 _FREE_HEIGHT_STEP_M: Final = 0.25  # distance of these heights at the reference height
@@ -69,7 +70,6 @@ def free_ground(
 
 def dense_points(flight: FlightBlock, surface: GroundModel) -> tuple[Array, Array, Array]:
     """Ground points (K, 3) and their sigmas, one per cell where a height was found; and points (H, 3) high above it."""
-    c = active().surface
     cameras, height = flight.cameras(), flying_height(flight, surface)
     cells = cells_near(cameras.position[:, :2], _DENSE_CELL_M * height / REFERENCE_HEIGHT_M, sight_reach(flight))
     if not len(cells):
@@ -77,8 +77,8 @@ def dense_points(flight: FlightBlock, surface: GroundModel) -> tuple[Array, Arra
     ground, gray = surface.terrain(), flight.pictures.gray
     found = dense_ground(cameras, gray, cells, terrain=ground, leg_of_camera=flight.leg)
     high = np.zeros((0, 3))
-    middle_m = 0.5 * (c.high_from_m + c.high_to_share * height)
-    reach_m = 0.5 * (c.high_to_share * height - c.high_from_m)
+    middle_m = 0.5 * (HIGH_FROM_M + HIGH_TO_SHARE * height)
+    reach_m = 0.5 * (HIGH_TO_SHARE * height - HIGH_FROM_M)
     if reach_m > 0.0:
         left = np.delete(cells, found.cell, axis=0)
         raised = replace(ground, z=ground.z + np.float32(middle_m))

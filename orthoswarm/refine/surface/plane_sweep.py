@@ -15,7 +15,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.config import active
 from orthoswarm.model.arrays import Array, Flags, Floats, Gray, Ints
 from orthoswarm.model.placement import Terrain
 from orthoswarm.model.task_runner import Run
@@ -50,6 +49,10 @@ _TALL_SLOPE_COST: Final = 0.15  # cost of a step to the next height between cell
 _TALL_EDGE_COST: Final = (0.15, 1.2)
 """Cost of a larger step across a strong edge of the picture, and on even ground (measured: 0.3 and 1.2 give 0.4 per
 cent fewer right nodes, 0.3 and 1.8 another 0.7)."""
+TALL_FROM_M: Final = 1.5  # what differs less from the ground belongs to it
+_TALL_HIDDEN_COST: Final = (0.2, 0.4)
+"""Least and greatest cost, in correlation, of a height at which something taller hides the cell from the picture
+compared (measured: with greater ones more roofs are whole and more of the ground behind them is raised)."""
 _TALL_EDGE_LEVELS: Final = 8.0  # difference of grey values that halves what is between these costs
 _TALL_REACH_HEIGHTS: Final = 1.5  # pictures whose nadir points are farther away, in flying heights, are not compared
 _TALL_RIM_SHARE: Final = 0.05  # share of a picture's sides at its rim that a block's middle must not lie in
@@ -249,7 +252,7 @@ def _measure(task: _SweepTask) -> list[Floats]:
 
 def _heights(task: _SweepTask, block: _Block, pictures: Sequence[Gray]) -> Floats:
     """The heights of a block's nodes, those around the inner ones included."""
-    c, f = active().surface, np.float32
+    f = np.float32
     levels, most = block.levels, int(block.levels.max())
     around = np.asarray(cv2.dilate(levels.astype(np.uint16), np.ones((3, 3), np.uint8)), np.int32)
     volumes = np.empty((len(block.views), levels.shape[0], most, levels.shape[1]), np.float32)
@@ -265,7 +268,7 @@ def _heights(task: _SweepTask, block: _Block, pictures: Sequence[Gray]) -> Float
     steps = f(_TALL_SLOPE_COST), f(_TALL_EDGE_COST[0]), f(_TALL_EDGE_COST[1]), f(1.0 / _TALL_EDGE_LEVELS)
     found = np.empty(levels.shape, np.float32)
     kernels.lowest(kernels.semi_global(cost, volumes[0], levels, steps, aslant=False), levels, f(task.step_m), found)
-    above, (low, high) = task.views[block.views[0]].position, c.tall_hidden_cost
+    above, (low, high) = task.views[block.views[0]].position, _TALL_HIDDEN_COST
     kernels.bound_hidden(
         cost, levels, found, block.ground, west, south, task.cell_m, f(task.step_m), above, f(low), f(high),
         f(_TALL_DOUBT), f(_TALL_HIDDEN_M),
@@ -283,9 +286,8 @@ def with_tall_surfaces(
         points: float64 (K, 3) at free positions on the visible surface. height_m: flying height above the ground.
         most_nodes: the ground gets no more nodes than this.
     """
-    c = active().surface
     over = points[:, 2] - ground.height(points[:, :2])
-    raised = over > c.tall_from_m
+    raised = over > TALL_FROM_M
     if not raised.any():
         return ground
     scale = height_m / REFERENCE_HEIGHT_M
@@ -295,7 +297,7 @@ def with_tall_surfaces(
     fine = _finer(ground, parts)
     tallest = _tallest(points[raised, :2], over[raised], fine, _TALL_NEAR_M * scale)
     heights = tall_heights(views, fine, tallest, height_m=height_m, run=run)
-    heights[heights < c.tall_from_m] = 0.0
+    heights[heights < TALL_FROM_M] = 0.0
     if not heights.any():
         return ground
     return replace(fine, z=fine.z + heights, bare=fine.z)

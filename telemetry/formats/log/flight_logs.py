@@ -18,6 +18,7 @@ from telemetry.formats.log.dataflash import read_dataflash
 from telemetry.formats.log.exposure_list import read_exposure_list
 from telemetry.formats.log.log_data import LEAST_STEP_S, FlightLog, NotALog, mapped
 from telemetry.formats.log.mavlink_poses import TYPES, ExposureEvent, MavlinkPoses
+from telemetry.formats.log.receiver_track import TRACK_SUFFIXES, is_nmea, read_track
 from telemetry.formats.log.ulog import read_ulog
 from telemetry.samples.findings import Finding, plural
 from telemetry.samples.sample import Sample
@@ -33,15 +34,19 @@ def read_log(path: Path) -> list[FlightLog]:
     """
     of_one_vehicle: dict[str, Callable[[Path], FlightLog]] = {
         ".bin": read_dataflash, ".ulg": read_ulog, ".pos": read_exposure_list, ".mrk": read_exposure_list,
-        **dict.fromkeys(CAN_LOGS, read_can_log),
+        **dict.fromkeys(CAN_LOGS, read_can_log), **dict.fromkeys(TRACK_SUFFIXES, read_track),
     }  # fmt: skip
     suffix = path.suffix.lower()
     reader = of_one_vehicle.get(suffix)
     if reader is None and suffix != ".tlog":
-        raise NotALog("the file is not a flight log (.tlog, .BIN, .ulg, .pos, .MRK, .log, .asc, .blf, .trc)")
+        raise NotALog(
+            "the file is not a flight log (.tlog, .BIN, .ulg, .pos, .MRK, .gpx, .nmea, .log, .asc, .blf, .trc)"
+        )
     try:
         if path.stat().st_size == 0:
             raise NotALog("the log is empty; copy it again")
+        if suffix == ".log" and is_nmea(path):
+            reader = read_track
         logs = read_tlog(path) if reader is None else [reader(path)]
     except OSError as error:
         raise NotALog(f"the log cannot be read ({error.strerror}); check its permissions") from None

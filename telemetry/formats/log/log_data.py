@@ -35,6 +35,7 @@ class FlightLog:
         has_gimbal: whether the camera's own attitude was logged.
         findings: irregularities, for the user.
         position_sigma_m: last horizontal sigma stated by the autopilot's receiver, None if it stated none.
+        max_gap_s: positions farther apart in time are not interpolated between.
     """
 
     path: Path
@@ -45,10 +46,11 @@ class FlightLog:
     has_gimbal: bool = False
     findings: list[Finding] = field(default_factory=list)
     position_sigma_m: float | None = None
+    max_gap_s: float = 2.0
 
     def timeline(self) -> Timeline:
         """Its poses, which can be read at any time."""
-        return Timeline(self.samples)
+        return Timeline(self.samples, max_gap_s=self.max_gap_s)
 
 
 @contextlib.contextmanager

@@ -21,13 +21,16 @@ _STRUCTURES = (
 )  # fmt: skip
 _MAX_STRUCTURE = 1024
 
+_DEGREES = re.compile(
+    r"\s*([+-]?)(\d{1,3}(?:\.\d*)?)(?:,(\d{1,2}(?:\.\d*)?)(?:,(\d{1,2}(?:\.\d*)?))?)?\s*([NSEWnsew]?)\s*"
+)
 PACKET_START = b"<x:xmpmeta"
-_MAX_PACKET = 1 << 18
+MAX_PACKET = 1 << 18
 
 
 def properties(packet: bytes) -> dict[str, str]:
     """All flat properties of a packet, "prefix:Name" -> text; of a list its first item. Never raises."""
-    packet = packet[:_MAX_PACKET]
+    packet = packet[: 2 * MAX_PACKET]  # of the picture, and of a file beside it
     found: dict[str, str] = {}
     for name, first, second in _ATTRIBUTE.findall(packet):
         if not name.startswith((b"xmlns:", b"rdf:", b"x:")):
@@ -76,3 +79,12 @@ def number(found: Properties, *names: str) -> float | None:
         if result == result and abs(result) != float("inf"):
             return result
     return None
+
+
+def degrees(found: Properties, name: str) -> float | None:
+    """An angle as XMP writes it ("44,3.36N", "44,3,21.6N") or as a decimal number; None if it is no angle."""
+    match = _DEGREES.fullmatch(found.get(name, ""))
+    if match is None:
+        return None
+    value = float(match[2]) + float(match[3] or 0.0) / 60.0 + float(match[4] or 0.0) / 3600.0
+    return -value if match[1] == "-" or (match[5] or "").upper() in ("S", "W") else value

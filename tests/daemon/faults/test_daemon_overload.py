@@ -175,6 +175,7 @@ def drawing(folder, read, **options):
         in_memory=12,
         read=read,
         expected=expected,
+        canvas_mb=64.0,
         **options,
     )
     drawer.start()

@@ -70,7 +70,7 @@ def test_a_map_that_was_begun_at_a_wrong_place_moves_once_while_pictures_are_dra
     events.on(DrawingRestarted, lambda event: again.append(1))
     (tmp_path / "layers").mkdir()
     site = MapSite(
-        journal, MapLayer("realtime"), tmp_path / "layers", gsd_m=0.5, fov_rad=None, events=events,
+        journal, MapLayer("realtime"), tmp_path / "layers", gsd_m=0.5, fov_rad=None, events=events, memory_mb=64.0,
         expected=ExpectedPlace(TileServer({}), Plans(tmp_path / "plans", None, None)),
     )  # fmt: skip
     frames = []

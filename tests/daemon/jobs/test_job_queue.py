@@ -6,8 +6,6 @@ import time
 
 import pytest
 
-from gcs_plugin.cli.configuration import use_config
-from gcs_plugin.cli.main import main
 from gcs_plugin.daemon.jobs.job_queue import Jobs
 from gcs_plugin.daemon.jobs.solution_file import SolutionFile, SolutionFileError, is_readable, read_solution
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
@@ -15,7 +13,6 @@ from gcs_plugin.daemon.store.daemon_events import JobEnded
 from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.frame_rows import add_frame, late_frames
 from gcs_plugin.daemon.store.journal import Journal
-from orthoswarm.config import active, override
 from orthoswarm.model.errors import DiskFullError, OrthoSwarmError, StorageError, WorkerStoppedError
 from orthoswarm.model.placement import Solution
 
@@ -197,26 +194,6 @@ def test_who_waits_for_a_process_is_released_when_the_daemon_stops():
         pool.close()
         thread.join(LIMIT_S)
     assert found == ["the daemon is stopping; start it again"]
-
-
-def _theta_hat(_):
-    return active().records.theta_hat_deg
-
-
-def test_worker_processes_have_the_daemons_configuration(tmp_path, capsys):
-    """As `serve --config` sets it; a file that is wrong is refused before anything is served."""
-    config = tmp_path / "config.toml"
-    config.write_text("[records]\ntheta_hat_deg = 'wide'\n")
-    assert main(["serve", "--workspace", str(tmp_path / "w"), "--config", str(config)]) == 2
-    assert "another kind" in capsys.readouterr().err
-    config.write_text("[records]\ntheta_hat_deg = 55\n")
-    pool = WorkerPool(1)
-    try:
-        use_config(config)
-        assert pool.run(_theta_hat, 0) == 55.0
-    finally:
-        override({})
-        pool.close()
 
 
 # -- solution files ---------------------------------------------------------------------------------------------------

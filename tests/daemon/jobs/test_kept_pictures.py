@@ -16,7 +16,6 @@ from gcs_plugin.daemon.jobs.solution_file import read_solution
 from gcs_plugin.daemon.jobs.worker_tasks import near
 from gcs_plugin.daemon.settings import Settings
 from gcs_plugin.daemon.store.kept_pictures import KeptPictures
-from orthoswarm.config import override
 from orthoswarm.raster.basemap import Basemap
 from orthoswarm.refine.strategy.swarm_refiner import SwarmRefiner
 from tests.kit.made_up import LIMIT_S, after_job, complete, post
@@ -142,24 +141,20 @@ def test_what_legs_left_is_not_needed_after_a_restart(tmp_path, flight):
 
 def test_folders_take_no_more_than_is_allowed_and_one_for_a_vehicle(tmp_path, flight):
     frames = flight[0]
-    kept = KeptPictures(tmp_path / "kept")
-    try:
-        override({"raster": {"grey_pictures_mb": 240 * 180 * 30 / 1e6}})
-        assert kept.of(("v1", 1), frames[:20]) == kept.of(("v1", 1), frames)
-        assert kept.of(("v2", 1), frames[:3]) is None
-        second = kept.of(("v1", 2), frames[:20])
-        assert second is not None and second.is_dir()
-        assert kept.of(("v2", 1), frames[:3]) not in (None, second)
-        assert len(list((tmp_path / "kept").iterdir())) == 2
-        kept.drop(("v1", 2))
-        kept.drop(("v1", 2))
-        assert not second.exists()
-        assert kept.of(("v2", 1), frames) is not None
-    finally:
-        override({})
+    kept = KeptPictures(tmp_path / "kept", 240 * 180 * 30 / 1e6)
+    assert kept.of(("v1", 1), frames[:20]) == kept.of(("v1", 1), frames)
+    assert kept.of(("v2", 1), frames[:3]) is None
+    second = kept.of(("v1", 2), frames[:20])
+    assert second is not None and second.is_dir()
+    assert kept.of(("v2", 1), frames[:3]) not in (None, second)
+    assert len(list((tmp_path / "kept").iterdir())) == 2
+    kept.drop(("v1", 2))
+    kept.drop(("v1", 2))
+    assert not second.exists()
+    assert kept.of(("v2", 1), frames) is not None
 
 
 def test_nothing_is_kept_on_a_disk_that_is_nearly_full(tmp_path, flight):
-    kept = KeptPictures(tmp_path / "kept", free_mb=1e12)
+    kept = KeptPictures(tmp_path / "kept", 1500.0, free_mb=1e12)
     assert kept.of(("v1", 1), flight[0]) is None
     assert list((tmp_path / "kept").iterdir()) == []

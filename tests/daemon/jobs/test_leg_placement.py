@@ -20,11 +20,10 @@ from gcs_plugin.daemon.store.daemon_events import JobDropped, LegsOver
 from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.daemon.store.sortie_rows import LegRow
-from orthoswarm.config import active
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.frame import Fix, Frame
 from orthoswarm.model.geo import LocalGrid
-from orthoswarm.trajectory.legs import ended_legs
+from orthoswarm.trajectory.legs import LEG_REACH, ended_legs
 from tests.kit.daemon_kit import Shot, exported, line, serving
 
 GRID = LocalGrid(32631)
@@ -70,14 +69,14 @@ def test_the_last_leg_is_over_when_nothing_more_comes():
     path = lawn(2)
     assert len(ended_legs(path)) == 1
     assert len(ended_legs(path, over=True)) == 2
-    assert len(ended_legs(path[: 20 + 2 * active().records.leg_reach], over=False)) <= 1
+    assert len(ended_legs(path[: 20 + 2 * LEG_REACH], over=False)) <= 1
 
 
 def test_only_the_newest_legs_are_placed_anew():
     frames, count = newest_legs(frames_at(lawn(12, 60)), 32631)
     assert 2 <= count <= 3
     assert len(frames) <= MOST
-    assert int(frames[-1].image[:-4]) >= 12 * 60 - 62 - 2 * active().records.leg_reach
+    assert int(frames[-1].image[:-4]) >= 12 * 60 - 62 - 2 * LEG_REACH
     long, _ = newest_legs(frames_at(lawn(1, 500)), 32631, over=True)
     assert len(long) == MOST
 

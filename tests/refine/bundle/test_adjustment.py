@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import lapack
 
-from orthoswarm.config import override
-from orthoswarm.refine.bundle import normal_equations
+from orthoswarm.refine.bundle import adjustment, normal_equations
 from orthoswarm.refine.bundle.adjustment import Adjustment, HeightPrior, MapTies
 from orthoswarm.refine.bundle.banded_solver import factorise, solve_factored
 from orthoswarm.refine.bundle.block_arrays import exp_rotation, log_rotation
@@ -104,17 +103,14 @@ def test_a_copy_is_as_it_was_whatever_becomes_of_the_other():
     np.testing.assert_array_equal(before.cameras.rotation, adj.cameras.rotation)
 
 
-def test_points_without_parallax_are_not_thrown_farther_than_the_limit():
+def test_points_without_parallax_are_not_thrown_farther_than_the_limit(monkeypatch):
     block = make_block(per_leg=15, legs=1)
     adj = Adjustment.begin(block.start, block.tracks, block.priors, first_points(block.start, block.tracks))
     before = adj.points.copy()
     adj.points[:, 2] = -400.0
     before = adj.points.copy()
-    override({"bundle": {"point_step_limit_m": 7.0}})
-    try:
-        adj.step(1e4, level(len(adj.points)))
-    finally:
-        override({})
+    monkeypatch.setattr(adjustment, "_POINT_STEP_LIMIT_M", 7.0)
+    adj.step(1e4, level(len(adj.points)))
     assert np.linalg.norm(adj.points - before, axis=1).max() == pytest.approx(7.0)
 
 

@@ -6,11 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from orthoswarm.config import active
 from orthoswarm.model.geo import local_origin
 from orthoswarm.refine.bundle.flight_records import read_records
 from orthoswarm.refine.features.flow_calibration import Calibration
-from orthoswarm.refine.flight.relative_block import height_prior
+from orthoswarm.refine.flight.relative_block import FIRST_HEIGHT_SIGMA_M, height_prior
 from orthoswarm.refine.strategy.swarm_refiner import SwarmRefiner
 from tests.kit.scenes import scene_of, tiny_twin
 from tests.refine.strategy.test_swarm_refiner import errors
@@ -68,9 +67,9 @@ def test_heights_that_leave_those_around_them_are_as_doubtful_as_they_differ(sce
         focal_px=200.0, height_m=90.0, yaw_offset=np.zeros(len(frames)), trusted_height=True, pairs=6, warnings=[]
     )
     height, sigma = height_prior(records, told)
-    expected = np.full(len(frames), active().flight.first_height_sigma_m)
+    expected = np.full(len(frames), FIRST_HEIGHT_SIGMA_M)
     expected[[0, 9]] = 70.0, 310.0
     np.testing.assert_allclose(sigma, expected)
     assert height[15] == 93.0 and (np.delete(height, 15) == 90.0).all()
     height, sigma = height_prior(records, replace(told, trusted_height=False, height_m=55.0))
-    assert (height == 55.0).all() and (sigma == active().flight.first_height_sigma_m).all()
+    assert (height == 55.0).all() and (sigma == FIRST_HEIGHT_SIGMA_M).all()

@@ -5,11 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from orthoswarm.config import active
 from orthoswarm.model.camera import ground_jacobian, rotation_from_angles
+from orthoswarm.model.placement import STATED_SIGMA_FACTOR
 from orthoswarm.model.plane_similarity import Similarity
 from orthoswarm.refine.bundle.adjustment import Adjustment, HeightPrior, MapTies
 from orthoswarm.refine.bundle.covariance import (
+    MAP_FLOOR_PX,
+    RECEIVER_BIAS_SIGMA_M,
+    TIE_SCATTER_SHARE,
+    TIED_COVARIANCE_SHARE,
     common_map_sigma,
     receiver_sigma,
     stated_errors,
@@ -19,23 +23,21 @@ from orthoswarm.refine.bundle.covariance import (
 from orthoswarm.refine.flight.relative_block import first_points
 from tests.kit.swarm_block import make_block
 
-BUNDLE = active().bundle
-
 
 def test_one_and_two_stated_sigmas_are_honest_by_axis_and_by_length():
     error = np.random.default_rng(0).normal(0.0, 1.0, (20000, 2))
     length = np.hypot(*error.T)
     for k, low, high in ((1, 0.50, 0.85), (2, 0.85, 0.99)):
-        assert low < (np.abs(error) < k * BUNDLE.stated_sigma_factor).mean() < high
-        assert low < (length < k * BUNDLE.stated_sigma_factor).mean() < high
+        assert low < (np.abs(error) < k * STATED_SIGMA_FACTOR).mean() < high
+        assert low < (length < k * STATED_SIGMA_FACTOR).mean() < high
 
 
 def test_a_map_that_scatters_its_ties_is_doubted_more():
     residual = np.random.default_rng(1).normal(0.0, 1.0, (400, 2))
     given = np.full(400, 0.1)
     good, bad = common_map_sigma(0.03 * residual, given, 0.5), common_map_sigma(0.5 * residual, given, 0.5)
-    assert good == pytest.approx(np.hypot(BUNDLE.map_floor_px * 0.5, BUNDLE.tie_scatter_share * 0.03), rel=0.1)
-    assert bad == pytest.approx(BUNDLE.tie_scatter_share * 0.5, rel=0.1)
+    assert good == pytest.approx(np.hypot(MAP_FLOOR_PX * 0.5, TIE_SCATTER_SHARE * 0.03), rel=0.1)
+    assert bad == pytest.approx(TIE_SCATTER_SHARE * 0.5, rel=0.1)
 
 
 def test_wrong_ties_make_no_doubt_of_the_others():
@@ -47,9 +49,9 @@ def test_wrong_ties_make_no_doubt_of_the_others():
 
 
 def test_few_ties_that_were_followed_are_not_believed_to_be_exact():
-    doubt = np.hypot(BUNDLE.map_floor_px * 0.5, BUNDLE.tie_scatter_share * 0.35)
+    doubt = np.hypot(MAP_FLOOR_PX * 0.5, TIE_SCATTER_SHARE * 0.35)
     assert common_map_sigma(np.zeros((10, 2)), np.full(10, 0.35), 0.5) == pytest.approx(doubt, rel=0.02)
-    assert common_map_sigma(np.zeros((0, 2)), np.zeros(0), 2.0) == pytest.approx(BUNDLE.map_floor_px * 2.0)
+    assert common_map_sigma(np.zeros((0, 2)), np.zeros(0), 2.0) == pytest.approx(MAP_FLOOR_PX * 2.0)
 
 
 def test_ties_that_agree_on_another_place_are_told_and_a_lone_wrong_one_is_not():
@@ -97,7 +99,7 @@ def test_a_solved_principal_point_does_not_move_the_ground_in_the_pictures_middl
             middle = np.array([0.5 * (true.lens.width - 1), 0.5 * (true.lens.height - 1)])
             errors.append(found.to_ground(middle) - true.to_ground(middle))
         said = stated_errors(adj, 9.0, heights, ties=ties, tie_c=6.0, floor_m=0.0).sigma_m
-        stated.append(said / (BUNDLE.stated_sigma_factor * BUNDLE.tied_covariance_share))
+        stated.append(said / (STATED_SIGMA_FACTOR * TIED_COVARIANCE_SHARE))
     ratio = np.sqrt(np.mean(np.square(errors))) / np.sqrt(np.mean(np.square(stated)))
     assert 0.5 < ratio < 1.7
 
@@ -107,10 +109,11 @@ def test_a_receiver_that_drifts_east_is_not_doubted_in_the_north():
     adj = Adjustment.begin(block.start, block.tracks, block.priors, first_points(block.start, block.tracks))
     first, knots = adj.layout.offset[0] + 5, adj.layout.knots[0]
     adj.common[first : first + 2 * knots : 2] = np.linspace(-9.0, 9.0, knots)
-    bias = active().registration.receiver_bias_sigma_m
     east, north = receiver_sigma(adj)
-    assert north == pytest.approx(bias)
-    assert east == pytest.approx(np.hypot(bias, 9.0), rel=0.1), "an even drift of 18 m since the receiver was right"
+    assert north == pytest.approx(RECEIVER_BIAS_SIGMA_M)
+    assert east == pytest.approx(np.hypot(RECEIVER_BIAS_SIGMA_M, 9.0), rel=0.1), (
+        "an even drift of 18 m since the receiver was right"
+    )
 
 
 def test_places_are_weighed_by_axis():

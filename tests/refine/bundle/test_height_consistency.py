@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from orthoswarm.config import active
 from orthoswarm.model.camera import fov_rad
 from orthoswarm.refine.bundle.adjustment import Adjustment
 from orthoswarm.refine.bundle.block_arrays import WIDTH, F
 from orthoswarm.refine.bundle.height_consistency import (
+    UNKNOWN_HEIGHT_SIGMA_M,
     contradicted_heights,
     height_disagreement,
     log_focal_sigmas,
@@ -97,7 +97,7 @@ def test_the_height_that_an_adjustment_comes_to_is_predicted_while_it_still_has_
 def test_heights_that_are_twice_too_much_are_not_believed_any_more():
     world = crosshatch(tilt_deg=10.0)
     adjustment, start, _ = solved(world, [recorded(f, 2.0 * f.fix.height_m) for f in world.frames])
-    assert adjustment.priors.models[0].height_sigma == active().bundle.unknown_height_sigma_m
+    assert adjustment.priors.models[0].height_sigma == UNKNOWN_HEIGHT_SIGMA_M
     assert start.height_known.all() and not trusted_heights(adjustment, start).any()
     assert trusted_heights(*solved(world, world.frames)[:2]).all()
 

@@ -9,15 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.sparse.csgraph import connected_components
 
-from orthoswarm.config import active
 from orthoswarm.model.angles import wrap_rad
 from orthoswarm.model.camera import Camera, Lens, rotation_from_angles
 from orthoswarm.model.earth import distance_m
-from orthoswarm.model.frame import Fix, Frame
+from orthoswarm.model.frame import DEFAULT_HEIGHT_M, Fix, Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import Leg, PlacedFrame, Solution
 from orthoswarm.refine.bundle.flight_records import read_records
-from orthoswarm.refine.flight.vehicle_refinement import merge_units, split_units
+from orthoswarm.refine.flight.vehicle_refinement import LONGEST_UNIT_PHOTOS, merge_units, split_units
 from orthoswarm.refine.flight.weakly_held_pictures import interpolate_weak
 from orthoswarm.trajectory.legs import split_legs
 from orthoswarm.trajectory.separate_places import separate_places
@@ -98,9 +97,9 @@ def test_a_stray_camera_name_does_not_split_a_flight():
 
 
 def test_long_flights_are_cut_into_even_stretches():
-    units = split_units({"a": [frame(i) for i in range(active().flight.longest_unit_photos * 2 + 10)]})
+    units = split_units({"a": [frame(i) for i in range(LONGEST_UNIT_PHOTOS * 2 + 10)]})
     assert len(units) == 3
-    assert max(map(len, units)) <= active().flight.longest_unit_photos
+    assert max(map(len, units)) <= LONGEST_UNIT_PHOTOS
 
 
 def test_photos_of_another_place_are_a_unit_of_their_own():
@@ -183,7 +182,7 @@ def test_records_fill_what_is_missing_and_mark_it():
     frames = [frame(i, height_m=None, yaw_rad=None, pitch_rad=None) for i in range(5)]
     records = read_records(frames, LocalGrid(32632), np.zeros(2))
     assert not records.has_height.any() and not records.has_yaw.any() and not records.has_tilt.any()
-    np.testing.assert_allclose(records.position[:, 2], active().records.default_height_m)
+    np.testing.assert_allclose(records.position[:, 2], DEFAULT_HEIGHT_M)
     np.testing.assert_allclose(records.pitch, -np.pi / 2)
     grid_north = -LocalGrid(32632).convergence_rad(48.0, 11.0)
     np.testing.assert_allclose(records.yaw, grid_north, atol=0.01)

@@ -4,9 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from orthoswarm.config import override
 from orthoswarm.model.camera import rotation_from_angles
-from orthoswarm.refine.features.tracks import Tracker, predicted_homography
+from orthoswarm.refine.features.tracks import CELL_PX, Tracker, predicted_homography
 
 
 @pytest.fixture(scope="module")
@@ -38,8 +37,8 @@ def error_of(tracker, matrices):
     return tracks, np.hypot(*(where - mean[tracks.point]).T)
 
 
-def follow(ground, matrices, wrong=(2.0, -1.5), gain=None):
-    tracker = Tracker()
+def follow(ground, matrices, wrong=(2.0, -1.5), gain=None, cell_px=CELL_PX):
+    tracker = Tracker(cell_px=cell_px)
     shares = []
     for i, m in enumerate(matrices):
         picture = view(ground, m)
@@ -138,14 +137,10 @@ def test_there_is_at_most_one_track_in_a_cell(ground):
     assert len(np.unique(cells, axis=0)) == len(cells)
 
 
-def test_cells_are_as_large_as_configured(ground):
+def test_cells_are_as_large_as_asked_for(ground):
     matrices = [placed(0.0, 500 + 20 * i, 700) for i in range(4)]
     usual, _ = follow(ground, matrices)
-    override({"features": {"cell_px": 160}})
-    try:
-        wide, _ = follow(ground, matrices)
-    finally:
-        override({})
+    wide, _ = follow(ground, matrices, cell_px=160)
     assert wide.tracks().count < 0.4 * usual.tracks().count
 
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from gcs_plugin.daemon.jobs.kernel_warmup import made_up_flight, made_up_ground, write_map
-from orthoswarm.config import override
 from orthoswarm.raster.basemap import Basemap
 from orthoswarm.raster.grey_pictures import GreyPictures
+from orthoswarm.refine.flight import kept_tracks
 from orthoswarm.refine.flight.kept_tracks import KeptTracks
 from orthoswarm.refine.strategy.swarm_refiner import RefinerOptions, SwarmRefiner
 from orthoswarm.refine.strategy.vehicle_passes import read_frame
@@ -105,15 +105,12 @@ def test_what_is_damaged_or_gone_is_made_again(scene, kept):
     assert values(refined(frames, basemap, kept)) == alone
 
 
-def test_only_the_last_few_tracks_stay(scene, kept):
+def test_only_the_last_few_tracks_stay(scene, kept, monkeypatch):
     frames, _, _ = scene
-    try:
-        override({"flight": {"kept_tracks": 2}})
-        first = followed(frames[:22], kept)
-        second = followed(frames[:24], kept)
-        third = followed(frames, kept)
-    finally:
-        override({})
+    monkeypatch.setattr(kept_tracks, "_MOST_KEPT", 2)
+    first = followed(frames[:22], kept)
+    second = followed(frames[:24], kept)
+    third = followed(frames, kept)
     assert (len(first), len(second), len(third)) == (1, 2, 2)
     assert not first[0].exists()
     assert set(second) & set(third)

@@ -26,7 +26,7 @@ def blind(monkeypatch):
     def first(flight, basemap, origin):
         return () if flight.frames[0].vehicle == LOST else by_edges(flight, basemap, origin)
 
-    def second(flight, basemap, origin):
+    def second(flight, basemap, origin, _device):
         asked.append(flight.frames[0].vehicle)
         return next(by_edges(flight, basemap, origin))
 

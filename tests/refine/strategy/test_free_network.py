@@ -78,6 +78,16 @@ def test_parts_without_two_points_are_not_placed():
     assert found.placed.tolist() == [True] * 3 + [False] * 6
 
 
+def test_photos_whose_pairs_contradict_each_other_are_no_block():
+    """Their sigmas grow with their scale, so they shrank to one point that agreed with one anchor."""
+    scale, centre = similarities_of(12, 4)
+    pairs = [(k, k + d) for d in (1, 2, 3) for k in range(12 - d)]
+    graph = graph_of(scale, centre, pairs)
+    graph.centre_second[:] += np.random.default_rng(1).normal(scale=2000.0, size=(len(pairs), 2)) @ [1, 1j]
+    found = solve_free_network(graph, 12, np.full(12, WIDTH), anchors_of(scale, centre, [0, 11]))
+    assert not found.placed.any() and [part.tolist() for part in found.left] == [list(range(12))]
+
+
 def test_only_pairs_that_can_place_a_photo_are_tried():
     pairs = candidate_pairs(2, 5)
     assert pairs.tolist() == [[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [1, 3], [1, 4]]

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from gcs_plugin.daemon.jobs import kernel_warmup
-from orthoswarm.config import active
 from orthoswarm.model.camera import fov_rad
 from orthoswarm.model.errors import AdjustmentError
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.raster.basemap import Basemap
 from orthoswarm.refine.bundle import height_consistency
 from orthoswarm.refine.bundle.covariance import systematic_tie_offset
-from orthoswarm.refine.bundle.height_consistency import FreeHeight, height_disagreement
+from orthoswarm.refine.bundle.height_consistency import UNKNOWN_HEIGHT_SIGMA_M, FreeHeight, height_disagreement
+from orthoswarm.refine.features import tracks
 from orthoswarm.refine.flight.relative_block import open_flight
 from orthoswarm.refine.registration.absolute_orientation import leg_corrections
 from orthoswarm.refine.registration.block_state import WorkArea
@@ -48,15 +48,15 @@ def fov_deg(flight):
     return float(np.degrees(fov_rad(flight.adjustment.cameras.lens[0, 0], flight.pictures.size[0])))
 
 
-def test_wrong_tracks_at_a_turn_do_not_carry_the_field_of_view_away(made_up, configure):
+def test_wrong_tracks_at_a_turn_do_not_carry_the_field_of_view_away(made_up, monkeypatch):
     """Two wrong tracks of ninety are enough where the first steps give them full weight."""
     frames, _ = made_up
-    configure({"features": {"flow_chance_share": 0.0}})  # else they are dropped at once
+    monkeypatch.setattr(tracks, "_FLOW_CHANCE_SHARE", 0.0)  # else they are dropped at once
     flight = opened(frames)
-    configure({"features": {"flow_chance_share": 0.0}, "strategy": {"schedule": [1e4, 1e4, 100.0, 100.0, 9.0, 9.0]}})
-    adjust_by_schedule(flight, RefinerOptions().ground(ORIGIN))
+    with monkeypatch.context() as wider:
+        wider.setattr(vehicle_passes, "_SCHEDULE", (1e4, 1e4, 100.0, 100.0, 9.0, 9.0))
+        adjust_by_schedule(flight, RefinerOptions().ground(ORIGIN))
     assert fov_deg(flight) > 90.0 and focal_length_ran_away(flight)
-    configure({"features": {"flow_chance_share": 0.0}})
     flight = opened(frames)
     adjust_by_schedule(flight, RefinerOptions().ground(ORIGIN))
     assert not focal_length_ran_away(flight)
@@ -95,16 +95,16 @@ def test_a_recorded_height_is_kept_where_the_pictures_alone_determine_none(resul
 
 
 @pytest.mark.parametrize("at_rest_share", [None, 0.0])
-def test_heights_that_are_kept_are_those_of_the_adjustment_before(made_up, monkeypatch, configure, at_rest_share):
+def test_heights_that_are_kept_are_those_of_the_adjustment_before(made_up, monkeypatch, at_rest_share):
     """Straight down over flat ground: set free it stays where it is, or (with a share of 0) counts as not converged."""
 
     def recorded(adjustment):
-        return np.array([m.height_sigma < active().bundle.unknown_height_sigma_m for m in adjustment.priors.models])
+        return np.array([m.height_sigma < UNKNOWN_HEIGHT_SIGMA_M for m in adjustment.priors.models])
 
     for module in (vehicle_passes, height_consistency):
         monkeypatch.setattr(module, "contradicted_heights", recorded)
     if at_rest_share is not None:
-        configure({"strategy": {"at_rest_share": at_rest_share}})
+        monkeypatch.setattr(height_consistency, "_AT_REST_SHARE", at_rest_share)
     flight = opened(made_up[0])
     adjust_without_map(flight)
     assert fov_deg(flight) == pytest.approx(70.0, abs=0.5)

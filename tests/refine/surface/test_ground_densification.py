@@ -5,8 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from orthoswarm.config import active
-from orthoswarm.refine.surface.ground_densification import dense_points, spaced_pictures
+from orthoswarm.refine.surface.ground_densification import HIGH_FROM_M, HIGH_TO_SHARE, dense_points, spaced_pictures
 from orthoswarm.refine.surface.vehicle_ground import GroundModel
 from tests.kit.draped import HEIGHT, WIDTH, Pictures, rig_of
 
@@ -53,8 +52,7 @@ def test_nothing_high_is_seen_over_level_ground():
 
 
 def test_low_flights_search_nothing_between_the_two_ranges():
-    c = active().surface
-    cameras, leg = rig_of(height=0.9 * c.high_from_m / c.high_to_share)
+    cameras, leg = rig_of(height=0.9 * HIGH_FROM_M / HIGH_TO_SHARE)
     gray = Pictures(cameras, lambda xy: np.zeros(xy.shape[:-1]))
     flight = SimpleNamespace(
         cameras=lambda: cameras, leg=leg, pictures=SimpleNamespace(gray=gray, size=(WIDTH, HEIGHT))

@@ -3,12 +3,11 @@
 import numpy as np
 import pytest
 
-from orthoswarm.config import active
 from orthoswarm.model.placement import Terrain
 from orthoswarm.model.task_runner import serial
 from orthoswarm.refine.features.working_pictures import Pictures
 from orthoswarm.refine.strategy.swarm_refiner import RefinerOptions
-from orthoswarm.refine.surface.plane_sweep import SweepViews, with_tall_surfaces
+from orthoswarm.refine.surface.plane_sweep import TALL_FROM_M, SweepViews, with_tall_surfaces
 from tests.kit.refine import refine_all, through_pickle
 from tests.refine.surface.hall_flight import GRID, HALF, HEIGHT_M, MIDDLE, ROOF_M, HallFlight, away
 
@@ -84,7 +83,7 @@ def test_what_too_few_pictures_show_stays_on_the_ground(flight) -> None:
 
 
 def test_ground_without_raised_points_is_given_back(flight) -> None:
-    assert drawn(flight, raised(0.9 * active().surface.tall_from_m)) is GROUND
+    assert drawn(flight, raised(0.9 * TALL_FROM_M)) is GROUND
     assert drawn(flight, np.zeros((0, 3))) is GROUND
 
 

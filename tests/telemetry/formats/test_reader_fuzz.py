@@ -163,7 +163,14 @@ def file_parser(name: str):
 GEO = b"EPSG:32632\na b.JPG 465000.0 5260000.0 512.0 12 -89 1 0.02\nc.JPG 465010.0 5260000.0 512.0\n"
 CSV = b"image,time,lat_deg,lon_deg,height_m,yaw_deg\na.jpg,2024-05-06T10:00:00Z,47.5,8.25,120,10\nb.jpg,5,47,8,1,2\n"
 
+GPX = b"<gpx><trk><trkseg>" + b"<trkpt lat='47' lon='8'><ele>9</ele><time>2026-05-04T10:00:00Z</time></trkpt>" * 9
+NMEA = (
+    b"$GPRMC,100000.00,A,4403.327,N,12304.21,W,5.0,0.0,040526,,,A\n$GPGGA,100001.00,4403.3,N,12304.2,W,1,12,0.8,250.5\n"
+)
+
 FILES = {
+    "a.gpx": ("log", lambda real: GPX),
+    "a.nmea": ("log", lambda real: NMEA),
     "photo.jpg": (
         "photo",
         lambda real: (real("sheffield_cross_800") / "DJI_0056.JPG").read_bytes()[:8000] + b"\xff\xd9",

@@ -8,8 +8,9 @@ import pytest
 
 import telemetry
 from orthoswarm.model.errors import InputError
+from orthoswarm.mosaic.recorded_pose import nothing_to_map
 from telemetry.ingest import copied_photos
-from telemetry.ingest.ingest import LoadOptions, load, require_frames, survey
+from telemetry.ingest.ingest import LoadOptions, load, survey
 from tests.telemetry.ingest.test_photos import gps_exif, jpeg
 
 
@@ -110,7 +111,7 @@ def test_a_missing_input_and_no_input_are_errors(tmp_path):
     with pytest.raises(InputError):
         load([])
     with pytest.raises(InputError, match="no picture"):
-        require_frames(load([tmp_path]))
+        raise nothing_to_map(load([tmp_path]))
 
 
 @pytest.mark.parametrize("again", ["itself", "link"])
@@ -150,7 +151,7 @@ def test_photos_of_one_size_are_read_beyond_their_beginnings_only_if_these_are_a
         for i in range(8):  # the first four begin alike
             path = photo(tmp_path / folder / f"{i}.JPG", second=i + 10 * (folder == "v2" and i >= 4))
             path.write_bytes(path.read_bytes() + bytes(300_000) + folder.encode())
-    assert not copied_photos.copies_among(sorted(tmp_path.rglob("*.JPG")))
+    assert copied_photos.copies_among(sorted(tmp_path.rglob("*.JPG"))) == ({}, {})
     assert sorted(set(asked)) == [0, copied_photos._SAMPLES] and asked.count(copied_photos._SAMPLES) == 8
 
 

@@ -123,13 +123,3 @@ def test_photos_of_a_clock_that_was_set_back_are_not_wild(tmp_path):
     for i in range(300):
         photo(tmp_path / f"P_{i}.JPG", 47.0 + 32.0 * i * METRE, 8.0, 2 * i - 51 * (i >= 150))
     assert not load([tmp_path]).rejected
-
-
-@pytest.mark.parametrize("frozen", [(0.90, 0.94), (0.05, 0.09)])
-def test_a_receiver_that_repeats_a_fix_for_a_while_loses_no_other(frozen):
-    """At 15 m/s and five fixes a second it is frozen for 12 s: the next fix lies 180 m further on."""
-    times = np.arange(0.0, 300.0, 0.2)
-    first, last = (int(share * len(times)) for share in frozen)
-    flown = 15.0 * times
-    flown[first:last] = flown[first]
-    assert not wild_fixes(times.tolist(), [(47.5 + north / 111_194.93, 8.25) for north in flown]).indices

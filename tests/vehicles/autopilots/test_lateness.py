@@ -9,7 +9,7 @@ from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.items import CHANGE_SPEED, RTL, TAKEOFF, WAYPOINT, Mission, MissionItem
 from gcs_plugin.sim.multirotor import Airframe, Chart
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
-from orthoswarm.planning.sorties.flight_time import autopilot_config
+from orthoswarm.config import DEFAULT
 
 AP, PX4 = Autopilot.ARDUPILOT, Autopilot.PX4
 BOTH = pytest.mark.parametrize("autopilot", [AP, PX4])
@@ -31,7 +31,7 @@ def lines(autopilot, speed):
 
 def flown(make_world, autopilot, top_m_s):
     """The world after a flight at 10 m/s as real autopilots fly, by a vehicle that reaches such a speed."""
-    frame = replace(Airframe().as_flown(autopilot_config(autopilot.value)), top_m_s=top_m_s)
+    frame = replace(Airframe().as_flown(DEFAULT.times(autopilot.value)), top_m_s=top_m_s)
     world = make_world(SimVehicle(system=1, autopilot=autopilot, airframe=frame))
     world.meet()
     assert world.finish(world.fleet.upload(1, lines(autopilot, 10.0)))[0].ok
@@ -70,7 +70,7 @@ def test_a_vehicle_that_falls_behind_its_plan_is_said_once(make_world, autopilot
     world = flown(make_world, autopilot, 6.0)
     said = [event for event in world.events if event.kind in ("behind", "caught_up")]
     assert [event.kind for event in said] == ["behind", "caught_up"]
-    allowed_s = autopilot_config(autopilot.value).schedule_slack_s
+    allowed_s = DEFAULT.times(autopilot.value).schedule_slack_s
     late_s = float(said[0].text.split(" s behind")[0].split()[-1])
     assert allowed_s <= late_s <= allowed_s + 2.0
     assert f"for {allowed_s:.0f} s" in said[0].text
@@ -83,7 +83,7 @@ def test_a_vehicle_in_time_is_not(make_world, autopilot):
 
 
 def test_one_that_was_paused_is_behind_as_it_goes_on(make_world):
-    world = make_world(SimVehicle(system=1, airframe=Airframe().as_flown(autopilot_config("ardupilot"))))
+    world = make_world(SimVehicle(system=1, airframe=Airframe().as_flown(DEFAULT.times("ardupilot"))))
     world.meet()
     assert world.finish(world.fleet.upload(1, lines(AP, 10.0)))[0].ok
     assert world.finish(world.fleet.start(1))[0].ok

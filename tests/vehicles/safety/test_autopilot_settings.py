@@ -12,6 +12,7 @@ from gcs_plugin.fleet.preflight import ITEMS, Level, Wanted, preflight
 from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.mission.plan_folder import PlanNeeds, plan_needs
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
+from orthoswarm.config import config_of
 from orthoswarm.model.plan import Apart
 
 AP, PX4 = Autopilot.ARDUPILOT, Autopilot.PX4
@@ -223,6 +224,11 @@ def test_a_plan_says_what_it_needs(tmp_path):
     ):
         (tmp_path / "plan.json").write_text(json.dumps(report))
         assert plan_needs(tmp_path).apart == apart
+    for config in ({"planning": {"launch_s": 9.0}, "px4": {"takeoff_s": 8.0}}, {}):
+        (tmp_path / "plan.json").write_text(json.dumps({"config": config}))
+        assert plan_needs(tmp_path).config == config_of(config)
+    (tmp_path / "plan.json").write_text(json.dumps({"endurance_min": 18.0, "config": {"bundle": {"former": 1}}}))
+    assert plan_needs(tmp_path) == PlanNeeds(endurance_s=1080.0)
     (tmp_path / "plan.json").write_text("[]")
     assert plan_needs(tmp_path) == PlanNeeds()
 

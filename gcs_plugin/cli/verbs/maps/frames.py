@@ -40,7 +40,8 @@ def run(args: argparse.Namespace) -> int:
     from orthoswarm.model.errors import InputError, OrthoSwarmError
 
     prepare_process()
-    from telemetry.ingest.ingest import LoadOptions, load, require_frames
+    from orthoswarm.mosaic.recorded_pose import nothing_to_map
+    from telemetry.ingest.ingest import LoadOptions, load
 
     for name, value in (("--every-m", args.every_m), ("--every-s", args.every_s)):
         if value is not None and not value > 0:
@@ -56,7 +57,8 @@ def run(args: argparse.Namespace) -> int:
                 every_m=args.every_m, every_s=args.every_s, cache=Path(cache), exclude=(args.out,), sei_layouts=layouts
             )
             found = load(args.inputs, progress=progress, options=options)
-            require_frames(found)
+            if not found.frames:
+                raise nothing_to_map(found)
             used_names: set[Path] = set()
             written = [write(frame, args.out, used_names) for frame in found.frames]
             progress("writing pictures", len(written), len(written))
@@ -64,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
         raise OrthoSwarmError(
             f"{args.out} cannot be written ({error.strerror}); free space or choose another"
         ) from None
-    except InputError:
+    except OrthoSwarmError:
         if new:
             with suppress(OSError):
                 args.out.rmdir()

@@ -6,14 +6,14 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gcs_plugin.cli.configuration import add_config, read_config
+from gcs_plugin.cli.configuration import add_config, given
 from orthoswarm.export.json_values import json_text
 from orthoswarm.stores.addresses import address_of, path_of
 
 if TYPE_CHECKING:
     from orthoswarm.batch.pipeline import MapOptions
     from orthoswarm.compute.workers import Workers
-    from orthoswarm.config import Overrides
+    from orthoswarm.config import Config
     from orthoswarm.model.frame import Ingest
 
 _REASONS = 5  # printed; all are in the report
@@ -35,9 +35,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("--refine", choices=refiners, default=refiners[0], help=f"how pictures are refined (default {refiners[0]})")
     add("--until", choices=("realtime", "coarse", "fine"), default="fine", help="last stage to run (default fine)")
     add(
-        "--fov-min", type=float, metavar="DEG", help="field of view assumed in real time (default: photo tags, else 70)"
+        "--fov-min",
+        dest="fov_min_deg",
+        type=float,
+        metavar="DEG",
+        help="field of view assumed in real time (default: photo tags, else 70)",
     )
-    add("--gsd", type=float, metavar="M", help="ground pixel of the products (default: the pictures' own)")
+    add("--gsd", dest="gsd_m", type=float, metavar="M", help="ground pixel (default: the pictures' own)")
     add("--sei-layout", type=Path, action="append", default=[], metavar="FILE", help="layout of a maker's private SEI")
     add_config(parser)
     add(
@@ -70,7 +74,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="which sensor's photos are mapped, of cameras with several (default: the widest in colour)",
     )  # fmt: skip
     add("--split", choices=("legs",), help="treat each straight leg of a flight as a vehicle of its own")
-    add("--no-gains", action="store_true", help="leave brightness as it is in each picture")
+    add("--no-gains", dest="gains", action="store_false", help="leave brightness as it is in each picture")
     add(
         "--tone", choices=("photos", "map"), default="photos",
         help="brightness and hue of large areas: as the photos have it (default), or as the basemap has",
@@ -116,7 +120,6 @@ def run(args: argparse.Namespace) -> int:
     from gcs_plugin.cli.progress import ProgressBars
     from orthoswarm.batch import pipeline
     from orthoswarm.batch.workspace import VIDEO, missing, unmake
-    from orthoswarm.config import override
     from orthoswarm.matchers.network_device import require_device
     from orthoswarm.model.errors import InputError
     from orthoswarm.stores.addresses import is_stored
@@ -127,8 +130,7 @@ def run(args: argparse.Namespace) -> int:
     _check(args)
     options = _options(args)
 
-    override(options.config)  # before workers are started, which have their own values
-    require_device()
+    require_device(options.config.matchers.device)
 
     def load(progress: pipeline.Progress) -> "Ingest":
         reading = telemetry.LoadOptions(
@@ -175,33 +177,17 @@ def _options(args: argparse.Namespace) -> "MapOptions":
     """What the pipeline is asked for."""
     from orthoswarm.batch.pipeline import MapOptions
 
-    return MapOptions(
-        basemap=args.basemap,
-        refine=args.refine,
-        until=args.until,
-        fov_min_deg=args.fov_min,
-        gsd_m=args.gsd,
-        surface=args.surface,
-        dem=args.dem,
-        split_legs=args.split == "legs",
-        gains=not args.no_gains,
-        tone=args.tone,
-        blend=args.blend,
-        control=args.control,
-        checkpoints=args.checkpoints,
-        pixel_scale=args.pixel_scale,
-        covariance=args.covariance,
-        tiles=args.tiles,
-        config=_overrides(args),
-    )
+    return MapOptions(**(given(args, MapOptions) | {"split_legs": args.split == "legs", "config": _config(args)}))
 
 
-def _overrides(args: argparse.Namespace) -> "Overrides":
-    """What differs from the defaults: the file of --config, and flags over it."""
-    values = read_config(args.config)
-    if args.device is None:
-        return values
-    return {**values, "matchers": {**values.get("matchers", {}), "device": args.device}}
+def _config(args: argparse.Namespace) -> "Config":
+    """The settings: those of the file of --config, and flags over them."""
+    from dataclasses import replace
+
+    from orthoswarm.config import read_config
+
+    config = read_config(args.config)
+    return config if args.device is None else replace(config, matchers=replace(config.matchers, device=args.device))
 
 
 def _pools(args: argparse.Namespace, out: Path) -> "tuple[Workers, Workers | None]":
@@ -243,10 +229,10 @@ def _check(args: argparse.Namespace) -> None:
     from orthoswarm.stores.addresses import is_stored
     from orthoswarm.stores.listing import exists
 
-    if args.gsd is not None and not 0.001 <= args.gsd <= 100.0:
-        raise InputError(f"--gsd {args.gsd:g} is not a ground pixel; give metres, for example 0.1")
-    if args.fov_min is not None and not 5.0 <= args.fov_min <= 150.0:
-        raise InputError(f"--fov-min {args.fov_min:g} is not a field of view; give degrees, for example 70")
+    if args.gsd_m is not None and not 0.001 <= args.gsd_m <= 100.0:
+        raise InputError(f"--gsd {args.gsd_m:g} is not a ground pixel; give metres, for example 0.1")
+    if args.fov_min_deg is not None and not 5.0 <= args.fov_min_deg <= 150.0:
+        raise InputError(f"--fov-min {args.fov_min_deg:g} is not a field of view; give degrees, for example 70")
     for flag, value in (("--every-m", args.every_m), ("--every-s", args.every_s)):
         if value is not None and not value > 0.0:
             raise InputError(f"{flag} must be larger than zero; leave it out for the default")
@@ -255,7 +241,7 @@ def _check(args: argparse.Namespace) -> None:
     if args.tone == "map":
         if args.basemap is None:
             raise InputError("--tone map takes brightness and hue from a basemap; give one with --basemap")
-        if args.no_gains or args.until != "fine":
+        if not args.gains or args.until != "fine":
             raise InputError("--tone map needs balanced, refined pictures; leave out --no-gains and --until")
     if args.control is not None and args.until == "realtime":
         raise InputError("--control moves refined pictures; leave out --until realtime")

@@ -220,7 +220,7 @@ def _command(backend: "Backend", args: argparse.Namespace, prepared: _Prepared, 
         flown, refused = _ready(backend, args, prepared, heard)
         if refused:
             return _report(args, refused, {})
-        airspace = Airspace.of(flown, apart=prepared.needs.apart) if args.action == "start" else None
+        airspace = Airspace.of(flown, needs=prepared.needs) if args.action == "start" else None
     orders, told = _unheard(args, missing), list(backend.events)
     watches = args.action == "start" and args.watch
 

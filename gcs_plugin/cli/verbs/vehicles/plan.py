@@ -4,15 +4,14 @@ import argparse
 import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
-from gcs_plugin.cli.configuration import add_config, use_config
+from gcs_plugin.cli.configuration import add_config, given
 from orthoswarm.model.errors import InputError
 
 if TYPE_CHECKING:
     from gcs_plugin.plans.plan_request import PlanRequest
     from orthoswarm.model.plan import Plan
-    from orthoswarm.planning.sorties.assignment import Heading
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -34,66 +33,59 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     add("--fly-not-arrived", action="store_true", help="fly gaps, too, whose pictures were taken but have not arrived")
     add("--vehicles", type=int, required=True, metavar="N", help="how many vehicles")
-    add(
-        "--altitude",
-        type=float,
-        required=True,
-        metavar="M",
-        help="height of the lines above takeoff, with --dem above the ground",
-    )
-    add("--fov-min", type=float, metavar="DEG", help="smallest horizontal field of view in the swarm")
+    altitude_help = "height of the lines above takeoff, with --dem above the ground"
+    add("--altitude", dest="altitude_m", type=float, required=True, metavar="M", help=altitude_help)
     add("--out", type=Path, required=True, metavar="DIR", help="folder for missions, report and picture")
-    add("--method", choices=["columns", "bcd", "tmstc"], default="bcd", help="how to lay lines (default bcd)")
+    add("--method", choices=["columns", "bcd", "tmstc"], help="how to lay lines (default bcd)")
     heading_help = "of the lines: degrees from true north, along the wind, or along the area's longest side"
     add("--heading", metavar="DEG|wind|longest", help=heading_help)
     add("--cross", action="store_true", help="cover the area a second time by lines across the first")
     autopilot_help = "for mission format and flight times; again for vehicles in turn (default ardupilot)"
-    add("--autopilot", action="append", choices=["ardupilot", "px4"], help=autopilot_help)
+    add("--autopilot", dest="autopilots", action="append", choices=["ardupilot", "px4"], help=autopilot_help)
     add_config(parser)
     add("--json", action="store_true", help="one JSON document on stdout")
     add("--dem", type=Path, metavar="FILE", help="height model; --altitude is then above the ground (needs --start)")
     relief_help = "with --dem: legs follow the ground, lie at one level, or whichever is done sooner (default auto)"
-    add("--relief", choices=["auto", "follow", "level"], default="auto", help=relief_help)
-    tolerance_help = "of the height above ground (default: a tenth of --altitude)"
-    add("--height-tolerance", type=float, metavar="M", help=tolerance_help)
+    add("--relief", choices=["auto", "follow", "level"], help=relief_help)
     terrain_help = "legs that follow the ground state heights above it (ArduPilot, which needs terrain data)"
     add("--terrain-items", action="store_true", help=terrain_help)
-    flight = parser.add_argument_group("flight")
+    add("--follow", action="store_true", help="follow the lines of a file that has polygons, too")
+    groups = {name: parser.add_argument_group(name) for name in ("flight", "pictures", "safety")}
     start_help = "takeoff point; give it again for more (default: at each vehicle's first line; for example -33.9,18.4)"
-    flight.add_argument("--start", action="append", default=[], metavar="LAT,LON", help=start_help)
-    flight.add_argument(
-        "--end", choices=["rtl", "land", "hover"], default="rtl", help="after the last line (default rtl)"
-    )
-    flight.add_argument("--speed", type=float, metavar="M/S", help="ground speed (default 10)")
-    flight.add_argument(
-        "--run-in",
-        type=float,
-        default=0.0,
-        metavar="M",
-        help="straight flight before a leg's first picture (default 0)",
-    )
-    flight.add_argument("--endurance", type=float, metavar="MIN", help="longest flight, minutes (default: no limit)")
-    flight.add_argument("--wind-m-s", type=float, default=0.0, metavar="V", help="wind, m/s (default none)")
-    wind_help = "where it comes from, degrees clockwise from north; --speed is then the speed through the air"
-    flight.add_argument("--wind-from", type=float, default=0.0, metavar="DEG", help=wind_help)
-    flight.add_argument("--swap", type=float, default=2.0, metavar="MIN", help="time to change a battery (default 2)")
-    wait_help = "stay at the end of the last line for the coverage to be known, within --endurance, then come home"
-    flight.add_argument("--wait", type=float, default=0.0, metavar="MIN", help=wait_help)
-    camera = parser.add_argument_group("pictures")
-    camera.add_argument("--side-overlap", type=float, default=0.4, metavar="SHARE", help="between lines (default 0.4)")
-    camera.add_argument("--forward-overlap", type=float, default=0.8, metavar="SHARE", help="along lines (default 0.8)")
-    camera.add_argument("--aspect", default="4:3", metavar="W:H", help="picture's width to height (default 4:3)")
+    groups["flight"].add_argument("--start", action="append", default=[], metavar="LAT,LON", help=start_help)
+    groups["flight"].add_argument("--end", choices=["rtl", "land", "hover"], help="after the last line (default rtl)")
+    groups["pictures"].add_argument("--aspect", metavar="W:H", help="picture's width to height (default 4:3)")
     gimbal_help = "pitch to which missions turn the gimbal, or none (default -90, straight down)"
-    camera.add_argument("--gimbal-pitch", default="-90", metavar="DEG", help=gimbal_help)
-    safety = parser.add_argument_group("safety")
-    safety.add_argument("--no-fly", type=Path, action="append", default=[], metavar="FILE", help="further no-fly zones")
-    safety.add_argument(
-        "--clearance", type=float, metavar="M", help="distance to no-fly zones (default 1, less for small pictures)"
-    )
-    safety.add_argument("--separation", type=float, default=10.0, metavar="M", help="between vehicles (default 10)")
-    safety.add_argument("--height-step", type=float, default=5.0, metavar="M", help="between heights (default 5)")
-    safety.add_argument("--ceiling", type=float, metavar="M", help="highest way out or home (default: 4 steps above)")
-    parser.add_argument("--follow", action="store_true", help="follow the lines of a file that has polygons, too")
+    groups["pictures"].add_argument("--gimbal-pitch", metavar="DEG", help=gimbal_help)
+    groups["safety"].add_argument("--no-fly", type=Path, action="append", metavar="FILE", help="further no-fly zones")
+    for group, flag, name, unit, text in _NUMBERS:
+        groups[group].add_argument(flag, dest=name, type=float, metavar=unit, help=text)
+
+
+_NUMBERS: Final = (
+    ("flight", "--speed", "speed_m_s", "M/S", "ground speed (default 10)"),
+    ("flight", "--run-in", "run_in_m", "M", "straight flight before a leg's first picture (default 0)"),
+    ("flight", "--endurance", "endurance_min", "MIN", "longest flight, minutes (default: no limit)"),
+    ("flight", "--wind-m-s", "wind_m_s", "V", "wind, m/s (default none)"),
+    (
+        "flight", "--wind-from", "wind_from_deg", "DEG",
+        "where it comes from, degrees clockwise from north; --speed is then the speed through the air",
+    ),
+    ("flight", "--swap", "swap_min", "MIN", "time to change a battery (default 2)"),
+    (
+        "flight", "--wait", "wait_min", "MIN",
+        "stay at the end of the last line for the coverage to be known, within --endurance, then come home",
+    ),
+    ("pictures", "--fov-min", "fov_min_deg", "DEG", "smallest horizontal field of view in the swarm"),
+    ("pictures", "--side-overlap", "side_overlap", "SHARE", "between lines (default 0.4)"),
+    ("pictures", "--forward-overlap", "forward_overlap", "SHARE", "along lines (default 0.8)"),
+    ("safety", "--height-tolerance", "height_tolerance_m", "M", "with --dem (default: a tenth of --altitude)"),
+    ("safety", "--clearance", "clearance_m", "M", "distance to no-fly zones (default 1, less for small pictures)"),
+    ("safety", "--separation", "separation_m", "M", "between vehicles (default 10)"),
+    ("safety", "--height-step", "height_step_m", "M", "between heights (default 5)"),
+    ("safety", "--ceiling", "ceiling_m", "M", "highest way out or home (default: 4 steps above)"),
+)  # fmt: skip
+"""Numbers of a plan: group in the help, flag, field of a PlanRequest, unit, help."""
 
 
 def run(args: argparse.Namespace) -> int:
@@ -101,12 +93,11 @@ def run(args: argparse.Namespace) -> int:
     from gcs_plugin.plans.plan_files import check_folder, write_plan
     from gcs_plugin.plans.plan_request import make_plan
 
-    changed = use_config(args.config)
     check_folder(args.out)
     request = _request(args)
     plan, area = make_plan(request, _say)
     _say("files")
-    figures = write_plan(args.out, plan, area, request, settings=changed)
+    figures = write_plan(args.out, plan, area, request)
     _say("")
     if args.json:
         print(json.dumps(figures))
@@ -120,46 +111,25 @@ def run(args: argparse.Namespace) -> int:
 def _request(args: argparse.Namespace) -> "PlanRequest":
     """The plan request of the arguments."""
     from gcs_plugin.plans.plan_request import PlanRequest
+    from orthoswarm.config import read_config
 
     if (args.area is None) == (args.gaps is None):
         raise InputError("give either an AREA or --gaps GAPS.geojson")
-    if (args.fov_min is None) == (args.map is None):
+    if (args.fov_min_deg is None) == (args.map is None):
         raise InputError("give the smallest field of view with --fov-min, or with --map the map that it was solved in")
-    return PlanRequest(
-        area=args.area or args.gaps,
-        gaps=args.gaps is not None,
-        fly_not_arrived=args.fly_not_arrived,
-        dem=args.dem,
-        relief=args.relief,
-        height_tolerance_m=args.height_tolerance,
-        terrain_items=args.terrain_items,
-        vehicles=args.vehicles,
-        altitude_m=args.altitude,
-        fov_min_deg=args.fov_min if args.map is None else _fov_of_map(args.map, args.dem is None),
-        no_fly=args.no_fly,
-        method=args.method,
-        heading=_heading(args.heading),
-        cross=args.cross,
-        autopilots=args.autopilot or ["ardupilot"],
-        end=args.end,
-        starts=[_position(text) for text in args.start],
-        speed_m_s=args.speed,
-        run_in_m=args.run_in,
-        endurance_min=args.endurance,
-        wind_m_s=args.wind_m_s,
-        wind_from_deg=args.wind_from,
-        swap_min=args.swap,
-        wait_min=args.wait,
-        side_overlap=args.side_overlap,
-        forward_overlap=args.forward_overlap,
-        aspect=_aspect(args.aspect),
-        gimbal_pitch_deg=_pitch(args.gimbal_pitch),
-        clearance_m=args.clearance,
-        separation_m=args.separation,
-        height_step_m=args.height_step,
-        ceiling_m=args.ceiling,
-        follow=args.follow,
-    )
+    values = given(args, PlanRequest) | {
+        "area": args.area or args.gaps, "gaps": args.gaps is not None, "config": read_config(args.config),
+        "starts": [_position(text) for text in args.start],
+    }  # fmt: skip
+    if args.map is not None:
+        values["fov_min_deg"] = _fov_of_map(args.map, args.dem is None)
+    if args.heading not in (None, "wind", "longest"):
+        values["heading"] = _degrees(args.heading, "wind or longest")
+    if args.gimbal_pitch is not None:
+        values["gimbal_pitch_deg"] = None if args.gimbal_pitch == "none" else _degrees(args.gimbal_pitch, "none")
+    if args.aspect is not None:
+        values["aspect"] = _aspect(args.aspect)
+    return PlanRequest(**values)
 
 
 def _fov_of_map(folder: Path, heights_over_level_ground: bool) -> float:
@@ -182,19 +152,11 @@ def _aspect(text: str) -> float:
         raise InputError(f"the aspect ratio '{text}' is not of the form W:H; give it as 4:3") from None
 
 
-def _heading(text: str | None) -> "Heading | None":
-    named: dict[str | None, Heading | None] = {None: None, "wind": "wind", "longest": "longest"}
+def _degrees(text: str, words: str) -> float:
     try:
-        return named[text] if text is None or text in named else float(text)
+        return float(text)
     except ValueError:
-        raise InputError(f"the heading '{text}' is no number; give degrees from north, wind or longest") from None
-
-
-def _pitch(text: str) -> float | None:
-    try:
-        return None if text == "none" else float(text)
-    except ValueError:
-        raise InputError(f"the gimbal's pitch '{text}' is no number; give degrees (-90 is down), or none") from None
+        raise InputError(f"'{text}' is no number of degrees; give one, or {words}") from None
 
 
 def _position(text: str) -> tuple[float, float]:

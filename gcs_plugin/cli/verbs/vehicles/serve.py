@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from gcs_plugin.cli.configuration import add_config, use_config
+from gcs_plugin.cli.configuration import add_config
 
 if TYPE_CHECKING:
     from gcs_plugin.daemon.settings import Settings
@@ -84,7 +84,6 @@ def run(args: argparse.Namespace) -> int:
             return 0
     except OSError as error:
         raise disk_error(error, args.workspace) from None
-    use_config(args.config)
     settings = settings_of(args)
     return _show_token(settings) if args.show_token else serve(settings, end_with_input=args.end_with_input)
 
@@ -123,13 +122,16 @@ def settings_of(args: argparse.Namespace) -> "Settings":
     from gcs_plugin.daemon.intake.can_reader import CAN
     from gcs_plugin.daemon.settings import VehicleSettings, read_settings
     from orthoswarm.compute.workers import cores
+    from orthoswarm.config import read_config
+    from orthoswarm.matchers.network_device import require_device
     from orthoswarm.model.errors import InputError
 
-    settings = read_settings(args.workspace)
+    settings, config = read_settings(args.workspace), read_config(args.config)
+    require_device(config.matchers.device)
     flags = {
         "bind": args.bind, "port": args.port, "basemap": args.basemap, "dem": args.dem, "fov_min_deg": args.fov_min,
         "gsd_m": args.gsd, "workers": args.workers, "token_file": args.token_file, "links": tuple(args.link) or None,
-        "tak": tuple(args.tak) or None,
+        "tak": tuple(args.tak) or None, "config": config,
     }  # fmt: skip
     if args.workers is None and settings.workers == 1:
         flags["workers"] = max(1, cores() - 1)
