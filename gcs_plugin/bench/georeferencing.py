@@ -5,15 +5,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.compute.robust_kernel import robust_weights
+from orthoswarm.model.arrays import Array, Bytes
 from orthoswarm.model.errors import OrthoSwarmError
 
 if TYPE_CHECKING:
     from orthoswarm.model.camera import Camera
 
-Array = NDArray[np.float64]
 
 _LEAST_CAMERAS = 4  # to fit a similarity
 _LEAST_INLIERS = 40  # matches
@@ -142,7 +141,7 @@ def lay_on_reference(picture: Path, reference: Path, out: Path) -> int:
     return inliers
 
 
-def _colours(path: Path, most: int | None) -> tuple[NDArray[np.uint8], Array]:
+def _colours(path: Path, most: int | None) -> tuple[Bytes, Array]:
     """RGB (rows, columns, 3) of a file, black where it is empty, reduced to at most `most` pixels.
 
     Also returns the width and height of a reduced pixel in pixels of the file.
@@ -174,7 +173,7 @@ def _enlarged(per: Array) -> Array:
     return np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1.0]])
 
 
-def find_homography(picture: NDArray[np.uint8], ground: NDArray[np.uint8]) -> tuple[Array, int]:
+def find_homography(picture: Bytes, ground: Bytes) -> tuple[Array, int]:
     """The homography from a grey picture to a grey map by SIFT matches, and the number of inliers.
 
     Raises:

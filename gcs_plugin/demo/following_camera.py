@@ -19,11 +19,11 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gcs_plugin.demo.setting import DemoSetting
 from gcs_plugin.demo.simulated_camera import TwinCamera, VideoSender, VideoServer
 from orthoswarm.export.product_files import iso_time
+from orthoswarm.model.arrays import Bytes
 from orthoswarm.model.errors import InputError
 from telemetry.live.live_poses import LivePoses
 from telemetry.samples.sample import Sample
@@ -44,8 +44,6 @@ farther apart, but still evenly spaced."""
 _IDLE_S: Final = 0.02
 _POST_TIMEOUT_S: Final = 30.0
 
-Pixels = NDArray[np.uint8]
-
 
 class Outlet(Protocol):
     """Destination of a vehicle's pictures.
@@ -56,7 +54,7 @@ class Outlet(Protocol):
 
     url: str
 
-    def send(self, image: Pixels, sample: Sample) -> None:
+    def send(self, image: Bytes, sample: Sample) -> None:
         """Send a picture, uint8 (rows, columns, 3), with its recorded pose."""
 
     def close(self) -> None:
@@ -75,7 +73,7 @@ class Poster:
         self.failed = 0
         self._opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
 
-    def send(self, image: Pixels, sample: Sample) -> None:
+    def send(self, image: Bytes, sample: Sample) -> None:
         """Post a picture; one that the daemon does not accept is counted in `failed`."""
         import simplejpeg
 

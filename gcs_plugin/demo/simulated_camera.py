@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gcs_plugin.demo.setting import HEIGHT, WIDTH, DemoSetting, Errors
+from orthoswarm.model.arrays import Bytes
 from orthoswarm.model.camera import Camera, Lens, focal_px, rotation_from_angles
 from orthoswarm.twin.imaging.ray_marching import lens_rays, render
 from orthoswarm.twin.imaging.sensor import Sensor
@@ -47,7 +47,7 @@ class TwinCamera:
         self._sensor = Sensor(WIDTH, HEIGHT, setting.seed)
         self._seed = setting.seed
 
-    def take(self, exposure: "TakenPicture", time_s: float) -> tuple[NDArray[np.uint8], Sample]:
+    def take(self, exposure: "TakenPicture", time_s: float) -> tuple[Bytes, Sample]:
         """The picture, uint8 (480, 640, 3), and its recorded pose; a gimbal keeps the camera at nadir."""
         pose = exposure.pose
         true = Sample(
@@ -56,9 +56,7 @@ class TwinCamera:
         )  # fmt: skip
         return self.shoot(true, exposure.index, received=(exposure.lat_deg, exposure.lon_deg))
 
-    def shoot(
-        self, true: Sample, index: int, *, received: tuple[float, float] | None = None
-    ) -> tuple[NDArray[np.uint8], Sample]:
+    def shoot(self, true: Sample, index: int, *, received: tuple[float, float] | None = None) -> tuple[Bytes, Sample]:
         """The picture at a pose, uint8 (480, 640, 3), and its recorded pose.
 
         Args:
@@ -104,7 +102,7 @@ class VideoStream:
         self._form: Any = None
         self._first_s = 0.0
 
-    def send(self, image: NDArray[np.uint8], sample: Sample) -> None:
+    def send(self, image: Bytes, sample: Sample) -> None:
         """Encode and send a picture, uint8 (rows, columns, 3)."""
         import av
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.model.angles import wrap_deg
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.twin.city.builder import ParkingPlace
 from orthoswarm.twin.city.city import place_cars
@@ -140,7 +141,7 @@ def vehicle_name(spec: TwinSpec, v: int) -> str:
     return f"uav{v + 1:0{max(2, len(str(spec.plan.vehicles)))}d}"
 
 
-def _lonlat(spec: TwinSpec, site: Site, local: NDArray[np.float64]) -> list[list[float]]:
+def _lonlat(spec: TwinSpec, site: Site, local: Array) -> list[list[float]]:
     geographic = site.grid.to_geographic(spec.plan.to_grid(local, site.center))
     return [[round(float(lon), 9), round(float(lat), 9)] for lat, lon in geographic]
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array, Floats
 from orthoswarm.model.camera import Camera, rotation_from_angles
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid
@@ -150,7 +150,7 @@ def _render_all(
 
 
 def _photo(
-    spec: TwinSpec, stage: PreparedScene, grid: LocalGrid, *, shot: _TwinShot, rays: NDArray[np.float32], sensor: Sensor
+    spec: TwinSpec, stage: PreparedScene, grid: LocalGrid, *, shot: _TwinShot, rays: Floats, sensor: Sensor
 ) -> bytes:
     """One JPEG with its tags."""
     flight, i = shot.flight, shot.index
@@ -175,6 +175,6 @@ def _photo(
     return with_tags(sensor.encode(image, spec.quality), tags)
 
 
-def _degrees(angles: NDArray[np.float64], convergence: float) -> tuple[float, float, float]:
+def _degrees(angles: Array, convergence: float) -> tuple[float, float, float]:
     yaw, pitch, roll = (float(x) for x in np.degrees(angles))
     return yaw + float(np.degrees(convergence)), pitch, roll

@@ -3,13 +3,11 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.model.angles import wrap_rad
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.camera import Lens, focal_px
 from orthoswarm.model.placement import Terrain
-
-Array = NDArray[np.float64]
 
 FOVS_DEG = (85.0, 90.0, 95.0, 100.0, 105.0)
 """The paper's cameras (IV.A)."""

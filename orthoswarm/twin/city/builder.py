@@ -3,12 +3,11 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array
 from orthoswarm.twin.city.scene import CELL_M, TEXEL_M, Scene
 from orthoswarm.twin.city.stamps import stamp_building, stamp_tree
 
-Array = NDArray[np.float64]
 Color = tuple[float, float, float]
 Area = tuple[float, float, float, float]
 """u0, v0, u1, v1 of a rectangle in the city's frame, metres."""

@@ -3,14 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel
+from orthoswarm.model.arrays import Bytes
 from orthoswarm.twin.city import scene as kinds
 from orthoswarm.twin.city.procedural_noise import add_detail
 from orthoswarm.twin.city.scene import CELL_M, Scene
-
-Pixels = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +71,7 @@ def _shade(dsm, top, sun, ambient, cell, out):  # type: ignore[no-untyped-def]
             out[r, c] = min(255.0, 128.0 * (ambient + (1.0 - ambient) * min(light, 1.35)))
 
 
-def light_map(scene: Scene, sun: Sun) -> Pixels:
+def light_map(scene: Scene, sun: Sun) -> Bytes:
     """Light on each cell of the height field, uint8, 128 for level ground in the sun."""
     out = np.empty(scene.dsm.shape, np.uint8)
     _shade(scene.dsm, float(scene.dsm.max()), np.array(sun.direction()), sun.ambient, CELL_M, out)
@@ -104,7 +102,7 @@ def _lit(albedo, light, gain, out):  # type: ignore[no-untyped-def]
                 out[r, c, b] = min(v, 255.0)
 
 
-def lit_texture(scene: Scene, sun: Sun, gain: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Pixels:
+def lit_texture(scene: Scene, sun: Sun, gain: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Bytes:
     """The scene's colours under the sun, uint8 (rows, columns, 3).
 
     A scene made from a photograph carries its own shadows; light it with `ambient` near 1.

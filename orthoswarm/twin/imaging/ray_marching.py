@@ -7,16 +7,13 @@ ray from above hits the top. A table of the highest point of each 8 m tile lets 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel, kernel
+from orthoswarm.model.arrays import Array, Bytes, Floats
 from orthoswarm.model.camera import Camera, Lens
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.twin.city.procedural_noise import noise_field
 from orthoswarm.twin.city.scene import CELL_M, TEXEL_M, TILE_CELLS, WATER, Scene
-
-Pixels = NDArray[np.uint8]
-Floats = NDArray[np.float32]
 
 NOISE_SIDE = 1024
 HAZE_CELL_M = 4.0
@@ -38,7 +35,7 @@ class PreparedScene:
     """
 
     scene: Scene
-    levels: tuple[Pixels, Pixels, Pixels]
+    levels: tuple[Bytes, Bytes, Bytes]
     tiles: Floats
     sun: tuple[float, float, float]
     ambient: float
@@ -47,7 +44,7 @@ class PreparedScene:
 
 
 def make_stage(
-    scene: Scene, lit: Pixels, sun: tuple[float, float, float], ambient: float, haze: Floats
+    scene: Scene, lit: Bytes, sun: tuple[float, float, float], ambient: float, haze: Floats
 ) -> PreparedScene:
     """Prepare a scene and its lit colours for rendering; arguments as the attributes of `PreparedScene`."""
     import cv2
@@ -324,7 +321,7 @@ def lens_rays(lens: Lens, side: int = 2) -> Floats:
     return np.ascontiguousarray(lens.undistort(xy) if not lens.is_pinhole else xy, np.float32)
 
 
-def render(stage: PreparedScene, camera: Camera, rays: Floats, motion: NDArray[np.float64]) -> Floats:
+def render(stage: PreparedScene, camera: Camera, rays: Floats, motion: Array) -> Floats:
     """One picture, float32 (rows, columns, 3), red first, before the sensor.
 
     Args:

@@ -1,10 +1,8 @@
 """The sensor model: from light to a JPEG by optics, vignetting, exposure, noise and encoding."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-Pixels = NDArray[np.uint8]
-Floats = NDArray[np.float32]
+from orthoswarm.model.arrays import Bytes, Floats
 
 
 class Sensor:
@@ -22,7 +20,7 @@ class Sensor:
         y = (np.arange(height, dtype=np.float32) - 0.5 * (height - 1)) / (0.5 * width)
         self._vignette = (1.0 - 0.13 * (x[None, :] ** 2 + y[:, None] ** 2))[..., None]
 
-    def expose(self, light: Floats, rng: np.random.Generator) -> Pixels:
+    def expose(self, light: Floats, rng: np.random.Generator) -> Bytes:
         """8-bit colours of a picture: slight blur, darker corners, exposure within 4 %, noise of 2 grey values."""
         import cv2
 
@@ -33,7 +31,7 @@ class Sensor:
         image += 1.9 * self._bank[r : r + rows, c : c + cols]
         return np.asarray(np.clip(image, 0, 255).astype(np.uint8))
 
-    def encode(self, image: Pixels, quality: int) -> bytes:
+    def encode(self, image: Bytes, quality: int) -> bytes:
         """A baseline JPEG with halved chroma."""
         import simplejpeg
 
