@@ -12,7 +12,7 @@ from gcs_plugin.cli.interrupt import safe_interrupts
 from orthoswarm import __version__
 from orthoswarm.model.errors import OrthoSwarmError
 
-# verb -> one line of help; its module in a room of gcs_plugin.cli.verbs has configure(parser) and run(args) -> int.
+# verb -> one line of help; its module in gcs_plugin.cli.verbs has configure(parser) and run(args) -> int.
 VERBS = {
     "plan": "make missions that cover an area, or follow lines, with a swarm",
     "mosaic": "make a georeferenced orthoimage from drone photos",
@@ -30,13 +30,6 @@ VERBS = {
     "weights": "list, import and check the weights of learned matchers",
     "doctor": "show what this machine has (codecs, weights, cores, disk), and what does not work without the rest",
 }
-
-_ROOMS = {
-    "maps": ("mosaic", "coverage", "inspect", "frames", "export", "evaluate"),
-    "vehicles": ("plan", "fleet", "sim", "demo", "serve"),
-    "tools": ("twin", "bench", "weights", "doctor"),
-}
-_ROOM_OF = {verb: room for room, verbs in _ROOMS.items() for verb in verbs}
 
 _NEGATIVE = re.compile(r"-[0-9.]")
 
@@ -96,7 +89,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if verb not in VERBS:
         print(f"orthoswarm: there is no verb '{verb}'; choose one of: {', '.join(VERBS)}", file=sys.stderr)
         return 2
-    module = importlib.import_module(f"gcs_plugin.cli.verbs.{_ROOM_OF[verb]}.{verb}")
+    module = importlib.import_module(f"gcs_plugin.cli.verbs.{verb}")
     parser = argparse.ArgumentParser(
         prog=f"orthoswarm {verb}",
         description=VERBS[verb][0].upper() + VERBS[verb][1:] + ".",

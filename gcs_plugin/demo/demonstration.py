@@ -12,10 +12,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from gcs_plugin.demo.setting import FOV_MIN_DEG, HEIGHT_M, DemoSetting, write_world
+from gcs_plugin.demo.setting import FOV_MIN_DEG, HEIGHT_M, DemoSetting
 from gcs_plugin.demo.simulator import simulate
 from orthoswarm.compute.workers import spawn_context
 from orthoswarm.model.errors import InputError, OrthoSwarmError
+from orthoswarm.twin.make import make_twin
 
 if TYPE_CHECKING:
     from gcs_plugin.daemon.daemon import Daemon
@@ -62,7 +63,7 @@ def run_demo(
     theirs.close()
     try:
         report("city", 0, 1)
-        write_world(setting, out / "twin")
+        make_twin(setting.twin, out / "twin", only=0)  # the map before the disaster and the truth after it, no photos
         report("city", 1, 1)
         prepare(report)
         addresses = _receive_addresses(ours, process)

@@ -12,13 +12,13 @@ import numpy as np
 from gcs_plugin.demo.setting import HEIGHT, WIDTH, DemoSetting, Errors
 from orthoswarm.model.arrays import Bytes
 from orthoswarm.model.camera import Camera, Lens, focal_px, rotation_from_angles
-from orthoswarm.twin.imaging.ray_marching import lens_rays, render
-from orthoswarm.twin.imaging.sensor import Sensor
+from orthoswarm.twin.drone_photo import Sensor
+from orthoswarm.twin.ray_marching import lens_rays, render
 from telemetry.samples.sample import Sample
 
 if TYPE_CHECKING:
     from gcs_plugin.sim.mission_flight import TakenPicture
-    from orthoswarm.twin.imaging.ray_marching import PreparedScene
+    from orthoswarm.twin.ray_marching import PreparedScene
     from orthoswarm.twin.site import Site
 
 _POSITION_M: Final = 0.8

@@ -9,7 +9,7 @@ from orthoswarm.model.arrays import Flags, Floats
 from orthoswarm.twin.city import scene as kinds
 from orthoswarm.twin.city.procedural_noise import hash01, lattice, noise_field
 from orthoswarm.twin.city.scene import TEXEL_M, Scene
-from orthoswarm.twin.imaging.ray_marching import HAZE_CELL_M
+from orthoswarm.twin.ray_marching import HAZE_CELL_M
 
 SIZES_M = {"debris": (400.0, 880.0), "water": (330.0, 320.0), "haze": (440.0, 190.0)}
 """Extent of each disaster across and along, metres (paper IV.A)."""

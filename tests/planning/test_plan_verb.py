@@ -12,7 +12,7 @@ import pytest
 import shapely
 
 from gcs_plugin.cli.main import main
-from gcs_plugin.cli.verbs.vehicles.plan import configure
+from gcs_plugin.cli.verbs.plan import configure
 from gcs_plugin.plans.plan_request import PlanRequest
 from tests.kit.plan_checks import GRID, ORIGIN, crossed, fly, on_globe, seen_by, to_metres, write_geojson
 from tests.planning.test_plan_files import survey_plan

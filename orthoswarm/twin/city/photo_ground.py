@@ -105,13 +105,8 @@ def _solid_part(image: Bytes) -> tuple[int, int, int, int]:
     valid: Flags = np.asarray(image[::4, ::4].any(axis=2))
     top, left, bottom, right = 0, 0, *valid.shape
     while bottom - top > 8 and right - left > 8:
-        rim = [
-            valid[top, left:right],
-            valid[bottom - 1, left:right],
-            valid[top:bottom, left],
-            valid[top:bottom, right - 1],
-        ]
-        shares = [float(line.mean()) for line in rim]
+        part = valid[top:bottom, left:right]
+        shares = [float(rim.mean()) for rim in (part[0], part[-1], part[:, 0], part[:, -1])]
         worst = int(np.argmin(shares))
         if shares[worst] > 0.98:
             break

@@ -67,21 +67,12 @@ class Scene:
     @property
     def cells(self) -> GroundGrid:
         """The grid of the height fields."""
-        g = self.grid
-        return GroundGrid(
-            epsg=g.epsg, west=g.west, north=g.north, gsd_m=CELL_M, width=g.width // 2, height=g.height // 2
-        )
+        return replace(self.grid, gsd_m=CELL_M, width=self.grid.width // 2, height=self.grid.height // 2)
 
     def copy(self) -> "Scene":
         """A copy whose colours and surface can be changed independently (the bare ground is shared)."""
-        return replace(
-            self,
-            albedo=self.albedo.copy(),
-            kind=self.kind.copy(),
-            dsm=self.dsm.copy(),
-            wall=self.wall.copy(),
-            facade=self.facade.copy(),
-        )
+        changed = {name: getattr(self, name).copy() for name in ("albedo", "kind", "dsm", "wall", "facade")}
+        return replace(self, **changed)
 
     def bare_ground(self) -> Terrain:
         """Heights of the bare ground, a node in the middle of each cell."""

@@ -11,6 +11,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from orthoswarm.model.errors import InputError
+
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
@@ -98,7 +100,6 @@ def run(args: argparse.Namespace) -> int:
 
 def _accuracy(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from gcs_plugin.bench.accuracy import METHODS, accuracy_table, run_accuracy
-    from orthoswarm.model.errors import InputError
 
     methods = _list(args.methods)
     if not methods or set(methods) - set(METHODS):
@@ -121,7 +122,6 @@ def _scaling(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 def _peers(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from gcs_plugin.bench.peers import PeerSettings, peers_sheet, peers_table, run_peers
-    from orthoswarm.model.errors import InputError
 
     if args.every < 1 or args.limit_s <= 0 or (args.workers or 1) < 1:
         raise InputError("--every, --limit-s and --workers take numbers above 0")

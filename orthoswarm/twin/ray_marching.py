@@ -4,7 +4,7 @@ The height field is a set of columns with tilted tops: a ray that enters a colum
 ray from above hits the top. A table of the highest point of each 8 m tile lets rays skip empty air.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -54,16 +54,10 @@ def make_stage(
     rows, cols = scene.dsm.shape
     blocks = scene.dsm.reshape(rows // TILE_CELLS, TILE_CELLS, cols // TILE_CELLS, TILE_CELLS)
     tiles = np.ascontiguousarray(blocks.max(axis=(1, 3)) + 0.3, np.float32)
-    noise = noise_field((NOISE_SIDE, NOISE_SIDE), 1.0, 48.0, 5, 4711)
     return PreparedScene(
-        scene=scene,
-        levels=(lit, np.asarray(half), np.asarray(quarter)),
-        tiles=tiles,
-        sun=sun,
-        ambient=ambient,
-        haze=haze,
-        noise=noise,
-    )
+        scene=scene, levels=(lit, np.asarray(half), np.asarray(quarter)), tiles=tiles, sun=sun, ambient=ambient,
+        haze=haze, noise=noise_field((NOISE_SIDE, NOISE_SIDE), 1.0, 48.0, 5, 4711),
+    )  # fmt: skip
 
 
 @in_place_kernel
@@ -402,15 +396,8 @@ def satellite_view(stage: PreparedScene, lean: tuple[float, float], gsd_m: float
         float32 (rows, columns, 3) and its grid.
     """
     s = stage.scene
-    g = s.grid
-    grid = GroundGrid(
-        epsg=g.epsg,
-        west=g.west,
-        north=g.north,
-        gsd_m=gsd_m,
-        width=int(g.width * TEXEL_M / gsd_m),
-        height=int(g.height * TEXEL_M / gsd_m),
-    )
+    width, height = (int(n * TEXEL_M / gsd_m) for n in (s.grid.width, s.grid.height))
+    grid = replace(s.grid, gsd_m=gsd_m, width=width, height=height)
     out = np.empty((grid.height, grid.width, 3), np.float32)
     _satellite(
         stage.levels[0], s.dsm, s.dtm, stage.tiles, s.wall, s.facade, np.asarray(stage.sun), stage.ambient,

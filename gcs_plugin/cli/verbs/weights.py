@@ -1,8 +1,12 @@
 """`orthoswarm weights`: the weights of learned matchers: list, import and test them."""
 
 import argparse
+import json
 from pathlib import Path
+from time import perf_counter
 from typing import Any
+
+from orthoswarm.model.errors import InputError
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -42,7 +46,6 @@ def run(args: argparse.Namespace) -> int:
     from orthoswarm.compute.workers import prepare_process
 
     prepare_process()
-    import json
 
     from orthoswarm.matchers import weight_files
 
@@ -102,15 +105,12 @@ def checked_files() -> list[dict[str, Any]]:
 
 def checked_matchers() -> list[dict[str, Any]]:
     """Run every built-in matcher once on a synthetic picture and its shifted copy."""
-    from time import perf_counter
-
     import cv2
     import numpy as np
 
     from orthoswarm.matchers import map_matcher, picture_matcher
     from orthoswarm.matchers.matcher import UnavailableError
     from orthoswarm.matchers.registry import MAP, PICTURE
-    from orthoswarm.model.errors import InputError
 
     rng = np.random.default_rng(1)
     ground = sum(
