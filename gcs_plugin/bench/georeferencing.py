@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 
 _LEAST_CAMERAS = 4  # to fit a similarity
+_ROUNDS = 30  # of reweighting, with the median residual as scale
 _LEAST_INLIERS = 40  # matches
 _MATCHED_PX = 6_000_000
 
@@ -31,12 +32,11 @@ class SpaceSimilarity(NamedTuple):
         return np.asarray(self.scale * points @ self.rotation.T + self.shift)
 
 
-def fit_similarity(source: Array, target: Array, rounds: int = 30) -> SpaceSimilarity:
-    """Robust similarity from source to target points: iteratively reweighted least squares (Umeyama).
+def fit_similarity(source: Array, target: Array) -> SpaceSimilarity:
+    """Robust similarity from source to target points: least squares (Umeyama), reweighted by Geman-McClure.
 
     Args:
         source: (N, 3), any frame and scale. target: (N, 3), metres.
-        rounds: of reweighting, with Geman-McClure weights scaled by the median residual.
 
     Raises:
         OrthoSwarmError: for fewer than four points, or collinear ones, which leave a rotation undetermined.
@@ -44,7 +44,7 @@ def fit_similarity(source: Array, target: Array, rounds: int = 30) -> SpaceSimil
     if len(source) < _LEAST_CAMERAS:
         raise OrthoSwarmError(f"{len(source)} cameras are too few to place a model")
     weight = np.ones(len(source))
-    for _ in range(rounds):
+    for _ in range(_ROUNDS):
         found = _weighted(source, target, weight)
         residual = np.linalg.norm(found.apply(source) - target, axis=1)
         spread = max(float(np.median(residual)), 1e-6)

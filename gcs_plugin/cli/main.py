@@ -7,6 +7,7 @@ import os
 import re
 import sys
 from collections.abc import Sequence
+from typing import Any
 
 from gcs_plugin.cli.interrupt import safe_interrupts
 from orthoswarm import __version__
@@ -32,6 +33,13 @@ VERBS = {
 }
 
 _NEGATIVE = re.compile(r"-[0-9.]")
+
+
+class _Parser(argparse.ArgumentParser):
+    """A parser whose help keeps the lines of its examples, as those of its actions do."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**settings, formatter_class=argparse.RawDescriptionHelpFormatter)
 
 
 def _overview() -> str:
@@ -90,11 +98,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"orthoswarm: there is no verb '{verb}'; choose one of: {', '.join(VERBS)}", file=sys.stderr)
         return 2
     module = importlib.import_module(f"gcs_plugin.cli.verbs.{verb}")
-    parser = argparse.ArgumentParser(
-        prog=f"orthoswarm {verb}",
-        description=VERBS[verb][0].upper() + VERBS[verb][1:] + ".",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = _Parser(prog=f"orthoswarm {verb}", description=VERBS[verb][0].upper() + VERBS[verb][1:] + ".")
     module.configure(parser)
     try:
         parsed = parser.parse_args(_join_negative_values(args[1:]))

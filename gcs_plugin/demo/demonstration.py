@@ -32,14 +32,9 @@ ReportProgress = Callable[[str, int, int], None]
 
 
 def run_demo(
-    setting: DemoSetting,
-    out: Path,
-    report: ReportProgress,
-    *,
-    port: int = 0,
-    opened: Callable[[str], None],
+    setting: DemoSetting, out: Path, report: ReportProgress, *, port: int = 0, opened: Callable[[str], None],
     prepare: Callable[[ReportProgress], None],
-) -> dict[str, Any]:
+) -> dict[str, Any]:  # fmt: skip
     """Run the demonstration and return the content of report.json.
 
     Args:
@@ -235,9 +230,12 @@ def _finish(daemon: "Daemon", report: ReportProgress) -> None:
     _wait(refined, 300.0, "the refinement")
     report("products", 0, 1)
     job = daemon.requests.export(["cog", "gpkg", "mbtiles", "kmz"])
-    _wait(
-        lambda: (found := daemon.jobs.find(job.id)) is not None and found.state in ("done", "failed"), 300.0, "export"
-    )
+
+    def exported() -> bool:
+        found = daemon.jobs.find(job.id)
+        return found is not None and found.state in ("done", "failed")
+
+    _wait(exported, 300.0, "export")
     report("products", 1, 1)
 
 
@@ -260,13 +258,7 @@ def _measure(setting: DemoSetting, out: Path, end: dict[str, Any], wall_s: float
         name: evaluate_ortho(out / file, reference, find_mask(reference, None)).figures()
         for name, file in (("realtime", "realtime.tif"), ("orthoimage", "orthoimage.tif"))
     }
-    report["accuracy"] = figures["orthoimage"]
-    report["accuracy_realtime"] = figures["realtime"]
-    report["demo"] = {
-        "vehicles": setting.vehicles,
-        "seed": setting.seed,
-        "pictures": end.get("taken"),
-        "wall_s": wall_s,
-    }
+    about = {"vehicles": setting.vehicles, "seed": setting.seed, "pictures": end.get("taken"), "wall_s": wall_s}
+    report |= {"accuracy": figures["orthoimage"], "accuracy_realtime": figures["realtime"], "demo": about}
     write_json(out / "report.json", report)
     return report

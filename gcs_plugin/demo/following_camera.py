@@ -7,7 +7,6 @@ exposure has arrived and the pose can be interpolated.
 """
 
 import contextlib
-import io
 import json
 import math
 import threading
@@ -103,11 +102,10 @@ class Poster:
 def _multipart(picture: bytes, pose: str) -> tuple[str, bytes]:
     """Content type and body of a form with `image` and `pose` (RFC 7578)."""
     boundary = "orthoswarm-picture-and-pose"
-    body = io.BytesIO()
-    body.write(f'--{boundary}\r\nContent-Disposition: form-data; name="pose"\r\n\r\n{pose}\r\n'.encode())
+    body = f'--{boundary}\r\nContent-Disposition: form-data; name="pose"\r\n\r\n{pose}\r\n'.encode()
     head = 'Content-Disposition: form-data; name="image"; filename="picture.jpg"\r\nContent-Type: image/jpeg'
-    body.write(f"--{boundary}\r\n{head}\r\n\r\n".encode() + picture + f"\r\n--{boundary}--\r\n".encode())
-    return f"multipart/form-data; boundary={boundary}", body.getvalue()
+    body += f"--{boundary}\r\n{head}\r\n\r\n".encode() + picture + f"\r\n--{boundary}--\r\n".encode()
+    return f"multipart/form-data; boundary={boundary}", body
 
 
 def open_outlet(url: str, system: int) -> Outlet:

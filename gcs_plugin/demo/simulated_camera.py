@@ -4,7 +4,7 @@ import contextlib
 import queue
 import socket
 import threading
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
@@ -95,7 +95,7 @@ class VideoStream:
         sink: receives the stream's bytes; each write is a multiple of 188 bytes, the size of a transport packet.
     """
 
-    def __init__(self, sink: "Sink") -> None:
+    def __init__(self, sink: Sink) -> None:
         self._sink = sink
         self._container: Any = None
         self._stream: Any = None
@@ -271,13 +271,12 @@ class RenderQueue:
     cameras: dict[int, TwinCamera]
     servers: dict[int, VideoServer]
     taken: int = 0
-    _waiting: "queue.SimpleQueue[tuple[int, TakenPicture, float] | None]" = None  # type: ignore[assignment]
-    _thread: threading.Thread = None  # type: ignore[assignment]
     problem: str = ""
+    _waiting: "queue.SimpleQueue[tuple[int, TakenPicture, float] | None]" = field(default_factory=queue.SimpleQueue)
+    _thread: threading.Thread = field(init=False)
 
     def __post_init__(self) -> None:
         """Start the thread."""
-        self._waiting = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name="render-queue", daemon=True)
         self._thread.start()
 

@@ -51,14 +51,8 @@ def run(args: argparse.Namespace) -> int:
             webbrowser.open(url)
 
     with ProgressBars() as progress:
-        report = run_demo(
-            DemoSetting(args.vehicles, args.seed, args.speed),
-            args.out,
-            progress,
-            port=args.port,
-            opened=opened,
-            prepare=compile_cold_kernels,
-        )
+        setting = DemoSetting(args.vehicles, args.seed, args.speed)
+        report = run_demo(setting, args.out, progress, port=args.port, opened=opened, prepare=compile_cold_kernels)
     accuracy = report["accuracy"]
     if args.json:
         json.dump(report, sys.stdout, indent=1, ensure_ascii=False)

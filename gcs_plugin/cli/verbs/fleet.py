@@ -71,13 +71,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     verbs = parser.add_subparsers(dest="action", required=True, metavar="VERB")
     for name, text in _VERBS.items():
-        verb = verbs.add_parser(
-            name,
-            help=text,
-            description=text[0].upper() + text[1:] + ".",
-            epilog=f"example:\n  {_EXAMPLES[name]}",
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        )
+        about, example = text[0].upper() + text[1:] + ".", f"example:\n  {_EXAMPLES[name]}"
+        verb = verbs.add_parser(name, help=text, description=about, epilog=example)
         _common(verb)
         if name == "upload":
             missions_help = "folder of a plan, or .plan or .waypoints files"

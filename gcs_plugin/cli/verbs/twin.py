@@ -55,19 +55,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.epilog = "example:\n  orthoswarm twin make tiny --out twin-tiny --seed 1 --noise paper"
     actions = parser.add_subparsers(dest="action", required=True, metavar="make|camera")
-    make = actions.add_parser(
-        "make",
-        help="make a set of photos, basemap and truth",
-        epilog="example:\n  orthoswarm twin make debris --out debris-hard --seed 3 --noise hard --lens=-0.05,0.01",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    camera = actions.add_parser(
-        "camera",
-        help="follow a real autopilot with a camera that sees the city",
-        epilog=_CAMERA_EXAMPLE,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    _configure_camera(camera)
+    example = "example:\n  orthoswarm twin make debris --out debris-hard --seed 3 --noise hard --lens=-0.05,0.01"
+    make = actions.add_parser("make", help="make a set of photos, basemap and truth", epilog=example)
+    camera_help = "follow a real autopilot with a camera that sees the city"
+    _configure_camera(actions.add_parser("camera", help=camera_help, epilog=_CAMERA_EXAMPLE))
     add = make.add_argument
     add("preset", metavar="PRESET", help="tiny (40 photos), debris, water, haze, clear (1,017 each), full (32,544)")
     add("--out", type=Path, required=True, metavar="DIR", help="folder of the set; an interrupted run goes on there")
@@ -224,12 +215,10 @@ def _configure_camera(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--link", action="append", required=True, metavar="URL", help="the autopilot's link; again for more vehicles")
     add(
-        "--stream",
-        required=True,
-        metavar="URL",
+        "--stream", required=True, metavar="URL",
         help="tcp://HOST:PORT serves video (H.264 with the poses as SEI), udp://HOST:PORT sends it, http://HOST:PORT "
         "posts photos to a daemon; vehicle 2 uses the next port, and so on",
-    )
+    )  # fmt: skip
     add("--relay", metavar="URL", help="where a ground station finds the vehicles behind the camera, e.g. tcpin:...")
     add("--set", type=Path, metavar="DIR", help="set of `twin make`, or where a new one goes (default twin-PRESET)")
     add("--preset", default="tiny", help="city of a new set (default tiny, 0.67 x 0.43 km; debris has 1.8 x 1.2 km)")

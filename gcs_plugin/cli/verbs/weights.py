@@ -18,12 +18,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     actions = parser.add_subparsers(dest="action", required=True, metavar="list|import|check")
     listing = _action(actions, "list", "which weights are known, where they lie, which matchers use them")
-    bring = _action(
-        actions,
-        "import",
-        "copy a file of weights, or all known ones of a folder, to your own folder",
-        " /media/stick/weights",
-    )
+    bring_help = "copy a file of weights, or all known ones of a folder, to your own folder"
+    bring = _action(actions, "import", bring_help, " /media/stick/weights")
     bring.add_argument("source", type=Path, metavar="FILE|DIR", help="file or folder with weights")
     check = _action(actions, "check", "compare files with the published ones and run each matcher once")
     for sub in (listing, bring, check):
@@ -36,7 +32,6 @@ def _action(actions: Any, name: str, text: str, example: str = "") -> argparse.A
         help=text,
         description=text[0].upper() + text[1:] + ".",
         epilog=f"example:\n  orthoswarm weights {name}{example}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     return parser
 
@@ -46,7 +41,6 @@ def run(args: argparse.Namespace) -> int:
     from orthoswarm.compute.workers import prepare_process
 
     prepare_process()
-
     from orthoswarm.matchers import weight_files
 
     ok = True
