@@ -253,12 +253,7 @@ class DirectBackend(Backend):
     name = "pymavlink"
 
     def __init__(
-        self,
-        links: Iterable[Link | str],
-        *,
-        own: Address,
-        key: bytes | None = None,
-        tlog: Path | None = None,
+        self, links: Iterable[Link | str], *, own: Address, key: bytes | None = None, tlog: Path | None = None
     ) -> None:
         self.fleet = Fleet(links, own=own, key=key, tlog=tlog)
         self.events: list[FleetEvent] = []
@@ -324,12 +319,7 @@ class DirectBackend(Backend):
         """Close the fleet."""
         self.fleet.close()
 
-    def _run(
-        self,
-        begin: Mapping[int, Callable[[], Exchange]],
-        what: str,
-        report: Report,
-    ) -> dict[int, Outcome]:
+    def _run(self, begin: Mapping[int, Callable[[], Exchange]], what: str, report: Report) -> dict[int, Outcome]:
         """Begin all exchanges and poll until each has ended."""
         outcomes: dict[int, Outcome] = {}
         jobs: dict[int, Exchange] = {}

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from orthoswarm.export.atomic_file import write_file
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 
 
@@ -19,9 +20,7 @@ def check_set(folder: Path, *, truth: bool = False) -> None:
         InputError: if its photos, its map or (where asked for) its truth is missing.
     """
     if not (folder / "photos").is_dir() or not (folder / "basemap.tif").exists():
-        raise InputError(
-            f"{folder} is not a data set with photos and basemap.tif; make one with `orthoswarm twin make`"
-        )
+        raise InputError(f"{folder} has no photos and basemap.tif; make a set with `orthoswarm twin make`")
     if truth and not (folder / "truth" / "reference.tif").exists():
         raise InputError(f"{folder} has no truth/reference.tif; make the set with `orthoswarm twin make`")
 
@@ -53,10 +52,7 @@ def label(row: dict[str, Any]) -> str:
 
 def write_result(path: Path, value: Any) -> None:
     """Write a result as JSON; the file is complete or absent."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_suffix(".part")
-    part.write_text(json.dumps(value, indent=1), encoding="utf-8")
-    os.replace(part, path)
+    write_file(path, json.dumps(value, indent=1))
 
 
 def read_result(path: Path) -> Any:
@@ -131,12 +127,12 @@ def cost(report: dict[str, Any]) -> dict[str, Any]:
 
 
 def text(value: float | None, digits: int) -> str:
-    """A number for a table, a dash for none."""
+    """A number for a table, a dash for None."""
     return "-" if value is None else f"{value:.{digits}f}"
 
 
 def share(value: float | None, digits: int = 1) -> str:
-    """A share as percent, a dash for none."""
+    """A share as percent, a dash for None."""
     return "-" if value is None else f"{100 * value:.{digits}f} %"
 
 
@@ -161,11 +157,9 @@ def machine() -> str:
 
     from orthoswarm.compute.workers import cores
 
-    model = platform.processor() or platform.machine()
     info = Path("/proc/cpuinfo")
-    if info.exists():
-        lines = info.read_text(encoding="utf-8", errors="replace").splitlines()
-        names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-        model = names[0] if names else model
+    lines = info.read_text(encoding="utf-8", errors="replace").splitlines() if info.exists() else []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    model = [*names, platform.processor() or platform.machine()][0]
     gpu = "an NVIDIA GPU" if shutil.which("nvidia-smi") else "no GPU"
     return f"{cores()} cores of {model}, {gpu}"

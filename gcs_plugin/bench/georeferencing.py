@@ -5,17 +5,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.compute.robust_kernel import robust_weights
+from orthoswarm.model.arrays import Array, Bytes
 from orthoswarm.model.errors import OrthoSwarmError
 
 if TYPE_CHECKING:
     from orthoswarm.model.camera import Camera
 
-Array = NDArray[np.float64]
 
 _LEAST_CAMERAS = 4  # to fit a similarity
+_ROUNDS = 30  # of reweighting, with the median residual as scale
 _LEAST_INLIERS = 40  # matches
 _MATCHED_PX = 6_000_000
 
@@ -32,12 +32,11 @@ class SpaceSimilarity(NamedTuple):
         return np.asarray(self.scale * points @ self.rotation.T + self.shift)
 
 
-def fit_similarity(source: Array, target: Array, rounds: int = 30) -> SpaceSimilarity:
-    """Robust similarity from source to target points: iteratively reweighted least squares (Umeyama).
+def fit_similarity(source: Array, target: Array) -> SpaceSimilarity:
+    """Robust similarity from source to target points: least squares (Umeyama), reweighted by Geman-McClure.
 
     Args:
         source: (N, 3), any frame and scale. target: (N, 3), metres.
-        rounds: of reweighting, with Geman-McClure weights scaled by the median residual.
 
     Raises:
         OrthoSwarmError: for fewer than four points, or collinear ones, which leave a rotation undetermined.
@@ -45,7 +44,7 @@ def fit_similarity(source: Array, target: Array, rounds: int = 30) -> SpaceSimil
     if len(source) < _LEAST_CAMERAS:
         raise OrthoSwarmError(f"{len(source)} cameras are too few to place a model")
     weight = np.ones(len(source))
-    for _ in range(rounds):
+    for _ in range(_ROUNDS):
         found = _weighted(source, target, weight)
         residual = np.linalg.norm(found.apply(source) - target, axis=1)
         spread = max(float(np.median(residual)), 1e-6)
@@ -142,7 +141,7 @@ def lay_on_reference(picture: Path, reference: Path, out: Path) -> int:
     return inliers
 
 
-def _colours(path: Path, most: int | None) -> tuple[NDArray[np.uint8], Array]:
+def _colours(path: Path, most: int | None) -> tuple[Bytes, Array]:
     """RGB (rows, columns, 3) of a file, black where it is empty, reduced to at most `most` pixels.
 
     Also returns the width and height of a reduced pixel in pixels of the file.
@@ -174,7 +173,7 @@ def _enlarged(per: Array) -> Array:
     return np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1.0]])
 
 
-def find_homography(picture: NDArray[np.uint8], ground: NDArray[np.uint8]) -> tuple[Array, int]:
+def find_homography(picture: Bytes, ground: Bytes) -> tuple[Array, int]:
     """The homography from a grey picture to a grey map by SIFT matches, and the number of inliers.
 
     Raises:

@@ -36,11 +36,7 @@ class Measured:
 
 
 def run_measured(
-    command: Sequence[str],
-    log: Path,
-    limit_s: float,
-    env: Mapping[str, str] | None = None,
-    out: Path | None = None,
+    command: Sequence[str], log: Path, limit_s: float, env: Mapping[str, str] | None = None, out: Path | None = None
 ) -> Measured:
     """Run a command to its end or to its limit.
 

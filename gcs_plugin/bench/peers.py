@@ -4,7 +4,6 @@ Each program runs in its own virtual environment, made on first use; none of the
 included, get the same photos, number of threads and limit, and are measured in the same way.
 """
 
-import os
 import shutil
 import subprocess
 import sys
@@ -29,6 +28,7 @@ from gcs_plugin.bench.benchmark_runs import (
     write_result,
 )
 from gcs_plugin.bench.meter import run_measured
+from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 
 SUCCESS = 0.9
@@ -144,28 +144,18 @@ PROGRAMS = {
     "swarm": _own("swarm"),
     "paper": _own("paper"),
     "pyorthomosaic": Program(
-        title="pyOrthomosaic",
-        packages=("pyOrthomosaic==0.9.3",),
-        command=_orthomosaic_command,
-        product=_orthomosaic_product,
-        georeferenced="yes, by GPS tags",
+        title="pyOrthomosaic", packages=("pyOrthomosaic==0.9.3",), command=_orthomosaic_command,
+        product=_orthomosaic_product, georeferenced="yes, by GPS tags",
     ),
     "stitcher": Program(
-        title="OpenCV Stitcher, scans",
-        packages=("opencv-python-headless>=4.10,<5",),
-        command=_script("stitch.py"),
-        product=_stitched,
-        georeferenced="no",
-        placed=False,
+        title="OpenCV Stitcher, scans", packages=("opencv-python-headless>=4.10,<5",), command=_script("stitch.py"),
+        product=_stitched, georeferenced="no", placed=False,
     ),
     "pycolmap": Program(
-        title="pycolmap, pasted on flat ground",
-        packages=("pycolmap==4.2.1",),
-        command=_script("colmap.py"),
-        product=_pasted,
-        georeferenced="yes, by a similarity to the GPS tags",
+        title="pycolmap, pasted on flat ground", packages=("pycolmap==4.2.1",), command=_script("colmap.py"),
+        product=_pasted, georeferenced="yes, by a similarity to the GPS tags",
     ),
-}
+}  # fmt: skip
 
 
 # -- running ------------------------------------------------------------------------------------------------------
@@ -350,9 +340,9 @@ def _picture(product: Path, out: Path) -> None:
         shape = (max(1, round(file.height / scale)), max(1, round(file.width / scale)))
         data = file.read([1, 2, 3], out_shape=(3, *shape), resampling=rasterio.enums.Resampling.average)
         drawn = file.dataset_mask(out_shape=shape) > 0
-    part = out.with_suffix(".part")
-    Image.fromarray(np.moveaxis(np.where(drawn, data, 255), 0, -1).astype(np.uint8)).save(part, "JPEG", quality=85)
-    os.replace(part, out)
+    thumbnail = Image.fromarray(np.moveaxis(np.where(drawn, data, 255), 0, -1).astype(np.uint8))
+    with atomic_write(out) as part:
+        thumbnail.save(part, "JPEG", quality=85)
 
 
 # -- judging ------------------------------------------------------------------------------------------------------
@@ -454,10 +444,9 @@ def contact_sheet(rows: Sequence[tuple[str, Sequence[Cell]]], out: Path) -> None
                     axes.imshow(image.convert("RGB"))
             else:
                 axes.text(0.5, 0.5, "no map", ha="center", va="center", fontsize=9)
-    part = out.with_suffix(".part")
-    figure.savefig(part, dpi=110, format="jpg", pil_kwargs={"quality": 88})
+    with atomic_write(out) as part:
+        figure.savefig(part, dpi=110, format="jpg", pil_kwargs={"quality": 88})
     pyplot.close(figure)
-    os.replace(part, out)
 
 
 def verdict(title: str, row: dict[str, Any]) -> str:

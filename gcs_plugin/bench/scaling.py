@@ -1,6 +1,5 @@
 """Cost by number of vehicles (the paper's Fig. 7) and by pictures per vehicle (Fig. 8), each from separate runs."""
 
-import os
 import shutil
 import sys
 from collections.abc import Sequence
@@ -8,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from gcs_plugin.bench.benchmark_runs import cost, link_photos, machine, mosaic, pictures, read_result, write_result
+from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.model.errors import InputError
 
 FLAT = 0.2
@@ -63,6 +63,7 @@ def run_scaling(
 def _run(
     folder: Path, photos: list[Path], name: str, *, refine: str, out: Path, workers: int | None, maps: bool
 ) -> dict[str, Any]:
+    """Map some photos of a set, and store the report."""
     subset, product = out / "photos", out / f"map-{name}"
     link_photos(photos, folder / "photos", subset)
     report = mosaic(subset, folder / "basemap.tif", product, ["--refine", refine], workers)
@@ -194,8 +195,7 @@ def _plot_growth(result: dict[str, Any], path: Path) -> Path:
 def _saved(figure: Any, path: Path) -> Path:
     from matplotlib import pyplot
 
-    part = path.with_suffix(".part")
-    figure.savefig(part, dpi=110, format="png")
+    with atomic_write(path) as part:
+        figure.savefig(part, dpi=110, format="png")
     pyplot.close(figure)
-    os.replace(part, path)
     return path

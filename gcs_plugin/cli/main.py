@@ -7,12 +7,13 @@ import os
 import re
 import sys
 from collections.abc import Sequence
+from typing import Any
 
 from gcs_plugin.cli.interrupt import safe_interrupts
 from orthoswarm import __version__
 from orthoswarm.model.errors import OrthoSwarmError
 
-# verb -> one line of help; its module in a room of gcs_plugin.cli.verbs has configure(parser) and run(args) -> int.
+# verb -> one line of help; its module in gcs_plugin.cli.verbs has configure(parser) and run(args) -> int.
 VERBS = {
     "plan": "make missions that cover an area, or follow lines, with a swarm",
     "mosaic": "make a georeferenced orthoimage from drone photos",
@@ -31,14 +32,14 @@ VERBS = {
     "doctor": "show what this machine has (codecs, weights, cores, disk), and what does not work without the rest",
 }
 
-_ROOMS = {
-    "maps": ("mosaic", "coverage", "inspect", "frames", "export", "evaluate"),
-    "vehicles": ("plan", "fleet", "sim", "demo", "serve"),
-    "tools": ("twin", "bench", "weights", "doctor"),
-}
-_ROOM_OF = {verb: room for room, verbs in _ROOMS.items() for verb in verbs}
-
 _NEGATIVE = re.compile(r"-[0-9.]")
+
+
+class _Parser(argparse.ArgumentParser):
+    """A parser whose help keeps the lines of its examples, as those of its actions do."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**settings, formatter_class=argparse.RawDescriptionHelpFormatter)
 
 
 def _overview() -> str:
@@ -96,12 +97,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if verb not in VERBS:
         print(f"orthoswarm: there is no verb '{verb}'; choose one of: {', '.join(VERBS)}", file=sys.stderr)
         return 2
-    module = importlib.import_module(f"gcs_plugin.cli.verbs.{_ROOM_OF[verb]}.{verb}")
-    parser = argparse.ArgumentParser(
-        prog=f"orthoswarm {verb}",
-        description=VERBS[verb][0].upper() + VERBS[verb][1:] + ".",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    module = importlib.import_module(f"gcs_plugin.cli.verbs.{verb}")
+    parser = _Parser(prog=f"orthoswarm {verb}", description=VERBS[verb][0].upper() + VERBS[verb][1:] + ".")
     module.configure(parser)
     try:
         parsed = parser.parse_args(_join_negative_values(args[1:]))

@@ -37,8 +37,7 @@ from gcs_plugin.daemon.store.sortie_rows import coarse_only, placed_sorties
 from gcs_plugin.daemon.vehicle_names import VehicleRow
 from gcs_plugin.daemon.views import Views
 from orthoswarm.export.atomic_file import atomic_write
-from orthoswarm.export.tactical.places import Place
-from orthoswarm.export.tactical.seen_in import sightings
+from orthoswarm.export.tactical.places import Place, sightings
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.raster import picture_file

@@ -12,10 +12,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from gcs_plugin.demo.setting import FOV_MIN_DEG, HEIGHT_M, DemoSetting, write_world
+from gcs_plugin.demo.setting import FOV_MIN_DEG, HEIGHT_M, DemoSetting
 from gcs_plugin.demo.simulator import simulate
 from orthoswarm.compute.workers import spawn_context
 from orthoswarm.model.errors import InputError, OrthoSwarmError
+from orthoswarm.twin.make import make_twin
 
 if TYPE_CHECKING:
     from gcs_plugin.daemon.daemon import Daemon
@@ -31,14 +32,9 @@ ReportProgress = Callable[[str, int, int], None]
 
 
 def run_demo(
-    setting: DemoSetting,
-    out: Path,
-    report: ReportProgress,
-    *,
-    port: int = 0,
-    opened: Callable[[str], None],
+    setting: DemoSetting, out: Path, report: ReportProgress, *, port: int = 0, opened: Callable[[str], None],
     prepare: Callable[[ReportProgress], None],
-) -> dict[str, Any]:
+) -> dict[str, Any]:  # fmt: skip
     """Run the demonstration and return the content of report.json.
 
     Args:
@@ -62,7 +58,7 @@ def run_demo(
     theirs.close()
     try:
         report("city", 0, 1)
-        write_world(setting, out / "twin")
+        make_twin(setting.twin, out / "twin", only=0)  # the map before the disaster and the truth after it, no photos
         report("city", 1, 1)
         prepare(report)
         addresses = _receive_addresses(ours, process)
@@ -234,9 +230,12 @@ def _finish(daemon: "Daemon", report: ReportProgress) -> None:
     _wait(refined, 300.0, "the refinement")
     report("products", 0, 1)
     job = daemon.requests.export(["cog", "gpkg", "mbtiles", "kmz"])
-    _wait(
-        lambda: (found := daemon.jobs.find(job.id)) is not None and found.state in ("done", "failed"), 300.0, "export"
-    )
+
+    def exported() -> bool:
+        found = daemon.jobs.find(job.id)
+        return found is not None and found.state in ("done", "failed")
+
+    _wait(exported, 300.0, "export")
     report("products", 1, 1)
 
 
@@ -259,13 +258,7 @@ def _measure(setting: DemoSetting, out: Path, end: dict[str, Any], wall_s: float
         name: evaluate_ortho(out / file, reference, find_mask(reference, None)).figures()
         for name, file in (("realtime", "realtime.tif"), ("orthoimage", "orthoimage.tif"))
     }
-    report["accuracy"] = figures["orthoimage"]
-    report["accuracy_realtime"] = figures["realtime"]
-    report["demo"] = {
-        "vehicles": setting.vehicles,
-        "seed": setting.seed,
-        "pictures": end.get("taken"),
-        "wall_s": wall_s,
-    }
+    about = {"vehicles": setting.vehicles, "seed": setting.seed, "pictures": end.get("taken"), "wall_s": wall_s}
+    report |= {"accuracy": figures["orthoimage"], "accuracy_realtime": figures["realtime"], "demo": about}
     write_json(out / "report.json", report)
     return report

@@ -7,8 +7,8 @@ exposure has arrived and the pose can be interpolated.
 """
 
 import contextlib
-import io
 import json
+import math
 import threading
 import time
 import urllib.error
@@ -16,22 +16,26 @@ import urllib.request
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gcs_plugin.demo.setting import DemoSetting
 from gcs_plugin.demo.simulated_camera import TwinCamera, VideoSender, VideoServer
 from orthoswarm.export.product_files import iso_time
+from orthoswarm.model.arrays import Bytes
 from orthoswarm.model.errors import InputError
+from orthoswarm.twin.flights import FlightDeviations, FlightPlan, Noise
+from orthoswarm.twin.presets import TwinSpec, spec
+from orthoswarm.twin.site import Site, with_heading
 from telemetry.live.live_poses import LivePoses
 from telemetry.samples.sample import Sample
 
 if TYPE_CHECKING:
     from gcs_plugin.fleet.fleet import Fleet
     from gcs_plugin.fleet.vehicle_state import Vehicle
-    from orthoswarm.twin.imaging.ray_marching import PreparedScene
+    from orthoswarm.twin.ray_marching import PreparedScene
     from orthoswarm.twin.site import Site
 
 LATE_S: Final = 0.25
@@ -44,8 +48,6 @@ farther apart, but still evenly spaced."""
 _IDLE_S: Final = 0.02
 _POST_TIMEOUT_S: Final = 30.0
 
-Pixels = NDArray[np.uint8]
-
 
 class Outlet(Protocol):
     """Destination of a vehicle's pictures.
@@ -56,7 +58,7 @@ class Outlet(Protocol):
 
     url: str
 
-    def send(self, image: Pixels, sample: Sample) -> None:
+    def send(self, image: Bytes, sample: Sample) -> None:
         """Send a picture, uint8 (rows, columns, 3), with its recorded pose."""
 
     def close(self) -> None:
@@ -75,7 +77,7 @@ class Poster:
         self.failed = 0
         self._opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
 
-    def send(self, image: Pixels, sample: Sample) -> None:
+    def send(self, image: Bytes, sample: Sample) -> None:
         """Post a picture; one that the daemon does not accept is counted in `failed`."""
         import simplejpeg
 
@@ -100,11 +102,10 @@ class Poster:
 def _multipart(picture: bytes, pose: str) -> tuple[str, bytes]:
     """Content type and body of a form with `image` and `pose` (RFC 7578)."""
     boundary = "orthoswarm-picture-and-pose"
-    body = io.BytesIO()
-    body.write(f'--{boundary}\r\nContent-Disposition: form-data; name="pose"\r\n\r\n{pose}\r\n'.encode())
+    body = f'--{boundary}\r\nContent-Disposition: form-data; name="pose"\r\n\r\n{pose}\r\n'.encode()
     head = 'Content-Disposition: form-data; name="image"; filename="picture.jpg"\r\nContent-Type: image/jpeg'
-    body.write(f"--{boundary}\r\n{head}\r\n\r\n".encode() + picture + f"\r\n--{boundary}--\r\n".encode())
-    return f"multipart/form-data; boundary={boundary}", body.getvalue()
+    body += f"--{boundary}\r\n{head}\r\n\r\n".encode() + picture + f"\r\n--{boundary}--\r\n".encode()
+    return f"multipart/form-data; boundary={boundary}", body
 
 
 def open_outlet(url: str, system: int) -> Outlet:
@@ -360,3 +361,75 @@ def _missing(fleet: "Fleet", vehicles: int, placed: int) -> str:
         return f"{len(heard)} of {vehicles} vehicles heard"
     lacking = [f"v{s} has {'no position yet' if v.gps_fix >= 3 else 'no GPS fix'}" for s, v in heard if not v.lat_deg]
     return "; ".join(lacking) or f"{placed} of {vehicles} vehicles have a position"
+
+
+# -- the twin's city around a vehicle ----------------------------------------------------------------------------------
+
+_FAR_M = 20_000.0
+
+
+def set_there(folder: Path) -> bool:
+    """Whether a folder holds a set already."""
+    return (folder / "truth" / "manifest.json").is_file()
+
+
+def read_spec(folder: Path) -> TwinSpec:
+    """The parameters of a data set made by `orthoswarm twin make` or by this module.
+
+    Raises:
+        InputError: the folder holds no set, or one of another version.
+    """
+    path = folder / "truth" / "manifest.json"
+    try:
+        values: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        values.pop("generator", None)
+        parts = {"plan": FlightPlan, "motion": FlightDeviations, "noise": Noise}
+        for name, kind in parts.items():
+            values[name] = kind(**{key: _tuples(value) for key, value in values[name].items()})
+        return TwinSpec(**{key: _tuples(value) for key, value in values.items()})
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{folder} contains no readable data set ({error}); make one in an empty folder") from None
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value
+
+
+def place_spec(preset: str, seed: int, lat_deg: float, lon_deg: float) -> TwinSpec:
+    """A preset's city around a place."""
+    return with_heading(spec(preset, seed=seed, lat_deg=lat_deg, lon_deg=lon_deg))
+
+
+def write_set(world: TwinSpec, folder: Path, report: Callable[[str, int, int], None]) -> Path:
+    """Write the map before the disaster, the truth after it and the area to map, but no photos.
+
+    Returns:
+        The area, a GeoJSON file with one polygon.
+
+    Raises:
+        InputError: the folder holds another set.
+    """
+    from orthoswarm.twin.dataset_files import write_atomic
+    from orthoswarm.twin.make import make_twin
+
+    make_twin(world, folder, only=0, progress=report)
+    path = folder / "area.geojson"
+    write_atomic(path, json.dumps(area_of(world)).encode())
+    return path
+
+
+def area_of(world: TwinSpec) -> dict[str, Any]:
+    """The area that the set's own flight maps, a GeoJSON polygon; all footprints over it are inside the city."""
+    site = Site.of(world)
+    places = site.grid.to_geographic(world.plan.to_grid(world.plan.outline(), site.center))
+    return {"type": "Polygon", "coordinates": [[[float(lon), float(lat)] for lat, lon in places]]}
+
+
+def away_m(world: TwinSpec, lat_deg: float, lon_deg: float) -> float:
+    """Distance of a position from the part of the city that a camera may fly over, metres; 0 inside."""
+    site = Site.of(world)
+    east, north = np.asarray(site.grid.to_grid(lat_deg, lon_deg)) - site.center
+    if not (math.isfinite(east) and math.isfinite(north)):
+        return _FAR_M
+    reach = 0.5 * max(world.plan.extent_m) + world.margin_m
+    return float(max(0.0, math.hypot(east, north) - reach))

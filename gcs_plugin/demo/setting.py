@@ -1,17 +1,13 @@
 """The setting of the demonstration: the twin's city, the area to map, and the vehicles' pose errors."""
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
+from orthoswarm.twin.flights import FlightPlan
 from orthoswarm.twin.presets import TwinSpec, spec
-from orthoswarm.twin.site import Site, disaster_zones
-from orthoswarm.twin.true_flight import FlightPlan
-
-if TYPE_CHECKING:
-    from orthoswarm.twin.imaging.ray_marching import PreparedScene
+from orthoswarm.twin.site import Site
 
 HEIGHT_M: Final = 90.0
 FOV_MIN_DEG: Final = 75.0
@@ -81,20 +77,3 @@ class Errors:
         rng = np.random.default_rng([setting.seed, 211, system])
         yaw, pitch, roll = np.radians(rng.normal(0.0, [2.0, 0.8, 0.8]))
         return cls(float(np.radians(rng.choice(_FOVS_DEG))), float(yaw), float(pitch), float(roll))
-
-
-def build_stage(setting: DemoSetting) -> tuple["PreparedScene", Site]:
-    """The city after the disaster, prepared for rendering, and its site."""
-    from orthoswarm.twin.dataset_files import after_disaster
-
-    twin = setting.twin
-    site = Site.of(twin)
-    scene, slots = site.build(twin)
-    return after_disaster(twin, scene, slots, disaster_zones(twin, site)), site
-
-
-def write_world(setting: DemoSetting, folder: Path) -> None:
-    """Write the map before the disaster and the truth after it, but no photos."""
-    from orthoswarm.twin.make import make_twin
-
-    make_twin(setting.twin, folder, only=0)

@@ -4,21 +4,21 @@ import contextlib
 import queue
 import socket
 import threading
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gcs_plugin.demo.setting import HEIGHT, WIDTH, DemoSetting, Errors
+from orthoswarm.model.arrays import Bytes
 from orthoswarm.model.camera import Camera, Lens, focal_px, rotation_from_angles
-from orthoswarm.twin.imaging.ray_marching import lens_rays, render
-from orthoswarm.twin.imaging.sensor import Sensor
+from orthoswarm.twin.drone_photo import Sensor
+from orthoswarm.twin.ray_marching import lens_rays, render
 from telemetry.samples.sample import Sample
 
 if TYPE_CHECKING:
     from gcs_plugin.sim.mission_flight import TakenPicture
-    from orthoswarm.twin.imaging.ray_marching import PreparedScene
+    from orthoswarm.twin.ray_marching import PreparedScene
     from orthoswarm.twin.site import Site
 
 _POSITION_M: Final = 0.8
@@ -47,7 +47,7 @@ class TwinCamera:
         self._sensor = Sensor(WIDTH, HEIGHT, setting.seed)
         self._seed = setting.seed
 
-    def take(self, exposure: "TakenPicture", time_s: float) -> tuple[NDArray[np.uint8], Sample]:
+    def take(self, exposure: "TakenPicture", time_s: float) -> tuple[Bytes, Sample]:
         """The picture, uint8 (480, 640, 3), and its recorded pose; a gimbal keeps the camera at nadir."""
         pose = exposure.pose
         true = Sample(
@@ -56,9 +56,7 @@ class TwinCamera:
         )  # fmt: skip
         return self.shoot(true, exposure.index, received=(exposure.lat_deg, exposure.lon_deg))
 
-    def shoot(
-        self, true: Sample, index: int, *, received: tuple[float, float] | None = None
-    ) -> tuple[NDArray[np.uint8], Sample]:
+    def shoot(self, true: Sample, index: int, *, received: tuple[float, float] | None = None) -> tuple[Bytes, Sample]:
         """The picture at a pose, uint8 (480, 640, 3), and its recorded pose.
 
         Args:
@@ -97,14 +95,14 @@ class VideoStream:
         sink: receives the stream's bytes; each write is a multiple of 188 bytes, the size of a transport packet.
     """
 
-    def __init__(self, sink: "Sink") -> None:
+    def __init__(self, sink: Sink) -> None:
         self._sink = sink
         self._container: Any = None
         self._stream: Any = None
         self._form: Any = None
         self._first_s = 0.0
 
-    def send(self, image: NDArray[np.uint8], sample: Sample) -> None:
+    def send(self, image: Bytes, sample: Sample) -> None:
         """Encode and send a picture, uint8 (rows, columns, 3)."""
         import av
 
@@ -273,13 +271,12 @@ class RenderQueue:
     cameras: dict[int, TwinCamera]
     servers: dict[int, VideoServer]
     taken: int = 0
-    _waiting: "queue.SimpleQueue[tuple[int, TakenPicture, float] | None]" = None  # type: ignore[assignment]
-    _thread: threading.Thread = None  # type: ignore[assignment]
     problem: str = ""
+    _waiting: "queue.SimpleQueue[tuple[int, TakenPicture, float] | None]" = field(default_factory=queue.SimpleQueue)
+    _thread: threading.Thread = field(init=False)
 
     def __post_init__(self) -> None:
         """Start the thread."""
-        self._waiting = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name="render-queue", daemon=True)
         self._thread.start()
 

@@ -38,12 +38,12 @@ def simulate(setting: DemoSetting, pipe: Connection) -> None:
     from orthoswarm.compute.workers import prepare_process
 
     prepare_process()
-    from gcs_plugin.demo.setting import build_stage
     from gcs_plugin.demo.simulated_camera import RenderQueue, TwinCamera, VideoServer
     from gcs_plugin.sim.multirotor import Airframe
     from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
+    from orthoswarm.twin.dataset_files import damaged_city
 
-    stage, site = build_stage(setting)
+    stage, site = damaged_city(setting.twin)
     systems = range(1, setting.vehicles + 1)
     renderer = RenderQueue(
         cameras={s: TwinCamera(stage, site, setting, s) for s in systems},

@@ -13,8 +13,8 @@ from orthoswarm.compute.workers import trim_memory
 from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.export.catalog.tiled_raster import copy_tiled, in_tiles, product_file, remove_tiles, write_tiled
 from orthoswarm.export.cog import write_cog
+from orthoswarm.export.footprint_layer import write_seamlines
 from orthoswarm.export.product_files import describe_frame
-from orthoswarm.export.seamlines import write_seamlines
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.frame import last_time
 from orthoswarm.model.geo import GroundGrid

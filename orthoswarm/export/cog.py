@@ -1,5 +1,7 @@
 """Cloud-optimised GeoTIFFs, written in one pass from a source of windows: memory does not grow with the picture.
 
+An existing raster is brought to another coordinate system, or to JPEG, by GDAL's own writer.
+
 Layout as the OGC's COG standard (21-026) and GDAL's driver have it: header, all directories (full resolution first),
 then tiles from the coarsest overview to full resolution. Tile positions are filled in at the end, which is possible
 because the length of every table is known at the beginning. Transparent tiles take no room (offset and size 0).
@@ -9,24 +11,25 @@ is a BigTIFF.
 """
 
 import struct
+import tempfile
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import BinaryIO, Protocol
+from typing import Any, BinaryIO, Protocol
 
 import numpy as np
 from isal import isal_zlib
-from numpy.typing import NDArray
 
 from orthoswarm import __version__
 from orthoswarm.compute.jit import kernel
 from orthoswarm.export.atomic_file import atomic_write
+from orthoswarm.model.arrays import Bytes
+from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import GroundGrid
 
-Bytes = NDArray[np.uint8]
 TILE_PX = 512
 _LEVEL = 2  # of ISA-L's four: three times as fast as zlib's first level, and no larger
 # GDAL's hints for readers; the last line's blank leaves room to say YES there.
@@ -273,7 +276,7 @@ def _tags(level: _Level, grid: GroundGrid | None, first: tuple[int, int]) -> dic
     }
     if grid is not None:
         west, north = grid.west + first[1] * grid.gsd_m, grid.north - first[0] * grid.gsd_m
-        tags[305] = (_ASCII, f"OrthoSwarm {__version__}".encode() + b"\0")
+        tags[305] = (_ASCII, software().encode() + b"\0")
         tags[33550] = (_DOUBLE, [grid.gsd_m, grid.gsd_m, 0.0])
         tags[33922] = (_DOUBLE, [0.0, 0.0, 0.0, west, north, 0.0])
         # GeoTIFF keys: projected, pixel is area, the CRS by its EPSG code, metres.
@@ -329,3 +332,98 @@ def _directory(
     following = struct.pack(form.place, 0 if last else values_at + len(values))
     block = number + b"".join(entries) + following
     return block + bytes(values_at - at - len(block)) + bytes(values)
+
+
+# -- GDAL's own writer: another coordinate system, or JPEG with a mask -------------------------------------------------
+
+_DATE = "TIFFTAG_DATETIME"
+
+
+def convert_cog(source: Path, path: Path, *, epsg: int | None = None, jpeg_quality: int | None = None) -> None:
+    """Write a raster as a COG.
+
+    Args:
+        source: a georeferenced RGBA raster.
+        path: the file; appears when it is complete.
+        epsg: its coordinate system; None keeps the source's.
+        jpeg_quality: 1 to 100 for JPEG with a mask instead of the alpha band; None is lossless.
+
+    Raises:
+        InputError: if the raster cannot be read or brought to the coordinate system.
+        OrthoSwarmError: if the disk is full.
+    """
+    import rasterio
+    from rasterio.errors import CRSError, RasterioError
+    from rasterio.vrt import WarpedVRT
+
+    lossless = {"compress": "DEFLATE", "predictor": 2}
+    settings: dict[str, Any] = {
+        "driver": "COG",
+        "bigtiff": "IF_SAFER",  # by default GDAL never makes one of a compressed picture, and fails at 4 GB
+        "overview_resampling": "AVERAGE",
+        **(lossless if jpeg_quality is None else {"compress": "JPEG", "quality": jpeg_quality}),
+    }
+    try:
+        with rasterio.open(source) as raster, atomic_write(path) as part, rasterio.Env(CHECK_DISK_FREE_SPACE=True):
+            crs = raster.crs if epsg is None else rasterio.crs.CRS.from_epsg(epsg)
+            if crs == raster.crs:
+                copy_dataset(raster, part, **settings)
+                return
+            with WarpedVRT(raster, crs=crs, resampling=rasterio.enums.Resampling.cubic, warp_mem_limit=64) as vrt:
+                _copy_warped(vrt, part, settings, raster.tags().get(_DATE))
+    except (CRSError, RasterioError) as error:
+        raise InputError(f"{source.name} cannot be written as asked ({_first_line(error)}); check --epsg") from None
+
+
+def _first_line(error: Exception) -> str:
+    return next(iter(str(error).splitlines()), type(error).__name__)
+
+
+def software() -> str:
+    """What the TIFF tag "Software" says of a file that is made here."""
+    return f"OrthoSwarm {__version__}"
+
+
+def copy_dataset(dataset: Any, part: Path, **settings: Any) -> None:
+    """Copy an open dataset by a driver of GDAL.
+
+    Args:
+        dataset: what is copied. part: the file. settings: driver and its creation options.
+
+    Raises:
+        InputError: the dataset cannot be read to its end.
+        OSError: the file cannot be written; GDAL does not say why.
+    """
+    import rasterio.shutil
+    from rasterio._err import CPLE_BaseError
+
+    try:
+        rasterio.shutil.copy(dataset, part, **settings)
+    except CPLE_BaseError as error:  # which is none of rasterio's own errors, and may be of either file
+        if not _is_whole(dataset):
+            raise InputError(f"{dataset.name} cannot be read ({_first_line(error)}); make the map again") from None
+        raise OSError(0, _first_line(error)) from None
+
+
+def _is_whole(dataset: Any) -> bool:
+    from rasterio.errors import RasterioError
+
+    try:
+        for _, window in dataset.block_windows(1):
+            dataset.read(window=window)
+    except RasterioError:
+        return False
+    return True
+
+
+def _copy_warped(vrt: Any, part: Path, settings: dict[str, Any], date: str | None) -> None:
+    """Copy a warped raster, which has none of its source's tags, by way of a description that has."""
+    import rasterio
+
+    with tempfile.TemporaryDirectory(dir=part.parent, prefix=".warped") as folder:
+        described = Path(folder) / "warped.vrt"
+        copy_dataset(vrt, described, driver="VRT")
+        with rasterio.open(described, "r+") as file:
+            file.update_tags(TIFFTAG_SOFTWARE=software(), **({_DATE: date} if date else {}))
+        with rasterio.open(described) as file:
+            copy_dataset(file, part, **settings)

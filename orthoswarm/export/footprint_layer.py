@@ -1,7 +1,9 @@
-"""Footprints of frames as polygons in a GeoPackage, for QGIS."""
+"""Polygons in GeoPackages, for QGIS: footprints of frames, and which picture shows which ground."""
 
 import contextlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -9,22 +11,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.canvas.canvas import Canvas
+from orthoswarm.canvas.tile_store import Key
 from orthoswarm.export.atomic_file import atomic_write
+from orthoswarm.model.arrays import Array, Ints
+from orthoswarm.model.task_runner import Run, serial
 
-Array = NDArray[np.float64]
 Feature = tuple[Mapping[str, Any], Array]
 """What is known about a frame, and its outline."""
 
 Column = type[np.generic]
 """np.object_ for text, np.float64 for numbers, np.datetime64 for times (ISO 8601, UTC; kept to a millisecond)."""
-_COLUMNS: dict[str, Column] = {
-    "image": np.object_,
-    "vehicle": np.object_,
-    "time": np.datetime64,
-    "stage": np.object_,
-    "fov_deg": np.float64,
-    "sigma_m": np.float64,
-}
+_FRAME: dict[str, Column] = {
+    "image": np.object_, "vehicle": np.object_, "time": np.datetime64, "stage": np.object_,
+}  # fmt: skip
+_FOOTPRINT = {**_FRAME, "fov_deg": np.float64, "sigma_m": np.float64}
+_SEAMLINE = {**_FRAME, "sigma_m": np.float64, "area_m2": np.float64}
 _AT_ONCE = 4096
 _UTC = 100
 """GDAL's number of the time zone."""
@@ -47,7 +49,7 @@ def write_footprints(path: Path, features: Iterable[Feature], epsg: int) -> None
         batch = list(islice(shown, _AT_ONCE))
         while batch or not part.exists():
             rows, rings = [row for row, _ in batch], [ring for _, ring in batch]
-            append_polygons(part, "footprints", _polygons(rings), rows=rows, columns=_COLUMNS, epsg=epsg)
+            append_polygons(part, "footprints", _polygons(rings), rows=rows, columns=_FOOTPRINT, epsg=epsg)
             batch = list(islice(shown, _AT_ONCE))
 
 
@@ -118,3 +120,67 @@ def _column(values: list[Any], kind: type[np.generic]) -> NDArray[Any]:
     column = np.empty(len(values), object)
     column[:] = values
     return column
+
+
+_JOINED_AT_ONCE = 64
+"""Frames that one task joins; it changes the speed, not the result."""
+
+
+def write_seamlines(
+    path: Path, canvas: Canvas, describe: Sequence[Callable[[], Mapping[str, Any]]], *, run: Run = serial
+) -> None:
+    """Write a multipolygon for each picture that the orthoimage shows.
+
+    Args:
+        path: the GeoPackage; appears when it is complete.
+        canvas: rendered, with plane "frame".
+        describe: for each frame of the rendering what is known about it, by the columns `image`, `vehicle`, `time`,
+            `stage` and `sigma_m`; called for frames that are shown.
+        run: where tiles are outlined; other processes need the canvas's folder under the same path.
+
+    Raises:
+        OrthoSwarmError: if the disk is full or the folder cannot be written.
+    """
+    import shapely
+
+    parts: dict[int, list[bytes]] = defaultdict(list)
+    for frames, outlines in run(partial(_tile_polygons, canvas.path), sorted(canvas.changed_since(0))):
+        for index, outline in zip(frames, outlines, strict=True):
+            parts[index].append(outline)
+    frames = sorted(parts)
+    some = [[parts[i] for i in frames[k : k + _JOINED_AT_ONCE]] for k in range(0, len(frames), _JOINED_AT_ONCE)]
+    joined = [whole for several in run(_joined, some) for whole in several]
+    shapes = np.array([shapely.from_wkb(whole) for whole in joined], dtype=object)
+    rows = [{**describe[i](), "area_m2": float(shapely.area(shape))} for i, shape in zip(frames, shapes)]
+    with gpkg_file(path) as part:
+        append_polygons(part, "seamlines", shapes, rows=rows, columns=_SEAMLINE, epsg=canvas.grid.epsg)
+
+
+def _joined(frames: Sequence[Sequence[bytes]]) -> list[bytes]:
+    """For each of several frames the multipolygon (WKB) of its pieces (WKB) in all tiles."""
+    import shapely
+
+    whole = [shapely.get_parts(shapely.union_all(shapely.from_wkb(pieces))) for pieces in frames]
+    return [shapely.to_wkb(shapely.multipolygons(own[shapely.get_type_id(own) == 3])) for own in whole]
+
+
+def _tile_polygons(path: Path, key: Key) -> tuple[list[int], list[bytes]]:
+    """Frame index and polygon (WKB) for each connected piece of a tile of the canvas in a folder."""
+    import shapely
+    from rasterio.features import shapes
+    from rasterio.transform import from_origin
+
+    row, col = key
+    with Canvas.open(path, writable=False) as canvas:
+        grid, t = canvas.grid, canvas.tile_px
+        labels: Ints = canvas.read_plane(
+            row * t, min(grid.height, (row + 1) * t), col * t, min(grid.width, (col + 1) * t)
+        )
+    left, top = grid.west + col * t * grid.gsd_m, grid.north - row * t * grid.gsd_m
+    corner = from_origin(left, top, grid.gsd_m, grid.gsd_m)
+    frames, polygons = [], []
+    for shape, value in shapes(np.ascontiguousarray(labels), mask=labels > 0, transform=corner):
+        shell, *holes = shape["coordinates"]
+        frames.append(int(value) - 1)
+        polygons.append(shapely.Polygon(shell, holes))
+    return frames, list(shapely.to_wkb(np.array(polygons, dtype=object))) if polygons else []

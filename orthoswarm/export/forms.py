@@ -105,9 +105,7 @@ def _gpkg(what: MapExport) -> Path:
 
 def _cameras(kind: str, what: MapExport) -> Path:
     """A folder of another program with the refined cameras."""
-    from orthoswarm.export.colmap_folder import write_colmap
-    from orthoswarm.export.odm_folder import write_odm
-    from orthoswarm.export.opensfm_folder import write_opensfm
+    from orthoswarm.export.camera_folders import write_colmap, write_odm, write_opensfm
     from orthoswarm.export.product_files import read_frames
     from orthoswarm.stores.addresses import path_of
 
@@ -136,7 +134,7 @@ def _cameras(kind: str, what: MapExport) -> Path:
 
 
 def _cog(what: MapExport) -> Path:
-    from orthoswarm.export.cog_conversion import convert_cog
+    from orthoswarm.export.cog import convert_cog
 
     convert_cog(what.picture, what.file("tif"), epsg=what.epsg, jpeg_quality=what.quality if what.jpeg else None)
     return what.file("tif")

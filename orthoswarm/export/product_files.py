@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.export.atomic_file import write_file
 from orthoswarm.export.footprint_layer import write_footprints
 from orthoswarm.export.json_values import finite, json_text
 from orthoswarm.model.angles import wrap_deg
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.camera import Camera, Lens, angles_from_rotation, ground_jacobian
 from orthoswarm.model.frame import Frame, Rejection
 from orthoswarm.model.geo import LocalGrid
@@ -25,8 +25,6 @@ from orthoswarm.model.placement import STATED_SIGMA_FACTOR, PlacedFrame, Solutio
 from orthoswarm.mosaic.footprint import footprint
 from orthoswarm.mosaic.takeoff_altitude import TakeoffLevel, height_sigma_m, takeoff_levels
 from orthoswarm.stores.addresses import address_of
-
-Array = NDArray[np.float64]
 
 OBLIQUE_AXIS_DOWN: Final = 0.2  # no sigma of a photo's centre whose axis points down by less (unit vector)
 

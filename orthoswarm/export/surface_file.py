@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from orthoswarm.export.atomic_file import atomic_write
-from orthoswarm.export.cog_conversion import copy_dataset, software
+from orthoswarm.export.cog import copy_dataset, software
 from orthoswarm.stereo.surface_cells import SurfaceModel
 
 NO_DATA = -9999.0

@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
+from xml.sax.saxutils import escape
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm import __version__
 from orthoswarm.export.atomic_file import write_file
@@ -21,16 +21,16 @@ from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import PlacedFrame
 from orthoswarm.mosaic.footprint import footprint
 from orthoswarm.raster.basemap import Basemap
-from orthoswarm.report import charts
-from orthoswarm.report.displacement_map import Moved, moved
 from orthoswarm.report.report_pictures import (
     MapView,
+    Moved,
     Picture,
     data_uri,
     draw_arrows,
     draw_lines,
     fill_polygons,
     map_edges,
+    moved,
     pale,
     product_bounds,
     product_picture,
@@ -38,8 +38,6 @@ from orthoswarm.report.report_pictures import (
     surface_picture,
     view_grid,
 )
-
-Array = NDArray[np.float64]
 
 ORTHOIMAGE = "orthoimage.tif"
 _STAGES = (
@@ -50,10 +48,15 @@ _STAGES = (
 _FINE_M, _PART_PX = 1.2, 640
 _EDGE = (255, 214, 0)
 _ARROW = (208, 30, 60)
+PALETTE = (
+    (0, 114, 178), (213, 94, 0), (86, 180, 233), (204, 121, 167), (0, 158, 115),
+    (136, 0, 238), (85, 34, 0), (51, 51, 68), (187, 204, 119), (221, 0, 68),
+)  # fmt: skip
+"""Colours that stay apart on photographs and in print: five of Okabe and Ito's, and others that differ from all before
+by at least 16 (CIE 1976), also as seen without red, green or blue cones (Machado and others 2009)."""
 _LEGS = {"matched": (0, 158, 115), "carried": (230, 159, 0), "failed": (163, 32, 13)}
 _LEG_WIDTHS = {"matched": 2, "carried": 4, "failed": 7}
 """Pixels: which is which can be seen without the colours."""
-_VEHICLES = charts.PALETTE
 
 _LEAST_PICTURE_PX: Final = 200
 """Side that pictures of the report have at least where a map's pixel is large (one of 640 m would leave nothing to
@@ -125,8 +128,8 @@ def write_page(
         values["surface"] = Figure("Surface model", data_uri(shaded), text)
     values["verdict"] = _verdict(report, placed, shifts)
     values["facts"] = _facts(report, placed, shifts)
-    values["fov"] = charts.fields_of_view(report["vehicles"])
-    values["times"] = charts.times(report["stages"])
+    values["fov"] = fields_of_view(report["vehicles"])
+    values["times"] = time_bars(report["stages"])
     values["legs"], values["on_map"] = _leg_summary(report), _on_map(report)
     write_file(out / "report.html", environment.get_template("page.html.j2").render(values))
     if shifts is None or not len(shifts.at):
@@ -245,7 +248,7 @@ def _footprints(reduced: Picture, placed: Sequence[PlacedFrame], there: MapView 
         own = [p for p in placed if p.frame.vehicle == vehicle]
         step = max(1, len(own) // 60)
         rings = [ring for p in own[::step] if len(ring := footprint(p.camera, ground_z_m))]
-        colour = _VEHICLES[i % len(_VEHICLES)]
+        colour = PALETTE[i % len(PALETTE)]
         fill_polygons(picture, rings, colour, 0.03)
         draw_lines(picture, rings, colour, 1, closed=True)
     scale_bar(picture)
@@ -276,7 +279,7 @@ def _paths(reduced: Picture, placed: Sequence[PlacedFrame], report: Mapping[str,
         draw_lines(picture, [np.array([p.camera.nadir for p in own])], (150, 155, 165), 1)
     for leg in report["legs"]:
         own = by_vehicle.get(leg["vehicle"], [])[leg["first"] : leg["last"] + 1]
-        colour, width = (_LEGS[leg["state"]], _LEG_WIDTHS[leg["state"]]) if _on_map(report) else (_VEHICLES[0], 3)
+        colour, width = (_LEGS[leg["state"]], _LEG_WIDTHS[leg["state"]]) if _on_map(report) else (PALETTE[0], 3)
         draw_lines(picture, [np.array([p.camera.nadir for p in own])] if own else [], colour, width)
     scale_bar(picture)
     text = (
@@ -409,3 +412,74 @@ def _leg_summary(report: Mapping[str, Any]) -> list[dict[str, Any]]:
             }
         )
     return rows
+
+
+# -- charts (SVG) --------------------------------------------------------------------------------------------------
+
+_STAGE_COLOURS = {
+    "load": "#bbbbbb",
+    "realtime": "#0072b2",
+    "coarse": "#009e73",
+    "fine": "#e69f00",
+    "final": "#882255",
+}
+_WIDTH, _HEIGHT, _LEFT, _BASE = 640, 220, 46, 190
+
+
+def fields_of_view(vehicles: Sequence[Mapping[str, Any]]) -> str | None:
+    """Each vehicle's field of view with a bar of two sigma either way, an SVG; None if nothing was estimated."""
+    known = [v for v in vehicles if v["fov_deg"] is not None and v["fov_sigma_deg"] is not None]
+    if not known:
+        return None
+    fov = np.array([v["fov_deg"] for v in known])
+    spread = np.minimum(2 * np.array([v["fov_sigma_deg"] for v in known]), 30.0)
+    low, high = float((fov - spread).min()), float((fov + spread).max())
+    room = max(1.0, 0.1 * (high - low))
+    low, high = low - room, high + room
+
+    def y(value: float) -> float:
+        return _BASE - (value - low) / (high - low) * (_BASE - 14)
+
+    parts = [f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="fields of view">']
+    step = _round_step((high - low) / 4)
+    for tick in np.arange(np.ceil(low / step) * step, high, step):
+        parts.append(f'<line x1="{_LEFT}" x2="{_WIDTH}" y1="{y(tick):.1f}" y2="{y(tick):.1f}" class="grid"/>')
+        parts.append(f'<text x="{_LEFT - 6}" y="{y(tick) + 4:.1f}" text-anchor="end">{tick:g}°</text>')
+    gap = (_WIDTH - _LEFT) / len(known)
+    for i, (vehicle, value, wide) in enumerate(zip(known, fov, spread, strict=True)):
+        x = _LEFT + (i + 0.5) * gap
+        colour = f"rgb{PALETTE[i % len(PALETTE)]}" if len(known) <= 16 else f"rgb{PALETTE[0]}"
+        parts.append(
+            f'<g stroke="{colour}" fill="{colour}"><line x1="{x:.1f}" x2="{x:.1f}" y1="{y(value - wide):.1f}" '
+            f'y2="{y(value + wide):.1f}" stroke-width="2"/><circle cx="{x:.1f}" cy="{y(value):.1f}" r="3.5"/></g>'
+        )
+        if len(known) <= 16:
+            name, most = str(vehicle["id"]), max(4, int(gap / 7))
+            shown = escape(name if len(name) <= most else "…" + name[-(most - 1) :])
+            parts.append(f'<text x="{x:.1f}" y="{_BASE + 20}" text-anchor="middle">{shown}</text>')
+    if len(known) > 16:
+        parts.append(f'<text x="{_LEFT}" y="{_BASE + 20}">{len(known)} vehicles</text>')
+    return "".join([*parts, "</svg>"])
+
+
+def time_bars(stages: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """What the page needs for two stacked bars, wall and CPU seconds, and their legend."""
+    colours = [_colour(str(stage["name"]), i) for i, stage in enumerate(stages)]
+    bars = []
+    for key, title in (("wall_s", "time"), ("cpu_s", "processor time")):
+        seconds = [float(stage[key]) for stage in stages]
+        total = sum(seconds)
+        parts = [{"share": 100.0 * s / total if total else 0.0, "colour": c} for s, c in zip(seconds, colours)]
+        bars.append({"title": title, "total": total, "parts": parts})
+    keys = ("name", "wall_s", "cpu_s")
+    return {"bars": bars, "legend": [{"colour": c} | {k: s[k] for k in keys} for s, c in zip(stages, colours)]}
+
+
+def _colour(name: str, index: int) -> str:
+    base = next((c for prefix, c in _STAGE_COLOURS.items() if name.startswith(prefix)), "#555")
+    return base + ("", "cc", "99", "bb")[index % 4] if name.startswith("final") else base
+
+
+def _round_step(value: float) -> float:
+    unit = 10.0 ** np.floor(np.log10(max(value, 1e-6)))
+    return float(next(s for s in (1, 2, 5, 10) if s * unit >= value) * unit)

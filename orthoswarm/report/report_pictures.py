@@ -1,21 +1,21 @@
 """Pictures of the report: windows of the products, drawings on them, and their encoding into the page."""
 
 import base64
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.evaluation.displacement import Displacements, FieldSettings, displacement_field
+from orthoswarm.model.arrays import Array, Bytes, Flags
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import MapWindow
 from orthoswarm.raster.resampling import resample
 
-Bytes = NDArray[np.uint8]
-Array = NDArray[np.float64]
 Colour = tuple[int, int, int]
 
 PAPER: Colour = (238, 240, 243)
@@ -36,7 +36,7 @@ class Picture:
     """
 
     rgb: Bytes
-    seen: NDArray[np.bool_]
+    seen: Flags
     grid: GroundGrid
 
     def on(self, grid: GroundGrid) -> "Picture":
@@ -45,9 +45,7 @@ class Picture:
         return on_paper(bands.transpose(1, 2, 0).copy(), seen, grid)
 
 
-def _regrid(
-    bands: Bytes, valid: NDArray[np.bool_], old: GroundGrid, new: GroundGrid
-) -> tuple[Bytes, NDArray[np.bool_]]:
+def _regrid(bands: Bytes, valid: Flags, old: GroundGrid, new: GroundGrid) -> tuple[Bytes, Flags]:
     first = ((new.west - old.west) / old.gsd_m, (old.north - new.north) / old.gsd_m)
     scale = new.gsd_m / old.gsd_m
     return resample(bands, valid, first, (scale, scale), (new.width, new.height))
@@ -108,7 +106,7 @@ class MapView:
     """The map in grey on a grid: uint8 (rows, columns), and where it means something."""
 
     gray: Bytes
-    valid: NDArray[np.bool_]
+    valid: Flags
     grid: GroundGrid
 
     @classmethod
@@ -128,7 +126,7 @@ class MapView:
         return on_paper(np.repeat(self.gray[..., None], 3, axis=2), self.valid, self.grid)
 
 
-def on_paper(rgb: Bytes, seen: NDArray[np.bool_], grid: GroundGrid) -> Picture:
+def on_paper(rgb: Bytes, seen: Flags, grid: GroundGrid) -> Picture:
     """A picture whose empty ground has the page's colour; its array must be in order (OpenCV draws in no other)."""
     rgb[~seen] = PAPER
     return Picture(rgb, seen, grid)
@@ -193,7 +191,7 @@ def scale_bar(picture: Picture) -> None:
     cv2.putText(picture.rgb, text, (x, y - 7), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (20, 24, 30), 1, cv2.LINE_AA)
 
 
-def map_edges(view: MapView) -> NDArray[np.bool_]:
+def map_edges(view: MapView) -> Flags:
     """Strong edges of a map, the upper part of its own gradients."""
     import cv2
 
@@ -208,7 +206,7 @@ def map_edges(view: MapView) -> NDArray[np.bool_]:
     return np.asarray((edges > 0) & inside)
 
 
-def relief(height_m: NDArray[np.floating[Any]], cell_m: float) -> NDArray[np.uint8]:
+def relief(height_m: NDArray[np.floating[Any]], cell_m: float) -> Bytes:
     """Shaded relief, uint8 (rows, columns, 3), of heights (rows, columns; rows go south); NaN in the page's colour."""
     z = np.asarray(height_m, np.float64)
     south, east = np.gradient(z, cell_m)
@@ -218,7 +216,7 @@ def relief(height_m: NDArray[np.floating[Any]], cell_m: float) -> NDArray[np.uin
     return np.where(known[..., None], grey[..., None], np.array(PAPER, np.uint8)).astype(np.uint8)
 
 
-def surface_picture(surface: Mapping[str, Any]) -> tuple[NDArray[np.uint8], str]:
+def surface_picture(surface: Mapping[str, Any]) -> tuple[Bytes, str]:
     """The picture of a surface model, and what it shows.
 
     Args:
@@ -255,3 +253,90 @@ def data_uri(rgb: Bytes, quality: int = 82) -> str:
 
 def _pixels(grid: GroundGrid, points: Array) -> Any:
     return np.round(np.clip(grid.to_pixel(points), -1e5, 1e5) * 2**_SUBPIXEL_BITS).astype(np.int32)
+
+
+# -- how far blocks of the orthoimage lie from the map -----------------------------------------------------------------
+
+
+_BLOCK_PX: Final = 64  # side of a block
+_SEARCH_PX: Final = 15  # how far it is searched
+_APART_PX: Final = 6  # correlations within this distance, pixels, belong to the same peak
+_MOST_BLOCKS: Final = 500  # most blocks of a map (for its time)
+_LEAST_COVER: Final = 0.9  # least share of a block and of its search area that is drawn
+_LEAST_PEAK: Final = 0.4  # least correlation: chance likeness reaches 0.3 (measured on simulated disasters)
+_BAND_PX: Final = 500_000  # pixels that are compared at once (memory: gradients take a hundred bytes a pixel)
+
+
+@dataclass(frozen=True, slots=True)
+class Moved:
+    """Where blocks of the map are found in the orthoimage.
+
+    Attributes:
+        at: float64 (K, 2), places in the orthoimage, on the ground.
+        shift: float64 (K, 2), from there to the same thing in the map, metres.
+        blocks: how many blocks were tried.
+    """
+
+    at: Array
+    shift: Array
+    blocks: int
+
+    @classmethod
+    def joined(cls, parts: "Sequence[Moved]") -> "Moved":
+        """What several parts of the map show, together."""
+        at, shift = ([np.zeros((0, 2)), *(getattr(p, name) for p in parts)] for name in ("at", "shift"))
+        return cls(np.concatenate(at), np.concatenate(shift), sum(p.blocks for p in parts))
+
+    @property
+    def size_m(self) -> Array:
+        """Lengths of the shifts, metres."""
+        return np.asarray(np.hypot(self.shift[:, 0], self.shift[:, 1]))
+
+
+def moved(ortho: Bytes, seen: Flags, basemap: Bytes, valid: Flags, grid: GroundGrid) -> Moved:
+    """Match a map to an orthoimage of the same grid, at up to some hundred places.
+
+    Only clear matches count. What changed between the two (debris, other seasons) therefore gives no arrow, rather
+    than a wrong one.
+
+    Args:
+        ortho: grey orthoimage (rows, columns).
+        seen: where it is drawn.
+        basemap: grey map on the same grid.
+        valid: where the map means something.
+        grid: of both.
+    """
+    step = max(_BLOCK_PX, float(np.sqrt(seen.sum() / _MOST_BLOCKS)))
+    settings = FieldSettings(
+        gsd_m=grid.gsd_m,
+        block_m=_BLOCK_PX * grid.gsd_m,
+        step_m=step * grid.gsd_m,
+        search_m=_SEARCH_PX * grid.gsd_m,
+        apart_m=_APART_PX * grid.gsd_m,
+        min_cover=_LEAST_COVER,
+        min_peak=_LEAST_PEAK,
+    )
+    field = Displacements.joined(list(_fields(ortho, seen, basemap, valid, settings)))
+    found = field.matched
+    shift = field.shift_m[found]
+    return Moved(grid.to_ground(field.position[found]) + shift, -shift, len(found))
+
+
+def _fields(
+    ortho: Bytes, seen: Flags, basemap: Bytes, valid: Flags, settings: FieldSettings
+) -> Iterator[Displacements]:
+    """The field in bands of whole rows of blocks: gradients take a hundred bytes a pixel."""
+    side, step, reach = (
+        max(1, round(length / settings.gsd_m)) for length in (settings.block_m, settings.step_m, settings.search_m)
+    )
+    wide_ortho, wide_seen = np.pad(ortho, reach), np.pad(seen, reach)
+    rows, columns = basemap.shape
+    at_once = step * max(1, _BAND_PX // columns // step)
+    for top in range(0, rows - side + 1, at_once):
+        last = min(top + at_once, rows - side + 1) - 1
+        end = last // step * step + side
+        around = slice(top, end + 2 * reach)
+        yield displacement_field(
+            wide_ortho[around].astype(np.float32), wide_seen[around], basemap[top:end].astype(np.float32),
+            valid[top:end], settings=settings, offset=(top, 0),
+        )  # fmt: skip

@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -11,16 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.model.angles import wrap_deg
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.twin.city.builder import ParkingPlace
 from orthoswarm.twin.city.city import place_cars
 from orthoswarm.twin.city.scene import TEXEL_M, WATER, Scene
 from orthoswarm.twin.city.sunlight import change_season, lit_texture
 from orthoswarm.twin.disaster import DamagedGround, debris_flow, flood, haze_opacity, zone_mask
-from orthoswarm.twin.imaging.ray_marching import PreparedScene, make_stage, satellite_view
+from orthoswarm.twin.flights import TrueFlight
 from orthoswarm.twin.presets import TwinSpec
-from orthoswarm.twin.site import Site, light_of, map_lean
-from orthoswarm.twin.true_flight import TrueFlight
+from orthoswarm.twin.ray_marching import PreparedScene, make_stage, satellite_view
+from orthoswarm.twin.site import Site, disaster_zones, light_of, map_lean
 
 
 def write_atomic(path: Path, data: bytes) -> None:
@@ -31,7 +33,7 @@ def write_atomic(path: Path, data: bytes) -> None:
     os.replace(part, path)
 
 
-def write_geotiff(path: Path, image: NDArray[Any], grid: GroundGrid, nodata: float | None = None) -> None:
+def write_geotiff(path: Path, image: NDArray[Any], grid: GroundGrid) -> None:
     """Write a tiled GeoTIFF of (rows, columns, bands) or (rows, columns); it is complete or absent."""
     import rasterio
 
@@ -41,7 +43,7 @@ def write_geotiff(path: Path, image: NDArray[Any], grid: GroundGrid, nodata: flo
         "driver": "GTiff", "width": grid.width, "height": grid.height, "count": bands.shape[2],
         "dtype": bands.dtype.name,
         "crs": f"EPSG:{grid.epsg}", "transform": grid.affine(), "tiled": True, "blockxsize": 512, "blockysize": 512,
-        "compress": "deflate", "zlevel": 3, "nodata": nodata,
+        "compress": "deflate", "zlevel": 3,
     }  # fmt: skip
     if bands.dtype == np.uint8:
         profile["predictor"] = 2
@@ -93,22 +95,22 @@ def after_disaster(
     return make_stage(scene, lit, sun.direction(), sun.ambient, haze)
 
 
+def damaged_city(spec: TwinSpec) -> tuple[PreparedScene, Site]:
+    """The city after the disaster, prepared for rendering, and its site."""
+    site = Site.of(spec)
+    scene, slots = site.build(spec)
+    return after_disaster(spec, scene, slots, disaster_zones(spec, site)), site
+
+
 def write_truth(spec: TwinSpec, stage: PreparedScene, zones: dict[str, DamagedGround], truth: Path) -> None:
     """Write the true orthoimage after the disaster, surface, bare ground, and masks: moving, disaster, open ground."""
     import cv2
 
     if (truth / "ground_mask.tif").exists():
         return
-    s, g = stage.scene, stage.scene.grid
-    size = spec.reference_gsd_m
-    grid = GroundGrid(
-        epsg=g.epsg,
-        west=g.west,
-        north=g.north,
-        gsd_m=size,
-        width=round(g.width * TEXEL_M / size),
-        height=round(g.height * TEXEL_M / size),
-    )
+    s, size = stage.scene, spec.reference_gsd_m
+    width, height = (round(n * TEXEL_M / size) for n in (s.grid.width, s.grid.height))
+    grid = replace(s.grid, gsd_m=size, width=width, height=height)
     reference = cv2.resize(stage.levels[0], (grid.width, grid.height), interpolation=cv2.INTER_AREA)
     write_geotiff(truth / "reference.tif", np.asarray(reference), grid)
     write_geotiff(truth / "dsm.tif", s.dsm, s.cells)
@@ -125,32 +127,19 @@ def write_truth(spec: TwinSpec, stage: PreparedScene, zones: dict[str, DamagedGr
 
 def write_plan(spec: TwinSpec, site: Site, path: Path) -> None:
     """Area and planned paths as GeoJSON."""
-    across, along = (0.5 * x for x in spec.plan.extent_m)
-    ring = np.array([[-across, -along], [across, -along], [across, along], [-across, along], [-across, -along]])
-    features = [_feature("Polygon", [_lonlat(spec, site, ring)], {"role": "area"})]
-    for v in range(spec.plan.vehicles):
-        line = _lonlat(spec, site, spec.plan.corners(v))
-        properties = {"role": "path", "vehicle": vehicle_name(spec, v), "height_m": spec.plan.height_m}
-        features.append(_feature("LineString", line, properties))
+    plan = spec.plan
+
+    def feature(kind: str, local: Array, **properties: Any) -> dict[str, Any]:
+        places = site.grid.to_geographic(plan.to_grid(local, site.center))
+        line = [[round(float(lon), 9), round(float(lat), 9)] for lat, lon in places]
+        geometry = {"type": kind, "coordinates": [line] if kind == "Polygon" else line}
+        return {"type": "Feature", "properties": properties, "geometry": geometry}
+
+    features = [feature("Polygon", plan.outline(), role="area")]
+    for v in range(plan.vehicles):
+        path_of = {"role": "path", "vehicle": plan.vehicle_id(v), "height_m": plan.height_m}
+        features.append(feature("LineString", plan.corners(v), **path_of))
     write_atomic(path, json.dumps({"type": "FeatureCollection", "features": features}, indent=1).encode())
-
-
-def vehicle_name(spec: TwinSpec, v: int) -> str:
-    """Id of the v-th vehicle."""
-    return f"uav{v + 1:0{max(2, len(str(spec.plan.vehicles)))}d}"
-
-
-def _lonlat(spec: TwinSpec, site: Site, local: NDArray[np.float64]) -> list[list[float]]:
-    geographic = site.grid.to_geographic(spec.plan.to_grid(local, site.center))
-    return [[round(float(lon), 9), round(float(lat), 9)] for lat, lon in geographic]
-
-
-def _feature(kind: str, coordinates: Any, properties: dict[str, Any]) -> dict[str, Any]:
-    return {
-        "type": "Feature",
-        "properties": properties,
-        "geometry": {"type": kind, "coordinates": coordinates},
-    }
 
 
 def photo_name(vehicle: str, index: int) -> str:

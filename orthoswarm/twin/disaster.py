@@ -3,15 +3,13 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel, kernel
+from orthoswarm.model.arrays import Flags, Floats
 from orthoswarm.twin.city import scene as kinds
 from orthoswarm.twin.city.procedural_noise import hash01, lattice, noise_field
 from orthoswarm.twin.city.scene import TEXEL_M, Scene
-from orthoswarm.twin.imaging.ray_marching import HAZE_CELL_M
-
-Floats = NDArray[np.float32]
+from orthoswarm.twin.ray_marching import HAZE_CELL_M
 
 SIZES_M = {"debris": (400.0, 880.0), "water": (330.0, 320.0), "haze": (440.0, 190.0)}
 """Extent of each disaster across and along, metres (paper IV.A)."""
@@ -170,7 +168,7 @@ def haze_opacity(scene: Scene, zone: DamagedGround, seed: int) -> Floats:
     return np.asarray(0.66 * np.clip((depth + 6.0) / 26.0, 0.0, 1.0), np.float32)
 
 
-def zone_mask(scene: Scene, zone: DamagedGround, disaster: str, seed: int) -> NDArray[np.bool_]:
+def zone_mask(scene: Scene, zone: DamagedGround, disaster: str, seed: int) -> Flags:
     """Cells of the height fields inside the zone of a disaster ("debris", "water" or "haze"), bool."""
     salt = {"debris": 1, "water": 2, "haze": 3}[disaster]
     return np.asarray(zone_depth(scene, zone, 2, seed * 13 + salt) > 0.0)

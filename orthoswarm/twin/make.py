@@ -3,12 +3,12 @@
 import json
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array, Floats
 from orthoswarm.model.camera import Camera, rotation_from_angles
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid
@@ -22,13 +22,11 @@ from orthoswarm.twin.dataset_files import (
     write_plan,
     write_truth,
 )
-from orthoswarm.twin.imaging.photo_tags_writer import PhotoTags, with_tags
-from orthoswarm.twin.imaging.ray_marching import PreparedScene, lens_rays, render
-from orthoswarm.twin.imaging.sensor import Sensor
+from orthoswarm.twin.drone_photo import PhotoTags, Sensor, with_tags
+from orthoswarm.twin.flights import Record, TrueFlight, fly, raised, record
 from orthoswarm.twin.presets import TwinSpec
-from orthoswarm.twin.recorded_noise import Record, record
+from orthoswarm.twin.ray_marching import PreparedScene, lens_rays, render
 from orthoswarm.twin.site import Site, disaster_zones
-from orthoswarm.twin.true_flight import TrueFlight, fly, raised
 
 SEA_LEVEL_M = 512.0
 """Absolute altitude of the takeoff point; far from 0, so that mixing up altitude and height shows at once."""
@@ -103,7 +101,7 @@ def make_twin(
 
 
 def _claim(manifest: Path, spec: TwinSpec) -> None:
-    text = json.dumps({"generator": GENERATOR, **spec.parameters()}, indent=1, sort_keys=True)
+    text = json.dumps({"generator": GENERATOR, **asdict(spec)}, indent=1, sort_keys=True)
     if manifest.exists():
         if json.loads(manifest.read_text()) != json.loads(text):
             raise InputError(f"{manifest.parent.parent} holds a set with other parameters; choose another folder")
@@ -150,7 +148,7 @@ def _render_all(
 
 
 def _photo(
-    spec: TwinSpec, stage: PreparedScene, grid: LocalGrid, *, shot: _TwinShot, rays: NDArray[np.float32], sensor: Sensor
+    spec: TwinSpec, stage: PreparedScene, grid: LocalGrid, *, shot: _TwinShot, rays: Floats, sensor: Sensor
 ) -> bytes:
     """One JPEG with its tags."""
     flight, i = shot.flight, shot.index
@@ -164,17 +162,12 @@ def _photo(
     lat, lon = (float(x) for x in grid.to_geographic(position[:2]))
     convergence = float(grid.convergence_rad(lat, lon))
     tags = PhotoTags(
-        time_s=float(flight.time_s[i]),
-        lat_deg=lat,
-        lon_deg=lon,
-        altitude_m=float(position[2]) + SEA_LEVEL_M,
-        height_m=float(position[2]),
-        gimbal_deg=_degrees(angles, convergence),
-        flight_deg=_degrees(body, convergence),
-    )
+        time_s=float(flight.time_s[i]), lat_deg=lat, lon_deg=lon, altitude_m=float(position[2]) + SEA_LEVEL_M,
+        height_m=float(position[2]), gimbal_deg=_degrees(angles, convergence), flight_deg=_degrees(body, convergence),
+    )  # fmt: skip
     return with_tags(sensor.encode(image, spec.quality), tags)
 
 
-def _degrees(angles: NDArray[np.float64], convergence: float) -> tuple[float, float, float]:
+def _degrees(angles: Array, convergence: float) -> tuple[float, float, float]:
     yaw, pitch, roll = (float(x) for x in np.degrees(angles))
     return yaw + float(np.degrees(convergence)), pitch, roll

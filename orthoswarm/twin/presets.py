@@ -1,11 +1,10 @@
 """The parameters of a data set: presets, kinds of noise, and every single value."""
 
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from orthoswarm.model.errors import InputError
-from orthoswarm.twin.recorded_noise import Noise
-from orthoswarm.twin.true_flight import FlightDeviations, FlightPlan
+from orthoswarm.twin.flights import FlightDeviations, FlightPlan, Noise
 
 _HARD = Noise(
     heading_bias_deg=3.0, tilt_bias_deg=1.0, angle_deg=0.07, outlier_share=0.02, lag_s=(0.1, 0.5), height_m=0.15,
@@ -74,10 +73,6 @@ class TwinSpec:
     ground: tuple[str, str, str] | None = None
     margin_m: float = 290.0
     cars: float = 0.5
-
-    def parameters(self) -> dict[str, Any]:
-        """All values, for the manifest."""
-        return asdict(self)
 
 
 _TINY = FlightPlan(

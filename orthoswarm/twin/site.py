@@ -86,10 +86,7 @@ def suns(seed: int) -> tuple[Sun, Sun]:
     first = rng.uniform(0.6, 1.0)
     azimuth = rng.uniform(1.6, 4.6)
     turn = rng.choice([-1.0, 1.0]) * rng.uniform(0.7, 1.6)
-    return (
-        Sun(float(azimuth), float(first), 0.45),
-        Sun(float(azimuth + turn), float(rng.uniform(0.6, 1.05)), 0.45),
-    )
+    return Sun(float(azimuth), float(first), 0.45), Sun(float(azimuth + turn), float(rng.uniform(0.6, 1.05)), 0.45)
 
 
 def light_of(spec: TwinSpec, which: int) -> Sun:

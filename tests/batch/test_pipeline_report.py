@@ -13,9 +13,16 @@ from orthoswarm.compute.workers import Usage
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.frame import Fix, Frame
 from orthoswarm.model.geo import GroundGrid
-from orthoswarm.report.charts import PALETTE, fields_of_view, times
-from orthoswarm.report.displacement_map import moved
-from orthoswarm.report.report_pictures import Picture, draw_arrows, draw_lines, fill_polygons, scale_bar, view_grid
+from orthoswarm.report.page import PALETTE, fields_of_view, time_bars
+from orthoswarm.report.report_pictures import (
+    Picture,
+    draw_arrows,
+    draw_lines,
+    fill_polygons,
+    moved,
+    scale_bar,
+    view_grid,
+)
 from tests.kit.looks.colour_vision import least_difference, rgb_of
 from tests.kit.scene import Scene
 
@@ -36,12 +43,12 @@ def test_the_colours_of_charts_differ_for_those_who_do_not_see_all_colours():
     assert least_difference(PALETTE) > 15
     names = ("load", "realtime", "coarse", "fine", "final")
     stages = [{"name": name, "wall_s": 1.0, "cpu_s": 1.0} for name in names]
-    assert least_difference([rgb_of(part["colour"]) for part in times(stages)["legend"]]) > 15
+    assert least_difference([rgb_of(part["colour"]) for part in time_bars(stages)["legend"]]) > 15
 
 
 def test_bars_add_up():
     stages = [{"name": "load", "wall_s": 1.0, "cpu_s": 0.0}, {"name": "final: report", "wall_s": 3.0, "cpu_s": 0.0}]
-    found = times(stages)
+    found = time_bars(stages)
     assert [p["share"] for p in found["bars"][0]["parts"]] == [25.0, 75.0]
     assert sum(p["share"] for p in found["bars"][1]["parts"]) == 0.0
 

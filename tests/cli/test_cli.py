@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from gcs_plugin.cli import main
-from gcs_plugin.cli.machine_check import checks, find_weights
+from gcs_plugin.cli.verbs.doctor import checks, find_weights
 from orthoswarm import __version__
 
 HEAVY = {"numpy", "torch", "kornia", "numba", "cv2", "rasterio", "matplotlib", "pymavlink", "av", "rich", "scipy"}

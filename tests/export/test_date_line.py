@@ -15,7 +15,7 @@ import shapely
 from rasterio.warp import transform
 
 from gcs_plugin.cli.main import main
-from orthoswarm.export.sheets.geojson_outline import joined_bbox, outline
+from orthoswarm.export.sheets.stac_item import joined_bbox, outline
 
 EPSG, GSD = 32760, 0.5
 KML = "{http://www.opengis.net/kml/2.2}"

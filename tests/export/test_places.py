@@ -20,8 +20,7 @@ from gcs_plugin.daemon.exports import places_of
 from gcs_plugin.daemon.tak_feed import TakFeed
 from orthoswarm.export.tactical.cursor_on_target import event, write_data_package
 from orthoswarm.export.tactical.place_files import write_csv, write_gpx, write_kml
-from orthoswarm.export.tactical.places import FILE, Place, read_places, write_geojson
-from orthoswarm.export.tactical.seen_in import sightings
+from orthoswarm.export.tactical.places import FILE, Place, read_places, sightings, write_geojson
 from orthoswarm.export.tactical.tak_sender import TakAddress, TakSender
 from orthoswarm.model.camera import NADIR_PITCH_RAD, Camera, Lens, rotation_from_angles
 from orthoswarm.model.errors import InputError, OrthoSwarmError

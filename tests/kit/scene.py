@@ -9,7 +9,7 @@ from PIL import Image
 
 from orthoswarm.model.camera import Camera, Lens, focal_px, rotation_from_angles
 from orthoswarm.model.geo import GroundGrid, LocalGrid, utm_epsg
-from orthoswarm.twin.imaging.photo_tags_writer import PhotoTags, with_tags
+from orthoswarm.twin.drone_photo import PhotoTags, with_tags
 
 GSD = 0.5
 SIDE = 640.0

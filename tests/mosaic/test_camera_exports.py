@@ -7,10 +7,7 @@ import pytest
 from pyproj import Transformer
 from scipy.spatial.transform import Rotation
 
-from orthoswarm.export.colmap_folder import write_colmap
-from orthoswarm.export.exterior_orientation import camera_of
-from orthoswarm.export.odm_folder import write_odm
-from orthoswarm.export.opensfm_folder import write_opensfm
+from orthoswarm.export.camera_folders import camera_of, write_colmap, write_odm, write_opensfm
 from orthoswarm.export.product_files import frame_row
 from orthoswarm.model.camera import Camera, Lens, rotation_from_angles
 from orthoswarm.model.errors import InputError

@@ -18,10 +18,8 @@ from rasterio.warp import transform, transform_bounds
 from gcs_plugin.cli.main import main
 from orthoswarm.export import cog
 from orthoswarm.export.atomic_file import atomic_write
-from orthoswarm.export.cog import CLASSIC_BYTES, TILE_PX, predict, write_cog
-from orthoswarm.export.cog_conversion import convert_cog, copy_dataset
-from orthoswarm.export.exterior_orientation import unique_names
-from orthoswarm.export.odm_folder import write_odm
+from orthoswarm.export.camera_folders import unique_names, write_odm
+from orthoswarm.export.cog import CLASSIC_BYTES, TILE_PX, convert_cog, copy_dataset, predict, write_cog
 from orthoswarm.export.product_files import iso_time, simple_lens
 from orthoswarm.export.tiles.kmz import write_kmz
 from orthoswarm.export.tiles.mbtiles import write_mbtiles

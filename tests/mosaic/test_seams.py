@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from orthoswarm.canvas.canvas import Canvas
-from orthoswarm.export.seamlines import write_seamlines
+from orthoswarm.export.footprint_layer import write_seamlines
 from orthoswarm.model.placement import Terrain
 from orthoswarm.mosaic.renderer import Seams, render, serial
 from orthoswarm.mosaic.seams.previews import PreviewFile

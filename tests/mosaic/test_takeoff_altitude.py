@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from orthoswarm.export.odm_folder import write_odm
-from orthoswarm.export.opensfm_folder import write_opensfm
+from orthoswarm.export.camera_folders import write_odm, write_opensfm
 from orthoswarm.export.product_files import read_frames, write_frames
 from orthoswarm.model.camera import Camera, Lens, rotation_from_angles
 from orthoswarm.model.frame import Fix, Frame

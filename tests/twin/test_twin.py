@@ -14,10 +14,10 @@ from orthoswarm.evaluation.true_cameras import read_truth
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.raster.picture_file import read_gray
+from orthoswarm.twin.flights import FlightPlan
 from orthoswarm.twin.make import make_twin
 from orthoswarm.twin.presets import spec
 from orthoswarm.twin.site import with_heading
-from orthoswarm.twin.true_flight import FlightPlan
 
 SMALL = FlightPlan(
     columns=1, photos=8, legs=2, spacing_m=15.0, leg_spacing_m=20.0, width=160, height=120, height_m=40.0

@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from orthoswarm.twin.flights import FOVS_DEG, FlightDeviations, FlightPlan, Noise, fly, record, smooth_noise
 from orthoswarm.twin.presets import NOISES, PRESETS, spec
-from orthoswarm.twin.recorded_noise import Noise, record
-from orthoswarm.twin.true_flight import FOVS_DEG, FlightDeviations, FlightPlan, fly, smooth_noise
 
 PLAN = FlightPlan()
 CENTER = (400000.0, 3400000.0)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from orthoswarm.model.camera import Camera, Lens, rotation_from_angles
 from orthoswarm.twin.city.scene import CELL_M, TILE_CELLS, WATER, Scene, scene_grid
 from orthoswarm.twin.city.sunlight import Sun, light_map, lit_texture
-from orthoswarm.twin.imaging.ray_marching import _march, lens_rays, make_stage, render, satellite_view
+from orthoswarm.twin.ray_marching import _march, lens_rays, make_stage, render, satellite_view
 
 STILL = np.zeros(8)
 NO_HAZE = np.zeros((0, 0), np.float32)

@@ -11,7 +11,7 @@ import time
 import pytest
 
 from gcs_plugin.cli.main import main
-from gcs_plugin.cli.verbs.vehicles.fleet import parse_systems
+from gcs_plugin.cli.verbs.fleet import parse_systems
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission import mission_files
 from gcs_plugin.mission.plan_folder import read_plan_folder

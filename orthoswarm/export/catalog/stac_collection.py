@@ -12,18 +12,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.export.camera_folders import camera_of
 from orthoswarm.export.catalog.tiled_raster import COLLECTION, FOLDER, VEHICLES, RasterTile, tiles_of
-from orthoswarm.export.exterior_orientation import camera_of
 from orthoswarm.export.product_files import read_frames, write_json
-from orthoswarm.export.sheets.geojson_outline import joined_bbox, outline
-from orthoswarm.export.sheets.stac_item import EXTENSIONS, raster_item, surface_assets
+from orthoswarm.export.sheets.stac_item import EXTENSIONS, joined_bbox, outline, raster_item, surface_assets
 from orthoswarm.export.sheets.stated_accuracy import stated_accuracy
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.mosaic.footprint import footprint
 
-Array = NDArray[np.float64]
 _TITLES = {"realtime.tif": "Real-time picture", "coarse.tif": "Coarse orthoimage", "orthoimage.tif": "Orthoimage"}
 _LEAST_M = 0.1
 """Half the width of an outline that would have none."""

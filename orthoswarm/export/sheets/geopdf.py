@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from orthoswarm.export.atomic_file import atomic_write
-from orthoswarm.export.reduced_raster import ReducedRaster
 from orthoswarm.export.sheets.stac_item import time_span
 from orthoswarm.export.sheets.stated_accuracy import stated_accuracy
 from orthoswarm.export.tactical.places import Place
+from orthoswarm.export.tiles.tile_pyramid import ReducedRaster
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 from orthoswarm.model.geo import LocalGrid

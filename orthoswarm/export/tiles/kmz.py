@@ -12,14 +12,13 @@ from pathlib import Path
 from xml.etree.ElementTree import Element
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.export.tiles.mbtiles import encode_tile
 from orthoswarm.export.tiles.tile_pyramid import SIDE, Pyramid, Quad, degrees_of, draw_tiles
 from orthoswarm.export.xml_elements import element, kml_bytes, texts
+from orthoswarm.model.arrays import Bytes
 
-Bytes = NDArray[np.uint8]
 Box = tuple[float, float, float, float]
 """West, south, east, north in degrees."""
 _SINGLE_PX = 2048

@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.export.atomic_file import atomic_write
 from orthoswarm.export.tiles.tile_pyramid import Pyramid, Quad, draw_tiles
+from orthoswarm.model.arrays import Bytes
 
-Bytes = NDArray[np.uint8]
 Format = Literal["png", "webp", "jpg"]
 Tile = tuple[int, int, bytes]
 _TABLES: Final = (

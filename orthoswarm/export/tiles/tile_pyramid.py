@@ -8,6 +8,7 @@ A map on the meridian of 180 degrees is drawn as one that goes on to the east of
 columns beyond the last one. Files get columns and longitudes as they are counted from the west again.
 """
 
+import contextlib
 import math
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -17,16 +18,53 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.canvas.overviews import reduce_rgba
 from orthoswarm.compute.jit import in_place_kernel
-from orthoswarm.export.reduced_raster import ReducedRaster
+from orthoswarm.model.arrays import Array, Bytes
 from orthoswarm.model.earth import WEB_MERCATOR_M
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 
-Bytes = NDArray[np.uint8]
-Array = NDArray[np.float64]
+
+class ReducedRaster(contextlib.ExitStack):
+    """An open raster, and its overviews as rasters of their own.
+
+    The overviews of our orthoimages are means of 2 x 2 pixels, so that nothing is lost against reading all pixels; they
+    are opened when they are first asked for. Not for several threads at once.
+
+    Args:
+        path: the raster.
+
+    Raises:
+        RasterioError: it cannot be read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        import rasterio
+
+        super().__init__()
+        self._path = path
+        self.full = self.enter_context(rasterio.open(path))
+        self._factors: list[int] = self.full.overviews(1)
+        self._overviews: dict[int, Any] = {}
+
+    def at(self, factor: float) -> tuple[Any, float]:
+        """The dataset whose pixels are the largest that are at most `factor` pixels of the raster wide.
+
+        Returns:
+            The dataset, and how many of its pixels `factor` is.
+        """
+        import rasterio
+
+        levels = [k for k, size in enumerate(self._factors) if size <= factor]
+        if not levels:
+            return self.full, factor
+        level = levels[-1]
+        if level not in self._overviews:
+            self._overviews[level] = self.enter_context(rasterio.open(self._path, overview_level=level))
+        return self._overviews[level], factor / self._factors[level]
+
+
 Tell = Callable[[int, int], None]
 SIDE: Final = 256
 _STEP: Final = 32

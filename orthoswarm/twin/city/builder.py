@@ -3,12 +3,11 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array, Ints
 from orthoswarm.twin.city.scene import CELL_M, TEXEL_M, Scene
 from orthoswarm.twin.city.stamps import stamp_building, stamp_tree
 
-Array = NDArray[np.float64]
 Color = tuple[float, float, float]
 Area = tuple[float, float, float, float]
 """u0, v0, u1, v1 of a rectangle in the city's frame, metres."""
@@ -59,15 +58,11 @@ class Builder:
         p = self.place(np.array([[u, v], [u + 1.0, v]]))
         return float(p[0, 0]), float(p[0, 1]), float(np.arctan2(p[1, 1] - p[0, 1], p[1, 0] - p[0, 0]))
 
-    def polygon(self, uv: Array, color: Color, kind: int, *, dense: bool = True) -> None:
+    def polygon(self, uv: Array, color: Color, kind: int) -> None:
         """Fill a polygon given in city coordinates."""
-        self.polygon_xy(self.place(_densify(uv) if dense else uv), color, kind)
-
-    def polygon_xy(self, xy: Array, color: Color, kind: int) -> None:
-        """Fill a polygon given in X, Y."""
         import cv2
 
-        points = np.round((xy / TEXEL_M - 0.5) * 16).astype(np.int32)
+        points = self._sixteenths(uv)
         cv2.fillPoly(self.scene.albedo, [points], color, cv2.LINE_AA, 4)
         cv2.fillPoly(self.scene.kind, [points], float(kind), cv2.LINE_8, 4)
 
@@ -75,10 +70,14 @@ class Builder:
         """A stroke along city coordinates, at least one texel wide."""
         import cv2
 
-        points = np.round((self.place(_densify(uv)) / TEXEL_M - 0.5) * 16).astype(np.int32)
+        points = self._sixteenths(uv)
         thick = max(1, round(width_m / TEXEL_M))
         cv2.polylines(self.scene.albedo, [points], False, color, thick, cv2.LINE_AA, 4)
         cv2.polylines(self.scene.kind, [points], False, float(kind), thick, cv2.LINE_8, 4)
+
+    def _sixteenths(self, uv: Array) -> Ints:
+        """Vertices in sixteenths of a texel, as OpenCV draws them, dense enough to follow the bends of streets."""
+        return np.round((self.place(_densify(uv)) / TEXEL_M - 0.5) * 16).astype(np.int32)
 
     def building(
         self, u: float, v: float, hu: float, hv: float, *, eave: float, rise: float, shape: int, color: Color,
@@ -97,10 +96,6 @@ class Builder:
     def tree(self, u: float, v: float, radius: float, height: float) -> None:
         """A tree at a city position."""
         x, y, _ = self.local(u, v)
-        self.tree_xy(x, y, radius, height)
-
-    def tree_xy(self, x: float, y: float, radius: float, height: float) -> None:
-        """A tree at X, Y."""
         s = self.scene
         color = np.asarray(pick(self.rng, TREES), float) + self.rng.uniform(-10, 10, 3)
         seed = int(self.rng.integers(1 << 30))
@@ -136,7 +131,7 @@ def pick(rng: np.random.Generator, colors: list[Color]) -> Color:
 
 
 def _densify(uv: Array, step: float = 25.0) -> Array:
-    """More vertices along a closed or open line, so that bends of the streets are followed."""
+    """More vertices along a line, closed or open."""
     pieces = []
     for a, b in zip(uv, np.roll(uv, -1, axis=0), strict=True):
         n = max(1, int(np.hypot(*(b - a)) / step))

@@ -1,11 +1,11 @@
 """A procedural city: streets, blocks and surface detail that never repeats (the twin's default ground)."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array, Floats
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.twin.city import scene as kinds
-from orthoswarm.twin.city.builder import CARS, Area, Array, Builder, Color, ParkingPlace, pick, rect
+from orthoswarm.twin.city.builder import CARS, Area, Builder, Color, ParkingPlace, pick, rect
 from orthoswarm.twin.city.procedural_noise import add_detail, noise_field
 from orthoswarm.twin.city.quarters import fill_block
 from orthoswarm.twin.city.scene import CELL_M, TEXEL_M, Scene
@@ -58,7 +58,7 @@ def build_city(grid: GroundGrid, seed: int, *, relief_m: float = 0.0) -> tuple[S
     return scene, builder.slots
 
 
-def smooth_relief(shape: tuple[int, ...], relief_m: float, seed: int) -> NDArray[np.float32]:
+def smooth_relief(shape: tuple[int, ...], relief_m: float, seed: int) -> Floats:
     """Rolling ground of about +-relief_m: features of 600 m down to 150 m, float32 of `shape` on cells."""
     import cv2
 

@@ -3,13 +3,11 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array, Bytes, Flags, Floats
 from orthoswarm.model.errors import InputError
 from orthoswarm.twin.city.procedural_noise import noise_field
 from orthoswarm.twin.city.scene import CELL_M, PHOTO, TEXEL_M, TREE, Scene, scene_grid
-
-Floats = NDArray[np.float32]
 
 
 def _open(path: str, what: str) -> Any:
@@ -102,18 +100,13 @@ def load_ground(ground: tuple[str, str, str], center: tuple[float, float], half:
     return scene
 
 
-def _solid_part(image: NDArray[np.uint8]) -> tuple[int, int, int, int]:
+def _solid_part(image: Bytes) -> tuple[int, int, int, int]:
     """Rows and columns (top, left, bottom, right) of the part without the black wedges of a rotated orthoimage."""
-    valid: NDArray[np.bool_] = np.asarray(image[::4, ::4].any(axis=2))
+    valid: Flags = np.asarray(image[::4, ::4].any(axis=2))
     top, left, bottom, right = 0, 0, *valid.shape
     while bottom - top > 8 and right - left > 8:
-        rim = [
-            valid[top, left:right],
-            valid[bottom - 1, left:right],
-            valid[top:bottom, left],
-            valid[top:bottom, right - 1],
-        ]
-        shares = [float(line.mean()) for line in rim]
+        part = valid[top:bottom, left:right]
+        shares = [float(rim.mean()) for rim in (part[0], part[-1], part[:, 0], part[:, -1])]
         worst = int(np.argmin(shares))
         if shares[worst] > 0.98:
             break
@@ -143,7 +136,7 @@ def _sample(data: Any, place: Any, scene: Scene, *, step: float, border: tuple[i
     return out
 
 
-def _mirror(x: NDArray[np.float64], length: float) -> NDArray[np.float64]:
+def _mirror(x: Array, length: float) -> Array:
     m = np.mod(x, 2.0 * length)
     return np.asarray(np.where(m > length, 2.0 * length - m, m))
 

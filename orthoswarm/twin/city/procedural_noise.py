@@ -1,9 +1,9 @@
 """Procedural noise from hashed lattices: detailed texture that never repeats and depends only on the seed."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel
+from orthoswarm.model.arrays import Floats
 
 
 @in_place_kernel
@@ -42,7 +42,7 @@ def _fill(out, step, scale, octaves, seed):  # type: ignore[no-untyped-def]
             out[r, c] = total / norm
 
 
-def noise_field(shape: tuple[int, int], step_m: float, scale_m: float, octaves: int, seed: int) -> NDArray[np.float32]:
+def noise_field(shape: tuple[int, int], step_m: float, scale_m: float, octaves: int, seed: int) -> Floats:
     """Fractal noise, float32 of `shape`, about -1 to 1.
 
     Args:

@@ -72,41 +72,15 @@ def _lot(b: Builder, area: Area, front: float) -> None:
     color = pick(rng, ROOFS)
     b.building(u, v, hu, hv, eave=eave, rise=rise, shape=shape, color=color, turn=turn)
     if rng.random() < 0.4:  # a wing
-        b.building(
-            u + rng.uniform(-2, 2),
-            v - front * hv,
-            3.0,
-            3.5,
-            eave=eave * 0.7,
-            rise=rise * 0.6,
-            shape=shape,
-            color=color,
-            turn=turn,
-        )
+        at = u + rng.uniform(-2, 2), v - front * hv
+        b.building(*at, 3.0, 3.5, eave=eave * 0.7, rise=rise * 0.6, shape=shape, color=color, turn=turn)
     if rng.random() < 0.5:
-        b.building(
-            u + rng.uniform(-hu, hu) * 0.5,
-            v + rng.uniform(-1, 1),
-            0.5,
-            0.5,
-            eave=eave + rise + 0.8,
-            rise=0,
-            shape=FLAT,
-            color=(110, 84, 74),
-        )
+        at = u + rng.uniform(-hu, hu) * 0.5, v + rng.uniform(-1, 1)
+        b.building(*at, 0.5, 0.5, eave=eave + rise + 0.8, rise=0, shape=FLAT, color=(110, 84, 74))
     back = v1 if front < 0 else v0
     if rng.random() < 0.5:
-        b.building(
-            rng.uniform(u0 + 3, u1 - 3),
-            back + front * 3.5,
-            2.2,
-            1.8,
-            eave=2.4,
-            rise=0.5,
-            shape=GABLE,
-            color=pick(rng, ROOFS),
-            windows=False,
-        )
+        at = rng.uniform(u0 + 3, u1 - 3), back + front * 3.5
+        b.building(*at, 2.2, 1.8, eave=2.4, rise=0.5, shape=GABLE, color=pick(rng, ROOFS), windows=False)
     if rng.random() < 0.12 and b.is_free(u, back + front * 9.0, 3.5):  # a pool
         b.polygon(rect(u - 3, back + front * 9 - 2, u + 3, back + front * 9 + 2), (92, 168, 190), kinds.CONCRETE)
     for _ in range(int(rng.integers(0, 4))):

@@ -3,8 +3,8 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Bytes, Floats
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import Terrain
 
@@ -36,12 +36,12 @@ class Scene:
     """
 
     grid: GroundGrid
-    albedo: NDArray[np.uint8]
-    kind: NDArray[np.uint8]
-    dsm: NDArray[np.float32]
-    dtm: NDArray[np.float32]
-    wall: NDArray[np.uint8]
-    facade: NDArray[np.uint8]
+    albedo: Bytes
+    kind: Bytes
+    dsm: Floats
+    dtm: Floats
+    wall: Bytes
+    facade: Bytes
     angle_rad: float = 0.0
 
     @classmethod
@@ -67,21 +67,12 @@ class Scene:
     @property
     def cells(self) -> GroundGrid:
         """The grid of the height fields."""
-        g = self.grid
-        return GroundGrid(
-            epsg=g.epsg, west=g.west, north=g.north, gsd_m=CELL_M, width=g.width // 2, height=g.height // 2
-        )
+        return replace(self.grid, gsd_m=CELL_M, width=self.grid.width // 2, height=self.grid.height // 2)
 
     def copy(self) -> "Scene":
         """A copy whose colours and surface can be changed independently (the bare ground is shared)."""
-        return replace(
-            self,
-            albedo=self.albedo.copy(),
-            kind=self.kind.copy(),
-            dsm=self.dsm.copy(),
-            wall=self.wall.copy(),
-            facade=self.facade.copy(),
-        )
+        changed = {name: getattr(self, name).copy() for name in ("albedo", "kind", "dsm", "wall", "facade")}
+        return replace(self, **changed)
 
     def bare_ground(self) -> Terrain:
         """Heights of the bare ground, a node in the middle of each cell."""
@@ -89,7 +80,7 @@ class Scene:
         south = g.north - g.gsd_m * (g.height - 0.5)
         return Terrain(g.west + 0.5 * g.gsd_m, south, g.gsd_m, self.dtm[::-1])
 
-    def above_ground(self) -> NDArray[np.float32]:
+    def above_ground(self) -> Floats:
         """Height of the surface over the bare ground, float32 (rows/2, columns/2)."""
         return np.asarray(self.dsm - self.dtm)
 

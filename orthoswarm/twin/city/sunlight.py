@@ -3,14 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel
+from orthoswarm.model.arrays import Bytes
 from orthoswarm.twin.city import scene as kinds
 from orthoswarm.twin.city.procedural_noise import add_detail
 from orthoswarm.twin.city.scene import CELL_M, Scene
-
-Pixels = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,11 +27,8 @@ class Sun:
     def direction(self) -> tuple[float, float, float]:
         """Unit vector towards the sun: columns (east), rows (south), up."""
         c = np.cos(self.elevation_rad)
-        return (
-            float(np.sin(self.azimuth_rad) * c),
-            float(-np.cos(self.azimuth_rad) * c),
-            float(np.sin(self.elevation_rad)),
-        )
+        east, south = np.sin(self.azimuth_rad) * c, -np.cos(self.azimuth_rad) * c
+        return float(east), float(south), float(np.sin(self.elevation_rad))
 
 
 @in_place_kernel
@@ -73,7 +68,7 @@ def _shade(dsm, top, sun, ambient, cell, out):  # type: ignore[no-untyped-def]
             out[r, c] = min(255.0, 128.0 * (ambient + (1.0 - ambient) * min(light, 1.35)))
 
 
-def light_map(scene: Scene, sun: Sun) -> Pixels:
+def light_map(scene: Scene, sun: Sun) -> Bytes:
     """Light on each cell of the height field, uint8, 128 for level ground in the sun."""
     out = np.empty(scene.dsm.shape, np.uint8)
     _shade(scene.dsm, float(scene.dsm.max()), np.array(sun.direction()), sun.ambient, CELL_M, out)
@@ -81,8 +76,8 @@ def light_map(scene: Scene, sun: Sun) -> Pixels:
 
 
 @in_place_kernel
-def _lit(albedo, light, gain, out):  # type: ignore[no-untyped-def]
-    """Colour = albedo * light / 128 * gain; light lies on cells of two texels, bilinear between their centres."""
+def _lit(albedo, light, out):  # type: ignore[no-untyped-def]
+    """Colour = albedo * light / 128; light lies on cells of two texels, bilinear between their centres."""
     rows, cols = albedo.shape[:2]
     high, wide = light.shape
     for r in range(rows):
@@ -100,17 +95,17 @@ def _lit(albedo, light, gain, out):  # type: ignore[no-untyped-def]
             s /= 128.0
             for b in range(3):
                 # shadows are lit by the sky: bluer
-                v = albedo[r, c, b] * (s + (0.05 if b == 2 else 0.0) * max(0.0, 1.0 - s)) * gain[b]
+                v = albedo[r, c, b] * (s + (0.05 if b == 2 else 0.0) * max(0.0, 1.0 - s))
                 out[r, c, b] = min(v, 255.0)
 
 
-def lit_texture(scene: Scene, sun: Sun, gain: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Pixels:
+def lit_texture(scene: Scene, sun: Sun) -> Bytes:
     """The scene's colours under the sun, uint8 (rows, columns, 3).
 
     A scene made from a photograph carries its own shadows; light it with `ambient` near 1.
     """
     out = np.empty_like(scene.albedo)
-    _lit(scene.albedo, light_map(scene, sun), np.asarray(gain, float), out)
+    _lit(scene.albedo, light_map(scene, sun), out)
     return out
 
 
@@ -127,21 +122,21 @@ def _tone(image, kind, matrix, offset, contrast):  # type: ignore[no-untyped-def
                 image[r, c, i] = min(max(v, 0.0), 255.0)
 
 
-def change_season(scene: Scene, seed: int, strength: float = 1.0) -> None:
+def change_season(scene: Scene, seed: int) -> None:
     """Another season: change the colours of plants and soil, and the contrast of everything, in place."""
     rng = np.random.default_rng([seed, 31])
     matrix = np.tile(np.eye(3), (kinds.KINDS, 1, 1))
     offset = np.zeros((kinds.KINDS, 3))
     for kind in (kinds.GRASS, kinds.TREE, kinds.FIELD):
-        dry = strength * rng.uniform(0.15, 0.5)
+        dry = rng.uniform(0.15, 0.5)
         matrix[kind] = (1 - dry) * np.eye(3) + dry * np.array([[0.2, 0.95, 0.1], [0.35, 0.6, 0.1], [0.3, 0.3, 0.4]])
-        offset[kind] = strength * rng.uniform(-12, 12)
-    offset[kinds.SOIL] = offset[kinds.FIELD] + strength * rng.uniform(-10, 10)
-    offset[kinds.ASPHALT] = strength * rng.uniform(-10, 14)
-    offset[kinds.PHOTO] = strength * rng.uniform(-14, 14, 3)
-    _tone(scene.albedo, scene.kind, matrix, offset, 1.0 + strength * float(rng.uniform(-0.12, 0.08)))
+        offset[kind] = rng.uniform(-12, 12)
+    offset[kinds.SOIL] = offset[kinds.FIELD] + rng.uniform(-10, 10)
+    offset[kinds.ASPHALT] = rng.uniform(-10, 14)
+    offset[kinds.PHOTO] = rng.uniform(-14, 14, 3)
+    _tone(scene.albedo, scene.kind, matrix, offset, 1.0 + float(rng.uniform(-0.12, 0.08)))
     amplitude = np.zeros((kinds.KINDS, 5), np.float32)
     # soil and plants also change locally between two dates: weeds, wear, wet spots
     amplitude[[kinds.PHOTO, kinds.TREE]] = (5, 6, 7, 8, 10)
     amplitude[[kinds.GRASS, kinds.SOIL, kinds.FIELD]] = (3, 4, 5, 6, 8)
-    add_detail(scene.albedo, scene.kind, strength * amplitude, np.ones((kinds.KINDS, 3), np.float32), seed * 613 + 9)
+    add_detail(scene.albedo, scene.kind, amplitude, np.ones((kinds.KINDS, 3), np.float32), seed * 613 + 9)

@@ -4,6 +4,7 @@ ORTHOSWARM_SITL is a comma-separated list of links, one autopilot each, as for t
 """
 
 import contextlib
+import dataclasses
 import json
 import os
 import re
@@ -17,8 +18,7 @@ import numpy as np
 import pytest
 
 from gcs_plugin.cli.main import main
-from gcs_plugin.demo.city_site import area_of, away_m, place_spec, read_spec
-from gcs_plugin.demo.following_camera import LATE_S, Shutter, open_outlet
+from gcs_plugin.demo.following_camera import LATE_S, Shutter, area_of, away_m, open_outlet, place_spec, read_spec
 from gcs_plugin.demo.simulated_camera import VideoSender, VideoServer
 from gcs_plugin.demo.simulator import PacedClock
 from gcs_plugin.links.mavlink import Autopilot
@@ -267,7 +267,7 @@ def test_the_city_lies_where_the_vehicle_stands_and_its_set_says_so(tmp_path):
     assert ring[:, 1].min() < HOME[0] < ring[:, 1].max()
     assert ring[:, 0].min() < HOME[1] < ring[:, 0].max()
     (tmp_path / "truth").mkdir()
-    (tmp_path / "truth" / "manifest.json").write_text(json.dumps({"generator": 0, **world.parameters()}))
+    (tmp_path / "truth" / "manifest.json").write_text(json.dumps({"generator": 0, **dataclasses.asdict(world)}))
     assert read_spec(tmp_path) == world
     (tmp_path / "truth" / "manifest.json").write_text('{"preset": 3, "surprise": 1}')
     with pytest.raises(InputError, match="empty folder"):

@@ -11,6 +11,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from orthoswarm.model.errors import InputError
+
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
@@ -24,20 +26,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     kinds = parser.add_subparsers(dest="kind", required=True, metavar="accuracy|scaling|peers")
     accuracy = kinds.add_parser(
-        "accuracy",
-        help="do nothing, the paper, swarm, true poses: error, cost, memory",
+        "accuracy", help="do nothing, the paper, swarm, true poses: error, cost, memory",
         epilog="example:\n  orthoswarm bench accuracy sets/debris --methods swarm,truth --out bench",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    )  # fmt: skip
     accuracy.add_argument("sets", nargs="+", type=Path, metavar="SET", help="folders of `twin make`")
     methods = "nothing,paper,swarm,truth"
     accuracy.add_argument("--methods", default=methods, metavar="LIST", help=f"some of {methods} (default all)")
     scaling = kinds.add_parser(
-        "scaling",
-        help="time against vehicles (Fig. 7) and pictures a vehicle (Fig. 8)",
+        "scaling", help="time against vehicles (Fig. 7) and pictures a vehicle (Fig. 8)",
         epilog="example:\n  orthoswarm bench scaling sets/debris --vehicles 1,2,3 --images 85,170,339 --out bench",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    )  # fmt: skip
     scaling.add_argument("sets", nargs=1, type=Path, metavar="SET", help="a folder of `twin make`")
     scaling.add_argument(
         "--vehicles", default="1,2,3,4,8,16,32,64,96", help="numbers of vehicles (default %(default)s)"
@@ -45,13 +43,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
     scaling.add_argument("--images", default="42,85,170,339", help="pictures a vehicle (default %(default)s)")
     scaling.add_argument("--refine", default="swarm", help="which refiner (default %(default)s)")
     peers = kinds.add_parser(
-        "peers",
-        help="other programs on the same photos (Table I)",
+        "peers", help="other programs on the same photos (Table I)",
         description="Runs other programs in environments of their own, made with pip on first use, and judges their "
         "maps by the true map. Linux only.",
         epilog="example:\n  orthoswarm bench peers sets/debris --every 3 --out bench",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    )  # fmt: skip
     peers.add_argument("sets", nargs="+", type=Path, metavar="SET", help="folders of `twin make`")
     programs = "swarm,paper,pyorthomosaic,stitcher,pycolmap"
     peers.add_argument("--programs", default=programs, metavar="LIST", help=f"some of {programs} (default all)")
@@ -98,7 +94,6 @@ def run(args: argparse.Namespace) -> int:
 
 def _accuracy(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from gcs_plugin.bench.accuracy import METHODS, accuracy_table, run_accuracy
-    from orthoswarm.model.errors import InputError
 
     methods = _list(args.methods)
     if not methods or set(methods) - set(METHODS):
@@ -121,7 +116,6 @@ def _scaling(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
 
 def _peers(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     from gcs_plugin.bench.peers import PeerSettings, peers_sheet, peers_table, run_peers
-    from orthoswarm.model.errors import InputError
 
     if args.every < 1 or args.limit_s <= 0 or (args.workers or 1) < 1:
         raise InputError("--every, --limit-s and --workers take numbers above 0")

@@ -4,19 +4,16 @@ The height field is a set of columns with tilted tops: a ray that enters a colum
 ray from above hits the top. A table of the highest point of each 8 m tile lets rays skip empty air.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel, kernel
+from orthoswarm.model.arrays import Array, Bytes, Floats
 from orthoswarm.model.camera import Camera, Lens
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.twin.city.procedural_noise import noise_field
 from orthoswarm.twin.city.scene import CELL_M, TEXEL_M, TILE_CELLS, WATER, Scene
-
-Pixels = NDArray[np.uint8]
-Floats = NDArray[np.float32]
 
 NOISE_SIDE = 1024
 HAZE_CELL_M = 4.0
@@ -38,7 +35,7 @@ class PreparedScene:
     """
 
     scene: Scene
-    levels: tuple[Pixels, Pixels, Pixels]
+    levels: tuple[Bytes, Bytes, Bytes]
     tiles: Floats
     sun: tuple[float, float, float]
     ambient: float
@@ -47,7 +44,7 @@ class PreparedScene:
 
 
 def make_stage(
-    scene: Scene, lit: Pixels, sun: tuple[float, float, float], ambient: float, haze: Floats
+    scene: Scene, lit: Bytes, sun: tuple[float, float, float], ambient: float, haze: Floats
 ) -> PreparedScene:
     """Prepare a scene and its lit colours for rendering; arguments as the attributes of `PreparedScene`."""
     import cv2
@@ -57,16 +54,10 @@ def make_stage(
     rows, cols = scene.dsm.shape
     blocks = scene.dsm.reshape(rows // TILE_CELLS, TILE_CELLS, cols // TILE_CELLS, TILE_CELLS)
     tiles = np.ascontiguousarray(blocks.max(axis=(1, 3)) + 0.3, np.float32)
-    noise = noise_field((NOISE_SIDE, NOISE_SIDE), 1.0, 48.0, 5, 4711)
     return PreparedScene(
-        scene=scene,
-        levels=(lit, np.asarray(half), np.asarray(quarter)),
-        tiles=tiles,
-        sun=sun,
-        ambient=ambient,
-        haze=haze,
-        noise=noise,
-    )
+        scene=scene, levels=(lit, np.asarray(half), np.asarray(quarter)), tiles=tiles, sun=sun, ambient=ambient,
+        haze=haze, noise=noise_field((NOISE_SIDE, NOISE_SIDE), 1.0, 48.0, 5, 4711),
+    )  # fmt: skip
 
 
 @in_place_kernel
@@ -324,7 +315,7 @@ def lens_rays(lens: Lens, side: int = 2) -> Floats:
     return np.ascontiguousarray(lens.undistort(xy) if not lens.is_pinhole else xy, np.float32)
 
 
-def render(stage: PreparedScene, camera: Camera, rays: Floats, motion: NDArray[np.float64]) -> Floats:
+def render(stage: PreparedScene, camera: Camera, rays: Floats, motion: Array) -> Floats:
     """One picture, float32 (rows, columns, 3), red first, before the sensor.
 
     Args:
@@ -405,15 +396,8 @@ def satellite_view(stage: PreparedScene, lean: tuple[float, float], gsd_m: float
         float32 (rows, columns, 3) and its grid.
     """
     s = stage.scene
-    g = s.grid
-    grid = GroundGrid(
-        epsg=g.epsg,
-        west=g.west,
-        north=g.north,
-        gsd_m=gsd_m,
-        width=int(g.width * TEXEL_M / gsd_m),
-        height=int(g.height * TEXEL_M / gsd_m),
-    )
+    width, height = (int(n * TEXEL_M / gsd_m) for n in (s.grid.width, s.grid.height))
+    grid = replace(s.grid, gsd_m=gsd_m, width=width, height=height)
     out = np.empty((grid.height, grid.width, 3), np.float32)
     _satellite(
         stage.levels[0], s.dsm, s.dtm, stage.tiles, s.wall, s.facade, np.asarray(stage.sun), stage.ambient,

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from orthoswarm.export.json_values import json_text
+from orthoswarm.model.errors import InputError, OrthoSwarmError
 
 if TYPE_CHECKING:
     from orthoswarm.evaluation.displacement import Accuracy
@@ -58,8 +59,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure and print."""
-    from orthoswarm.model.errors import InputError
-
     if (args.poses is None) != (args.truth is None):
         raise InputError("--poses and --truth belong together; give both or none")
     if args.reference is None and args.checkpoints is None:
@@ -100,7 +99,6 @@ def _wait(args: argparse.Namespace) -> None:
     """
     from gcs_plugin.daemon.store.journal import wrote_refined
     from orthoswarm.export.catalog.tiled_raster import product_file
-    from orthoswarm.model.errors import InputError, OrthoSwarmError
 
     ortho = args.ortho / "orthoimage.tif" if args.ortho.is_dir() or not args.ortho.suffix else args.ortho
     for path in (ortho.parent, args.reference, args.checkpoints, args.truth):

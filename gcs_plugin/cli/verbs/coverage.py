@@ -2,11 +2,12 @@
 
 import argparse
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from orthoswarm.export.json_values import json_text
+from orthoswarm.model.errors import InputError
 
 if TYPE_CHECKING:
     from orthoswarm.coverage.camera_events import CameraEvent
@@ -52,7 +53,6 @@ def run(args: argparse.Namespace) -> int:
     from orthoswarm.coverage.map_folder import read_map
     from orthoswarm.export.catalog.tiled_raster import product_file
     from orthoswarm.export.product_files import write_json
-    from orthoswarm.model.errors import InputError
     from orthoswarm.model.geo import LocalGrid
     from orthoswarm.planning.area.area import make_area
 
@@ -95,7 +95,6 @@ def _events(logs: list[str], flown: "MapFolder", grid: "LocalGrid") -> "list[Cam
     import numpy as np
 
     from orthoswarm.coverage.camera_events import CameraEvent
-    from orthoswarm.model.errors import InputError
     from telemetry.formats.log.flight_logs import read_log
 
     vehicles = sorted({v.vehicle for v in flown.views})
@@ -120,11 +119,8 @@ def _events(logs: list[str], flown: "MapFolder", grid: "LocalGrid") -> "list[Cam
 
 def _judged(flown: "MapFolder") -> "MapFolder":
     """The map's pictures with their quality."""
-    from dataclasses import replace
-
     from gcs_plugin.cli.progress import ProgressBars
     from orthoswarm.coverage.map_folder import with_flaws
-    from orthoswarm.model.errors import InputError
 
     if flown.root is None or not flown.root.is_dir():
         raise InputError(f"the pictures are not at {flown.root}; leave out --pictures or bring them back")
@@ -147,8 +143,6 @@ def _cover(args: argparse.Namespace, flown: "MapFolder", area: "Area") -> "Cover
 
 def _terrain(dem: Path, bounds: Any, flown: "MapFolder") -> "Terrain":
     """A DEM's heights, shifted so that the ground below the cameras has the level found by the map."""
-    from dataclasses import replace
-
     import numpy as np
 
     from orthoswarm.raster.height_model import HeightModel

@@ -1,7 +1,12 @@
 """`orthoswarm demo`: a simulated swarm, end to end, no files and no autopilot needed."""
 
 import argparse
+import json
+import os
+import sys
 from pathlib import Path
+
+from orthoswarm.model.errors import InputError, OrthoSwarmError
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -27,14 +32,11 @@ def run(args: argparse.Namespace) -> int:
     from orthoswarm.compute.workers import prepare_process
 
     prepare_process()
-    import json
-    import sys
 
-    from gcs_plugin.cli.machine_check import compile_cold_kernels
     from gcs_plugin.cli.progress import ProgressBars
+    from gcs_plugin.cli.verbs.doctor import compile_cold_kernels
     from gcs_plugin.demo.demonstration import run_demo
     from gcs_plugin.demo.setting import DemoSetting
-    from orthoswarm.model.errors import InputError, OrthoSwarmError
 
     if not 1 <= args.vehicles <= 12:
         raise InputError(f"{args.vehicles} vehicles are not possible here; choose 1 to 12")
@@ -49,14 +51,8 @@ def run(args: argparse.Namespace) -> int:
             webbrowser.open(url)
 
     with ProgressBars() as progress:
-        report = run_demo(
-            DemoSetting(args.vehicles, args.seed, args.speed),
-            args.out,
-            progress,
-            port=args.port,
-            opened=opened,
-            prepare=compile_cold_kernels,
-        )
+        setting = DemoSetting(args.vehicles, args.seed, args.speed)
+        report = run_demo(setting, args.out, progress, port=args.port, opened=opened, prepare=compile_cold_kernels)
     accuracy = report["accuracy"]
     if args.json:
         json.dump(report, sys.stdout, indent=1, ensure_ascii=False)
@@ -70,8 +66,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _has_display() -> bool:
-    import os
-    import sys
 
     return sys.stdout.isatty() and bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 

@@ -1,16 +1,16 @@
-"""True flights over the area: boustrophedon legs of each vehicle, deviations from the plan, exposure positions."""
+"""Flights over the area: boustrophedon legs, the true deviations from them, and what receivers and compasses record."""
 
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.model.angles import wrap_rad
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.camera import Lens, focal_px
 from orthoswarm.model.placement import Terrain
 
-Array = NDArray[np.float64]
-
+_START_S: Final = 1_750_000_000.0  # UTC epoch seconds of the first vehicle's first picture
 FOVS_DEG = (85.0, 90.0, 95.0, 100.0, 105.0)
 """The paper's cameras (IV.A)."""
 
@@ -59,6 +59,15 @@ class FlightPlan:
         across = self.columns * self.legs * self.leg_spacing_m
         along = self.rows * (self.leg_length_m + self.leg_spacing_m) - self.leg_spacing_m
         return across, along
+
+    def vehicle_id(self, vehicle: int) -> str:
+        """Id of a vehicle by its number, "uav01" for 0."""
+        return f"uav{vehicle + 1:0{max(2, len(str(self.vehicles)))}d}"
+
+    def outline(self) -> Array:
+        """The closed ring (5, 2) around the area, across and along, about its centre."""
+        across, along = (0.5 * side for side in self.extent_m)
+        return np.array([[-across, -along], [across, -along], [across, along], [-across, along], [-across, -along]])
 
     def to_grid(self, across_along: Array, center: tuple[float, float]) -> Array:
         """Grid coordinates (..., 2) of positions across and along the legs, about the area's centre."""
@@ -204,7 +213,6 @@ def fly(
     vehicle: int,
     seed: int,
     lens_k: tuple[float, float] = (0.0, 0.0),
-    start_s: float = 1_750_000_000.0,
 ) -> TrueFlight:
     """One vehicle's true flight.
 
@@ -215,7 +223,6 @@ def fly(
         vehicle: its number.
         seed: of the set; each vehicle draws its own numbers from it.
         lens_k: radial distortion k1, k2 of all lenses.
-        start_s: UTC epoch seconds of the first picture.
     """
     rng = np.random.default_rng([seed, 41, vehicle])
     n = plan.photos
@@ -226,7 +233,7 @@ def fly(
     speed, crab = _ground_speed(heading + plan.heading_rad, motion, wind_from, plan.speed_m_s)
     seconds = plan.spacing_m / speed
     since_start: Array = np.concatenate([[0.0], np.cumsum(seconds[:-1])])
-    if not motion.wind_m_s:  # the same numbers as those of older sets, to the last bit
+    if not motion.wind_m_s:  # equal steps, to the last bit
         since_start = seconds[0] * np.arange(n, dtype=np.float64)
     planned = np.c_[plan.to_grid(local, center), np.full(n, plan.height_m)]
     fov = float(rng.choice(FOVS_DEG))
@@ -249,19 +256,11 @@ def fly(
     # the gimbal lets 80 % of the airframe's tilt through
     angles = np.stack([body[:, 0] + mount[0], -np.pi / 2 + mount[1] + 0.8 * body[:, 1], 0.8 * body[:, 2]], -1)
     lens = Lens(plan.width, plan.height, focal_px(np.radians(fov), plan.width), k1=lens_k[0], k2=lens_k[1])
-    time: Array = start_s + 7.0 * vehicle + since_start
-    name = f"uav{vehicle + 1:0{max(2, len(str(plan.vehicles)))}d}"
+    time: Array = _START_S + 7.0 * vehicle + since_start
     return TrueFlight(
-        vehicle=name,
-        lens=lens,
-        mount_rad=(float(mount[0]), float(mount[1])),
-        time_s=time,
-        planned=planned,
-        position=position,
-        velocity=velocity,
-        angles=angles,
-        body=body,
-    )
+        vehicle=plan.vehicle_id(vehicle), lens=lens, mount_rad=(float(mount[0]), float(mount[1])), time_s=time,
+        planned=planned, position=position, velocity=velocity, angles=angles, body=body,
+    )  # fmt: skip
 
 
 def raised(flight: TrueFlight, ground: Terrain) -> TrueFlight:
@@ -279,3 +278,72 @@ def _receiver_drift(rng: np.random.Generator, n: int, size: float) -> Array:
     fast = smooth_noise(rng, n, 0.04 * n + 1, 0.05 * size)
     curve = line + slow + fast
     return np.asarray(curve - curve[0])
+
+
+# -- records -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Noise:
+    """Errors of recorded poses; each value is one sigma or a half range, as stated.
+
+    Attributes:
+        position_m: half range of the uniform error of each picture's horizontal position (paper IV.A: 1 m).
+        drift_per_photo_m: half range of the drift per picture; the drift is index times one draw per vehicle
+            and axis (paper IV.A: 0.1 m).
+        heading_bias_deg: one sigma of a vehicle's fixed compass error. tilt_bias_deg: of its pitch and roll error.
+        angle_deg: one sigma of the angles from picture to picture.
+        outlier_share: share of positions that are 5 to 20 m off.
+        lag_s: (smallest, largest) delay of positions in seconds, one draw per vehicle.
+        height_m: one sigma of the height from picture to picture. height_offset_m: fixed offset of all heights.
+        follows_plan: the autopilot steers by the drifting receiver, so the recorded positions follow the plan.
+    """
+
+    position_m: float = 1.0
+    drift_per_photo_m: float = 0.1
+    heading_bias_deg: float = 0.0
+    tilt_bias_deg: float = 0.0
+    angle_deg: float = 0.0
+    outlier_share: float = 0.0
+    lag_s: tuple[float, float] = (0.0, 0.0)
+    height_m: float = 0.0
+    height_offset_m: float = 0.0
+    follows_plan: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """Recorded poses of one vehicle.
+
+    Attributes:
+        position: float64 (N, 3), easting, northing, height over takeoff.
+        angles: float64 (N, 3), the camera's GRID yaw, pitch, roll in radians.
+        body: float64 (N, 3), the airframe's.
+    """
+
+    position: Array
+    angles: Array
+    body: Array
+
+
+def record(flight: TrueFlight, noise: Noise, vehicle: int, seed: int) -> Record:
+    """The recorded poses of a flight; the same seed gives the same errors."""
+    rng = np.random.default_rng([seed, 43, vehicle])
+    n = len(flight.time_s)
+    position = flight.position.copy()
+    drift = rng.uniform(-noise.drift_per_photo_m, noise.drift_per_photo_m, 2)
+    jitter = rng.uniform(-noise.position_m, noise.position_m, (n, 2))
+    lag = float(rng.uniform(*noise.lag_s))
+    if noise.follows_plan:
+        position = flight.planned.copy()
+        position[:, 2] = flight.position[:, 2]
+    else:
+        position[:, :2] += np.arange(n)[:, None] * drift
+    position[:, :2] += jitter - lag * flight.velocity
+    far = rng.random(n) < noise.outlier_share
+    bearing, size = rng.uniform(0, 2 * np.pi, n), rng.uniform(5.0, 20.0, n)
+    position[far, :2] += (size[:, None] * np.stack([np.cos(bearing), np.sin(bearing)], -1))[far]
+    position[:, 2] += noise.height_offset_m + rng.normal(0.0, noise.height_m, n)
+    bias = np.radians(rng.normal(0, [noise.heading_bias_deg, noise.tilt_bias_deg, noise.tilt_bias_deg]))
+    wander = np.radians(rng.normal(0, noise.angle_deg, (n, 3)))
+    return Record(position, flight.angles + bias + wander, flight.body + bias + wander)

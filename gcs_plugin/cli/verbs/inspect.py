@@ -1,11 +1,13 @@
 """`orthoswarm inspect`: the content of inputs, and what is suspicious."""
 
 import argparse
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from orthoswarm.export.json_values import json_text
 from orthoswarm.model.angles import wrap_deg
+from orthoswarm.model.errors import InputError
 from orthoswarm.stores.addresses import path_of
 
 if TYPE_CHECKING:
@@ -140,8 +142,6 @@ def draw_tracks(found: "Survey", path: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    from orthoswarm.model.errors import InputError
-
     areas = _areas(_tracks(found))
     if not areas:
         raise InputError("there is no position to draw; leave --picture out")
@@ -165,8 +165,6 @@ def draw_tracks(found: "Survey", path: Path) -> None:
 
 def _tracks(found: "Survey") -> dict[str, list[Row]]:
     """Positions and yaw of each vehicle."""
-    import math
-
     rows: dict[str, list[Row]] = {}
     for source in found.sources:
         for frame in source.frames:

@@ -1,8 +1,6 @@
-"""Checks what a machine has for mapping: programs, codecs, weights, cores, memory, disk.
+"""`orthoswarm doctor`: what this machine has, and what each missing thing costs."""
 
-And what is lost without it.
-"""
-
+import argparse
 import importlib
 import json
 import os
@@ -12,10 +10,44 @@ import shutil
 import sys
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import PackageNotFoundError, distribution, version
 from importlib.util import find_spec
 from pathlib import Path
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.epilog = "example:\n  orthoswarm doctor --warm"
+    add = parser.add_argument
+    add("--warm", action="store_true", help="compile kernels now, so that the first run in the field does not wait")
+    add("--workspace", type=Path, default=Path("."), metavar="DIR", help="folder whose disk is checked (default: here)")
+    add("--json", action="store_true", help="one JSON document on stdout")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Check the machine."""
+    from orthoswarm.compute.workers import prepare_process
+
+    prepare_process()
+    if args.warm:
+        seconds = warm_kernels(lambda text: print(text, file=sys.stderr, flush=True))
+        print(f"kernels are compiled ({seconds:.0f} s)", file=sys.stderr)
+    found = checks(args.workspace)
+    if args.json:
+        document = {"ok": all(c.ok or not c.needed for c in found), "checks": [asdict(c) for c in found]}
+        print(json.dumps(document, indent=1, ensure_ascii=False))
+        return 0
+    width = max(len(c.name) for c in found)
+    for check in found:
+        mark = "ok" if check.ok else "MISSING" if check.needed else "absent"
+        print(f"{check.name:<{width}}  {mark:<7}  {check.detail}")
+        if not check.ok and check.cost:
+            print(f"{'':<{width}}           {check.cost}")
+    return 0
+
+
+# -- checks ------------------------------------------------------------------------------------------------------------
 
 _NEEDED_MB = 2000.0
 _WEIGHTS = {

@@ -1,10 +1,12 @@
 """`orthoswarm export`: a finished map in the formats of other programs."""
 
 import argparse
+import json
 from functools import partial
 from pathlib import Path
 
 from orthoswarm.export.forms import FORMS, MapExport
+from orthoswarm.model.errors import InputError
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -30,11 +32,9 @@ def run(args: argparse.Namespace) -> int:
     from orthoswarm.compute.workers import prepare_process
 
     prepare_process()
-    import json
 
     from gcs_plugin.cli.progress import ProgressBars
     from gcs_plugin.cli.written_files import require_no_file
-    from orthoswarm.model.errors import InputError
 
     if not 1 <= args.quality <= 100:
         raise InputError(f"--quality {args.quality} is out of range; give 1 to 100")
@@ -76,10 +76,6 @@ def _require_report(path: Path) -> None:
     Raises:
         InputError: it is there and cannot be read.
     """
-    import json
-
-    from orthoswarm.model.errors import InputError
-
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:

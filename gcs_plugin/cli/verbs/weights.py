@@ -1,8 +1,12 @@
 """`orthoswarm weights`: the weights of learned matchers: list, import and test them."""
 
 import argparse
+import json
 from pathlib import Path
+from time import perf_counter
 from typing import Any
+
+from orthoswarm.model.errors import InputError
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -14,12 +18,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     actions = parser.add_subparsers(dest="action", required=True, metavar="list|import|check")
     listing = _action(actions, "list", "which weights are known, where they lie, which matchers use them")
-    bring = _action(
-        actions,
-        "import",
-        "copy a file of weights, or all known ones of a folder, to your own folder",
-        " /media/stick/weights",
-    )
+    bring_help = "copy a file of weights, or all known ones of a folder, to your own folder"
+    bring = _action(actions, "import", bring_help, " /media/stick/weights")
     bring.add_argument("source", type=Path, metavar="FILE|DIR", help="file or folder with weights")
     check = _action(actions, "check", "compare files with the published ones and run each matcher once")
     for sub in (listing, bring, check):
@@ -32,7 +32,6 @@ def _action(actions: Any, name: str, text: str, example: str = "") -> argparse.A
         help=text,
         description=text[0].upper() + text[1:] + ".",
         epilog=f"example:\n  orthoswarm weights {name}{example}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     return parser
 
@@ -42,8 +41,6 @@ def run(args: argparse.Namespace) -> int:
     from orthoswarm.compute.workers import prepare_process
 
     prepare_process()
-    import json
-
     from orthoswarm.matchers import weight_files
 
     ok = True
@@ -102,15 +99,12 @@ def checked_files() -> list[dict[str, Any]]:
 
 def checked_matchers() -> list[dict[str, Any]]:
     """Run every built-in matcher once on a synthetic picture and its shifted copy."""
-    from time import perf_counter
-
     import cv2
     import numpy as np
 
     from orthoswarm.matchers import map_matcher, picture_matcher
     from orthoswarm.matchers.matcher import UnavailableError
     from orthoswarm.matchers.registry import MAP, PICTURE
-    from orthoswarm.model.errors import InputError
 
     rng = np.random.default_rng(1)
     ground = sum(

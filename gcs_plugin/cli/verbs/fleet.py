@@ -5,11 +5,12 @@ import json
 import re
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
-from gcs_plugin.cli.verbs.vehicles.fleet_arguments import DEFAULT_LINK, add_arguments
+from gcs_plugin.config import LIMITS
 from gcs_plugin.mission.plan_folder import NO_NEEDS, number_in, plan_needs, read_plan_folder
 from orthoswarm.model.errors import InputError
 
@@ -17,16 +18,118 @@ if TYPE_CHECKING:
     from gcs_plugin.backends import Backend
     from gcs_plugin.fleet.commands import Order
     from gcs_plugin.fleet.fleet_events import FleetEvent
+    from gcs_plugin.fleet.preflight import Check
     from gcs_plugin.mission.exchange import Outcome
     from gcs_plugin.mission.items import Mission
 
-_STEP_S = 0.05
-_PASSING = frozenset({"link", "gps", "ekf", "home", "pre-arm"})  # red items that clear by waiting
+DEFAULT_LINK: Final = "udpin:0.0.0.0:14550"
+_WAIT_S: Final = 8.0
+_STEP_S: Final = 0.05
+_PASSING: Final = frozenset({"link", "gps", "ekf", "home", "pre-arm"})  # red items that clear by waiting
+_VERBS = {
+    "list": "show the vehicles",
+    "upload": "put missions into vehicles and read them back",
+    "start": "let vehicles fly their missions from the beginning (mode, arm, start)",
+    "pause": "hold vehicles where they are",
+    "resume": "let paused vehicles go on with what they did: their missions, or their ways home",
+    "continue": "let vehicles in the air go on with missions that they broke off; checks battery, fence and failsafes",
+    "rtl": "let vehicles fly home and land",
+    "land": "let vehicles land where they are",
+    "check": "check vehicles before their start",
+    "watch": "follow missions until each has ended",
+}
+_EXAMPLES = {
+    "list": "orthoswarm fleet list --link udpin:0.0.0.0:14550",
+    "upload": (
+        "orthoswarm fleet upload missions --link udpin:0.0.0.0:14550     (a folder made by `orthoswarm plan`)\n"
+        "  orthoswarm fleet upload survey.plan --vehicle 3 --link tcp:127.0.0.1:5760"
+    ),
+    "start": (
+        "orthoswarm fleet start --plan missions --watch --link udpin:0.0.0.0:14550     (at the plan's times)\n"
+        "  orthoswarm fleet start --vehicle 3 --link tcp:127.0.0.1:5760"
+    ),
+    "pause": "orthoswarm fleet pause --vehicle 3 --link udpin:0.0.0.0:14550",
+    "resume": "orthoswarm fleet resume --vehicle 3 --link udpin:0.0.0.0:14550",
+    "continue": "orthoswarm fleet continue --vehicle 3 --link udpin:0.0.0.0:14550",
+    "rtl": (
+        "orthoswarm fleet rtl --link udpin:0.0.0.0:14550     (all at once)\n"
+        "  orthoswarm fleet rtl --in-turn --link udpin:0.0.0.0:14550     (so that they do not meet on their ways)"
+    ),
+    "land": "orthoswarm fleet land --vehicle 3 --link udpin:0.0.0.0:14550",
+    "check": "orthoswarm fleet check --plan missions --link udpin:0.0.0.0:14550",
+    "watch": "orthoswarm fleet watch --link udpin:0.0.0.0:14550 --seconds 1800",
+}
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
-    add_arguments(parser)
+    parser.epilog = (
+        "A link is udpin:HOST:PORT (listen), udpout:HOST:PORT, tcp:HOST:PORT, or serial:DEVICE:BAUD; give --link\n"
+        f"again for more; without one, {DEFAULT_LINK}. Nothing moves a vehicle but start, resume, continue,\n"
+        "rtl and land.\n\n"
+        f"example:\n  {_EXAMPLES['list']}"
+    )
+    verbs = parser.add_subparsers(dest="action", required=True, metavar="VERB")
+    for name, text in _VERBS.items():
+        about, example = text[0].upper() + text[1:] + ".", f"example:\n  {_EXAMPLES[name]}"
+        verb = verbs.add_parser(name, help=text, description=about, epilog=example)
+        _common(verb)
+        if name == "upload":
+            missions_help = "folder of a plan, or .plan or .waypoints files"
+            verb.add_argument("missions", nargs="+", type=Path, metavar="MISSION", help=missions_help)
+            verb.add_argument("--sortie", type=int, default=1, metavar="N", help="which flight of a plan (default 1)")
+        if name in ("start", "check"):
+            _start_arguments(verb)
+        if name == "start":
+            verb.add_argument("--watch", action="store_true", help="follow the missions until each has ended")
+            verb.add_argument(
+                "--ready", type=float, default=60.0, metavar="S",
+                help="wait at most this long until all vehicles' own checks pass (default 60)",
+            )  # fmt: skip
+        if name in ("start", "continue"):
+            verb.add_argument(
+                "--override", action="append", default=[], metavar="ITEM",
+                help="do it in spite of a red item of the check: battery, or v3:battery for one vehicle",
+            )  # fmt: skip
+        if name == "continue":
+            verb.set_defaults(ready=0.0, max_height=LIMITS.legal_height_m, plan=None)
+        if name == "rtl":
+            verb.add_argument(
+                "--in-turn", action="store_true",
+                help="those whose ways home come near each other hold and return one after the other",
+            )  # fmt: skip
+            verb.add_argument(
+                "--seconds", type=float, default=7200.0, metavar="S",
+                help="with --in-turn: wait for turns at most this long; who waits then holds (default 7200)",
+            )  # fmt: skip
+        if name in ("start", "watch"):
+            verb.add_argument(
+                "--seconds", type=float, default=7200.0, metavar="S", help="follow at most this long (default 7200)"
+            )
+
+
+def _start_arguments(verb: argparse.ArgumentParser) -> None:
+    verb.add_argument("--plan", type=Path, metavar="DIR", help="folder of a plan: its vehicles, at its times")
+    verb.add_argument("--sortie", type=int, default=1, metavar="N", help="which flight of the plan (default 1)")
+    verb.add_argument(
+        "--max-height", type=float, default=LIMITS.legal_height_m, metavar="M",
+        help=f"height above takeoff that may be flown (default {LIMITS.legal_height_m:g}, the usual legal limit)",
+    )  # fmt: skip
+
+
+def _common(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add(
+        "--link", action="append", default=[], metavar="URL", help=f"link to vehicles, several allowed ({DEFAULT_LINK})"
+    )
+    add("--vehicle", action="append", default=[], metavar="ID", help="system ids: 3, v3, or 1,2,5 (default: all heard)")
+    add("--wait", type=float, default=_WAIT_S, metavar="S", help=f"wait for vehicles at most this long ({_WAIT_S:g})")
+    add("--json", action="store_true", help="one JSON document on stdout")
+    add("--backend", default="pymavlink", choices=["pymavlink", "mavsdk"], help="library for MAVLink (pymavlink)")
+    add("--tlog", type=Path, metavar="FILE", help="append all packets to a telemetry log")
+    key_help = "key for signed MAVLink (or ORTHOSWARM_SIGNING_KEY_FILE, ORTHOSWARM_SIGNING_KEY)"
+    add("--signing-key", type=Path, metavar="FILE", help=key_help)
+    add("--gcs-system", type=int, default=255, metavar="ID", help="our own system id (255)")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -233,7 +336,7 @@ def _command(backend: "Backend", args: argparse.Namespace, prepared: _Prepared, 
         args.action, {s: prepared.delays.get(s, 0.0) for s in heard}, lambda line: _say(args, line), airspace,
         standing=standing, missions=flown, pump=pump,
     )  # fmt: skip
-    outcomes = {s: order.outcome for s, order in orders.items() if order.outcome is not None}
+    outcomes = _outcomes(orders)
     followed = [s for s, outcome in outcomes.items() if outcome.ok]
     if watches and followed:
         return _follow(backend, args, followed, all(outcome.ok for outcome in outcomes.values()), told)
@@ -261,8 +364,7 @@ def _as_they_are_heard(backend: "Backend", args: argparse.Namespace) -> int:
             break
     if not orders:
         return _nobody(backend, args, [], [])
-    outcomes = {s: order.outcome for s, order in orders.items() if order.outcome is not None}
-    return _report(args, outcomes, _ids(orders), said=True)
+    return _report(args, _outcomes(orders), _ids(orders), said=True)
 
 
 def _return_in_turn(backend: "Backend", args: argparse.Namespace, prepared: _Prepared, found: list[int]) -> int:
@@ -277,7 +379,7 @@ def _return_in_turn(backend: "Backend", args: argparse.Namespace, prepared: _Pre
     try:
         turn.run([s for s in systems if s in found], args.seconds)
     finally:  # Ctrl-C ends the order: what it has come to is said all the same
-        outcomes = {s: order.outcome for s, order in orders.items() if order.outcome is not None} | turn.outcomes()
+        outcomes = _outcomes(orders) | turn.outcomes()
         code = _report(args, outcomes, _ids(orders | turn.orders), said=True)
     return code
 
@@ -293,6 +395,11 @@ def _unheard(args: argparse.Namespace, systems: Sequence[int]) -> "dict[int, Ord
         orders[s] = Order(verb=args.action, system=s, given_s=time.monotonic()).end(text, Verdict.NOT_SENT)
         _say(args, text)
     return orders
+
+
+def _outcomes(orders: "Mapping[int, Order]") -> "dict[int, Outcome]":
+    """The outcomes that there are."""
+    return {s: order.outcome for s, order in orders.items() if order.outcome is not None}
 
 
 def _ids(orders: "Mapping[int, Order]") -> dict[int, dict[str, Any]]:
@@ -314,13 +421,11 @@ def _ready(
     allowed = _overrides(args.override, systems, ITEMS)
     if args.action == "continue":
         allowed = {s: items | (set(ITEMS) - CONTINUED) for s, items in allowed.items()}
-    missions, stored, starts = _missions(backend, prepared, systems)
-    zones = _with_bar(lambda report: backend.zones(systems, report))
-    backend.hear_states(systems, args.wait)
+    missions, stored, look = _look(backend, args, prepared, systems)
     end = time.monotonic() + args.ready
     said: dict[int, str] = {}
     while True:
-        checks = backend.check(systems, missions, stored, starts, args.max_height, needs=prepared.needs, zones=zones)
+        checks = look()
         red = red_text(checks, allowed)
         waits = all(item.name in _PASSING for check in checks for item in check.red(allowed.get(check.system, ())))
         if not red or not waits or time.monotonic() >= end:
@@ -354,16 +459,20 @@ def _changes(before: Mapping[int, str], red: Mapping[int, str]) -> list[str]:
     return [*lines, f"ready: {', '.join(ready)}"] if ready else lines
 
 
-def _missions(
-    backend: "Backend", prepared: _Prepared, systems: list[int]
-) -> "tuple[dict[int, Mission], dict[int, Mission], dict[int, float]]":
-    """The plan's missions, the vehicles' stored ones, and the plan's takeoffs."""
+def _look(
+    backend: "Backend", args: argparse.Namespace, prepared: _Prepared, systems: list[int]
+) -> "tuple[dict[int, Mission], dict[int, Mission], Callable[[], list[Check]]]":
+    """The plan's missions, those that the vehicles hold, and the check of all, which may be repeated."""
     from gcs_plugin.mission.mission_builder import read_mission
 
     missions = {s: read_mission(prepared.files[s], backend.autopilot(s)) for s in systems if s in prepared.files}
     stored = _with_bar(lambda report: backend.stored(systems, report))
     held = {s: mission for s, mission in stored.items() if mission is not None}
-    return missions, held, {s: prepared.delays.get(s, 0.0) for s in systems}
+    starts = {s: prepared.delays.get(s, 0.0) for s in systems}
+    zones = _with_bar(lambda report: backend.zones(systems, report))
+    backend.hear_states(systems, args.wait)
+    check = partial(backend.check, systems, missions, held, starts, args.max_height, needs=prepared.needs, zones=zones)
+    return missions, held, check
 
 
 def _overrides(texts: Sequence[str], systems: Sequence[int], items: Sequence[str]) -> dict[int, set[str]]:
@@ -381,10 +490,7 @@ def _overrides(texts: Sequence[str], systems: Sequence[int], items: Sequence[str
 def _check(backend: "Backend", args: argparse.Namespace, prepared: _Prepared, found: list[int]) -> int:
     """Show the check of each vehicle; 0 if none has a red item."""
     systems = [s for s in prepared.systems or found if s in found]
-    missions, stored, starts = _missions(backend, prepared, systems)
-    zones = _with_bar(lambda report: backend.zones(systems, report))
-    backend.hear_states(systems, args.wait)
-    checks = backend.check(systems, missions, stored, starts, args.max_height, needs=prepared.needs, zones=zones)
+    checks = _look(backend, args, prepared, systems)[2]()
     if args.json:
         print(json.dumps({"vehicles": [check.document(f"v{check.system}") for check in checks]}))
     else:

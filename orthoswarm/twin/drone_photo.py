@@ -1,12 +1,54 @@
-"""EXIF and XMP tags as a DJI camera writes them; without focal length and field of view (an uncalibrated camera)."""
+"""A drone's photo: from light to a JPEG by its sensor, and the EXIF and XMP tags that a DJI camera writes.
+
+The tags are without focal length and field of view: the camera is uncalibrated.
+"""
 
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from fractions import Fraction
+from typing import Final
+
+import numpy as np
 
 from orthoswarm.model.angles import wrap_deg
+from orthoswarm.model.arrays import Bytes, Floats
 
-_XMP = (
+
+class Sensor:
+    """A small drone camera with automatic exposure.
+
+    Args:
+        width: columns; height: rows.
+        seed: of the noise array; each picture uses another part of it.
+    """
+
+    def __init__(self, width: int, height: int, seed: int) -> None:
+        rng = np.random.default_rng([seed, 101])
+        self._bank = rng.normal(0.0, 1.0, (height + 257, width + 263, 3)).astype(np.float32)
+        x = (np.arange(width, dtype=np.float32) - 0.5 * (width - 1)) / (0.5 * width)
+        y = (np.arange(height, dtype=np.float32) - 0.5 * (height - 1)) / (0.5 * width)
+        self._vignette = (1.0 - 0.13 * (x[None, :] ** 2 + y[:, None] ** 2))[..., None]
+
+    def expose(self, light: Floats, rng: np.random.Generator) -> Bytes:
+        """8-bit colours of a picture: slight blur, darker corners, exposure within 4 %, noise of 2 grey values."""
+        import cv2
+
+        image = cv2.GaussianBlur(light, (0, 0), 0.42)
+        image *= self._vignette * np.float32(1.06 + rng.uniform(-0.04, 0.04))
+        rows, cols = image.shape[:2]
+        r, c = int(rng.integers(257)), int(rng.integers(263))
+        image += 1.9 * self._bank[r : r + rows, c : c + cols]
+        return np.asarray(np.clip(image, 0, 255).astype(np.uint8))
+
+    def encode(self, image: Bytes, quality: int) -> bytes:
+        """A baseline JPEG with halved chroma."""
+        import simplejpeg
+
+        return bytes(simplejpeg.encode_jpeg(np.ascontiguousarray(image), quality, "RGB", "420"))
+
+
+_MODEL: Final = "TWIN"
+_XMP: Final = (
     '<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>\n'
     '<x:xmpmeta xmlns:x="adobe:ns:meta/">\n'
     ' <rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">\n'
@@ -45,7 +87,6 @@ class PhotoTags:
         altitude_m: absolute altitude. height_m: over takeoff.
         gimbal_deg: the camera's yaw (from true north), pitch (-90 straight down), roll.
         flight_deg: the airframe's yaw, pitch, roll.
-        model: camera model.
     """
 
     time_s: float
@@ -55,36 +96,24 @@ class PhotoTags:
     height_m: float
     gimbal_deg: tuple[float, float, float]
     flight_deg: tuple[float, float, float]
-    model: str = "TWIN"
 
 
 def with_tags(jpeg: bytes, tags: PhotoTags) -> bytes:
     """A JPEG with its EXIF and XMP segments; angles are wrapped to +-180 degrees."""
-    exif, xmp = _exif(tags), _xmp(tags)
-    return b"".join([jpeg[:2], _segment(exif), _segment(b"http://ns.adobe.com/xap/1.0/\x00" + xmp), jpeg[2:]])
+    xmp = b"http://ns.adobe.com/xap/1.0/\x00" + _xmp(tags)
+    return jpeg[:2] + _segment(_exif(tags)) + _segment(xmp) + jpeg[2:]
 
 
 def _segment(payload: bytes) -> bytes:
     return b"\xff\xe1" + (len(payload) + 2).to_bytes(2, "big") + payload
 
 
-def _wrap(angles: tuple[float, float, float]) -> tuple[float, float, float]:
-    a, b, c = (wrap_deg(x) for x in angles)
-    return a, b, c
-
-
 def _xmp(tags: PhotoTags) -> bytes:
     return _XMP.format(
-        date=datetime.fromtimestamp(tags.time_s, UTC).isoformat(timespec="seconds"),
-        make="DJI",
-        model=tags.model,
-        altitude=tags.altitude_m,
-        height=tags.height_m,
-        lat=tags.lat_deg,
-        lon=tags.lon_deg,
-        gimbal=_wrap(tags.gimbal_deg),
-        flight=_wrap(tags.flight_deg),
-    ).encode()
+        date=datetime.fromtimestamp(tags.time_s, UTC).isoformat(timespec="seconds"), make="DJI", model=_MODEL,
+        altitude=tags.altitude_m, height=tags.height_m, lat=tags.lat_deg, lon=tags.lon_deg,
+        gimbal=[wrap_deg(x) for x in tags.gimbal_deg], flight=[wrap_deg(x) for x in tags.flight_deg],
+    ).encode()  # fmt: skip
 
 
 def _exif(tags: PhotoTags) -> bytes:
@@ -93,7 +122,7 @@ def _exif(tags: PhotoTags) -> bytes:
     moment = datetime.fromtimestamp(round(tags.time_s, 3), UTC)
     stamp, fraction = moment.strftime("%Y:%m:%d %H:%M:%S"), f"{moment.microsecond // 1000:03d}"
     exif = Image.Exif()
-    exif[0x010F], exif[0x0110], exif[0x0132] = "DJI", tags.model, stamp
+    exif[0x010F], exif[0x0110], exif[0x0132] = "DJI", _MODEL, stamp
     detail = exif.get_ifd(0x8769)
     detail[0x9003] = detail[0x9004] = stamp
     detail[0x9291] = detail[0x9292] = fraction

@@ -1,1 +1,0 @@
-"""Verbs that make, inspect, measure and export maps."""

@@ -1,1 +1,0 @@
-"""Verbs for data sets with truth, benchmarks, weights and the machine."""

@@ -1,1 +1,0 @@
-"""Verbs that plan flights, speak with vehicles, and run the daemon and simulations."""
