@@ -28,11 +28,8 @@ def _swarm(epsg: int, origin: Array, dem: HeightModel | None, pictures: GreyPict
 def _paper(epsg: int, origin: Array, dem: HeightModel | None, pictures: GreyPictures | None, device: str) -> Refiner:
     """The paper's refiner; its ground is flat, so it does not use a height model. It reads the pictures by itself."""
     from orthoswarm.paper import PaperOptions, PaperRefiner
-    from orthoswarm.paper.coarse_cameras import CoarseOptions
-    from orthoswarm.paper.leg_patches import PatchOptions
 
-    options = PaperOptions(CoarseOptions(device=device), PatchOptions(device=device))
-    return PaperRefiner(epsg, origin, options)
+    return PaperRefiner(epsg, origin, PaperOptions(device))
 
 
 REFINERS: Mapping[RefinerName, Factory] = {"swarm": _swarm, "paper": _paper}

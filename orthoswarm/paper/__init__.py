@@ -4,6 +4,7 @@ It serves for comparison; the default refiner (orthoswarm.refine) is more accura
 paper is ambiguous and how each case is decided here.
 """
 
-from orthoswarm.paper.paper_refiner import PaperOptions, PaperRefiner
+from orthoswarm.paper.coarse_cameras import PaperOptions
+from orthoswarm.paper.paper_refiner import PaperRefiner
 
 __all__ = ["PaperOptions", "PaperRefiner"]

@@ -26,17 +26,17 @@ _UNKNOWN_FOV_SIGMA_DEG: Final = 10.0  # sigma of a field of view that could not 
 
 
 @dataclass(frozen=True, slots=True)
-class CoarseOptions:
-    """Options of the coarse stage.
+class PaperOptions:
+    """How the paper's refiner works.
 
     Attributes:
-        fov_start_rad: first guess, which places the orthogonal centre; also the result where nothing can be matched.
-        matcher: name of the picture matcher; None for the best available. device: where it runs.
+        device: where matchers' networks run, see `network_device`.
+        picture_matcher, map_matcher: their names; None for the best available.
     """
 
-    fov_start_rad: float = field(default_factory=lambda: float(np.radians(START_FOV_DEG)))
-    matcher: str | None = None
     device: str = "auto"
+    picture_matcher: str | None = None
+    map_matcher: str | None = None
 
 
 @dataclass(slots=True, kw_only=True)
@@ -66,7 +66,7 @@ class CoarseVehicle:
         return np.array([i for i in np.flatnonzero(self.leg == leg) if i not in self.damaged], np.int32)
 
 
-def coarse_vehicle(frames: Sequence[Frame], *, epsg: int, origin: Array, options: CoarseOptions) -> CoarseVehicle:
+def coarse_vehicle(frames: Sequence[Frame], *, epsg: int, origin: Array, options: PaperOptions) -> CoarseVehicle:
     """Coarse cameras of one vehicle (one lens) in the local frame: III.C from legs to Eq. 4."""
     began = process_time()
     records = read_records(frames, LocalGrid(epsg), origin)
@@ -81,7 +81,7 @@ def coarse_vehicle(frames: Sequence[Frame], *, epsg: int, origin: Array, options
         position[mine, :2] = line.project(records.position[mine, :2])
         sigma[mine] = np.hypot(RECEIVER_SIGMA_M, line.sigma_m)
     hints = [f.fov_hint_rad for f in frames if f.fov_hint_rad is not None]
-    start = float(np.median(hints)) if hints else options.fov_start_rad
+    start = float(np.median(hints) if hints else np.radians(START_FOV_DEG))  # the result, too, if nothing matches
     rotation = records.rotation()
     tilt = np.arccos(np.clip(-rotation[:, 2, 2], -1.0, 1.0))
     tasks = []
@@ -93,7 +93,7 @@ def coarse_vehicle(frames: Sequence[Frame], *, epsg: int, origin: Array, options
     warnings = []
     found = None
     if records.has_height.any():
-        matcher = picture_matcher(options.matcher, options.device)
+        matcher = picture_matcher(options.picture_matcher, options.device)
         found = estimate_fov(tasks, pictures.gray, rotation, size=pictures.size, start_rad=start, matcher=matcher)
     if found is None:
         warnings.append(f"the field of view could not be measured; {np.degrees(start):.0f} degrees are used")

@@ -15,6 +15,7 @@ from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import MapWindow
 from orthoswarm.model.robust import mad_sigma
+from orthoswarm.paper.coarse_cameras import PaperOptions
 from orthoswarm.raster.picture_file import read_gray
 from orthoswarm.refine.bundle.block_arrays import WIDTH, CameraBlock, F
 from orthoswarm.refine.features.working_pictures import Pictures
@@ -77,19 +78,7 @@ class PatchFit:
         return np.asarray(self.move(self.centre[None])[0] - self.centre)
 
 
-@dataclass(frozen=True, slots=True)
-class PatchOptions:
-    """Options of the matching of patches.
-
-    Attributes:
-        matcher: name of the map matcher; None for the best available. device: where it runs.
-    """
-
-    matcher: str | None = None
-    device: str = "auto"
-
-
-def match_patch(task: PatchTask, *, basemap: MapWindow, origin: Array, options: PatchOptions) -> PatchFit:
+def match_patch(task: PatchTask, *, basemap: MapWindow, origin: Array, options: PaperOptions) -> PatchFit:
     """Register one leg on the map."""
     began, clock = process_time(), perf_counter()
     pictures = Pictures(task.frames, lambda f: read_gray(f.path), 10_000, cache_mb=8.0)
@@ -109,7 +98,7 @@ def match_patch(task: PatchTask, *, basemap: MapWindow, origin: Array, options: 
             if not known.any():
                 break
             consistent = HeightFilter(task.cameras, own, there)
-            matcher = map_matcher(options.matcher, options.device)
+            matcher = map_matcher(options.map_matcher, options.device)
             found = register(patch, valid, window, known=known, reach=reach, matcher=matcher, keep=consistent)
             if found is not None and found.share >= TRUSTED_SHARE and len(found.matches) >= LEAST_TILES:
                 homography = in_metres(found.homography, own, there, centre)

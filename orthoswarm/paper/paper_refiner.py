@@ -18,20 +18,12 @@ from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import Leg, LegState, MapWindow, PlacedFrame, Refinement, Solution, Stage
 from orthoswarm.model.task_runner import Progress, Run, serial
-from orthoswarm.paper.coarse_cameras import RECEIVER_SIGMA_M, CoarseOptions, CoarseVehicle, coarse_vehicle
-from orthoswarm.paper.leg_patches import PatchFit, PatchOptions, PatchTask, match_patch
+from orthoswarm.paper.coarse_cameras import RECEIVER_SIGMA_M, CoarseVehicle, PaperOptions, coarse_vehicle
+from orthoswarm.paper.leg_patches import PatchFit, PatchTask, match_patch
 from orthoswarm.refine.flight.vehicle_refinement import UnitRefiner, merge_units, unit_states, units_of_area
 
 _CARRYING_NEIGHBOURS: Final = 3  # nearest registered legs of neighbours that carry a vehicle without one
 _CARRIED_SIGMA_M: Final = 2.0  # least sigma of a correction carried from other legs
-
-
-@dataclass(frozen=True, slots=True)
-class PaperOptions:
-    """How the paper's refiner works: see CoarseOptions (III.C) and PatchOptions (III.D)."""
-
-    coarse: CoarseOptions = field(default_factory=CoarseOptions)
-    patches: PatchOptions = field(default_factory=PatchOptions)
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +104,7 @@ def _refine(
     progress: Progress | None,
 ) -> Refinement:
     clock = perf_counter()
-    first = partial(_timed_coarse, epsg=grid.epsg, origin=origin, options=options.coarse)
+    first = partial(_timed_coarse, epsg=grid.epsg, origin=origin, options=options)
     coarse, tasks_s = [], {"vehicles (III.C)": [], "legs (III.D)": []}  # type: tuple[list[CoarseVehicle], dict[str, list[float]]]
     parallel_s = -perf_counter()
     for n, (vehicle, seconds) in enumerate(run(first, units)):
@@ -124,7 +116,7 @@ def _refine(
     fits: list[dict[int, PatchFit]] = [{} for _ in coarse]
     if basemap is not None:
         tasks = [(u, _task(v, k)) for u, v in enumerate(coarse) for k in range(len(v.lines)) if len(v.members(k))]
-        second = partial(match_patch, basemap=basemap, origin=origin, options=options.patches)
+        second = partial(match_patch, basemap=basemap, origin=origin, options=options)
         parallel_s -= perf_counter()
         for n, fit in enumerate(run(second, [t for _, t in tasks])):
             fits[tasks[n][0]][fit.leg] = fit
@@ -172,7 +164,7 @@ def _equation_5(tasks_s: Mapping[str, Sequence[float]], sequential_s: float, wal
 
 
 def _timed_coarse(
-    frames: Sequence[Frame], *, epsg: int, origin: Array, options: CoarseOptions
+    frames: Sequence[Frame], *, epsg: int, origin: Array, options: PaperOptions
 ) -> tuple[CoarseVehicle, float]:
     clock = perf_counter()
     return coarse_vehicle(frames, epsg=epsg, origin=origin, options=options), perf_counter() - clock

@@ -12,10 +12,9 @@ from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import Camera, Lens, focal_px, rotation_from_angles
 from orthoswarm.model.geo import GroundGrid, local_origin
 from orthoswarm.paper import PaperOptions, PaperRefiner, coarse_cameras, leg_patches
-from orthoswarm.paper.coarse_cameras import CoarseOptions
 from orthoswarm.paper.ground_scale import choose_pairs, field_of_view, gaussian, metres_per_pixel, orthogonal_centre
 from orthoswarm.paper.leg_lines import find_legs, fit_line
-from orthoswarm.paper.leg_patches import HeightFilter, PatchOptions
+from orthoswarm.paper.leg_patches import HeightFilter
 from orthoswarm.paper.paper_refiner import carried_shift, fit_camera, pixel_grid
 from orthoswarm.raster.basemap import Basemap
 from orthoswarm.refine.bundle.block_arrays import HEIGHT, WIDTH, CameraBlock, F
@@ -23,7 +22,7 @@ from orthoswarm.refine.bundle.flight_records import FlightRecords
 from telemetry import load
 from tests.kit.scene import FOV, Scene, legs
 
-OPTIONS = PaperOptions(CoarseOptions(matcher="sift"), PatchOptions(matcher="cfog"))
+OPTIONS = PaperOptions(picture_matcher="sift", map_matcher="cfog")
 BIAS = (6.0, -4.0)
 
 
