@@ -59,10 +59,8 @@ OURS = [command for command in commands(PAGE) if command.words[0] == "orthoswarm
 def parsed(words, monkeypatch):
     """What the command line makes of a command, which is not run."""
     found = []
-    for room in ("maps", "vehicles", "tools"):
-        with contextlib.suppress(ModuleNotFoundError):
-            module = importlib.import_module(f"gcs_plugin.cli.verbs.{room}.{words[1]}")
-            monkeypatch.setattr(module, "run", lambda args: found.append(args) or 0)
+    module = importlib.import_module(f"gcs_plugin.cli.verbs.{words[1]}")
+    monkeypatch.setattr(module, "run", lambda args: found.append(args) or 0)
     assert main(list(words[1:])) == 0
     return found[0]
 
