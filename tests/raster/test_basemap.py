@@ -470,7 +470,7 @@ def lacking(folder, zoom, how):
 
 
 @pytest.mark.parametrize("mbtiles", [False, True])
-@pytest.mark.parametrize("suffix", ["jpg", "png", "webp"])
+@pytest.mark.parametrize("suffix", ["jpg", *(pytest.param(s, marks=pytest.mark.slow) for s in ("png", "webp"))])
 @pytest.mark.parametrize("how", ["placeholders", "one colour", "half downloads", "pages", "none"])
 def test_what_the_finest_level_lacks_comes_from_the_others(tmp_path, how, suffix, mbtiles):
     folder = tmp_path / "xyz"
@@ -483,6 +483,7 @@ def test_what_the_finest_level_lacks_comes_from_the_others(tmp_path, how, suffix
         assert_same_ground(basemap, gsd, tolerance=6.0)
 
 
+@pytest.mark.slow
 def test_a_level_that_shows_a_corner_of_the_flight_is_not_the_map(tmp_path):
     for zoom in (18, 19, 21):
         web_tiles(tmp_path, zoom)
