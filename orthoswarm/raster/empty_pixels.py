@@ -20,8 +20,7 @@ _BULK_PERCENT: Final = (2.0, 98.0)
 _COLLAR_PX: Final = 15  # squares of at least this side that are plain are collar or fill and no ground
 _NOISE: Final = 12  # JPEG leaves a black or white collar within this of it, ...
 _NOISE_MEAN: Final = 2.0  # ... and within this on average over a square
-_BLURRED_PX: Final = 2  # interpolation blurs a collar's edge by this; ...
-_RINGING_PX: Final = 10  # ... JPEG by a block of 8 pixels, too
+_BLURRED_PX: Final = 2  # interpolation blurs a collar's edge by this; more would take the ground beside small holes
 _FILL_SHARE: Final = 0.01  # of the sampled pixels: less plain ground of one colour is not worth a thought
 _MOST_FILLS: Final = 3  # a map with more plain colours is drawn, and plain is what it shows
 _PLAIN_SHARE: Final = 0.95  # a map that is plain nearly everywhere is what it is
@@ -82,26 +81,26 @@ def fills(windows: Iterable[NDArray[Any]]) -> list[tuple[float, ...]]:
     return [tuple(colour.tolist()) for colour in common] if photographed else []
 
 
-def blank(values: NDArray[Any], fills: Sequence[tuple[float, ...]] = (), reduced: float = 1.0) -> Mask:
+def blank(values: NDArray[Any], fills: Sequence[tuple[float, ...]] = ()) -> Mask:
     """Plain patches of a map without a mask: black or white, or of one of the fills.
 
     Args:
-        values: (bands, rows, columns). fills: colours, a value a band. reduced: pixels of the map to one of these.
+        values: (bands, rows, columns). fills: colours, a value a band.
     """
     dtype = values.dtype
     noise = _NOISE if dtype == np.uint8 else 0
     ends = [0.0, float(np.iinfo(dtype).max)] if dtype.kind in "iu" else [0.0]
     out = np.zeros(values.shape[1:], bool)
     for end in ends:
-        out |= _patches(values, (end,) * len(values), noise, reduced)
+        out |= _patches(values, (end,) * len(values), noise)
     for colour in fills:
-        found = _patches(values, colour, 0, reduced)
+        found = _patches(values, colour, 0)
         if found.any():
             out |= cv2.morphologyEx(found.astype(np.uint8), cv2.MORPH_CLOSE, _square(_LETTERS_PX)).astype(bool)
     return out
 
 
-def _patches(values: NDArray[Any], colour: Sequence[float], noise: int, reduced: float) -> Mask:
+def _patches(values: NDArray[Any], colour: Sequence[float], noise: int) -> Mask:
     """Squares that keep to a colour within a noise, with what interpolation blurs of them."""
     near = np.abs(values[0].astype(np.float32) - colour[0]) <= noise if noise else values[0] == colour[0]
     if np.count_nonzero(near) < _COLLAR_PX**2:
@@ -112,8 +111,7 @@ def _patches(values: NDArray[Any], colour: Sequence[float], noise: int, reduced:
         core &= cv2.blur(off, (_COLLAR_PX, _COLLAR_PX), borderType=cv2.BORDER_REPLICATE) <= _NOISE_MEAN
     if not core.any():
         return np.zeros(near.shape, bool)
-    margin = max(_BLURRED_PX, round(_RINGING_PX / max(reduced, 1.0))) if off[core].any() else _BLURRED_PX
-    return np.asarray(cv2.dilate(core.astype(np.uint8), _square(_COLLAR_PX + 2 * margin), borderValue=0)) > 0
+    return np.asarray(cv2.dilate(core.astype(np.uint8), _square(_COLLAR_PX + 2 * _BLURRED_PX), borderValue=0)) > 0
 
 
 def _least(band: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -136,17 +136,17 @@ class RasterMap:
                 return parts[0] if len(parts) == 1 else _below_each_other(parts)
             data, valid = self._warp(grid)
         ratio = grid.gsd_m / self.native_gsd_m
-        valid &= self._shown(data, ratio, mixed_px=int(np.ceil(_CUBIC_PX / min(ratio, 1.0))))
+        valid &= self._shown(data, mixed_px=int(np.ceil(_CUBIC_PX / min(ratio, 1.0))))
         return self._eight_bit(data), valid
 
     def _eight_bit(self, data: NDArray[Any]) -> Bytes:
         return self._stretch.apply(data) if self._stretch is not None else np.asarray(data, np.uint8)
 
-    def _shown(self, data: NDArray[Any], reduced: float, mixed_px: int) -> Mask:
+    def _shown(self, data: NDArray[Any], mixed_px: int) -> Mask:
         """Where values (bands, rows, columns) can be ground, bool (rows, columns).
 
         Args:
-            reduced: pixels of the map to one of these. mixed_px: pixels beside empty ones that are mixed with them.
+            mixed_px: pixels beside empty ones that are mixed with them.
         """
         import cv2
 
@@ -155,7 +155,7 @@ class RasterMap:
             side = 2 * mixed_px + 1
             shown = cv2.erode(shown.astype(np.uint8), np.ones((side, side), np.uint8)).astype(bool)
         if self._opaque:
-            shown &= ~blank(data, self._fills, reduced)
+            shown &= ~blank(data, self._fills)
         return shown
 
     def _in_range(self, data: NDArray[Any]) -> Mask:
@@ -228,8 +228,7 @@ class RasterMap:
             return np.zeros((bands, grid.height, grid.width), np.uint8), np.zeros((grid.height, grid.width), bool)
         window = Window(c0, r0, c1 - c0, r1 - r0)
         data = source.read(self._bands, window=window)
-        reduced = t.a / self._affine.a
-        valid = self._shown(data, reduced, mixed_px=int(reduced > 1.0))
+        valid = self._shown(data, mixed_px=int(t.a > self._affine.a))
         if not self._opaque:
             valid &= source.dataset_mask(window=window) > 127
         data = self._eight_bit(data)

@@ -183,7 +183,7 @@ class TileMap:
             dst_alpha=4,
             tolerance=0.01,
         )
-        return out[:3], (out[3] > 127) & ~blank(out[:3], reduced=grid.gsd_m / self.native_gsd_m)
+        return out[:3], (out[3] > 127) & ~blank(out[:3])
 
     def _assemble(self, bounds: BoundingBox, zoom: int, shrink: int) -> tuple[Bytes, tuple[float, float], float]:
         """The tiles under bounds as one RGBA picture (4, rows, columns), its upper left corner and pixel size."""
