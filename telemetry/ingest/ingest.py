@@ -396,7 +396,7 @@ def _measured(
     if lost:
         text = f"all {len(photos)} photos tell one place to the last digit: the receiver stood still, it is not used"
         source.findings.append(Finding("position-held", text, vehicle))
-    for i, lat, lon, sigma in zip(held.index, held.lat_deg.tolist(), held.lon_deg.tolist(), held.sigma_m.tolist()):
+    for i, lat, lon, sigma in held.each():
         if sigma > LOST_SIGMA_M:
             lost.add(i)
             continue

@@ -7,7 +7,7 @@ has no place but between those measured before and after, with the sigma of a wa
 """
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -56,6 +56,10 @@ class HeldFixes:
 
     def __len__(self) -> int:
         return len(self.index)
+
+    def each(self) -> Iterator[tuple[int, float, float, float]]:
+        """Index, latitude, longitude and sigma of one after the other."""
+        return zip(self.index, self.lat_deg.tolist(), self.lon_deg.tolist(), self.sigma_m.tolist(), strict=True)
 
     def finding(self, of_what: str) -> Finding:
         """What is said about them; of_what: whose they are."""
@@ -231,7 +235,7 @@ def without_held_fixes(
     placed = [i for i, sample in enumerate(samples) if sample.has_position]
     held = held_fixes([times_s[i] for i in placed], [samples[i].place for i in placed])
     sound = list(samples)
-    for n, lat, lon, sigma in zip(held.index, held.lat_deg.tolist(), held.lon_deg.tolist(), held.sigma_m.tolist()):
+    for n, lat, lon, sigma in held.each():
         own = samples[placed[n]]
         if sigma > LOST_SIGMA_M:
             sound[placed[n]] = replace(own, lat_deg=None, lon_deg=None, sigma_m=None)
@@ -244,7 +248,7 @@ def measured_frames(frames: Sequence[Frame]) -> list[Frame]:
     """One flight's frames, those with held fixes between measured ones, with the sigma of that however large it is."""
     held = held_fixes([f.time_s for f in frames], [(f.fix.lat_deg, f.fix.lon_deg) for f in frames])
     sound = list(frames)
-    for n, lat, lon, sigma in zip(held.index, held.lat_deg.tolist(), held.lon_deg.tolist(), held.sigma_m.tolist()):
+    for n, lat, lon, sigma in held.each():
         fix = frames[n].fix
         stated = stated_sigma_m(fix.position_sigma_m, sigma)
         sound[n] = replace(frames[n], fix=replace(fix, lat_deg=lat, lon_deg=lon, position_sigma_m=stated))

@@ -19,7 +19,7 @@ from telemetry.samples.unreadable import MOST_TEXT_BYTES
 
 TRACK_SUFFIXES: Final = frozenset({".gpx", ".nmea", ".nma"})
 _MAX_GAP_S: Final = 10.0
-"""Fixes so far apart are interpolated between (chosen): loggers write one in some seconds, or where the way bends."""
+"""Fixes so far apart are interpolated between: loggers write one in some seconds, or where the way bends."""
 _DAY_S: Final = 86_400.0
 _POINT = re.compile(r"<(?:\w+:)?trkpt\b([^>]{0,1000}[^>/])>(.{0,2000}?)</(?:\w+:)?trkpt\s*>", re.DOTALL)
 _ATTRIBUTE = re.compile(r"""\b(lat|lon)\s*=\s*["']\s*([^"']*?)\s*["']""")
