@@ -74,14 +74,13 @@ def candidates(
         sweep_rad: direction of the sweep, across the lines, from grid east, counter-clockwise; None to try several.
         cross: each is followed by lines across its own.
     """
-    lay = partial(candidates, field, vehicles, foot, method=method, turn_m=turn_m, router=router, reach_m=reach_m)
+    angles = rank_directions(field, foot, turn_m, vehicles) if sweep_rad is None else [sweep_rad]
     if cross:
-        angles = rank_directions(field, foot, turn_m, vehicles) if sweep_rad is None else [sweep_rad]
+        lay = partial(candidates, field, vehicles, foot, method=method, turn_m=turn_m, router=router, reach_m=reach_m)
         for angle in angles[: _TRIES[method]]:
             across = next(lay(sweep_rad=angle + 0.5 * np.pi), None)
             yield from (one.then(across) for one in lay(sweep_rad=angle) if across is not None)
         return
-    angles = rank_directions(field, foot, turn_m, vehicles) if sweep_rad is None else [sweep_rad]
     if method == "tmstc":  # a grid looks the same after a right angle
         quarter = [a % (0.5 * np.pi) for a in angles]
         angles = [a for k, a in enumerate(quarter) if not any(abs(a - b) < _SAME_GRID_RAD for b in quarter[:k])]
