@@ -21,6 +21,7 @@ from orthoswarm.model.task_runner import Run
 from orthoswarm.refine.bundle.block_arrays import HEIGHT, WIDTH, CameraBlock, F
 from orthoswarm.refine.features.working_pictures import Pictures, shrunk
 from orthoswarm.refine.surface import plane_sweep_kernels as kernels
+from orthoswarm.refine.surface.seen_objects import seen_objects
 from orthoswarm.refine.surface.vertical_line_locus import REFERENCE_HEIGHT_M
 
 _LEAST_PICTURES = 3
@@ -280,7 +281,7 @@ def _heights(task: _SweepTask, block: _Block, pictures: Sequence[Gray]) -> Float
 def with_tall_surfaces(
     ground: Terrain, points: Array, views: Sequence[SweepViews], *, height_m: float, most_nodes: int, run: Run
 ) -> Terrain:
-    """The bare ground plus the tops of what stands near raised points; the ground itself where there are none.
+    """The bare ground plus the tops of what stands near raised points, where pictures see the ground behind it too.
 
     Args:
         points: float64 (K, 3) at free positions on the visible surface. height_m: flying height above the ground.
@@ -300,7 +301,8 @@ def with_tall_surfaces(
     heights[heights < TALL_FROM_M] = 0.0
     if not heights.any():
         return ground
-    return replace(fine, z=fine.z + heights, bare=fine.z)
+    cameras = CameraBlock.joined([v.cameras.take(np.flatnonzero(v.usable)) for v in views])
+    return seen_objects(replace(fine, z=fine.z + heights, bare=fine.z), cameras)
 
 
 def _finer(ground: Terrain, parts: int) -> Terrain:
