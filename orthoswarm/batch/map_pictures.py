@@ -41,7 +41,7 @@ def refined_pictures(run: RunContext, state: RunState, refinement: Refinement | 
             stats = draw(run, name, placed, Terrain.flat(), state)
         if name == ORTHOIMAGE:
             _copy_coarse(run, state)
-        state.drawn = (stats.drawn_m2, stats.covered_share)
+        state.drawn = stats.drawn
         state.leave_out(stats.rejected, placed)
         return [p for p in placed if p.frame.image not in state.rejected]
     terrain = state.terrain = _ground(run, state, refinement)
@@ -119,12 +119,9 @@ def _both(run: RunContext, state: RunState, coarse: _Map, fine: _Map) -> None:
         _write(run, second, ORTHOIMAGE, fine[0])
         _write_seamlines(run, second, fine[0])
     run.space.clear_scratch()
-    state.drawn = (stats[1].drawn_m2, stats[1].covered_share)
+    state.drawn = stats[1].drawn
     run.space.remember(ORTHOIMAGE, (stats[1].rejected, state.drawn, stage))
-    run.space.remember(
-        COARSE,
-        (stats[0].rejected, (stats[0].drawn_m2, stats[0].covered_share), replace(stage, wall_s=0.0, cpu_s=0.0)),
-    )
+    run.space.remember(COARSE, (stats[0].rejected, stats[0].drawn, replace(stage, wall_s=0.0, cpu_s=0.0)))
     for s in stats:
         state.leave_out(s.rejected, fine[0])
 
@@ -141,7 +138,7 @@ def _picture(
         label = "orthoimage" if name == ORTHOIMAGE else "coarse picture"
         with run.clock.stage(f"final: {label}", len(placed)) as stage:
             stats = draw(run, name, placed, terrain or Terrain.flat(), state)
-        rejected, state.drawn = stats.rejected, (stats.drawn_m2, stats.covered_share)
+        rejected, state.drawn = stats.rejected, stats.drawn
         run.space.remember(name, (rejected, state.drawn, stage))
     state.leave_out(rejected, placed)
 

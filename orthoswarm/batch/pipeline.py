@@ -233,7 +233,7 @@ def _realtime(run: RunContext, state: RunState) -> list[PlacedFrame]:
             reason = next(iter(stats.rejected.values()), "no picture sees the ground")
             raise OrthoSwarmError(f"no picture could be drawn: {reason}")
         run.space.remember("realtime", (stats, stage))
-    state.thumbnails, state.drawn = stats.thumbnails, (stats.drawn_m2, stats.covered_share)
+    state.thumbnails, state.drawn = stats.thumbnails, stats.drawn
     state.undrawn = {**aside, **stats.rejected}
     if run.options.until == "realtime":
         state.leave_out(state.undrawn, state.recorded.placed)

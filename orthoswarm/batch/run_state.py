@@ -22,7 +22,7 @@ from orthoswarm.model.placement import PlacedFrame, Terrain
 from orthoswarm.model.task_runner import Progress
 from orthoswarm.mosaic.recorded_pose import Recorded
 from orthoswarm.mosaic.render_passes import Read
-from orthoswarm.mosaic.renderer import Blend
+from orthoswarm.mosaic.renderer import NOTHING_DRAWN, Blend, DrawnGround
 from orthoswarm.mosaic.seams.previews import PreviewFile
 from orthoswarm.raster.basemap import Basemap
 from orthoswarm.raster.grey_pictures import GreyPictures
@@ -126,7 +126,7 @@ class RunState:
         warnings: for the report. rejected: image -> why it was left out.
         thumbnails, gains: image -> small picture, brightness gains.
         still: frames of vehicles that hovered. odd: frames of another camera or direction than their vehicle's others.
-        terrain: ground under the fine cameras. drawn: area drawn in square metres, covered share.
+        terrain: ground under the fine cameras. drawn: what the map covers.
         previews: small copies of the pictures, for the seams. pictures: those that are decoded, None to read the files.
         parts: what the real-time map shows of each picture, for the refined ones.
         undrawn: image -> why the real-time picture does not show it.
@@ -149,7 +149,7 @@ class RunState:
     still: list[PlacedFrame] = field(default_factory=list)
     odd: list[PlacedFrame] = field(default_factory=list)
     terrain: Terrain | None = None
-    drawn: tuple[float, float] = (0.0, 1.0)
+    drawn: DrawnGround = NOTHING_DRAWN
     previews: PreviewFile | None = None
     parts: PictureParts | None = None
     pictures: GreyPictures | None = None

@@ -18,7 +18,7 @@ from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import Terrain
 from orthoswarm.mosaic.kernels.downsampling import bearable, reduced, reduced_exactly
 from orthoswarm.mosaic.kernels.drawn_heights import heights
-from orthoswarm.mosaic.kernels.pixel_sampling import AFTER, BEFORE, WEIGHTS, blend, place, widen
+from orthoswarm.mosaic.kernels.pixel_sampling import AFTER, BEFORE, WEIGHTS, blend, drawn_again, place, widen
 from orthoswarm.mosaic.kernels.render_arrays import Shots
 from orthoswarm.mosaic.seam_labels import label_tile, label_windows, write_labels
 from orthoswarm.mosaic.seams.feather import labels_around, mix, transition
@@ -35,6 +35,9 @@ Read = Callable[[Path], Bytes]
 
 THUMBNAIL = (12, 16)
 """Rows and columns of a picture's thumbnail."""
+TWICE_M: Final = 0.5
+"""What a picture shows at places farther apart than this is drawn twice, metres."""
+_SPOT_PX: Final = 2  # pixels of a picture along each side that count as one
 _TILES_MB: Final = 64.0  # memory that a drawing task keeps of the tiles that it writes
 
 
@@ -297,12 +300,16 @@ class SampleTask:
 
 @dataclass(frozen=True, slots=True)
 class Sampled:
-    """What became of a picture in a layer: its thumbnail if it was read, or the reason why it could not be used."""
+    """What became of a picture in a layer: its thumbnail if it was read, or the reason why it could not be used.
+
+    twice: pixels that show what it shows more than `TWICE_M` away as well.
+    """
 
     layer: int
     index: int
     thumbnail: Bytes | None
     reason: str | None = None
+    twice: int = 0
 
 
 class _Ground:
@@ -314,13 +321,13 @@ class _Ground:
         self.lattices = {key: layer.place.heights(key, terrain) for key, terrain in layer.terrain.items()}
         self.about = {key: layer.shots.about(*layer.place.corner(key)) for key in layer.terrain}
 
-    def place(self, shot: Shot) -> "list[_Placed]":
-        """Where the pixels of a picture's windows lie in it."""
+    def place(self, shot: Shot) -> "tuple[list[_Placed], int]":
+        """Where the pixels of a picture's windows lie in it, and how many of them show what others show, too."""
         layer = self.layer
         size = np.array(layer.shots.size[shot.row], np.int32)
         factor = bearable(shot.factor, int(size.min()))
         size //= np.int32(factor)
-        placed = []
+        placed, own = [], []
         for store, windows in ((self.store, shot.windows), (self.second, shot.near_seams)):
             for w in windows:
                 tile = store.get(w.key)
@@ -331,9 +338,25 @@ class _Ground:
                     tile.plane, shot.index + 1, window, position[shot.row], rotation[shot.row],
                     layer.shots.lens[shot.row], self.lattices[w.key], layer.place.grid.gsd_m, size, factor,
                 )  # fmt: skip
+                if len(found[0]) and store is self.store:
+                    own.append((w.key, *found))
                 if len(found[0]):
                     placed.append(_Placed(tile, *found, size=size, factor=factor, field=shot.field))
-        return placed
+        return placed, self._twice(own)
+
+    def _twice(self, own: list[tuple[Key, Ints, Ints, NDArray[np.float32], Ints]]) -> int:
+        """How many pixels of a picture's windows show what is drawn elsewhere in them already."""
+        if not own:
+            return 0
+        boxes, side = np.array([box for *_, box in own]), self.layer.place.tile_px
+        low = (boxes[:, [2, 0]].min(0) // _SPOT_PX).astype(np.int32)
+        first = np.full((*(boxes[:, [3, 1]].max(0) // _SPOT_PX - low + 1), 2), -1, np.int32)
+        far_px = TWICE_M / self.layer.place.grid.gsd_m + 2 * _SPOT_PX
+        corners = [np.array(key, np.int32) * np.int32(side) for key, *_ in own]
+        return sum(
+            drawn_again(index, spots, side, corner, _SPOT_PX, far_px, low, first)
+            for corner, (_, index, spots, *_) in zip(corners, own, strict=True)
+        )
 
 
 class _Placed:
@@ -398,7 +421,8 @@ def sample_pass(task: SampleTask) -> list[Sampled]:
     copy_ahead(path for path, _ in task.pictures)
     results = []
     for path, shots in task.pictures:
-        placed = [p for shot in shots for p in grounds[shot.layer].place(shot)]
+        found = [grounds[shot.layer].place(shot) for shot in shots]
+        placed = [p for windows, _ in found for p in windows]
         needs = Box.around([p.needs for p in placed])
         part = None
         if task.parts is not None and all(shot.preview is None for shot in shots):
@@ -421,7 +445,9 @@ def sample_pass(task: SampleTask) -> list[Sampled]:
             part = Part(picture, (0, 0))
         for window in placed:
             window.draw(part, scratch)
-        results += [Sampled(shot.layer, shot.index, small) for shot in shots]
+        results += [
+            Sampled(shot.layer, shot.index, small, twice=twice) for shot, (_, twice) in zip(shots, found, strict=True)
+        ]
     return results
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,28 +78,37 @@ def serial(function: Callable[[Any], Any], arguments: Iterable[Any]) -> Iterable
     return map(function, arguments)
 
 
+class DrawnGround(NamedTuple):
+    """What a map covers.
+
+    Attributes:
+        area_m2: ground that was drawn. covered_share: its share of the ground that any frame sees; 1 where none does.
+        twice_share: share of its pixels that show what the same picture shows more than `TWICE_M` away as well.
+    """
+
+    area_m2: float
+    covered_share: float
+    twice_share: float
+
+
+NOTHING_DRAWN: Final = DrawnGround(area_m2=0.0, covered_share=1.0, twice_share=0.0)
+
+
 @dataclass(frozen=True, slots=True)
 class RenderStats:
     """What was rendered.
 
     Attributes:
         pixels: int64 (N,), map pixels taken from each frame.
-        seen_m2: ground that any frame sees (that was not rejected), measured on cells of up to 64 pixels.
-        drawn_m2: ground that was drawn; both within what was rendered.
+        drawn: what the map covers, within what was rendered.
         rejected: image -> why it was left out although it was placed (absurd pose, damaged picture).
         thumbnails: image -> uint8 (12, 16, 3), means of the picture's parts, of the frames that were read.
     """
 
     pixels: NDArray[np.int64]
-    seen_m2: float
-    drawn_m2: float
+    drawn: DrawnGround
     rejected: dict[str, str]
     thumbnails: dict[str, Bytes] = field(default_factory=dict)
-
-    @property
-    def covered_share(self) -> float:
-        """Share of the ground that any frame sees that was drawn; 1 where nothing is seen."""
-        return min(1.0, self.drawn_m2 / self.seen_m2) if self.seen_m2 > 0 else 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -277,7 +286,7 @@ class _Job:
         self.usable = np.ones(len(self.frames), bool)
         self.rejected: dict[str, str] = {}
         self.thumbnails: dict[str, Bytes] = {}
-        self.pixels = np.zeros(len(self.frames), np.int64)
+        self.pixels, self.twice = np.zeros((2, len(self.frames)), np.int64)
         self.windows = self.near_seams = FrameWindows()
         self.seams, self.previews = layer.seams, layer.previews
         self.failed: dict[int, str] = {}
@@ -429,7 +438,9 @@ class _Job:
         """Note what became of a frame."""
         if sampled.reason is not None:
             self.failed[sampled.index] = sampled.reason
-        elif sampled.thumbnail is not None:
+            return
+        self.twice[sampled.index] += sampled.twice
+        if sampled.thumbnail is not None:
             self.thumbnails[self.frames[sampled.index].frame.image] = sampled.thumbnail
 
     def adopt(self) -> None:
@@ -439,12 +450,13 @@ class _Job:
         self.canvas.adopt(store, sorted(keys))
 
     def stats(self) -> RenderStats:
-        gsd = self.canvas.grid.gsd_m
-        drawn = float(self.pixels.sum()) * gsd * gsd
-        return RenderStats(self.pixels, self.seen_m2(), drawn, self.rejected, self.thumbnails)
+        seen, pixels = self.seen_m2(), int(self.pixels.sum())
+        area = pixels * self.canvas.grid.gsd_m**2
+        drawn = DrawnGround(area, min(1.0, area / seen) if seen > 0 else 1.0, int(self.twice.sum()) / max(pixels, 1))
+        return RenderStats(self.pixels, drawn, self.rejected, self.thumbnails)
 
     def seen_m2(self) -> float:
-        """Ground that the usable frames see, measured on coarse cells."""
+        """Ground that the usable frames see, measured on cells of up to 64 pixels."""
         grid, t = self.canvas.grid, self.canvas.tile_px
         factor, most = 1, _COMPLETENESS_CELLS
         while factor < 64 and grid.width * grid.height > factor * factor * most:

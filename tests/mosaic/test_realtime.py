@@ -108,7 +108,7 @@ def test_batch_gives_the_same_mosaic_as_frame_after_frame(canvas, tmp_path):
         stats = mosaic(flight.frames, batch, read=flight.read)
         one, many = whole(canvas).astype(int), whole(batch).astype(int)
     both = (one[..., 3] == 255) & (many[..., 3] == 255)
-    assert stats.covered_share > 0.97
+    assert stats.drawn.covered_share > 0.97
     assert both.sum() > 0.97 * (one[..., 3] == 255).sum()
     assert np.percentile(np.abs(one - many)[both], 99) <= 8  # bilinear against bicubic
     assert np.abs((one - many)[both].mean(0)).max() < 0.3

@@ -109,7 +109,7 @@ def test_what_any_frame_sees_is_covered_without_holes(canvas):
     assert drawn[well].all()
     assert not drawn[~seen].any()
     assert (drawn & seen).sum() >= 0.97 * seen.sum()
-    assert stats.covered_share == pytest.approx(drawn.sum() / seen.sum(), abs=0.01)
+    assert stats.drawn.covered_share == pytest.approx(drawn.sum() / seen.sum(), abs=0.01)
     assert stats.pixels.sum() == drawn.sum()
 
 
@@ -147,7 +147,7 @@ def test_equal_distance_goes_to_the_earlier_frame(canvas):
 
 def test_lone_small_picture_is_covered_to_its_border(canvas):
     flight = scene.Flight().take(scene.camera(lens=Lens(80, 60, 45.0)))
-    assert render(flight.frames, FLAT, canvas, read=flight.read).covered_share > 0.97
+    assert render(flight.frames, FLAT, canvas, read=flight.read).drawn.covered_share > 0.97
 
 
 def test_unreadable_picture_is_replaced_by_its_neighbours_and_reported(canvas):
@@ -193,7 +193,7 @@ def test_absurd_frames_are_left_out_with_a_reason(canvas):
 
 def test_nothing_to_render_gives_an_empty_canvas(canvas):
     stats = render([], FLAT, canvas)
-    assert stats.covered_share == 1.0
+    assert stats.drawn.covered_share == 1.0
     assert canvas.version == 0
 
 
@@ -231,7 +231,7 @@ def test_bounds_renew_only_the_tiles_they_touch(canvas):
     assert (new[128:] == old[128:]).all() and (new[:, 128:] == old[:, 128:]).all()
     assert (new[:128, :128] != old[:128, :128]).any()
     assert stats.pixels.sum() == (new[:128, :128, 3] == 255).sum()
-    assert 0.95 < stats.covered_share <= 1.0
+    assert 0.95 < stats.drawn.covered_share <= 1.0
 
 
 def test_threads_give_the_same_picture(tmp_path, monkeypatch):
@@ -389,3 +389,18 @@ def test_a_picture_of_which_more_is_wanted_than_was_kept_is_read(tmp_path):
             images.append(whole(canvas))
     assert np.array_equal(images[1], images[2])
     assert not np.array_equal(images[0], images[1])
+
+
+def test_what_one_picture_shows_at_two_places_is_counted(canvas):
+    """Behind a wall that no other picture looks past, a picture shows the wall's top once more."""
+    flight = scene.survey(1, count=1)
+    assert render(flight.frames, FLAT, canvas, read=flight.read).drawn.twice_share == 0.0
+    nadir = flight.cameras[0].nadir
+    z = np.zeros((300, 300), np.float32)
+    z[:, 165:175] = 15.0
+    wall = Terrain(nadir[0] - 150.0, nadir[1] - 150.0, 1.0, z, np.zeros_like(z))
+    drawn = render(flight.frames, wall, canvas, read=flight.read).drawn
+    camera_m = flight.cameras[0].position[2]
+    shadow_m = 15.0 * 25.0 / (camera_m - 15.0)  # of ground behind the wall, which ends 25 m from below the camera
+    width_m = drawn.area_m2 / (scene.seen(flight.cameras[0], canvas.grid)[0].any(0).sum() * canvas.grid.gsd_m)
+    assert drawn.twice_share * drawn.area_m2 / width_m == pytest.approx(shadow_m, rel=0.5)

@@ -1,6 +1,7 @@
 """`orthoswarm evaluate`: an orthoimage against a reference or surveyed points, placed frames against true cameras."""
 
 import argparse
+import json
 import sys
 import time
 from pathlib import Path
@@ -84,11 +85,21 @@ def run(args: argparse.Namespace) -> int:
         from orthoswarm.evaluation.checkpoints import evaluate_checkpoints
 
         figures |= evaluate_checkpoints(args.ortho, args.checkpoints, args.pixel_scale).figures()
+    figures |= _of_the_drawing(args.ortho)
     if args.json:
         print(json_text(figures))
     else:
         _print(figures)
     return 0
+
+
+def _of_the_drawing(ortho: Path) -> dict[str, Any]:
+    """What the run that drew it said of it, where its report.json is there."""
+    report = (ortho if ortho.is_dir() else ortho.parent) / "report.json"
+    if not report.is_file():
+        return {}
+    drawn_twice = json.loads(report.read_text("utf-8")).get("drawn_twice_share")
+    return {} if drawn_twice is None else {"drawn_twice_share": drawn_twice}
 
 
 def _wait(args: argparse.Namespace) -> None:

@@ -2,8 +2,8 @@
 
 Surfaces parallel to the ground are laid through the pictures (Collins 1996). At each cell and height the picture most
 nearly above is correlated with four around it, of which the two most alike count, since a wall hides a place from some
-(Kang et al. 2001); semi-global optimisation (Hirschmüller 2008) chooses the heights. What the pictures do not decide stays on the
-ground.
+(Kang et al. 2001); semi-global optimisation (Hirschmüller 2008) chooses the heights. What the pictures do not decide
+stays on the ground.
 """
 
 from collections.abc import Iterator, Sequence

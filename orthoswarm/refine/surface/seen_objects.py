@@ -16,8 +16,8 @@ from orthoswarm.model.arrays import Flags, Ints
 from orthoswarm.model.placement import Terrain
 from orthoswarm.refine.bundle.block_arrays import CameraBlock, project_point
 
-_MOST_HIDDEN_SHARE: Final = 0.05
-"""An object may hide so much of its own area from all pictures. On real sets 0.02 to 0.1 look alike."""
+_MOST_HIDDEN_SHARE: Final = 0.02
+"""An object may hide so much of its own area from all pictures: of a suburb 0.01 % is drawn twice, with 0.05 0.3 %."""
 _HIDES_M: Final = 0.5  # what rises above a line of sight by less hides nothing: the noise of measured heights
 _MOST_TAN: Final = 2.0  # tangent of the view angle of pictures that are looked at: 63 degrees
 _BLOCK_NODES: Final = 32  # nodes a side that are looked at with the pictures in one order
