@@ -18,7 +18,7 @@ from orthoswarm.stores.listing import StoredFile, known
 from orthoswarm.stores.local_copies import expect
 from orthoswarm.stores.requests import CONNECTIONS
 from telemetry.formats.photo import exif, xmp
-from telemetry.formats.photo.makernotes import parse_dji
+from telemetry.formats.photo.exif import parse_dji
 from telemetry.formats.photo.picture_container import Container, NotAPicture, read_container
 from telemetry.photos.maker_angles import Angles, camera_angles, flight_angles
 from telemetry.samples.sample import is_position
