@@ -26,9 +26,9 @@ from telemetry.formats.video.sei import read_sei_layout, register
 from telemetry.ingest.discovery import Discovery, Folder, discover, natural_key
 from telemetry.ingest.log_choice import LogSource
 from telemetry.ingest.log_ingest import add_logs, read_logs
-from telemetry.ingest.photo_order import SHIFTED, clock_went_back, in_order
 from telemetry.ingest.side_files import read_control_points
 from telemetry.ingest.survey import LoadOptions, SourceInfo, Survey
+from telemetry.ingest.track_poses import SHIFTED, clock_went_back, in_order
 from telemetry.ingest.video_ingest import read_videos
 from telemetry.photos.flight_checks import OTHER_DAY_S, flight_findings, times_without_zone
 from telemetry.photos.maker_angles import Angles

@@ -6,7 +6,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gcs_plugin.cli.configuration import add_config, given
+from gcs_plugin.cli.arguments import add_config, given
 from orthoswarm.export.json_values import json_text
 from orthoswarm.stores.addresses import address_of, path_of
 
@@ -265,7 +265,7 @@ def _check(args: argparse.Namespace) -> None:
 
 def _check_written(args: argparse.Namespace) -> None:
     """Refuse to write over an input, and to write two products into one file."""
-    from gcs_plugin.cli.written_files import refuse_product, refuse_replacing
+    from gcs_plugin.cli.arguments import refuse_product, refuse_replacing
     from orthoswarm.batch.run_state import WRITTEN
     from orthoswarm.model.errors import InputError
 

@@ -137,7 +137,7 @@ def _check(args: argparse.Namespace) -> None:
     Raises:
         InputError: one is out of range, or --out is a file.
     """
-    from gcs_plugin.cli.written_files import require_no_file
+    from gcs_plugin.cli.arguments import require_no_file
 
     for name, least in _LEAST.items():
         value = getattr(args, name)

@@ -109,22 +109,17 @@ class _Track:
     slack: NDArray[np.int64]
 
 
-def _step_s() -> float:
-    """Time step in which flights are compared, seconds."""
-    return _STEP_S
-
-
 def _sampled(flight: Flight, motion: Motion, apart: Separation) -> _Track:
     track = flight.track()
     waits = np.zeros(len(track))
     if flight.wait_s > 0.0:  # it comes to where it waits, and stays there
         at = 3 + flight.last_leg_end
         track, waits = np.insert(track, at, track[at - 1], axis=0), np.insert(waits, at, flight.wait_s)
-    places = motion.places(track, waits, _step_s())
+    places = motion.places(track, waits, _STEP_S)
     flying = np.flatnonzero(places[:, 2] > flight.home_z_m + ON_GROUND_M)
     places = np.ascontiguousarray(places[flying[0] : flying[-1] + 1])
     pad = np.hypot(*(places[:, :2] - flight.home).T) < apart.pad_m
-    slack = np.ceil(np.minimum(start_slack_s(pad, motion.autopilot), apart.slack_s) / _step_s()).astype(np.int64)
+    slack = np.ceil(np.minimum(start_slack_s(pad, motion.autopilot), apart.slack_s) / _STEP_S).astype(np.int64)
     return _Track(flight.home, int(flying[0]), places, pad, slack)
 
 
@@ -209,11 +204,11 @@ class _Sky:
         self._apart, self._in_turn = apart, in_turn
         self._tracks: list[tuple[int, _Track]] = []
         # Between samples a vehicle moves: half a step is added to the distance to keep.
-        self._reach = apart.distance_m + 0.5 * _step_s() * speed_m_s
+        self._reach = apart.distance_m + 0.5 * _STEP_S * speed_m_s
 
     def place(self, make: Maker, motion: Motion, ready_s: float) -> Slot:
         """Give a flight its layers and takeoff, not before it is ready, and remember it."""
-        ready = int(np.ceil(ready_s / _step_s()))
+        ready = int(np.ceil(ready_s / _STEP_S))
         layers = self._apart.layers + 1
         pairs = sorted(((o, h) for o in range(layers) for h in range(layers)), key=lambda p: (sum(p), p))
         frozen = self._frozen(make(0.0, 0.0).home)
@@ -227,12 +222,12 @@ class _Sky:
             track = _sampled(flight, motion, self._apart)
             marks = self._launches(track, ready)
             if best is None:  # whatever the layers, takeoffs at one start come one after the other
-                soonest = _first_zero(marks) * _step_s()
+                soonest = _first_zero(marks) * _STEP_S
             self._meetings(track, ready, frozen, marks)
             delay = _first_zero(marks)
-            if best is None or price + delay * _step_s() < best[0]:
-                slot = Slot(out, home, (ready + delay) * _step_s(), flight)
-                best = (price + delay * _step_s(), slot, track, ready + delay)
+            if best is None or price + delay * _STEP_S < best[0]:
+                slot = Slot(out, home, (ready + delay) * _STEP_S, flight)
+                best = (price + delay * _STEP_S, slot, track, ready + delay)
         assert best is not None
         self._tracks.append((best[3], best[2]))
         return best[1]
@@ -252,12 +247,12 @@ class _Sky:
     @property
     def _slack(self) -> int:
         """How many samples a vehicle may be off schedule away from its start."""
-        return int(np.ceil(self._apart.slack_s / _step_s()))
+        return int(np.ceil(self._apart.slack_s / _STEP_S))
 
     def _launches(self, track: _Track, ready: int) -> NDArray[np.int64]:
         """Delays that takeoffs from the same start forbid, as marks; room for all others."""
         apart = self._apart
-        slack, gap = self._slack, int(np.ceil(apart.launch_s / _step_s()))
+        slack, gap = self._slack, int(np.ceil(apart.launch_s / _STEP_S))
         end = max((s + t.ground + len(t.places) for s, t in self._tracks), default=0)
         marks = np.zeros(max(1, end - ready) + slack + gap + 3, np.int64)
         for start, other in self._tracks:
@@ -284,7 +279,7 @@ class _Sky:
         for start, placed in self._tracks:
             if self._shared(placed.home, track.home):
                 landing = start + placed.ground + len(placed.places) - track.ground - len(track.places)
-                _mark(marks, landing - ready, int(np.ceil(apart.launch_s / _step_s())) - 1)
+                _mark(marks, landing - ready, int(np.ceil(apart.launch_s / _STEP_S)) - 1)
 
 
 def _mark(marks: NDArray[np.int64], delay: int, slack: int) -> None:
