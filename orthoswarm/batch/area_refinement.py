@@ -13,6 +13,7 @@ from orthoswarm.batch.run_state import RunContext
 from orthoswarm.compute.workers import trim_memory
 from orthoswarm.control.area_adjustment import AreaMove, AreaTie, adjust_areas
 from orthoswarm.control.moved_block import moved_camera, moved_terrain
+from orthoswarm.model.arrays import Array, Floats
 from orthoswarm.model.errors import AdjustmentError
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
@@ -21,7 +22,6 @@ from orthoswarm.mosaic.extent import solved_level
 from orthoswarm.refine.flight.vehicle_refinement import unrefined
 from orthoswarm.trajectory.near_paths import NearPaths
 
-Array = NDArray[np.float64]
 _TIE_PLACES = 8
 """Camera positions of a vehicle that tie two areas: they move as one, a few tell shift, turn and scale."""
 
@@ -214,7 +214,6 @@ def _moved_ground(terrain: Terrain | None, move: AreaMove, level_m: float) -> Te
     return replace(moved, z=moved.z + up, bare=None if moved.bare is None else moved.bare + up)
 
 
-Float32 = NDArray[np.float32]
 _BLOCK = 32
 """Nodes along each side that are taken from one area."""
 
@@ -238,7 +237,7 @@ def merged_ground(grounds: Sequence[Terrain | None], nadirs: Sequence[Array]) ->
     columns, rows = (np.ceil((high - low) / step - 1e-6).astype(int) + 1).tolist()
     area = _nearest_areas(low, step, (rows, columns), nadirs)
 
-    def joined(height: Callable[[Terrain], Float32]) -> Float32:
+    def joined(height: Callable[[Terrain], Floats]) -> Floats:
         z = np.zeros((rows, columns), np.float32)
         for i, j in np.ndindex(area.shape):
             ground = grounds[int(area[i, j])]

@@ -19,18 +19,16 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.evaluation.independent_points import Surveyed, control_of_report, shared_points
 from orthoswarm.evaluation.misread_points import FARTHEST_M, Coordinates, away_m, doubts, misplaced
 from orthoswarm.evaluation.photo_names import photo_named
 from orthoswarm.evaluation.point_rays import Ray, RayPoint, intersect_rays
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.camera import Lens, focal_px
 from orthoswarm.model.coordinate_system import to_degrees
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid, area_epsg
-
-Array = NDArray[np.float64]
 
 STANDARD_COUNT = 30
 """Checkpoints that a statement by the standard needs at least."""

@@ -9,16 +9,14 @@ from typing import Any
 
 import numpy as np
 import rasterio
-from numpy.typing import NDArray
 from PIL import Image
 
 from orthoswarm.evaluation.photo_names import photos_named
 from orthoswarm.model.angles import wrap_deg
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.camera import Camera, Lens, angles_from_rotation, focal_px, rotation_from_angles
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid
-
-Array = NDArray[np.float64]
 
 
 def read_truth(path: Path) -> dict[str, tuple[str, int, Camera]]:

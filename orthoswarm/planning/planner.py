@@ -6,8 +6,8 @@ from typing import Any, Final
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid, area_epsg
 from orthoswarm.model.placement import Terrain
@@ -28,7 +28,6 @@ from orthoswarm.planning.sorties.flight_time import Motion
 
 __all__ = ["METHODS", "Method", "PlanOptions", "plan_area", "plan_gaps", "plan_lines"]
 
-Array = NDArray[np.float64]
 Progress = Callable[[str], None]
 
 _OUTLINE_SPACINGS: Final = 0.05  # the outline of an area with many corners is at most twice so many spacings outside it
@@ -105,6 +104,15 @@ def plan_area(
     clearance_m = _clearance_m(options, foot)
     router = Router(make_obstacles(area.no_fly, clearance_m))
     swarm = Swarm(vehicles, over.heights, foot=foot, grid=area.grid, router=router, options=options)
+
+    def incomplete(gaps: tuple[Gap, ...], missed_m2: float, seen: float) -> list[str]:
+        if seen >= planned_coverage.COMPLETE_SHARE:
+            return []
+        return [
+            f"only {100 * seen:.2f} % of the area is covered and {len(gaps)} gaps are left: this plan is not complete; "
+            "reduce the clearance or the no-fly zones, or fly lower"
+        ]
+
     progress("lines")
     best = _best_work(
         area,
@@ -115,20 +123,8 @@ def plan_area(
         router=router,
         reach_m=min(foot.reach_m, 2.0 * clearance_m),
     )
-    progress("separation")
-    schedule = swarm.schedule(best)
-    progress("coverage")
-    left = over.missed(area.ground, schedule.slots)
-    gaps = tuple(_gap(p, area.grid) for p in planned_coverage.pieces(left))
-    seen = 1.0 - float(left.area) / area.size_m2
-    warnings = _warnings(schedule, best, foot, options)
-    if seen < planned_coverage.COMPLETE_SHARE:
-        warnings.append(
-            f"only {100 * seen:.2f} % of the area is covered and {len(gaps)} gaps are left: this plan is not complete; "
-            "reduce the clearance or the no-fly zones, or fly lower"
-        )
     return _plan(
-        method, schedule, over, grid=area.grid, options=options, warnings=warnings, covered=(area.size_m2, seen, gaps)
+        method, best, swarm, over, grid=area.grid, options=options, progress=progress, area=area, said=incomplete
     )
 
 
@@ -196,15 +192,11 @@ def plan_gaps(
 ) -> Plan:
     """Missions that cover separate pieces of ground, each by the shortest parallel legs that see it.
 
+    Other arguments are as of `plan_area`.
+
     Args:
         area: the pieces, grown by the margin that they need, and no-fly zones.
         vehicles: how many there are; fewer are used where there are fewer legs.
-        altitude_m: height of the legs above takeoff, metres; with `heights`, that above level ground at which `foot`
-            was made.
-        foot: footprint of the narrowest camera at that height.
-        options: the rest.
-        progress: called with what is being done.
-        heights: of the flights over a height model; None for level ground at takeoff.
 
     Raises:
         InputError: no piece can be reached, a start in a no-fly zone, an endurance too short.
@@ -221,20 +213,14 @@ def plan_gaps(
     most = stretches(np.hypot(*(legs[:, 1] - legs[:, 0]).T), foot.spacing_m)
     swarm = Swarm(min(vehicles, most), over.heights, foot=foot, grid=area.grid, router=router, options=options)
     work = swarm.share(shorten(legs, router, None if swarm.starts is None else swarm.starts[0]), True)
-    progress("separation")
-    schedule = swarm.schedule(work)
-    progress("coverage")
-    left = over.missed(area.ground, schedule.slots)
-    gaps = tuple(_gap(p, area.grid) for p in planned_coverage.pieces(left))
-    warnings = _warnings(schedule, work, foot, options)
-    if most < vehicles:
-        warnings.append(f"{most} of the {vehicles} vehicles are enough for these gaps")
-    if gaps:
-        warnings.append(f"{left.area:.0f} square metres of the gaps cannot be seen from where flying is allowed")
-    share = 1.0 - float(left.area) / area.size_m2
-    return _plan(
-        "gaps", schedule, over, grid=area.grid, options=options, warnings=warnings, covered=(area.size_m2, share, gaps)
-    )
+
+    def unseen(gaps: tuple[Gap, ...], missed_m2: float, seen: float) -> list[str]:
+        said = [f"{most} of the {vehicles} vehicles are enough for these gaps"] if most < vehicles else []
+        if gaps:
+            said.append(f"{missed_m2:.0f} square metres of the gaps cannot be seen from where flying is allowed")
+        return said
+
+    return _plan("gaps", work, swarm, over, grid=area.grid, options=options, progress=progress, area=area, said=unseen)
 
 
 def _gap_legs(piece: planned_coverage.Geometry, router: Router, foot: Footprint) -> Array:
@@ -258,19 +244,13 @@ def plan_lines(
     progress: Progress = lambda _: None,
     heights: FlightHeights | None = None,
 ) -> Plan:
-    """Missions along given lines, with pictures on their straight stretches.
+    """Missions along given lines, with pictures on their straight stretches; other arguments are as of `plan_area`.
 
     Args:
         lines: float64 (n, 2) each, latitude and longitude in degrees, flown in the order given. Stretches shorter
             than two trigger distances are flown without pictures: they are turns.
         vehicles: how many share the lines.
-        altitude_m: height of the legs above takeoff, metres; with `heights`, that above level ground at which `foot`
-            was made.
-        foot: footprint of the narrowest camera at that height.
         no_fly: an area whose no-fly zones hold here, too.
-        options: the rest.
-        progress: called with what is being done.
-        heights: of the flights over a height model; None for level ground at takeoff.
 
     Raises:
         InputError: no stretch is long enough, more vehicles than stretches, or a line crosses a no-fly zone.
@@ -300,10 +280,7 @@ def plan_lines(
     progress("lines")
     swarm = Swarm(vehicles, over.heights, foot=foot, grid=grid, router=router, options=options)
     work = swarm.share(legs, reorder=False)
-    progress("separation")
-    schedule = swarm.schedule(work)
-    warnings = _warnings(schedule, work, foot, options)
-    return _plan("lines", schedule, over, grid=grid, options=options, warnings=warnings, covered=(None, None, ()))
+    return _plan("lines", work, swarm, over, grid=grid, options=options, progress=progress)
 
 
 def _warnings(schedule: Schedule, work: Work, foot: Footprint, options: PlanOptions) -> list[str]:
@@ -377,15 +354,32 @@ def _sortie(slot: Slot, foot: Footprint, grid: LocalGrid, motion: Motion) -> Sor
 
 def _plan(
     method: str,
-    schedule: Schedule,
+    work: Work,
+    swarm: Swarm,
     over: _Over,
     *,
     grid: LocalGrid,
     options: PlanOptions,
-    warnings: list[str],
-    covered: tuple[float | None, float | None, tuple[Gap, ...]],
+    progress: Progress,
+    area: Area | None = None,
+    said: Callable[[tuple[Gap, ...], float, float], list[str]] = lambda gaps, missed_m2, seen: [],
 ) -> Plan:
-    area_m2, share, gaps = covered
+    """The plan of shared work: its times and layers, and how much of an area it covers.
+
+    `said`: warnings by the gaps left, the square metres missed and the share seen.
+    """
+    progress("separation")
+    schedule = swarm.schedule(work)
+    warnings = _warnings(schedule, work, over.foot, options)
+    area_m2: float | None = None
+    share: float | None = None
+    gaps: tuple[Gap, ...] = ()
+    if area is not None:
+        progress("coverage")
+        left = over.missed(area.ground, schedule.slots)
+        gaps = tuple(_gap(p, grid) for p in planned_coverage.pieces(left))
+        area_m2, share = area.size_m2, 1.0 - float(left.area) / area.size_m2
+        warnings += said(gaps, float(left.area), share)
     foot, level_m = over.foot, over.heights.above_m if over.heights.follows else over.heights.at(np.zeros(2), 0.0)
     made = tuple(
         VehiclePlan(number, tuple(_sortie(s, foot, grid, options.motion_of(number - 1)) for s in row))

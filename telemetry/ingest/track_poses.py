@@ -8,8 +8,8 @@ from pathlib import PurePath
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array, Indices
 from orthoswarm.model.earth import distance_m
 from telemetry.formats.log.log_data import FlightLog
 from telemetry.formats.log.mavlink_poses import fixed_camera
@@ -314,15 +314,13 @@ def clock_went_back(photos: Sequence[Photo]) -> bool:
     return any(_went_back(np.array(times)) for times in series.values())
 
 
-def _went_back(times: NDArray[np.float64]) -> bool:
+def _went_back(times: Array) -> bool:
     back = np.flatnonzero(np.diff(times) < -TIME_RESOLUTION_S) + 1
     if not 0 < len(back) <= 3:  # more: names that are not in the order of exposure
         return False
     spans = sorted((run.min(), run.max()) for run in np.split(times, back))
     return any(later[0] < earlier[1] for earlier, later in pairwise(spans))
 
-
-Array = NDArray[np.float64]
 
 LOG_LEAST_SHARE: Final = 0.5  # a log belongs to photos if this share of the shorter of both is paired
 
@@ -398,7 +396,7 @@ def _same_clock(
     return apart_s <= LEAST_JUMP_S + MOST_DRIFT * between_s
 
 
-def nearest_span(times: Array, spans: Sequence[tuple[float, float]]) -> NDArray[np.int64]:
+def nearest_span(times: Array, spans: Sequence[tuple[float, float]]) -> Indices:
     """(N,) index of the span of time that each time lies in, or nearest to."""
     starts, ends = np.array(spans, dtype=np.float64).T
     apart = np.maximum(np.maximum(starts - times[:, None], times[:, None] - ends), 0.0)

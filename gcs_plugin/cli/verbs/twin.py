@@ -240,8 +240,7 @@ def _follow_vehicles(args: argparse.Namespace) -> int:
 
     prepare_process()
 
-    from gcs_plugin.demo.following_camera import FollowingCameras, Shutter, open_outlet, wait_for_place
-    from gcs_plugin.demo.relay import Relay
+    from gcs_plugin.demo.following_camera import FollowingCameras, Relay, Shutter, open_outlet, wait_for_place
     from gcs_plugin.fleet.fleet import Fleet
     from gcs_plugin.links.signing import find_key
     from gcs_plugin.mission.exchange import Address

@@ -11,15 +11,14 @@ from typing import Any, Final
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import kernel
+from orthoswarm.model.arrays import Array
 from orthoswarm.planning.lines.detours import Router
 from orthoswarm.planning.lines.line_spacing import Footprint
 from orthoswarm.planning.lines.sweep_lines import Field, Turned, lines_across
 
 Geometry = Any
-Array = NDArray[np.float64]
 
 # Walls exactly across the sweep have no single critical point; a hair of rotation gives them one.
 _HAIR_RAD = 1e-7

@@ -6,8 +6,8 @@ from functools import partial
 from typing import Final, Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array
 from orthoswarm.planning.lines import planned_coverage
 from orthoswarm.planning.lines.bcd import bcd_legs
 from orthoswarm.planning.lines.detours import Router
@@ -16,7 +16,6 @@ from orthoswarm.planning.lines.sweep_lines import Field, Turned, lines_across, r
 from orthoswarm.planning.lines.tmstc import tmstc_legs
 from orthoswarm.planning.lines.visiting_order import shorten
 
-Array = NDArray[np.float64]
 Method = Literal["columns", "bcd", "tmstc"]
 
 METHODS: tuple[str, ...] = get_args(Method)

@@ -4,14 +4,13 @@ from typing import Any, Final
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array
 from orthoswarm.planning.lines.detours import Router
 from orthoswarm.planning.lines.line_spacing import Footprint
 from orthoswarm.planning.lines.sweep_lines import Field, Turned, strip_legs
 
 Geometry = Any
-Array = NDArray[np.float64]
 
 COMPLETE_SHARE: Final = 0.999  # share of an area from which on a plan covers it
 _TARGET_SHARE: Final = 0.9996  # share up to which gaps are mended: above the other for errors of the flight

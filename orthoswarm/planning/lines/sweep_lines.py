@@ -11,13 +11,12 @@ from typing import Any, Final
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.errors import InputError
 from orthoswarm.planning.lines.line_spacing import Footprint
 
 Geometry = Any
-Array = NDArray[np.float64]
 
 MOST_LINES = 20_000
 

@@ -13,16 +13,15 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel, kernel
 from orthoswarm.config.autopilot import ARDUPILOT
 from orthoswarm.config.planning import PLANNING
+from orthoswarm.model.arrays import Array, Flags, Indices
 from orthoswarm.model.plan import APART, ON_GROUND_M, PAD_DISTANCES
 from orthoswarm.planning.sorties.flight_path import Flight
 from orthoswarm.planning.sorties.flight_time import Motion, start_slack_s
 
-Array = NDArray[np.float64]
 Maker = Callable[[float, float], Flight]
 
 _STEP_S: Final = 0.5  # time step in which flights are compared (for its time)
@@ -105,8 +104,8 @@ class _Track:
     home: Array
     ground: int
     places: Array
-    pad: NDArray[np.bool_]
-    slack: NDArray[np.int64]
+    pad: Flags
+    slack: Indices
 
 
 def _sampled(flight: Flight, motion: Motion, apart: Separation) -> _Track:
@@ -169,15 +168,13 @@ class _Frozen:
 
     pad: bool
     points: Array
-    when: NDArray[np.int64]
-    slack: NDArray[np.int64]
-    bins: tuple[NDArray[np.int64], NDArray[np.int64]]
+    when: Indices
+    slack: Indices
+    bins: tuple[Indices, Indices]
     raster: Array
 
     @classmethod
-    def of(
-        cls, pad: bool, points: Array, when: NDArray[np.int64], slack: NDArray[np.int64], cell_m: float
-    ) -> "_Frozen":
+    def of(cls, pad: bool, points: Array, when: Indices, slack: Indices, cell_m: float) -> "_Frozen":
         low, high = points[:, :2].min(0), points[:, :2].max(0)
         cell = max(cell_m, float((high - low).max()) / 1000.0)
         shape = ((high - low) / cell).astype(np.int64) + 1
@@ -188,10 +185,10 @@ class _Frozen:
     def forbid(
         self,
         points: Array,
-        when: NDArray[np.int64],
-        slack: NDArray[np.int64],
+        when: Indices,
+        slack: Indices,
         apart: Array,
-        marks: NDArray[np.int64],
+        marks: Indices,
     ) -> None:
         """Mark delays at which samples of another track come near; see `_forbid`."""
         _forbid(points, when, slack, self.points, self.when, self.slack, self.bins, self.raster, apart, marks)
@@ -249,7 +246,7 @@ class _Sky:
         """How many samples a vehicle may be off schedule away from its start."""
         return int(np.ceil(self._apart.slack_s / _STEP_S))
 
-    def _launches(self, track: _Track, ready: int) -> NDArray[np.int64]:
+    def _launches(self, track: _Track, ready: int) -> Indices:
         """Delays that takeoffs from the same start forbid, as marks; room for all others."""
         apart = self._apart
         slack, gap = self._slack, int(np.ceil(apart.launch_s / _STEP_S))
@@ -264,7 +261,7 @@ class _Sky:
         """Two places of takeoff count as one start."""
         return bool(np.hypot(*(home - other)) < self._apart.pad_m)
 
-    def _meetings(self, track: _Track, ready: int, frozen: list[_Frozen], marks: NDArray[np.int64]) -> None:
+    def _meetings(self, track: _Track, ready: int, frozen: list[_Frozen], marks: Indices) -> None:
         """Mark delays that bring a track too near a placed one, or to the same start at the same time."""
         apart = self._apart
         # Layers are apart: the hair keeps neighbouring ones from clashing by rounding.
@@ -282,14 +279,14 @@ class _Sky:
                 _mark(marks, landing - ready, int(np.ceil(apart.launch_s / _STEP_S)) - 1)
 
 
-def _mark(marks: NDArray[np.int64], delay: int, slack: int) -> None:
+def _mark(marks: Indices, delay: int, slack: int) -> None:
     first, last = max(0, delay - slack), min(len(marks) - 2, delay + slack)
     if last >= first:
         marks[first] += 1
         marks[last + 1] -= 1
 
 
-def _first_zero(marks: NDArray[np.int64]) -> int:
+def _first_zero(marks: Indices) -> int:
     return int(np.argmax(np.cumsum(marks) == 0))
 
 
@@ -391,7 +388,7 @@ class _Placing:
         return sum(map(bool, self.slots)) / len(self.slots)
 
     @property
-    def _one_start(self) -> NDArray[np.bool_]:
+    def _one_start(self) -> Flags:
         """Pairs of vehicles that take off at one start, (n, n)."""
         away = np.hypot(*(self._homes[:, None] - self._homes[None]).transpose(2, 0, 1))
         return np.asarray(away < self._apart.pad_m)
