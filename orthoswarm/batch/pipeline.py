@@ -14,16 +14,11 @@ from numpy.typing import NDArray
 
 from orthoswarm.batch import map_pictures, refinement_stage, run_report
 from orthoswarm.batch.run_state import (
-    COARSE,
-    ORTHOIMAGE,
-    PRODUCTS,
     REALTIME,
-    WRITTEN,
     Load,
     MapOptions,
     RunContext,
     RunState,
-    is_written,
 )
 from orthoswarm.batch.workspace import Workspace, run_key
 from orthoswarm.compute.stage_times import Clock
@@ -54,19 +49,6 @@ from orthoswarm.refine.strategy.unpositioned_photos import place_unpositioned
 from orthoswarm.stores.addresses import address_of
 from orthoswarm.stores.listing import exists
 from orthoswarm.trajectory.legs import split_legs
-
-__all__ = [
-    "COARSE",
-    "ORTHOIMAGE",
-    "PRODUCTS",
-    "REALTIME",
-    "WRITTEN",
-    "Load",
-    "MapOptions",
-    "Progress",
-    "is_written",
-    "run",
-]
 
 
 def run(

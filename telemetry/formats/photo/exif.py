@@ -10,7 +10,7 @@ import struct
 from dataclasses import dataclass, field
 
 from telemetry.samples.sample import Sample, is_position
-from telemetry.samples.times import ZONE_UNKNOWN, parse_offset, parse_time
+from telemetry.samples.times import ZONE_UNKNOWN, epoch_of, parse_offset, parse_time
 
 Value = str | bytes | tuple[float, ...]
 Tags = dict[int, Value]
@@ -173,8 +173,8 @@ def gps_time(gps: Tags) -> float | None:
     stamp = gps.get(7)
     if not isinstance(stamp, tuple) or len(stamp) < 3 or not all(map(math.isfinite, stamp[:3])):
         return None
-    day = parse_time(text(gps.get(29))[:10] + " 00:00:00")
-    return None if day is None else day[0] + stamp[0] * 3600.0 + stamp[1] * 60.0 + stamp[2]
+    day = epoch_of(text(gps.get(29))[:10] + " 00:00:00")
+    return None if day is None else day + stamp[0] * 3600.0 + stamp[1] * 60.0 + stamp[2]
 
 
 def exposure_time(exif: Exif) -> tuple[float, str] | None:

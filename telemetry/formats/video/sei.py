@@ -39,7 +39,7 @@ from typing import Any
 from orthoswarm.model.earth import DEGREE_M
 from orthoswarm.model.errors import InputError
 from telemetry.samples.sample import Sample, checked
-from telemetry.samples.times import epoch_seconds, parse_time
+from telemetry.samples.times import epoch_of, epoch_seconds
 
 UUID = bytes.fromhex("0470547eac274f00856a5455b0eaf430")
 USER_DATA_UNREGISTERED = 5
@@ -315,9 +315,9 @@ def _decode_json(body: bytes) -> Sample | None:
 def _json_number(value: object, name: str) -> float | None:
     if isinstance(value, str):
         if name == "time_s":
-            parsed = parse_time(value)
+            parsed = epoch_of(value)
             if parsed is not None:
-                return parsed[0]
+                return parsed
         try:
             value = float(value)
         except ValueError:
