@@ -24,8 +24,7 @@ from orthoswarm.batch.workspace import Workspace, run_key
 from orthoswarm.compute.stage_times import Clock
 from orthoswarm.compute.workers import Workers, prepare_process, usage_of, workers
 from orthoswarm.control.control_observations import absent_marks, check_control
-from orthoswarm.evaluation.checkpoints import Checkpoint, read_checkpoints
-from orthoswarm.evaluation.independent_points import shared_points, shared_warning
+from orthoswarm.evaluation.checkpoints import Checkpoint, read_checkpoints, shared_points, shared_warning
 from orthoswarm.evaluation.misread_points import require_places
 from orthoswarm.export.atomic_file import disk_error
 from orthoswarm.export.catalog.tiled_raster import product_file

@@ -13,8 +13,7 @@ import numpy as np
 
 from orthoswarm.batch.run_state import COARSE, ORTHOIMAGE, PRODUCTS, REALTIME, SEAMLINES, RunContext, RunState
 from orthoswarm.config import changes
-from orthoswarm.evaluation.checkpoints import evaluate_checkpoints
-from orthoswarm.evaluation.independent_points import control_rows
+from orthoswarm.evaluation.checkpoints import control_rows, evaluate_checkpoints
 from orthoswarm.export.catalog.tiled_raster import remove_collection, remove_product, tiles_of
 from orthoswarm.export.product_files import (
     image_root,
