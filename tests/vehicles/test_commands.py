@@ -19,7 +19,7 @@ from gcs_plugin.sim.lossy_radio import Faults
 from gcs_plugin.sim.mission_flight import MissionFlight
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
 from orthoswarm.model.errors import OrthoSwarmError
-from tests.kit.memory_link import SimLink, VirtualClock
+from tests.kit.vehicles.memory_link import SimLink, VirtualClock
 from tests.vehicles.test_fleet import END, kinds, sent_by
 from tests.vehicles.test_sim import mission
 

@@ -23,7 +23,7 @@ from gcs_plugin.sim.multirotor import Airframe
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
 from orthoswarm.config import DEFAULT
 from orthoswarm.model.earth import distance_m
-from tests.kit.memory_link import VirtualClock, World
+from tests.kit.vehicles.memory_link import VirtualClock, World
 
 FLIGHTS = Path(__file__).parents[1] / "data" / "flights"
 

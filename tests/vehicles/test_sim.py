@@ -25,7 +25,7 @@ from gcs_plugin.sim.lossy_radio import Channel, Faults
 from gcs_plugin.sim.multirotor import Airframe, Chart
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
 from orthoswarm.config import DEFAULT
-from tests.kit.memory_link import World
+from tests.kit.vehicles.memory_link import World
 
 AP, PX4 = Autopilot.ARDUPILOT, Autopilot.PX4
 BOTH = pytest.mark.parametrize("autopilot", [AP, PX4])

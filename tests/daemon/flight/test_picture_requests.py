@@ -11,7 +11,7 @@ from gcs_plugin.sim.file_server import FileServer
 from gcs_plugin.sim.lossy_radio import NO_FAULTS, Faults
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
 from orthoswarm.model.errors import DiskFullError, InputError, OrthoSwarmError
-from tests.kit.memory_link import World
+from tests.kit.vehicles.memory_link import World
 
 START_S = 1_780_000_000.0
 

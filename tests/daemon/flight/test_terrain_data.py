@@ -13,7 +13,7 @@ from gcs_plugin.links.mavlink import Autopilot, Message, dialect
 from gcs_plugin.mission.exchange import Address
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
 from orthoswarm.model.geo import LocalGrid
-from tests.kit.memory_link import World
+from tests.kit.vehicles.memory_link import World
 
 EPSG = 32632
 TILES: set[int] = set()

@@ -19,7 +19,7 @@ from gcs_plugin.sim.lossy_radio import Faults
 from gcs_plugin.sim.multirotor import Chart
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
 from orthoswarm.model.errors import OrthoSwarmError
-from tests.kit.memory_link import World
+from tests.kit.vehicles.memory_link import World
 
 AP, PX4 = Autopilot.ARDUPILOT, Autopilot.PX4
 OTHER = Address(254, 190)
