@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from orthoswarm.model.lazy_names import on_first_use
 
 if TYPE_CHECKING:
-    from orthoswarm.batch.make_map import make_map
+    from orthoswarm.batch.pipeline import make_map
     from orthoswarm.batch.run_state import MapOptions
     from orthoswarm.evaluation.checkpoints import evaluate_checkpoints
     from orthoswarm.evaluation.orthoimage import evaluate_ortho
@@ -37,7 +37,7 @@ __all__ = [
 __getattr__ = on_first_use(
     __name__,
     {
-        "batch.make_map": ("make_map",),
+        "batch.pipeline": ("make_map",),
         "batch.run_state": ("MapOptions",),
         "evaluation.checkpoints": ("evaluate_checkpoints",),
         "evaluation.orthoimage": ("evaluate_ortho",),

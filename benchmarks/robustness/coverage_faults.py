@@ -20,11 +20,10 @@ import shapely
 from numpy.typing import NDArray
 
 from gcs_plugin.plans.plan_request import gap_area, read_gaps
-from orthoswarm.coverage.camera_events import CameraEvent, missing_by_events
 from orthoswarm.coverage.coverage_files import write_gaps
 from orthoswarm.coverage.coverage_grid import Cells, CellState, CoverageGrid
 from orthoswarm.coverage.gaps import PlannedFlight, find_gaps
-from orthoswarm.coverage.missing_pictures import Cause
+from orthoswarm.coverage.missing_pictures import CameraEvent, Cause, missing_by_events
 from orthoswarm.coverage.planning_lens import planning_fovs_deg
 from orthoswarm.coverage.view import NO_FLAW, Flaw, View
 from orthoswarm.model.camera import Camera, Lens, focal_px, rotation_from_angles

@@ -31,7 +31,7 @@ def _seeds() -> dict[str, tuple[list[bytes], Reader]]:
     """What each reader is fed: a valid input, and how it reads one."""
     from telemetry.formats.log.flight_logs import read_log
     from telemetry.formats.photo import exif, xmp
-    from telemetry.formats.photo.makernotes import parse_dji
+    from telemetry.formats.photo.exif import parse_dji
     from telemetry.formats.table.geo_txt import read_geo_txt
     from telemetry.formats.table.pose_csv import read_pose_csv
     from telemetry.formats.video import bitstream, djmd, gpmf, klv, sei, srt

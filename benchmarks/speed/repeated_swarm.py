@@ -17,7 +17,8 @@ import rasterio
 from rasterio.windows import Window
 
 import telemetry
-from orthoswarm.batch.pipeline import MapOptions, run
+from orthoswarm.batch.pipeline import run
+from orthoswarm.batch.run_state import MapOptions
 from orthoswarm.compute.workers import prepare_process, workers
 from orthoswarm.config import config_of
 from orthoswarm.model.frame import Frame, Ingest

@@ -24,12 +24,11 @@ from gcs_plugin.fleet.message_rates import Streams
 from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.mavlink import AUTOPILOT_COMPONENT, Autopilot, Message, is_vehicle
 from gcs_plugin.links.transports import parse_address
-from gcs_plugin.mission.comparison import difference
 from gcs_plugin.mission.completion import CompletionDetector, Phase
 from gcs_plugin.mission.exchange import Address, Exchange, Outcome, Verdict
 from gcs_plugin.mission.flight_modes import modes_of, why_no_missions
 from gcs_plugin.mission.geofence import FenceZone, zones_of
-from gcs_plugin.mission.items import Mission, MissionItem
+from gcs_plugin.mission.items import Mission, MissionItem, difference
 from gcs_plugin.mission.start_dialogue import Expected, start_mission
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 

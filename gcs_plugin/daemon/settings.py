@@ -8,7 +8,7 @@ from typing import Any, Final
 from gcs_plugin.daemon.intake.can_reader import check_bus
 from gcs_plugin.daemon.vehicle_names import VehicleNames, system_in_name
 from orthoswarm.config import DEFAULT, Config
-from orthoswarm.export.tactical.tak_sender import TakAddress
+from orthoswarm.export.tactical.cursor_on_target import TakAddress
 from orthoswarm.model.errors import InputError
 
 FILE: Final = "orthoswarm.toml"

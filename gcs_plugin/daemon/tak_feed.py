@@ -7,9 +7,8 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 from gcs_plugin.daemon.stoppable_thread import StoppableThread
-from orthoswarm.export.tactical.cursor_on_target import event
+from orthoswarm.export.tactical.cursor_on_target import TakAddress, TakSender, event
 from orthoswarm.export.tactical.places import Place
-from orthoswarm.export.tactical.tak_sender import TakAddress, TakSender
 from orthoswarm.model.errors import OrthoSwarmError
 
 _EVERY_S: Final = 2.0

@@ -17,9 +17,8 @@ from gcs_plugin.fleet.separation.separation_check import SeparationFindings, fli
 from gcs_plugin.fleet.separation.separation_watch import number_name
 from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.mavlink import Autopilot
-from gcs_plugin.mission.comparison import difference
 from gcs_plugin.mission.geofence import FenceZone, breach
-from gcs_plugin.mission.items import FRAME_GLOBAL, GIMBAL_PITCH, MOUNT_CONTROL, TRIGGER_DISTANCE, Mission
+from gcs_plugin.mission.items import FRAME_GLOBAL, GIMBAL_PITCH, MOUNT_CONTROL, TRIGGER_DISTANCE, Mission, difference
 from gcs_plugin.mission.mission_builder import unflyable
 from gcs_plugin.mission.plan_folder import NO_NEEDS, PlanNeeds
 from gcs_plugin.mission.track import fastest_m_s, flight_seconds, highest_m, takeoff_place

@@ -14,11 +14,10 @@ from typing import Final
 from gcs_plugin.config import COMMAND
 from gcs_plugin.links.mavlink import Autopilot, Message, dialect, has_place, is_autopilot
 from gcs_plugin.mission.command_dialogues import Command, InOrder, Pilot, Several
-from gcs_plugin.mission.comparison import difference
 from gcs_plugin.mission.download import AT_ONCE, MissionDownload
 from gcs_plugin.mission.exchange import Address, Exchange, Outcome, Verdict, command_long
 from gcs_plugin.mission.flight_modes import Modes, mode_params
-from gcs_plugin.mission.items import Mission
+from gcs_plugin.mission.items import Mission, difference
 from gcs_plugin.mission.mission_builder import unflyable
 from orthoswarm.model.earth import distance_m
 

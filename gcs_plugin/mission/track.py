@@ -14,7 +14,6 @@ from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gcs_plugin.config import LIMITS
 from gcs_plugin.mission.items import (
@@ -34,11 +33,11 @@ from gcs_plugin.mission.plan_folder import NO_NEEDS, PlanNeeds
 from orthoswarm.config import DEFAULT, Config
 from orthoswarm.config.autopilot import ARDUPILOT, AutopilotTimes
 from orthoswarm.config.planning import PLANNING
+from orthoswarm.model.arrays import Array, Flags, Indices
 from orthoswarm.model.earth import DEGREE_M
 from orthoswarm.model.plan import APART, ON_GROUND_M, PAD_DISTANCES
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
+Ints = Indices
 STEP_S: Final = 0.5
 """Time between the samples of a track, seconds."""
 _SPEED_M_S: Final = 5.0
@@ -88,7 +87,7 @@ class Track:
             return 0.0
         return STEP_S * float(np.argmin(np.linalg.norm(self.places - np.array(place), axis=1)))
 
-    def pad(self, radius_m: float) -> NDArray[np.bool_]:
+    def pad(self, radius_m: float) -> Flags:
         """Samples near its start."""
         return np.asarray(np.hypot(*(self.places[:, :2] - self.places[0, :2]).T) < radius_m)
 
@@ -201,7 +200,7 @@ class _Approaches:
     delay: Ints
     at: Ints
     distance_m: Array
-    at_start: NDArray[np.bool_]
+    at_start: Flags
     start_slack_s: Array
 
 

@@ -17,7 +17,6 @@ from dataclasses import dataclass, field, replace
 from typing import Final
 
 from gcs_plugin.links.mavlink import Autopilot, Message, dialect
-from gcs_plugin.mission.comparison import difference
 from gcs_plugin.mission.download import MissionDownload
 from gcs_plugin.mission.exchange import (
     ACCEPTED,
@@ -34,7 +33,7 @@ from gcs_plugin.mission.exchange import (
     RoundTrip,
     Verdict,
 )
-from gcs_plugin.mission.items import Mission
+from gcs_plugin.mission.items import Mission, difference
 
 _PARAMETER = {6: "param1", 7: "param2", 8: "param3", 9: "param4", 10: "latitude", 11: "longitude", 12: "altitude"}
 # Vehicles repeat a request every 0.25 s (PX4) or 1 s (ArduPilot): a silence of several intervals is more than packet

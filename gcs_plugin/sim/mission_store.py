@@ -193,7 +193,7 @@ class MissionStore:
         self.items[seq : seq + 1] = [item]
 
     def _as_stored(self, item: MissionItem, seq: int) -> MissionItem:
-        """An item as ArduPilot returns it: see `mission.comparison`."""
+        """An item as ArduPilot returns it: see `mission.items.difference`."""
         if seq == 0:
             return self.home
         p1, p2, p3, p4 = (0.0 if math.isnan(value) else float(value) for value in item.params)

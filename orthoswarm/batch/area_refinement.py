@@ -9,22 +9,33 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.batch.merged_ground import merged_ground
 from orthoswarm.batch.run_state import RunContext
-from orthoswarm.batch.swarm_areas import SolvedArea
 from orthoswarm.compute.workers import trim_memory
 from orthoswarm.control.area_adjustment import AreaMove, AreaTie, adjust_areas
 from orthoswarm.control.moved_block import moved_camera, moved_terrain
+from orthoswarm.model.arrays import Array, Floats
 from orthoswarm.model.errors import AdjustmentError
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import MapWindow, PlacedFrame, Refinement, Refiner, Solution, Terrain
 from orthoswarm.mosaic.extent import solved_level
 from orthoswarm.refine.flight.vehicle_refinement import unrefined
+from orthoswarm.trajectory.near_paths import NearPaths
 
-Array = NDArray[np.float64]
 _TIE_PLACES = 8
 """Camera positions of a vehicle that tie two areas: they move as one, a few tell shift, turn and scale."""
+
+
+@dataclass(frozen=True, slots=True)
+class SolvedArea:
+    """Vehicles that are solved together.
+
+    Attributes:
+        own: those whose solutions count. halo: neighbours of these that belong to other areas.
+    """
+
+    own: tuple[str, ...]
+    halo: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,3 +212,98 @@ def _moved_ground(terrain: Terrain | None, move: AreaMove, level_m: float) -> Te
     moved = terrain if np.abs(move.plane.values).max() < 1e-5 else moved_terrain(terrain, move.plane, level_m)
     up = np.float32(move.up_m)
     return replace(moved, z=moved.z + up, bare=None if moved.bare is None else moved.bare + up)
+
+
+_BLOCK = 32
+"""Nodes along each side that are taken from one area."""
+
+
+def merged_ground(grounds: Sequence[Terrain | None], nadirs: Sequence[Array]) -> Terrain | None:
+    """Join the grounds of areas, on nodes as near to each other as those of the finest.
+
+    Args:
+        grounds: of the areas, each some way beyond its own cameras; None for flat at zero.
+        nadirs: of their own cameras, float64 (N, 2) each.
+
+    Returns:
+        None where all are None.
+    """
+    found = [ground for ground in grounds if ground is not None]
+    if not found:
+        return None
+    step = min(ground.step_m for ground in found)
+    low = np.min([(g.west, g.south) for g in found], axis=0)
+    high = np.max([(g.west + g.step_m * (g.z.shape[1] - 1), g.south + g.step_m * (g.z.shape[0] - 1)) for g in found], 0)
+    columns, rows = (np.ceil((high - low) / step - 1e-6).astype(int) + 1).tolist()
+    area = _nearest_areas(low, step, (rows, columns), nadirs)
+
+    def joined(height: Callable[[Terrain], Floats]) -> Floats:
+        z = np.zeros((rows, columns), np.float32)
+        for i, j in np.ndindex(area.shape):
+            ground = grounds[int(area[i, j])]
+            if ground is not None:
+                part = z[i * _BLOCK : (i + 1) * _BLOCK, j * _BLOCK : (j + 1) * _BLOCK]
+                east = low[0] + step * (j * _BLOCK + np.arange(part.shape[1]))
+                north = low[1] + step * (i * _BLOCK + np.arange(part.shape[0]))
+                at = Terrain(ground.west, ground.south, ground.step_m, height(ground))
+                part[:] = at.height(np.stack(np.meshgrid(east, north), -1))
+        return z
+
+    tall = any(ground.bare is not None for ground in found)
+    return Terrain(
+        float(low[0]), float(low[1]), step, joined(lambda g: g.z),
+        joined(lambda g: g.z if g.bare is None else g.bare) if tall else None,
+    )  # fmt: skip
+
+
+def _nearest_areas(low: Array, step: float, shape: tuple[int, int], nadirs: Sequence[Array]) -> NDArray[np.intp]:
+    """For each block of nodes the area with the nearest camera."""
+    from scipy.spatial import cKDTree  # a tenth of a second that runs of one area do without here
+
+    rows, columns = (-(-n // _BLOCK) for n in shape)
+    side = _BLOCK * step
+    middle = np.stack(
+        np.meshgrid(low[0] + side * (np.arange(columns) + 0.5), low[1] + side * (np.arange(rows) + 0.5)), -1
+    )
+    area = np.repeat(np.arange(len(nadirs)), [len(own) for own in nadirs])
+    return np.asarray(area[cKDTree(np.concatenate(nadirs)).query(middle)[1]])
+
+
+def divide(paths: Mapping[str, Array], most: int) -> list[SolvedArea]:
+    """Divide vehicles into areas of about the same number of pictures, each with a halo of neighbours around it.
+
+    A vehicle is never divided: its flight is what is adjusted at once.
+
+    Args:
+        paths: vehicle -> float64 (N, 3), its pictures' recorded positions above the takeoff level.
+        most: so many pictures an area may have, or one vehicle.
+
+    Returns:
+        The areas, each with its halo; one without a halo where all pictures are few enough.
+    """
+    names = list(paths)
+    middle = np.array([path[:, :2].mean(0) for path in paths.values()])
+    count = np.array([len(path) for path in paths.values()])
+    parts = _halves(np.arange(len(names)), middle, count, most)
+    if len(parts) == 1:
+        return [SolvedArea(tuple(names), ())]
+    neighbours = NearPaths(list(paths.values()))
+    areas = []
+    for part in parts:
+        own = set(part.tolist())
+        near = {other for k in part.tolist() for other in neighbours.of(k)}
+        areas.append(SolvedArea(tuple(names[k] for k in sorted(own)), tuple(names[k] for k in sorted(near - own))))
+    return areas
+
+
+def _halves(members: NDArray[np.intp], middle: Array, count: NDArray[np.intp], most: int) -> Sequence[NDArray[np.intp]]:
+    """Members divided across the longer side of where they are, again and again, into parts of equal size."""
+    parts = -(-int(count[members].sum()) // most)
+    if parts <= 1 or len(members) == 1:
+        return [members]
+    place = middle[members]
+    order = members[np.argsort(place[:, int(np.argmax(np.ptp(place, axis=0)))], kind="stable")]
+    until = np.cumsum(count[order])
+    cut = int(np.argmin(np.abs(until - until[-1] * (parts // 2) / parts))) + 1
+    cut = min(cut, len(order) - 1)
+    return [*_halves(order[:cut], middle, count, most), *_halves(order[cut:], middle, count, most)]

@@ -3,38 +3,33 @@
 load -> real time (paper III.B) -> coarse and fine refinement, vehicle by vehicle (III.C, III.D) -> final pictures.
 """
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from orthoswarm.batch import map_pictures, refinement_stage, run_report
 from orthoswarm.batch.run_state import (
-    COARSE,
-    ORTHOIMAGE,
-    PRODUCTS,
     REALTIME,
-    WRITTEN,
     Load,
     MapOptions,
     RunContext,
     RunState,
-    is_written,
 )
-from orthoswarm.batch.split_legs import legs_as_vehicles
-from orthoswarm.batch.unpositioned import with_found_positions
 from orthoswarm.batch.workspace import Workspace, run_key
 from orthoswarm.compute.stage_times import Clock
-from orthoswarm.compute.workers import Workers, usage_of
+from orthoswarm.compute.workers import Workers, prepare_process, usage_of, workers
 from orthoswarm.control.control_observations import absent_marks, check_control
-from orthoswarm.evaluation.checkpoints import Checkpoint, read_checkpoints
-from orthoswarm.evaluation.independent_points import shared_points, shared_warning
+from orthoswarm.evaluation.checkpoints import Checkpoint, read_checkpoints, shared_points, shared_warning
+from orthoswarm.evaluation.misread_points import require_places
 from orthoswarm.export.atomic_file import disk_error
 from orthoswarm.export.catalog.tiled_raster import product_file
 from orthoswarm.model.errors import InputError, OrthoSwarmError
-from orthoswarm.model.frame import Ingest
+from orthoswarm.model.frame import Frame, Ingest
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import PlacedFrame, Terrain
 from orthoswarm.model.task_runner import Progress
@@ -44,24 +39,15 @@ from orthoswarm.mosaic.oblique import stray_warning, strays
 from orthoswarm.mosaic.recorded_pose import Recorded, area_grid, in_one_area, nothing_to_map, recorded_cameras
 from orthoswarm.mosaic.seams.previews import PreviewFile
 from orthoswarm.raster.basemap import Basemap
-from orthoswarm.raster.grey_pictures import GreyPictures
+from orthoswarm.raster.grey_pictures import WORK_WIDTH_PX, GreyPictures
 from orthoswarm.raster.height_model import HeightModel, check_dem
+from orthoswarm.raster.picture_file import read_gray, reduction
 from orthoswarm.raster.picture_parts import PictureParts
+from orthoswarm.refine.flight.record_findings import NAMED_MOST
+from orthoswarm.refine.strategy.unpositioned_photos import place_unpositioned
 from orthoswarm.stores.addresses import address_of
 from orthoswarm.stores.listing import exists
-
-__all__ = [
-    "COARSE",
-    "ORTHOIMAGE",
-    "PRODUCTS",
-    "REALTIME",
-    "WRITTEN",
-    "Load",
-    "MapOptions",
-    "Progress",
-    "is_written",
-    "run",
-]
+from orthoswarm.trajectory.legs import split_legs
 
 
 def run(
@@ -239,3 +225,130 @@ def _realtime(run: RunContext, state: RunState) -> list[PlacedFrame]:
         state.leave_out(state.undrawn, state.recorded.placed)
         state.warnings += stray_warning(aside)
     return [p for p in placed if p.frame.image not in stats.rejected]
+
+
+def make_map(
+    frames: Ingest | Sequence[Frame],
+    out: Path,
+    options: MapOptions | None = None,
+    *,
+    processes: int | None = 1,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Make orthoimage, refined poses and report of pictures, as `orthoswarm mosaic` does.
+
+    Args:
+        frames: the pictures with their recorded poses; what `telemetry.load` gives, or frames of your own.
+        out: output folder; a run that was interrupted there goes on.
+        options: basemap, ground pixel and so on, see MapOptions.
+        processes: how many compute at once, None for one a core. With more than one the calling script needs the guard
+            `if __name__ == "__main__":`, as always with processes. The products do not depend on it.
+        progress: called during the work with what is done, how many, and of how many.
+
+    Returns:
+        The content of report.json.
+
+    Raises:
+        InputError: no picture has a position, or a file of the options cannot be used.
+        OrthoSwarmError: nothing could be made of them.
+    """
+    prepare_process()
+    ingest = frames if isinstance(frames, Ingest) else Ingest(list(frames), [], [])
+    options = options or MapOptions()
+    pool = workers(processes)
+    try:
+        return run(lambda _: ingest, out, options, pool, progress or (lambda *_: None))
+    finally:
+        pool.close()
+
+
+def legs_as_vehicles(frames: Sequence[Frame], grid: LocalGrid) -> list[Frame]:
+    """Frames with each straight leg renamed to a separate vehicle (`id/leg1`); turns belong to the leg before."""
+    members: dict[str, list[Frame]] = {}
+    for frame in frames:
+        members.setdefault(frame.vehicle, []).append(frame)
+    out: list[Frame] = []
+    for vehicle, own in members.items():
+        ground = grid.to_grid([f.fix.lat_deg for f in own], [f.fix.lon_deg for f in own])
+        leg = split_legs(ground)
+        last = 0
+        for frame, number in zip(own, leg.tolist(), strict=True):
+            last = number if number >= 0 else last
+            out.append(replace(frame, vehicle=f"{vehicle}/leg{last + 1}"))
+    return out
+
+
+_BESIDE_PHOTOS: Final = 15
+"""Photos with a position before and after, of the same flight, that may show the ground of one without (its cost)."""
+
+
+def with_found_positions(run: RunContext, ingest: Ingest) -> Ingest:
+    """Inputs with the photos without a position that the points of --control, or photos beside them, place.
+
+    Raises:
+        InputError: the points cannot be read, or a mark lies outside its photo.
+    """
+    options = run.options
+    photos, positioned, points = ingest.unpositioned, ingest.frames, list[Checkpoint]()
+    if options.control is not None:
+        points = read_checkpoints(options.control, options.pixel_scale)
+        require_places((point.name, point.surveyed) for point in points)
+    else:
+        photos, positioned = _beside(ingest)
+    tasks = run.workers.map
+    placed, left = place_unpositioned(photos, positioned, points, read_gray=_reduced, run=tasks, progress=run.progress)
+    names = {frame.image for frame in placed}
+    by = "control points" if points else "the photos beside them"
+    said = [f"{len(placed)} photos without a position were placed by {by}"] if placed else []
+    said += _left_out(len(photos) - len(placed), left) if points else []
+    return replace(
+        ingest,
+        frames=_in_order([*ingest.frames, *placed], ingest),
+        rejected=[r for r in ingest.rejected if r.image not in names],
+        warnings=[*ingest.warnings, *said],
+        unpositioned=[f for f in ingest.unpositioned if f.image not in names],
+    )
+
+
+def _left_out(count: int, blocks: list[list[str]]) -> list[str]:
+    """What is said about photos that control points could not place."""
+    said = [
+        f"{len(block)} photos without a position ({_first_of(block)}) show ground in common, but nothing tells where "
+        "it is: two control points, some way apart, must be seen in them; they are left out"
+        for block in blocks
+    ]
+    alone = count - sum(map(len, blocks))
+    if alone:
+        said.append(f"{alone} photos without a position show nothing that other photos show, and are left out")
+    return said
+
+
+def _beside(ingest: Ingest) -> tuple[list[Frame], list[Frame]]:
+    """Photos without a position, of a size that their flight's others have, and those with one next to them in time."""
+    flights = {(frame.vehicle, frame.width, frame.height) for frame in ingest.frames}
+    photos = [f for f in ingest.unpositioned if (f.vehicle, f.width, f.height) in flights]
+    lost = {frame.image for frame in photos}
+    near: dict[str, Frame] = {}
+    for vehicle in {frame.vehicle for frame in photos}:
+        order = [f for f in _in_order([*ingest.frames, *photos], ingest) if f.vehicle == vehicle]
+        known = np.flatnonzero([f.image not in lost for f in order])
+        for k in np.flatnonzero([f.image in lost for f in order]):
+            at = int(np.searchsorted(known, k))
+            for n in known[max(at - _BESIDE_PHOTOS, 0) : at + _BESIDE_PHOTOS]:
+                near[order[n].image] = order[n]
+    return photos, list(near.values())
+
+
+def _first_of(images: list[str]) -> str:
+    more = f" and {len(images) - NAMED_MOST} more" if len(images) > NAMED_MOST else ""
+    return ", ".join(images[:NAMED_MOST]) + more
+
+
+def _reduced(frame: Frame) -> NDArray[np.uint8]:
+    return read_gray(frame.path, reduction(frame.width, frame.height, WORK_WIDTH_PX))
+
+
+def _in_order(frames: list[Frame], ingest: Ingest) -> list[Frame]:
+    """By vehicle and time; where times are unknown, photos keep the order of their names."""
+    vehicles = {f.vehicle: k for k, f in reversed(list(enumerate([*ingest.frames, *ingest.unpositioned])))}
+    return sorted(frames, key=lambda f: (vehicles[f.vehicle], math.inf if f.time_s is None else f.time_s, f.image))

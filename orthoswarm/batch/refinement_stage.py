@@ -7,10 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from orthoswarm.batch.area_refinement import refine_by_area, with_frames
+from orthoswarm.batch.area_refinement import SolvedArea, divide, refine_by_area, with_frames
 from orthoswarm.batch.refiners import make_refiner
 from orthoswarm.batch.run_state import RunContext, RunState
-from orthoswarm.batch.swarm_areas import SolvedArea, divide
 from orthoswarm.compute.stage_times import Clock, Stage
 from orthoswarm.compute.workers import trim_memory
 from orthoswarm.control.ground_control import place_on_control

@@ -4,14 +4,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.placement import Refiner
 from orthoswarm.raster.grey_pictures import GreyPictures
 from orthoswarm.raster.height_model import HeightModel
 
-Array = NDArray[np.float64]
 RefinerName = Literal["swarm", "paper"]
 Factory = Callable[[int, Array, HeightModel | None, GreyPictures | None, str], Refiner]
 """Makes a refiner of the area's grid (EPSG code), the origin (2,) of its local frame, a height model or None, the

@@ -5,9 +5,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
 from orthoswarm.batch.refiners import RefinerName
 from orthoswarm.batch.workspace import Workspace
 from orthoswarm.compute.stage_times import Clock
@@ -16,6 +13,7 @@ from orthoswarm.config import DEFAULT, Config
 from orthoswarm.control.ground_control import GroundControl
 from orthoswarm.evaluation.checkpoints import Checkpoint
 from orthoswarm.export.catalog.tiled_raster import FOLDER, Tiles, is_tile_or_collection
+from orthoswarm.model.arrays import Bytes, Floats
 from orthoswarm.model.frame import Ingest, Rejection
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import PlacedFrame, Terrain
@@ -31,7 +29,6 @@ from orthoswarm.raster.picture_file import read_rgb
 from orthoswarm.raster.picture_parts import PictureParts
 from orthoswarm.refine.registration.map_offset import MapOffset
 
-Bytes = NDArray[np.uint8]
 Load = Callable[[Progress], Ingest]
 
 REALTIME, COARSE, ORTHOIMAGE = "realtime.tif", "coarse.tif", "orthoimage.tif"
@@ -145,7 +142,7 @@ class RunState:
     warnings: list[str] = field(default_factory=list)
     rejected: dict[str, Rejection] = field(default_factory=dict)
     thumbnails: dict[str, Bytes] = field(default_factory=dict)
-    gains: dict[str, NDArray[np.float32]] = field(default_factory=dict)
+    gains: dict[str, Floats] = field(default_factory=dict)
     still: list[PlacedFrame] = field(default_factory=list)
     odd: list[PlacedFrame] = field(default_factory=list)
     terrain: Terrain | None = None

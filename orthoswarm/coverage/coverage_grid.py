@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from orthoswarm.coverage.painting import UNSEEN, paint
 from orthoswarm.coverage.view import Flaw, View
+from orthoswarm.model.arrays import Array, Bytes, Flags, Floats
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import Lens
 from orthoswarm.model.errors import InputError
@@ -27,10 +28,9 @@ from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import Terrain
 from orthoswarm.mosaic.footprint import least_descent, tan_limit
 
-Array = NDArray[np.float64]
 Box = tuple[int, int, int, int]
 Geometry = Any
-Due = bool | NDArray[np.bool_]
+Due = bool | Flags
 
 _ROWS_AT_ONCE = 64
 
@@ -72,8 +72,8 @@ class Cells:
     """
 
     grid: GroundGrid
-    wanted: NDArray[np.bool_]
-    excluded: NDArray[np.bool_]
+    wanted: Flags
+    excluded: Flags
 
     @classmethod
     def of_area(cls, epsg: int, ground: Geometry, no_fly: Geometry = None, cell_m: float = _CELL_M) -> "Cells":
@@ -92,7 +92,7 @@ class Cells:
             raise InputError(f"the area has too many cells of {cell_m:g} m; use --cell {side:g} or a smaller area")
         grid = GroundGrid.around(epsg, bounds, cell_m)
 
-        def burn(shape: Geometry) -> NDArray[np.bool_]:
+        def burn(shape: Geometry) -> Flags:
             size = (grid.height, grid.width)
             if shape is None or shape.is_empty:
                 return np.zeros(size, bool)
@@ -133,7 +133,7 @@ class CoverageGrid:
 
     def __post_init__(self) -> None:
         grid = self.cells.grid
-        self.best: NDArray[np.uint8] = np.full((grid.height, grid.width), UNSEEN, np.uint8)
+        self.best: Bytes = np.full((grid.height, grid.width), UNSEEN, np.uint8)
         self.good: NDArray[np.uint16] = np.zeros((grid.height, grid.width), np.uint16)
         self._views: dict[tuple[str, str], View] = {}
         self._boxes: dict[tuple[str, str], Box] = {}
@@ -173,7 +173,7 @@ class CoverageGrid:
         changed = [b for b in (*replaced, *(self._boxes[key] for key, _ in fresh)) if b[0] < b[1] and b[2] < b[3]]
         return _union(changed) if changed else None
 
-    def states(self, due: Due = True) -> NDArray[np.uint8]:
+    def states(self, due: Due = True) -> Bytes:
         """State of each cell, uint8 (rows, columns).
 
         Args:
@@ -251,7 +251,7 @@ def _common(a: Box, b: Box) -> Box:
     return max(a[0], b[0]), min(a[1], b[1]), max(a[2], b[2]), min(a[3], b[3])
 
 
-def _heights(terrain: Terrain, grid: GroundGrid, box: Box) -> NDArray[np.float32]:
+def _heights(terrain: Terrain, grid: GroundGrid, box: Box) -> Floats:
     """Ground at the centres of a box of cells; (1, 1) where it is level."""
     if float(np.ptp(terrain.z)) == 0.0:
         return np.array([[terrain.z[0, 0]]], np.float32)

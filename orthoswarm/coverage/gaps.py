@@ -12,9 +12,9 @@ from orthoswarm.coverage.coverage_grid import Cells, CellState, CoverageGrid, Du
 from orthoswarm.coverage.missing_pictures import Cause, MissingPicture
 from orthoswarm.coverage.painting import UNSEEN
 from orthoswarm.coverage.view import FLAW_NAMES, Flaw
+from orthoswarm.model.arrays import Array, Bytes, Flags, Floats
 
 Geometry = Any
-Array = NDArray[np.float64]
 _CAUSES = tuple(Cause)
 _NONE = 255
 _SMALLEST_GAP_M2: Final = 4.0  # smaller gaps are only counted
@@ -72,11 +72,11 @@ class Gaps:
 class _Explained:
     """Per cell: cause (index of Cause, 255 none), confidence, index of the vehicle (-1 unknown)."""
 
-    cause: NDArray[np.uint8]
-    confidence: NDArray[np.float32]
+    cause: Bytes
+    confidence: Floats
     vehicle: NDArray[np.int16]
 
-    def enter(self, where: NDArray[np.bool_], cause: Cause, confidence: float, vehicle: int = -1) -> None:
+    def enter(self, where: Flags, cause: Cause, confidence: float, vehicle: int = -1) -> None:
         cells = where & (self.cause == _NONE)
         self.cause[cells], self.confidence[cells], self.vehicle[cells] = _CAUSES.index(cause), confidence, vehicle
 
@@ -132,13 +132,13 @@ def _is_narrow(fov_rad: float, focal_sigma: float, planned_rad: float) -> bool:
     return own < planned * (1.0 - max(0.005, 2.0 * focal_sigma))
 
 
-def _would_see(cover: CoverageGrid, views: Sequence[Any]) -> NDArray[np.bool_]:
+def _would_see(cover: CoverageGrid, views: Sequence[Any]) -> Flags:
     other = CoverageGrid(cover.cells, cover.terrain)
     other.put(views)
     return np.asarray(other.best != UNSEEN)
 
 
-def below_legs(cells: Cells, plan: PlannedFlight, legs: Array) -> NDArray[np.bool_]:
+def below_legs(cells: Cells, plan: PlannedFlight, legs: Array) -> Flags:
     """Cells that a plan's pictures of some of its legs would show, bool (rows, columns).
 
     Args:
@@ -197,7 +197,7 @@ def _polygons(cover: CoverageGrid, explained: _Explained, vehicles: Sequence[str
     return Gaps(gaps, small, small_m2)
 
 
-def _worst_flaw(best: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def _worst_flaw(best: Bytes) -> Bytes:
     """The flaw of each cell that is reported: of several, one that affects the complete picture comes first."""
     worst = np.zeros(best.shape, np.uint8)
     for flaw in _BY_IMPORTANCE:

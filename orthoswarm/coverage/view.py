@@ -7,14 +7,12 @@ from enum import IntFlag
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.camera import Camera, Lens, focal_px
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import PlacedFrame, Terrain
-
-Array = NDArray[np.float64]
 
 
 class Flaw(IntFlag):

@@ -12,11 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array, Flags, Floats, Indices
 from orthoswarm.raster.subpixel_peak import vertex
 
-Floats = NDArray[np.float32]
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+Mask = Flags
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -137,7 +136,7 @@ def _peak(score: Array, s: FieldSettings) -> tuple[float, float, float] | None:
     return float(r) + dr, float(c) + dc, top
 
 
-def block_centers(shape: tuple[int, int], s: FieldSettings) -> NDArray[np.int64]:
+def block_centers(shape: tuple[int, int], s: FieldSettings) -> Indices:
     """Rows and columns (N, 2) of the blocks' upper left corners on a grid of `shape` pixels."""
     side, step = round(s.block_m / s.gsd_m), max(1, round(s.step_m / s.gsd_m))
     rows = np.arange(0, shape[0] - side + 1, step)

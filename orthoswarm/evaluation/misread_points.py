@@ -5,15 +5,13 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.model.angles import wrap_deg
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.coordinate_system import to_degrees
 from orthoswarm.model.earth import distance_m
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import utm_epsg
-
-Array = NDArray[np.float64]
 
 FARTHEST_M: Final = 1000.0  # a point farther from where it is seen belongs elsewhere; neither map nor receiver errs so
 _FAR_OFF_M: Final = 20.0  # more than receivers and maps err; datums of a country differ by 50 to 500 m

@@ -20,12 +20,12 @@ from orthoswarm.evaluation.displacement import (
     Accuracy,
     Displacements,
     FieldSettings,
-    Floats,
     Mask,
     accuracy,
     completeness,
     displacement_field,
 )
+from orthoswarm.model.arrays import Floats
 from orthoswarm.model.camera import Camera
 from orthoswarm.model.errors import InputError
 

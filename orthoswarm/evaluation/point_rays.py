@@ -5,9 +5,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from orthoswarm.model.arrays import Array
 
 MISTAKE_PROBABILITY: Final = 1e-3
 """A control point is left out if the others put it so far off with this probability only."""

@@ -2,6 +2,8 @@
 
 import csv
 import json
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +12,9 @@ import rasterio
 from PIL import Image
 
 from orthoswarm.evaluation.photo_names import photos_named
-from orthoswarm.evaluation.pose_errors import Placement, PoseErrors, pose_errors
-from orthoswarm.model.camera import Camera, Lens, focal_px, rotation_from_angles
+from orthoswarm.model.angles import wrap_deg
+from orthoswarm.model.arrays import Array
+from orthoswarm.model.camera import Camera, Lens, angles_from_rotation, focal_px, rotation_from_angles
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid
 
@@ -50,6 +53,56 @@ def _size(row: dict[str, str], truth: Path) -> tuple[int, int]:
         with Image.open(picture) as image:
             return image.width, image.height
     return 640, 480
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PoseErrors:
+    """Errors of placed frames, arrays over the compared frames (NaN where not stated).
+
+    Attributes:
+        image: names. vehicle: ids.
+        position_m: float64 (N, 3), camera's east, north, up minus truth.
+        angle_deg: float64 (N, 3), grid yaw, pitch, roll minus truth.
+        fov_deg: float64 (N,), minus truth.
+        center_m: float64 (N, 2), ground point of the picture's centre minus truth, on the mean ground level.
+        nadir_m: float64 (N, 2), the same at the pixel that truly looks straight down (no height plays a part).
+        sigma_m: float64 (N,), stated.
+    """
+
+    image: list[str]
+    vehicle: list[str]
+    position_m: Array
+    angle_deg: Array
+    fov_deg: Array
+    center_m: Array
+    nadir_m: Array
+    sigma_m: Array
+
+    def figures(self) -> dict[str, Any]:
+        """Numbers for a report: medians, 95 % values, FoV per vehicle, honesty of the stated sigma.
+
+        The shares of errors within 1 and 2 sigma are counted in two ways, because "error" has two meanings: each axis
+        by itself (`sigma_axis_within_1`; a Gaussian has 68 and 95 %), and the length of the error
+        (`sigma_length_within_1`; 39 and 86 % of a Gaussian whose axes have that sigma). `sigma_within_1` is the first.
+        """
+        horizontal = np.hypot(*self.position_m[:, :2].T)
+        center, nadir = np.hypot(*self.center_m.T), np.hypot(*self.nadir_m.T)
+        out: dict[str, Any] = {"frames_compared": len(self.image)}
+        for name, values in (
+            ("camera_horizontal", horizontal), ("camera_up", np.abs(self.position_m[:, 2])),
+            ("center_ground", center), ("nadir_ground", nadir),
+        ):  # fmt: skip
+            out[f"{name}_median_m"], out[f"{name}_p95_m"] = _median_p95(values)
+        out["angle_median_deg"] = [_median_p95(a)[0] for a in np.abs(self.angle_deg).T]
+        vehicles = np.array(self.vehicle)
+        out["fov_error_deg"] = {v: _median_p95(self.fov_deg[vehicles == v])[0] for v in sorted(set(self.vehicle))}
+        for label, errors in (("sigma", self.center_m), ("sigma_nadir", self.nadir_m)):
+            for k in (1, 2):
+                by_axis = _share_within(errors, self.sigma_m, k)
+                out[f"{label}_within_{k}"] = out[f"{label}_axis_within_{k}"] = by_axis
+                out[f"{label}_length_within_{k}"] = _share_within(np.hypot(*errors.T)[:, None], self.sigma_m, k)
+        out["sigma_median_m"] = _median_p95(self.sigma_m)[0]
+        return out
 
 
 def evaluate_poses(poses: Path, truth: Path) -> PoseErrors:
@@ -97,3 +150,110 @@ def true_ground_level(dtm: Path, cameras: list[Any]) -> float:
     with rasterio.open(dtm) as file:
         values = np.array([v[0] for v in file.sample([c.position[:2] for c in cameras])], float)
     return float(np.median(values))
+
+
+def camera_from_homography(homography: Array, lens: Lens, ground_z_m: float) -> Camera:
+    """The camera that has a homography from undistorted pixels to a level plane; inverse of Camera.homography.
+
+    H^-1 = K [r1 r2 t] up to scale, r1 and r2 the first columns of the ground-to-camera rotation (Zhang 2000).
+
+    Args:
+        homography: 3x3, pixel (column, row, 1) to (east, north).
+        lens: its focal length and principal point (distortion plays no part).
+        ground_z_m: height of the plane.
+    """
+    u, v = lens.principal_point
+    center = homography @ np.array([u, v, 1.0])
+    origin = center[:2] / center[2]
+    shifted = np.array([[1, 0, -origin[0]], [0, 1, -origin[1]], [0, 0, 1.0]]) @ homography
+    m = np.linalg.inv(lens.matrix()) @ np.linalg.inv(shifted)
+    m /= 0.5 * (np.linalg.norm(m[:, 0]) + np.linalg.norm(m[:, 1]))
+    if m[2, 2] < 0:
+        m = -m
+    near = np.stack([m[:, 0], m[:, 1], np.cross(m[:, 0], m[:, 1])], -1)
+    left, _, right = np.linalg.svd(near)
+    rotation = left @ right
+    position = -rotation.T @ m[:, 2]
+    return Camera(position + np.array([origin[0], origin[1], ground_z_m]), np.ascontiguousarray(rotation.T), lens)
+
+
+@dataclass(frozen=True, slots=True)
+class Placement:
+    """A frame as a product places it.
+
+    Attributes:
+        image: name. vehicle: id. homography: 3x3, undistorted pixel to (east, north) on a plane.
+        fov_deg: its field of view, None if not stated. sigma_m: its own estimate of the ground error, None if none.
+    """
+
+    image: str
+    vehicle: str
+    homography: Array
+    fov_deg: float | None
+    sigma_m: float | None
+
+
+def _median_p95(values: Array) -> tuple[float | None, float | None]:
+    known = values[np.isfinite(values)]
+    if not len(known):
+        return None, None
+    return float(np.median(known)), float(np.percentile(known, 95))
+
+
+def _share_within(errors: Array, sigma: Array, k: int) -> float | None:
+    """Share of errors (N, axes), each axis by itself, within k sigma."""
+    known = np.isfinite(sigma) & np.isfinite(errors).all(1)
+    if not known.any():
+        return None
+    return float((np.abs(errors[known]) <= k * sigma[known, None]).mean())
+
+
+def pose_errors(
+    placed: Sequence[Placement], truth: Sequence[Camera], ground_z_m: float, true_ground_z_m: float
+) -> PoseErrors:
+    """Compare placed frames with their true cameras, in the same grid and order.
+
+    Args:
+        placed: frames as placed.
+        truth: the true camera of each.
+        ground_z_m: height of the plane of the homographies, in the product's heights.
+        true_ground_z_m: the mean ground level in the truth's heights.
+    """
+    n = len(placed)
+    position, angle, fov = np.full((n, 3), np.nan), np.full((n, 3), np.nan), np.full(n, np.nan)
+    center, nadir, sigma = np.full((n, 2), np.nan), np.full((n, 2), np.nan), np.full(n, np.nan)
+    for i, (frame, true) in enumerate(zip(placed, truth, strict=True)):
+        middle = np.array(true.lens.principal_point)
+        center[i] = _apply(frame.homography, middle) - true.to_ground(middle, true_ground_z_m)
+        down = true.position - np.array([0, 0, 1.0])
+        pinhole = Camera(true.position, true.rotation, _without_distortion(true.lens))
+        nadir[i] = _apply(frame.homography, pinhole.project(down)) - true.position[:2]
+        sigma[i] = np.nan if frame.sigma_m is None else frame.sigma_m
+        if frame.fov_deg is None:
+            continue
+        fov[i] = frame.fov_deg - np.degrees(true.lens.fov_rad)
+        focal = 0.5 * true.lens.width / np.tan(0.5 * np.radians(frame.fov_deg))
+        camera = camera_from_homography(frame.homography, Lens(true.lens.width, true.lens.height, focal), ground_z_m)
+        position[i] = camera.position - true.position
+        position[i, 2] += true_ground_z_m - ground_z_m
+        turn = np.array(angles_from_rotation(camera.rotation)) - np.array(angles_from_rotation(true.rotation))
+        angle[i] = wrap_deg(np.degrees(turn))
+    return PoseErrors(
+        image=[p.image for p in placed],
+        vehicle=[p.vehicle for p in placed],
+        position_m=position,
+        angle_deg=angle,
+        fov_deg=fov,
+        center_m=center,
+        nadir_m=nadir,
+        sigma_m=sigma,
+    )
+
+
+def _apply(homography: Array, pixel: Array) -> Array:
+    p = homography @ np.array([pixel[0], pixel[1], 1.0])
+    return np.asarray(p[:2] / p[2])
+
+
+def _without_distortion(lens: Lens) -> Lens:
+    return Lens(lens.width, lens.height, lens.focal_px, cx=lens.cx, cy=lens.cy)

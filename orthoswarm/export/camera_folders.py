@@ -172,16 +172,8 @@ def write_opensfm(rows: Iterable[Row], find: Find, folder: Path, *, progress: Te
     OpenSfM's world is a plane tangent to the ellipsoid at `reference_lla`: east, north, up in metres. Pixels are
     counted from the picture's middle in units of the longer side; its camera axes are ours.
 
-    Args:
-        rows: lines of frames.jsonl. find: their picture files.
-        folder: appears when it is complete; an existing one is replaced. progress: called with pictures done and all.
-
-    Returns:
-        Images whose files are missing: they are in the reconstruction, but not in `images`.
-
-    Raises:
-        InputError: if no picture was placed.
-        OrthoSwarmError: if the disk is full.
+    Arguments and errors are as of `write_odm`; returns the images whose files are missing: the reconstruction has them,
+    `images` has not.
     """
     pictures = oriented_pictures(rows)
     lat, lon = (float(np.mean([p.row["camera"][name] for p in pictures])) for name in ("lat_deg", "lon_deg"))
@@ -320,16 +312,8 @@ def write_colmap(rows: Iterable[Row], find: Find, folder: Path, *, progress: Tel
     World axes are east, north, up in metres from `origin.txt`, a corner of the map's grid. COLMAP's camera axes are
     ours (x right, y down, z forward); its pixel (0, 0) is the upper left CORNER of the first pixel, ours its centre.
 
-    Args:
-        rows: lines of frames.jsonl. find: their picture files.
-        folder: appears when it is complete; an existing one is replaced. progress: called with pictures done and all.
-
-    Returns:
-        Images whose files are missing: they are in the model, but not in `images`.
-
-    Raises:
-        InputError: if no picture was placed.
-        OrthoSwarmError: if the disk is full.
+    Arguments and errors are as of `write_odm`; returns the images whose files are missing: they are in the model,
+    but not in `images`.
     """
     pictures = oriented_pictures(rows)
     positions = np.array([p.camera.position for p in pictures])

@@ -149,8 +149,7 @@ def _stac(what: MapExport) -> Path:
 
 
 def _pmtiles(what: MapExport) -> Path:
-    from orthoswarm.export.tiles.mbtiles import write_mbtiles
-    from orthoswarm.export.tiles.pmtiles import write_pmtiles
+    from orthoswarm.export.tiles.mbtiles import write_mbtiles, write_pmtiles
 
     what.dest.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=what.dest, prefix=".tiles") as folder:
@@ -168,7 +167,7 @@ def _pdf(what: MapExport) -> Path:
 
 
 def _places(what: MapExport) -> Path:
-    from orthoswarm.export.tactical.place_files import PLACE_FILES
+    from orthoswarm.export.tactical.places import PLACE_FILES
 
     for name, write in PLACE_FILES.items():
         write(what.all_places, what.dest / "places" / name)

@@ -2,14 +2,15 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid, area_epsg
+from orthoswarm.model.placement import Terrain
 from orthoswarm.model.plan import Apart, Gap, OverGround, Plan, Sortie, VehiclePlan, Waypoint
 from orthoswarm.planning.area.area import Area, coarser
 from orthoswarm.planning.area.shape_files import Ring
@@ -21,14 +22,12 @@ from orthoswarm.planning.lines.sweep_lines import Field, stretches
 from orthoswarm.planning.lines.visiting_order import shorten
 from orthoswarm.planning.sorties.assignment import PlanOptions, Swarm, Work
 from orthoswarm.planning.sorties.deconfliction import Schedule, Separation, Slot
-from orthoswarm.planning.sorties.flight_heights import FlightHeights, LevelHeights
+from orthoswarm.planning.sorties.flight_heights import BESIDE_M, FlightHeights, LevelHeights, profile_step_m
 from orthoswarm.planning.sorties.flight_path import Flight
 from orthoswarm.planning.sorties.flight_time import Motion
-from orthoswarm.planning.sorties.ground_check import leg_paths, over_ground, swaths
 
 __all__ = ["METHODS", "Method", "PlanOptions", "plan_area", "plan_gaps", "plan_lines"]
 
-Array = NDArray[np.float64]
 Progress = Callable[[str], None]
 
 _OUTLINE_SPACINGS: Final = 0.05  # the outline of an area with many corners is at most twice so many spacings outside it
@@ -105,6 +104,15 @@ def plan_area(
     clearance_m = _clearance_m(options, foot)
     router = Router(make_obstacles(area.no_fly, clearance_m))
     swarm = Swarm(vehicles, over.heights, foot=foot, grid=area.grid, router=router, options=options)
+
+    def incomplete(gaps: tuple[Gap, ...], missed_m2: float, seen: float) -> list[str]:
+        if seen >= planned_coverage.COMPLETE_SHARE:
+            return []
+        return [
+            f"only {100 * seen:.2f} % of the area is covered and {len(gaps)} gaps are left: this plan is not complete; "
+            "reduce the clearance or the no-fly zones, or fly lower"
+        ]
+
     progress("lines")
     best = _best_work(
         area,
@@ -115,20 +123,8 @@ def plan_area(
         router=router,
         reach_m=min(foot.reach_m, 2.0 * clearance_m),
     )
-    progress("separation")
-    schedule = swarm.schedule(best)
-    progress("coverage")
-    left = over.missed(area.ground, schedule.slots)
-    gaps = tuple(_gap(p, area.grid) for p in planned_coverage.pieces(left))
-    seen = 1.0 - float(left.area) / area.size_m2
-    warnings = _warnings(schedule, best, foot, options)
-    if seen < planned_coverage.COMPLETE_SHARE:
-        warnings.append(
-            f"only {100 * seen:.2f} % of the area is covered and {len(gaps)} gaps are left: this plan is not complete; "
-            "reduce the clearance or the no-fly zones, or fly lower"
-        )
     return _plan(
-        method, schedule, over, grid=area.grid, options=options, warnings=warnings, covered=(area.size_m2, seen, gaps)
+        method, best, swarm, over, grid=area.grid, options=options, progress=progress, area=area, said=incomplete
     )
 
 
@@ -196,15 +192,11 @@ def plan_gaps(
 ) -> Plan:
     """Missions that cover separate pieces of ground, each by the shortest parallel legs that see it.
 
+    Other arguments are as of `plan_area`.
+
     Args:
         area: the pieces, grown by the margin that they need, and no-fly zones.
         vehicles: how many there are; fewer are used where there are fewer legs.
-        altitude_m: height of the legs above takeoff, metres; with `heights`, that above level ground at which `foot`
-            was made.
-        foot: footprint of the narrowest camera at that height.
-        options: the rest.
-        progress: called with what is being done.
-        heights: of the flights over a height model; None for level ground at takeoff.
 
     Raises:
         InputError: no piece can be reached, a start in a no-fly zone, an endurance too short.
@@ -221,20 +213,14 @@ def plan_gaps(
     most = stretches(np.hypot(*(legs[:, 1] - legs[:, 0]).T), foot.spacing_m)
     swarm = Swarm(min(vehicles, most), over.heights, foot=foot, grid=area.grid, router=router, options=options)
     work = swarm.share(shorten(legs, router, None if swarm.starts is None else swarm.starts[0]), True)
-    progress("separation")
-    schedule = swarm.schedule(work)
-    progress("coverage")
-    left = over.missed(area.ground, schedule.slots)
-    gaps = tuple(_gap(p, area.grid) for p in planned_coverage.pieces(left))
-    warnings = _warnings(schedule, work, foot, options)
-    if most < vehicles:
-        warnings.append(f"{most} of the {vehicles} vehicles are enough for these gaps")
-    if gaps:
-        warnings.append(f"{left.area:.0f} square metres of the gaps cannot be seen from where flying is allowed")
-    share = 1.0 - float(left.area) / area.size_m2
-    return _plan(
-        "gaps", schedule, over, grid=area.grid, options=options, warnings=warnings, covered=(area.size_m2, share, gaps)
-    )
+
+    def unseen(gaps: tuple[Gap, ...], missed_m2: float, seen: float) -> list[str]:
+        said = [f"{most} of the {vehicles} vehicles are enough for these gaps"] if most < vehicles else []
+        if gaps:
+            said.append(f"{missed_m2:.0f} square metres of the gaps cannot be seen from where flying is allowed")
+        return said
+
+    return _plan("gaps", work, swarm, over, grid=area.grid, options=options, progress=progress, area=area, said=unseen)
 
 
 def _gap_legs(piece: planned_coverage.Geometry, router: Router, foot: Footprint) -> Array:
@@ -258,19 +244,13 @@ def plan_lines(
     progress: Progress = lambda _: None,
     heights: FlightHeights | None = None,
 ) -> Plan:
-    """Missions along given lines, with pictures on their straight stretches.
+    """Missions along given lines, with pictures on their straight stretches; other arguments are as of `plan_area`.
 
     Args:
         lines: float64 (n, 2) each, latitude and longitude in degrees, flown in the order given. Stretches shorter
             than two trigger distances are flown without pictures: they are turns.
         vehicles: how many share the lines.
-        altitude_m: height of the legs above takeoff, metres; with `heights`, that above level ground at which `foot`
-            was made.
-        foot: footprint of the narrowest camera at that height.
         no_fly: an area whose no-fly zones hold here, too.
-        options: the rest.
-        progress: called with what is being done.
-        heights: of the flights over a height model; None for level ground at takeoff.
 
     Raises:
         InputError: no stretch is long enough, more vehicles than stretches, or a line crosses a no-fly zone.
@@ -300,10 +280,7 @@ def plan_lines(
     progress("lines")
     swarm = Swarm(vehicles, over.heights, foot=foot, grid=grid, router=router, options=options)
     work = swarm.share(legs, reorder=False)
-    progress("separation")
-    schedule = swarm.schedule(work)
-    warnings = _warnings(schedule, work, foot, options)
-    return _plan("lines", schedule, over, grid=grid, options=options, warnings=warnings, covered=(None, None, ()))
+    return _plan("lines", work, swarm, over, grid=grid, options=options, progress=progress)
 
 
 def _warnings(schedule: Schedule, work: Work, foot: Footprint, options: PlanOptions) -> list[str]:
@@ -377,15 +354,32 @@ def _sortie(slot: Slot, foot: Footprint, grid: LocalGrid, motion: Motion) -> Sor
 
 def _plan(
     method: str,
-    schedule: Schedule,
+    work: Work,
+    swarm: Swarm,
     over: _Over,
     *,
     grid: LocalGrid,
     options: PlanOptions,
-    warnings: list[str],
-    covered: tuple[float | None, float | None, tuple[Gap, ...]],
+    progress: Progress,
+    area: Area | None = None,
+    said: Callable[[tuple[Gap, ...], float, float], list[str]] = lambda gaps, missed_m2, seen: [],
 ) -> Plan:
-    area_m2, share, gaps = covered
+    """The plan of shared work: its times and layers, and how much of an area it covers.
+
+    `said`: warnings by the gaps left, the square metres missed and the share seen.
+    """
+    progress("separation")
+    schedule = swarm.schedule(work)
+    warnings = _warnings(schedule, work, over.foot, options)
+    area_m2: float | None = None
+    share: float | None = None
+    gaps: tuple[Gap, ...] = ()
+    if area is not None:
+        progress("coverage")
+        left = over.missed(area.ground, schedule.slots)
+        gaps = tuple(_gap(p, grid) for p in planned_coverage.pieces(left))
+        area_m2, share = area.size_m2, 1.0 - float(left.area) / area.size_m2
+        warnings += said(gaps, float(left.area), share)
     foot, level_m = over.foot, over.heights.above_m if over.heights.follows else over.heights.at(np.zeros(2), 0.0)
     made = tuple(
         VehiclePlan(number, tuple(_sortie(s, foot, grid, options.motion_of(number - 1)) for s in row))
@@ -431,3 +425,110 @@ def _separation_text(schedule: Schedule, altitude_m: float, apart: Separation) -
     if any(delays):
         text += f"; takeoffs later than the first, up to {max(delays):g} s: {sum(map(bool, delays))}"
     return text
+
+
+Geometry = Any
+
+_EDGE_ROUNDS: Final = 12  # bisections of the highest ground between two places of a profile (to millimetres)
+
+
+def leg_paths(flight: Flight) -> list[Array]:
+    """The points of each leg of a flight, float64 (n, 3), those put in for their height included."""
+    firsts, lasts = np.flatnonzero(flight.camera == 1), np.flatnonzero(flight.camera == -1)
+    return [flight.points[a : b + 1] for a, b in zip(firsts, lasts, strict=True)]
+
+
+def swaths(paths: Sequence[Array], ground: Terrain, foot: Footprint, foot_above_m: float) -> list[Geometry]:
+    """The ground that pictures along legs are certain to see, a shapely polygon a leg.
+
+    Across the leg a picture ends where the ray of its border meets the ground. A leg counts beyond its ends as far as
+    its footprint there does.
+
+    Args:
+        paths: float64 (n, 3) each, straight on the map. ground: its heights. foot: footprint of the narrowest camera
+            at `foot_above_m` above level ground.
+    """
+    return [_swath(_sampled(path, ground), ground, foot, foot_above_m) for path in paths]
+
+
+def _sampled(path: Array, *grounds: Terrain) -> Array:
+    """A path (n, 3) with points at most half a node of the height models apart."""
+    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path[:, :2], axis=0).T))])
+    at = np.union1d(np.linspace(0.0, along[-1], int(np.ceil(along[-1] / profile_step_m(*grounds))) + 1), along)
+    return np.stack([np.interp(at, along, path[:, axis]) for axis in range(3)], axis=1)
+
+
+def _half_widths(points: Array, ground: Terrain, slope: float) -> tuple[Array, Array]:
+    """How far pictures reach to the left and to the right of a leg's points (n, 3), metres; and the unit vector left.
+
+    Args:
+        slope: half a footprint's width over the height above ground.
+    """
+    way = points[-1, :2] - points[0, :2]
+    left = np.array([-way[1], way[0]]) / max(float(np.hypot(*way)), 1e-9)
+    sides = np.array([1.0, -1.0])[:, None]
+    above = points[:, 2] - np.asarray(ground.height(points[:, :2]))
+    reach = np.repeat(slope * above[None], 2, 0)
+    # Damped, as ground steeper than the ray would make plain iteration swing.
+    for _ in range(_EDGE_ROUNDS):
+        places = points[None, :, :2] + (sides * reach)[..., None] * left
+        height = points[None, :, 2] - np.asarray(ground.height(places))
+        reach = 0.5 * (reach + slope * np.maximum(height, 0.0))
+    return reach, left
+
+
+def _swath(points: Array, ground: Terrain, foot: Footprint, foot_above_m: float) -> Geometry:
+    reach, left = _half_widths(points, ground, 0.5 * foot.width_m / foot_above_m)
+    way = points[-1, :2] - points[0, :2]
+    along = way / max(float(np.hypot(*way)), 1e-9)
+    above = points[[0, -1], 2] - np.asarray(ground.height(points[[0, -1], :2]))
+    seen = 0.5 * foot.height_m - foot.slant_m  # along the leg, before the trigger's phase
+    before, behind = np.maximum(0.0, seen * above / foot_above_m - foot.trigger_m)
+    line = np.concatenate([points[:1, :2] - before * along, points[:, :2], points[-1:, :2] + behind * along])
+    wide = np.concatenate([reach[:, :1], reach, reach[:, -1:]], axis=1)
+    ring = np.concatenate([line + wide[0][:, None] * left, (line - wide[1][:, None] * left)[::-1]])
+    return shapely.make_valid(shapely.Polygon(ring))
+
+
+def over_ground(flights: Sequence[Flight], heights: FlightHeights, foot: Footprint, foot_above_m: float) -> OverGround:
+    """How flights lie over the ground.
+
+    Args:
+        flights: of all vehicles. heights: by which they were made, with a ground. foot, foot_above_m: see `swaths`.
+
+    Raises:
+        InputError: a leg or a way is lower than `heights.least_above_m` above the ground, or above that beside it.
+    """
+    ground, highest = heights.ground, heights.highest
+    assert ground is not None and highest is not None
+    on_legs, overlaps, on_ways = [], [], []
+    for flight in flights:
+        cruise = _sampled(np.concatenate([[[*flight.home, flight.climb_m]], flight.points]), ground, highest)
+        on_ways.append(cruise[:, 2] - np.asarray(highest.height(cruise[:, :2])))
+        for path in leg_paths(flight):
+            points = _sampled(path, ground)
+            on_legs.append(points[:, 2] - np.asarray(ground.height(points[:, :2])))
+            width = _half_widths(points, ground, 0.5 * foot.width_m / foot_above_m)[0].sum(axis=0)
+            overlaps.append(1.0 - foot.spacing_m / np.maximum(width, 1e-9))
+    above, overlap = np.concatenate(on_legs), np.concatenate(overlaps)
+    least = float(np.concatenate(on_ways).min())
+    least_above_m = heights.least_above_m
+    if least < least_above_m - 0.01:
+        raise InputError(
+            f"the flight would be {least:.0f} m above the highest ground within {BESIDE_M:g} m, "
+            f"and {least_above_m:g} m must be kept; give --altitude "
+            f"{np.ceil(heights.above_m + least_above_m - least):.0f} or more"
+        )
+    forward = 1.0 - foot.trigger_m / (foot.height_m * float(above.min()) / foot_above_m)
+    top = max(float(flight.track()[:, 2].max()) - flight.home_z_m for flight in flights)
+    return OverGround(
+        follows=heights.follows,
+        by_vehicle=heights.by_vehicle,
+        nominal_m=heights.above_m,
+        least_m=float(above.min()),
+        most_m=float(above.max()),
+        way_least_m=least,
+        top_m=top,
+        side_overlap=(float(np.percentile(overlap, 5)), float(np.median(overlap))),
+        forward_overlap=forward,
+    )

@@ -18,9 +18,18 @@ from telemetry.ingest.discovery import Discovery
 from telemetry.ingest.log_choice import LOG_SAME_EXPOSURE_S, LogMatch, LogSource, apart_m, bettered, same_flight
 from telemetry.ingest.pairing.event_pairing import Pairing, pair
 from telemetry.ingest.pairing.motion_chains import PictureMotion, picture_motion
-from telemetry.ingest.several_flights import LOG_LEAST_SHARE, logs_of_one_clock, nearest_span, of_one_vehicle
 from telemetry.ingest.survey import SourceInfo, Survey
-from telemetry.ingest.track_poses import EVENT_FAR_M, add_track, best_log_of, explain, fill
+from telemetry.ingest.track_poses import (
+    EVENT_FAR_M,
+    LOG_LEAST_SHARE,
+    add_track,
+    best_log_of,
+    explain,
+    fill,
+    logs_of_one_clock,
+    nearest_span,
+    of_one_vehicle,
+)
 from telemetry.photos.flight_checks import number_of
 from telemetry.photos.photo_tags import Photo
 from telemetry.samples.course import Placed, local_metres

@@ -25,7 +25,7 @@ class LoadOptions:
         exclude: files and folders that are left out (the output folder, for instance).
         workers: threads that read.
         run: maps a function over items in processes, for many photos; None: read in threads.
-        sei_layouts: files that describe private SEI messages; see `telemetry.formats.video.sei_layout`.
+        sei_layouts: files that describe private SEI messages; see `telemetry.formats.video.sei`.
         camera: which sensor of cameras with several is mapped: wide, zoom or thermal; "" for the widest in colour.
         decode: False to read only the metadata of videos, without extracting pictures (for `inspect`).
     """

@@ -1,29 +1,38 @@
 """Poses of photos from a log's track, at the photos' times: for logs without camera events."""
 
-from collections.abc import Sequence
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import PurePath
 from typing import Final
 
 import numpy as np
 
+from orthoswarm.model.arrays import Array, Indices
 from orthoswarm.model.earth import distance_m
 from telemetry.formats.log.log_data import FlightLog
 from telemetry.formats.log.mavlink_poses import fixed_camera
+from telemetry.ingest.discovery import natural_key
 from telemetry.ingest.log_choice import LogMatch, LogSource, best_log
 from telemetry.ingest.pairing.clock_offset import (
+    SPAN_MARGIN_S,
+    ZONES_S,
     median_distance_m,
     offset_by_positions,
     offset_by_zone,
     zones_of_flight,
 )
-from telemetry.ingest.photo_order import CLOCK_JUMP_S, clock_went_back
-from telemetry.ingest.several_flights import nearest_span, of_one_vehicle, zone_of_all
+from telemetry.ingest.pairing.event_pairing import JUMP_LEAST_PHOTOS, LEAST_JUMP_S, Pairing
+from telemetry.ingest.pairing.sequence_model import MOST_DRIFT
 from telemetry.photos.flight_checks import number_of
 from telemetry.photos.photo_tags import Photo
+from telemetry.samples.course import ground_track, length_m
 from telemetry.samples.findings import Finding, plural
 from telemetry.samples.sample import Sample
+from telemetry.samples.timeline import Timeline
 from telemetry.samples.times import YEAR_2000_S, ZONE_UNKNOWN
+from telemetry.samples.wild_fixes import TIME_RESOLUTION_S
 
 _NO_LOG_THEN = "no log that is here was recorded when it was taken; give the log of that flight, or a geo.txt"
 _NO_LOG_FITS = (
@@ -253,3 +262,166 @@ def fill(photo: Photo, pose: Sample, origin: str, *, gimbal: bool) -> None:
         photo.origin["flight_yaw"] = origin
     if pose.time_s is not None:
         photo.time_s, photo.origin["time"] = pose.time_s, origin
+
+
+SHIFTED: Final = "shifted after a jump"
+"""Said in the origin of a photo's time that was moved to follow the photos before it."""
+CLOCK_JUMP_S: Final = 60.0  # a step back in the photos' times by more than this is a jump of the camera's clock
+
+
+def in_order(photos: Sequence[Photo], vehicle: str, findings: list[Finding]) -> list[Photo]:
+    """Sort photos by time, or by name where the clock jumped.
+
+    Where the two orders differ, the one with the shorter track is used; times are then shifted after each jump so
+    that they continue, which preserves intervals within each part.
+    """
+    by_name = sorted(photos, key=lambda p: natural_key(p.path.name))
+    by_time = sorted(by_name, key=lambda p: float("inf") if p.time_s is None else p.time_s)
+    if by_time == by_name or any(p.time_s is None or p.lat_deg is None for p in photos):
+        return by_time
+    times = np.array([p.time_s for p in by_name], dtype=np.float64)
+    steps = np.diff(times)
+    back = np.flatnonzero(steps < 0.0)
+    if len(back) > 3 or steps[back].min() > -CLOCK_JUMP_S:
+        return by_time
+    if length_m(ground_track(by_name)) > 0.7 * length_m(ground_track(by_time)):
+        return by_time
+    usual = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 1.0
+    for at in back:
+        shift = times[at] + usual - times[at + 1]
+        times[at + 1 :] += shift
+    for photo, time_s in zip(by_name, times.tolist(), strict=True):
+        if photo.time_s != time_s:
+            photo.time_s = time_s
+            photo.origin["time"] = f"{photo.origin.get('time', 'camera clock')}, {SHIFTED}"
+    text = (
+        f"the camera's clock jumped back {plural(len(back), 'time')} during the flight; the order of the file names is "
+        "used, and times after a jump are shifted"
+    )
+    findings.append(Finding("clock-jump", text, vehicle))
+    return by_name
+
+
+def clock_went_back(photos: Sequence[Photo]) -> bool:
+    """Whether the clock was set back between photos: runs of names, in order within, of which two share some time.
+
+    Runs one after the other are no sign of it: numbers begin anew after the last one.
+    """
+    series: dict[str, list[float]] = {}  # by the names without their number: two cameras in one folder are two
+    for p in sorted(photos, key=lambda p: natural_key(p.path.name)):
+        if p.time_s is not None:
+            series.setdefault(re.sub(r"\d+\D*$", "", p.path.stem), []).append(p.time_s)
+    return any(_went_back(np.array(times)) for times in series.values())
+
+
+def _went_back(times: Array) -> bool:
+    back = np.flatnonzero(np.diff(times) < -TIME_RESOLUTION_S) + 1
+    if not 0 < len(back) <= 3:  # more: names that are not in the order of exposure
+        return False
+    spans = sorted((run.min(), run.max()) for run in np.split(times, back))
+    return any(later[0] < earlier[1] for earlier, later in pairwise(spans))
+
+
+LOG_LEAST_SHARE: Final = 0.5  # a log belongs to photos if this share of the shorter of both is paired
+
+
+def of_one_vehicle(logs: Iterable[FlightLog]) -> bool:
+    """Whether logs may be of one vehicle: what a ground station recorded names it by its system id."""
+    return len({log.vehicle for log in logs if log.kind == "tlog"}) < 2
+
+
+def logs_of_one_clock(
+    pairings: Mapping[int, Pairing],
+    times: Array,
+    *,
+    pair_some: Callable[[int, Sequence[int]], Pairing],
+    same_flight: Callable[[int, int], bool],
+) -> list[int]:
+    """The logs that find one clock for different photos; fewer than two if that is not certain.
+
+    A log of a mission that was flown twice fits the photos of both flights: it is asked again about those that no other
+    log has.
+
+    Args:
+        pairings: of all photos with the events of each log, by the log's key.
+        times: (N,) of the photos by the camera, NaN where unknown.
+        pair_some: pairs some photos with the events of a log.
+        same_flight: whether two logs record one flight, by autopilot and ground station perhaps.
+
+    Returns:
+        Keys in order of time.
+    """
+    sure = {key: photos for key, pairing in pairings.items() if (photos := _sure(pairing))}
+    groups = [_joined(key, sure, pairings, times) for key in sure]
+    best = max(groups, key=lambda keys: sum(len(sure[key]) for key in keys), default=[])
+    for key in [key for key in pairings if best and key not in best]:
+        taken = {i for own in best for i in sure[own]}
+        rest = [i for i in range(len(times)) if i not in taken]
+        again = pair_some(key, rest) if len(rest) > 1 else Pairing()
+        found = {**sure, key: [rest[i] for i in _sure(again)]}
+        if found[key] and _same_clock(best[0], key, found, {**pairings, key: again}, times):
+            sure, best = found, [*best, key]
+    for key in pairings.keys() - set(best):  # another vehicle's log that fits the same photos
+        fitting = {i for i, _ in pairings[key].pairs}
+        for own in best:
+            common = len(fitting.intersection(sure[own]))
+            if common >= LOG_LEAST_SHARE * len(sure[own]) and not same_flight(key, own):
+                return []
+    return sorted(best, key=lambda key: float(np.median(times[sure[key]])))
+
+
+def _sure(pairing: Pairing) -> list[int]:
+    """The photos whose events are certain; none if they are few, or if more than one clock fits."""
+    if pairing.how != "time" or pairing.offset_s is None or pairing.ambiguous or pairing.jumps:
+        return []
+    photos = [i for i, _ in pairing.pairs if i not in pairing.doubtful]
+    return photos if len(photos) >= JUMP_LEAST_PHOTOS else []
+
+
+def _joined(first: int, sure: Mapping[int, Sequence[int]], pairings: Mapping[int, Pairing], times: Array) -> list[int]:
+    """A log and those that find its clock for other photos, the ones with most photos first."""
+    joined = [first]
+    for key in sorted(sure, key=lambda key: -len(sure[key])):
+        taken = {i for other in joined for i in sure[other]}
+        if key not in joined and taken.isdisjoint(sure[key]) and _same_clock(first, key, sure, pairings, times):
+            joined.append(key)
+    return joined
+
+
+def _same_clock(
+    a: int, b: int, sure: Mapping[int, Sequence[int]], pairings: Mapping[int, Pairing], times: Array
+) -> bool:
+    between_s = abs(float(np.median(times[sure[a]]) - np.median(times[sure[b]])))
+    apart_s = abs((pairings[a].offset_s or 0.0) - (pairings[b].offset_s or 0.0))
+    return apart_s <= LEAST_JUMP_S + MOST_DRIFT * between_s
+
+
+def nearest_span(times: Array, spans: Sequence[tuple[float, float]]) -> Indices:
+    """(N,) index of the span of time that each time lies in, or nearest to."""
+    starts, ends = np.array(spans, dtype=np.float64).T
+    apart = np.maximum(np.maximum(starts - times[:, None], times[:, None] - ends), 0.0)
+    return np.asarray(np.argmin(apart, axis=1))
+
+
+def zone_of_all(times: Array, timelines: Sequence[Timeline], *, zone_known: bool) -> float | None:
+    """The only time zone under which each photo lies in the flight of exactly one log; None if there is no such one.
+
+    Args:
+        times: (N,) of the photos by the camera. timelines: of the logs.
+        zone_known: whether the times are UTC already, so that no other zone is possible.
+    """
+    spans = [timeline.span for timeline in timelines]
+    if len(spans) < 2 or any(span is None for span in spans):
+        return None
+    starts, ends = np.array(spans, dtype=np.float64).T
+    zones = (0.0,) if zone_known else ZONES_S
+    held = {}
+    for zone in zones:
+        at = (times - zone)[:, None]
+        inside = (at >= starts - SPAN_MARGIN_S) & (at <= ends + SPAN_MARGIN_S)
+        if inside.any(axis=1).all():
+            held[zone] = bool((inside.sum(axis=1) == 1).all())
+    if len(held) != 1:
+        return None
+    ((zone, only_one_each),) = held.items()
+    return zone if only_one_each else None

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array, Bytes
 from orthoswarm.model.frame import Rejection
 from orthoswarm.model.task_runner import Progress
 from orthoswarm.stores.local_copies import local_file
@@ -35,8 +35,6 @@ from telemetry.videos.extraction import decoded, extract
 from telemetry.videos.picture_choice import luma
 from telemetry.videos.picture_poses import Poses
 from telemetry.videos.video_file import VideoScan, scan
-
-Array = NDArray[np.float64]
 
 _NO_POSITION = "the video carries no position (SEI, KLV, djmd, subtitles); put an SRT next to it, or give its log, too"
 _WHY_NOT = ("rate-unknown", "log-ambiguous", "log-unused", "srt-length", "srt-no-position", "unreadable")
@@ -259,7 +257,7 @@ def _picture_rates(found: VideoScan) -> tuple[Array, Array]:
     every = max(1, round(rate / _TURNING_RATE_HZ))
     times: list[float] = []
     rates: list[float] = []
-    before: tuple[float, NDArray[np.uint8]] | None = None
+    before: tuple[float, Bytes] | None = None
     for number, index, frame in decoded(found):
         if number % every:
             continue

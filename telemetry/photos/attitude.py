@@ -10,15 +10,13 @@ from itertools import pairwise
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.model.angles import wrap_deg
+from orthoswarm.model.arrays import Array
 from telemetry.photos.maker_angles import Angles
 from telemetry.photos.photo_tags import Photo
 from telemetry.samples.course import Straight
 from telemetry.samples.findings import Finding, plural
-
-Array = NDArray[np.float64]
 
 _RELATIVE_GIMBAL_MODELS = frozenset({"FC7203"})
 """Camera models known to record the gimbal's yaw relative to the airframe (Mavic Mini).

@@ -10,15 +10,13 @@ from datetime import UTC, datetime
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.frame import THETA_HAT_DEG, Frame
 from telemetry.photos.photo_tags import Photo
 from telemetry.samples.course import Straight, ground_track, straight_legs
 from telemetry.samples.findings import Finding, metres, plural
 from telemetry.samples.times import YEAR_2000_S, ZONE_UNKNOWN
-
-Array = NDArray[np.float64]
 
 _OUTLYING_POSITION_M: Final = 100.0  # a photo farther from those beside it (and 15 steps) has a wrong position
 OTHER_DAY_S: Final = 43_200.0  # photos farther apart in time than half a day are of another day

@@ -18,11 +18,11 @@ from orthoswarm.stores.listing import StoredFile, known
 from orthoswarm.stores.local_copies import expect
 from orthoswarm.stores.requests import CONNECTIONS
 from telemetry.formats.photo import exif, xmp
-from telemetry.formats.photo.makernotes import parse_dji
+from telemetry.formats.photo.exif import parse_dji
 from telemetry.formats.photo.picture_container import Container, NotAPicture, read_container
 from telemetry.photos.maker_angles import Angles, camera_angles, flight_angles
 from telemetry.samples.sample import is_position
-from telemetry.samples.times import ZONE_UNKNOWN, parse_time
+from telemetry.samples.times import ZONE_UNKNOWN, epoch_of, parse_time
 from telemetry.samples.unreadable import Unreadable, read_or_reason
 
 Run = Callable[..., Iterator[Any]]
@@ -251,8 +251,8 @@ _RELATIVE_ALTITUDES = (
 
 
 def _time(photo: Photo, tags: exif.Exif, found: xmp.Properties) -> None:
-    exact = parse_time(found.get("drone-dji:UTCAtExposure", ""))
-    exposed = (exact[0], "XMP UTCAtExposure") if exact is not None else exif.exposure_time(tags)
+    exact = epoch_of(found.get("drone-dji:UTCAtExposure", ""))
+    exposed = (exact, "XMP UTCAtExposure") if exact is not None else exif.exposure_time(tags)
     if exposed is None:
         written = parse_time(found.get("exif:DateTimeOriginal") or found.get("xmp:CreateDate", ""))
         if written is not None:

@@ -12,15 +12,13 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.model.angles import wrap_deg
+from orthoswarm.model.arrays import Array, Floats
 from orthoswarm.model.frame import Frame
 from orthoswarm.raster.picture_file import PictureError, read_gray, reduction
 from telemetry.samples.course import Straight, ground_track, straight_legs
 from telemetry.samples.findings import Finding, plural
-
-Array = NDArray[np.float64]
 
 _MOTION_LEAST_INLIERS: Final = 25  # corners that the motion between two pictures takes at least
 _MOTION_RATIO: Final = 0.8  # ratio test of their matches (Lowe 2004)
@@ -48,7 +46,7 @@ class PictureFeatures:
     """
 
     points: Array
-    descriptors: NDArray[np.float32]
+    descriptors: Floats
     centre: Array
 
 

@@ -5,12 +5,10 @@ from dataclasses import dataclass
 from typing import Final, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.model.angles import wrap_deg, wrap_rad
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.earth import MEAN_RADIUS_M
-
-Array = NDArray[np.float64]
 
 _LEAST_STEP_M: Final = 1.0  # shorter steps have no course: receivers at rest wander
 _COURSE_BEND_DEG: Final = 40.0  # a bend from which a position lies in a turn

@@ -12,15 +12,13 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.earth import DEGREE_M, MEAN_RADIUS_M, distance_m
 from orthoswarm.model.frame import UNSTATED_SIGMA_M, Frame
 from telemetry.samples.course import local_metres
 from telemetry.samples.findings import Finding, metres, plural
 from telemetry.samples.sample import Sample
-
-Array = NDArray[np.float64]
 
 LOST_SIGMA_M: Final = 20.0  # a place that is known no better is none: a picture would be drawn beside its ground
 _NEWS_M: Final = 3.0  # shorter ways are a receiver's noise

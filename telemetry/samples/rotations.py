@@ -1,12 +1,10 @@
 """Attitudes of other conventions converted to ours (orthoswarm.model.camera: pitch -90 deg looks straight down)."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.camera import NED_TO_ENU, angles_from_rotation
 from telemetry.samples.sample import Sample
-
-Array = NDArray[np.float64]
 
 # Camera (x right, y down, z along the optical axis) in a frame whose x is the optical axis, y right, z down.
 _CAMERA_TO_FORWARD = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])

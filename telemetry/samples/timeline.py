@@ -8,12 +8,11 @@ longer than `max_gap_s` is bridged.
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from orthoswarm.model.angles import wrap_deg
+from orthoswarm.model.arrays import Array
 from telemetry.samples.sample import CAMERA_ANGLES, FLIGHT_ANGLES, Sample
-
-Array = NDArray[np.float64]
 
 _WRAPPED = (*CAMERA_ANGLES, *FLIGHT_ANGLES, "lon_deg")
 _FIELDS = ("lat_deg", "height_m", "altitude_m", "fov_deg", "zoom", "sigma_m", *_WRAPPED)

@@ -38,6 +38,12 @@ def parse_time(value: str) -> tuple[float, bool] | None:
     return None if zone is None else (seconds - zone, True)
 
 
+def epoch_of(value: str) -> float | None:
+    """Epoch seconds of a time that `parse_time` reads; None if it is none."""
+    parsed = parse_time(value)
+    return None if parsed is None else parsed[0]
+
+
 def parse_offset(value: str) -> float | None:
     """Seconds east of UTC of "+02:00", "-0530", "+02" (ISO 8601: minutes may be left out) or "Z"; else None."""
     value = value.strip().upper()

@@ -5,14 +5,12 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array, Flags, Indices
 from telemetry.samples.course import local_metres
 from telemetry.samples.findings import Finding, metres, plural
 from telemetry.samples.held_fixes import without_held_fixes
 from telemetry.samples.sample import Sample
-
-Array = NDArray[np.float64]
 
 TIME_RESOLUTION_S: Final = 1.0  # times of positions may be off by this: many are written in whole seconds
 FASTEST_M_S: Final = 128.6
@@ -76,13 +74,13 @@ def wild_fixes(times_s: Sequence[float | None], places: Sequence[tuple[float, fl
     return WildFixes([order[i] for i in wild.tolist()], float(near.max()))
 
 
-def _flyable(t0: Array, a: Array, t1: Array, b: Array) -> NDArray[np.bool_]:
+def _flyable(t0: Array, a: Array, t1: Array, b: Array) -> Flags:
     """Whether an aircraft can fly from places `a` (N, 2), metres, at times `t0` to places `b` at `t1`."""
     reach = FASTEST_M_S * (t1 - t0 + TIME_RESOLUTION_S)
     return np.asarray(np.hypot(b[..., 0] - a[..., 0], b[..., 1] - a[..., 1]) <= reach)
 
 
-def _longest_track(first: NDArray[np.int64], last: NDArray[np.int64], times: Array, ground: Array) -> set[int]:
+def _longest_track(first: Indices, last: Indices, times: Array, ground: Array) -> set[int]:
     """Pieces (from index `first` to `last`) that can be flown one after the other and hold most fixes together."""
     best = (last - first + 1).astype(np.float64)
     before = np.full(len(first), -1)

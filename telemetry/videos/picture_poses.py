@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array
 from telemetry.formats.log.mavlink_poses import fixed_camera
 from telemetry.formats.video import srt
 from telemetry.samples.findings import Finding, plural
@@ -20,8 +20,6 @@ from telemetry.samples.sample import Sample
 from telemetry.samples.timeline import Timeline
 from telemetry.samples.wild_fixes import sound_positions
 from telemetry.videos.video_file import VideoScan, square_size
-
-Array = NDArray[np.float64]
 
 _SUBTITLE_EXCESS_S: Final = 3.0  # subtitles that end later than their video by more than this are of another length
 _HELD_AT_ENDS_S: Final = 1.0  # metadata counts this long before its first and after its last value

@@ -16,7 +16,7 @@ from typing import Any, Final
 
 from telemetry.formats.video import bitstream, djmd, gpmf, klv, sei, srt
 from telemetry.samples.sample import Sample
-from telemetry.samples.times import parse_time
+from telemetry.samples.times import epoch_of
 from telemetry.samples.unreadable import Unreadable
 from telemetry.videos.display_turn import AS_CODED, Turn, turn_of
 
@@ -270,8 +270,7 @@ def scan(path: Path) -> VideoScan:
         contexts = [s.codec_context for s in moving_streams(container) if s is not stream]
         result.others = [(c.width, c.height) for c in contexts if c is not None]
         result.rate = _rate(container, stream)
-        created = parse_time(str(container.metadata.get("creation_time", "")))
-        result.created_s = created[0] if created is not None else None
+        result.created_s = epoch_of(str(container.metadata.get("creation_time", "")))
         _scan_packets(container, stream, result)
     if not result.pictures:
         raise NotAVideo("the file holds no pictures; it may be cut off")

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orthoswarm.batch.merged_ground import merged_ground
-from orthoswarm.batch.pipeline import PRODUCTS, MapOptions, run
-from orthoswarm.batch.swarm_areas import divide
+from orthoswarm.batch.area_refinement import divide, merged_ground
+from orthoswarm.batch.pipeline import run
+from orthoswarm.batch.run_state import PRODUCTS, MapOptions
 from orthoswarm.batch.workspace import Workspace
 from orthoswarm.compute.workers import Processes, Serial
 from orthoswarm.config import DEFAULT, config_of

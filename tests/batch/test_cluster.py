@@ -135,7 +135,8 @@ def test_a_worker_that_would_sum_differently_is_refused(tmp_path, monkeypatch):
 
 
 def test_the_same_map_as_with_local_workers(loopback, tmp_path):
-    from orthoswarm.batch.pipeline import MapOptions, run
+    from orthoswarm.batch.pipeline import run
+    from orthoswarm.batch.run_state import MapOptions
     from telemetry import LoadOptions, load
     from tests.kit.scene import Scene, legs
 
@@ -226,7 +227,8 @@ def test_a_scheduler_that_stays_away_is_one_sentence(tmp_path, monkeypatch):
 
 
 def test_a_run_whose_cluster_is_lost_keeps_finished_flights(tmp_path):
-    from orthoswarm.batch.pipeline import MapOptions, run
+    from orthoswarm.batch.pipeline import run
+    from orthoswarm.batch.run_state import MapOptions
     from telemetry import load
     from tests.kit.scene import Scene, legs
 

@@ -11,9 +11,9 @@ import pytest
 import rasterio
 
 from gcs_plugin.cli.main import main
-from orthoswarm.batch.pipeline import PRODUCTS, MapOptions, run
+from orthoswarm.batch.pipeline import legs_as_vehicles, run
 from orthoswarm.batch.refiners import REFINERS
-from orthoswarm.batch.split_legs import legs_as_vehicles
+from orthoswarm.batch.run_state import PRODUCTS, MapOptions
 from orthoswarm.batch.workspace import Workspace
 from orthoswarm.compute.workers import Processes, Serial
 from orthoswarm.export import cog

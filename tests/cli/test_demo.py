@@ -10,8 +10,8 @@ import time
 import pytest
 
 from gcs_plugin.cli.main import main
+from gcs_plugin.demo.demonstration import PacedClock
 from gcs_plugin.demo.setting import DemoSetting, Errors
-from gcs_plugin.demo.simulator import PacedClock
 
 
 def test_a_folder_with_something_else_in_it_is_left_alone(tmp_path, capsys):
@@ -42,7 +42,7 @@ def test_vehicles_differ_and_stay_as_they_are():
 
 def test_the_clock_runs_slower_while_cameras_are_behind(monkeypatch):
     now = [100.0]
-    monkeypatch.setattr("gcs_plugin.demo.simulator.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("gcs_plugin.demo.demonstration.time.monotonic", lambda: now[0])
     clock = PacedClock()
     now[0] += 2.0
     assert clock() == pytest.approx(2.0)

@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from gcs_plugin.cli.interrupt import safe_interrupts
+from gcs_plugin.cli.main import safe_interrupts
 
 COMPILER = "def compile(raise_signal, sleep):\n    raise_signal()\n    sleep(0.2)\n    return 'compiled'\n"
 
@@ -72,7 +72,7 @@ def test_an_interrupt_that_came_too_late_interrupts_nothing():
 def test_where_interrupts_are_ignored_they_stay_ignored():
     code = (
         "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
-        "from gcs_plugin.cli.interrupt import safe_interrupts\n"
+        "from gcs_plugin.cli.main import safe_interrupts\n"
         "with safe_interrupts(): signal.raise_signal(signal.SIGINT)\n"
         "print('went on')"
     )

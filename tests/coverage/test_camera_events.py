@@ -4,8 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from orthoswarm.coverage.camera_events import CameraEvent, missing_by_events
-from orthoswarm.coverage.missing_pictures import Cause
+from orthoswarm.coverage.missing_pictures import CameraEvent, Cause, missing_by_events
 from orthoswarm.coverage.view import View
 from tests.kit.flown_area import FlownArea
 

@@ -11,7 +11,7 @@ from gcs_plugin.sim.multirotor import Airframe
 from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
 from tests.kit.daemon_kit import GRID, camera_at, jpeg, serving
 from tests.kit.mosaic_scene import EAST, NORTH
-from tests.kit.sim_cameras import Cameras, square
+from tests.kit.vehicles.sim_cameras import Cameras, square
 
 _ON_THE_CARD = range(5, 13)
 

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rasterio.transform import from_origin
 
-from gcs_plugin.bench import georeferencing, meter, peers
+from gcs_plugin.bench import georeferencing, peers
 from gcs_plugin.cli.main import main
 from orthoswarm.model.camera import Camera, Lens, rotation_from_angles
 from orthoswarm.model.errors import OrthoSwarmError
@@ -31,7 +31,7 @@ def python(code):
 
 def test_time_and_memory_of_children_count(tmp_path):
     code = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {BURN.format(0.7)!r}]); print('made')"
-    used = meter.run_measured(python(code), tmp_path / "log", 60.0, out=tmp_path / "out")
+    used = peers.run_measured(python(code), tmp_path / "log", 60.0, out=tmp_path / "out")
     assert used.code == 0 and used.cpu_s >= 0.7 and used.wall_s >= 0.7
     assert 150 < used.peak_rss_mb < 400
     assert (tmp_path / "out").read_text() == "made\n"
@@ -39,7 +39,7 @@ def test_time_and_memory_of_children_count(tmp_path):
 
 def test_memory_of_the_measuring_process_does_not_count(tmp_path):
     held = np.ones(600_000_000 // 8)
-    used = meter.run_measured(python(BURN.format(0.7)), tmp_path / "log", 60.0)
+    used = peers.run_measured(python(BURN.format(0.7)), tmp_path / "log", 60.0)
     assert held.all() and 150 < used.peak_rss_mb < 400
 
 
@@ -50,7 +50,7 @@ def test_a_program_at_its_limit_is_stopped_with_its_children(tmp_path):
         "print(child.pid, flush=True); time.sleep(60)"
     )
     start = time.monotonic()
-    used = meter.run_measured(python(code), tmp_path / "log", 0.5)
+    used = peers.run_measured(python(code), tmp_path / "log", 0.5)
     assert used.code is None and used.cpu_s > 0.5 and time.monotonic() - start < 30
     child = Path(f"/proc/{(tmp_path / 'log').read_text().strip()}/stat")
     deadline = time.monotonic() + 10
@@ -60,13 +60,13 @@ def test_a_program_at_its_limit_is_stopped_with_its_children(tmp_path):
 
 
 def test_a_program_that_fails_gives_its_code_and_words(tmp_path):
-    used = meter.run_measured(python("import sys; sys.exit('no overlap')"), tmp_path / "log", 60.0)
+    used = peers.run_measured(python("import sys; sys.exit('no overlap')"), tmp_path / "log", 60.0)
     assert used.code == 1 and (tmp_path / "log").read_text() == "no overlap\n"
 
 
 def test_variables_reach_the_program(tmp_path):
     show = python("import os; print(os.environ['OMP_NUM_THREADS'])")
-    meter.run_measured(show, tmp_path / "log", 60.0, {"OMP_NUM_THREADS": "7"})
+    peers.run_measured(show, tmp_path / "log", 60.0, {"OMP_NUM_THREADS": "7"})
     assert (tmp_path / "log").read_text() == "7\n"
 
 

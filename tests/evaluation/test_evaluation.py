@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from gcs_plugin.cli.main import main
 from orthoswarm.evaluation.displacement import FieldSettings, accuracy, completeness, displacement_field
-from orthoswarm.evaluation.pose_errors import Placement, camera_from_homography, pose_errors
+from orthoswarm.evaluation.true_cameras import Placement, camera_from_homography, pose_errors
 from orthoswarm.model.camera import Camera, Lens, angles_from_rotation, rotation_from_angles
 from orthoswarm.twin.city.procedural_noise import noise_field
 

@@ -18,10 +18,17 @@ from hypothesis import strategies as st
 
 from gcs_plugin.daemon.exports import places_of
 from gcs_plugin.daemon.tak_feed import TakFeed
-from orthoswarm.export.tactical.cursor_on_target import event, write_data_package
-from orthoswarm.export.tactical.place_files import write_csv, write_gpx, write_kml
-from orthoswarm.export.tactical.places import FILE, Place, read_places, sightings, write_geojson
-from orthoswarm.export.tactical.tak_sender import TakAddress, TakSender
+from orthoswarm.export.tactical.cursor_on_target import TakAddress, TakSender, event, write_data_package
+from orthoswarm.export.tactical.places import (
+    FILE,
+    Place,
+    read_places,
+    sightings,
+    write_csv,
+    write_geojson,
+    write_gpx,
+    write_kml,
+)
 from orthoswarm.model.camera import NADIR_PITCH_RAD, Camera, Lens, rotation_from_angles
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 from orthoswarm.model.frame import Fix, Frame

@@ -22,8 +22,7 @@ from orthoswarm.export.sheets.stac_item import write_stac_item
 from orthoswarm.export.sheets.stated_accuracy import stated_accuracy
 from orthoswarm.export.surface_file import write_surface
 from orthoswarm.export.tactical.places import FILE, Place, write_geojson
-from orthoswarm.export.tiles.mbtiles import write_mbtiles
-from orthoswarm.export.tiles.pmtiles import write_pmtiles
+from orthoswarm.export.tiles.mbtiles import write_mbtiles, write_pmtiles
 from orthoswarm.export.tiles.tile_pyramid import ReducedRaster
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.stereo.surface_cells import SurfaceModel

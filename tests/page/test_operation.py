@@ -13,7 +13,7 @@ from tests.kit.daemon_kit import GRID, serving
 from tests.kit.mosaic_scene import EAST, NORTH
 from tests.kit.page_kit import DESK, PHONE, TABLET, opened, poll
 from tests.kit.servers.ports import free_port
-from tests.kit.sim_cameras import Cameras, square
+from tests.kit.vehicles.sim_cameras import Cameras, square
 from tests.page.test_command_bar import confirm
 from tests.vehicles.autopilots.test_fleet_scenarios import charge
 from tests.vehicles.autopilots.test_twin_camera import ADDRESSES, CameraProcess, small_area

@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import maximum_bipartite_matching
 
 from orthoswarm.planning.lines.bcd import bcd_legs, cells, critical_points, order_cells
 from orthoswarm.planning.lines.bricks import joins, maximum_matching
-from orthoswarm.planning.lines.columns import column_legs
+from orthoswarm.planning.lines.candidates import column_legs
 from orthoswarm.planning.lines.detours import Router, make_obstacles
 from orthoswarm.planning.lines.line_spacing import footprint
 from orthoswarm.planning.lines.spanning_tree import circumnavigate, spanning_edges

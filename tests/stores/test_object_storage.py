@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from gcs_plugin.cli.main import main
-from orthoswarm.batch.pipeline import is_written
+from orthoswarm.batch.run_state import is_written
 from orthoswarm.model.errors import InputError
 from orthoswarm.stores import local_copies, published_folder, requests
 from orthoswarm.stores.addresses import path_of

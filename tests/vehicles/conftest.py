@@ -3,7 +3,7 @@
 import pytest
 
 from gcs_plugin.sim.lossy_radio import Faults
-from gcs_plugin.sim.memory_link import World
+from tests.kit.vehicles.memory_link import World
 
 
 @pytest.fixture

@@ -16,10 +16,10 @@ from gcs_plugin.links.transports import TcpLink
 from gcs_plugin.mission.exchange import GROUND_STATION, Verdict
 from gcs_plugin.mission.items import TAKEOFF, MissionItem
 from gcs_plugin.sim.lossy_radio import Faults
-from gcs_plugin.sim.memory_link import SimLink, VirtualClock
 from gcs_plugin.sim.mission_flight import MissionFlight
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
 from orthoswarm.model.errors import OrthoSwarmError
+from tests.kit.vehicles.memory_link import SimLink, VirtualClock
 from tests.vehicles.test_fleet import END, kinds, sent_by
 from tests.vehicles.test_sim import mission
 

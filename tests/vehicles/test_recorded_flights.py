@@ -19,11 +19,11 @@ from gcs_plugin.links.transports import Link
 from gcs_plugin.mission.completion import MissionEvent
 from gcs_plugin.mission.items import CHANGE_SPEED, RTL, TAKEOFF, WAYPOINT, Mission, MissionItem
 from gcs_plugin.mission.track import STEP_S, track_of
-from gcs_plugin.sim.memory_link import VirtualClock, World
 from gcs_plugin.sim.multirotor import Airframe
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
 from orthoswarm.config import DEFAULT
 from orthoswarm.model.earth import distance_m
+from tests.kit.vehicles.memory_link import VirtualClock, World
 
 FLIGHTS = Path(__file__).parents[1] / "data" / "flights"
 

@@ -22,10 +22,10 @@ from gcs_plugin.mission.items import (
 )
 from gcs_plugin.mission.track import flight_seconds, track_of
 from gcs_plugin.sim.lossy_radio import Channel, Faults
-from gcs_plugin.sim.memory_link import World
 from gcs_plugin.sim.multirotor import Airframe, Chart
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
 from orthoswarm.config import DEFAULT
+from tests.kit.vehicles.memory_link import World
 
 AP, PX4 = Autopilot.ARDUPILOT, Autopilot.PX4
 BOTH = pytest.mark.parametrize("autopilot", [AP, PX4])

@@ -7,7 +7,6 @@ import pytest
 
 from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.links.packets import Framer
-from gcs_plugin.mission.comparison import difference
 from gcs_plugin.mission.download import MissionDownload
 from gcs_plugin.mission.exchange import GROUND_STATION, Address, Verdict
 from gcs_plugin.mission.items import (
@@ -22,6 +21,7 @@ from gcs_plugin.mission.items import (
     WAYPOINT,
     Mission,
     MissionItem,
+    difference,
 )
 from gcs_plugin.mission.upload import MissionUpload
 from gcs_plugin.sim.lossy_radio import Channel, Faults

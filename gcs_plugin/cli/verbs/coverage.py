@@ -10,11 +10,10 @@ from orthoswarm.export.json_values import json_text
 from orthoswarm.model.errors import InputError
 
 if TYPE_CHECKING:
-    from orthoswarm.coverage.camera_events import CameraEvent
     from orthoswarm.coverage.coverage_grid import CoverageGrid
     from orthoswarm.coverage.gaps import Gaps
     from orthoswarm.coverage.map_folder import MapFolder
-    from orthoswarm.coverage.missing_pictures import MissingPicture
+    from orthoswarm.coverage.missing_pictures import CameraEvent, MissingPicture
     from orthoswarm.model.geo import LocalGrid
     from orthoswarm.model.placement import Terrain
     from orthoswarm.planning.area.area import Area
@@ -47,10 +46,10 @@ def run(args: argparse.Namespace) -> int:
     """Compute, write, print."""
     from gcs_plugin.plans.area_files import read_shapes
     from gcs_plugin.plans.plan_files import read_planned_flight
-    from orthoswarm.coverage.camera_events import missing_by_events
     from orthoswarm.coverage.coverage_files import draw_cells, write_cells, write_gaps
     from orthoswarm.coverage.gaps import find_gaps
     from orthoswarm.coverage.map_folder import read_map
+    from orthoswarm.coverage.missing_pictures import missing_by_events
     from orthoswarm.export.catalog.tiled_raster import product_file
     from orthoswarm.export.product_files import write_json
     from orthoswarm.model.geo import LocalGrid
@@ -94,7 +93,7 @@ def _events(logs: list[str], flown: "MapFolder", grid: "LocalGrid") -> "list[Cam
     """The camera events of logs, each for its given vehicle, or for the only one of the map."""
     import numpy as np
 
-    from orthoswarm.coverage.camera_events import CameraEvent
+    from orthoswarm.coverage.missing_pictures import CameraEvent
     from telemetry.formats.log.flight_logs import read_log
 
     vehicles = sorted({v.vehicle for v in flown.views})

@@ -277,7 +277,8 @@ def compile_cold_kernels(report: Callable[[str, int, int], None]) -> None:
 def _make_maps(folder: Path) -> None:
     """Map a dense flight, and a sparse one, whose pictures are matched in pairs instead of tracked."""
     import telemetry
-    from orthoswarm.batch.pipeline import MapOptions, run
+    from orthoswarm.batch.pipeline import run
+    from orthoswarm.batch.run_state import MapOptions
     from orthoswarm.compute.workers import Serial
     from orthoswarm.model.frame import Ingest
     from orthoswarm.twin.make import make_twin

@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
     if not args.pixel_scale > 0.0:
         raise InputError("--pixel-scale must be greater than 0")
     if args.field is not None:
-        from gcs_plugin.cli.written_files import refuse_replacing, require_folder_for
+        from gcs_plugin.cli.arguments import refuse_replacing, require_folder_for
 
         read = ("ortho", "reference", "checkpoints", "poses", "truth")
         refuse_replacing("--field", args.field, {name: getattr(args, name) for name in read})

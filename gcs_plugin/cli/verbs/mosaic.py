@@ -6,15 +6,16 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gcs_plugin.cli.configuration import add_config, given
+from gcs_plugin.cli.arguments import add_config, given
 from orthoswarm.export.json_values import json_text
 from orthoswarm.stores.addresses import address_of, path_of
 
 if TYPE_CHECKING:
-    from orthoswarm.batch.pipeline import MapOptions
+    from orthoswarm.batch.run_state import MapOptions
     from orthoswarm.compute.workers import Workers
     from orthoswarm.config import Config
     from orthoswarm.model.frame import Ingest
+    from orthoswarm.model.task_runner import Progress
 
 _REASONS = 5  # printed; all are in the report
 
@@ -118,7 +119,8 @@ def run(args: argparse.Namespace) -> int:
 
     import telemetry
     from gcs_plugin.cli.progress import ProgressBars
-    from orthoswarm.batch import pipeline
+    from orthoswarm.batch.pipeline import run as run_pipeline
+    from orthoswarm.batch.run_state import is_written
     from orthoswarm.batch.workspace import VIDEO, missing, unmake
     from orthoswarm.matchers.network_device import require_device
     from orthoswarm.model.errors import InputError
@@ -132,7 +134,7 @@ def run(args: argparse.Namespace) -> int:
 
     require_device(options.config.matchers.device)
 
-    def load(progress: pipeline.Progress) -> "Ingest":
+    def load(progress: "Progress") -> "Ingest":
         reading = telemetry.LoadOptions(
             every_m=args.every_m,
             every_s=args.every_s,
@@ -159,8 +161,8 @@ def run(args: argparse.Namespace) -> int:
     try:
         pool, drawers = _pools(args, out)
         with ProgressBars() as progress:
-            publish = None if published is None else partial(published.publish, pipeline.is_written, progress)
-            report = pipeline.run(load, out, options, pool, progress, drawers=drawers, publish=publish)
+            publish = None if published is None else partial(published.publish, is_written, progress)
+            report = run_pipeline(load, out, options, pool, progress, drawers=drawers, publish=publish)
     finally:
         for each in (pool, drawers):
             if each is not None:
@@ -175,7 +177,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _options(args: argparse.Namespace) -> "MapOptions":
     """What the pipeline is asked for."""
-    from orthoswarm.batch.pipeline import MapOptions
+    from orthoswarm.batch.run_state import MapOptions
 
     return MapOptions(**(given(args, MapOptions) | {"split_legs": args.split == "legs", "config": _config(args)}))
 
@@ -265,7 +267,7 @@ def _check(args: argparse.Namespace) -> None:
 
 def _check_written(args: argparse.Namespace) -> None:
     """Refuse to write over an input, and to write two products into one file."""
-    from gcs_plugin.cli.written_files import refuse_product, refuse_replacing
+    from gcs_plugin.cli.arguments import refuse_product, refuse_replacing
     from orthoswarm.batch.run_state import WRITTEN
     from orthoswarm.model.errors import InputError
 

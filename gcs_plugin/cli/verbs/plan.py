@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from gcs_plugin.cli.configuration import add_config, given
+from gcs_plugin.cli.arguments import add_config, given
 from orthoswarm.model.errors import InputError
 
 if TYPE_CHECKING:

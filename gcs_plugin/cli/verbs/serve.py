@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from gcs_plugin.cli.configuration import add_config
+from gcs_plugin.cli.arguments import add_config
 
 if TYPE_CHECKING:
     from gcs_plugin.daemon.settings import Settings

@@ -137,7 +137,7 @@ def _check(args: argparse.Namespace) -> None:
     Raises:
         InputError: one is out of range, or --out is a file.
     """
-    from gcs_plugin.cli.written_files import require_no_file
+    from gcs_plugin.cli.arguments import require_no_file
 
     for name, least in _LEAST.items():
         value = getattr(args, name)
@@ -240,8 +240,7 @@ def _follow_vehicles(args: argparse.Namespace) -> int:
 
     prepare_process()
 
-    from gcs_plugin.demo.following_camera import FollowingCameras, Shutter, open_outlet, wait_for_place
-    from gcs_plugin.demo.relay import Relay
+    from gcs_plugin.demo.following_camera import FollowingCameras, Relay, Shutter, open_outlet, wait_for_place
     from gcs_plugin.fleet.fleet import Fleet
     from gcs_plugin.links.signing import find_key
     from gcs_plugin.mission.exchange import Address

@@ -17,7 +17,7 @@ from gcs_plugin.daemon.store.exposure_rows import Exposed, all_exposures, exposu
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.daemon.vehicle_names import VehicleNames
 from gcs_plugin.links.mavlink import Message, dialect
-from orthoswarm.coverage.camera_events import CameraEvent
+from orthoswarm.coverage.missing_pictures import CameraEvent
 from orthoswarm.model.geo import LocalGrid
 
 if TYPE_CHECKING:

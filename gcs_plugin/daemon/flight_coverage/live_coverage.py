@@ -36,11 +36,10 @@ from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.frame_rows import last_drawn_arrival
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.daemon.vehicle_names import VehicleRow
-from orthoswarm.coverage.camera_events import missing_by_events
 from orthoswarm.coverage.coverage_files import COLOURS, gap_feature
 from orthoswarm.coverage.coverage_grid import Cells, CellState, CoverageGrid, Shares
 from orthoswarm.coverage.gaps import below_legs, find_gaps
-from orthoswarm.coverage.missing_pictures import MissingPicture
+from orthoswarm.coverage.missing_pictures import MissingPicture, missing_by_events
 from orthoswarm.coverage.planning_lens import planning_fovs_deg
 from orthoswarm.coverage.view import View
 from orthoswarm.export.product_files import iso_time

@@ -18,7 +18,7 @@ from gcs_plugin.daemon.store.sortie_rows import completion_rows
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.compute.workers import Usage, peak_rss_mb
 from orthoswarm.export.forms import FORMS, MapExport
-from orthoswarm.export.tactical import places as place_files
+from orthoswarm.export.tactical import places
 from orthoswarm.export.tactical.places import Place
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.frame import Frame, Rejection, last_time
@@ -95,7 +95,7 @@ def write_products(task: ExportTask) -> dict[str, str]:
     basemap = None if task.basemap is None else Basemap.open(task.basemap, task.epsg)
     report["against_map_m"] = write_page(out, report, placed, rejected=rejected, basemap=basemap, cells=task.cells)
     write_json(out / "report.json", report)
-    place_files.write_geojson(task.places, out / place_files.FILE)
+    places.write_geojson(task.places, out / places.FILE)
     files = {"cog": made[-1], "gpkg": "footprints.gpkg"}
     others = [name for name in task.formats if name not in files]
     if others:

@@ -21,8 +21,9 @@ from gcs_plugin.fleet.flight_state import Word, flight_state
 from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.flight_modes import why_no_missions
-from gcs_plugin.mission.track import STEP_S, Array, Track, metres, near_samples
+from gcs_plugin.mission.track import STEP_S, Track, metres, near_samples
 from orthoswarm.config import DEFAULT
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.earth import distance_m
 from orthoswarm.model.plan import APART, ON_GROUND_M
 

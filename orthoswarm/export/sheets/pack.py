@@ -18,11 +18,9 @@ from orthoswarm.export.sheets.geopdf import write_geopdf
 from orthoswarm.export.sheets.stac_item import SURFACE, surface_path, time_span, write_stac_item
 from orthoswarm.export.sheets.stated_accuracy import stated_accuracy
 from orthoswarm.export.tactical.cursor_on_target import write_data_package
-from orthoswarm.export.tactical.place_files import PLACE_FILES
-from orthoswarm.export.tactical.places import Place
+from orthoswarm.export.tactical.places import PLACE_FILES, Place
 from orthoswarm.export.tiles.kmz import kmz_file
-from orthoswarm.export.tiles.mbtiles import mbtiles_file
-from orthoswarm.export.tiles.pmtiles import write_pmtiles
+from orthoswarm.export.tiles.mbtiles import mbtiles_file, write_pmtiles
 from orthoswarm.export.tiles.tile_pyramid import draw_tiles
 
 _PAGE: Final = Path(__file__).with_name("pack_page.html")

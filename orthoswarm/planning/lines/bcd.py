@@ -6,21 +6,19 @@ that every line crosses in one piece. Cells are then flown in an order, and ente
 between them.
 """
 
-import itertools
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import kernel
+from orthoswarm.model.arrays import Array
 from orthoswarm.planning.lines.detours import Router
 from orthoswarm.planning.lines.line_spacing import Footprint
-from orthoswarm.planning.lines.sweep_lines import Field, Turned, line_count, strip_legs
+from orthoswarm.planning.lines.sweep_lines import Field, Turned, lines_across
 
 Geometry = Any
-Array = NDArray[np.float64]
 
 # Walls exactly across the sweep have no single critical point; a hair of rotation gives them one.
 _HAIR_RAD = 1e-7
@@ -122,7 +120,7 @@ def bcd_legs(field: Field, angle_rad: float, foot: Footprint, router: Router, mu
     parts = cells(local.ground.simplify(_TOOTH_SPACINGS * foot.spacing_m))
     sweeps = [
         _Sweep([frame.to_grid(np.array(line)) for line in lines])
-        for lines in _by_cell(_lines(local, foot, multiple), parts)
+        for lines in _by_cell(lines_across(local, foot, multiple), parts)
     ]
     if not sweeps:
         return np.empty((0, 2, 2))
@@ -132,14 +130,6 @@ def bcd_legs(field: Field, angle_rad: float, foot: Footprint, router: Router, mu
     ways = np.minimum(router.distances(exit_, entry), 1e9)
     order = order_cells(ways)
     return np.concatenate([variants[k // 4][k % 4] for k in order])
-
-
-def _lines(field: Field, foot: Footprint, multiple: int) -> list[list[Array]]:
-    """The legs of each line over the whole area, from low to high y."""
-    x0, y0, x1, y1 = field.ground.bounds
-    edges = np.linspace(x0, x1, -(-line_count(x1 - x0, foot.spacing_m) // multiple) * multiple + 1)
-    pairs = itertools.pairwise(edges)
-    return [strip_legs(field, (a, y0 - 1.0, b, y1 + 1.0), foot, 0.5 * foot.spacing_m) for a, b in pairs]
 
 
 def _by_cell(lines: list[list[Array]], parts: list[Geometry]) -> list[list[list[Array]]]:

@@ -6,18 +6,16 @@ from functools import partial
 from typing import Final, Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array
 from orthoswarm.planning.lines import planned_coverage
 from orthoswarm.planning.lines.bcd import bcd_legs
-from orthoswarm.planning.lines.columns import column_legs
 from orthoswarm.planning.lines.detours import Router
 from orthoswarm.planning.lines.line_spacing import Footprint
-from orthoswarm.planning.lines.sweep_lines import Field, rank_directions, stretches
+from orthoswarm.planning.lines.sweep_lines import Field, Turned, lines_across, rank_directions, stretches
 from orthoswarm.planning.lines.tmstc import tmstc_legs
 from orthoswarm.planning.lines.visiting_order import shorten
 
-Array = NDArray[np.float64]
 Method = Literal["columns", "bcd", "tmstc"]
 
 METHODS: tuple[str, ...] = get_args(Method)
@@ -120,6 +118,21 @@ def _lay(field: Field, angle: float, foot: Footprint, *, method: Method, router:
     if method == "bcd":
         return planned_coverage.prune(field, bcd_legs(field, angle, foot, router, multiple), foot)
     return planned_coverage.prune(field, chained(tmstc_legs(field, angle, foot)), foot)
+
+
+def column_legs(field: Field, angle_rad: float, foot: Footprint, multiple: int = 1) -> Array:
+    """Legs of all columns over the area in flying order, float64 (n, 2, 2), grid metres; arguments as of `bcd_legs`.
+
+    A column that an obstacle or a bay of the outline interrupts is flown to its end (around the obstacle) before the
+    next one begins: simple and even, but it goes around an obstacle once per column.
+    """
+    frame = Turned(angle_rad, (field.ground.centroid.x, field.ground.centroid.y))
+    found: list[Array] = []
+    up = True
+    for legs in lines_across(field.turned(frame), foot, multiple):
+        found += legs if up else [leg[::-1] for leg in reversed(legs)]
+        up = up != bool(legs)
+    return frame.to_grid(np.array(found)) if found else np.empty((0, 2, 2))
 
 
 def _finished(

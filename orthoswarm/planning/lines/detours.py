@@ -8,13 +8,13 @@ from typing import Any, Final
 
 import numpy as np
 import shapely
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from orthoswarm.compute.jit import kernel
+from orthoswarm.model.arrays import Array, Flags, Ints
 from orthoswarm.model.errors import InputError
 
 Geometry = Any
-Array = NDArray[np.float64]
 
 _DETOUR_INSIDE_M: Final = 0.02  # how far a detour may pass inside an obstacle: its corners touch it (rounding)
 _OBSTACLE_TOLERANCE: Final = 0.1  # obstacles are simplified outwards by this share of the clearance ...
@@ -93,7 +93,7 @@ class Router:
         self._shrunk = shrunk
         self._corners = _convex_corners(obstacles)
         self._hops: Array = np.empty((0, 0))
-        self._before: NDArray[np.int32] = np.empty((0, 0), np.int32)
+        self._before: Ints = np.empty((0, 0), np.int32)
         if len(self._corners):
             from scipy.sparse.csgraph import shortest_path  # not at the start of a station, which it holds up
 
@@ -102,14 +102,14 @@ class Router:
                 np.where(np.isfinite(sight), sight, 0.0), directed=False, return_predecessors=True
             )
 
-    def blocked(self, start: ArrayLike, end: ArrayLike) -> NDArray[np.bool_]:
+    def blocked(self, start: ArrayLike, end: ArrayLike) -> Flags:
         """Which straight segments start[i] -> end[i], both (n, 2), cross an obstacle: bool (n,)."""
         p, q = np.ascontiguousarray(start, np.float64), np.ascontiguousarray(end, np.float64)
         if not len(self._edges):
             return np.zeros(len(p), bool)
         return np.asarray(_blocked(p, q, self._edges))
 
-    def inside(self, points: ArrayLike) -> NDArray[np.bool_]:
+    def inside(self, points: ArrayLike) -> Flags:
         """Which points (n, 2) lie in an obstacle: bool (n,)."""
         p = np.asarray(points, np.float64).reshape(-1, 2)
         return np.asarray(shapely.contains_xy(self._shrunk, p[:, 0], p[:, 1]))

@@ -4,14 +4,13 @@ from typing import Any, Final
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array
 from orthoswarm.planning.lines.detours import Router
 from orthoswarm.planning.lines.line_spacing import Footprint
 from orthoswarm.planning.lines.sweep_lines import Field, Turned, strip_legs
 
 Geometry = Any
-Array = NDArray[np.float64]
 
 COMPLETE_SHARE: Final = 0.999  # share of an area from which on a plan covers it
 _TARGET_SHARE: Final = 0.9996  # share up to which gaps are mended: above the other for errors of the flight
@@ -46,11 +45,10 @@ def missed(ground: Geometry, legs: Array, width_m: float, reach_m: float) -> Geo
     return ground.difference(shapely.union_all(bands(legs, width_m, reach_m)))
 
 
-def pieces(geometry: Geometry, least_m2: float | None = None) -> list[Geometry]:
-    """Polygons of at least a size (None: as configured) in a geometry, largest first."""
-    least_m2 = _CRUMB_M2 if least_m2 is None else least_m2
+def pieces(geometry: Geometry) -> list[Geometry]:
+    """Polygons in a geometry, largest first, without crumbs."""
     parts = [p for p in shapely.get_parts(shapely.get_parts(geometry)) if p.geom_type == "Polygon"]
-    return sorted((p for p in parts if p.area >= least_m2), key=lambda p: -p.area)
+    return sorted((p for p in parts if p.area >= _CRUMB_M2), key=lambda p: -p.area)
 
 
 def prune(field: Field, legs: Array, foot: Footprint) -> Array:

@@ -4,19 +4,19 @@ In a turned frame lines run along +y and the sweep goes along +x. A leg covers i
 it reaches from the lowest to the highest ground in the strip, so that slanted borders leave no triangles uncovered.
 """
 
+import itertools
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.errors import InputError
 from orthoswarm.planning.lines.line_spacing import Footprint
 
 Geometry = Any
-Array = NDArray[np.float64]
 
 MOST_LINES = 20_000
 
@@ -119,6 +119,14 @@ def strip_legs(field: Field, box: tuple[float, float, float, float], foot: Footp
                 ends = (min(a for a, _ in seen), max(b for _, b in seen))
                 legs.append(_at_least(field.obstacles, x, ends, foot.trigger_m))
     return legs
+
+
+def lines_across(field: Field, foot: Footprint, multiple: int) -> list[list[Array]]:
+    """The legs of each line over the whole ground, from low to high y; their number is a multiple of a number."""
+    x0, y0, x1, y1 = field.ground.bounds
+    edges = np.linspace(x0, x1, -(-line_count(x1 - x0, foot.spacing_m) // multiple) * multiple + 1)
+    pairs = itertools.pairwise(edges)
+    return [strip_legs(field, (a, y0 - 1.0, b, y1 + 1.0), foot, 0.5 * foot.spacing_m) for a, b in pairs]
 
 
 def _free_parts(obstacles: Geometry, x: float, low: float, high: float) -> list[tuple[float, float]]:

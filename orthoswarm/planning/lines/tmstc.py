@@ -9,16 +9,15 @@ from typing import Any, Final
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array, Flags, Indices
 from orthoswarm.planning.lines.bricks import joins
 from orthoswarm.planning.lines.line_spacing import Footprint
 from orthoswarm.planning.lines.spanning_tree import circumnavigate, spanning_edges
 from orthoswarm.planning.lines.sweep_lines import Field, Turned, line_count, strip_legs
 
 Geometry = Any
-Array = NDArray[np.float64]
-Loop = NDArray[np.int64]
+Loop = Indices
 
 _TMSTC_CRUMB_SHARE: Final = 0.02  # a cell of the spanning tree that holds a smaller share of the area is left out
 
@@ -48,9 +47,7 @@ def tmstc_legs(field: Field, angle_rad: float, foot: Footprint) -> list[Array]:
     return [frame.to_grid(np.array(legs)) for legs in found if legs]
 
 
-def occupied(
-    ground: Geometry, origin: tuple[float, float], size: tuple[float, float], shape: tuple[int, int]
-) -> NDArray[np.bool_]:
+def occupied(ground: Geometry, origin: tuple[float, float], size: tuple[float, float], shape: tuple[int, int]) -> Flags:
     """Which boxes of a raster hold more than a crumb of ground: bool, `shape` = boxes along x and y."""
     x = origin[0] + size[0] * np.arange(shape[0])[:, None]
     y = origin[1] + size[1] * np.arange(shape[1])[None, :]
@@ -73,7 +70,7 @@ def _runs(loop: Loop) -> list[Loop]:
 
 def _loop_legs(
     loop: Loop,
-    filled: NDArray[np.bool_],
+    filled: Flags,
     fields: tuple[Field, Field],
     *,
     origin: tuple[float, float],

@@ -3,12 +3,10 @@
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel, kernel
+from orthoswarm.model.arrays import Array
 from orthoswarm.planning.lines.detours import Router
-
-Array = NDArray[np.float64]
 
 _ORDERED_MOST_LEGS: Final = 500  # orders of more legs are not improved: cost grows with the square (for its time)
 

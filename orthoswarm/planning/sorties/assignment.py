@@ -7,10 +7,10 @@ from functools import partial
 from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.config.autopilot import ARDUPILOT, AutopilotTimes
 from orthoswarm.config.planning import PLANNING
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.plan import End
@@ -23,7 +23,6 @@ from orthoswarm.planning.sorties.flight_path import Flight, make_flight
 from orthoswarm.planning.sorties.flight_time import Motion
 from orthoswarm.planning.sorties.workload_split import Limits, Row, cut, share, sorties
 
-Array = NDArray[np.float64]
 Heading = float | Literal["wind", "longest"]
 
 MOST_VEHICLES = 250  # MAVLink system ids

@@ -13,16 +13,15 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel, kernel
 from orthoswarm.config.autopilot import ARDUPILOT
 from orthoswarm.config.planning import PLANNING
+from orthoswarm.model.arrays import Array, Flags, Indices
 from orthoswarm.model.plan import APART, ON_GROUND_M, PAD_DISTANCES
 from orthoswarm.planning.sorties.flight_path import Flight
 from orthoswarm.planning.sorties.flight_time import Motion, start_slack_s
 
-Array = NDArray[np.float64]
 Maker = Callable[[float, float], Flight]
 
 _STEP_S: Final = 0.5  # time step in which flights are compared (for its time)
@@ -105,13 +104,8 @@ class _Track:
     home: Array
     ground: int
     places: Array
-    pad: NDArray[np.bool_]
-    slack: NDArray[np.int64]
-
-
-def _step_s() -> float:
-    """Time step in which flights are compared, seconds."""
-    return _STEP_S
+    pad: Flags
+    slack: Indices
 
 
 def _sampled(flight: Flight, motion: Motion, apart: Separation) -> _Track:
@@ -120,11 +114,11 @@ def _sampled(flight: Flight, motion: Motion, apart: Separation) -> _Track:
     if flight.wait_s > 0.0:  # it comes to where it waits, and stays there
         at = 3 + flight.last_leg_end
         track, waits = np.insert(track, at, track[at - 1], axis=0), np.insert(waits, at, flight.wait_s)
-    places = motion.places(track, waits, _step_s())
+    places = motion.places(track, waits, _STEP_S)
     flying = np.flatnonzero(places[:, 2] > flight.home_z_m + ON_GROUND_M)
     places = np.ascontiguousarray(places[flying[0] : flying[-1] + 1])
     pad = np.hypot(*(places[:, :2] - flight.home).T) < apart.pad_m
-    slack = np.ceil(np.minimum(start_slack_s(pad, motion.autopilot), apart.slack_s) / _step_s()).astype(np.int64)
+    slack = np.ceil(np.minimum(start_slack_s(pad, motion.autopilot), apart.slack_s) / _STEP_S).astype(np.int64)
     return _Track(flight.home, int(flying[0]), places, pad, slack)
 
 
@@ -174,15 +168,13 @@ class _Frozen:
 
     pad: bool
     points: Array
-    when: NDArray[np.int64]
-    slack: NDArray[np.int64]
-    bins: tuple[NDArray[np.int64], NDArray[np.int64]]
+    when: Indices
+    slack: Indices
+    bins: tuple[Indices, Indices]
     raster: Array
 
     @classmethod
-    def of(
-        cls, pad: bool, points: Array, when: NDArray[np.int64], slack: NDArray[np.int64], cell_m: float
-    ) -> "_Frozen":
+    def of(cls, pad: bool, points: Array, when: Indices, slack: Indices, cell_m: float) -> "_Frozen":
         low, high = points[:, :2].min(0), points[:, :2].max(0)
         cell = max(cell_m, float((high - low).max()) / 1000.0)
         shape = ((high - low) / cell).astype(np.int64) + 1
@@ -193,10 +185,10 @@ class _Frozen:
     def forbid(
         self,
         points: Array,
-        when: NDArray[np.int64],
-        slack: NDArray[np.int64],
+        when: Indices,
+        slack: Indices,
         apart: Array,
-        marks: NDArray[np.int64],
+        marks: Indices,
     ) -> None:
         """Mark delays at which samples of another track come near; see `_forbid`."""
         _forbid(points, when, slack, self.points, self.when, self.slack, self.bins, self.raster, apart, marks)
@@ -209,11 +201,11 @@ class _Sky:
         self._apart, self._in_turn = apart, in_turn
         self._tracks: list[tuple[int, _Track]] = []
         # Between samples a vehicle moves: half a step is added to the distance to keep.
-        self._reach = apart.distance_m + 0.5 * _step_s() * speed_m_s
+        self._reach = apart.distance_m + 0.5 * _STEP_S * speed_m_s
 
     def place(self, make: Maker, motion: Motion, ready_s: float) -> Slot:
         """Give a flight its layers and takeoff, not before it is ready, and remember it."""
-        ready = int(np.ceil(ready_s / _step_s()))
+        ready = int(np.ceil(ready_s / _STEP_S))
         layers = self._apart.layers + 1
         pairs = sorted(((o, h) for o in range(layers) for h in range(layers)), key=lambda p: (sum(p), p))
         frozen = self._frozen(make(0.0, 0.0).home)
@@ -227,12 +219,12 @@ class _Sky:
             track = _sampled(flight, motion, self._apart)
             marks = self._launches(track, ready)
             if best is None:  # whatever the layers, takeoffs at one start come one after the other
-                soonest = _first_zero(marks) * _step_s()
+                soonest = _first_zero(marks) * _STEP_S
             self._meetings(track, ready, frozen, marks)
             delay = _first_zero(marks)
-            if best is None or price + delay * _step_s() < best[0]:
-                slot = Slot(out, home, (ready + delay) * _step_s(), flight)
-                best = (price + delay * _step_s(), slot, track, ready + delay)
+            if best is None or price + delay * _STEP_S < best[0]:
+                slot = Slot(out, home, (ready + delay) * _STEP_S, flight)
+                best = (price + delay * _STEP_S, slot, track, ready + delay)
         assert best is not None
         self._tracks.append((best[3], best[2]))
         return best[1]
@@ -252,12 +244,12 @@ class _Sky:
     @property
     def _slack(self) -> int:
         """How many samples a vehicle may be off schedule away from its start."""
-        return int(np.ceil(self._apart.slack_s / _step_s()))
+        return int(np.ceil(self._apart.slack_s / _STEP_S))
 
-    def _launches(self, track: _Track, ready: int) -> NDArray[np.int64]:
+    def _launches(self, track: _Track, ready: int) -> Indices:
         """Delays that takeoffs from the same start forbid, as marks; room for all others."""
         apart = self._apart
-        slack, gap = self._slack, int(np.ceil(apart.launch_s / _step_s()))
+        slack, gap = self._slack, int(np.ceil(apart.launch_s / _STEP_S))
         end = max((s + t.ground + len(t.places) for s, t in self._tracks), default=0)
         marks = np.zeros(max(1, end - ready) + slack + gap + 3, np.int64)
         for start, other in self._tracks:
@@ -269,7 +261,7 @@ class _Sky:
         """Two places of takeoff count as one start."""
         return bool(np.hypot(*(home - other)) < self._apart.pad_m)
 
-    def _meetings(self, track: _Track, ready: int, frozen: list[_Frozen], marks: NDArray[np.int64]) -> None:
+    def _meetings(self, track: _Track, ready: int, frozen: list[_Frozen], marks: Indices) -> None:
         """Mark delays that bring a track too near a placed one, or to the same start at the same time."""
         apart = self._apart
         # Layers are apart: the hair keeps neighbouring ones from clashing by rounding.
@@ -284,17 +276,17 @@ class _Sky:
         for start, placed in self._tracks:
             if self._shared(placed.home, track.home):
                 landing = start + placed.ground + len(placed.places) - track.ground - len(track.places)
-                _mark(marks, landing - ready, int(np.ceil(apart.launch_s / _step_s())) - 1)
+                _mark(marks, landing - ready, int(np.ceil(apart.launch_s / _STEP_S)) - 1)
 
 
-def _mark(marks: NDArray[np.int64], delay: int, slack: int) -> None:
+def _mark(marks: Indices, delay: int, slack: int) -> None:
     first, last = max(0, delay - slack), min(len(marks) - 2, delay + slack)
     if last >= first:
         marks[first] += 1
         marks[last + 1] -= 1
 
 
-def _first_zero(marks: NDArray[np.int64]) -> int:
+def _first_zero(marks: Indices) -> int:
     return int(np.argmax(np.cumsum(marks) == 0))
 
 
@@ -396,7 +388,7 @@ class _Placing:
         return sum(map(bool, self.slots)) / len(self.slots)
 
     @property
-    def _one_start(self) -> NDArray[np.bool_]:
+    def _one_start(self) -> Flags:
         """Pairs of vehicles that take off at one start, (n, n)."""
         away = np.hypot(*(self._homes[:, None] - self._homes[None]).transpose(2, 0, 1))
         return np.asarray(away < self._apart.pad_m)

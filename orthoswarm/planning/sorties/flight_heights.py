@@ -8,12 +8,10 @@ from dataclasses import KW_ONLY, dataclass, field
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.config.planning import PLANNING
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.placement import Terrain
-
-Array = NDArray[np.float64]
 
 _SAME_M = 0.01
 

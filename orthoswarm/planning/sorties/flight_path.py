@@ -6,11 +6,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array, Flags
 from orthoswarm.planning.lines.detours import Router
 from orthoswarm.planning.sorties.flight_heights import FlightHeights
 from orthoswarm.planning.sorties.flight_time import Motion, length, turns
-
-Array = NDArray[np.float64]
 
 _SAME_M = 0.05
 
@@ -42,7 +41,7 @@ class Flight:
     returns: bool
     home_z_m: float
     above_m: Array
-    between: NDArray[np.bool_]
+    between: Flags
     ground_by_vehicle: bool = False
     wait_s: float = 0.0
 

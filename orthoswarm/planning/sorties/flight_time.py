@@ -5,12 +5,10 @@ import math
 from dataclasses import KW_ONLY, dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.config.autopilot import ARDUPILOT, AutopilotTimes
 from orthoswarm.model.angles import wrap_rad
-
-Array = NDArray[np.float64]
+from orthoswarm.model.arrays import Array, Flags
 
 _TURN_RAD = np.radians(10.0)
 _SPOT_M = 0.01
@@ -184,7 +182,7 @@ class Motion:
         return self.autopilot.land_wait_s if self.lands else self.autopilot.home_wait_s
 
 
-def start_slack_s(near_start: NDArray[np.bool_], autopilot: AutopilotTimes) -> Array:
+def start_slack_s(near_start: Flags, autopilot: AutopilotTimes) -> Array:
     """Seconds off schedule that a plan allows a flight around a start that vehicles share, float64 (n,).
 
     Args:

@@ -10,13 +10,11 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import kernel
+from orthoswarm.model.arrays import Array, Indices
 from orthoswarm.planning.lines.detours import Router
 from orthoswarm.planning.sorties.flight_time import Motion, angles
-
-Array = NDArray[np.float64]
 
 _FIRST_CAP: Final = 1.3
 """Divisions are searched up to so many times the mean share first, which keeps the search narrow ..."""
@@ -39,7 +37,7 @@ class Row:
     """
 
     parts: Array
-    leg: NDArray[np.int64]
+    leg: Indices
     begin_s: Array
     end_s: Array
 
@@ -165,7 +163,7 @@ def _cut_evenly(parts, leg, when, out, home, own, single, back, endurance, limit
 
 def _evenly(
     row: Row, out: Array, home: Array, motion: Motion, limits: Limits, *, own: bool, returns: bool, single: bool
-) -> NDArray[np.int64] | None:
+) -> Indices | None:
     problem = (
         np.ascontiguousarray(row.parts),
         row.leg,
@@ -187,7 +185,7 @@ def _evenly(
     return None
 
 
-def _pairs(cuts: NDArray[np.int64]) -> list[tuple[int, int]]:
+def _pairs(cuts: Indices) -> list[tuple[int, int]]:
     return list(itertools.pairwise(cuts.tolist()))
 
 

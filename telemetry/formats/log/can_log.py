@@ -4,6 +4,7 @@ Several nodes may send the same value; at each moment the one with the lowest st
 which dates the rest of the log; without them the log's own times are used if they are dates.
 """
 
+import logging
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -30,6 +31,9 @@ _HEADS: Final = {
     ".blf": re.compile(rb"LOGG"),
     ".trc": re.compile(rb"\s*;"),
 }
+
+_NO_SIZE: Final = re.compile(rb"LOBJ(?=.{4}\0{4})", re.DOTALL)
+"""An object of a .blf: signature, sizes of its header and version (2 bytes each), its size (4 bytes)."""
 
 
 def is_can_log(path: Path) -> bool:
@@ -88,11 +92,9 @@ def _messages(path: Path, reading: _Reading) -> Iterator[Any]:
     """The frames of a log; damaged places are skipped."""
     import can
 
-    from telemetry.formats.log.blf_reader import BlfReader
-
     log = None
     try:
-        log = BlfReader(str(path)) if path.suffix.lower() == ".blf" else can.LogReader(str(path))
+        log = _blf_reader(path) if path.suffix.lower() == ".blf" else can.LogReader(str(path))
         while reading.damaged < _MOST_DAMAGE:
             try:
                 yield from log
@@ -109,6 +111,23 @@ def _messages(path: Path, reading: _Reading) -> Iterator[Any]:
     finally:
         if log is not None:
             log.stop()
+
+
+def _blf_reader(path: Path) -> Any:
+    """python-can's reader of Vector's .blf, safe against damaged files.
+
+    It follows the size that each object states. In a damaged file that may be 0, and the reader then stays at this
+    object for ever. An object of no size is given another signature, which the reader takes for damage.
+    """
+    import can
+
+    class BlfReader(can.BLFReader):  # type: ignore[misc]
+        def _parse_data(self, data: bytes) -> Iterator[can.Message]:
+            yield from super()._parse_data(_NO_SIZE.sub(b"damg", data))
+
+    # A line for each object of an unknown kind would fill the terminal; our own finding counts damaged places.
+    logging.getLogger("can.io.blf").setLevel(logging.ERROR)
+    return BlfReader(str(path))
 
 
 def _best(poses: list[tuple[str, NodePose]]) -> list[Sample]:

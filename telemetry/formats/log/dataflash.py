@@ -11,10 +11,11 @@ import contextlib
 import mmap
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from telemetry.formats.log.log_data import LEAST_STEP_S, FlightLog, NotALog, Row, add_sample, each, mapped
+from telemetry.formats.log.log_data import FlightLog, NotALog, Row, add_sample, each, is_later, mapped
 from telemetry.formats.log.mavlink_poses import ExposureEvent
 from telemetry.samples.rotations import camera_angles_deg, euler_ned
 from telemetry.samples.sample import Sample, checked
@@ -63,16 +64,44 @@ def read_dataflash(path: Path) -> FlightLog:
         raise NotALog("the file holds no DataFlash record; it is not an ArduPilot log")
     log = FlightLog(path=path, kind="DataFlash", vehicle=path.stem)
     clock = _utc_minus_boot(rows.get("GPS", []))
-    if "POS" in rows:
-        each(rows["POS"], lambda row: _position(log, row, clock))
-    else:
-        each(rows.get("GPS", []), lambda row: _fix(log, row, clock))
-    each(rows.get("ATT") or rows.get("AHR2", []), lambda row: _attitude(log, row, clock))
-    each(rows.get("RFND", []), lambda row: _rangefinder(log, row, clock))
-    each(rows.get("TERR", []), lambda row: _terrain(log, row, clock))
-    each(rows.get("MNT", []), lambda row: _gimbal(log, row, clock))
-    each(rows.get("CAM", []), lambda row: log.events.append(_event(row, "CAM", clock)))
-    each(rows.get("TRIG", []), lambda row: log.events.append(_event(row, "TRIG", clock)))
+
+    def add(row: Row, **values: Any) -> None:
+        add_sample(log, _utc_s(row, clock), **values)
+
+    def position(row: Row) -> None:
+        height = row.get("RelHomeAlt", row.get("RelAlt"))
+        add(row, lat_deg=row["Lat"], lon_deg=row["Lng"], altitude_m=row.get("Alt"), height_m=height)
+
+    def fix(row: Row) -> None:
+        if _has_fix(row) and row.get("I", 0) == 0:
+            position(row)
+
+    def attitude(row: Row) -> None:
+        add(row, flight_yaw_deg=row["Yaw"], flight_pitch_deg=row["Pitch"], flight_roll_deg=row["Roll"])
+
+    def rangefinder(row: Row) -> None:
+        if row.get("Orient", 25) == 25 and row.get("Stat", 4) == 4 and 0.5 < row["Dist"] < 5000.0:
+            add(row, height_m=float(row["Dist"]), height_is_ground=True)
+
+    def terrain(row: Row) -> None:
+        if row.get("Status", 2) == 2 and row["CHeight"] > 0.5:
+            add(row, height_m=float(row["CHeight"]), height_is_ground=True)
+
+    def gimbal(row: Row) -> None:
+        stated = [row.get("YawE", row.get("Yaw", np.nan)), row.get("Pitch", np.nan), row.get("Roll", np.nan)]
+        if not np.isfinite(stated).all():
+            return
+        log.has_gimbal = True
+        yaw, pitch, roll = camera_angles_deg(euler_ned(*map(float, stated)))
+        add(row, yaw_deg=yaw, pitch_deg=pitch, roll_deg=roll)
+
+    # Receivers' positions only where the filter's are not logged.
+    each(rows["POS"] if "POS" in rows else rows.get("GPS", []), position if "POS" in rows else fix)
+    each(rows.get("ATT") or rows.get("AHR2", []), attitude)
+    for kind, take in (("RFND", rangefinder), ("TERR", terrain), ("MNT", gimbal)):
+        each(rows.get(kind, []), take)
+    for kind in ("CAM", "TRIG"):
+        each(rows.get(kind, []), lambda row, kind=kind: log.events.append(_event(row, kind, clock)))  # type: ignore[misc]
     if clock is None and not any(event.time_s is not None for event in log.events):
         raise NotALog("the log has no GPS time, so nothing in it can be dated; log GPS records or use the tlog")
     return log
@@ -142,7 +171,7 @@ def _boot_s(row: Row) -> float | None:
 def _is_later(row: Row, last: Row) -> bool:
     """Whether a record is late enough after the last stored one to be stored, too."""
     now, before = _boot_s(row), _boot_s(last)
-    return now is None or before is None or not 0.0 <= now - before < LEAST_STEP_S
+    return now is None or before is None or is_later(now - before)
 
 
 def _has_fix(row: Row) -> bool:
@@ -152,44 +181,6 @@ def _has_fix(row: Row) -> bool:
 def _utc_s(row: Row, clock: float | None) -> float | None:
     boot_s = _boot_s(row)
     return None if clock is None or boot_s is None else boot_s + clock
-
-
-def _position(log: FlightLog, row: Row, clock: float | None) -> None:
-    height = row.get("RelHomeAlt", row.get("RelAlt"))
-    add_sample(
-        log, _utc_s(row, clock), lat_deg=row["Lat"], lon_deg=row["Lng"], altitude_m=row.get("Alt"), height_m=height
-    )
-
-
-def _fix(log: FlightLog, row: Row, clock: float | None) -> None:
-    """A receiver's position, for logs without the filter's."""
-    if _has_fix(row) and row.get("I", 0) == 0:
-        _position(log, row, clock)
-
-
-def _attitude(log: FlightLog, row: Row, clock: float | None) -> None:
-    add_sample(
-        log, _utc_s(row, clock), flight_yaw_deg=row["Yaw"], flight_pitch_deg=row["Pitch"], flight_roll_deg=row["Roll"]
-    )
-
-
-def _rangefinder(log: FlightLog, row: Row, clock: float | None) -> None:
-    if row.get("Orient", 25) == 25 and row.get("Stat", 4) == 4 and 0.5 < row["Dist"] < 5000.0:
-        add_sample(log, _utc_s(row, clock), height_m=float(row["Dist"]), height_is_ground=True)
-
-
-def _terrain(log: FlightLog, row: Row, clock: float | None) -> None:
-    if row.get("Status", 2) == 2 and row["CHeight"] > 0.5:
-        add_sample(log, _utc_s(row, clock), height_m=float(row["CHeight"]), height_is_ground=True)
-
-
-def _gimbal(log: FlightLog, row: Row, clock: float | None) -> None:
-    yaw = row.get("YawE", row.get("Yaw"))
-    if yaw is None or not np.isfinite([yaw, row.get("Pitch", np.nan), row.get("Roll", np.nan)]).all():
-        return
-    log.has_gimbal = True
-    yaw, pitch, roll = camera_angles_deg(euler_ned(float(yaw), float(row["Pitch"]), float(row["Roll"])))
-    add_sample(log, _utc_s(row, clock), yaw_deg=yaw, pitch_deg=pitch, roll_deg=roll)
 
 
 def _event(row: Row, kind: str, clock: float | None) -> ExposureEvent:

@@ -12,15 +12,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-import numpy as np
-from numpy.typing import NDArray
-
+from orthoswarm.model.arrays import Array
 from telemetry.formats.log.mavlink_poses import euler_deg
 from telemetry.samples.rotations import camera_frame_angles_deg, quaternion_ned
 from telemetry.samples.sample import Sample, checked
 from telemetry.samples.times import GPS_MINUS_UTC_S, TAI_MINUS_UTC_S
-
-Array = NDArray[np.float64]
 
 _SOLUTION, _GIMBAL, _FIX, _FIX2 = 1000, 1044, 1060, 1063
 MESSAGES: Final = (_SOLUTION, _GIMBAL, _FIX, _FIX2)

@@ -23,7 +23,7 @@ import numpy as np
 from telemetry.formats.log.log_data import FlightLog, NotALog
 from telemetry.formats.log.mavlink_poses import ExposureEvent
 from telemetry.samples.sample import Sample, checked
-from telemetry.samples.times import GPS_EPOCH_S, GPS_MINUS_UTC_S, WEEK_S, parse_time
+from telemetry.samples.times import GPS_EPOCH_S, GPS_MINUS_UTC_S, WEEK_S, epoch_of
 from telemetry.samples.unreadable import MOST_TEXT_BYTES
 
 _NUMBER = r"\s*([+-]?\d+(?:\.\d+)?)"
@@ -176,8 +176,8 @@ def _time(words: Sequence[str]) -> float:
     Raises:
         ValueError: it is no time.
     """
-    written = parse_time(" ".join(words[:2]))
-    return GPS_EPOCH_S + int(words[0]) * WEEK_S + float(words[1]) if written is None else written[0]
+    written = epoch_of(" ".join(words[:2]))
+    return GPS_EPOCH_S + int(words[0]) * WEEK_S + float(words[1]) if written is None else written
 
 
 def _degrees(numbers: Sequence[float]) -> tuple[float, float, float]:

@@ -64,6 +64,11 @@ def mapped(path: Path) -> Iterator[mmap.mmap]:
         yield data
 
 
+def is_later(by_s: float) -> bool:
+    """Whether a record is late enough after the last one that was kept to be kept, too."""
+    return not 0.0 <= by_s < LEAST_STEP_S
+
+
 def add_sample(log: FlightLog, time_s: float | None, **values: Any) -> None:
     """Add a pose to a log if it is dated and has valid values: where it states a position, a valid one."""
     sample = checked(Sample(**values))

@@ -13,14 +13,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array
 from telemetry.formats.log.sender_clocks import AUTOPILOT, SenderClocks
 from telemetry.samples.rotations import airframe_ned, camera_angles_deg, euler_ned, mounted_down_deg, quaternion_ned
 from telemetry.samples.sample import Sample, checked, is_position
 from telemetry.samples.times import YEAR_2000_S
-
-Array = NDArray[np.float64]
 
 _YAW_LOCK, _YAW_IN_VEHICLE, _YAW_IN_EARTH = 16, 32, 64
 _LEAST_HEIGHT_M = 0.5

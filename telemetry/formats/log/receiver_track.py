@@ -14,7 +14,7 @@ from typing import Final
 
 from telemetry.formats.log.log_data import FlightLog, NotALog, add_sample
 from telemetry.samples.findings import Finding, plural
-from telemetry.samples.times import parse_time
+from telemetry.samples.times import epoch_of
 from telemetry.samples.unreadable import MOST_TEXT_BYTES
 
 TRACK_SUFFIXES: Final = frozenset({".gpx", ".nmea", ".nma"})
@@ -61,12 +61,12 @@ def _gpx(log: FlightLog, text: str) -> int:
     undated = 0
     for attributes, body in _POINT.findall(text):
         place, said = dict(_ATTRIBUTE.findall(attributes)), dict(_CHILD.findall(body))
-        moment = parse_time(said.get("time", ""))
+        moment = epoch_of(said.get("time", ""))
         lat, lon = _number(place.get("lat", "")), _number(place.get("lon", ""))
         if moment is None:
             undated += lat is not None and lon is not None
         elif lat is not None and lon is not None:
-            add_sample(log, moment[0], lat_deg=lat, lon_deg=lon, altitude_m=_number(said.get("ele", "")))
+            add_sample(log, moment, lat_deg=lat, lon_deg=lon, altitude_m=_number(said.get("ele", "")))
     return undated
 
 
@@ -141,8 +141,7 @@ def _date_s(words: list[str], kind: str) -> float | None:
         day, month, year = words[1:4]
     else:
         return None
-    found = parse_time(f"{year}-{month}-{day} 00:00:00")
-    return None if found is None else found[0]
+    return epoch_of(f"{year}-{month}-{day} 00:00:00")
 
 
 def _degrees(word: str, hemisphere: str) -> float | None:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from telemetry.formats.log.log_data import LEAST_STEP_S, FlightLog, NotALog, Row, add_sample, each, mapped
+from telemetry.formats.log.log_data import FlightLog, NotALog, Row, add_sample, each, is_later, mapped
 from telemetry.formats.log.mavlink_poses import ExposureEvent, euler_deg, gimbal_rotation, put_capture_attitude
 from telemetry.samples.rotations import camera_angles_deg, quaternion_ned
 from telemetry.samples.sample import Sample, checked
@@ -122,14 +122,11 @@ def _rows(data: mmap.mmap) -> dict[tuple[str, int], list[Row]]:
             if topic is not None:
                 row = _row(body[2:], topic[1])
                 rows = found.setdefault(topic[0], [])
-                if row is not None and (topic[0][0] in _EVENTS or not rows or _is_later(row, rows[-1])):
+                if row is not None and (
+                    topic[0][0] in _EVENTS or not rows or is_later((row["timestamp"] - rows[-1]["timestamp"]) * 1e-6)
+                ):
                     rows.append(row)
     return found
-
-
-def _is_later(row: Row, last: Row) -> bool:
-    """Whether a record is late enough after the last stored one to be stored, too."""
-    return not 0.0 <= (row["timestamp"] - last["timestamp"]) * 1e-6 < LEAST_STEP_S
 
 
 def _fields(text: str) -> list[tuple[str, str, int]]:

@@ -9,8 +9,8 @@ import mmap
 import struct
 from dataclasses import dataclass, field
 
-from telemetry.samples.sample import is_position
-from telemetry.samples.times import ZONE_UNKNOWN, parse_offset, parse_time
+from telemetry.samples.sample import Sample, is_position
+from telemetry.samples.times import ZONE_UNKNOWN, epoch_of, parse_offset, parse_time
 
 Value = str | bytes | tuple[float, ...]
 Tags = dict[int, Value]
@@ -173,8 +173,8 @@ def gps_time(gps: Tags) -> float | None:
     stamp = gps.get(7)
     if not isinstance(stamp, tuple) or len(stamp) < 3 or not all(map(math.isfinite, stamp[:3])):
         return None
-    day = parse_time(text(gps.get(29))[:10] + " 00:00:00")
-    return None if day is None else day[0] + stamp[0] * 3600.0 + stamp[1] * 60.0 + stamp[2]
+    day = epoch_of(text(gps.get(29))[:10] + " 00:00:00")
+    return None if day is None else day + stamp[0] * 3600.0 + stamp[1] * 60.0 + stamp[2]
 
 
 def exposure_time(exif: Exif) -> tuple[float, str] | None:
@@ -244,3 +244,42 @@ def _days_early(apart: float) -> int:
         return 0
     # 13 h and more share their time of day with -11 h and less: where the date does not tell, the zone of more people.
     return math.ceil((apart - 13.0 * 3600.0 - _MOST_LAG_S) / _DAY_S)
+
+
+_MOST_NOTE_ENTRIES = 256
+
+
+def parse_dji(note: bytes) -> Sample | None:
+    """Attitude in a DJI MakerNote, of models that write no XMP; None if it has none or is another note. Never raises.
+
+    The note is a directory of 12-byte entries in a byte order of its own; tags 3-11 are single floats held in the entry
+    itself: speed x, y, z; aircraft pitch, yaw, roll; camera pitch, yaw, roll (degrees; true north, camera pitch -90 =
+    straight down). Source: ExifTool's DJI tag table, checked with photos that have both.
+    """
+    if len(note) < 14:
+        return None
+    # Software that rewrites the EXIF may change its byte order but not the note's, which the note's own count shows.
+    order = "<" if note[1] == 0 else ">"
+    (count,) = struct.unpack_from(order + "H", note)
+    count = min(count, _MOST_NOTE_ENTRIES, (len(note) - 2) // 12)
+    floats: dict[int, float] = {}
+    is_dji = False
+    for i in range(count):
+        tag, kind, length, raw = struct.unpack_from(order + "HHI4s", note, 2 + 12 * i)
+        if tag == 1 and kind == 2:
+            is_dji = raw[:3] == b"DJI"
+        elif 3 <= tag <= 11 and kind == 11 and length == 1:
+            (value,) = struct.unpack(order + "f", raw)
+            if math.isfinite(value) and abs(value) <= 720.0:
+                floats[tag] = round(value, 4)
+    if not is_dji or not floats:
+        return None
+    pitch, yaw, roll, camera_pitch, camera_yaw, camera_roll = (floats.get(tag) for tag in range(6, 12))
+    return Sample(
+        flight_pitch_deg=pitch,
+        flight_yaw_deg=yaw,
+        flight_roll_deg=roll,
+        pitch_deg=camera_pitch,
+        yaw_deg=camera_yaw,
+        roll_deg=camera_roll,
+    )

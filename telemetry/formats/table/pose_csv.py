@@ -32,7 +32,7 @@ from telemetry.formats.table.geo_txt import to_geographic
 from telemetry.formats.table.pose_table import PoseTable, as_path, decoded, pitch_by_value, read_text, words_of_name
 from telemetry.samples.rotations import camera_angles_from_opk_deg
 from telemetry.samples.sample import Sample, is_position
-from telemetry.samples.times import epoch_seconds, parse_time
+from telemetry.samples.times import epoch_of, epoch_seconds
 from telemetry.samples.unreadable import beginning
 
 _HEAD_BYTES = 1 << 14
@@ -325,8 +325,7 @@ def _time(written: str, _factor: float) -> float | None:
     try:
         value = epoch_seconds(float(written))
     except ValueError:
-        parsed = parse_time(written)
-        value = None if parsed is None else parsed[0]
+        value = epoch_of(written)
     return value if value is not None and 0.0 < value < 7.3e9 else None
 
 

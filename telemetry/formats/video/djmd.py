@@ -14,7 +14,7 @@ import math
 import struct
 
 from telemetry.samples.sample import CAMERA_ANGLES, FLIGHT_ANGLES, Sample, checked
-from telemetry.samples.times import parse_time
+from telemetry.samples.times import epoch_of
 
 Fields = dict[int, int | float | bytes]
 _MAX_FIELDS = 512
@@ -117,8 +117,7 @@ def read_djmd(data: bytes) -> Sample | None:
     for name in (*(CAMERA_ANGLES if gimbal else ()), *(FLIGHT_ANGLES if airframe else ())):
         setattr(sample, name, getattr(sample, name) or 0.0)
     written = _inner(place, 6).get(1) if position_at == 2 else None
-    parsed = parse_time(written.decode("ascii", "replace")) if isinstance(written, bytes) else None
-    sample.time_s = None if parsed is None else parsed[0]
+    sample.time_s = epoch_of(written.decode("ascii", "replace")) if isinstance(written, bytes) else None
     number = _inner(body, 1).get(1)
     sample.number = number if isinstance(number, int) else None
     return checked(sample)

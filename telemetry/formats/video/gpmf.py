@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from telemetry.samples.sample import Sample, checked
-from telemetry.samples.times import YEAR_2000_S, parse_time
+from telemetry.samples.times import YEAR_2000_S, epoch_of
 
 _MOST_ENTRIES = 4096
 _MOST_DEPTH = 4
@@ -83,8 +83,7 @@ def _utc(entry: _GpmfEntry | None) -> float | None:
     """UTC of `yymmddhhmmss.sss`."""
     text = b"" if entry is None else entry.value[:16]
     digits = text.decode("ascii", "replace").rstrip("\0 ")
-    parsed = parse_time(f"20{digits[0:2]}-{digits[2:4]}-{digits[4:6]} {digits[6:8]}:{digits[8:10]}:{digits[10:]}")
-    return None if parsed is None else parsed[0]
+    return epoch_of(f"20{digits[0:2]}-{digits[2:4]}-{digits[4:6]} {digits[6:8]}:{digits[8:10]}:{digits[10:]}")
 
 
 def _gps5(entry: _GpmfEntry, scale: list[float], utc: float | None) -> list[Sample]:

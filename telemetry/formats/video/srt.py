@@ -24,7 +24,7 @@ from typing import Final
 from orthoswarm.model.earth import DEGREE_M
 from telemetry.samples.findings import plural
 from telemetry.samples.sample import Sample, checked
-from telemetry.samples.times import parse_time
+from telemetry.samples.times import epoch_of
 from telemetry.samples.unreadable import MOST_TEXT_BYTES
 
 _MAX_BLOCK = 4096
@@ -227,8 +227,7 @@ def _local_time(written: str) -> float | None:
     """Epoch seconds of "2022-08-07 13:40:40,774,808" (milliseconds, microseconds); the zone is not written."""
     head, _, fraction = written.replace(".", "-", 2 if "." in written[:10] else 0).replace(",", ".").partition(".")
     digits = fraction.replace(".", "").replace("-", "")
-    parsed = parse_time(f"{head}.{digits}" if digits else head)
-    return None if parsed is None else parsed[0]
+    return epoch_of(f"{head}.{digits}" if digits else head)
 
 
 def _note_oddities(result: Subtitles) -> None:

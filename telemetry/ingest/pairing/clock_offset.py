@@ -7,12 +7,10 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array, Bytes
 from telemetry.samples.course import local_metres
 from telemetry.samples.timeline import Timeline
-
-Array = NDArray[np.float64]
 
 _QUARTER_S = 900.0
 _HALF_HOURS = (-9.5, -4.5, -3.5, -2.5, 3.5, 4.5, 5.5, 5.75, 6.5, 8.5, 8.75, 9.5, 10.5, 11.5, 12.75, 13.75)
@@ -150,7 +148,7 @@ def offset_by_turning(
     return offset, correlation
 
 
-def turning_of_pictures(grays: Sequence[NDArray[np.uint8]], times: Array) -> tuple[Array, Array]:
+def turning_of_pictures(grays: Sequence[Bytes], times: Array) -> tuple[Array, Array]:
     """Rotation rate of consecutive pictures about their centre: times between them and degrees a second.
 
     A picture that rotates clockwise over the ground (yaw grows) shows the ground rotating the other way.

@@ -14,13 +14,11 @@ from itertools import pairwise
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array
 from telemetry.ingest.pairing.motion_chains import SAME_EXPOSURE_SHARE, PictureMotion
 from telemetry.ingest.pairing.sequence_match import CERTAIN, match_sequences
 from telemetry.ingest.pairing.sequence_model import MOST_DRIFT
-
-Array = NDArray[np.float64]
 
 _JUMP_WINDOWS: Final = 4  # parts of a flight compared to find whether the camera's clock was set in between
 JUMP_LEAST_PHOTOS: Final = 6  # photos of a part of a flight, and those only its clock gives an event, at least

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array, Indices
 from telemetry.formats.log.log_data import FlightLog
 from telemetry.formats.log.mavlink_poses import fixed_camera
 from telemetry.photos.photo_tags import Photo
@@ -19,9 +19,6 @@ from telemetry.photos.picture_motion import PictureFile, shifts_px
 from telemetry.samples.course import ground_track
 from telemetry.samples.sample import Sample
 from telemetry.samples.timeline import Timeline
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 _MOST_CHAIN_PHOTOS: Final = 24  # longest chain whose motion is added up: errors of relief and scale grow
 _PHASE_STEP_S: Final = 0.06  # step of the hypotheses for when in its second a chain's first photo was taken

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array, Flags, Indices
 from telemetry.ingest.pairing.motion_chains import PictureMotion, chains_of, variants
 from telemetry.ingest.pairing.sequence_model import (
     FIRST_JITTER_S,
@@ -24,8 +24,6 @@ from telemetry.ingest.pairing.sequence_model import (
     posterior,
 )
 
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 Clock = tuple[float, float]
 """Offset in seconds and drift."""
 
@@ -173,7 +171,7 @@ def _alignment(model: SequenceModel, windows: list[Clock], single: Indices) -> S
     )
 
 
-def _decided(match: SequenceMatch) -> NDArray[np.bool_]:
+def _decided(match: SequenceMatch) -> Flags:
     """(N,) whether a photo's event is certain, or that it has none."""
     likeliest = match.probability.max(axis=1, initial=0.0)
     return np.asarray((likeliest >= CERTAIN) | (match.probability.sum(axis=1) <= 1.0 - CERTAIN))
@@ -306,9 +304,7 @@ def _window(model: SequenceModel, centre: Clock) -> ClockGrid:
     return clock_grid(model, *centre, 2.0 * FIRST_JITTER_S + 0.3 * _reach_s(model), _WINDOW_DRIFT_S)
 
 
-def _inside(
-    model: SequenceModel, centre: Clock, offset: Array, drift: Array, *, share: float = 1.0
-) -> NDArray[np.bool_]:
+def _inside(model: SequenceModel, centre: Clock, offset: Array, drift: Array, *, share: float = 1.0) -> Flags:
     """Which clocks lie in a share of the window around one."""
     half = max(0.5 * float(np.ptp(model.e)), 1e-3)
     reach = share * (2.0 * FIRST_JITTER_S + 0.3 * _reach_s(model))

@@ -12,14 +12,11 @@ from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from orthoswarm.model.arrays import Array, Indices
 from orthoswarm.model.robust import mad_sigma
 from telemetry.ingest.pairing.motion_chains import Chains
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 MOST_DRIFT: Final = 1.2e-3
 """Largest drift between the two clocks, seconds a second: quartz clocks of cameras stay below 1e-4, and a tenfold

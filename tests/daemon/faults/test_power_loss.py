@@ -25,7 +25,7 @@ from orthoswarm.model.errors import InputError
 from tests.daemon.faults.test_daemon_crash import check, post_until_gone
 from tests.daemon.on_links import OnLinks
 from tests.kit.daemon_kit import exported, line, serving, start, stop, tile_over
-from tests.kit.sim_cameras import square
+from tests.kit.vehicles.sim_cameras import square
 
 # Loaded by every interpreter of the daemon: notes what was synced, and how long it was then.
 SPY = """

@@ -9,9 +9,9 @@ from gcs_plugin.links.file_transfer import FtpPayload, Nak, Opcode, file_crc32
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.sim.file_server import FileServer
 from gcs_plugin.sim.lossy_radio import NO_FAULTS, Faults
-from gcs_plugin.sim.memory_link import World
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
 from orthoswarm.model.errors import DiskFullError, InputError, OrthoSwarmError
+from tests.kit.vehicles.memory_link import World
 
 START_S = 1_780_000_000.0
 

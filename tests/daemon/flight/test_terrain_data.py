@@ -11,9 +11,9 @@ from rasterio.transform import from_origin
 from gcs_plugin.daemon.airspace.terrain_data import TerrainData, terrain_answers
 from gcs_plugin.links.mavlink import Autopilot, Message, dialect
 from gcs_plugin.mission.exchange import Address
-from gcs_plugin.sim.memory_link import World
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
 from orthoswarm.model.geo import LocalGrid
+from tests.kit.vehicles.memory_link import World
 
 EPSG = 32632
 TILES: set[int] = set()

@@ -9,7 +9,7 @@ import pytest
 
 from gcs_plugin.mavproxy.daemon_client import Client, Commands
 from tests.kit.daemon_kit import line, serving
-from tests.kit.sim_cameras import square
+from tests.kit.vehicles.sim_cameras import square
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ import pytest
 from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
 from tests.kit.daemon_kit import GRID, Shot, form, line, serving
 from tests.kit.mosaic_scene import EAST, NORTH
-from tests.kit.sim_cameras import square
+from tests.kit.vehicles.sim_cameras import square
 
 COUNT = int(os.environ.get("ORTHOSWARM_FUZZ", "3000"))
 LIMIT_S = float(os.environ.get("ORTHOSWARM_FUZZ_S", "inf"))

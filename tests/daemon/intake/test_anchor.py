@@ -17,7 +17,7 @@ from gcs_plugin.daemon.web_plans import Plans
 from orthoswarm.model.earth import distance_m
 from orthoswarm.model.frame import Fix, Frame
 from tests.kit.daemon_kit import Shot, camera_at, jpeg, line, pose_of, serving, tile_over
-from tests.kit.sim_cameras import square
+from tests.kit.vehicles.sim_cameras import square
 
 
 def moved(shots, lat_deg, lon_deg, **more):

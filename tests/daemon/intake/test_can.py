@@ -22,7 +22,7 @@ from telemetry.live.live_poses import LivePoses
 from tests.daemon.flight.test_daemon_flight import fly
 from tests.kit.daemon_kit import GRID, Shot, camera_at, jpeg, pose_of, serving
 from tests.kit.mosaic_scene import EAST, NORTH
-from tests.kit.sim_cameras import square
+from tests.kit.vehicles.sim_cameras import square
 
 can = pytest.importorskip("can")
 pytest.importorskip("dronecan")

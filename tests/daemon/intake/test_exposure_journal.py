@@ -11,9 +11,9 @@ from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.daemon.vehicle_names import VehicleNames
 from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.sim.lossy_radio import Faults
-from gcs_plugin.sim.memory_link import World
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
 from orthoswarm.model.geo import LocalGrid
+from tests.kit.vehicles.memory_link import World
 
 GRID = LocalGrid(32632)
 PLACE = np.array([600_100.0, 5_300_200.0])

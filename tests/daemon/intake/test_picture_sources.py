@@ -32,7 +32,7 @@ from telemetry.write.tag_writer import with_pose
 from tests.daemon.flight.test_daemon_flight import fly
 from tests.kit.daemon_kit import GRID, camera_at, jpeg, line, serving
 from tests.kit.mosaic_scene import EAST, NORTH
-from tests.kit.sim_cameras import square
+from tests.kit.vehicles.sim_cameras import square
 
 av = pytest.importorskip("av")
 

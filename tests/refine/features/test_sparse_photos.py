@@ -342,7 +342,7 @@ def test_all_sheffield_photos_lie_on_the_control_points(real_data):
 
 @pytest.mark.slow
 def test_legs_of_sheffield_as_vehicles_fit_together(real_data):
-    from orthoswarm.batch.split_legs import legs_as_vehicles
+    from orthoswarm.batch.pipeline import legs_as_vehicles
 
     folder = real_data("sheffield_cross_800")
     frames = real_frames(folder, 2)

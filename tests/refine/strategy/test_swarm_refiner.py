@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from orthoswarm.batch.split_legs import legs_as_vehicles
+from orthoswarm.batch.pipeline import legs_as_vehicles
 from orthoswarm.model.camera import Camera, Lens, focal_px, rotation_from_angles
 from orthoswarm.model.geo import GroundGrid, LocalGrid, area_epsg, local_origin
 from orthoswarm.raster.basemap import Basemap

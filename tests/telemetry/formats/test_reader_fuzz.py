@@ -8,7 +8,7 @@ import pytest
 
 from telemetry.formats.log.flight_logs import NotALog, read_log
 from telemetry.formats.photo import exif, xmp
-from telemetry.formats.photo.makernotes import parse_dji
+from telemetry.formats.photo.exif import parse_dji
 from telemetry.formats.photo.picture_container import NotAPicture, read_container
 from telemetry.formats.table import geo_txt, pose_csv
 from telemetry.formats.video import bitstream, djmd, klv, sei, srt

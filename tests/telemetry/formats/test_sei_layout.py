@@ -6,7 +6,7 @@ import pytest
 
 from orthoswarm.model.errors import InputError
 from telemetry.formats.video import bitstream
-from telemetry.formats.video.sei_layout import read_sei_layout
+from telemetry.formats.video.sei import read_sei_layout
 from telemetry.ingest.ingest import LoadOptions, survey
 from tests.telemetry.videos.test_video import make_video
 

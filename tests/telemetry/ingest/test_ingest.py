@@ -9,7 +9,7 @@ import pytest
 import telemetry
 from orthoswarm.model.errors import InputError
 from orthoswarm.mosaic.recorded_pose import nothing_to_map
-from telemetry.ingest import copied_photos
+from telemetry.ingest import discovery
 from telemetry.ingest.ingest import LoadOptions, load, survey
 from tests.telemetry.ingest.test_photos import gps_exif, jpeg
 
@@ -145,14 +145,14 @@ def test_a_backup_beside_the_photos_is_told_and_kept(tmp_path, renamed):
 
 
 def test_photos_of_one_size_are_read_beyond_their_beginnings_only_if_these_are_alike(tmp_path, monkeypatch):
-    asked, digest = [], copied_photos._digest
-    monkeypatch.setattr(copied_photos, "_digest", lambda path, samples: asked.append(samples) or digest(path, samples))
+    asked, digest = [], discovery._digest
+    monkeypatch.setattr(discovery, "_digest", lambda path, samples: asked.append(samples) or digest(path, samples))
     for folder in ("v1", "v2"):
         for i in range(8):  # the first four begin alike
             path = photo(tmp_path / folder / f"{i}.JPG", second=i + 10 * (folder == "v2" and i >= 4))
             path.write_bytes(path.read_bytes() + bytes(300_000) + folder.encode())
-    assert copied_photos.copies_among(sorted(tmp_path.rglob("*.JPG"))) == ({}, {})
-    assert sorted(set(asked)) == [0, copied_photos._SAMPLES] and asked.count(copied_photos._SAMPLES) == 8
+    assert discovery.copies_among(sorted(tmp_path.rglob("*.JPG"))) == ({}, {})
+    assert sorted(set(asked)) == [0, discovery._SAMPLES] and asked.count(discovery._SAMPLES) == 8
 
 
 def test_pictures_that_only_a_table_tells_apart_are_no_copies(tmp_path):

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from telemetry.formats.photo import exif, xmp
-from telemetry.formats.photo.makernotes import parse_dji
+from telemetry.formats.photo.exif import parse_dji
 from telemetry.formats.photo.picture_container import NotAPicture, read_container
 from telemetry.ingest.ingest import survey
 from telemetry.photos.photo_tags import read_photo

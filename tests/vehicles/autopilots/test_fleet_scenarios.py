@@ -20,9 +20,9 @@ from gcs_plugin.mission.items import CHANGE_SPEED, LAND, LOITER_UNLIM, RTL, TAKE
 from gcs_plugin.mission.mission_builder import build_mission
 from gcs_plugin.mission.mission_files import FileItem
 from gcs_plugin.sim.lossy_radio import Channel, Faults
-from gcs_plugin.sim.memory_link import World
 from gcs_plugin.sim.multirotor import Chart
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
+from tests.kit.vehicles.memory_link import World
 
 AP, PX4 = Autopilot.ARDUPILOT, Autopilot.PX4
 ADDRESSES = [a.strip() for a in os.environ.get("ORTHOSWARM_SITL", "").split(",") if a.strip()]

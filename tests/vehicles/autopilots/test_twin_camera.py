@@ -18,9 +18,9 @@ import numpy as np
 import pytest
 
 from gcs_plugin.cli.main import main
+from gcs_plugin.demo.demonstration import PacedClock
 from gcs_plugin.demo.following_camera import LATE_S, Shutter, area_of, away_m, open_outlet, place_spec, read_spec
 from gcs_plugin.demo.simulated_camera import VideoSender, VideoServer
-from gcs_plugin.demo.simulator import PacedClock
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.sim.multirotor import Airframe
 from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm

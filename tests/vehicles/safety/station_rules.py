@@ -7,10 +7,9 @@ from dataclasses import dataclass, field
 from gcs_plugin.fleet.flight_state import Word, flight_state
 from gcs_plugin.links.mavlink import dialect
 from gcs_plugin.links.packets import Framer
-from gcs_plugin.mission.comparison import difference
 from gcs_plugin.mission.exchange import GROUND_STATION
 from gcs_plugin.mission.flight_modes import HOLDS, mode_params
-from gcs_plugin.mission.items import RTL, MissionItem
+from gcs_plugin.mission.items import RTL, MissionItem, difference
 from orthoswarm.model.earth import distance_m
 from tests.vehicles.safety.two_stations import ARM, OTHER, PAUSE, SET_MODE, START
 

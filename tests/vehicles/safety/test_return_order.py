@@ -276,7 +276,7 @@ def test_whoever_sets_out_keeps_apart_from_those_that_fly_and_somebody_always_do
 @pytest.fixture(scope="module")
 def vehicle_at():
     """Makes a vehicle in the air of the fleet's own kind: its place about the first home, its return height."""
-    from gcs_plugin.sim.memory_link import World
+    from tests.kit.vehicles.memory_link import World
 
     def make(system, place, rtl_m):
         with World(make_swarm(1, home=HOME)) as world:

@@ -7,8 +7,8 @@ from gcs_plugin.fleet.flight_state import summary
 from gcs_plugin.fleet.preflight import Level, Wanted, preflight
 from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.mission.exchange import Address
-from gcs_plugin.sim.memory_link import SimLink, VirtualClock
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
+from tests.kit.vehicles.memory_link import SimLink, VirtualClock
 
 AP, PX4 = Autopilot.ARDUPILOT, Autopilot.PX4
 GENERIC, INVALID, ARDUPILOT = 0, 8, 3

@@ -16,10 +16,10 @@ from gcs_plugin.mission.exchange import GROUND_STATION, Address
 from gcs_plugin.mission.flight_modes import mode_params
 from gcs_plugin.mission.items import CHANGE_SPEED, LAND, RTL, TAKEOFF, WAYPOINT, Mission, MissionItem
 from gcs_plugin.sim.lossy_radio import Faults
-from gcs_plugin.sim.memory_link import World
 from gcs_plugin.sim.multirotor import Chart
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
 from orthoswarm.model.errors import OrthoSwarmError
+from tests.kit.vehicles.memory_link import World
 
 AP, PX4 = Autopilot.ARDUPILOT, Autopilot.PX4
 OTHER = Address(254, 190)

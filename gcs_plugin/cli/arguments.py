@@ -1,8 +1,11 @@
-"""Refusing to write over what was read, or over a product of another kind."""
+"""What verbs have in common: arguments that fill a dataclass, `--config`, refusing to write over what was read."""
 
+import argparse
 import os
 from collections.abc import Iterable, Mapping
+from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 from orthoswarm.model.errors import InputError
 from orthoswarm.stores.addresses import address_of, is_stored
@@ -69,3 +72,14 @@ def require_no_file(flag: str, folder: Path) -> None:
     blocked = next((p for p in (folder, *folder.parents) if p.exists() and not p.is_dir()), None)
     if blocked is not None:
         raise InputError(f"{flag} {folder}: {blocked} is a file; choose a folder")
+
+
+def add_config(parser: argparse.ArgumentParser) -> None:
+    """Add the argument."""
+    parser.add_argument("--config", type=Path, metavar="FILE.toml", help="settings other than usual (docs/usage.md)")
+
+
+def given(args: argparse.Namespace, options: type[Any]) -> dict[str, Any]:
+    """The arguments that are fields of a dataclass; without those that were not given, for which it has defaults."""
+    values = {field.name: getattr(args, field.name, None) for field in fields(options)}
+    return {name: value for name, value in values.items() if value is not None}

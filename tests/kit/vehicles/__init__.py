@@ -1,0 +1,1 @@
+"""Simulated vehicles and their cameras, for tests."""
