@@ -12,8 +12,8 @@ import time
 from functools import partial
 from typing import Any, Final
 
-from gcs_plugin.daemon.airspace.terrain_data import TerrainData
-from gcs_plugin.daemon.exports import Exports
+from gcs_plugin.daemon.airspace import TerrainData
+from gcs_plugin.daemon.exports import Exports, TakFeed
 from gcs_plugin.daemon.flight_coverage.exposure_journal import MESSAGES as EVENT_MESSAGES
 from gcs_plugin.daemon.flight_coverage.exposure_journal import EventRequests, ExposureJournal
 from gcs_plugin.daemon.flight_coverage.live_coverage import LiveCoverage
@@ -21,9 +21,8 @@ from gcs_plugin.daemon.flight_coverage.picture_requests import FetchedPictures, 
 from gcs_plugin.daemon.flight_coverage.picture_views import PictureViews
 from gcs_plugin.daemon.gap_flights import GapFlights
 from gcs_plugin.daemon.intake.can_reader import CanReader
-from gcs_plugin.daemon.intake.picture_intake import LinkLog, PictureIntake, VehicleIntake
+from gcs_plugin.daemon.intake.picture_intake import LinkLog, PictureIntake, RefusedPictures, VehicleIntake
 from gcs_plugin.daemon.intake.picture_sources import PictureSource
-from gcs_plugin.daemon.intake.refused_pictures import RefusedPictures
 from gcs_plugin.daemon.jobs.job_queue import Jobs
 from gcs_plugin.daemon.jobs.job_requests import JobRequests
 from gcs_plugin.daemon.jobs.joint_refinement import JointRefinement
@@ -34,8 +33,8 @@ from gcs_plugin.daemon.jobs.sortie_refinement import SortieRefinement
 from gcs_plugin.daemon.jobs.tone_balance import ToneBalance
 from gcs_plugin.daemon.jobs.worker_pool import LAST, WorkerPool
 from gcs_plugin.daemon.jobs.workspace_products import RunFacts
-from gcs_plugin.daemon.layers.anchor import ExpectedPlace
 from gcs_plugin.daemon.layers.layers import NAMES, MapLayer
+from gcs_plugin.daemon.layers.map_site import ExpectedPlace
 from gcs_plugin.daemon.layers.realtime_layer import Drawer
 from gcs_plugin.daemon.layers.web_tiles import TileServer
 from gcs_plugin.daemon.settings import Settings
@@ -44,6 +43,7 @@ from gcs_plugin.daemon.store.daemon_events import (
     AreaChanged,
     CardRead,
     DrawingRestarted,
+    Events,
     JobDropped,
     JobEnded,
     JobsStop,
@@ -57,12 +57,9 @@ from gcs_plugin.daemon.store.daemon_events import (
     RefinementBegins,
     VehicleSilent,
 )
-from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.journal import Journal
-from gcs_plugin.daemon.store.kept_pictures import KeptPictures
-from gcs_plugin.daemon.store.picture_store import PictureStore
+from gcs_plugin.daemon.store.picture_store import KeptPictures, PictureStore
 from gcs_plugin.daemon.store.workspace_lock import distrust_after_power_cut, take_over
-from gcs_plugin.daemon.tak_feed import TakFeed
 from gcs_plugin.daemon.takeoffs import Takeoffs
 from gcs_plugin.daemon.vehicles import VehicleLinks
 from gcs_plugin.daemon.views import Views

@@ -1,12 +1,13 @@
-"""Exports of the workspace, its finds and vehicles as places, and which pictures show one."""
+"""Exports of the workspace, its finds and vehicles as places (for TAK programs, too), and which pictures show one."""
 
 import contextlib
+import logging
 import math
 import os
 import shutil
 import threading
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -28,6 +29,7 @@ from gcs_plugin.daemon.jobs.workspace_products import (
 from gcs_plugin.daemon.layers.layers import MapArea, MapLayer
 from gcs_plugin.daemon.layers.realtime_layer import Drawer
 from gcs_plugin.daemon.settings import Settings
+from gcs_plugin.daemon.stoppable_thread import StoppableThread
 from gcs_plugin.daemon.store.console_state import ConsoleState, FindRow
 from gcs_plugin.daemon.store.frame_rows import all_frames, frame_number, frame_path
 from gcs_plugin.daemon.store.job_rows import Job
@@ -37,8 +39,10 @@ from gcs_plugin.daemon.store.sortie_rows import coarse_only, placed_sorties
 from gcs_plugin.daemon.vehicle_names import VehicleRow
 from gcs_plugin.daemon.views import Views
 from orthoswarm.export.atomic_file import atomic_write
+from orthoswarm.export.tactical.cursor_on_target import event
 from orthoswarm.export.tactical.places import Place, sightings
-from orthoswarm.model.errors import InputError
+from orthoswarm.export.tactical.tak_sender import TakAddress, TakSender
+from orthoswarm.model.errors import InputError, OrthoSwarmError
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.raster import picture_file
 
@@ -250,3 +254,58 @@ def pictures_at(task: ExportTask, lat_deg: float, lon_deg: float) -> list[Sighti
         }
         for s in sightings(placed, (east, north, level))[:_MOST_SIGHTINGS]
     ]  # fmt: skip
+
+
+_EVERY_S: Final = 2.0
+_FINDS_EVERY: Final = 15  # rounds after which all finds are sent again
+_log = logging.getLogger(__name__)
+
+
+class TakFeed:
+    """Sends all vehicles every two seconds, and all finds when one is new or changed and every half minute.
+
+    Attributes:
+        problem: why a receiver gets nothing at present, else empty.
+    """
+
+    def __init__(self, addresses: Sequence[TakAddress], places: Callable[[], Sequence[Place]]) -> None:
+        self._senders = [TakSender(address) for address in addresses]
+        self._places = places
+        self._thread = StoppableThread(self._run, "tak", join_s=10.0)
+        self.problem = ""
+
+    def start(self) -> None:
+        """Start sending, if there is a receiver."""
+        if self._senders:
+            self._thread.start()
+
+    def close(self) -> None:
+        """Stop sending."""
+        self._thread.close()
+        for sender in self._senders:
+            sender.close()
+
+    def _run(self, stop: threading.Event) -> None:
+        number, known = 0, set[Place]()
+        while not stop.wait(_EVERY_S):
+            try:
+                places = self._places()
+            except (OrthoSwarmError, TimeoutError) as error:
+                _log.warning("TAK: %s", error)
+                continue
+            finds = {place for place in places if place.kind == "find"}
+            everything = number % _FINDS_EVERY == 0 or not finds <= known
+            number, known = number + 1, finds
+            now = time.time()
+            events = [event(place, now) for place in places if everything or place.kind == "vehicle"]
+            self.problem = "; ".join(text for sender in self._senders if (text := _sent(sender, events)))
+
+
+def _sent(sender: TakSender, events: Sequence[bytes]) -> str:
+    """Send all events; returns the reason of a failure, else an empty text."""
+    try:
+        for one in events:
+            sender.send(one)
+    except OrthoSwarmError as error:
+        return str(error)
+    return ""

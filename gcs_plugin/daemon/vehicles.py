@@ -15,20 +15,19 @@ from functools import partial
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, cast
 
-from gcs_plugin.daemon.airspace.fences import Fences
-from gcs_plugin.daemon.airspace.traffic import Traffic
+from gcs_plugin.daemon.airspace import Fences, Traffic
 from gcs_plugin.daemon.settings import Settings
-from gcs_plugin.daemon.start_checks import CheckRow, StartChecks, red_items
+from gcs_plugin.daemon.start_checks import CheckRow, StartChecks, WaitingTakeoffs, red_items
 from gcs_plugin.daemon.store.daemon_events import (
     CommandDone,
     CompletionRefined,
+    Events,
     JobEnded,
     MissionNoted,
     TrafficChanged,
     VehicleChanged,
     VehicleReported,
 )
-from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.daemon.store.sortie_rows import (
     completion_refined,
@@ -38,7 +37,6 @@ from gcs_plugin.daemon.store.sortie_rows import (
     vehicle_state,
 )
 from gcs_plugin.daemon.vehicle_names import VehicleRow
-from gcs_plugin.daemon.waiting_takeoffs import WaitingTakeoffs
 from gcs_plugin.fleet.commands import CommandResult
 from gcs_plugin.fleet.separation.returns import Returns
 from gcs_plugin.fleet.separation.separation_watch import apart_text, near_text

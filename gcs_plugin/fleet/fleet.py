@@ -17,9 +17,8 @@ from typing import Any, Final, TypeVar
 
 from gcs_plugin.config import COMMAND
 from gcs_plugin.fleet.commands import URGENT, Order, Verb
-from gcs_plugin.fleet.dialogues import Dialogues
+from gcs_plugin.fleet.dialogues import Dialogues, continued, resumed
 from gcs_plugin.fleet.fleet_events import FleetEvent
-from gcs_plugin.fleet.going_on import continued, resumed
 from gcs_plugin.fleet.heard_messages import MESSAGE_IDS
 from gcs_plugin.fleet.link_hub import Hub
 from gcs_plugin.fleet.reception import Handler, Reception

@@ -19,9 +19,8 @@ from gcs_plugin.daemon.metrics import prometheus
 from gcs_plugin.web.answers import JsonAnswer, in_thread, install_error_answers, json_body
 from gcs_plugin.web.areas import read_area
 from gcs_plugin.web.command_routes import CommandRoutes
-from gcs_plugin.web.event_stream import stream_events
+from gcs_plugin.web.event_stream import Standstill, stream_events
 from gcs_plugin.web.guard import Guard
-from gcs_plugin.web.standstill import Standstill
 from gcs_plugin.web.uploads import UploadRoute
 from orthoswarm import __version__
 from orthoswarm.export.tactical.places import feature

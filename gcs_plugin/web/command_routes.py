@@ -28,8 +28,7 @@ from gcs_plugin.fleet.commands import URGENT, VERBS, CommandResult, new_id
 from gcs_plugin.fleet.separation.returns import VERB as RETURN_VERB
 from gcs_plugin.mission.exchange import Verdict
 from gcs_plugin.web.answers import JsonAnswer, in_thread, json_body
-from gcs_plugin.web.event_stream import RUN
-from gcs_plugin.web.standstill import Standstill, clock_with_sleep
+from gcs_plugin.web.event_stream import RUN, Standstill, clock_with_sleep
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 
 Rows = list[dict[str, Any]]

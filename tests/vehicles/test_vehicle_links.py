@@ -7,9 +7,9 @@ import time
 
 import pytest
 
-from gcs_plugin.daemon.airspace.traffic import Traffic
+from gcs_plugin.daemon.airspace import Traffic
 from gcs_plugin.daemon.settings import Settings, VehicleSettings
-from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.daemon.store.daemon_events import Events
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.daemon.takeoffs import Takeoffs
 from gcs_plugin.daemon.vehicles import VehicleLinks

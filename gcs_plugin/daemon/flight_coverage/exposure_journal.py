@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from gcs_plugin.daemon.store.exposure_rows import Exposed, all_exposures, exposures_added
+from gcs_plugin.daemon.store.frame_rows import Exposed, all_exposures, exposures_added
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.daemon.vehicle_names import VehicleNames
 from gcs_plugin.links.mavlink import Message, dialect

@@ -18,21 +18,21 @@ from typing import Any, Final, Protocol, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from gcs_plugin.daemon.flight_coverage.battery_use import BatteryUse
 from gcs_plugin.daemon.flight_coverage.exposure_journal import ExposureJournal
-from gcs_plugin.daemon.flight_coverage.flown_legs import FlownLegs, flies
-from gcs_plugin.daemon.flight_coverage.picture_views import FlawedPictures, Measured, PictureViews
-from gcs_plugin.daemon.flight_coverage.planned_area import (
+from gcs_plugin.daemon.flight_coverage.flown_legs import (
     AreaSource,
+    BatteryUse,
     CoveredArea,
+    FlownLegs,
     area_source,
+    flies,
     read_covered_area,
     zone_features,
 )
+from gcs_plugin.daemon.flight_coverage.picture_views import FlawedPictures, Measured, PictureViews
 from gcs_plugin.daemon.layers.realtime_layer import Drawer
 from gcs_plugin.daemon.store.console_state import ConsoleState
-from gcs_plugin.daemon.store.daemon_events import CoverageChanged, PictureDrawn
-from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.daemon.store.daemon_events import CoverageChanged, Events, PictureDrawn
 from gcs_plugin.daemon.store.frame_rows import last_drawn_arrival
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.daemon.vehicle_names import VehicleRow

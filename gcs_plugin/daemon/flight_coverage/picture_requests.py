@@ -7,23 +7,23 @@ certain is not read. While a command or a mission is under way with any vehicle 
 
 import contextlib
 import logging
+import re
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, Protocol
 from urllib.parse import unquote, urlsplit
 
-from gcs_plugin.daemon.flight_coverage.file_download import FileRead, FolderList
-from gcs_plugin.daemon.flight_coverage.file_numbers import PictureNames
-from gcs_plugin.daemon.flight_coverage.ftp_talk import FtpTalk, LinkShare
+import numpy as np
+
+from gcs_plugin.daemon.flight_coverage.file_download import FileRead, FolderList, FtpTalk, LinkShare
 from gcs_plugin.daemon.flight_coverage.live_coverage import LiveCoverage, MissingRow
 from gcs_plugin.daemon.intake.picture_intake import PictureIntake
 from gcs_plugin.daemon.intake.posted_pose import PostedPose, linked_pose
-from gcs_plugin.daemon.store.daemon_events import RequestsChanged
-from gcs_plugin.daemon.store.event_bus import Events
-from gcs_plugin.daemon.store.exposure_rows import exposure_place, exposure_times
-from gcs_plugin.daemon.store.frame_rows import dated_images, pose_near
+from gcs_plugin.daemon.store.daemon_events import Events, RequestsChanged
+from gcs_plugin.daemon.store.frame_rows import dated_images, exposure_place, exposure_times, pose_near
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.links.file_transfer import payload_of
 from orthoswarm.model.errors import InputError, OrthoSwarmError
@@ -32,6 +32,80 @@ from telemetry.live.live_poses import LinkPoses
 if TYPE_CHECKING:
     from gcs_plugin.fleet.fleet import Fleet
     from gcs_plugin.fleet.vehicle_state import Vehicle
+
+_SURE: Final = 0.9  # share of the pictures that agree on the shift of numbers
+_LEAST: Final = 3  # pictures for it
+_PICTURES: Final = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
+
+
+@dataclass(slots=True)
+class PictureNames:
+    """The pictures of a vehicle that have arrived.
+
+    Attributes:
+        images: their names. shift: number of a file less that of its camera event; None if there is no such number.
+    """
+
+    images: set[str] = field(default_factory=set)
+    shift: int | None = 0
+
+    @staticmethod
+    def of(pictures: Iterable[tuple[str, float]], events: Iterable[tuple[int, float]]) -> "PictureNames":
+        """From arrived pictures (name, UTC seconds) and camera events (number, UTC seconds).
+
+        Each picture belongs to the event nearest in time, within half of the usual time between events. The shift is
+        0 while fewer than three pictures have arrived, and None if the differences of the numbers vary.
+        """
+        arrived, exposed = list(pictures), sorted(events, key=lambda event: event[1])
+        images = {image for image, _ in arrived}
+        times = np.array([time_s for _, time_s in exposed])
+        if len(times) < 2:
+            return PictureNames(images)
+        slack_s = 0.5 * float(np.median(np.diff(times)))
+        shifts: Counter[int] = Counter()
+        for image, time_s in arrived:
+            nearest = int(np.abs(times - time_s).argmin())
+            number = number_of(image)
+            if number is not None and abs(times[nearest] - time_s) <= slack_s:
+                shifts[number - exposed[nearest][0]] += 1
+        if shifts.total() < _LEAST:
+            return PictureNames(images)
+        shift, count = shifts.most_common(1)[0]
+        return PictureNames(images, shift if count >= _SURE * shifts.total() else None)
+
+    def find(self, number: int, files: Mapping[str, int]) -> tuple[str, str]:
+        """The path of an event's picture among a vehicle's files, and why there is none ("" where there is one)."""
+        if self.shift is None:
+            return "", "the numbers of its files do not match those of its camera events"
+        pictures = [path for path in files if path.lower().endswith(_PICTURES)]
+        if self.images:
+            forms = {_form(image) for image in self.images}
+            same_form = [path for path in pictures if _form(path) in forms]
+            if pictures and not same_form:
+                return "", "its files have other names than the pictures that have arrived"
+            pictures = same_form
+        found = [path for path in pictures if number_of(path) == number + self.shift]
+        same = [path for path in found if path.rpartition("/")[0] in self._folders(files)]
+        found = same or found
+        if len(found) > 1:
+            return "", f"several of its files have number {number + self.shift}"
+        return (found[0], "") if found else ("", f"it has no picture file with number {number + self.shift}")
+
+    def _folders(self, files: Mapping[str, int]) -> set[str]:
+        """The folders with pictures that have arrived."""
+        return {path.rpartition("/")[0] for path in files if path.rpartition("/")[2] in self.images}
+
+
+def _form(name: str) -> str:
+    """A name without its numbers: `img_#.jpg`."""
+    return re.sub(r"\d+", "#", name.rpartition("/")[2].lower())
+
+
+def number_of(name: str) -> int | None:
+    """The last number in a file's name."""
+    digits = re.findall(r"\d+", name.rpartition("/")[2])
+    return int(digits[-1]) if digits else None
+
 
 _EVENT: Final = "camera event"
 _STEP_S, _LOOK_S = 0.02, 1.0

@@ -11,7 +11,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from gcs_plugin.daemon.stoppable_thread import StoppableThread
-from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.daemon.store.daemon_events import Events
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 from telemetry.live.live_poses import LivePoses
 

@@ -13,8 +13,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, Final
 
-from gcs_plugin.daemon.store.daemon_events import JobChanged, JobDropped, JobEnded, JobsStop, Problem
-from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.daemon.store.daemon_events import Events, JobChanged, JobDropped, JobEnded, JobsStop, Problem
 from gcs_plugin.daemon.store.frame_rows import newest_seq
 from gcs_plugin.daemon.store.job_rows import (
     Job,

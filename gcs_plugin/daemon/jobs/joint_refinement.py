@@ -12,9 +12,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from gcs_plugin.daemon.jobs.job_queue import ReportProgress
-from gcs_plugin.daemon.jobs.placed_sorties import detail_of, others_near, refined_change
 from gcs_plugin.daemon.jobs.preemption import Preemption
-from gcs_plugin.daemon.jobs.publisher import Publisher
+from gcs_plugin.daemon.jobs.publisher import Publisher, detail_of, others_near, refined_change
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
 from gcs_plugin.daemon.jobs.worker_tasks import JointTask, SortieResult, refine_jointly
 from gcs_plugin.daemon.layers.layers import new_name

@@ -14,17 +14,15 @@ from typing import Final
 import numpy as np
 
 from gcs_plugin.daemon.jobs.job_queue import Preempted, ReportProgress
-from gcs_plugin.daemon.jobs.placed_sorties import detail_of, frames_of
 from gcs_plugin.daemon.jobs.preemption import Preemption
-from gcs_plugin.daemon.jobs.publisher import Publisher
+from gcs_plugin.daemon.jobs.publisher import Publisher, detail_of, frames_of
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
 from gcs_plugin.daemon.jobs.worker_tasks import SolveTask, SortieResult, coarse_after, follow, near, place
 from gcs_plugin.daemon.layers.layers import new_name
 from gcs_plugin.daemon.store.daemon_events import JobDropped, LayerNeeded
 from gcs_plugin.daemon.store.job_rows import Job, refinement_is_open
 from gcs_plugin.daemon.store.journal import Change, Journal, no_change
-from gcs_plugin.daemon.store.kept_pictures import KeptPictures
-from gcs_plugin.daemon.store.picture_store import PictureStore
+from gcs_plugin.daemon.store.picture_store import KeptPictures, PictureStore
 from gcs_plugin.daemon.store.sortie_rows import (
     LegRow,
     PlacedSortie,

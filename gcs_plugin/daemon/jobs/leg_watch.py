@@ -13,8 +13,7 @@ import numpy as np
 
 from gcs_plugin.config import SORTIE
 from gcs_plugin.daemon.stoppable_thread import StoppableThread
-from gcs_plugin.daemon.store.daemon_events import LegsOver, PictureStored, VehicleSilent
-from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.daemon.store.daemon_events import Events, LegsOver, PictureStored, VehicleSilent
 from orthoswarm.model.earth import DEGREE_M
 from orthoswarm.trajectory.legs import ended_legs
 

@@ -11,20 +11,17 @@ from typing import Final
 from gcs_plugin.config import SORTIE
 from gcs_plugin.daemon.jobs.job_queue import ReportProgress
 from gcs_plugin.daemon.jobs.joint_refinement import together_jobs
-from gcs_plugin.daemon.jobs.placed_sorties import detail_of, frames_of, others_near, refined_change
-from gcs_plugin.daemon.jobs.publisher import Publisher
+from gcs_plugin.daemon.jobs.publisher import Publisher, detail_of, frames_of, others_near, refined_change
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
 from gcs_plugin.daemon.jobs.worker_tasks import FollowTask, SolveTask, SortieResult, follow, near, register_late, solve
 from gcs_plugin.daemon.jobs.workspace_products import PRODUCTS
 from gcs_plugin.daemon.layers.layers import new_name
 from gcs_plugin.daemon.layers.realtime_layer import Drawer
-from gcs_plugin.daemon.store.daemon_events import JobsStop, LayerNeeded, RefinementBegins
-from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.daemon.store.daemon_events import Events, JobsStop, LayerNeeded, RefinementBegins
 from gcs_plugin.daemon.store.frame_rows import last_arrivals, late_frames, newest_seq
 from gcs_plugin.daemon.store.job_rows import Job, new_job
 from gcs_plugin.daemon.store.journal import Change, Journal, all_changes, no_change
-from gcs_plugin.daemon.store.kept_pictures import KeptPictures
-from gcs_plugin.daemon.store.picture_store import PictureStore
+from gcs_plugin.daemon.store.picture_store import KeptPictures, PictureStore
 from gcs_plugin.daemon.store.sortie_rows import PlacedSortie, placed_sortie
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import OrthoSwarmError

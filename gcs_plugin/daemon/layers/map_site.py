@@ -4,17 +4,17 @@ The basemap determines the location, else the newest plan, else the majority of 
 """
 
 import logging
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import numpy as np
 
 from gcs_plugin.daemon.intake.posted_pose import is_position
-from gcs_plugin.daemon.layers.anchor import ExpectedPlace
 from gcs_plugin.daemon.layers.layers import MapArea, MapLayer, new_name, successor
-from gcs_plugin.daemon.store.daemon_events import AreaChanged, DrawingRestarted
-from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.daemon.layers.web_tiles import TileServer
+from gcs_plugin.daemon.store.daemon_events import AreaChanged, DrawingRestarted, Events
 from gcs_plugin.daemon.store.frame_rows import frames_undrawn, poses_after
 from gcs_plugin.daemon.store.journal import Journal, all_changes, area_forgotten, fact_change, no_change
 from gcs_plugin.daemon.store.sortie_rows import solution_paths
@@ -28,6 +28,57 @@ from orthoswarm.model.geo import LocalGrid, utm_epsg
 from orthoswarm.mosaic.footprint import default_gsd, footprint_boxes, rejection
 from orthoswarm.mosaic.realtime import RealtimeMosaic
 from orthoswarm.mosaic.recorded_pose import recorded_cameras
+
+
+@dataclass(frozen=True, slots=True)
+class Anchor:
+    """The place where pictures are expected.
+
+    Attributes:
+        name: for messages: "the basemap". bounds: south, west, north, east in degrees.
+    """
+
+    name: str
+    bounds: tuple[float, float, float, float]
+
+    @classmethod
+    def of_ground(cls, name: str, epsg: int, box: BoundingBox) -> "Anchor":
+        """The anchor of a box on a UTM grid."""
+        west, south, east, north = box
+        ring = LocalGrid(epsg).to_geographic([[west, south], [west, north], [east, south], [east, north]])
+        low, high = ring.min(0), ring.max(0)
+        return cls(name, (float(low[0]), float(low[1]), float(high[0]), float(high[1])))
+
+    def distance_m(self, lat_deg: float, lon_deg: float) -> float:
+        """Distance of a position from the bounds in metres, to a hundredth; 0 inside."""
+        south, west, north, east = self.bounds
+        middle = 0.5 * (west + east)
+        lon_deg = middle + (lon_deg - middle + 180.0) % 360.0 - 180.0
+        return distance_m(lat_deg, lon_deg, min(max(lat_deg, south), north), min(max(lon_deg, west), east))
+
+
+class NewestPlan(Protocol):
+    """The plans of a workspace."""
+
+    def newest_bounds(self) -> tuple[float, float, float, float] | None:
+        """South, west, north, east of the newest plan in degrees, None if there is none."""
+
+
+@dataclass(frozen=True, slots=True)
+class ExpectedPlace:
+    """The location of the map before its first picture."""
+
+    tiles: TileServer
+    plans: NewestPlan
+
+    def place(self) -> Anchor | None:
+        """The basemap, else the newest plan; None if the pictures decide."""
+        basemap = self.tiles.basemap
+        if basemap is not None:
+            return Anchor.of_ground("the basemap", basemap.epsg, basemap.bounds)
+        found = self.plans.newest_bounds()
+        return None if found is None else Anchor("the newest plan", found)
+
 
 _FEW: Final = 200  # pictures drawn, up to which another ground pixel is chosen anew
 _OTHER_GSD: Final = 3.0  # times the map's ground pixel

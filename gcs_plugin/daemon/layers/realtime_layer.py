@@ -18,12 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcs_plugin.daemon.intake.posted_pose import frame_of_row
-from gcs_plugin.daemon.layers.anchor import ExpectedPlace
 from gcs_plugin.daemon.layers.draw_queue import DrawQueue, MapDelay, PendingFrame
 from gcs_plugin.daemon.layers.layers import MapArea, MapLayer, new_name
-from gcs_plugin.daemon.layers.map_site import MapSite
+from gcs_plugin.daemon.layers.map_site import ExpectedPlace, MapSite
 from gcs_plugin.daemon.store.daemon_events import (
     DrawingRestarted,
+    Events,
     FrameReported,
     LayerDrawn,
     Overload,
@@ -32,7 +32,6 @@ from gcs_plugin.daemon.store.daemon_events import (
     PictureStored,
     Problem,
 )
-from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.frame_rows import (
     Drawn,
     frames_drawn,

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from gcs_plugin.daemon.flight_coverage.file_numbers import PictureNames
-from gcs_plugin.daemon.flight_coverage.picture_requests import PictureRequests, WantedPicture
+from gcs_plugin.daemon.flight_coverage.picture_requests import PictureNames, PictureRequests, WantedPicture
 from gcs_plugin.links.file_transfer import FtpPayload, Nak, Opcode, file_crc32
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.sim.file_server import FileServer

@@ -11,8 +11,7 @@ from gcs_plugin.daemon.jobs.leg_watch import LegWatch
 from gcs_plugin.daemon.jobs.publisher import Publisher
 from gcs_plugin.daemon.jobs.solution_file import read_solution
 from gcs_plugin.daemon.settings import Settings
-from gcs_plugin.daemon.store.daemon_events import LegsOver, VehicleSilent
-from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.daemon.store.daemon_events import Events, LegsOver, VehicleSilent
 from orthoswarm.model.errors import StorageError
 from tests.kit.made_up import LIMIT_S, after_job, complete, post, truth
 

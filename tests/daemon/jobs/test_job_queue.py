@@ -9,8 +9,7 @@ import pytest
 from gcs_plugin.daemon.jobs.job_queue import Jobs
 from gcs_plugin.daemon.jobs.solution_file import SolutionFile, SolutionFileError, is_readable, read_solution
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
-from gcs_plugin.daemon.store.daemon_events import JobEnded
-from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.daemon.store.daemon_events import Events, JobEnded
 from gcs_plugin.daemon.store.frame_rows import add_frame, late_frames
 from gcs_plugin.daemon.store.journal import Journal
 from orthoswarm.model.errors import DiskFullError, OrthoSwarmError, StorageError, WorkerStoppedError

@@ -14,7 +14,7 @@ from gcs_plugin.daemon.jobs.kernel_warmup import made_up_flight, made_up_ground,
 from gcs_plugin.daemon.jobs.solution_file import read_solution
 from gcs_plugin.daemon.jobs.worker_tasks import without_strays
 from gcs_plugin.daemon.settings import Settings
-from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.daemon.store.daemon_events import Events
 from gcs_plugin.daemon.store.journal import Journal, packed
 from orthoswarm.model.camera import Camera, Lens, rotation_from_angles
 from orthoswarm.model.placement import PlacedFrame, Solution

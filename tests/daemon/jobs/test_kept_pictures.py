@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from gcs_plugin.daemon.daemon import Daemon
-from gcs_plugin.daemon.jobs.placed_sorties import frames_of
+from gcs_plugin.daemon.jobs.publisher import frames_of
 from gcs_plugin.daemon.jobs.solution_file import read_solution
 from gcs_plugin.daemon.jobs.worker_tasks import near
 from gcs_plugin.daemon.settings import Settings
-from gcs_plugin.daemon.store.kept_pictures import KeptPictures
+from gcs_plugin.daemon.store.picture_store import KeptPictures
 from orthoswarm.raster.basemap import Basemap
 from orthoswarm.refine.strategy.swarm_refiner import SwarmRefiner
 from tests.kit.made_up import LIMIT_S, after_job, complete, post

@@ -13,11 +13,10 @@ from gcs_plugin.daemon.jobs.job_queue import Jobs, Preempted
 from gcs_plugin.daemon.jobs.kernel_warmup import made_up_flight, made_up_ground, write_map
 from gcs_plugin.daemon.jobs.leg_placement import MOST, newest_legs
 from gcs_plugin.daemon.jobs.leg_watch import LegWatch
-from gcs_plugin.daemon.jobs.placed_sorties import detail_of
+from gcs_plugin.daemon.jobs.publisher import detail_of
 from gcs_plugin.daemon.jobs.solution_file import read_solution
 from gcs_plugin.daemon.jobs.worker_tasks import SortieResult
-from gcs_plugin.daemon.store.daemon_events import JobDropped, LegsOver
-from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.daemon.store.daemon_events import Events, JobDropped, LegsOver
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.daemon.store.sortie_rows import LegRow
 from orthoswarm.model.bounding_box import BoundingBox

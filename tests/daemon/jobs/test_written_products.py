@@ -7,8 +7,7 @@ import pytest
 
 from gcs_plugin.cli.main import main
 from gcs_plugin.daemon.jobs.job_queue import Jobs
-from gcs_plugin.daemon.store.daemon_events import JobEnded
-from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.daemon.store.daemon_events import Events, JobEnded
 from gcs_plugin.daemon.store.journal import Journal, wrote_refined
 from tests.kit.daemon_kit import exported, line, serving
 
