@@ -9,24 +9,22 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gcs_plugin.daemon.stoppable_thread import Background
+from gcs_plugin.fleet.fleet import Fleet
+from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.mavlink import Message, dialect
+from gcs_plugin.mission.download import MissionDownload
+from gcs_plugin.mission.geofence import FenceZone, zones_of
 from gcs_plugin.plans.plan_request import DEM_MARGIN_M
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.geo import LocalGrid, area_epsg
 from orthoswarm.raster.height_model import HeightModel
-
-if TYPE_CHECKING:
-    from gcs_plugin.fleet.fleet import Fleet
-    from gcs_plugin.fleet.vehicle_state import Vehicle
-    from gcs_plugin.mission.download import MissionDownload
-    from gcs_plugin.mission.geofence import FenceZone
-
 
 _AT_ONCE: Final = 4  # fences that are read at a time, so that links stay free
 _AGAIN_S: Final = 60.0
@@ -43,22 +41,20 @@ class _Fence:
     """
 
     due: float
-    read: "MissionDownload | None" = None
+    read: MissionDownload | None = None
     document: dict[str, Any] | None = None
-    zones: "tuple[FenceZone, ...] | None" = None
+    zones: tuple[FenceZone, ...] | None = None
 
 
 class Fences:
     """Reads geofences, a few vehicles at once; whatever an operator asks for comes first and breaks the reading off."""
 
-    def __init__(self, fleet: "Fleet", clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, fleet: Fleet, clock: Callable[[], float] = time.monotonic) -> None:
         self._fleet, self._clock = fleet, clock
         self._fences: dict[int, _Fence] = {}
 
     def look(self) -> None:
         """Take what has been read and begin what is due; in the fleet's thread."""
-        from gcs_plugin.mission.geofence import zones_of
-
         now = self._clock()
         for fence in self._fences.values():
             if fence.read is None or fence.read.outcome is None:
@@ -79,7 +75,7 @@ class Fences:
                     fence.read = self._fleet.read_fence(system)
                     under_way += 1
 
-    def zones(self) -> "dict[int, tuple[FenceZone, ...]]":
+    def zones(self) -> dict[int, tuple[FenceZone, ...]]:
         """The zones of each vehicle whose fence has been read, by system id; from any thread."""
         return {s: fence.zones for s, fence in list(self._fences.items()) if fence.zones is not None}
 
@@ -156,26 +152,22 @@ _MOST_WAITING: Final = 100  # requests; vehicles repeat theirs
 _log = logging.getLogger(__name__)
 
 
-class TerrainData:
+class TerrainData(Background):
     """Answers vehicles' requests for terrain data."""
 
-    def __init__(self, dem: Path, fleet: "Fleet") -> None:
+    def __init__(self, dem: Path, fleet: Fleet) -> None:
+        super().__init__("terrain", join_s=None)
         self._dem, self._fleet = dem, fleet
         self._wanted: queue.Queue[tuple[int, int, int, int, int] | None] = queue.Queue(_MOST_WAITING)
-        self._thread = threading.Thread(target=self._run, name="terrain", daemon=True)
         fleet.subscribe(self._requested, "TERRAIN_REQUEST")
-
-    def start(self) -> None:
-        """Begin to answer."""
-        self._thread.start()
 
     def close(self) -> None:
         """Stop."""
         if self._thread.ident is not None:
             self._wanted.put(None)
-            self._thread.join()
+        super().close()
 
-    def _requested(self, vehicle: "Vehicle", message: Any, _: float) -> None:
+    def _requested(self, vehicle: Vehicle, message: Any, _: float) -> None:
         if not self._wanted.full():  # the vehicle repeats its request
             self._wanted.put((vehicle.system, message.lat, message.lon, message.grid_spacing, message.mask))
 

@@ -7,7 +7,7 @@ import os
 import shutil
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -15,9 +15,8 @@ from typing import Any, Final, TypedDict
 
 from gcs_plugin.daemon.flight_coverage.live_coverage import LiveCoverage
 from gcs_plugin.daemon.intake.posted_pose import frame_of_row
-from gcs_plugin.daemon.jobs.job_queue import ReportProgress
+from gcs_plugin.daemon.jobs.job_queue import RunningJob
 from gcs_plugin.daemon.jobs.solution_file import read_solution
-from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
 from gcs_plugin.daemon.jobs.workspace_products import (
     PRODUCTS,
     ExportTask,
@@ -29,10 +28,9 @@ from gcs_plugin.daemon.jobs.workspace_products import (
 from gcs_plugin.daemon.layers.layers import MapArea, MapLayer
 from gcs_plugin.daemon.layers.realtime_layer import Drawer
 from gcs_plugin.daemon.settings import Settings
-from gcs_plugin.daemon.stoppable_thread import StoppableThread
+from gcs_plugin.daemon.stoppable_thread import Background
 from gcs_plugin.daemon.store.console_state import ConsoleState, FindRow
 from gcs_plugin.daemon.store.frame_rows import all_frames, frame_number, frame_path
-from gcs_plugin.daemon.store.job_rows import Job
 from gcs_plugin.daemon.store.journal import Change, Journal, no_change
 from gcs_plugin.daemon.store.picture_store import PictureStore
 from gcs_plugin.daemon.store.sortie_rows import coarse_only, placed_sorties
@@ -87,7 +85,7 @@ class Exports:
 
     Args:
         layers: by name. drawer: knows the map's area. views: has the vehicles. coverage: its cells and figures are
-            part of the report. workers: write the files. facts: of the daemon, for the report.
+            part of the report. facts: of the daemon, for the report.
     """
 
     def __init__(
@@ -101,21 +99,21 @@ class Exports:
         drawer: Drawer,
         views: Views,
         coverage: LiveCoverage,
-        workers: WorkerPool,
         facts: RunFacts,
     ) -> None:
         self._settings, self._journal, self._store = settings, journal, store
-        self._layers, self._console, self._workers = layers, console, workers
+        self._layers, self._console = layers, console
         self._drawer, self._views, self._coverage, self._facts = drawer, views, coverage, facts
         self._written: tuple[dict[str, int], dict[str, str]] = ({}, {})  # the layers' versions, and the files of them
 
-    def write(self, job: Job, report: ReportProgress) -> Change:
+    def write(self, run: RunningJob) -> Change:
         """The handler of an `export` job; one that nobody asked for writes only what has changed since the last one.
 
         Raises:
             InputError: there is no map yet.
         """
-        report(0.05, "writing")
+        job = run.job
+        run.report(0.05, "writing")
         area = self._drawer.area
         if area is None:
             raise InputError("there is no map yet; wait for pictures")
@@ -133,7 +131,7 @@ class Exports:
             ]
             places = tuple(self._places(shown))
             task = replace(task, facts=self._report_facts(), places=places, cells=self._coverage.png)
-            job.detail["files"] = files = self._workers.run(write_products, task)
+            job.detail["files"] = files = run.run(write_products, task)
             self._written = versions, {name: files[name] for name in PRODUCTS}
         return no_change
 
@@ -261,35 +259,35 @@ _FINDS_EVERY: Final = 15  # rounds after which all finds are sent again
 _log = logging.getLogger(__name__)
 
 
-class TakFeed:
+class TakFeed(Background):
     """Sends all vehicles every two seconds, and all finds when one is new or changed and every half minute.
 
     Attributes:
         problem: why a receiver gets nothing at present, else empty.
     """
 
-    def __init__(self, addresses: Sequence[TakAddress], places: Callable[[], Sequence[Place]]) -> None:
+    def __init__(self, addresses: Sequence[TakAddress], exports: Exports) -> None:
+        super().__init__("tak", join_s=10.0)
         self._senders = [TakSender(address) for address in addresses]
-        self._places = places
-        self._thread = StoppableThread(self._run, "tak", join_s=10.0)
+        self._exports = exports
         self.problem = ""
 
     def start(self) -> None:
         """Start sending, if there is a receiver."""
         if self._senders:
-            self._thread.start()
+            super().start()
 
     def close(self) -> None:
         """Stop sending."""
-        self._thread.close()
+        super().close()
         for sender in self._senders:
             sender.close()
 
-    def _run(self, stop: threading.Event) -> None:
+    def _run(self) -> None:
         number, known = 0, set[Place]()
-        while not stop.wait(_EVERY_S):
+        while not self._stop.wait(_EVERY_S):
             try:
-                places = self._places()
+                places = self._exports.places()
             except (OrthoSwarmError, TimeoutError) as error:
                 _log.warning("TAK: %s", error)
                 continue

@@ -59,10 +59,8 @@ def prometheus(daemon: Daemon, uploads_waiting: int = 0) -> str:
     )  # fmt: skip
     single("uploads_waiting", "gauge", "Posted pictures that wait for their turn.", uploads_waiting)
     covered = daemon.coverage.document
-    shares = {
-        "seen": covered["seen_share"], "poor": covered["poor_share"], "missed": covered["missed_share"],
-        "planned": covered["planned_share"],
-    }  # fmt: skip
+    names = ("seen", "poor", "missed", "planned")
+    shares = {name: covered[f"{name}_share"] for name in names}  # type: ignore[literal-required]
     metric(
         "coverage_share", "gauge", "Share of the planned area by state.",
         [({"state": name}, share) for name, share in shares.items() if share is not None],

@@ -9,20 +9,18 @@ CAMERA_FEEDBACK cannot be asked for.
 
 from collections import deque
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
 from gcs_plugin.daemon.store.frame_rows import Exposed, all_exposures, exposures_added
 from gcs_plugin.daemon.store.journal import Journal
-from gcs_plugin.daemon.vehicle_names import VehicleNames
+from gcs_plugin.fleet.fleet import Fleet
+from gcs_plugin.fleet.separation.separation_watch import VehicleNames
+from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.mavlink import Message, dialect
 from orthoswarm.coverage.camera_events import CameraEvent
 from orthoswarm.model.geo import LocalGrid
-
-if TYPE_CHECKING:
-    from gcs_plugin.fleet.fleet import Fleet
-    from gcs_plugin.fleet.vehicle_state import Vehicle
 
 MESSAGES: Final = ("CAMERA_IMAGE_CAPTURED", "CAMERA_FEEDBACK")
 _AFTER_2001_S: Final = 1e9
@@ -45,7 +43,7 @@ class ExposureJournal:
         self._boot_s: dict[int, float] = {}
         self._last: dict[int, tuple[int, float]] = {}
 
-    def message(self, vehicle: "Vehicle", message: Any, utc_s: float) -> None:
+    def message(self, vehicle: Vehicle, message: Any, utc_s: float) -> None:
         """Process a message of MESSAGES; of a vehicle that sends both kinds, only the kind received first is used."""
         kind, system = message.get_type(), vehicle.system
         if self._kinds.setdefault(system, kind) != kind:
@@ -102,13 +100,13 @@ class _Camera:
 class EventRequests:
     """Asks vehicles' cameras for the events that have not come; runs in the links' thread."""
 
-    def __init__(self, fleet: "Fleet") -> None:
+    def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
         self._cameras: dict[tuple[int, int], _Camera] = {}
         fleet.subscribe(self._captured, "CAMERA_IMAGE_CAPTURED")
         fleet.subscribe(self._tick, "HEARTBEAT")
 
-    def _captured(self, vehicle: "Vehicle", message: Any, _: float) -> None:
+    def _captured(self, vehicle: Vehicle, message: Any, _: float) -> None:
         camera = self._cameras.setdefault((vehicle.system, int(message.get_srcComponent())), _Camera())
         number, highest = int(message.image_index), camera.highest
         camera.missing.pop(number, None)
@@ -118,7 +116,7 @@ class EventRequests:
         camera.missing |= dict.fromkeys(range(highest + 1, number), (0, 0.0))
         camera.highest = max(highest, number)
 
-    def _tick(self, vehicle: "Vehicle", _: Any, utc_s: float) -> None:
+    def _tick(self, vehicle: Vehicle, _: Any, utc_s: float) -> None:
         for (system, component), camera in self._cameras.items():
             if system == vehicle.system:
                 self._fleet.send(system, _requests(system, component, camera, utc_s))

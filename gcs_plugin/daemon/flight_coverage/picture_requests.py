@@ -8,12 +8,11 @@ certain is not read. While a command or a mission is under way with any vehicle 
 import contextlib
 import logging
 import re
-import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import Any, Final, Protocol
 from urllib.parse import unquote, urlsplit
 
 import numpy as np
@@ -22,16 +21,15 @@ from gcs_plugin.daemon.flight_coverage.file_download import FileRead, FolderList
 from gcs_plugin.daemon.flight_coverage.live_coverage import LiveCoverage, MissingRow
 from gcs_plugin.daemon.intake.picture_intake import PictureIntake
 from gcs_plugin.daemon.intake.posted_pose import PostedPose, linked_pose
+from gcs_plugin.daemon.stoppable_thread import Background
 from gcs_plugin.daemon.store.daemon_events import Events, RequestsChanged
 from gcs_plugin.daemon.store.frame_rows import dated_images, exposure_place, exposure_times, pose_near
 from gcs_plugin.daemon.store.journal import Journal
+from gcs_plugin.fleet.fleet import Fleet
+from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.file_transfer import payload_of
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 from telemetry.live.live_poses import LinkPoses
-
-if TYPE_CHECKING:
-    from gcs_plugin.fleet.fleet import Fleet
-    from gcs_plugin.fleet.vehicle_state import Vehicle
 
 _SURE: Final = 0.9  # share of the pictures that agree on the shift of numbers
 _LEAST: Final = 3  # pictures for it
@@ -227,7 +225,7 @@ class FetchedPictures:
         return PostedPose(wanted.vehicle, name, wanted.time_s, values, {"position": _EVENT, "time": _EVENT})
 
 
-class PictureRequests:
+class PictureRequests(Background):
     """Asks vehicles for their pictures.
 
     Args:
@@ -238,13 +236,14 @@ class PictureRequests:
 
     def __init__(
         self,
-        fleet: "Fleet",
+        fleet: Fleet,
         workspace: FetchedPictures,
         *,
         folder: str = "/DCIM",
         most_bytes_s: float = 30_000.0,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
+        super().__init__("picture requests")
         self._fleet, self._workspace, self._folder, self._clock = fleet, workspace, folder, clock
         self._on = most_bytes_s > 0.0
         self._share = LinkShare(max(1.0, most_bytes_s))
@@ -254,21 +253,13 @@ class PictureRequests:
         self._reading: _Request | None = None
         self._stepped = self._busy_at = -_QUIET_S
         self._told_at = 0.0
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="picture requests", daemon=True)
         fleet.subscribe(self._answered, "FILE_TRANSFER_PROTOCOL")
         fleet.subscribe(self._captured, "CAMERA_IMAGE_CAPTURED")
 
     def start(self) -> None:
-        """Start the thread."""
+        """Start the thread. A picture that is being read when it stops is read anew after the next start."""
         if self._on:
-            self._thread.start()
-
-    def close(self) -> None:
-        """Stop; a picture that is being read is read anew after the next start."""
-        self._stop.set()
-        if self._thread.ident is not None:
-            self._thread.join(5.0)
+            super().start()
 
     def rows(self) -> list[dict[str, Any]]:
         """All requests as JSON values, by vehicle and number: `state`, `reason`, `percent`, `image`."""
@@ -427,14 +418,14 @@ class PictureRequests:
             return
         talk.step(now)
 
-    def _answered(self, vehicle: "Vehicle", message: Any, _: float) -> None:
+    def _answered(self, vehicle: Vehicle, message: Any, _: float) -> None:
         talk, answer = self._talk, payload_of(message)
         if talk is None or answer is None or vehicle.system != talk.system:
             return
         if message.target_system == self._fleet.own.system:
             talk.answer(answer, self._clock())
 
-    def _captured(self, vehicle: "Vehicle", message: Any, _: float) -> None:
+    def _captured(self, vehicle: Vehicle, message: Any, _: float) -> None:
         server = self._servers.setdefault(vehicle.system, _Server())
         server.component = int(message.get_srcComponent())
         url = message.file_url

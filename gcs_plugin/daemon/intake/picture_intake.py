@@ -7,7 +7,7 @@ import logging
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -19,6 +19,7 @@ from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.daemon.store.picture_store import PictureStore, frame_key, picture_size
 from gcs_plugin.daemon.store.sortie_rows import present_sortie
 from gcs_plugin.daemon.store.workspace_lock import require_space
+from gcs_plugin.links.tlog_writer import write_link_log
 from orthoswarm.export.product_files import iso_time
 from orthoswarm.model.errors import OrthoSwarmError, StorageError
 from telemetry.live.live_poses import LinkPose, LinkPoses
@@ -170,29 +171,12 @@ class PictureIntake:
         return replace(linked, values=linked.values | without, origin=linked.origin | pose.origin)
 
 
-@dataclass(frozen=True, slots=True)
-class LinkLog:
-    """The packets of all vehicles on the links, of this run and earlier ones.
-
-    Attributes:
-        path: the telemetry log; it may be absent. systems: MAVLink system ids by the vehicles' ids.
-    """
-
-    path: Path
-    systems: Mapping[str, int]
-
-    def write(self, vehicle: str, out: Path) -> bool:
-        """Write a vehicle's packets into its own log; False if there are none."""
-        from gcs_plugin.links.tlog_writer import write_link_log
-
-        return vehicle in self.systems and write_link_log(self.path, self.systems[vehicle], out) > 0
-
-
 class VehicleIntake:
     """One vehicle's pictures on their way into the workspace, from a stream or a folder.
 
     Args:
-        intake: takes the pictures. poses, link_log: where pictures without a pose get theirs from.
+        system: its MAVLink system id, None without. intake: takes the pictures.
+        poses, tlog: where pictures without a pose get theirs from; the log of all links may be absent.
         cache: folder of the workspace for the folder's state, and for pictures of videos until they are stored.
 
     Attributes:
@@ -200,10 +184,18 @@ class VehicleIntake:
     """
 
     def __init__(
-        self, vehicle: str, intake: PictureIntake, events: Events, *, poses: LinkPoses, link_log: LinkLog, cache: Path
+        self,
+        vehicle: str,
+        intake: PictureIntake,
+        events: Events,
+        *,
+        poses: LinkPoses,
+        tlog: Path,
+        system: int | None,
+        cache: Path,
     ) -> None:
         self.vehicle, self.cache, self.stop, self.taken = vehicle, cache, threading.Event(), 0
-        self._intake, self._events, self._poses, self._link_log = intake, events, poses, link_log
+        self._intake, self._events, self._poses, self._tlog, self._system = intake, events, poses, tlog, system
 
     def keep(self, pose: PostedPose, data: bytes) -> None:
         """Store a picture; if the disk is full, wait until there is room."""
@@ -224,8 +216,8 @@ class VehicleIntake:
         return self._poses.at(self.vehicle, time_s)
 
     def link_log(self, out: Path) -> bool:
-        """Write the vehicle's packets so far to a .tlog; False if there are none."""
-        return self._link_log.write(self.vehicle, out)
+        """Write the vehicle's packets, of this run and earlier ones, to a .tlog; False if there are none."""
+        return self._system is not None and write_link_log(self._tlog, self._system, out) > 0
 
     def notify(self, text: str) -> None:
         """Tell the operator something."""

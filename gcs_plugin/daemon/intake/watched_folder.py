@@ -517,19 +517,12 @@ class FolderReader:
             mine = frames.get(self._name(path), [])
             with contextlib.suppress(OSError):  # gone meanwhile: left for the next scan
                 if mine and "#" in mine[0].image:
-                    self._keep_video(path, replace_frames(found, mine), video_digest(path))
+                    self._keep_video(path, replace(found, frames=mine, rejected=[]), video_digest(path))
                 elif mine:
                     data = path.read_bytes()
                     digest = digest_of(data)
                     self._keep(mine[0], self._folder_state.name(self._name(path), digest), data)
                     self._done(path, digest)
-
-
-def replace_frames(found: "Ingest", frames: "list[Frame]") -> "Ingest":
-    """A copy with other frames and nothing rejected."""
-    from orthoswarm.model.frame import Ingest
-
-    return Ingest(frames, [], found.warnings)
 
 
 def _stand_in(path: Path, place: Path) -> None:

@@ -7,15 +7,15 @@ the layer's new generation and all facts that change with it.
 import logging
 import shutil
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from gcs_plugin.daemon.intake.posted_pose import frame_of_row
-from gcs_plugin.daemon.jobs.job_queue import ReportProgress
+from gcs_plugin.daemon.jobs.job_queue import RunningJob
 from gcs_plugin.daemon.jobs.solution_file import Bytes, is_readable, thumbnail_of
-from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
-from gcs_plugin.daemon.jobs.worker_tasks import DrawTask, SortieResult, draw
+from gcs_plugin.daemon.jobs.worker_tasks import DrawTask, SortieResult, SortieTask, draw
 from gcs_plugin.daemon.layers.layers import MapArea, MapLayer, new_name
 from gcs_plugin.daemon.layers.realtime_layer import Drawer
 from gcs_plugin.daemon.store.daemon_events import Events, LayerPublished
@@ -51,6 +51,7 @@ class Publisher:
 
     Attributes:
         folder: of the layers' canvases. solutions: folder of the solution files.
+        basemap: the map, or None. refined: the layer of refinements: fine with a map, coarse without.
         lost: layers whose pixels cannot be trusted and are to be drawn again (see `draw_again`).
         outdated: vehicle and sortie of those that were refined by another version of the program, and are to be
             refined again from their pictures.
@@ -58,18 +59,18 @@ class Publisher:
 
     def __init__(
         self, journal: Journal, layers: dict[str, MapLayer], workspace: Path, *, drawer: Drawer, events: Events,
-        workers: WorkerPool, trusted: bool,
+        basemap: Path | None, device: str = "auto", trusted: bool,
     ) -> None:  # fmt: skip
         """Remove unfinished files of a killed daemon, and open what it had published.
 
         Args:
-            workspace: its folder. workers: draw lost layers again.
+            workspace: its folder. device: where networks run.
             trusted: False after a power cut: canvases are not synced, for speed.
         """
-        self.journal, self.layers, self._drawer, self._events, self._workers = journal, layers, drawer, events, workers
+        self.journal, self.layers, self._drawer, self._events = journal, layers, drawer, events
+        self.basemap, self._device, self.refined = basemap, device, "fine" if basemap is not None else "coarse"
         self.folder, self.solutions = workspace / "layers", workspace / "solutions"
         self._turns = {name: threading.Lock() for name in REFINED}
-        self.drawing: set[str] = set()
         self.solutions.mkdir(parents=True, exist_ok=True)
         self.outdated = self._forget_outdated()
         begun = journal.fact("lost") or []
@@ -107,17 +108,17 @@ class Publisher:
         )
         return refined
 
-    def draw_again(self, _: Job, report: ReportProgress) -> Change:
+    def draw_again(self, run: RunningJob) -> Change:
         """The handler of `redraw`: draws the lost layers from the solution files."""
         todo = [(layer, row.whose) for layer in self.lost for row in shown_sorties(self.journal, layer)]
         for n, (layer, whose) in enumerate(todo):
-            with self.turn(layer):
+            with self.turn(layer) as turn:
                 row = self.shown(layer, whose)
                 if row is None:
                     continue  # refined, or drawn again, meanwhile
-                report(n / len(todo), f"drawing {row.vehicle} on {layer}")
-                target = self.solutions / row.path
-                self.publish(layer, self._workers, whose, target=target, changed=row.bounds, change=_as_it_is)
+                run.report(n / len(todo), f"drawing {row.vehicle} on {layer}")
+                turn.draw(run, whose, self.solutions / row.path, row.bounds)
+                turn.publish(no_change)
         return fact_change("lost", [])
 
     def sweep(self) -> None:
@@ -126,10 +127,14 @@ class Publisher:
         for path in self.folder.iterdir():
             if path.name not in named:
                 shutil.rmtree(path, ignore_errors=True)
-        known = {path for table in _TABLES for path in solution_paths(self.journal, table).values()}
+        known = self._named()
         for path in self.solutions.iterdir():
             if path.name not in known:
                 path.unlink(missing_ok=True)
+
+    def _named(self) -> set[str]:
+        """The solution files that the journal names."""
+        return {path for table in _TABLES for path in solution_paths(self.journal, table).values()}
 
     def area(self) -> MapArea:
         """The map's area.
@@ -141,50 +146,33 @@ class Publisher:
             raise OrthoSwarmError("there is no map yet; wait for pictures")
         return self._drawer.area
 
+    def task(self, target: Path, **more: Any) -> SortieTask:
+        """A worker's task on the map's area; `more`: further values of a SortieTask."""
+        area = self.area()
+        return SortieTask(
+            epsg=area.epsg, origin=area.origin, target=target, basemap=self.basemap, device=self._device, **more
+        )
+
     @contextmanager
-    def turn(self, layer: str) -> Iterator[None]:
+    def new_solution(self, kind: str = "solution") -> Iterator[Path]:
+        """The path of a new solution file, which is removed in the end unless the journal names it."""
+        target = self.solutions / f"{new_name(kind)}.pickle"
+        try:
+            yield target
+        finally:
+            if target.name not in self._named():
+                target.unlink(missing_ok=True)
+
+    @contextmanager
+    def turn(self, layer: str) -> Iterator["Turn"]:
         """Wait for exclusive use of a layer."""
         with self._turns[layer]:
-            self.drawing.add(layer)
+            turn = Turn(self, layer)
             try:
-                yield
+                yield turn
             finally:
-                self.drawing.discard(layer)
-
-    def publish(
-        self,
-        layer: str,
-        workers: WorkerPool,
-        whose: Whose,
-        *,
-        target: Path,
-        changed: BoundingBox,
-        change: Callable[[dict[str, str]], Change],
-    ) -> tuple[int, int]:
-        """Draw a placed sortie into the next generation of a layer and publish it; the layer's turn must be held.
-
-        Args:
-            layer: coarse or fine. workers: where the work runs.
-            target: its solution file. changed: ground whose pixels change.
-            change: returns the journal change, given image -> why it could not be drawn.
-
-        Returns:
-            The layer's version before and now.
-
-        Raises:
-            OrthoSwarmError: the disk is full, or the work was stopped; nothing has changed.
-        """
-        name = new_name(layer)
-        try:
-            rejected = workers.run(draw, self._task(layer, name, whose, target, changed))
-            stands = all_changes(change(rejected), fact_change(layer, name))
-            before = self.layers[layer].version
-            self.journal.write(stands)  # here, so that the next drawing starts from it
-        except BaseException:
-            shutil.rmtree(self.folder / name, ignore_errors=True)
-            raise
-        self.layers[layer].replace(Canvas.open(self.folder / name))
-        return before, self.layers[layer].version
+                if not turn.published:
+                    shutil.rmtree(turn.folder, ignore_errors=True)
 
     def tell(self, layer: str, job: Job) -> None:
         """Tell that a job has changed pixels of a layer."""
@@ -195,31 +183,60 @@ class Publisher:
         """A sortie on a layer, None if it is not there."""
         return next((row for row in shown_sorties(self.journal, layer) if row.whose == whose), None)
 
-    def retire(self, path: Path) -> None:
-        """Remove a solution file later, as others may be reading it."""
-        later = threading.Timer(60.0, path.unlink, kwargs={"missing_ok": True})
-        later.daemon = True
-        later.start()
+    def retire(self, row: PlacedSortie | None) -> None:
+        """Remove the solution file of what was replaced, later, as others may be reading it."""
+        if row is not None:
+            path = self.solutions / row.path
+            later = threading.Timer(60.0, path.unlink, kwargs={"missing_ok": True})
+            later.daemon = True
+            later.start()
 
-    def _task(self, layer: str, name: str, whose: Whose, target: Path, changed: BoundingBox) -> DrawTask:
+
+class Turn:
+    """The exclusive use of a layer, in which one sortie is drawn into its next generation, and this published.
+
+    Attributes:
+        folder: of the next generation's canvas; removed unless it was `published`.
+    """
+
+    def __init__(self, publisher: Publisher, layer: str) -> None:
+        self._publisher, self._layer, self._name = publisher, layer, new_name(layer)
+        self.folder, self.published = publisher.folder / self._name, False
+
+    def draw(self, run: RunningJob, whose: Whose, target: Path, changed: BoundingBox) -> dict[str, str]:
+        """Draw a placed sortie; returns image -> why it could not be drawn.
+
+        Args:
+            target: its solution file. changed: ground whose pixels change.
+
+        Raises:
+            OrthoSwarmError: the disk is full, or the work was stopped.
+        """
+        publisher = self._publisher
         others = [
-            self.solutions / row.path
-            for row in shown_sorties(self.journal, layer)
+            publisher.solutions / row.path
+            for row in shown_sorties(publisher.journal, self._layer)
             if row.whose != whose and row.bounds.overlaps(changed)
         ]
-        canvas = self.layers[layer].canvas
-        return DrawTask(
-            old=None if canvas is None else canvas.path,
-            new=self.folder / name,
-            grid=self.area().grid,
-            solutions=[*others, target],
-            changed=target,
-            bounds=changed,
-        )
+        canvas = publisher.layers[self._layer].canvas
+        task = DrawTask(
+            old=None if canvas is None else canvas.path, new=self.folder, grid=publisher.area().grid,
+            solutions=[*others, target], changed=target, bounds=changed,
+        )  # fmt: skip
+        return run.run(draw, task)
 
+    def publish(self, change: Change) -> dict[str, int]:
+        """Make what was drawn the layer, and a change of the journal with it; returns the versions before and now.
 
-def _as_it_is(_: dict[str, str]) -> Change:
-    return no_change
+        Raises:
+            OrthoSwarmError: the disk is full; nothing has changed.
+        """
+        publisher, layer = self._publisher, self._publisher.layers[self._layer]
+        before = layer.version
+        publisher.journal.write(all_changes(change, fact_change(self._layer, self._name)))
+        self.published = True
+        layer.replace(Canvas.open(self.folder))
+        return {"version_before": before, "version": layer.version}
 
 
 def frames_of(journal: Journal, store: PictureStore, job: Job) -> tuple[list[Frame], dict[str, Bytes]]:

@@ -7,21 +7,18 @@ are drawn again.
 """
 
 import time
-from dataclasses import dataclass, field, replace
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gcs_plugin.daemon.jobs.job_queue import ReportProgress
-from gcs_plugin.daemon.jobs.preemption import Preemption
+from gcs_plugin.daemon.jobs.job_queue import RunningJob
 from gcs_plugin.daemon.jobs.publisher import Publisher
 from gcs_plugin.daemon.jobs.solution_file import Bytes, Gain, SolutionFile, read_solution, uniquely_named
-from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
-from gcs_plugin.daemon.layers.layers import new_name
-from gcs_plugin.daemon.store.job_rows import Job
-from gcs_plugin.daemon.store.journal import Change, Journal, no_change
+from gcs_plugin.daemon.store.journal import Change, no_change
 from gcs_plugin.daemon.store.sortie_rows import PlacedSortie, shown_sorties, solution_paths, solution_replaced
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.placement import PlacedFrame, Terrain
@@ -106,69 +103,47 @@ def _common_ground(sorties: list[SolutionFile]) -> Terrain:
     return Terrain(west, south, step, z)
 
 
-@dataclass(slots=True, kw_only=True)
+@dataclass(slots=True)
 class ToneBalance:
-    """Does the jobs `tones`.
+    """Does the jobs `tones`."""
 
-    Attributes:
-        journal, publisher: of the workspace. workers: compute the job; used by nothing else meanwhile.
-        layer: name of the refined layer.
-    """
-
-    journal: Journal
     publisher: Publisher
-    workers: WorkerPool
-    layer: str
-    _preemption: Preemption = field(init=False)
 
-    def __post_init__(self) -> None:
-        self._preemption = Preemption(self.workers)
-
-    def balance(self, job: Job, report: ReportProgress) -> Change:
+    def balance(self, run: RunningJob) -> Change:
         """The handler of `tones`."""
         began = time.monotonic()
-        targets: list[Path] = []
-        try:
-            with self._preemption.running():
-                self._balance(job, report, targets)
-        finally:
-            for target in targets:  # of those that were not published
-                target.unlink(missing_ok=True)
-        job.detail["seconds"] = round(time.monotonic() - began, 3)
+        self._balance(run)
+        run.job.detail["seconds"] = round(time.monotonic() - began, 3)
         return no_change
 
-    def give_way(self, _: object = None) -> None:
-        """Stop the running job; it is done later."""
-        self._preemption.stop()
-
-    def _balance(self, job: Job, report: ReportProgress, targets: list[Path]) -> None:
-        refined = solution_paths(self.journal, "solutions")
-        shown = [row for row in shown_sorties(self.journal, self.layer) if row.whose in refined]
+    def _balance(self, run: RunningJob) -> None:
+        publisher, detail = self.publisher, run.job.detail
+        refined = solution_paths(publisher.journal, "solutions")
+        shown = [row for row in shown_sorties(publisher.journal, publisher.refined) if row.whose in refined]
         if len({row.vehicle for row in shown}) < 2:
-            job.detail["note"] = "there is one vehicle only"
+            detail["note"] = "there is one vehicle only"
             return
-        report(0.05, f"balancing the tones of {len(shown)} flights")
-        targets += [self.publisher.solutions / f"{new_name('solution')}.pickle" for _ in shown]
-        task = ToneTask(solutions=[self.publisher.solutions / row.path for row in shown], targets=list(targets))
-        changes, pictures, cpu_s = self.workers.run(balance_tones, task)
-        job.detail |= {"frames": pictures, "tones_changed": round(max(changes), 4), "solve_cpu_s": cpu_s, "drawn": 0}
-        todo = [(row, target) for row, target in zip(shown, task.targets, strict=True) if target.exists()]
-        for n, (row, target) in enumerate(todo):
-            report(0.2 + 0.8 * n / len(todo), f"drawing {row.vehicle}")
-            if self._draw(row, target):
-                targets.remove(target)
-                job.detail["drawn"] += 1
-                self.publisher.tell(self.layer, job)
+        run.report(0.05, f"balancing the tones of {len(shown)} flights")
+        with ExitStack() as stack:
+            targets = [stack.enter_context(publisher.new_solution()) for _ in shown]
+            task = ToneTask(solutions=[publisher.solutions / row.path for row in shown], targets=targets)
+            changes, pictures, cpu_s = run.run(balance_tones, task)
+            detail |= {"frames": pictures, "tones_changed": round(max(changes), 4), "solve_cpu_s": cpu_s, "drawn": 0}
+            todo = [(row, target) for row, target in zip(shown, targets, strict=True) if target.exists()]
+            for n, (row, target) in enumerate(todo):
+                run.report(0.2 + 0.8 * n / len(todo), f"drawing {row.vehicle}")
+                if self._draw(run, row, target):
+                    detail["drawn"] += 1
+                    publisher.tell(publisher.refined, run.job)
 
-    def _draw(self, before: PlacedSortie, target: Path) -> bool:
+    def _draw(self, run: RunningJob, before: PlacedSortie, target: Path) -> bool:
         """Draw and publish a sortie; False if it was refined again meanwhile."""
-        with self.publisher.turn(self.layer):
-            now = self.publisher.shown(self.layer, before.whose)
+        publisher = self.publisher
+        with publisher.turn(publisher.refined) as turn:
+            now = publisher.shown(publisher.refined, before.whose)
             if now is None or now.path != before.path:
                 return False
-            stands = solution_replaced(before.whose, target.name)
-            self.publisher.publish(
-                self.layer, self.workers, before.whose, target=target, changed=before.bounds, change=lambda _: stands
-            )
-        self.publisher.retire(self.publisher.solutions / before.path)
+            turn.draw(run, before.whose, target, before.bounds)
+            turn.publish(solution_replaced(before.whose, target.name))
+        publisher.retire(before)
         return True

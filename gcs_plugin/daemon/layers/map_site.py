@@ -15,8 +15,15 @@ from gcs_plugin.daemon.intake.posted_pose import is_position
 from gcs_plugin.daemon.layers.layers import MapArea, MapLayer, new_name, successor
 from gcs_plugin.daemon.layers.web_tiles import TileServer
 from gcs_plugin.daemon.store.daemon_events import AreaChanged, DrawingRestarted, Events
-from gcs_plugin.daemon.store.frame_rows import frames_undrawn, poses_after
-from gcs_plugin.daemon.store.journal import Journal, all_changes, area_forgotten, fact_change, no_change
+from gcs_plugin.daemon.store.frame_rows import poses_after
+from gcs_plugin.daemon.store.journal import (
+    Journal,
+    all_changes,
+    area_forgotten,
+    drawn_forgotten,
+    fact_change,
+    no_change,
+)
 from gcs_plugin.daemon.store.sortie_rows import solution_paths
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.model.bounding_box import BoundingBox
@@ -92,6 +99,7 @@ class MapSite:
 
     Attributes:
         area: the map's area, None before the first frame. grid: its grid. mosaic: draws on its canvas.
+        layer: the real-time layer. folder: of all layers' canvases.
     """
 
     def __init__(
@@ -101,12 +109,11 @@ class MapSite:
         """Continue where the last daemon stopped.
 
         Args:
-            layer: the real-time layer. folder: of all layers' canvases.
             gsd_m: ground pixel; from the first pictures if None. fov_rad: theta-hat, see recorded_cameras.
             expected: where the map is to lie. events: told when the area changes, and when all is drawn again.
             memory_mb: what the canvas keeps of its tiles.
         """
-        self._journal, self._layer, self._folder, self._events = journal, layer, folder, events
+        self._journal, self.layer, self.folder, self._events = journal, layer, folder, events
         self._gsd_m, self._fov_rad, self._expected, self._memory_mb = gsd_m, fov_rad, expected, memory_mb
         self._positions: list[tuple[float, float]] = []  # of the journal's frames up to the number `_counted`
         self._counted = 0
@@ -198,7 +205,7 @@ class MapSite:
         self._journal.write(area_forgotten)
         self._events.publish(DrawingRestarted())
         self.area, self.grid, self.mosaic = None, None, None
-        self._layer.replace(None)
+        self.layer.replace(None)
 
     def _is_other_scale(self, camera: Camera) -> bool:
         """Whether the map's ground pixel was derived from pictures during the climb."""
@@ -230,26 +237,26 @@ class MapSite:
             area = self.area.grown(bounds)
         except OrthoSwarmError as error:
             return str(error)
-        old = self._layer.canvas
+        old = self.layer.canvas
         name = new_name("realtime")
-        path, memory_mb = self._folder / name, self._memory_mb
+        path, memory_mb = self.folder / name, self._memory_mb
         self._adopt(area, successor(old, path, area.grid, "orthogonality", share=True, memory_mb=memory_mb))
         return None
 
     # -- the layer ------------------------------------------------------------------------------------------------
 
     def _begin(self, area: MapArea, *, again: bool = False) -> None:
-        canvas = Canvas.create(self._folder / new_name("realtime"), area.grid, memory_mb=self._memory_mb)
+        canvas = Canvas.create(self.folder / new_name("realtime"), area.grid, memory_mb=self._memory_mb)
         self._adopt(area, canvas, again=again)
 
     def _adopt(self, area: MapArea, canvas: Canvas, *, again: bool = False) -> None:
         """Make a canvas the layer, in the journal first."""
         facts = [fact_change("area", area.document()), fact_change("realtime", canvas.path.name)]
-        self._journal.write(all_changes(*facts, frames_undrawn if again else no_change))
+        self._journal.write(all_changes(*facts, drawn_forgotten if again else no_change))
         if again:
             self._events.publish(DrawingRestarted())
         self.area = area
-        self._layer.replace(canvas)
+        self.layer.replace(canvas)
         self.mosaic = RealtimeMosaic(canvas)
         self.grid = LocalGrid(area.epsg)
         self._events.publish(AreaChanged(area.epsg))
@@ -258,12 +265,12 @@ class MapSite:
         """The canvas that the last daemon drew on; drawn anew from the journal if it is damaged."""
         assert self.area is not None
         try:
-            canvas = Canvas.open(self._folder / str(name), memory_mb=self._memory_mb)
+            canvas = Canvas.open(self.folder / str(name), memory_mb=self._memory_mb)
         except (OrthoSwarmError, OSError):
             _log.warning("the real-time layer is damaged and is drawn again")
             self._begin(self.area, again=True)
             return
-        self._layer.replace(canvas)
+        self.layer.replace(canvas)
         self.mosaic = RealtimeMosaic(canvas)
         self.grid = LocalGrid(self.area.epsg)
         self._events.publish(AreaChanged(self.area.epsg))

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from gcs_plugin.daemon.intake.posted_pose import frame_of_row
 from gcs_plugin.daemon.layers.draw_queue import DrawQueue, MapDelay, PendingFrame
-from gcs_plugin.daemon.layers.layers import MapArea, MapLayer, new_name
-from gcs_plugin.daemon.layers.map_site import ExpectedPlace, MapSite
+from gcs_plugin.daemon.layers.layers import MapArea, new_name
+from gcs_plugin.daemon.layers.map_site import MapSite
 from gcs_plugin.daemon.store.daemon_events import (
     DrawingRestarted,
     Events,
@@ -72,14 +72,9 @@ class Drawer:
         self,
         journal: Journal,
         store: PictureStore,
-        layer: MapLayer,
-        folder: Path,
+        site: MapSite,
         events: Events,
         *,
-        gsd_m: float | None = None,
-        fov_rad: float | None = None,
-        expected: ExpectedPlace,
-        canvas_mb: float,
         in_memory: int = _IN_MEMORY,
         late_s: float = _LATE_S,
         look_s: float = _LOOK_S,
@@ -88,16 +83,14 @@ class Drawer:
         """Continue where the last daemon stopped; `start` begins to draw.
 
         Args:
-            layer: to draw on. folder: of all layers' canvases. expected: where the map should lie.
-            gsd_m: ground pixel; from the first pictures if None. canvas_mb: memory that the layer keeps of its tiles.
-            fov_rad: theta-hat, the field of view to assume; see recorded_cameras.
+            site: of the map, whose layer is drawn on.
             in_memory: most frames that wait in memory; the journal has the others.
             late_s: a frame drawn later than this after its arrival is late, seconds.
             look_s: time between looks for late frames, seconds.
             read: reads a picture file, uint8 (rows, columns, 4).
         """
         self._in_memory, self._late_s, self._look_s, self._read = in_memory, late_s, look_s, read
-        self._journal, self._store, self._layer, self._folder, self._events = journal, store, layer, folder, events
+        self._journal, self._store, self._site, self._events = journal, store, site, events
         self._begun = 0
         self._queue = DrawQueue(self._in_memory)
         self._delay = MapDelay()
@@ -110,16 +103,6 @@ class Drawer:
         self.drawn = self.late = self.put_off = 0
         self.latencies: list[float] = []
         self.problem = ""
-        self._site = MapSite(
-            journal,
-            layer,
-            folder,
-            gsd_m=gsd_m,
-            fov_rad=fov_rad,
-            expected=expected,
-            events=events,
-            memory_mb=canvas_mb,
-        )
 
     # -- from outside ---------------------------------------------------------------------------------------------
 
@@ -172,7 +155,7 @@ class Drawer:
     # -- the thread -----------------------------------------------------------------------------------------------
 
     def _run(self) -> None:
-        load_kernels(self._folder)
+        load_kernels(self._site.folder)
         while True:
             with self._condition:
                 while not len(self._queue) and not self._more and not self._stop:
@@ -269,7 +252,7 @@ class Drawer:
             self._note(pending, result)
         if done:
             self._journal.write(frames_drawn(done))
-            self._events.publish(LayerDrawn("realtime", self._layer.version))
+            self._events.publish(LayerDrawn("realtime", self._site.layer.version))
         with self._condition:
             self._waiting.difference_update(seqs)
             self._condition.notify_all()

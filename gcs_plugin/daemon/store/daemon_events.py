@@ -116,36 +116,10 @@ class MissionNoted(Event):
 
 
 @dataclass(frozen=True, slots=True)
-class RefinementBegins(Event):
-    """The refinement of a completed sortie begins: what is done in the background gives way."""
-
-    vehicle: str
-
-
-@dataclass(frozen=True, slots=True)
-class LayerNeeded(Event):
-    """A refinement needs a layer: what draws on it in the background gives way."""
-
-    layer: str
-
-
-@dataclass(frozen=True, slots=True)
-class JobDropped(Event):
-    """A running job was cancelled; its work is to be abandoned."""
-
-    job: Job
-
-
-@dataclass(frozen=True, slots=True)
 class JobEnded(Event):
     """A job's end is in the journal."""
 
     job: Job
-
-
-@dataclass(frozen=True, slots=True)
-class JobsStop(Event):
-    """The daemon stops: no job is started any more."""
 
 
 # -- what pages are told, too -----------------------------------------------------------------------------------------
@@ -211,20 +185,6 @@ class LayerPublished(Event):
     version: int
     vehicle: str | None
     sortie: int | None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CoverageChanged(Event):
-    """Gaps were looked for again."""
-
-    page = "coverage"
-    gaps: int
-    state: str
-    version: int
-    seen_share: float | None
-    poor_share: float | None
-    missed_share: float | None
-    planned_share: float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -298,6 +258,13 @@ class PlanChanged(_RowEvent):
     """The operator's plan."""
 
     page = "plan"
+
+
+@dataclass(frozen=True, slots=True)
+class CoverageChanged(_RowEvent):
+    """Gaps were looked for again: their number, the shares, and the version of /api/coverage."""
+
+    page = "coverage"
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import astuple, dataclass
 from typing import Any, Final
 
-from gcs_plugin.daemon.store.journal import Change, Journal, packed, unpacked
+from gcs_plugin.daemon.store.journal import Change, Journal, all_changes, packed, statements, unpacked
 from orthoswarm.raster.picture_quality import PictureQuality
 
 Whose = tuple[str, int]
@@ -296,21 +296,15 @@ def frames_drawn(results: Iterable[Drawn]) -> Change:
     thumbnails = [(d.seq, d.thumbnail) for d in done if d.thumbnail is not None]
     qualities = [(d.seq, *astuple(d.quality)) for d in done if d.quality is not None]
 
-    def change(db: sqlite3.Connection) -> None:
-        db.executemany(
+    return all_changes(
+        statements(
             "UPDATE frames SET drawn = 1, reason = ?, stage = CASE WHEN stage IN ('coarse', 'fine') THEN stage"
             " ELSE ? END, sigma = CASE WHEN stage IN ('coarse', 'fine') THEN sigma ELSE ? END WHERE seq = ?",
             rows,
-        )
-        db.executemany("INSERT OR REPLACE INTO thumbnails VALUES (?, ?)", thumbnails)
-        db.executemany("INSERT OR REPLACE INTO qualities VALUES (?, ?, ?, ?, ?)", qualities)
-
-    return change
-
-
-def frames_undrawn(db: sqlite3.Connection) -> None:
-    """The change after which all frames are drawn again."""
-    db.execute("UPDATE frames SET drawn = 0")
+        ),
+        statements("INSERT OR REPLACE INTO thumbnails VALUES (?, ?)", thumbnails),
+        statements("INSERT OR REPLACE INTO qualities VALUES (?, ?, ?, ?, ?)", qualities),
+    )
 
 
 Exposed = tuple[str, int, float, float | None, float | None]
@@ -320,11 +314,7 @@ Exposed = tuple[str, int, float, float | None, float | None]
 def exposures_added(rows: Sequence[Exposed]) -> Change:
     """The change that adds events; those that are known stay."""
     values = [(packed(vehicle), *rest) for vehicle, *rest in rows]
-
-    def change(db: sqlite3.Connection) -> None:
-        db.executemany("INSERT OR IGNORE INTO exposures VALUES (?, ?, ?, ?, ?)", values)
-
-    return change
+    return statements("INSERT OR IGNORE INTO exposures VALUES (?, ?, ?, ?, ?)", values)
 
 
 def all_exposures(journal: Journal) -> list[Exposed]:
