@@ -8,6 +8,7 @@ Waiting takeoffs are dropped when the daemon ends: a start is a command and is n
 import logging
 import threading
 import time
+from collections import OrderedDict
 from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from typing import Any, Final
@@ -26,6 +27,7 @@ from gcs_plugin.mission.track import Airspace
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 
 _LOOK_S: Final = 0.05
+_REMEMBERED: Final = 1000  # cancelled starts
 _log = logging.getLogger(__name__)
 
 
@@ -40,6 +42,7 @@ class Takeoffs:
         self._missions: dict[int, Mission] = {}
         self._needs = NO_NEEDS
         self._allowed: dict[str, Collection[str]] = {}
+        self._cancelled: OrderedDict[str | None, None] = OrderedDict()
         self._closed = False
 
     def preflight(
@@ -87,7 +90,7 @@ class Takeoffs:
         names: Mapping[str, str] | None = None,
         override: Mapping[str, Collection[str]] | None = None,
         *,
-        wanted: Callable[[], bool] = lambda: True,
+        number: str | None = None,
         given_s: float | None = None,
     ) -> dict[str, float]:
         """Start a plan's vehicles; returns vehicle -> seconds from now.
@@ -99,7 +102,7 @@ class Takeoffs:
             plan: its id. sortie: which flight of each vehicle, from 1.
             names: the plan's vehicle -> the daemon's, where they differ.
             override: names of red preflight items that do not stop the start, by the daemon's vehicle.
-            wanted: asked after the check, which takes seconds: whether they are still to start.
+            number: the start's id, by which it can be cancelled until the first is told to start.
             given_s: when it was given, on the clock; default now.
 
         Raises:
@@ -125,7 +128,7 @@ class Takeoffs:
             schedule = TakeoffSchedule.of(delays, time.monotonic())
             needs = self._plans.needs(plan)
             with self.waiting.condition:
-                if not wanted():
+                if number in self._cancelled:
                     raise OrthoSwarmError("the start was cancelled; no vehicle was started")
                 self._still_wanted(given, stops)
                 self.waiting.failed.clear()
@@ -142,6 +145,12 @@ class Takeoffs:
         known = {s: mission for s, mission in held.items() if mission is not None}
         threading.Thread(target=self._follow, args=(schedule, known, delays), daemon=True).start()
         return {whose[vehicle]: round(start_s - first, 1) for vehicle, start_s in starts.items()}
+
+    def cancel(self, number: str) -> None:
+        """Have no vehicle started by a start with this id that is still being checked, or that has not come yet."""
+        self._cancelled[number] = None
+        while len(self._cancelled) > _REMEMBERED:
+            self._cancelled.popitem(last=False)
 
     def close(self) -> None:
         """Cancel all waiting takeoffs."""

@@ -14,8 +14,11 @@ from typing import Any, Final, Protocol
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.items import Mission
+from gcs_plugin.mission.mission_builder import build_mission, read_mission
+from gcs_plugin.mission.mission_files import parse_mission
 from gcs_plugin.mission.plan_folder import PlanNeeds, plan_needs
 from gcs_plugin.plans.no_fly import refuse_no_zones
+from gcs_plugin.plans.plan_files import write_plan
 from gcs_plugin.plans.plan_request import AUTOPILOTS, ENDS, METHODS, RELIEFS, PlanRequest, make_plan
 from orthoswarm.config import DEFAULT, Config
 from orthoswarm.model.errors import InputError
@@ -169,9 +172,6 @@ class Plans:
         Raises:
             InputError: there is none, or the text is not a mission file.
         """
-        from gcs_plugin.mission.mission_builder import build_mission, read_mission
-        from gcs_plugin.mission.mission_files import parse_mission
-
         if isinstance(body.get("text"), str):
             parsed = parse_mission(body["text"], "the mission")
             return build_mission(autopilot, parsed.items, parsed.home, "the mission")
@@ -328,7 +328,5 @@ def _positions(document: Any) -> Iterator[tuple[float, float]]:
 
 def plan_into(request: PlanRequest, notes: Sequence[str]) -> dict[str, Any]:
     """Plan in a worker and write the plan's folder; returns the figures, with notes before the plan's warnings."""
-    from gcs_plugin.plans.plan_files import write_plan
-
     plan, area = make_plan(request)
     return write_plan(request.area.parent, plan, area, request, notes=notes, picture=False)

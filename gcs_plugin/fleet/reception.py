@@ -15,7 +15,7 @@ from gcs_plugin.fleet.heard_messages import HEARD, MESSAGE_IDS, HeardMessage, ra
 from gcs_plugin.fleet.link_hub import Hub, Side
 from gcs_plugin.fleet.message_rates import Streams
 from gcs_plugin.fleet.routes import LongText, Route
-from gcs_plugin.fleet.separation.separation_watch import SeparationWatch, apart_text, near_text
+from gcs_plugin.fleet.separation.separation_watch import SeparationWatch, VehicleNames, apart_text, near_text
 from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.mavlink import Autopilot, Message, dialect, has_place, is_vehicle
 from gcs_plugin.links.packets import Packet
@@ -60,13 +60,14 @@ class Reception:
     def __init__(
         self, vehicles: dict[int, Vehicle], hub: Hub, *, dialogues: Dialogues, own: Address,
         remembered: Mapping[int, Mapping[str, Any]], event: Callable[[FleetEvent], None], wall: Callable[[], float],
+        names: VehicleNames,
     ) -> None:  # fmt: skip
         self._vehicles, self._hub, self._dialogues, self._own = vehicles, hub, dialogues, own
         self._remembered, self._publish, self._wall = dict(remembered), event, wall
         self._counters: dict[tuple[Side, Peer, int, int], int] = {}
         self._said: dict[tuple[int, str], tuple[float, Route]] = {}
         self._lateness: dict[int, Lateness] = {}
-        self.separation = SeparationWatch()
+        self.separation = SeparationWatch(names=names)
         self.handlers: dict[int, list[Handler]] = {}
         self.taps: list[Callable[[Packet, float], None]] = []
 
@@ -260,7 +261,7 @@ class Reception:
         for near in new:
             self._event("near", self._vehicles[near.other], near_text(near, self.separation), near.pair)
         for pair in ended:
-            self._event("apart", self._vehicles[pair[1]], apart_text(pair), pair)
+            self._event("apart", self._vehicles[pair[1]], apart_text(pair, self.separation.names), pair)
 
     def _watch_danger(self, vehicle: Vehicle) -> None:
         """Tell once that a vehicle is in a failsafe, or sinks though nobody ordered it."""

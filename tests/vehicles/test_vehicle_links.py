@@ -83,7 +83,7 @@ def ready(links, count):
 def upload_all(links, folder):  # noqa: F811
     for system, vehicle in links.fleet.vehicles.items():
         loaded = read_mission(folder / f"v{system}.waypoints", vehicle.autopilot)
-        links.command(lambda fleet, s=system, m=loaded: fleet.upload(s, m))
+        links.upload(system, loaded)
 
 
 def test_all_are_commanded_at_once_with_an_outcome_each(open_links, folder):  # noqa: F811
@@ -176,9 +176,9 @@ def test_an_alarm_names_two_vehicles_whatever_the_operator_called_them(open_link
     """The one with system id 1 is called v2: the one with system id 2 needs another name."""
     links = open_links(make_swarm(2, home=HOME), named=(VehicleSettings("v2", 1),))
     assert (links.name_of(1), links.name_of(2), links.name_of(3)) == ("v2", "system-2", "v3")
-    watch = SeparationWatch(alarms={(1, 2): Near(2, 1, 4.0, 1.0)})
+    watch = SeparationWatch(alarms={(1, 2): Near(2, 1, 4.0, 1.0)}, names=links.names)
     for system in (1, 2):
-        assert watch.text(system, links.name_of).startswith("system-2 and v2 are 4.0 m apart and 1.0 m in height")
+        assert watch.text(system).startswith("system-2 and v2 are 4.0 m apart and 1.0 m in height")
 
 
 def adsb(number, lat_deg, *, flags=0xFF, tslc=0, callsign=b"SWR12"):
