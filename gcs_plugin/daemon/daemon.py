@@ -156,7 +156,7 @@ class Daemon:
         )  # fmt: skip
         self.gap_flights = GapFlights(self.coverage, self.plans, self.links)
         fetched = FetchedPictures(
-            self.links, self.journal, self.events, poses=self.poses, coverage=self.coverage, intake=self.intake
+            self.journal, self.events, poses=self.poses, coverage=self.coverage, intake=self.intake
         )
         self.picture_requests = PictureRequests(
             self.links.fleet, fetched, folder=settings.picture_folder, most_bytes_s=settings.picture_bytes_s

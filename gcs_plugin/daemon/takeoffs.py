@@ -76,7 +76,7 @@ class Takeoffs:
         whose = {vehicle: (names or {}).get(vehicle, vehicle) for vehicle in starts}
         missions = {}
         for vehicle, name in whose.items():
-            known = self._links.fleet.vehicles[self._links.system_of(name)]
+            known = self._links.fleet.vehicles[self._links.fleet.system_of(name)]
             mission = vehicle if sortie == 1 else f"{vehicle}-sortie{sortie}"
             missions[name] = self._plans.mission({"plan": plan, "mission": mission}, vehicle, known.autopilot)
         times = {whose[vehicle]: start_s for vehicle, start_s in starts.items()}
@@ -166,7 +166,7 @@ class Takeoffs:
             OrthoSwarmError: one is not heard.
         """
         try:
-            return {vehicle: self._links.system_of(name) for vehicle, name in whose.items()}
+            return {vehicle: self._links.fleet.system_of(name) for vehicle, name in whose.items()}
         except OrthoSwarmError as error:
             raise OrthoSwarmError(f"{error}; no vehicle was started") from None
 
@@ -178,7 +178,7 @@ class Takeoffs:
         """
         told = [s for s in sorted(self.waiting.checking) if self._links.fleet.stops.get(s, 0) != stops.get(s, 0)]
         if told:
-            who = ", ".join(self._links.name_of(system) for system in told)
+            who = ", ".join(self._links.names.name_of(system) for system in told)
             raise OrthoSwarmError(f"{who} was told to stop during the check; no vehicle was started")
         age_s = time.monotonic() - given_s
         if age_s > COMMAND.fresh_s:

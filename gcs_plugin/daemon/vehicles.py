@@ -112,7 +112,7 @@ class VehicleLinks:
         self.fleet.subscribe(self._message)
         self._fences = Fences(self.fleet)
         self._checks = StartChecks(self.fleet, self._fences, self.names, self.waiting)
-        self._returns = Returns(self.fleet, self._give, self._tell_command, self.names.name_of)
+        self._returns = Returns(self.fleet, self._give, self._told, self.names.name_of)
         self.traffic = Traffic()
         self.fleet.subscribe(self.traffic.heard, "ADSB_VEHICLE")
         self._threads = [  # with what ends them: first the one that asks the links
@@ -136,33 +136,21 @@ class VehicleLinks:
 
     # -- queries ------------------------------------------------------------------------------------------
 
-    def name_of(self, system: int) -> str:
-        """The id of a vehicle with a MAVLink system id."""
-        return self.names.name_of(system)
-
-    def system_of(self, vehicle: str) -> int:
-        """The MAVLink system id of a vehicle, by its id or that number.
-
-        Raises:
-            OrthoSwarmError: it was not heard on any link.
-        """
-        for system in list(self.fleet.vehicles):
-            if vehicle in (self.name_of(system), str(system)):
-                return system
-        known = ", ".join(self.name_of(system) for system in sorted(self.fleet.vehicles)) or "none"
-        raise OrthoSwarmError(f"{vehicle} is not on the links (heard: {known}); check links and system ids")
+    def heard(self) -> list[str]:
+        """The ids of all vehicles on the links."""
+        return [self.names.name_of(system) for system in sorted(self.fleet.vehicles)]
 
     def standing(self) -> dict[str, tuple[float, float] | str]:
         """Where vehicles stand on the ground, latitude and longitude in degrees, or why that is not known, by id."""
         known: dict[str, tuple[float, float] | str] = {}
         for system, v in list(self.fleet.vehicles.items()):
             place = "no position yet" if v.lat_deg is None or v.lon_deg is None else (v.lat_deg, v.lon_deg)
-            known[self.name_of(system)] = "in the air" if v.flying else place
+            known[self.names.name_of(system)] = "in the air" if v.flying else place
         return known
 
     def autopilots(self) -> dict[str, str]:
         """The autopilot of each vehicle that was heard, by id."""
-        return {self.name_of(system): v.autopilot.value for system, v in list(self.fleet.vehicles.items())}
+        return {self.names.name_of(system): v.autopilot.value for system, v in list(self.fleet.vehicles.items())}
 
     def rows(self) -> list[VehicleRow]:
         """All vehicles on the links as JSON values."""
@@ -190,7 +178,7 @@ class VehicleLinks:
         Raises:
             OrthoSwarmError: it was not heard on any link.
         """
-        known = self.fleet.vehicles[self.system_of(vehicle)]
+        known = self.fleet.vehicles[self.fleet.system_of(vehicle)]
         return self.fleet.call(partial(flight_state, known)).result(_SOON_S).document()
 
     def commands(
@@ -220,9 +208,9 @@ class VehicleLinks:
         if verb not in VERBS:
             raise InputError(f"there is no command '{verb}'; choose {', '.join(VERBS)}")
         given, number = self.clock() if given_s is None else min(given_s, self.clock()), command_id or new_id()
-        names = [self.name_of(s) for s in sorted(self.fleet.vehicles)] if vehicles is None else list(vehicles)
+        names = self.heard() if vehicles is None else list(vehicles)
         for system in list(self.fleet.vehicles):
-            if self.name_of(system) in names:
+            if self.names.name_of(system) in names:
                 self._returns.cancel(system)
         return self._give(verb, names, given, number, override or {})
 
@@ -267,7 +255,9 @@ class VehicleLinks:
         Returns:
             A row per vehicle, see `commands`; one that holds until its turn comes has done as it was told.
         """
-        return self._returns.begin({self.name_of(s): s for s in sorted(self.fleet.vehicles)}, command_id or new_id())
+        return self._returns.begin(
+            {self.names.name_of(s): s for s in sorted(self.fleet.vehicles)}, command_id or new_id()
+        )
 
     def _without_command(
         self, verb: str, names: Collection[str], number: str, override: Mapping[str, Collection[str]]
@@ -281,7 +271,7 @@ class VehicleLinks:
 
         for name in names:
             try:
-                systems[name] = self.system_of(name)
+                systems[name] = self.fleet.system_of(name)
             except OrthoSwarmError as error:
                 end(name, Verdict.NOT_SENT, str(error))
                 continue
@@ -334,8 +324,8 @@ class VehicleLinks:
         Raises:
             OrthoSwarmError: a vehicle was not heard on any link.
         """
-        names = [self.name_of(s) for s in sorted(self.fleet.vehicles)] if vehicles is None else list(vehicles)
-        systems = {self.system_of(name): name for name in names}
+        names = self.heard() if vehicles is None else list(vehicles)
+        systems = {self.fleet.system_of(name): name for name in names}
         wanted = {s: missions[name] for s, name in systems.items() if missions and name in missions}
         times = {s: starts[name] for s, name in systems.items() if starts and name in starts}
         return self._checks.check(systems, wanted, times, needs=needs, reread=reread)
@@ -379,23 +369,22 @@ class VehicleLinks:
         self._journal.write(completion_refined(job.whose, facts))
         self._events.publish(CompletionRefined({"vehicle": job.vehicle, "sortie": job.sortie, **facts}))
 
-    def _tell_command(self, row: dict[str, Any]) -> None:
+    def _told(self, row: dict[str, Any]) -> None:
         self._events.publish(CommandDone(row))
 
     # -- what vehicles say (in the fleet's thread) ------------------------------------------------------------------
 
     def _record(self, system: int) -> _VehicleRecord:
         if system not in self._records:
-            name = self.name_of(system)
+            name = self.names.name_of(system)
             self._records[system] = _VehicleRecord(id=name, poses=self._poses.of(name))
         return self._records[system]
 
     def _message(self, vehicle: Vehicle, message: Any, utc: float) -> None:
-        record = self._record(vehicle.system)
-        record.poses.feed(message, utc)
+        self._record(vehicle.system).poses.feed(message, utc)
 
     def _event(self, event: FleetEvent) -> None:
-        name = self.name_of(event.system)
+        name = self.names.name_of(event.system)
         vehicle = self.fleet.vehicles[event.system]
         record = self._record(event.system)
         try:
@@ -403,7 +392,7 @@ class VehicleLinks:
                 self._found(vehicle, name)
             elif event.kind in ("started", "complete", "aborted", "suspended", "resumed"):
                 flying = [
-                    self.name_of(s)
+                    self.names.name_of(s)
                     for s, v in sorted(self.fleet.vehicles.items())
                     if s != event.system and (v.detector.phase is Phase.ACTIVE or v.flying) and not v.lost
                 ]
@@ -413,7 +402,7 @@ class VehicleLinks:
         except OrthoSwarmError as error:  # the disk is full: flying goes on
             _log.error("%s", error)
         record.lost_since = time.monotonic() if event.kind == "lost" else None
-        text, pair = event.text, [self.name_of(system) for system in event.pair or ()]
+        text, pair = event.text, [self.names.name_of(system) for system in event.pair or ()]
         about: dict[str, Any] = {"vehicle": name, "kind": event.kind, "text": text, "time": event.time_s, "pair": pair}
         if event.kind == "text":
             said = {"text": vehicle.texts[-1], "severity": event.severity, "time": round(event.time_s, 1)}

@@ -199,7 +199,7 @@ def _fly(daemon: "Daemon", setting: DemoSetting, report: ReportProgress) -> None
     delays = {v["id"]: v["flights"][0]["start_s"] for v in plan["vehicles"]}
     began = time.monotonic()
     for number, vehicle in enumerate(sorted(delays, key=lambda name: delays[name]), start=1):
-        system = links.system_of(vehicle)
+        system = links.fleet.system_of(vehicle)
         mission = daemon.plans.mission({"plan": plan["id"]}, vehicle, links.fleet.vehicles[system].autopilot)
         links.upload(system, mission)
         # with the planned delays, at least 6 s, so that one vehicle completes while others still fly

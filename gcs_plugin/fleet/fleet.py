@@ -180,6 +180,19 @@ class Fleet:
         """Send messages without waiting for answers; in the polling thread. Nothing is sent to an unknown vehicle."""
         self._dialogues.send(system, messages)
 
+    def system_of(self, name: str) -> int:
+        """The system id of a vehicle, by what it is called or that number; from any thread.
+
+        Raises:
+            OrthoSwarmError: it was not heard on any link.
+        """
+        called = {system: self.names.name_of(system) for system in list(self.vehicles)}
+        for system in called:
+            if name in (called[system], str(system)):
+                return system
+        heard = ", ".join(called[system] for system in sorted(called)) or "none"
+        raise OrthoSwarmError(f"{name} is not on the links (heard: {heard}); check links and system ids")
+
     def vehicle(self, system: int) -> Vehicle:
         """A vehicle that can be commanded.
 

@@ -134,7 +134,7 @@ class CommandRoutes:
     def _carry_out(self, vehicle: str, verb: str, issue: Issue, body: dict[str, Any]) -> Rows:
         """Execute a command and publish its outcome; runs in a thread."""
         links = self._daemon.links
-        names = _names(links) if vehicle == ALL else [vehicle]
+        names = links.heard() if vehicle == ALL else [vehicle]
         late = _late(issue, verb)
         if late is not None:
             rows = [CommandResult(issue.id, name, verb, Verdict.NOT_SENT, late).document() for name in names]
@@ -160,7 +160,7 @@ class CommandRoutes:
             return CommandResult(issue.id, vehicle, "upload", outcome, reason).document()
 
         try:
-            system = links.system_of(vehicle)
+            system = links.fleet.system_of(vehicle)
         except OrthoSwarmError as error:
             return result(Verdict.NOT_SENT, str(error))
         mission = self._daemon.plans.mission(body, vehicle, links.fleet.vehicles[system].autopilot)
@@ -273,10 +273,6 @@ def _late(issue: Issue, verb: str) -> str | None:
     if age < -_AHEAD_S and verb not in _ENDS:  # the clock was set; what ends a flight counts as given now
         return f"it was given {-age:.0f} s from now; take the time from the daemon's heartbeats and give it again"
     return None
-
-
-def _names(links: VehicleLinks) -> list[str]:
-    return [links.name_of(system) for system in sorted(links.fleet.vehicles)]
 
 
 def _override(body: Mapping[str, Any], vehicle: str) -> dict[str, list[str]]:

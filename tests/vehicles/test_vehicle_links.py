@@ -175,7 +175,7 @@ def test_a_takeoff_that_waits_is_cancelled_by_rtl(open_links, folder):  # noqa: 
 def test_an_alarm_names_two_vehicles_whatever_the_operator_called_them(open_links):
     """The one with system id 1 is called v2: the one with system id 2 needs another name."""
     links = open_links(make_swarm(2, home=HOME), named=(VehicleSettings("v2", 1),))
-    assert (links.name_of(1), links.name_of(2), links.name_of(3)) == ("v2", "system-2", "v3")
+    assert tuple(map(links.names.name_of, (1, 2, 3))) == ("v2", "system-2", "v3")
     watch = SeparationWatch(alarms={(1, 2): Near(2, 1, 4.0, 1.0)}, names=links.names)
     for system in (1, 2):
         assert watch.text(system).startswith("system-2 and v2 are 4.0 m apart and 1.0 m in height")
@@ -254,7 +254,7 @@ def test_vehicles_of_one_start_return_in_turn_and_one_given_another_command_does
     assert next(row for row in links.rows() if row["id"] == second)["returns_after"] is None
     down = {"on ground", "complete"}
     wait(lambda: all(links.flight_state(n)["state"] in down for n in ("v1", "v2", "v3")), 240.0)
-    landed = links.fleet.vehicles[links.system_of(second)]
+    landed = links.fleet.vehicles[links.fleet.system_of(second)]
     assert landed.mode == "LAND"  # not sent home after it was told to land
 
 

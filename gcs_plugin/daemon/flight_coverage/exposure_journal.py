@@ -59,7 +59,8 @@ class ExposureJournal:
             return  # a repetition
         self._last[system] = number, time_s
         place = (lat * 1e-7, lon * 1e-7) if lat or lon else (None, None)
-        self._fresh.append((self._names.name_of(system), int(number), _utc(time_s, utc_s), *place))
+        taken_s = time_s if time_s > _AFTER_2001_S else utc_s  # a clock without a date: when it came
+        self._fresh.append((self._names.name_of(system), int(number), taken_s, *place))
 
     def _dated(self, system: int, message: Any, utc_s: float) -> float:
         """When a picture was taken; without a date in it, by the time since boot, since an event may come late."""
@@ -82,11 +83,6 @@ class ExposureJournal:
             place = None if lat is None or lon is None else np.array([*grid.to_grid(lat, lon), 0.0])
             found.append(CameraEvent(vehicle, number, time_s, place))
         return found
-
-
-def _utc(time_s: float, received_s: float) -> float:
-    """Time of exposure: from the message, or its arrival if its clock has no date."""
-    return time_s if time_s > _AFTER_2001_S else received_s
 
 
 @dataclass(slots=True)

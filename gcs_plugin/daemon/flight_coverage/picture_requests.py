@@ -12,7 +12,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final, Protocol
+from typing import Any, Final
 from urllib.parse import unquote, urlsplit
 
 import numpy as np
@@ -158,34 +158,15 @@ class _Server:
     urls: dict[int, str] = field(default_factory=dict)
 
 
-class Heard(Protocol):
-    """The vehicles on the links."""
-
-    def system_of(self, vehicle: str) -> int:
-        """The system id of a vehicle.
-
-        Raises:
-            OrthoSwarmError: it is not on the links.
-        """
-
-
 class FetchedPictures:
     """What the requests for pictures need of the workspace."""
 
     def __init__(
-        self, links: Heard, journal: Journal, events: Events, *, poses: LinkPoses, coverage: LiveCoverage,
+        self, journal: Journal, events: Events, *, poses: LinkPoses, coverage: LiveCoverage,
         intake: PictureIntake,
     ) -> None:  # fmt: skip
-        self._links, self._journal, self._events = links, journal, events
+        self._journal, self._events = journal, events
         self._poses, self._coverage, self._intake = poses, coverage, intake
-
-    def system_of(self, vehicle: str) -> int:
-        """The system id of a vehicle.
-
-        Raises:
-            OrthoSwarmError: it is not on the links.
-        """
-        return self._links.system_of(vehicle)
 
     def wanted(self) -> Iterable[WantedPicture]:
         """The pictures that were taken and have not arrived."""
@@ -321,7 +302,7 @@ class PictureRequests(Background):
             request.state, request.reason = "refused", str(error)
         except OrthoSwarmError as error:  # the disk is full: it is read again when there is room
             request.state, request.reason = "waiting", str(error)
-            self._servers[self._workspace.system_of(request.wanted.vehicle)].not_before = self._clock() + _AGAIN_S
+            self._servers[self._fleet.system_of(request.wanted.vehicle)].not_before = self._clock() + _AGAIN_S
         else:
             request.state, request.reason = "arrived", ""
         request.read = None
@@ -345,7 +326,7 @@ class PictureRequests(Background):
         waiting = [r for r in self._requests.values() if r.state in ("waiting", "refused")]
         for request in sorted(waiting, key=lambda r: (r.state, r.wanted.time_s)):
             try:
-                system = self._workspace.system_of(request.wanted.vehicle)
+                system = self._fleet.system_of(request.wanted.vehicle)
             except OrthoSwarmError:
                 continue
             server = self._servers.setdefault(system, _Server())
@@ -398,7 +379,7 @@ class PictureRequests(Background):
         """All waiting requests to a vehicle are refused for one reason; they are tried again later."""
         for request in self._requests.values():
             with contextlib.suppress(OrthoSwarmError):
-                if request.state == "waiting" and self._workspace.system_of(request.wanted.vehicle) == system:
+                if request.state == "waiting" and self._fleet.system_of(request.wanted.vehicle) == system:
                     request.state, request.reason, request.path = "refused", reason, ""
         self._servers[system].files = None
 

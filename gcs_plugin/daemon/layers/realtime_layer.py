@@ -21,6 +21,7 @@ from gcs_plugin.daemon.intake.posted_pose import frame_of_row
 from gcs_plugin.daemon.layers.draw_queue import DrawQueue, MapDelay, PendingFrame
 from gcs_plugin.daemon.layers.layers import MapArea, new_name
 from gcs_plugin.daemon.layers.map_site import MapSite
+from gcs_plugin.daemon.stoppable_thread import Background
 from gcs_plugin.daemon.store.daemon_events import (
     DrawingRestarted,
     Events,
@@ -59,7 +60,7 @@ _log = logging.getLogger(__name__)
 Bytes = NDArray[np.uint8]
 
 
-class Drawer:
+class Drawer(Background):
     """Draws the frames of a journal on the real-time layer.
 
     Attributes:
@@ -89,6 +90,7 @@ class Drawer:
             look_s: time between looks for late frames, seconds.
             read: reads a picture file, uint8 (rows, columns, 4).
         """
+        super().__init__("drawing", join_s=None)
         self._in_memory, self._late_s, self._look_s, self._read = in_memory, late_s, look_s, read
         self._journal, self._store, self._site, self._events = journal, store, site, events
         self._begun = 0
@@ -98,26 +100,18 @@ class Drawer:
         self._looked = 0.0
         self._more = True
         self._condition = threading.Condition()
-        self._stop = False
-        self._thread: threading.Thread | None = None
         self.drawn = self.late = self.put_off = 0
         self.latencies: list[float] = []
         self.problem = ""
 
     # -- from outside ---------------------------------------------------------------------------------------------
 
-    def start(self) -> None:
-        """Start drawing, in a thread."""
-        self._thread = threading.Thread(target=self._run, name="drawing", daemon=True)
-        self._thread.start()
-
     def close(self) -> None:
         """Stop after the present frame."""
         with self._condition:
-            self._stop = True
+            self._stop.set()
             self._condition.notify_all()
-        if self._thread is not None:
-            self._thread.join()
+        super().close()
 
     def picture_stored(self, event: PictureStored) -> None:
         """Add a frame that is in the journal."""
@@ -147,7 +141,7 @@ class Drawer:
         """Wait until a sortie's frames are drawn; False after the time-out."""
         end = time.monotonic() + timeout_s
         while not sortie_is_drawn(self._journal, vehicle, sortie):
-            if time.monotonic() > end or self._stop:
+            if time.monotonic() > end or self._stop.is_set():
                 return False
             time.sleep(0.05)
         return True
@@ -158,9 +152,9 @@ class Drawer:
         load_kernels(self._site.folder)
         while True:
             with self._condition:
-                while not len(self._queue) and not self._more and not self._stop:
+                while not len(self._queue) and not self._more and not self._stop.is_set():
                     self._condition.wait()
-                if self._stop:
+                if self._stop.is_set():
                     return
             try:
                 self._refill()
@@ -240,7 +234,7 @@ class Drawer:
         seqs: list[int] = []
         while len(done) < _AT_ONCE:
             with self._condition:
-                pending = None if self._stop else self._queue.take()
+                pending = None if self._stop.is_set() else self._queue.take()
             if pending is None:
                 break
             begun = self._begun

@@ -10,7 +10,7 @@ from gcs_plugin.sim.file_server import FileServer
 from gcs_plugin.sim.lossy_radio import NO_FAULTS, Faults
 from gcs_plugin.sim.memory_link import World
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
-from orthoswarm.model.errors import DiskFullError, InputError, OrthoSwarmError
+from orthoswarm.model.errors import DiskFullError, InputError
 
 START_S = 1_780_000_000.0
 
@@ -24,11 +24,6 @@ class Workspace:
 
     def __init__(self, ground, names):
         self.ground, self.known = ground, names
-
-    def system_of(self, vehicle):
-        if vehicle != "v1":
-            raise OrthoSwarmError("unknown")
-        return 1
 
     def wanted(self):
         return list(self.ground.wanted.values())
