@@ -129,15 +129,16 @@ class Exports:
                 find | FindRow(pictures=[row["image"] for row in pictures_at(task, find["lat_deg"], find["lon_deg"])])
                 for find in self._console.finds()
             ]
-            places = tuple(self._places(shown))
+            places = tuple(self.places(shown))
             task = replace(task, facts=self._report_facts(), places=places, cells=self._coverage.png)
             job.detail["files"] = files = run.run(write_products, task)
             self._written = versions, {name: files[name] for name in PRODUCTS}
         return no_change
 
-    def places(self) -> list[Place]:
-        """The finds, and the vehicles with a known position."""
-        return self._places(self._console.finds())
+    def places(self, finds: Sequence[FindRow] | None = None) -> list[Place]:
+        """The finds (default: the operator's), and the vehicles with a known position."""
+        found, name = self._console.finds() if finds is None else finds, self._settings.workspace.resolve().name
+        return places_of(name, found, self._views.vehicles(), time.time())
 
     def find_pictures(self, number: int) -> list[SightingRow]:
         """The pictures that show a find, best first; see `pictures_at`. Each has its `seq`.
@@ -177,9 +178,6 @@ class Exports:
         import simplejpeg
 
         return bytes(simplejpeg.encode_jpeg(picture_file.read_rgb(path), _VIEW_QUALITY, "RGB"))
-
-    def _places(self, finds: list[FindRow]) -> list[Place]:
-        return places_of(self._settings.workspace.resolve().name, finds, self._views.vehicles(), time.time())
 
     def _report_facts(self) -> dict[str, Any]:
         covered = self._coverage.document

@@ -182,7 +182,7 @@ class FetchedPictures:
         Raises:
             InputError: it is no picture, or neither pose is known. OrthoSwarmError: the disk is full or missing.
         """
-        linked = linked_pose(wanted.vehicle, name, wanted.time_s, self._poses.at(wanted.vehicle, wanted.time_s))
+        linked = linked_pose(self._poses, wanted.vehicle, name, wanted.time_s)
         self._intake.add(linked or self._event_pose(wanted, name), data)
 
     def changed(self) -> None:

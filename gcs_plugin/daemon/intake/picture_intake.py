@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from gcs_plugin.daemon.intake.posted_pose import PostedPose, frame_of, linked_pose
-from gcs_plugin.daemon.store.daemon_events import CardRead, Events, PictureRefused, PictureRejected, PictureStored
+from gcs_plugin.daemon.store.daemon_events import Events, PictureRefused, PictureRejected, PictureStored
 from gcs_plugin.daemon.store.frame_rows import add_frame, frame_by_key
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.daemon.store.picture_store import PictureStore, frame_key, picture_size
@@ -22,7 +22,7 @@ from gcs_plugin.daemon.store.workspace_lock import require_space
 from gcs_plugin.links.tlog_writer import write_link_log
 from orthoswarm.export.product_files import iso_time
 from orthoswarm.model.errors import OrthoSwarmError, StorageError
-from telemetry.live.live_poses import LinkPose, LinkPoses
+from telemetry.live.live_poses import LinkPoses
 
 CAUSES: Final = {
     "disk": "the workspace's disk is full or gone",
@@ -162,9 +162,7 @@ class PictureIntake:
 
     def _with_fix(self, pose: PostedPose) -> PostedPose:
         """The pose; if its receiver had no fix, with the values of the vehicle's link at that time."""
-        if pose.has_fix or pose.time_s is None:
-            return pose
-        linked = linked_pose(pose.vehicle, pose.image, pose.time_s, self._poses.at(pose.vehicle, pose.time_s))
+        linked = None if pose.has_fix else linked_pose(self._poses, pose.vehicle, pose.image, pose.time_s)
         if linked is None:
             return pose
         without = {k: v for k, v in pose.values.items() if k not in ("lat_deg", "lon_deg", "gps_fix")}
@@ -195,7 +193,7 @@ class VehicleIntake:
         cache: Path,
     ) -> None:
         self.vehicle, self.cache, self.stop, self.taken = vehicle, cache, threading.Event(), 0
-        self._intake, self._events, self._poses, self._tlog, self._system = intake, events, poses, tlog, system
+        self.events, self.poses, self._intake, self._tlog, self._system = events, poses, intake, tlog, system
 
     def keep(self, pose: PostedPose, data: bytes) -> None:
         """Store a picture; if the disk is full, wait until there is room."""
@@ -205,24 +203,12 @@ class VehicleIntake:
                 self.taken += new
                 return
             except StorageError as error:
-                self.notify(str(error))
+                self.events.say(str(error))
                 self.stop.wait(_FULL_S)
             except OrthoSwarmError as error:
                 _log.warning("%s of %s: %s", pose.image, self.vehicle, error)
                 return
 
-    def pose_at(self, time_s: float) -> LinkPose | None:
-        """The vehicle's pose at a time (UTC epoch seconds), from its link and bus."""
-        return self._poses.at(self.vehicle, time_s)
-
     def link_log(self, out: Path) -> bool:
         """Write the vehicle's packets, of this run and earlier ones, to a .tlog; False if there are none."""
         return self._system is not None and write_link_log(self._tlog, self._system, out) > 0
-
-    def notify(self, text: str) -> None:
-        """Tell the operator something."""
-        self._events.say(text)
-
-    def settled(self) -> None:
-        """Tell that the folder has stopped changing after new pictures."""
-        self._events.publish(CardRead(self.vehicle))

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Final
 
 from gcs_plugin.daemon.intake.picture_intake import VehicleIntake
 from gcs_plugin.daemon.intake.posted_pose import apart_m, linked_pose, posted_frame
+from gcs_plugin.daemon.store.daemon_events import CardRead
 from orthoswarm.model.errors import OrthoSwarmError
 
 if TYPE_CHECKING:
@@ -289,7 +290,7 @@ class FolderReader:
         self._pair(here, now)
         if self._fresh_at is not None and not self._busy() and now - self._fresh_at > _REST_S:
             self._fresh_at = None
-            self._intake.settled()
+            self._intake.events.publish(CardRead(self._intake.vehicle))
 
     def _scan(self, folder: Path) -> Iterator[tuple[Path, Stamp]]:
         """Files of the wanted kinds with their stamps, by name; unreadable ones are left for the next scan."""
@@ -337,7 +338,7 @@ class FolderReader:
         file.again_at = now + _UNCHANGED_S
         if now - file.since > _STALLED_S and not file.stall_reported:
             file.stall_reported = True
-            self._intake.notify(f"{self._name(path)} of {self._intake.vehicle} is incomplete; copy it again")
+            self._intake.events.say(f"{self._name(path)} of {self._intake.vehicle} is incomplete; copy it again")
 
     # -- storing -----------------------------------------------------------------------------------------------
 
@@ -389,9 +390,8 @@ class FolderReader:
                     "%s: %s", self._name(path), rejection.reason if rejection else "no picture can be read from it"
                 )
                 continue
-            linked = None if rejection.time_s is None else self._intake.pose_at(rejection.time_s)
             name = self._folder_state.name(self._name(path), digest)
-            posted = linked_pose(self._intake.vehicle, name, rejection.time_s, linked)
+            posted = linked_pose(self._intake.poses, self._intake.vehicle, name, rejection.time_s)
             if posted is None:
                 self.poseless.add(path)
                 continue
@@ -438,8 +438,8 @@ class FolderReader:
     def _keep(self, frame: "Frame", name: str, data: bytes) -> None:
         """Store a frame; missing height and angles come from the link, if its position agrees."""
         posted = posted_frame(frame, self._intake.vehicle, name)
-        if posted.time_s is not None and ("height_m" not in posted.values or "yaw_deg" not in posted.values):
-            linked = linked_pose(posted.vehicle, name, posted.time_s, self._intake.pose_at(posted.time_s))
+        if "height_m" not in posted.values or "yaw_deg" not in posted.values:
+            linked = linked_pose(self._intake.poses, posted.vehicle, name, posted.time_s)
             if linked is not None and apart_m(linked.values, posted.values) < _NEAR_M:
                 for key in ("lat_deg", "lon_deg", "position_sigma_m", "altitude_m"):
                     linked.values.pop(key, None)
@@ -472,7 +472,7 @@ class FolderReader:
         said = [] if self._zone_told else times_without_zone(frames)
         self._zone_told |= bool(said)
         for finding in said:
-            self._intake.notify(f"{self._intake.vehicle}: {finding}")
+            self._intake.events.say(f"{self._intake.vehicle}: {finding}")
 
     def _tables(self, photos: Iterable[Path]) -> list[Path]:
         """Tables of poses (geo.txt, CSV) in the photos' folder or above it, within the watched folder."""
@@ -505,7 +505,7 @@ class FolderReader:
                 self._take_paired(waiting, found, copies)
         if self.poseless and self.poseless != self._told:
             self._told, count = frozenset(self.poseless), len(self.poseless)
-            self._intake.notify(
+            self._intake.events.say(
                 f"{count} files of {self._intake.vehicle} wait for poses; put the flight's log next to them"
             )
 
