@@ -23,12 +23,11 @@ from gcs_plugin.daemon.intake.can_reader import CanReader
 from gcs_plugin.daemon.intake.picture_intake import PictureIntake, RefusedPictures, VehicleIntake
 from gcs_plugin.daemon.intake.picture_sources import PictureSource
 from gcs_plugin.daemon.jobs.job_queue import JobRequests, Jobs
-from gcs_plugin.daemon.jobs.joint_refinement import JointRefinement
 from gcs_plugin.daemon.jobs.leg_placement import LegPlacement
 from gcs_plugin.daemon.jobs.leg_watch import LegWatch
+from gcs_plugin.daemon.jobs.neighbours import JointRefinement, ToneBalance
 from gcs_plugin.daemon.jobs.publisher import Publisher
 from gcs_plugin.daemon.jobs.sortie_refinement import SortieRefinement
-from gcs_plugin.daemon.jobs.tone_balance import ToneBalance
 from gcs_plugin.daemon.jobs.worker_pool import LAST, WorkerPool
 from gcs_plugin.daemon.jobs.workspace_products import RunFacts
 from gcs_plugin.daemon.layers.layers import NAMES, MapLayer

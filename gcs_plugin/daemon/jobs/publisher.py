@@ -174,6 +174,14 @@ class Publisher:
                 if not turn.published:
                     shutil.rmtree(turn.folder, ignore_errors=True)
 
+    def refined_near(self, whose: Whose, box: BoundingBox, reach_m: float = 0.0) -> dict[Whose, Path]:
+        """The solution files of the refined sorties (except that one) whose ground is within a distance of a box."""
+        return {
+            row.whose: self.solutions / row.path
+            for row in placed_sorties(self.journal, "solutions")
+            if row.whose != whose and row.bounds.gap_m(box) < reach_m
+        }
+
     def tell(self, layer: str, job: Job) -> None:
         """Tell that a job has changed pixels of a layer."""
         version = self.layers[layer].version
@@ -260,13 +268,6 @@ def detail_of(solved: SortieResult, legs: Iterable[LegRow]) -> SortieDetail:
         "fov_deg": finite(solved.fov_deg), "fov_sigma_deg": finite(solved.fov_sigma_deg),
         "warnings": solved.warnings, "cpu_s": solved.cpu_s, "wall_s": solved.wall_s,
     }  # fmt: skip
-
-
-def others_near(journal: Journal, whose: Whose, box: BoundingBox, reach_m: float) -> list[PlacedSortie]:
-    """The refined sorties (except that one) whose ground is within a distance of a box."""
-    return [
-        row for row in placed_sorties(journal, "solutions") if row.whose != whose and row.bounds.gap_m(box) < reach_m
-    ]
 
 
 def refined_change(

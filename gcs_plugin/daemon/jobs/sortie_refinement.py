@@ -9,8 +9,8 @@ from typing import Final
 
 from gcs_plugin.config import SORTIE
 from gcs_plugin.daemon.jobs.job_queue import RunningJob
-from gcs_plugin.daemon.jobs.joint_refinement import together_jobs
-from gcs_plugin.daemon.jobs.publisher import Publisher, detail_of, frames_of, others_near, refined_change
+from gcs_plugin.daemon.jobs.neighbours import together_jobs
+from gcs_plugin.daemon.jobs.publisher import Publisher, detail_of, frames_of, refined_change
 from gcs_plugin.daemon.jobs.worker_tasks import SortieResult, follow, near, register_late, solve
 from gcs_plugin.daemon.jobs.workspace_products import PRODUCTS
 from gcs_plugin.daemon.layers.realtime_layer import Drawer
@@ -106,12 +106,12 @@ class SortieRefinement:
         run.report(
             0.05, f"refining {len(frames)} pictures" if before is None else "registering late pictures to the others"
         )
-        others = others_near(journal, job.whose, near(frames, publisher.area().epsg), _REACH_M)
+        others = publisher.refined_near(job.whose, near(frames, publisher.area().epsg), _REACH_M)
         task = publisher.task(
             target,
             frames=frames,
             thumbnails=thumbnails,
-            neighbours=[publisher.solutions / row.path for row in others],
+            neighbours=list(others.values()),
             before=None if before is None else publisher.solutions / before.path,
             kept=self.kept.of(job.whose, frames),
         )
@@ -177,7 +177,7 @@ class SortieRefinement:
         if self.publisher.basemap is not None:  # the coarse layer shows all of the sortie, too
             then.append(new_job("coarse", *job.whose, {"after": "refine"}))
             if before is None:
-                then += together_jobs(self.publisher.journal, job, solved.bounds)
+                then += together_jobs(self.publisher, job, solved.bounds)
         then.append(new_job("tones", None, None, {}))
         then.append(new_job("export", None, None, {"formats": list(PRODUCTS), "after": "refine"}))
         return all_changes(*then)

@@ -9,8 +9,8 @@ import pytest
 
 from gcs_plugin.daemon.daemon import Daemon
 from gcs_plugin.daemon.jobs.job_queue import Jobs
-from gcs_plugin.daemon.jobs.joint_refinement import JointRefinement
 from gcs_plugin.daemon.jobs.kernel_warmup import made_up_flight, made_up_ground, write_map
+from gcs_plugin.daemon.jobs.neighbours import JointRefinement
 from gcs_plugin.daemon.jobs.publisher import Publisher
 from gcs_plugin.daemon.jobs.solution_file import read_solution
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool

@@ -10,9 +10,9 @@ import pytest
 from gcs_plugin.daemon.daemon import Daemon
 from gcs_plugin.daemon.jobs.job_queue import Preempted, RunningJob
 from gcs_plugin.daemon.jobs.kernel_warmup import made_up_flight, made_up_ground, write_map
+from gcs_plugin.daemon.jobs.neighbours import ToneBalance, ToneTask, balance_tones
 from gcs_plugin.daemon.jobs.publisher import Publisher
 from gcs_plugin.daemon.jobs.solution_file import SolutionFile, gains_of, read_solution
-from gcs_plugin.daemon.jobs.tone_balance import ToneBalance, ToneTask, balance_tones
 from gcs_plugin.daemon.settings import Settings
 from gcs_plugin.daemon.store.daemon_events import Events
 from gcs_plugin.daemon.store.journal import packed

@@ -1,9 +1,15 @@
-"""Balancing of the tones of all refined sorties together.
+"""Refined neighbours together: those that overlap are solved again with each other, and the tones of all are balanced.
+
+A vehicle is refined when it completes, with the neighbours refined so far held fixed; the first one has none. Once a
+neighbour has been refined, all sorties that overlap it are refined again together with it (the second pass of the
+batch, `orthoswarm.refine.strategy`): on a common height level, with ties between their pictures, so that sorties that
+could not be registered onto the map are registered to their neighbours.
 
 When a sortie is refined, its tones follow those drawn before, which stay. Where two that hardly overlap were drawn
-first, each has a tone of its own, and one that comes between them would have to change from the one to the other.
-Once nothing more urgent is to be done, the tones of all are solved together, and sorties whose tones change visibly
-are drawn again.
+first, each has a tone of its own, and one that comes between them would have to change from the one to the other. So
+the tones of all are solved together, and sorties whose tones change visibly are drawn again.
+
+These jobs have low priority: they start when no refinement waits, and give way to any that begins.
 """
 
 import time
@@ -16,10 +22,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcs_plugin.daemon.jobs.job_queue import RunningJob
-from gcs_plugin.daemon.jobs.publisher import Publisher
+from gcs_plugin.daemon.jobs.publisher import Publisher, detail_of, refined_change
 from gcs_plugin.daemon.jobs.solution_file import Bytes, Gain, SolutionFile, read_solution, uniquely_named
+from gcs_plugin.daemon.jobs.worker_tasks import refine_jointly
+from gcs_plugin.daemon.store.job_rows import Job, new_job
 from gcs_plugin.daemon.store.journal import Change, no_change
-from gcs_plugin.daemon.store.sortie_rows import PlacedSortie, shown_sorties, solution_paths, solution_replaced
+from gcs_plugin.daemon.store.sortie_rows import (
+    PlacedSortie,
+    placed_sortie,
+    shown_sorties,
+    solution_paths,
+    solution_replaced,
+)
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.placement import PlacedFrame, Terrain
 from orthoswarm.mosaic.radiometry import estimate_fields
@@ -147,3 +161,61 @@ class ToneBalance:
             turn.publish(solution_replaced(before.whose, target.name))
         publisher.retire(before)
         return True
+
+
+def together_jobs(publisher: Publisher, job: Job, box: BoundingBox) -> list[Change]:
+    """The changes that queue joint refinements after a sortie was refined: of its neighbours, then of itself."""
+    others = publisher.refined_near(job.whose, box)
+    again = [*others, job.whose] if others else []
+    return [new_job("together", vehicle, sortie, {}) for vehicle, sortie in again]
+
+
+@dataclass(slots=True)
+class JointRefinement:
+    """Does the jobs `together`; `least_px`: pictures that move less, in pixels of the layer, are not drawn again."""
+
+    publisher: Publisher
+    least_px: float
+
+    def solve(self, run: RunningJob) -> Change:
+        """The handler of `together`."""
+        began = time.monotonic()
+        with self.publisher.new_solution() as target:
+            note = self._solve(run, target)
+        run.job.detail |= {"note": note} if note else {}
+        run.job.detail["seconds"] = round(time.monotonic() - began, 3)
+        return no_change
+
+    def _solve(self, run: RunningJob, target: Path) -> str:
+        """Solve and publish; returns why nothing changes, empty if something does."""
+        job, publisher = run.job, self.publisher
+        row = placed_sortie(publisher.journal, "solutions", job.whose)
+        if row is None or publisher.basemap is None or row.detail["layer"] != "fine":
+            return "it was not refined on the map"
+        others = list(publisher.refined_near(job.whose, row.bounds).values())
+        if not others:
+            return "it has no neighbours"
+        run.report(0.05, f"refining again together with {len(others)} neighbour{'s' * (len(others) > 1)}")
+        found = run.run(
+            refine_jointly, publisher.task(target, before=publisher.solutions / row.path, neighbours=others)
+        )
+        if found is None:
+            return "nothing of it needs refining again"
+        solved, moved_m = found
+        job.detail |= {
+            "frames": len(solved.stages), "neighbours": len(others), "moved_p95_m": round(moved_m, 3),
+            "solve_cpu_s": round(solved.cpu_s, 3), "warnings": solved.warnings,
+        }  # fmt: skip
+        if moved_m < self.least_px * publisher.area().gsd_m:
+            return "it agrees with its neighbours already"
+        with publisher.turn("fine") as turn:
+            now = placed_sortie(publisher.journal, "solutions", job.whose)
+            if now is None or now.path != row.path:
+                return "it was refined again meanwhile"
+            run.report(0.7, "drawing")
+            rejected = turn.draw(run, job.whose, target, solved.changed)
+            detail = row.detail | detail_of(solved, solved.legs)
+            job.detail |= turn.publish(refined_change(job, solved, rejected, target.name, detail))
+        publisher.retire(row)
+        publisher.tell("fine", job)
+        return ""
