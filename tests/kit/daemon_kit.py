@@ -139,6 +139,23 @@ class Served:
                 raise AssertionError(f"{path} is still {now[0]}; jobs {now[1]}")
             time.sleep(0.1)
 
+    def start_plan(self, plan: str, body: dict | None = None) -> dict:
+        """Start a plan's vehicles, again until they are ready; gives the answer.
+
+        A vehicle's state comes piece by piece and grows old on a busy machine, as it does on a poor link.
+        """
+        answers = []
+
+        def starts(_rows: list[dict]) -> bool:
+            answers.append(self.command(f"/api/plans/{plan}/start", body))
+            return answers[-1].status_code == 202
+
+        try:
+            self.until("/api/vehicles", starts)
+        except AssertionError:
+            raise AssertionError(f"{plan} does not start: {answers[-1].text}") from None
+        return answers[-1].json()
+
     def take_off(self, vehicle: str, limit_s: float = 400.0) -> None:
         """Start a vehicle's mission, again until its autopilot lets it: its own checks may take minutes.
 
