@@ -5,11 +5,12 @@ started unless all have passed their preflight check; if one then refuses, the w
 Waiting takeoffs are dropped when the daemon ends: a start is a command and is never repeated automatically.
 """
 
+import contextlib
 import logging
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from functools import partial
 from typing import Any, Final
 
@@ -45,12 +46,7 @@ class Takeoffs:
         self._cancelled: OrderedDict[str | None, None] = OrderedDict()
         self._closed = False
 
-    def preflight(
-        self,
-        plan: str,
-        sortie: int = 1,
-        names: Mapping[str, str] | None = None,
-    ) -> list[CheckRow]:
+    def preflight(self, plan: str, sortie: int = 1, names: Mapping[str, str] | None = None) -> list[CheckRow]:
         """Check a plan's vehicles before their start.
 
         Args:
@@ -66,10 +62,7 @@ class Takeoffs:
         return self._check(plan, sortie, names)[0]
 
     def _check(
-        self,
-        plan: str,
-        sortie: int,
-        names: Mapping[str, str] | None,
+        self, plan: str, sortie: int, names: Mapping[str, str] | None
     ) -> tuple[list[CheckRow], dict[str, Mission]]:
         """The rows of `preflight`, and the plan's missions by vehicle."""
         starts = self._plans.starts(plan, sortie)
@@ -117,11 +110,13 @@ class Takeoffs:
         with self.waiting.condition:
             if self.waiting.are_under_way:
                 raise OrthoSwarmError("other takeoffs are under way; pause or rtl a waiting vehicle to cancel its own")
-            systems = self._systems(whose)
+            with _none_started():
+                systems = {vehicle: self._links.fleet.system_of(name) for vehicle, name in whose.items()}
             self.waiting.checking, stops = frozenset(systems.values()), dict(self._links.fleet.stops)
             standing = {s: self._links.fleet.vehicles[s].standing for s in systems.values()}
         try:
-            missions = self._ready(plan, sortie, names, override or {})
+            with _none_started():
+                missions = self._ready(plan, sortie, names, override or {})
             first = min(starts.values())
             delays = {systems[vehicle]: start_s - first for vehicle, start_s in starts.items()}
             held = {s: self._links.fleet.vehicles[s].mission for s in delays}
@@ -159,17 +154,6 @@ class Takeoffs:
             self.waiting.schedule.waiting.clear()
             self.waiting.condition.notify_all()
 
-    def _systems(self, whose: Mapping[str, str]) -> dict[str, int]:
-        """System ids of the plan's vehicles.
-
-        Raises:
-            OrthoSwarmError: one is not heard.
-        """
-        try:
-            return {vehicle: self._links.fleet.system_of(name) for vehicle, name in whose.items()}
-        except OrthoSwarmError as error:
-            raise OrthoSwarmError(f"{error}; no vehicle was started") from None
-
     def _still_wanted(self, given_s: float, stops: Mapping[int, int]) -> None:
         """Make sure that nobody told a vehicle to stop during the check, and that this did not take too long.
 
@@ -199,17 +183,12 @@ class Takeoffs:
         Raises:
             OrthoSwarmError: not all have passed.
         """
-        try:
-            rows, missions = self._check(plan, sortie, names)
-        except InputError:
-            raise
-        except OrthoSwarmError as error:
-            raise OrthoSwarmError(f"{error}; no vehicle was started") from None
+        rows, missions = self._check(plan, sortie, names)
         wrong = [
             f"{row['vehicle']}: {text}" for row in rows for text in red_items(row, override.get(row["vehicle"], ()))
         ]
         if wrong:
-            raise OrthoSwarmError(f"{'; '.join(wrong)}; no vehicle was started")
+            raise OrthoSwarmError("; ".join(wrong))
         return missions
 
     def _follow(self, schedule: TakeoffSchedule, missions: Mapping[int, Mission], delays: Mapping[int, float]) -> None:
@@ -290,6 +269,17 @@ class Takeoffs:
             self.waiting.condition.notify_all()
         for text in said:
             self._say(text)
+
+
+@contextlib.contextmanager
+def _none_started() -> Iterator[None]:
+    """Say of what keeps a start back that no vehicle was started; a wrong request is told as it is."""
+    try:
+        yield
+    except InputError:
+        raise
+    except OrthoSwarmError as error:
+        raise OrthoSwarmError(f"{error}; no vehicle was started") from None
 
 
 def names_of(body: Mapping[str, Any]) -> tuple[int, dict[str, str]]:

@@ -43,7 +43,7 @@ from gcs_plugin.daemon.vehicle_names import VehicleRow
 from gcs_plugin.fleet.commands import URGENT, VERBS, CommandResult, Order, Verb, new_id
 from gcs_plugin.fleet.fleet import Fleet
 from gcs_plugin.fleet.fleet_events import FleetEvent
-from gcs_plugin.fleet.flight_state import flight_state, summary
+from gcs_plugin.fleet.flight_state import summary
 from gcs_plugin.fleet.preflight import CONTINUED, ITEMS
 from gcs_plugin.fleet.separation.returns import Returns
 from gcs_plugin.fleet.vehicle_state import Vehicle
@@ -171,15 +171,6 @@ class VehicleLinks:
     def clock() -> float:
         """Monotonic seconds, by which commands expire: a page that has them says when its command was given."""
         return time.monotonic()
-
-    def flight_state(self, vehicle: str) -> dict[str, Any]:
-        """What a vehicle is doing: `state`, `text`, `item`, `items`.
-
-        Raises:
-            OrthoSwarmError: it was not heard on any link.
-        """
-        known = self.fleet.vehicles[self.fleet.system_of(vehicle)]
-        return self.fleet.call(partial(flight_state, known)).result(_SOON_S).document()
 
     def commands(
         self,

@@ -10,10 +10,10 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
 from concurrent.futures import Future
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Final, TypeVar
 
 from gcs_plugin.config import COMMAND
 from gcs_plugin.fleet.commands import URGENT, Order, Verb
@@ -69,7 +69,6 @@ class Fleet:
         own: Address = GROUND_STATION,
         key: bytes | None = None,
         tlog: Path | None = None,
-        remembered: Mapping[int, Mapping[str, Any]] | None = None,
         takeoffs: Container[int] = (),
         names: VehicleNames = NUMBERED,
         clock: Callable[[], float] = time.monotonic,
@@ -82,7 +81,6 @@ class Fleet:
             own: our address; different from that of another ground station.
             key: signing key; with it only signed packets are accepted.
             tlog: telemetry log to append to.
-            remembered: result of `memory` before a restart of this program: no completion is missed or repeated.
             takeoffs, names: see above. clock: monotonic seconds. wall: UTC epoch seconds.
 
         Raises:
@@ -100,7 +98,6 @@ class Fleet:
             self.hub,
             dialogues=self._dialogues,
             own=own,
-            remembered=remembered or {},
             event=self._publish,
             wall=wall,
             names=names,
@@ -289,10 +286,6 @@ class Fleet:
     def land(self, system: int) -> Exchange:
         """Make a vehicle land at its position."""
         return self._now(self._dialogue("land", system))
-
-    def memory(self) -> dict[int, dict[str, Any]]:
-        """State of each vehicle's mission, as JSON values by system id; for `remembered` after a restart."""
-        return {system: vehicle.detector.state() for system, vehicle in self.vehicles.items()}
 
     def problems(self) -> list[str]:
         """Broken links, rejected packets, vehicles that sign and those that share a system id; from any thread."""

@@ -4,8 +4,8 @@
 reasons why a vehicle would not arm.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final
+from collections.abc import Callable, Sequence
+from typing import Final
 
 from gcs_plugin.config import HEARING
 from gcs_plugin.fleet.dialogues import Dialogues
@@ -49,7 +49,6 @@ class Reception:
 
     Args:
         vehicles: by system id; found vehicles are added.
-        remembered: states of detectors before a restart of this program, by system id.
         event: called with each event. wall: UTC epoch seconds.
 
     Attributes:
@@ -59,11 +58,11 @@ class Reception:
 
     def __init__(
         self, vehicles: dict[int, Vehicle], hub: Hub, *, dialogues: Dialogues, own: Address,
-        remembered: Mapping[int, Mapping[str, Any]], event: Callable[[FleetEvent], None], wall: Callable[[], float],
+        event: Callable[[FleetEvent], None], wall: Callable[[], float],
         names: VehicleNames,
     ) -> None:  # fmt: skip
         self._vehicles, self._hub, self._dialogues, self._own = vehicles, hub, dialogues, own
-        self._remembered, self._publish, self._wall = dict(remembered), event, wall
+        self._publish, self._wall = event, wall
         self._counters: dict[tuple[Side, Peer, int, int], int] = {}
         self._said: dict[tuple[int, str], tuple[float, Route]] = {}
         self._lateness: dict[int, Lateness] = {}
@@ -196,9 +195,6 @@ class Reception:
             heard=now,
             kind=int(heartbeat.type),
         )
-        before = self._remembered.pop(packet.system, None)
-        if before is not None and before.get("autopilot") == autopilot.value:
-            vehicle.detector = CompletionDetector.from_state(before)
         self._vehicles[packet.system] = vehicle
         self._event("found", vehicle, f"was found ({autopilot.value})")
         return vehicle

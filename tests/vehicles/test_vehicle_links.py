@@ -71,6 +71,11 @@ def wait(done, limit_s=120.0):
     assert done()
 
 
+def doing(links, vehicle):
+    """The flight state of a vehicle, in a word."""
+    return next(row["flight"]["state"] for row in links.rows() if row["id"] == vehicle)
+
+
 def ready(links, count):
     def known():
         rows = links.rows()
@@ -100,10 +105,10 @@ def test_all_are_commanded_at_once_with_an_outcome_each(open_links, folder):  # 
     assert all(r["outcome"] == "refused" and "separation" in r["reason"] for r in refused)  # all on one path
     override = {name: ["separation"] for name in ("v1", "v2", "v3")}
     assert [r["outcome"] for r in links.commands("start", override=override)] == ["done"] * 3
-    wait(lambda: all(links.flight_state(f"v{n}")["state"] == "on mission" for n in (1, 2, 3)))
+    wait(lambda: all(doing(links, f"v{n}") == "on mission" for n in (1, 2, 3)))
     assert [r["outcome"] for r in links.commands("rtl")] == ["done"] * 3
     home = {"returning", "landing", "on ground"}  # at ten times the speed a busy machine may see only the last
-    wait(lambda: {links.flight_state(name)["state"] for name in ("v1", "v2", "v3")} <= home)
+    wait(lambda: {doing(links, name) for name in ("v1", "v2", "v3")} <= home)
     assert [r["outcome"] for r in links.commands("land", ["v2"])] == ["done"]
     late = links.commands("rtl", ["v1"], given_s=links.clock() - 6.0)
     assert late[0]["outcome"] == "not_sent" and re.search(r"was given \d+ s ago and was not sent", late[0]["reason"])
@@ -238,7 +243,7 @@ def test_vehicles_of_one_start_return_in_turn_and_one_given_another_command_does
     upload_all(links, folder)
     override = {name: ["separation"] for name in ("v1", "v2", "v3")}
     assert [r["outcome"] for r in links.commands("start", override=override)] == ["done"] * 3
-    wait(lambda: all(links.flight_state(f"v{n}")["state"] == "on mission" for n in (1, 2, 3)))
+    wait(lambda: all(doing(links, f"v{n}") == "on mission" for n in (1, 2, 3)))
     rows = links.return_in_turn("turn-1")
     assert [(r["id"], r["vehicle"], r["command"], r["outcome"]) for r in rows] == [
         ("turn-1", f"v{n}", "return", "done") for n in (1, 2, 3)
@@ -253,7 +258,7 @@ def test_vehicles_of_one_start_return_in_turn_and_one_given_another_command_does
     assert [r["outcome"] for r in links.commands("land", [second])] == ["done"]
     assert next(row for row in links.rows() if row["id"] == second)["returns_after"] is None
     down = {"on ground", "complete"}
-    wait(lambda: all(links.flight_state(n)["state"] in down for n in ("v1", "v2", "v3")), 240.0)
+    wait(lambda: all(doing(links, n) in down for n in ("v1", "v2", "v3")), 240.0)
     landed = links.fleet.vehicles[links.fleet.system_of(second)]
     assert landed.mode == "LAND"  # not sent home after it was told to land
 
