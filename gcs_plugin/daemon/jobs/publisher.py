@@ -164,10 +164,10 @@ class Publisher:
                 target.unlink(missing_ok=True)
 
     @contextmanager
-    def turn(self, layer: str) -> Iterator["Turn"]:
+    def turn(self, layer: str) -> Iterator["LayerTurn"]:
         """Wait for exclusive use of a layer."""
         with self._turns[layer]:
-            turn = Turn(self, layer)
+            turn = LayerTurn(self, layer)
             try:
                 yield turn
             finally:
@@ -200,7 +200,7 @@ class Publisher:
             later.start()
 
 
-class Turn:
+class LayerTurn:
     """The exclusive use of a layer, in which one sortie is drawn into its next generation, and this published.
 
     Attributes:

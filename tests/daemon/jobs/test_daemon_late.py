@@ -8,7 +8,7 @@ import pytest
 
 from gcs_plugin.daemon.daemon import Daemon
 from gcs_plugin.daemon.jobs.leg_watch import LegWatch
-from gcs_plugin.daemon.jobs.publisher import Publisher, Turn
+from gcs_plugin.daemon.jobs.publisher import LayerTurn, Publisher
 from gcs_plugin.daemon.jobs.solution_file import read_solution
 from gcs_plugin.daemon.settings import Settings
 from gcs_plugin.daemon.store.daemon_events import Events, LegsOver, VehicleSilent
@@ -91,7 +91,7 @@ def test_a_refinement_that_cannot_be_published_leaves_the_former_one(daemon, fli
     def full(turn, change):
         raise StorageError("the disk is full")
 
-    monkeypatch.setattr(Turn, "publish", full)
+    monkeypatch.setattr(LayerTurn, "publish", full)
     monkeypatch.setattr(Publisher, "retire", lambda _, row: retired.append(row))
     post_at_once(daemon, frames[14:])
     _, late = after_job(daemon, 2)
