@@ -13,7 +13,6 @@ from gcs_plugin.fleet.fleet import Fleet
 from gcs_plugin.fleet.fleet_events import FleetEvent
 from gcs_plugin.fleet.flight_state import Word, flight_state, summary
 from gcs_plugin.fleet.preflight import Check, preflight_all
-from gcs_plugin.fleet.separation.separation_watch import number_name
 from gcs_plugin.fleet.separation.takeoff_schedule import TakeoffSchedule
 from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.mavlink import Autopilot, Message
@@ -273,7 +272,7 @@ class DirectBackend(Backend):
 
     def problems(self) -> list[str]:
         """See `Fleet.problems`."""
-        return self.fleet.problems(number_name)
+        return self.fleet.problems()
 
     def upload(self, missions: Mapping[int, Mission], report: Report) -> dict[int, Outcome]:
         """All uploads at the same time."""

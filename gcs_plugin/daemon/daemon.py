@@ -9,11 +9,10 @@ import logging
 import math
 import threading
 import time
-from functools import partial
 from typing import Any, Final
 
-from gcs_plugin.daemon.airspace.terrain_data import TerrainData
-from gcs_plugin.daemon.exports import Exports
+from gcs_plugin.daemon.airspace import TerrainData
+from gcs_plugin.daemon.exports import Exports, TakFeed
 from gcs_plugin.daemon.flight_coverage.exposure_journal import MESSAGES as EVENT_MESSAGES
 from gcs_plugin.daemon.flight_coverage.exposure_journal import EventRequests, ExposureJournal
 from gcs_plugin.daemon.flight_coverage.live_coverage import LiveCoverage
@@ -21,21 +20,18 @@ from gcs_plugin.daemon.flight_coverage.picture_requests import FetchedPictures, 
 from gcs_plugin.daemon.flight_coverage.picture_views import PictureViews
 from gcs_plugin.daemon.gap_flights import GapFlights
 from gcs_plugin.daemon.intake.can_reader import CanReader
-from gcs_plugin.daemon.intake.picture_intake import LinkLog, PictureIntake, VehicleIntake
+from gcs_plugin.daemon.intake.picture_intake import PictureIntake, RefusedPictures, VehicleIntake
 from gcs_plugin.daemon.intake.picture_sources import PictureSource
-from gcs_plugin.daemon.intake.refused_pictures import RefusedPictures
-from gcs_plugin.daemon.jobs.job_queue import Jobs
-from gcs_plugin.daemon.jobs.job_requests import JobRequests
-from gcs_plugin.daemon.jobs.joint_refinement import JointRefinement
+from gcs_plugin.daemon.jobs.job_queue import JobRequests, Jobs
 from gcs_plugin.daemon.jobs.leg_placement import LegPlacement
 from gcs_plugin.daemon.jobs.leg_watch import LegWatch
+from gcs_plugin.daemon.jobs.neighbours import JointRefinement, ToneBalance
 from gcs_plugin.daemon.jobs.publisher import Publisher
 from gcs_plugin.daemon.jobs.sortie_refinement import SortieRefinement
-from gcs_plugin.daemon.jobs.tone_balance import ToneBalance
 from gcs_plugin.daemon.jobs.worker_pool import LAST, WorkerPool
 from gcs_plugin.daemon.jobs.workspace_products import RunFacts
-from gcs_plugin.daemon.layers.anchor import ExpectedPlace
 from gcs_plugin.daemon.layers.layers import NAMES, MapLayer
+from gcs_plugin.daemon.layers.map_site import ExpectedPlace, MapSite
 from gcs_plugin.daemon.layers.realtime_layer import Drawer
 from gcs_plugin.daemon.layers.web_tiles import TileServer
 from gcs_plugin.daemon.settings import Settings
@@ -44,25 +40,19 @@ from gcs_plugin.daemon.store.daemon_events import (
     AreaChanged,
     CardRead,
     DrawingRestarted,
-    JobDropped,
+    Events,
     JobEnded,
-    JobsStop,
-    LayerNeeded,
     LayerPublished,
     LegsOver,
     MissionNoted,
     PictureDrawn,
     PictureRejected,
     PictureStored,
-    RefinementBegins,
     VehicleSilent,
 )
-from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.journal import Journal
-from gcs_plugin.daemon.store.kept_pictures import KeptPictures
-from gcs_plugin.daemon.store.picture_store import PictureStore
+from gcs_plugin.daemon.store.picture_store import KeptPictures, PictureStore
 from gcs_plugin.daemon.store.workspace_lock import distrust_after_power_cut, take_over
-from gcs_plugin.daemon.tak_feed import TakFeed
 from gcs_plugin.daemon.takeoffs import Takeoffs
 from gcs_plugin.daemon.vehicles import VehicleLinks
 from gcs_plugin.daemon.views import Views
@@ -130,9 +120,14 @@ class Daemon:
         settings, folder = self.settings, self.settings.workspace
         systems = settings.systems()
         self.intake = PictureIntake(self.journal, self.store, self.events, poses=self.poses, refused=self.refused)
-        link_log, videos = LinkLog(folder / "telemetry.tlog", systems), folder / "videos"
-        one = partial(VehicleIntake, intake=self.intake, events=self.events, poses=self.poses, link_log=link_log)
-        self.sources = [PictureSource(v.pictures, one(v.id, cache=videos)) for v in settings.vehicles if v.pictures]
+        taken: dict[str, Any] = {
+            "intake": self.intake, "events": self.events, "poses": self.poses, "tlog": folder / "telemetry.tlog",
+            "cache": folder / "videos",
+        }  # fmt: skip
+        self.sources = [
+            PictureSource(v.pictures, VehicleIntake(v.id, system=systems.get(v.id), **taken))
+            for v in settings.vehicles if v.pictures
+        ]  # fmt: skip
         self.buses = [
             CanReader(
                 v.id, v.can, poses=self.poses.of(v.id), events=self.events, fleet=self.links.fleet,
@@ -146,11 +141,12 @@ class Daemon:
         canvases = folder / "layers"
         canvases.mkdir(exist_ok=True)
         fov_rad = None if settings.fov_min_deg is None else math.radians(settings.fov_min_deg)
-        self.drawer = Drawer(
-            self.journal, self.store, self.layers["realtime"], canvases, self.events, gsd_m=settings.gsd_m,
-            fov_rad=fov_rad, expected=ExpectedPlace(self.tiles, self.plans),
-            canvas_mb=settings.config.compute.live_canvas_mb,
+        site = MapSite(
+            self.journal, self.layers["realtime"], canvases, gsd_m=settings.gsd_m, fov_rad=fov_rad,
+            expected=ExpectedPlace(self.tiles, self.plans), events=self.events,
+            memory_mb=settings.config.compute.live_canvas_mb,
         )  # fmt: skip
+        self.drawer = Drawer(self.journal, self.store, site, self.events)
         self.leg_watch = LegWatch(self.events, silent_s=settings.silent_s)
         self.coverage = LiveCoverage(
             self.journal, self.events, views=PictureViews(self.journal, self.store, folder / "solutions", fov_rad),
@@ -159,7 +155,7 @@ class Daemon:
         )  # fmt: skip
         self.gap_flights = GapFlights(self.coverage, self.plans, self.links)
         fetched = FetchedPictures(
-            self.links, self.journal, self.events, poses=self.poses, coverage=self.coverage, intake=self.intake
+            self.journal, self.events, poses=self.poses, coverage=self.coverage, intake=self.intake
         )
         self.picture_requests = PictureRequests(
             self.links.fleet, fetched, folder=settings.picture_folder, most_bytes_s=settings.picture_bytes_s
@@ -167,35 +163,27 @@ class Daemon:
 
     def _open_jobs(self) -> None:
         """What refines, publishes and exports in the background, and what a stop left undone of it."""
-        settings, folder = self.settings, self.settings.workspace
+        settings = self.settings
         self.workers, self.background = WorkerPool(settings.workers), WorkerPool(1, LAST)
+        config, folder = settings.config, settings.workspace
         publisher = Publisher(
-            self.journal, self.layers, folder, drawer=self.drawer, events=self.events, workers=self.background,
-            trusted=self._trusted,
+            self.journal, self.layers, folder, drawer=self.drawer, events=self.events, basemap=settings.basemap,
+            device=config.matchers.device, trusted=self._trusted,
         )  # fmt: skip
-        shared: dict[str, Any] = {"journal": self.journal, "publisher": publisher}
-        config = settings.config
-        one = shared | {
-            "store": self.store, "kept": KeptPictures(folder / "kept", config.raster.grey_pictures_mb),
-            "basemap": settings.basemap, "device": config.matchers.device,
-        }  # fmt: skip
-        self.coarse = LegPlacement(workers=self.background, **one)
-        self.refinement = SortieRefinement(workers=self.workers, drawer=self.drawer, events=self.events, **one)
-        self.together = JointRefinement(
-            workers=self.background, basemap=settings.basemap, least_px=settings.redraw_px, **shared
-        )
-        self.tones = ToneBalance(workers=self.background, layer="fine" if settings.basemap else "coarse", **shared)
+        kept = KeptPictures(folder / "kept", config.raster.grey_pictures_mb)
+        refinement = SortieRefinement(publisher, self.store, kept, self.drawer)
         facts = RunFacts(self.journal, self.started, (self.workers, self.background))
         self.exports = Exports(
             settings, self.journal, store=self.store, layers=self.layers, console=self.console, drawer=self.drawer,
-            views=self.views, coverage=self.coverage, workers=self.background, facts=facts,
+            views=self.views, coverage=self.coverage, facts=facts,
         )  # fmt: skip
-        self.tak = TakFeed([settings.tak_address(text) for text in settings.tak], self.exports.places)
+        self.tak = TakFeed([settings.tak_address(text) for text in settings.tak], self.exports)
         handlers = {
-            "refine": self.refinement.refine, "together": self.together.solve, "coarse": self.coarse.make,
-            "tones": self.tones.balance, "export": self.exports.write, "redraw": publisher.draw_again,
+            "refine": refinement.refine, "coarse": LegPlacement(publisher, self.store, kept).make,
+            "together": JointRefinement(publisher, settings.redraw_px).solve, "tones": ToneBalance(publisher).balance,
+            "export": self.exports.write, "redraw": publisher.draw_again,
         }  # fmt: skip
-        self.jobs = Jobs(self.journal, self.events, handlers, settings.workers)
+        self.jobs = Jobs(self.journal, self.events, handlers, self.workers, self.background)
         self.requests = JobRequests(self.journal, self.jobs, coarse=settings.coarse)
         if publisher.lost:
             self.jobs.add("redraw")
@@ -216,17 +204,9 @@ class Daemon:
         on(VehicleSilent, self.requests.vehicle_silent)
         on(CardRead, self.requests.card_read)  # VehicleIntake
         on(MissionNoted, self.requests.mission_noted)  # VehicleLinks
-        for gives_way in (self.together.give_way, self.tones.give_way):
-            on(RefinementBegins, gives_way)  # SortieRefinement
-            on(LayerNeeded, gives_way)
-        on(RefinementBegins, self.requests.refinement_begins)  # first of all its own coarse maps end
-        on(RefinementBegins, self.coarse.give_way)
-        on(LayerNeeded, self.coarse.give_way)
         on(LayerPublished, self.coverage.look)  # Publisher
-        on(JobDropped, self.coarse.drop)  # Jobs
-        on(JobEnded, self.links.job_ended)
+        on(JobEnded, self.links.job_ended)  # Jobs
         on(JobEnded, self.requests.job_ended)
-        on(JobsStop, self.refinement.stop)
 
     def _warm_up(self, event: PictureStored) -> None:
         """Have the kernels of a refinement compiled, as one is to come."""
@@ -240,36 +220,20 @@ class Daemon:
         self.jobs.start()
         threading.Thread(target=self.workers.warm_up, daemon=True).start()
         self.requests.continue_last(self.leg_watch)
-        self.leg_watch.start()
-        self.coverage.start()
         self.links.start()
-        for terrain in self.terrain:
-            terrain.start()
-        self.picture_requests.start()
-        self.tak.start()
+        for part in (self.leg_watch, self.coverage, *self.terrain, self.picture_requests, self.tak, *self.buses):
+            part.start()
         for source in self.sources:
             source.start()
-        for bus in self.buses:
-            bus.start()
 
     def close(self) -> None:
         """Stop; unfinished work continues at the next start."""
         self.jobs.give_up()
         self._close_sources()
-        for bus in self.buses:
-            bus.close()
-        self.leg_watch.close()
-        self.tak.close()
-        self.picture_requests.close()
-        for terrain in self.terrain:
-            terrain.close()
-        self.takeoffs.close()
-        self.links.close()
-        self.workers.close()
-        self.background.close()
-        self.jobs.close()
-        self.drawer.close()
-        self.coverage.close()
+        for background in (*self.buses, self.leg_watch, self.tak, self.picture_requests, *self.terrain):
+            background.close()
+        for part in (self.takeoffs, self.links, self.workers, self.background, self.jobs, self.drawer, self.coverage):
+            part.close()
         for layer in self.layers.values():
             layer.close()
         self.journal.remember("clean", True)
@@ -295,5 +259,5 @@ class Daemon:
     def problems(self) -> list[str]:
         """The present problems, in words."""
         own = (self.drawer.problem, self.drawer.overload, self.jobs.problem, self.tak.problem)
-        linked = self.links.fleet.problems(self.links.name_of)
+        linked = self.links.fleet.problems()
         return [text for text in (*own, *linked, *self.refused.problems(), *(s.problem for s in self.sources)) if text]

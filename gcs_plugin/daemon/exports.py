@@ -1,12 +1,13 @@
-"""Exports of the workspace, its finds and vehicles as places, and which pictures show one."""
+"""Exports of the workspace, its finds and vehicles as places (for TAK programs, too), and which pictures show one."""
 
 import contextlib
+import logging
 import math
 import os
 import shutil
 import threading
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -14,9 +15,8 @@ from typing import Any, Final, TypedDict
 
 from gcs_plugin.daemon.flight_coverage.live_coverage import LiveCoverage
 from gcs_plugin.daemon.intake.posted_pose import frame_of_row
-from gcs_plugin.daemon.jobs.job_queue import ReportProgress
+from gcs_plugin.daemon.jobs.job_queue import RunningJob
 from gcs_plugin.daemon.jobs.solution_file import read_solution
-from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
 from gcs_plugin.daemon.jobs.workspace_products import (
     PRODUCTS,
     ExportTask,
@@ -28,17 +28,18 @@ from gcs_plugin.daemon.jobs.workspace_products import (
 from gcs_plugin.daemon.layers.layers import MapArea, MapLayer
 from gcs_plugin.daemon.layers.realtime_layer import Drawer
 from gcs_plugin.daemon.settings import Settings
+from gcs_plugin.daemon.stoppable_thread import Background
 from gcs_plugin.daemon.store.console_state import ConsoleState, FindRow
 from gcs_plugin.daemon.store.frame_rows import all_frames, frame_number, frame_path
-from gcs_plugin.daemon.store.job_rows import Job
 from gcs_plugin.daemon.store.journal import Change, Journal, no_change
 from gcs_plugin.daemon.store.picture_store import PictureStore
 from gcs_plugin.daemon.store.sortie_rows import coarse_only, placed_sorties
 from gcs_plugin.daemon.vehicle_names import VehicleRow
 from gcs_plugin.daemon.views import Views
 from orthoswarm.export.atomic_file import atomic_write
+from orthoswarm.export.tactical.cursor_on_target import TakAddress, TakSender, event
 from orthoswarm.export.tactical.places import Place, sightings
-from orthoswarm.model.errors import InputError
+from orthoswarm.model.errors import InputError, OrthoSwarmError
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.raster import picture_file
 
@@ -83,7 +84,7 @@ class Exports:
 
     Args:
         layers: by name. drawer: knows the map's area. views: has the vehicles. coverage: its cells and figures are
-            part of the report. workers: write the files. facts: of the daemon, for the report.
+            part of the report. facts: of the daemon, for the report.
     """
 
     def __init__(
@@ -97,21 +98,21 @@ class Exports:
         drawer: Drawer,
         views: Views,
         coverage: LiveCoverage,
-        workers: WorkerPool,
         facts: RunFacts,
     ) -> None:
         self._settings, self._journal, self._store = settings, journal, store
-        self._layers, self._console, self._workers = layers, console, workers
+        self._layers, self._console = layers, console
         self._drawer, self._views, self._coverage, self._facts = drawer, views, coverage, facts
         self._written: tuple[dict[str, int], dict[str, str]] = ({}, {})  # the layers' versions, and the files of them
 
-    def write(self, job: Job, report: ReportProgress) -> Change:
+    def write(self, run: RunningJob) -> Change:
         """The handler of an `export` job; one that nobody asked for writes only what has changed since the last one.
 
         Raises:
             InputError: there is no map yet.
         """
-        report(0.05, "writing")
+        job = run.job
+        run.report(0.05, "writing")
         area = self._drawer.area
         if area is None:
             raise InputError("there is no map yet; wait for pictures")
@@ -127,15 +128,16 @@ class Exports:
                 find | FindRow(pictures=[row["image"] for row in pictures_at(task, find["lat_deg"], find["lon_deg"])])
                 for find in self._console.finds()
             ]
-            places = tuple(self._places(shown))
+            places = tuple(self.places(shown))
             task = replace(task, facts=self._report_facts(), places=places, cells=self._coverage.png)
-            job.detail["files"] = files = self._workers.run(write_products, task)
+            job.detail["files"] = files = run.run(write_products, task)
             self._written = versions, {name: files[name] for name in PRODUCTS}
         return no_change
 
-    def places(self) -> list[Place]:
-        """The finds, and the vehicles with a known position."""
-        return self._places(self._console.finds())
+    def places(self, finds: Sequence[FindRow] | None = None) -> list[Place]:
+        """The finds (default: the operator's), and the vehicles with a known position."""
+        found, name = self._console.finds() if finds is None else finds, self._settings.workspace.resolve().name
+        return places_of(name, found, self._views.vehicles(), time.time())
 
     def find_pictures(self, number: int) -> list[SightingRow]:
         """The pictures that show a find, best first; see `pictures_at`. Each has its `seq`.
@@ -175,9 +177,6 @@ class Exports:
         import simplejpeg
 
         return bytes(simplejpeg.encode_jpeg(picture_file.read_rgb(path), _VIEW_QUALITY, "RGB"))
-
-    def _places(self, finds: list[FindRow]) -> list[Place]:
-        return places_of(self._settings.workspace.resolve().name, finds, self._views.vehicles(), time.time())
 
     def _report_facts(self) -> dict[str, Any]:
         covered = self._coverage.document
@@ -250,3 +249,58 @@ def pictures_at(task: ExportTask, lat_deg: float, lon_deg: float) -> list[Sighti
         }
         for s in sightings(placed, (east, north, level))[:_MOST_SIGHTINGS]
     ]  # fmt: skip
+
+
+_EVERY_S: Final = 2.0
+_FINDS_EVERY: Final = 15  # rounds after which all finds are sent again
+_log = logging.getLogger(__name__)
+
+
+class TakFeed(Background):
+    """Sends all vehicles every two seconds, and all finds when one is new or changed and every half minute.
+
+    Attributes:
+        problem: why a receiver gets nothing at present, else empty.
+    """
+
+    def __init__(self, addresses: Sequence[TakAddress], exports: Exports) -> None:
+        super().__init__("tak", join_s=10.0)
+        self._senders = [TakSender(address) for address in addresses]
+        self._exports = exports
+        self.problem = ""
+
+    def start(self) -> None:
+        """Start sending, if there is a receiver."""
+        if self._senders:
+            super().start()
+
+    def close(self) -> None:
+        """Stop sending."""
+        super().close()
+        for sender in self._senders:
+            sender.close()
+
+    def _run(self) -> None:
+        number, known = 0, set[Place]()
+        while not self._stop.wait(_EVERY_S):
+            try:
+                places = self._exports.places()
+            except (OrthoSwarmError, TimeoutError) as error:
+                _log.warning("TAK: %s", error)
+                continue
+            finds = {place for place in places if place.kind == "find"}
+            everything = number % _FINDS_EVERY == 0 or not finds <= known
+            number, known = number + 1, finds
+            now = time.time()
+            events = [event(place, now) for place in places if everything or place.kind == "vehicle"]
+            self.problem = "; ".join(text for sender in self._senders if (text := _sent(sender, events)))
+
+
+def _sent(sender: TakSender, events: Sequence[bytes]) -> str:
+    """Send all events; returns the reason of a failure, else an empty text."""
+    try:
+        for one in events:
+            sender.send(one)
+    except OrthoSwarmError as error:
+        return str(error)
+    return ""

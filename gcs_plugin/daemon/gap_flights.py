@@ -82,7 +82,7 @@ class GapFlights:
             "fly_not_arrived": body.get("fly_not_arrived") is True,
             "autopilots": self._plans.autopilots_of(ordered),
         }  # fmt: skip
-        made = self._plans.make_gaps(self._coverage.gaps, self._coverage.no_fly, values, notes)
+        made = self._plans.make_in("gaps.geojson", self._coverage.gaps, self._coverage.no_fly, values, notes)
         names = dict(zip([f"v{k}" for k in range(1, len(ordered) + 1)], ordered, strict=True))
         return made | {"names": {row["id"]: names[row["id"]] for row in made["vehicles"]}}
 

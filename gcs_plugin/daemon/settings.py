@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from gcs_plugin.daemon.intake.can_reader import check_bus
-from gcs_plugin.daemon.vehicle_names import VehicleNames, system_in_name
+from gcs_plugin.daemon.vehicle_names import system_in_name
+from gcs_plugin.fleet.separation.separation_watch import VehicleNames
 from orthoswarm.config import DEFAULT, Config
 from orthoswarm.export.tactical.cursor_on_target import TakAddress
 from orthoswarm.model.errors import InputError

@@ -5,10 +5,12 @@ started unless all have passed their preflight check; if one then refuses, the w
 Waiting takeoffs are dropped when the daemon ends: a start is a command and is never repeated automatically.
 """
 
+import contextlib
 import logging
 import threading
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections import OrderedDict
+from collections.abc import Callable, Collection, Iterator, Mapping
 from functools import partial
 from typing import Any, Final
 
@@ -26,6 +28,7 @@ from gcs_plugin.mission.track import Airspace
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 
 _LOOK_S: Final = 0.05
+_REMEMBERED: Final = 1000  # cancelled starts
 _log = logging.getLogger(__name__)
 
 
@@ -40,14 +43,10 @@ class Takeoffs:
         self._missions: dict[int, Mission] = {}
         self._needs = NO_NEEDS
         self._allowed: dict[str, Collection[str]] = {}
+        self._cancelled: OrderedDict[str | None, None] = OrderedDict()
         self._closed = False
 
-    def preflight(
-        self,
-        plan: str,
-        sortie: int = 1,
-        names: Mapping[str, str] | None = None,
-    ) -> list[CheckRow]:
+    def preflight(self, plan: str, sortie: int = 1, names: Mapping[str, str] | None = None) -> list[CheckRow]:
         """Check a plan's vehicles before their start.
 
         Args:
@@ -63,17 +62,14 @@ class Takeoffs:
         return self._check(plan, sortie, names)[0]
 
     def _check(
-        self,
-        plan: str,
-        sortie: int,
-        names: Mapping[str, str] | None,
+        self, plan: str, sortie: int, names: Mapping[str, str] | None
     ) -> tuple[list[CheckRow], dict[str, Mission]]:
         """The rows of `preflight`, and the plan's missions by vehicle."""
         starts = self._plans.starts(plan, sortie)
         whose = {vehicle: (names or {}).get(vehicle, vehicle) for vehicle in starts}
         missions = {}
         for vehicle, name in whose.items():
-            known = self._links.fleet.vehicles[self._links.system_of(name)]
+            known = self._links.fleet.vehicles[self._links.fleet.system_of(name)]
             mission = vehicle if sortie == 1 else f"{vehicle}-sortie{sortie}"
             missions[name] = self._plans.mission({"plan": plan, "mission": mission}, vehicle, known.autopilot)
         times = {whose[vehicle]: start_s for vehicle, start_s in starts.items()}
@@ -87,7 +83,7 @@ class Takeoffs:
         names: Mapping[str, str] | None = None,
         override: Mapping[str, Collection[str]] | None = None,
         *,
-        wanted: Callable[[], bool] = lambda: True,
+        number: str | None = None,
         given_s: float | None = None,
     ) -> dict[str, float]:
         """Start a plan's vehicles; returns vehicle -> seconds from now.
@@ -99,7 +95,7 @@ class Takeoffs:
             plan: its id. sortie: which flight of each vehicle, from 1.
             names: the plan's vehicle -> the daemon's, where they differ.
             override: names of red preflight items that do not stop the start, by the daemon's vehicle.
-            wanted: asked after the check, which takes seconds: whether they are still to start.
+            number: the start's id, by which it can be cancelled until the first is told to start.
             given_s: when it was given, on the clock; default now.
 
         Raises:
@@ -114,18 +110,20 @@ class Takeoffs:
         with self.waiting.condition:
             if self.waiting.are_under_way:
                 raise OrthoSwarmError("other takeoffs are under way; pause or rtl a waiting vehicle to cancel its own")
-            systems = self._systems(whose)
+            with _none_started():
+                systems = {vehicle: self._links.fleet.system_of(name) for vehicle, name in whose.items()}
             self.waiting.checking, stops = frozenset(systems.values()), dict(self._links.fleet.stops)
             standing = {s: self._links.fleet.vehicles[s].standing for s in systems.values()}
         try:
-            missions = self._ready(plan, sortie, names, override or {})
+            with _none_started():
+                missions = self._ready(plan, sortie, names, override or {})
             first = min(starts.values())
             delays = {systems[vehicle]: start_s - first for vehicle, start_s in starts.items()}
             held = {s: self._links.fleet.vehicles[s].mission for s in delays}
             schedule = TakeoffSchedule.of(delays, time.monotonic())
             needs = self._plans.needs(plan)
             with self.waiting.condition:
-                if not wanted():
+                if number in self._cancelled:
                     raise OrthoSwarmError("the start was cancelled; no vehicle was started")
                 self._still_wanted(given, stops)
                 self.waiting.failed.clear()
@@ -143,23 +141,18 @@ class Takeoffs:
         threading.Thread(target=self._follow, args=(schedule, known, delays), daemon=True).start()
         return {whose[vehicle]: round(start_s - first, 1) for vehicle, start_s in starts.items()}
 
+    def cancel(self, number: str) -> None:
+        """Have no vehicle started by a start with this id that is still being checked, or that has not come yet."""
+        self._cancelled[number] = None
+        while len(self._cancelled) > _REMEMBERED:
+            self._cancelled.popitem(last=False)
+
     def close(self) -> None:
         """Cancel all waiting takeoffs."""
         with self.waiting.condition:
             self._closed = True
             self.waiting.schedule.waiting.clear()
             self.waiting.condition.notify_all()
-
-    def _systems(self, whose: Mapping[str, str]) -> dict[str, int]:
-        """System ids of the plan's vehicles.
-
-        Raises:
-            OrthoSwarmError: one is not heard.
-        """
-        try:
-            return {vehicle: self._links.system_of(name) for vehicle, name in whose.items()}
-        except OrthoSwarmError as error:
-            raise OrthoSwarmError(f"{error}; no vehicle was started") from None
 
     def _still_wanted(self, given_s: float, stops: Mapping[int, int]) -> None:
         """Make sure that nobody told a vehicle to stop during the check, and that this did not take too long.
@@ -169,7 +162,7 @@ class Takeoffs:
         """
         told = [s for s in sorted(self.waiting.checking) if self._links.fleet.stops.get(s, 0) != stops.get(s, 0)]
         if told:
-            who = ", ".join(self._links.name_of(system) for system in told)
+            who = ", ".join(self._links.names.name_of(system) for system in told)
             raise OrthoSwarmError(f"{who} was told to stop during the check; no vehicle was started")
         age_s = time.monotonic() - given_s
         if age_s > COMMAND.fresh_s:
@@ -190,17 +183,12 @@ class Takeoffs:
         Raises:
             OrthoSwarmError: not all have passed.
         """
-        try:
-            rows, missions = self._check(plan, sortie, names)
-        except InputError:
-            raise
-        except OrthoSwarmError as error:
-            raise OrthoSwarmError(f"{error}; no vehicle was started") from None
+        rows, missions = self._check(plan, sortie, names)
         wrong = [
             f"{row['vehicle']}: {text}" for row in rows for text in red_items(row, override.get(row["vehicle"], ()))
         ]
         if wrong:
-            raise OrthoSwarmError(f"{'; '.join(wrong)}; no vehicle was started")
+            raise OrthoSwarmError("; ".join(wrong))
         return missions
 
     def _follow(self, schedule: TakeoffSchedule, missions: Mapping[int, Mission], delays: Mapping[int, float]) -> None:
@@ -281,6 +269,17 @@ class Takeoffs:
             self.waiting.condition.notify_all()
         for text in said:
             self._say(text)
+
+
+@contextlib.contextmanager
+def _none_started() -> Iterator[None]:
+    """Say of what keeps a start back that no vehicle was started; a wrong request is told as it is."""
+    try:
+        yield
+    except InputError:
+        raise
+    except OrthoSwarmError as error:
+        raise OrthoSwarmError(f"{error}; no vehicle was started") from None
 
 
 def names_of(body: Mapping[str, Any]) -> tuple[int, dict[str, str]]:

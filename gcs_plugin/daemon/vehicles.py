@@ -1,6 +1,8 @@
 """The vehicles on the daemon's links: their state and poses, their missions, commands to them, and their check.
 
-One thread polls the fleet. State that must survive a restart is written to the journal first, see `MissionJournal`.
+One thread polls the fleet. A new sortie, a completion with the refinement that it requests,
+and the state of the completion detector are written to the journal in one transaction before they are acted on, so that
+a restart continues where the last daemon stopped.
 The HTTP API gets JSON values: of vehicles a `VehicleRow` each, of commands a `CommandResult.document`, of checks a
 `CheckRow`.
 """
@@ -9,26 +11,26 @@ import logging
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 from functools import partial
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import Any, Final, cast
 
-from gcs_plugin.daemon.airspace.fences import Fences
-from gcs_plugin.daemon.airspace.traffic import Traffic
+from gcs_plugin.daemon.airspace import Fences, Traffic
 from gcs_plugin.daemon.settings import Settings
-from gcs_plugin.daemon.start_checks import CheckRow, StartChecks, red_items
+from gcs_plugin.daemon.start_checks import CheckRow, StartChecks, WaitingTakeoffs, red_items
 from gcs_plugin.daemon.store.daemon_events import (
     CommandDone,
     CompletionRefined,
+    Events,
     JobEnded,
     MissionNoted,
     TrafficChanged,
     VehicleChanged,
     VehicleReported,
 )
-from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.daemon.store.sortie_rows import (
     completion_refined,
@@ -38,24 +40,20 @@ from gcs_plugin.daemon.store.sortie_rows import (
     vehicle_state,
 )
 from gcs_plugin.daemon.vehicle_names import VehicleRow
-from gcs_plugin.daemon.waiting_takeoffs import WaitingTakeoffs
-from gcs_plugin.fleet.commands import CommandResult
+from gcs_plugin.fleet.commands import URGENT, VERBS, CommandResult, Order, Verb, new_id
+from gcs_plugin.fleet.fleet import Fleet
+from gcs_plugin.fleet.fleet_events import FleetEvent
+from gcs_plugin.fleet.flight_state import summary
+from gcs_plugin.fleet.preflight import CONTINUED, ITEMS
 from gcs_plugin.fleet.separation.returns import Returns
-from gcs_plugin.fleet.separation.separation_watch import apart_text, near_text
+from gcs_plugin.fleet.vehicle_state import Vehicle
+from gcs_plugin.links.signing import find_key
 from gcs_plugin.mission.completion import CompletionDetector, Phase
 from gcs_plugin.mission.exchange import Verdict
+from gcs_plugin.mission.items import Mission
 from gcs_plugin.mission.plan_folder import NO_NEEDS, PlanNeeds
 from orthoswarm.model.errors import InputError, OrthoSwarmError
-from telemetry.live.live_poses import LinkPoses
-
-if TYPE_CHECKING:
-    from gcs_plugin.fleet.commands import Verb
-    from gcs_plugin.fleet.fleet import Fleet
-    from gcs_plugin.fleet.fleet_events import FleetEvent
-    from gcs_plugin.fleet.vehicle_state import Vehicle
-    from gcs_plugin.mission.exchange import Exchange
-    from gcs_plugin.mission.items import Mission
-    from telemetry.live.live_poses import LivePoses
+from telemetry.live.live_poses import LinkPoses, LivePoses
 
 _WATCH_S: Final = 0.5
 _SOON_S: Final = 5.0
@@ -72,44 +70,11 @@ class _VehicleRecord:
     """The daemon's own data about a vehicle, besides the fleet's."""
 
     id: str
-    poses: "LivePoses"
+    poses: LivePoses
     trail: list[tuple[float, float]] = field(default_factory=list)
     texts: deque[dict[str, Any]] = field(default_factory=lambda: deque(maxlen=_MOST_TEXTS))
     sent: dict[str, Any] = field(default_factory=dict)
     lost_since: float | None = None
-
-
-class MissionJournal:
-    """The vehicles' missions in the journal: sorties, completions, and the states of the completion detectors.
-
-    A new sortie, a completion with the refinement that it requests, and the detector's state are written in one
-    transaction before they are acted on, so that a restart continues where the last daemon stopped.
-    """
-
-    def __init__(self, journal: Journal) -> None:
-        self._journal = journal
-
-    def found(self, vehicle: "Vehicle", name: str) -> None:
-        """Record a detected vehicle; its detector continues from the state stored by an earlier daemon."""
-        detector = vehicle_state(self._journal, name).get("detector")
-        if detector and detector.get("autopilot") == vehicle.autopilot.value:
-            try:
-                vehicle.detector = CompletionDetector.from_state(detector)
-            except (KeyError, TypeError, ValueError):  # of another version
-                _log.warning("%s: what was known about its mission cannot be read", name)
-        self._journal.write(vehicle_found(name))
-
-    def note(self, event: "FleetEvent", vehicle: "Vehicle", name: str, still_flying: Sequence[str]) -> None:
-        """Write a mission's event (started, complete, aborted, suspended, resumed).
-
-        A start after a flight opens a sortie; a completion requests the refinement of its sortie.
-        """
-        completion = {"complete_s": event.time_s, "still_flying": list(still_flying)}
-        self._journal.write(mission_noted(name, event.kind, vehicle.detector.state(), completion))
-
-    def give_up(self, name: str) -> bool:
-        """Request the refinement of a silent vehicle's incomplete sortie; False if it sent no picture."""
-        return bool(self._journal.write(sortie_given_up(name)))
 
 
 class VehicleLinks:
@@ -128,25 +93,26 @@ class VehicleLinks:
         Raises:
             InputError: a link cannot be opened.
         """
-        from gcs_plugin.fleet.fleet import Fleet
-        from gcs_plugin.links.signing import find_key
-
         self._settings, self._events, self._journal = settings, events, journal
-        self._missions, self.names = MissionJournal(journal), settings.names()
+        self.names, self.waiting = settings.names(), WaitingTakeoffs(settings.names())
         self._records: dict[int, _VehicleRecord] = {}
         self._poses = poses
         self._stop, self._silent = threading.Event(), threading.Event()
         self.latest: list[VehicleRow] = []
         self._starting = Counter[int]()
         log = settings.workspace / "telemetry.tlog" if settings.links else None
-        self.fleet: Fleet = Fleet(settings.links, key=find_key() if settings.links else None, tlog=log)
+        self.fleet: Fleet = Fleet(
+            settings.links,
+            key=find_key() if settings.links else None,
+            tlog=log,
+            takeoffs=self.waiting,
+            names=self.names,
+        )
         self.fleet.on_event(self._event)
         self.fleet.subscribe(self._message)
         self._fences = Fences(self.fleet)
-        self.waiting = WaitingTakeoffs(self.fleet, self.names)
-        self.fleet.takeoff_due = self.waiting.is_due
         self._checks = StartChecks(self.fleet, self._fences, self.names, self.waiting)
-        self._returns = Returns(self.fleet, self._give, self._tell_command, self.names.name_of)
+        self._returns = Returns(self.fleet, self._give, self._told, self.names.name_of)
         self.traffic = Traffic()
         self.fleet.subscribe(self.traffic.heard, "ADSB_VEHICLE")
         self._threads = [  # with what ends them: first the one that asks the links
@@ -170,33 +136,21 @@ class VehicleLinks:
 
     # -- queries ------------------------------------------------------------------------------------------
 
-    def name_of(self, system: int) -> str:
-        """The id of a vehicle with a MAVLink system id."""
-        return self.names.name_of(system)
-
-    def system_of(self, vehicle: str) -> int:
-        """The MAVLink system id of a vehicle, by its id or that number.
-
-        Raises:
-            OrthoSwarmError: it was not heard on any link.
-        """
-        for system in list(self.fleet.vehicles):
-            if vehicle in (self.name_of(system), str(system)):
-                return system
-        known = ", ".join(self.name_of(system) for system in sorted(self.fleet.vehicles)) or "none"
-        raise OrthoSwarmError(f"{vehicle} is not on the links (heard: {known}); check links and system ids")
+    def heard(self) -> list[str]:
+        """The ids of all vehicles on the links."""
+        return [self.names.name_of(system) for system in sorted(self.fleet.vehicles)]
 
     def standing(self) -> dict[str, tuple[float, float] | str]:
         """Where vehicles stand on the ground, latitude and longitude in degrees, or why that is not known, by id."""
         known: dict[str, tuple[float, float] | str] = {}
         for system, v in list(self.fleet.vehicles.items()):
             place = "no position yet" if v.lat_deg is None or v.lon_deg is None else (v.lat_deg, v.lon_deg)
-            known[self.name_of(system)] = "in the air" if v.flying else place
+            known[self.names.name_of(system)] = "in the air" if v.flying else place
         return known
 
     def autopilots(self) -> dict[str, str]:
         """The autopilot of each vehicle that was heard, by id."""
-        return {self.name_of(system): v.autopilot.value for system, v in list(self.fleet.vehicles.items())}
+        return {self.names.name_of(system): v.autopilot.value for system, v in list(self.fleet.vehicles.items())}
 
     def rows(self) -> list[VehicleRow]:
         """All vehicles on the links as JSON values."""
@@ -217,17 +171,6 @@ class VehicleLinks:
     def clock() -> float:
         """Monotonic seconds, by which commands expire: a page that has them says when its command was given."""
         return time.monotonic()
-
-    def flight_state(self, vehicle: str) -> dict[str, Any]:
-        """What a vehicle is doing: `state`, `text`, `item`, `items`.
-
-        Raises:
-            OrthoSwarmError: it was not heard on any link.
-        """
-        from gcs_plugin.fleet.flight_state import flight_state
-
-        known = self.fleet.vehicles[self.system_of(vehicle)]
-        return self.fleet.call(partial(flight_state, known)).result(_SOON_S).document()
 
     def commands(
         self,
@@ -253,28 +196,24 @@ class VehicleLinks:
         Raises:
             InputError: there is no such command.
         """
-        from gcs_plugin.fleet.commands import VERBS, new_id
-
         if verb not in VERBS:
             raise InputError(f"there is no command '{verb}'; choose {', '.join(VERBS)}")
         given, number = self.clock() if given_s is None else min(given_s, self.clock()), command_id or new_id()
-        names = [self.name_of(s) for s in sorted(self.fleet.vehicles)] if vehicles is None else list(vehicles)
+        names = self.heard() if vehicles is None else list(vehicles)
         for system in list(self.fleet.vehicles):
-            if self.name_of(system) in names:
+            if self.names.name_of(system) in names:
                 self._returns.cancel(system)
         return self._give(verb, names, given, number, override or {})
 
     def _give(
         self,
-        verb: "Verb",
+        verb: Verb,
         names: Collection[str],
         given: float | None = None,
         number: str | None = None,
         override: Mapping[str, Collection[str]] = MappingProxyType({}),
     ) -> list[dict[str, Any]]:
         """Give a command, see `commands`; `given` and `number`: default now, and a new one."""
-        from gcs_plugin.fleet.commands import Order, new_id
-
         given, number = self.clock() if given is None else given, number or new_id()
         stops, fleet = dict(self.fleet.stops), self.fleet.vehicles
         standing = {s: v.standing for s, v in list(fleet.items())}
@@ -307,17 +246,14 @@ class VehicleLinks:
         Returns:
             A row per vehicle, see `commands`; one that holds until its turn comes has done as it was told.
         """
-        from gcs_plugin.fleet.commands import new_id
-
-        return self._returns.begin({self.name_of(s): s for s in sorted(self.fleet.vehicles)}, command_id or new_id())
+        return self._returns.begin(
+            {self.names.name_of(s): s for s in sorted(self.fleet.vehicles)}, command_id or new_id()
+        )
 
     def _without_command(
         self, verb: str, names: Collection[str], number: str, override: Mapping[str, Collection[str]]
     ) -> tuple[dict[str, dict[str, Any]], dict[str, int]]:
         """The rows of vehicles that need no command, and the system ids of the others."""
-        from gcs_plugin.fleet.commands import URGENT
-        from gcs_plugin.fleet.preflight import CONTINUED, ITEMS
-
         rows: dict[str, dict[str, Any]] = {}
         systems: dict[str, int] = {}
 
@@ -326,7 +262,7 @@ class VehicleLinks:
 
         for name in names:
             try:
-                systems[name] = self.system_of(name)
+                systems[name] = self.fleet.system_of(name)
             except OrthoSwarmError as error:
                 end(name, Verdict.NOT_SENT, str(error))
                 continue
@@ -335,7 +271,7 @@ class VehicleLinks:
                 checked = "its start is cancelled" if self._starting[systems[name]] else ""
                 if checked:
                     self.fleet.told_to_stop(systems[name])  # again, for a check that began after the first time
-                cancelled = self.waiting.cancel(name) or checked
+                cancelled = self.waiting.cancel(name, self.fleet) or checked
                 under_way = self.fleet.vehicles[systems[name]].armed or self.fleet.starting(systems[name])
                 if cancelled and not under_way:
                     end(name, Verdict.DONE, f"{name} stays on the ground: {cancelled}")
@@ -361,7 +297,7 @@ class VehicleLinks:
     def preflight(
         self,
         vehicles: Collection[str] | None = None,
-        missions: "Mapping[str, Mission] | None" = None,
+        missions: Mapping[str, Mission] | None = None,
         *,
         starts: Mapping[str, float] | None = None,
         needs: PlanNeeds = NO_NEEDS,
@@ -379,19 +315,27 @@ class VehicleLinks:
         Raises:
             OrthoSwarmError: a vehicle was not heard on any link.
         """
-        names = [self.name_of(s) for s in sorted(self.fleet.vehicles)] if vehicles is None else list(vehicles)
-        systems = {self.system_of(name): name for name in names}
+        names = self.heard() if vehicles is None else list(vehicles)
+        systems = {self.fleet.system_of(name): name for name in names}
         wanted = {s: missions[name] for s, name in systems.items() if missions and name in missions}
         times = {s: starts[name] for s, name in systems.items() if starts and name in starts}
         return self._checks.check(systems, wanted, times, needs=needs, reread=reread)
 
-    def command(self, begin: Callable[["Fleet"], "Exchange"], timeout_s: float = 180.0) -> str:
-        """Run a dialogue with a vehicle to its end; returns the final text.
+    def upload(self, system: int, mission: Mission) -> str:
+        """Put a mission into a vehicle, see `Fleet.upload`; returns what has come of it, in words.
 
         Raises:
             OrthoSwarmError: the vehicle refused, or did not answer.
         """
-        dialogue = self.fleet.call(partial(begin, self.fleet)).result(10.0)
+        return self.finish(self.fleet.call(partial(self.fleet.upload, system, mission)))
+
+    def finish(self, begun: Future[Any], timeout_s: float = 180.0) -> str:
+        """Wait for the end of a dialogue that the fleet begins; returns the final text.
+
+        Raises:
+            OrthoSwarmError: the vehicle refused, or did not answer.
+        """
+        dialogue = begun.result(10.0)
         end = time.monotonic() + timeout_s
         while dialogue.outcome is None:
             if time.monotonic() > end or self._stop.is_set():
@@ -399,7 +343,7 @@ class VehicleLinks:
             time.sleep(0.02)
         if not dialogue.outcome.ok:
             raise OrthoSwarmError(dialogue.outcome.text)
-        return dialogue.outcome.text
+        return str(dialogue.outcome.text)
 
     def job_ended(self, event: JobEnded) -> None:
         """Record what the refinement after a completion came to, and who still flew then."""
@@ -416,40 +360,40 @@ class VehicleLinks:
         self._journal.write(completion_refined(job.whose, facts))
         self._events.publish(CompletionRefined({"vehicle": job.vehicle, "sortie": job.sortie, **facts}))
 
-    def _tell_command(self, row: dict[str, Any]) -> None:
+    def _told(self, row: dict[str, Any]) -> None:
         self._events.publish(CommandDone(row))
 
     # -- what vehicles say (in the fleet's thread) ------------------------------------------------------------------
 
     def _record(self, system: int) -> _VehicleRecord:
         if system not in self._records:
-            name = self.name_of(system)
+            name = self.names.name_of(system)
             self._records[system] = _VehicleRecord(id=name, poses=self._poses.of(name))
         return self._records[system]
 
-    def _message(self, vehicle: "Vehicle", message: Any, utc: float) -> None:
-        record = self._record(vehicle.system)
-        record.poses.feed(message, utc)
+    def _message(self, vehicle: Vehicle, message: Any, utc: float) -> None:
+        self._record(vehicle.system).poses.feed(message, utc)
 
-    def _event(self, event: "FleetEvent") -> None:
-        name = self.name_of(event.system)
+    def _event(self, event: FleetEvent) -> None:
+        name = self.names.name_of(event.system)
         vehicle = self.fleet.vehicles[event.system]
         record = self._record(event.system)
         try:
             if event.kind == "found":
-                self._missions.found(vehicle, name)
+                self._found(vehicle, name)
             elif event.kind in ("started", "complete", "aborted", "suspended", "resumed"):
                 flying = [
-                    self.name_of(s)
+                    self.names.name_of(s)
                     for s, v in sorted(self.fleet.vehicles.items())
                     if s != event.system and (v.detector.phase is Phase.ACTIVE or v.flying) and not v.lost
                 ]
-                self._missions.note(event, vehicle, name, flying)
+                completion = {"complete_s": event.time_s, "still_flying": flying}
+                self._journal.write(mission_noted(name, event.kind, vehicle.detector.state(), completion))
                 self._events.publish(MissionNoted(name, event.kind))
         except OrthoSwarmError as error:  # the disk is full: flying goes on
             _log.error("%s", error)
         record.lost_since = time.monotonic() if event.kind == "lost" else None
-        text, pair = self._words(event), [self.name_of(system) for system in event.pair or ()]
+        text, pair = event.text, [self.names.name_of(system) for system in event.pair or ()]
         about: dict[str, Any] = {"vehicle": name, "kind": event.kind, "text": text, "time": event.time_s, "pair": pair}
         if event.kind == "text":
             said = {"text": vehicle.texts[-1], "severity": event.severity, "time": round(event.time_s, 1)}
@@ -460,16 +404,15 @@ class VehicleLinks:
             _log.log(logging.WARNING if grave else logging.INFO, "%s", text)
         self._events.publish(VehicleReported(about))
 
-    def _words(self, event: "FleetEvent") -> str:
-        """An event in words; one about two vehicles names them as the operator does."""
-        if event.pair is None:
-            return event.text
-        near = self.fleet.separation.alarms.get(event.pair)
-        return (
-            apart_text(event.pair, self.names.name_of)
-            if near is None
-            else near_text(near, self.fleet.separation, self.names.name_of)
-        )
+    def _found(self, vehicle: Vehicle, name: str) -> None:
+        """Record a detected vehicle; its detector continues from the state stored by an earlier daemon."""
+        detector = vehicle_state(self._journal, name).get("detector")
+        if detector and detector.get("autopilot") == vehicle.autopilot.value:
+            try:
+                vehicle.detector = CompletionDetector.from_state(detector)
+            except (KeyError, TypeError, ValueError):  # of another version
+                _log.warning("%s: what was known about its mission cannot be read", name)
+        self._journal.write(vehicle_found(name))
 
     # -- what time asks for -----------------------------------------------------------------------------------------
 
@@ -509,19 +452,17 @@ class VehicleLinks:
                 continue
             if vehicle.detector.phase not in (Phase.ACTIVE, Phase.SUSPENDED):
                 continue
-            given_up = self._missions.give_up(record.id)
+            given_up = self._journal.write(sortie_given_up(record.id))
             record.lost_since = None  # after that: if the disk is full, it is tried again
             if given_up:
                 _log.info("%s has been silent for long; what it sent is refined", record.id)
                 self._events.publish(MissionNoted(record.id, "lost"))
 
-    def _row(self, vehicle: "Vehicle", now: float) -> VehicleRow:
-        from gcs_plugin.fleet.flight_state import summary
-
+    def _row(self, vehicle: Vehicle, now: float) -> VehicleRow:
         record = self._record(vehicle.system)
         row = cast(VehicleRow, summary(vehicle, now))
         row["id"], row["name"] = record.id, self.names.title_of(record.id)
-        near = self.fleet.separation.text(vehicle.system, self.names.name_of)
+        near = self.fleet.separation.text(vehicle.system)
         row["alarm"] = "; ".join(text for text in (near, vehicle.danger and f"{record.id} {vehicle.danger}") if text)
         row["behind"] = self.fleet.behind(vehicle.system)
         row["yaw_deg"] = row["heading_deg"]

@@ -14,8 +14,11 @@ from typing import Any, Final, Protocol
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.items import Mission
+from gcs_plugin.mission.mission_builder import build_mission, read_mission
+from gcs_plugin.mission.mission_files import parse_mission
 from gcs_plugin.mission.plan_folder import PlanNeeds, plan_needs
 from gcs_plugin.plans.no_fly import refuse_no_zones
+from gcs_plugin.plans.plan_files import write_plan
 from gcs_plugin.plans.plan_request import AUTOPILOTS, ENDS, METHODS, RELIEFS, PlanRequest, make_plan
 from orthoswarm.config import DEFAULT, Config
 from orthoswarm.model.errors import InputError
@@ -77,7 +80,7 @@ class Plans:
         area = body.get("area")
         if not isinstance(area, dict):
             raise InputError("area is missing; send a GeoJSON polygon")
-        return self._make("area.geojson", area, _zones(body.get("no_fly")), values, notes)
+        return self.make_in("area.geojson", area, _zones(body.get("no_fly")), values, notes)
 
     def autopilots_of(self, vehicles: Sequence[str]) -> list[str]:
         """The autopilots of vehicles; ArduPilot for those that were not heard."""
@@ -103,44 +106,35 @@ class Plans:
             "one that stands elsewhere is not started: plan again when all of them stand there with a position"
         ]
 
-    def make_gaps(
+    def make_in(
         self,
-        gaps: Mapping[str, Any],
+        name: str,
+        area: Mapping[str, Any],
         no_fly: Mapping[str, Any] | None,
         values: Mapping[str, Any],
         notes: Sequence[str] = (),
     ) -> dict[str, Any]:
-        """Plan a flight over gaps; returns its figures with the plan's `id`.
+        """Plan in a new folder, with area and no-fly zones in it; returns the figures with the plan's `id`.
 
         Args:
-            gaps: GeoJSON as `orthoswarm coverage` writes it. no_fly: GeoJSON of zones, None if there are none.
-            values: further fields of the PlanRequest. notes: to be added to the plan's warnings.
+            name: of the area's file. area: GeoJSON, or gaps as `orthoswarm coverage` writes them.
+            no_fly: GeoJSON of zones, None if there are none. values: further fields of the PlanRequest.
+            notes: to be added to the plan's warnings.
 
         Raises:
             InputError: there is nothing to fly, or a value is invalid.
         """
-        return self._make("gaps.geojson", gaps, no_fly, values, notes)
-
-    def _make(
-        self,
-        name: str,
-        area: Mapping[str, Any],
-        zones: Mapping[str, Any] | None,
-        values: Mapping[str, Any],
-        notes: Sequence[str],
-    ) -> dict[str, Any]:
-        """Plan in a new folder, into which area and no-fly zones are written first."""
         plan = f"plan-{time.strftime('%Y%m%d-%H%M%S', time.gmtime())}-{time.time_ns() % 10**6:06d}"
         path = self.folder / plan
         path.mkdir(parents=True)
         try:
             (path / name).write_text(json.dumps(area), encoding="utf-8")
-            no_fly = []
-            if zones is not None:
-                no_fly = [path / _NO_FLY_FILE]
-                no_fly[0].write_text(json.dumps(zones), encoding="utf-8")
+            zones = []
+            if no_fly is not None:
+                zones = [path / _NO_FLY_FILE]
+                zones[0].write_text(json.dumps(no_fly), encoding="utf-8")
             with closing(WorkerPool(1)) as pool:
-                request = PlanRequest(area=path / name, no_fly=no_fly, dem=self.dem, config=self._config, **values)
+                request = PlanRequest(area=path / name, no_fly=zones, dem=self.dem, config=self._config, **values)
                 figures: dict[str, Any] = pool.run(partial(plan_into, notes=notes), request)
         except BaseException:
             shutil.rmtree(path, ignore_errors=True)
@@ -169,9 +163,6 @@ class Plans:
         Raises:
             InputError: there is none, or the text is not a mission file.
         """
-        from gcs_plugin.mission.mission_builder import build_mission, read_mission
-        from gcs_plugin.mission.mission_files import parse_mission
-
         if isinstance(body.get("text"), str):
             parsed = parse_mission(body["text"], "the mission")
             return build_mission(autopilot, parsed.items, parsed.home, "the mission")
@@ -328,7 +319,5 @@ def _positions(document: Any) -> Iterator[tuple[float, float]]:
 
 def plan_into(request: PlanRequest, notes: Sequence[str]) -> dict[str, Any]:
     """Plan in a worker and write the plan's folder; returns the figures, with notes before the plan's warnings."""
-    from gcs_plugin.plans.plan_files import write_plan
-
     plan, area = make_plan(request)
     return write_plan(request.area.parent, plan, area, request, notes=notes, picture=False)

@@ -9,6 +9,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -198,13 +199,13 @@ def _fly(daemon: "Daemon", setting: DemoSetting, report: ReportProgress) -> None
     delays = {v["id"]: v["flights"][0]["start_s"] for v in plan["vehicles"]}
     began = time.monotonic()
     for number, vehicle in enumerate(sorted(delays, key=lambda name: delays[name]), start=1):
-        system = links.system_of(vehicle)
+        system = links.fleet.system_of(vehicle)
         mission = daemon.plans.mission({"plan": plan["id"]}, vehicle, links.fleet.vehicles[system].autopilot)
-        links.command(lambda fleet, s=system, m=mission: fleet.upload(s, m))  # type: ignore[misc]
+        links.upload(system, mission)
         # with the planned delays, at least 6 s, so that one vehicle completes while others still fly
         due = began + max(delays[vehicle], 6.0 * (number - 1)) / setting.speed
         time.sleep(max(0.0, due - time.monotonic()))
-        links.command(lambda fleet, s=system: fleet.start(s))  # type: ignore[misc]
+        links.finish(links.fleet.call(partial(links.fleet.start, system)))
         report("starting", number, setting.vehicles)
     photos = sum(vehicle["photos"] for vehicle in plan["vehicles"])
 

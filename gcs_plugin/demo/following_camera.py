@@ -462,7 +462,7 @@ class Relay:
 
     def __init__(self, fleet: "Fleet", ground: Link | str, own: Address) -> None:
         self._fleet = fleet
-        self._hub = Hub([ground], own, self._from_ground)
+        self._hub = Hub([ground], own)
         self.down = self.up = 0
         fleet.tap(self._from_vehicle)
         self._stop = threading.Event()
@@ -482,7 +482,7 @@ class Relay:
 
     def _run(self) -> None:
         while not self._stop.is_set():
-            self._hub.poll(_WAIT_S)
+            self._hub.poll(_WAIT_S, self._from_ground)
 
     # -- in the fleet's thread ------------------------------------------------------------------------------------
 

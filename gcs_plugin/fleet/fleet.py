@@ -10,19 +10,19 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
 from concurrent.futures import Future
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Final, TypeVar
 
 from gcs_plugin.config import COMMAND
 from gcs_plugin.fleet.commands import URGENT, Order, Verb
-from gcs_plugin.fleet.dialogues import Dialogues
+from gcs_plugin.fleet.dialogues import Dialogues, continued, resumed
 from gcs_plugin.fleet.fleet_events import FleetEvent
-from gcs_plugin.fleet.going_on import continued, resumed
 from gcs_plugin.fleet.heard_messages import MESSAGE_IDS
 from gcs_plugin.fleet.link_hub import Hub
 from gcs_plugin.fleet.reception import Handler, Reception
+from gcs_plugin.fleet.separation.separation_watch import NUMBERED, VehicleNames
 from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.mavlink import Autopilot, Message
 from gcs_plugin.links.packets import Packet
@@ -57,7 +57,8 @@ class Fleet:
         own: our address.
         hub: the links. signed: whether it has a key.
         separation: watches the distances of vehicles in the air.
-        takeoff_due: whether a vehicle's takeoff waits or is being checked; it then takes no other mission.
+        takeoffs: those whose takeoff waits or is being checked; they take no other mission.
+        names: what vehicles are called where an event is about two of them.
         stops: number of the last command to pause, return or land, by system id; see `told_to_stop`.
     """
 
@@ -68,7 +69,8 @@ class Fleet:
         own: Address = GROUND_STATION,
         key: bytes | None = None,
         tlog: Path | None = None,
-        remembered: Mapping[int, Mapping[str, Any]] | None = None,
+        takeoffs: Container[int] = (),
+        names: VehicleNames = NUMBERED,
         clock: Callable[[], float] = time.monotonic,
         wall: Callable[[], float] = time.time,
     ) -> None:
@@ -79,16 +81,13 @@ class Fleet:
             own: our address; different from that of another ground station.
             key: signing key; with it only signed packets are accepted.
             tlog: telemetry log to append to.
-            remembered: result of `memory` before a restart of this program: no completion is missed or repeated.
-            clock: monotonic seconds. wall: UTC epoch seconds.
+            takeoffs, names: see above. clock: monotonic seconds. wall: UTC epoch seconds.
 
         Raises:
             InputError: a link cannot be opened.
         """
         self.own, self.vehicles, self.signed = own, dict[int, Vehicle](), key is not None
-        self.hub = Hub(
-            links, own, lambda *heard: self._reception.packet(*heard), key=key, tlog=tlog, clock=clock, wall=wall
-        )
+        self.hub = Hub(links, own, key=key, tlog=tlog, clock=clock, wall=wall)
         self._clock = clock
         self._listeners: list[Callable[[FleetEvent], None]] = []
         self._pauses: dict[int, tuple[Exchange, float]] = {}
@@ -99,12 +98,12 @@ class Fleet:
             self.hub,
             dialogues=self._dialogues,
             own=own,
-            remembered=remembered or {},
             event=self._publish,
             wall=wall,
+            names=names,
         )
         self.separation = self._reception.separation
-        self.takeoff_due: Callable[[int], bool] = lambda _: False
+        self.takeoffs, self.names = takeoffs, names
         self.stops: dict[int, int] = {}
         self._stop_numbers = itertools.count(1)
         self._tick_at = 0.0
@@ -178,6 +177,19 @@ class Fleet:
         """Send messages without waiting for answers; in the polling thread. Nothing is sent to an unknown vehicle."""
         self._dialogues.send(system, messages)
 
+    def system_of(self, name: str) -> int:
+        """The system id of a vehicle, by what it is called or that number; from any thread.
+
+        Raises:
+            OrthoSwarmError: it was not heard on any link.
+        """
+        called = {system: self.names.name_of(system) for system in list(self.vehicles)}
+        for system in called:
+            if name in (called[system], str(system)):
+                return system
+        heard = ", ".join(called[system] for system in sorted(called)) or "none"
+        raise OrthoSwarmError(f"{name} is not on the links (heard: {heard}); check links and system ids")
+
     def vehicle(self, system: int) -> Vehicle:
         """A vehicle that can be commanded.
 
@@ -199,7 +211,7 @@ class Fleet:
             OrthoSwarmError: the vehicle is not there, is not a multirotor, is flying its mission, is about to take
                 off, or is busy with another upload or start.
         """
-        if self.takeoff_due(system):
+        if system in self.takeoffs:
             raise OrthoSwarmError(f"vehicle {system} waits for its takeoff with the mission it has; cancel that first")
         vehicle = self._flies_missions(system)
         if vehicle.detector.phase is Phase.ACTIVE and vehicle.armed and not self._was_just_paused(system):
@@ -275,16 +287,9 @@ class Fleet:
         """Make a vehicle land at its position."""
         return self._now(self._dialogue("land", system))
 
-    def memory(self) -> dict[int, dict[str, Any]]:
-        """State of each vehicle's mission, as JSON values by system id; for `remembered` after a restart."""
-        return {system: vehicle.detector.state() for system, vehicle in self.vehicles.items()}
-
-    def problems(self, name_of: Callable[[int], str]) -> list[str]:
-        """Broken links, rejected packets, vehicles that sign and those that share a system id; from any thread.
-
-        `name_of` gives the id of a vehicle by its system id.
-        """
-        hub, vehicles = self.hub, list(self.vehicles.values())
+    def problems(self) -> list[str]:
+        """Broken links, rejected packets, vehicles that sign and those that share a system id; from any thread."""
+        hub, vehicles, name_of = self.hub, list(self.vehicles.values()), self.names.name_of
         problems = [f"{side.link.name}: {side.link.problem}" for side in hub.sides if side.link.problem]
         if hub.rejected:
             problems.append(f"{hub.rejected} packets had no valid signature; check the signing key")
@@ -384,7 +389,8 @@ class Fleet:
 
     def poll(self, timeout_s: float = 0.1) -> None:
         """Wait for input until the time-out, process all of it, and do what is due."""
-        self.hub.poll(min(timeout_s, min(self._tick_at, self._dialogues.deadline) - self._clock()))
+        due = min(self._tick_at, self._dialogues.deadline)
+        self.hub.poll(min(timeout_s, due - self._clock()), self._reception.packet)
         now = self._clock()
         self._dialogues.tick(now)
         if now >= self._tick_at:

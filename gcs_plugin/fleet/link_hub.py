@@ -46,7 +46,6 @@ class Hub:
         self,
         links: Iterable[Link | str],
         own: Address,
-        sink: Sink,
         *,
         key: bytes | None = None,
         tlog: Path | None = None,
@@ -57,12 +56,11 @@ class Hub:
 
         Args:
             links: links or their addresses.
-            sink: called with the link's side, the peer, the packet, the clock's time and UTC seconds of its arrival.
             key: signing key; with it only signed packets are accepted.
             tlog: telemetry log to append to.
             clock: monotonic seconds. wall: UTC epoch seconds.
         """
-        self.own, self._sink, self._clock, self._wall = own, sink, clock, wall
+        self.own, self._clock, self._wall = own, clock, wall
         opened = _make_links(links)
         self._tlog = TlogWriter(tlog) if tlog else None
         self._beat_at = 0.0
@@ -96,8 +94,12 @@ class Hub:
         self._bell.close()
         self._ear.close()
 
-    def poll(self, timeout_s: float) -> None:
-        """Wait for input until the time-out and pass all of it to the sink; send heartbeats."""
+    def poll(self, timeout_s: float, sink: Sink) -> None:
+        """Wait for input until the time-out and pass all of it on; send heartbeats.
+
+        Args:
+            sink: called with the link's side, the peer, the packet, the clock's time and UTC seconds of its arrival.
+        """
         wait = max(0.0, min(timeout_s, self._beat_at - self._clock()))
         polled = [side for side in self.sides if side.link.polled is not None]
         for key, events in self._selector.select(min(wait, 0.01) if polled else wait):
@@ -105,9 +107,9 @@ class Hub:
                 with contextlib.suppress(BlockingIOError):
                     self._ear.recv(4096)
                 continue
-            self._receive(self._by_link[key.data], key.fileobj, events)
+            self._receive(self._by_link[key.data], key.fileobj, events, sink)
         for side in polled:
-            self._receive(side, side.link.polled, selectors.EVENT_READ)
+            self._receive(side, side.link.polled, selectors.EVENT_READ, sink)
         while not self._work.empty():
             self._work.get()()
         now = self._clock()
@@ -134,9 +136,9 @@ class Hub:
             self._tlog.write(utc, raw)
         return accepted
 
-    def _receive(self, side: Side, source: Any, events: int) -> None:
+    def _receive(self, side: Side, source: Any, events: int, sink: Sink) -> None:
         now, utc = self._clock(), self._wall()
-        framers, peers, sink, signing, own = side.framers, side.peers, self._sink, side.signing, self.own
+        framers, peers, signing, own = side.framers, side.peers, side.signing, self.own
         for peer, data in side.link.receive(source, events, now):
             framer = framers.get(peer)
             if framer is None:

@@ -5,7 +5,7 @@ pre-arm checks, its filter) is included here, so that no vehicle takes off while
 """
 
 import enum
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from typing import Any, Final
 
@@ -14,7 +14,7 @@ from gcs_plugin.fleet.autopilot_settings import Setting, SetTo
 from gcs_plugin.fleet.fence_limits import fence_findings, fence_limits, in_all_zones
 from gcs_plugin.fleet.heard_messages import MESSAGE_IDS
 from gcs_plugin.fleet.separation.separation_check import SeparationFindings, flights_of, separation_of
-from gcs_plugin.fleet.separation.separation_watch import number_name
+from gcs_plugin.fleet.separation.separation_watch import NUMBERED, VehicleNames
 from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.geofence import FenceZone, breach
@@ -131,7 +131,7 @@ def preflight_all(
     *,
     needs: PlanNeeds = NO_NEEDS,
     legal_height_m: float = LIMITS.legal_height_m,
-    name: Callable[[int], str] = number_name,
+    names: VehicleNames = NUMBERED,
     separation: SeparationFindings | None = None,
     zones: Mapping[int, Sequence[FenceZone]] | None = None,
     reading: Collection[int] = (),
@@ -144,11 +144,11 @@ def preflight_all(
         stored: what was read from the vehicles just now. reading: vehicles whose missions are still being read.
         starts: takeoffs in seconds after the first; default 0. now: the fleet's clock.
         needs, legal_height_m: see Wanted. zones: of the geofences that were read.
-        name: name of a vehicle by its system id.
+        names: of the vehicles.
         separation: of them from each other and from others, where that was examined before.
     """
     if separation is None:
-        separation = separation_of(flights_of(vehicles, missions, stored, starts), name, needs)
+        separation = separation_of(flights_of(vehicles, missions, stored, starts), names, needs)
     return [
         preflight(
             vehicle,

@@ -4,8 +4,8 @@
 reasons why a vehicle would not arm.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final
+from collections.abc import Callable, Sequence
+from typing import Final
 
 from gcs_plugin.config import HEARING
 from gcs_plugin.fleet.dialogues import Dialogues
@@ -15,7 +15,7 @@ from gcs_plugin.fleet.heard_messages import HEARD, MESSAGE_IDS, HeardMessage, ra
 from gcs_plugin.fleet.link_hub import Hub, Side
 from gcs_plugin.fleet.message_rates import Streams
 from gcs_plugin.fleet.routes import LongText, Route
-from gcs_plugin.fleet.separation.separation_watch import SeparationWatch, apart_text, near_text
+from gcs_plugin.fleet.separation.separation_watch import SeparationWatch, VehicleNames, apart_text, near_text
 from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.mavlink import Autopilot, Message, dialect, has_place, is_vehicle
 from gcs_plugin.links.packets import Packet
@@ -49,7 +49,6 @@ class Reception:
 
     Args:
         vehicles: by system id; found vehicles are added.
-        remembered: states of detectors before a restart of this program, by system id.
         event: called with each event. wall: UTC epoch seconds.
 
     Attributes:
@@ -59,14 +58,15 @@ class Reception:
 
     def __init__(
         self, vehicles: dict[int, Vehicle], hub: Hub, *, dialogues: Dialogues, own: Address,
-        remembered: Mapping[int, Mapping[str, Any]], event: Callable[[FleetEvent], None], wall: Callable[[], float],
+        event: Callable[[FleetEvent], None], wall: Callable[[], float],
+        names: VehicleNames,
     ) -> None:  # fmt: skip
         self._vehicles, self._hub, self._dialogues, self._own = vehicles, hub, dialogues, own
-        self._remembered, self._publish, self._wall = dict(remembered), event, wall
+        self._publish, self._wall = event, wall
         self._counters: dict[tuple[Side, Peer, int, int], int] = {}
         self._said: dict[tuple[int, str], tuple[float, Route]] = {}
         self._lateness: dict[int, Lateness] = {}
-        self.separation = SeparationWatch()
+        self.separation = SeparationWatch(names=names)
         self.handlers: dict[int, list[Handler]] = {}
         self.taps: list[Callable[[Packet, float], None]] = []
 
@@ -195,9 +195,6 @@ class Reception:
             heard=now,
             kind=int(heartbeat.type),
         )
-        before = self._remembered.pop(packet.system, None)
-        if before is not None and before.get("autopilot") == autopilot.value:
-            vehicle.detector = CompletionDetector.from_state(before)
         self._vehicles[packet.system] = vehicle
         self._event("found", vehicle, f"was found ({autopilot.value})")
         return vehicle
@@ -260,7 +257,7 @@ class Reception:
         for near in new:
             self._event("near", self._vehicles[near.other], near_text(near, self.separation), near.pair)
         for pair in ended:
-            self._event("apart", self._vehicles[pair[1]], apart_text(pair), pair)
+            self._event("apart", self._vehicles[pair[1]], apart_text(pair, self.separation.names), pair)
 
     def _watch_danger(self, vehicle: Vehicle) -> None:
         """Tell once that a vehicle is in a failsafe, or sinks though nobody ordered it."""

@@ -2,10 +2,12 @@
 
 import asyncio
 import contextlib
+import os
+import time
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final, NamedTuple, TypeVar
 
 from fastapi import FastAPI, HTTPException, Query, Request, Response, WebSocket
 from starlette.responses import FileResponse
@@ -15,15 +17,16 @@ from gcs_plugin.daemon.daemon import Daemon
 from gcs_plugin.daemon.exports import zipped_folder
 from gcs_plugin.daemon.intake.posted_pose import parse_time
 from gcs_plugin.daemon.layers.web_tiles import TileAddress
-from gcs_plugin.daemon.metrics import prometheus
+from gcs_plugin.daemon.store.frame_rows import stage_counts
+from gcs_plugin.daemon.store.job_rows import job_counts
 from gcs_plugin.web.answers import JsonAnswer, in_thread, install_error_answers, json_body
 from gcs_plugin.web.areas import read_area
 from gcs_plugin.web.command_routes import CommandRoutes
-from gcs_plugin.web.event_stream import stream_events
+from gcs_plugin.web.event_stream import Standstill, stream_events
 from gcs_plugin.web.guard import Guard
-from gcs_plugin.web.standstill import Standstill
 from gcs_plugin.web.uploads import UploadRoute
 from orthoswarm import __version__
+from orthoswarm.compute.workers import peak_rss_mb
 from orthoswarm.export.tactical.places import feature
 
 Result = TypeVar("Result")
@@ -31,58 +34,48 @@ STATIC: Final = Path(__file__).parent / "static"
 _TYPES: Final = {"webp": "image/webp", "png": "image/png"}
 
 
-class CoverageRoutes:
-    """The functions of the routes.
+class Call(NamedTuple):
+    """A route that answers with what a function of the daemon gives; one that changes something gets the JSON body."""
 
-    Args:
-        daemon: the daemon with the coverage.
-    """
+    path: str
+    name: str
+    function: Callable[..., Any]
+    text: str
+    method: str = "GET"
+    status: int = 200
 
-    def __init__(self, daemon: Daemon) -> None:
-        self._daemon = daemon
-        self._threads = ThreadPoolExecutor(2, thread_name_prefix="coverage")
 
-    def install(self, app: FastAPI) -> None:
-        """Add the routes."""
-        app.add_api_route("/api/coverage", self.coverage)
-        app.add_api_route("/api/coverage/gaps.geojson", self.gaps)
-        app.add_api_route("/api/coverage/cells.png", self.cells)
-        app.add_api_route("/api/coverage/vehicles", self.vehicles)
-        app.add_api_route("/api/coverage/flight", self.flight, methods=["POST"], status_code=201)
-
-    async def vehicles(self) -> Response:
-        """Vehicles that could fly the gaps: battery, minutes left (null: unknown), and why one cannot at present."""
-        return JsonAnswer(await in_thread(self._threads, self._daemon.gap_flights.vehicles))
-
-    async def flight(self, request: Request) -> Response:
-        """Plan a flight over the gaps for {"vehicles": {"v1": minutes or null}, "altitude_m": M}; nothing is uploaded.
-
-        Answers the plan's figures with `id` and `names` (the plan's vehicle -> yours). Upload and start it as any plan.
-        """
-        body = await json_body(request)
-        return JsonAnswer(await in_thread(self._threads, self._daemon.gap_flights.plan, body), status_code=201)
-
-    async def coverage(self) -> Response:
-        """Coverage of the planned area: `state`, shares, `gaps` (each with area, cause, confidence and polygon).
-
-        `requests`: the pictures that were asked from vehicles, each with `state`, `reason`, `percent`.
-        """
-        return JsonAnswer(self._daemon.coverage.document | {"requests": self._daemon.picture_requests.rows()})
-
-    async def gaps(self) -> Response:
-        """The gaps as GeoJSON, as `orthoswarm coverage` writes them; `orthoswarm plan --gaps` reads them."""
-        return JsonAnswer(self._daemon.coverage.gaps, media_type="application/geo+json")
-
-    async def cells(self, request: Request) -> Response:
-        """The states of the cells as a PNG, an overlay with the `corners` of /api/coverage."""
-        data: bytes = self._daemon.coverage.png
-        if not data:
-            raise HTTPException(404, "there is no area yet; plan one, or draw it")
-        version: Any = self._daemon.coverage.document["version"]
-        headers = {"ETag": f'"{version}"', "Cache-Control": "no-cache"}
-        if f'"{version}"' in request.headers.get("if-none-match", ""):
-            return Response(status_code=304, headers=headers)
-        return Response(data, media_type="image/png", headers=headers)
+def calls(daemon: Daemon) -> list[Call]:
+    """The routes that do nothing but call a part of a daemon, in a thread."""
+    views, plans, console = daemon.views, daemon.plans, daemon.console
+    return [
+        Call("/api/vehicles", "vehicles", views.vehicles, "Every vehicle that was heard on a link or sent pictures."),
+        Call("/api/layers", "layers", views.layers,
+             "Layers with versions, bounds (west, south, east, north in degrees) and tile addresses."),
+        Call("/api/jobs", "jobs", daemon.jobs.documents, "The latest jobs, oldest first."),
+        Call("/api/legs", "legs", views.legs,
+             "The legs of refined vehicles as GeoJSON, with state (matched, carried, failed)."),
+        Call("/api/completions", "completions", views.completions,
+             "Times of vehicles' completions and of their refinements, and the vehicles still flying then."),
+        Call("/api/plans", "plans", plans.all, "The figures of all plans."),
+        Call("/api/plans", "plan", plans.make,
+             'Plan missions for {"area": GeoJSON, "vehicles": N, "altitude_m": M, "fov_min_deg": D, ...}.',
+             "POST", 201),
+        Call("/api/traffic", "traffic", daemon.links.traffic.rows,
+             "Other aircraft that the vehicles' ADS-B receivers hear."),
+        Call("/api/plan", "put_console_plan", console.put_plan,
+             "Replace the operator's plan; 409 if it has another `version` than the one that was changed.", "PUT"),
+        Call("/api/finds", "finds", console.finds, "Marked finds, oldest first."),
+        Call("/api/finds", "add_find", console.add_find,
+             "Mark a find: `lat_deg`, `lon_deg`, `sigma_m`, `note`; `time` (ISO 8601) if it was marked before now.",
+             "POST", 201),
+        Call("/api/coverage/vehicles", "vehicles", daemon.gap_flights.vehicles,
+             "Vehicles that could fly the gaps: battery, minutes left (null: unknown), and why one cannot at present."),
+        Call("/api/coverage/flight", "flight", daemon.gap_flights.plan,
+             'Plan a flight over the gaps for {"vehicles": {"v1": minutes or null}, "altitude_m": M}; nothing is'
+             " uploaded.\n\nAnswers the plan's figures with `id` and `names` (the plan's vehicle -> yours). Upload and"
+             " start it as any plan.", "POST", 201),
+    ]  # fmt: skip
 
 
 class HttpRoutes:
@@ -111,6 +104,20 @@ class HttpRoutes:
         """Run a function in a thread."""
         return await in_thread(self._tiles if tiles else self._threads, function, *values)
 
+    def install(self, app: FastAPI, call: Call) -> None:
+        """Add the route of a call."""
+
+        async def read() -> Response:
+            return JsonAnswer(await self.work(call.function), status_code=call.status)
+
+        async def change(request: Request) -> Response:
+            return JsonAnswer(await self.work(call.function, await json_body(request)), status_code=call.status)
+
+        app.add_api_route(
+            call.path, read if call.method == "GET" else change, methods=[call.method], name=call.name,
+            description=call.text, status_code=call.status,
+        )  # fmt: skip
+
     # -- reading --------------------------------------------------------------------------------------------------
 
     async def health(self) -> Response:
@@ -126,14 +133,6 @@ class HttpRoutes:
         text = await self.work(prometheus, self.daemon, self.uploads.waiting)
         return Response(text, media_type="text/plain; version=0.0.4; charset=utf-8")
 
-    async def vehicles(self) -> Response:
-        """Every vehicle that was heard on a link or sent pictures."""
-        return JsonAnswer(await self.work(self.daemon.views.vehicles))
-
-    async def traffic(self) -> Response:
-        """Other aircraft that the vehicles' ADS-B receivers hear."""
-        return JsonAnswer(await self.work(self.daemon.links.traffic.rows))
-
     async def frames(
         self,
         vehicle: str | None = None,
@@ -146,14 +145,6 @@ class HttpRoutes:
         rows = await self.work(self.daemon.views.frames, vehicle, moment, most)
         return JsonAnswer(rows)
 
-    async def layers(self) -> Response:
-        """Layers with versions, bounds (west, south, east, north in degrees) and tile addresses."""
-        return JsonAnswer(await self.work(self.daemon.views.layers))
-
-    async def jobs(self) -> Response:
-        """The latest jobs, oldest first."""
-        return JsonAnswer(await self.work(lambda: [job.document() for job in self.daemon.jobs.all()]))
-
     async def tile(self, request: Request, *, layer: str, z: int, x: int, y: int, suffix: str) -> Response:
         """A map tile; transparent where there is no picture. The ETag changes with the content."""
         address = TileAddress(z, x, y)
@@ -165,6 +156,28 @@ class HttpRoutes:
             return Response(status_code=304, headers=headers)
         data, fresh = await self.work(self.daemon.tiles.tile, layer, address, suffix, tiles=True)
         return Response(data, media_type=_TYPES[suffix], headers=headers | {"ETag": f'"{fresh}"'})
+
+    async def coverage(self) -> Response:
+        """Coverage of the planned area: `state`, shares, `gaps` (each with area, cause, confidence and polygon).
+
+        `requests`: the pictures that were asked from vehicles, each with `state`, `reason`, `percent`.
+        """
+        return JsonAnswer(self.daemon.coverage.document | {"requests": self.daemon.picture_requests.rows()})
+
+    async def cells(self, request: Request) -> Response:
+        """The states of the cells as a PNG, an overlay with the `corners` of /api/coverage."""
+        data: bytes = self.daemon.coverage.png
+        if not data:
+            raise HTTPException(404, "there is no area yet; plan one, or draw it")
+        version: Any = self.daemon.coverage.document["version"]
+        headers = {"ETag": f'"{version}"', "Cache-Control": "no-cache"}
+        if f'"{version}"' in request.headers.get("if-none-match", ""):
+            return Response(status_code=304, headers=headers)
+        return Response(data, media_type="image/png", headers=headers)
+
+    async def gaps(self) -> Response:
+        """The gaps as GeoJSON, as `orthoswarm coverage` writes them; `orthoswarm plan --gaps` reads them."""
+        return JsonAnswer(self.daemon.coverage.gaps, media_type="application/geo+json")
 
     # -- commands -------------------------------------------------------------------------------------------------
 
@@ -203,23 +216,6 @@ class HttpRoutes:
             raise HTTPException(404, "the file was removed; export again")
         return path
 
-    async def legs(self) -> Response:
-        """The legs of refined vehicles as GeoJSON, with state (matched, carried, failed)."""
-        return JsonAnswer(await self.work(self.daemon.views.legs))
-
-    async def completions(self) -> Response:
-        """Times of vehicles' completions and of their refinements, and the vehicles still flying then."""
-        return JsonAnswer(await self.work(self.daemon.views.completions))
-
-    async def plan(self, request: Request) -> Response:
-        """Plan missions for {"area": GeoJSON, "vehicles": N, "altitude_m": M, "fov_min_deg": D, ...}."""
-        body = await json_body(request)
-        return JsonAnswer(await self.work(self.daemon.plans.make, body), status_code=201)
-
-    async def plans(self) -> Response:
-        """The figures of all plans."""
-        return JsonAnswer(await self.work(self.daemon.plans.all))
-
     async def plan_map(self, number: str) -> Response:
         """A plan as GeoJSON: area, legs, ways, starts."""
         return Response(await self.work(self.daemon.plans.geojson, number), media_type="application/geo+json")
@@ -233,20 +229,6 @@ class HttpRoutes:
         """
         dem = self.daemon.plans.dem
         return JsonAnswer(await self.work(self.daemon.console.plan) | {"dem": None if dem is None else dem.name})
-
-    async def put_console_plan(self, request: Request) -> Response:
-        """Replace the operator's plan; 409 if it has another `version` than the one that was changed."""
-        body = await json_body(request)
-        return JsonAnswer(await self.work(self.daemon.console.put_plan, body))
-
-    async def finds(self) -> Response:
-        """Marked finds, oldest first."""
-        return JsonAnswer(await self.work(self.daemon.console.finds))
-
-    async def add_find(self, request: Request) -> Response:
-        """Mark a find: `lat_deg`, `lon_deg`, `sigma_m`, `note`; `time` (ISO 8601) if it was marked before now."""
-        body = await json_body(request)
-        return JsonAnswer(await self.work(self.daemon.console.add_find, body), status_code=201)
 
     async def change_find(self, number: int, request: Request) -> Response:
         """Change a find's place and note; 409 if it has another `version` than the one that was changed."""
@@ -329,32 +311,23 @@ def make_app(daemon: Daemon, token: str, bind: str = "127.0.0.1") -> Any:
 
     app = FastAPI(title="OrthoSwarm", version=__version__, lifespan=lifespan, docs_url=None, redoc_url=None)
     install_error_answers(app)
+    for call in calls(daemon):
+        routes.install(app, call)
     add = app.add_api_route
     add("/healthz", routes.health)
     add("/metrics", routes.metrics)
-    add("/api/vehicles", routes.vehicles)
     add("/api/frames", routes.frames)
     add("/api/frames", routes.uploads.post_frame, methods=["POST"], status_code=201, openapi_extra=_FORM)
-    add("/api/layers", routes.layers)
-    add("/api/jobs", routes.jobs)
     add("/api/refine", routes.refine, methods=["POST"], status_code=202)
     add("/api/export", routes.export, methods=["POST"], status_code=202)
     add("/api/export/{job}/{kind}", routes.exported)
-    add("/api/legs", routes.legs)
-    add("/api/completions", routes.completions)
-    add("/api/plans", routes.plans)
-    add("/api/plans", routes.plan, methods=["POST"], status_code=201)
     add("/api/plans/{number}/map", routes.plan_map)
     add("/api/plans/{number}/preflight", routes.commands.preflight, methods=["POST"])
     add("/api/plans/{number}/start", routes.commands.start_plan, methods=["POST"], status_code=202)
     add("/api/plans/{number}/start", routes.commands.cancel_start, methods=["DELETE"])
     add("/api/missions/{vehicle:path}/{verb}", routes.commands.mission, methods=["POST"])
     add("/api/areas", read_area, methods=["POST"])
-    add("/api/traffic", routes.traffic)
     add("/api/plan", routes.console_plan)
-    add("/api/plan", routes.put_console_plan, methods=["PUT"])
-    add("/api/finds", routes.finds)
-    add("/api/finds", routes.add_find, methods=["POST"], status_code=201)
     add("/api/finds/{number}/pictures", routes.find_pictures)
     add("/api/frames/{seq}/picture", routes.picture)
     add("/api/frames/{seq}/view", routes.picture_view)
@@ -362,7 +335,9 @@ def make_app(daemon: Daemon, token: str, bind: str = "127.0.0.1") -> Any:
     add("/api/finds/{number}", routes.change_find, methods=["PUT"])
     add("/api/finds/{number}", routes.delete_find, methods=["DELETE"], status_code=204)
     add("/tiles/{layer}/{z}/{x}/{y}.{suffix}", routes.tile, methods=["GET", "HEAD"])
-    CoverageRoutes(daemon).install(app)
+    add("/api/coverage", routes.coverage)
+    add("/api/coverage/gaps.geojson", routes.gaps)
+    add("/api/coverage/cells.png", routes.cells)
     app.add_api_websocket_route("/api/events", routes.events)
     if STATIC.is_dir():
         app.mount("/static", StaticFiles(directory=STATIC), name="static")
@@ -380,3 +355,83 @@ def make_app(daemon: Daemon, token: str, bind: str = "127.0.0.1") -> Any:
         return Response(status_code=204)
 
     return Guard(app, token, bind)
+
+
+_QUANTILES: Final = (0.5, 0.9, 0.99, 1)
+
+
+def prometheus(daemon: Daemon, uploads_waiting: int = 0) -> str:
+    """All figures, one metric a line with its help and type."""
+    lines: list[str] = []
+
+    def metric(name: str, kind: str, text: str, values: list[tuple[dict[str, str], float]]) -> None:
+        lines.append(f"# HELP orthoswarm_{name} {text}")
+        lines.append(f"# TYPE orthoswarm_{name} {kind}")
+        for labels, value in values:
+            inner = ",".join(f'{key}="{_escape(label)}"' for key, label in labels.items())
+            lines.append(f"orthoswarm_{name}{'{' + inner + '}' if inner else ''} {_number(value)}")
+
+    def single(name: str, kind: str, text: str, value: float) -> None:
+        metric(name, kind, text, [({}, value)])
+
+    drawer = daemon.drawer
+    metric("info", "gauge", "The program's version.", [({"version": __version__}, 1)])
+    single("uptime_seconds", "gauge", "Since the daemon was started.", time.time() - daemon.started)
+    stages = stage_counts(daemon.journal).items()
+    metric("frames", "gauge", "Frames in the workspace by stage.", [({"stage": stage}, n) for stage, n in stages])
+    single(
+        "frames_accepted_total", "counter", "Pictures accepted since the start.", sum(daemon.intake.accepted.values())
+    )
+    single("frames_drawn_total", "counter", "Frames drawn in real time since the start.", drawer.drawn)
+    single("frames_late_total", "counter", "Frames drawn later than a second after they came.", drawer.late)
+    single("draw_backlog", "gauge", "Frames that wait to be drawn.", drawer.backlog)
+    single("draw_put_off", "gauge", "Frames that wait because they would show least.", drawer.put_off)
+    text = "Longest time for which newer pictures of a vehicle have come than any that is drawn."
+    single("draw_behind_seconds", "gauge", text, drawer.behind_s)
+    recent = sorted(drawer.latencies)
+    metric(
+        "draw_latency_seconds", "gauge", "From arrival to the map, of the last thousand frames.",
+        [({"quantile": str(q)}, recent[min(len(recent) - 1, int(q * len(recent)))]) for q in _QUANTILES if recent],
+    )  # fmt: skip
+    metric(
+        "layer_version", "gauge", "Grows with every change of a layer.",
+        [({"layer": name}, layer.version) for name, layer in daemon.layers.items()],
+    )  # fmt: skip
+    counts = job_counts(daemon.journal)
+    metric("jobs", "gauge", "Jobs by kind and state.", [({"kind": k, "state": s}, n) for (k, s), n in counts.items()])
+    single("journal_commits_total", "counter", "Commits since the start.", daemon.journal.commits)
+    metric(
+        "pictures_refused_total", "counter", "Pictures refused, or not on the map, since the start, by cause.",
+        [({"cause": cause}, count) for cause, count in daemon.refused.counts.items()],
+    )  # fmt: skip
+    single("uploads_waiting", "gauge", "Posted pictures that wait for their turn.", uploads_waiting)
+    covered = daemon.coverage.document
+    names = ("seen", "poor", "missed", "planned")
+    shares = {name: covered[f"{name}_share"] for name in names}  # type: ignore[literal-required]
+    metric(
+        "coverage_share", "gauge", "Share of the planned area by state.",
+        [({"state": name}, share) for name, share in shares.items() if share is not None],
+    )  # fmt: skip
+    single("coverage_gaps", "gauge", "Gaps in the planned area.", len(covered["gaps"]))
+    single("coverage_seconds", "gauge", "Time that finding the gaps took last.", daemon.coverage.seconds)
+    single("problems", "gauge", "Problems at present.", len(daemon.problems()))
+    single("cpu_seconds_total", "counter", "CPU time of the daemon's own process.", time.process_time())
+    single("resident_megabytes", "gauge", "Memory of the daemon's own process.", _resident_mb())
+    return "\n".join(lines) + "\n"
+
+
+def _escape(text: str) -> str:
+    return text.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n").encode("utf-8", "replace").decode()
+
+
+def _number(value: float) -> str:
+    return f"{value:.9g}" if isinstance(value, float) else str(value)
+
+
+def _resident_mb() -> float:
+    """Memory of this process now, megabytes."""
+    try:
+        with open("/proc/self/statm", encoding="ascii") as file:
+            return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+    except (OSError, AttributeError):  # not Linux: the largest so far
+        return peak_rss_mb()

@@ -11,7 +11,7 @@ import asyncio
 import math
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -28,8 +28,7 @@ from gcs_plugin.fleet.commands import URGENT, VERBS, CommandResult, new_id
 from gcs_plugin.fleet.separation.returns import VERB as RETURN_VERB
 from gcs_plugin.mission.exchange import Verdict
 from gcs_plugin.web.answers import JsonAnswer, in_thread, json_body
-from gcs_plugin.web.event_stream import RUN
-from gcs_plugin.web.standstill import Standstill, clock_with_sleep
+from gcs_plugin.web.event_stream import RUN, Standstill, clock_with_sleep
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 
 Rows = list[dict[str, Any]]
@@ -73,7 +72,6 @@ class CommandRoutes:
         self._daemon, self._standstill = daemon, standstill
         self._threads = ThreadPoolExecutor(_THREADS, thread_name_prefix="commands")
         self._known: OrderedDict[str, tuple[tuple[str, str], asyncio.Task[Any]]] = OrderedDict()
-        self._cancelled: OrderedDict[str, None] = OrderedDict()  # ids of starts
 
     def close(self) -> None:
         """Stop the threads."""
@@ -136,7 +134,7 @@ class CommandRoutes:
     def _carry_out(self, vehicle: str, verb: str, issue: Issue, body: dict[str, Any]) -> Rows:
         """Execute a command and publish its outcome; runs in a thread."""
         links = self._daemon.links
-        names = _names(links) if vehicle == ALL else [vehicle]
+        names = links.heard() if vehicle == ALL else [vehicle]
         late = _late(issue, verb)
         if late is not None:
             rows = [CommandResult(issue.id, name, verb, Verdict.NOT_SENT, late).document() for name in names]
@@ -148,6 +146,9 @@ class CommandRoutes:
             override = _override(body, vehicle)
             began = links.clock() - max(0.0, issue.age_s)
             rows = links.commands(verb, names, given_s=began, command_id=issue.id, override=override)
+        return self._told(rows)
+
+    def _told(self, rows: Rows) -> Rows:
         for row in rows:
             self._daemon.events.publish(CommandDone(row))
         return rows
@@ -159,12 +160,12 @@ class CommandRoutes:
             return CommandResult(issue.id, vehicle, "upload", outcome, reason).document()
 
         try:
-            system = links.system_of(vehicle)
+            system = links.fleet.system_of(vehicle)
         except OrthoSwarmError as error:
             return result(Verdict.NOT_SENT, str(error))
         mission = self._daemon.plans.mission(body, vehicle, links.fleet.vehicles[system].autopilot)
         try:
-            return result(Verdict.DONE, links.command(lambda fleet: fleet.upload(system, mission)))
+            return result(Verdict.DONE, links.upload(system, mission))
         except OrthoSwarmError as error:
             return result(Verdict.REFUSED, str(error))
 
@@ -202,7 +203,6 @@ class CommandRoutes:
             begin = partial(
                 _begin, self._daemon.takeoffs, issue, number,
                 sortie=sortie, names=names, override=_override(body, ALL),
-                wanted=lambda: issue.id not in self._cancelled,
             )  # fmt: skip
             task = asyncio.ensure_future(in_thread(self._threads, begin))
             self._remember(issue.id, what, task)
@@ -217,9 +217,7 @@ class CommandRoutes:
         """
         issue = self._issue(await json_body(request))
         self._require_links()
-        self._cancelled[issue.id] = None
-        while len(self._cancelled) > _REMEMBERED:
-            self._cancelled.popitem(last=False)
+        self._daemon.takeoffs.cancel(issue.id)
         known = self._known.get(issue.id)
         rows: Rows = []
         if known is not None and known[0] == (number, _PLAN):
@@ -233,10 +231,7 @@ class CommandRoutes:
         return JsonAnswer({"plan": number, "results": rows})
 
     def _pause(self, vehicles: list[str], issue: Issue) -> Rows:
-        rows = self._daemon.links.commands("pause", vehicles, command_id=issue.id)
-        for row in rows:
-            self._daemon.events.publish(CommandDone(row))
-        return rows
+        return self._told(self._daemon.links.commands("pause", vehicles, command_id=issue.id))
 
     def _require_links(self) -> None:
         if not self._daemon.settings.links:
@@ -251,13 +246,12 @@ def _begin(
     sortie: int,
     names: dict[str, str],
     override: Mapping[str, Collection[str]],
-    wanted: Callable[[], bool],
 ) -> dict[str, float]:
     late = _late(issue, "start")
     if late is not None:
         raise OrthoSwarmError(f"{late}; no vehicle was started")
     began = VehicleLinks.clock() - max(0.0, issue.age_s)
-    return takeoffs.begin(number, sortie, names, override, wanted=wanted, given_s=began)
+    return takeoffs.begin(number, sortie, names, override, number=issue.id, given_s=began)
 
 
 def _seconds(body: Mapping[str, Any], key: str) -> float | None:
@@ -279,10 +273,6 @@ def _late(issue: Issue, verb: str) -> str | None:
     if age < -_AHEAD_S and verb not in _ENDS:  # the clock was set; what ends a flight counts as given now
         return f"it was given {-age:.0f} s from now; take the time from the daemon's heartbeats and give it again"
     return None
-
-
-def _names(links: VehicleLinks) -> list[str]:
-    return [links.name_of(system) for system in sorted(links.fleet.vehicles)]
 
 
 def _override(body: Mapping[str, Any], vehicle: str) -> dict[str, list[str]]:

@@ -16,8 +16,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gcs_plugin.daemon.exports import places_of
-from gcs_plugin.daemon.tak_feed import TakFeed
+from gcs_plugin.daemon.exports import TakFeed, places_of
 from orthoswarm.export.tactical.cursor_on_target import TakAddress, TakSender, event, write_data_package
 from orthoswarm.export.tactical.places import (
     FILE,

@@ -36,8 +36,11 @@ class StoppedWorkers:
 
     def __init__(self, target):
         self._target, self.began, self.ends = target, threading.Event(), threading.Event()
+        self.count, self.asked = 1, 0
 
     def run(self, function, task):
+        self.ends.clear()
+        self.asked += 1
         self._target(task).write_bytes(b"half")
         self.began.set()
         assert self.ends.wait(300)

@@ -15,6 +15,7 @@ from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.links.packets import Framer, checksum
 from gcs_plugin.links.tlog_writer import read_tlog
 from gcs_plugin.links.transports import UdpLink
+from gcs_plugin.mission.completion import CompletionDetector
 from gcs_plugin.mission.exchange import Address
 from gcs_plugin.mission.items import RTL, MissionItem
 from gcs_plugin.sim.lossy_radio import Faults
@@ -269,7 +270,7 @@ def test_a_restarted_station_misses_and_doubles_no_completion(make_world, autopi
     world.finish(world.fleet.upload(1, mission(autopilot, END)))
     world.finish(world.fleet.start(1))
     world.wait(20.0)
-    memory = json.loads(json.dumps({str(s): state for s, state in world.fleet.memory().items()}))
+    state = json.loads(json.dumps(world.fleet.vehicles[1].detector.state()))
     events = list(world.events)
     world.fleet.close()
     end = world.clock.now + gone_s
@@ -277,10 +278,14 @@ def test_a_restarted_station_misses_and_doubles_no_completion(make_world, autopi
         world.clock.now += 0.05
         for _ in world.link.receive(None, 1, world.clock.now):
             pass
-    world.fleet = Fleet(
-        [world.link], clock=world.clock, wall=world.clock.utc, remembered={int(s): m for s, m in memory.items()}
-    )
-    world.fleet.on_event(events.append)
+    world.fleet = Fleet([world.link], clock=world.clock, wall=world.clock.utc)
+
+    def heard(event):
+        events.append(event)
+        if event.kind == "found":  # as the daemon does
+            world.fleet.vehicles[1].detector = CompletionDetector.from_state(state)
+
+    world.fleet.on_event(heard)
     world.until(lambda: False, 150.0)
     assert [event.kind for event in events].count("complete") == 1
 

@@ -7,9 +7,9 @@ import time
 
 import pytest
 
-from gcs_plugin.daemon.airspace.traffic import Traffic
+from gcs_plugin.daemon.airspace import Traffic
 from gcs_plugin.daemon.settings import Settings, VehicleSettings
-from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.daemon.store.daemon_events import Events
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.daemon.takeoffs import Takeoffs
 from gcs_plugin.daemon.vehicles import VehicleLinks
@@ -71,6 +71,11 @@ def wait(done, limit_s=120.0):
     assert done()
 
 
+def doing(links, vehicle):
+    """The flight state of a vehicle, in a word."""
+    return next(row["flight"]["state"] for row in links.rows() if row["id"] == vehicle)
+
+
 def ready(links, count):
     def known():
         rows = links.rows()
@@ -83,7 +88,7 @@ def ready(links, count):
 def upload_all(links, folder):  # noqa: F811
     for system, vehicle in links.fleet.vehicles.items():
         loaded = read_mission(folder / f"v{system}.waypoints", vehicle.autopilot)
-        links.command(lambda fleet, s=system, m=loaded: fleet.upload(s, m))
+        links.upload(system, loaded)
 
 
 def test_all_are_commanded_at_once_with_an_outcome_each(open_links, folder):  # noqa: F811
@@ -100,10 +105,10 @@ def test_all_are_commanded_at_once_with_an_outcome_each(open_links, folder):  # 
     assert all(r["outcome"] == "refused" and "separation" in r["reason"] for r in refused)  # all on one path
     override = {name: ["separation"] for name in ("v1", "v2", "v3")}
     assert [r["outcome"] for r in links.commands("start", override=override)] == ["done"] * 3
-    wait(lambda: all(links.flight_state(f"v{n}")["state"] == "on mission" for n in (1, 2, 3)))
+    wait(lambda: all(doing(links, f"v{n}") == "on mission" for n in (1, 2, 3)))
     assert [r["outcome"] for r in links.commands("rtl")] == ["done"] * 3
     home = {"returning", "landing", "on ground"}  # at ten times the speed a busy machine may see only the last
-    wait(lambda: {links.flight_state(name)["state"] for name in ("v1", "v2", "v3")} <= home)
+    wait(lambda: {doing(links, name) for name in ("v1", "v2", "v3")} <= home)
     assert [r["outcome"] for r in links.commands("land", ["v2"])] == ["done"]
     late = links.commands("rtl", ["v1"], given_s=links.clock() - 6.0)
     assert late[0]["outcome"] == "not_sent" and re.search(r"was given \d+ s ago and was not sent", late[0]["reason"])
@@ -175,10 +180,10 @@ def test_a_takeoff_that_waits_is_cancelled_by_rtl(open_links, folder):  # noqa: 
 def test_an_alarm_names_two_vehicles_whatever_the_operator_called_them(open_links):
     """The one with system id 1 is called v2: the one with system id 2 needs another name."""
     links = open_links(make_swarm(2, home=HOME), named=(VehicleSettings("v2", 1),))
-    assert (links.name_of(1), links.name_of(2), links.name_of(3)) == ("v2", "system-2", "v3")
-    watch = SeparationWatch(alarms={(1, 2): Near(2, 1, 4.0, 1.0)})
+    assert tuple(map(links.names.name_of, (1, 2, 3))) == ("v2", "system-2", "v3")
+    watch = SeparationWatch(alarms={(1, 2): Near(2, 1, 4.0, 1.0)}, names=links.names)
     for system in (1, 2):
-        assert watch.text(system, links.name_of).startswith("system-2 and v2 are 4.0 m apart and 1.0 m in height")
+        assert watch.text(system).startswith("system-2 and v2 are 4.0 m apart and 1.0 m in height")
 
 
 def adsb(number, lat_deg, *, flags=0xFF, tslc=0, callsign=b"SWR12"):
@@ -238,7 +243,7 @@ def test_vehicles_of_one_start_return_in_turn_and_one_given_another_command_does
     upload_all(links, folder)
     override = {name: ["separation"] for name in ("v1", "v2", "v3")}
     assert [r["outcome"] for r in links.commands("start", override=override)] == ["done"] * 3
-    wait(lambda: all(links.flight_state(f"v{n}")["state"] == "on mission" for n in (1, 2, 3)))
+    wait(lambda: all(doing(links, f"v{n}") == "on mission" for n in (1, 2, 3)))
     rows = links.return_in_turn("turn-1")
     assert [(r["id"], r["vehicle"], r["command"], r["outcome"]) for r in rows] == [
         ("turn-1", f"v{n}", "return", "done") for n in (1, 2, 3)
@@ -253,8 +258,8 @@ def test_vehicles_of_one_start_return_in_turn_and_one_given_another_command_does
     assert [r["outcome"] for r in links.commands("land", [second])] == ["done"]
     assert next(row for row in links.rows() if row["id"] == second)["returns_after"] is None
     down = {"on ground", "complete"}
-    wait(lambda: all(links.flight_state(n)["state"] in down for n in ("v1", "v2", "v3")), 240.0)
-    landed = links.fleet.vehicles[links.system_of(second)]
+    wait(lambda: all(doing(links, n) in down for n in ("v1", "v2", "v3")), 240.0)
+    landed = links.fleet.vehicles[links.fleet.system_of(second)]
     assert landed.mode == "LAND"  # not sent home after it was told to land
 
 

@@ -9,20 +9,18 @@ CAMERA_FEEDBACK cannot be asked for.
 
 from collections import deque
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
-from gcs_plugin.daemon.store.exposure_rows import Exposed, all_exposures, exposures_added
+from gcs_plugin.daemon.store.frame_rows import Exposed, all_exposures, exposures_added
 from gcs_plugin.daemon.store.journal import Journal
-from gcs_plugin.daemon.vehicle_names import VehicleNames
+from gcs_plugin.fleet.fleet import Fleet
+from gcs_plugin.fleet.separation.separation_watch import VehicleNames
+from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.mavlink import Message, dialect
 from orthoswarm.coverage.missing_pictures import CameraEvent
 from orthoswarm.model.geo import LocalGrid
-
-if TYPE_CHECKING:
-    from gcs_plugin.fleet.fleet import Fleet
-    from gcs_plugin.fleet.vehicle_state import Vehicle
 
 MESSAGES: Final = ("CAMERA_IMAGE_CAPTURED", "CAMERA_FEEDBACK")
 _AFTER_2001_S: Final = 1e9
@@ -45,7 +43,7 @@ class ExposureJournal:
         self._boot_s: dict[int, float] = {}
         self._last: dict[int, tuple[int, float]] = {}
 
-    def message(self, vehicle: "Vehicle", message: Any, utc_s: float) -> None:
+    def message(self, vehicle: Vehicle, message: Any, utc_s: float) -> None:
         """Process a message of MESSAGES; of a vehicle that sends both kinds, only the kind received first is used."""
         kind, system = message.get_type(), vehicle.system
         if self._kinds.setdefault(system, kind) != kind:
@@ -61,7 +59,8 @@ class ExposureJournal:
             return  # a repetition
         self._last[system] = number, time_s
         place = (lat * 1e-7, lon * 1e-7) if lat or lon else (None, None)
-        self._fresh.append((self._names.name_of(system), int(number), _utc(time_s, utc_s), *place))
+        taken_s = time_s if time_s > _AFTER_2001_S else utc_s  # a clock without a date: when it came
+        self._fresh.append((self._names.name_of(system), int(number), taken_s, *place))
 
     def _dated(self, system: int, message: Any, utc_s: float) -> float:
         """When a picture was taken; without a date in it, by the time since boot, since an event may come late."""
@@ -86,11 +85,6 @@ class ExposureJournal:
         return found
 
 
-def _utc(time_s: float, received_s: float) -> float:
-    """Time of exposure: from the message, or its arrival if its clock has no date."""
-    return time_s if time_s > _AFTER_2001_S else received_s
-
-
 @dataclass(slots=True)
 class _Camera:
     """What is known of a camera's numbers: the highest, and those left out with tries made and the time of the last."""
@@ -102,13 +96,13 @@ class _Camera:
 class EventRequests:
     """Asks vehicles' cameras for the events that have not come; runs in the links' thread."""
 
-    def __init__(self, fleet: "Fleet") -> None:
+    def __init__(self, fleet: Fleet) -> None:
         self._fleet = fleet
         self._cameras: dict[tuple[int, int], _Camera] = {}
         fleet.subscribe(self._captured, "CAMERA_IMAGE_CAPTURED")
         fleet.subscribe(self._tick, "HEARTBEAT")
 
-    def _captured(self, vehicle: "Vehicle", message: Any, _: float) -> None:
+    def _captured(self, vehicle: Vehicle, message: Any, _: float) -> None:
         camera = self._cameras.setdefault((vehicle.system, int(message.get_srcComponent())), _Camera())
         number, highest = int(message.image_index), camera.highest
         camera.missing.pop(number, None)
@@ -118,7 +112,7 @@ class EventRequests:
         camera.missing |= dict.fromkeys(range(highest + 1, number), (0, 0.0))
         camera.highest = max(highest, number)
 
-    def _tick(self, vehicle: "Vehicle", _: Any, utc_s: float) -> None:
+    def _tick(self, vehicle: Vehicle, _: Any, utc_s: float) -> None:
         for (system, component), camera in self._cameras.items():
             if system == vehicle.system:
                 self._fleet.send(system, _requests(system, component, camera, utc_s))

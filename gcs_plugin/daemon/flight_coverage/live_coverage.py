@@ -18,21 +18,22 @@ from typing import Any, Final, Protocol, TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from gcs_plugin.daemon.flight_coverage.battery_use import BatteryUse
 from gcs_plugin.daemon.flight_coverage.exposure_journal import ExposureJournal
-from gcs_plugin.daemon.flight_coverage.flown_legs import FlownLegs, flies
-from gcs_plugin.daemon.flight_coverage.picture_views import FlawedPictures, Measured, PictureViews
-from gcs_plugin.daemon.flight_coverage.planned_area import (
+from gcs_plugin.daemon.flight_coverage.flown_legs import (
     AreaSource,
+    BatteryUse,
     CoveredArea,
+    FlownLegs,
     area_source,
+    flies,
     read_covered_area,
     zone_features,
 )
+from gcs_plugin.daemon.flight_coverage.picture_views import FlawedPictures, Measured, PictureViews
 from gcs_plugin.daemon.layers.realtime_layer import Drawer
+from gcs_plugin.daemon.stoppable_thread import Background
 from gcs_plugin.daemon.store.console_state import ConsoleState
-from gcs_plugin.daemon.store.daemon_events import CoverageChanged, PictureDrawn
-from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.daemon.store.daemon_events import CoverageChanged, Events, PictureDrawn
 from gcs_plugin.daemon.store.frame_rows import last_drawn_arrival
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.daemon.vehicle_names import VehicleRow
@@ -54,6 +55,7 @@ _LEAST_PAUSE: Final = 3.0
 _MOST_CELLS: Final = 16_000_000  # of the grid; cells grow beyond it
 _ON_THE_WAY_S: Final = 15.0
 _FACT: Final = "coverage"
+_TOLD: Final = ("state", "version", "seen_share", "poor_share", "missed_share", "planned_share")
 _log = logging.getLogger(__name__)
 _LARGEST_PX: Final = 2048
 _SHOWN_FIRST: Final = (CellState.MISSED, CellState.POOR, CellState.PLANNED, CellState.SEEN, CellState.EXCLUDED)
@@ -144,7 +146,7 @@ class LinkedVehicles(Protocol):
     latest: Rows
 
 
-class LiveCoverage:
+class LiveCoverage(Background):
     """Updates the coverage.
 
     Args:
@@ -159,12 +161,12 @@ class LiveCoverage:
         self, journal: Journal, events: Events, *, views: PictureViews, console: ConsoleState, plans: Path,
         drawer: Drawer, vehicles: LinkedVehicles, exposures: ExposureJournal,
     ) -> None:  # fmt: skip
+        super().__init__("coverage", join_s=None)
         self._journal, self._events, self._views = journal, events, views
         self._console, self._plans, self._drawer, self._vehicles = console, plans, drawer, vehicles
         self._exposures = exposures
         self._fresh: deque[tuple[View, PictureQuality | None]] = deque()
-        self._bell, self._stop = threading.Event(), threading.Event()
-        self._thread = threading.Thread(target=self._run, name="coverage", daemon=True)
+        self._bell = threading.Event()
         self._followed: _Followed | None = None
         self._result = _NOTHING
         self._version = 0
@@ -174,16 +176,11 @@ class LiveCoverage:
         self.seconds = 0.0
         self.battery = BatteryUse()
 
-    def start(self) -> None:
-        """Start, with the content of the workspace."""
-        self._thread.start()
-
     def close(self) -> None:
         """Stop."""
         self._stop.set()
         self._bell.set()
-        if self._thread.ident is not None:
-            self._thread.join()
+        super().close()
 
     def picture_drawn(self, event: PictureDrawn) -> None:
         """Take a picture that is on the real-time layer; any thread."""
@@ -347,17 +344,12 @@ class LiveCoverage:
         here = self._followed
         began, cpu = time.monotonic(), time.thread_time()
         self._version += 1
-        if here is None:
-            self._result = _NOTHING
-        else:
-            self._result = self._found(here)
+        self._result = _NOTHING if here is None else self._found(here)
         self.seconds = time.monotonic() - began
         self._rest_until = time.monotonic() + _LEAST_PAUSE * (time.thread_time() - cpu)
         found = self._result.document
-        self._events.publish(CoverageChanged(
-            gaps=len(found["gaps"]), state=found["state"], version=found["version"], seen_share=found["seen_share"],
-            poor_share=found["poor_share"], missed_share=found["missed_share"], planned_share=found["planned_share"],
-        ))  # fmt: skip
+        told: dict[str, Any] = {key: found[key] for key in _TOLD}
+        self._events.publish(CoverageChanged({"gaps": len(found["gaps"]), **told}))
 
     def _found(self, here: _Followed) -> _Result:
         cover, grid = here.cover, here.covered.area.grid

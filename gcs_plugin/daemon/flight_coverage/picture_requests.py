@@ -7,31 +7,103 @@ certain is not read. While a command or a mission is under way with any vehicle 
 
 import contextlib
 import logging
-import threading
+import re
 import time
-from collections.abc import Callable, Iterable
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import Any, Final
 from urllib.parse import unquote, urlsplit
 
-from gcs_plugin.daemon.flight_coverage.file_download import FileRead, FolderList
-from gcs_plugin.daemon.flight_coverage.file_numbers import PictureNames
-from gcs_plugin.daemon.flight_coverage.ftp_talk import FtpTalk, LinkShare
+import numpy as np
+
+from gcs_plugin.daemon.flight_coverage.file_download import FileRead, FolderList, FtpTalk, LinkShare
 from gcs_plugin.daemon.flight_coverage.live_coverage import LiveCoverage, MissingRow
 from gcs_plugin.daemon.intake.picture_intake import PictureIntake
 from gcs_plugin.daemon.intake.posted_pose import PostedPose, linked_pose
-from gcs_plugin.daemon.store.daemon_events import RequestsChanged
-from gcs_plugin.daemon.store.event_bus import Events
-from gcs_plugin.daemon.store.exposure_rows import exposure_place, exposure_times
-from gcs_plugin.daemon.store.frame_rows import dated_images, pose_near
+from gcs_plugin.daemon.stoppable_thread import Background
+from gcs_plugin.daemon.store.daemon_events import Events, RequestsChanged
+from gcs_plugin.daemon.store.frame_rows import dated_images, exposure_place, exposure_times, pose_near
 from gcs_plugin.daemon.store.journal import Journal
+from gcs_plugin.fleet.fleet import Fleet
+from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.file_transfer import payload_of
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 from telemetry.live.live_poses import LinkPoses
 
-if TYPE_CHECKING:
-    from gcs_plugin.fleet.fleet import Fleet
-    from gcs_plugin.fleet.vehicle_state import Vehicle
+_SURE: Final = 0.9  # share of the pictures that agree on the shift of numbers
+_LEAST: Final = 3  # pictures for it
+_PICTURES: Final = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
+
+
+@dataclass(slots=True)
+class PictureNames:
+    """The pictures of a vehicle that have arrived.
+
+    Attributes:
+        images: their names. shift: number of a file less that of its camera event; None if there is no such number.
+    """
+
+    images: set[str] = field(default_factory=set)
+    shift: int | None = 0
+
+    @staticmethod
+    def of(pictures: Iterable[tuple[str, float]], events: Iterable[tuple[int, float]]) -> "PictureNames":
+        """From arrived pictures (name, UTC seconds) and camera events (number, UTC seconds).
+
+        Each picture belongs to the event nearest in time, within half of the usual time between events. The shift is
+        0 while fewer than three pictures have arrived, and None if the differences of the numbers vary.
+        """
+        arrived, exposed = list(pictures), sorted(events, key=lambda event: event[1])
+        images = {image for image, _ in arrived}
+        times = np.array([time_s for _, time_s in exposed])
+        if len(times) < 2:
+            return PictureNames(images)
+        slack_s = 0.5 * float(np.median(np.diff(times)))
+        shifts: Counter[int] = Counter()
+        for image, time_s in arrived:
+            nearest = int(np.abs(times - time_s).argmin())
+            number = number_of(image)
+            if number is not None and abs(times[nearest] - time_s) <= slack_s:
+                shifts[number - exposed[nearest][0]] += 1
+        if shifts.total() < _LEAST:
+            return PictureNames(images)
+        shift, count = shifts.most_common(1)[0]
+        return PictureNames(images, shift if count >= _SURE * shifts.total() else None)
+
+    def find(self, number: int, files: Mapping[str, int]) -> tuple[str, str]:
+        """The path of an event's picture among a vehicle's files, and why there is none ("" where there is one)."""
+        if self.shift is None:
+            return "", "the numbers of its files do not match those of its camera events"
+        pictures = [path for path in files if path.lower().endswith(_PICTURES)]
+        if self.images:
+            forms = {_form(image) for image in self.images}
+            same_form = [path for path in pictures if _form(path) in forms]
+            if pictures and not same_form:
+                return "", "its files have other names than the pictures that have arrived"
+            pictures = same_form
+        found = [path for path in pictures if number_of(path) == number + self.shift]
+        same = [path for path in found if path.rpartition("/")[0] in self._folders(files)]
+        found = same or found
+        if len(found) > 1:
+            return "", f"several of its files have number {number + self.shift}"
+        return (found[0], "") if found else ("", f"it has no picture file with number {number + self.shift}")
+
+    def _folders(self, files: Mapping[str, int]) -> set[str]:
+        """The folders with pictures that have arrived."""
+        return {path.rpartition("/")[0] for path in files if path.rpartition("/")[2] in self.images}
+
+
+def _form(name: str) -> str:
+    """A name without its numbers: `img_#.jpg`."""
+    return re.sub(r"\d+", "#", name.rpartition("/")[2].lower())
+
+
+def number_of(name: str) -> int | None:
+    """The last number in a file's name."""
+    digits = re.findall(r"\d+", name.rpartition("/")[2])
+    return int(digits[-1]) if digits else None
+
 
 _EVENT: Final = "camera event"
 _STEP_S, _LOOK_S = 0.02, 1.0
@@ -86,34 +158,15 @@ class _Server:
     urls: dict[int, str] = field(default_factory=dict)
 
 
-class Heard(Protocol):
-    """The vehicles on the links."""
-
-    def system_of(self, vehicle: str) -> int:
-        """The system id of a vehicle.
-
-        Raises:
-            OrthoSwarmError: it is not on the links.
-        """
-
-
 class FetchedPictures:
     """What the requests for pictures need of the workspace."""
 
     def __init__(
-        self, links: Heard, journal: Journal, events: Events, *, poses: LinkPoses, coverage: LiveCoverage,
+        self, journal: Journal, events: Events, *, poses: LinkPoses, coverage: LiveCoverage,
         intake: PictureIntake,
     ) -> None:  # fmt: skip
-        self._links, self._journal, self._events = links, journal, events
+        self._journal, self._events = journal, events
         self._poses, self._coverage, self._intake = poses, coverage, intake
-
-    def system_of(self, vehicle: str) -> int:
-        """The system id of a vehicle.
-
-        Raises:
-            OrthoSwarmError: it is not on the links.
-        """
-        return self._links.system_of(vehicle)
 
     def wanted(self) -> Iterable[WantedPicture]:
         """The pictures that were taken and have not arrived."""
@@ -129,7 +182,7 @@ class FetchedPictures:
         Raises:
             InputError: it is no picture, or neither pose is known. OrthoSwarmError: the disk is full or missing.
         """
-        linked = linked_pose(wanted.vehicle, name, wanted.time_s, self._poses.at(wanted.vehicle, wanted.time_s))
+        linked = linked_pose(self._poses, wanted.vehicle, name, wanted.time_s)
         self._intake.add(linked or self._event_pose(wanted, name), data)
 
     def changed(self) -> None:
@@ -153,7 +206,7 @@ class FetchedPictures:
         return PostedPose(wanted.vehicle, name, wanted.time_s, values, {"position": _EVENT, "time": _EVENT})
 
 
-class PictureRequests:
+class PictureRequests(Background):
     """Asks vehicles for their pictures.
 
     Args:
@@ -164,13 +217,14 @@ class PictureRequests:
 
     def __init__(
         self,
-        fleet: "Fleet",
+        fleet: Fleet,
         workspace: FetchedPictures,
         *,
         folder: str = "/DCIM",
         most_bytes_s: float = 30_000.0,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
+        super().__init__("picture requests")
         self._fleet, self._workspace, self._folder, self._clock = fleet, workspace, folder, clock
         self._on = most_bytes_s > 0.0
         self._share = LinkShare(max(1.0, most_bytes_s))
@@ -180,21 +234,13 @@ class PictureRequests:
         self._reading: _Request | None = None
         self._stepped = self._busy_at = -_QUIET_S
         self._told_at = 0.0
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="picture requests", daemon=True)
         fleet.subscribe(self._answered, "FILE_TRANSFER_PROTOCOL")
         fleet.subscribe(self._captured, "CAMERA_IMAGE_CAPTURED")
 
     def start(self) -> None:
-        """Start the thread."""
+        """Start the thread. A picture that is being read when it stops is read anew after the next start."""
         if self._on:
-            self._thread.start()
-
-    def close(self) -> None:
-        """Stop; a picture that is being read is read anew after the next start."""
-        self._stop.set()
-        if self._thread.ident is not None:
-            self._thread.join(5.0)
+            super().start()
 
     def rows(self) -> list[dict[str, Any]]:
         """All requests as JSON values, by vehicle and number: `state`, `reason`, `percent`, `image`."""
@@ -256,7 +302,7 @@ class PictureRequests:
             request.state, request.reason = "refused", str(error)
         except OrthoSwarmError as error:  # the disk is full: it is read again when there is room
             request.state, request.reason = "waiting", str(error)
-            self._servers[self._workspace.system_of(request.wanted.vehicle)].not_before = self._clock() + _AGAIN_S
+            self._servers[self._fleet.system_of(request.wanted.vehicle)].not_before = self._clock() + _AGAIN_S
         else:
             request.state, request.reason = "arrived", ""
         request.read = None
@@ -280,7 +326,7 @@ class PictureRequests:
         waiting = [r for r in self._requests.values() if r.state in ("waiting", "refused")]
         for request in sorted(waiting, key=lambda r: (r.state, r.wanted.time_s)):
             try:
-                system = self._workspace.system_of(request.wanted.vehicle)
+                system = self._fleet.system_of(request.wanted.vehicle)
             except OrthoSwarmError:
                 continue
             server = self._servers.setdefault(system, _Server())
@@ -333,7 +379,7 @@ class PictureRequests:
         """All waiting requests to a vehicle are refused for one reason; they are tried again later."""
         for request in self._requests.values():
             with contextlib.suppress(OrthoSwarmError):
-                if request.state == "waiting" and self._workspace.system_of(request.wanted.vehicle) == system:
+                if request.state == "waiting" and self._fleet.system_of(request.wanted.vehicle) == system:
                     request.state, request.reason, request.path = "refused", reason, ""
         self._servers[system].files = None
 
@@ -353,14 +399,14 @@ class PictureRequests:
             return
         talk.step(now)
 
-    def _answered(self, vehicle: "Vehicle", message: Any, _: float) -> None:
+    def _answered(self, vehicle: Vehicle, message: Any, _: float) -> None:
         talk, answer = self._talk, payload_of(message)
         if talk is None or answer is None or vehicle.system != talk.system:
             return
         if message.target_system == self._fleet.own.system:
             talk.answer(answer, self._clock())
 
-    def _captured(self, vehicle: "Vehicle", message: Any, _: float) -> None:
+    def _captured(self, vehicle: Vehicle, message: Any, _: float) -> None:
         server = self._servers.setdefault(vehicle.system, _Server())
         server.component = int(message.get_srcComponent())
         url = message.file_url

@@ -10,8 +10,8 @@ import time
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
-from gcs_plugin.daemon.stoppable_thread import StoppableThread
-from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.daemon.stoppable_thread import Background
+from gcs_plugin.daemon.store.daemon_events import Events
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 from telemetry.live.live_poses import LivePoses
 
@@ -49,7 +49,7 @@ def check_bus(bus: str) -> None:
         )
 
 
-class CanReader:
+class CanReader(Background):
     """Reads one vehicle's bus in its own thread."""
 
     def __init__(
@@ -75,28 +75,19 @@ class CanReader:
         """
         from telemetry.live.dronecan_bus import CanSource
 
+        super().__init__(f"CAN bus of {vehicle}")
         self.vehicle = vehicle
         self._bus, self._events, self._state, self._said = bus, events, "waiting", ""
         self._source = CanSource(poses)
         self._heard, self._count = float("-inf"), 0
-        run = self._read
+        self._tunnel: _Tunnel | None = None
         if bus.partition(":")[0] == _TUNNEL:
             if not fleet.hub.sides or system is None:
                 raise InputError(
                     f"the CAN bus of {vehicle} is behind its MAVLink link, and there is none; give --link, and the "
                     f"vehicle's system id in the workspace's orthoswarm.toml where its name is not v1 to v255"
                 )
-            tunnel = _Tunnel(fleet, system, int(bus.partition(":")[2] or 1), self._source)
-            run = tunnel.run
-        self._thread = StoppableThread(run, f"CAN bus of {vehicle}")
-
-    def start(self) -> None:
-        """Start reading."""
-        self._thread.start()
-
-    def close(self) -> None:
-        """Stop reading."""
-        self._thread.close()
+            self._tunnel = _Tunnel(fleet, system, int(bus.partition(":")[2] or 1), self._source)
 
     def document(self) -> dict[str, Any]:
         """Its state as JSON values: `bus`, `state` and, by node id, messages `received` and `lost`."""
@@ -106,17 +97,20 @@ class CanReader:
         state = "receiving" if now - self._heard < _SILENT_S else self._state
         return {"bus": self._bus, "state": state, "nodes": self._source.nodes()}
 
-    def _read(self, stop: threading.Event) -> None:
+    def _run(self) -> None:
         import can
 
-        while not stop.is_set():
+        if self._tunnel is not None:
+            self._tunnel.run(self._stop)
+            return
+        while not self._stop.is_set():
             try:
                 self._state = "waiting"
-                self._source.run(self._bus, stop)
+                self._source.run(self._bus, self._stop)
                 return
             except (OrthoSwarmError, OSError, can.CanError) as error:
                 self._fail(str(error))
-            stop.wait(_AGAIN_S)
+            self._stop.wait(_AGAIN_S)
 
     def _fail(self, reason: str) -> None:
         """Report a problem once; the connection is retried all the time."""

@@ -1,25 +1,107 @@
-"""All pictures come into the workspace here: posted, from streams, from folders, and fetched from vehicles."""
+"""All pictures come into the workspace here: posted, from streams, from folders, and fetched from vehicles.
+
+Those that were refused, dropped or left off the map are counted by cause; recent ones are problems.
+"""
 
 import logging
 import threading
 import time
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from gcs_plugin.daemon.intake.posted_pose import PostedPose, frame_of, linked_pose
-from gcs_plugin.daemon.intake.refused_pictures import RefusedPictures
-from gcs_plugin.daemon.store.daemon_events import CardRead, PictureStored
-from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.daemon.store.daemon_events import Events, PictureRefused, PictureRejected, PictureStored
 from gcs_plugin.daemon.store.frame_rows import add_frame, frame_by_key
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.daemon.store.picture_store import PictureStore, frame_key, picture_size
 from gcs_plugin.daemon.store.sortie_rows import present_sortie
 from gcs_plugin.daemon.store.workspace_lock import require_space
+from gcs_plugin.links.tlog_writer import write_link_log
+from orthoswarm.export.product_files import iso_time
 from orthoswarm.model.errors import OrthoSwarmError, StorageError
-from telemetry.live.live_poses import LinkPose, LinkPoses
+from telemetry.live.live_poses import LinkPoses
+
+CAUSES: Final = {
+    "disk": "the workspace's disk is full or gone",
+    "pose": "the pose is wrong or missing",
+    "picture": "the file is not a picture, or too large",
+    "time": "the upload stood still",
+    "name": "another picture of the vehicle has the name",
+    "place": "the picture's position cannot be on the map",
+    "map": "the picture cannot be drawn",
+}
+_NEWS_S: Final = 600.0
+
+
+@dataclass(slots=True)
+class _Refusals:
+    count: int
+    vehicle: str
+    image: str
+    reason: str
+    time_s: float
+
+
+class RefusedPictures:
+    """Counts them since the daemon's start; any thread.
+
+    Args:
+        events: told of each. clock: UTC epoch seconds.
+    """
+
+    def __init__(self, events: Events, clock: Callable[[], float] = time.time) -> None:
+        self._events, self._clock = events, clock
+        self._lock = threading.Lock()
+        self._by_cause: dict[str, _Refusals] = {}
+
+    def note(self, cause: str, reason: str, vehicle: str = "", image: str = "") -> None:
+        """Count one.
+
+        Args:
+            cause: one of CAUSES. reason: in a sentence. vehicle, image: as far as known.
+        """
+        with self._lock:
+            before = self._by_cause.get(cause)
+            count = 1 if before is None else before.count + 1
+            self._by_cause[cause] = _Refusals(count, vehicle, image, reason, self._clock())
+        self._events.publish(PictureRefused(cause, count, vehicle, image, reason))
+
+    def picture_rejected(self, event: PictureRejected) -> None:
+        """Count a stored picture that cannot be on the map."""
+        self.note("place" if event.misplaced else "map", event.reason, event.frame.vehicle, event.frame.image)
+
+    def note_name_taken(self, vehicle: str, image: str) -> None:
+        """Count a picture whose name another one of the vehicle has; the first one stays."""
+        text = f"{vehicle} sent another picture by a name that it used before"
+        self.note("name", f"{text}; have its camera or computer count on, and send it again", vehicle, image)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Cause -> how many; every cause is there."""
+        with self._lock:
+            return {cause: self._by_cause[cause].count if cause in self._by_cause else 0 for cause in CAUSES}
+
+    def rows(self) -> list[dict[str, Any]]:
+        """A row per cause with `cause`, `text`, `count` and the last one's `vehicle`, `image`, `reason`, `time`."""
+        with self._lock:
+            return [
+                {
+                    "cause": cause, "text": CAUSES[cause], "count": r.count, "vehicle": r.vehicle, "image": r.image,
+                    "reason": r.reason, "time": iso_time(r.time_s),
+                }
+                for cause, r in self._by_cause.items()
+            ]  # fmt: skip
+
+    def problems(self) -> list[str]:
+        """A sentence for each cause of the last ten minutes."""
+        now = self._clock()
+        with self._lock:
+            recent = [r for r in self._by_cause.values() if now - r.time_s < _NEWS_S]
+        return [f"{r.count} picture{'s' * (r.count > 1)} refused or not on the map: {r.reason}" for r in recent]
+
 
 _FULL_S: Final = 2.0
 _log = logging.getLogger(__name__)
@@ -80,38 +162,19 @@ class PictureIntake:
 
     def _with_fix(self, pose: PostedPose) -> PostedPose:
         """The pose; if its receiver had no fix, with the values of the vehicle's link at that time."""
-        if pose.has_fix or pose.time_s is None:
-            return pose
-        linked = linked_pose(pose.vehicle, pose.image, pose.time_s, self._poses.at(pose.vehicle, pose.time_s))
+        linked = None if pose.has_fix else linked_pose(self._poses, pose.vehicle, pose.image, pose.time_s)
         if linked is None:
             return pose
         without = {k: v for k, v in pose.values.items() if k not in ("lat_deg", "lon_deg", "gps_fix")}
         return replace(linked, values=linked.values | without, origin=linked.origin | pose.origin)
 
 
-@dataclass(frozen=True, slots=True)
-class LinkLog:
-    """The packets of all vehicles on the links, of this run and earlier ones.
-
-    Attributes:
-        path: the telemetry log; it may be absent. systems: MAVLink system ids by the vehicles' ids.
-    """
-
-    path: Path
-    systems: Mapping[str, int]
-
-    def write(self, vehicle: str, out: Path) -> bool:
-        """Write a vehicle's packets into its own log; False if there are none."""
-        from gcs_plugin.links.tlog_writer import write_link_log
-
-        return vehicle in self.systems and write_link_log(self.path, self.systems[vehicle], out) > 0
-
-
 class VehicleIntake:
     """One vehicle's pictures on their way into the workspace, from a stream or a folder.
 
     Args:
-        intake: takes the pictures. poses, link_log: where pictures without a pose get theirs from.
+        system: its MAVLink system id, None without. intake: takes the pictures.
+        poses, tlog: where pictures without a pose get theirs from; the log of all links may be absent.
         cache: folder of the workspace for the folder's state, and for pictures of videos until they are stored.
 
     Attributes:
@@ -119,10 +182,18 @@ class VehicleIntake:
     """
 
     def __init__(
-        self, vehicle: str, intake: PictureIntake, events: Events, *, poses: LinkPoses, link_log: LinkLog, cache: Path
+        self,
+        vehicle: str,
+        intake: PictureIntake,
+        events: Events,
+        *,
+        poses: LinkPoses,
+        tlog: Path,
+        system: int | None,
+        cache: Path,
     ) -> None:
         self.vehicle, self.cache, self.stop, self.taken = vehicle, cache, threading.Event(), 0
-        self._intake, self._events, self._poses, self._link_log = intake, events, poses, link_log
+        self.events, self.poses, self._intake, self._tlog, self._system = events, poses, intake, tlog, system
 
     def keep(self, pose: PostedPose, data: bytes) -> None:
         """Store a picture; if the disk is full, wait until there is room."""
@@ -132,24 +203,12 @@ class VehicleIntake:
                 self.taken += new
                 return
             except StorageError as error:
-                self.notify(str(error))
+                self.events.say(str(error))
                 self.stop.wait(_FULL_S)
             except OrthoSwarmError as error:
                 _log.warning("%s of %s: %s", pose.image, self.vehicle, error)
                 return
 
-    def pose_at(self, time_s: float) -> LinkPose | None:
-        """The vehicle's pose at a time (UTC epoch seconds), from its link and bus."""
-        return self._poses.at(self.vehicle, time_s)
-
     def link_log(self, out: Path) -> bool:
-        """Write the vehicle's packets so far to a .tlog; False if there are none."""
-        return self._link_log.write(self.vehicle, out)
-
-    def notify(self, text: str) -> None:
-        """Tell the operator something."""
-        self._events.say(text)
-
-    def settled(self) -> None:
-        """Tell that the folder has stopped changing after new pictures."""
-        self._events.publish(CardRead(self.vehicle))
+        """Write the vehicle's packets, of this run and earlier ones, to a .tlog; False if there are none."""
+        return self._system is not None and write_link_log(self._tlog, self._system, out) > 0

@@ -92,7 +92,7 @@ class PictureSource:
         def state(text: str) -> None:
             before, self._state = self._state, text.split(":")[0]
             if self._state != before:  # every attempt fails while a camera sends nothing on the ground
-                self._intake.notify(f"the pictures of {self.vehicle}: {self._state}")
+                self._intake.events.say(f"the pictures of {self.vehicle}: {self._state}")
 
         for picture in open_stream(self.where, stop=self._intake.stop, on_state=state, timeout_s=_SILENT_S):
             pose = self._pose(picture)
@@ -108,7 +108,7 @@ class PictureSource:
         recorded = {"position": own.lat_deg, "height": own.height_m, "angles": own.yaw_deg}
         origins = dict.fromkeys((key for key, value in recorded.items() if value is not None), origin)
         if not own.has_position or own.yaw_deg is None or own.height_m is None:
-            linked = self._intake.pose_at(time_s)
+            linked = self._intake.poses.at(self.vehicle, time_s)
             if linked is not None:
                 own, origins = own.merge(linked.sample), linked.origin | origins
         values = pose_values(own)

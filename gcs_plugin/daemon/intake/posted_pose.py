@@ -14,7 +14,7 @@ from gcs_plugin.daemon.store.picture_store import PictureStore
 from orthoswarm.model.earth import distance_m
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.frame import Frame
-from telemetry.live.live_poses import LinkPose
+from telemetry.live.live_poses import LinkPoses
 from telemetry.samples import sample_frame
 from telemetry.samples.sample import Sample
 from telemetry.samples.sample_frame import sample_of
@@ -154,8 +154,9 @@ def apart_m(a: Mapping[str, float], b: Mapping[str, float]) -> float:
     return distance_m(a["lat_deg"], a["lon_deg"], b["lat_deg"], b["lon_deg"])
 
 
-def linked_pose(vehicle: str, name: str, time_s: float | None, linked: LinkPose | None) -> PostedPose | None:
-    """What a vehicle's link and bus say as if it had been posted; None without a position."""
+def linked_pose(poses: LinkPoses, vehicle: str, name: str, time_s: float | None) -> PostedPose | None:
+    """What a vehicle's link and bus say of a picture as if it had been posted; None without a time or a position."""
+    linked = None if time_s is None else poses.at(vehicle, time_s)
     values = None if linked is None else pose_values(linked.sample)
     return None if linked is None or values is None else PostedPose(vehicle, name, time_s, values, linked.origin)
 

@@ -1,8 +1,8 @@
 """Watches a folder that receives a vehicle's photos and videos, over a network or from a memory card.
 
-A file is read when it is complete (`file_complete`) and has not changed between two scans. Files read are remembered
-in the workspace, so that after a restart, or for a known card, only the names are compared. Pictures without a
-pose of their own get it from the vehicle's link, or from a log, subtitles or table in the folder.
+A file is read when it is complete (`is_complete`, by the end of its data) and has not changed between two scans. Files
+read are remembered in the workspace, so that after a restart, or for a known card, only the names are compared.
+Pictures without a pose of their own get it from the vehicle's link, or from a log, subtitles or table in the folder.
 """
 
 import contextlib
@@ -11,6 +11,7 @@ import json
 import logging
 import os
 import shutil
+import struct
 import tempfile
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -18,13 +19,107 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from gcs_plugin.daemon.intake.file_complete import is_complete, is_video_complete
 from gcs_plugin.daemon.intake.picture_intake import VehicleIntake
 from gcs_plugin.daemon.intake.posted_pose import apart_m, linked_pose, posted_frame
+from gcs_plugin.daemon.store.daemon_events import CardRead
 from orthoswarm.model.errors import OrthoSwarmError
 
 if TYPE_CHECKING:
     from orthoswarm.model.frame import Frame, Ingest, Rejection
+
+_SOI: Final = b"\xff\xd8"
+_SOS: Final = 0xDA
+_EOI: Final = b"\xff\xd9"
+_BARE: Final = frozenset({0x01, *range(0xD0, 0xD8)})
+"""JPEG markers without a length."""
+
+
+def is_complete(data: bytes, suffix: str) -> bool:
+    """Whether a picture's bytes are complete; True for formats in which this is unknown.
+
+    A stalled copy, or one whose reserved space is still zeros, is not complete.
+
+    Args:
+        data: the file's bytes so far. suffix: of its name, with the dot.
+    """
+    kind = suffix.lower()
+    if kind in (".jpg", ".jpeg"):
+        return _jpeg(data)
+    if kind == ".png":
+        return b"IEND\xaeB`\x82" in data[-64:]
+    if kind == ".webp":
+        return len(data) >= 12 and len(data) >= 8 + int(struct.unpack_from("<I", data, 4)[0])
+    if kind == ".bmp":
+        return len(data) >= 6 and len(data) >= int(struct.unpack_from("<I", data, 2)[0])
+    return _opens(data)
+
+
+def _jpeg(data: bytes) -> bool:
+    """Whether the main picture's end of image is there (ITU-T T.81, B.1): thumbnails in APP segments end earlier."""
+    if not data.startswith(_SOI):
+        return len(data) > 4  # not a JPEG: its reader reports that
+    at = 2
+    while at + 4 <= len(data):
+        if data[at] != 0xFF:
+            return False
+        marker = data[at + 1]
+        if marker == 0xFF:  # a fill byte
+            at += 1
+        elif marker in _BARE:
+            at += 2
+        elif marker == _SOS:
+            return data.find(_EOI, at) >= 0
+        else:
+            at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    return False
+
+
+def _opens(data: bytes) -> bool:
+    """Whether a picture of another kind (TIFF) can be decoded to its last row."""
+    import io
+
+    from PIL import Image
+
+    from orthoswarm.raster.picture_file import PictureError, picture_size
+
+    try:
+        picture_size(data)
+    except PictureError:
+        return len(data) > 64  # not a picture, or too large: its reader reports that
+    try:
+        with Image.open(io.BytesIO(data)) as picture:
+            picture.load()
+    except (OSError, ValueError, SyntaxError, EOFError, struct.error, Image.DecompressionBombError):
+        return False
+    return True
+
+
+def is_video_complete(path: Path) -> bool:
+    """Whether an MP4 or MOV contains all its boxes, including the index; True for other formats.
+
+    Raises:
+        OSError: the file cannot be read.
+    """
+    if path.suffix.lower() not in (".mp4", ".mov", ".m4v"):
+        return True
+    size, at, index = path.stat().st_size, 0, False
+    with path.open("rb") as file:
+        while at + 8 <= size:
+            file.seek(at)
+            head = file.read(16)
+            length, kind = int.from_bytes(head[:4], "big"), head[4:8]
+            if at == 0 and kind not in (b"ftyp", b"moov", b"mdat", b"free", b"wide", b"skip", b"styp"):
+                return True  # not such a file
+            if length == 1:
+                length = int.from_bytes(head[8:16], "big")
+            index |= kind in (b"moov", b"moof")
+            if length == 0:  # to the end of the file
+                return index or kind == b"moov"
+            if length < 8:
+                return False
+            at += length
+    return index and at <= size
+
 
 _POLL_S: Final = 0.25
 _SCAN_SHARE: Final = 0.1  # of the time that looking at the folder may take
@@ -195,7 +290,7 @@ class FolderReader:
         self._pair(here, now)
         if self._fresh_at is not None and not self._busy() and now - self._fresh_at > _REST_S:
             self._fresh_at = None
-            self._intake.settled()
+            self._intake.events.publish(CardRead(self._intake.vehicle))
 
     def _scan(self, folder: Path) -> Iterator[tuple[Path, Stamp]]:
         """Files of the wanted kinds with their stamps, by name; unreadable ones are left for the next scan."""
@@ -243,7 +338,7 @@ class FolderReader:
         file.again_at = now + _UNCHANGED_S
         if now - file.since > _STALLED_S and not file.stall_reported:
             file.stall_reported = True
-            self._intake.notify(f"{self._name(path)} of {self._intake.vehicle} is incomplete; copy it again")
+            self._intake.events.say(f"{self._name(path)} of {self._intake.vehicle} is incomplete; copy it again")
 
     # -- storing -----------------------------------------------------------------------------------------------
 
@@ -295,9 +390,8 @@ class FolderReader:
                     "%s: %s", self._name(path), rejection.reason if rejection else "no picture can be read from it"
                 )
                 continue
-            linked = None if rejection.time_s is None else self._intake.pose_at(rejection.time_s)
             name = self._folder_state.name(self._name(path), digest)
-            posted = linked_pose(self._intake.vehicle, name, rejection.time_s, linked)
+            posted = linked_pose(self._intake.poses, self._intake.vehicle, name, rejection.time_s)
             if posted is None:
                 self.poseless.add(path)
                 continue
@@ -344,8 +438,8 @@ class FolderReader:
     def _keep(self, frame: "Frame", name: str, data: bytes) -> None:
         """Store a frame; missing height and angles come from the link, if its position agrees."""
         posted = posted_frame(frame, self._intake.vehicle, name)
-        if posted.time_s is not None and ("height_m" not in posted.values or "yaw_deg" not in posted.values):
-            linked = linked_pose(posted.vehicle, name, posted.time_s, self._intake.pose_at(posted.time_s))
+        if "height_m" not in posted.values or "yaw_deg" not in posted.values:
+            linked = linked_pose(self._intake.poses, posted.vehicle, name, posted.time_s)
             if linked is not None and apart_m(linked.values, posted.values) < _NEAR_M:
                 for key in ("lat_deg", "lon_deg", "position_sigma_m", "altitude_m"):
                     linked.values.pop(key, None)
@@ -378,7 +472,7 @@ class FolderReader:
         said = [] if self._zone_told else times_without_zone(frames)
         self._zone_told |= bool(said)
         for finding in said:
-            self._intake.notify(f"{self._intake.vehicle}: {finding}")
+            self._intake.events.say(f"{self._intake.vehicle}: {finding}")
 
     def _tables(self, photos: Iterable[Path]) -> list[Path]:
         """Tables of poses (geo.txt, CSV) in the photos' folder or above it, within the watched folder."""
@@ -411,7 +505,7 @@ class FolderReader:
                 self._take_paired(waiting, found, copies)
         if self.poseless and self.poseless != self._told:
             self._told, count = frozenset(self.poseless), len(self.poseless)
-            self._intake.notify(
+            self._intake.events.say(
                 f"{count} files of {self._intake.vehicle} wait for poses; put the flight's log next to them"
             )
 
@@ -423,19 +517,12 @@ class FolderReader:
             mine = frames.get(self._name(path), [])
             with contextlib.suppress(OSError):  # gone meanwhile: left for the next scan
                 if mine and "#" in mine[0].image:
-                    self._keep_video(path, replace_frames(found, mine), video_digest(path))
+                    self._keep_video(path, replace(found, frames=mine, rejected=[]), video_digest(path))
                 elif mine:
                     data = path.read_bytes()
                     digest = digest_of(data)
                     self._keep(mine[0], self._folder_state.name(self._name(path), digest), data)
                     self._done(path, digest)
-
-
-def replace_frames(found: "Ingest", frames: "list[Frame]") -> "Ingest":
-    """A copy with other frames and nothing rejected."""
-    from orthoswarm.model.frame import Ingest
-
-    return Ingest(frames, [], found.warnings)
 
 
 def _stand_in(path: Path, place: Path) -> None:

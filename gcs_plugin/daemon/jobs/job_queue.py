@@ -3,19 +3,31 @@
 A job that was queued or running when the daemon ended is queued again; it must be repeatable up to the
 journal change that also marks it as done. Refinements have their own threads; background jobs
 (coarse maps in flight, joint refinements of neighbours, tones, exports) run one at a time in another thread. They
-start only while no refinement waits or runs; drawing a layer again does not wait.
+start only while no refinement waits or runs, and give way to one that begins; drawing a layer again does not wait.
+`JobRequests` asks for jobs when something has happened: a leg is over, a mission complete, a refinement done.
 """
 
 import logging
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import replace
-from typing import Any, Final
+from dataclasses import dataclass, replace
+from typing import Any, Final, TypeVar
 
-from gcs_plugin.daemon.store.daemon_events import JobChanged, JobDropped, JobEnded, JobsStop, Problem
-from gcs_plugin.daemon.store.event_bus import Events
-from gcs_plugin.daemon.store.frame_rows import newest_seq
+from gcs_plugin.daemon.jobs.leg_watch import LegWatch
+from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
+from gcs_plugin.daemon.jobs.workspace_products import FORMATS, PRODUCTS
+from gcs_plugin.daemon.store.daemon_events import (
+    CardRead,
+    Events,
+    JobChanged,
+    JobEnded,
+    LegsOver,
+    MissionNoted,
+    Problem,
+    VehicleSilent,
+)
+from gcs_plugin.daemon.store.frame_rows import Whose, late_frames, newest_seq, photographed_sorties, unplaced_frames
 from gcs_plugin.daemon.store.job_rows import (
     Job,
     find_job,
@@ -26,55 +38,104 @@ from gcs_plugin.daemon.store.job_rows import (
     new_job,
     open_jobs,
     queued_jobs,
+    refinement_is_open,
     waiting_jobs_dropped,
 )
 from gcs_plugin.daemon.store.journal import Change, Journal, all_changes
-from orthoswarm.model.errors import OrthoSwarmError, StorageError, WorkerStoppedError
+from gcs_plugin.daemon.store.sortie_rows import complete_sorties, is_complete, present_sortie
+from orthoswarm.model.errors import InputError, OrthoSwarmError, StorageError, WorkerStoppedError
+
+Result = TypeVar("Result")
 
 _MOST_ATTEMPTS: Final = 3  # of a job whose worker stopped
 _MOST_LISTED: Final = 1000  # finished jobs
 _BACKGROUND: Final = frozenset({"coarse", "together", "tones", "redraw", "export"})
 _AFTER_REFINEMENT: Final = _BACKGROUND - {"redraw"}
 """An export that was asked for during a refinement holds its result."""
+_GIVES_WAY: Final = _AFTER_REFINEMENT - {"export"}
+_REPLACED: Final = "dropped: the vehicle's refinement takes its place"
+_COMPLETE: Final = "dropped: the vehicle is complete, its refinement takes its place"
+_WATCHED_AGAIN: Final = 2000  # pictures of the last daemon
 _WAITING_THREADS: Final = 2  # beyond those of the workers, for jobs that wait for pictures
 _JOURNAL_AGAIN_S: Final = 1.0
 _log = logging.getLogger(__name__)
 
 
-class Preempted(Exception):
-    """Raised by a handler that had to give way; the job is queued again."""
+class Preempted(OrthoSwarmError):
+    """A job has to give way; it is queued again."""
 
 
-ReportProgress = Callable[[float, str], None]
-"""Called with a job's progress, 0 to 1, and what is being done."""
-Handler = Callable[[Job, ReportProgress], Change]
-"""Does a job, reporting its progress; returns the change that records its result. The job's end is written with it, in
-one transaction."""
+@dataclass(slots=True, eq=False)
+class RunningJob:
+    """A job under way, as the part that does it sees it.
+
+    Attributes:
+        job: what is done; its `detail` takes what it comes to. stopping: set once the daemon stops.
+        workers: the pool that computes it; what is to be stopped while it runs is computed by `run`.
+    """
+
+    job: Job
+    workers: WorkerPool
+    stopping: threading.Event
+    _events: Events
+    _gives_way: bool = False
+
+    def report(self, share: float, message: str) -> None:
+        """Tell the pages its progress, 0 to 1, and what is being done."""
+        self.job.progress, self.job.message = share, message
+        self._events.publish(JobChanged(self.job.document()))
+
+    def run(self, function: Callable[[Any], Result], item: Any) -> Result:
+        """Run a function of one argument in a worker process, see `WorkerPool.run`.
+
+        Raises:
+            Preempted: the job has to give way.
+        """
+        try:
+            if not self._gives_way:
+                return self.workers.run(function, item)
+        except OrthoSwarmError:
+            if not self._gives_way:
+                raise
+        raise Preempted("it gives way")
+
+    def give_way(self) -> None:
+        """Stop what it computes, now and from now on; any thread."""
+        self._gives_way = True
+        self.workers.abandon()
+
+
+Handler = Callable[[RunningJob], Change]
+"""Does a job; returns the change that records its result. The job's end is written with it, in one transaction."""
 
 
 class Jobs:
     """The queue of jobs.
 
     Args:
-        events: hears of every change; see JobChanged, JobDropped, JobEnded.
+        events: hears of every change; see JobChanged, JobEnded.
         handlers: kind -> function that does the job.
-        slots: number of refinements computed at once. Two more may be at a step that needs no worker process
-            (waiting for a vehicle's last pictures, publishing).
+        workers: compute refinements, as many at once as it has processes. Two more may be at a step that needs none
+            (waiting for a vehicle's last pictures, publishing). background: computes the others, and nothing else.
 
     Attributes:
         problem: why a job's end cannot be written at present, else empty.
     """
 
-    def __init__(self, journal: Journal, events: Events, handlers: Mapping[str, Handler], slots: int) -> None:
+    def __init__(
+        self, journal: Journal, events: Events, handlers: Mapping[str, Handler], workers: WorkerPool,
+        background: WorkerPool,
+    ) -> None:  # fmt: skip
         self._journal, self._events, self._handlers = journal, events, handlers
+        self._workers, self._background = workers, background
         self._condition = threading.Condition()
-        self._running: dict[int, Job] = {}
+        self._running: dict[int, RunningJob] = {}
         self._unwanted: dict[int, str] = {}
-        self._stop = False
+        self._stop = threading.Event()
         self.problem = ""
         self._threads = [
             threading.Thread(target=self._run, args=(False,), name=f"refinement {n}", daemon=True)
-            for n in range(max(1, slots) + _WAITING_THREADS)
+            for n in range(workers.count + _WAITING_THREADS)
         ]
         self._threads.append(threading.Thread(target=self._run, args=(True,), name="background jobs", daemon=True))
         journal.write(interrupted_jobs_queued)
@@ -86,10 +147,8 @@ class Jobs:
 
     def give_up(self) -> None:
         """Start no more jobs; errors from now on are due to the shutdown and not failures."""
-        with self._condition:
-            self._stop = True
-            self._condition.notify_all()
-        self._events.publish(JobsStop())
+        self._stop.set()
+        self.wake()
 
     def close(self) -> None:
         """Start no more jobs; running ones are abandoned by their workers and queued again at the next start."""
@@ -101,24 +160,19 @@ class Jobs:
     def add(self, kind: str, vehicle: str | None = None, sortie: int | None = None, **detail: Any) -> Job:
         """Queue a job; returns an equal waiting one if there is one."""
         job = self._journal.write(new_job(kind, vehicle, sortie, detail))
-        self._publish(job)
-        with self._condition:
-            self._condition.notify_all()
+        self._events.publish(JobChanged(job.document()))
+        self.wake()
         return job
 
     def drop(self, kind: str, vehicle: str, why: str) -> None:
         """Cancel a vehicle's jobs of a kind: waiting ones end at once, a running one is abandoned."""
         self._journal.write(waiting_jobs_dropped(kind, vehicle, why))
         with self._condition:
-            running = [
-                job
-                for job in self._running.values()
-                if (job.kind, job.vehicle) == (kind, vehicle) and "after" not in job.detail
-            ]
-            for job in running:
-                self._unwanted[job.id] = why
-        for job in running:
-            self._events.publish(JobDropped(job))
+            found = [run for run in self._running.values() if (run.job.kind, run.job.vehicle) == (kind, vehicle)]
+            dropped = [run for run in found if "after" not in run.job.detail]
+            self._unwanted |= {run.job.id: why for run in dropped}
+        for run in dropped:
+            run.give_way()
 
     def wake(self) -> None:
         """Check the queue again, after a job was put directly into the journal."""
@@ -129,7 +183,11 @@ class Jobs:
         """The latest jobs, oldest first."""
         found = latest_jobs(self._journal, _MOST_LISTED)
         with self._condition:
-            return [self._running.get(job.id, job) for job in found]
+            return [self._running[job.id].job if job.id in self._running else job for job in found]
+
+    def documents(self) -> list[dict[str, Any]]:
+        """The latest jobs as JSON values, oldest first."""
+        return [job.document() for job in self.all()]
 
     def find(self, number: int) -> Job | None:
         """A job by its number."""
@@ -144,26 +202,24 @@ class Jobs:
     def _run(self, background: bool) -> None:
         while True:
             with self._condition:
-                job = None
-                while not self._stop:
-                    job = self._next(background)
-                    if job is not None:
-                        break
-                    self._condition.wait(5.0)
-                if self._stop or job is None:
+                if self._stop.is_set():
                     return
+                run = self._next(background)
+                if run is None:
+                    self._condition.wait(5.0)
+                    continue
             try:
-                self._do(job)
+                self._do(run)
             except Exception as error:  # its start cannot be written: it is still queued in the journal
-                _log.error("job %d (%s) waits: %s", job.id, job.kind, error)
+                _log.error("job %d (%s) waits: %s", run.job.id, run.job.kind, error)
                 with self._condition:
-                    self._running.pop(job.id, None)
+                    self._running.pop(run.job.id, None)
                     self._condition.wait(_JOURNAL_AGAIN_S)
 
-    def _next(self, background: bool) -> Job | None:
+    def _next(self, background: bool) -> RunningJob | None:
         """Take the next background job, or the next refinement; the jobs of a vehicle run one after the other."""
         queued = queued_jobs(self._journal)
-        busy = {_lane(job) for job in self._running.values()}
+        busy = {_lane(run.job) for run in self._running.values()}
         refining = any(kind == "refine" for kind, _ in busy) or any(job.kind == "refine" for job in queued)
         for job in queued:
             if (job.kind in _BACKGROUND) != background or job.id in self._running or _lane(job) in busy:
@@ -171,22 +227,20 @@ class Jobs:
             if refining and job.kind in _AFTER_REFINEMENT:
                 continue
             job.state, job.started, job.attempts = "running", time.time(), job.attempts + 1
-            self._running[job.id] = job
-            return job
+            workers = self._background if background else self._workers
+            self._running[job.id] = RunningJob(job, workers, self._stop, self._events)
+            return self._running[job.id]
         return None
 
-    def _do(self, job: Job) -> None:
+    def _do(self, run: RunningJob) -> None:
+        job = run.job
         if job.kind == "refine":
             job.detail["newest_seq"] = newest_seq(self._journal)  # pictures that arrive later are late
+            self._make_way(job)
         self._journal.write(job_started(job))
-        self._publish(job)
-
-        def progress(share: float, message: str) -> None:
-            job.progress, job.message = share, message
-            self._publish(job)
-
+        self._events.publish(JobChanged(job.document()))
         try:
-            outcome = self._outcome(job, progress)
+            outcome = self._outcome(run)
             if outcome is None or not self._write_end(*outcome):
                 return  # the daemon stops; the job is queued again at the next start
             ended = outcome[0]
@@ -195,22 +249,31 @@ class Jobs:
                 self._running.pop(job.id, None)
                 self._unwanted.pop(job.id, None)
                 self._condition.notify_all()
-        self._publish(ended)
+        self._events.publish(JobChanged(ended.document()))
         try:
             self._events.publish(JobEnded(ended))
         except OrthoSwarmError as error:
             _log.error("after job %d: %s", job.id, error)
 
-    def _outcome(self, job: Job, progress: ReportProgress) -> tuple[Job, Change] | None:
+    def _make_way(self, refinement: Job) -> None:
+        """Drop the vehicle's coarse maps, and stop what is done in the background; none of that begins meanwhile."""
+        self.drop("coarse", str(refinement.vehicle), _REPLACED)
+        with self._condition:
+            running = [run for run in self._running.values() if run.job.kind in _GIVES_WAY]
+        for run in running:
+            run.give_way()
+
+    def _outcome(self, run: RunningJob) -> tuple[Job, Change] | None:
         """Do a job; returns the ended job and the journal change that records it, None if the daemon stops."""
+        job = run.job
         try:
-            change = self._handlers[job.kind](job, progress)
-            if self._stop:
+            change = self._handlers[job.kind](run)
+            if self._stop.is_set():
                 return None
             ended = replace(job, state="done", progress=1.0, message="", ended=time.time())
             return ended, all_changes(change, job_ended(ended))
         except Exception as error:
-            if self._stop:  # its worker was stopped
+            if self._stop.is_set():  # its worker was stopped
                 return None
             if job.id in self._unwanted:
                 ended = replace(job, state="done", progress=1.0, message=self._unwanted[job.id], ended=time.time())
@@ -233,13 +296,8 @@ class Jobs:
             else:
                 self.problem = ""
                 return True
-            with self._condition:
-                if self._stop:
-                    return False
-                self._condition.wait(_JOURNAL_AGAIN_S)
-
-    def _publish(self, job: Job) -> None:
-        self._events.publish(JobChanged(job.document()))
+            if self._stop.wait(_JOURNAL_AGAIN_S):
+                return False
 
 
 def _failed(job: Job, error: Exception) -> Job:
@@ -256,3 +314,77 @@ def _failed(job: Job, error: Exception) -> Job:
 def _lane(job: Job) -> tuple[str, str | None]:
     """The lane of a job: of jobs in one lane only one runs at a time."""
     return ("background", None) if job.kind in _BACKGROUND else (job.kind, job.vehicle)
+
+
+class JobRequests:
+    """Asks for jobs."""
+
+    def __init__(self, journal: Journal, jobs: Jobs, *, coarse: bool) -> None:
+        self._journal, self._jobs, self._coarse = journal, jobs, coarse
+
+    def refine(self, vehicle: str | None = None) -> list[Job]:
+        """Queue the refinement of a vehicle's last sortie, or of all sorties that have pictures.
+
+        Raises:
+            InputError: the vehicle has sent no picture.
+        """
+        wanted = photographed_sorties(self._journal)
+        if vehicle is not None:
+            wanted = [whose for whose in wanted if whose[0] == vehicle][-1:]
+            if not wanted:
+                raise InputError(f"vehicle {vehicle} has sent no picture; see /api/vehicles")
+        return [self._jobs.add("refine", *whose) for whose in wanted]
+
+    def export(self, formats: list[str]) -> Job:
+        """Queue an export.
+
+        Raises:
+            InputError: an unknown format.
+        """
+        unknown = [name for name in formats if name not in FORMATS]
+        if unknown or not formats:
+            raise InputError(f"there is no format {unknown or 'given'}; choose from: {', '.join(FORMATS)}")
+        return self._jobs.add("export", formats=list(dict.fromkeys(formats)))
+
+    def continue_last(self, watch: LegWatch) -> None:
+        """Ask for what the last daemon left undone, and have its unplaced pictures watched."""
+        for whose in complete_sorties(self._journal):
+            self._refine_late(whose)
+        for row in unplaced_frames(self._journal, _WATCHED_AGAIN):
+            time_s = row.arrived_s if row.time_s is None else row.time_s
+            watch.add(row.vehicle, row.sortie, time_s, row.pose["lat_deg"], row.pose["lon_deg"])
+
+    # -- what has happened ----------------------------------------------------------------------------------------
+
+    def legs_over(self, event: LegsOver) -> None:
+        """Queue the coarse map of a sortie that is still flown."""
+        if self._coarse and not is_complete(self._journal, (event.vehicle, event.sortie)):
+            self._jobs.add("coarse", event.vehicle, event.sortie, **({"over": True} if event.silent else {}))
+
+    def vehicle_silent(self, event: VehicleSilent) -> None:
+        """Have pictures placed that came after their vehicle's refinement, over a slow link."""
+        self._refine_late((event.vehicle, event.sortie))
+
+    def card_read(self, event: CardRead) -> None:
+        """Have the sortie refined with the pictures of a card that was read after landing."""
+        self._refine_late((event.vehicle, present_sortie(self._journal, event.vehicle)))
+
+    def _refine_late(self, whose: Whose) -> None:
+        if not refinement_is_open(self._journal, whose, "queued") and late_frames(self._journal, *whose):
+            self._jobs.add("refine", *whose, trigger="late")
+
+    def mission_noted(self, event: MissionNoted) -> None:
+        """Begin the refinement that a completion has queued; the vehicle's coarse maps are not needed any more."""
+        if event.kind == "complete":
+            self._jobs.drop("coarse", event.vehicle, _COMPLETE)
+        self._jobs.wake()
+
+    def job_ended(self, event: JobEnded) -> None:
+        """Export the products again once nothing is left to refine."""
+        job = event.job
+        if job.kind == "refine":
+            self._jobs.wake()
+        elif job.kind not in ("together", "tones", "redraw") and (job.kind != "coarse" or "after" not in job.detail):
+            return
+        if not self._jobs.open("refine", "together", "tones", "coarse", "redraw"):
+            self._jobs.add("export", formats=list(PRODUCTS), after="all")

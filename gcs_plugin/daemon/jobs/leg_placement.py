@@ -1,30 +1,24 @@
 """The coarse layer: legs are placed and drawn as they finish, in flight, at the lowest priority.
 
 A job places all finished legs of the vehicle, so jobs that arrive faster than they can be done are merged into
-one. Its result is temporary: the work stops at once when the vehicle completes (its refinement
-replaces it) or when a refinement needs the layer.
+one. Its result is temporary: the work stops at once when the vehicle completes (its refinement replaces it), or when
+any refinement begins.
 """
 
 import logging
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from gcs_plugin.daemon.jobs.job_queue import Preempted, ReportProgress
-from gcs_plugin.daemon.jobs.placed_sorties import detail_of, frames_of
-from gcs_plugin.daemon.jobs.preemption import Preemption
-from gcs_plugin.daemon.jobs.publisher import Publisher
-from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
-from gcs_plugin.daemon.jobs.worker_tasks import SolveTask, SortieResult, coarse_after, follow, near, place
-from gcs_plugin.daemon.layers.layers import new_name
-from gcs_plugin.daemon.store.daemon_events import JobDropped, LayerNeeded
+from gcs_plugin.daemon.jobs.job_queue import Preempted, RunningJob
+from gcs_plugin.daemon.jobs.publisher import Publisher, detail_of, frames_of
+from gcs_plugin.daemon.jobs.worker_tasks import SortieResult, SortieTask, coarse_after, follow, near, place
 from gcs_plugin.daemon.store.job_rows import Job, refinement_is_open
-from gcs_plugin.daemon.store.journal import Change, Journal, no_change
-from gcs_plugin.daemon.store.kept_pictures import KeptPictures
-from gcs_plugin.daemon.store.picture_store import PictureStore
+from gcs_plugin.daemon.store.journal import Change, no_change
+from gcs_plugin.daemon.store.picture_store import KeptPictures, PictureStore
 from gcs_plugin.daemon.store.sortie_rows import (
     LegRow,
     PlacedSortie,
@@ -45,154 +39,112 @@ _REACH_M: Final = 100.0
 _log = logging.getLogger(__name__)
 
 
-@dataclass(slots=True, kw_only=True)
+@dataclass(slots=True)
 class LegPlacement:
-    """Does the jobs `coarse`.
+    """Does the jobs `coarse`; `kept`: what is kept of the pictures in `store` until they are refined."""
 
-    Attributes:
-        journal, store, kept, publisher: of the workspace. workers: compute the job; used by nothing else meanwhile.
-        basemap: the map, or None. device: where networks run.
-    """
-
-    journal: Journal
+    publisher: Publisher
     store: PictureStore
     kept: KeptPictures
-    publisher: Publisher
-    workers: WorkerPool
-    basemap: Path | None
-    device: str = "auto"
-    _preemption: Preemption = field(init=False)
 
-    def __post_init__(self) -> None:
-        self._preemption = Preemption(self.workers)
-
-    def make(self, job: Job, report: ReportProgress) -> Change:
+    def make(self, run: RunningJob) -> Change:
         """The handler of `coarse`."""
-        target = self.publisher.solutions / f"{new_name('coarse')}.pickle"
         began = time.monotonic()
         try:
-            with self._preemption.running(str(job.vehicle)):
-                change = self._after(job, report, target) if "after" in job.detail else self._legs(job, report, target)
+            with self.publisher.new_solution("coarse") as target:
+                (self._after if "after" in run.job.detail else self._legs)(run, target)
         except (Preempted, WorkerStoppedError, StorageError):
-            target.unlink(missing_ok=True)
             raise
         except OrthoSwarmError as error:
-            target.unlink(missing_ok=True)
-            job.detail["note"] = str(error)  # the map in flight stays as it is until the refinement
-            return no_change
-        job.detail["seconds"] = round(time.monotonic() - began, 3)
-        return change
-
-    def drop(self, event: JobDropped) -> None:
-        """Stop a job that was cancelled."""
-        if event.job.vehicle == self._preemption.vehicle:
-            self._preemption.stop()
-
-    def give_way(self, event: object) -> None:
-        """Stop the running job; where a layer is needed, only if it draws on that."""
-        if not isinstance(event, LayerNeeded) or event.layer in self.publisher.drawing:
-            self._preemption.stop()
+            run.job.detail["note"] = str(error)  # the map in flight stays as it is until the refinement
+        else:
+            run.job.detail["seconds"] = round(time.monotonic() - began, 3)
+        return no_change
 
     # -- in flight ------------------------------------------------------------------------------------------------
 
-    def _legs(self, job: Job, report: ReportProgress, target: Path) -> Change:
-        area = self.publisher.area()
+    def _legs(self, run: RunningJob, target: Path) -> None:
+        job, publisher = run.job, self.publisher
+        area = publisher.area()
         if self._is_refined(job):
             job.detail["note"] = "it is refined already"
-            return no_change
-        frames, thumbnails = frames_of(self.journal, self.store, job)
-        everything, kept = frames, self.kept.of(job.whose, frames)
-        frames, count = newest_legs(frames, area.epsg, over=bool(job.detail.get("over")))
+            return
+        everything, thumbnails = frames_of(publisher.journal, self.store, job)
+        kept = self.kept.of(job.whose, everything)
+        frames, count = newest_legs(everything, area.epsg, over=bool(job.detail.get("over")))
         if not frames:
             raise OrthoSwarmError("no leg is over yet")
-        report(0.1, f"{len(frames)} pictures, {count} legs")
-        before = placed_sortie(self.journal, "coarse", job.whose)
-        small = {f.image: thumbnails[f.image] for f in frames if f.image in thumbnails}
-        task = SolveTask(
+        run.report(0.1, f"{len(frames)} pictures, {count} legs")
+        before = placed_sortie(publisher.journal, "coarse", job.whose)
+        task = publisher.task(
+            target,
             frames=frames,
-            epsg=area.epsg,
-            origin=area.origin,
-            basemap=self.basemap,
-            thumbnails=small,
-            neighbours=self._others(job, frames),
-            target=target,
-            before=None if before is None else self.publisher.solutions / before.path,
+            thumbnails={f.image: thumbnails[f.image] for f in frames if f.image in thumbnails},
+            neighbours=self._others(job, near(frames, area.epsg)),
+            before=None if before is None else publisher.solutions / before.path,
             kept=kept,
-            device=self.device,
         )
-        solved = self.workers.run(place, task)
+        solved = run.run(place, task)
         job.detail |= {"frames": len(frames), "solve_cpu_s": round(solved.cpu_s, 3), "legs": len(solved.legs)}
-        fresh = {leg["images"][0] for leg in solved.legs}
-        mine = {frame.image for frame in frames}
+        again = {leg["images"][0] for leg in solved.legs} | {frame.image for frame in frames}
         earlier = [] if before is None else before.detail["legs"]
-        legs = [leg for leg in earlier if leg.get("images") and leg["images"][0] not in mine | fresh]
-        change = self._publish(job, report, target, solved, [*legs, *solved.legs])
+        legs = [leg for leg in earlier if leg.get("images") and leg["images"][0] not in again]
+        self._publish(run, target, solved, [*legs, *solved.legs])
         if job.detail.get("over") and kept is not None:
-            self._follow(job, replace(task, frames=everything))
-        return change
+            self._follow(run, replace(task, frames=everything))
 
-    def _follow(self, job: Job, task: SolveTask) -> None:
+    def _follow(self, run: RunningJob, task: SortieTask) -> None:
         """Track all pictures of a vehicle that has fallen silent: they may be all of its sortie when it completes."""
         try:
-            job.detail["follow_cpu_s"] = round(self.workers.run(follow, task), 3)
+            run.job.detail["follow_cpu_s"] = round(run.run(follow, task), 3)
         except OrthoSwarmError as error:  # the legs are placed, whatever stopped this
-            _log.debug("the tracks of %s: %s", job.vehicle, error)
+            _log.debug("the tracks of %s: %s", run.job.vehicle, error)
 
-    def _others(self, job: Job, frames: list[Frame]) -> list[Path]:
-        """Drawn sorties nearby, whose exposure is fixed."""
-        box = near(frames, self.publisher.area().epsg)
+    def _others(self, job: Job, box: BoundingBox) -> list[Path]:
+        """Drawn sorties near a box, whose exposure is fixed."""
         return [
             self.publisher.solutions / row.path
-            for row in shown_sorties(self.journal, "coarse")
+            for row in shown_sorties(self.publisher.journal, "coarse")
             if row.whose != job.whose and row.bounds.gap_m(box) < _REACH_M
         ]
 
     def _is_refined(self, job: Job) -> bool:
         """Whether a refinement has replaced, or is about to replace, the result."""
-        if is_complete(self.journal, job.whose) or refinement_is_open(self.journal, job.whose, "queued", "running"):
+        journal = self.publisher.journal
+        if is_complete(journal, job.whose) or refinement_is_open(journal, job.whose, "queued", "running"):
             return True
-        row = placed_sortie(self.journal, "solutions", job.whose)
+        row = placed_sortie(journal, "solutions", job.whose)
         return row is not None and row.detail["layer"] == "coarse"
 
     # -- after a refinement ---------------------------------------------------------------------------------------
 
-    def _after(self, job: Job, report: ReportProgress, target: Path) -> Change:
+    def _after(self, run: RunningJob, target: Path) -> None:
         """Place the complete sortie on the coarse layer, from the start values of its refinement."""
-        row = placed_sortie(self.journal, "solutions", job.whose)
+        row = placed_sortie(self.publisher.journal, "solutions", run.job.whose)
         if row is None or row.detail["layer"] != "fine":
-            return no_change
-        report(0.1, "the coarse layer beside the refined one")
-        solved = self.workers.run(
-            coarse_after, (self.publisher.solutions / row.path, self.publisher.area().origin, target)
-        )
-        return self._publish(job, report, target, solved, row.detail["legs"])
+            return
+        run.report(0.1, "the coarse layer beside the refined one")
+        solved = run.run(coarse_after, self.publisher.task(target, before=self.publisher.solutions / row.path))
+        self._publish(run, target, solved, row.detail["legs"])
 
     # -- both -----------------------------------------------------------------------------------------------------
 
-    def _publish(
-        self, job: Job, report: ReportProgress, target: Path, solved: SortieResult, legs: list[LegRow]
-    ) -> Change:
-        old = placed_sortie(self.journal, "coarse", job.whose)
+    def _publish(self, run: RunningJob, target: Path, solved: SortieResult, legs: list[LegRow]) -> None:
+        job, publisher = run.job, self.publisher
+        old = placed_sortie(publisher.journal, "coarse", job.whose)
         changed = solved.changed
         if old is not None and "after" in job.detail:
             changed = BoundingBox.around([changed, old.bounds])
         placed = PlacedSortie(*job.whose, target.name, detail_of(solved, legs))
         sigmas = {image: sigma for image, (_, sigma) in solved.stages.items()}
-
-        def change(rejected: dict[str, str]) -> Change:
-            return legs_placed(placed, sigmas, rejected)
-
-        with self.publisher.turn("coarse"):
-            report(0.7, "drawing")
-            if self._preemption.requested or ("after" not in job.detail and self._is_refined(job)):
+        with publisher.turn("coarse") as turn:
+            run.report(0.7, "drawing")
+            if "after" not in job.detail and self._is_refined(job):
                 raise OrthoSwarmError("a refinement takes its place")
-            job.detail["version_before"], job.detail["version"] = self.publisher.publish(
-                "coarse", self.workers, job.whose, target=target, changed=changed, change=change
-            )
-        if old is not None:
-            self.publisher.retire(self.publisher.solutions / old.path)
-        self.publisher.tell("coarse", job)
-        return no_change
+            rejected = turn.draw(run, job.whose, target, changed)
+            job.detail |= turn.publish(legs_placed(placed, sigmas, rejected))
+        publisher.retire(old)
+        publisher.tell("coarse", job)
 
 
 def newest_legs(frames: list[Frame], epsg: int, *, over: bool = False) -> tuple[list[Frame], int]:

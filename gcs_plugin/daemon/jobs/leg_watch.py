@@ -12,9 +12,8 @@ from typing import Final
 import numpy as np
 
 from gcs_plugin.config import SORTIE
-from gcs_plugin.daemon.stoppable_thread import StoppableThread
-from gcs_plugin.daemon.store.daemon_events import LegsOver, PictureStored, VehicleSilent
-from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.daemon.stoppable_thread import Background
+from gcs_plugin.daemon.store.daemon_events import Events, LegsOver, PictureStored, VehicleSilent
 from orthoswarm.model.earth import DEGREE_M
 from orthoswarm.trajectory.legs import ended_legs
 
@@ -32,7 +31,7 @@ class _Path:
     dirty: bool = False
 
 
-class LegWatch:
+class LegWatch(Background):
     """Watches the paths of all vehicles, in a thread.
 
     Args:
@@ -43,18 +42,10 @@ class LegWatch:
     """
 
     def __init__(self, events: Events, *, silent_s: float) -> None:
+        super().__init__("legs")
         self._events, self.silent_s = events, silent_s
         self._lock = threading.Lock()
         self._paths: dict[tuple[str, int], _Path] = {}
-        self._thread = StoppableThread(self._run, "legs")
-
-    def start(self) -> None:
-        """Start watching."""
-        self._thread.start()
-
-    def close(self) -> None:
-        """Stop watching."""
-        self._thread.close()
 
     def picture_stored(self, event: PictureStored) -> None:
         """Record a picture that has come; one without a position says nothing of the path."""
@@ -71,8 +62,8 @@ class LegWatch:
             path.places.append((lat_deg, lon_deg))
             path.heard, path.dirty = time.monotonic(), True
 
-    def _run(self, stop: threading.Event) -> None:
-        while not stop.wait(min(_LOOK_S, 0.25 * self.silent_s)):
+    def _run(self) -> None:
+        while not self._stop.wait(min(_LOOK_S, 0.25 * self.silent_s)):
             now = time.monotonic()
             with self._lock:
                 due = [

@@ -7,33 +7,40 @@ the layer's new generation and all facts that change with it.
 import logging
 import shutil
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
-from gcs_plugin.daemon.jobs.job_queue import ReportProgress
-from gcs_plugin.daemon.jobs.solution_file import is_readable
-from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
-from gcs_plugin.daemon.jobs.worker_tasks import DrawTask, draw
+from gcs_plugin.daemon.intake.posted_pose import frame_of_row
+from gcs_plugin.daemon.jobs.job_queue import RunningJob
+from gcs_plugin.daemon.jobs.solution_file import Bytes, is_readable, thumbnail_of
+from gcs_plugin.daemon.jobs.worker_tasks import DrawTask, SortieResult, SortieTask, draw
 from gcs_plugin.daemon.layers.layers import MapArea, MapLayer, new_name
 from gcs_plugin.daemon.layers.realtime_layer import Drawer
-from gcs_plugin.daemon.store.daemon_events import LayerPublished
-from gcs_plugin.daemon.store.event_bus import Events
-from gcs_plugin.daemon.store.frame_rows import Whose
-from gcs_plugin.daemon.store.job_rows import Job
+from gcs_plugin.daemon.store.daemon_events import Events, LayerPublished
+from gcs_plugin.daemon.store.frame_rows import Whose, sortie_frames
+from gcs_plugin.daemon.store.job_rows import Job, job_done
 from gcs_plugin.daemon.store.journal import Change, Journal, all_changes, fact_change, no_change
+from gcs_plugin.daemon.store.picture_store import PictureStore
 from gcs_plugin.daemon.store.sortie_rows import (
     REFINED,
+    LegRow,
     PlacedSortie,
+    SortieDetail,
     Table,
     placed_sorties,
     placements_forgotten,
     shown_sorties,
     solution_paths,
+    sortie_refined,
 )
 from orthoswarm.canvas.canvas import Canvas
+from orthoswarm.export.json_values import finite
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import OrthoSwarmError
+from orthoswarm.model.frame import Frame
+from telemetry.samples.held_fixes import measured_frames
 
 _TABLES: tuple[Table, ...] = ("solutions", "coarse")
 _log = logging.getLogger(__name__)
@@ -44,6 +51,7 @@ class Publisher:
 
     Attributes:
         folder: of the layers' canvases. solutions: folder of the solution files.
+        basemap: the map, or None. refined: the layer of refinements: fine with a map, coarse without.
         lost: layers whose pixels cannot be trusted and are to be drawn again (see `draw_again`).
         outdated: vehicle and sortie of those that were refined by another version of the program, and are to be
             refined again from their pictures.
@@ -51,18 +59,18 @@ class Publisher:
 
     def __init__(
         self, journal: Journal, layers: dict[str, MapLayer], workspace: Path, *, drawer: Drawer, events: Events,
-        workers: WorkerPool, trusted: bool,
+        basemap: Path | None, device: str = "auto", trusted: bool,
     ) -> None:  # fmt: skip
         """Remove unfinished files of a killed daemon, and open what it had published.
 
         Args:
-            workspace: its folder. workers: draw lost layers again.
+            workspace: its folder. device: where networks run.
             trusted: False after a power cut: canvases are not synced, for speed.
         """
-        self.journal, self.layers, self._drawer, self._events, self._workers = journal, layers, drawer, events, workers
+        self.journal, self.layers, self._drawer, self._events = journal, layers, drawer, events
+        self.basemap, self._device, self.refined = basemap, device, "fine" if basemap is not None else "coarse"
         self.folder, self.solutions = workspace / "layers", workspace / "solutions"
         self._turns = {name: threading.Lock() for name in REFINED}
-        self.drawing: set[str] = set()
         self.solutions.mkdir(parents=True, exist_ok=True)
         self.outdated = self._forget_outdated()
         begun = journal.fact("lost") or []
@@ -100,17 +108,17 @@ class Publisher:
         )
         return refined
 
-    def draw_again(self, _: Job, report: ReportProgress) -> Change:
+    def draw_again(self, run: RunningJob) -> Change:
         """The handler of `redraw`: draws the lost layers from the solution files."""
         todo = [(layer, row.whose) for layer in self.lost for row in shown_sorties(self.journal, layer)]
         for n, (layer, whose) in enumerate(todo):
-            with self.turn(layer):
+            with self.turn(layer) as turn:
                 row = self.shown(layer, whose)
                 if row is None:
                     continue  # refined, or drawn again, meanwhile
-                report(n / len(todo), f"drawing {row.vehicle} on {layer}")
-                target = self.solutions / row.path
-                self.publish(layer, self._workers, whose, target=target, changed=row.bounds, change=_as_it_is)
+                run.report(n / len(todo), f"drawing {row.vehicle} on {layer}")
+                turn.draw(run, whose, self.solutions / row.path, row.bounds)
+                turn.publish(no_change)
         return fact_change("lost", [])
 
     def sweep(self) -> None:
@@ -119,10 +127,14 @@ class Publisher:
         for path in self.folder.iterdir():
             if path.name not in named:
                 shutil.rmtree(path, ignore_errors=True)
-        known = {path for table in _TABLES for path in solution_paths(self.journal, table).values()}
+        known = self._named()
         for path in self.solutions.iterdir():
             if path.name not in known:
                 path.unlink(missing_ok=True)
+
+    def _named(self) -> set[str]:
+        """The solution files that the journal names."""
+        return {path for table in _TABLES for path in solution_paths(self.journal, table).values()}
 
     def area(self) -> MapArea:
         """The map's area.
@@ -134,50 +146,41 @@ class Publisher:
             raise OrthoSwarmError("there is no map yet; wait for pictures")
         return self._drawer.area
 
+    def task(self, target: Path, **more: Any) -> SortieTask:
+        """A worker's task on the map's area; `more`: further values of a SortieTask."""
+        area = self.area()
+        return SortieTask(
+            epsg=area.epsg, origin=area.origin, target=target, basemap=self.basemap, device=self._device, **more
+        )
+
     @contextmanager
-    def turn(self, layer: str) -> Iterator[None]:
+    def new_solution(self, kind: str = "solution") -> Iterator[Path]:
+        """The path of a new solution file, which is removed in the end unless the journal names it."""
+        target = self.solutions / f"{new_name(kind)}.pickle"
+        try:
+            yield target
+        finally:
+            if target.name not in self._named():
+                target.unlink(missing_ok=True)
+
+    @contextmanager
+    def turn(self, layer: str) -> Iterator["LayerTurn"]:
         """Wait for exclusive use of a layer."""
         with self._turns[layer]:
-            self.drawing.add(layer)
+            turn = LayerTurn(self, layer)
             try:
-                yield
+                yield turn
             finally:
-                self.drawing.discard(layer)
+                if not turn.published:
+                    shutil.rmtree(turn.folder, ignore_errors=True)
 
-    def publish(
-        self,
-        layer: str,
-        workers: WorkerPool,
-        whose: Whose,
-        *,
-        target: Path,
-        changed: BoundingBox,
-        change: Callable[[dict[str, str]], Change],
-    ) -> tuple[int, int]:
-        """Draw a placed sortie into the next generation of a layer and publish it; the layer's turn must be held.
-
-        Args:
-            layer: coarse or fine. workers: where the work runs.
-            target: its solution file. changed: ground whose pixels change.
-            change: returns the journal change, given image -> why it could not be drawn.
-
-        Returns:
-            The layer's version before and now.
-
-        Raises:
-            OrthoSwarmError: the disk is full, or the work was stopped; nothing has changed.
-        """
-        name = new_name(layer)
-        try:
-            rejected = workers.run(draw, self._task(layer, name, whose, target, changed))
-            stands = all_changes(change(rejected), fact_change(layer, name))
-            before = self.layers[layer].version
-            self.journal.write(stands)  # here, so that the next drawing starts from it
-        except BaseException:
-            shutil.rmtree(self.folder / name, ignore_errors=True)
-            raise
-        self.layers[layer].replace(Canvas.open(self.folder / name))
-        return before, self.layers[layer].version
+    def refined_near(self, whose: Whose, box: BoundingBox, reach_m: float = 0.0) -> dict[Whose, Path]:
+        """The solution files of the refined sorties (except that one) whose ground is within a distance of a box."""
+        return {
+            row.whose: self.solutions / row.path
+            for row in placed_sorties(self.journal, "solutions")
+            if row.whose != whose and row.bounds.gap_m(box) < reach_m
+        }
 
     def tell(self, layer: str, job: Job) -> None:
         """Tell that a job has changed pixels of a layer."""
@@ -188,28 +191,93 @@ class Publisher:
         """A sortie on a layer, None if it is not there."""
         return next((row for row in shown_sorties(self.journal, layer) if row.whose == whose), None)
 
-    def retire(self, path: Path) -> None:
-        """Remove a solution file later, as others may be reading it."""
-        later = threading.Timer(60.0, path.unlink, kwargs={"missing_ok": True})
-        later.daemon = True
-        later.start()
+    def retire(self, row: PlacedSortie | None) -> None:
+        """Remove the solution file of what was replaced, later, as others may be reading it."""
+        if row is not None:
+            path = self.solutions / row.path
+            later = threading.Timer(60.0, path.unlink, kwargs={"missing_ok": True})
+            later.daemon = True
+            later.start()
 
-    def _task(self, layer: str, name: str, whose: Whose, target: Path, changed: BoundingBox) -> DrawTask:
+
+class LayerTurn:
+    """The exclusive use of a layer, in which one sortie is drawn into its next generation, and this published.
+
+    Attributes:
+        folder: of the next generation's canvas; removed unless it was `published`.
+    """
+
+    def __init__(self, publisher: Publisher, layer: str) -> None:
+        self._publisher, self._layer, self._name = publisher, layer, new_name(layer)
+        self.folder, self.published = publisher.folder / self._name, False
+
+    def draw(self, run: RunningJob, whose: Whose, target: Path, changed: BoundingBox) -> dict[str, str]:
+        """Draw a placed sortie; returns image -> why it could not be drawn.
+
+        Args:
+            target: its solution file. changed: ground whose pixels change.
+
+        Raises:
+            OrthoSwarmError: the disk is full, or the work was stopped.
+        """
+        publisher = self._publisher
         others = [
-            self.solutions / row.path
-            for row in shown_sorties(self.journal, layer)
+            publisher.solutions / row.path
+            for row in shown_sorties(publisher.journal, self._layer)
             if row.whose != whose and row.bounds.overlaps(changed)
         ]
-        canvas = self.layers[layer].canvas
-        return DrawTask(
-            old=None if canvas is None else canvas.path,
-            new=self.folder / name,
-            grid=self.area().grid,
-            solutions=[*others, target],
-            changed=target,
-            bounds=changed,
-        )
+        canvas = publisher.layers[self._layer].canvas
+        task = DrawTask(
+            old=None if canvas is None else canvas.path, new=self.folder, grid=publisher.area().grid,
+            solutions=[*others, target], changed=target, bounds=changed,
+        )  # fmt: skip
+        return run.run(draw, task)
+
+    def publish(self, change: Change) -> dict[str, int]:
+        """Make what was drawn the layer, and a change of the journal with it; returns the versions before and now.
+
+        Raises:
+            OrthoSwarmError: the disk is full; nothing has changed.
+        """
+        publisher, layer = self._publisher, self._publisher.layers[self._layer]
+        before = layer.version
+        publisher.journal.write(all_changes(change, fact_change(self._layer, self._name)))
+        self.published = True
+        layer.replace(Canvas.open(self.folder))
+        return {"version_before": before, "version": layer.version}
 
 
-def _as_it_is(_: dict[str, str]) -> Change:
-    return no_change
+def frames_of(journal: Journal, store: PictureStore, job: Job) -> tuple[list[Frame], dict[str, Bytes]]:
+    """The frames of a job's sortie in order of time, without rejected ones, and image -> thumbnail of the drawn ones.
+
+    Raises:
+        OrthoSwarmError: there are none.
+    """
+    rows = sortie_frames(journal, str(job.vehicle), job.sortie)
+    if not rows:
+        raise OrthoSwarmError(f"{job.vehicle} has no pictures that could be drawn; check its camera and its poses")
+    small = {row.image: thumbnail_of(row.thumbnail) for row in rows if row.thumbnail is not None}
+    return measured_frames([frame_of_row(row, store) for row in rows]), small
+
+
+def detail_of(solved: SortieResult, legs: Iterable[LegRow]) -> SortieDetail:
+    """The journal's details of a placed sortie."""
+    return {
+        "bounds": solved.bounds,
+        "legs": [leg | LegRow(confidence=finite(leg["confidence"]), sigma_m=finite(leg["sigma_m"])) for leg in legs],
+        "fov_deg": finite(solved.fov_deg), "fov_sigma_deg": finite(solved.fov_sigma_deg),
+        "warnings": solved.warnings, "cpu_s": solved.cpu_s, "wall_s": solved.wall_s,
+    }  # fmt: skip
+
+
+def refined_change(
+    job: Job, solved: SortieResult, rejected: Mapping[str, str], name: str, detail: SortieDetail
+) -> Change:
+    """The change that records a refinement: the stages of its frames, its solution, and its job as done.
+
+    Args:
+        job: whose sortie it is. solved: with stages and sigmas of the new frames.
+        rejected: image -> why it could not be drawn. name: of the solution file. detail: stored with it.
+    """
+    stands = sortie_refined(PlacedSortie(*job.whose, name, detail), solved.stages, {**solved.dropped, **rejected})
+    return all_changes(stands, job_done(job.id))

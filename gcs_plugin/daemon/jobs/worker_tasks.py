@@ -5,7 +5,7 @@ Large results are passed as files: a solution is pickled next to the journal, a 
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -41,37 +41,40 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FollowTask:
-    """What is needed to track a sortie's pictures.
+class SortieTask:
+    """A sortie, or the part of it that has arrived, and what is needed to track, place, or place its pictures again.
 
     Attributes:
-        frames: of one sortie, in order of time. epsg, origin: the area's grid.
+        epsg, origin: the area's grid. target: path of the new solution file.
+        frames: of one sortie, in order of time. thumbnails: image -> uint8 (12, 16, 3).
+        before: the solution file of the sortie's earlier legs (in flight) or of its refinement.
+        neighbours: solution files nearby, held fixed. basemap: the map, or None. device: where networks run.
         kept: folder with what is kept of its pictures until it is refined, None if nothing is.
-        device: where networks run.
     """
 
-    frames: list[Frame]
     epsg: int
     origin: tuple[float, float]
-    kept: Path | None = None
-    device: str = "auto"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SolveTask(FollowTask):
-    """One vehicle's sortie, or the part that has arrived.
-
-    Attributes:
-        basemap: the map, or None. thumbnails: image -> uint8 (12, 16, 3).
-        neighbours: solution files nearby, held fixed. target: path of the new one.
-        before: the solution file of the sortie's earlier legs (in flight) or of its refinement (for late pictures).
-    """
-
-    basemap: Path | None
-    thumbnails: dict[str, Bytes]
-    neighbours: list[Path]
     target: Path
+    frames: list[Frame] = field(default_factory=list)
+    thumbnails: dict[str, Bytes] = field(default_factory=dict)
     before: Path | None = None
+    neighbours: list[Path] = field(default_factory=list)
+    basemap: Path | None = None
+    device: str = "auto"
+    kept: Path | None = None
+
+    def read_before(self) -> SolutionFile:
+        """The solution in `before`, of a task that has one."""
+        assert self.before is not None
+        return read_solution(self.before)
+
+    def read_neighbours(self) -> list[SolutionFile]:
+        """The solutions nearby."""
+        return [read_solution(path) for path in self.neighbours]
+
+    def open_basemap(self, frames: Sequence[Frame]) -> Basemap | None:
+        """The map below pictures."""
+        return None if self.basemap is None else Basemap.open(self.basemap, self.epsg, near(frames, self.epsg))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -118,23 +121,21 @@ class _Watch:
         )
 
 
-def solve(task: SolveTask) -> SortieResult:
+def solve(task: SortieTask) -> SortieResult:
     """Refine one vehicle.
 
     Raises:
         OrthoSwarmError: its frames cannot be refined.
     """
     watch = _Watch()
-    others = [read_solution(path) for path in task.neighbours]
-    solution = without_strays(
-        _refiner(task).refine(task.frames, [sortie.solution for sortie in others], _basemap(task))
-    )
+    others, basemap = task.read_neighbours(), task.open_basemap(task.frames)
+    solution = without_strays(_refiner(task).refine(task.frames, [other.solution for other in others], basemap))
     sortie = SolutionFile(solution, task.thumbnails, gains_of(solution, task.thumbnails, others))
     sortie.write(task.target)
     return watch.solved(solution, task.frames, sortie, visible_ground(solution.placed, sortie.terrain))
 
 
-def follow(task: FollowTask) -> float:
+def follow(task: SortieTask) -> float:
     """Track the pictures of a sortie for `solve`, while it is not certain yet that no more will come.
 
     Returns the CPU seconds used.
@@ -144,13 +145,13 @@ def follow(task: FollowTask) -> float:
     return time.process_time() - began
 
 
-def _refiner(task: FollowTask) -> "SwarmRefiner":
+def _refiner(task: SortieTask) -> "SwarmRefiner":
     from orthoswarm.refine.strategy.swarm_refiner import SwarmRefiner
 
     return SwarmRefiner(task.epsg, np.array(task.origin), _options(task))
 
 
-def _options(task: FollowTask) -> "RefinerOptions":
+def _options(task: SortieTask) -> "RefinerOptions":
     """Options that use what is kept of the sortie's pictures, and keep what is made."""
     from orthoswarm.refine.flight.kept_tracks import KeptTracks
     from orthoswarm.refine.strategy.swarm_refiner import RefinerOptions
@@ -161,14 +162,12 @@ def _options(task: FollowTask) -> "RefinerOptions":
     return replace(options, read=GreyPictures(task.kept, from_colors=False).gray, kept=KeptTracks(task.kept))
 
 
-def register_late(task: SolveTask) -> SortieResult:
+def register_late(task: SortieTask) -> SortieResult:
     """Register late pictures to the others of their sortie, which was refined without them."""
     from orthoswarm.refine.registration.late_pictures import register_late_pictures
     from orthoswarm.refine.strategy.vehicle_passes import read_frame
 
-    assert task.before is not None
-    watch = _Watch()
-    before = read_solution(task.before)
+    watch, before = _Watch(), task.read_before()
     refined = before.solution
     known = {p.frame.image for p in refined.placed} | set(refined.dropped)
     placed, dropped = register_late_pictures(
@@ -176,7 +175,7 @@ def register_late(task: SolveTask) -> SortieResult:
     )
     complete = replace(refined, placed=[*refined.placed, *placed], dropped={**refined.dropped, **dropped})
     thumbnails = before.thumbnails | task.thumbnails
-    gains = gains_of(complete, thumbnails, [read_solution(path) for path in task.neighbours], before.gains)
+    gains = gains_of(complete, thumbnails, task.read_neighbours(), before.gains)
     sortie = SolutionFile(complete, thumbnails, gains)
     sortie.write(task.target)
     new = replace(complete, placed=placed, dropped=dropped, legs=[])
@@ -196,39 +195,21 @@ def without_strays(solution: Solution) -> Solution:
     )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class JointTask:
-    """A refined sortie, to be refined again together with neighbours.
-
-    Attributes:
-        before: the solution file. neighbours: solution files nearby, held fixed. target: path of the new one.
-        epsg, origin: the area's. basemap: the map.
-    """
-
-    before: Path
-    neighbours: list[Path]
-    target: Path
-    epsg: int
-    origin: tuple[float, float]
-    basemap: Path
-
-
-def refine_jointly(task: JointTask) -> tuple[SortieResult, float] | None:
+def refine_jointly(task: SortieTask) -> tuple[SortieResult, float] | None:
     """Refine a sortie again.
 
     Returns the result and its pictures' movement (metres, 95 %), None if nothing is to be solved.
 
     Its exposure stays as it is: its neighbours were drawn to agree with it.
     """
-    watch = _Watch()
-    before = read_solution(task.before)
+    watch, before = _Watch(), task.read_before()
     refiner = make_refiner("swarm", task.epsg, np.array(task.origin))
     frames = refiner.refined_frames(before.solution)
     if not frames:
         return None
-    others = [read_solution(path).solution for path in task.neighbours]
-    basemap = Basemap.open(task.basemap, task.epsg, near(frames, task.epsg))
-    solution = refiner.again(before.solution, others, basemap)
+    basemap = task.open_basemap(frames)
+    assert basemap is not None  # without a map nothing is refined again
+    solution = refiner.again(before.solution, [other.solution for other in task.read_neighbours()], basemap)
     if solution is before.solution:
         return None
     sortie = replace(before, solution=solution)
@@ -254,7 +235,7 @@ def _ground_of(camera: Camera, z_m: float) -> np.ndarray[Any, np.dtype[np.float6
     return np.vstack([camera.to_ground(np.array(camera.lens.principal_point), z_m), camera.corners(z_m)])
 
 
-def place(task: SolveTask) -> SortieResult:
+def place(task: SortieTask) -> SortieResult:
     """Place the pictures of a vehicle's finished legs, registered to its earlier legs if those were placed.
 
     Raises:
@@ -265,46 +246,41 @@ def place(task: SolveTask) -> SortieResult:
     watch = _Watch()
     options = replace(_options(task), kept=None)  # the next leg's tracks will be others
     solution = place_in_flight(
-        task.frames, epsg=task.epsg, origin=np.array(task.origin), basemap=_basemap(task), options=options
+        task.frames,
+        epsg=task.epsg,
+        origin=np.array(task.origin),
+        basemap=task.open_basemap(task.frames),
+        options=options,
     )
     mine = {frame.image for frame in task.frames}
-    before = SolutionFile(replace(solution, placed=[])) if task.before is None else read_solution(task.before)
+    before = SolutionFile(replace(solution, placed=[])) if task.before is None else task.read_before()
     earlier = [p for p in before.solution.placed if p.frame.image not in mine]
     moved = [p for p in before.solution.placed if p.frame.image in mine]
     complete = replace(solution, placed=[*earlier, *solution.placed])
     stays = {p.frame.image: before.gains[p.frame.image] for p in earlier if p.frame.image in before.gains}
     thumbnails = before.thumbnails | task.thumbnails
-    gains = gains_of(complete, thumbnails, [read_solution(path) for path in task.neighbours], stays)
+    gains = gains_of(complete, thumbnails, task.read_neighbours(), stays)
     sortie = SolutionFile(complete, thumbnails, gains)
     sortie.write(task.target)
     changed = visible_ground([*solution.placed, *moved], sortie.terrain)
     return watch.solved(solution, task.frames, sortie, changed)
 
 
-def coarse_after(task: tuple[Path, tuple[float, float], Path]) -> SortieResult:
-    """The coarse placement that a refined sortie began from, for the coarse layer.
-
-    Args:
-        task: the refined sortie's solution file, the area's origin, the path of the coarse one.
+def coarse_after(task: SortieTask) -> SortieResult:
+    """The coarse placement that the refined sortie in `before` began from, for the coarse layer.
 
     Raises:
         OrthoSwarmError: the refined one does not contain it any more.
     """
     from orthoswarm.refine.strategy.in_flight import coarse_of
 
-    watch = _Watch()
-    source, origin, target = task
-    fine = read_solution(source)
-    solution = coarse_of(fine.solution, np.array(origin))
+    watch, fine = _Watch(), task.read_before()
+    solution = coarse_of(fine.solution, np.array(task.origin))
     there = {p.frame.image for p in solution.placed}
     solution.placed.extend(p for p in fine.solution.placed if p.frame.image not in there)  # registered to the others
     sortie = replace(fine, solution=solution)
-    sortie.write(target)
+    sortie.write(task.target)
     return watch.solved(replace(solution, legs=[]), [], sortie, visible_ground(solution.placed, sortie.terrain))
-
-
-def _basemap(task: SolveTask) -> Basemap | None:
-    return None if task.basemap is None else Basemap.open(task.basemap, task.epsg, near(task.frames, task.epsg))
 
 
 def near(frames: Sequence[Frame], epsg: int) -> BoundingBox:

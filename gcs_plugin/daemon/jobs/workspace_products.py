@@ -12,11 +12,11 @@ import numpy as np
 
 from gcs_plugin.daemon.jobs.solution_file import read_solution
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
-from gcs_plugin.daemon.store.job_rows import Job, latest_jobs
+from gcs_plugin.daemon.store.job_rows import latest_jobs
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.daemon.store.sortie_rows import completion_rows
 from orthoswarm.canvas.canvas import Canvas
-from orthoswarm.compute.workers import Usage, peak_rss_mb
+from orthoswarm.compute.workers import peak_rss_mb
 from orthoswarm.export.forms import FORMS, MapExport
 from orthoswarm.export.tactical import places
 from orthoswarm.export.tactical.places import Place
@@ -33,6 +33,9 @@ FORMATS: Final = tuple(name for name, form in FORMS.items() if form.daemon)
 PRODUCTS: Final = ("cog", "gpkg")
 """The formats that are written without being asked for."""
 _MOST_JOBS: Final = 1000  # the latest ones
+_OTHER_STAGES: Final = {
+    "coarse: in flight": "coarse", "fine: neighbours together": "together", "final: tones": "tones",
+}  # fmt: skip
 _FILES: Final = {"realtime": "realtime.tif", "coarse": "coarse.tif", "fine": "orthoimage.tif"}
 
 
@@ -259,42 +262,25 @@ class RunFacts:
 
     def document(self) -> dict[str, Any]:
         """Stage timings from jobs, completions, and resource usage, as JSON values."""
-        return _facts(
-            latest_jobs(self.journal, _MOST_JOBS), completion_rows(self.journal), time.time() - self.started,
-            [pool.usage() for pool in self.pools],
-        )  # fmt: skip
+        jobs, pools = latest_jobs(self.journal, _MOST_JOBS), [pool.usage() for pool in self.pools]
+        wall_s, cpu_s = time.time() - self.started, time.process_time()
+        stages = [{"name": "realtime", "wall_s": wall_s, "cpu_s": cpu_s, "items": 0}]  # counted in the report
+        for job in jobs:
+            if job.kind == "refine" and job.state == "done":
+                stages += _summed(f"{job.detail.get('layer', 'fine')}: {job.vehicle}", [job.detail])
+        placing = [job for job in jobs if "frames" in job.detail]
+        for name, kind in _OTHER_STAGES.items():
+            stages += _summed(name, [job.detail for job in placing if job.kind == kind])
+        document = {
+            "stages": stages, "wall_s": wall_s, "cpu_s": cpu_s + sum(pool.cpu_s for pool in pools),
+            "peak_rss_mb": peak_rss_mb() + sum(pool.peak_rss_mb for pool in pools),
+            "completions": completion_rows(self.journal),
+        }  # fmt: skip
+        return dict(json.loads(json.dumps(document)))
 
 
-def _facts(
-    jobs: Sequence[Job], completions: list[dict[str, Any]], wall_s: float, others: Sequence[Usage]
-) -> dict[str, Any]:
-    cpu_s = time.process_time()
-    stages = [
-        {"name": "realtime", "wall_s": wall_s, "cpu_s": cpu_s, "items": 0},  # counted when the report is written
-        *(
-            {
-                "name": f"{job.detail.get('layer', 'fine')}: {job.vehicle}",
-                "wall_s": job.detail.get("seconds", 0.0),
-                "cpu_s": job.detail.get("solve_cpu_s", 0.0), "items": job.detail.get("frames", 0),
-            }
-            for job in jobs
-            if job.kind == "refine" and job.state == "done"
-        ),
-        *_summed("coarse: in flight", "coarse", jobs),
-        *_summed("fine: neighbours together", "together", jobs),
-        *_summed("final: tones", "tones", jobs),
-    ]  # fmt: skip
-    document = {
-        "stages": stages, "wall_s": wall_s, "cpu_s": cpu_s + sum(other.cpu_s for other in others),
-        "peak_rss_mb": peak_rss_mb() + sum(other.peak_rss_mb for other in others), "completions": completions,
-    }  # fmt: skip
-    return dict(json.loads(json.dumps(document)))
-
-
-def _summed(name: str, kind: str, jobs: Sequence[Job]) -> list[dict[str, Any]]:
-    """The summed timing of all jobs of a kind that placed pictures, if there were any."""
-    details = [job.detail for job in jobs if job.kind == kind and "frames" in job.detail]
-    if not details:
-        return []
-    wall, cpu = (sum(d.get(key, 0.0) for d in details) for key in ("seconds", "solve_cpu_s"))
-    return [{"name": name, "wall_s": wall, "cpu_s": cpu, "items": sum(d["frames"] for d in details)}]
+def _summed(name: str, details: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The summed timing of some jobs, by what is kept of each; nothing of no job."""
+    wall_s, cpu_s = (sum(d.get(key, 0.0) for d in details) for key in ("seconds", "solve_cpu_s"))
+    items = sum(d.get("frames", 0) for d in details)
+    return [{"name": name, "wall_s": wall_s, "cpu_s": cpu_s, "items": items}] if details else []

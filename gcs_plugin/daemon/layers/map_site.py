@@ -4,19 +4,26 @@ The basemap determines the location, else the newest plan, else the majority of 
 """
 
 import logging
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import numpy as np
 
 from gcs_plugin.daemon.intake.posted_pose import is_position
-from gcs_plugin.daemon.layers.anchor import ExpectedPlace
 from gcs_plugin.daemon.layers.layers import MapArea, MapLayer, new_name, successor
-from gcs_plugin.daemon.store.daemon_events import AreaChanged, DrawingRestarted
-from gcs_plugin.daemon.store.event_bus import Events
-from gcs_plugin.daemon.store.frame_rows import frames_undrawn, poses_after
-from gcs_plugin.daemon.store.journal import Journal, all_changes, area_forgotten, fact_change, no_change
+from gcs_plugin.daemon.layers.web_tiles import TileServer
+from gcs_plugin.daemon.store.daemon_events import AreaChanged, DrawingRestarted, Events
+from gcs_plugin.daemon.store.frame_rows import poses_after
+from gcs_plugin.daemon.store.journal import (
+    Journal,
+    all_changes,
+    area_forgotten,
+    drawn_forgotten,
+    fact_change,
+    no_change,
+)
 from gcs_plugin.daemon.store.sortie_rows import solution_paths
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.model.bounding_box import BoundingBox
@@ -28,6 +35,57 @@ from orthoswarm.model.geo import LocalGrid, utm_epsg
 from orthoswarm.mosaic.footprint import default_gsd, footprint_boxes, rejection
 from orthoswarm.mosaic.realtime import RealtimeMosaic
 from orthoswarm.mosaic.recorded_pose import recorded_cameras
+
+
+@dataclass(frozen=True, slots=True)
+class Anchor:
+    """The place where pictures are expected.
+
+    Attributes:
+        name: for messages: "the basemap". bounds: south, west, north, east in degrees.
+    """
+
+    name: str
+    bounds: tuple[float, float, float, float]
+
+    @classmethod
+    def of_ground(cls, name: str, epsg: int, box: BoundingBox) -> "Anchor":
+        """The anchor of a box on a UTM grid."""
+        west, south, east, north = box
+        ring = LocalGrid(epsg).to_geographic([[west, south], [west, north], [east, south], [east, north]])
+        low, high = ring.min(0), ring.max(0)
+        return cls(name, (float(low[0]), float(low[1]), float(high[0]), float(high[1])))
+
+    def distance_m(self, lat_deg: float, lon_deg: float) -> float:
+        """Distance of a position from the bounds in metres, to a hundredth; 0 inside."""
+        south, west, north, east = self.bounds
+        middle = 0.5 * (west + east)
+        lon_deg = middle + (lon_deg - middle + 180.0) % 360.0 - 180.0
+        return distance_m(lat_deg, lon_deg, min(max(lat_deg, south), north), min(max(lon_deg, west), east))
+
+
+class NewestPlan(Protocol):
+    """The plans of a workspace."""
+
+    def newest_bounds(self) -> tuple[float, float, float, float] | None:
+        """South, west, north, east of the newest plan in degrees, None if there is none."""
+
+
+@dataclass(frozen=True, slots=True)
+class ExpectedPlace:
+    """The location of the map before its first picture."""
+
+    tiles: TileServer
+    plans: NewestPlan
+
+    def place(self) -> Anchor | None:
+        """The basemap, else the newest plan; None if the pictures decide."""
+        basemap = self.tiles.basemap
+        if basemap is not None:
+            return Anchor.of_ground("the basemap", basemap.epsg, basemap.bounds)
+        found = self.plans.newest_bounds()
+        return None if found is None else Anchor("the newest plan", found)
+
 
 _FEW: Final = 200  # pictures drawn, up to which another ground pixel is chosen anew
 _OTHER_GSD: Final = 3.0  # times the map's ground pixel
@@ -41,6 +99,7 @@ class MapSite:
 
     Attributes:
         area: the map's area, None before the first frame. grid: its grid. mosaic: draws on its canvas.
+        layer: the real-time layer. folder: of all layers' canvases.
     """
 
     def __init__(
@@ -50,12 +109,11 @@ class MapSite:
         """Continue where the last daemon stopped.
 
         Args:
-            layer: the real-time layer. folder: of all layers' canvases.
             gsd_m: ground pixel; from the first pictures if None. fov_rad: theta-hat, see recorded_cameras.
             expected: where the map is to lie. events: told when the area changes, and when all is drawn again.
             memory_mb: what the canvas keeps of its tiles.
         """
-        self._journal, self._layer, self._folder, self._events = journal, layer, folder, events
+        self._journal, self.layer, self.folder, self._events = journal, layer, folder, events
         self._gsd_m, self._fov_rad, self._expected, self._memory_mb = gsd_m, fov_rad, expected, memory_mb
         self._positions: list[tuple[float, float]] = []  # of the journal's frames up to the number `_counted`
         self._counted = 0
@@ -147,7 +205,7 @@ class MapSite:
         self._journal.write(area_forgotten)
         self._events.publish(DrawingRestarted())
         self.area, self.grid, self.mosaic = None, None, None
-        self._layer.replace(None)
+        self.layer.replace(None)
 
     def _is_other_scale(self, camera: Camera) -> bool:
         """Whether the map's ground pixel was derived from pictures during the climb."""
@@ -179,26 +237,26 @@ class MapSite:
             area = self.area.grown(bounds)
         except OrthoSwarmError as error:
             return str(error)
-        old = self._layer.canvas
+        old = self.layer.canvas
         name = new_name("realtime")
-        path, memory_mb = self._folder / name, self._memory_mb
+        path, memory_mb = self.folder / name, self._memory_mb
         self._adopt(area, successor(old, path, area.grid, "orthogonality", share=True, memory_mb=memory_mb))
         return None
 
     # -- the layer ------------------------------------------------------------------------------------------------
 
     def _begin(self, area: MapArea, *, again: bool = False) -> None:
-        canvas = Canvas.create(self._folder / new_name("realtime"), area.grid, memory_mb=self._memory_mb)
+        canvas = Canvas.create(self.folder / new_name("realtime"), area.grid, memory_mb=self._memory_mb)
         self._adopt(area, canvas, again=again)
 
     def _adopt(self, area: MapArea, canvas: Canvas, *, again: bool = False) -> None:
         """Make a canvas the layer, in the journal first."""
         facts = [fact_change("area", area.document()), fact_change("realtime", canvas.path.name)]
-        self._journal.write(all_changes(*facts, frames_undrawn if again else no_change))
+        self._journal.write(all_changes(*facts, drawn_forgotten if again else no_change))
         if again:
             self._events.publish(DrawingRestarted())
         self.area = area
-        self._layer.replace(canvas)
+        self.layer.replace(canvas)
         self.mosaic = RealtimeMosaic(canvas)
         self.grid = LocalGrid(area.epsg)
         self._events.publish(AreaChanged(area.epsg))
@@ -207,12 +265,12 @@ class MapSite:
         """The canvas that the last daemon drew on; drawn anew from the journal if it is damaged."""
         assert self.area is not None
         try:
-            canvas = Canvas.open(self._folder / str(name), memory_mb=self._memory_mb)
+            canvas = Canvas.open(self.folder / str(name), memory_mb=self._memory_mb)
         except (OrthoSwarmError, OSError):
             _log.warning("the real-time layer is damaged and is drawn again")
             self._begin(self.area, again=True)
             return
-        self._layer.replace(canvas)
+        self.layer.replace(canvas)
         self.mosaic = RealtimeMosaic(canvas)
         self.grid = LocalGrid(self.area.epsg)
         self._events.publish(AreaChanged(self.area.epsg))

@@ -18,12 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gcs_plugin.daemon.intake.posted_pose import frame_of_row
-from gcs_plugin.daemon.layers.anchor import ExpectedPlace
 from gcs_plugin.daemon.layers.draw_queue import DrawQueue, MapDelay, PendingFrame
-from gcs_plugin.daemon.layers.layers import MapArea, MapLayer, new_name
+from gcs_plugin.daemon.layers.layers import MapArea, new_name
 from gcs_plugin.daemon.layers.map_site import MapSite
+from gcs_plugin.daemon.stoppable_thread import Background
 from gcs_plugin.daemon.store.daemon_events import (
     DrawingRestarted,
+    Events,
     FrameReported,
     LayerDrawn,
     Overload,
@@ -32,7 +33,6 @@ from gcs_plugin.daemon.store.daemon_events import (
     PictureStored,
     Problem,
 )
-from gcs_plugin.daemon.store.event_bus import Events
 from gcs_plugin.daemon.store.frame_rows import (
     Drawn,
     frames_drawn,
@@ -60,7 +60,7 @@ _log = logging.getLogger(__name__)
 Bytes = NDArray[np.uint8]
 
 
-class Drawer:
+class Drawer(Background):
     """Draws the frames of a journal on the real-time layer.
 
     Attributes:
@@ -73,14 +73,9 @@ class Drawer:
         self,
         journal: Journal,
         store: PictureStore,
-        layer: MapLayer,
-        folder: Path,
+        site: MapSite,
         events: Events,
         *,
-        gsd_m: float | None = None,
-        fov_rad: float | None = None,
-        expected: ExpectedPlace,
-        canvas_mb: float,
         in_memory: int = _IN_MEMORY,
         late_s: float = _LATE_S,
         look_s: float = _LOOK_S,
@@ -89,16 +84,15 @@ class Drawer:
         """Continue where the last daemon stopped; `start` begins to draw.
 
         Args:
-            layer: to draw on. folder: of all layers' canvases. expected: where the map should lie.
-            gsd_m: ground pixel; from the first pictures if None. canvas_mb: memory that the layer keeps of its tiles.
-            fov_rad: theta-hat, the field of view to assume; see recorded_cameras.
+            site: of the map, whose layer is drawn on.
             in_memory: most frames that wait in memory; the journal has the others.
             late_s: a frame drawn later than this after its arrival is late, seconds.
             look_s: time between looks for late frames, seconds.
             read: reads a picture file, uint8 (rows, columns, 4).
         """
+        super().__init__("drawing", join_s=None)
         self._in_memory, self._late_s, self._look_s, self._read = in_memory, late_s, look_s, read
-        self._journal, self._store, self._layer, self._folder, self._events = journal, store, layer, folder, events
+        self._journal, self._store, self._site, self._events = journal, store, site, events
         self._begun = 0
         self._queue = DrawQueue(self._in_memory)
         self._delay = MapDelay()
@@ -106,36 +100,18 @@ class Drawer:
         self._looked = 0.0
         self._more = True
         self._condition = threading.Condition()
-        self._stop = False
-        self._thread: threading.Thread | None = None
         self.drawn = self.late = self.put_off = 0
         self.latencies: list[float] = []
         self.problem = ""
-        self._site = MapSite(
-            journal,
-            layer,
-            folder,
-            gsd_m=gsd_m,
-            fov_rad=fov_rad,
-            expected=expected,
-            events=events,
-            memory_mb=canvas_mb,
-        )
 
     # -- from outside ---------------------------------------------------------------------------------------------
-
-    def start(self) -> None:
-        """Start drawing, in a thread."""
-        self._thread = threading.Thread(target=self._run, name="drawing", daemon=True)
-        self._thread.start()
 
     def close(self) -> None:
         """Stop after the present frame."""
         with self._condition:
-            self._stop = True
+            self._stop.set()
             self._condition.notify_all()
-        if self._thread is not None:
-            self._thread.join()
+        super().close()
 
     def picture_stored(self, event: PictureStored) -> None:
         """Add a frame that is in the journal."""
@@ -165,7 +141,7 @@ class Drawer:
         """Wait until a sortie's frames are drawn; False after the time-out."""
         end = time.monotonic() + timeout_s
         while not sortie_is_drawn(self._journal, vehicle, sortie):
-            if time.monotonic() > end or self._stop:
+            if time.monotonic() > end or self._stop.is_set():
                 return False
             time.sleep(0.05)
         return True
@@ -173,12 +149,12 @@ class Drawer:
     # -- the thread -----------------------------------------------------------------------------------------------
 
     def _run(self) -> None:
-        load_kernels(self._folder)
+        load_kernels(self._site.folder)
         while True:
             with self._condition:
-                while not len(self._queue) and not self._more and not self._stop:
+                while not len(self._queue) and not self._more and not self._stop.is_set():
                     self._condition.wait()
-                if self._stop:
+                if self._stop.is_set():
                     return
             try:
                 self._refill()
@@ -258,7 +234,7 @@ class Drawer:
         seqs: list[int] = []
         while len(done) < _AT_ONCE:
             with self._condition:
-                pending = None if self._stop else self._queue.take()
+                pending = None if self._stop.is_set() else self._queue.take()
             if pending is None:
                 break
             begun = self._begun
@@ -270,7 +246,7 @@ class Drawer:
             self._note(pending, result)
         if done:
             self._journal.write(frames_drawn(done))
-            self._events.publish(LayerDrawn("realtime", self._layer.version))
+            self._events.publish(LayerDrawn("realtime", self._site.layer.version))
         with self._condition:
             self._waiting.difference_update(seqs)
             self._condition.notify_all()

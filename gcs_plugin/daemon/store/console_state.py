@@ -6,8 +6,7 @@ from collections.abc import Mapping
 from datetime import datetime
 from typing import Any, Final, TypedDict, cast
 
-from gcs_plugin.daemon.store.daemon_events import FindsChanged, PlanChanged
-from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.daemon.store.daemon_events import Events, FindsChanged, PlanChanged
 from gcs_plugin.daemon.store.journal import Journal
 from orthoswarm.export.product_files import iso_time
 from orthoswarm.model.errors import InputError, OrthoSwarmError

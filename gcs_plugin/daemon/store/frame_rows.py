@@ -1,13 +1,13 @@
-"""Pictures in the journal: with their recorded poses, what was drawn of them, and what became of them."""
+"""Pictures in the journal: their recorded poses, what was drawn of them, what became of them; and camera events."""
 
 import json
 import sqlite3
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import astuple, dataclass
 from typing import Any, Final
 
-from gcs_plugin.daemon.store.journal import Change, Journal, packed, unpacked
+from gcs_plugin.daemon.store.journal import Change, Journal, all_changes, packed, statements, unpacked
 from orthoswarm.raster.picture_quality import PictureQuality
 
 Whose = tuple[str, int]
@@ -296,18 +296,43 @@ def frames_drawn(results: Iterable[Drawn]) -> Change:
     thumbnails = [(d.seq, d.thumbnail) for d in done if d.thumbnail is not None]
     qualities = [(d.seq, *astuple(d.quality)) for d in done if d.quality is not None]
 
-    def change(db: sqlite3.Connection) -> None:
-        db.executemany(
+    return all_changes(
+        statements(
             "UPDATE frames SET drawn = 1, reason = ?, stage = CASE WHEN stage IN ('coarse', 'fine') THEN stage"
             " ELSE ? END, sigma = CASE WHEN stage IN ('coarse', 'fine') THEN sigma ELSE ? END WHERE seq = ?",
             rows,
-        )
-        db.executemany("INSERT OR REPLACE INTO thumbnails VALUES (?, ?)", thumbnails)
-        db.executemany("INSERT OR REPLACE INTO qualities VALUES (?, ?, ?, ?, ?)", qualities)
+        ),
+        statements("INSERT OR REPLACE INTO thumbnails VALUES (?, ?)", thumbnails),
+        statements("INSERT OR REPLACE INTO qualities VALUES (?, ?, ?, ?, ?)", qualities),
+    )
 
-    return change
+
+Exposed = tuple[str, int, float, float | None, float | None]
+"""Vehicle, number, UTC epoch seconds, latitude and longitude in degrees (None where the camera had no position)."""
 
 
-def frames_undrawn(db: sqlite3.Connection) -> None:
-    """The change after which all frames are drawn again."""
-    db.execute("UPDATE frames SET drawn = 0")
+def exposures_added(rows: Sequence[Exposed]) -> Change:
+    """The change that adds events; those that are known stay."""
+    values = [(packed(vehicle), *rest) for vehicle, *rest in rows]
+    return statements("INSERT OR IGNORE INTO exposures VALUES (?, ?, ?, ?, ?)", values)
+
+
+def all_exposures(journal: Journal) -> list[Exposed]:
+    """All events, by vehicle and time."""
+    rows = journal.rows("SELECT vehicle, number, time, lat, lon FROM exposures ORDER BY vehicle, time")
+    return [(unpacked(r["vehicle"]), int(r["number"]), float(r["time"]), r["lat"], r["lon"]) for r in rows]
+
+
+def exposure_times(journal: Journal, vehicle: str) -> list[tuple[int, float]]:
+    """Numbers and times of a vehicle's events."""
+    rows = journal.rows("SELECT number, time FROM exposures WHERE vehicle = ?", (packed(vehicle),))
+    return [(row["number"], row["time"]) for row in rows]
+
+
+def exposure_place(journal: Journal, vehicle: str, number: int, time_s: float) -> tuple[float, float] | None:
+    """Latitude and longitude of an event (of those with its number the nearest in time), None without a position."""
+    row = journal.one(
+        "SELECT lat, lon FROM exposures WHERE vehicle = ? AND number = ? AND lat IS NOT NULL ORDER BY ABS(time - ?)",
+        (packed(vehicle), number, time_s),
+    )
+    return None if row is None else (float(row["lat"]), float(row["lon"]))

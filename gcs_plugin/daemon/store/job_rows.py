@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from gcs_plugin.daemon.store.journal import Change, Journal, packed, unpacked
+from gcs_plugin.daemon.store.journal import Change, Journal, packed, statement, unpacked
 from orthoswarm.export.product_files import iso_time
 
 _MOST_RESTARTS: Final = 20  # of a job by the daemon's own restarts
@@ -132,16 +132,11 @@ def new_job(
 
 def waiting_jobs_dropped(kind: str, vehicle: str, why: str) -> Change:
     """The change that ends a vehicle's waiting jobs of a kind."""
-    values = (why, time.time(), kind, packed(vehicle))
-
-    def change(db: sqlite3.Connection) -> None:
-        db.execute(
-            "UPDATE jobs SET state = 'done', progress = 1, message = ?, ended = ? WHERE kind = ? AND vehicle = ?"
-            " AND state = 'queued' AND json_extract(detail, '$.after') IS NULL",
-            values,
-        )
-
-    return change
+    return statement(
+        "UPDATE jobs SET state = 'done', progress = 1, message = ?, ended = ? WHERE kind = ? AND vehicle = ?"
+        " AND state = 'queued' AND json_extract(detail, '$.after') IS NULL",
+        (why, time.time(), kind, packed(vehicle)),
+    )
 
 
 def interrupted_jobs_queued(db: sqlite3.Connection) -> None:
@@ -156,32 +151,18 @@ def interrupted_jobs_queued(db: sqlite3.Connection) -> None:
 
 def job_started(job: Job) -> Change:
     """The change that records a job's start."""
-    values = (job.started, job.attempts, json.dumps(job.detail), job.id)
-
-    def change(db: sqlite3.Connection) -> None:
-        db.execute(
-            "UPDATE jobs SET state = 'running', started = ?, attempts = ?, message = '', detail = ? WHERE id = ?",
-            values,
-        )
-
-    return change
+    return statement(
+        "UPDATE jobs SET state = 'running', started = ?, attempts = ?, message = '', detail = ? WHERE id = ?",
+        (job.started, job.attempts, json.dumps(job.detail), job.id),
+    )
 
 
 def job_ended(job: Job) -> Change:
     """The change that records a job's end."""
     values = (job.state, job.progress, job.message, job.ended, job.attempts, json.dumps(job.detail), job.id)
-
-    def change(db: sqlite3.Connection) -> None:
-        db.execute("UPDATE jobs SET state=?, progress=?, message=?, ended=?, attempts=?, detail=? WHERE id=?", values)
-
-    return change
+    return statement("UPDATE jobs SET state=?, progress=?, message=?, ended=?, attempts=?, detail=? WHERE id=?", values)
 
 
 def job_done(number: int) -> Change:
     """The change that marks a job as done, to be written with its result: it is not repeated if the daemon ends now."""
-    values = (time.time(), number)
-
-    def change(db: sqlite3.Connection) -> None:
-        db.execute("UPDATE jobs SET state = 'done', progress = 1, ended = ? WHERE id = ?", values)
-
-    return change
+    return statement("UPDATE jobs SET state = 'done', progress = 1, ended = ? WHERE id = ?", (time.time(), number))

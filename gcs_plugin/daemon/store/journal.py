@@ -223,32 +223,36 @@ class Journal:
         self.write(fact_change(key, value))
 
 
+def statement(query: str, values: Sequence[Any]) -> Change:
+    """The change that one statement makes."""
+    return lambda db: db.execute(query, values)
+
+
+def statements(query: str, rows: Sequence[Sequence[Any]]) -> Change:
+    """The change that a statement makes with each of some rows."""
+    return lambda db: db.executemany(query, rows)
+
+
 def fact_change(key: str, value: Any) -> Change:
     """The change that stores a JSON value, to be combined with others."""
-    text = json.dumps(value)
-
-    def change(db: sqlite3.Connection) -> None:
-        db.execute("INSERT OR REPLACE INTO meta VALUES (?, ?)", (key, text))
-
-    return change
+    return statement("INSERT OR REPLACE INTO meta VALUES (?, ?)", (key, json.dumps(value)))
 
 
 def workspace_opened(boot: str, *, trusted: bool) -> Change:
     """The change at a daemon's start; what was drawn before is drawn again unless it can be trusted."""
+    facts = fact_change("boot", boot), fact_change("clean", False)
+    drawn = () if trusted else (drawn_forgotten, statement("DELETE FROM meta WHERE key = 'realtime'", ()))
+    return all_changes(*facts, *drawn)
 
-    def change(db: sqlite3.Connection) -> None:
-        fact_change("boot", boot)(db)
-        fact_change("clean", False)(db)
-        if not trusted:
-            db.execute("UPDATE frames SET drawn = 0")
-            db.execute("DELETE FROM meta WHERE key = 'realtime'")
 
-    return change
+def drawn_forgotten(db: sqlite3.Connection) -> None:
+    """The change after which all frames are drawn again."""
+    db.execute("UPDATE frames SET drawn = 0")
 
 
 def area_forgotten(db: sqlite3.Connection) -> None:
     """The change that drops the map's location; all frames are drawn again."""
-    db.execute("UPDATE frames SET drawn = 0")
+    drawn_forgotten(db)
     db.execute("DELETE FROM meta WHERE key IN ('area', 'realtime')")
 
 

@@ -8,7 +8,16 @@ from typing import Any, Final, Literal, TypedDict
 
 from gcs_plugin.daemon.store.frame_rows import Whose
 from gcs_plugin.daemon.store.job_rows import new_job
-from gcs_plugin.daemon.store.journal import Change, Journal, fact_change, packed, unpacked
+from gcs_plugin.daemon.store.journal import (
+    Change,
+    Journal,
+    all_changes,
+    fact_change,
+    packed,
+    statement,
+    statements,
+    unpacked,
+)
 from orthoswarm.export.json_values import finite
 from orthoswarm.model.bounding_box import BoundingBox
 
@@ -159,16 +168,11 @@ def completion_rows(journal: Journal) -> list[dict[str, Any]]:
 
 def vehicle_found(vehicle: str) -> Change:
     """The change that adds a vehicle."""
-    key = packed(vehicle)
-
-    def change(db: sqlite3.Connection) -> None:
-        db.execute("INSERT OR IGNORE INTO vehicles (id) VALUES (?)", (key,))
-
-    return change
+    return statement("INSERT OR IGNORE INTO vehicles (id) VALUES (?)", (packed(vehicle),))
 
 
 def mission_noted(vehicle: str, kind: str, detector: Mapping[str, Any], completion: Mapping[str, Any]) -> Change:
-    """The change that records what a mission came to; see `MissionJournal.note`.
+    """The change that records what a mission came to; a start after a flight opens a sortie.
 
     Args:
         kind: started, complete, aborted, suspended or resumed. detector: its state.
@@ -236,16 +240,12 @@ def sortie_refined(placed: PlacedSortie, stages: Mapping[str, tuple[str, float]]
         (stage, finite(sigma), *key, packed(image)) for image, (stage, sigma) in stages.items() if image not in lost
     ]
     rejected = [(why, *key, packed(image)) for image, why in lost.items()]
-    row = (*key, placed.path, json.dumps(placed.detail))
-
-    def change(db: sqlite3.Connection) -> None:
-        db.executemany("UPDATE frames SET stage = ?, sigma = ? WHERE vehicle = ? AND sortie = ? AND image = ?", rows)
-        db.executemany(
-            "UPDATE frames SET stage = 'rejected', reason = ? WHERE vehicle = ? AND sortie = ? AND image = ?", rejected
-        )
-        db.execute("INSERT OR REPLACE INTO solutions VALUES (?, ?, ?, ?)", row)
-
-    return change
+    where = "WHERE vehicle = ? AND sortie = ? AND image = ?"
+    return all_changes(
+        statements(f"UPDATE frames SET stage = ?, sigma = ? {where}", rows),
+        statements(f"UPDATE frames SET stage = 'rejected', reason = ? {where}", rejected),
+        _stands("solutions", placed),
+    )
 
 
 def legs_placed(placed: PlacedSortie, sigmas: Mapping[str, float], lost: Collection[str]) -> Change:
@@ -256,41 +256,35 @@ def legs_placed(placed: PlacedSortie, sigmas: Mapping[str, float], lost: Collect
     """
     key = packed(placed.vehicle), placed.sortie
     rows = [(finite(sigma), *key, packed(image)) for image, sigma in sigmas.items() if image not in lost]
-    row = (*key, placed.path, json.dumps(placed.detail))
-
-    def change(db: sqlite3.Connection) -> None:
-        db.executemany(
+    return all_changes(
+        statements(
             "UPDATE frames SET stage = 'coarse', sigma = ? WHERE vehicle = ? AND sortie = ? AND image = ?"
             " AND stage IN ('realtime', 'coarse') AND reason IS NULL",
             rows,
-        )
-        db.execute("INSERT OR REPLACE INTO coarse VALUES (?, ?, ?, ?)", row)
+        ),
+        _stands("coarse", placed),
+    )
 
-    return change
+
+def _stands(table: Table, placed: PlacedSortie) -> Change:
+    values = packed(placed.vehicle), placed.sortie, placed.path, json.dumps(placed.detail)
+    return statement(f"INSERT OR REPLACE INTO {table} VALUES (?, ?, ?, ?)", values)
 
 
 def solution_replaced(whose: Whose, path: str) -> Change:
     """The change that names another solution file of a refined sortie."""
     values = path, packed(whose[0]), whose[1]
-
-    def change(db: sqlite3.Connection) -> None:
-        db.execute("UPDATE solutions SET path = ? WHERE vehicle = ? AND sortie = ?", values)
-
-    return change
+    return statement("UPDATE solutions SET path = ? WHERE vehicle = ? AND sortie = ?", values)
 
 
 def placements_forgotten(gone: Mapping[Table, Iterable[PlacedSortie]]) -> Change:
     """The change that drops placed sorties, and the layers that show them."""
-    keys = {table: [(packed(row.vehicle), row.sortie) for row in rows] for table, rows in gone.items()}
-
-    def change(db: sqlite3.Connection) -> None:
-        for table, rows in keys.items():
-            db.executemany(f"DELETE FROM {table} WHERE vehicle = ? AND sortie = ?", rows)
-            db.executemany(
-                "UPDATE frames SET stage = 'realtime' WHERE vehicle = ? AND sortie = ? AND stage IN ('coarse', 'fine')",
-                rows,
-            )
-        for layer in REFINED:
-            fact_change(layer, None)(db)
-
-    return change
+    changes = [fact_change(layer, None) for layer in REFINED]
+    for table, rows in gone.items():
+        keys = [(packed(row.vehicle), row.sortie) for row in rows]
+        where = "WHERE vehicle = ? AND sortie = ?"
+        changes += [
+            statements(f"DELETE FROM {table} {where}", keys),
+            statements(f"UPDATE frames SET stage = 'realtime' {where} AND stage IN ('coarse', 'fine')", keys),
+        ]
+    return all_changes(*changes)

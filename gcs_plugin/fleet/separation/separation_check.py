@@ -4,13 +4,13 @@ All are followed on their missions from their takeoffs on by the planner's model
 the levels of their homes (`Airspace`). What cannot be followed so is said: it was not examined.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Final
 
 from gcs_plugin.fleet.flight_state import Word, flight_state
-from gcs_plugin.fleet.separation.separation_watch import number_name
+from gcs_plugin.fleet.separation.separation_watch import NUMBERED, VehicleNames
 from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.mission.items import Mission
 from gcs_plugin.mission.plan_folder import NO_NEEDS, PlanNeeds
@@ -73,12 +73,13 @@ def others_of(vehicles: Mapping[int, Vehicle], waiting: Mapping[int, float]) -> 
 
 
 def separation_of(
-    flights: Mapping[int, TimedFlight], name: Callable[[int], str] = number_name, needs: PlanNeeds = NO_NEEDS
+    flights: Mapping[int, TimedFlight], names: VehicleNames = NUMBERED, needs: PlanNeeds = NO_NEEDS
 ) -> SeparationFindings:
     """Which vehicles come too near each other; takes a second or more for a large swarm.
 
     `needs`: of the plan, by which it keeps its own vehicles apart; what is usual holds for all others.
     """
+    name = names.name_of
     known = {s: flight for s, flight in flights.items() if flight.mission is not None}
     found: dict[int, list[str]] = {}
     for one, other, at, apart_m in _conflicts(tuple(sorted(known.items())), needs):

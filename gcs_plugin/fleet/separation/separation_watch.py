@@ -1,7 +1,7 @@
 """Alarms about vehicles in the air that come too close, with a proposal."""
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import Final
 
@@ -39,9 +39,30 @@ class Near:
         return min(self.one, self.other), max(self.one, self.other)
 
 
-def number_name(system: int) -> str:
-    """Name of a vehicle to which the operator gave none."""
-    return f"v{system}"
+@dataclass(frozen=True, slots=True)
+class VehicleNames:
+    """What vehicles are called: by the operator, else v and their MAVLink system id.
+
+    Attributes:
+        systems: id of a vehicle by its MAVLink system id. titles: what people call it, by its id.
+    """
+
+    systems: Mapping[int, str] = field(default_factory=dict)
+    titles: Mapping[str, str] = field(default_factory=dict)
+
+    def name_of(self, system: int) -> str:
+        """The id of a vehicle with a MAVLink system id; no two have the same."""
+        name = f"v{system}"
+        if system not in self.systems and name in self.systems.values():  # the name of another system id
+            return f"system-{system}"
+        return self.systems.get(system, name)
+
+    def title_of(self, vehicle: str) -> str:
+        """What people call a vehicle, empty if nothing else than its id."""
+        return self.titles.get(vehicle, "")
+
+
+NUMBERED: Final = VehicleNames()
 
 
 @dataclass(slots=True)
@@ -50,12 +71,13 @@ class SeparationWatch:
 
     Attributes:
         distance_m: horizontally, or height_m: vertically, they keep at least so far apart.
-        alarms: pairs that are too near now or soon, by their system ids in order.
+        alarms: pairs that are too near now or soon, by their system ids in order. names: of the vehicles.
     """
 
     distance_m: float = APART.distance_m
     height_m: float = APART.height_m
     alarms: dict[tuple[int, int], Near] = field(default_factory=dict)
+    names: VehicleNames = NUMBERED
 
     def look(self, vehicles: Iterable[Vehicle], now: float) -> tuple[list[Near], list[tuple[int, int]]]:
         """Compare all pairs; returns new or newly unknown alarms, and the pairs whose alarm is over.
@@ -90,11 +112,11 @@ class SeparationWatch:
         self.alarms = found
         return new, ended
 
-    def text(self, system: int, name: Callable[[int], str] = number_name) -> str:
-        """The alarm of a vehicle in words, empty if there is none; `name` returns the names of vehicles."""
+    def text(self, system: int) -> str:
+        """The alarm of a vehicle in words, empty if there is none."""
         for near in self.alarms.values():
             if system in near.pair:
-                return near_text(near, self, name)
+                return near_text(near, self)
         return ""
 
     def _reach(self, vehicle: Vehicle) -> float:
@@ -127,8 +149,9 @@ class SeparationWatch:
         return all(distance_m(*_place(v, ahead_s), *(v.launch or (0.0, 0.0))) < reach for v in (one, other))
 
 
-def near_text(near: Near, watch: SeparationWatch, name: Callable[[int], str] = number_name) -> str:
-    """An alarm in words; `name` gives the names of vehicles."""
+def near_text(near: Near, watch: SeparationWatch) -> str:
+    """An alarm in words."""
+    name = watch.names.name_of
     one, other = name(near.one), name(near.other)
     if near.silent:
         lost = " and ".join(name(system) for system in near.silent)
@@ -143,9 +166,9 @@ def near_text(near: Near, watch: SeparationWatch, name: Callable[[int], str] = n
     )
 
 
-def apart_text(pair: tuple[int, int], name: Callable[[int], str] = number_name) -> str:
+def apart_text(pair: tuple[int, int], names: VehicleNames) -> str:
     """The end of an alarm in words."""
-    return f"{name(pair[0])} and {name(pair[1])} are apart again"
+    return f"{names.name_of(pair[0])} and {names.name_of(pair[1])} are apart again"
 
 
 def _proposal(one: Vehicle, other: Vehicle) -> tuple[int, int]:

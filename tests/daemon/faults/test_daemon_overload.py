@@ -10,13 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gcs_plugin.daemon.intake.posted_pose import frame_of, parse_pose
-from gcs_plugin.daemon.layers.anchor import ExpectedPlace
 from gcs_plugin.daemon.layers.draw_queue import DrawQueue, MapDelay, PendingFrame
 from gcs_plugin.daemon.layers.layers import MapLayer
+from gcs_plugin.daemon.layers.map_site import ExpectedPlace, MapSite
 from gcs_plugin.daemon.layers.realtime_layer import Drawer
 from gcs_plugin.daemon.layers.web_tiles import TileServer
-from gcs_plugin.daemon.store.daemon_events import FrameReported, Overload, PictureStored
-from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.daemon.store.daemon_events import Events, FrameReported, Overload, PictureStored
 from gcs_plugin.daemon.store.frame_rows import add_frame, undrawn_frames
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.daemon.store.picture_store import PictureStore, frame_key
@@ -165,19 +164,10 @@ def drawing(folder, read, **options):
     journal, store = Journal(folder / "journal.db"), PictureStore(folder / "p")
     (folder / "layers").mkdir()
     expected = ExpectedPlace(TileServer({}), Plans(folder / "plans", None, None))
-    drawer = Drawer(
-        journal,
-        store,
-        layer,
-        folder / "layers",
-        events,
-        gsd_m=0.5,
-        in_memory=12,
-        read=read,
-        expected=expected,
-        canvas_mb=64.0,
-        **options,
+    site = MapSite(
+        journal, layer, folder / "layers", gsd_m=0.5, fov_rad=None, expected=expected, events=events, memory_mb=64.0
     )
+    drawer = Drawer(journal, store, site, events, in_memory=12, read=read, **options)
     drawer.start()
     data = jpeg(camera_at())
 

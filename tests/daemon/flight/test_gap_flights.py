@@ -8,9 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gcs_plugin.daemon.flight_coverage.battery_use import BatteryUse
-from gcs_plugin.daemon.flight_coverage.flown_legs import FlownLegs
-from gcs_plugin.daemon.flight_coverage.planned_area import PlannedLegs
+from gcs_plugin.daemon.flight_coverage.flown_legs import BatteryUse, FlownLegs, PlannedLegs
 from gcs_plugin.daemon.gap_flights import GapFlights
 from gcs_plugin.daemon.web_plans import Plans
 from orthoswarm.model.errors import InputError, OrthoSwarmError

@@ -3,14 +3,13 @@
 import numpy as np
 import pytest
 
-from gcs_plugin.daemon.flight_coverage.file_numbers import PictureNames
-from gcs_plugin.daemon.flight_coverage.picture_requests import PictureRequests, WantedPicture
+from gcs_plugin.daemon.flight_coverage.picture_requests import PictureNames, PictureRequests, WantedPicture
 from gcs_plugin.links.file_transfer import FtpPayload, Nak, Opcode, file_crc32
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.sim.file_server import FileServer
 from gcs_plugin.sim.lossy_radio import NO_FAULTS, Faults
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
-from orthoswarm.model.errors import DiskFullError, InputError, OrthoSwarmError
+from orthoswarm.model.errors import DiskFullError, InputError
 from tests.kit.vehicles.memory_link import World
 
 START_S = 1_780_000_000.0
@@ -25,11 +24,6 @@ class Workspace:
 
     def __init__(self, ground, names):
         self.ground, self.known = ground, names
-
-    def system_of(self, vehicle):
-        if vehicle != "v1":
-            raise OrthoSwarmError("unknown")
-        return 1
 
     def wanted(self):
         return list(self.ground.wanted.values())

@@ -8,7 +8,7 @@ import pytest
 import rasterio
 from rasterio.transform import from_origin
 
-from gcs_plugin.daemon.airspace.terrain_data import TerrainData, terrain_answers
+from gcs_plugin.daemon.airspace import TerrainData, terrain_answers
 from gcs_plugin.links.mavlink import Autopilot, Message, dialect
 from gcs_plugin.mission.exchange import Address
 from gcs_plugin.sim.simulated_vehicle import SimVehicle

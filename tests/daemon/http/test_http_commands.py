@@ -14,13 +14,12 @@ from urllib.parse import urlsplit
 import httpx
 import pytest
 
-from gcs_plugin.daemon.intake.refused_pictures import RefusedPictures
+from gcs_plugin.daemon.intake.picture_intake import RefusedPictures
 from gcs_plugin.daemon.settings import Settings, VehicleSettings
-from gcs_plugin.daemon.store.daemon_events import PictureRefused
-from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.daemon.store.daemon_events import Events, PictureRefused
 from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
 from gcs_plugin.web.connections import open_listener
-from gcs_plugin.web.standstill import Standstill
+from gcs_plugin.web.event_stream import Standstill
 from gcs_plugin.web.uploads import UploadLimits, moving
 from orthoswarm.model.errors import InputError
 from tests.kit.daemon_kit import GRID, form, line, serving

@@ -5,12 +5,10 @@ import json
 import pytest
 
 from gcs_plugin.daemon.intake.posted_pose import is_position, parse_pose
-from gcs_plugin.daemon.layers.anchor import Anchor, ExpectedPlace
 from gcs_plugin.daemon.layers.layers import MapLayer
-from gcs_plugin.daemon.layers.map_site import MapSite
+from gcs_plugin.daemon.layers.map_site import Anchor, ExpectedPlace, MapSite
 from gcs_plugin.daemon.layers.web_tiles import TileServer
-from gcs_plugin.daemon.store.daemon_events import DrawingRestarted
-from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.daemon.store.daemon_events import DrawingRestarted, Events
 from gcs_plugin.daemon.store.frame_rows import add_frame
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.daemon.web_plans import Plans

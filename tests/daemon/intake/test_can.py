@@ -9,8 +9,7 @@ import pytest
 
 from gcs_plugin.daemon.intake.can_reader import CanReader
 from gcs_plugin.daemon.settings import Settings, VehicleSettings
-from gcs_plugin.daemon.store.daemon_events import Note
-from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.daemon.store.daemon_events import Events, Note
 from gcs_plugin.fleet.fleet import Fleet
 from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.sim.multirotor import Airframe

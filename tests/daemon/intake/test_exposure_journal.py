@@ -8,7 +8,7 @@ import numpy as np
 
 from gcs_plugin.daemon.flight_coverage.exposure_journal import EventRequests, ExposureJournal
 from gcs_plugin.daemon.store.journal import Journal
-from gcs_plugin.daemon.vehicle_names import VehicleNames
+from gcs_plugin.fleet.separation.separation_watch import VehicleNames
 from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.sim.lossy_radio import Faults
 from gcs_plugin.sim.simulated_vehicle import SimVehicle

@@ -12,12 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gcs_plugin.daemon.intake.file_complete import is_complete, is_video_complete
-from gcs_plugin.daemon.intake.picture_intake import LinkLog, VehicleIntake
+from gcs_plugin.daemon.intake.picture_intake import VehicleIntake
 from gcs_plugin.daemon.intake.picture_sources import PictureSource
 from gcs_plugin.daemon.intake.posted_pose import frame_of
-from gcs_plugin.daemon.store.daemon_events import Note
-from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.daemon.intake.watched_folder import is_complete, is_video_complete
+from gcs_plugin.daemon.store.daemon_events import Events, Note
 from gcs_plugin.daemon.store.picture_store import frame_key
 from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.links.tlog_writer import TlogWriter, read_tlog, write_link_log
@@ -95,8 +94,9 @@ def source_to(workspace, where, said, cache):
     """A vehicle's source of pictures; what it says is added to a list."""
     events = Events()
     events.on(Note, lambda note: said.append(note.text))
-    log = LinkLog(cache / "telemetry.tlog", {})
-    return PictureSource(where, VehicleIntake("v1", workspace, events, poses=LinkPoses(), link_log=log, cache=cache))
+    log = cache / "telemetry.tlog"
+    intake = VehicleIntake("v1", workspace, events, poses=LinkPoses(), tlog=log, system=None, cache=cache)
+    return PictureSource(where, intake)
 
 
 def test_a_stream_without_pictures_is_told_once(tmp_path):

@@ -8,11 +8,10 @@ import pytest
 
 from gcs_plugin.daemon.daemon import Daemon
 from gcs_plugin.daemon.jobs.leg_watch import LegWatch
-from gcs_plugin.daemon.jobs.publisher import Publisher
+from gcs_plugin.daemon.jobs.publisher import LayerTurn, Publisher
 from gcs_plugin.daemon.jobs.solution_file import read_solution
 from gcs_plugin.daemon.settings import Settings
-from gcs_plugin.daemon.store.daemon_events import LegsOver, VehicleSilent
-from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.daemon.store.daemon_events import Events, LegsOver, VehicleSilent
 from orthoswarm.model.errors import StorageError
 from tests.kit.made_up import LIMIT_S, after_job, complete, post, truth
 
@@ -89,12 +88,11 @@ def test_a_refinement_that_cannot_be_published_leaves_the_former_one(daemon, fli
     assert refined.state == "done", refined.message
     retired = []
 
-    def full(publisher, *_, change, **__):
-        change({})
+    def full(turn, change):
         raise StorageError("the disk is full")
 
-    monkeypatch.setattr(Publisher, "publish", full)
-    monkeypatch.setattr(Publisher, "retire", lambda _, path: retired.append(path))
+    monkeypatch.setattr(LayerTurn, "publish", full)
+    monkeypatch.setattr(Publisher, "retire", lambda _, row: retired.append(row))
     post_at_once(daemon, frames[14:])
     _, late = after_job(daemon, 2)
     assert late.state == "failed" and "disk is full" in late.message

@@ -9,8 +9,7 @@ import pytest
 from gcs_plugin.daemon.jobs.job_queue import Jobs
 from gcs_plugin.daemon.jobs.solution_file import SolutionFile, SolutionFileError, is_readable, read_solution
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
-from gcs_plugin.daemon.store.daemon_events import JobEnded
-from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.daemon.store.daemon_events import Events, JobEnded
 from gcs_plugin.daemon.store.frame_rows import add_frame, late_frames
 from gcs_plugin.daemon.store.journal import Journal
 from orthoswarm.model.errors import DiskFullError, OrthoSwarmError, StorageError, WorkerStoppedError
@@ -47,18 +46,18 @@ def until(is_so):
         time.sleep(0.01)
 
 
-def nothing(job, report):
+def nothing(run):
     return lambda db: None
 
 
 def test_the_end_of_a_job_is_written_when_the_disk_has_room_again(journal):
-    def fill(job, report):
+    def fill(run):
         journal.full.set()
         return lambda db: None
 
     ended = []
     events = Events()
-    jobs = Jobs(journal, events, {"refine": fill}, slots=1)
+    jobs = Jobs(journal, events, {"refine": fill}, WorkerPool(1), WorkerPool(1))
     events.on(JobEnded, lambda event: ended.append((event.job.kind, event.job.state, jobs.open("refine"))))
     job = jobs.add("refine", "v1", 1)
     jobs.start()
@@ -75,11 +74,11 @@ def test_the_end_of_a_job_is_written_when_the_disk_has_room_again(journal):
 
 
 def test_a_failure_is_written_when_the_disk_has_room_again(journal):
-    def fail(job, report):
+    def fail(run):
         journal.full.set()
         raise OrthoSwarmError("no pictures")
 
-    jobs = Jobs(journal, Events(), {"refine": fail}, slots=1)
+    jobs = Jobs(journal, Events(), {"refine": fail}, WorkerPool(1), WorkerPool(1))
     job = jobs.add("refine", "v1", 1)
     jobs.start()
     assert journal.refused.wait(LIMIT_S)
@@ -92,13 +91,13 @@ def test_a_failure_is_written_when_the_disk_has_room_again(journal):
 def test_only_a_lost_worker_is_tried_again_whatever_the_message_says(journal):
     tries = []
 
-    def handler(job, report):
-        tries.append(job.vehicle)
-        if job.vehicle == "v1":
+    def handler(run):
+        tries.append(run.job.vehicle)
+        if run.job.vehicle == "v1":
             raise WorkerStoppedError("gone")
         raise OrthoSwarmError("a picture named 'stopped from outside' is damaged")
 
-    jobs = Jobs(journal, Events(), {"refine": handler}, slots=1)
+    jobs = Jobs(journal, Events(), {"refine": handler}, WorkerPool(1), WorkerPool(1))
     one, other = jobs.add("refine", "v1", 1), jobs.add("refine", "v2", 1)
     jobs.start()
     until(lambda: all(jobs.find(job.id).state == "failed" for job in (one, other)))
@@ -110,12 +109,12 @@ def test_a_refinement_begins_while_others_wait_and_the_background_is_busy(journa
     """One slot, a background job and two refinements that wait for pictures: the third one begins all the same."""
     go, began = threading.Event(), []
 
-    def handler(job, report):
-        began.append(job.vehicle)
+    def handler(run):
+        began.append(run.job.vehicle)
         assert go.wait(LIMIT_S)
         return lambda db: None
 
-    jobs = Jobs(journal, Events(), {"refine": handler, "export": handler}, slots=1)
+    jobs = Jobs(journal, Events(), {"refine": handler, "export": handler}, WorkerPool(1), WorkerPool(1))
     jobs.start()
     jobs.add("export")
     until(lambda: began == [None])
@@ -129,16 +128,16 @@ def test_a_refinement_begins_while_others_wait_and_the_background_is_busy(journa
 def test_an_export_waits_for_a_refinement_and_so_holds_its_result(journal):
     go, order = threading.Event(), []
 
-    def refine(job, report):
+    def refine(run):
         assert go.wait(LIMIT_S)
         order.append("refine")
         return lambda db: None
 
-    def export(job, report):
+    def export(run):
         order.append("export")
         return lambda db: None
 
-    jobs = Jobs(journal, Events(), {"refine": refine, "export": export}, slots=1)
+    jobs = Jobs(journal, Events(), {"refine": refine, "export": export}, WorkerPool(1), WorkerPool(1))
     jobs.start()
     running = jobs.add("refine", "v1", 1)
     until(lambda: jobs.find(running.id).state == "running")
@@ -152,7 +151,7 @@ def test_an_export_waits_for_a_refinement_and_so_holds_its_result(journal):
 
 
 def test_a_number_that_no_job_can_have_finds_none(journal):
-    jobs = Jobs(journal, Events(), {}, slots=1)
+    jobs = Jobs(journal, Events(), {}, WorkerPool(1), WorkerPool(1))
     assert [jobs.find(number) for number in (0, -1, 2**63, 2**63 - 1)] == [None] * 4
 
 
@@ -251,7 +250,7 @@ def test_what_is_late_does_not_depend_on_the_clock(journal, monkeypatch, set_s):
 
     ended, events = [], Events()
     events.on(JobEnded, lambda event: ended.append(event.job.id))
-    jobs = Jobs(journal, events, {"refine": nothing}, slots=1)
+    jobs = Jobs(journal, events, {"refine": nothing}, WorkerPool(1), WorkerPool(1))
     come("a", "b")
     jobs.add("refine", "v1", 1, trigger="lost")
     jobs.start()
@@ -272,7 +271,7 @@ def test_pictures_that_were_late_for_an_earlier_version_are_late_still(journal):
     for image, came_s in (("a", 10.0), ("b", 20.0), ("c", 30.0)):
         journal.write(add_frame(image.encode(), "v1", image, time_s=1e9, path=image, size=(640, 480), pose={}))
         journal.write(lambda db, s=came_s, i=image: db.execute("UPDATE frames SET arrived = ? WHERE path = ?", (s, i)))
-    job = Jobs(journal, Events(), {"refine": nothing}, slots=1).add(
+    job = Jobs(journal, Events(), {"refine": nothing}, WorkerPool(1), WorkerPool(1)).add(
         "refine", "v1", 1, trigger="lost", refine_started_s=15.0
     )
     journal.write(lambda db: db.execute("UPDATE jobs SET state = 'done', started = 5.0 WHERE id = ?", (job.id,)))
@@ -282,12 +281,12 @@ def test_pictures_that_were_late_for_an_earlier_version_are_late_still(journal):
 def test_a_refinement_that_was_interrupted_is_not_queued_beside_itself(journal):
     begun, go_on = threading.Event(), threading.Event()
 
-    def wait(job, report):
+    def wait(run):
         begun.set()
         assert go_on.wait(LIMIT_S)
         return lambda db: None
 
-    jobs = Jobs(journal, Events(), {"refine": wait}, slots=1)
+    jobs = Jobs(journal, Events(), {"refine": wait}, WorkerPool(1), WorkerPool(1))
     jobs.start()
     first = jobs.add("refine", "v1", 1)
     assert begun.wait(LIMIT_S)

@@ -8,13 +8,16 @@ import numpy as np
 import pytest
 
 from gcs_plugin.daemon.daemon import Daemon
-from gcs_plugin.daemon.jobs.job_queue import Jobs, Preempted
-from gcs_plugin.daemon.jobs.joint_refinement import JointRefinement
+from gcs_plugin.daemon.jobs.job_queue import Jobs
 from gcs_plugin.daemon.jobs.kernel_warmup import made_up_flight, made_up_ground, write_map
+from gcs_plugin.daemon.jobs.neighbours import JointRefinement
+from gcs_plugin.daemon.jobs.publisher import Publisher
 from gcs_plugin.daemon.jobs.solution_file import read_solution
+from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
 from gcs_plugin.daemon.jobs.worker_tasks import without_strays
+from gcs_plugin.daemon.layers.layers import MapArea
 from gcs_plugin.daemon.settings import Settings
-from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.daemon.store.daemon_events import Events
 from gcs_plugin.daemon.store.journal import Journal, packed
 from orthoswarm.model.camera import Camera, Lens, rotation_from_angles
 from orthoswarm.model.placement import PlacedFrame, Solution
@@ -141,18 +144,18 @@ def ended(jobs, count):
 def test_neighbours_wait_until_no_refinement_waits_or_runs(journal):
     going, order, beside = threading.Event(), [], []
 
-    def refine(job, report):
+    def refine(run):
         assert going.wait(240)
         time.sleep(0.1)  # there is a thread that could take the other job
-        order.append(job.kind)
+        order.append(run.job.kind)
         return lambda db: None
 
-    def together(job, report):
+    def together(run):
         beside.append([other.kind for other in jobs.all() if other.state == "running"])
-        order.append(job.kind)
+        order.append(run.job.kind)
         return lambda db: None
 
-    jobs = Jobs(journal, Events(), {"refine": refine, "together": together}, slots=2)
+    jobs = Jobs(journal, Events(), {"refine": refine, "together": together}, WorkerPool(2), WorkerPool(1))
     jobs.add("together", "v1", 1)
     jobs.add("refine", "v2", 1)
     jobs.add("refine", "v3", 1)
@@ -174,38 +177,37 @@ class Rows:
         return [self.one("", (packed(v),)) for v in ("v1", "v2")]
 
 
-class Placed:
+class Placed(Publisher):
     """A publisher of an area."""
 
     def __init__(self, folder):
-        self.solutions = folder
+        self.solutions, self.journal, self.basemap, self._device = folder, Rows(), folder / "map.tif", "auto"
 
     def area(self):
-        from gcs_plugin.daemon.layers.layers import MapArea
-
         return MapArea(32631, 0.1, (0.0, 0.0), (0.0, 0.0, 9.0, 9.0))
 
 
 def test_a_refinement_that_begins_takes_its_process_and_it_is_done_later(journal, tmp_path):
     workers = StoppedWorkers(lambda task: task.target)
-    work = JointRefinement(
-        journal=Rows(), publisher=Placed(tmp_path), workers=workers, basemap=tmp_path / "map.tif", least_px=0.1
-    )
-    jobs = Jobs(journal, Events(), {"together": work.solve}, slots=1)
+    work = JointRefinement(Placed(tmp_path), least_px=0.1)
+    began = threading.Event()
+
+    def refine(run):
+        began.set()
+        return lambda db: None
+
+    jobs = Jobs(journal, Events(), {"together": work.solve, "refine": refine}, WorkerPool(1), workers)
     job = jobs.add("together", "v1", 1)
-    found = []
-
-    def run():
-        try:
-            work.solve(job, lambda share, text: None)
-        except Preempted:
-            found.append("gave way")
-
-    thread = threading.Thread(target=run)
-    thread.start()
+    jobs.start()
     assert workers.began.wait(240)
-    work.give_way()
-    thread.join(240)
-    assert found == ["gave way"]
+    jobs.add("refine", "v2", 1)
+    assert began.wait(240)
+    end = time.monotonic() + LIMIT_S
+    while workers.asked < 2:  # it is done once more
+        assert time.monotonic() < end, jobs.all()
+        time.sleep(0.01)
+    assert jobs.find(job.id).attempts == 1  # giving way is not a failed attempt
+    jobs.give_up()
+    workers.abandon()
+    jobs.close()
     assert not list(tmp_path.glob("*.pickle"))
-    work.give_way()  # nothing runs: nothing happens

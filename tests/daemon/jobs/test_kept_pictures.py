@@ -2,7 +2,6 @@
 
 import contextlib
 import os
-import threading
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,11 +10,12 @@ import numpy as np
 import pytest
 
 from gcs_plugin.daemon.daemon import Daemon
-from gcs_plugin.daemon.jobs.placed_sorties import frames_of
+from gcs_plugin.daemon.jobs.publisher import frames_of
 from gcs_plugin.daemon.jobs.solution_file import read_solution
+from gcs_plugin.daemon.jobs.sortie_refinement import SortieRefinement
 from gcs_plugin.daemon.jobs.worker_tasks import near
 from gcs_plugin.daemon.settings import Settings
-from gcs_plugin.daemon.store.kept_pictures import KeptPictures
+from gcs_plugin.daemon.store.picture_store import KeptPictures
 from orthoswarm.raster.basemap import Basemap
 from orthoswarm.refine.strategy.swarm_refiner import SwarmRefiner
 from tests.kit.made_up import LIMIT_S, after_job, complete, post
@@ -104,17 +104,18 @@ def test_a_vehicle_that_is_silent_before_it_completes_is_followed_then(tmp_path,
         assert found == alone
 
 
-def test_a_picture_that_comes_meanwhile_is_refined_with_the_others(tmp_path, flight):
+def test_a_picture_that_comes_meanwhile_is_refined_with_the_others(tmp_path, flight, monkeypatch):
     with Daemon(settings_of(tmp_path, flight, coarse=False)) as daemon:
         last = [flight[0][27:]]
 
-        class AskedWhileItWaitsForPictures(threading.Event):
-            def is_set(self):
-                if last:
-                    post(daemon, last.pop())
-                return super().is_set()
+        wait = SortieRefinement.wait_drawn
 
-        daemon.refinement.stopping = AskedWhileItWaitsForPictures()
+        def last_comes(work, run):
+            if last:
+                post(daemon, last.pop())
+            wait(work, run)
+
+        monkeypatch.setattr(SortieRefinement, "wait_drawn", last_comes)
         post(daemon, flight[0][:27])
         complete(daemon)
         (job,) = after_job(daemon, 1)

@@ -13,18 +13,18 @@ from gcs_plugin.daemon.jobs.job_queue import Jobs, Preempted
 from gcs_plugin.daemon.jobs.kernel_warmup import made_up_flight, made_up_ground, write_map
 from gcs_plugin.daemon.jobs.leg_placement import MOST, newest_legs
 from gcs_plugin.daemon.jobs.leg_watch import LegWatch
-from gcs_plugin.daemon.jobs.placed_sorties import detail_of
+from gcs_plugin.daemon.jobs.publisher import detail_of
 from gcs_plugin.daemon.jobs.solution_file import read_solution
+from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
 from gcs_plugin.daemon.jobs.worker_tasks import SortieResult
-from gcs_plugin.daemon.store.daemon_events import JobDropped, LegsOver
-from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.daemon.store.daemon_events import Events, LegsOver
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.daemon.store.sortie_rows import LegRow
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.frame import Fix, Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.trajectory.legs import LEG_REACH, ended_legs
-from tests.kit.daemon_kit import Shot, exported, line, serving
+from tests.kit.daemon_kit import Shot, StoppedWorkers, exported, line, serving
 
 GRID = LocalGrid(32631)
 
@@ -130,12 +130,12 @@ def finished(jobs, count, limit_s=240.0):
 def test_refinement_goes_before_what_is_in_the_background(journal):
     order = []
 
-    def handler(job, report):
-        order.append((job.kind, job.vehicle))
+    def handler(run):
+        order.append((run.job.kind, run.job.vehicle))
         time.sleep(0.02)
         return lambda db: None
 
-    jobs = Jobs(journal, Events(), dict.fromkeys(("refine", "coarse", "export"), handler), slots=1)
+    jobs = Jobs(journal, Events(), dict.fromkeys(("refine", "coarse", "export"), handler), WorkerPool(1), WorkerPool(1))
     for vehicle in ("v1", "v2"):
         jobs.add("coarse", vehicle, 1)
     jobs.add("coarse", "v0", 1, after="refine")
@@ -149,20 +149,12 @@ def test_refinement_goes_before_what_is_in_the_background(journal):
     assert order.index(("refine", "v3")) < order.index(("coarse", "v0"))  # an export may run beside the refinement
 
 
-def test_coarse_jobs_of_a_vehicle_are_dropped_when_it_completes(journal):
-    started, stop = threading.Event(), threading.Event()
-
-    def handler(job, report):
-        started.set()
-        assert stop.wait(240)
-        raise OSError("its process was taken away")
-
-    events = Events()
-    events.on(JobDropped, lambda event: stop.set())
-    jobs = Jobs(journal, events, {"coarse": handler}, slots=1)
+def test_coarse_jobs_of_a_vehicle_are_dropped_when_it_completes(journal, tmp_path):
+    workers = StoppedWorkers(lambda item: tmp_path / "half")
+    jobs = Jobs(journal, Events(), {"coarse": lambda run: run.run(len, "")}, WorkerPool(1), workers)
     jobs.add("coarse", "v1", 1)
     jobs.start()
-    assert started.wait(240)
+    assert workers.began.wait(240)
     jobs.add("coarse", "v1", 1, over=True)
     jobs.drop("coarse", "v1", "dropped: the refinement takes its place")
     done = finished(jobs, 2)
@@ -173,13 +165,13 @@ def test_coarse_jobs_of_a_vehicle_are_dropped_when_it_completes(journal):
 def test_work_that_gave_way_is_done_again(journal):
     tries = []
 
-    def handler(job, report):
-        tries.append(job.attempts)
+    def handler(run):
+        tries.append(run.job.attempts)
         if len(tries) == 1:
-            raise Preempted
+            raise Preempted("a refinement begins")
         return lambda db: None
 
-    jobs = Jobs(journal, Events(), {"coarse": handler}, slots=1)
+    jobs = Jobs(journal, Events(), {"coarse": handler}, WorkerPool(1), WorkerPool(1))
     jobs.add("coarse", "v1", 1)
     jobs.start()
     finished(jobs, 1)

@@ -1,12 +1,12 @@
 """A refinement waits for the map that its first picture begins."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import threading
+from dataclasses import dataclass, field
 
 import pytest
 
+from gcs_plugin.daemon.jobs.job_queue import RunningJob
 from gcs_plugin.daemon.jobs.sortie_refinement import SortieRefinement
-from gcs_plugin.daemon.store.daemon_events import JobsStop
 from gcs_plugin.daemon.store.job_rows import Job
 
 JOB = Job(
@@ -32,40 +32,38 @@ class Drawing:
     begins: bool = True
     asked: int = 0
     area: object = None
-    at_fourth: Callable = lambda _: None
+    stops: bool = False
+    stopping: threading.Event = field(default_factory=threading.Event)
 
     def wait_drawn(self, vehicle, sortie, timeout_s):
         self.asked += 1
-        if self.asked == 4:
-            self.at_fourth(JobsStop())
+        if self.asked == 4 and self.stops:
+            self.stopping.set()
         if self.asked <= self.busy:
             return False
         self.area = object() if self.begins else None
         return True
 
 
-def refinement(drawing):
-    return SortieRefinement(
-        journal=None, store=None, kept=None, publisher=None, workers=None, drawer=drawing, basemap=None, events=None
-    )
+def wait(drawing):
+    run = RunningJob(JOB, None, drawing.stopping, None)
+    SortieRefinement(publisher=None, store=None, kept=None, drawer=drawing).wait_drawn(run)
 
 
 @pytest.mark.parametrize("busy", [0, 5])
 def test_it_waits_until_the_first_picture_has_begun_the_map(busy):
     drawing = Drawing(busy)
-    refinement(drawing).wait_drawn(JOB)
+    wait(drawing)
     assert drawing.area is not None and drawing.asked == busy + 1
 
 
 def test_it_waits_no_longer_where_no_picture_can_begin_it():
     drawing = Drawing(2, begins=False)
-    refinement(drawing).wait_drawn(JOB)
+    wait(drawing)
     assert drawing.asked == 3
 
 
 def test_it_waits_no_longer_once_the_daemon_ends():
-    drawing = Drawing(1000)
-    work = refinement(drawing)
-    drawing.at_fourth = work.stop
-    work.wait_drawn(JOB)
+    drawing = Drawing(1000, stops=True)
+    wait(drawing)
     assert drawing.asked == 4

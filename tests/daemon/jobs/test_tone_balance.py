@@ -1,17 +1,20 @@
 """The tones of all refined sorties are balanced together once nothing more urgent is to be done."""
 
 import threading
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 
 from gcs_plugin.daemon.daemon import Daemon
-from gcs_plugin.daemon.jobs.job_queue import Preempted
+from gcs_plugin.daemon.jobs.job_queue import Preempted, RunningJob
 from gcs_plugin.daemon.jobs.kernel_warmup import made_up_flight, made_up_ground, write_map
+from gcs_plugin.daemon.jobs.neighbours import ToneBalance, ToneTask, balance_tones
+from gcs_plugin.daemon.jobs.publisher import Publisher
 from gcs_plugin.daemon.jobs.solution_file import SolutionFile, gains_of, read_solution
-from gcs_plugin.daemon.jobs.tone_balance import ToneBalance, ToneTask, balance_tones
 from gcs_plugin.daemon.settings import Settings
+from gcs_plugin.daemon.store.daemon_events import Events
 from gcs_plugin.daemon.store.journal import packed
 from orthoswarm.model.placement import Solution, Terrain
 from orthoswarm.mosaic.render_passes import thumbnail
@@ -139,34 +142,36 @@ def solution_path(daemon, vehicle):
     return daemon.journal.one("SELECT path FROM solutions WHERE vehicle = ?", (packed(vehicle),))["path"]
 
 
-class Shown:
-    """A publisher of two refined sorties, and the journal that holds them."""
-
-    def __init__(self, folder):
-        self.solutions = folder
+class Refined:
+    """A journal with two refined sorties."""
 
     def rows(self, query):
         detail = '{"layer": "fine", "bounds": [0, 0, 9, 9]}'
         return [{"vehicle": packed(v), "sortie": 1, "path": v, "detail": detail} for v in ("v1", "v2")]
 
 
+class Shown(Publisher):
+    """A publisher of two refined sorties."""
+
+    def __init__(self, folder):
+        self.solutions, self.journal, self.refined = folder, Refined(), "fine"
+
+
 def test_it_gives_way_to_a_refinement_and_leaves_nothing_behind(tmp_path):
     workers, found = StoppedWorkers(lambda task: task.targets[0]), []
-    work = ToneBalance(journal=Shown(tmp_path), publisher=Shown(tmp_path), workers=workers, layer="fine")
-
-    class AnyJob:
-        def __init__(self):
-            self.detail = {}
+    running = RunningJob(SimpleNamespace(detail={}, document=dict), workers, threading.Event(), Events())
 
     def run():
         try:
-            work.balance(AnyJob(), lambda share, text: None)
+            ToneBalance(Shown(tmp_path)).balance(running)
         except Preempted:
             found.append("gave way")
 
     thread = threading.Thread(target=run)
     thread.start()
     assert workers.began.wait(240)
-    work.give_way()
+    running.give_way()
     thread.join(240)
     assert found == ["gave way"] and not list(tmp_path.glob("*.pickle"))
+    with pytest.raises(Preempted):
+        running.run(len, "")  # nor is anything begun any more

@@ -7,8 +7,8 @@ import pytest
 
 from gcs_plugin.cli.main import main
 from gcs_plugin.daemon.jobs.job_queue import Jobs
-from gcs_plugin.daemon.store.daemon_events import JobEnded
-from gcs_plugin.daemon.store.event_bus import Events
+from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
+from gcs_plugin.daemon.store.daemon_events import Events, JobEnded
 from gcs_plugin.daemon.store.journal import Journal, wrote_refined
 from tests.kit.daemon_kit import exported, line, serving
 
@@ -18,12 +18,13 @@ LIMIT_S = 240.0
 def test_what_a_refinement_has_changed_is_written_before_other_work_and_after_refinements_that_wait(tmp_path):
     journal, order, over = Journal(tmp_path / "journal.db"), [], threading.Event()
 
-    def handler(job, report):
+    def handler(run):
+        job = run.job
         order.append((job.kind, job.vehicle, job.detail.get("after")))
         return lambda db: None
 
     events, kinds = Events(), ("refine", "together", "coarse", "tones", "export")
-    jobs = Jobs(journal, events, dict.fromkeys(kinds, handler), slots=1)
+    jobs = Jobs(journal, events, dict.fromkeys(kinds, handler), WorkerPool(1), WorkerPool(1))
     events.on(JobEnded, lambda event: over.set() if not jobs.open() else None)
     jobs.add("export", formats=["kmz"])
     for kind, vehicle in (("coarse", "v1"), ("together", "v1"), ("tones", None)):

@@ -243,7 +243,7 @@ def test_a_start_does_not_wait_for_what_is_never_told(open_links, folder, monkey
         del vehicle.parameters[name]
     links = open_links(vehicles)
     ready(links, 1)
-    links.command(lambda fleet: fleet.upload(1, read_mission(folder / "v1.waypoints", AP)))
+    links.upload(1, read_mission(folder / "v1.waypoints", AP))
     asked, ask = [], links.fleet.ask_settings
     monkeypatch.setattr(links.fleet, "ask_settings", lambda system: (asked.append(system), ask(system)))
     for _ in range(3):

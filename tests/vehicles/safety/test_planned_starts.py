@@ -98,10 +98,10 @@ def test_a_command_to_stop_counts_though_the_check_begins_at_that_moment(open_li
     takeoffs = Takeoffs(links, plans, lambda _: None)
     cancel = links.waiting.cancel
 
-    def late(vehicle):
+    def late(vehicle, fleet):
         thread.start()
         assert plans.asked.wait(120.0)
-        return cancel(vehicle)
+        return cancel(vehicle, fleet)
 
     thread = beginning(takeoffs, said)
     monkeypatch.setattr(links.waiting, "cancel", late)
@@ -161,9 +161,9 @@ def test_a_vehicle_whose_takeoff_waits_takes_no_other_mission(open_links, folder
     takeoffs.begin("plan-1")
     other = read_mission(folder / "v1.waypoints", links.fleet.vehicles[2].autopilot)
     with pytest.raises(OrthoSwarmError, match=r"waits for its takeoff .* cancel that first"):
-        links.command(lambda fleet: fleet.upload(2, other))
+        links.upload(2, other)
     assert links.commands("pause", ["v2"])[0]["outcome"] == "done"
-    links.command(lambda fleet: fleet.upload(2, other))
+    links.upload(2, other)
     takeoffs.close()
 
 

@@ -221,7 +221,11 @@ class Field:
         self.missions = {v.system: self._mission(v) for v in vehicles}
         self.log: list[str] = []
         self._later: list[tuple[float, float, Iterator[None]]] = []  # uploads of the other station: when, how often
-        self.fleet.takeoff_due = lambda s: any(s in plan.schedule.waiting for plan in self.plans)
+        self.fleet.takeoffs = self
+
+    def __contains__(self, system):
+        """Whether a vehicle's takeoff waits."""
+        return any(system in plan.schedule.waiting for plan in self.plans)
 
     @property
     def now(self):
@@ -312,7 +316,7 @@ class Field:
         if verb == "start":
             vehicle = self.fleet.vehicles[system]
             mission = self.random.choice((self.missions[system], None))
-            if not self.fleet.takeoff_due(system):
+            if system not in self:
                 self._start(system, self.now, self.fleet.stops.get(system, 0), vehicle.standing, mission)
             return
         order = self.fleet.order(Order(verb=verb, system=system, given_s=self.now))

@@ -1,1 +1,0 @@
-"""What bounds the flight: other aircraft, geofences, and the terrain that vehicles follow."""
