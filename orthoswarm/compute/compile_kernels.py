@@ -56,7 +56,7 @@ def compile_all(report: Report) -> int:
             compiled += task.result()
             done += len(modules[running[task]])
             report(done, total)
-        if compiled:
+        if compiled or not (SIGNATURES.with_name("compiled") / "made_for.json").exists():
             pool.submit(_tidy, order).result()
     return compiled
 
