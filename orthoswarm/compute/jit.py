@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any, Final, cast
 
 import numba
+from numba.core.types import unliteral
 
 from orthoswarm.compute import processor
 from orthoswarm.compute.kernel_cache import KernelCache
@@ -43,4 +44,11 @@ def in_place_kernel(function: Kernel) -> Kernel:
 def _compiled(function: Kernel, **options: bool) -> Kernel:
     made = numba.njit(**_OPTIONS, **options)(function)
     made._cache = KernelCache(function)
+    called = made.get_call_template
+
+    def without_constants(args: Any, keywords: Any) -> Any:
+        """Types of a call in another kernel, so that one with a constant needs no code of its own."""
+        return called(tuple(map(unliteral, args)), {name: unliteral(kind) for name, kind in keywords.items()})
+
+    made.get_call_template = without_constants
     return cast(Kernel, made)

@@ -23,6 +23,7 @@ Function = Callable[..., Any]
 
 FOLDER: Final = Path(__file__).with_name("compiled")
 """Of the kernels that were compiled into the package."""
+_OPTIONS: Final = str(Path(__file__).with_name("jit.py"))
 
 
 class KernelCache:
@@ -107,8 +108,8 @@ class _Packaged(caching.FunctionCache):  # type: ignore[misc]
 
 
 def compiled_in(function: Function) -> bytes:
-    """Digest of what a function's machine code depends on: its file, numbers it may read, functions of other files."""
-    digest = blake2b(_content(function.__code__.co_filename), digest_size=16)
+    """Digest of what machine code depends on: a function's file, numbers and functions of others, the options."""
+    digest = blake2b(_content(function.__code__.co_filename) + _content(_OPTIONS), digest_size=16)
     for name, value in sorted(function.__globals__.items()):
         if isinstance(value, Dispatcher | _Intrinsic):
             called = inspect.unwrap(value)
