@@ -2,7 +2,7 @@
 
 What was compiled before stays unless something changed that goes into it. `signatures.txt` lists the kernels that
 Python calls and the types of their arguments, a line each; what they call comes with them. A test runs the product and
-shows that nothing is missing there (`tests/batch/test_compiled_kernels.py`).
+shows that nothing is missing there (`tests/model/test_compiled_kernels.py`).
 """
 
 import importlib

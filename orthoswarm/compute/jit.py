@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import Any, Final, cast
 
 import numba
-from numba.core.types import unliteral
+from numba.core.types import misc
 
 from orthoswarm.compute import processor
 from orthoswarm.compute.kernel_cache import KernelCache
@@ -48,7 +48,7 @@ def _compiled(function: Kernel, **options: bool) -> Kernel:
 
     def without_constants(args: Any, keywords: Any) -> Any:
         """Types of a call in another kernel, so that one with a constant needs no code of its own."""
-        return called(tuple(map(unliteral, args)), {name: unliteral(kind) for name, kind in keywords.items()})
+        return called(tuple(map(misc.unliteral, args)), {name: misc.unliteral(kind) for name, kind in keywords.items()})
 
     made.get_call_template = without_constants
     return cast(Kernel, made)
