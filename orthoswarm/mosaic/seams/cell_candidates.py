@@ -2,7 +2,7 @@
 
 The cost of a picture grows with the squared tangent of its view angle (obliqueness), with the contrast that it lacks
 against the clearest picture on the same ground (haze), and with the sharpness that it lacks as a whole (blur). One from
-which something taller hides the cell shows that instead: it costs more than any oblique view.
+which something taller hides the cell would show that twice: it is used only where no other picture sees the cell.
 """
 
 from dataclasses import dataclass
@@ -27,7 +27,9 @@ SLOTS = 5
 BLOCK = 16
 """Cells a side of the blocks at whose corners contrasts are compared."""
 
-_WEAK_COST: Final = 1e6  # cost of a picture that is used only where no other sees (damaged, weakly determined)
+_WEAK_COST: Final = 1e6
+"""Cost of a picture that is used only where no other sees: it is damaged, weakly determined, or something taller hides
+the cell from it."""
 _CANDIDATE_TAN2: Final = 0.5  # pictures more oblique than the best by this squared tangent are none of a cell's (time)
 _OBLIQUENESS_COST: Final = 15000.0
 """Cost of obliqueness, times the squared tangent of the view angle. Chosen by looking at four sets."""
@@ -36,10 +38,7 @@ _HAZE_COST: Final = 6000.0
 the contrast outweighs a view that is some 20 degrees more oblique."""
 _HAZE_IGNORED_LOG: Final = 0.3  # log ratios of contrast up to this cost nothing: parallax, shadows, noise
 _GLARE_COST: Final = 3000.0  # cost of ground that is burnt out (glints of water): as of a view at 25 degrees
-_HIDDEN_COST: Final = 10000.0
-"""Cost of a picture from which something taller hides the cell: as of a view at 39 degrees, more than `_CANDIDATE_TAN2`
-allows."""
-_HIDDEN_M: Final = 1.0  # what rises above the line of sight by less than this hides nothing
+_HIDDEN_M: Final = 0.5  # what rises above the line of sight by less than this hides nothing
 _BLUR_COST: Final = 6000.0
 """Cost of a picture that is less sharp than the median of those around, times the logarithm of the ratio."""
 _BLUR_IGNORED_LOG: Final = 0.25  # log ratios of sharpness up to this cost nothing
@@ -122,7 +121,7 @@ def cell_candidates(region: Region, shots: Shots, tone: Floats, previews: Previe
         *arrays, usable, penalty, haze, previews.gray, previews.rows, tone, region.lattice, region.gsd_m,
         region.cell_px, unit * _OBLIQUENESS_COST, cells.candidate, cells.cost, cells.level,
         np.ascontiguousarray(local, np.float32), cells.texture, unit * _GLARE_COST,
-        GLARE_LEVEL, _CANDIDATE_TAN2, tan_limit() ** 2, unit * _HIDDEN_COST, _HIDDEN_M,
+        GLARE_LEVEL, _CANDIDATE_TAN2, tan_limit() ** 2, _WEAK_COST, _HIDDEN_M,
     )  # fmt: skip
     return cells
 

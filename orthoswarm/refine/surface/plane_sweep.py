@@ -2,9 +2,8 @@
 
 Surfaces parallel to the ground are laid through the pictures (Collins 1996). At each cell and height the picture most
 nearly above is correlated with four around it, of which the two most alike count, since a wall hides a place from some
-(Kang et al. 2001); semi-global optimisation (Hirschmüller 2008) chooses the heights. They are chosen twice: what lies
-behind a tower that was found the first time cannot be seen by the picture from above, and its likeness to others says
-little. What the pictures do not decide stays on the ground.
+(Kang et al. 2001); semi-global optimisation (Hirschmüller 2008) chooses the heights. What the pictures do not decide stays on the
+ground.
 """
 
 from collections.abc import Iterator, Sequence
@@ -21,6 +20,7 @@ from orthoswarm.model.task_runner import Run
 from orthoswarm.refine.bundle.block_arrays import HEIGHT, WIDTH, CameraBlock, F
 from orthoswarm.refine.features.working_pictures import Pictures, shrunk
 from orthoswarm.refine.surface import plane_sweep_kernels as kernels
+from orthoswarm.refine.surface.seen_objects import seen_objects
 from orthoswarm.refine.surface.vertical_line_locus import REFERENCE_HEIGHT_M
 
 _LEAST_PICTURES = 3
@@ -44,15 +44,11 @@ nodes are right within 1 m; less than 1 is the noise of a JPEG)."""
 _TALL_DOUBT: Final = 0.07
 """Cost of any height against the ground, in correlation: what is not sure is ground (measured: with 0.05 more roofs are
 whole and more of the ground beside them is raised, with 0.1 the other way round)."""
-_TALL_HIDDEN_M: Final = 1.0  # what rises above a line of sight by less hides nothing (measured: 0.5 is no better)
 _TALL_SLOPE_COST: Final = 0.15  # cost of a step to the next height between cells, in correlation
 _TALL_EDGE_COST: Final = (0.15, 1.2)
 """Cost of a larger step across a strong edge of the picture, and on even ground (measured: 0.3 and 1.2 give 0.4 per
 cent fewer right nodes, 0.3 and 1.8 another 0.7)."""
 TALL_FROM_M: Final = 1.5  # what differs less from the ground belongs to it
-_TALL_HIDDEN_COST: Final = (0.2, 0.4)
-"""Least and greatest cost, in correlation, of a height at which something taller hides the cell from the picture
-compared (measured: with greater ones more roofs are whole and more of the ground behind them is raised)."""
 _TALL_EDGE_LEVELS: Final = 8.0  # difference of grey values that halves what is between these costs
 _TALL_REACH_HEIGHTS: Final = 1.5  # pictures whose nadir points are farther away, in flying heights, are not compared
 _TALL_RIM_SHARE: Final = 0.05  # share of a picture's sides at its rim that a block's middle must not lie in
@@ -267,12 +263,6 @@ def _heights(task: _SweepTask, block: _Block, pictures: Sequence[Gray]) -> Float
     kernels.unlikeness(volumes, levels, f(_TALL_NOISE_LEVELS**2), f(_TALL_DOUBT), cost)
     steps = f(_TALL_SLOPE_COST), f(_TALL_EDGE_COST[0]), f(_TALL_EDGE_COST[1]), f(1.0 / _TALL_EDGE_LEVELS)
     found = np.empty(levels.shape, np.float32)
-    kernels.lowest(kernels.semi_global(cost, volumes[0], levels, steps, aslant=False), levels, f(task.step_m), found)
-    above, (low, high) = task.views[block.views[0]].position, _TALL_HIDDEN_COST
-    kernels.bound_hidden(
-        cost, levels, found, block.ground, west, south, task.cell_m, f(task.step_m), above, f(low), f(high),
-        f(_TALL_DOUBT), f(_TALL_HIDDEN_M),
-    )  # fmt: skip
     kernels.lowest(kernels.semi_global(cost, volumes[0], levels, steps), levels, f(task.step_m), found)
     return np.asarray(cv2.medianBlur(found, 3), np.float32)  # single cells tell nothing
 
@@ -280,7 +270,7 @@ def _heights(task: _SweepTask, block: _Block, pictures: Sequence[Gray]) -> Float
 def with_tall_surfaces(
     ground: Terrain, points: Array, views: Sequence[SweepViews], *, height_m: float, most_nodes: int, run: Run
 ) -> Terrain:
-    """The bare ground plus the tops of what stands near raised points; the ground itself where there are none.
+    """The bare ground plus the tops of what stands near raised points, where pictures see the ground behind it too.
 
     Args:
         points: float64 (K, 3) at free positions on the visible surface. height_m: flying height above the ground.
@@ -300,7 +290,8 @@ def with_tall_surfaces(
     heights[heights < TALL_FROM_M] = 0.0
     if not heights.any():
         return ground
-    return replace(fine, z=fine.z + heights, bare=fine.z)
+    cameras = CameraBlock.joined([v.cameras.take(np.flatnonzero(v.usable)) for v in views])
+    return seen_objects(replace(fine, z=fine.z + heights, bare=fine.z), cameras)
 
 
 def _finer(ground: Terrain, parts: int) -> Terrain:

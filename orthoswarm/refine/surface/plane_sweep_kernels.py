@@ -144,42 +144,6 @@ def unlikeness(volumes, levels, noise, doubt, cost):  # type: ignore[no-untyped-
     cost[:, :, 0], cost[:, :, columns - 1] = _ZERO, _ZERO
 
 
-@in_place_kernel
-def bound_hidden(cost, levels, surface, ground, west, south, cell, step, position, least, most, doubt, slack):  # type: ignore[no-untyped-def]
-    """Bound the cost of heights at which something taller hides a cell from a camera: its likeness says little there.
-
-    Args:
-        cost: a volume, changed. levels: see above. surface: float32 (rows, columns), heights above the ground.
-        ground, west, south, cell, step, position: see `sample`; position: of the camera.
-        least, most: the bounds. doubt: cost of heights above the ground, added to them. slack: what stands over a line
-        of sight by less hides nothing, metres.
-    """
-    rows, columns = surface.shape
-    top = np.float64(-1e9)
-    for r in range(rows):
-        for c in range(columns):
-            top = max(top, np.float64(ground[r, c] + surface[r, c]))
-    for r in range(rows):
-        for c in range(columns):
-            if levels[r, c] == 0:
-                continue
-            dx, dy = position[0] - (west + c * cell), position[1] - (south + r * cell)
-            away, z = max(np.hypot(dx, dy), 1e-3), np.float64(ground[r, c])
-            rise = (position[2] - z) / away * cell
-            seen_from, n = z, 1
-            while seen_from + n * rise < top:
-                i, j = int(r + dy / away * n + 0.5), int(c + dx / away * n + 0.5)
-                if i < 0 or j < 0 or i >= rows or j >= columns:
-                    break
-                seen_from = max(seen_from, np.float64(ground[i, j] + surface[i, j]) - n * rise)
-                n += 1
-            for k in range(levels[r, c]):
-                if z + k * step > seen_from - slack:
-                    break
-                more = doubt if k > 0 else _ZERO
-                cost[r, k, c] = min(max(cost[r, k, c], least + more), most + more)
-
-
 @kernel
 def _shifted(row, d, fill, out):  # type: ignore[no-untyped-def]
     """Each cell's neighbour d columns before it, at all heights; `fill` where there is none."""
@@ -225,9 +189,8 @@ def _pass_on(before, least, cost, here, there, n, small, low, high, scale, step,
 
 
 def semi_global(
-    cost: Floats, gray: Floats, levels: Ints, steps: tuple[np.float32, np.float32, np.float32, np.float32],
-    *, aslant: bool = True,
-) -> Floats:  # fmt: skip
+    cost: Floats, gray: Floats, levels: Ints, steps: tuple[np.float32, np.float32, np.float32, np.float32]
+) -> Floats:
     """The volume of the sums of path costs from eight directions (Hirschmüller 2008).
 
     A step between two cells costs `high`, and less the more the picture differs between them on the upper one's height
@@ -237,10 +200,9 @@ def semi_global(
         cost: a volume, see `unlikeness`. gray: the volume of a picture. levels: see above.
         steps: cost of a step to the next height; of a larger one (low, high); and one over the difference in grey
             values that halves what is between them.
-        aslant: along the diagonals, too; else from four directions.
     """
     total = np.zeros_like(cost)
-    _from_rows(cost, gray, levels, int(aslant), *steps, total)
+    _from_rows(cost, gray, levels, 1, *steps, total)
     turned, shade = (np.ascontiguousarray(volume.transpose(2, 1, 0)) for volume in (cost, gray))
     across = np.zeros_like(turned)
     _from_rows(turned, shade, np.ascontiguousarray(levels.T), 0, *steps, across)

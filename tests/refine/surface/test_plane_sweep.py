@@ -1,4 +1,4 @@
-"""Semi-global labels: steps lie where the picture has an edge, and what something taller hides is not believed."""
+"""Semi-global labels: steps lie where the picture has an edge."""
 
 import numpy as np
 import pytest
@@ -37,24 +37,3 @@ def test_what_no_picture_tells_stays_on_the_ground() -> None:
     cost = np.ones((ROWS, COLUMNS, LEVELS), np.float32)
     cost[..., 1:] += np.float32(0.1)
     assert (heights(cost, np.full(cost.shape, 100.0, np.float32)) == 0.0).all()
-
-
-@pytest.mark.parametrize("unlike", [0.05, 0.9])
-def test_likeness_says_little_at_heights_that_something_taller_hides_from_the_camera(unlike: float) -> None:
-    f, shape, cell, tower = np.float32, (ROWS, COLUMNS), 1.0, 4.0
-    surface = np.zeros(shape, np.float32)
-    surface[2:-2, 8:11] = tower
-    cost = np.full((ROWS, LEVELS, COLUMNS), unlike, np.float32)
-    levels = np.full(shape, LEVELS, np.int32)
-    west_of_it = np.array([-12.0, 10.0, 24.0])  # a line of sight falls by about a metre a cell
-    kernels.bound_hidden(
-        cost, levels, surface, np.zeros(shape, np.float32), 0.0, 0.0, cell, f(1.0), west_of_it, f(0.2), f(0.35), f(0.1),
-        f(0.2),
-    )  # fmt: skip
-    touched = cost != f(unlike)
-    assert not touched[10, :, :8].any()  # before it, seen as it is
-    assert touched[10, 0, 11:13].all() and not touched[10, 4:, 11:].any()  # behind it, up to the line of sight
-    assert not touched[10, :, 16:].any()  # farther than its shadow
-    bounded = cost[10, :, 11][touched[10, :, 11]]
-    bound = f(0.2) if unlike < 0.2 else f(0.35)
-    np.testing.assert_allclose(bounded, bound + np.array([0.0, 0.1, 0.1, 0.1])[: len(bounded)], atol=1e-6)

@@ -5,9 +5,11 @@ import pytest
 
 from orthoswarm.model.placement import Terrain
 from orthoswarm.model.task_runner import serial
+from orthoswarm.refine.bundle.block_arrays import CameraBlock
 from orthoswarm.refine.features.working_pictures import Pictures
 from orthoswarm.refine.strategy.swarm_refiner import RefinerOptions
 from orthoswarm.refine.surface.plane_sweep import TALL_FROM_M, SweepViews, with_tall_surfaces
+from orthoswarm.refine.surface.seen_objects import hidden_by
 from tests.kit.refine import refine_all, through_pickle
 from tests.refine.surface.hall_flight import GRID, HALF, HEIGHT_M, MIDDLE, ROOF_M, HallFlight, away
 
@@ -90,3 +92,31 @@ def test_ground_without_raised_points_is_given_back(flight) -> None:
 def test_number_of_nodes_stays_bounded(flight) -> None:
     surface = drawn(flight, raised(), most_nodes=200 * GROUND.z.size)
     assert GROUND.z.size < surface.z.size <= 200 * GROUND.z.size
+
+
+def test_it_is_drawn_on_the_ground_where_all_pictures_look_from_one_side(flight, places) -> None:
+    """Behind it the ground is in no picture: drawn on its top, the hall would be shown there once more."""
+    west = flight.cameras.position[:, 0] < MIDDLE[0] - HALF[0] - 25.0
+    assert west.sum() >= 6
+    assert drawn(flight, raised(), usable=west).bare is None
+    assert drawn(flight, raised()).bare is not None
+
+
+def test_places_that_no_picture_sees_are_named_by_what_hides_them() -> None:
+    z = np.zeros((21, 21), np.float32)
+    z[:, 10] = 4.0  # a wall from south to north
+    wall = Terrain(-10.0, -10.0, 1.0, z, np.zeros_like(z))
+    lens = np.array([[100.0, 0.0, 0.0, 0.0, 0.0, 0.0, 400.0, 400.0]])
+    above, west = np.array([[0.0, 0.0, 20.0]]), np.array([[-20.0, 0.0, 20.0]])
+    down = np.diag([1.0, -1.0, -1.0])[None]
+    everywhere = np.ones(z.shape, bool)
+
+    def hidden(*positions: np.ndarray) -> np.ndarray:
+        position = np.concatenate(positions)
+        n = len(position)
+        return hidden_by(wall, CameraBlock(position, np.repeat(down, n, 0), np.zeros(n, np.int32), lens), everywhere)
+
+    behind = hidden(west)
+    assert (behind[10, 12:15] == 10 * 21 + 10).all()  # 45 degrees: four metres behind the wall
+    assert (behind[10, :11] == -1).all() and (behind[10, 17:] == -1).all()
+    assert (hidden(west, above) == -1).all()  # both sides of the wall are seen from over it
