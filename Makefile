@@ -12,10 +12,10 @@ PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11 p
 export OMP_NUM_THREADS ?= 1
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
-.PHONY: demo test check lock clean
+.PHONY: demo test check kernels wheel lock clean
 
 # The median is the accuracy against the simulated city's truth that the demonstration must reach, metres.
-demo: $(STAMP)
+demo: kernels
 	@$(BIN)/orthoswarm demo --out $(DEMO) --median 0.5
 	@echo "The map: $(DEMO)/orthoimage.tif; how it was made: $(DEMO)/report.html"
 
@@ -26,7 +26,7 @@ PYTEST ?= -n 4 --dist loadgroup
 test: check
 	@$(BIN)/python -m pytest $(PYTEST)
 
-check: $(STAMP)
+check: kernels
 	@$(BIN)/ruff format --check .
 	@$(BIN)/ruff check .
 	@$(BIN)/mypy
@@ -42,8 +42,16 @@ $(STAMP): requirements.lock pyproject.toml
 	@$(BIN)/python -m pip install -qq --no-deps $$(grep '^scm-' requirements.lock)
 	@touch $(STAMP)
 
+# What is compiled already is only looked up (2 s): a kernel is compiled again if what goes into it has changed.
+kernels: $(STAMP)
+	@$(BIN)/python -m orthoswarm.compute.compile_kernels
+
+# With the compiled kernels, for this Python and platform.
+wheel: kernels
+	@$(BIN)/python -m pip wheel -q --no-deps -w dist .
+
 lock: $(STAMP)
 	@$(BIN)/python .ci/lock.py > requirements.lock.part && mv requirements.lock.part requirements.lock && touch $(STAMP)
 
 clean:
-	rm -rf $(VENV) out .mypy_cache .ruff_cache .pytest_cache .import_linter_cache
+	rm -rf $(VENV) orthoswarm/compute/compiled out .mypy_cache .ruff_cache .pytest_cache .import_linter_cache

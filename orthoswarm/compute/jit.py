@@ -4,19 +4,23 @@ from collections.abc import Callable
 from typing import Any, Final, cast
 
 import numba
+from numba.core.types import misc
 
-from orthoswarm.compute import kernel_cache
+from orthoswarm.compute import processor
+from orthoswarm.compute.kernel_cache import KernelCache
+
+processor.choose()
 
 Kernel = Callable[..., Any]
 
-_OPTIONS: Final = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"nsz"}}
+_OPTIONS: Final = {"no_cfunc_wrapper": True, "nogil": True, "error_model": "numpy", "fastmath": {"nsz"}}
 
 
 def kernel(function: Kernel) -> Kernel:
     """Compile a function on arrays with numba, cached on disk, releasing the GIL.
 
-    The cache is next to the module (or in the user's cache folder if that is read-only), so only the first run on a
-    machine compiles; see `kernel_cache` for when a kernel is compiled again. Kernels may call each other.
+    They are compiled beforehand, see `compile_kernels`, and again when anything changes that is compiled
+    in, see `kernel_cache`. Kernels may call each other. The code is for a baseline processor, see `processor`.
 
     Of `fastmath` only the sign of zero is given up. What depends on how much the compiler sees at once (reassociation,
     multiplications fused with additions, reciprocals) makes a kernel just compiled differ in its last digits from the
@@ -24,8 +28,7 @@ def kernel(function: Kernel) -> Kernel:
     1,017 pictures takes 1 % more CPU without, medians of three pairs).
     Division by zero gives infinity or NaN, as in numpy: a test for it would keep loops from being vectorised.
     """
-    kernel_cache.watch(function)
-    return cast(Kernel, numba.njit(**_OPTIONS)(function))
+    return _compiled(function)
 
 
 def in_place_kernel(function: Kernel) -> Kernel:
@@ -35,5 +38,17 @@ def in_place_kernel(function: Kernel) -> Kernel:
     numba counts them with locked instructions at every call and slice, which took a tenth of the CPU time of a run
     of 1,017 pictures (perf, samples in NRT_incref and NRT_decref).
     """
-    kernel_cache.watch(function)
-    return cast(Kernel, numba.njit(**_OPTIONS, _nrt=False)(function))
+    return _compiled(function, _nrt=False)
+
+
+def _compiled(function: Kernel, **options: bool) -> Kernel:
+    made = numba.njit(**_OPTIONS, **options)(function)
+    made._cache = KernelCache(function)
+    called = made.get_call_template
+
+    def without_constants(args: Any, keywords: Any) -> Any:
+        """Types of a call in another kernel, so that one with a constant needs no code of its own."""
+        return called(tuple(map(misc.unliteral, args)), {name: misc.unliteral(kind) for name, kind in keywords.items()})
+
+    made.get_call_template = without_constants
+    return cast(Kernel, made)

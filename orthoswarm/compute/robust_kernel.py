@@ -10,7 +10,7 @@ from orthoswarm.model.arrays import Array
 
 
 @in_place_kernel
-def robust_weight(e2, c, precision=1.0):  # type: ignore[no-untyped-def]
+def robust_weight(e2, c, precision):  # type: ignore[no-untyped-def]
     """Weight precision / (1 + e2 / c)^2 of a squared normalised residual, for compiled code."""
     q = 1.0 + e2 / c
     return precision / (q * q)

@@ -74,6 +74,6 @@ def paint(best, good, height, level, box, edges, camera, position, lens, quality
                 good[r, c] = min(65535, good[r, c] + 1)
                 best[r, c] = 0
                 seen += 1
-            elif best[r, c] == UNSEEN or (best[r, c] > 0 and _count(flaws) < _count(best[r, c])):
+            elif best[r, c] == UNSEEN or (best[r, c] > 0 and _count(flaws) < _count(np.int64(best[r, c]))):
                 best[r, c] = flaws
     return seen

@@ -151,7 +151,7 @@ def label_pass(task: LabelTask) -> list[tuple[int, Window]]:
     if len(won):
         tile = store.get(task.key, create=True)
         assert tile is not None
-        write_labels(local, task.ids, tile.plane[:rows, :cols])
+        write_labels(local, task.ids, tile.plane)
     return [(int(task.ids[k]), Window.of(task.key, boxes[k])) for k in won]
 
 

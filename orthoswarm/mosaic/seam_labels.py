@@ -95,7 +95,7 @@ def _contest(best, label, r0, r1, c0, c1, mark, position, rotation, lens, lattic
             d2 = dx * dx + dy2
             if d2 < best[r, c] or (d2 == best[r, c] and mark < label[r, c]):
                 if not flat:
-                    z = lattice_height(lattice, r, c)
+                    z = lattice_height(lattice, float(r), float(c))
                 rise = position[2] - z
                 if rise > 0.0 and d2 <= limit * rise * rise:
                     u, v = project(position, rotation, lens, (c + 0.5) * gsd, (r + 0.5) * gsd, z)
@@ -220,7 +220,7 @@ def label_windows(local: Labels, count: int) -> NDArray[np.int32]:
 
 @in_place_kernel
 def write_labels(local, ids, plane):  # type: ignore[no-untyped-def]
-    """Put ids[k - 1] + 1 where a tile's local label is k > 0."""
+    """Put ids[k - 1] + 1 where a tile's local label is k > 0; the tile may be larger."""
     for r in range(local.shape[0]):
         for c in range(local.shape[1]):
             if local[r, c] > 0:

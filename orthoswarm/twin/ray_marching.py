@@ -359,13 +359,20 @@ def _satellite(texture, dsm, dtm, tiles, wall, facade, sun, ambient, ca, sa, lea
                 ground = dtm[tr, tc]
                 # p(z) = x - lean (z - ground): what lies above the ground is displaced by lean * height
                 hr, hc, z, side = _march(
-                    dsm, tiles, x / CELL_M, y / CELL_M, ground, lean_x / CELL_M, lean_y / CELL_M, top
+                    dsm, tiles, x / CELL_M, y / CELL_M, float(ground), lean_x / CELL_M, lean_y / CELL_M, top
                 )
                 if hr < 0:  # at the height of the scene's highest point the ray is outside: start where it enters
                     wide, high = CELL_M * dsm.shape[1], CELL_M * dsm.shape[0]
                     rise = min(_rise_inside(x, lean_x, wide), _rise_inside(y, lean_y, high))
                     hr, hc, z, side = _march(
-                        dsm, tiles, x / CELL_M, y / CELL_M, ground, lean_x / CELL_M, lean_y / CELL_M, ground + rise
+                        dsm,
+                        tiles,
+                        x / CELL_M,
+                        y / CELL_M,
+                        float(ground),
+                        lean_x / CELL_M,
+                        lean_y / CELL_M,
+                        ground + rise,
                     )
                 if hr < 0:
                     rgb[0] = rgb[1] = rgb[2] = 0.0

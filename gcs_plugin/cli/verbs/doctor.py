@@ -1,16 +1,13 @@
 """`orthoswarm doctor`: what this machine has, and what each missing thing costs."""
 
 import argparse
-import importlib
 import json
 import os
 import platform
-import re
 import shutil
 import sys
-import time
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, distribution, version
 from importlib.util import find_spec
 from pathlib import Path
@@ -31,8 +28,7 @@ def run(args: argparse.Namespace) -> int:
 
     prepare_process()
     if args.warm:
-        seconds = warm_kernels(lambda text: print(text, file=sys.stderr, flush=True))
-        print(f"kernels are compiled ({seconds:.0f} s)", file=sys.stderr)
+        compile_cold_kernels(lambda *at: print("{}: {} of {} kernels".format(*at), file=sys.stderr, flush=True))
     found = checks(args.workspace)
     if args.json:
         document = {"ok": all(c.ok or not c.needed for c in found), "checks": [asdict(c) for c in found]}
@@ -204,10 +200,11 @@ def _gpu() -> MachineCheck:
 
 
 def _kernels() -> MachineCheck:
-    modules = kernel_modules()
-    cold = sum(not warm for _, warm in modules)
-    cost = "the first run compiles them, up to a minute; `orthoswarm doctor --warm` does it now"
-    text = f"{cold} of {len(modules)} modules are not compiled yet" if cold else "compiled"
+    from orthoswarm.compute.compile_kernels import missing
+
+    cold, total = missing()
+    cost = "the first run compiles them, up to two minutes; `orthoswarm doctor --warm` does it now"
+    text = f"{cold} of {total} are not compiled yet" if cold else "compiled"
     return MachineCheck("kernels", not cold, text, cost=cost)
 
 
@@ -219,114 +216,13 @@ def _cluster() -> MachineCheck:
     )
 
 
-def kernel_modules() -> list[tuple[str, bool]]:
-    """Modules with compiled kernels that mapping and planning use, and whether their present source is compiled."""
-    import orthoswarm
-
-    root = Path(str(orthoswarm.__file__)).parent
-    out = []
-    for source in sorted(root.rglob("*.py")):
-        simulated = "twin" in source.relative_to(root).parts
-        if not simulated and re.search(r"^@(in_place_)?kernel$", source.read_text(encoding="utf-8"), re.MULTILINE):
-            name = ".".join(["orthoswarm", *source.relative_to(root).with_suffix("").parts])
-            out.append((name, _is_warm(name, source)))
-    return out
-
-
-def _is_warm(module: str, source: Path) -> bool:
-    """Whether the cache (beside the module, or in the user's folder) holds something newer than the source."""
-    folders = {source.parent / "__pycache__"}
-    for value in vars(importlib.import_module(module)).values():
-        stats = getattr(value, "stats", None)
-        if stats is not None and getattr(stats, "cache_path", None):
-            folders.add(Path(stats.cache_path))
-    saved = (file for folder in folders for file in folder.glob(f"{source.stem}.*.nbi"))
-    return any(file.stat().st_mtime >= source.stat().st_mtime for file in saved)
-
-
-def warm_kernels(say: Callable[[str], None]) -> float:
-    """Compile the kernels by making tiny maps of simulated pictures, plans, tiles, and a map of what is covered.
-
-    Returns:
-        The seconds needed.
-    """
-    import tempfile
-
-    started = time.perf_counter()
-    say("making tiny maps of simulated pictures, to compile the kernels")
-    with tempfile.TemporaryDirectory() as folder:
-        _make_maps(Path(folder))
-        _make_plans(Path(folder))
-        _use_map(Path(folder))
-    return time.perf_counter() - started
-
-
 def compile_cold_kernels(report: Callable[[str, int, int], None]) -> None:
-    """Compile the kernels if some are not compiled yet, so that what follows shows the speed of every later run.
+    """Compile the kernels that are not compiled yet, so that what follows shows the speed of every later run.
 
     Args:
         report: called with the stage's name, the number of finished items and their total.
     """
-    if all(warm for _, warm in kernel_modules()):
-        return
-    report("compiling, once", 0, 1)
-    warm_kernels(lambda _: None)
-    report("compiling, once", 1, 1)
+    from orthoswarm.compute.compile_kernels import compile_all, missing
 
-
-def _make_maps(folder: Path) -> None:
-    """Map a dense flight, and a sparse one, whose pictures are matched in pairs instead of tracked."""
-    import telemetry
-    from orthoswarm.batch.pipeline import run
-    from orthoswarm.batch.run_state import MapOptions
-    from orthoswarm.compute.workers import Serial
-    from orthoswarm.model.frame import Ingest
-    from orthoswarm.twin.make import make_twin
-    from orthoswarm.twin.presets import spec
-
-    make_twin(spec("tiny"), folder / "twin")
-    photos = sorted((folder / "twin" / "photos").rglob("*.JPG"))
-    options = MapOptions(basemap=folder / "twin" / "basemap.tif")
-    for name, some in (("dense", photos), ("sparse", photos[::3])):
-
-        def load(_: Callable[[str, int, int], None], some: list[Path] = some) -> Ingest:
-            return telemetry.load(some)
-
-        run(load, folder / name, options, Serial(), lambda *_: None)
-
-
-def _make_plans(folder: Path) -> None:
-    """Make plans by two methods around holes, so many that cells between them are not ordered exactly."""
-    from gcs_plugin.plans.plan_request import PlanRequest, make_plan
-
-    holes = [_box(9.001 + 0.002 * k, 47.002, 9.002 + 0.002 * k, 47.004) for k in range(4)]
-    area = folder / "area.geojson"
-    polygon = {"type": "Polygon", "coordinates": [_box(9.0, 47.0, 9.01, 47.006), *holes]}
-    area.write_text(json.dumps(polygon), encoding="utf-8")
-    request = PlanRequest(
-        area=area, vehicles=3, altitude_m=60.0, fov_min_deg=60.0, starts=[(46.999, 9.0)], endurance_min=12.0
-    )
-    for method in ("bcd", "tmstc"):
-        make_plan(replace(request, method=method))
-
-
-def _use_map(folder: Path) -> None:
-    """Find what the pictures of the dense map cover, export it as tiles, and draw a picture as the daemon does."""
-    from contextlib import redirect_stderr, redirect_stdout
-    from io import StringIO
-
-    from gcs_plugin.cli.main import main
-    from gcs_plugin.daemon.layers.realtime_layer import load_kernels
-
-    dense, area = str(folder / "dense"), str(folder / "twin" / "plan.geojson")
-    with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
-        codes = [main(["coverage", dense, "--area", area, "--out", str(folder / "coverage")])]
-        codes += [main(["export", dense, "--to", "mbtiles"])]
-    if 130 in codes:
-        raise KeyboardInterrupt
-    load_kernels(folder)
-
-
-def _box(west: float, south: float, east: float, north: float) -> list[list[float]]:
-    """A ring around a box, degrees."""
-    return [[west, south], [east, south], [east, north], [west, north], [west, south]]
+    if missing()[0]:
+        compile_all(lambda done, total: report("compiling, once", done, total))

@@ -141,7 +141,7 @@ def _haze(position, rotation, lens, size, usable, contrast, lattice, gsd, cell, 
     for i in range(haze.shape[0]):
         for j in range(haze.shape[1]):
             r, c = min(i * BLOCK * cell, last), min(j * BLOCK * cell, last)
-            z = lattice_height(lattice, r, c)
+            z = lattice_height(lattice, float(r), float(c))
             best = np.float32(-1e9)
             for k in usable:
                 u, v = project(position[k], rotation[k], lens[k], (c + 0.5) * gsd, (r + 0.5) * gsd, z)

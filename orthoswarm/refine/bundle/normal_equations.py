@@ -135,7 +135,7 @@ def build(cameras, points, observations, slot, c, heights, ties, system, substit
             obs_weight[m] = 0.0
             if not linearise(position[i], rotation[i], lens[li], x, y, z, uv[m, 0], uv[m, 1], r, jc, jp, jl):
                 continue
-            obs_weight[m] = robust_weight((r[0] * r[0] + r[1] * r[1]) * weight[m], c)
+            obs_weight[m] = robust_weight((r[0] * r[0] + r[1] * r[1]) * weight[m], c, 1.0)
             w = obs_weight[m] * weight[m]
             s = slot[i]
             for a in range(3):
@@ -158,7 +158,7 @@ def build(cameras, points, observations, slot, c, heights, ties, system, substit
                     for q in range(3):
                         w_obs[m, a, q] = w * (jc[0, a] * jp[0, q] + jc[1, a] * jp[1, q])
         e = height[p] - z
-        hw = height_weight * robust_weight(e * e * height_weight, height_c) + height_soft
+        hw = height_weight * robust_weight(e * e * height_weight, height_c, 1.0) + height_soft
         v[2, 2] += hw
         b[2] += hw * e
         t = tie_point[p]
@@ -166,7 +166,7 @@ def build(cameras, points, observations, slot, c, heights, ties, system, substit
             ex = tie_xy[t, 0] - x
             ey = tie_xy[t, 1] - y
             tie_residual[t, 0], tie_residual[t, 1] = ex, ey
-            tw = tie_weight[t] * robust_weight((ex * ex + ey * ey) * tie_weight[t], tie_c)
+            tw = tie_weight[t] * robust_weight((ex * ex + ey * ey) * tie_weight[t], tie_c, 1.0)
             v[0, 0] += tw
             v[1, 1] += tw
             b[0] += tw * ex

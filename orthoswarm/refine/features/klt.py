@@ -266,7 +266,7 @@ def track(before, before_half, after, after_half, points, homography, back, limi
             q[0], q[1] = (q[0] + 0.5) * 2 - 0.5, (q[1] + 0.5) * 2 - 0.5
         else:
             q[0], q[1] = guess[k, 0], guess[k, 1]
-        if not _template(before, points[k, 0], points[k, 1], affine, wide):
+        if not _template(before, float(points[k, 0]), float(points[k, 1]), affine, wide):
             continue
         error = _refine(after, scratch, q, rounds[1], texture, step)
         if error < 0 or error > mismatch * _variance(wide) + noise:
@@ -299,7 +299,7 @@ def anchor(stack, chain, slot, points, after, here, farthest, limits, found, ok)
                 for i in range(3):
                     back[a, b] += chain[slot[k], a, i] * here[i, b]
         _derivative(back, float(found[k, 0]), float(found[k, 1]), affine)
-        if not _template(stack[slot[k]], points[k, 0], points[k, 1], affine, wide):
+        if not _template(stack[slot[k]], float(points[k, 0]), float(points[k, 1]), affine, wide):
             continue
         q[0], q[1] = found[k, 0], found[k, 1]
         error = _refine(after, scratch, q, rounds, texture, step)

@@ -6,14 +6,13 @@ in LLVM's own terms: a block of four rows by up to four vectors of shifts stays 
 The order of the sums is fixed, so that the result is the same on each run.
 """
 
-import platform
 from typing import Any
 
 from llvmlite import ir
-from llvmlite.binding import get_host_cpu_features
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
+from orthoswarm.compute import processor
 from orthoswarm.compute.jit import in_place_kernel
 
 LANES = 8
@@ -23,8 +22,7 @@ ROWS = 4
 
 _FLOAT, _INT = ir.FloatType(), ir.IntType(32)
 _VECTOR = ir.VectorType(_FLOAT, LANES)
-_FUSES = get_host_cpu_features().get("fma", False) or platform.machine() in ("arm64", "aarch64")
-"""Whether this machine multiplies and adds in one instruction."""
+_FUSES = processor.fuses()
 
 
 def _block(vectors: int) -> Any:

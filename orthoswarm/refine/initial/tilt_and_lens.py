@@ -235,7 +235,7 @@ def _fit(p, q, n, floor, rounds, robust, w):  # type: ignore[no-untyped-def]
         scale = max(np.median(misfit), floor)
         for k in range(n):
             e = misfit[k] / (robust * scale)
-            w[k] = robust_weight(e * e, 1.0)
+            w[k] = robust_weight(e * e, 1.0, 1.0)
     return a, cp, cq, scale
 
 

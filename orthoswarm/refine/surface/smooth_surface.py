@@ -354,7 +354,7 @@ def _robust(z, cell, share, inner, height, sigma, above, below, weight):  # type
         high = z[i + inner] * (1.0 - c) + z[i + inner + 1] * c
         e = height[m] - low * (1.0 - r) - high * r
         scale = above if e > 0.0 else below
-        weight[m] = robust_weight(e * e, scale * scale + sigma[m] * sigma[m])
+        weight[m] = robust_weight(e * e, scale * scale + sigma[m] * sigma[m], 1.0)
 
 
 @kernel

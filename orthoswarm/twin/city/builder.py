@@ -89,8 +89,9 @@ class Builder:
         wall = wall or pick(self.rng, WALLS)
         s = self.scene
         stamp_building(
-            s.albedo, s.kind, s.dsm, s.wall, s.facade, x, y, angle + turn, hu, hv, base, eave, rise, shape,
-            np.asarray(color, float), np.asarray(wall, float), int(windows), int(self.rng.integers(1 << 30)),
+            s.albedo, s.kind, s.dsm, s.wall, s.facade, x, y, angle + turn, float(hu), float(hv), base, eave,
+            float(rise), shape, np.asarray(color, float), np.asarray(wall, float), int(windows),
+            int(self.rng.integers(1 << 30)),
         )  # fmt: skip
 
     def tree(self, u: float, v: float, radius: float, height: float) -> None:

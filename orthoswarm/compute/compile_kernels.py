@@ -1,0 +1,121 @@
+"""Compiles the product's kernels into the package: `python -m orthoswarm.compute.compile_kernels`.
+
+What was compiled before stays unless something changed that goes into it. `signatures.txt` lists the kernels that
+Python calls and the types of their arguments, a line each; what they call comes with them. A test runs the product and
+shows that nothing is missing there (`tests/model/test_compiled_kernels.py`).
+"""
+
+import importlib
+import json
+import os
+import sys
+from collections import defaultdict
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, Final
+
+Report = Callable[[int, int], None]
+
+SIGNATURES: Final = Path(__file__).with_name("signatures.txt")
+_PROCESSES: Final = 2  # the longest module takes a quarter of all the time: more would wait for it
+
+
+def listed() -> dict[str, list[str]]:
+    """The lines "kernel types" of each module that has kernels that are called from Python."""
+    lines: dict[str, list[str]] = defaultdict(list)
+    for line in SIGNATURES.read_text(encoding="utf-8").splitlines():
+        module, kernel = line.split(" ", 1)
+        lines[f"orthoswarm.{module}"].append(kernel)
+    return dict(lines)
+
+
+def missing() -> tuple[int, int]:
+    """How many of the listed kernels are not compiled yet, and how many there are."""
+    lines = [(module, line) for module, lines in listed().items() for line in lines]
+    return sum(_to_compile(module, line) is not None for module, line in lines), len(lines)
+
+
+def compile_all(report: Report) -> int:
+    """Compile what is missing, in two processes, into the package or, if that is read-only, numba's cache folder.
+
+    Args:
+        report: called with the number of kernels that are there and that of all.
+
+    Returns:
+        How many were compiled.
+    """
+    modules = listed()
+    done, total, compiled = 0, sum(map(len, modules.values())), 0
+    with ProcessPoolExecutor(min(_PROCESSES, os.cpu_count() or 1), get_context("spawn")) as pool:
+        # Those with most arguments first, so that no process is left with a long one at the end.
+        order = sorted(modules, key=lambda module: -sum(map(len, modules[module])))
+        running = {pool.submit(_compile, module, modules[module]): module for module in order}
+        for task in as_completed(running):
+            compiled += task.result()
+            done += len(modules[running[task]])
+            report(done, total)
+        if compiled or not (SIGNATURES.with_name("compiled") / "made_for.json").exists():
+            pool.submit(_tidy, order).result()
+    return compiled
+
+
+def main() -> None:
+    """Compile, and say how far it is."""
+    tenths = set()
+
+    def say(done: int, total: int) -> None:
+        if (tenth := 10 * done // total) not in tenths:
+            tenths.add(tenth)
+            print(f"compiling the kernels: {done} of {total}", file=sys.stderr, flush=True)
+
+    compile_all(say)
+
+
+def _compile(module: str, lines: list[str]) -> int:
+    from orthoswarm.compute.kernel_cache import FOLDER, KernelCache
+
+    KernelCache.filling = os.access(FOLDER if FOLDER.exists() else FOLDER.parent, os.W_OK)
+    wanted = [found for line in lines if (found := _to_compile(module, line))]
+    for kernel, types in wanted:
+        kernel.compile(types)
+    return len(wanted)
+
+
+def _to_compile(module: str, line: str) -> tuple[Any, Any] | None:
+    """A kernel and the types of its arguments, None if it is compiled."""
+    from numba.core.sigutils import normalize_signature
+
+    name, types = line.split(" ", 1)
+    kernel = getattr(importlib.import_module(module), name)
+    arguments, _ = normalize_signature(f"({types},)")
+    return None if kernel._cache.has(arguments, kernel.targetctx.codegen()) else (kernel, arguments)
+
+
+def _tidy(modules: list[str]) -> None:
+    """Remove the files of kernels that have changed or are gone, and write what a wheel of the others needs."""
+    import numba
+
+    from orthoswarm.compute.kernel_cache import FOLDER, KernelCache
+
+    for name in modules:
+        importlib.import_module(name)
+    found = [
+        value
+        for name, module in sys.modules.items()
+        if name.startswith("orthoswarm.")
+        for value in vars(module).values()
+    ]
+    caches = [cache for value in found if isinstance(cache := getattr(value, "_cache", None), KernelCache)]
+    kept = set().union(*(cache.files() for cache in caches))
+    for file in FOLDER.rglob("*.nb[ci]"):
+        if file not in kept:
+            file.unlink(missing_ok=True)
+    if KernelCache.filling:
+        made = {"numba": numba.__version__, "python": sys.version_info[:2], "processor": numba.config.CPU_NAME}
+        (FOLDER / "made_for.json").write_text(json.dumps(made), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
