@@ -62,7 +62,9 @@ def compile_all(report: Report) -> int:
 
 
 def main() -> None:
-    """Compile, and say how far it is."""
+    """Compile, and say how far it is; say nothing where all is compiled."""
+    if not missing()[0]:
+        return
     tenths = set()
 
     def say(done: int, total: int) -> None:
