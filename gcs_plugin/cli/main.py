@@ -123,10 +123,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
 
 
-if __name__ == "__main__":
-    sys.exit(main())
-
-
 _AGAIN_S = 0.05  # well below what a person notices
 _LIBRARIES = ("numba", "llvmlite")  # compile and call back from C
 _IMPORTS = "<frozen importlib"
@@ -179,3 +175,7 @@ def _interrupt_main_thread() -> None:
         signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
     else:
         _thread.interrupt_main()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

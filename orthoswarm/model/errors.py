@@ -19,13 +19,12 @@
     │   ├── StoreRequestError          a store refuses one request      stores.requests
     │   ├── SolutionFileError          a refined sortie's file is damaged or old    gcs_plugin.daemon.jobs.solution_file
     │   ├── OutdatedError              the shared plan was changed by another user meanwhile  gcs_plugin.daemon.store
+    │   ├── Preempted                  a job gave way to one of higher priority     gcs_plugin.daemon.jobs.job_queue
     │   └── TooLarge                   a request's body is too large        gcs_plugin.web.guard
     ├── UnavailableError               a matcher's weights or packages are missing  matchers.matcher
-    ├── Unreadable                     bytes are not of the format they claim       telemetry.samples.unreadable
-    └── Preempted                      a job gave way to one of higher priority     gcs_plugin.daemon.jobs.job_queue
+    └── Unreadable                     bytes are not of the format they claim       telemetry.samples.unreadable
 
-The last three do not end a run: their callers use the next matcher, reject the file with the reason, or start the job
-again.
+The last two do not end a run: their callers use the next matcher, or reject the file with the reason.
 """
 
 

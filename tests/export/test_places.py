@@ -9,6 +9,7 @@ import threading
 import zipfile
 from dataclasses import replace
 from html.parser import HTMLParser
+from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import numpy as np
@@ -214,7 +215,9 @@ def test_the_feed_sends_vehicles_always_and_finds_when_they_are_new():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
         receiver.bind(("127.0.0.1", 0))
         receiver.settimeout(30.0)
-        feed = TakFeed([TakAddress.parse(f"udp://127.0.0.1:{receiver.getsockname()[1]}")], lambda: places)
+        feed = TakFeed(
+            [TakAddress.parse(f"udp://127.0.0.1:{receiver.getsockname()[1]}")], SimpleNamespace(places=lambda: places)
+        )
         feed.start()
         try:
             heard = [ElementTree.fromstring(receiver.recv(65536)).get("uid") for _ in range(2)]
