@@ -19,6 +19,7 @@ from typing import Any, Final
 Report = Callable[[int, int], None]
 
 SIGNATURES: Final = Path(__file__).with_name("signatures.txt")
+_MADE_FOR: Final = Path(__file__).with_name("compiled") / "made_for.json"
 _PROCESSES: Final = 2  # the longest module takes a quarter of all the time: more would wait for it
 
 
@@ -56,14 +57,15 @@ def compile_all(report: Report) -> int:
             compiled += task.result()
             done += len(modules[running[task]])
             report(done, total)
-        if compiled or not (SIGNATURES.with_name("compiled") / "made_for.json").exists():
+        if compiled or not _MADE_FOR.exists():
             pool.submit(_tidy, order).result()
     return compiled
 
 
 def main() -> None:
-    """Compile, and say how far it is; say nothing where all is compiled."""
-    if not missing()[0]:
+    """Compile, and say how far it is; say nothing where all is compiled into the package."""
+    _save_in_package()
+    if not missing()[0] and _MADE_FOR.exists():
         return
     tenths = set()
 
@@ -75,10 +77,15 @@ def main() -> None:
     compile_all(say)
 
 
-def _compile(module: str, lines: list[str]) -> int:
+def _save_in_package() -> None:
+    """Have this process look for kernels in the package alone and save them there, if it can be written."""
     from orthoswarm.compute.kernel_cache import FOLDER, KernelCache
 
     KernelCache.filling = os.access(FOLDER if FOLDER.exists() else FOLDER.parent, os.W_OK)
+
+
+def _compile(module: str, lines: list[str]) -> int:
+    _save_in_package()
     wanted = [found for line in lines if (found := _to_compile(module, line))]
     for kernel, types in wanted:
         kernel.compile(types)
@@ -116,7 +123,7 @@ def _tidy(modules: list[str]) -> None:
             file.unlink(missing_ok=True)
     if KernelCache.filling:
         made = {"numba": numba.__version__, "python": sys.version_info[:2], "processor": numba.config.CPU_NAME}
-        (FOLDER / "made_for.json").write_text(json.dumps(made), encoding="utf-8")
+        _MADE_FOR.write_text(json.dumps(made), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from orthoswarm.compute.jit import in_place_kernel, kernel
 from orthoswarm.mosaic.footprint import tan_limit
 from orthoswarm.mosaic.kernels.lens_arrays import U_HIGH, U_LOW, V_HIGH, V_LOW
+from orthoswarm.mosaic.kernels.line_of_sight import HIDES_M, first_over
 from orthoswarm.mosaic.kernels.render_arrays import LATTICE_PX, Shots, lattice_height, project
 from orthoswarm.mosaic.seam_labels import OUTSIDE, block_heights, sight
 from orthoswarm.mosaic.seams.previews import GLARE_LEVEL, Previews
@@ -38,7 +39,6 @@ _HAZE_COST: Final = 6000.0
 the contrast outweighs a view that is some 20 degrees more oblique."""
 _HAZE_IGNORED_LOG: Final = 0.3  # log ratios of contrast up to this cost nothing: parallax, shadows, noise
 _GLARE_COST: Final = 3000.0  # cost of ground that is burnt out (glints of water): as of a view at 25 degrees
-_HIDDEN_M: Final = 0.5  # what rises above the line of sight by less than this hides nothing
 _BLUR_COST: Final = 6000.0
 """Cost of a picture that is less sharp than the median of those around, times the logarithm of the ratio."""
 _BLUR_IGNORED_LOG: Final = 0.25  # log ratios of sharpness up to this cost nothing
@@ -121,7 +121,7 @@ def cell_candidates(region: Region, shots: Shots, tone: Floats, previews: Previe
         *arrays, usable, penalty, haze, previews.gray, previews.rows, tone, region.lattice, region.gsd_m,
         region.cell_px, unit * _OBLIQUENESS_COST, cells.candidate, cells.cost, cells.level,
         np.ascontiguousarray(local, np.float32), cells.texture, unit * _GLARE_COST,
-        GLARE_LEVEL, _CANDIDATE_TAN2, tan_limit() ** 2, _WEAK_COST, _HIDDEN_M,
+        GLARE_LEVEL, _CANDIDATE_TAN2, tan_limit() ** 2, _WEAK_COST, HIDES_M,
     )  # fmt: skip
     return cells
 
@@ -179,19 +179,7 @@ def _hidden(lattice, position, x, y, z, gsd, top, above):  # type: ignore[no-unt
     dx, dy = position[0] - x, position[1] - y
     away = max(np.hypot(dx, dy), 1e-6)
     rise = (position[2] - z) / away * step
-    col, row, ec, er = x / step, y / step, dx / away, dy / away
-    last = lattice.shape[0] - 1
-    n = 1
-    line = z + above + rise
-    while line < top:
-        n += 1
-        line += rise
-        i, j = int(row + n * er + 0.5), int(col + n * ec + 0.5)
-        if i < 0 or j < 0 or i > last or j > last:
-            return False
-        if lattice[i, j] > line:
-            return True
-    return False
+    return first_over(lattice, y / step, x / step, dy / away, dx / away, z + above, rise, top, 1) >= 0
 
 
 @kernel

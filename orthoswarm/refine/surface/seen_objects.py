@@ -14,11 +14,11 @@ import numpy as np
 from orthoswarm.compute.jit import in_place_kernel
 from orthoswarm.model.arrays import Flags, Ints
 from orthoswarm.model.placement import Terrain
+from orthoswarm.mosaic.kernels.line_of_sight import HIDES_M, first_over
 from orthoswarm.refine.bundle.block_arrays import CameraBlock, project_point
 
 _MOST_HIDDEN_SHARE: Final = 0.02
 """An object may hide so much of its own area from all pictures: of a suburb 0.01 % is drawn twice, with 0.05 0.3 %."""
-_HIDES_M: Final = 0.5  # what rises above a line of sight by less hides nothing: the noise of measured heights
 _MOST_TAN: Final = 2.0  # tangent of the view angle of pictures that are looked at: 63 degrees
 _BLOCK_NODES: Final = 32  # nodes a side that are looked at with the pictures in one order
 
@@ -68,7 +68,7 @@ def hidden_by(terrain: Terrain, cameras: CameraBlock, wanted: Flags) -> Ints:
             order = near[np.argsort(away[near], kind="stable")]
             _look(
                 terrain.z, terrain.west, terrain.south, terrain.step_m, part, order, *cameras.arrays,
-                top, _MOST_TAN, _HIDES_M, wanted, found,
+                top, _MOST_TAN, HIDES_M, wanted, found,
             )  # fmt: skip
     return found
 
@@ -91,25 +91,11 @@ def _look(z, west, south, step, part, order, position, rotation, lens_id, lens, 
                 u, v = project_point(position[k], rotation[k], row, x, y, h)
                 if not (u >= 0.0 and v >= 0.0 and u <= row[6] - 1.0 and v <= row[7] - 1.0):
                     continue
-                hides = _first_over(z, r, c, dx / away, dy / away, h + above, rise / away * step, top)
+                step_rise = rise / away * step
+                hides = first_over(z, np.float64(r), np.float64(c), dy / away, dx / away, h + above, step_rise, top, 0)
                 if hides < 0:
                     by = -1
                     break
                 if away < least * rise:
                     least, by = away / rise, hides
             found[r, c] = by
-
-
-@in_place_kernel
-def _first_over(z, r, c, east, north, line, rise, top):  # type: ignore[no-untyped-def]
-    """The first node over a line of sight from a node, which rises by `rise` a step; -1 where none is."""
-    n = 0
-    while line < top:
-        n += 1
-        line += rise
-        i, j = int(r + n * north + 0.5), int(c + n * east + 0.5)
-        if i < 0 or j < 0 or i >= z.shape[0] or j >= z.shape[1]:
-            return -1
-        if z[i, j] > line and (i != r or j != c):
-            return i * z.shape[1] + j
-    return -1
