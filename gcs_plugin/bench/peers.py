@@ -39,6 +39,9 @@ SUCCESS = 0.9
 _INSIDE = Path(__file__).parent / "inside"
 Cell = tuple[str, Path | None]
 """Title above a map, and its thumbnail; None where there is no map."""
+_PROC = Path("/proc")
+_MEASURED_EVERY_S = 0.25
+_WALL_FACTOR = 20.0  # a program may wait so many times its limit of CPU time
 
 
 @dataclass(frozen=True, slots=True)
@@ -461,11 +464,6 @@ def verdict(title: str, row: dict[str, Any]) -> str:
     return f"{title}\n{100 * row['right_share']:.0f} % within 1 m"
 
 
-_PROC = Path("/proc")
-_EVERY_S = 0.25
-_WALL_FACTOR = 20.0  # a program may wait so many times its limit of CPU time
-
-
 @dataclass(frozen=True, slots=True)
 class Measured:
     """Resources that a command used.
@@ -517,7 +515,7 @@ def run_measured(
                     os.killpg(process.pid, signal.SIGKILL)
                 ended, status, usage = os.wait4(process.pid, 0 if stopped else os.WNOHANG)
                 if not ended:
-                    time.sleep(_EVERY_S)
+                    time.sleep(_MEASURED_EVERY_S)
             process.returncode = os.waitstatus_to_exitcode(status)
         finally:
             with contextlib.suppress(ProcessLookupError, PermissionError):  # remaining child processes, or Ctrl-C

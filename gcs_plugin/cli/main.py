@@ -37,6 +37,9 @@ VERBS = {
 }
 
 _NEGATIVE = re.compile(r"-[0-9.]")
+_INTERRUPT_AGAIN_S = 0.05  # well below what a person notices
+_NOT_INTERRUPTED = ("numba", "llvmlite")  # compile and call back from C
+_IMPORT_CODE = "<frozen importlib"
 
 
 class _Parser(argparse.ArgumentParser):
@@ -123,11 +126,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
 
 
-_AGAIN_S = 0.05  # well below what a person notices
-_LIBRARIES = ("numba", "llvmlite")  # compile and call back from C
-_IMPORTS = "<frozen importlib"
-
-
 @contextmanager
 def safe_interrupts() -> Iterator[None]:
     """Within it SIGINT raises KeyboardInterrupt as always, but not amid a compilation or an import: right after it.
@@ -147,7 +145,7 @@ def safe_interrupts() -> Iterator[None]:
     def interrupt(_number: int, frame: FrameType | None) -> None:
         if _may_raise(frame):
             raise KeyboardInterrupt
-        again[:] = [threading.Timer(_AGAIN_S, _interrupt_main_thread)]
+        again[:] = [threading.Timer(_INTERRUPT_AGAIN_S, _interrupt_main_thread)]
         again[0].daemon = True
         again[0].start()
 
@@ -164,7 +162,7 @@ def safe_interrupts() -> Iterator[None]:
 def _may_raise(frame: FrameType | None) -> bool:
     while frame is not None:
         module = str(frame.f_globals.get("__name__", "")).partition(".")[0]
-        if module in _LIBRARIES or frame.f_code.co_filename.startswith(_IMPORTS):
+        if module in _NOT_INTERRUPTED or frame.f_code.co_filename.startswith(_IMPORT_CODE):
             return False
         frame = frame.f_back
     return True

@@ -47,6 +47,9 @@ _SHOWN: Final = (".jpg", ".webp", ".bmp")  # by all browsers
 _VIEW_QUALITY: Final = 90
 _zipping: Final = threading.Lock()
 _MOST_SIGHTINGS = 24  # pictures of one place
+_SENT_EVERY_S: Final = 2.0
+_FINDS_EVERY: Final = 15  # rounds after which all finds are sent again
+_log = logging.getLogger(__name__)
 
 
 class SightingRow(TypedDict, total=False):
@@ -251,11 +254,6 @@ def pictures_at(task: ExportTask, lat_deg: float, lon_deg: float) -> list[Sighti
     ]  # fmt: skip
 
 
-_EVERY_S: Final = 2.0
-_FINDS_EVERY: Final = 15  # rounds after which all finds are sent again
-_log = logging.getLogger(__name__)
-
-
 class TakFeed(Background):
     """Sends all vehicles every two seconds, and all finds when one is new or changed and every half minute.
 
@@ -282,7 +280,7 @@ class TakFeed(Background):
 
     def _run(self) -> None:
         number, known = 0, set[Place]()
-        while not self._stop.wait(_EVERY_S):
+        while not self._stop.wait(_SENT_EVERY_S):
             try:
                 places = self._exports.places()
             except (OrthoSwarmError, TimeoutError) as error:

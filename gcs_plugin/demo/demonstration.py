@@ -30,6 +30,9 @@ _DEMO_FILES: Final = (
 )  # fmt: skip
 _MOST_S: Final = 900.0
 ReportProgress = Callable[[str, int, int], None]
+_MOST_WAITING: Final = 4  # pictures
+_SLOW_RATE: Final = 0.15  # times real time while cameras lag behind
+_BEHIND_S: Final = 0.05
 
 
 def run_demo(
@@ -265,11 +268,6 @@ def _measure(setting: DemoSetting, out: Path, end: dict[str, Any], wall_s: float
     return report
 
 
-_MOST_WAITING: Final = 4  # pictures
-_SLOW: Final = 0.15  # times real time while cameras lag behind
-_BEHIND_S: Final = 0.05
-
-
 class PacedClock:
     """A clock that slows down while rendering is behind: a slow machine flies slower and loses no picture."""
 
@@ -281,7 +279,7 @@ class PacedClock:
         """Simulated seconds since the start."""
         with self._lock:
             real = time.monotonic()
-            self._now += (real - self._real) * (_SLOW if self.slow else 1.0)
+            self._now += (real - self._real) * (_SLOW_RATE if self.slow else 1.0)
             self._real = real
             return self._now
 

@@ -50,6 +50,7 @@ _THINNED_S: Final = 2.0
 farther apart, but still evenly spaced."""
 _IDLE_S: Final = 0.02
 _POST_TIMEOUT_S: Final = 30.0
+_WAIT_S: Final = 0.5
 
 
 class Outlet(Protocol):
@@ -441,8 +442,6 @@ def away_m(world: TwinSpec, lat_deg: float, lon_deg: float) -> float:
 if TYPE_CHECKING:
     from gcs_plugin.fleet.fleet import Fleet
     from gcs_plugin.links.packets import Packet
-
-_WAIT_S: Final = 0.5
 
 
 class Relay:

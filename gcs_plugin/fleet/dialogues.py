@@ -21,6 +21,7 @@ from gcs_plugin.mission.upload import MissionUpload
 from orthoswarm.model.errors import OrthoSwarmError
 
 _ON_THE_WAY_S = 1.0
+_ON_WAY_M: Final = 15.0  # one that holds no farther from the way to its item was held on it: vehicles brake in less
 
 
 class Dialogues:
@@ -174,9 +175,6 @@ class Dialogues:
 
 def _in_background(job: Exchange) -> bool:
     return isinstance(job, MissionDownload) and job.background
-
-
-_ON_WAY_M: Final = 15.0  # one that holds no farther from the way to its item was held on it: vehicles brake in less
 
 
 def resumed(vehicle: Vehicle) -> Exchange:

@@ -33,6 +33,14 @@ GIMBAL_CLAIM = int(dialect.MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE)
 _NAV_LAST = int(dialect.MAV_CMD_NAV_LAST)
 _PLAIN_FRAME = {5: 0, 6: 3, 11: 10}
 DEG_E7 = 1e7
+# Which of param1 to param4 (0 to 3) affect a command's execution; for other commands all are compared.
+_DECISIVE: dict[int, tuple[int, ...]] = {
+    WAYPOINT: (0,), TAKEOFF: (), RTL: (), LAND: (), VTOL_LAND: (), LOITER_UNLIM: (),
+    DELAY: (0, 1, 2, 3), JUMP: (0, 1), CHANGE_SPEED: (0, 1), TRIGGER_DISTANCE: (0,),
+    MOUNT_CONTROL: (0, 1, 2), GIMBAL_PITCH: (0, 1),
+}  # fmt: skip
+_PLACE_E7 = 2
+_ALTITUDE_M = 0.011
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -192,16 +200,6 @@ def ending_of(commands: Sequence[int | None], first_seq: int) -> Ending:
     return {
         RTL: Ending.RTL, LAND: Ending.LAND, VTOL_LAND: Ending.LAND, LOITER_UNLIM: Ending.NEVER,
     }.get(commands[last] or 0, Ending.WAYPOINT)  # fmt: skip
-
-
-# Which of param1 to param4 (0 to 3) affect a command's execution; for other commands all are compared.
-_DECISIVE: dict[int, tuple[int, ...]] = {
-    WAYPOINT: (0,), TAKEOFF: (), RTL: (), LAND: (), VTOL_LAND: (), LOITER_UNLIM: (),
-    DELAY: (0, 1, 2, 3), JUMP: (0, 1), CHANGE_SPEED: (0, 1), TRIGGER_DISTANCE: (0,),
-    MOUNT_CONTROL: (0, 1, 2), GIMBAL_PITCH: (0, 1),
-}  # fmt: skip
-_PLACE_E7 = 2
-_ALTITUDE_M = 0.011
 
 
 def difference(mission: Mission, stored: Sequence[MissionItem]) -> str:

@@ -32,6 +32,7 @@ from orthoswarm.export.tactical.places import feature
 Result = TypeVar("Result")
 STATIC: Final = Path(__file__).parent / "static"
 _TYPES: Final = {"webp": "image/webp", "png": "image/png"}
+_QUANTILES: Final = (0.5, 0.9, 0.99, 1)
 
 
 class Call(NamedTuple):
@@ -355,9 +356,6 @@ def make_app(daemon: Daemon, token: str, bind: str = "127.0.0.1") -> Any:
         return Response(status_code=204)
 
     return Guard(app, token, bind)
-
-
-_QUANTILES: Final = (0.5, 0.9, 0.99, 1)
 
 
 def prometheus(daemon: Daemon, uploads_waiting: int = 0) -> str:

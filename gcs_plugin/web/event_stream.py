@@ -23,6 +23,9 @@ from orthoswarm.export.json_values import json_text
 _TICK_S: Final = 0.25
 STILL_S: Final = 3.0
 _AFTER_S: Final = 1.0
+HEARTBEAT_S: Final = 1.0
+RUN: Final = os.urandom(6).hex()
+"""Names this run of the daemon: its clock means nothing to another."""
 
 
 def clock_with_sleep() -> float:
@@ -62,11 +65,6 @@ class Standstill:
         while True:
             self.tick()
             await asyncio.sleep(_TICK_S)
-
-
-HEARTBEAT_S: Final = 1.0
-RUN: Final = os.urandom(6).hex()
-"""Names this run of the daemon: its clock means nothing to another."""
 
 
 def clocks() -> dict[str, Any]:

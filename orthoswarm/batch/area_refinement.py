@@ -24,6 +24,8 @@ from orthoswarm.trajectory.near_paths import NearPaths
 
 _TIE_PLACES = 8
 """Camera positions of a vehicle that tie two areas: they move as one, a few tell shift, turn and scale."""
+_BLOCK_NODES = 32
+"""Nodes along each side that are taken from one area."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,10 +216,6 @@ def _moved_ground(terrain: Terrain | None, move: AreaMove, level_m: float) -> Te
     return replace(moved, z=moved.z + up, bare=None if moved.bare is None else moved.bare + up)
 
 
-_BLOCK = 32
-"""Nodes along each side that are taken from one area."""
-
-
 def merged_ground(grounds: Sequence[Terrain | None], nadirs: Sequence[Array]) -> Terrain | None:
     """Join the grounds of areas, on nodes as near to each other as those of the finest.
 
@@ -242,9 +240,9 @@ def merged_ground(grounds: Sequence[Terrain | None], nadirs: Sequence[Array]) ->
         for i, j in np.ndindex(area.shape):
             ground = grounds[int(area[i, j])]
             if ground is not None:
-                part = z[i * _BLOCK : (i + 1) * _BLOCK, j * _BLOCK : (j + 1) * _BLOCK]
-                east = low[0] + step * (j * _BLOCK + np.arange(part.shape[1]))
-                north = low[1] + step * (i * _BLOCK + np.arange(part.shape[0]))
+                part = z[i * _BLOCK_NODES : (i + 1) * _BLOCK_NODES, j * _BLOCK_NODES : (j + 1) * _BLOCK_NODES]
+                east = low[0] + step * (j * _BLOCK_NODES + np.arange(part.shape[1]))
+                north = low[1] + step * (i * _BLOCK_NODES + np.arange(part.shape[0]))
                 at = Terrain(ground.west, ground.south, ground.step_m, height(ground))
                 part[:] = at.height(np.stack(np.meshgrid(east, north), -1))
         return z
@@ -260,8 +258,8 @@ def _nearest_areas(low: Array, step: float, shape: tuple[int, int], nadirs: Sequ
     """For each block of nodes the area with the nearest camera."""
     from scipy.spatial import cKDTree  # a tenth of a second that runs of one area do without here
 
-    rows, columns = (-(-n // _BLOCK) for n in shape)
-    side = _BLOCK * step
+    rows, columns = (-(-n // _BLOCK_NODES) for n in shape)
+    side = _BLOCK_NODES * step
     middle = np.stack(
         np.meshgrid(low[0] + side * (np.arange(columns) + 0.5), low[1] + side * (np.arange(rows) + 0.5)), -1
     )

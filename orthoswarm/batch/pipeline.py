@@ -49,6 +49,9 @@ from orthoswarm.stores.addresses import address_of
 from orthoswarm.stores.listing import exists
 from orthoswarm.trajectory.legs import split_legs
 
+_BESIDE_PHOTOS: Final = 15
+"""Photos with a position before and after, of the same flight, that may show the ground of one without (its cost)."""
+
 
 def run(
     load: Load,
@@ -276,10 +279,6 @@ def legs_as_vehicles(frames: Sequence[Frame], grid: LocalGrid) -> list[Frame]:
             last = number if number >= 0 else last
             out.append(replace(frame, vehicle=f"{vehicle}/leg{last + 1}"))
     return out
-
-
-_BESIDE_PHOTOS: Final = 15
-"""Photos with a position before and after, of the same flight, that may show the ground of one without (its cost)."""
 
 
 def with_found_positions(run: RunContext, ingest: Ingest) -> Ingest:

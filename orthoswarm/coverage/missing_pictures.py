@@ -20,6 +20,10 @@ _HOLE_STEPS: Final = 1.6  # usual steps between two pictures from which on one i
 _STRAIGHT_DEG: Final = 20.0  # steps of one straight leg differ by less than this in direction
 _MOST_MISSING: Final = 400  # most missing pictures that are made up in one hole (for its time)
 _SLACK_S: Final = 0.05  # camera events this near in time to a picture are its own
+_MATCH_SHARE: Final = 0.45  # a picture's event is within this share of the usual time between them (below a half)
+_LEAST_MATCHED: Final = 0.5  # share of a vehicle's pictures that must have an event: else its clocks disagree
+_SURE: Final = 0.95  # confidence of a cause that camera events show
+_BORROWED_LENS: Final = 0.6  # confidence in what a vehicle has seen of which no picture has arrived
 
 
 class Cause(StrEnum):
@@ -135,12 +139,6 @@ def _why(before: View, after: View, count: int, lost: Sequence[Exposure]) -> tup
 def _number(image: str) -> int | None:
     digits = re.findall(r"\d+", image.rpartition("/")[2])
     return int(digits[-1]) if digits else None
-
-
-_MATCH_SHARE: Final = 0.45  # a picture's event is within this share of the usual time between them (below a half)
-_LEAST_MATCHED: Final = 0.5  # share of a vehicle's pictures that must have an event: else its clocks disagree
-_SURE: Final = 0.95  # confidence of a cause that camera events show
-_BORROWED_LENS: Final = 0.6  # confidence in what a vehicle has seen of which no picture has arrived
 
 
 @dataclass(frozen=True, slots=True)

@@ -43,6 +43,8 @@ RECEIVERS_LOCAL_SIGMA_M: Final = 0.4
 """How far a block without a map is bent besides shift, turn and scale, one sigma an axis. Measured on the same photos:
 0.31 m are left at five points after four unknowns; 73 to 80 % of the points that took no part lie within one stated
 sigma and 90 to 100 % within two."""
+_ONE_PLACE_M: Final = 0.05  # checkpoint within this distance of a control point is that point (as surveys differ) ...
+_SAME_NAME_M: Final = 10.0  # ... and within this one if it has its name
 
 
 class Surveyed(Protocol):
@@ -453,10 +455,6 @@ class _Views:
         own = RECEIVERS_LOCAL_SIGMA_M if row["stage"] == "coarse" else row.get("sigma_m")
         pixel_rad = POINTING_SIGMA_PX / focal
         return Ray(row["image"], position, away / np.linalg.norm(away), pixel_rad, float(own or 0.0))
-
-
-_ONE_PLACE_M: Final = 0.05  # checkpoint within this distance of a control point is that point (as surveys differ) ...
-_SAME_NAME_M: Final = 10.0  # ... and within this one if it has its name
 
 
 @dataclass(frozen=True, slots=True)

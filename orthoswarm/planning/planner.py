@@ -36,6 +36,8 @@ _BETTER_SHARE: Final = 0.99  # a later candidate must be better by this factor
 _CLEARANCE_M: Final = 1.0  # distance that is kept from no-fly zones where none is asked for ...
 _CLEARANCE_WIDTHS: Final = 0.125  # at most so many widths of a picture from no-fly zones
 _LEAST_CLEARANCE_M: Final = 0.1  # least clearance, however narrow a picture is
+Geometry = Any
+_EDGE_ROUNDS: Final = 12  # bisections of the highest ground between two places of a profile (to millimetres)
 
 
 @dataclass(frozen=True)
@@ -425,11 +427,6 @@ def _separation_text(schedule: Schedule, altitude_m: float, apart: Separation) -
     if any(delays):
         text += f"; takeoffs later than the first, up to {max(delays):g} s: {sum(map(bool, delays))}"
     return text
-
-
-Geometry = Any
-
-_EDGE_ROUNDS: Final = 12  # bisections of the highest ground between two places of a profile (to millimetres)
 
 
 def leg_paths(flight: Flight) -> list[Array]:

@@ -35,6 +35,9 @@ _SUBTITLES = frozenset({".srt"})
 _COPY = "a copy of another photo in its folder"
 _ALREADY = "which is in the input already"
 _OTHER_NAME = f"the same file as one of another name, {_ALREADY}"
+_SAMPLE_BYTES, _SAMPLES = 16 << 10, 8
+_COPY_NAME: Final = re.compile(r"\s*\(\d+\)|[\s_-]+copy(?:\s*\(?\d+\)?)?", re.IGNORECASE)  # after the photo's own name
+_COPIED_LEAST: Final = 3  # two folders with so many photos in common may be one and its copy
 
 
 @dataclass(slots=True, kw_only=True)
@@ -291,11 +294,6 @@ def _video_vehicles(folders: list[Folder], root: Path) -> dict[Path, str]:
         for path, name in paths.items()
         for stem in [os.path.splitext(name)[0]]
     }
-
-
-_SAMPLE_BYTES, _SAMPLES = 16 << 10, 8
-_COPY_NAME: Final = re.compile(r"\s*\(\d+\)|[\s_-]+copy(?:\s*\(?\d+\)?)?", re.IGNORECASE)  # after the photo's own name
-_COPIED_LEAST: Final = 3  # two folders with so many photos in common may be one and its copy
 
 
 class Copies(NamedTuple):

@@ -51,6 +51,12 @@ _CONTRADICTION_M: Final = 500.0  # table that puts a photo so far from its tags,
 _NOT_MEASURED: Final = (
     "the picture has no position: its receiver stood still; put a geo.txt next to it, or give its log as well"
 )
+_FEW_SHARE: Final = 0.1  # strangers are at most this share of a folder's photos
+_OTHER_CAMERA_MOST: Final = 2  # photos of another camera: more are a flight's second camera
+_SMALLER: Final = 0.75  # a copy has at most this share of the photo's columns
+_ELSEWHERE_M: Final = 500.0  # ... and elsewhere, if they are farther than this from all others
+Reasons = dict[int, tuple[str, str]]
+"""Photos by their index: why they are left out, one reason for all that share it, and a detail."""
 
 
 def load(inputs: Sequence[Path], *, progress: Progress | None = None, options: LoadOptions | None = None) -> Ingest:
@@ -455,15 +461,6 @@ def _merge_tables(
             photo.origin["angles"] = kind
             photo.yaw_is_stated |= angles[0] is not None
     return vehicle
-
-
-_FEW_SHARE: Final = 0.1  # strangers are at most this share of a folder's photos
-_OTHER_CAMERA_MOST: Final = 2  # photos of another camera: more are a flight's second camera
-_SMALLER: Final = 0.75  # a copy has at most this share of the photo's columns
-_ELSEWHERE_M: Final = 500.0  # ... and elsewhere, if they are farther than this from all others
-
-Reasons = dict[int, tuple[str, str]]
-"""Photos by their index: why they are left out, one reason for all that share it, and a detail."""
 
 
 def strangers(photos: Sequence[Photo]) -> Reasons:

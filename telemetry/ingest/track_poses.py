@@ -45,6 +45,10 @@ _LEAST_PLACED = 5
 EVENT_FAR_M: Final = 60.0  # photos whose own position is farther than this from their camera event are reported
 _TRACK_FAR_M: Final = 10.0  # photos nearer than this to a log's track at their times do not contradict it
 _TRACK_FAR_TIMES: Final = 5.0  # photos farther from it than so many times their median distance contradict it
+SHIFTED: Final = "shifted after a jump"
+"""Said in the origin of a photo's time that was moved to follow the photos before it."""
+CLOCK_JUMP_S: Final = 60.0  # a step back in the photos' times by more than this is a jump of the camera's clock
+LOG_LEAST_SHARE: Final = 0.5  # a log belongs to photos if this share of the shorter of both is paired
 
 
 def best_log_of(matches: Sequence[LogMatch], vehicle: str) -> LogMatch | Finding:
@@ -264,11 +268,6 @@ def fill(photo: Photo, pose: Sample, origin: str, *, gimbal: bool) -> None:
         photo.time_s, photo.origin["time"] = pose.time_s, origin
 
 
-SHIFTED: Final = "shifted after a jump"
-"""Said in the origin of a photo's time that was moved to follow the photos before it."""
-CLOCK_JUMP_S: Final = 60.0  # a step back in the photos' times by more than this is a jump of the camera's clock
-
-
 def in_order(photos: Sequence[Photo], vehicle: str, findings: list[Finding]) -> list[Photo]:
     """Sort photos by time, or by name where the clock jumped.
 
@@ -320,9 +319,6 @@ def _went_back(times: Array) -> bool:
         return False
     spans = sorted((run.min(), run.max()) for run in np.split(times, back))
     return any(later[0] < earlier[1] for earlier, later in pairwise(spans))
-
-
-LOG_LEAST_SHARE: Final = 0.5  # a log belongs to photos if this share of the shorter of both is paired
 
 
 def of_one_vehicle(logs: Iterable[FlightLog]) -> bool:

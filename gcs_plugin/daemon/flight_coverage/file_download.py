@@ -19,6 +19,17 @@ from gcs_plugin.links.mavlink import Message
 _MOST_FILES: Final = 100_000  # of a vehicle's card
 _DEPTH: Final = 2  # of folders below the root
 _RESET_AFTER: Final = 3  # answers that the server is busy
+_AT_ONCE: Final = 4
+"""ArduPilot's server holds five requests."""
+_PATIENCE: Final = 4.0  # times the quickest answer
+_LEAST_PATIENCE_S, _MOST_PATIENCE_S = 0.5, 4.0
+_SILENT_S: Final = 12.0
+_BUSY_S: Final = 5.0
+_LEAST_BYTES_S: Final = 600.0
+"""Two packets a second."""
+_TARGET_S: Final = 0.1
+_MEMORY_S: Final = 30.0
+_UP, _DOWN, _LOST = 1.04, 0.75, 0.9
 
 
 class FtpJob:
@@ -242,19 +253,6 @@ class FileRead(FtpJob):
 def numbered(payload: FtpPayload, number: int) -> FtpPayload:
     """A request with its number."""
     return replace(payload, number=number)
-
-
-_AT_ONCE: Final = 4
-"""ArduPilot's server holds five requests."""
-_PATIENCE: Final = 4.0  # times the quickest answer
-_LEAST_PATIENCE_S, _MOST_PATIENCE_S = 0.5, 4.0
-_SILENT_S: Final = 12.0
-_BUSY_S: Final = 5.0
-_LEAST_BYTES_S: Final = 600.0
-"""Two packets a second."""
-_TARGET_S: Final = 0.1
-_MEMORY_S: Final = 30.0
-_UP, _DOWN, _LOST = 1.04, 0.75, 0.9
 
 
 class LinkShare:

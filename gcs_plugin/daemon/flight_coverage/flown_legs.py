@@ -23,6 +23,12 @@ from orthoswarm.planning.area.shape_files import parse_geojson
 _LEAST_DROP: Final = 0.03  # share of the battery after which its use is known
 _LEAST_S: Final = 60.0  # of flight for that
 _SWAPPED: Final = 0.05  # a charge that rises by this share is another battery
+Array = NDArray[np.float64]
+_LEAST_REACH_M: Final = 12.0
+_ARRIVED_M: Final = 3.0
+"""A vehicle so near the end of a leg has flown it, though it waits there."""
+_IDLE_S: Final = 60.0
+_MISSION_OVER: Final = ("complete", "aborted")
 
 
 @dataclass(slots=True)
@@ -173,14 +179,6 @@ def zone_features(area: Area) -> dict[str, Any]:
             "geometry": {"type": "Polygon", "coordinates": [ring]},
         })  # fmt: skip
     return {"type": "FeatureCollection", "features": features}
-
-
-Array = NDArray[np.float64]
-_LEAST_REACH_M: Final = 12.0
-_ARRIVED_M: Final = 3.0
-"""A vehicle so near the end of a leg has flown it, though it waits there."""
-_IDLE_S: Final = 60.0
-_MISSION_OVER: Final = ("complete", "aborted")
 
 
 @dataclass(kw_only=True)

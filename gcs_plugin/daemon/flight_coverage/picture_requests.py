@@ -34,6 +34,14 @@ from telemetry.live.live_poses import LinkPoses
 _SURE: Final = 0.9  # share of the pictures that agree on the shift of numbers
 _LEAST: Final = 3  # pictures for it
 _PICTURES: Final = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp")
+_EVENT: Final = "camera event"
+_STEP_S, _LOOK_S = 0.02, 1.0
+_AGAIN_S: Final = 60.0
+_LIST_AGAIN_S, _LIST_AT_LEAST_S = 10.0, 600.0
+_QUIET_S: Final = 1.0
+_TELL_S: Final = 2.0
+_MOST_URLS: Final = 20_000  # of one camera's list
+_log = logging.getLogger(__name__)
 
 
 @dataclass(slots=True)
@@ -103,16 +111,6 @@ def number_of(name: str) -> int | None:
     """The last number in a file's name."""
     digits = re.findall(r"\d+", name.rpartition("/")[2])
     return int(digits[-1]) if digits else None
-
-
-_EVENT: Final = "camera event"
-_STEP_S, _LOOK_S = 0.02, 1.0
-_AGAIN_S: Final = 60.0
-_LIST_AGAIN_S, _LIST_AT_LEAST_S = 10.0, 600.0
-_QUIET_S: Final = 1.0
-_TELL_S: Final = 2.0
-_MOST_URLS: Final = 20_000  # of one camera's list
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,6 +32,21 @@ _SOS: Final = 0xDA
 _EOI: Final = b"\xff\xd9"
 _BARE: Final = frozenset({0x01, *range(0xD0, 0xD8)})
 """JPEG markers without a length."""
+_POLL_S: Final = 0.25
+_SCAN_SHARE: Final = 0.1  # of the time that looking at the folder may take
+_QUIET_S: Final = 1.0
+_SETTLED_S: Final = 3.0
+_BATCH: Final = 32  # pictures that are handed over at a time
+_BATCH_BYTES: Final = 64 << 20
+_STALLED_S: Final = 30.0
+_UNCHANGED_S: Final = 2.0
+_REST_S: Final = 5.0
+_AGAIN_S: Final = (20.0, 600.0)
+_NEAR_M: Final = 50.0
+_log = logging.getLogger(__name__)
+_HEAD: Final = 1 << 20  # bytes at either end that identify a file
+Stamp = tuple[int, int]
+"""Size of a file and time of its last change, nanoseconds."""
 
 
 def is_complete(data: bytes, suffix: str) -> bool:
@@ -119,23 +134,6 @@ def is_video_complete(path: Path) -> bool:
                 return False
             at += length
     return index and at <= size
-
-
-_POLL_S: Final = 0.25
-_SCAN_SHARE: Final = 0.1  # of the time that looking at the folder may take
-_QUIET_S: Final = 1.0
-_SETTLED_S: Final = 3.0
-_BATCH: Final = 32  # pictures that are handed over at a time
-_BATCH_BYTES: Final = 64 << 20
-_STALLED_S: Final = 30.0
-_UNCHANGED_S: Final = 2.0
-_REST_S: Final = 5.0
-_AGAIN_S: Final = (20.0, 600.0)
-_NEAR_M: Final = 50.0
-_log = logging.getLogger(__name__)
-_HEAD: Final = 1 << 20  # bytes at either end that identify a file
-Stamp = tuple[int, int]
-"""Size of a file and time of its last change, nanoseconds."""
 
 
 class FolderState:

@@ -12,6 +12,8 @@ from orthoswarm.raster.picture_quality import PictureQuality
 
 Whose = tuple[str, int]
 """A vehicle and the number of its sortie."""
+Exposed = tuple[str, int, float, float | None, float | None]
+"""Vehicle, number, UTC epoch seconds, latitude and longitude in degrees (None where the camera had no position)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -305,10 +307,6 @@ def frames_drawn(results: Iterable[Drawn]) -> Change:
         statements("INSERT OR REPLACE INTO thumbnails VALUES (?, ?)", thumbnails),
         statements("INSERT OR REPLACE INTO qualities VALUES (?, ?, ?, ?, ?)", qualities),
     )
-
-
-Exposed = tuple[str, int, float, float | None, float | None]
-"""Vehicle, number, UTC epoch seconds, latitude and longitude in degrees (None where the camera had no position)."""
 
 
 def exposures_added(rows: Sequence[Exposed]) -> Change:

@@ -25,6 +25,7 @@ MOST_PICTURE_BYTES: Final = 96_000_000
 """Larger files are refused, posted or read from a vehicle: twice the largest JPEG of a drone's camera (chosen)."""
 _SUFFIXES: Final = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png", "WEBP": ".webp", "TIFF": ".tif", "BMP": ".bmp"}
 _FORMATS: Final = ("JPEG", "PNG", "WEBP", "TIFF", "BMP")  # a JPEG with several pictures opens as MPO
+_FREE_MB: Final = 1000.0
 
 
 def frame_key(vehicle: str, image: str) -> bytes:
@@ -125,9 +126,6 @@ def _sync_folder(folder: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-_FREE_MB: Final = 1000.0
 
 
 class KeptPictures:

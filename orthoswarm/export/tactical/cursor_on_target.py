@@ -27,6 +27,8 @@ _UNKNOWN: Final = "9999999.0"
 _STALE_S: Final = {"vehicle": 30.0, "find": 7 * 86_400.0}
 _MAGENTA: Final = "-65281"
 """ARGB of a find's marker as a signed 32-bit integer."""
+_HOPS: Final = 1
+_WAIT_S: Final = 5.0
 
 
 def event(place: Place, now_s: float | None = None) -> bytes:
@@ -81,10 +83,6 @@ def write_data_package(places: Iterable[Place], path: Path, name: str = "OrthoSw
         settings = [element("Parameter", name=key, value=value) for key, value in (("uid", uid), ("name", name))]
         parts = element("Configuration", *settings), element("Contents", *contents)
         archive.writestr("MANIFEST/manifest.xml", xml_bytes(element("MissionPackageManifest", *parts, version="2")))
-
-
-_HOPS: Final = 1
-_WAIT_S: Final = 5.0
 
 
 @dataclass(frozen=True, slots=True)

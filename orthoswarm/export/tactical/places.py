@@ -20,6 +20,11 @@ from orthoswarm.model.placement import PlacedFrame
 from orthoswarm.mosaic.footprint import least_descent
 
 FILE: Final = "places.geojson"
+_COLUMNS: Final = (
+    "uid", "kind", "name", "lat_deg", "lon_deg", "height_m", "sigma_m", "time", "note", "course_deg", "speed_m_s",
+    "pictures",
+)  # fmt: skip
+_FORMULA: Final = ("=", "+", "-", "@", "\t", "\r")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -139,13 +144,6 @@ def sightings(placed: Iterable[PlacedFrame], point: ArrayLike) -> list[Sighting]
             off = float(np.hypot(column - 0.5 * lens.width, row - 0.5 * lens.height) / half)
             found.append(Sighting(frame, column, row, off))
     return sorted(found, key=lambda s: s.off_centre)
-
-
-_COLUMNS: Final = (
-    "uid", "kind", "name", "lat_deg", "lon_deg", "height_m", "sigma_m", "time", "note", "course_deg", "speed_m_s",
-    "pictures",
-)  # fmt: skip
-_FORMULA: Final = ("=", "+", "-", "@", "\t", "\r")
 
 
 def write_csv(places: Iterable[Place], path: Path) -> None:

@@ -24,6 +24,8 @@ _TABLES: Final = (
     "CREATE TABLE tiles (zoom_level integer, tile_column integer, tile_row integer, tile_data blob);"
     "CREATE UNIQUE INDEX tile_index ON tiles (zoom_level, tile_column, tile_row);"
 )
+_FORMATS: Final = {"png": "PNG", "jpg": "JPEG", "webp": "WEBP"}
+_TILE: Final = "SELECT tile_data FROM tiles WHERE zoom_level = ? AND tile_column = ? AND tile_row = ?"
 
 
 def write_mbtiles(
@@ -120,10 +122,6 @@ def encode_tile(rgba: Bytes, tile_format: Format, quality: int = 85) -> bytes:
         image = cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGRA if not opaque else cv2.COLOR_RGBA2BGR)
         options = [cv2.IMWRITE_PNG_COMPRESSION, 4] if tile_format == "png" else [cv2.IMWRITE_WEBP_QUALITY, quality]
     return bytes(cv2.imencode("." + tile_format, image, options)[1])
-
-
-_FORMATS: Final = {"png": "PNG", "jpg": "JPEG", "webp": "WEBP"}
-_TILE: Final = "SELECT tile_data FROM tiles WHERE zoom_level = ? AND tile_column = ? AND tile_row = ?"
 
 
 def write_pmtiles(mbtiles: Path, path: Path) -> None:

@@ -36,6 +36,7 @@ _LARGE_MAIN = frozenset({XMP})
 _LARGE_EXIF = frozenset({MAKER_NOTE})
 # Strips, tiles and colour maps can be megabytes and are not needed here.
 _SKIPPED = frozenset({0x111, 0x117, 0x140, 0x144, 0x145, 0x201, 0x202, 0x14A, 0x9286})
+_MOST_NOTE_ENTRIES = 256
 
 
 @dataclass(slots=True)
@@ -244,9 +245,6 @@ def _days_early(apart: float) -> int:
         return 0
     # 13 h and more share their time of day with -11 h and less: where the date does not tell, the zone of more people.
     return math.ceil((apart - 13.0 * 3600.0 - _MOST_LAG_S) / _DAY_S)
-
-
-_MOST_NOTE_ENTRIES = 256
 
 
 def parse_dji(note: bytes) -> Sample | None:

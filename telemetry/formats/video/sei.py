@@ -54,6 +54,8 @@ _FIELDS = (
 _FIXED = struct.Struct(">BBH11d")
 _MAX_VEHICLE = 64
 _MAX_JSON = 1 << 16
+_NUMBERS = frozenset(f.name for f in fields(Sample)) - {"vehicle", "height_is_ground", "number", "zoom"}
+_FIELD = re.compile(r"(\w+)(?:\*([+-]?[\d.]+(?:e[+-]?\d+)?))?([+-][\d.]+)?", re.IGNORECASE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -336,10 +338,6 @@ for _built_in in (
     Decoder("SEI DJI", DJI_TYPE, None, _decode_dji),
 ):
     register(_built_in)
-
-
-_NUMBERS = frozenset(f.name for f in fields(Sample)) - {"vehicle", "height_is_ground", "number", "zoom"}
-_FIELD = re.compile(r"(\w+)(?:\*([+-]?[\d.]+(?:e[+-]?\d+)?))?([+-][\d.]+)?", re.IGNORECASE)
 
 
 def read_sei_layout(path: Path) -> Decoder:
