@@ -102,6 +102,15 @@ def test_a_kernel_that_changed_is_compiled_again_and_the_others_are_not(installe
     assert _compiled(copy, tmp_path, _ONE) == []  # from NUMBA_CACHE_DIR
 
 
+def test_what_the_package_lacks_is_compiled_into_it_although_it_was_compiled_when_it_was_called(installed, tmp_path):
+    copy = shutil.copytree(installed, tmp_path / "lacking")
+    shutil.rmtree(copy / COMPILED / "canvas")
+    assert len(_compiled(copy, tmp_path, _ONE)) >= 1
+    env = os.environ | {"PYTHONPATH": str(copy), "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    subprocess.run([sys.executable, "-m", "orthoswarm.compute.compile_kernels"], cwd=copy, env=env, check=True)
+    assert any((copy / COMPILED / "canvas").rglob("*.nbc"))
+
+
 def test_a_read_only_installation_uses_its_kernels(installed, tmp_path):
     copy = shutil.copytree(installed, tmp_path / "read_only")
     folders = [copy, *(folder for folder in copy.rglob("*") if folder.is_dir())]
