@@ -41,11 +41,11 @@ def planned(browser, **shared):
 
 def test_a_plan_that_was_made_is_in_view(browser):
     with planned(browser) as (_, page):
-        page.evaluate("document.querySelector('#panel-plan').scrollTop = 0")
-        page.wait_for_function("document.querySelector('.plan-result').getBoundingClientRect().bottom > innerHeight")
-        page.locator("#panel-plan form").evaluate("(form) => form.requestSubmit()")
         box = "document.querySelector('.plan-result .primary').getBoundingClientRect()"
         bar = "document.querySelector('.command-bar').getBoundingClientRect()"
+        top = "document.querySelector('#panel-plan').scrollTop = 0"  # again each time: the first plan may still scroll
+        page.wait_for_function(f"() => {{ {top}; return {box}.bottom > {bar}.top + 1; }}")
+        page.locator("#panel-plan form").evaluate("(form) => form.requestSubmit()")
         page.wait_for_function(f"{box}.bottom <= {bar}.top + 1")
 
 
