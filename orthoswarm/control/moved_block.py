@@ -40,8 +40,7 @@ def moved_terrain(terrain: Terrain, similarity: Similarity, level_m: float) -> T
     before = similarity.back(np.stack([e, n], axis=-1))
 
     def moved(z: NDArray[np.float32]) -> NDArray[np.float32]:
-        heights = replace(terrain, z=z, bare=None).height(before)
+        heights = replace(terrain, z=z).height(before)
         return np.asarray(similarity.moved_heights(heights, level_m), np.float32)
 
-    bare = None if terrain.bare is None else moved(terrain.bare)
-    return Terrain(float(low[0]), float(low[1]), step, moved(terrain.z), bare)
+    return terrain.changed(moved, west=float(low[0]), south=float(low[1]))
