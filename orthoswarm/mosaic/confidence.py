@@ -31,6 +31,7 @@ _LENGTH_SIGMAS: Final = 2.2  # 98 % of errors are shorter: 2.8 sigmas of an axis
 _LOW_THINGS_M: Final = 0.3  # sigma of the height of what is not measured: kerbs, cars, shrubs
 _UNMEASURED_M: Final = 3.0  # what may stand where too few pictures see the ground to measure heights: a hedge, a roof
 _LEAST_PICTURES: Final = 3  # that heights are measured from
+_LEANS_M: Final = 0.5  # what stands may be so far from where it is drawn: more than the half of a car
 _CELL_M: Final = 1.0  # least side of a cell
 _MOST_CELLS: Final = 2_000_000  # cells are larger where there would be more (memory, time)
 _CUT_SHARE: Final = 0.05  # a second picture with less of an object only touches its edge
@@ -74,6 +75,7 @@ class Confidence(NamedTuple):
             "good_to_m": shares,
             "whole_good_to_m": self.whole_m,
             "hidden_share": float(self.hidden.sum()) / count,
+            "leaning_share": float((self.lean_m[drawn] > _LEANS_M).sum()) / count,
             "single_picture_share": float((self.pictures[drawn] <= 1).sum()) / count,
             "doubtful_sides": [name for name, share in self._sides().items() if share > _DOUBTFUL_SIDE],
             "objects": self.objects,

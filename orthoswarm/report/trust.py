@@ -12,7 +12,7 @@ from orthoswarm.report.report_pictures import Picture, pale, scale_bar
 TRUST_COLOURS: Final = {0.2: (0, 140, 90), 0.5: (120, 190, 60), 2.0: (230, 159, 0), 99.0: (190, 30, 60)}
 """Of each class of confidence.tif, metres; 99: only for orientation."""
 _TINT: Final = 0.5
-_MOST: Final = 0.5  # a class is said of the map if so much of it is as good
+_MOST: Final = 0.5  # a class is said of the map if so much of it is as good, of what is not only for orientation
 _SOME: Final = 0.02  # less of the map is not worth a word
 
 
@@ -21,19 +21,23 @@ def headline(report: Mapping[str, Any]) -> str:
     trust = report.get("trust")
     if not trust:
         return ""
-    usual = next((name for name, share in trust["good_to_m"].items() if share >= _MOST), None)
+    known = max(trust["good_to_m"].values())
+    usual = next((name for name, share in trust["good_to_m"].items() if share >= _MOST * known > 0.0), None)
     on_map, whole = bool(report["basemap"]) and trust["whole_good_to_m"] == 0.0, trust["whole_good_to_m"]
-    of = "of the pre-disaster map" if on_map else "of where they are against each other"
-    good = f"places lie within about {_length(float(usual))} {of}" if usual else "for orientation only"
-    rough = 1.0 - max(trust["good_to_m"].values())
-    where = [f"the {_listed(trust['doubtful_sides'])} edge{'s'[: len(trust['doubtful_sides']) > 1]}"]
-    where = [
-        *(where if trust["doubtful_sides"] else []),
-        *(["what stands high"] if trust["hidden_share"] > _SOME else []),
-    ]
+    rough = 1.0 - known
+    good = "for orientation only"
+    if usual:
+        size = f"about {_length(float(usual))}"
+        good = f"places lie within {size} of the pre-disaster map" if on_map else f"distances are good to {size}"
+    where = [_edges(trust["doubtful_sides"])] if trust["doubtful_sides"] else []
+    where += ["what stands high"] if trust["leaning_share"] > _SOME else []
     doubt = f"{_listed(where)} only for orientation" if usual and rough > _SOME and where else ""
     said = "; ".join(part for part in (good, _absolute(report, whole), doubt) if part)
     return said[0].upper() + said[1:] + "."
+
+
+def _edges(sides: list[str]) -> str:
+    return "the edges" if len(sides) == 4 else f"the {_listed(sides)} edge{'s' if len(sides) > 1 else ''}"
 
 
 def _absolute(report: Mapping[str, Any], whole_m: float) -> str:
@@ -51,12 +55,12 @@ def sentences(report: Mapping[str, Any]) -> str:
     """Three sentences below the picture."""
     trust = report["trust"]
     shares = trust["good_to_m"]
-    parts = [f"{share:.0%} of the map is good to {_length(float(name))}" for name, share in shares.items()]
+    parts = [f"{share:.0%} to {_length(float(name))}" for name, share in shares.items()]
     rest = 1.0 - max(shares.values())
     return (
-        f"{', '.join(parts)} or better; {rest:.0%} is only for orientation (red). "
-        f"There a picture shows what stands in front of the ground ({trust['hidden_share']:.0%}), only one picture "
-        f"sees it ({trust['single_picture_share']:.0%}), or it is seen from far aside. "
+        f"Of the map are good: {', '.join(parts)} or better; {rest:.0%} is only for orientation (red). "
+        f"Roofs, trees and the ground behind them may lie more than half a metre off ({trust['leaning_share']:.0%} of "
+        f"the map), as may what one picture shows alone ({trust['single_picture_share']:.0%}) or from far aside. "
         "confidence.tif has the number of each place, and why."
     )
 
