@@ -64,10 +64,10 @@ def test_all_rules_are_put_to_the_test():
     assert all(sum(each[rule] for each in judgements) >= number for rule, number in least.items())
 
 
-def broken_rules(enough, seeds=range(60)):
-    """Which rules are broken on one of some days, until there are enough of them."""
+def broken_rules(enough, first=0):
+    """Which rules are broken on one of sixty days, until there are enough of them; the first day mostly does."""
     found = set()
-    for seed in seeds:
+    for seed in range(first, first + 60):
         found |= {text.partition("rule ")[2][:1] for text in judged(seed)[0].broken}
         if enough <= found:
             break
@@ -90,7 +90,7 @@ def test_a_plan_that_does_not_wait_for_those_before_is_found_out(monkeypatch):
         return [system for system in ready if schedule.waiting.pop(system) is not None]
 
     monkeypatch.setattr(TakeoffSchedule, "due", due)
-    assert "5" in broken_rules({"5"})
+    assert "5" in broken_rules({"5"}, first=12)
 
 
 def test_a_word_that_comes_from_the_mode_alone_is_found_out(monkeypatch):
@@ -99,9 +99,9 @@ def test_a_word_that_comes_from_the_mode_alone_is_found_out(monkeypatch):
         return replace(state, word=Word.PAUSED) if state.word in (Word.DESCENDING, Word.FLYING) else state
 
     monkeypatch.setattr(station_rules, "flight_state", by_mode)
-    assert "3" in broken_rules({"3"})
+    assert "3" in broken_rules({"3"}, first=15)
 
 
 def test_an_end_that_is_believed_is_found_out(monkeypatch):
     monkeypatch.setattr(FlownItems, "all_reached", True)
-    assert "4" in broken_rules({"4"})
+    assert "4" in broken_rules({"4"}, first=10)
