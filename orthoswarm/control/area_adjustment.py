@@ -10,11 +10,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.plane_similarity import Similarity, design
 
-Array = NDArray[np.float64]
 _HELD = 1e-6
 """Sigma of what does not move, metres (or radians)."""
 

@@ -10,16 +10,14 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.control.control_observations import in_photos, on_basemap
 from orthoswarm.control.moved_block import moved_camera, moved_terrain
 from orthoswarm.control.similarity import ControlFit, fit_similarity
 from orthoswarm.evaluation.checkpoints import RECEIVERS_LOCAL_SIGMA_M, Checkpoint
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import Leg, PlacedFrame, Refinement, Solution, Terrain
-
-Array = NDArray[np.float64]
 
 _SCATTER_TOLD_M: Final = 0.5  # points that scatter by more than this are warned about, one sigma of an axis
 _BORDER_M: Final = 0.5

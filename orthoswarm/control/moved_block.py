@@ -3,8 +3,8 @@
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Floats
 from orthoswarm.model.camera import Camera
 from orthoswarm.model.placement import Terrain
 from orthoswarm.model.plane_similarity import Similarity
@@ -39,7 +39,7 @@ def moved_terrain(terrain: Terrain, similarity: Similarity, level_m: float) -> T
     e, n = np.meshgrid(low[0] + step * np.arange(count[0]), low[1] + step * np.arange(count[1]))
     before = similarity.back(np.stack([e, n], axis=-1))
 
-    def moved(z: NDArray[np.float32]) -> NDArray[np.float32]:
+    def moved(z: Floats) -> Floats:
         heights = replace(terrain, z=z, bare=None).height(before)
         return np.asarray(similarity.moved_heights(heights, level_m), np.float32)
 

@@ -9,14 +9,13 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.control.control_observations import ControlObservation
 from orthoswarm.evaluation.misread_points import FARTHEST_M
 from orthoswarm.evaluation.point_rays import MISTAKE_PROBABILITY
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.plane_similarity import Similarity
 
-Array = NDArray[np.float64]
 _HALVINGS = 20
 """Of a bracket of a kilometre, to a millimetre."""
 

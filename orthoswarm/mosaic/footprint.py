@@ -6,12 +6,11 @@ from functools import lru_cache
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.camera import Camera, Lens
 from orthoswarm.mosaic.kernels.lens_arrays import INNER, OUTER, lens_row
-
-Array = NDArray[np.float64]
 
 MOST_OFF_NADIR_DEG: Final = 75.0
 """Ground that is seen farther from straight down is not drawn: a pixel there is smeared over more than 15 times its

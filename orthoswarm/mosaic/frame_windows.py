@@ -4,8 +4,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Ints
 from orthoswarm.mosaic.render_passes import Window
 
 _NUMBERS = 8
@@ -41,6 +41,6 @@ class FrameWindows(Mapping[int, list[Window]]):
         return len(self._row)
 
 
-def _table(result: Iterable[tuple[int, Window]]) -> NDArray[np.int32]:
+def _table(result: Iterable[tuple[int, Window]]) -> Ints:
     rows = [(i, *w.key, w.row0, w.row1, w.col0, w.col1, w.pixels) for i, w in result]
     return np.array(rows, np.int32).reshape(-1, _NUMBERS)

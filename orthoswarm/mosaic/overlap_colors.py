@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel
 from orthoswarm.compute.threads import on_threads
+from orthoswarm.model.arrays import Array, Bytes, Floats, Ints
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import Camera, Lens
 from orthoswarm.model.geo import GroundGrid
@@ -22,10 +23,6 @@ from orthoswarm.mosaic.kernels.drawn_heights import heights
 from orthoswarm.mosaic.kernels.render_arrays import Shots, project
 from orthoswarm.mosaic.seam_labels import label_tile
 from orthoswarm.mosaic.visible_ground import by_tile
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int32]
-Bytes = NDArray[np.uint8]
 
 _TILE = 512
 
@@ -60,9 +57,9 @@ class OverlapColors:
     """
 
     frame: Ints
-    ratio: NDArray[np.float32]
-    place: NDArray[np.float32]
-    sigma: NDArray[np.float32]
+    ratio: Floats
+    place: Floats
+    sigma: Floats
 
     @classmethod
     def joined(cls, parts: "Sequence[OverlapColors]") -> "OverlapColors":

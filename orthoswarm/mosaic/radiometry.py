@@ -25,13 +25,13 @@ from numpy.typing import NDArray
 from orthoswarm.compute.jit import in_place_kernel, kernel
 from orthoswarm.compute.robust_kernel import robust_weight
 from orthoswarm.compute.threads import on_threads
+from orthoswarm.model.arrays import Array, Bytes, Flags, Ints
 from orthoswarm.model.placement import PlacedFrame, Terrain
 from orthoswarm.mosaic.kernels.lens_arrays import F, U, V
 from orthoswarm.mosaic.kernels.render_arrays import Shots
 from orthoswarm.mosaic.map_colors import ColorMap, map_colors
-from orthoswarm.mosaic.overlap_colors import Bytes, OverlapColors, overlap_colors
+from orthoswarm.mosaic.overlap_colors import OverlapColors, overlap_colors
 
-Array = NDArray[np.float64]
 Field = NDArray[np.float32]
 """Factors of a frame: float32 (3, 6), for red, green and blue the coefficients of 1, x, y, x^2, xy, y^2; x and y are
 the place in the picture from its centre, half the picture's width being 1."""
@@ -178,9 +178,7 @@ def _with_held(colors: OverlapColors, held: Sequence[Field | None]) -> OverlapCo
     return replace(colors, ratio=ratio.astype(np.float32))
 
 
-def _solve(
-    colors: OverlapColors, vehicle: NDArray[np.int32], vehicles: int, fixed: NDArray[np.bool_], threads: int
-) -> tuple[Array, Array]:
+def _solve(colors: OverlapColors, vehicle: Ints, vehicles: int, fixed: Flags, threads: int) -> tuple[Array, Array]:
     """Unknowns of vehicles (V, 11, 3) and of frames (N, 6, 3), by conjugate gradients within reweighting rounds."""
     prior_v = np.array([_VEHICLE_SIGMA, *_LENS_SIGMAS, *_VIEW_SIGMAS]) ** -2.0
     prior_f = np.array([_PICTURE_SIGMA, *[_SLOPE_SIGMA] * 2, *[_CURVE_SIGMA] * 3]) ** -2.0
@@ -220,9 +218,7 @@ class _Samples:
     They are summed in parts, always the same ones, so that the result does not depend on the number of threads.
     """
 
-    def __init__(
-        self, colors: OverlapColors, vehicle: NDArray[np.int32], vehicles: int, free: Array, threads: int
-    ) -> None:
+    def __init__(self, colors: OverlapColors, vehicle: Ints, vehicles: int, free: Array, threads: int) -> None:
         self._threads = threads
         edges = np.linspace(0, len(colors.frame), _PARTS + 1).astype(int)
         parts = [slice(a, b) for a, b in pairwise(edges.tolist())]
@@ -342,7 +338,7 @@ def _apply(frame, place, vehicle, free, vehicles, weight, values, out):  # type:
         _gather(frame[m], vehicle, vehicles, of_vehicle, of_frame, count, w * a, w * b, w * c, out)
 
 
-def _nodes(size: NDArray[np.int32]) -> tuple[Array, Array]:
+def _nodes(size: Ints) -> tuple[Array, Array]:
     """Places in the pictures (N, nodes^2) at which fields are fitted."""
     count = _NODES
     across = np.linspace(-1.0, 1.0, count)
@@ -367,7 +363,7 @@ def _log_factors(of_vehicle: Array, of_frame: Array, shots: Shots) -> Array:
     return np.asarray(common @ of_vehicle + own @ of_frame)
 
 
-def _as_polynomials(factor: Array, size: NDArray[np.int32]) -> Field:
+def _as_polynomials(factor: Array, size: Ints) -> Field:
     """Coefficients (N, 3, 6) of the polynomials nearest to factors (N, nodes, 3) of pictures of these sizes (N, 2)."""
     x, y = _nodes(size)
     basis = np.stack([np.ones_like(y), x, y, x * x, x * y, y * y], -1)

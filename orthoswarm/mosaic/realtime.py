@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.canvas.tile_store import Key
+from orthoswarm.model.arrays import Array, Bytes
 from orthoswarm.model.camera import Camera
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.placement import PlacedFrame, Terrain
@@ -27,10 +28,6 @@ from orthoswarm.mosaic.renderer import Progress, RenderStats, Run, render, seria
 from orthoswarm.mosaic.seams.previews import PreviewFile
 from orthoswarm.raster.picture_file import read_rgb
 from orthoswarm.raster.picture_parts import PictureParts
-
-Array = NDArray[np.float64]
-Bytes = NDArray[np.uint8]
-
 
 _WEAK = 1e6  # metres for micrometres: farther than any other
 

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array, Flags
 from orthoswarm.model.camera import NADIR_PITCH_RAD, Camera, Lens, focal_px, rotation_from_angles
 from orthoswarm.model.earth import on_sphere
 from orthoswarm.model.errors import InputError, OrthoSwarmError
@@ -27,8 +27,6 @@ from orthoswarm.model.frame import (
 from orthoswarm.model.geo import LocalGrid, area_epsg
 from orthoswarm.model.placement import PlacedFrame
 from orthoswarm.trajectory.courses import MOVED_M, course
-
-Array = NDArray[np.float64]
 
 _USUAL_HEIGHTS_M: Final = (50.0, 150.0)
 """Heights between which mapping flights are flown: where the photos' spacing gives a height."""
@@ -200,7 +198,7 @@ def _sigma(frame: Frame, camera: Camera) -> float:
     return float(np.hypot(position, share * float(camera.position[2])))
 
 
-def _near(ground: Array) -> NDArray[np.bool_]:
+def _near(ground: Array) -> Flags:
     """Which positions belong to the set: near their median, bool (N,)."""
     away = np.hypot(*(ground - np.median(ground, axis=0)).T)
     return np.asarray(np.isfinite(away) & (away <= max(_FAR_M, _FAR_SPREADS * float(np.median(away)))))

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.canvas.tile_store import Key, Tile, TileStore
+from orthoswarm.model.arrays import Bytes, Floats, Indices, Ints
 from orthoswarm.model.errors import OrthoSwarmError, RunInterruptedError
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import Terrain
@@ -29,8 +30,6 @@ from orthoswarm.raster.picture_file import PictureError
 from orthoswarm.raster.picture_parts import Box, Part, PictureParts
 from orthoswarm.stores.local_copies import copy_ahead
 
-Bytes = NDArray[np.uint8]
-Ints = NDArray[np.int32]
 Read = Callable[[Path], Bytes]
 
 THUMBNAIL = (12, 16)
@@ -72,7 +71,7 @@ class TilePlace:
             min(self.tile_px, self.grid.width - key[1] * self.tile_px),
         )
 
-    def heights(self, key: Key, terrain: Terrain) -> NDArray[np.float32]:
+    def heights(self, key: Key, terrain: Terrain) -> Floats:
         """A tile's lattice of heights."""
         return heights(terrain, *self.corner(key), self.grid.gsd_m, self.tile_px)
 
@@ -263,7 +262,7 @@ class Shot:
     layer: int
     row: int
     index: int
-    field: NDArray[np.float32]
+    field: Floats
     factor: int
     windows: list[Window]
     near_seams: list[Window]
@@ -344,7 +343,7 @@ class _Ground:
                     placed.append(_Placed(tile, *found, size=size, factor=factor, field=shot.field))
         return placed, self._twice(own)
 
-    def _twice(self, own: list[tuple[Key, Ints, Ints, NDArray[np.float32], Ints]]) -> int:
+    def _twice(self, own: list[tuple[Key, Ints, Ints, Floats, Ints]]) -> int:
         """How many pixels of a picture's windows show what is drawn elsewhere in them already."""
         if not own:
             return 0
@@ -371,12 +370,12 @@ class _Placed:
         tile: Tile,
         index: Ints,
         spots: Ints,
-        sights: NDArray[np.float32],
+        sights: Floats,
         box: Ints,
         *,
         size: Ints,
         factor: int,
-        field: NDArray[np.float32],
+        field: Floats,
     ) -> None:
         self._tile, self._index, self._spots, self._sights = tile, index, spots, sights
         self._box, self._size, self._factor, self._field = box, size, factor, field
@@ -408,7 +407,7 @@ class _Scratch:
     def __init__(self) -> None:
         self._words = np.empty(0, np.int64)
 
-    def words(self, rows: int, columns: int) -> NDArray[np.int64]:
+    def words(self, rows: int, columns: int) -> Indices:
         """Of int64, not set."""
         if self._words.size < rows * columns:
             self._words = np.empty(rows * columns, np.int64)

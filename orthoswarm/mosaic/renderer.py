@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.canvas.tile_store import Key
+from orthoswarm.model.arrays import Bytes, Indices, Ints
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import GroundGrid
@@ -56,8 +56,6 @@ from orthoswarm.mosaic.visible_ground import by_tile, coverage
 from orthoswarm.raster.picture_file import read_rgb
 from orthoswarm.raster.picture_parts import PictureParts
 
-Bytes = NDArray[np.uint8]
-Ints = NDArray[np.int32]
 Run = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 """Applies a module-level function to every argument, in this process or in others; results in any order. It should
 take arguments as it needs them (workers.Workers.map does), since all of them at once may be large."""
@@ -105,7 +103,7 @@ class RenderStats:
         thumbnails: image -> uint8 (12, 16, 3), means of the picture's parts, of the frames that were read.
     """
 
-    pixels: NDArray[np.int64]
+    pixels: Indices
     drawn: DrawnGround
     rejected: dict[str, str]
     thumbnails: dict[str, Bytes] = field(default_factory=dict)

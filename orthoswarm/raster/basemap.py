@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Bytes, Flags, Floats
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import GroundGrid
@@ -19,9 +19,6 @@ from orthoswarm.raster.map_check import sample_windows
 from orthoswarm.raster.tile_map import TileMap
 from orthoswarm.stores.addresses import address_of
 from orthoswarm.stores.listing import exists
-
-Bytes = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 
 
 class _Source(Protocol):
@@ -36,7 +33,7 @@ class _Source(Protocol):
     def require_complete(self, bounds: BoundingBox) -> None:
         """Raise UnreadableMapError if the file is too short for its blocks within bounds."""
 
-    def read(self, grid: GroundGrid, gray: bool) -> tuple[Bytes, Mask]:
+    def read(self, grid: GroundGrid, gray: bool) -> tuple[Bytes, Flags]:
         """Values uint8 (bands, rows, columns), one or three bands (one if grey is enough), and their validity."""
 
 
@@ -115,7 +112,7 @@ class Basemap:
             for window in sample_windows(bounds, gsd):
                 self.gray(window, gsd)
 
-    def gray(self, bounds: BoundingBox, gsd_m: float) -> tuple[NDArray[np.float32], Mask]:
+    def gray(self, bounds: BoundingBox, gsd_m: float) -> tuple[Floats, Flags]:
         """Grey values and validity of a window.
 
         Args:
@@ -131,7 +128,7 @@ class Basemap:
         gray[~valid] = 0.0
         return gray, valid
 
-    def rgb(self, bounds: BoundingBox, gsd_m: float) -> tuple[Bytes, Mask]:
+    def rgb(self, bounds: BoundingBox, gsd_m: float) -> tuple[Bytes, Flags]:
         """Colours uint8 (rows, columns, 3) and validity of a window; the grid is that of `gray`."""
         data, valid = self._source.read(GroundGrid.around(self.epsg, bounds, gsd_m), gray=False)
         out = np.array(np.broadcast_to(data, (3, *data.shape[1:])).transpose(1, 2, 0), order="C")  # never a view

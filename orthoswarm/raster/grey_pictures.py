@@ -7,13 +7,12 @@ from typing import Final
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Bytes
 from orthoswarm.model.frame import Frame
 from orthoswarm.raster.packed_records import records
 from orthoswarm.raster.picture_file import read_gray, read_rgb, reduction
 
-Bytes = NDArray[np.uint8]
 _SHAPE = np.dtype("<i4")
 WORK_WIDTH_PX: Final = 960  # longer side of the pictures on which corners are followed
 

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from orthoswarm.model.arrays import Array, Flags, Floats
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.coordinate_system import require_datum
 from orthoswarm.model.errors import InputError
@@ -17,8 +18,6 @@ from orthoswarm.model.placement import Terrain
 from orthoswarm.stores.addresses import address_of
 from orthoswarm.stores.listing import exists
 from orthoswarm.stores.local_copies import local_file
-
-Array = NDArray[np.float64]
 
 _US_FOOT_M = 1200.0 / 3937.0
 _METRES = {
@@ -59,9 +58,9 @@ class KnownGround:
     """
 
     terrain: Terrain
-    known: NDArray[np.bool_]
+    known: Flags
 
-    def knows(self, east_north: Array) -> NDArray[np.bool_]:
+    def knows(self, east_north: Array) -> Flags:
         """Whether the DEM has heights all around positions (M, 2)."""
         t = self.terrain
         c, r = (east_north[..., 0] - t.west) / t.step_m, (east_north[..., 1] - t.south) / t.step_m
@@ -352,7 +351,7 @@ def _resampling(pixel_steps: float, highest: bool) -> str:
     return "average" if pixel_steps < _DEM_MEAN_STEPS else "bilinear"
 
 
-def _highest_within(z: Array, steps: float) -> NDArray[np.float32]:
+def _highest_within(z: Array, steps: float) -> Floats:
     """The highest of the nodes (rows, columns) up to so many steps away from each."""
     import cv2
 
@@ -368,7 +367,7 @@ def _own_step(pixel_m: float, bounds: BoundingBox, most_nodes: int | None) -> fl
     return float(max(_DEM_FINEST_M, round(pixel_m, 1), spread))
 
 
-def _filled(z: Array, known: NDArray[np.bool_]) -> Array:
+def _filled(z: Array, known: Flags) -> Array:
     """Gaps filled from their surroundings: averages over growing neighbourhoods, the nearest known scale first."""
     if known.all():
         return z

@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-Bytes = NDArray[np.uint8]
+from orthoswarm.model.arrays import Bytes
+
 _SUFFIX: Final = ".pack"
 _HEAD: Final = struct.Struct("<16sQ")  # a record's key and the bytes of its content, which follows
 _OPEN_FOLDERS: Final = 8

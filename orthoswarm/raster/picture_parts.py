@@ -6,11 +6,10 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Bytes
 from orthoswarm.raster.packed_records import records
 
-Bytes = NDArray[np.uint8]
 _HEAD = np.dtype("<i4")
 _NUMBERS = 4  # columns and rows of the part, column and row of its corner
 

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel
+from orthoswarm.model.arrays import Bytes
 
 _BLOCK_PX = 16
 _COLUMNS, _ROWS = 12, 9
@@ -32,7 +33,7 @@ class PictureQuality:
     saturated_share: float
 
 
-def picture_quality(picture: NDArray[np.uint8]) -> PictureQuality:
+def picture_quality(picture: Bytes) -> PictureQuality:
     """Measure a picture, uint8 (rows, columns) or (rows, columns, 3 or 4), of which the second channel is used.
 
     Raises:

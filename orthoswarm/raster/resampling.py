@@ -1,17 +1,14 @@
 """Resampling between grids of one orientation: exact area means where the answer is coarser, else cubic."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import kernel
-
-Bytes = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
+from orthoswarm.model.arrays import Bytes, Flags
 
 
 def resample(
-    data: Bytes, valid: Mask, first: tuple[float, float], scale: tuple[float, float], size: tuple[int, int]
-) -> tuple[Bytes, Mask]:
+    data: Bytes, valid: Flags, first: tuple[float, float], scale: tuple[float, float], size: tuple[int, int]
+) -> tuple[Bytes, Flags]:
     """Bring bands to another grid.
 
     Args:

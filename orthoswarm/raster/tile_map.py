@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from pyproj import Transformer
 
+from orthoswarm.model.arrays import Array, Bytes, Flags
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.earth import WEB_MERCATOR_M
 from orthoswarm.model.errors import InputError
@@ -19,9 +19,6 @@ from orthoswarm.model.geo import GroundGrid
 from orthoswarm.raster.empty_pixels import blank
 from orthoswarm.raster.map_check import UnreadableMapError
 from orthoswarm.stores.local_copies import local_file
-
-Bytes = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 
 _MARGIN_M: Final = 5000.0  # tiles this far from the flight belong to the map that is spoken of
 _COARSEST_M: Final = 40.0  # pixels of a zoom level that a flight can be laid on at all
@@ -109,7 +106,7 @@ class TileMap:
             if ranges[z][0] <= c <= ranges[z][1] and ranges[z][2] <= r <= ranges[z][3]
         ]
 
-    def _mercator(self, east_north: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _mercator(self, east_north: Array) -> Array:
         x, y = _transformer(self._epsg).transform(east_north[:, 0], east_north[:, 1])
         return np.stack([np.asarray(x), np.asarray(y)], axis=1)
 
@@ -158,7 +155,7 @@ class TileMap:
     def require_complete(self, bounds: BoundingBox) -> None:
         """Does nothing: each tile is a separate file, and one that cannot be decoded is a hole in the map."""
 
-    def read(self, grid: GroundGrid, gray: bool) -> tuple[Bytes, Mask]:
+    def read(self, grid: GroundGrid, gray: bool) -> tuple[Bytes, Flags]:
         """Colours uint8 (3, rows, columns), also where grey is enough, and validity of a window."""
         from rasterio.enums import Resampling
         from rasterio.transform import from_origin

@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, minimum_filter
 
+from orthoswarm.model.arrays import Bytes, Floats, Indices
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.robust import MAD_TO_SIGMA
 from orthoswarm.stereo.rectified_pair import PairPoints
-
-Float32 = NDArray[np.float32]
 
 _HEIGHT_BITS, _HEIGHT_STEP_M = 20, 1e-3
 _HIGHEST = (1 << _HEIGHT_BITS) - 1
@@ -41,9 +40,9 @@ _BLOCK_SIGMA_M: Final = 0.05
 class CellHeights:
     """The heights of one pair by cell: int64 (N,) cell, float32 (N,) metres, float32 (N,) sigma."""
 
-    cell: NDArray[np.int64]
-    height_m: Float32
-    sigma_m: Float32
+    cell: Indices
+    height_m: Floats
+    sigma_m: Floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,9 +58,9 @@ class SurfaceModel:
     """
 
     grid: GroundGrid
-    height_m: Float32
-    sigma_m: Float32
-    pairs: NDArray[np.uint8]
+    height_m: Floats
+    sigma_m: Floats
+    pairs: Bytes
 
 
 def cell_heights(found: PairPoints, grid: GroundGrid) -> CellHeights:
@@ -118,8 +117,8 @@ class SurfaceCells:
 
 
 def merge_heights(
-    height_m: NDArray[np.floating], sigma_m: NDArray[np.floating], count: NDArray[np.uint8]
-) -> tuple[Float32, Float32, NDArray[np.uint8]]:
+    height_m: NDArray[np.floating], sigma_m: NDArray[np.floating], count: Bytes
+) -> tuple[Floats, Floats, Bytes]:
     """The weighted mean of the heights that agree with the median, cell by cell.
 
     Args:
@@ -156,7 +155,7 @@ def merge_heights(
     )
 
 
-def _range_around(height_m: Float32) -> Float32:
+def _range_around(height_m: Floats) -> Floats:
     """Highest less lowest known height of the 3 x 3 cells around each, 0 without any."""
     known = np.isfinite(height_m)
     high = maximum_filter(np.where(known, height_m, -np.inf), 3)

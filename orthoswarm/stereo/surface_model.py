@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.config.mapping import StereoConfig
+from orthoswarm.model.arrays import Bytes
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.geo import GroundGrid
@@ -118,7 +118,7 @@ def _match(task: _PairsTask) -> tuple[list[CellHeights], int]:
     factors = [_factor(frame, task.config.longest_px) for frame in task.frames]
 
     @lru_cache(_PICTURES_HELD)
-    def picture(index: int) -> NDArray[np.uint8] | None:
+    def picture(index: int) -> Bytes | None:
         try:
             return read_gray(task.frames[index].frame.path, factors[index])
         except PictureError:

@@ -3,10 +3,9 @@
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.model.angles import wrap_rad
-from orthoswarm.model.arrays import Array, Ints
+from orthoswarm.model.arrays import Array, Flags, Ints
 
 PAUSE_S: Final = 60.0  # photos farther apart in time do not follow each other: the vehicle did something else between
 LEG_REACH: Final = 3
@@ -60,7 +59,7 @@ def _bend(position: Array) -> Array:
     return np.where(moving, np.abs(turn), 0.0)
 
 
-def _breaks(position: Array, time_s: Array | None) -> NDArray[np.bool_]:
+def _breaks(position: Array, time_s: Array | None) -> Flags:
     """Frames before which the flight was interrupted: a pause, or a jump of many steps."""
     n = len(position)
     out = np.zeros(n, bool)

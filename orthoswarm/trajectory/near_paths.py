@@ -4,9 +4,8 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from orthoswarm.model.arrays import Array
 
 _NEIGHBOUR_REACH_HEIGHTS: Final = 1.5  # vehicles whose paths come within so many flying heights share ground
 

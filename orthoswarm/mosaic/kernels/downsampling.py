@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-Bytes = NDArray[np.uint8]
+from orthoswarm.model.arrays import Bytes
 
 
 def reduction(gsd_m: float, picture_gsd_m: float) -> int:

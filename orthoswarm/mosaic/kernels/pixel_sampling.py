@@ -9,9 +9,9 @@ for the negative weights, lies within 0 to 65,535; what is carried between lanes
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel, kernel
+from orthoswarm.model.arrays import Array, Indices
 from orthoswarm.mosaic.kernels.lens_arrays import K1, K2, K3, F, U, V
 from orthoswarm.mosaic.kernels.render_arrays import LATTICE_PX
 
@@ -25,7 +25,7 @@ _BIAS2 = np.int64((2 * _LOW * UNIT) * (1 + (1 << 16) + (1 << 32)))
 _LANES = np.int64(0x01FF_01FF_01FF)
 
 
-def cubic_convolution(t: NDArray[np.float64]) -> NDArray[np.float64]:
+def cubic_convolution(t: Array) -> Array:
     """Weights of the samples at -1, 0, 1, 2 for places t (N,) between 0 and 1 (Keys 1981, a = -1/2), float64 (4, N)."""
     return np.stack(
         [
@@ -37,7 +37,7 @@ def cubic_convolution(t: NDArray[np.float64]) -> NDArray[np.float64]:
     )
 
 
-def cubic_weights() -> NDArray[np.int64]:
+def cubic_weights() -> Indices:
     """Weights at -1, 0, 1, 2 for every fraction k / UNIT, int64 (UNIT, 4), each row's sum UNIT."""
     t = np.arange(UNIT) / UNIT
     exact = cubic_convolution(t).T

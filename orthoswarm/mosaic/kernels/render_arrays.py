@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel
+from orthoswarm.model.arrays import Array, Flags, Ints
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import LEAST_RADIAL_SLOPE, Camera
 from orthoswarm.model.placement import Terrain
 from orthoswarm.mosaic.kernels.lens_arrays import K1, K2, K3, F, U, V, lens_row
 
-Array = NDArray[np.float64]
 LATTICE_PX = 2
 """Pixels between heights of a tile's lattice (bilinear between them)."""
 MARGIN_PX = 0.0
@@ -39,8 +39,8 @@ class Shots:
     position: Array
     rotation: Array
     lens: Array
-    size: NDArray[np.int32]
-    weak: NDArray[np.bool_]
+    size: Ints
+    weak: Flags
 
     @classmethod
     def of(cls, cameras: Sequence[Camera], weak: Sequence[bool], margin_px: float = MARGIN_PX) -> "Shots":

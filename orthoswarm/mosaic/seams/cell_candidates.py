@@ -9,19 +9,15 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel, kernel
+from orthoswarm.model.arrays import Floats, Ints
 from orthoswarm.mosaic.footprint import tan_limit
 from orthoswarm.mosaic.kernels.lens_arrays import U_HIGH, U_LOW, V_HIGH, V_LOW
 from orthoswarm.mosaic.kernels.line_of_sight import HIDES_M, first_over
 from orthoswarm.mosaic.kernels.render_arrays import LATTICE_PX, Shots, lattice_height, project
 from orthoswarm.mosaic.seam_labels import OUTSIDE, block_heights, sight
 from orthoswarm.mosaic.seams.previews import GLARE_LEVEL, Previews
-
-Array = NDArray[np.float64]
-Floats = NDArray[np.float32]
-Ints = NDArray[np.int32]
 
 SLOTS = 5
 """Candidates a cell: the cheapest ones."""

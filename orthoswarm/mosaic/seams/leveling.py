@@ -18,16 +18,12 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.canvas.tile_store import Key, Tile
+from orthoswarm.model.arrays import Array, Flags, Floats, Indices, Ints
 from orthoswarm.mosaic.kernels.leveling_kernels import BOTH, SLOTS, apply_factors, laplacian, sum_colors
 from orthoswarm.mosaic.overlap_colors import BRIGHT_LEVEL, DARK_LEVEL
 from orthoswarm.mosaic.radiometry import GREATEST_FACTOR
-
-Array = NDArray[np.float64]
-Floats = NDArray[np.float32]
-Integers = NDArray[np.int64]
 
 _LEVEL_CELLS: Final = 32
 """Cells across a picture in which it is corrected, about 3 m of the ground at a height of 75 m (the factor of a lawn
@@ -81,9 +77,9 @@ class TileColors:
         both: float32 (S, 9), sums over the pixels that both show, see sum_colors.
     """
 
-    place: Integers
+    place: Indices
     pixels: Floats
-    seam: Integers
+    seam: Indices
     both: Floats
 
 
@@ -113,7 +109,7 @@ class TileFactors:
     """
 
     cell_px: int
-    labels: NDArray[np.int32]
+    labels: Ints
     factors: Floats
 
     def apply(self, tile: Tile) -> None:
@@ -156,15 +152,15 @@ class Leveling:
             factors[at] = np.exp(np.clip(self._log[part], -limit, limit))
         return TileFactors(self._cells.px, labels, factors)
 
-    def _key(self, row: Integers, column: Integers, label: Integers) -> Integers:
+    def _key(self, row: Indices, column: Indices, label: Indices) -> Indices:
         return (row * self._columns + column) * self._labels + label
 
-    def _index(self, key: Integers) -> tuple[Integers, NDArray[np.bool_]]:
+    def _index(self, key: Indices) -> tuple[Indices, Flags]:
         """Where keys are among the unknowns, and whether."""
         at = np.searchsorted(self._keys, key).clip(0, len(self._keys) - 1)
         return at, self._keys[at] == key
 
-    def _steps(self, seam: Integers, both: Array) -> tuple[Integers, Integers, Array, Array]:
+    def _steps(self, seam: Indices, both: Array) -> tuple[Indices, Indices, Array, Array]:
         """Pairs of unknowns at seams (S,), the log ratio of their colours (S, 3), and its weight (S,)."""
         one, found = self._index(self._key(seam[:, 0], seam[:, 1], seam[:, 2]))
         other, too = self._index(self._key(seam[:, 0], seam[:, 1], seam[:, 3]))
@@ -177,7 +173,7 @@ class Leveling:
         robust = np.exp(-0.5 * np.square(ratio.mean(1) / _LEVEL_STEP))  # Welsch's kernel
         return one, other, ratio, _LEVEL_RISE**2 / sigma2 * robust
 
-    def _solved(self, one: Integers, other: Integers, ratio: Array, weight: Array) -> Array:
+    def _solved(self, one: Indices, other: Indices, ratio: Array, weight: Array) -> Array:
         """Log factors (M, 3), by conjugate gradients."""
         firsts, seconds, weights = [one], [other], [weight]
         for ahead in (self._labels, self._columns * self._labels):  # the next cell to the east and to the south
@@ -199,7 +195,7 @@ class Leveling:
 
 
 def _conjugate_gradients(
-    first: NDArray[np.int32], second: NDArray[np.int32], weight: Array, *, anchor: Array, diagonal: Array, right: Array
+    first: Ints, second: Ints, weight: Array, *, anchor: Array, diagonal: Array, right: Array
 ) -> Array:
     """The solution (M, 3) of the normal equations; their diagonal is the preconditioner."""
     x, left, image = np.zeros_like(right), right.copy(), np.empty_like(right)

@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel
+from orthoswarm.model.arrays import Bytes, Flags, Floats, Ints
 from orthoswarm.model.errors import StorageError
 from orthoswarm.raster.picture_quality import LEAST_SIDE_PX, picture_quality
-
-Bytes = NDArray[np.uint8]
 
 ROWS, COLUMNS = 240, 320
 BLOCK_PX = 20
@@ -123,10 +122,10 @@ class Previews:
     """
 
     gray: Bytes
-    rows: NDArray[np.int32]
-    contrast: NDArray[np.float32]
-    sharpness: NDArray[np.float32]
-    written: NDArray[np.bool_]
+    rows: Ints
+    contrast: Floats
+    sharpness: Floats
+    written: Flags
 
     @classmethod
     def of(cls, records: NDArray[np.void], rows: NDArray[np.integer]) -> "Previews":
@@ -140,7 +139,7 @@ def read_previews(path: Path, rows: NDArray[np.integer]) -> Previews:
     return Previews.of(np.asarray(np.memmap(path, RECORD, mode="r")), rows)
 
 
-def unwritten(path: Path, rows: NDArray[np.integer]) -> NDArray[np.bool_]:
+def unwritten(path: Path, rows: NDArray[np.integer]) -> Flags:
     """Which of some records were never written, bool (N,)."""
     at = RECORD.fields["written"][1] if RECORD.fields is not None else 0
     missing = np.ones(len(rows), bool)

@@ -9,13 +9,10 @@ Besag 1986, on several scales): a block the size of a house escapes minima in wh
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel, kernel
+from orthoswarm.model.arrays import Floats, Ints
 from orthoswarm.mosaic.seams.cell_candidates import SLOTS, CandidateCells
-
-Ints = NDArray[np.int32]
-Floats = NDArray[np.float32]
 
 NONE, FOREIGN = -1, -2
 """Labels of cells that no picture sees, and of a neighbour's cells whose picture is not a candidate here."""
