@@ -18,6 +18,9 @@ from orthoswarm.refine.bundle.block_arrays import CameraBlock
 
 OrientationField = NDArray[np.complex64]
 
+Mosaic = tuple[Floats, Flags, float, float]
+"""Grey values (rows, columns), their validity, west and north edges, metres in the local frame."""
+
 Found = tuple[float, float, float, float]
 """Column and row of a shift from the centre, pixels, peak, and ratio of second peak to peak."""
 
@@ -103,11 +106,12 @@ def highest(score: Floats, apart: int) -> Found:
     return c + dc - n // 2, r + dr - n // 2, peak, ratio
 
 
-def without_peak(score: Floats, apart: int) -> Floats:
-    """The values (n,) of a correlation that do not belong to its highest peak."""
+def standing_out(score: Floats, apart: int) -> float:
+    """How many standard deviations of the rest a correlation's peak stands over their mean."""
     r, c = np.unravel_index(int(score.argmax()), score.shape)
     rest = _without(score, int(r), int(c), apart)
-    return np.asarray(rest[rest != 0])
+    rest = rest[rest != 0]
+    return (float(score[r, c]) - float(rest.mean())) / max(float(rest.std()), 1e-9)
 
 
 def _without(score: Floats, row: int, column: int, apart: int) -> Floats:
@@ -118,10 +122,10 @@ def _without(score: Floats, row: int, column: int, apart: int) -> Floats:
 
 def strip_mosaic(
     cameras: CameraBlock, index: NDArray[np.integer], small: Callable[[int], Gray], ground_z: float, gsd_m: float
-) -> tuple[Floats, Flags, float, float] | None:
-    """Nearest-nadir mosaic of some pictures on a level plane: grey (rows, columns), validity, west and north edges.
+) -> Mosaic | None:
+    """Nearest-nadir mosaic of some pictures on a level plane; None where nothing is seen.
 
-    None where nothing is seen. small: reduced picture i; its scale is taken from its width.
+    small: reduced picture i; its scale is taken from its width.
     """
     corners, homographies = [], []
     for i in index:
@@ -197,10 +201,13 @@ def strip_and_map(
     cameras: CameraBlock, index: NDArray[np.integer], picture: Callable[[int], Gray], search: Search
 ) -> Strip | None:
     """Mosaic some consecutive pictures and read the map around them; None where either has nothing to show."""
+    mosaic = strip_mosaic(cameras, index, picture, 0.0, search.gsd_m)
+    return None if mosaic is None else on_map(mosaic, search)
+
+
+def on_map(mosaic: Mosaic, search: Search) -> Strip | None:
+    """A mosaic with the map around it; None where the map hardly covers that."""
     basemap, origin, gsd_m = search.basemap, search.origin, search.gsd_m
-    mosaic = strip_mosaic(cameras, index, picture, 0.0, gsd_m)
-    if mosaic is None:
-        return None
     gray, valid, west, north = mosaic
     reach = int(np.ceil(search.reach_m / gsd_m))
     rows, cols = gray.shape
@@ -227,7 +234,7 @@ def strip_and_map(
 
 
 def by_edges(strip: Strip) -> Found | None:
-    """Where a strip lies on its map, by their edges; None where there is nothing to find."""
+    """Where a strip lies on its map, by their edges."""
     fields = _edges(strip)
     return None if fields is None else highest(correlation(*fields, strip.reach), PEAK_APART_PX)
 
@@ -266,9 +273,8 @@ def stacked(strips: Sequence[Strip]) -> tuple[Array, float, float] | None:
         total = score if total is None else total + score
     if total is None:
         return None
-    column, row, peak, ratio = highest(total, apart)
-    rest = without_peak(total, apart)
-    z = (peak - float(rest.mean())) / max(float(rest.std()), 1e-9)
+    column, row, _, ratio = highest(total, apart)
+    z = standing_out(total, apart)
     offset, gsd = np.mean([s.offset for s in strips], axis=0), strips[0].gsd_m
     return offset + gsd * np.array([column, -row]), z, ratio
 

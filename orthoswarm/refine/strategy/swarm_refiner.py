@@ -243,7 +243,7 @@ def first_passes(
     unit -> why not, of the others.
     """
     # Learned matching is left to one process afterwards: its network takes 400 MB.
-    task = partial(refine_tracked, area=area, options=options, learned=False)
+    task = partial(refine_tracked, area=area, options=options)
     states: list[VehicleState | None] = []
     for n, state in enumerate(run(task, units)):
         states.append(state)
@@ -258,7 +258,7 @@ def first_passes(
         watch.lap("tracks")
         lost = {k: flight for k, flight in zip(unfollowed, opened, strict=True) if isinstance(flight, str)}
         flights = [flight for flight in opened if not isinstance(flight, str)]
-        place = partial(refine_matched, area=area, options=options, learned=False)
+        place = partial(refine_matched, area=area, options=options)
         for k, state in zip([k for k in unfollowed if k not in lost], run(place, flights), strict=True):
             state.timings["tracks"] = watch.seconds["tracks"] / len(unfollowed)
             states[k] = state
