@@ -205,8 +205,7 @@ def _compared(
         ground = np.nan_to_num(some.ground)
         place = np.stack([ground[:, 0] - west, north - ground[:, 1], terrain.height(ground)], 1)
         _compare(
-            some.a, some.b, place, position, rotation, shots.lens, shots.size, small, DARK_LEVEL,
-            BRIGHT_LEVEL, ratio, usable, seen, contrast,
+            some.a, some.b, place, position, rotation, shots.lens, shots.size, small, ratio, usable, seen, contrast,
         )  # fmt: skip
         usable &= np.asarray(np.isfinite(some.ground).all(axis=1))
         sigma = np.sqrt(_RATIO_SIGMA**2 + np.square(_MISPLACED * contrast))
@@ -231,7 +230,7 @@ def _compared(
 
 
 @in_place_kernel
-def _compare(a, b, place, position, rotation, lens, size, small, dark, bright, ratio, usable, seen, contrast):  # type: ignore[no-untyped-def]
+def _compare(a, b, place, position, rotation, lens, size, small, ratio, usable, seen, contrast):  # type: ignore[no-untyped-def]
     rows, columns = small.shape[1], small.shape[2]
     for m in range(len(a)):
         clear = 0
@@ -254,7 +253,7 @@ def _compare(a, b, place, position, rotation, lens, size, small, dark, bright, r
                     rising = float(small[k, i, j + 1, 1]) - float(small[k, i + 1, j, 1])
                     across, down = falling + rising, falling - rising
                     contrast[m] += 0.5 * np.hypot(across, down) / max(value, 1.0)
-                good = good and value > dark and value < bright
+                good = good and value > DARK_LEVEL and value < BRIGHT_LEVEL
                 ratio[m, channel] += (1.0 - 2.0 * side) * np.log(max(value, 1.0))
             half = 0.5 * size[k, 0]
             seen[m, side, 0] = (u + 0.5) / half - 1.0

@@ -14,7 +14,7 @@ tighter, since meadows and shadows differ in it by themselves. The solution of a
 place in the picture, which the renderer evaluates at each pixel that it takes.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from typing import Final
@@ -94,12 +94,10 @@ def tone_warning(fields: Mapping[str, Field]) -> str:
         return "the tones are those of the photos: there is nothing to compare"
     red, green, blue = np.median(factors, axis=0)
     text = f"the tones follow the basemap: red, green and blue times {red:.2f}, {green:.2f} and {blue:.2f} (median)"
-    greatest = GREATEST_FACTOR
-    at_limit = float((np.abs(np.log(factors)).max(1) > _LIMITED_LOG_SHARE * np.log(greatest)).mean())
+    most = GREATEST_FACTOR
+    at_limit = float((np.abs(np.log(factors)).max(1) > _LIMITED_LOG_SHARE * np.log(most)).mean())
     if at_limit > _LIMITED_SHARE:
-        text += (
-            f"; {at_limit:.0%} of the photos would need more than {greatest:g}, the greatest factor, and differ from it"
-        )
+        text += f"; {at_limit:.0%} of the photos would need more than {most:g}, the greatest factor, and differ from it"
     if max(red, green, blue) > _TINT_RATIO * min(red, green, blue):
         text += "; the map has another tint than the photos (season, light, sensor), which the orthoimage now has, too"
     return text
@@ -190,26 +188,40 @@ def _solve(colors: OverlapColors, vehicle: Ints, vehicles: int, fixed: Flags, th
     x = np.zeros((len(prior), 3))
     for _ in range(_REWEIGHTINGS):
         right, diagonal = samples.weigh(x)
-        scale = 1.0 / (diagonal[:, None] + prior)
         # the step from x: (A' W A + P) d = -(A' W r + P x)
-        left = -(right + prior * x)
-        step, z = np.zeros_like(x), scale * left
-        towards, product = z.copy(), (left * z).sum(0)
-        enough = _SOLVER_TOLERANCE**2 * product
-        for _ in range(_SOLVER_STEPS):
-            image = samples.applied(towards) + prior * towards
-            curve = (towards * image).sum(0)
-            alpha = product / np.where(curve > 0.0, curve, 1.0)
-            step += alpha * towards
-            left -= alpha * image
-            z = scale * left
-            last, product = product, (left * z).sum(0)
-            if (product <= enough).all():
-                break
-            towards = z + product / np.where(last > 0.0, last, 1.0) * towards
-        x += step
+        x += conjugate_gradients(
+            lambda towards: samples.applied(towards) + prior * towards, diagonal[:, None] + prior,
+            -(right + prior * x), _SOLVER_TOLERANCE, _SOLVER_STEPS,
+        )  # fmt: skip
     x = x @ _BRIGHTNESS_HUE
     return x[: vehicles * _COMMON].reshape(vehicles, _COMMON, 3), x[vehicles * _COMMON :].reshape(-1, _OWN, 3)
+
+
+def conjugate_gradients(
+    applied: Callable[[Array], Array], diagonal: Array, right: Array, tolerance: float, most_steps: int
+) -> Array:
+    """The solutions (M, K) of K systems with one positive definite matrix, preconditioned by its diagonal.
+
+    Args:
+        applied: the matrix times (M, K). diagonal: of the matrix, (M, 1) or (M, K). right: (M, K).
+        tolerance: preconditioned residual at which they end, as a share of the first one.
+    """
+    x, left = np.zeros_like(right), right.copy()
+    z = left / diagonal
+    towards, product = z.copy(), (left * z).sum(0)
+    enough = tolerance**2 * product
+    for _ in range(most_steps):
+        if (product <= enough).all():
+            break
+        image = applied(towards)
+        curve = (towards * image).sum(0)
+        alpha = product / np.where(curve > 0.0, curve, 1.0)
+        x += alpha * towards
+        left -= alpha * image
+        z = left / diagonal
+        last, product = product, (left * z).sum(0)
+        towards = z + product / np.where(last > 0.0, last, 1.0) * towards
+    return x
 
 
 class _Samples:
@@ -228,12 +240,11 @@ class _Samples:
 
     def weigh(self, x: Array) -> tuple[Array, Array]:
         """Set the weights W by the residuals r at x; returns A' W r and the diagonal of A' W A."""
-        robust = _ROBUST_SIGMAS
 
         def part(k: int) -> tuple[Array, Array]:
             right, diagonal = np.zeros_like(x), np.zeros(len(x))
             seen, weight = self._measured[k], self._weights[k]
-            _weigh(*self._unknowns[k], *seen, _BRIGHTNESS_HUE, robust, x, weight, right, diagonal)
+            _weigh(*self._unknowns[k], *seen, _BRIGHTNESS_HUE, x, weight, right, diagonal)
             return right, diagonal
 
         rights, diagonals = zip(*on_threads(part, range(_PARTS), self._threads), strict=True)
@@ -305,7 +316,7 @@ def _gather(frame, vehicle, vehicles, of_vehicle, of_frame, count, a, b, c, out)
 
 @kernel
 def _weigh(  # type: ignore[no-untyped-def]
-    frame, place, vehicle, free, vehicles, ratio, sigma, axes, robust, values, weight, right, diagonal
+    frame, place, vehicle, free, vehicles, ratio, sigma, axes, values, weight, right, diagonal
 ):
     """Weights (M,) of samples by their residuals, and what they add to the right side and to the diagonal."""
     of_vehicle, of_frame = np.empty((2, _COMMON)), np.empty((2, _OWN))
@@ -317,7 +328,7 @@ def _weigh(  # type: ignore[no-untyped-def]
         b += axes[1, 0] * red + axes[1, 1] * green + axes[1, 2] * blue
         c += axes[2, 0] * red + axes[2, 1] * green + axes[2, 2] * blue
         precision = 1.0 / (float(sigma[m]) * float(sigma[m]))
-        w = robust_weight((a * a + b * b + c * c) / 3.0 * precision, robust**2, precision)
+        w = robust_weight((a * a + b * b + c * c) / 3.0 * precision, _ROBUST_SIGMAS**2, precision)
         weight[m] = w
         _gather(frame[m], vehicle, vehicles, of_vehicle, of_frame, count, w * a, w * b, w * c, right)
         for side in range(count):

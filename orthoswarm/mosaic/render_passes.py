@@ -4,8 +4,9 @@ A label task owns one tile; sample tasks write disjoint pixels (their own labels
 """
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -36,6 +37,8 @@ THUMBNAIL = (12, 16)
 """Rows and columns of a picture's thumbnail."""
 TWICE_M: Final = 0.5
 """What a picture shows at places farther apart than this is drawn twice, metres."""
+_NUMBERS = 8
+"""Frame, row and column of the tile, rows and columns of the window (4), pixels."""
 _SPOT_PX: Final = 2  # pixels of a picture along each side that count as one
 _TILES_MB: Final = 64.0  # memory that a drawing task keeps of the tiles that it writes
 
@@ -94,6 +97,40 @@ class Window(NamedTuple):
         """The window of a row of `label_windows`."""
         row0, row1, col0, col1, pixels = (int(value) for value in box)
         return cls(key=key, row0=row0, row1=row1, col0=col0, col1=col1, pixels=pixels)
+
+
+class FrameWindows(Mapping[int, list[Window]]):
+    """Windows by frame, frames and tiles in order, as a few numbers each: a large map has millions of them.
+
+    Args:
+        results: of tasks, pairs of a frame and its window in a tile.
+    """
+
+    def __init__(self, results: Iterable[Iterable[tuple[int, Window]]] = ()) -> None:
+        tables = [_table(result) for result in results]
+        table = np.concatenate([np.empty((0, _NUMBERS), np.int32), *tables])
+        self._table = table[np.lexsort((table[:, 2], table[:, 1], table[:, 0]))]
+        frames, first = np.unique(self._table[:, 0], return_index=True)
+        ends = [*first.tolist(), len(self._table)]
+        self._row = {frame: slice(*both) for frame, both in zip(frames.tolist(), pairwise(ends), strict=True)}
+
+    def __getitem__(self, frame: int) -> list[Window]:
+        own = self._table[self._row[frame]]
+        return [
+            Window(key=(r, c), row0=row0, row1=row1, col0=col0, col1=col1, pixels=pixels)
+            for _, r, c, row0, row1, col0, col1, pixels in own.tolist()
+        ]
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._row)
+
+    def __len__(self) -> int:
+        return len(self._row)
+
+
+def _table(result: Iterable[tuple[int, Window]]) -> Ints:
+    rows = [(i, *w.key, w.row0, w.row1, w.col0, w.col1, w.pixels) for i, w in result]
+    return np.array(rows, np.int32).reshape(-1, _NUMBERS)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -26,7 +26,6 @@ from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import PlacedFrame, Terrain
 from orthoswarm.mosaic.footprint import rejections
-from orthoswarm.mosaic.frame_windows import FrameWindows
 from orthoswarm.mosaic.kernels.downsampling import reduction
 from orthoswarm.mosaic.kernels.render_arrays import Shots, crop
 from orthoswarm.mosaic.radiometry import Field, uniform
@@ -34,6 +33,7 @@ from orthoswarm.mosaic.render_passes import (
     ColorTask,
     FeatherTask,
     FinishTask,
+    FrameWindows,
     LabelTask,
     PreviewTask,
     Read,

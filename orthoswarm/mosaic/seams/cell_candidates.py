@@ -99,26 +99,15 @@ def cell_candidates(region: Region, shots: Shots, tone: Floats, previews: Previe
         np.zeros(shape, np.float32),
         np.zeros(shape[:2], np.float32),
     )
-    arrays = (position, rotation, shots.lens, shots.size)
+    pictures = (position, rotation, shots.lens, shots.size, usable)
+    ground = (region.lattice, region.gsd_m, region.cell_px)
     nodes = -(-region.side // BLOCK) + 1
     haze = np.zeros((nodes, nodes, len(position)), np.float32)
-    _haze(
-        *arrays,
-        usable,
-        contrast,
-        region.lattice,
-        region.gsd_m,
-        region.cell_px,
-        np.float32(_HAZE_IGNORED_LOG),
-        haze,
-    )
+    _haze(pictures, contrast, ground, haze)
     haze *= np.float32(unit * _HAZE_COST)
-    _candidates(
-        *arrays, usable, penalty, haze, previews.gray, previews.rows, tone, region.lattice, region.gsd_m,
-        region.cell_px, unit * _OBLIQUENESS_COST, cells.candidate, cells.cost, cells.level,
-        np.ascontiguousarray(local, np.float32), cells.texture, unit * _GLARE_COST,
-        GLARE_LEVEL, _CANDIDATE_TAN2, tan_limit() ** 2, _WEAK_COST, HIDES_M,
-    )  # fmt: skip
+    grays = (previews.gray, previews.rows, tone, np.ascontiguousarray(local, np.float32))
+    costs = (penalty, haze, unit * _OBLIQUENESS_COST, unit * _GLARE_COST, tan_limit() ** 2)
+    _candidates(pictures, ground, grays, costs, (cells.candidate, cells.cost, cells.level, cells.texture))
     return cells
 
 
@@ -130,8 +119,11 @@ def _smoothed(contrast: Floats) -> Floats:
 
 
 @in_place_kernel
-def _haze(position, rotation, lens, size, usable, contrast, lattice, gsd, cell, ignored, haze):  # type: ignore[no-untyped-def]
+def _haze(pictures, contrast, ground, haze):  # type: ignore[no-untyped-def]
     """Log of the contrast that each picture lacks against the clearest one, at the corners of blocks of cells."""
+    position, rotation, lens, size, usable = pictures
+    lattice, gsd, cell = ground
+    ignored = np.float32(_HAZE_IGNORED_LOG)
     last = (lattice.shape[0] - 1) * LATTICE_PX - 1
     rows, columns = contrast.shape[1], contrast.shape[2]
     for i in range(haze.shape[0]):
@@ -166,8 +158,8 @@ def _gray(gray, tone, u, v, width, height):  # type: ignore[no-untyped-def]
 
 
 @in_place_kernel
-def _hidden(lattice, position, x, y, z, gsd, top, above):  # type: ignore[no-untyped-def]
-    """Whether the ground stands more than `above` metres over the line from a point (x, y, z) to a camera.
+def _hidden(lattice, position, x, y, z, gsd, top):  # type: ignore[no-untyped-def]
+    """Whether the ground stands more than `HIDES_M` over the line from a point (x, y, z) to a camera.
 
     Nodes of the lattice are met at every step along the line, from the second on, up to the height `top`.
     """
@@ -175,40 +167,27 @@ def _hidden(lattice, position, x, y, z, gsd, top, above):  # type: ignore[no-unt
     dx, dy = position[0] - x, position[1] - y
     away = max(np.hypot(dx, dy), 1e-6)
     rise = (position[2] - z) / away * step
-    return first_over(lattice, y / step, x / step, dy / away, dx / away, z + above, rise, top, 1) >= 0
+    return first_over(lattice, y / step, x / step, dy / away, dx / away, z + HIDES_M, rise, top, 1) >= 0
 
 
 @kernel
-def _candidates(  # type: ignore[no-untyped-def]
-    position,
-    rotation,
-    lens,
-    size,
-    usable,
-    penalty,
-    haze,
-    gray,
-    record,
-    tone,
-    lattice,
-    gsd,
-    cell,
-    weight,
-    candidate,
-    cost,
-    level,
-    local,
-    texture,
-    glare,
-    glare_level,
-    spread,
-    tan2_limit,
-    hidden,
-    above,
-):
+def _candidates(pictures, ground, grays, costs, cells):  # type: ignore[no-untyped-def]
+    """Fill the cells with their cheapest candidates.
+
+    Args:
+        pictures: position, rotation, lens, size of all, and which are usable. ground: lattice, pixel, pixels a cell.
+        grays: all previews, which are meant, tone and local contrast.
+        costs: penalty and haze of each picture, weight of obliqueness, cost of glare, greatest squared tangent.
+        cells: candidate, cost, level and texture, changed.
+    """
+    position, rotation, lens, size, usable = pictures
+    lattice, gsd, cell = ground
+    gray, record, tone, local = grays
+    penalty, haze, weight, glare, tan2_limit = costs
+    candidate, cost, level, texture = cells
     side = candidate.shape[0]
     top = np.float64(lattice.max())
-    step = cell * gsd
+    step, spread = cell * gsd, np.float32(weight * _CANDIDATE_TAN2)
     least = np.empty(len(usable))
     for b0 in range(0, side, BLOCK):
         for b1 in range(0, side, BLOCK):
@@ -238,7 +217,7 @@ def _candidates(  # type: ignore[no-untyped-def]
                         fx = (c - b1 + 0.5) / BLOCK
                         z = lattice_height(lattice, (r + 0.5) * cell - 0.5, (c + 0.5) * cell - 0.5)
                         dx, dy, rise = x - position[k, 0], y - position[k, 1], position[k, 2] - z
-                        limit = min(cost[r, c, SLOTS - 1], cost[r, c, 0] + np.float32(weight * spread))
+                        limit = min(cost[r, c, SLOTS - 1], cost[r, c, 0] + spread)
                         tan2 = (dx * dx + dy * dy) / (rise * rise) if rise > 0.0 else np.inf
                         here = penalty[k] + weight * tan2
                         if here < limit and tan2 <= tan2_limit:
@@ -256,10 +235,10 @@ def _candidates(  # type: ignore[no-untyped-def]
                                 )
                                 if inside:
                                     g = _gray(gray[record[k]], tone[k], u, v, size[k, 0], size[k, 1])
-                                    if g >= glare_level:
+                                    if g >= GLARE_LEVEL:
                                         here += glare
-                                    if here < limit and _hidden(lattice, position[k], x, y, z, gsd, top, above):
-                                        here += hidden
+                                    if here < limit and _hidden(lattice, position[k], x, y, z, gsd, top):
+                                        here += _WEAK_COST
                                 if inside and here < limit:
                                     s = SLOTS - 1
                                     while s > 0 and cost[r, c, s - 1] > here:
@@ -273,5 +252,5 @@ def _candidates(  # type: ignore[no-untyped-def]
                                         i = min(int((v + 0.5) / size[k, 1] * local.shape[1]), local.shape[1] - 1)
                                         j = min(int((u + 0.5) / size[k, 0] * local.shape[2]), local.shape[2] - 1)
                                         texture[r, c] = local[k, i, j]
-                                    limit = min(cost[r, c, SLOTS - 1], cost[r, c, 0] + np.float32(weight * spread))
+                                    limit = min(cost[r, c, SLOTS - 1], cost[r, c, 0] + spread)
                         worst = max(worst, limit)

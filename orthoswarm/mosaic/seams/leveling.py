@@ -23,7 +23,7 @@ from orthoswarm.canvas.tile_store import Key, Tile
 from orthoswarm.model.arrays import Array, Flags, Floats, Indices, Ints
 from orthoswarm.mosaic.kernels.leveling_kernels import BOTH, SLOTS, apply_factors, laplacian, sum_colors
 from orthoswarm.mosaic.overlap_colors import BRIGHT_LEVEL, DARK_LEVEL
-from orthoswarm.mosaic.radiometry import GREATEST_FACTOR
+from orthoswarm.mosaic.radiometry import GREATEST_FACTOR, conjugate_gradients
 
 _LEVEL_CELLS: Final = 32
 """Cells across a picture in which it is corrected, about 3 m of the ground at a height of 75 m (the factor of a lawn
@@ -190,27 +190,11 @@ class Leveling:
             pull = weight * ratio[:, channel]
             right[:, channel] = np.bincount(other, pull, count) - np.bincount(one, pull, count)
         diagonal = anchor + np.bincount(first, links, count) + np.bincount(second, links, count)
-        log = _conjugate_gradients(first, second, links, anchor=anchor, diagonal=diagonal, right=right)
+        image = np.empty_like(right)
+
+        def applied(x: Array) -> Array:
+            laplacian(first, second, links, anchor, x, image)
+            return image
+
+        log = conjugate_gradients(applied, diagonal[:, None], right, _LEVEL_TOLERANCE, _LEVEL_STEPS)
         return np.asarray(log - self._pixels @ log / self._pixels.sum())
-
-
-def _conjugate_gradients(
-    first: Ints, second: Ints, weight: Array, *, anchor: Array, diagonal: Array, right: Array
-) -> Array:
-    """The solution (M, 3) of the normal equations; their diagonal is the preconditioner."""
-    x, left, image = np.zeros_like(right), right.copy(), np.empty_like(right)
-    z = left / diagonal[:, None]
-    towards, product = z.copy(), (left * z).sum(0)
-    enough = _LEVEL_TOLERANCE**2 * product
-    for _ in range(_LEVEL_STEPS):
-        if (product <= enough).all():
-            break
-        laplacian(first, second, weight, anchor, towards, image)
-        curve = (towards * image).sum(0)
-        alpha = product / np.where(curve > 0.0, curve, 1.0)
-        x += alpha * towards
-        left -= alpha * image
-        z = left / diagonal[:, None]
-        last, product = product, (left * z).sum(0)
-        towards = z + product / np.where(last > 0.0, last, 1.0) * towards
-    return x

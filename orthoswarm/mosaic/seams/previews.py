@@ -84,7 +84,7 @@ def make_preview(picture: Bytes) -> NDArray[np.void]:
     record = np.zeros(1, RECORD)
     gray = cv2.resize(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), (COLUMNS, ROWS), interpolation=cv2.INTER_AREA)
     record["gray"][0] = gray
-    _contrasts(record["gray"][0], GLARE_LEVEL, _GLARE_SHARE, record["contrast"][0])
+    _contrasts(record["gray"][0], record["contrast"][0])
     sharp = picture_quality(picture).sharpness if min(picture.shape[:2]) >= LEAST_SIDE_PX else 0.0
     record["sharpness"] = max(sharp, 1e-3)
     record["written"] = 1
@@ -92,7 +92,7 @@ def make_preview(picture: Bytes) -> NDArray[np.void]:
 
 
 @in_place_kernel
-def _contrasts(gray, glare_level, glare_share, contrast):  # type: ignore[no-untyped-def]
+def _contrasts(gray, contrast):  # type: ignore[no-untyped-def]
     """Standard deviation of each block of a preview, at least half a level; 0 where too much of it is glare."""
     pixels = np.int64(BLOCK_PX * BLOCK_PX)
     for i in range(contrast.shape[0]):
@@ -104,9 +104,9 @@ def _contrasts(gray, glare_level, glare_share, contrast):  # type: ignore[no-unt
                     level = np.int64(row[c])
                     total += level
                     square += level * level
-                    glare += np.int64(level >= glare_level)
+                    glare += np.int64(level >= GLARE_LEVEL)
             variance = (pixels * square - total * total) / (pixels * pixels)
-            contrast[i, j] = np.sqrt(max(variance, 0.25)) if glare <= glare_share * pixels else 0.0
+            contrast[i, j] = np.sqrt(max(variance, 0.25)) if glare <= _GLARE_SHARE * pixels else 0.0
 
 
 @dataclass(frozen=True, slots=True)
