@@ -36,12 +36,12 @@ def moved_terrain(terrain: Terrain, similarity: Similarity, level_m: float) -> T
     corners = similarity.moved(np.array([[west, south], [east, south], [east, north], [west, north]]))
     low = np.floor(corners.min(axis=0) / step) * step
     count = np.ceil((corners.max(axis=0) - low) / step).astype(int) + 1
-    e, n = np.meshgrid(low[0] + step * np.arange(count[0]), low[1] + step * np.arange(count[1]))
-    before = similarity.back(np.stack([e, n], axis=-1))
+    empty = Terrain(float(low[0]), float(low[1]), step, np.zeros(count[::-1], np.float32))
+    before = similarity.back(empty.nodes())
 
     def moved(z: Floats) -> Floats:
         heights = replace(terrain, z=z, bare=None).height(before)
         return np.asarray(similarity.moved_heights(heights, level_m), np.float32)
 
     bare = None if terrain.bare is None else moved(terrain.bare)
-    return Terrain(float(low[0]), float(low[1]), step, moved(terrain.z), bare)
+    return replace(empty, z=moved(terrain.z), bare=bare)

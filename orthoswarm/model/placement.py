@@ -107,6 +107,12 @@ class Terrain:
         """The ground without the tops of what stands on it."""
         return self if self.bare is None else replace(self, z=self.bare, bare=None)
 
+    def nodes(self) -> Array:
+        """Positions (rows, columns, 2) of the nodes."""
+        rows, columns = self.z.shape
+        east, north = self.west + self.step_m * np.arange(columns), self.south + self.step_m * np.arange(rows)
+        return np.stack(np.meshgrid(east, north), -1)
+
     def height(self, east_north: NDArray[Any]) -> Array:
         """Heights (...,) at ground points (..., 2)."""
         p = np.asarray(east_north, float)

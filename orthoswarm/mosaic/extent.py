@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 
 from orthoswarm.canvas.canvas import Canvas
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.placement import MapWindow, PlacedFrame, Solution, Terrain
@@ -38,6 +39,30 @@ def ground_level(placed: Sequence[PlacedFrame], terrain: Terrain | None) -> floa
     if terrain is None or not placed:
         return 0.0
     return float(np.median(terrain.bare_ground().height(np.array([p.camera.nadir for p in placed]))))
+
+
+def ground_of_nearest(
+    grounds: Sequence[Terrain | None], paths: Sequence[Array], reach_m: float, *, step_m: float, most_nodes: int
+) -> Terrain:
+    """Everywhere the ground of the vehicle whose camera is nearest, as that is drawn; 0 where it has none.
+
+    Args:
+        grounds: of the vehicles. paths: where their cameras were, float64 (N, 2) each. reach_m: how far beyond them.
+        step_m: distance of the nodes, more where they would be more than `most_nodes`.
+    """
+    from scipy.spatial import cKDTree
+
+    path = np.concatenate(paths)
+    box = BoundingBox.around_points(path, reach_m)
+    step = max(step_m, float(np.sqrt(box.width * box.height / most_nodes)))
+    rows, columns = (int(np.ceil(side / step)) + 1 for side in (box.height, box.width))
+    out = Terrain(box.west, box.south, step, np.zeros((rows, columns), np.float32))
+    nodes = out.nodes()
+    nearest = np.repeat(np.arange(len(paths)), [len(own) for own in paths])[cKDTree(path).query(nodes)[1]]
+    for k, ground in enumerate(grounds):
+        if ground is not None:
+            out.z[nearest == k] = ground.height(nodes[nearest == k])
+    return out
 
 
 def solved_level(solutions: Sequence[Solution]) -> float:

@@ -15,18 +15,11 @@ from orthoswarm.mosaic.kernels.lens_arrays import INNER, OUTER, lens_row
 MOST_OFF_NADIR_DEG: Final = 75.0
 """Ground that is seen farther from straight down is not drawn: a pixel there is smeared over more than 15 times its
 size at nadir."""
+TAN_LIMIT: Final = math.tan(math.radians(MOST_OFF_NADIR_DEG))
+LEAST_DESCENT: Final = math.cos(math.radians(MOST_OFF_NADIR_DEG))
+"""Smallest descent of a ray per unit of depth that is drawn: on level ground a straight line below the horizon."""
 _MOST_MAGNIFICATION: Final = 16.0
 """A picture whose ground pixel is more than so many times the map's is none of this flight."""
-
-
-def tan_limit() -> float:
-    """Tangent of the greatest angle off nadir at which ground is drawn."""
-    return float(np.tan(np.radians(MOST_OFF_NADIR_DEG)))
-
-
-def least_descent() -> float:
-    """Smallest descent of a ray per unit of depth that is drawn: on level ground a straight line below the horizon."""
-    return float(np.cos(np.radians(MOST_OFF_NADIR_DEG)))
 
 
 def default_gsd(cameras: Sequence[Camera], ground_z_m: float = 0.0) -> float:
@@ -84,7 +77,7 @@ def _reason(height: float, focal_px: float, steepest: float, gsd_m: float) -> st
             f"from {height:.0f} m above the ground its pixels are {times:.0f} times as large as the map's: "
             "its height is wrong, or the map's pixel (--gsd) too small"
         )
-    if steepest < least_descent():
+    if steepest < LEAST_DESCENT:
         return "it looks at the horizon or above, and not at the ground"
     return None
 
@@ -131,7 +124,7 @@ def footprint(camera: Camera, ground_z_m: float = 0.0, inset_px: float = 0.0) ->
     height = float(camera.position[2]) - ground_z_m
     xy = _border(camera.lens, 1 if camera.lens.is_pinhole else 8, inset_px)
     rays = np.concatenate([xy, np.ones((len(xy), 1))], 1) @ camera.rotation.T
-    rays = _clip(rays, least_descent())
+    rays = _clip(rays, LEAST_DESCENT)
     if len(rays) < 3 or height <= 0:
         return np.empty((0, 2))
     return np.asarray(camera.position[:2] + rays[:, :2] * (height / -rays[:, 2:]))
@@ -154,7 +147,7 @@ def _clip(rays: Array, least: float) -> Array:
 
 def reach(camera: Camera, ground_z_m: float = 0.0) -> float:
     """Greatest distance from the nadir point at which the ground is drawn, metres."""
-    return tan_limit() * (float(camera.position[2]) - ground_z_m)
+    return TAN_LIMIT * (float(camera.position[2]) - ground_z_m)
 
 
 def footprint_boxes(cameras: Sequence[Camera], z_low: float, z_high: float) -> Array:
@@ -163,7 +156,7 @@ def footprint_boxes(cameras: Sequence[Camera], z_low: float, z_high: float) -> A
     West > east where a camera sees nothing.
     """
     boxes = np.tile([np.inf, np.inf, -np.inf, -np.inf], (len(cameras), 1))
-    least = least_descent()
+    least = LEAST_DESCENT
     for lens, index in _by_lens(cameras).items():
         position = np.stack([cameras[i].position for i in index]).astype(float)
         rays = _corners(lens) @ np.stack([cameras[i].rotation for i in index]).transpose(0, 2, 1)

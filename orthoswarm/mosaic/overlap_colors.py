@@ -18,7 +18,7 @@ from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import Camera, Lens
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import Terrain
-from orthoswarm.mosaic.footprint import footprint_boxes, least_descent
+from orthoswarm.mosaic.footprint import LEAST_DESCENT, footprint_boxes
 from orthoswarm.mosaic.kernels.drawn_heights import heights
 from orthoswarm.mosaic.kernels.render_arrays import Shots, project
 from orthoswarm.mosaic.seam_labels import label_tile
@@ -175,7 +175,7 @@ def grid_on_ground(cameras: Sequence[Camera], shots: Shots, terrain: Terrain, sh
         by_lens[lens] = np.concatenate([xy, np.ones((len(xy), 1))], 1)
     rays = np.stack([by_lens[camera.lens] for camera in cameras]) @ shots.rotation.transpose(0, 2, 1)
     height = shots.position[:, 2] - terrain.height(shots.position[:, :2])
-    descent = np.where(rays[..., 2:] < -least_descent(), -rays[..., 2:], np.nan)
+    descent = np.where(rays[..., 2:] < -LEAST_DESCENT, -rays[..., 2:], np.nan)
     return np.asarray(shots.position[:, None, :2] + rays[..., :2] * (height[:, None, None] / descent))
 
 

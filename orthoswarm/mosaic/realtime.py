@@ -19,7 +19,7 @@ from orthoswarm.model.arrays import Array, Bytes
 from orthoswarm.model.camera import Camera
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.placement import PlacedFrame, Terrain
-from orthoswarm.mosaic.footprint import least_descent, reach, rejection
+from orthoswarm.mosaic.footprint import LEAST_DESCENT, reach, rejection
 from orthoswarm.mosaic.kernels.downsampling import pack, reduction
 from orthoswarm.mosaic.kernels.lens_arrays import INNER, OUTER, lens_row
 from orthoswarm.mosaic.kernels.realtime_kernel import RUN, aim, fuse, touches
@@ -88,7 +88,7 @@ class RealtimeMosaic:
         planes, box = np.empty((8, 3)), np.empty(4)
         outer = np.array(lens_row(lens, 0.0)[OUTER:INNER])
         number = aim(
-            camera.position, camera.rotation, outer, ground_z_m, least_descent(), grid.west, grid.north, grid.gsd_m,
+            camera.position, camera.rotation, outer, ground_z_m, LEAST_DESCENT, grid.west, grid.north, grid.gsd_m,
             planes, box,
         )  # fmt: skip
         keys = self._tiles_in(box) if number else []

@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from orthoswarm.model.arrays import Array, Flags
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.camera import NADIR_PITCH_RAD, Camera, Lens, focal_px, rotation_from_angles
 from orthoswarm.model.earth import on_sphere
 from orthoswarm.model.errors import InputError, OrthoSwarmError
@@ -111,8 +111,9 @@ def recorded_cameras(frames: Sequence[Frame], grid: LocalGrid, fov_rad: float | 
     lat = np.array([f.fix.lat_deg for f in frames])
     lon = np.array([f.fix.lon_deg for f in frames])
     ground = grid.to_grid(lat, lon)
-    near = _near(ground)
-    rejected = [_too_far(frames[i], ground, i) for i in np.nonzero(~near)[0].tolist()]
+    away = np.hypot(*(ground - np.median(ground, axis=0)).T)
+    near = np.isfinite(away) & (away <= max(_FAR_M, _FAR_SPREADS * float(np.median(away))))
+    rejected = [_far_from_others(frames[i], float(away[i]) / 1000) for i in np.nonzero(~near)[0].tolist()]
     convergence = grid.convergence_rad(lat, lon)
     placed: list[PlacedFrame] = []
     warnings: list[str] = []
@@ -196,17 +197,6 @@ def _sigma(frame: Frame, camera: Camera) -> float:
     position = frame.fix.position_sigma_m or UNSTATED_SIGMA_M
     share = _UNTAGGED_TILT_SIGMA if frame.fix.pitch_rad is None else TAGGED_TILT_SIGMA
     return float(np.hypot(position, share * float(camera.position[2])))
-
-
-def _near(ground: Array) -> Flags:
-    """Which positions belong to the set: near their median, bool (N,)."""
-    away = np.hypot(*(ground - np.median(ground, axis=0)).T)
-    return np.asarray(np.isfinite(away) & (away <= max(_FAR_M, _FAR_SPREADS * float(np.median(away)))))
-
-
-def _too_far(frame: Frame, ground: Array, i: int) -> Rejection:
-    away = float(np.hypot(*(ground[i] - np.median(ground, axis=0)))) / 1000
-    return _far_from_others(frame, away)
 
 
 def _far_from_others(frame: Frame, away_km: float) -> Rejection:

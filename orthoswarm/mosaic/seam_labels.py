@@ -10,7 +10,7 @@ import numpy as np
 
 from orthoswarm.compute.jit import in_place_kernel, kernel
 from orthoswarm.model.arrays import Floats, Ints
-from orthoswarm.mosaic.footprint import tan_limit
+from orthoswarm.mosaic.footprint import TAN_LIMIT
 from orthoswarm.mosaic.kernels.lens_arrays import INNER, OUTER, U_HIGH, U_LOW, V_HIGH, V_LOW
 from orthoswarm.mosaic.kernels.render_arrays import LATTICE_PX, Shots, lattice_height, project
 
@@ -185,7 +185,7 @@ def label_tile(
         gsd_m: ground pixel.
     """
     position, rotation = shots.about(west, north)
-    limit = tan_limit() ** 2
+    limit = TAN_LIMIT**2
     for weak in (False, True):
         index = np.nonzero(shots.weak == weak)[0]
         if len(index) == 0:

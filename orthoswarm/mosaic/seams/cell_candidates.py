@@ -12,7 +12,7 @@ import numpy as np
 
 from orthoswarm.compute.jit import in_place_kernel, kernel
 from orthoswarm.model.arrays import Floats, Ints
-from orthoswarm.mosaic.footprint import tan_limit
+from orthoswarm.mosaic.footprint import TAN_LIMIT
 from orthoswarm.mosaic.kernels.lens_arrays import U_HIGH, U_LOW, V_HIGH, V_LOW
 from orthoswarm.mosaic.kernels.line_of_sight import HIDES_M, first_over
 from orthoswarm.mosaic.kernels.render_arrays import LATTICE_PX, Shots, lattice_height, project
@@ -106,7 +106,7 @@ def cell_candidates(region: Region, shots: Shots, tone: Floats, previews: Previe
     _haze(pictures, contrast, ground, haze)
     haze *= np.float32(unit * _HAZE_COST)
     grays = (previews.gray, previews.rows, tone, np.ascontiguousarray(local, np.float32))
-    costs = (penalty, haze, unit * _OBLIQUENESS_COST, unit * _GLARE_COST, tan_limit() ** 2)
+    costs = (penalty, haze, unit * _OBLIQUENESS_COST, unit * _GLARE_COST, TAN_LIMIT**2)
     _candidates(pictures, ground, grays, costs, (cells.candidate, cells.cost, cells.level, cells.texture))
     return cells
 

@@ -196,13 +196,6 @@ def log_rotation(rotation: Array) -> Array:
     """Rotation vectors (N, 3) of rotation matrices (N, 3, 3)."""
     cosine = np.clip((np.trace(rotation, axis1=1, axis2=2) - 1.0) / 2.0, -1.0, 1.0)
     angle = np.arccos(cosine)
-    vector = np.stack(
-        [
-            rotation[:, 2, 1] - rotation[:, 1, 2],
-            rotation[:, 0, 2] - rotation[:, 2, 0],
-            rotation[:, 1, 0] - rotation[:, 0, 1],
-        ],
-        axis=1,
-    )
+    vector = (rotation - np.swapaxes(rotation, 1, 2))[:, [2, 0, 1], [1, 2, 0]]
     scale = np.where(angle < 1e-6, 0.5, angle / np.maximum(2.0 * np.sin(angle), 1e-9))
     return np.asarray(vector * scale[:, None])

@@ -56,7 +56,6 @@ class Priors:
         velocity: float64 (N, 2), ground velocity in m/s for the lag; zeros where time is unknown.
         group: int32 (N,). models: sigmas of each group.
         lens: float64 (L, 6), start of log f, k1, k2, k3, cx, cy. lens_sigma: float64 (L, 6), 0 fixes a parameter.
-        position_c: robust scale (squared sigmas) of the horizontal positions.
     """
 
     position: Array
@@ -68,7 +67,6 @@ class Priors:
     models: tuple[GroupPriors, ...]
     lens: Array
     lens_sigma: Array
-    position_c: float = POSITION_ROBUST_C
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -213,7 +211,7 @@ def _add_positions(
     knots = np.asarray(layout.knots)[priors.group[index]]
     xy, rz = residual[:, :2], residual[:, 2]
     w = _weights(priors.position_sigma[index])
-    w[:, :2] *= robust_weights((xy * xy * w[:, :2]).sum(1), priors.position_c)[:, None]
+    w[:, :2] *= robust_weights((xy * xy * w[:, :2]).sum(1), POSITION_ROBUST_C)[:, None]
     left = layout.knot_left[index]
     fraction = layout.knot_fraction[index]
     for a in range(2):

@@ -18,6 +18,7 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from orthoswarm.compute.jit import in_place_kernel, kernel
+from orthoswarm.refine.features.shift_products import everywhere
 
 SIZE = 15
 """Side of a window, pixels: a layout of the compiled code (Lucas and Kanade 1981)."""
@@ -27,8 +28,7 @@ LANES = 16
 """Columns that are added at once: those of a window and one that is not used."""
 _HALF = SIZE // 2
 
-_FLOAT, _INT = ir.FloatType(), ir.IntType(32)
-_VECTOR = ir.VectorType(_FLOAT, LANES)
+_VECTOR = ir.VectorType(ir.FloatType(), LANES)
 
 
 class _Lanes:
@@ -74,12 +74,6 @@ class _Lanes:
         for line, total in enumerate(totals):
             self.store(self.builder.load(total), array, ir.Constant(self.number, line), 0)
 
-    def everywhere(self, value: Any) -> Any:
-        """A vector of one value."""
-        undefined = ir.Constant(_VECTOR, ir.Undefined)
-        first = self.builder.insert_element(undefined, value, ir.Constant(_INT, 0))
-        return self.builder.shuffle_vector(first, undefined, ir.Constant(ir.VectorType(_INT, LANES), [0] * LANES))
-
 
 @intrinsic
 def add_gradients(typing, wide, gradient, sums):  # type: ignore[no-untyped-def]
@@ -114,7 +108,7 @@ def add_residuals(typing, under, wide, gradient, part_u, part_v, sums):  # type:
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         lanes = _Lanes(context, builder, signature, arguments)
         totals = lanes.totals(4)
-        u, v = lanes.everywhere(arguments[3]), lanes.everywhere(arguments[4])
+        u, v = (everywhere(builder, value, LANES) for value in arguments[3:5])
         with lanes.rows() as row:
             rows = []
             for k in range(2):

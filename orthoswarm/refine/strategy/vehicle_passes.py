@@ -104,13 +104,11 @@ class RefinerOptions:
     """How the refiner works.
 
     Attributes:
-        fov_start_rad: field of view to start from where the tags hint at none.
         dem: given height model, None to find the ground. read: reads a frame's grey picture; picklable.
         kept: where tracks are kept for a refinement of the same pictures, None if they are not.
         device: where networks run.
     """
 
-    fov_start_rad: float = field(default_factory=lambda: float(np.radians(START_FOV_DEG)))
     dem: HeightModel | None = None
     read: ReadGray = field(default_factory=lambda: read_frame)
     kept: KeptTracks | None = None
@@ -181,7 +179,7 @@ def _registered(item: tuple[VehicleState, dict[int, Gray]], *, area: WorkArea) -
 def tracked_flight(frames: Sequence[Frame], area: WorkArea, options: RefinerOptions) -> FlightBlock | None:
     """A vehicle's pictures with corners tracked from one to the next, see `open_flight`."""
     hints = [f.fov_hint_rad for f in frames if f.fov_hint_rad is not None]
-    start = float(np.median(hints)) if hints else options.fov_start_rad
+    start = float(np.median(hints)) if hints else float(np.radians(START_FOV_DEG))
     return open_flight(frames, area.grid, area.origin, options.read, start, kept=options.kept)
 
 

@@ -14,11 +14,9 @@ from orthoswarm.model.arrays import Array, Flags
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.placement import Terrain
+from orthoswarm.model.robust import MEDIAN_LENGTH_SIGMAS
 from orthoswarm.mosaic.extent import FLAT_RELIEF_M
 from orthoswarm.refine.surface.smooth_surface import FitSettings, fit_nodes
-
-HALF_MAXIMUM_SIGMAS = 1.1774
-"""Half width of a Gaussian at half its maximum, in sigmas: sqrt(2 ln 2)."""
 
 _GROUND_MODE_KERNEL_M: Final = 0.15  # Gaussian kernel of the density of heights in which the ground's level is sought
 _GROUND_MODE_WINDOW_M: Final = 15.0  # heights farther than this from the median do not count for the ground's level
@@ -148,7 +146,7 @@ def lower_flank(height: Array, sigma: Array | None = None) -> float:
     noise = kernel_m
     if sigma is not None and len(sigma):
         noise = float(np.hypot(kernel_m, np.median(sigma)))
-    return centre + float(min(flank + HALF_MAXIMUM_SIGMAS * noise, mode))
+    return centre + float(min(flank + MEDIAN_LENGTH_SIGMAS * noise, mode))
 
 
 def robust_centre(x: Array) -> float:

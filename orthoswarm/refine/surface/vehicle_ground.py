@@ -130,9 +130,7 @@ def mapped_ground_level(terrain: Terrain | None, camera_position: Array, dense: 
     below = ground.height(position[:, :2])
     height = float(np.median(position[:, 2] - below))
     stride = max(1, int(_LEVEL_SPACING_M / ground.step_m))
-    z = ground.z[::stride, ::stride]
-    rows, columns = np.indices(z.shape) * stride
-    nodes = np.column_stack([columns.ravel(), rows.ravel()]) * ground.step_m + [ground.west, ground.south]
+    z, nodes = ground.z[::stride, ::stride], ground.nodes()[::stride, ::stride].reshape(-1, 2)
     near = cKDTree(position[:, :2]).query(nodes, distance_upper_bound=_LEVEL_REACH_HEIGHTS * height)[0]
     mapped = np.isfinite(near)
     heights = z.ravel()[mapped] if mapped.any() else below

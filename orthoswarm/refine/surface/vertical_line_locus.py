@@ -55,8 +55,8 @@ class Sweep:
     Attributes:
         half: half width of the square patch in samples (7: 15 x 15 samples), step_m apart.
         reach_m: range searched above and below the terrain, in steps of height_step_m. min_score: least correlation.
-        rival_m: a second peak farther than this from the best one, above rival_share of it, makes the height
-            ambiguous; infinite switches the test off. sigma_m: one sigma of a height on open ground.
+        rival_m: a second peak farther than this from the best one, nearly as high, makes the height ambiguous;
+            infinite switches the test off. sigma_m: one sigma of a height on open ground.
         baselines_m: desired distances of the partners, on both sides of the reference.
         spacing_m: only pictures this far apart along a leg are used, to limit decoding.
     """
@@ -68,7 +68,6 @@ class Sweep:
     reach_m: float = _SWEEP_REACH_M
     height_step_m: float = _SWEEP_HEIGHT_STEP_M
     rival_m: float = _SWEEP_RIVAL_M
-    rival_share: float = _SWEEP_RIVAL_SHARE
     baselines_m: tuple[float, ...] = _SWEEP_BASELINES_M
     spacing_m: float = _SWEEP_SPACING_M
 
@@ -245,7 +244,7 @@ def _sweep_in_windows(
                 cameras.arrays, (window.stack, window.slot, factor), cells[block], plane[block], ref[block],
                 partner[block], s.heights, s.half, s.step_m, _SWEEP_LEAST_VARIANCE, curve,
             )  # fmt: skip
-            kernels.peaks(curve, s.heights, s.rival_m, s.rival_share, peak)
+            kernels.peaks(curve, s.heights, s.rival_m, _SWEEP_RIVAL_SHARE, peak)
             good = peak[:, 1] >= s.min_score
             found[block[good], :2], found[block[good], 2] = peak[good], s.sigma_m
             block = block[~good]
