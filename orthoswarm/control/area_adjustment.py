@@ -28,8 +28,7 @@ _AREA_TIE_SIGMA_M: Final = 0.3  # how well a vehicle's place agrees in two areas
 class AreaTie:
     """A vehicle that was solved in two areas.
 
-    Attributes:
-        one, other: numbers of the areas. place: float64 (2, N, 3), some camera positions in the one and the other.
+    one, other: numbers of the areas. place: float64 (2, N, 3), some camera positions in the one and the other.
     """
 
     one: int

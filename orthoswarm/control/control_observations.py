@@ -85,9 +85,8 @@ def in_photos(
 ) -> list[ControlObservation]:
     """Points by the rays of the photos that show them.
 
-    Args:
-        points: surveyed points. placed: photos of one frame of reference. terrain: ground below them.
-        grid: the area's. on_map: whether that frame is the basemap.
+    points: surveyed points. placed: photos of one frame of reference. terrain: ground below them. grid: the area's.
+    on_map: whether that frame is the basemap.
     """
     images = {p.frame.image: p for p in placed}
     out = []

@@ -33,10 +33,8 @@ _FREE_BORDER_SHARE: Final = 0.1
 class GroundControl:
     """Result of the ground control.
 
-    Attributes:
-        on_map: the fit of the photos registered on the basemap; by_receivers: of the others. None without a control
-            point in these photos.
-        warnings: findings in plain words.
+    on_map: the fit of the photos registered on the basemap; by_receivers: of the others. None without a control point
+    in these photos. warnings: findings in plain words.
     """
 
     on_map: ControlFit | None
@@ -75,14 +73,9 @@ class GroundControl:
 def place_on_control(
     refinement: Refinement, points: Sequence[Checkpoint], grid: LocalGrid, map_gsd_m: float | None
 ) -> tuple[Refinement, GroundControl]:
-    """Move the fine cameras and their terrain onto control points.
+    """Move the fine cameras and their terrain onto control points; the given refinement is not modified.
 
-    Args:
-        refinement: result of the refiner; not modified. points: surveyed points. grid: the area's.
-        map_gsd_m: the basemap's pixel, None without a basemap.
-
-    Returns:
-        The moved refinement, and the result of the ground control.
+    map_gsd_m: the basemap's pixel, None without a basemap.
 
     Raises:
         InputError: a point's pixel lies outside its photo.

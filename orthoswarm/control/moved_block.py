@@ -13,8 +13,7 @@ from orthoswarm.model.plane_similarity import Similarity
 def moved_camera(camera: Camera, similarity: Similarity, level_m: float, up_m: float = 0.0) -> Camera:
     """A camera after a similarity; heights over a level are scaled, too, so that no pixel's ray is bent.
 
-    Args:
-        camera: before it. level_m: of the ground. up_m: added to its height.
+    camera: before it. level_m: of the ground. up_m: added to its height.
     """
     height = float(similarity.moved_heights(camera.position[2], level_m)) + up_m
     position = np.array([*similarity.moved(camera.nadir), height])
@@ -24,8 +23,7 @@ def moved_camera(camera: Camera, similarity: Similarity, level_m: float, up_m: f
 def moved_terrain(terrain: Terrain, similarity: Similarity, level_m: float) -> Terrain:
     """The ground after a similarity, on nodes as far apart as before.
 
-    Args:
-        terrain: before it. level_m: heights over this level are scaled.
+    terrain: before it. level_m: heights over this level are scaled.
     """
     rows, columns = terrain.z.shape
     step = terrain.step_m

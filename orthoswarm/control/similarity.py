@@ -50,9 +50,8 @@ def fit_similarity(observations: Sequence[ControlObservation], nadirs: Array, bo
     sigma are believed as far as they agree: a handheld receiver's are metres off, and of nine such points those that
     agree by chance must not reject the others.
 
-    Args:
-        observations: at least one. nadirs: float64 (N, 2), nadir points of the photos, for their centre and extent.
-        border_m: prior sigma of rotation and scale, as the displacement at the photos' rms radius, metres.
+    observations: at least one. nadirs: float64 (N, 2), nadir points of the photos, for their centre and extent.
+    border_m: prior sigma of rotation and scale, as the displacement at the photos' rms radius, metres.
     """
     middle = np.asarray(nadirs.mean(axis=0))
     radius = max(float(np.sqrt(((nadirs - middle) ** 2).sum(axis=1).mean())), 1.0)

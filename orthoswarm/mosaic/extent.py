@@ -46,9 +46,8 @@ def ground_of_nearest(
 ) -> Terrain:
     """Everywhere the ground of the vehicle whose camera is nearest, as that is drawn; 0 where it has none.
 
-    Args:
-        grounds: of the vehicles. paths: where their cameras were, float64 (N, 2) each. reach_m: how far beyond them.
-        step_m: distance of the nodes, more where they would be more than `most_nodes`.
+    grounds: of the vehicles. paths: where their cameras were, float64 (N, 2) each. reach_m: how far beyond them.
+    step_m: distance of the nodes, more where they would be more than `most_nodes`.
     """
     from scipy.spatial import cKDTree
 
@@ -81,8 +80,7 @@ def from_takeoff(
     the relief. Their weighted mean becomes zero. No homography changes by this, only the heights stated with it.
 
     Args:
-        placed: placed frames.
-        level: of the mapped ground, metres.
+        placed: placed frames. level: of the mapped ground, metres.
         terrain: the ground below them; None: nothing was solved, and heights stay as they are.
 
     Returns:

@@ -38,10 +38,8 @@ def default_gsd(cameras: Sequence[Camera], ground_z_m: float = 0.0) -> float:
 def rejections(cameras: Sequence[Camera], ground_z_m: ArrayLike, gsd_m: float) -> dict[int, str]:
     """Frames that cannot be drawn on a map: index -> why, one clause.
 
-    Args:
-        cameras: where the frames' cameras are.
-        ground_z_m: height of the ground below each, (N,) or one number.
-        gsd_m: the map's ground pixel.
+    cameras: where the frames' cameras are. ground_z_m: height of the ground below each, (N,) or one number. gsd_m: the
+    map's ground pixel.
     """
     if len(cameras) == 0:
         return {}
@@ -112,14 +110,10 @@ def _border(lens: Lens, per_side: int, inset_px: float) -> Array:
 def footprint(camera: Camera, ground_z_m: float = 0.0, inset_px: float = 0.0) -> Array:
     """The ground that a camera sees on a level plane, a closed polygon float64 (K, 2), K = 0 if none.
 
-    Without distortion it is exact and convex, clipped where the view is flatter than `most_off_nadir_deg`
-    (along a straight line: the circle of that angle, `reach`, cuts the rest). With distortion the border is
-    densified, 8 points a side, and the polygon may be slightly concave.
-
-    Args:
-        camera: where it is.
-        ground_z_m: the plane's height.
-        inset_px: how far inside the outermost pixel centres; -0.5 is the picture's very edge.
+    Without distortion it is exact and convex, clipped where the view is flatter than `MOST_OFF_NADIR_DEG` (along a
+    straight line: the circle of that angle, `reach`, cuts the rest). With distortion the border has 8 points a side,
+    and the polygon may be slightly concave. inset_px: how far inside the outermost pixel centres; -0.5 is the picture's
+    very edge.
     """
     height = float(camera.position[2]) - ground_z_m
     xy = _border(camera.lens, 1 if camera.lens.is_pinhole else 8, inset_px)

@@ -37,9 +37,8 @@ def map_colors(
 ) -> OverlapColors:
     """Compare frames with a map; the map's index as a frame is the number of cameras.
 
-    Args:
-        cameras: N cameras; shots: the same as arrays. small: uint8 (N, rows, columns, 3) thumbnails.
-        terrain: the ground. tone: the map; where it is grey its hue says nothing.
+    cameras: N cameras; shots: the same as arrays. small: uint8 (N, rows, columns, 3) thumbnails. terrain: the ground.
+    tone: the map; where it is grey its hue says nothing.
     """
     count = len(cameras)
     side = _MAP_BLOCK_PX

@@ -112,22 +112,17 @@ def estimate_fields(
     tone: ColorMap | None = None,
     threads: int = 1,
 ) -> dict[str, Field]:
-    """Factors that make neighbouring frames alike.
+    """Factors that make neighbouring frames alike: image -> field, within `GREATEST_FACTOR` and its inverse.
 
     The mean logarithm of the mosaic's brightness stays as it was, channel by channel; where some fields are held, the
     others follow those instead, and with a map its tone.
 
     Args:
-        frames: placed frames in order of vehicle and time.
+        frames: placed frames in order of vehicle and time. terrain: the ground's height.
         thumbnails: image -> uint8 (rows, columns, 3), means of a picture's parts (RenderStats.thumbnails of an earlier
             rendering); a frame without one gets what its vehicle has in common.
-        terrain: the ground's height.
         held: image -> field of frames that are drawn already and stay as they are.
-        tone: a map that the mosaic's tone is to follow at low frequency.
-        threads: that share the work; the result does not depend on them.
-
-    Returns:
-        image -> field for every frame; factors lie within `GREATEST_FACTOR` and its inverse.
+        tone: a map that the mosaic's tone is to follow at low frequency. threads: do not change the result.
     """
     held = held or {}
     known = [i for i, f in enumerate(frames) if f.frame.image in thumbnails]
@@ -202,9 +197,8 @@ def conjugate_gradients(
 ) -> Array:
     """The solutions (M, K) of K systems with one positive definite matrix, preconditioned by its diagonal.
 
-    Args:
-        applied: the matrix times (M, K). diagonal: of the matrix, (M, 1) or (M, K). right: (M, K).
-        tolerance: preconditioned residual at which they end, as a share of the first one.
+    applied: the matrix times (M, K). diagonal: of the matrix, (M, 1) or (M, K). right: (M, K). tolerance:
+    preconditioned residual at which they end, as a share of the first one.
     """
     x, left = np.zeros_like(right), right.copy()
     z = left / diagonal

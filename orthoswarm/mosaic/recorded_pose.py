@@ -41,10 +41,8 @@ _UNTAGGED_TILT_SIGMA: Final = 0.1  # tilt without a recorded attitude: 6 degrees
 class Recorded:
     """Frames after the real-time stage.
 
-    Attributes:
-        placed: in the order of the frames.
-        rejected: frames whose position cannot be true.
-        warnings: sentences that name what was assumed.
+    placed: in the order of the frames. rejected: frames whose position cannot be true. warnings: sentences that name
+    what was assumed.
     """
 
     placed: list[PlacedFrame]
@@ -102,11 +100,8 @@ def in_one_area(ingest: Ingest) -> Ingest:
 def recorded_cameras(frames: Sequence[Frame], grid: LocalGrid, fov_rad: float | None = None) -> Recorded:
     """Place frames as recorded.
 
-    Args:
-        frames: sorted by vehicle, then time.
-        grid: the area's grid.
-        fov_rad: theta-hat, an assumed horizontal field of view for all; None takes the pictures' tags, else the
-            default of the configuration.
+    frames: sorted by vehicle, then time. grid: the area's. fov_rad: theta-hat, an assumed horizontal field of view for
+    all; None takes the pictures' tags, else the default.
     """
     lat = np.array([f.fix.lat_deg for f in frames])
     lon = np.array([f.fix.lon_deg for f in frames])

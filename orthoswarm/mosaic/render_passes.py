@@ -102,8 +102,7 @@ class Window(NamedTuple):
 class FrameWindows(Mapping[int, list[Window]]):
     """Windows by frame, frames and tiles in order, as a few numbers each: a large map has millions of them.
 
-    Args:
-        results: of tasks, pairs of a frame and its window in a tile.
+    results: of tasks, pairs of a frame and its window in a tile.
     """
 
     def __init__(self, results: Iterable[Iterable[tuple[int, Window]]] = ()) -> None:
@@ -139,8 +138,7 @@ class LabelTask:
 
     Attributes:
         place: where. key: the tile.
-        ids: int32 (K,), indices of the candidate frames. shots: their cameras.
-        terrain: the ground there.
+        ids: int32 (K,), indices of the candidate frames. shots: their cameras. terrain: the ground there.
         again: int32, frames that turned out to be unreadable: only their pixels are labelled anew.
         seams: what seam lines are chosen by; None takes the nearest nadir point alone.
     """
@@ -195,8 +193,7 @@ def label_pass(task: LabelTask) -> list[tuple[int, Window]]:
 class FeatherTask:
     """Find or mix what lies near the seams of a tile.
 
-    Attributes:
-        place: where. key: the tile. width_px: how far from a seam pictures are mixed.
+    place: where. key: the tile. width_px: how far from a seam pictures are mixed.
     """
 
     place: TilePlace
@@ -243,9 +240,8 @@ def color_pass(task: ColorTask) -> tuple[Key, TileColors]:
 class FinishTask:
     """Level and mix a tile.
 
-    Attributes:
-        place: where. key: the tile. factors: of its pictures, None to leave them.
-        width_px: how far from a seam pictures are mixed, 0 not to.
+    place: where. key: the tile. factors: of its pictures, None to leave them. width_px: how far from a seam pictures
+    are mixed, 0 not to.
     """
 
     place: TilePlace
@@ -310,8 +306,7 @@ class Shot:
 class TaskLayer:
     """What a task has to know of one of the maps that are drawn.
 
-    Attributes:
-        place: where. shots: the cameras of the task's pictures. terrain: the ground by tile.
+    place: where. shots: the cameras of the task's pictures. terrain: the ground by tile.
     """
 
     place: TilePlace
@@ -323,9 +318,8 @@ class TaskLayer:
 class SampleTask:
     """Read pictures and colour what they won.
 
-    Attributes:
-        layers: the maps that are drawn. pictures: files, and where each goes. read: reads a picture.
-        parts: what is kept of the pictures between drawings; None to read them.
+    layers: the maps that are drawn. pictures: files, and where each goes. read: reads a picture. parts: what is kept of
+    the pictures between drawings; None to read them.
     """
 
     layers: list[TaskLayer]
@@ -398,8 +392,7 @@ class _Ground:
 class _Placed:
     """Pixels of a tile and where they lie in a picture, see pixel_sampling.place; its size and factor of reduction.
 
-    Attributes:
-        needs: what must be known of the picture to draw them.
+    needs: what must be known of the picture to draw them.
     """
 
     def __init__(

@@ -79,9 +79,8 @@ def serial(function: Callable[[Any], Any], arguments: Iterable[Any]) -> Iterable
 class DrawnGround(NamedTuple):
     """What a map covers.
 
-    Attributes:
-        area_m2: ground that was drawn. covered_share: its share of the ground that any frame sees; 1 where none does.
-        twice_share: share of its pixels that show what the same picture shows more than `TWICE_M` away as well.
+    area_m2: ground that was drawn. covered_share: its share of the ground that any frame sees; 1 where none does.
+    twice_share: share of its pixels that show what the same picture shows more than `TWICE_M` away as well.
     """
 
     area_m2: float

@@ -177,12 +177,8 @@ def label_tile(
 
     Args:
         label: int32 (rows, columns), changed in place; pixels that have a label keep it.
-        shots: the candidates.
-        marks: int32 (N,), the candidates' labels, positive and rising.
-        lattice: float32, the tile's heights, see lattice.heights.
-        west: easting of the tile's left edge.
-        north: northing of its upper edge.
-        gsd_m: ground pixel.
+        shots: the candidates. marks: int32 (N,), their labels, positive and rising.
+        lattice: float32, the tile's heights. west, north: its left and upper edge. gsd_m: ground pixel.
     """
     position, rotation = shots.about(west, north)
     limit = TAN_LIMIT**2

@@ -22,10 +22,8 @@ def coverage(cameras: Sequence[Camera], grid: GroundGrid, terrain: Terrain | Non
 
     Seen means: within the picture up to its very edge, distortion and terrain honoured, at most 75 degrees off nadir.
 
-    Args:
-        cameras: where the pictures were taken.
-        grid: the cells; metres to tens of metres wide, since the mask is in memory.
-        terrain: the ground; level at 0 if None.
+    cameras: where the pictures were taken. grid: the cells; metres to tens of metres wide, since the mask is in memory.
+    terrain: the ground; level at 0 if None.
     """
     ground = terrain or Terrain.flat()
     mask = np.zeros((grid.height, grid.width), bool)

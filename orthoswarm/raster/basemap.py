@@ -40,9 +40,7 @@ class _Source(Protocol):
 class Basemap:
     """A pre-disaster map (a `placement.MapWindow`); can be pickled and shared among threads.
 
-    Attributes:
-        path: the file or folder.
-        epsg: the area's grid, in which windows are asked for and returned.
+    path: the file or folder. epsg: the area's grid, in which windows are asked for and returned.
     """
 
     def __init__(self, path: Path, epsg: int, near: BoundingBox | None) -> None:
@@ -101,8 +99,7 @@ class Basemap:
     def require_readable(self, near: BoundingBox) -> None:
         """Raise UnreadableMapError if the opened map is truncated or damaged where it is needed.
 
-        Args:
-            near: west, south, east, north of the area in its grid, metres. Only the map's part of it counts.
+        near: west, south, east, north of the area in its grid, metres. Only the map's part of it counts.
         """
         bounds = near.intersection(self.bounds)
         if bounds.empty:

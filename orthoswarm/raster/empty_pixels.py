@@ -30,8 +30,7 @@ _LETTERS_PX: Final = 31  # gaps in a fill that letters on it make
 def range_of_ground(values: NDArray[Any]) -> tuple[float, float]:
     """Lowest and highest value that ground can have, infinite where nothing bounds it.
 
-    Args:
-        values: (n,) of pixels of the map, finite.
+    values: (n,) of pixels of the map, finite.
     """
     low, high = -np.inf, np.inf
     for _ in range(4):
@@ -65,8 +64,7 @@ def _apart(values: Array, spike: float) -> float | None:
 def fills(windows: Iterable[NDArray[Any]]) -> list[tuple[float, ...]]:
     """Colours in which a photographed map is plain without being ground.
 
-    Args:
-        windows: (bands, rows, columns) each, samples of the map at its own resolution.
+    windows: (bands, rows, columns) each, samples of the map at its own resolution.
     """
     plain, pixels = list[Array](), 0
     for window in windows:
@@ -84,8 +82,7 @@ def fills(windows: Iterable[NDArray[Any]]) -> list[tuple[float, ...]]:
 def blank(values: NDArray[Any], fills: Sequence[tuple[float, ...]] = ()) -> Flags:
     """Plain patches of a map without a mask: black or white, or of one of the fills.
 
-    Args:
-        values: (bands, rows, columns). fills: colours, a value a band.
+    values: (bands, rows, columns). fills: colours, a value a band.
     """
     dtype = values.dtype
     noise = _NOISE if dtype == np.uint8 else 0

@@ -50,9 +50,8 @@ class _Stretch:
 class RasterMap:
     """A file that GDAL reads. Handles belong to one thread of one process; each opens its own.
 
-    Attributes:
-        native_gsd_m: size of the map's own pixel on the ground of the area, metres.
-        bounds: west, south, east, north in the area's grid; of a huge map, of the part near the area.
+    native_gsd_m: size of the map's own pixel on the ground of the area, metres. bounds: west, south, east, north in the
+    area's grid; of a huge map, of the part near the area.
     """
 
     def __init__(self, path: Path, epsg: int, near: BoundingBox | None) -> None:
@@ -143,8 +142,7 @@ class RasterMap:
     def _shown(self, data: NDArray[Any], mixed_px: int) -> Flags:
         """Where values (bands, rows, columns) can be ground, bool (rows, columns).
 
-        Args:
-            mixed_px: pixels beside empty ones that are mixed with them.
+        mixed_px: pixels beside empty ones that are mixed with them.
         """
         import cv2
 

@@ -24,9 +24,8 @@ class GreyPictures:
     Grey values of pictures of at most the refiner's working size come from the colours, which are read for drawing
     anyhow; larger ones are decoded once more, reduced. Any number of processes may use a store at the same time.
 
-    Attributes:
-        folder: where the files are; an existing folder.
-        from_colors: False to decode only the grey values of small pictures, too, where colours are read elsewhere.
+    folder: where the files are; an existing folder. from_colors: False to decode only the grey values of small
+    pictures, too, where colours are read elsewhere.
     """
 
     folder: Path

@@ -52,9 +52,8 @@ _DEM_LEAST_COVER: Final = 0.02  # height model with heights on a smaller share o
 class KnownGround:
     """Heights of a DEM in a window.
 
-    Attributes:
-        terrain: heights above the model's zero; smoothly filled where the DEM has none.
-        known: bool (rows, columns), nodes where it has.
+    terrain: heights above the model's zero; smoothly filled where the DEM has none. known: bool (rows, columns), nodes
+    where it has.
     """
 
     terrain: Terrain
@@ -76,10 +75,8 @@ class HeightModel:
 
     It is small, so that it can be part of a task for another process; the file must have the same path there.
 
-    Attributes:
-        path: the file. epsg: CRS of the area.
-        zero_m: height in the DEM's own datum that counts as 0: the ground in the middle below the cameras.
-        cover: share of the area on which it has heights.
+    path: the file. epsg: CRS of the area. zero_m: height in the DEM's own datum that counts as 0: the ground in the
+    middle below the cameras. cover: share of the area on which it has heights.
     """
 
     path: Path
@@ -117,9 +114,8 @@ class HeightModel:
         It is made of the DEM's highest pixels, where `window` has the mean of those about a node, and reaches up to
         one and a half steps farther, so that what lies between nodes is not lost.
 
-        Args:
-            bounds: west, south, east, north. within_m: the distance. steps: nodes on it at least, where the DEM is
-                coarser, as far as there are not more than `most_nodes`.
+        bounds: west, south, east, north. within_m: the distance. steps: nodes on it at least, where the DEM is coarser,
+        as far as there are not more than `most_nodes`.
         """
         z, west, south, step_m = _on_area(self.path, self.epsg, bounds, most_nodes, highest_step_m=within_m / steps)
         known = np.isfinite(z)

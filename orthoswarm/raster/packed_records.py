@@ -64,8 +64,7 @@ class PackedRecords:
     def put(self, name: Path, *parts: Bytes) -> None:
         """Keep parts, one after the other, under a name; nothing happens where they cannot be written.
 
-        Args:
-            parts: C-contiguous uint8 arrays of any shape.
+        parts: C-contiguous uint8 arrays of any shape.
         """
         key, size = _key(name), sum(part.nbytes for part in parts)
         pieces = [memoryview(_HEAD.pack(key, size)), *(part.data.cast("B") for part in parts)]

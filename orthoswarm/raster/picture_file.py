@@ -34,8 +34,7 @@ _DEPTH_PICTURES: Final = 9  # pictures of a folder that tell the range of its 16
 class PictureError(OrthoSwarmError):
     """A picture cannot be decoded.
 
-    Attributes:
-        reason: the fault without the picture's name, the same for all pictures that have it.
+    reason: the fault without the picture's name, the same for all pictures that have it.
     """
 
     def __init__(self, text: str, reason: str = "") -> None:

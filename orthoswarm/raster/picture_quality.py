@@ -21,8 +21,7 @@ class PictureQuality:
 
     Attributes:
         sharpness: energy of differences over 1 pixel divided by that over 4 pixels, 0 to about 1; it hardly depends on
-            contrast and falls with every kind of blur.
-        contrast: standard deviation of the sample, grey levels.
+            contrast and falls with every kind of blur. contrast: standard deviation of the sample, grey levels.
         flat_share: share of blocks in which all pixels are equal: what a truncated JPEG or a lost slice leaves.
         saturated_share: share of pixels at 250 or above: glare, sky.
     """

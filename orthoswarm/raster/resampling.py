@@ -12,8 +12,7 @@ def resample(
     """Bring bands to another grid.
 
     Args:
-        data: uint8 (bands, rows, columns).
-        valid: bool (rows, columns), which pixels count.
+        data: uint8 (bands, rows, columns). valid: bool (rows, columns), which pixels count.
         first: left and upper edge of the answer in pixels of the data, from the data's own upper left edge.
         scale: pixels of the data in a pixel of the answer, across and down.
         size: columns and rows of the answer.

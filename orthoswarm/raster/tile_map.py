@@ -42,9 +42,8 @@ class TileMap:
     The finest level that covers the flight is the map; what it lacks comes from the levels beside it. Placeholders of
     a server, tiles of one colour and half downloads are lacking.
 
-    Attributes:
-        native_gsd_m: ground size of a pixel of that level, metres.
-        bounds: west, south, east, north of the tiles near the area, in its grid.
+    native_gsd_m: ground size of a pixel of that level, metres. bounds: west, south, east, north of the tiles near the
+    area, in its grid.
     """
 
     def __init__(self, path: Path, epsg: int, near: BoundingBox | None) -> None:

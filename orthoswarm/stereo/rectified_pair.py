@@ -38,9 +38,7 @@ _WIDE_MARGIN: Final = 0.15  # ... with this share of their range to either side,
 class PairView:
     """A picture with its camera.
 
-    Attributes:
-        camera: of the full picture.
-        gray: uint8 (rows, columns), the picture reduced by `factor` along each side.
+    camera: of the full picture. gray: uint8 (rows, columns), the picture reduced by `factor` along each side.
     """
 
     camera: Camera
@@ -190,8 +188,7 @@ def _resampled(view: PairView, frame: _Rectified, shift: int) -> tuple[Gray, Fla
 def _disparities(left: Gray, right: Gray, valid: Flags, count: int) -> Floats:
     """Disparity of each pixel of the left picture, float32 in 0 to count - 1, negative where no match is found.
 
-    Args:
-        left, right: rectified. valid: where the left one has content. count: disparities that may occur.
+    left, right: rectified. valid: where the left one has content. count: disparities that may occur.
     """
     least = 0
     if count > _WIDE_PX:

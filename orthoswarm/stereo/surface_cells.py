@@ -122,8 +122,7 @@ def merge_heights(
     """The weighted mean of the heights that agree with the median, cell by cell.
 
     Args:
-        height_m, sigma_m: (K, N), the first `count` values of a column count.
-        count: (N,).
+        height_m, sigma_m: (K, N), the first `count` values of a column count. count: (N,).
 
     Returns:
         Height, sigma (both NaN where fewer than `_LEAST_PAIRS` agree) and number of agreeing pairs. The sigma is

@@ -50,14 +50,10 @@ def surface_model(
     run: Run = serial,
     progress: Callable[[int, int], None] | None = None,
 ) -> SurfaceModel:
-    """Measure the visible surface from refined frames.
+    """Measure the visible surface from refined frames, around the terrain below them.
 
-    Args:
-        frames: with solved cameras.
-        terrain: ground below them; heights are searched around it.
-        epsg: the grid of the area. scratch: an empty folder for temporary files.
-        config: which pairs, and how far heights are searched.
-        run: runs the tasks. progress: called with the pairs done and all pairs.
+    epsg: the grid of the area. scratch: an empty folder for temporary files. config: which pairs, and how far heights
+    are searched. progress: called with the pairs done and all pairs.
 
     Raises:
         OrthoSwarmError: if no two pictures overlap enough.

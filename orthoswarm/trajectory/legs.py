@@ -23,9 +23,8 @@ def split_legs(position: Array, time_s: Array | None = None) -> Ints:
 
     Legs end at corners of the path (where it bends most, over a few frames), at jumps and at pauses.
 
-    Args:
-        position: float64 (N, 2) or (N, 3), smoothed or recorded positions in flying order, metres.
-        time_s: float64 (N,) or None; a longer gap than `PAUSE_S` ends a leg.
+    position: float64 (N, 2) or (N, 3), smoothed or recorded positions in flying order, metres. time_s: float64 (N,) or
+    None; a longer gap than `PAUSE_S` ends a leg.
     """
     turn_rad = float(np.radians(_LEG_TURN_DEG))
     n = len(position)
@@ -74,8 +73,7 @@ def _breaks(position: Array, time_s: Array | None) -> Flags:
 def leads_one_way(position: Array, leg: Ints) -> bool:
     """Whether the legs lead in one direction, but for short ways between them.
 
-    Args:
-        position: float64 (N, 2) or (N, 3) in flying order, metres. leg: int32 (N,), -1 outside legs.
+    position: float64 (N, 2) or (N, 3) in flying order, metres. leg: int32 (N,), -1 outside legs.
     """
     ways = []
     for k in range(int(leg.max()) + 1 if len(leg) else 0):
@@ -92,9 +90,8 @@ def leads_one_way(position: Array, leg: Ints) -> bool:
 def ended_legs(position: Array, time_s: Array | None = None, *, over: bool = False) -> list[tuple[int, int]]:
     """First and last frame (inclusive) of each finished leg, in order.
 
-    Args:
-        position: float64 (N, 2) or (N, 3), recorded positions in flying order so far, metres.
-        over: True if no more frames are expected, so that the last leg is finished, too.
+    position: float64 (N, 2) or (N, 3), recorded positions in flying order so far, metres. over: True if no more frames
+    are expected, so that the last leg is finished, too.
     """
     n = len(position)
     if n < 2:

@@ -32,8 +32,7 @@ def near_paths(path: Array, others: Sequence[Array]) -> list[int]:
 class NearPaths:
     """Which of many paths come near each other; of thousands of vehicles few have to be compared.
 
-    Args:
-        paths: float64 (N, 3) each, camera positions above the takeoff level.
+    paths: float64 (N, 3) each, camera positions above the takeoff level.
     """
 
     def __init__(self, paths: Sequence[Array]) -> None:

@@ -43,10 +43,8 @@ def heights(terrain: Terrain, west: float, north: float, gsd_m: float, tile_px: 
 class _Taps:
     """Where places lie between the nodes of an axis.
 
-    Attributes:
-        nodes: the nodes that are used. index: int32 (4, N), two nodes before and two after each place, from the first
-            of them on.
-        cubic, spline: float32 (4, N), their weights by cubic convolution, and by a cubic B-spline, which smooths.
+    nodes: the nodes that are used. index: int32 (4, N), two nodes before and two after each place, from the first of
+    them on. cubic, spline: float32 (4, N), their weights by cubic convolution, and by a cubic B-spline, which smooths.
     """
 
     def __init__(self, at: Array, count: int) -> None:
@@ -84,8 +82,7 @@ def _smooth(z, rows, down, columns, across, between, out):  # type: ignore[no-un
 def _find_walls(z, wall, walls):  # type: ignore[no-untyped-def]
     """Mark cells between four nodes that differ by more than a height, and those around them; whether there are any.
 
-    Args:
-        walls: uint8, a cell at the node of its least row and column, 0 before; set to _WALL or _NEAR_WALL.
+    walls: uint8, a cell at the node of its least row and column, 0 before; set to _WALL or _NEAR_WALL.
     """
     found = False
     for r in range(z.shape[0] - 1):

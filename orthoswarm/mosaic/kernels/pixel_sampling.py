@@ -140,21 +140,13 @@ def _columns_of(rows, chosen):  # type: ignore[no-untyped-def]
 
 @kernel
 def place(label, mark, window, position, rotation, lens, lattice, gsd, size, factor):  # type: ignore[no-untyped-def]
-    """Find a tile's pixels of one label in a picture.
-
-    The projection is render_arrays.project.
+    """Find a tile's pixels of one label in a picture, by the projection of render_arrays.
 
     Args:
-        label: int32 (T, T).
-        mark: the label.
-        window: int32 (4,), row0, row1, col0, col1 that hold the label.
-        position: float64 (3,), the camera in the tile's frame, see lattice.Shots.about.
-        rotation: float64 (3, 3), ground to camera.
-        lens: float64 (18,), see lattice.
-        lattice: float32, the tile's heights.
-        gsd: ground pixel, metres.
-        size: int32 (2,), columns and rows of the reduced picture.
-        factor: by which the picture is reduced.
+        label: int32 (T, T). mark: the label. window: int32 (4,), row0, row1, col0, col1 that hold it.
+        position, rotation, lens: the camera in the tile's frame, (3,), (3, 3), (18,), see render_arrays.Shots.about.
+        lattice: float32, the tile's heights. gsd: ground pixel, metres.
+        size: int32 (2,), columns and rows of the picture reduced by `factor`.
 
     Returns:
         For N pixels that the picture shows: int32 (N,), their numbers in the tile; int32 (2, N), their columns and rows
@@ -206,8 +198,7 @@ def widen(part, corner, box, size, lanes):  # type: ignore[no-untyped-def]
     """The colours in a box of a picture and around it as one word each; at the picture's border they repeat.
 
     Args:
-        part: uint8 (H, W, 3), a part of the picture.
-        corner: int32 (2,), column and row of its corner.
+        part: uint8 (H, W, 3), a part of the picture. corner: int32 (2,), column and row of its corner.
         box: int32 (4,), see `place`; `part` holds it, with BEFORE and AFTER as far as the picture goes.
         size: int32 (2,), columns and rows of the whole picture.
         lanes: int64 (rows, columns) of the box with BEFORE and AFTER added, set.

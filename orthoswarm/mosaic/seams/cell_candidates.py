@@ -61,9 +61,8 @@ class CandidateCells:
 class Region:
     """A square of cells on the ground.
 
-    Attributes:
-        west: easting of its left edge. north: northing of its upper edge. gsd_m: ground pixel. cell_px: pixels a cell.
-        side: cells a side. lattice: float32, its heights, see render_arrays.heights.
+    west: easting of its left edge. north: northing of its upper edge. gsd_m: ground pixel. cell_px: pixels a cell.
+    side: cells a side. lattice: float32, its heights, see render_arrays.heights.
     """
 
     west: float
@@ -77,11 +76,8 @@ class Region:
 def cell_candidates(region: Region, shots: Shots, tone: Floats, previews: Previews) -> CandidateCells:
     """The candidates of a region's cells.
 
-    Args:
-        region: the cells.
-        shots: N pictures that may see it.
-        tone: float32 (N, 6), factor of brightness over each picture (mean of the rows of radiometry.Field).
-        previews: of the N pictures; one that has none is not a candidate.
+    region: the cells. shots: N pictures that may see it. tone: float32 (N, 6), factor of brightness over each picture
+    (mean of the rows of radiometry.Field). previews: of the N pictures; one that has none is not a candidate.
     """
     position, rotation = shots.about(region.west, region.north)
     height = float(np.median(position[:, 2] - float(np.median(region.lattice)))) if len(position) else 1.0

@@ -57,8 +57,7 @@ class CellSize:
 def cell_size(picture_px: float, tile_px: int, map_px: int) -> CellSize:
     """Cells for a map: about `_LEVEL_CELLS` across a picture.
 
-    Args:
-        picture_px: width of a picture, pixels of the map. tile_px: side of the tiles. map_px: pixels of the map.
+    picture_px: width of a picture, pixels of the map. tile_px: side of the tiles. map_px: pixels of the map.
     """
     wanted = max(picture_px / _LEVEL_CELLS, float(np.sqrt(map_px / _LEVEL_MOST_CELLS)), 4.0)
     fitting = [px for px in range(1, tile_px + 1) if tile_px % px == 0]
@@ -102,10 +101,8 @@ def tile_colors(key: Key, tile: Tile, other: Tile | None, cell_px: int) -> TileC
 class TileFactors:
     """Factors of the pictures of a tile.
 
-    Attributes:
-        cell_px: side of the cells.
-        labels: int32 (R + 2, C + 2, SLOTS), pictures in the tile's cells and one beyond each border, 0 = none.
-        factors: float32 (R + 2, C + 2, SLOTS, 3), of their red, green and blue.
+    cell_px: side of the cells. labels: int32 (R + 2, C + 2, SLOTS), pictures in the tile's cells and one beyond each
+    border, 0 = none. factors: float32 (R + 2, C + 2, SLOTS, 3), of their red, green and blue.
     """
 
     cell_px: int
@@ -120,8 +117,7 @@ class TileFactors:
 class Leveling:
     """The correction of a whole map.
 
-    Args:
-        tiles: of all its tiles. columns: cells across the map (whole tiles). cells: their size.
+    tiles: of all its tiles. columns: cells across the map (whole tiles). cells: their size.
     """
 
     def __init__(self, tiles: Sequence[TileColors], columns: int, cells: CellSize) -> None:

@@ -37,9 +37,7 @@ _GLARE_SHARE: Final = 0.05  # a block of the preview with a larger share of glar
 class PreviewFile:
     """The previews of a set of pictures.
 
-    Attributes:
-        path: the file, made by `create`.
-        row: image -> number of its record.
+    path: the file, made by `create`. row: image -> number of its record.
     """
 
     path: Path
@@ -117,8 +115,7 @@ class Previews:
         gray: uint8 (M, ROWS, COLUMNS), grey copies of all pictures of the file, mapped and not read.
         rows: int32 (N,), which of them are meant.
         contrast: float32 (N, ROWS / BLOCK_PX, COLUMNS / BLOCK_PX), of the parts of the pictures, levels.
-        sharpness: float32 (N,), see picture_quality.
-        written: bool (N,), whether there is a preview.
+        sharpness: float32 (N,), see picture_quality. written: bool (N,), whether there is a preview.
     """
 
     gray: Bytes

@@ -34,10 +34,8 @@ _BLOCK_OFFSETS: Final = (0, 2, 1, 0)  # where the first of these blocks begins, 
 def relax(cells: CandidateCells, fixed: Ints, standing_m: Floats) -> Ints:
     """Labels int32 (rows, columns) of cells: indices of shots, NONE where there is no candidate.
 
-    Args:
-        cells: the candidates.
-        fixed: int32 (rows, columns), labels that are settled already (FOREIGN included), NONE elsewhere.
-        standing_m: float32 (rows, columns), height over the bare ground.
+    cells: the candidates. fixed: int32 (rows, columns), labels that are settled already (FOREIGN included), NONE
+    elsewhere. standing_m: float32 (rows, columns), height over the bare ground.
     """
     label = np.where(fixed == NONE, cells.candidate[..., 0], fixed).astype(np.int32)
     held = fixed != NONE
@@ -154,10 +152,8 @@ def _sweep(label, held, candidate, cost, level, scale, over, costs, side, offset
 def to_pixels(label, candidate, cell, border, pixels):  # type: ignore[no-untyped-def]
     """Draw the labels of cells (plus 1) on the pixels of a tile, seams rounded: each pixel by the nearest cells' vote.
 
-    Args:
-        label: int32 (side, side) of the region. candidate: its candidates. cell: pixels a cell.
-        border: cells of the region beyond the tile, to each side.
-        pixels: int32 (rows, columns), the tile; changed where a cell has a label.
+    label: int32 (side, side) of the region. candidate: its candidates. cell: pixels a cell. border: cells of the region
+    beyond the tile, to each side. pixels: int32 (rows, columns), the tile; changed where a cell has a label.
     """
     rows, columns = pixels.shape
     last = label.shape[0] - 1

@@ -44,8 +44,7 @@ class SeamCells:
 def cell_size_px(picture_width: int, picture_gsd_m: float, gsd_m: float) -> int:
     """Side of the cells, pixels of the map (within `_CELL_PX`): about a pixel of the previews.
 
-    Args:
-        picture_width: columns of the pictures. picture_gsd_m: their ground pixel at nadir. gsd_m: the map's.
+    picture_width: columns of the pictures. picture_gsd_m: their ground pixel at nadir. gsd_m: the map's.
     """
     wanted = picture_width / COLUMNS * picture_gsd_m / gsd_m
     size = 2 ** round(float(np.log2(max(wanted, 1.0))))

@@ -21,9 +21,8 @@ LEAST_DEPTH_M = 1e-3
 class CameraBlock:
     """Cameras of one or several vehicles in a local frame (east, north, up about a common origin, metres).
 
-    Attributes:
-        position: float64 (N, 3). rotation: float64 (N, 3, 3), camera to ground (columns are the camera's x, y, z axes).
-        lens_id: int32 (N,), row of `lens`, float64 (L, 8), columns F, K1, K2, K3, CX, CY, WIDTH, HEIGHT.
+    position: float64 (N, 3). rotation: float64 (N, 3, 3), camera to ground (columns are the camera's x, y, z axes).
+    lens_id: int32 (N,), row of `lens`, float64 (L, 8), columns F, K1, K2, K3, CX, CY, WIDTH, HEIGHT.
     """
 
     position: Array
@@ -83,10 +82,8 @@ class CameraBlock:
 class Tracks:
     """Observations of tie points in pictures, from tracked corners or matched features, in any order.
 
-    Attributes:
-        camera: int32 (M,), index of the camera. point: int32 (M,), id of the track, 0..P-1.
-        uv: float64 (M, 2), column and row, distorted as in the picture, pixel centres at integers.
-        sigma_px: float32 (M,), one sigma.
+    camera: int32 (M,), index of the camera. point: int32 (M,), id of the track, 0..P-1. uv: float64 (M, 2), column and
+    row, distorted as in the picture, pixel centres at integers. sigma_px: float32 (M,), one sigma.
     """
 
     camera: Ints

@@ -73,9 +73,8 @@ class Priors:
 class Layout:
     """Columns of the common unknowns: lenses, then for each group bias (3), height, lag, drift knots (east, north).
 
-    Attributes:
-        lens_columns: 6 L. offset: first column of each group. knots: knots of each group. size: all columns.
-        knot_left: int32 (N,), index of the knot before each camera; knot_fraction: float64 (N,) of the way to the next.
+    lens_columns: 6 L. offset: first column of each group. knots: knots of each group. size: all columns. knot_left:
+    int32 (N,), index of the knot before each camera; knot_fraction: float64 (N,) of the way to the next.
     """
 
     lens_columns: int

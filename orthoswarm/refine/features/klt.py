@@ -100,9 +100,8 @@ def add_gradients(typing, wide, gradient, sums):  # type: ignore[no-untyped-def]
 def add_residuals(typing, under, wide, gradient, part_u, part_v, sums):  # type: ignore[no-untyped-def]
     """What a template differs from a picture by, e: sums of gx e, gy e, e, e e over its columns, (5, LANES).
 
-    Args:
-        under: float32 (SIZE + 1, LANES + 1), the picture from the pixel before the window's place on.
-        wide, gradient: of the template, see `add_gradients`. part_u, part_v: float32, part of a pixel to the place.
+    under: float32 (SIZE + 1, LANES + 1), the picture from the pixel before the window's place on. wide, gradient: of
+    the template, see `add_gradients`. part_u, part_v: float32, part of a pixel to the place.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:

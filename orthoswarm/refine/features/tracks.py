@@ -277,11 +277,10 @@ def _oldest_per_cell(uv, age, ident, cols, size):  # type: ignore[no-untyped-def
 def measured_homography(previous: Gray | None, gray: Gray, uv: Floats, predicted: Array) -> Array | None:
     """The homography that most of a flow over several octaves agrees on; None without agreement.
 
-    For a swaying camera whose angles are degrees off or not recorded. Starts from the prediction and, if that finds no
-    consensus (a heading more than ten degrees off), from no motion; after that from ORB corners.
+    For a swaying camera whose angles are degrees off or not recorded. From the prediction and, without a consensus (a
+    heading more than ten degrees off), from no motion; after that from ORB corners.
 
-    Args:
-        uv: float32 (K, 2), corners of the previous picture. predicted: 3x3 homography from its pixels.
+    uv: float32 (K, 2), corners of the previous picture. predicted: 3x3 homography from its pixels.
     """
     if previous is None or len(uv) < _HOMOGRAPHY_LEAST:
         return None
@@ -348,9 +347,8 @@ def is_inside(uv: Floats, shape: tuple[int, ...]) -> Flags:
 def predicted_homography(before: Array, after: Array, height_m: float, step: Array, matrix: Array) -> Array:
     """The homography of flat ground from one picture's pixels to the next one's, predicted from their records.
 
-    Args:
-        before, after: (3, 3) rotations, camera to ground. height_m: of the earlier camera above the ground.
-        step: (3,) its movement in metres, east, north, up. matrix: 3x3 calibration matrix.
+    before, after: (3, 3) rotations, camera to ground. height_m: of the earlier camera above the ground. step: (3,) its
+    movement in metres, east, north, up. matrix: 3x3 calibration matrix.
     """
     upward = before[2]  # the ground's normal in the earlier camera's axes
     relative = after.T @ before + np.outer(after.T @ step, upward) / height_m
@@ -362,9 +360,8 @@ def follow(
 ) -> tuple[Tracks, Array]:
     """The tracks of corners through pictures 0 .. count - 1, and the share that survived into each, float64 (count,).
 
-    Args:
-        read: returns picture i at working scale. cell_px: see Tracker.
-        prediction: 3x3 homography from picture i - 1 to i, None where tracking starts afresh.
+    read: returns picture i at working scale. cell_px: see Tracker. prediction: 3x3 homography from picture i - 1 to i,
+    None where tracking starts afresh.
     """
     tracker = Tracker(cell_px=cell_px)
     survived = np.ones(count)
@@ -377,8 +374,7 @@ def follow(
 def strongest(gray, empty, size, top, left, uv):  # type: ignore[no-untyped-def]
     """The strongest corner of each wanted cell, into uv float32 (K, 2), column and row; returns how many.
 
-    Args:
-        gray: uint8 (rows, columns). empty: bool, which cells are wanted. size: of a cell; top, left: of the first one.
+    gray: uint8 (rows, columns). empty: bool, which cells are wanted. size: of a cell; top, left: of the first one.
     """
     cells, cols = empty.shape[1], gray.shape[1]
     best, where, score = np.empty(cells, np.float32), np.empty((cells, 2), np.int64), np.empty(cols, np.float32)

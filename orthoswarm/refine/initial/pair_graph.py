@@ -39,10 +39,8 @@ _HEADER_SIZE_SHARE: Final = 0.02  # a picture's shape may differ from its header
 class PairGraphBuilder:
     """Features and matches of N photos, extended step by step.
 
-    Attributes:
-        run: executes the feature and matching tasks; results do not depend on it.
-        progress: called with stage, number done, total.
-        tried: pair -> match (empty where it failed). damaged: photo -> why it cannot be read.
+    run: executes the feature and matching tasks; results do not depend on it. progress: called with stage, number done,
+    total. tried: pair -> match (empty where it failed). damaged: photo -> why it cannot be read.
     """
 
     frames: Sequence[Frame]

@@ -36,9 +36,8 @@ _SHAPE_ROBUST_SCALE: Final = 2.0  # a match's weight falls to a quarter at so ma
 class PairMatches:
     """Matches of all pairs in one array: of pair e, rows start[e] to start[e + 1].
 
-    Attributes:
-        first: int32 (E,), photo; second: int32 (E,). start: int64 (E + 1,). count: int64 (E,), all matches of a pair.
-        p: complex (M,), pixels in the first about its centre, y up; q: in the second.
+    first: int32 (E,), photo; second: int32 (E,). start: int64 (E + 1,). count: int64 (E,), all matches of a pair. p:
+    complex (M,), pixels in the first about its centre, y up; q: in the second.
     """
 
     first: Ints
@@ -74,9 +73,8 @@ class PairMatches:
 class TiltAndLens:
     """Tilt and lens found from the shapes of matches.
 
-    Attributes:
-        level: float64 (N, 3, 3), camera to level camera. tilt_sigma: float64 (S,), radians.
-        log_focal: float64 (L,), of the focal length in pixels; log_focal_sigma: float64 (L,). k1: float64 (L,).
+    level: float64 (N, 3, 3), camera to level camera. tilt_sigma: float64 (S,), radians. log_focal: float64 (L,), of the
+    focal length in pixels; log_focal_sigma: float64 (L,). k1: float64 (L,).
     """
 
     level: Array

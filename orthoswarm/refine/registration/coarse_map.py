@@ -57,9 +57,8 @@ to 0.5 m at 10 m."""
 class CoarseMapShift:
     """One shift of a block onto a coarse map of pixel gsd_m: metres to add, and their sigma, an axis.
 
-    Attributes:
-        confidence: 1 minus the ratio of the second peak to the first.
-        false_matches: expected number of peaks as high on a map of other ground.
+    confidence: 1 minus the ratio of the second peak to the first. false_matches: expected number of peaks as high on a
+    map of other ground.
     """
 
     east: float

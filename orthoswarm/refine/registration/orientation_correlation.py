@@ -48,9 +48,8 @@ _STACK_MAP_SHARE: Final = 0.7  # least share of the search area that the map cov
 class Match:
     """A window of consecutive pictures found on the map.
 
-    Attributes:
-        first, last: its pictures (inclusive). shift: (2,) east, north: what has to be added to the cameras, metres.
-        peak: correlation. ratio: second peak / peak (small is sure).
+    first, last: its pictures (inclusive). shift: (2,) east, north: what has to be added to the cameras, metres. peak:
+    correlation. ratio: second peak / peak (small is sure).
     """
 
     first: int
@@ -248,15 +247,12 @@ def _edges(strip: Strip) -> tuple[OrientationField, OrientationField] | None:
 
 
 def stacked(strips: Sequence[Strip]) -> tuple[Array, float, float] | None:
-    """Where strips of one flight lie on the map if one shift is right for all of them, by the sum of what each says.
+    """Where strips of one flight, at one pixel size and reach, lie on the map by the sum of what each says.
 
-    Strips that all lie a little wrong among themselves (tilt, field of view and drift are not known yet) have low and
+    Strips that lie a little wrong among themselves (tilt, field of view and drift are not known yet) have low and
     ragged peaks, each near the right place: blurred and summed they make one that stands out. Of 96 flights of 42
     pictures the windows of 37 had no consensus; 20 of those pass here, all at the right place, and none of 288 maps of
-    other ground (mirrored ones; the highest stood 4.6 standard deviations out).
-
-    Args:
-        strips: of one flight, at the same pixel size and reach.
+    other ground.
 
     Returns:
         Shift (2,) east, north in metres, peak in standard deviations of the rest, ratio of second peak to peak: a guess

@@ -61,9 +61,8 @@ _GRADIENT_FLOOR: Final = np.float32(1e-3)  # least median gradient, grey values:
 class LoadedMap:
     """Grey map of an area in a local frame, in memory at one pixel size.
 
-    Attributes:
-        west, north: edges in the local frame (grid minus origin), metres. gsd_m: pixel.
-        gray: uint8 (rows, columns). valid: bool (rows, columns).
+    west, north: edges in the local frame (grid minus origin), metres. gsd_m: pixel. gray: uint8 (rows, columns). valid:
+    bool (rows, columns).
     """
 
     west: float
@@ -177,8 +176,7 @@ def _by_picture(ascending: NDArray[np.integer]) -> Iterator[tuple[int, slice]]:
 def vote_lean(matches: MapMatches, height: Array, offset: Array) -> tuple[float, float] | None:
     """The map's lean, metres of shift east and north per metre of height, from roofs; None where too few of them agree.
 
-    Args:
-        height: float64 (Q,) of each matched point above the ground. offset: float64 (2,) shift of ground points now.
+    height: float64 (Q,) of each matched point above the ground. offset: float64 (2,) shift of ground points now.
     """
     if len(height) < _LEAN_FEWEST:
         return None
@@ -221,9 +219,8 @@ def link_legs(
 ) -> tuple[Ints, Ints, Array]:
     """Find points of one leg in the pictures of other legs: camera (K,), point (K,), pixel (K, 2) of new observations.
 
-    Args:
-        camera: (P,) reference picture of each point. leg: (N,) of each camera. candidates: cameras that may be linked.
-        most: other legs in which a point is observed, None: as configured. reach: search in pixels.
+    camera: (P,) reference picture of each point. leg: (N,) of each camera. candidates: cameras that may be linked.
+    most: other legs in which a point is observed, None: as configured. reach: search in pixels.
     """
     most, half = most or _LINK_PICTURES, _LINK_HALF_PX
     chosen = chosen[np.argsort(camera[chosen], kind="stable")]
@@ -356,10 +353,8 @@ def _views_of_other_legs(  # type: ignore[no-untyped-def]
 
     Of each leg the picture whose nadir is nearest, the nearest legs first.
 
-    Args:
-        own_leg: int64 (K,), the leg of each point. leg: int64 (N,), of each camera, 0 to legs - 1.
-        candidates: int64 (C,), cameras that may be taken.
-        views: int64 (K, V) out, cameras; -1 where there are no more.
+    own_leg: int64 (K,), the leg of each point. leg: int64 (N,), of each camera, 0 to legs - 1. candidates: int64 (C,),
+    cameras that may be taken. views: int64 (K, V) out, cameras; -1 where there are no more.
     """
     margin = _LINK_MARGIN_PX
     nearest, which = np.empty(legs), np.empty(legs, np.int64)

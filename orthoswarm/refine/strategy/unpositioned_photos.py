@@ -1,8 +1,7 @@
 """Photos without a recorded position (kites, old cameras, lost tags), placed by surveyed points that they show.
 
 The pictures tell how the photos lie to each other (`free_network`), surveyed points and the positions of other photos
-where on the ground. What comes out is a recorded position and heading with a sigma, as a receiver's would be: the
-refiner then adjusts these photos like all others.
+where on the ground. The result is a position and heading with a sigma, as a receiver's, for the refiner to adjust.
 """
 
 from collections.abc import Sequence
@@ -51,10 +50,8 @@ def place_unpositioned(
 ) -> PlacedPhotos:
     """Give photos the positions and angles that surveyed points and other photos tell.
 
-    Args:
-        photos: without positions (their latitude and longitude are NaN), of a vehicle in order of time.
-        positioned: photos with positions, which may show the same ground.
-        points: surveyed, with their marks in photos of either kind.
+    photos: without positions (their latitude and longitude are NaN), of a vehicle in order of time. positioned: photos
+    with positions, which may show the same ground. points: surveyed, with their marks in photos of either kind.
     """
     places = _known_places(positioned, points)
     if not photos or not len(places):

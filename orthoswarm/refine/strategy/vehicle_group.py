@@ -54,9 +54,8 @@ def common_terrain(
 
     A given height model is shifted to their level; where the points contradict it, a warning says so.
 
-    Args:
-        states: vehicles that are drawn: what stands on the ground is measured where they have found raised points.
-        others: more that the ground is common to. near_own: without the ground of others alone.
+    states: vehicles that are drawn: what stands on the ground is measured where they have found raised points. others:
+    more that the ground is common to. near_own: without the ground of others alone.
     """
     own, states = states, [*states, *others]
     if not states:

@@ -103,10 +103,8 @@ _DECENTRED_SHARE: Final = 0.02
 class RefinerOptions:
     """How the refiner works.
 
-    Attributes:
-        dem: given height model, None to find the ground. read: reads a frame's grey picture; picklable.
-        kept: where tracks are kept for a refinement of the same pictures, None if they are not.
-        device: where networks run.
+    dem: given height model, None to find the ground. read: reads a frame's grey picture; picklable. kept: where tracks
+    are kept for a refinement of the same pictures, None if they are not. device: where networks run.
     """
 
     dem: HeightModel | None = None
@@ -357,11 +355,10 @@ def registered_by(item: tuple[VehicleState, CoarseFit | None], *, area: WorkArea
 def _onto_map(
     state: VehicleState, fits: Iterable[CoarseFit], basemap: MapWindow, origin: Array, watch: Stopwatch
 ) -> bool:
-    """Register a flight at the first coarse registration that tie points confirm.
+    """Register a flight at the first coarse registration that tie points confirm; whether one was confirmed.
 
-    The flight stays as it was where none is confirmed, or where the confirmed one would need another field of view than
-    its pictures alone gave and its new tie points do not prove that: tags may have misled the pictures, no tag makes
-    the map agree. Returns whether one was confirmed.
+    The flight stays as it was where the confirmed one would need another field of view than its pictures alone gave and
+    its new tie points do not prove that: tags may have misled the pictures, no tag makes the map agree.
     """
     flight = state.flight
     before, ground_alone, sigma = flight.adjustment.copy(), state.surface, state.fov_sigma_deg
@@ -391,8 +388,7 @@ def _onto_map(
 def _proven(flight: FlightBlock, matches: MapMatches, false_matches: float) -> bool:
     """Whether new tie points of a flight that lies on the map speak for its place more than the first ones did.
 
-    Args:
-        matches: the new ones. false_matches: expected number of false matches behind the first.
+    matches: the new ones. false_matches: expected number of false matches behind the first.
     """
     first = float(np.log10(max(false_matches, float(np.finfo(float).tiny))))
     return evidence_log10(flight, matches, tie_half_m(flight), TIE_REACH_M) <= _NEW_EVIDENCE * first

@@ -1,9 +1,8 @@
 """Ground shaped by the user's height model (DEM), corrected where the pictures contradict it.
 
-The model's vertical datum differs from heights above takeoff, and it may be old (before a debris flow),
-coarse, or not cover the area. So a smooth surface is fitted to the points' heights above the model. Where
-that surface is level, as with a correct model, it is one vertical shift and the model's shape is used; where it is not,
-the pictures are used. A model that explains none of the relief is ignored.
+The model's vertical datum differs from heights above takeoff, and it may be old, coarse, or not cover the area. So a
+smooth surface is fitted to the points' heights above the model. Where that is level, it is one vertical shift and the
+model's shape is used; elsewhere the pictures are used. A model that explains none of the relief is ignored.
 """
 
 from dataclasses import dataclass, field, replace

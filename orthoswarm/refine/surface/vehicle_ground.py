@@ -117,10 +117,8 @@ def fit_ground(
 def mapped_ground_level(terrain: Terrain | None, camera_position: Array, dense: Sequence[Array]) -> float:
     """Median height of the mapped ground, metres, in the datum of the cameras (N, 3); 0 without a terrain.
 
-    Points lie on the ground and on rubble, hedges and cars, which only raise them: so the open ground is at the lower
-    flank of their heights (`lower_flank`). On level ground these are heights above zero, else heights above the
-    terrain, whose median below the cameras and around them is added.
-
+    Rubble, hedges and cars only raise points: so the open ground is at the lower flank of their heights. On level
+    ground these are heights above zero, else above the terrain, whose median below and around the cameras is added.
     dense: ground points (K, 3) at free positions (not at corners), one array per vehicle.
     """
     if terrain is None or not len(camera_position):

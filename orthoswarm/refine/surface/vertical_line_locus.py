@@ -1,10 +1,9 @@
 """Ground points between tie points: the vertical line locus method with several pictures.
 
-At a free position the picture nearest to nadir is the reference. Partners before and behind it on the same leg
-(where the leg ends too early, pictures of other legs) are compared with it at every height. A patch of the reference
-is rectified on the local plane of the terrain, and so is a strip of each partner along its epipolar line on that plane:
-there a change of height is a shift, so each picture is sampled once and all heights are tested by one correlation along
-the strip. Pictures are read one after the other along the legs, with only a window of them in memory.
+At a free position the picture nearest to nadir is the reference. Partners before and behind it on the same leg (where
+it ends too early, pictures of other legs) are compared with it at every height. A patch of the reference is rectified
+on the local plane of the terrain, and so is a strip of each partner along its epipolar line there, on which a change of
+height is a shift. Pictures are read one after the other along the legs, with only a window of them in memory.
 """
 
 from collections.abc import Callable, Sequence
