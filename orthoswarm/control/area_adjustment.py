@@ -14,8 +14,7 @@ import numpy as np
 from orthoswarm.model.arrays import Array
 from orthoswarm.model.plane_similarity import Similarity, design
 
-_HELD = 1e-6
-"""Sigma of what does not move, metres (or radians)."""
+_HELD = 1e-6  # sigma of what does not move, metres (or radians)
 
 _AREA_SHIFT_SIGMA_M: Final = 1.0
 """How well an area's receivers tell its place, an axis, and its level; over its extent the same of its turn and scale:

@@ -16,8 +16,7 @@ from orthoswarm.evaluation.point_rays import MISTAKE_PROBABILITY
 from orthoswarm.model.arrays import Array
 from orthoswarm.model.plane_similarity import Similarity
 
-_HALVINGS = 20
-"""Of a bracket of a kilometre, to a millimetre."""
+_HALVINGS = 20  # of a bracket of a kilometre, to a millimetre
 
 _SCATTER_FEWEST: Final = 5  # fewest points without a stated sigma whose scatter is estimated
 _SHIFT_SIGMA_M: Final = 100.0  # what is known of the shift before the control points: nothing, so that they decide it

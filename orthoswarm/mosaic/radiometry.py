@@ -43,8 +43,7 @@ _COMMON, _OWN = 11, 6
 curvatures."""
 
 
-_PARTS = 8
-"""Parts in which samples are summed, at most so many threads (chosen)."""
+_PARTS = 8  # parts in which samples are summed, at most so many threads (chosen)
 
 _ROBUST_SIGMAS: Final = 3.0  # scale of the Geman-McClure kernel on these ratios, sigmas
 _VEHICLE_SIGMA: Final = 0.30  # log gain of a vehicle's camera: another exposure or white balance

@@ -33,12 +33,9 @@ from orthoswarm.stores.local_copies import copy_ahead
 
 Read = Callable[[Path], Bytes]
 
-THUMBNAIL = (12, 16)
-"""Rows and columns of a picture's thumbnail."""
-TWICE_M: Final = 0.5
-"""What a picture shows at places farther apart than this is drawn twice, metres."""
-_NUMBERS = 8
-"""Frame, row and column of the tile, rows and columns of the window (4), pixels."""
+THUMBNAIL = (12, 16)  # rows and columns of a picture's thumbnail
+TWICE_M: Final = 0.5  # what a picture shows at places farther apart than this is drawn twice, metres
+_NUMBERS = 8  # frame, row and column of the tile, rows and columns of the window (4), pixels
 _SPOT_PX: Final = 2  # pixels of a picture along each side that count as one
 _TILES_MB: Final = 64.0  # memory that a drawing task keeps of the tiles that it writes
 

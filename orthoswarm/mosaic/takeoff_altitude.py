@@ -17,8 +17,7 @@ from orthoswarm.model.placement import PlacedFrame
 from orthoswarm.model.robust import mad_sigma
 from orthoswarm.trajectory.near_paths import NearPaths
 
-_LEVELS_M = (-500.0, 9000.0)
-"""Lowest and highest ground that can be true, metres."""
+_LEVELS_M = (-500.0, 9000.0)  # lowest and highest ground that can be true, metres
 
 _VERTICAL_SIGMAS: Final = 2.0
 """Sigma of a recorded altitude over that of the recorded place (an axis): satellites stand on one side of the receiver

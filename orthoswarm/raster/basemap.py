@@ -6,7 +6,7 @@ alpha, nodata, a rotated or different grid) are returned as 8-bit values and a v
 
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -21,22 +21,6 @@ from orthoswarm.stores.addresses import address_of
 from orthoswarm.stores.listing import exists
 
 
-class _Source(Protocol):
-    """A source of pixels: a raster file or a folder of tiles."""
-
-    native_gsd_m: float
-    bounds: BoundingBox
-
-    def gsds(self) -> list[float]:
-        """A pixel size for each of the resolutions that are stored, metres."""
-
-    def require_complete(self, bounds: BoundingBox) -> None:
-        """Raise UnreadableMapError if the file is too short for its blocks within bounds."""
-
-    def read(self, grid: GroundGrid, gray: bool) -> tuple[Bytes, Flags]:
-        """Values uint8 (bands, rows, columns), one or three bands (one if grey is enough), and their validity."""
-
-
 class Basemap:
     """A pre-disaster map (a `placement.MapWindow`); can be pickled and shared among threads.
 
@@ -49,7 +33,7 @@ class Basemap:
         self._near = near
 
     @cached_property
-    def _source(self) -> _Source:
+    def _source(self) -> RasterMap | TileMap:
         """The open map; a copy in another process opens its own at its first use, where an error can be reported."""
         is_tiles = self.path.is_dir() or self.path.suffix.lower() == ".mbtiles"
         kind = TileMap if is_tiles else RasterMap

@@ -36,8 +36,7 @@ _MOST_WORDS = max(len(unit.split()) for unit in _METRES)
 _NO_UNIT = frozenset({"unknown", "none", "unitless", "1"})
 """Words of a unit that states none: metres, as where it is empty."""
 
-_BETWEEN_NODES = 1.5
-"""How far the nodes around a place and the node of a pixel are from them, together, in steps."""
+_BETWEEN_NODES = 1.5  # how far the nodes around a place and the node of a pixel are from them, together, in steps
 
 _DEM_FINEST_M: Final = 2.0  # finest distance of the nodes on which a height model is read
 _DEM_MEAN_STEPS: Final = 0.7  # where its pixels are smaller than so many distances of nodes, a node has their mean ...

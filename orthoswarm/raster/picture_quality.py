@@ -11,8 +11,7 @@ from orthoswarm.model.arrays import Bytes
 
 _BLOCK_PX = 16
 _COLUMNS, _ROWS = 12, 9
-LEAST_SIDE_PX = _BLOCK_PX + 8
-"""Smaller pictures cannot be judged."""
+LEAST_SIDE_PX = _BLOCK_PX + 8  # smaller pictures cannot be judged
 
 
 @dataclass(frozen=True, slots=True)

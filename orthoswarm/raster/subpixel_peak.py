@@ -4,8 +4,7 @@ import numpy as np
 
 from orthoswarm.compute.jit import in_place_kernel, kernel
 
-_STRAIGHT = 1e-9
-"""Less bend than this is rounding (correlations are of order one): the sample itself is the top."""
+_STRAIGHT = 1e-9  # less bend than this is rounding (correlations are of order one): the sample itself is the top
 
 
 @in_place_kernel

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import numpy as np
 from pyproj import Transformer
@@ -26,7 +26,7 @@ _COVERS_SHARE: Final = 0.5  # of what any level shows of the flight: a level wit
 _LEVELS: Final = 3  # a hole is filled from so many levels on either side; eight times coarser is no map of its place
 _MOST_COMPARED: Final = 10_000  # tiles that are looked at for placeholders (time)
 Tiles = dict[tuple[int, int], Any]
-"""Column and row of a zoom level -> what `TileSource.read` needs to find the tile."""
+"""Column and row of a zoom level -> what `read` of the set needs to find the tile."""
 Ranges = Callable[[int], tuple[int, int, int, int]]
 """Zoom -> first and last column, first and last row (from the north), inclusive."""
 
@@ -264,20 +264,7 @@ def _decode(data: bytes) -> Bytes | None:
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGBA if image.shape[2] == 3 else cv2.COLOR_BGRA2RGBA))
 
 
-class TileSource(Protocol):
-    """A set of tiles."""
-
-    def tiles(self, near: Ranges | None) -> dict[int, Tiles]:
-        """Zoom -> its tiles, rows as the set counts them; where the set is large, only those of ranges."""
-
-    def read(self, key: Any) -> bytes:
-        """The content of a tile."""
-
-    def signature(self, key: Any) -> tuple[int, bytes]:
-        """Length and a part of a tile, by which two that are alike are found."""
-
-
-def _placeholders(source: TileSource, keys: Iterable[Any]) -> set[Any]:
+def _placeholders(source: "_Folder | _Mbtiles", keys: Iterable[Any]) -> set[Any]:
     """Tiles that stand for what a server did not have: two photographs are never alike, these are."""
     signatures = {key: source.signature(key) for key in keys}
     count = Counter(signatures.values())
@@ -296,6 +283,8 @@ def _is_whole(data: bytes) -> bool:
 
 
 class _Folder:
+    """Tiles in a folder z/x/y; rows as it counts them."""
+
     def __init__(self, path: Path) -> None:
         self._path = path
 
@@ -315,6 +304,7 @@ class _Folder:
         return key.read_bytes()
 
     def signature(self, key: Path) -> tuple[int, bytes]:
+        """Length and a part of a tile, by which two that are alike are found."""
         size = key.stat().st_size
         with key.open("rb") as file:
             file.seek(size // 2)
@@ -322,7 +312,7 @@ class _Folder:
 
 
 class _Mbtiles:
-    """Rows are counted from the north, although the file counts them from the south."""
+    """Tiles of a file, of a large one those of ranges; rows from the north, though the file counts from the south."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

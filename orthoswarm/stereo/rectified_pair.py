@@ -15,8 +15,7 @@ from orthoswarm.model.arrays import Array, Flags, Floats, Gray
 from orthoswarm.model.camera import Camera
 from orthoswarm.model.placement import Terrain
 
-_FRACTION = 16.0
-"""Disparities of OpenCV are whole numbers of this part of a pixel."""
+_FRACTION = 16.0  # disparities of OpenCV are whole numbers of this part of a pixel
 
 _BLOCK_PX: Final = 3
 """Side of the blocks of semi-global matching. With 3, 5, 7 heights of roofs were within (68 %) 1.25, 1.42 and 1.76 m of

@@ -17,8 +17,7 @@ from orthoswarm.stereo.rectified_pair import PairPoints
 _HEIGHT_BITS, _HEIGHT_STEP_M = 20, 1e-3
 _HIGHEST = (1 << _HEIGHT_BITS) - 1
 """Cell and height are packed into one integer, which is sorted in a third of the time of two columns."""
-_ROWS_AT_ONCE = 256
-"""Rows of cells that are merged at a time, for memory."""
+_ROWS_AT_ONCE = 256  # rows of cells that are merged at a time, for memory
 
 _CELL_MATCHES: Final = 2  # matched pixels that a pair has in a cell at least
 _PAIRS_KEPT: Final = 8  # heights of different pairs that are kept a cell; later ones change little

@@ -20,10 +20,8 @@ from orthoswarm.stereo.picture_pairs import choose_pairs
 from orthoswarm.stereo.rectified_pair import PairView, match_pair
 from orthoswarm.stereo.surface_cells import CellHeights, SurfaceCells, SurfaceModel, cell_heights
 
-_PAIRS_PER_TASK = 12
-"""Pairs of a task: enough of them share pictures."""
-_PICTURES_HELD = 8
-"""Number of decoded pictures that a task caches for its next pairs."""
+_PAIRS_PER_TASK = 12  # pairs of a task: enough of them share pictures
+_PICTURES_HELD = 8  # number of decoded pictures that a task caches for its next pairs
 
 _CELL_PIXELS: Final = 2.0  # side of a cell, ground pixels of the (reduced) pictures: fewer would hold no more detail
 _MOST_CELLS: Final = 8_000_000  # larger cells beyond this many, for memory and disk: 50 bytes a cell

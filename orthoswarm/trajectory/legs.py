@@ -8,8 +8,7 @@ from orthoswarm.model.angles import wrap_rad
 from orthoswarm.model.arrays import Array, Flags, Ints
 
 PAUSE_S: Final = 60.0  # photos farther apart in time do not follow each other: the vehicle did something else between
-LEG_REACH: Final = 3
-"""Frames before and after a frame between which the bend of the path is measured: one is noise."""
+LEG_REACH: Final = 3  # frames before and after a frame between which the bend of the path is measured: one is noise
 _LEG_TURN_DEG: Final = 35.0  # least bend of the path at the corner between two legs
 _LEG_FEWEST: Final = 3  # fewer frames are not a leg
 _LEG_JUMP_STEPS: Final = 6.0  # a step of more than so many median steps and the next field ends a leg ...

@@ -15,8 +15,7 @@ from orthoswarm.model.arrays import Array, Indices
 from orthoswarm.mosaic.kernels.lens_arrays import K1, K2, K3, F, U, V
 from orthoswarm.mosaic.kernels.render_arrays import LATTICE_PX
 
-UNIT = 128
-"""Sum of the weights, and number of steps of a fraction of a pixel."""
+UNIT = 128  # sum of the weights, and number of steps of a fraction of a pixel
 BEFORE, AFTER = 1, 2
 """Pixels that interpolation takes before and after that which holds the place, across and down."""
 _LOW = 32  # a row's least value (-32) becomes 0

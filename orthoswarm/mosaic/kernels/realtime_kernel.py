@@ -16,8 +16,7 @@ _HALF = np.uint32(0x00800080)
 _8 = np.uint32(8)
 _FULL = np.uint32(256)
 _FRACTION = np.uint32(255)
-RUN = 32
-"""Pixels that vector code handles at once."""
+RUN = 32  # pixels that vector code handles at once
 
 
 @kernel

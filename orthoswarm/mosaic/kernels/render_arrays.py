@@ -17,8 +17,7 @@ from orthoswarm.model.camera import LEAST_RADIAL_SLOPE, Camera
 from orthoswarm.model.placement import Terrain
 from orthoswarm.mosaic.kernels.lens_arrays import K1, K2, K3, F, U, V, lens_row
 
-LATTICE_PX = 2
-"""Pixels between heights of a tile's lattice (bilinear between them)."""
+LATTICE_PX = 2  # pixels between heights of a tile's lattice (bilinear between them)
 MARGIN_PX = 0.0
 """How far inside the outermost pixel centres a picture is used. At the very border the outermost pixels stand in for
 the neighbours that interpolation misses; a pixel's margin would cost a lone small picture 4 % of its ground."""

@@ -19,10 +19,8 @@ from orthoswarm.mosaic.kernels.render_arrays import LATTICE_PX, Shots, lattice_h
 from orthoswarm.mosaic.seam_labels import OUTSIDE, block_heights, sight
 from orthoswarm.mosaic.seams.previews import GLARE_LEVEL, Previews
 
-SLOTS = 5
-"""Candidates a cell: the cheapest ones."""
-BLOCK = 16
-"""Cells a side of the blocks at whose corners contrasts are compared."""
+SLOTS = 5  # candidates a cell: the cheapest ones
+BLOCK = 16  # cells a side of the blocks at whose corners contrasts are compared
 
 _WEAK_COST: Final = 1e6
 """Cost of a picture that is used only where no other sees: it is damaged, weakly determined, or something taller hides

@@ -18,8 +18,7 @@ from orthoswarm.model.errors import StorageError
 from orthoswarm.raster.picture_quality import LEAST_SIDE_PX, picture_quality
 
 ROWS, COLUMNS = 240, 320
-BLOCK_PX = 20
-"""Side of the blocks of which the local contrast is stated."""
+BLOCK_PX = 20  # side of the blocks of which the local contrast is stated
 RECORD = np.dtype(
     [
         ("gray", np.uint8, (ROWS, COLUMNS)),

@@ -16,8 +16,7 @@ from orthoswarm.mosaic.seams.cell_candidates import SLOTS, CandidateCells
 
 NONE, FOREIGN = -1, -2
 """Labels of cells that no picture sees, and of a neighbour's cells whose picture is not a candidate here."""
-_MOST_LABELS = 8
-"""Room for the labels in and around a block; a block of 8 cells seldom has more than four."""
+_MOST_LABELS = 8  # room for the labels in and around a block; a block of 8 cells seldom has more than four
 
 _SEAM_COST: Final = 3.0  # cost of a seam where pictures are alike: short and few; by looking at four sets
 _DIFFERENCE_SCALE: Final = 16.0  # the squared difference of the two pictures, in levels, is divided by this

@@ -13,8 +13,7 @@ from orthoswarm.model.camera import LEAST_RADIAL_SLOPE, Camera, Lens
 
 F, K1, K2, K3, CX, CY, WIDTH, HEIGHT = range(8)
 """Columns of CameraBlock.lens: focal length in px, radial terms, offset of the principal point in px, picture size."""
-LEAST_DEPTH_M = 1e-3
-"""Points less than this before a camera are not visible."""
+LEAST_DEPTH_M = 1e-3  # points less than this before a camera are not visible
 
 
 @dataclass(frozen=True, slots=True)

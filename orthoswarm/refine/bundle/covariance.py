@@ -21,8 +21,7 @@ from orthoswarm.refine.bundle.adjustment import Adjustment, HeightPrior, MapTies
 from orthoswarm.refine.bundle.block_arrays import WIDTH, F
 from orthoswarm.refine.bundle.priors import Priors
 
-_LENS_CX = 4
-"""Column of the principal point's cx among a lens's unknowns, cy is the next (see priors.Priors)."""
+_LENS_CX = 4  # column of the principal point's cx among a lens's unknowns, cy is the next (see priors.Priors)
 
 RECEIVER_COMMON_SIGMA_M: Final = 1.5
 """The part of the error that all receivers at a place and time share, an axis: ionosphere and orbits. The GPS standard
@@ -46,8 +45,7 @@ _SCATTER_LEAST_TIES: Final = 40  # with fewer ties the adjustment follows them, 
 _SYSTEMATIC_LEAST_TIES: Final = 4  # with fewer ties about a photo a systematic offset of the map there is not estimated
 _SYSTEMATIC_REACH_PHOTOS: Final = 4  # ... which uses the ties of so many photos before and after, of the same leg
 _SYSTEMATIC_SIGMAS: Final = 2.0  # sigmas of the ties' median taken off before it counts as systematic
-_LN2 = float(np.log(2.0))
-"""Median of the squared length of a Gaussian vector of two axes, for one of its mean."""
+_LN2 = float(np.log(2.0))  # median of the squared length of a Gaussian vector of two axes, for one of its mean
 
 _VARIOGRAM_MOST_TIES: Final = 200  # of more ties every so many-th is used: pairs grow with their square (its cost)
 _VARIOGRAM_CLASSES: Final = 9  # classes of distance between ties; the first ends at ....

@@ -20,8 +20,7 @@ DRIFT_SIGMA_M: Final = 15.0  # drift of a receiver without corrections (made-up 
 _DRIFT_BEND_SIGMA_M: Final = 0.5  # sigma of the second difference of the drift's knots: it changes slowly
 _DRIFT_KNOT_PHOTOS: Final = 60  # photos between two knots of the piecewise linear drift
 LAG_SIGMA_S: Final = 0.5  # sigma of the delay of recorded positions behind the shutter (lags of up to 0.4 s are found)
-_HELD = 1e18
-"""Weight of an unknown that is held."""
+_HELD = 1e18  # weight of an unknown that is held
 
 _ATTITUDE_ROBUST_C: Final = 25.0  # robust scale of recorded attitudes, squared sigmas: wider than that of positions
 

@@ -20,12 +20,9 @@ from numba.extending import intrinsic
 from orthoswarm.compute.jit import in_place_kernel, kernel
 from orthoswarm.refine.features.shift_products import everywhere
 
-SIZE = 15
-"""Side of a window, pixels: a layout of the compiled code (Lucas and Kanade 1981)."""
-WIDE = SIZE + 2
-"""Side of a template: the window and the pixels around it, for its gradients."""
-LANES = 16
-"""Columns that are added at once: those of a window and one that is not used."""
+SIZE = 15  # side of a window, pixels: a layout of the compiled code (Lucas and Kanade 1981)
+WIDE = SIZE + 2  # side of a template: the window and the pixels around it, for its gradients
+LANES = 16  # columns that are added at once: those of a window and one that is not used
 _HALF = SIZE // 2
 
 _VECTOR = ir.VectorType(ir.FloatType(), LANES)

@@ -15,10 +15,8 @@ from numba.extending import intrinsic
 from orthoswarm.compute import processor
 from orthoswarm.compute.jit import in_place_kernel
 
-LANES = 8
-"""Shifts of one vector: 32 bytes, which all x86 processors with AVX add at once; others take them in parts."""
-ROWS = 4
-"""Rows of shifts of one block: with three vectors each they fill the sixteen registers of AVX2."""
+LANES = 8  # shifts of one vector: 32 bytes, which all x86 processors with AVX add at once; others take them in parts
+ROWS = 4  # rows of shifts of one block: with three vectors each they fill the sixteen registers of AVX2
 
 _VECTOR = ir.VectorType(ir.FloatType(), LANES)
 _FUSES = processor.fuses()

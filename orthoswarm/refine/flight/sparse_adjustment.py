@@ -19,8 +19,7 @@ from orthoswarm.refine.bundle.priors import HEIGHT_OFFSET_SIGMA_M, LAG_SIGMA_S, 
 from orthoswarm.refine.flight.relative_block import PRINCIPAL_POINT_SHARE, first_points
 from orthoswarm.refine.flight.sparse_start import SparseStart
 
-NO_PRIOR_SIGMA_M = 1e6
-"""A sigma that makes a prior's weight vanish, metres."""
+NO_PRIOR_SIGMA_M = 1e6  # a sigma that makes a prior's weight vanish, metres
 _SPARSE_STATED_OFFSET_SIGMA_M: Final = 0.1  # common offset of heights where positions state sigmas
 _SPARSE_STATED_LAG_SIGMA_S: Final = 0.2  # sigma of the lag of recorded positions where they state their sigmas
 _SPARSE_BIAS_SIGMA_DEG: Final = (15.0, 15.0, 5.0)

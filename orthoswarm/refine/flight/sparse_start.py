@@ -2,6 +2,8 @@
 
 For photos that overlap too little or too irregularly for tracking: forward overlap under about
 80 %, corners, crosshatches, several sorties. Tags are evidence; the pictures decide.
+
+Thresholds without another source were chosen on four real flights.
 """
 
 from collections.abc import Sequence
@@ -40,10 +42,9 @@ _SPARSE_FREE_HEIGHT_SIGMA_M: Final = 1.5  # sigma of a height that was not recor
 _UNLIKE_SIGMAS: Final = 2.5  # vehicles' focal lengths that differ by more sigmas are of two lenses
 _UNLIKE_SHARE: Final = 0.06  # ... and by more than this share
 _ONE_WAY_CONCENTRATION: Final = 0.9  # mean unit vector of headings from which shapes give no focal length
-_SEGMENT_GAP_S: Final = 180.0  # a longer pause ends a segment: landing, battery (chosen on four real flights)
-_SEGMENT_CLIMB_M: Final = 5.0  # a larger jump of the recorded height ends a segment (chosen on four real flights)
-_SEGMENT_TILT_DEG: Final = 1.5
-"""A larger jump of the recorded tilt ends it: the gimbal was turned (chosen on four real flights)."""
+_SEGMENT_GAP_S: Final = 180.0  # a longer pause ends a segment: landing, battery
+_SEGMENT_CLIMB_M: Final = 5.0  # a larger jump of the recorded height ends a segment
+_SEGMENT_TILT_DEG: Final = 1.5  # A larger jump of the recorded tilt ends it: the gimbal was turned
 _SEGMENT_JUMP_SIGMAS: Final = 5.0  # a jump must exceed so many sigmas of the record's own noise as well
 _LEG_STILL_M: Final = 1.5  # shorter steps have no direction
 _LEG_TURN_DEG: Final = 35.0  # a leg ends where a step leaves the mean of its steps by more than this

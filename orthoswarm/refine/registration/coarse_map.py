@@ -34,8 +34,7 @@ from orthoswarm.refine.registration.orientation_correlation import (
     strip_mosaic,
 )
 
-_STEP = 2
-"""Pixels of the correlation in one of the map's, and of the mosaic in one of the correlation."""
+_STEP = 2  # pixels of the correlation in one of the map's, and of the mosaic in one of the correlation
 
 _COARSE_MAP_GSD_M: Final = 4.5
 """On maps with larger pixels, metres, no tie points are searched. On three sets (0.47 m a pixel) maps of 4 m place

@@ -23,8 +23,7 @@ from orthoswarm.refine.surface import plane_sweep_kernels as kernels
 from orthoswarm.refine.surface.seen_objects import seen_objects
 from orthoswarm.refine.surface.vertical_line_locus import REFERENCE_HEIGHT_M
 
-_LEAST_PICTURES = 3
-"""One and two others: of fewer the two most alike are none."""
+_LEAST_PICTURES = 3  # one and two others: of fewer the two most alike are none
 
 _TALL_BLOCK_NODES: Final = 48
 """Side of the blocks of nodes that are measured at a time, in the same pictures (measured: of 96 nodes 82.9 % of those
