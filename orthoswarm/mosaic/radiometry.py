@@ -199,8 +199,8 @@ def conjugate_gradients(
     applied: the matrix times (M, K). diagonal: of the matrix, (M, 1) or (M, K). right: (M, K). tolerance:
     preconditioned residual at which they end, as a share of the first one.
     """
-    x, left = np.zeros_like(right), right.copy()
-    z = left / diagonal
+    x, left, scale = np.zeros_like(right), right.copy(), 1.0 / diagonal
+    z = scale * left
     towards, product = z.copy(), (left * z).sum(0)
     enough = tolerance**2 * product
     for _ in range(most_steps):
@@ -211,7 +211,7 @@ def conjugate_gradients(
         alpha = product / np.where(curve > 0.0, curve, 1.0)
         x += alpha * towards
         left -= alpha * image
-        z = left / diagonal
+        z = scale * left
         last, product = product, (left * z).sum(0)
         towards = z + product / np.where(last > 0.0, last, 1.0) * towards
     return x
