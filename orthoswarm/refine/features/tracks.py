@@ -199,7 +199,7 @@ class Tracker:
             self._gray, self._half, gray, half, self._live.uv, predicted, np.linalg.inv(predicted), limits, guess,
             found, good,
         )  # fmt: skip
-        kept, expected = _gate(guess, found, good, *gray.shape)
+        kept, expected = _gate(guess, found, good, *gray.shape, _FLOW_CHANCE_SHARE)
         return _Flow(good, found, kept, expected)
 
     def _start(self, gray: Gray) -> None:
@@ -228,13 +228,13 @@ class Tracker:
 
 
 @kernel
-def _gate(guess, found, ok, rows, cols):  # type: ignore[no-untyped-def]
+def _gate(guess, found, ok, rows, cols, chance):  # type: ignore[no-untyped-def]
     """Keep flow close to the median residual, which must itself be close to the prediction, in ok, in place.
 
     None is kept where no more agree than corners on different ground would by chance (binomial, 3 sigma). Returns how
     many are kept, and how many were expected inside the picture.
     """
-    expected, margin, chance = 0, _FLOW_INSIDE_PX, _FLOW_CHANCE_SHARE
+    expected, margin = 0, _FLOW_INSIDE_PX
     for k in range(len(ok)):
         u, v = guess[k, 0], guess[k, 1]
         expected += u >= 0 and v >= 0 and u <= cols - 1 and v <= rows - 1
