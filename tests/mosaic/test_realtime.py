@@ -192,7 +192,9 @@ def test_matrix_is_the_inverse_of_the_papers_homography(camera, column, row):
     uv = camera.project(np.append(ground, 0.0))
     if depth < 1.0:
         return
-    assert camera.lens.principal_point + camera.lens.focal_px * np.array([x, y]) / depth == pytest.approx(uv, abs=1e-6)
+    assert camera.lens.principal_point + camera.lens.focal_px * np.array([x, y]) / depth == pytest.approx(
+        uv, rel=1e-9, abs=1e-6
+    )
     east, north, w = camera.homography(0.0) @ np.append(uv, 1.0)
     if np.abs(uv).max() < 1e4:
         assert (east / w, north / w) == pytest.approx(tuple(ground), abs=1e-3)
