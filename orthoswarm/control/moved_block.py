@@ -38,8 +38,7 @@ def moved_terrain(terrain: Terrain, similarity: Similarity, level_m: float) -> T
     before = similarity.back(empty.nodes())
 
     def moved(z: Floats) -> Floats:
-        heights = replace(terrain, z=z, bare=None).height(before)
+        heights = replace(terrain, z=z).height(before)
         return np.asarray(similarity.moved_heights(heights, level_m), np.float32)
 
-    bare = None if terrain.bare is None else moved(terrain.bare)
-    return replace(empty, z=moved(terrain.z), bare=bare)
+    return terrain.changed(moved, west=float(low[0]), south=float(low[1]))

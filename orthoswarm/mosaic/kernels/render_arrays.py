@@ -5,7 +5,7 @@ heights as they are. Terrain enters as a lattice of heights every LATTICE_PX pix
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,8 +70,10 @@ def crop(terrain: Terrain, bounds: BoundingBox) -> Terrain:
     r0 = int(np.clip(np.floor((bounds[1] - terrain.south) / terrain.step_m) - 2, 0, rows - 2))
     r1 = int(np.clip(np.ceil((bounds[3] - terrain.south) / terrain.step_m) + 3, r0 + 2, rows))
     step = terrain.step_m
-    bare = None if terrain.bare is None else terrain.bare[r0:r1, c0:c1].copy()
-    return Terrain(terrain.west + c0 * step, terrain.south + r0 * step, step, terrain.z[r0:r1, c0:c1].copy(), bare)
+    drawn = replace(terrain, tops=None)
+    return drawn.changed(
+        lambda z: z[r0:r1, c0:c1].copy(), west=terrain.west + c0 * step, south=terrain.south + r0 * step
+    )
 
 
 @in_place_kernel
