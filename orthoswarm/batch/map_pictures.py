@@ -27,7 +27,7 @@ from orthoswarm.mosaic.oblique import stray_warning, strays, weakly_held_warning
 from orthoswarm.mosaic.radiometry import NO_MAP_TONE, estimate_fields, tone_warning
 from orthoswarm.mosaic.realtime import mosaic
 from orthoswarm.mosaic.renderer import Layer, RenderStats, Seams, render, render_layers
-from orthoswarm.raster.height_model import read_dem
+from orthoswarm.raster.height_model import DEM_MOST_NODES, HeightModel
 from orthoswarm.refine.flight.record_findings import NAMED_MOST
 
 _Map = tuple[Sequence[PlacedFrame], Terrain | None]
@@ -94,9 +94,10 @@ def _ground(run: RunContext, state: RunState, refinement: Refinement) -> Terrain
         return refinement.terrain
     fine = [p for s in refinement.fine for p in s.placed]
     level = ground_level(fine, refinement.terrain)
-    nadirs = np.array([p.camera.nadir for p in fine])
-    model = read_dem(run.options.dem, state.grid.epsg, placed_bounds(fine, level, level), takeoff=nadirs)
-    return replace(model, z=model.z + np.float32(level))
+    bounds, cameras = placed_bounds(fine, level, level), np.array([[*p.camera.nadir, np.nan] for p in fine])
+    model = HeightModel.open(run.options.dem, state.grid.epsg, bounds, cameras)
+    ground = model.window(bounds, DEM_MOST_NODES).terrain
+    return replace(ground, z=ground.z + np.float32(level))
 
 
 def _both(run: RunContext, state: RunState, coarse: _Map, fine: _Map) -> None:

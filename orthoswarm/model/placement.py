@@ -122,6 +122,12 @@ class Terrain:
         west, south = self.west if west is None else west, self.south if south is None else south
         return replace(self, west=west, south=south, z=change(self.z), bare=bare, tops=tops)
 
+    def nodes(self) -> Array:
+        """Positions (rows, columns, 2) of the nodes."""
+        rows, columns = self.z.shape
+        east, north = self.west + self.step_m * np.arange(columns), self.south + self.step_m * np.arange(rows)
+        return np.stack(np.meshgrid(east, north), -1)
+
     def height(self, east_north: NDArray[Any]) -> Array:
         """Heights (...,) at ground points (..., 2)."""
         p = np.asarray(east_north, float)

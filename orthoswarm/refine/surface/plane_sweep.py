@@ -23,8 +23,7 @@ from orthoswarm.refine.surface import plane_sweep_kernels as kernels
 from orthoswarm.refine.surface.seen_objects import seen_objects
 from orthoswarm.refine.surface.vertical_line_locus import REFERENCE_HEIGHT_M
 
-_LEAST_PICTURES = 3
-"""One and two others: of fewer the two most alike are none."""
+_LEAST_PICTURES = 3  # one and two others: of fewer the two most alike are none
 
 _TALL_BLOCK_NODES: Final = 48
 """Side of the blocks of nodes that are measured at a time, in the same pictures (measured: of 96 nodes 82.9 % of those
@@ -117,10 +116,8 @@ class _SweepTask:
 def tall_heights(views: Sequence[SweepViews], ground: Terrain, tallest: Floats, *, height_m: float, run: Run) -> Floats:
     """Heights above the ground, float32 (rows, columns) of its nodes, metres, 0 where it is the surface.
 
-    Args:
-        ground: its nodes are the cells whose heights are measured.
-        tallest: float32 (rows, columns), how high something may stand, metres; 0: the node is on the ground.
-        height_m: flying height above the ground.
+    ground: its nodes are the cells whose heights are measured. tallest: float32 (rows, columns), how high something may
+    stand, metres; 0: the node is on the ground. height_m: flying height above the ground.
     """
     out = np.zeros(tallest.shape, np.float32)
     tasks = list(_tasks(_Swath(views, ground, height_m), tallest))
@@ -273,9 +270,8 @@ def with_tall_surfaces(
 ) -> Terrain:
     """The bare ground plus the tops of what stands near raised points, where pictures see the ground behind it too.
 
-    Args:
-        points: float64 (K, 3) at free positions on the visible surface. height_m: flying height above the ground.
-        most_nodes: the ground gets no more nodes than this.
+    points: float64 (K, 3) at free positions on the visible surface. height_m: flying height above the ground.
+    most_nodes: the ground gets no more nodes than this.
     """
     over = points[:, 2] - ground.height(points[:, :2])
     raised = over > TALL_FROM_M

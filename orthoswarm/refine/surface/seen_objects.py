@@ -28,8 +28,7 @@ def seen_objects(terrain: Terrain, cameras: CameraBlock) -> Terrain:
 
     An object is what is raised and connected. It is put down as a whole, so that it is drawn in one piece.
 
-    Args:
-        terrain: with `bare`. cameras: all that may be drawn, in the terrain's frame.
+    terrain: with `bare`. cameras: all that may be drawn, in the terrain's frame.
     """
     assert terrain.bare is not None
     z, over = terrain.z, terrain.z - terrain.bare
