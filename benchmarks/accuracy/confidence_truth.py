@@ -18,7 +18,7 @@ from orthoswarm.evaluation.displacement import FieldSettings
 from orthoswarm.evaluation.orthoimage import displacements
 from orthoswarm.mosaic.confidence import GOOD_TO_M, ORIENTATION_ONLY
 
-_SETTINGS = FieldSettings(gsd_m=0.3, block_m=9.0, step_m=4.5, search_m=5.0, min_cover=0.9)
+_SETTINGS = FieldSettings(block_m=9.0, step_m=4.5, search_m=5.0, min_cover=0.9, min_peak=0.4)
 
 
 def main() -> None:
