@@ -40,8 +40,9 @@ class GettingReady:
 
     def _follow(self, process: "subprocess.Popen[str]") -> None:
         assert process.stderr is not None
-        for line in process.stderr:
-            self.problem = f"getting ready, {line.strip()}; {_MEANWHILE}"
-            self._events.publish(Problem(self.problem))
+        with process.stderr as lines:
+            for line in lines:
+                self.problem = f"getting ready, {line.strip()}; {_MEANWHILE}"
+                self._events.publish(Problem(self.problem))
         self.problem = ""
         self._events.publish(Problem("ready" if process.wait() == 0 else "kernels are compiled when they are needed"))

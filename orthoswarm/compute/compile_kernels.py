@@ -91,22 +91,27 @@ def _save_in_package() -> None:
 def _compile(module: str, lines: list[str]) -> int:
     _save_in_package()
     importlib.import_module(module)
-    _leave_out_inner()
+    _spare_inner()
     wanted = [found for line in lines if (found := _to_compile(module, line))]
     for kernel, types in wanted:
         kernel.compile(types)
     return len(wanted)
 
 
-def _leave_out_inner() -> None:
-    """Have kernels that only kernels call compiled into those alone: no function for Python, and no file."""
-    from numba.core.caching import NullCache
+def _spare_inner() -> None:
+    """Have kernels that only kernels call compiled into the package without a function for Python, until `_tidy`."""
+    from orthoswarm.compute.kernel_cache import KernelCache
 
     called = {f"{module}.{line.split(' ', 1)[0]}" for module, lines in listed().items() for line in lines}
-    for kernel in _kernels():
-        if f"{kernel.py_func.__module__}.{kernel.py_func.__name__}" not in called:
+    for kernel in _kernels() if KernelCache.filling else []:
+        name = f"{kernel.py_func.__module__}.{kernel.py_func.__name__}"
+        if name not in called and not _is_inner(kernel):
             kernel.targetoptions["no_cpython_wrapper"] = True
-            kernel._cache = NullCache()
+            kernel._cache.keep_inner()
+
+
+def _is_inner(kernel: Any) -> bool:
+    return "no_cpython_wrapper" in kernel.targetoptions
 
 
 def _kernels() -> list[Any]:
@@ -135,8 +140,7 @@ def _tidy(modules: list[str]) -> None:
 
     for name in modules:
         importlib.import_module(name)
-    caches = [kernel._cache for kernel in _kernels()]
-    kept = set().union(*(cache.files() for cache in caches if isinstance(cache, KernelCache)))
+    kept = set().union(*(kernel._cache.files() for kernel in _kernels() if not _is_inner(kernel)))
     for file in FOLDER.rglob("*.nb[ci]"):
         if file not in kept:
             file.unlink(missing_ok=True)
