@@ -62,7 +62,8 @@ def run_demo(
     began = time.monotonic()
     with _Simulator(setting, out / "twin") as simulator:
         prepare(report)
-        wait_for(lambda: simulator.addresses, "the city", lambda: simulator.stage, lambda: report(*simulator.stage))
+        made = partial(getattr, simulator, "stage")
+        wait_for(lambda: simulator.hear().addresses, "the city", made, lambda: report(*simulator.stage))
         with _daemon(setting, out, simulator.addresses) as daemon, Served(daemon, port) as served:
             opened(served.url)
             _fly(daemon, setting, simulator, report)
@@ -76,12 +77,12 @@ def run_demo(
 
 
 class _Simulator:
-    """The process of the city, its vehicles and their cameras, and what it has told.
+    """The process of the city, its vehicles and their cameras, and what `hear` heard of it.
 
     Attributes:
         addresses: of the vehicles' links and video streams, empty until the city is there.
         stage: of the city's making: name, number of finished items, and their total.
-        flown_s: seconds on the vehicles' clock. taken: pictures so far; to_render: those that wait for it.
+        flown_s: seconds on the vehicles' clock. taken: pictures so far.
     """
 
     def __init__(self, setting: DemoSetting, folder: Path) -> None:
@@ -90,49 +91,27 @@ class _Simulator:
         self._process = context.Process(target=simulate, args=(setting, folder, theirs), name="simulator", daemon=True)
         _start(self._process)
         theirs.close()
-        self._addresses: dict[str, list[str]] = {}
-        self._stage: tuple[str, int, int] = ("city", 0, 1)
-        self._state: tuple[float, int, int] = (0.0, 0, 0)
-
-    @property
-    def addresses(self) -> dict[str, list[str]]:
-        self._hear()
-        return self._addresses
-
-    @property
-    def stage(self) -> tuple[str, int, int]:
-        self._hear()
-        return self._stage
-
-    @property
-    def flown_s(self) -> float:
-        self._hear()
-        return self._state[0]
-
-    @property
-    def taken(self) -> int:
-        self._hear()
-        return self._state[1]
-
-    @property
-    def to_render(self) -> int:
-        self._hear()
-        return self._state[2]
+        self.addresses: dict[str, list[str]] = {}
+        self.stage: tuple[str, int, int] = ("city", 0, 1)
+        self.flown_s, self.taken = 0.0, 0
 
     def tell(self, drawn: int, fastest: float) -> None:
         """Say how many pictures are on the map, and how many vehicle seconds may pass in a second."""
-        with contextlib.suppress(OSError):  # `_hear` says why it has ended
+        with contextlib.suppress(OSError):  # `hear` says why it has ended
             self._pipe.send((drawn, fastest))
 
-    def _hear(self) -> None:
+    def hear(self) -> "_Simulator":
+        """Take in what it has told; returns itself."""
         try:
             while self._pipe.poll(0.0):
-                kind, value = self._pipe.recv()
-                if kind == "problem":
-                    raise OrthoSwarmError(f"a simulated camera failed: {value}")
-                setattr(self, f"_{kind}", value)
+                told = self._pipe.recv()
+                if "problem" in told:
+                    raise OrthoSwarmError(f"a simulated camera failed: {told['problem']}")
+                for name, value in told.items():
+                    setattr(self, name, value)
         except (EOFError, OSError):
             raise OrthoSwarmError("the simulated swarm has ended by itself; run the demonstration again") from None
+        return self
 
     def __enter__(self) -> "_Simulator":
         return self
@@ -244,7 +223,7 @@ def _fly(daemon: "Daemon", setting: DemoSetting, simulator: _Simulator, report: 
         return sum(row["lat_deg"] is not None for row in links.rows())
 
     def fly_on(fastest: float) -> None:
-        simulator.tell(daemon.drawer.drawn, fastest)
+        simulator.hear().tell(daemon.drawer.drawn, fastest)
         report("connecting vehicles", heard(), setting.vehicles)
 
     starting = min(_STARTS, setting.speed)
@@ -260,7 +239,7 @@ def _fly(daemon: "Daemon", setting: DemoSetting, simulator: _Simulator, report: 
     report("planning", 1, 1)
     photos = sum(vehicle["photos"] for vehicle in plan["vehicles"])
     delays = {v["id"]: v["flights"][0]["start_s"] for v in plan["vehicles"]}
-    began = simulator.flown_s
+    began = simulator.hear().flown_s
 
     def shown(fastest: float) -> None:
         # The map in flight is placed leg by leg, in real time: faster vehicles would be home before.
@@ -269,9 +248,9 @@ def _fly(daemon: "Daemon", setting: DemoSetting, simulator: _Simulator, report: 
         report("pictures on the map", min(daemon.drawer.drawn, photos - 1), photos)
 
     def moved() -> tuple[float, ...]:
-        drawn = daemon.drawer.drawn
+        drawn, flown_s, taken = daemon.drawer.drawn, simulator.hear().flown_s, simulator.taken
         # The clock counts while no picture waits: a daemon that draws no more is not taken for one that waits for more.
-        return len(daemon.views.completions()), simulator.taken, drawn, simulator.flown_s * (drawn >= simulator.taken)
+        return len(daemon.views.completions()), taken, drawn, flown_s * (drawn >= taken)
 
     for number, vehicle in enumerate(sorted(delays, key=lambda name: delays[name]), start=1):
         # with the planned delays, at least 6 s, so that one vehicle completes while others still fly
@@ -411,8 +390,7 @@ def vehicle_rate(fastest: float, to_render: int, to_draw: int) -> float:
 def simulate(setting: DemoSetting, folder: Path, pipe: Connection) -> None:
     """Make the twin in a folder and fly over it until the pipe is closed.
 
-    Sends ("stage", its making), ("addresses", {"links": [...], "streams": [...]}), and then again and again
-    ("state", (seconds flown, pictures taken, pictures to be rendered)) or ("problem", text).
+    Sends attributes of `_Simulator`: its "stage", "addresses", again and again "flown_s" and "taken", or a "problem".
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # not all systems inherit this from the parent process
     from orthoswarm.compute.workers import prepare_process
@@ -424,7 +402,7 @@ def simulate(setting: DemoSetting, folder: Path, pipe: Connection) -> None:
     from orthoswarm.twin.make import make_scene
 
     try:
-        made = make_scene(setting.twin, folder, lambda *stage: pipe.send(("stage", stage)))
+        made = make_scene(setting.twin, folder, lambda *stage: pipe.send({"stage": stage}))
     except OSError:  # the demonstration has ended already
         return
     systems = range(1, setting.vehicles + 1)
@@ -441,12 +419,12 @@ def simulate(setting: DemoSetting, folder: Path, pipe: Connection) -> None:
         EOFError, OSError  # the demonstration has ended
     ):  # fmt: skip
         streams = [renderer.servers[s].url for s in systems]
-        pipe.send(("addresses", {"links": swarm.addresses, "streams": streams}))
+        pipe.send({"addresses": {"links": swarm.addresses, "streams": streams}})
         while not renderer.problem:
             while pipe.poll(_SAID_S):
                 drawn, fastest = pipe.recv()
                 rate = vehicle_rate(fastest, renderer.backlog, renderer.taken - drawn)
                 clock.share = rate / setting.speed
-            pipe.send(("state", (swarm.now, renderer.taken, renderer.backlog)))
-        pipe.send(("problem", renderer.problem))
+            pipe.send({"flown_s": swarm.now, "taken": renderer.taken})
+        pipe.send({"problem": renderer.problem})
     renderer.close()
