@@ -37,6 +37,7 @@ _SLOWEST: Final = 0.4  # vehicle seconds in a second: heartbeats then come often
 _TO_RENDER: Final = 4  # pictures that may wait while the vehicles fly as fast as they are asked to
 _TO_DRAW: Final = 24  # the same, of those in streams and queues
 _SAID_S: Final = 0.05
+_LAST_S: Final = 60.0  # without a picture: those are lost that were under way as a reader took its stream for dead
 _KEPT: Final = 0.7  # of the speed that was asked for: a flight that keeps less is told
 
 
@@ -259,12 +260,20 @@ def _fly(daemon: "Daemon", setting: DemoSetting, simulator: _Simulator, report: 
         _start_vehicle(daemon, plan["id"], vehicle)
         report("starting", number, setting.vehicles)
 
+    drawn, drawn_at = 0, time.monotonic()
+
     def done() -> bool:
-        return len(daemon.views.completions()) >= setting.vehicles and daemon.drawer.drawn >= simulator.taken
+        nonlocal drawn, drawn_at
+        if daemon.drawer.drawn != drawn:
+            drawn, drawn_at = daemon.drawer.drawn, time.monotonic()
+        all_there = drawn >= simulator.taken or time.monotonic() - drawn_at > _LAST_S
+        return all_there and len(daemon.views.completions()) >= setting.vehicles
 
     began, flown = time.monotonic(), simulator.flown_s
     wait_for(done, "the missions' completion", moved, partial(shown, setting.speed))
     report("pictures on the map", photos, photos)
+    if drawn < simulator.taken:
+        report("pictures lost with a stream that was silent and opened again", simulator.taken - drawn, 1)
     rate = (simulator.flown_s - flown) / (time.monotonic() - began)
     if rate < _KEPT * setting.speed:
         report(f"flown at {rate:.1f} of real time instead of {setting.speed:.1f}, as fast as this machine draws", 1, 1)

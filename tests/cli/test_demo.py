@@ -141,6 +141,7 @@ def test_a_demonstration_on_a_quarter_of_a_core_ends_well_and_says_how_far_it_is
             process.wait()
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
-    assert report["frames"]["used"] == report["demo"]["pictures"] > 20
+    # A stream that was silent for ten seconds is opened again, without what was under way.
+    assert report["frames"]["used"] >= 0.9 * report["demo"]["pictures"] > 20
     assert report["accuracy"]["median_m"] < 0.5
     assert "instead of 6.0" in done.stderr and re.search(r"pictures on the map: \d+ of \d+", done.stderr)
