@@ -269,7 +269,7 @@ def _fly(daemon: "Daemon", setting: DemoSetting, simulator: _Simulator, report: 
         all_there = drawn >= simulator.taken or time.monotonic() - drawn_at > _LAST_S
         return all_there and len(daemon.views.completions()) >= setting.vehicles
 
-    began, flown = time.monotonic(), simulator.flown_s
+    began, flown = time.monotonic(), simulator.hear().flown_s
     wait_for(done, "the missions' completion", moved, partial(shown, setting.speed))
     report("pictures on the map", photos, photos)
     if drawn < simulator.taken:
