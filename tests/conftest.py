@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import sys
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,10 @@ from hypothesis import settings
 from orthoswarm.compute.workers import prepare_process
 
 prepare_process()  # before numpy comes: sums depend on the number of BLAS threads, and so would results
+
+# Tests start hundreds of interpreters: where an environment keeps no bytecode, each would compile the packages anew.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 # Machines differ and are shared: a slow example is not a failure. A gate tries the same examples each time.
 settings.register_profile("unhurried", deadline=None, derandomize=bool(os.environ.get("CI")))

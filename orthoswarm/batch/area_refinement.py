@@ -212,8 +212,7 @@ def _moved_ground(terrain: Terrain | None, move: AreaMove, level_m: float) -> Te
         return None
     # Where the map holds an area, it is not resampled.
     moved = terrain if np.abs(move.plane.values).max() < 1e-5 else moved_terrain(terrain, move.plane, level_m)
-    up = np.float32(move.up_m)
-    return replace(moved, z=moved.z + up, bare=None if moved.bare is None else moved.bare + up)
+    return moved.changed(lambda z: z + np.float32(move.up_m))
 
 
 def merged_ground(grounds: Sequence[Terrain | None], nadirs: Sequence[Array]) -> Terrain | None:
@@ -247,11 +246,12 @@ def merged_ground(grounds: Sequence[Terrain | None], nadirs: Sequence[Array]) ->
                 part[:] = at.height(np.stack(np.meshgrid(east, north), -1))
         return z
 
-    tall = any(ground.bare is not None for ground in found)
-    return Terrain(
-        float(low[0]), float(low[1]), step, joined(lambda g: g.z),
-        joined(lambda g: g.z if g.bare is None else g.bare) if tall else None,
-    )  # fmt: skip
+    def joined_where(name: str) -> Floats | None:
+        known = any(getattr(ground, name) is not None for ground in found)
+        return joined(lambda g: g.z if getattr(g, name) is None else getattr(g, name)) if known else None
+
+    z, bare, tops = joined(lambda g: g.z), joined_where("bare"), joined_where("tops")
+    return Terrain(float(low[0]), float(low[1]), step, z, bare=bare, tops=tops)
 
 
 def _nearest_areas(low: Array, step: float, shape: tuple[int, int], nadirs: Sequence[Array]) -> NDArray[np.intp]:

@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from orthoswarm.batch.run_state import COARSE, ORTHOIMAGE, SEAMLINES, RunContext, RunState
+from orthoswarm.batch.run_state import COARSE, CONFIDENCE, ORTHOIMAGE, SEAMLINES, RunContext, RunState
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.compute.workers import trim_memory
 from orthoswarm.export.atomic_file import atomic_write
@@ -15,17 +15,19 @@ from orthoswarm.export.catalog.tiled_raster import copy_tiled, in_tiles, product
 from orthoswarm.export.cog import write_cog
 from orthoswarm.export.footprint_layer import write_seamlines
 from orthoswarm.export.product_files import describe_frame
+from orthoswarm.export.value_raster import write_confidence
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.frame import last_time
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import PlacedFrame, Refinement, Solution, Terrain
+from orthoswarm.mosaic.confidence import confidence
 from orthoswarm.mosaic.extent import drawn_window, ground_level, placed_bounds
 from orthoswarm.mosaic.footprint import default_gsd, rejection
 from orthoswarm.mosaic.oblique import stray_warning, strays, weakly_held_warning
 from orthoswarm.mosaic.radiometry import NO_MAP_TONE, estimate_fields, tone_warning
 from orthoswarm.mosaic.realtime import mosaic
 from orthoswarm.mosaic.renderer import Layer, RenderStats, Seams, render, render_layers
-from orthoswarm.raster.height_model import read_dem
+from orthoswarm.raster.height_model import DEM_MOST_NODES, HeightModel
 from orthoswarm.refine.flight.record_findings import NAMED_MOST
 
 _Map = tuple[Sequence[PlacedFrame], Terrain | None]
@@ -92,9 +94,10 @@ def _ground(run: RunContext, state: RunState, refinement: Refinement) -> Terrain
         return refinement.terrain
     fine = [p for s in refinement.fine for p in s.placed]
     level = ground_level(fine, refinement.terrain)
-    nadirs = np.array([p.camera.nadir for p in fine])
-    model = read_dem(run.options.dem, state.grid.epsg, placed_bounds(fine, level, level), takeoff=nadirs)
-    return replace(model, z=model.z + np.float32(level))
+    bounds, cameras = placed_bounds(fine, level, level), np.array([[*p.camera.nadir, np.nan] for p in fine])
+    model = HeightModel.open(run.options.dem, state.grid.epsg, bounds, cameras)
+    ground = model.window(bounds, DEM_MOST_NODES).terrain
+    return replace(ground, z=ground.z + np.float32(level))
 
 
 def _both(run: RunContext, state: RunState, coarse: _Map, fine: _Map) -> None:
@@ -117,11 +120,11 @@ def _both(run: RunContext, state: RunState, coarse: _Map, fine: _Map) -> None:
             stats = render_layers(layers, read=state.read_rgb(), parts=state.parts, run=run.drawers.map, progress=drawn)
             _write(run, first, COARSE, coarse[0])
         _write(run, second, ORTHOIMAGE, fine[0])
-        _write_seamlines(run, second, fine[0])
+        _write_about(run, state, second, fine[0], fine_ground)
     run.space.clear_scratch()
     state.drawn = stats[1].drawn
-    run.space.remember(ORTHOIMAGE, (stats[1].rejected, state.drawn, stage))
-    run.space.remember(COARSE, (stats[0].rejected, stats[0].drawn, replace(stage, wall_s=0.0, cpu_s=0.0)))
+    run.space.remember(ORTHOIMAGE, (stats[1].rejected, state.drawn, state.trust, stage))
+    run.space.remember(COARSE, (stats[0].rejected, stats[0].drawn, {}, replace(stage, wall_s=0.0, cpu_s=0.0)))
     for s in stats:
         state.leave_out(s.rejected, fine[0])
 
@@ -132,14 +135,14 @@ def _picture(
     """Render one product, unless an interrupted run has."""
     known = run.space.recall(name)
     if known is not None and product_file(run.out, name) is not None:
-        rejected, state.drawn, stage = known
+        rejected, state.drawn, state.trust, stage = known
         run.clock.stages.append(stage)
     else:
         label = "orthoimage" if name == ORTHOIMAGE else "coarse picture"
         with run.clock.stage(f"final: {label}", len(placed)) as stage:
             stats = draw(run, name, placed, terrain or Terrain.flat(), state)
         rejected, state.drawn = stats.rejected, stats.drawn
-        run.space.remember(name, (rejected, state.drawn, stage))
+        run.space.remember(name, (rejected, state.drawn, state.trust, stage))
     state.leave_out(rejected, placed)
 
 
@@ -180,7 +183,7 @@ def draw(
             )
         _write(run, canvas, name, placed)
         if name == ORTHOIMAGE:
-            _write_seamlines(run, canvas, placed)
+            _write_about(run, state, canvas, placed, terrain)
     run.space.clear_scratch()
     return stats
 
@@ -222,9 +225,14 @@ def _write(run: RunContext, canvas: Canvas, name: str, placed: Sequence[PlacedFr
     remove_tiles(run.out, name)
 
 
-def _write_seamlines(run: RunContext, canvas: Canvas, placed: Sequence[PlacedFrame]) -> None:
-    """Write which picture shows which ground."""
+def _write_about(
+    run: RunContext, state: RunState, canvas: Canvas, placed: Sequence[PlacedFrame], terrain: Terrain
+) -> None:
+    """Write which picture shows which ground, and how far it can be trusted."""
     write_seamlines(run.out / SEAMLINES, canvas, [partial(describe_frame, p) for p in placed], run=run.drawers.map)
+    found = confidence(canvas, placed, terrain, state.gains)
+    write_confidence(run.out / CONFIDENCE, found)
+    state.trust = found.figures()
 
 
 def _copy_coarse(run: RunContext, state: RunState) -> None:

@@ -40,7 +40,7 @@ from orthoswarm.mosaic.recorded_pose import Recorded, area_grid, in_one_area, no
 from orthoswarm.mosaic.seams.previews import PreviewFile
 from orthoswarm.raster.basemap import Basemap
 from orthoswarm.raster.grey_pictures import WORK_WIDTH_PX, GreyPictures
-from orthoswarm.raster.height_model import HeightModel, check_dem
+from orthoswarm.raster.height_model import HeightModel
 from orthoswarm.raster.picture_file import read_gray, reduction
 from orthoswarm.raster.picture_parts import PictureParts
 from orthoswarm.refine.flight.record_findings import NAMED_MOST
@@ -190,12 +190,9 @@ def _height_model(run: RunContext, path: Path, grid: LocalGrid, recorded: Record
     bounds = placed_bounds(recorded.placed, 0.0, 0.0)
     at = np.array([p.camera.position for p in recorded.placed])
     has_height = np.array([p.frame.fix.height_m is not None for p in recorded.placed])
-    if run.options.refine != "swarm":
-        check_dem(path, grid.epsg, bounds, at[has_height])
-        return None
-    return HeightModel.open(
-        path, grid.epsg, bounds, np.column_stack([at[:, :2], np.where(has_height, at[:, 2], np.nan)])
-    )
+    cameras = np.column_stack([at[:, :2], np.where(has_height, at[:, 2], np.nan)])
+    model = HeightModel.open(path, grid.epsg, bounds, cameras)
+    return model if run.options.refine == "swarm" else None
 
 
 def _realtime(run: RunContext, state: RunState) -> list[PlacedFrame]:

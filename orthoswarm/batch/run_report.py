@@ -5,13 +5,22 @@ import statistics
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from orthoswarm.batch.run_state import COARSE, ORTHOIMAGE, PRODUCTS, REALTIME, SEAMLINES, RunContext, RunState
+from orthoswarm.batch.run_state import (
+    COARSE,
+    CONFIDENCE,
+    ORTHOIMAGE,
+    PRODUCTS,
+    REALTIME,
+    SEAMLINES,
+    RunContext,
+    RunState,
+)
 from orthoswarm.config import changes
 from orthoswarm.evaluation.checkpoints import control_rows, evaluate_checkpoints
 from orthoswarm.export.catalog.tiled_raster import remove_collection, remove_product, tiles_of
@@ -28,6 +37,7 @@ from orthoswarm.model.placement import PlacedFrame, Refinement, Terrain
 from orthoswarm.mosaic.extent import from_takeoff, ground_level, solved_level
 from orthoswarm.mosaic.takeoff_altitude import TakeoffLevel, takeoff_levels
 from orthoswarm.report.page import write_page
+from orthoswarm.report.trust import headline
 from orthoswarm.stores.addresses import address_of
 
 
@@ -49,6 +59,7 @@ def write_products(
         write_frames(run.out, stated, list(state.rejected.values()), state.grid, z, covariance=run.options.covariance)
         report = _report(run, state, placed, refinement, z) | {"surface": surface}
         _add_checkpoints(run, state, report, z)
+        report["headline"] = headline(report)
         left_out = list(state.rejected.values())
         try:
             report["against_map_m"] = write_page(run.out, report, stated, rejected=left_out, basemap=state.basemap)
@@ -87,7 +98,7 @@ def _add_checkpoints(run: RunContext, state: RunState, report: dict[str, Any], g
 def _made(run: RunContext, faulty: bool) -> set[str]:
     names = set(PRODUCTS)
     if run.options.until != "fine" or faulty:
-        names -= {ORTHOIMAGE, SEAMLINES}
+        names -= {ORTHOIMAGE, SEAMLINES, CONFIDENCE}
     if run.options.until == "realtime" or faulty:
         names.discard(COARSE)
     return names
@@ -118,6 +129,7 @@ def _report(
         "area_ha": state.drawn.area_m2 / 1e4,
         "covered_share": state.drawn.covered_share,
         "drawn_twice_share": state.drawn.twice_share,
+        "trust": dict(state.trust),
         "basemap": address_of(run.options.basemap) if run.options.basemap and state.basemap else None,
         "map_offset_m": None if state.map_offset is None else state.map_offset.document(),
         "control_points": control_rows(state.control_points),
@@ -151,10 +163,7 @@ def make_surface(
     if refinement is None:
         state.warnings.append("the surface model was not made: the pictures could not be refined")
         return None
-    terrain = state.terrain or Terrain.flat()
-    terrain = replace(
-        terrain, z=terrain.z + np.float32(moved_m), bare=None if terrain.bare is None else terrain.bare + moved_m
-    )
+    terrain = (state.terrain or Terrain.flat()).changed(lambda z: z + np.float32(moved_m))
     levels = takeoff_levels(placed)
     altitude = statistics.median(level.altitude_m for level in levels.values()) if levels else None
     scale_sigma, common_m = _common_errors(placed, terrain, refinement, levels)

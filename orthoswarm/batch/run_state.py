@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from orthoswarm.batch.refiners import RefinerName
 from orthoswarm.batch.workspace import Workspace
@@ -32,7 +32,7 @@ from orthoswarm.refine.registration.map_offset import MapOffset
 Load = Callable[[Progress], Ingest]
 
 REALTIME, COARSE, ORTHOIMAGE = "realtime.tif", "coarse.tif", "orthoimage.tif"
-SEAMLINES = "seamlines.gpkg"
+SEAMLINES, CONFIDENCE = "seamlines.gpkg", "confidence.tif"
 PRODUCTS = (
     REALTIME,
     COARSE,
@@ -40,6 +40,7 @@ PRODUCTS = (
     "frames.jsonl",
     "footprints.gpkg",
     SEAMLINES,
+    CONFIDENCE,
     "report.json",
     "report.html",
 )
@@ -123,7 +124,7 @@ class RunState:
         warnings: for the report. rejected: image -> why it was left out.
         thumbnails, gains: image -> small picture, brightness gains.
         still: frames of vehicles that hovered. odd: frames of another camera or direction than their vehicle's others.
-        terrain: ground under the fine cameras. drawn: what the map covers.
+        terrain: ground under the fine cameras. drawn: what the map covers. trust: how far, see mosaic.confidence.
         previews: small copies of the pictures, for the seams. pictures: those that are decoded, None to read the files.
         parts: what the real-time map shows of each picture, for the refined ones.
         undrawn: image -> why the real-time picture does not show it.
@@ -147,6 +148,7 @@ class RunState:
     odd: list[PlacedFrame] = field(default_factory=list)
     terrain: Terrain | None = None
     drawn: DrawnGround = NOTHING_DRAWN
+    trust: Mapping[str, Any] = field(default_factory=dict)
     previews: PreviewFile | None = None
     parts: PictureParts | None = None
     pictures: GreyPictures | None = None

@@ -10,13 +10,11 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.plane_similarity import Similarity, design
 
-Array = NDArray[np.float64]
-_HELD = 1e-6
-"""Sigma of what does not move, metres (or radians)."""
+_HELD = 1e-6  # sigma of what does not move, metres (or radians)
 
 _AREA_SHIFT_SIGMA_M: Final = 1.0
 """How well an area's receivers tell its place, an axis, and its level; over its extent the same of its turn and scale:
@@ -29,8 +27,7 @@ _AREA_TIE_SIGMA_M: Final = 0.3  # how well a vehicle's place agrees in two areas
 class AreaTie:
     """A vehicle that was solved in two areas.
 
-    Attributes:
-        one, other: numbers of the areas. place: float64 (2, N, 3), some camera positions in the one and the other.
+    one, other: numbers of the areas. place: float64 (2, N, 3), some camera positions in the one and the other.
     """
 
     one: int

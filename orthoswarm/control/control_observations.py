@@ -9,18 +9,16 @@ from dataclasses import KW_ONLY, dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.evaluation.checkpoints import POINTING_SIGMA_PX, RECEIVERS_LOCAL_SIGMA_M, SURVEY_SIGMA_M, Checkpoint
 from orthoswarm.evaluation.misread_points import FARTHEST_M, misplaced
 from orthoswarm.evaluation.photo_names import photo_named, photos_named
 from orthoswarm.evaluation.point_rays import Ray, RayPoint, intersect_rays
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.frame import Ingest
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import PlacedFrame, Terrain
-
-Array = NDArray[np.float64]
 
 _HEIGHT_SIGMA_M: Final = 2.0  # sigma of a point's height over the solved terrain below it
 
@@ -87,9 +85,8 @@ def in_photos(
 ) -> list[ControlObservation]:
     """Points by the rays of the photos that show them.
 
-    Args:
-        points: surveyed points. placed: photos of one frame of reference. terrain: ground below them.
-        grid: the area's. on_map: whether that frame is the basemap.
+    points: surveyed points. placed: photos of one frame of reference. terrain: ground below them. grid: the area's.
+    on_map: whether that frame is the basemap.
     """
     images = {p.frame.image: p for p in placed}
     out = []

@@ -10,16 +10,14 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.control.control_observations import in_photos, on_basemap
 from orthoswarm.control.moved_block import moved_camera, moved_terrain
 from orthoswarm.control.similarity import ControlFit, fit_similarity
 from orthoswarm.evaluation.checkpoints import RECEIVERS_LOCAL_SIGMA_M, Checkpoint
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import Leg, PlacedFrame, Refinement, Solution, Terrain
-
-Array = NDArray[np.float64]
 
 _SCATTER_TOLD_M: Final = 0.5  # points that scatter by more than this are warned about, one sigma of an axis
 _BORDER_M: Final = 0.5
@@ -35,10 +33,8 @@ _FREE_BORDER_SHARE: Final = 0.1
 class GroundControl:
     """Result of the ground control.
 
-    Attributes:
-        on_map: the fit of the photos registered on the basemap; by_receivers: of the others. None without a control
-            point in these photos.
-        warnings: findings in plain words.
+    on_map: the fit of the photos registered on the basemap; by_receivers: of the others. None without a control point
+    in these photos. warnings: findings in plain words.
     """
 
     on_map: ControlFit | None
@@ -77,14 +73,9 @@ class GroundControl:
 def place_on_control(
     refinement: Refinement, points: Sequence[Checkpoint], grid: LocalGrid, map_gsd_m: float | None
 ) -> tuple[Refinement, GroundControl]:
-    """Move the fine cameras and their terrain onto control points.
+    """Move the fine cameras and their terrain onto control points; the given refinement is not modified.
 
-    Args:
-        refinement: result of the refiner; not modified. points: surveyed points. grid: the area's.
-        map_gsd_m: the basemap's pixel, None without a basemap.
-
-    Returns:
-        The moved refinement, and the result of the ground control.
+    map_gsd_m: the basemap's pixel, None without a basemap.
 
     Raises:
         InputError: a point's pixel lies outside its photo.

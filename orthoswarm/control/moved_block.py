@@ -3,8 +3,8 @@
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Floats
 from orthoswarm.model.camera import Camera
 from orthoswarm.model.placement import Terrain
 from orthoswarm.model.plane_similarity import Similarity
@@ -13,8 +13,7 @@ from orthoswarm.model.plane_similarity import Similarity
 def moved_camera(camera: Camera, similarity: Similarity, level_m: float, up_m: float = 0.0) -> Camera:
     """A camera after a similarity; heights over a level are scaled, too, so that no pixel's ray is bent.
 
-    Args:
-        camera: before it. level_m: of the ground. up_m: added to its height.
+    camera: before it. level_m: of the ground. up_m: added to its height.
     """
     height = float(similarity.moved_heights(camera.position[2], level_m)) + up_m
     position = np.array([*similarity.moved(camera.nadir), height])
@@ -24,8 +23,7 @@ def moved_camera(camera: Camera, similarity: Similarity, level_m: float, up_m: f
 def moved_terrain(terrain: Terrain, similarity: Similarity, level_m: float) -> Terrain:
     """The ground after a similarity, on nodes as far apart as before.
 
-    Args:
-        terrain: before it. level_m: heights over this level are scaled.
+    terrain: before it. level_m: heights over this level are scaled.
     """
     rows, columns = terrain.z.shape
     step = terrain.step_m
@@ -36,12 +34,11 @@ def moved_terrain(terrain: Terrain, similarity: Similarity, level_m: float) -> T
     corners = similarity.moved(np.array([[west, south], [east, south], [east, north], [west, north]]))
     low = np.floor(corners.min(axis=0) / step) * step
     count = np.ceil((corners.max(axis=0) - low) / step).astype(int) + 1
-    e, n = np.meshgrid(low[0] + step * np.arange(count[0]), low[1] + step * np.arange(count[1]))
-    before = similarity.back(np.stack([e, n], axis=-1))
+    empty = Terrain(float(low[0]), float(low[1]), step, np.zeros(count[::-1], np.float32))
+    before = similarity.back(empty.nodes())
 
-    def moved(z: NDArray[np.float32]) -> NDArray[np.float32]:
-        heights = replace(terrain, z=z, bare=None).height(before)
+    def moved(z: Floats) -> Floats:
+        heights = replace(terrain, z=z).height(before)
         return np.asarray(similarity.moved_heights(heights, level_m), np.float32)
 
-    bare = None if terrain.bare is None else moved(terrain.bare)
-    return Terrain(float(low[0]), float(low[1]), step, moved(terrain.z), bare)
+    return terrain.changed(moved, west=float(low[0]), south=float(low[1]))

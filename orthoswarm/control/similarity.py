@@ -9,16 +9,14 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.control.control_observations import ControlObservation
 from orthoswarm.evaluation.misread_points import FARTHEST_M
 from orthoswarm.evaluation.point_rays import MISTAKE_PROBABILITY
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.plane_similarity import Similarity
 
-Array = NDArray[np.float64]
-_HALVINGS = 20
-"""Of a bracket of a kilometre, to a millimetre."""
+_HALVINGS = 20  # of a bracket of a kilometre, to a millimetre
 
 _SCATTER_FEWEST: Final = 5  # fewest points without a stated sigma whose scatter is estimated
 _SHIFT_SIGMA_M: Final = 100.0  # what is known of the shift before the control points: nothing, so that they decide it
@@ -51,9 +49,8 @@ def fit_similarity(observations: Sequence[ControlObservation], nadirs: Array, bo
     sigma are believed as far as they agree: a handheld receiver's are metres off, and of nine such points those that
     agree by chance must not reject the others.
 
-    Args:
-        observations: at least one. nadirs: float64 (N, 2), nadir points of the photos, for their centre and extent.
-        border_m: prior sigma of rotation and scale, as the displacement at the photos' rms radius, metres.
+    observations: at least one. nadirs: float64 (N, 2), nadir points of the photos, for their centre and extent.
+    border_m: prior sigma of rotation and scale, as the displacement at the photos' rms radius, metres.
     """
     middle = np.asarray(nadirs.mean(axis=0))
     radius = max(float(np.sqrt(((nadirs - middle) ** 2).sum(axis=1).mean())), 1.0)

@@ -26,7 +26,7 @@ from orthoswarm.model.camera import Lens
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import Terrain
-from orthoswarm.mosaic.footprint import least_descent, tan_limit
+from orthoswarm.mosaic.footprint import LEAST_DESCENT, TAN_LIMIT
 
 Box = tuple[int, int, int, int]
 Geometry = Any
@@ -217,7 +217,7 @@ class CoverageGrid:
         """Rows and columns that hold the view's footprint on the lowest and the highest ground."""
         corners, grid, ground = _border(view.lens), self.cells.grid, view.ground or self.terrain
         rays = corners @ np.linalg.inv(view.to_camera).T
-        points, flattest = [], tan_limit()
+        points, flattest = [], TAN_LIMIT
         for z in (float(ground.z.min()), float(ground.z.max())):
             above = float(view.position[2]) - z
             if above <= 0.0:
@@ -239,7 +239,7 @@ class CoverageGrid:
 
 def _descents() -> tuple[float, float]:
     """Cosines of the largest off-nadir angle that is not oblique, and of the largest that sees the ground at all."""
-    return math.cos(math.radians(_OBLIQUE_DEG)), least_descent()
+    return math.cos(math.radians(_OBLIQUE_DEG)), LEAST_DESCENT
 
 
 def _union(boxes: Sequence[Box]) -> Box:

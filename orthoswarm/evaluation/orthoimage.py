@@ -60,6 +60,20 @@ def evaluate_ortho(
     Raises:
         InputError: if a file cannot be read or the two do not overlap.
     """
+    field, covered, ground, s = _field(ortho, reference, mask, settings, gsd_m)
+    step, thin = max(1, round(s.step_m / s.gsd_m)), max(1, round(1.2 / s.gsd_m))
+    return accuracy(field, completeness(covered, ground, s.gsd_m * thin), float(step))
+
+
+def displacements(ortho: Path, reference: Path, mask: Path | None, settings: FieldSettings) -> Displacements:
+    """The field of displacements of an orthoimage file against a reference file; see evaluate_ortho."""
+    return _field(ortho, reference, mask, settings, None)[0]
+
+
+def _field(
+    ortho: Path, reference: Path, mask: Path | None, settings: FieldSettings | None, gsd_m: float | None
+) -> tuple[Displacements, Mask, Mask, FieldSettings]:
+    """The displacements, where both pictures are at 1.2 m, and the settings with the pixel that was used."""
     parts, own_ortho, own_ground = [], [], []
     with _Pair(ortho, reference, mask, gsd_m) as pair:
         s = dataclasses.replace(settings or FieldSettings(), gsd_m=pair.gsd_m)
@@ -72,8 +86,7 @@ def evaluate_ortho(
     covered, ground = np.concatenate(own_ortho), np.concatenate(own_ground)
     if not (covered & ground).any():
         raise InputError(f"{ortho.name} and {reference.name} do not overlap; check that both show the same place")
-    step = max(1, round(s.step_m / s.gsd_m))
-    return accuracy(Displacements.joined(parts), completeness(covered, ground, s.gsd_m * thin), float(step))
+    return Displacements.joined(parts), covered, ground, s
 
 
 def _readable(strips: "Iterator[_Strip]", names: str) -> "Iterator[_Strip]":

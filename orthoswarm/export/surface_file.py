@@ -1,14 +1,13 @@
 """The surface model as a cloud-optimised GeoTIFF."""
 
-import tempfile
 import warnings
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from orthoswarm.export.atomic_file import atomic_write
-from orthoswarm.export.cog import copy_dataset, software
+from orthoswarm.export.cog import software
+from orthoswarm.export.value_raster import write_values
 from orthoswarm.stereo.surface_cells import SurfaceModel
 
 NO_DATA = -9999.0
@@ -16,10 +15,6 @@ NO_DATA = -9999.0
 _UNITS: Final = ("m", "m", "")
 _DATUM: Final = "that of the altitudes in the photos: the ellipsoid, the geoid or another one, as their maker has it"
 _NO_DATUM: Final = "none: heights are over the takeoff level"
-_COG: Final = {
-    "driver": "COG", "compress": "deflate", "predictor": "floating_point", "overview_resampling": "average",
-    "bigtiff": "if_safer",
-}  # fmt: skip
 
 
 def write_surface(
@@ -37,14 +32,6 @@ def write_surface(
     Raises:
         StorageError: if the disk is full or the folder cannot be written.
     """
-    import rasterio
-
-    grid = surface.grid
-    profile = {
-        "driver": "GTiff", "width": grid.width, "height": grid.height, "count": 3, "dtype": "float32",
-        "crs": f"EPSG:{grid.epsg}", "transform": grid.affine(), "nodata": NO_DATA, "tiled": True,
-        "bigtiff": "if_safer",
-    }  # fmt: skip
     unknown = ~np.isfinite(surface.height_m)
     zero = "the takeoff level" if takeoff_altitude_m is None else "the zero of the receivers' altitudes"
     common = (
@@ -60,16 +47,8 @@ def write_surface(
     tags = {"HEIGHTS_FROM": zero, "VERTICAL_DATUM": _NO_DATUM, "TIFFTAG_SOFTWARE": software()}
     if takeoff_altitude_m is not None:
         tags |= {"TAKEOFF_ALTITUDE_M": f"{takeoff_altitude_m:.2f}", "VERTICAL_DATUM": _DATUM}
-    with atomic_write(path) as part, tempfile.TemporaryDirectory(dir=path.parent, prefix=".surface") as folder:
-        plain = Path(folder) / "plain.tif"  # overviews are made of a whole file
-        with rasterio.open(plain, "w", **profile) as file:
-            for band, (name, values) in enumerate(bands.items(), start=1):
-                file.write(np.where(unknown, np.float32(NO_DATA), values), band)
-                file.set_band_description(band, name)
-            file.units = _UNITS
-            file.update_tags(**tags)
-        with rasterio.open(plain) as file:
-            copy_dataset(file, part, **_COG)
+    known = {name: np.where(unknown, np.float32(NO_DATA), values) for name, values in bands.items()}
+    write_values(path, surface.grid, known, no_data=NO_DATA, units=_UNITS, tags=tags)
 
 
 def is_surface(path: Path) -> bool:

@@ -90,13 +90,17 @@ class Terrain:
         step_m: distance of nodes.
         z: float32 (rows, columns), metres over the datum of the cameras.
         bare: the same without tall surfaces (halls, woods); None where z has no such tops.
+        tops: up to where something may stand: what was found, drawn on its top or not, and what may be there where the
+            pictures did not decide; None where nothing stands.
     """
 
     west: float
     south: float
     step_m: float
     z: NDArray[np.float32]
+    _: KW_ONLY
     bare: NDArray[np.float32] | None = None
+    tops: NDArray[np.float32] | None = None
 
     @classmethod
     def flat(cls, z_m: float = 0.0) -> "Terrain":
@@ -105,7 +109,24 @@ class Terrain:
 
     def bare_ground(self) -> "Terrain":
         """The ground without the tops of what stands on it."""
-        return self if self.bare is None else replace(self, z=self.bare, bare=None)
+        return self if self.bare is None else replace(self, z=self.bare, bare=None, tops=None)
+
+    def changed(
+        self,
+        change: Callable[[NDArray[np.float32]], NDArray[np.float32]],
+        west: float | None = None,
+        south: float | None = None,
+    ) -> "Terrain":
+        """The ground with a change made to each of its grids of heights, whose first node then lies elsewhere."""
+        bare, tops = (None if z is None else change(z) for z in (self.bare, self.tops))
+        west, south = self.west if west is None else west, self.south if south is None else south
+        return replace(self, west=west, south=south, z=change(self.z), bare=bare, tops=tops)
+
+    def nodes(self) -> Array:
+        """Positions (rows, columns, 2) of the nodes."""
+        rows, columns = self.z.shape
+        east, north = self.west + self.step_m * np.arange(columns), self.south + self.step_m * np.arange(rows)
+        return np.stack(np.meshgrid(east, north), -1)
 
     def height(self, east_north: NDArray[Any]) -> Array:
         """Heights (...,) at ground points (..., 2)."""

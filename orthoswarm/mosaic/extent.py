@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 
 from orthoswarm.canvas.canvas import Canvas
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.placement import MapWindow, PlacedFrame, Solution, Terrain
@@ -40,6 +41,29 @@ def ground_level(placed: Sequence[PlacedFrame], terrain: Terrain | None) -> floa
     return float(np.median(terrain.bare_ground().height(np.array([p.camera.nadir for p in placed]))))
 
 
+def ground_of_nearest(
+    grounds: Sequence[Terrain | None], paths: Sequence[Array], reach_m: float, *, step_m: float, most_nodes: int
+) -> Terrain:
+    """Everywhere the ground of the vehicle whose camera is nearest, as that is drawn; 0 where it has none.
+
+    grounds: of the vehicles. paths: where their cameras were, float64 (N, 2) each. reach_m: how far beyond them.
+    step_m: distance of the nodes, more where they would be more than `most_nodes`.
+    """
+    from scipy.spatial import cKDTree
+
+    path = np.concatenate(paths)
+    box = BoundingBox.around_points(path, reach_m)
+    step = max(step_m, float(np.sqrt(box.width * box.height / most_nodes)))
+    rows, columns = (int(np.ceil(side / step)) + 1 for side in (box.height, box.width))
+    out = Terrain(box.west, box.south, step, np.zeros((rows, columns), np.float32))
+    nodes = out.nodes()
+    nearest = np.repeat(np.arange(len(paths)), [len(own) for own in paths])[cKDTree(path).query(nodes)[1]]
+    for k, ground in enumerate(grounds):
+        if ground is not None:
+            out.z[nearest == k] = ground.height(nodes[nearest == k])
+    return out
+
+
 def solved_level(solutions: Sequence[Solution]) -> float:
     """Level of the mapped ground, metres: the solutions' median, weighted by pictures; 0 where none has a terrain."""
     levels = [np.full(len(s.placed), s.ground_z_m) for s in solutions if s.terrain is not None]
@@ -56,8 +80,7 @@ def from_takeoff(
     the relief. Their weighted mean becomes zero. No homography changes by this, only the heights stated with it.
 
     Args:
-        placed: placed frames.
-        level: of the mapped ground, metres.
+        placed: placed frames. level: of the mapped ground, metres.
         terrain: the ground below them; None: nothing was solved, and heights stay as they are.
 
     Returns:

@@ -6,28 +6,20 @@ from functools import lru_cache
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.camera import Camera, Lens
 from orthoswarm.mosaic.kernels.lens_arrays import INNER, OUTER, lens_row
-
-Array = NDArray[np.float64]
 
 MOST_OFF_NADIR_DEG: Final = 75.0
 """Ground that is seen farther from straight down is not drawn: a pixel there is smeared over more than 15 times its
 size at nadir."""
+TAN_LIMIT: Final = math.tan(math.radians(MOST_OFF_NADIR_DEG))
+LEAST_DESCENT: Final = math.cos(math.radians(MOST_OFF_NADIR_DEG))
+"""Smallest descent of a ray per unit of depth that is drawn: on level ground a straight line below the horizon."""
 _MOST_MAGNIFICATION: Final = 16.0
 """A picture whose ground pixel is more than so many times the map's is none of this flight."""
-
-
-def tan_limit() -> float:
-    """Tangent of the greatest angle off nadir at which ground is drawn."""
-    return float(np.tan(np.radians(MOST_OFF_NADIR_DEG)))
-
-
-def least_descent() -> float:
-    """Smallest descent of a ray per unit of depth that is drawn: on level ground a straight line below the horizon."""
-    return float(np.cos(np.radians(MOST_OFF_NADIR_DEG)))
 
 
 def default_gsd(cameras: Sequence[Camera], ground_z_m: float = 0.0) -> float:
@@ -46,10 +38,8 @@ def default_gsd(cameras: Sequence[Camera], ground_z_m: float = 0.0) -> float:
 def rejections(cameras: Sequence[Camera], ground_z_m: ArrayLike, gsd_m: float) -> dict[int, str]:
     """Frames that cannot be drawn on a map: index -> why, one clause.
 
-    Args:
-        cameras: where the frames' cameras are.
-        ground_z_m: height of the ground below each, (N,) or one number.
-        gsd_m: the map's ground pixel.
+    cameras: where the frames' cameras are. ground_z_m: height of the ground below each, (N,) or one number. gsd_m: the
+    map's ground pixel.
     """
     if len(cameras) == 0:
         return {}
@@ -85,7 +75,7 @@ def _reason(height: float, focal_px: float, steepest: float, gsd_m: float) -> st
             f"from {height:.0f} m above the ground its pixels are {times:.0f} times as large as the map's: "
             "its height is wrong, or the map's pixel (--gsd) too small"
         )
-    if steepest < least_descent():
+    if steepest < LEAST_DESCENT:
         return "it looks at the horizon or above, and not at the ground"
     return None
 
@@ -120,19 +110,15 @@ def _border(lens: Lens, per_side: int, inset_px: float) -> Array:
 def footprint(camera: Camera, ground_z_m: float = 0.0, inset_px: float = 0.0) -> Array:
     """The ground that a camera sees on a level plane, a closed polygon float64 (K, 2), K = 0 if none.
 
-    Without distortion it is exact and convex, clipped where the view is flatter than `most_off_nadir_deg`
-    (along a straight line: the circle of that angle, `reach`, cuts the rest). With distortion the border is
-    densified, 8 points a side, and the polygon may be slightly concave.
-
-    Args:
-        camera: where it is.
-        ground_z_m: the plane's height.
-        inset_px: how far inside the outermost pixel centres; -0.5 is the picture's very edge.
+    Without distortion it is exact and convex, clipped where the view is flatter than `MOST_OFF_NADIR_DEG` (along a
+    straight line: the circle of that angle, `reach`, cuts the rest). With distortion the border has 8 points a side,
+    and the polygon may be slightly concave. inset_px: how far inside the outermost pixel centres; -0.5 is the picture's
+    very edge.
     """
     height = float(camera.position[2]) - ground_z_m
     xy = _border(camera.lens, 1 if camera.lens.is_pinhole else 8, inset_px)
     rays = np.concatenate([xy, np.ones((len(xy), 1))], 1) @ camera.rotation.T
-    rays = _clip(rays, least_descent())
+    rays = _clip(rays, LEAST_DESCENT)
     if len(rays) < 3 or height <= 0:
         return np.empty((0, 2))
     return np.asarray(camera.position[:2] + rays[:, :2] * (height / -rays[:, 2:]))
@@ -155,7 +141,7 @@ def _clip(rays: Array, least: float) -> Array:
 
 def reach(camera: Camera, ground_z_m: float = 0.0) -> float:
     """Greatest distance from the nadir point at which the ground is drawn, metres."""
-    return tan_limit() * (float(camera.position[2]) - ground_z_m)
+    return TAN_LIMIT * (float(camera.position[2]) - ground_z_m)
 
 
 def footprint_boxes(cameras: Sequence[Camera], z_low: float, z_high: float) -> Array:
@@ -164,7 +150,7 @@ def footprint_boxes(cameras: Sequence[Camera], z_low: float, z_high: float) -> A
     West > east where a camera sees nothing.
     """
     boxes = np.tile([np.inf, np.inf, -np.inf, -np.inf], (len(cameras), 1))
-    least = least_descent()
+    least = LEAST_DESCENT
     for lens, index in _by_lens(cameras).items():
         position = np.stack([cameras[i].position for i in index]).astype(float)
         rays = _corners(lens) @ np.stack([cameras[i].rotation for i in index]).transpose(0, 2, 1)

@@ -9,14 +9,14 @@ from collections.abc import Sequence
 from typing import Final, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array, Bytes, Flags
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import Camera
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import Terrain
 from orthoswarm.mosaic.kernels.render_arrays import Shots
-from orthoswarm.mosaic.overlap_colors import BRIGHT_LEVEL, DARK_LEVEL, Bytes, OverlapColors, grid_on_ground
+from orthoswarm.mosaic.overlap_colors import BRIGHT_LEVEL, DARK_LEVEL, OverlapColors, grid_on_ground
 
 _MAP_SIGMA: Final = 0.25  # log ratio of a picture's block to a map: another season, light and sensor, local changes
 _MAP_BLOCK_PX: Final = 4  # side of a block of the map's colours, pixels of a thumbnail
@@ -28,7 +28,7 @@ _MAP_COVERED_SHARE: Final = 0.9  # least share of a block that the map shows
 class ColorMap(Protocol):
     """A map in colour (raster.basemap.Basemap)."""
 
-    def rgb(self, bounds: BoundingBox, gsd_m: float) -> tuple[Bytes, NDArray[np.bool_]]:
+    def rgb(self, bounds: BoundingBox, gsd_m: float) -> tuple[Bytes, Flags]:
         """Colours (rows, columns, 3) and validity of a window; see GroundGrid.around for its frame."""
 
 
@@ -37,9 +37,8 @@ def map_colors(
 ) -> OverlapColors:
     """Compare frames with a map; the map's index as a frame is the number of cameras.
 
-    Args:
-        cameras: N cameras; shots: the same as arrays. small: uint8 (N, rows, columns, 3) thumbnails.
-        terrain: the ground. tone: the map; where it is grey its hue says nothing.
+    cameras: N cameras; shots: the same as arrays. small: uint8 (N, rows, columns, 3) thumbnails. terrain: the ground.
+    tone: the map; where it is grey its hue says nothing.
     """
     count = len(cameras)
     side = _MAP_BLOCK_PX
@@ -66,7 +65,7 @@ def map_colors(
     return OverlapColors(frame[valid], ratio[valid].astype(np.float32), place[valid], sigma)
 
 
-def _at(tone: ColorMap, ground: NDArray[np.float64], columns: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def _at(tone: ColorMap, ground: Array, columns: int) -> tuple[Array, Flags]:
     """The map's means (N, P, 3) about places (N, P, 2), and where there are any."""
     import cv2
 

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.placement import PlacedFrame
 
 _OBLIQUE_DEG: Final = 35.0
@@ -19,7 +19,7 @@ _NADIR_DEG: Final = 15.0  # a flight whose median tilt is below this looks strai
 _OBLIQUE_SHARE: Final = 1.0 / 3.0  # a vehicle with a larger share of oblique pictures took them on purpose
 
 
-def tilts(placed: Sequence[PlacedFrame]) -> NDArray[np.float64]:
+def tilts(placed: Sequence[PlacedFrame]) -> Array:
     """Angles (N,) between the middle of each picture's view and straight down, radians."""
     down = np.array([-p.camera.rotation[2, 2] for p in placed], float)
     return np.asarray(np.arccos(np.clip(down, -1.0, 1.0)))

@@ -13,19 +13,16 @@ from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel
 from orthoswarm.compute.threads import on_threads
+from orthoswarm.model.arrays import Array, Bytes, Floats, Ints
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import Camera, Lens
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import Terrain
-from orthoswarm.mosaic.footprint import footprint_boxes, least_descent
+from orthoswarm.mosaic.footprint import LEAST_DESCENT, footprint_boxes
 from orthoswarm.mosaic.kernels.drawn_heights import heights
 from orthoswarm.mosaic.kernels.render_arrays import Shots, project
 from orthoswarm.mosaic.seam_labels import label_tile
 from orthoswarm.mosaic.visible_ground import by_tile
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int32]
-Bytes = NDArray[np.uint8]
 
 _TILE = 512
 
@@ -60,9 +57,9 @@ class OverlapColors:
     """
 
     frame: Ints
-    ratio: NDArray[np.float32]
-    place: NDArray[np.float32]
-    sigma: NDArray[np.float32]
+    ratio: Floats
+    place: Floats
+    sigma: Floats
 
     @classmethod
     def joined(cls, parts: "Sequence[OverlapColors]") -> "OverlapColors":
@@ -178,7 +175,7 @@ def grid_on_ground(cameras: Sequence[Camera], shots: Shots, terrain: Terrain, sh
         by_lens[lens] = np.concatenate([xy, np.ones((len(xy), 1))], 1)
     rays = np.stack([by_lens[camera.lens] for camera in cameras]) @ shots.rotation.transpose(0, 2, 1)
     height = shots.position[:, 2] - terrain.height(shots.position[:, :2])
-    descent = np.where(rays[..., 2:] < -least_descent(), -rays[..., 2:], np.nan)
+    descent = np.where(rays[..., 2:] < -LEAST_DESCENT, -rays[..., 2:], np.nan)
     return np.asarray(shots.position[:, None, :2] + rays[..., :2] * (height[:, None, None] / descent))
 
 
@@ -208,8 +205,7 @@ def _compared(
         ground = np.nan_to_num(some.ground)
         place = np.stack([ground[:, 0] - west, north - ground[:, 1], terrain.height(ground)], 1)
         _compare(
-            some.a, some.b, place, position, rotation, shots.lens, shots.size, small, DARK_LEVEL,
-            BRIGHT_LEVEL, ratio, usable, seen, contrast,
+            some.a, some.b, place, position, rotation, shots.lens, shots.size, small, ratio, usable, seen, contrast,
         )  # fmt: skip
         usable &= np.asarray(np.isfinite(some.ground).all(axis=1))
         sigma = np.sqrt(_RATIO_SIGMA**2 + np.square(_MISPLACED * contrast))
@@ -234,7 +230,7 @@ def _compared(
 
 
 @in_place_kernel
-def _compare(a, b, place, position, rotation, lens, size, small, dark, bright, ratio, usable, seen, contrast):  # type: ignore[no-untyped-def]
+def _compare(a, b, place, position, rotation, lens, size, small, ratio, usable, seen, contrast):  # type: ignore[no-untyped-def]
     rows, columns = small.shape[1], small.shape[2]
     for m in range(len(a)):
         clear = 0
@@ -257,7 +253,7 @@ def _compare(a, b, place, position, rotation, lens, size, small, dark, bright, r
                     rising = float(small[k, i, j + 1, 1]) - float(small[k, i + 1, j, 1])
                     across, down = falling + rising, falling - rising
                     contrast[m] += 0.5 * np.hypot(across, down) / max(value, 1.0)
-                good = good and value > dark and value < bright
+                good = good and value > DARK_LEVEL and value < BRIGHT_LEVEL
                 ratio[m, channel] += (1.0 - 2.0 * side) * np.log(max(value, 1.0))
             half = 0.5 * size[k, 0]
             seen[m, side, 0] = (u + 0.5) / half - 1.0

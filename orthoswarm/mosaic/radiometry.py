@@ -14,7 +14,7 @@ tighter, since meadows and shadows differ in it by themselves. The solution of a
 place in the picture, which the renderer evaluates at each pixel that it takes.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from typing import Final
@@ -25,13 +25,13 @@ from numpy.typing import NDArray
 from orthoswarm.compute.jit import in_place_kernel, kernel
 from orthoswarm.compute.robust_kernel import robust_weight
 from orthoswarm.compute.threads import on_threads
+from orthoswarm.model.arrays import Array, Bytes, Flags, Ints
 from orthoswarm.model.placement import PlacedFrame, Terrain
 from orthoswarm.mosaic.kernels.lens_arrays import F, U, V
 from orthoswarm.mosaic.kernels.render_arrays import Shots
 from orthoswarm.mosaic.map_colors import ColorMap, map_colors
-from orthoswarm.mosaic.overlap_colors import Bytes, OverlapColors, overlap_colors
+from orthoswarm.mosaic.overlap_colors import OverlapColors, overlap_colors
 
-Array = NDArray[np.float64]
 Field = NDArray[np.float32]
 """Factors of a frame: float32 (3, 6), for red, green and blue the coefficients of 1, x, y, x^2, xy, y^2; x and y are
 the place in the picture from its centre, half the picture's width being 1."""
@@ -43,8 +43,7 @@ _COMMON, _OWN = 11, 6
 curvatures."""
 
 
-_PARTS = 8
-"""Parts in which samples are summed, at most so many threads (chosen)."""
+_PARTS = 8  # parts in which samples are summed, at most so many threads (chosen)
 
 _ROBUST_SIGMAS: Final = 3.0  # scale of the Geman-McClure kernel on these ratios, sigmas
 _VEHICLE_SIGMA: Final = 0.30  # log gain of a vehicle's camera: another exposure or white balance
@@ -94,12 +93,10 @@ def tone_warning(fields: Mapping[str, Field]) -> str:
         return "the tones are those of the photos: there is nothing to compare"
     red, green, blue = np.median(factors, axis=0)
     text = f"the tones follow the basemap: red, green and blue times {red:.2f}, {green:.2f} and {blue:.2f} (median)"
-    greatest = GREATEST_FACTOR
-    at_limit = float((np.abs(np.log(factors)).max(1) > _LIMITED_LOG_SHARE * np.log(greatest)).mean())
+    most = GREATEST_FACTOR
+    at_limit = float((np.abs(np.log(factors)).max(1) > _LIMITED_LOG_SHARE * np.log(most)).mean())
     if at_limit > _LIMITED_SHARE:
-        text += (
-            f"; {at_limit:.0%} of the photos would need more than {greatest:g}, the greatest factor, and differ from it"
-        )
+        text += f"; {at_limit:.0%} of the photos would need more than {most:g}, the greatest factor, and differ from it"
     if max(red, green, blue) > _TINT_RATIO * min(red, green, blue):
         text += "; the map has another tint than the photos (season, light, sensor), which the orthoimage now has, too"
     return text
@@ -114,22 +111,17 @@ def estimate_fields(
     tone: ColorMap | None = None,
     threads: int = 1,
 ) -> dict[str, Field]:
-    """Factors that make neighbouring frames alike.
+    """Factors that make neighbouring frames alike: image -> field, within `GREATEST_FACTOR` and its inverse.
 
     The mean logarithm of the mosaic's brightness stays as it was, channel by channel; where some fields are held, the
     others follow those instead, and with a map its tone.
 
     Args:
-        frames: placed frames in order of vehicle and time.
+        frames: placed frames in order of vehicle and time. terrain: the ground's height.
         thumbnails: image -> uint8 (rows, columns, 3), means of a picture's parts (RenderStats.thumbnails of an earlier
             rendering); a frame without one gets what its vehicle has in common.
-        terrain: the ground's height.
         held: image -> field of frames that are drawn already and stay as they are.
-        tone: a map that the mosaic's tone is to follow at low frequency.
-        threads: that share the work; the result does not depend on them.
-
-    Returns:
-        image -> field for every frame; factors lie within `GREATEST_FACTOR` and its inverse.
+        tone: a map that the mosaic's tone is to follow at low frequency. threads: do not change the result.
     """
     held = held or {}
     known = [i for i, f in enumerate(frames) if f.frame.image in thumbnails]
@@ -178,9 +170,7 @@ def _with_held(colors: OverlapColors, held: Sequence[Field | None]) -> OverlapCo
     return replace(colors, ratio=ratio.astype(np.float32))
 
 
-def _solve(
-    colors: OverlapColors, vehicle: NDArray[np.int32], vehicles: int, fixed: NDArray[np.bool_], threads: int
-) -> tuple[Array, Array]:
+def _solve(colors: OverlapColors, vehicle: Ints, vehicles: int, fixed: Flags, threads: int) -> tuple[Array, Array]:
     """Unknowns of vehicles (V, 11, 3) and of frames (N, 6, 3), by conjugate gradients within reweighting rounds."""
     prior_v = np.array([_VEHICLE_SIGMA, *_LENS_SIGMAS, *_VIEW_SIGMAS]) ** -2.0
     prior_f = np.array([_PICTURE_SIGMA, *[_SLOPE_SIGMA] * 2, *[_CURVE_SIGMA] * 3]) ** -2.0
@@ -192,26 +182,39 @@ def _solve(
     x = np.zeros((len(prior), 3))
     for _ in range(_REWEIGHTINGS):
         right, diagonal = samples.weigh(x)
-        scale = 1.0 / (diagonal[:, None] + prior)
         # the step from x: (A' W A + P) d = -(A' W r + P x)
-        left = -(right + prior * x)
-        step, z = np.zeros_like(x), scale * left
-        towards, product = z.copy(), (left * z).sum(0)
-        enough = _SOLVER_TOLERANCE**2 * product
-        for _ in range(_SOLVER_STEPS):
-            image = samples.applied(towards) + prior * towards
-            curve = (towards * image).sum(0)
-            alpha = product / np.where(curve > 0.0, curve, 1.0)
-            step += alpha * towards
-            left -= alpha * image
-            z = scale * left
-            last, product = product, (left * z).sum(0)
-            if (product <= enough).all():
-                break
-            towards = z + product / np.where(last > 0.0, last, 1.0) * towards
-        x += step
+        x += conjugate_gradients(
+            lambda towards: samples.applied(towards) + prior * towards, diagonal[:, None] + prior,
+            -(right + prior * x), _SOLVER_TOLERANCE, _SOLVER_STEPS,
+        )  # fmt: skip
     x = x @ _BRIGHTNESS_HUE
     return x[: vehicles * _COMMON].reshape(vehicles, _COMMON, 3), x[vehicles * _COMMON :].reshape(-1, _OWN, 3)
+
+
+def conjugate_gradients(
+    applied: Callable[[Array], Array], diagonal: Array, right: Array, tolerance: float, most_steps: int
+) -> Array:
+    """The solutions (M, K) of K systems with one positive definite matrix, preconditioned by its diagonal.
+
+    applied: the matrix times (M, K). diagonal: of the matrix, (M, 1) or (M, K). right: (M, K). tolerance:
+    preconditioned residual at which they end, as a share of the first one.
+    """
+    x, left, scale = np.zeros_like(right), right.copy(), 1.0 / diagonal
+    z = scale * left
+    towards, product = z.copy(), (left * z).sum(0)
+    enough = tolerance**2 * product
+    for _ in range(most_steps):
+        if (product <= enough).all():
+            break
+        image = applied(towards)
+        curve = (towards * image).sum(0)
+        alpha = product / np.where(curve > 0.0, curve, 1.0)
+        x += alpha * towards
+        left -= alpha * image
+        z = scale * left
+        last, product = product, (left * z).sum(0)
+        towards = z + product / np.where(last > 0.0, last, 1.0) * towards
+    return x
 
 
 class _Samples:
@@ -220,9 +223,7 @@ class _Samples:
     They are summed in parts, always the same ones, so that the result does not depend on the number of threads.
     """
 
-    def __init__(
-        self, colors: OverlapColors, vehicle: NDArray[np.int32], vehicles: int, free: Array, threads: int
-    ) -> None:
+    def __init__(self, colors: OverlapColors, vehicle: Ints, vehicles: int, free: Array, threads: int) -> None:
         self._threads = threads
         edges = np.linspace(0, len(colors.frame), _PARTS + 1).astype(int)
         parts = [slice(a, b) for a, b in pairwise(edges.tolist())]
@@ -232,12 +233,11 @@ class _Samples:
 
     def weigh(self, x: Array) -> tuple[Array, Array]:
         """Set the weights W by the residuals r at x; returns A' W r and the diagonal of A' W A."""
-        robust = _ROBUST_SIGMAS
 
         def part(k: int) -> tuple[Array, Array]:
             right, diagonal = np.zeros_like(x), np.zeros(len(x))
             seen, weight = self._measured[k], self._weights[k]
-            _weigh(*self._unknowns[k], *seen, _BRIGHTNESS_HUE, robust, x, weight, right, diagonal)
+            _weigh(*self._unknowns[k], *seen, _BRIGHTNESS_HUE, x, weight, right, diagonal)
             return right, diagonal
 
         rights, diagonals = zip(*on_threads(part, range(_PARTS), self._threads), strict=True)
@@ -309,7 +309,7 @@ def _gather(frame, vehicle, vehicles, of_vehicle, of_frame, count, a, b, c, out)
 
 @kernel
 def _weigh(  # type: ignore[no-untyped-def]
-    frame, place, vehicle, free, vehicles, ratio, sigma, axes, robust, values, weight, right, diagonal
+    frame, place, vehicle, free, vehicles, ratio, sigma, axes, values, weight, right, diagonal
 ):
     """Weights (M,) of samples by their residuals, and what they add to the right side and to the diagonal."""
     of_vehicle, of_frame = np.empty((2, _COMMON)), np.empty((2, _OWN))
@@ -321,7 +321,7 @@ def _weigh(  # type: ignore[no-untyped-def]
         b += axes[1, 0] * red + axes[1, 1] * green + axes[1, 2] * blue
         c += axes[2, 0] * red + axes[2, 1] * green + axes[2, 2] * blue
         precision = 1.0 / (float(sigma[m]) * float(sigma[m]))
-        w = robust_weight((a * a + b * b + c * c) / 3.0 * precision, robust**2, precision)
+        w = robust_weight((a * a + b * b + c * c) / 3.0 * precision, _ROBUST_SIGMAS**2, precision)
         weight[m] = w
         _gather(frame[m], vehicle, vehicles, of_vehicle, of_frame, count, w * a, w * b, w * c, right)
         for side in range(count):
@@ -342,7 +342,7 @@ def _apply(frame, place, vehicle, free, vehicles, weight, values, out):  # type:
         _gather(frame[m], vehicle, vehicles, of_vehicle, of_frame, count, w * a, w * b, w * c, out)
 
 
-def _nodes(size: NDArray[np.int32]) -> tuple[Array, Array]:
+def _nodes(size: Ints) -> tuple[Array, Array]:
     """Places in the pictures (N, nodes^2) at which fields are fitted."""
     count = _NODES
     across = np.linspace(-1.0, 1.0, count)
@@ -367,7 +367,7 @@ def _log_factors(of_vehicle: Array, of_frame: Array, shots: Shots) -> Array:
     return np.asarray(common @ of_vehicle + own @ of_frame)
 
 
-def _as_polynomials(factor: Array, size: NDArray[np.int32]) -> Field:
+def _as_polynomials(factor: Array, size: Ints) -> Field:
     """Coefficients (N, 3, 6) of the polynomials nearest to factors (N, nodes, 3) of pictures of these sizes (N, 2)."""
     x, y = _nodes(size)
     basis = np.stack([np.ones_like(y), x, y, x * x, x * y, y * y], -1)

@@ -1,9 +1,8 @@
 """The real-time module (paper III.B): every map pixel takes the picture that sees it most orthogonally, no blending.
 
 The homography of a frame follows in closed form from its recorded pose and an assumed field of view (theta-hat, below
-the smallest that any camera has), so no picture is matched to anything and each is done in about a millisecond.
-`RealtimeMosaic` draws one frame at a time as the daemon receives them; `mosaic` draws many at once, and samples each
-map pixel only once.
+the smallest that any camera has), so no picture is matched to anything. `RealtimeMosaic` draws one frame at a time as
+the daemon receives them; `mosaic` draws many at once, and samples each map pixel only once.
 """
 
 import math
@@ -15,10 +14,11 @@ from numpy.typing import NDArray
 
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.canvas.tile_store import Key
+from orthoswarm.model.arrays import Array, Bytes
 from orthoswarm.model.camera import Camera
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.placement import PlacedFrame, Terrain
-from orthoswarm.mosaic.footprint import least_descent, reach, rejection
+from orthoswarm.mosaic.footprint import LEAST_DESCENT, reach, rejection
 from orthoswarm.mosaic.kernels.downsampling import pack, reduction
 from orthoswarm.mosaic.kernels.lens_arrays import INNER, OUTER, lens_row
 from orthoswarm.mosaic.kernels.realtime_kernel import RUN, aim, fuse, touches
@@ -28,10 +28,6 @@ from orthoswarm.mosaic.seams.previews import PreviewFile
 from orthoswarm.raster.picture_file import read_rgb
 from orthoswarm.raster.picture_parts import PictureParts
 
-Array = NDArray[np.float64]
-Bytes = NDArray[np.uint8]
-
-
 _WEAK = 1e6  # metres for micrometres: farther than any other
 
 
@@ -39,10 +35,8 @@ _WEAK = 1e6  # metres for micrometres: farther than any other
 class Added:
     """What became of a frame.
 
-    Attributes:
-        tiles: the tiles (row, column) that changed.
-        won: how many map pixels it took.
-        reason: why it was not drawn, None if it was (also when it won nothing).
+    tiles: the tiles (row, column) that changed. won: how many map pixels it took. reason: why it was not drawn, None if
+    it was (also when it won nothing).
     """
 
     tiles: list[Key]
@@ -91,7 +85,7 @@ class RealtimeMosaic:
         planes, box = np.empty((8, 3)), np.empty(4)
         outer = np.array(lens_row(lens, 0.0)[OUTER:INNER])
         number = aim(
-            camera.position, camera.rotation, outer, ground_z_m, least_descent(), grid.west, grid.north, grid.gsd_m,
+            camera.position, camera.rotation, outer, ground_z_m, LEAST_DESCENT, grid.west, grid.north, grid.gsd_m,
             planes, box,
         )  # fmt: skip
         keys = self._tiles_in(box) if number else []
@@ -182,22 +176,9 @@ def mosaic(
 ) -> RenderStats:
     """Draw many frames at once by the same rule: which frame wins where is decided first, without the pictures.
 
-    Each picture is then read once, and not at all if it wins nothing, and each map pixel sampled once: the same mosaic
-    as by adding frame after frame (interpolated better), at little more than the cost of reading the pictures.
-
-    Args:
-        frames: with the recorded poses and the assumed field of view; "weak" means nothing here, but damaged pictures
-            are drawn only where no other sees.
-        canvas: made with plane "frame".
-        ground_z_m: height of the ground plane.
-        previews: see Layer.
-        read: see render. parts: see render.
-        run: see render.
-        progress: see render.
-
-    Raises:
-        InputError: if the canvas has another plane.
-        OrthoSwarmError: if the disk is full.
+    The same mosaic as by adding frame after frame (interpolated better), at little more than the cost of reading each
+    picture that wins something once. Canvases, errors and arguments as for `render`; `weak` means nothing here, but
+    damaged pictures are drawn only where no other sees.
     """
     unmarked = [replace(frame, weak=False) for frame in frames]
     ground = Terrain.flat(ground_z_m)

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.camera import NADIR_PITCH_RAD, Camera, Lens, focal_px, rotation_from_angles
 from orthoswarm.model.earth import on_sphere
 from orthoswarm.model.errors import InputError, OrthoSwarmError
@@ -28,8 +28,6 @@ from orthoswarm.model.geo import LocalGrid, area_epsg
 from orthoswarm.model.placement import PlacedFrame
 from orthoswarm.trajectory.courses import MOVED_M, course
 
-Array = NDArray[np.float64]
-
 _USUAL_HEIGHTS_M: Final = (50.0, 150.0)
 """Heights between which mapping flights are flown: where the photos' spacing gives a height."""
 _USUAL_OVERLAP: Final = 0.75  # forward overlap as flight planners propose it: it makes spacing a height
@@ -43,10 +41,8 @@ _UNTAGGED_TILT_SIGMA: Final = 0.1  # tilt without a recorded attitude: 6 degrees
 class Recorded:
     """Frames after the real-time stage.
 
-    Attributes:
-        placed: in the order of the frames.
-        rejected: frames whose position cannot be true.
-        warnings: sentences that name what was assumed.
+    placed: in the order of the frames. rejected: frames whose position cannot be true. warnings: sentences that name
+    what was assumed.
     """
 
     placed: list[PlacedFrame]
@@ -104,17 +100,15 @@ def in_one_area(ingest: Ingest) -> Ingest:
 def recorded_cameras(frames: Sequence[Frame], grid: LocalGrid, fov_rad: float | None = None) -> Recorded:
     """Place frames as recorded.
 
-    Args:
-        frames: sorted by vehicle, then time.
-        grid: the area's grid.
-        fov_rad: theta-hat, an assumed horizontal field of view for all; None takes the pictures' tags, else the
-            default of the configuration.
+    frames: sorted by vehicle, then time. grid: the area's. fov_rad: theta-hat, an assumed horizontal field of view for
+    all; None takes the pictures' tags, else the default.
     """
     lat = np.array([f.fix.lat_deg for f in frames])
     lon = np.array([f.fix.lon_deg for f in frames])
     ground = grid.to_grid(lat, lon)
-    near = _near(ground)
-    rejected = [_too_far(frames[i], ground, i) for i in np.nonzero(~near)[0].tolist()]
+    away = np.hypot(*(ground - np.median(ground, axis=0)).T)
+    near = np.isfinite(away) & (away <= max(_FAR_M, _FAR_SPREADS * float(np.median(away))))
+    rejected = [_far_from_others(frames[i], float(away[i]) / 1000) for i in np.nonzero(~near)[0].tolist()]
     convergence = grid.convergence_rad(lat, lon)
     placed: list[PlacedFrame] = []
     warnings: list[str] = []
@@ -198,17 +192,6 @@ def _sigma(frame: Frame, camera: Camera) -> float:
     position = frame.fix.position_sigma_m or UNSTATED_SIGMA_M
     share = _UNTAGGED_TILT_SIGMA if frame.fix.pitch_rad is None else TAGGED_TILT_SIGMA
     return float(np.hypot(position, share * float(camera.position[2])))
-
-
-def _near(ground: Array) -> NDArray[np.bool_]:
-    """Which positions belong to the set: near their median, bool (N,)."""
-    away = np.hypot(*(ground - np.median(ground, axis=0)).T)
-    return np.asarray(np.isfinite(away) & (away <= max(_FAR_M, _FAR_SPREADS * float(np.median(away)))))
-
-
-def _too_far(frame: Frame, ground: Array, i: int) -> Rejection:
-    away = float(np.hypot(*(ground[i] - np.median(ground, axis=0)))) / 1000
-    return _far_from_others(frame, away)
 
 
 def _far_from_others(frame: Frame, away_km: float) -> Rejection:

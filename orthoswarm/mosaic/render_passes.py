@@ -4,8 +4,9 @@ A label task owns one tile; sample tasks write disjoint pixels (their own labels
 """
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.canvas.tile_store import Key, Tile, TileStore
+from orthoswarm.model.arrays import Bytes, Floats, Indices, Ints
 from orthoswarm.model.errors import OrthoSwarmError, RunInterruptedError
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import Terrain
@@ -29,14 +31,11 @@ from orthoswarm.raster.picture_file import PictureError
 from orthoswarm.raster.picture_parts import Box, Part, PictureParts
 from orthoswarm.stores.local_copies import copy_ahead
 
-Bytes = NDArray[np.uint8]
-Ints = NDArray[np.int32]
 Read = Callable[[Path], Bytes]
 
-THUMBNAIL = (12, 16)
-"""Rows and columns of a picture's thumbnail."""
-TWICE_M: Final = 0.5
-"""What a picture shows at places farther apart than this is drawn twice, metres."""
+THUMBNAIL = (12, 16)  # rows and columns of a picture's thumbnail
+TWICE_M: Final = 0.5  # what a picture shows at places farther apart than this is drawn twice, metres
+_NUMBERS = 8  # frame, row and column of the tile, rows and columns of the window (4), pixels
 _SPOT_PX: Final = 2  # pixels of a picture along each side that count as one
 _TILES_MB: Final = 64.0  # memory that a drawing task keeps of the tiles that it writes
 
@@ -72,7 +71,7 @@ class TilePlace:
             min(self.tile_px, self.grid.width - key[1] * self.tile_px),
         )
 
-    def heights(self, key: Key, terrain: Terrain) -> NDArray[np.float32]:
+    def heights(self, key: Key, terrain: Terrain) -> Floats:
         """A tile's lattice of heights."""
         return heights(terrain, *self.corner(key), self.grid.gsd_m, self.tile_px)
 
@@ -97,14 +96,46 @@ class Window(NamedTuple):
         return cls(key=key, row0=row0, row1=row1, col0=col0, col1=col1, pixels=pixels)
 
 
+class FrameWindows(Mapping[int, list[Window]]):
+    """Windows by frame, frames and tiles in order, as a few numbers each: a large map has millions of them.
+
+    results: of tasks, pairs of a frame and its window in a tile.
+    """
+
+    def __init__(self, results: Iterable[Iterable[tuple[int, Window]]] = ()) -> None:
+        tables = [_table(result) for result in results]
+        table = np.concatenate([np.empty((0, _NUMBERS), np.int32), *tables])
+        self._table = table[np.lexsort((table[:, 2], table[:, 1], table[:, 0]))]
+        frames, first = np.unique(self._table[:, 0], return_index=True)
+        ends = [*first.tolist(), len(self._table)]
+        self._row = {frame: slice(*both) for frame, both in zip(frames.tolist(), pairwise(ends), strict=True)}
+
+    def __getitem__(self, frame: int) -> list[Window]:
+        own = self._table[self._row[frame]]
+        return [
+            Window(key=(r, c), row0=row0, row1=row1, col0=col0, col1=col1, pixels=pixels)
+            for _, r, c, row0, row1, col0, col1, pixels in own.tolist()
+        ]
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._row)
+
+    def __len__(self) -> int:
+        return len(self._row)
+
+
+def _table(result: Iterable[tuple[int, Window]]) -> Ints:
+    rows = [(i, *w.key, w.row0, w.row1, w.col0, w.col1, w.pixels) for i, w in result]
+    return np.array(rows, np.int32).reshape(-1, _NUMBERS)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LabelTask:
     """Label a tile.
 
     Attributes:
         place: where. key: the tile.
-        ids: int32 (K,), indices of the candidate frames. shots: their cameras.
-        terrain: the ground there.
+        ids: int32 (K,), indices of the candidate frames. shots: their cameras. terrain: the ground there.
         again: int32, frames that turned out to be unreadable: only their pixels are labelled anew.
         seams: what seam lines are chosen by; None takes the nearest nadir point alone.
     """
@@ -159,8 +190,7 @@ def label_pass(task: LabelTask) -> list[tuple[int, Window]]:
 class FeatherTask:
     """Find or mix what lies near the seams of a tile.
 
-    Attributes:
-        place: where. key: the tile. width_px: how far from a seam pictures are mixed.
+    place: where. key: the tile. width_px: how far from a seam pictures are mixed.
     """
 
     place: TilePlace
@@ -207,9 +237,8 @@ def color_pass(task: ColorTask) -> tuple[Key, TileColors]:
 class FinishTask:
     """Level and mix a tile.
 
-    Attributes:
-        place: where. key: the tile. factors: of its pictures, None to leave them.
-        width_px: how far from a seam pictures are mixed, 0 not to.
+    place: where. key: the tile. factors: of its pictures, None to leave them. width_px: how far from a seam pictures
+    are mixed, 0 not to.
     """
 
     place: TilePlace
@@ -263,7 +292,7 @@ class Shot:
     layer: int
     row: int
     index: int
-    field: NDArray[np.float32]
+    field: Floats
     factor: int
     windows: list[Window]
     near_seams: list[Window]
@@ -274,8 +303,7 @@ class Shot:
 class TaskLayer:
     """What a task has to know of one of the maps that are drawn.
 
-    Attributes:
-        place: where. shots: the cameras of the task's pictures. terrain: the ground by tile.
+    place: where. shots: the cameras of the task's pictures. terrain: the ground by tile.
     """
 
     place: TilePlace
@@ -287,9 +315,8 @@ class TaskLayer:
 class SampleTask:
     """Read pictures and colour what they won.
 
-    Attributes:
-        layers: the maps that are drawn. pictures: files, and where each goes. read: reads a picture.
-        parts: what is kept of the pictures between drawings; None to read them.
+    layers: the maps that are drawn. pictures: files, and where each goes. read: reads a picture. parts: what is kept of
+    the pictures between drawings; None to read them.
     """
 
     layers: list[TaskLayer]
@@ -344,7 +371,7 @@ class _Ground:
                     placed.append(_Placed(tile, *found, size=size, factor=factor, field=shot.field))
         return placed, self._twice(own)
 
-    def _twice(self, own: list[tuple[Key, Ints, Ints, NDArray[np.float32], Ints]]) -> int:
+    def _twice(self, own: list[tuple[Key, Ints, Ints, Floats, Ints]]) -> int:
         """How many pixels of a picture's windows show what is drawn elsewhere in them already."""
         if not own:
             return 0
@@ -362,8 +389,7 @@ class _Ground:
 class _Placed:
     """Pixels of a tile and where they lie in a picture, see pixel_sampling.place; its size and factor of reduction.
 
-    Attributes:
-        needs: what must be known of the picture to draw them.
+    needs: what must be known of the picture to draw them.
     """
 
     def __init__(
@@ -371,12 +397,12 @@ class _Placed:
         tile: Tile,
         index: Ints,
         spots: Ints,
-        sights: NDArray[np.float32],
+        sights: Floats,
         box: Ints,
         *,
         size: Ints,
         factor: int,
-        field: NDArray[np.float32],
+        field: Floats,
     ) -> None:
         self._tile, self._index, self._spots, self._sights = tile, index, spots, sights
         self._box, self._size, self._factor, self._field = box, size, factor, field
@@ -408,7 +434,7 @@ class _Scratch:
     def __init__(self) -> None:
         self._words = np.empty(0, np.int64)
 
-    def words(self, rows: int, columns: int) -> NDArray[np.int64]:
+    def words(self, rows: int, columns: int) -> Indices:
         """Of int64, not set."""
         if self._words.size < rows * columns:
             self._words = np.empty(rows * columns, np.int64)

@@ -17,16 +17,15 @@ from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.canvas.tile_store import Key
+from orthoswarm.model.arrays import Bytes, Indices, Ints
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import PlacedFrame, Terrain
 from orthoswarm.mosaic.footprint import rejections
-from orthoswarm.mosaic.frame_windows import FrameWindows
 from orthoswarm.mosaic.kernels.downsampling import reduction
 from orthoswarm.mosaic.kernels.render_arrays import Shots, crop
 from orthoswarm.mosaic.radiometry import Field, uniform
@@ -34,6 +33,7 @@ from orthoswarm.mosaic.render_passes import (
     ColorTask,
     FeatherTask,
     FinishTask,
+    FrameWindows,
     LabelTask,
     PreviewTask,
     Read,
@@ -56,8 +56,6 @@ from orthoswarm.mosaic.visible_ground import by_tile, coverage
 from orthoswarm.raster.picture_file import read_rgb
 from orthoswarm.raster.picture_parts import PictureParts
 
-Bytes = NDArray[np.uint8]
-Ints = NDArray[np.int32]
 Run = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 """Applies a module-level function to every argument, in this process or in others; results in any order. It should
 take arguments as it needs them (workers.Workers.map does), since all of them at once may be large."""
@@ -81,9 +79,8 @@ def serial(function: Callable[[Any], Any], arguments: Iterable[Any]) -> Iterable
 class DrawnGround(NamedTuple):
     """What a map covers.
 
-    Attributes:
-        area_m2: ground that was drawn. covered_share: its share of the ground that any frame sees; 1 where none does.
-        twice_share: share of its pixels that show what the same picture shows more than `TWICE_M` away as well.
+    area_m2: ground that was drawn. covered_share: its share of the ground that any frame sees; 1 where none does.
+    twice_share: share of its pixels that show what the same picture shows more than `TWICE_M` away as well.
     """
 
     area_m2: float
@@ -105,7 +102,7 @@ class RenderStats:
         thumbnails: image -> uint8 (12, 16, 3), means of the picture's parts, of the frames that were read.
     """
 
-    pixels: NDArray[np.int64]
+    pixels: Indices
     drawn: DrawnGround
     rejected: dict[str, str]
     thumbnails: dict[str, Bytes] = field(default_factory=dict)

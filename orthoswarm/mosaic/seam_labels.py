@@ -1,4 +1,4 @@
-"""Labels of map pixels: each is drawn from the frame with the nearest nadir point of those that really see it.
+"""Ints of map pixels: each is drawn from the frame with the nearest nadir point of those that really see it.
 
 Without the frames' borders this is the Voronoi diagram of the nadir points. Blocks of pixels are solved one by one:
 candidates in order of their least distance to the block, until none can be nearer than what the block has.
@@ -7,15 +7,13 @@ pixels projected into it, distortion and terrain included.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel, kernel
-from orthoswarm.mosaic.footprint import tan_limit
+from orthoswarm.model.arrays import Floats, Ints
+from orthoswarm.mosaic.footprint import TAN_LIMIT
 from orthoswarm.mosaic.kernels.lens_arrays import INNER, OUTER, U_HIGH, U_LOW, V_HIGH, V_LOW
 from orthoswarm.mosaic.kernels.render_arrays import LATTICE_PX, Shots, lattice_height, project
 
-Labels = NDArray[np.int32]
-Heights = NDArray[np.float32]
 _BLOCK = 64
 OUTSIDE, _PARTLY, _INSIDE = 0, 1, 2
 _ROUNDING = 1e-5  # of squared distances in float32, relative, with a margin
@@ -171,7 +169,7 @@ def _label(best, label, position, rotation, lens, marks, lattice, gsd, tan2):  #
 
 
 def label_tile(
-    label: Labels, shots: Shots, marks: Labels, *, lattice: Heights, west: float, north: float, gsd_m: float
+    label: Ints, shots: Shots, marks: Ints, *, lattice: Floats, west: float, north: float, gsd_m: float
 ) -> None:
     """Label the pixels of a tile that have none (0) with the mark of the nearest frame that sees them.
 
@@ -179,15 +177,11 @@ def label_tile(
 
     Args:
         label: int32 (rows, columns), changed in place; pixels that have a label keep it.
-        shots: the candidates.
-        marks: int32 (N,), the candidates' labels, positive and rising.
-        lattice: float32, the tile's heights, see lattice.heights.
-        west: easting of the tile's left edge.
-        north: northing of its upper edge.
-        gsd_m: ground pixel.
+        shots: the candidates. marks: int32 (N,), their labels, positive and rising.
+        lattice: float32, the tile's heights. west, north: its left and upper edge. gsd_m: ground pixel.
     """
     position, rotation = shots.about(west, north)
-    limit = tan_limit() ** 2
+    limit = TAN_LIMIT**2
     for weak in (False, True):
         index = np.nonzero(shots.weak == weak)[0]
         if len(index) == 0:
@@ -211,7 +205,7 @@ def _windows(label, count, windows):  # type: ignore[no-untyped-def]
                 windows[k, 4] += 1
 
 
-def label_windows(local: Labels, count: int) -> NDArray[np.int32]:
+def label_windows(local: Ints, count: int) -> Ints:
     """For labels 1..count of a tile: int32 (count, 5), row0, row1, col0, col1, pixels (0 where a label is absent)."""
     windows = np.zeros((count, 5), np.int32)
     _windows(local, count, windows)

@@ -10,16 +10,14 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array
 from orthoswarm.model.frame import UNSTATED_SIGMA_M
 from orthoswarm.model.placement import PlacedFrame
 from orthoswarm.model.robust import mad_sigma
 from orthoswarm.trajectory.near_paths import NearPaths
 
-Array = NDArray[np.float64]
-_LEVELS_M = (-500.0, 9000.0)
-"""Lowest and highest ground that can be true, metres."""
+_LEVELS_M = (-500.0, 9000.0)  # lowest and highest ground that can be true, metres
 
 _VERTICAL_SIGMAS: Final = 2.0
 """Sigma of a recorded altitude over that of the recorded place (an axis): satellites stand on one side of the receiver

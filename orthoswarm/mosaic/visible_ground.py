@@ -4,8 +4,8 @@ from collections import defaultdict
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Flags, Ints
 from orthoswarm.model.camera import Camera
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import Terrain
@@ -17,15 +17,13 @@ from orthoswarm.mosaic.seam_labels import label_tile
 _PART = 512
 
 
-def coverage(cameras: Sequence[Camera], grid: GroundGrid, terrain: Terrain | None = None) -> NDArray[np.bool_]:
+def coverage(cameras: Sequence[Camera], grid: GroundGrid, terrain: Terrain | None = None) -> Flags:
     """Where the centres of a coarse grid's cells are seen by at least one camera, bool (rows, columns).
 
     Seen means: within the picture up to its very edge, distortion and terrain honoured, at most 75 degrees off nadir.
 
-    Args:
-        cameras: where the pictures were taken.
-        grid: the cells; metres to tens of metres wide, since the mask is in memory.
-        terrain: the ground; level at 0 if None.
+    cameras: where the pictures were taken. grid: the cells; metres to tens of metres wide, since the mask is in memory.
+    terrain: the ground; level at 0 if None.
     """
     ground = terrain or Terrain.flat()
     mask = np.zeros((grid.height, grid.width), bool)
@@ -41,9 +39,7 @@ def coverage(cameras: Sequence[Camera], grid: GroundGrid, terrain: Terrain | Non
     return mask
 
 
-def by_tile(
-    cameras: Sequence[Camera], grid: GroundGrid, tile_px: int, terrain: Terrain
-) -> dict[tuple[int, int], NDArray[np.int32]]:
+def by_tile(cameras: Sequence[Camera], grid: GroundGrid, tile_px: int, terrain: Terrain) -> dict[tuple[int, int], Ints]:
     """For each tile (first row, first column in pixels) that any camera may see: indices of those cameras, in order."""
     if len(cameras) == 0:
         return {}

@@ -6,11 +6,11 @@ alpha, nodata, a rotated or different grid) are returned as 8-bit values and a v
 
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Bytes, Flags, Floats
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import GroundGrid
@@ -20,32 +20,11 @@ from orthoswarm.raster.tile_map import TileMap
 from orthoswarm.stores.addresses import address_of
 from orthoswarm.stores.listing import exists
 
-Bytes = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
-
-
-class _Source(Protocol):
-    """A source of pixels: a raster file or a folder of tiles."""
-
-    native_gsd_m: float
-    bounds: BoundingBox
-
-    def gsds(self) -> list[float]:
-        """A pixel size for each of the resolutions that are stored, metres."""
-
-    def require_complete(self, bounds: BoundingBox) -> None:
-        """Raise UnreadableMapError if the file is too short for its blocks within bounds."""
-
-    def read(self, grid: GroundGrid, gray: bool) -> tuple[Bytes, Mask]:
-        """Values uint8 (bands, rows, columns), one or three bands (one if grey is enough), and their validity."""
-
 
 class Basemap:
     """A pre-disaster map (a `placement.MapWindow`); can be pickled and shared among threads.
 
-    Attributes:
-        path: the file or folder.
-        epsg: the area's grid, in which windows are asked for and returned.
+    path: the file or folder. epsg: the area's grid, in which windows are asked for and returned.
     """
 
     def __init__(self, path: Path, epsg: int, near: BoundingBox | None) -> None:
@@ -54,7 +33,7 @@ class Basemap:
         self._near = near
 
     @cached_property
-    def _source(self) -> _Source:
+    def _source(self) -> RasterMap | TileMap:
         """The open map; a copy in another process opens its own at its first use, where an error can be reported."""
         is_tiles = self.path.is_dir() or self.path.suffix.lower() == ".mbtiles"
         kind = TileMap if is_tiles else RasterMap
@@ -104,8 +83,7 @@ class Basemap:
     def require_readable(self, near: BoundingBox) -> None:
         """Raise UnreadableMapError if the opened map is truncated or damaged where it is needed.
 
-        Args:
-            near: west, south, east, north of the area in its grid, metres. Only the map's part of it counts.
+        near: west, south, east, north of the area in its grid, metres. Only the map's part of it counts.
         """
         bounds = near.intersection(self.bounds)
         if bounds.empty:
@@ -115,7 +93,7 @@ class Basemap:
             for window in sample_windows(bounds, gsd):
                 self.gray(window, gsd)
 
-    def gray(self, bounds: BoundingBox, gsd_m: float) -> tuple[NDArray[np.float32], Mask]:
+    def gray(self, bounds: BoundingBox, gsd_m: float) -> tuple[Floats, Flags]:
         """Grey values and validity of a window.
 
         Args:
@@ -131,7 +109,7 @@ class Basemap:
         gray[~valid] = 0.0
         return gray, valid
 
-    def rgb(self, bounds: BoundingBox, gsd_m: float) -> tuple[Bytes, Mask]:
+    def rgb(self, bounds: BoundingBox, gsd_m: float) -> tuple[Bytes, Flags]:
         """Colours uint8 (rows, columns, 3) and validity of a window; the grid is that of `gray`."""
         data, valid = self._source.read(GroundGrid.around(self.epsg, bounds, gsd_m), gray=False)
         out = np.array(np.broadcast_to(data, (3, *data.shape[1:])).transpose(1, 2, 0), order="C")  # never a view

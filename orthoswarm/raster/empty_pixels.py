@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Mask = NDArray[np.bool_]
+from orthoswarm.model.arrays import Array, Bytes, Flags
 
 _SPIKE_SHARE: Final = 1e-3  # pixels of one value that make it a spike
 _APART: Final = 2.0  # a spike farther from the bulk of the values than so many times their spread is no ground
@@ -30,8 +30,7 @@ _LETTERS_PX: Final = 31  # gaps in a fill that letters on it make
 def range_of_ground(values: NDArray[Any]) -> tuple[float, float]:
     """Lowest and highest value that ground can have, infinite where nothing bounds it.
 
-    Args:
-        values: (n,) of pixels of the map, finite.
+    values: (n,) of pixels of the map, finite.
     """
     low, high = -np.inf, np.inf
     for _ in range(4):
@@ -50,7 +49,7 @@ def range_of_ground(values: NDArray[Any]) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def _apart(values: NDArray[np.float64], spike: float) -> float | None:
+def _apart(values: Array, spike: float) -> float | None:
     """The least value of ground if a spike below it stands apart; None if it does not."""
     rest = values[values > spike]
     if not len(rest):
@@ -65,10 +64,9 @@ def _apart(values: NDArray[np.float64], spike: float) -> float | None:
 def fills(windows: Iterable[NDArray[Any]]) -> list[tuple[float, ...]]:
     """Colours in which a photographed map is plain without being ground.
 
-    Args:
-        windows: (bands, rows, columns) each, samples of the map at its own resolution.
+    windows: (bands, rows, columns) each, samples of the map at its own resolution.
     """
-    plain, pixels = list[NDArray[np.float64]](), 0
+    plain, pixels = list[Array](), 0
     for window in windows:
         pixels += window[0].size
         flat = np.all([_least(band) == -_least(-band) for band in window.astype(np.float64)], axis=0)
@@ -81,11 +79,10 @@ def fills(windows: Iterable[NDArray[Any]]) -> list[tuple[float, ...]]:
     return [tuple(colour.tolist()) for colour in common] if photographed else []
 
 
-def blank(values: NDArray[Any], fills: Sequence[tuple[float, ...]] = ()) -> Mask:
+def blank(values: NDArray[Any], fills: Sequence[tuple[float, ...]] = ()) -> Flags:
     """Plain patches of a map without a mask: black or white, or of one of the fills.
 
-    Args:
-        values: (bands, rows, columns). fills: colours, a value a band.
+    values: (bands, rows, columns). fills: colours, a value a band.
     """
     dtype = values.dtype
     noise = _NOISE if dtype == np.uint8 else 0
@@ -100,7 +97,7 @@ def blank(values: NDArray[Any], fills: Sequence[tuple[float, ...]] = ()) -> Mask
     return out
 
 
-def _patches(values: NDArray[Any], colour: Sequence[float], noise: int) -> Mask:
+def _patches(values: NDArray[Any], colour: Sequence[float], noise: int) -> Flags:
     """Squares that keep to a colour within a noise, with what interpolation blurs of them."""
     near = np.abs(values[0].astype(np.float32) - colour[0]) <= noise if noise else values[0] == colour[0]
     if np.count_nonzero(near) < _COLLAR_PX**2:
@@ -114,10 +111,10 @@ def _patches(values: NDArray[Any], colour: Sequence[float], noise: int) -> Mask:
     return np.asarray(cv2.dilate(core.astype(np.uint8), _square(_COLLAR_PX + 2 * _BLURRED_PX), borderValue=0)) > 0
 
 
-def _least(band: NDArray[np.float64]) -> NDArray[np.float64]:
+def _least(band: Array) -> Array:
     """The least value of the square around each pixel, of which nothing lies outside."""
     return np.asarray(cv2.erode(band, _square(_COLLAR_PX), borderType=cv2.BORDER_REPLICATE))
 
 
-def _square(side: int) -> NDArray[np.uint8]:
+def _square(side: int) -> Bytes:
     return np.ones((side, side), np.uint8)

@@ -13,6 +13,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Bytes, Flags, Floats
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.coordinate_system import require_datum
 from orthoswarm.model.errors import InputError
@@ -23,9 +24,6 @@ from orthoswarm.raster.map_check import UnreadableMapError, ends_early
 from orthoswarm.raster.resampling import resample
 from orthoswarm.stores.addresses import is_stored
 from orthoswarm.stores.local_copies import local_file
-
-Bytes = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
 
 # GDAL keeps 5 % of the machine's memory in blocks otherwise, in every process; it reads this at its first block.
 os.environ.setdefault("GDAL_CACHEMAX", "64")
@@ -40,8 +38,8 @@ _SAMPLE_PX: Final = 48  # ... and their side, pixels
 class _Stretch:
     """Scaling of stored values to 8 bit: per band, low to 0 and high to 255."""
 
-    low: NDArray[np.float32]
-    high: NDArray[np.float32]
+    low: Floats
+    high: Floats
 
     def apply(self, data: NDArray[Any]) -> Bytes:
         low, high = self.low[:, None, None], self.high[:, None, None]
@@ -52,9 +50,8 @@ class _Stretch:
 class RasterMap:
     """A file that GDAL reads. Handles belong to one thread of one process; each opens its own.
 
-    Attributes:
-        native_gsd_m: size of the map's own pixel on the ground of the area, metres.
-        bounds: west, south, east, north in the area's grid; of a huge map, of the part near the area.
+    native_gsd_m: size of the map's own pixel on the ground of the area, metres. bounds: west, south, east, north in the
+    area's grid; of a huge map, of the part near the area.
     """
 
     def __init__(self, path: Path, epsg: int, near: BoundingBox | None) -> None:
@@ -126,7 +123,7 @@ class RasterMap:
                 f"the basemap {self._path.name} is damaged ({_short(error)}); copy or export it again"
             ) from None
 
-    def read(self, grid: GroundGrid, gray: bool) -> tuple[Bytes, Mask]:
+    def read(self, grid: GroundGrid, gray: bool) -> tuple[Bytes, Flags]:
         """Values uint8 (bands, rows, columns), one or three bands (one if grey is enough), and their validity."""
         with self._reading():
             if self._palette is not None:
@@ -142,11 +139,10 @@ class RasterMap:
     def _eight_bit(self, data: NDArray[Any]) -> Bytes:
         return self._stretch.apply(data) if self._stretch is not None else np.asarray(data, np.uint8)
 
-    def _shown(self, data: NDArray[Any], mixed_px: int) -> Mask:
+    def _shown(self, data: NDArray[Any], mixed_px: int) -> Flags:
         """Where values (bands, rows, columns) can be ground, bool (rows, columns).
 
-        Args:
-            mixed_px: pixels beside empty ones that are mixed with them.
+        mixed_px: pixels beside empty ones that are mixed with them.
         """
         import cv2
 
@@ -158,7 +154,7 @@ class RasterMap:
             shown &= ~blank(data, self._fills)
         return shown
 
-    def _in_range(self, data: NDArray[Any]) -> Mask:
+    def _in_range(self, data: NDArray[Any]) -> Flags:
         low, high = self._ground
         if data.dtype.kind != "f" and low == -np.inf and high == np.inf:
             return np.ones(data.shape[1:], bool)
@@ -211,7 +207,7 @@ class RasterMap:
             for top in range(0, grid.height, rows)
         ]
 
-    def _read_aligned(self, grid: GroundGrid, gray: bool) -> tuple[Bytes, Mask]:
+    def _read_aligned(self, grid: GroundGrid, gray: bool) -> tuple[Bytes, Flags]:
         """A window of a north-up raster in the area's CRS: several times cheaper than warping."""
         from rasterio.windows import Window
 
@@ -238,7 +234,7 @@ class RasterMap:
         first = ((west - t.c) / t.a - c0, (north - t.f) / t.e - r0)
         return resample(data, valid, first, scale, (grid.width, grid.height))
 
-    def _warp(self, grid: GroundGrid, nearest: bool = False) -> tuple[NDArray[Any], Mask]:
+    def _warp(self, grid: GroundGrid, nearest: bool = False) -> tuple[NDArray[Any], Flags]:
         """The bands and the validity of a window, warped; averaged where it is coarser than the map."""
         from rasterio.enums import Resampling
         from rasterio.vrt import WarpedVRT
@@ -263,7 +259,7 @@ class RasterMap:
         valid = bands[-1] > 0.5 * full
         return bands[:-1], valid
 
-    def _read_palette(self, grid: GroundGrid) -> tuple[Bytes, Mask]:
+    def _read_palette(self, grid: GroundGrid) -> tuple[Bytes, Flags]:
         """Read a palette map three times finer and average the colours, as palette numbers cannot be averaged."""
         import cv2
 
@@ -297,7 +293,7 @@ class RasterMap:
         return _Stretch(low, high)
 
 
-def _below_each_other(parts: list[tuple[Bytes, Mask]]) -> tuple[Bytes, Mask]:
+def _below_each_other(parts: list[tuple[Bytes, Flags]]) -> tuple[Bytes, Flags]:
     return np.concatenate([data for data, _ in parts], axis=1), np.concatenate([valid for _, valid in parts])
 
 

@@ -7,13 +7,12 @@ from typing import Final
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Bytes
 from orthoswarm.model.frame import Frame
 from orthoswarm.raster.packed_records import records
 from orthoswarm.raster.picture_file import read_gray, read_rgb, reduction
 
-Bytes = NDArray[np.uint8]
 _SHAPE = np.dtype("<i4")
 WORK_WIDTH_PX: Final = 960  # longer side of the pictures on which corners are followed
 
@@ -25,9 +24,8 @@ class GreyPictures:
     Grey values of pictures of at most the refiner's working size come from the colours, which are read for drawing
     anyhow; larger ones are decoded once more, reduced. Any number of processes may use a store at the same time.
 
-    Attributes:
-        folder: where the files are; an existing folder.
-        from_colors: False to decode only the grey values of small pictures, too, where colours are read elsewhere.
+    folder: where the files are; an existing folder. from_colors: False to decode only the grey values of small
+    pictures, too, where colours are read elsewhere.
     """
 
     folder: Path

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from orthoswarm.model.arrays import Array, Flags, Floats
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.coordinate_system import require_datum
 from orthoswarm.model.errors import InputError
@@ -17,8 +18,6 @@ from orthoswarm.model.placement import Terrain
 from orthoswarm.stores.addresses import address_of
 from orthoswarm.stores.listing import exists
 from orthoswarm.stores.local_copies import local_file
-
-Array = NDArray[np.float64]
 
 _US_FOOT_M = 1200.0 / 3937.0
 _METRES = {
@@ -37,8 +36,7 @@ _MOST_WORDS = max(len(unit.split()) for unit in _METRES)
 _NO_UNIT = frozenset({"unknown", "none", "unitless", "1"})
 """Words of a unit that states none: metres, as where it is empty."""
 
-_BETWEEN_NODES = 1.5
-"""How far the nodes around a place and the node of a pixel are from them, together, in steps."""
+_BETWEEN_NODES = 1.5  # how far the nodes around a place and the node of a pixel are from them, together, in steps
 
 _DEM_FINEST_M: Final = 2.0  # finest distance of the nodes on which a height model is read
 _DEM_MEAN_STEPS: Final = 0.7  # where its pixels are smaller than so many distances of nodes, a node has their mean ...
@@ -53,15 +51,14 @@ _DEM_LEAST_COVER: Final = 0.02  # height model with heights on a smaller share o
 class KnownGround:
     """Heights of a DEM in a window.
 
-    Attributes:
-        terrain: heights above the model's zero; smoothly filled where the DEM has none.
-        known: bool (rows, columns), nodes where it has.
+    terrain: heights above the model's zero; smoothly filled where the DEM has none. known: bool (rows, columns), nodes
+    where it has.
     """
 
     terrain: Terrain
-    known: NDArray[np.bool_]
+    known: Flags
 
-    def knows(self, east_north: Array) -> NDArray[np.bool_]:
+    def knows(self, east_north: Array) -> Flags:
         """Whether the DEM has heights all around positions (M, 2)."""
         t = self.terrain
         c, r = (east_north[..., 0] - t.west) / t.step_m, (east_north[..., 1] - t.south) / t.step_m
@@ -77,10 +74,8 @@ class HeightModel:
 
     It is small, so that it can be part of a task for another process; the file must have the same path there.
 
-    Attributes:
-        path: the file. epsg: CRS of the area.
-        zero_m: height in the DEM's own datum that counts as 0: the ground in the middle below the cameras.
-        cover: share of the area on which it has heights.
+    path: the file. epsg: CRS of the area. zero_m: height in the DEM's own datum that counts as 0: the ground in the
+    middle below the cameras. cover: share of the area on which it has heights.
     """
 
     path: Path
@@ -118,24 +113,17 @@ class HeightModel:
         It is made of the DEM's highest pixels, where `window` has the mean of those about a node, and reaches up to
         one and a half steps farther, so that what lies between nodes is not lost.
 
-        Args:
-            bounds: west, south, east, north. within_m: the distance. steps: nodes on it at least, where the DEM is
-                coarser, as far as there are not more than `most_nodes`.
+        bounds: west, south, east, north. within_m: the distance. steps: nodes on it at least, where the DEM is coarser,
+        as far as there are not more than `most_nodes`.
         """
-        z, west, south, step_m = _on_area(
-            self.path, self.epsg, bounds, None, most_nodes, highest_step_m=within_m / steps
-        )
+        z, west, south, step_m = _on_area(self.path, self.epsg, bounds, most_nodes, highest_step_m=within_m / steps)
         known = np.isfinite(z)
         z = _filled(z, known) if known.any() else np.zeros(z.shape)
         return Terrain(west, south, step_m, _highest_within(z - self.zero_m, within_m / step_m + _BETWEEN_NODES))
 
-    def window(self, bounds: BoundingBox, most_nodes: int | None = None) -> KnownGround:
-        """Heights over `zero_m` in the area's CRS within bounds, a node every pixel of the DEM or at most so many.
-
-        Args:
-            bounds: west, south, east, north. most_nodes: None takes `_DEM_WINDOW_NODES`.
-        """
-        return _window_over(self, bounds, most_nodes or _DEM_WINDOW_NODES)
+    def window(self, bounds: BoundingBox, most_nodes: int = _DEM_WINDOW_NODES) -> KnownGround:
+        """Heights over `zero_m` in the area's CRS within bounds, a node every pixel of the DEM or at most so many."""
+        return _window_over(self, bounds, most_nodes)
 
 
 @lru_cache(maxsize=6)
@@ -146,54 +134,10 @@ def _window_over(model: HeightModel, bounds: BoundingBox, most_nodes: int) -> Kn
 
 
 def _window(path: Path, epsg: int, bounds: BoundingBox, most_nodes: int) -> KnownGround:
-    z, left, low, step = _on_area(Path(path), epsg, bounds, None, most_nodes)
+    z, left, low, step = _on_area(Path(path), epsg, bounds, most_nodes)
     known = np.isfinite(z)
     z = _filled(z, known) if known.any() else np.zeros(z.shape)
     return KnownGround(Terrain(left, low, step, z.astype(np.float32)), known)
-
-
-def read_dem(
-    path: Path,
-    epsg: int,
-    bounds: BoundingBox,
-    *,
-    takeoff: ArrayLike | None = None,
-    level_m: float | None = None,
-    step_m: float | None = None,
-    least_cover: float = 0.5,
-) -> Terrain:
-    """Ground heights of a DEM on a regular grid of nodes in the area's CRS.
-
-    Heights become relative to the takeoff level, as the cameras' are: the DEM's height under `takeoff` (the median
-    where several positions are given: the cameras' own are a good choice) is zero. Whether the DEM's heights are
-    orthometric or ellipsoidal therefore does not matter. Gaps are filled smoothly from their borders.
-
-    Args:
-        path: a GeoTIFF (or anything that GDAL reads) with a CRS; its nodata, scale, offset and unit are honoured.
-        epsg: CRS of the area.
-        bounds: west, south, east, north of the area in that CRS.
-        takeoff: (2,) or (N, 2) positions in that CRS whose median ground height is the datum; None: the area's
-            median height.
-        level_m: absolute height of the takeoff level in the DEM's own datum (metres), instead of `takeoff`.
-        step_m: distance of nodes; None takes the DEM's own pixel, at least 2 m, and at most 4 million nodes.
-        least_cover: least share of the area on which the DEM must have heights.
-
-    Raises:
-        InputError: if the file cannot be read, has no CRS, or does not cover the area.
-    """
-    west, south, east, north = bounds
-    if not (east > west and north > south):
-        raise InputError("the area of the flight is empty, so no heights can be read; check the positions")
-    z, left, low, step = _on_area(Path(path), epsg, bounds, step_m)
-    known = np.isfinite(z)
-    if known.mean() < least_cover:
-        raise InputError(_no_cover(path, epsg, bounds, float(known.mean())))
-    z = _filled(z, known)
-    absolute = Terrain(left, low, step, z.astype(np.float32))
-    if level_m is None:
-        under = z if takeoff is None else absolute.height(np.asarray(takeoff, float).reshape(-1, 2))
-        level_m = float(np.median(under))
-    return Terrain(left, low, step, (z - level_m).astype(np.float32))
 
 
 def _no_cover(path: Path, epsg: int, bounds: BoundingBox, cover: float) -> str:
@@ -215,31 +159,8 @@ def _refuse_buried(path: Path, ground: Array, cameras: Array) -> None:
         )
 
 
-def check_dem(path: Path, epsg: int, bounds: BoundingBox, cameras: ArrayLike) -> None:
-    """Check a DEM before the work starts.
-
-    Args:
-        path, epsg, bounds: see `read_dem`.
-        cameras: (N, 3) east, north and height above takeoff of those that recorded one (none is allowed).
-
-    Raises:
-        InputError: as `read_dem`, or if the ground would lie above cameras (heights in another unit, for instance).
-    """
-    at = np.asarray(cameras, float).reshape(-1, 3)
-    terrain = read_dem(path, epsg, bounds, takeoff=at[:, :2] if len(at) else None)
-    if not len(at):
-        return
-    _refuse_buried(path, terrain.height(at[:, :2]), at[:, 2])
-
-
 def _on_area(
-    path: Path,
-    epsg: int,
-    bounds: BoundingBox,
-    step_m: float | None,
-    most_nodes: int | None = None,
-    *,
-    highest_step_m: float | None = None,
+    path: Path, epsg: int, bounds: BoundingBox, most_nodes: int, *, highest_step_m: float | None = None
 ) -> tuple[Array, float, float, float]:
     """Heights in metres on nodes (rows go north), NaN where unknown, with west, south and step.
 
@@ -269,7 +190,7 @@ def _on_area(
         try:
             west, south, east, north = bounds
             pixel = _pixel_m(dataset, epsg, bounds)
-            step = step_m or _own_step(min(pixel, highest_step_m or pixel), bounds, most_nodes)
+            step = _own_step(min(pixel, highest_step_m or pixel), bounds, most_nodes)
             left, low = float(np.floor(west / step) * step), float(np.floor(south / step) * step)
             columns, rows = int(np.ceil((east - left) / step)) + 1, int(np.ceil((north - low) / step)) + 1
             # a pixel about every node: its centre is the node
@@ -352,7 +273,7 @@ def _resampling(pixel_steps: float, highest: bool) -> str:
     return "average" if pixel_steps < _DEM_MEAN_STEPS else "bilinear"
 
 
-def _highest_within(z: Array, steps: float) -> NDArray[np.float32]:
+def _highest_within(z: Array, steps: float) -> Floats:
     """The highest of the nodes (rows, columns) up to so many steps away from each."""
     import cv2
 
@@ -361,14 +282,13 @@ def _highest_within(z: Array, steps: float) -> NDArray[np.float32]:
     return np.asarray(cv2.dilate(z.astype(np.float32), disc), np.float32)
 
 
-def _own_step(pixel_m: float, bounds: BoundingBox, most_nodes: int | None) -> float:
-    """Distance of nodes, metres: a pixel's side within the configuration's limits and a number of nodes."""
-    nodes = DEM_MOST_NODES if most_nodes is None else min(most_nodes, DEM_MOST_NODES)
-    spread = float(np.sqrt(bounds.width * bounds.height / nodes))
+def _own_step(pixel_m: float, bounds: BoundingBox, most_nodes: int) -> float:
+    """Distance of nodes, metres: a pixel's side, but not finer than `_DEM_FINEST_M` and a number of nodes allow."""
+    spread = float(np.sqrt(bounds.width * bounds.height / min(most_nodes, DEM_MOST_NODES)))
     return float(max(_DEM_FINEST_M, round(pixel_m, 1), spread))
 
 
-def _filled(z: Array, known: NDArray[np.bool_]) -> Array:
+def _filled(z: Array, known: Flags) -> Array:
     """Gaps filled from their surroundings: averages over growing neighbourhoods, the nearest known scale first."""
     if known.all():
         return z

@@ -1,8 +1,8 @@
 """A cache of map tiles, for many overlapping windows of one pixel size."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Flags, Floats
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import MapWindow
@@ -19,7 +19,7 @@ class TiledMap:
     def __init__(self, basemap: MapWindow, gsd_m: float) -> None:
         self.epsg = basemap.epsg
         self._basemap, self._gsd_m = basemap, gsd_m
-        self._tiles: dict[tuple[int, int], tuple[NDArray[np.float32], NDArray[np.bool_]]] = {}
+        self._tiles: dict[tuple[int, int], tuple[Floats, Flags]] = {}
 
     @property
     def bounds(self) -> BoundingBox:
@@ -31,7 +31,7 @@ class TiledMap:
         """Size of the map's own pixel."""
         return self._basemap.native_gsd_m
 
-    def gray(self, bounds: BoundingBox, gsd_m: float) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    def gray(self, bounds: BoundingBox, gsd_m: float) -> tuple[Floats, Flags]:
         """Grey values and validity of a window, as the map itself gives them."""
         if gsd_m != self._gsd_m:
             return self._basemap.gray(bounds, gsd_m)
@@ -48,7 +48,7 @@ class TiledMap:
                 gray[rows, cols], valid[rows, cols] = tile_gray[inner], tile_valid[inner]
         return gray, valid
 
-    def _tile(self, i: int, j: int) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    def _tile(self, i: int, j: int) -> tuple[Floats, Flags]:
         if (i, j) not in self._tiles:
             side = TILE_PX * self._gsd_m
             # from the middles of the outermost pixels, so that rounding cannot add a row or a column

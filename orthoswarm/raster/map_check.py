@@ -35,9 +35,8 @@ def sample_windows(bounds: BoundingBox, gsd_m: float) -> list[BoundingBox]:
 def ends_early(source: Any, path: Path, window: tuple[int, int, int, int]) -> bool:
     """True if a TIFF has blocks that its file is too short for; False for other files.
 
-    Args:
-        source: the open rasterio data set. path: its file.
-        window: first row, row after the last, first column, column after the last, full resolution; inside the raster.
+    source: the open rasterio data set. path: its file. window: first row, row after the last, first column, column
+    after the last, full resolution; inside the raster.
     """
     if source.driver not in ("GTiff", "COG") or not path.is_file():
         return False

@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-Bytes = NDArray[np.uint8]
+from orthoswarm.model.arrays import Bytes
+
 _SUFFIX: Final = ".pack"
 _HEAD: Final = struct.Struct("<16sQ")  # a record's key and the bytes of its content, which follows
 _OPEN_FOLDERS: Final = 8
@@ -64,8 +64,7 @@ class PackedRecords:
     def put(self, name: Path, *parts: Bytes) -> None:
         """Keep parts, one after the other, under a name; nothing happens where they cannot be written.
 
-        Args:
-            parts: C-contiguous uint8 arrays of any shape.
+        parts: C-contiguous uint8 arrays of any shape.
         """
         key, size = _key(name), sum(part.nbytes for part in parts)
         pieces = [memoryview(_HEAD.pack(key, size)), *(part.data.cast("B") for part in parts)]

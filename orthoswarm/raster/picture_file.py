@@ -12,13 +12,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Bytes
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.raster.kept_ranges import kept_range, limits
 from orthoswarm.stores.addresses import is_stored
 from orthoswarm.stores.local_copies import content
 from orthoswarm.stores.requests import NotStoredError, StoreRequestError
 
-Bytes = NDArray[np.uint8]
 PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".dng"})
 
 
@@ -34,8 +34,7 @@ _DEPTH_PICTURES: Final = 9  # pictures of a folder that tell the range of its 16
 class PictureError(OrthoSwarmError):
     """A picture cannot be decoded.
 
-    Attributes:
-        reason: the fault without the picture's name, the same for all pictures that have it.
+    reason: the fault without the picture's name, the same for all pictures that have it.
     """
 
     def __init__(self, text: str, reason: str = "") -> None:

@@ -6,11 +6,10 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Bytes
 from orthoswarm.raster.packed_records import records
 
-Bytes = NDArray[np.uint8]
 _HEAD = np.dtype("<i4")
 _NUMBERS = 4  # columns and rows of the part, column and row of its corner
 
@@ -45,9 +44,7 @@ class Box:
 class Part:
     """A rectangle of a picture.
 
-    Attributes:
-        pixels: uint8 (rows, columns, 3), red first.
-        corner: column and row of its first pixel in the picture.
+    pixels: uint8 (rows, columns, 3), red first. corner: column and row of its first pixel in the picture.
     """
 
     pixels: Bytes
@@ -65,9 +62,7 @@ class PictureParts:
 
     Any number of processes may use a store at the same time, as long as one at a time keeps a picture.
 
-    Attributes:
-        folder: where the files are; an existing folder.
-        most_bytes: larger parts are not kept.
+    folder: where the files are; an existing folder. most_bytes: larger parts are not kept.
     """
 
     folder: Path
@@ -99,8 +94,7 @@ class PictureParts:
     def keep(self, path: Path, picture: Bytes, drawn: Box) -> None:
         """Keep what was drawn of a picture and `_PART_MARGIN` around it, unless some of it is kept already.
 
-        Args:
-            path: its file. picture: uint8 (rows, columns, 3), all of it. drawn: lies in it.
+        path: its file. picture: uint8 (rows, columns, 3), all of it. drawn: lies in it.
         """
         margin = round(_PART_MARGIN * max(picture.shape))
         left, top = max(drawn.left - margin, 0), max(drawn.top - margin, 0)

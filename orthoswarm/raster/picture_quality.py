@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel
+from orthoswarm.model.arrays import Bytes
 
 _BLOCK_PX = 16
 _COLUMNS, _ROWS = 12, 9
-LEAST_SIDE_PX = _BLOCK_PX + 8
-"""Smaller pictures cannot be judged."""
+LEAST_SIDE_PX = _BLOCK_PX + 8  # smaller pictures cannot be judged
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,8 +20,7 @@ class PictureQuality:
 
     Attributes:
         sharpness: energy of differences over 1 pixel divided by that over 4 pixels, 0 to about 1; it hardly depends on
-            contrast and falls with every kind of blur.
-        contrast: standard deviation of the sample, grey levels.
+            contrast and falls with every kind of blur. contrast: standard deviation of the sample, grey levels.
         flat_share: share of blocks in which all pixels are equal: what a truncated JPEG or a lost slice leaves.
         saturated_share: share of pixels at 250 or above: glare, sky.
     """
@@ -32,7 +31,7 @@ class PictureQuality:
     saturated_share: float
 
 
-def picture_quality(picture: NDArray[np.uint8]) -> PictureQuality:
+def picture_quality(picture: Bytes) -> PictureQuality:
     """Measure a picture, uint8 (rows, columns) or (rows, columns, 3 or 4), of which the second channel is used.
 
     Raises:

@@ -1,22 +1,18 @@
 """Resampling between grids of one orientation: exact area means where the answer is coarser, else cubic."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import kernel
-
-Bytes = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
+from orthoswarm.model.arrays import Bytes, Flags
 
 
 def resample(
-    data: Bytes, valid: Mask, first: tuple[float, float], scale: tuple[float, float], size: tuple[int, int]
-) -> tuple[Bytes, Mask]:
+    data: Bytes, valid: Flags, first: tuple[float, float], scale: tuple[float, float], size: tuple[int, int]
+) -> tuple[Bytes, Flags]:
     """Bring bands to another grid.
 
     Args:
-        data: uint8 (bands, rows, columns).
-        valid: bool (rows, columns), which pixels count.
+        data: uint8 (bands, rows, columns). valid: bool (rows, columns), which pixels count.
         first: left and upper edge of the answer in pixels of the data, from the data's own upper left edge.
         scale: pixels of the data in a pixel of the answer, across and down.
         size: columns and rows of the answer.

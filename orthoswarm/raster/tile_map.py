@@ -6,12 +6,12 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 from pyproj import Transformer
 
+from orthoswarm.model.arrays import Array, Bytes, Flags
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.earth import WEB_MERCATOR_M
 from orthoswarm.model.errors import InputError
@@ -20,16 +20,13 @@ from orthoswarm.raster.empty_pixels import blank
 from orthoswarm.raster.map_check import UnreadableMapError
 from orthoswarm.stores.local_copies import local_file
 
-Bytes = NDArray[np.uint8]
-Mask = NDArray[np.bool_]
-
 _MARGIN_M: Final = 5000.0  # tiles this far from the flight belong to the map that is spoken of
 _COARSEST_M: Final = 40.0  # pixels of a zoom level that a flight can be laid on at all
 _COVERS_SHARE: Final = 0.5  # of what any level shows of the flight: a level with less is a rest of a download
 _LEVELS: Final = 3  # a hole is filled from so many levels on either side; eight times coarser is no map of its place
 _MOST_COMPARED: Final = 10_000  # tiles that are looked at for placeholders (time)
 Tiles = dict[tuple[int, int], Any]
-"""Column and row of a zoom level -> what `TileSource.read` needs to find the tile."""
+"""Column and row of a zoom level -> what `read` of the set needs to find the tile."""
 Ranges = Callable[[int], tuple[int, int, int, int]]
 """Zoom -> first and last column, first and last row (from the north), inclusive."""
 
@@ -45,9 +42,8 @@ class TileMap:
     The finest level that covers the flight is the map; what it lacks comes from the levels beside it. Placeholders of
     a server, tiles of one colour and half downloads are lacking.
 
-    Attributes:
-        native_gsd_m: ground size of a pixel of that level, metres.
-        bounds: west, south, east, north of the tiles near the area, in its grid.
+    native_gsd_m: ground size of a pixel of that level, metres. bounds: west, south, east, north of the tiles near the
+    area, in its grid.
     """
 
     def __init__(self, path: Path, epsg: int, near: BoundingBox | None) -> None:
@@ -109,7 +105,7 @@ class TileMap:
             if ranges[z][0] <= c <= ranges[z][1] and ranges[z][2] <= r <= ranges[z][3]
         ]
 
-    def _mercator(self, east_north: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _mercator(self, east_north: Array) -> Array:
         x, y = _transformer(self._epsg).transform(east_north[:, 0], east_north[:, 1])
         return np.stack([np.asarray(x), np.asarray(y)], axis=1)
 
@@ -158,7 +154,7 @@ class TileMap:
     def require_complete(self, bounds: BoundingBox) -> None:
         """Does nothing: each tile is a separate file, and one that cannot be decoded is a hole in the map."""
 
-    def read(self, grid: GroundGrid, gray: bool) -> tuple[Bytes, Mask]:
+    def read(self, grid: GroundGrid, gray: bool) -> tuple[Bytes, Flags]:
         """Colours uint8 (3, rows, columns), also where grey is enough, and validity of a window."""
         from rasterio.enums import Resampling
         from rasterio.transform import from_origin
@@ -268,20 +264,7 @@ def _decode(data: bytes) -> Bytes | None:
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGBA if image.shape[2] == 3 else cv2.COLOR_BGRA2RGBA))
 
 
-class TileSource(Protocol):
-    """A set of tiles."""
-
-    def tiles(self, near: Ranges | None) -> dict[int, Tiles]:
-        """Zoom -> its tiles, rows as the set counts them; where the set is large, only those of ranges."""
-
-    def read(self, key: Any) -> bytes:
-        """The content of a tile."""
-
-    def signature(self, key: Any) -> tuple[int, bytes]:
-        """Length and a part of a tile, by which two that are alike are found."""
-
-
-def _placeholders(source: TileSource, keys: Iterable[Any]) -> set[Any]:
+def _placeholders(source: "_Folder | _Mbtiles", keys: Iterable[Any]) -> set[Any]:
     """Tiles that stand for what a server did not have: two photographs are never alike, these are."""
     signatures = {key: source.signature(key) for key in keys}
     count = Counter(signatures.values())
@@ -300,6 +283,8 @@ def _is_whole(data: bytes) -> bool:
 
 
 class _Folder:
+    """Tiles in a folder z/x/y; rows as it counts them."""
+
     def __init__(self, path: Path) -> None:
         self._path = path
 
@@ -319,6 +304,7 @@ class _Folder:
         return key.read_bytes()
 
     def signature(self, key: Path) -> tuple[int, bytes]:
+        """Length and a part of a tile, by which two that are alike are found."""
         size = key.stat().st_size
         with key.open("rb") as file:
             file.seek(size // 2)
@@ -326,7 +312,7 @@ class _Folder:
 
 
 class _Mbtiles:
-    """Rows are counted from the north, although the file counts them from the south."""
+    """Tiles of a file, of a large one those of ranges; rows from the north, though the file counts from the south."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

@@ -38,6 +38,7 @@ from orthoswarm.report.report_pictures import (
     surface_picture,
     view_grid,
 )
+from orthoswarm.report.trust import sentences, trust_picture
 
 ORTHOIMAGE = "orthoimage.tif"
 _STAGES = (
@@ -126,6 +127,7 @@ def write_page(
     if report.get("surface"):
         shaded, text = surface_picture(report["surface"])
         values["surface"] = Figure("Surface model", data_uri(shaded), text)
+    values["headline"] = report.get("headline", "")
     values["verdict"] = _verdict(report, placed, shifts)
     values["facts"] = _facts(report, placed, shifts)
     values["fov"] = fields_of_view(report["vehicles"])
@@ -205,6 +207,7 @@ def _pictures(
         "footprints": _footprints(reduced, placed, there, float(report["ground_z_m"])),
         "arrows": _arrows(reduced, shifts) if shifts is not None and len(shifts.at) else None,
         "paths": _paths(reduced, placed, report) if report["legs"] else None,
+        "trust": _trust(out, reduced, report),
     }
 
 
@@ -268,6 +271,13 @@ def _arrows(reduced: Picture, shifts: Moved) -> Figure:
         "No arrow: changed since the map was made, or without texture."
     )
     return Figure("Displacement against the map", data_uri(picture.rgb), text)
+
+
+def _trust(out: Path, reduced: Picture, report: Mapping[str, Any]) -> Figure | None:
+    path = out / "confidence.tif"
+    if not report.get("trust") or not path.exists():
+        return None
+    return Figure("Where not to trust the map", data_uri(trust_picture(path, reduced).rgb), sentences(report))
 
 
 def _paths(reduced: Picture, placed: Sequence[PlacedFrame], report: Mapping[str, Any]) -> Figure:

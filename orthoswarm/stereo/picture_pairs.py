@@ -4,13 +4,10 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from orthoswarm.model.camera import Camera
 from orthoswarm.model.placement import PlacedFrame, Terrain
-
-Array = NDArray[np.float64]
 
 _BEST_BASE: Final = 0.4
 """Distance of two cameras over their height above ground at which a pair is preferred. Single pairs of a simulated city

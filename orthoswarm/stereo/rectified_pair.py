@@ -9,17 +9,13 @@ from typing import Final
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.config.mapping import StereoConfig
+from orthoswarm.model.arrays import Array, Flags, Floats, Gray
 from orthoswarm.model.camera import Camera
 from orthoswarm.model.placement import Terrain
 
-Array = NDArray[np.float64]
-Gray = NDArray[np.uint8]
-
-_FRACTION = 16.0
-"""Disparities of OpenCV are whole numbers of this part of a pixel."""
+_FRACTION = 16.0  # disparities of OpenCV are whole numbers of this part of a pixel
 
 _BLOCK_PX: Final = 3
 """Side of the blocks of semi-global matching. With 3, 5, 7 heights of roofs were within (68 %) 1.25, 1.42 and 1.76 m of
@@ -41,9 +37,7 @@ _WIDE_MARGIN: Final = 0.15  # ... with this share of their range to either side,
 class PairView:
     """A picture with its camera.
 
-    Attributes:
-        camera: of the full picture.
-        gray: uint8 (rows, columns), the picture reduced by `factor` along each side.
+    camera: of the full picture. gray: uint8 (rows, columns), the picture reduced by `factor` along each side.
     """
 
     camera: Camera
@@ -172,7 +166,7 @@ def _depths(camera: Camera, axes: Array, level_m: float) -> Array:
     return np.asarray(np.nan_to_num((points - camera.position) @ axes[:, 2], nan=-1.0))
 
 
-def _resampled(view: PairView, frame: _Rectified, shift: int) -> tuple[Gray, NDArray[np.bool_]]:
+def _resampled(view: PairView, frame: _Rectified, shift: int) -> tuple[Gray, Flags]:
     """A picture in the rectified frame, moved right by `shift` pixels, and where it has content."""
     lens, factor = view.camera.lens, view.factor
     u, v = ((p + 0.5) / factor - 0.5 for p in lens.principal_point)
@@ -190,11 +184,10 @@ def _resampled(view: PairView, frame: _Rectified, shift: int) -> tuple[Gray, NDA
     return np.asarray(picture, np.uint8), seen
 
 
-def _disparities(left: Gray, right: Gray, valid: NDArray[np.bool_], count: int) -> NDArray[np.float32]:
+def _disparities(left: Gray, right: Gray, valid: Flags, count: int) -> Floats:
     """Disparity of each pixel of the left picture, float32 in 0 to count - 1, negative where no match is found.
 
-    Args:
-        left, right: rectified. valid: where the left one has content. count: disparities that may occur.
+    left, right: rectified. valid: where the left one has content. count: disparities that may occur.
     """
     least = 0
     if count > _WIDE_PX:
@@ -202,7 +195,7 @@ def _disparities(left: Gray, right: Gray, valid: NDArray[np.bool_], count: int) 
     return _matched(left, right, least, count)
 
 
-def _occurring(left: Gray, right: Gray, valid: NDArray[np.bool_], count: int) -> tuple[int, int]:
+def _occurring(left: Gray, right: Gray, valid: Flags, count: int) -> tuple[int, int]:
     """The range of disparities that occurs, by matching at half size, which takes an eighth of the time.
 
     Only large regions of alike disparity count: false matches are small and have any disparity. Returns the least
@@ -228,7 +221,7 @@ def _whole_steps(disparities: float) -> int:
     return 16 * max(1, int(np.ceil(disparities / 16.0)))
 
 
-def _matched(left: Gray, right: Gray, least: int, count: int) -> NDArray[np.float32]:
+def _matched(left: Gray, right: Gray, least: int, count: int) -> Floats:
     """`_disparities` among `count` ones from `least` on."""
     area, last = _BLOCK_PX**2, least + count
     matcher = cv2.StereoSGBM.create(

@@ -9,17 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, minimum_filter
 
+from orthoswarm.model.arrays import Bytes, Floats, Indices
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.robust import MAD_TO_SIGMA
 from orthoswarm.stereo.rectified_pair import PairPoints
 
-Float32 = NDArray[np.float32]
-
 _HEIGHT_BITS, _HEIGHT_STEP_M = 20, 1e-3
 _HIGHEST = (1 << _HEIGHT_BITS) - 1
 """Cell and height are packed into one integer, which is sorted in a third of the time of two columns."""
-_ROWS_AT_ONCE = 256
-"""Rows of cells that are merged at a time, for memory."""
+_ROWS_AT_ONCE = 256  # rows of cells that are merged at a time, for memory
 
 _CELL_MATCHES: Final = 2  # matched pixels that a pair has in a cell at least
 _PAIRS_KEPT: Final = 8  # heights of different pairs that are kept a cell; later ones change little
@@ -41,9 +39,9 @@ _BLOCK_SIGMA_M: Final = 0.05
 class CellHeights:
     """The heights of one pair by cell: int64 (N,) cell, float32 (N,) metres, float32 (N,) sigma."""
 
-    cell: NDArray[np.int64]
-    height_m: Float32
-    sigma_m: Float32
+    cell: Indices
+    height_m: Floats
+    sigma_m: Floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,9 +57,9 @@ class SurfaceModel:
     """
 
     grid: GroundGrid
-    height_m: Float32
-    sigma_m: Float32
-    pairs: NDArray[np.uint8]
+    height_m: Floats
+    sigma_m: Floats
+    pairs: Bytes
 
 
 def cell_heights(found: PairPoints, grid: GroundGrid) -> CellHeights:
@@ -118,13 +116,12 @@ class SurfaceCells:
 
 
 def merge_heights(
-    height_m: NDArray[np.floating], sigma_m: NDArray[np.floating], count: NDArray[np.uint8]
-) -> tuple[Float32, Float32, NDArray[np.uint8]]:
+    height_m: NDArray[np.floating], sigma_m: NDArray[np.floating], count: Bytes
+) -> tuple[Floats, Floats, Bytes]:
     """The weighted mean of the heights that agree with the median, cell by cell.
 
     Args:
-        height_m, sigma_m: (K, N), the first `count` values of a column count.
-        count: (N,).
+        height_m, sigma_m: (K, N), the first `count` values of a column count. count: (N,).
 
     Returns:
         Height, sigma (both NaN where fewer than `_LEAST_PAIRS` agree) and number of agreeing pairs. The sigma is
@@ -156,7 +153,7 @@ def merge_heights(
     )
 
 
-def _range_around(height_m: Float32) -> Float32:
+def _range_around(height_m: Floats) -> Floats:
     """Highest less lowest known height of the 3 x 3 cells around each, 0 without any."""
     known = np.isfinite(height_m)
     high = maximum_filter(np.where(known, height_m, -np.inf), 3)

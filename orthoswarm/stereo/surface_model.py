@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.config.mapping import StereoConfig
+from orthoswarm.model.arrays import Bytes
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.geo import GroundGrid
@@ -20,10 +20,8 @@ from orthoswarm.stereo.picture_pairs import choose_pairs
 from orthoswarm.stereo.rectified_pair import PairView, match_pair
 from orthoswarm.stereo.surface_cells import CellHeights, SurfaceCells, SurfaceModel, cell_heights
 
-_PAIRS_PER_TASK = 12
-"""Pairs of a task: enough of them share pictures."""
-_PICTURES_HELD = 8
-"""Number of decoded pictures that a task caches for its next pairs."""
+_PAIRS_PER_TASK = 12  # pairs of a task: enough of them share pictures
+_PICTURES_HELD = 8  # number of decoded pictures that a task caches for its next pairs
 
 _CELL_PIXELS: Final = 2.0  # side of a cell, ground pixels of the (reduced) pictures: fewer would hold no more detail
 _MOST_CELLS: Final = 8_000_000  # larger cells beyond this many, for memory and disk: 50 bytes a cell
@@ -50,14 +48,10 @@ def surface_model(
     run: Run = serial,
     progress: Callable[[int, int], None] | None = None,
 ) -> SurfaceModel:
-    """Measure the visible surface from refined frames.
+    """Measure the visible surface from refined frames, around the terrain below them.
 
-    Args:
-        frames: with solved cameras.
-        terrain: ground below them; heights are searched around it.
-        epsg: the grid of the area. scratch: an empty folder for temporary files.
-        config: which pairs, and how far heights are searched.
-        run: runs the tasks. progress: called with the pairs done and all pairs.
+    epsg: the grid of the area. scratch: an empty folder for temporary files. config: which pairs, and how far heights
+    are searched. progress: called with the pairs done and all pairs.
 
     Raises:
         OrthoSwarmError: if no two pictures overlap enough.
@@ -118,7 +112,7 @@ def _match(task: _PairsTask) -> tuple[list[CellHeights], int]:
     factors = [_factor(frame, task.config.longest_px) for frame in task.frames]
 
     @lru_cache(_PICTURES_HELD)
-    def picture(index: int) -> NDArray[np.uint8] | None:
+    def picture(index: int) -> Bytes | None:
         try:
             return read_gray(task.frames[index].frame.path, factors[index])
         except PictureError:

@@ -3,11 +3,9 @@
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.model.angles import wrap_rad
-
-Array = NDArray[np.float64]
+from orthoswarm.model.arrays import Array
 
 MOVED_M: Final = 1.0  # steps that are shorter have no direction and no spacing: receivers scatter by about that
 _CORNER_DEG: Final = 50.0  # a change of course above this is a corner between two legs and no bend

@@ -3,14 +3,12 @@
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.model.angles import wrap_rad
-from orthoswarm.model.arrays import Array, Ints
+from orthoswarm.model.arrays import Array, Flags, Ints
 
 PAUSE_S: Final = 60.0  # photos farther apart in time do not follow each other: the vehicle did something else between
-LEG_REACH: Final = 3
-"""Frames before and after a frame between which the bend of the path is measured: one is noise."""
+LEG_REACH: Final = 3  # frames before and after a frame between which the bend of the path is measured: one is noise
 _LEG_TURN_DEG: Final = 35.0  # least bend of the path at the corner between two legs
 _LEG_FEWEST: Final = 3  # fewer frames are not a leg
 _LEG_JUMP_STEPS: Final = 6.0  # a step of more than so many median steps and the next field ends a leg ...
@@ -24,9 +22,8 @@ def split_legs(position: Array, time_s: Array | None = None) -> Ints:
 
     Legs end at corners of the path (where it bends most, over a few frames), at jumps and at pauses.
 
-    Args:
-        position: float64 (N, 2) or (N, 3), smoothed or recorded positions in flying order, metres.
-        time_s: float64 (N,) or None; a longer gap than `PAUSE_S` ends a leg.
+    position: float64 (N, 2) or (N, 3), smoothed or recorded positions in flying order, metres. time_s: float64 (N,) or
+    None; a longer gap than `PAUSE_S` ends a leg.
     """
     turn_rad = float(np.radians(_LEG_TURN_DEG))
     n = len(position)
@@ -60,7 +57,7 @@ def _bend(position: Array) -> Array:
     return np.where(moving, np.abs(turn), 0.0)
 
 
-def _breaks(position: Array, time_s: Array | None) -> NDArray[np.bool_]:
+def _breaks(position: Array, time_s: Array | None) -> Flags:
     """Frames before which the flight was interrupted: a pause, or a jump of many steps."""
     n = len(position)
     out = np.zeros(n, bool)
@@ -75,8 +72,7 @@ def _breaks(position: Array, time_s: Array | None) -> NDArray[np.bool_]:
 def leads_one_way(position: Array, leg: Ints) -> bool:
     """Whether the legs lead in one direction, but for short ways between them.
 
-    Args:
-        position: float64 (N, 2) or (N, 3) in flying order, metres. leg: int32 (N,), -1 outside legs.
+    position: float64 (N, 2) or (N, 3) in flying order, metres. leg: int32 (N,), -1 outside legs.
     """
     ways = []
     for k in range(int(leg.max()) + 1 if len(leg) else 0):
@@ -93,9 +89,8 @@ def leads_one_way(position: Array, leg: Ints) -> bool:
 def ended_legs(position: Array, time_s: Array | None = None, *, over: bool = False) -> list[tuple[int, int]]:
     """First and last frame (inclusive) of each finished leg, in order.
 
-    Args:
-        position: float64 (N, 2) or (N, 3), recorded positions in flying order so far, metres.
-        over: True if no more frames are expected, so that the last leg is finished, too.
+    position: float64 (N, 2) or (N, 3), recorded positions in flying order so far, metres. over: True if no more frames
+    are expected, so that the last leg is finished, too.
     """
     n = len(position)
     if n < 2:

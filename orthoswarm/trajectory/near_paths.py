@@ -4,9 +4,8 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from orthoswarm.model.arrays import Array
 
 _NEIGHBOUR_REACH_HEIGHTS: Final = 1.5  # vehicles whose paths come within so many flying heights share ground
 
@@ -33,8 +32,7 @@ def near_paths(path: Array, others: Sequence[Array]) -> list[int]:
 class NearPaths:
     """Which of many paths come near each other; of thousands of vehicles few have to be compared.
 
-    Args:
-        paths: float64 (N, 3) each, camera positions above the takeoff level.
+    paths: float64 (N, 3) each, camera positions above the takeoff level.
     """
 
     def __init__(self, paths: Sequence[Array]) -> None:

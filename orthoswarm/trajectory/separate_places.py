@@ -1,12 +1,9 @@
 """Groups of places so far apart that no picture of the one shows ground of the other."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array, Ints
 from orthoswarm.model.earth import on_sphere
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int32]
 
 
 def separate_places(lat_deg: Array, lon_deg: Array, gap_m: float, gap_steps: float = 0.0) -> Ints:

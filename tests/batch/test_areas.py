@@ -137,7 +137,7 @@ def test_areas_without_ties_stay():
 
 def test_the_ground_is_that_of_the_area_whose_cameras_are_nearest():
     west = Terrain(0.0, 0.0, 2.0, np.full((101, 151), 1.0, np.float32))
-    east = Terrain(200.0, 0.0, 1.0, np.full((201, 301), 3.0, np.float32), np.full((201, 301), 2.0, np.float32))
+    east = Terrain(200.0, 0.0, 1.0, np.full((201, 301), 3.0, np.float32), bare=np.full((201, 301), 2.0, np.float32))
     nadirs = [np.array([[100.0, 100.0]]), np.array([[400.0, 100.0]])]
     joined = merged_ground([west, east], nadirs)
     assert (joined.west, joined.south, joined.step_m) == (0.0, 0.0, 1.0)

@@ -253,7 +253,12 @@ def test_other_options_do_not_continue_an_interrupted_run(flight, tmp_path):
         make(photos, out, MapOptions(), progress=interrupt)
     make(photos, out, MapOptions(gsd_m=1.0, until="realtime"), progress=lambda what, *_: seen.append(what))
     assert "drawing realtime" in seen
-    assert {p.name for p in out.iterdir()} == set(PRODUCTS) - {"coarse.tif", "orthoimage.tif", "seamlines.gpkg"}
+    assert {p.name for p in out.iterdir()} == set(PRODUCTS) - {
+        "coarse.tif",
+        "orthoimage.tif",
+        "seamlines.gpkg",
+        "confidence.tif",
+    }
 
 
 def test_what_a_killed_run_left_half_written_is_cleared(flight, tmp_path):
@@ -264,6 +269,7 @@ def test_what_a_killed_run_left_half_written_is_cleared(flight, tmp_path):
         "coarse.tif",
         "orthoimage.tif",
         "seamlines.gpkg",
+        "confidence.tif",
     }
 
 
@@ -307,7 +313,12 @@ def test_a_fault_in_the_refinement_leaves_the_real_time_map_and_exit_1(flight, t
     assert main([*command, "--workers", "1"]) == 1
     told = capsys.readouterr()
     assert "ZeroDivisionError: by a bug" in told.err and not told.out
-    assert {p.name for p in out.iterdir()} == set(PRODUCTS) - {"orthoimage.tif", "coarse.tif", "seamlines.gpkg"}
+    assert {p.name for p in out.iterdir()} == set(PRODUCTS) - {
+        "orthoimage.tif",
+        "coarse.tif",
+        "seamlines.gpkg",
+        "confidence.tif",
+    }
     report = json.loads((out / "report.json").read_text())
     assert any("ZeroDivisionError" in w for w in report["warnings"]) and report["refine"] == "none"
     rows = rows_of(out)
@@ -334,6 +345,7 @@ def test_stopping_early_makes_what_was_asked(flight, tmp_path):
         "coarse.tif",
         "orthoimage.tif",
         "seamlines.gpkg",
+        "confidence.tif",
     }
     rows = rows_of(tmp_path / "r")
     assert {r["stage"] for r in rows.values()} == {"realtime", "rejected"}
@@ -342,7 +354,11 @@ def test_stopping_early_makes_what_was_asked(flight, tmp_path):
     with rasterio.open(tmp_path / "r" / "realtime.tif") as image:
         assert image.res == (0.8, 0.8)
     report = make(folder / "photos" / "a", tmp_path / "c", MapOptions(basemap=folder / "map.tif", until="coarse"))
-    assert {p.name for p in (tmp_path / "c").iterdir()} == set(PRODUCTS) - {"orthoimage.tif", "seamlines.gpkg"}
+    assert {p.name for p in (tmp_path / "c").iterdir()} == set(PRODUCTS) - {
+        "orthoimage.tif",
+        "seamlines.gpkg",
+        "confidence.tif",
+    }
     assert {r["stage"] for r in rows_of(tmp_path / "c").values()} == {"coarse", "rejected"}
     page = (tmp_path / "c" / "report.html").read_text()  # nothing was searched for on the map, so nothing failed
     assert "failed" not in page.partition("<main>")[2] and " m (one sigma an axis)" in page

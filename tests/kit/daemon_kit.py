@@ -127,11 +127,15 @@ class Served:
         self.process.wait(120)
 
     def until(self, path: str, done, limit_s=300.0):
-        """Poll an address until something is so; gives its last JSON. It gives up when nothing changes for a time."""
+        """Poll an address until something is so; gives its last JSON. It gives up when nothing changes for a time.
+
+        A busy daemon may refuse to answer; its health is told with an error's status where there are problems.
+        """
         before, end = None, 0.0
         while True:
-            value = self.get(path).json()
-            if done(value):
+            answer = self.get(path)
+            value = answer.json()
+            if (answer.is_success or path == "/healthz") and done(value):
                 return value
             if (now := (value, self.get("/api/jobs").json())) != before:
                 before, end = now, time.monotonic() + limit_s

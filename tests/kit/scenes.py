@@ -1,6 +1,9 @@
 """A made twin as the refiner is given it, with its truth."""
 
+import contextlib
 import csv
+import os
+import shutil
 
 from orthoswarm.model.geo import LocalGrid, area_epsg
 from orthoswarm.raster.basemap import Basemap
@@ -10,10 +13,17 @@ from telemetry import load
 
 
 def tiny_twin(factory, seed, **changes):
-    """The folder of a freshly made tiny twin."""
-    folder = factory.mktemp("twin") / "tiny"
-    make_twin(spec("tiny", seed=seed, **changes), folder)
-    return folder
+    """The folder of a tiny twin for one file of tests, copied from one that all processes of a test run share."""
+    base = factory.getbasetemp()
+    shared = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "twins"
+    made = shared / "-".join([str(seed), *(f"{name}={changes[name]}" for name in sorted(changes))])
+    if not made.exists():
+        shared.mkdir(exist_ok=True)
+        new = factory.mktemp("new") / "tiny"
+        make_twin(spec("tiny", seed=seed, **changes), new)
+        with contextlib.suppress(OSError):  # another process was as quick: its twin is the same
+            new.rename(made)
+    return shutil.copytree(made, factory.mktemp("twin") / "tiny")
 
 
 def scene_of(folder):

@@ -8,20 +8,23 @@ from orthoswarm.matchers.matcher import UnavailableError
 from orthoswarm.matchers.network_device import network_device, require_device
 from orthoswarm.model.errors import InputError
 
-torch = pytest.importorskip("torch")
+
+@pytest.fixture(scope="module")
+def torch():
+    return pytest.importorskip("torch")
 
 
 @pytest.mark.parametrize(("card", "name", "kind"), [
     (False, "auto", "cpu"), (False, "cpu", "cpu"), (True, "auto", "cuda"), (True, "cpu", "cpu"), (True, "cuda", "cuda"),
 ])  # fmt: skip
-def test_the_device_asked_for_is_used(monkeypatch, card, name, kind):
+def test_the_device_asked_for_is_used(torch, monkeypatch, card, name, kind):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: card)
     require_device(name)
     assert network_device(name).type == kind
 
 
 @pytest.mark.parametrize(("name", "words"), [("cuda", "sees no CUDA card"), ("gpu0", "no device 'gpu0'")])
-def test_a_device_that_is_not_there_is_refused(monkeypatch, name, words):
+def test_a_device_that_is_not_there_is_refused(torch, monkeypatch, name, words):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(UnavailableError, match=words):
         network_device(name)
@@ -29,7 +32,7 @@ def test_a_device_that_is_not_there_is_refused(monkeypatch, name, words):
         require_device(name)
 
 
-def test_mosaic_refuses_it_before_it_writes(monkeypatch, tmp_path, capsys):
+def test_mosaic_refuses_it_before_it_writes(torch, monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     (tmp_path / "photos").mkdir()
     assert main(["mosaic", str(tmp_path / "photos"), "--out", str(tmp_path / "map"), "--device", "cuda"]) == 2
@@ -37,8 +40,9 @@ def test_mosaic_refuses_it_before_it_writes(monkeypatch, tmp_path, capsys):
     assert not (tmp_path / "map").exists()
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA card")
-def test_a_card_finds_what_the_cpu_finds():
+def test_a_card_finds_what_the_cpu_finds(torch):
+    if not torch.cuda.is_available():
+        pytest.skip("no CUDA card")
     from orthoswarm.matchers import picture_matcher
 
     rng = np.random.default_rng(1)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.model.camera import Camera, Lens, rotation_from_angles
 from orthoswarm.model.errors import InputError
-from orthoswarm.mosaic.footprint import default_gsd, footprint, footprint_boxes, least_descent, rejection, rejections
+from orthoswarm.mosaic.footprint import LEAST_DESCENT, default_gsd, footprint, footprint_boxes, rejection, rejections
 from orthoswarm.mosaic.kernels.lens_arrays import INNER, OUTER, lens_row
 from orthoswarm.mosaic.kernels.realtime_kernel import aim, row_span
 from orthoswarm.mosaic.realtime import RealtimeMosaic, ground_to_camera, mosaic
@@ -192,7 +192,9 @@ def test_matrix_is_the_inverse_of_the_papers_homography(camera, column, row):
     uv = camera.project(np.append(ground, 0.0))
     if depth < 1.0:
         return
-    assert camera.lens.principal_point + camera.lens.focal_px * np.array([x, y]) / depth == pytest.approx(uv, abs=1e-6)
+    assert camera.lens.principal_point + camera.lens.focal_px * np.array([x, y]) / depth == pytest.approx(
+        uv, rel=1e-9, abs=1e-6
+    )
     east, north, w = camera.homography(0.0) @ np.append(uv, 1.0)
     if np.abs(uv).max() < 1e4:
         assert (east / w, north / w) == pytest.approx(tuple(ground), abs=1e-3)
@@ -209,9 +211,7 @@ def test_half_planes_and_boxes_hold_all_that_is_seen(camera, seed, k1):
         ground = ground[off <= camera.position[2] * np.tan(np.radians(74.9))]
     planes, box, corners = np.empty((8, 3)), np.empty(4), np.array(outer_box(camera.lens))
     grid = scene.grid(1000.0, 0.5)
-    count = aim(
-        camera.position, camera.rotation, corners, 0.0, least_descent(), grid.west, grid.north, 0.5, planes, box
-    )
+    count = aim(camera.position, camera.rotation, corners, 0.0, LEAST_DESCENT, grid.west, grid.north, 0.5, planes, box)
     assert (count > 0) or len(ground) == 0
     if rejection(camera, 0.0, 1.0) is not None:
         assert len(ground) == 0

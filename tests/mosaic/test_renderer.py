@@ -318,7 +318,7 @@ def test_a_measured_wall_is_a_step_along_a_straight_line_and_its_roof_stays_as_i
     on_roof = np.stack(np.meshgrid(nodes, nodes), -1) @ along > 0.3
     over = np.where(on_roof, 9.0 + 0.2 * np.sin(nodes), 0.0).astype(np.float32)
     bare = np.full(over.shape, 100.0, np.float32)
-    lattice = heights(Terrain(-30.0, -30.0, 1.25, bare + over, bare), -25.6, 25.6, 0.4, 128)
+    lattice = heights(Terrain(-30.0, -30.0, 1.25, bare + over, bare=bare), -25.6, 25.6, 0.4, 128)
     at = 0.4 * LATTICE_PX * np.arange(len(lattice))
     away = np.stack(np.meshgrid(at - 25.6, 25.6 - at), -1) @ along - 0.3
     assert (((lattice < 100.5) | (lattice > 108.5)) & (lattice < 109.5)).all()  # nothing in between, nothing above
@@ -398,7 +398,7 @@ def test_what_one_picture_shows_at_two_places_is_counted(canvas):
     nadir = flight.cameras[0].nadir
     z = np.zeros((300, 300), np.float32)
     z[:, 165:175] = 15.0
-    wall = Terrain(nadir[0] - 150.0, nadir[1] - 150.0, 1.0, z, np.zeros_like(z))
+    wall = Terrain(nadir[0] - 150.0, nadir[1] - 150.0, 1.0, z, bare=np.zeros_like(z))
     drawn = render(flight.frames, wall, canvas, read=flight.read).drawn
     camera_m = flight.cameras[0].position[2]
     shadow_m = 15.0 * 25.0 / (camera_m - 15.0)  # of ground behind the wall, which ends 25 m from below the camera

@@ -68,7 +68,7 @@ def test_ground_behind_a_tall_thing_is_drawn_from_a_picture_that_sees_it(tmp_pat
     nodes = np.arange(-140.0, 141.0, 1.0)
     tower = np.where((nodes >= 2.0) & (nodes <= 8.0), 25.0, 0.0).astype(np.float32)
     tower = np.where(np.abs(nodes)[:, None] < 40.0, tower, np.float32(0.0))
-    ground = Terrain(scene.EAST - 140.0, scene.NORTH - 140.0, 1.0, tower, np.zeros_like(tower))
+    ground = Terrain(scene.EAST - 140.0, scene.NORTH - 140.0, 1.0, tower, bare=np.zeros_like(tower))
     east, north = np.moveaxis(scene.pixel_centres(scene.grid(260.0)) - (scene.EAST, scene.NORTH), -1, 0)
     behind = (east > 9.5) & (east < 11.5) & (np.abs(north) < 20.0)
     assert (drawn(tmp_path / "level", flight)[1][behind] == 1).all()  # it is nearer to the first

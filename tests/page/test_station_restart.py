@@ -38,9 +38,9 @@ def test_what_the_new_run_does_not_know_goes(browser):
         page.wait_for_function("document.querySelectorAll('button.vehicle').length === 2")
         page.wait_for_selector(".jobs li", state="detached")
         page.wait_for_selector(".plan-result", state="hidden")
-        assert page.evaluate("import('/static/plan/area.js').then((m) => m.area.rings.length)") == 0
-        assert page.locator(".tile").count() == 2
-        assert page.locator(".alarms:visible").count() == 0
+        page.wait_for_function("() => import('/static/plan/area.js').then((m) => m.area.rings.length === 0)")
+        page.wait_for_function("document.querySelectorAll('.tile').length === 2")
+        page.wait_for_selector(".alarms", state="hidden")
 
 
 @pytest.mark.parametrize("sent", [True, False], ids=["had sent pictures", "had sent none"])

@@ -355,7 +355,7 @@ def test_ways_around_zones_are_free_and_as_short_as_a_dense_search_finds(seed):
         others = rng.uniform(-20, 120, (150, 2))
         first = np.hypot(*(others - p).T) + np.where(router.blocked(np.tile(p, (150, 1)), others), np.inf, 0)
         last = np.hypot(*(others - q).T) + np.where(router.blocked(others, np.tile(q, (150, 1))), np.inf, 0)
-        assert length <= (first + last).min() + 1e-6
+        assert length <= (first + last).min() + 1e-4  # a detour may graze a zone by as much
 
 
 @pytest.mark.slow

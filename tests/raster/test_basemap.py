@@ -40,12 +40,19 @@ def expected(bounds, gsd):
 
 def picture(affine, width, height, epsg=EPSG):
     """The ground as a raster with some transform and CRS sees it, float64."""
-    rows, cols = np.mgrid[:height, :width] + 0.5
-    x, y = affine.a * cols + affine.b * rows + affine.c, affine.d * cols + affine.e * rows + affine.f
-    if epsg != EPSG:
-        to = rasterio.warp.transform(f"EPSG:{epsg}", f"EPSG:{EPSG}", x.ravel(), y.ravel())
-        x, y = np.reshape(to[0], x.shape), np.reshape(to[1], y.shape)
-    return ground(x, y)
+    if epsg == EPSG:
+        rows, cols = np.mgrid[:height, :width] + 0.5
+        return ground(*(affine @ (cols, rows)))
+    step = 16  # 20 m at most, over which another system is straight to 0.1 mm
+    rows, cols = np.mgrid[: height + 2 * step : step, : width + 2 * step : step]
+    x, y = affine @ (cols, rows)
+    to = rasterio.warp.transform(f"EPSG:{epsg}", f"EPSG:{EPSG}", x.ravel(), y.ravel())
+    x, y = np.reshape(to[0], x.shape), np.reshape(to[1], y.shape)
+    down, across = (
+        np.maximum(0.0, 1.0 - np.abs((np.arange(side)[:, None] + 0.5) / step - np.arange(count)))
+        for side, count in zip((height, width), x.shape)
+    )
+    return ground(down @ x @ across.T, down @ y @ across.T)
 
 
 def write(path, bands, affine, epsg=EPSG, **profile):
@@ -296,8 +303,8 @@ def test_a_truncated_map_is_one_clear_error(tmp_path):
 
 def noisy(path, bands=1, kind=np.uint8, **profile):
     """A map of noise over AREA and around it, so that no compression makes its blocks alike."""
-    values = np.random.default_rng(0).integers(1, np.iinfo(kind).max, (bands, 2000, 2000), kind)
-    return write(path, values, from_origin(EAST, NORTH, 0.1, 0.1), **profile)
+    values = np.random.default_rng(0).integers(1, np.iinfo(kind).max, (bands, 1000, 1000), kind)
+    return write(path, values, from_origin(EAST, NORTH, 0.2, 0.2), **profile)
 
 
 STORED = [

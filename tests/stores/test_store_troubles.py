@@ -183,8 +183,12 @@ def test_an_upload_that_is_interrupted_ends_after_the_files_under_way(store, pho
             raise KeyboardInterrupt
 
     store.fault = fault
-    with pytest.raises(KeyboardInterrupt):
-        out.publish(lambda name: True, told)
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            out.publish(lambda name: True, told)
+    finally:
+        signal.signal(signal.SIGINT, handler)
     sent = len([method for method, _ in store.seen if method == "PUT"])
     assert 0 < sent < 100
     store.fault = lambda method, path: None

@@ -298,7 +298,7 @@ def test_one_that_cannot_arm_at_its_time_holds_the_others(folder, capsys):  # no
         code, said = fleet(capsys, "start", "--override", "separation", "--plan", folder, "--link", link, "--json")
         assert code == 1
         outcomes = [row["outcome"] for row in said["vehicles"]]
-        assert outcomes == ["done", "refused", "not_sent"]
+        assert outcomes == ["done", "refused", "not_sent"], said
         assert "stays on the ground, because vehicle 2 did not take off" in said["vehicles"][2]["text"]
         assert "Arm: Motors: Check frame class" in said["vehicles"][1]["text"]
 

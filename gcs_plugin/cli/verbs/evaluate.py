@@ -98,8 +98,9 @@ def _of_the_drawing(ortho: Path) -> dict[str, Any]:
     report = (ortho if ortho.is_dir() else ortho.parent) / "report.json"
     if not report.is_file():
         return {}
-    drawn_twice = json.loads(report.read_text("utf-8")).get("drawn_twice_share")
-    return {} if drawn_twice is None else {"drawn_twice_share": drawn_twice}
+    said = json.loads(report.read_text("utf-8"))
+    own = {"drawn_twice_share": said.get("drawn_twice_share"), **said.get("trust", {})}
+    return {name: value for name, value in own.items() if value is not None}
 
 
 def _wait(args: argparse.Namespace) -> None:

@@ -300,6 +300,8 @@ def _tell(report: dict[str, object], out: Path) -> None:
     frames = report["frames"]
     assert isinstance(frames, dict)
     print(f"{frames['used']} of {frames['input']} pictures mapped in {report['wall_s']:.0f} s: {address_of(out)}")
+    if report["headline"]:
+        print(report["headline"])
     left_out = report["left_out"]
     assert isinstance(left_out, dict)
     reasons = list(left_out.items())

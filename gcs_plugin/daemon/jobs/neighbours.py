@@ -36,6 +36,7 @@ from gcs_plugin.daemon.store.sortie_rows import (
 )
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.placement import PlacedFrame, Terrain
+from orthoswarm.mosaic.extent import ground_of_nearest
 from orthoswarm.mosaic.radiometry import estimate_fields
 
 _GROUND_STEP_M = 10.0
@@ -98,23 +99,10 @@ def _changes(before: dict[str, Gain], now: dict[str, Gain]) -> NDArray[np.float6
 
 def _common_ground(sorties: list[SolutionFile]) -> Terrain:
     """One terrain under all sorties: at each node the height that the sortie of the nearest picture has there."""
-    from scipy.spatial import cKDTree
-
-    at: NDArray[np.float64] = np.array([p.camera.position[:2] for s in sorties for p in s.solution.placed])
-    whose = np.repeat(np.arange(len(sorties)), [len(s.solution.placed) for s in sorties])
-    reach = max(float(p.camera.position[2]) for s in sorties for p in s.solution.placed)
-    box = BoundingBox.around_points(at)
-    west, south = box.west - reach, box.south - reach
-    width, height = box.width + 2 * reach, box.height + 2 * reach
-    step = max(_GROUND_STEP_M, float(np.sqrt(width * height / _MOST_NODES)))
-    columns, rows = int(np.ceil(width / step)) + 1, int(np.ceil(height / step)) + 1
-    nodes = np.stack(np.meshgrid(west + step * np.arange(columns), south + step * np.arange(rows)), -1)
-    nearest = whose[cKDTree(at).query(nodes)[1]]
-    z = np.empty((rows, columns), np.float32)
-    for number, sortie in enumerate(sorties):
-        here = nearest == number
-        z[here] = sortie.terrain.height(nodes[here])
-    return Terrain(west, south, step, z)
+    paths = [np.array([p.camera.position for p in s.solution.placed]).reshape(-1, 3) for s in sorties]
+    reach = float(np.concatenate(paths)[:, 2].max())
+    own = [path[:, :2] for path in paths]
+    return ground_of_nearest([s.terrain for s in sorties], own, reach, step_m=_GROUND_STEP_M, most_nodes=_MOST_NODES)
 
 
 @dataclass(slots=True)

@@ -29,6 +29,7 @@ _PURPOSES: Final = {
     "orthoimage.stac.json": "For catalogues: what it is, when and how accurate (STAC)",
     "footprints.gpkg": "For QGIS: footprints of the pictures (GeoPackage)",
     "seamlines.gpkg": "For QGIS: which picture shows which ground (GeoPackage)",
+    "confidence.tif": "For QGIS: how far each place can be trusted (GeoTIFF)",
     SURFACE: "For QGIS: heights of the surface (GeoTIFF)",
     "orthoimage.mbtiles": "For phones and tablets (MBTiles)",
     "orthoimage.pmtiles": "For web maps (PMTiles)",
@@ -50,8 +51,8 @@ def write_pack(
     """Write the pack of a map.
 
     Args:
-        cog: the orthoimage; the surface model, footprints.gpkg, seamlines.gpkg and report.html beside it go in if
-            there.
+        cog: the orthoimage; the surface model, footprints.gpkg, seamlines.gpkg, confidence.tif and report.html beside
+            it go in if there.
         path: the ZIP. places: finds and vehicles. progress: called with steps done and steps in all.
 
     Raises:
@@ -106,7 +107,7 @@ def _copy(cog: Path, folder: Path) -> None:
     surface = surface_path(cog.parent)
     if surface is not None:
         shutil.copyfile(surface, folder / SURFACE)
-    for name in ("footprints.gpkg", "seamlines.gpkg", "report.html", "report.json", "frames.jsonl"):
+    for name in ("footprints.gpkg", "seamlines.gpkg", "confidence.tif", "report.html", "report.json", "frames.jsonl"):
         if (cog.parent / name).is_file():
             shutil.copyfile(cog.parent / name, folder / name)
 

@@ -17,7 +17,7 @@ from orthoswarm.export.atomic_file import write_file
 from orthoswarm.export.xml_elements import element, kml_bytes, texts, xml_bytes
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.placement import PlacedFrame
-from orthoswarm.mosaic.footprint import least_descent
+from orthoswarm.mosaic.footprint import LEAST_DESCENT
 
 FILE: Final = "places.geojson"
 _COLUMNS: Final = (
@@ -136,7 +136,7 @@ def sightings(placed: Iterable[PlacedFrame], point: ArrayLike) -> list[Sighting]
     for frame in placed:
         camera, lens = frame.camera, frame.camera.lens
         ray = at - camera.position
-        if -ray[2] < least_descent() * float(np.linalg.norm(ray)) or float(ray @ camera.rotation[:, 2]) <= 0.0:
+        if -ray[2] < LEAST_DESCENT * float(np.linalg.norm(ray)) or float(ray @ camera.rotation[:, 2]) <= 0.0:
             continue
         column, row = (float(v) for v in camera.project(at[None])[0])
         if 0.0 <= column < lens.width and 0.0 <= row < lens.height:

@@ -3,15 +3,13 @@
 import numpy as np
 from numpy.typing import NDArray
 
-Bytes = NDArray[np.uint8]
+from orthoswarm.model.arrays import Bytes
 
 
 def reduction(gsd_m: float, picture_gsd_m: float) -> int:
     """How many picture pixels per side to average into one, so that a coarser map does not alias fine texture.
 
-    Args:
-        gsd_m: the map's ground pixel.
-        picture_gsd_m: the picture's ground pixel at nadir.
+    gsd_m: the map's ground pixel. picture_gsd_m: the picture's ground pixel at nadir.
     """
     return max(1, int(gsd_m / picture_gsd_m + 0.25))
 
@@ -46,9 +44,7 @@ def reduced_exactly(pixels: Bytes, factor: int) -> Bytes:
 def pack(picture: Bytes, factor: int = 1) -> tuple[NDArray[np.uint32], int]:
     """A picture as one uint32 per pixel (R, G, B, 255 in memory order), reduced, and the factor used.
 
-    Args:
-        picture: uint8 (H, W, 3), or (H, W, 4) with alpha 255.
-        factor: see `reduced`.
+    picture: uint8 (H, W, 3), or (H, W, 4) with alpha 255. factor: see `reduced`.
     """
     import cv2
 

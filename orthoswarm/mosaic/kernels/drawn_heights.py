@@ -7,9 +7,9 @@ shows roof and facade once more, mirrored. At a wall each place is either on its
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel
+from orthoswarm.model.arrays import Array, Floats
 from orthoswarm.model.placement import Terrain
 from orthoswarm.mosaic.kernels.pixel_sampling import cubic_convolution
 from orthoswarm.mosaic.kernels.render_arrays import LATTICE_PX
@@ -19,7 +19,7 @@ _NEAR_WALL, _WALL = np.uint8(1), np.uint8(2)
 _WALL_SLOPE: Final = 1.2  # steeper measured surfaces are walls (50 degrees; roofs and rubble are flatter)
 
 
-def heights(terrain: Terrain, west: float, north: float, gsd_m: float, tile_px: int) -> NDArray[np.float32]:
+def heights(terrain: Terrain, west: float, north: float, gsd_m: float, tile_px: int) -> Floats:
     """Heights every LATTICE_PX pixels from a tile's corner, float32 (tile_px / LATTICE_PX + 1, ...), rows going south.
 
     Cubic convolution (Keys 1981, a = -1/2) between the terrain's nodes, so slopes are continuous; constant beyond
@@ -43,13 +43,11 @@ def heights(terrain: Terrain, west: float, north: float, gsd_m: float, tile_px: 
 class _Taps:
     """Where places lie between the nodes of an axis.
 
-    Attributes:
-        nodes: the nodes that are used. index: int32 (4, N), two nodes before and two after each place, from the first
-            of them on.
-        cubic, spline: float32 (4, N), their weights by cubic convolution, and by a cubic B-spline, which smooths.
+    nodes: the nodes that are used. index: int32 (4, N), two nodes before and two after each place, from the first of
+    them on. cubic, spline: float32 (4, N), their weights by cubic convolution, and by a cubic B-spline, which smooths.
     """
 
-    def __init__(self, at: NDArray[np.float64], count: int) -> None:
+    def __init__(self, at: Array, count: int) -> None:
         at = np.clip(at, 0.0, count - 1.0)
         base = np.minimum(at.astype(np.int32), max(0, count - 2))
         index = np.clip(base + np.arange(-1, 3, dtype=np.int32)[:, None], 0, count - 1)
@@ -84,8 +82,7 @@ def _smooth(z, rows, down, columns, across, between, out):  # type: ignore[no-un
 def _find_walls(z, wall, walls):  # type: ignore[no-untyped-def]
     """Mark cells between four nodes that differ by more than a height, and those around them; whether there are any.
 
-    Args:
-        walls: uint8, a cell at the node of its least row and column, 0 before; set to _WALL or _NEAR_WALL.
+    walls: uint8, a cell at the node of its least row and column, 0 before; set to _WALL or _NEAR_WALL.
     """
     found = False
     for r in range(z.shape[0] - 1):

@@ -3,11 +3,9 @@
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from orthoswarm.model.arrays import Array, Flags
 from orthoswarm.model.camera import LEAST_RADIAL_SLOPE, Lens
-
-Array = NDArray[np.float64]
 
 F, K1, K2, K3, U, V, U_LOW, U_HIGH, V_LOW, V_HIGH = range(10)
 OUTER, INNER = 10, 14
@@ -15,7 +13,7 @@ OUTER, INNER = 10, 14
 y low, y high) of undistorted normalised coordinates: OUTER holds all the usable picture, INNER lies within it."""
 
 
-def folds(lens: Lens, r2: Array) -> NDArray[np.bool_]:
+def folds(lens: Lens, r2: Array) -> Flags:
     """Where (squared undistorted radius) the distortion hardly grows with the angle any more: nothing is visible."""
     return np.asarray(1.0 + r2 * (3 * lens.k1 + r2 * (5 * lens.k2 + r2 * 7 * lens.k3)) < LEAST_RADIAL_SLOPE)
 

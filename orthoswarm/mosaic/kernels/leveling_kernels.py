@@ -4,8 +4,7 @@ import numpy as np
 
 from orthoswarm.compute.jit import in_place_kernel, kernel
 
-SLOTS = 8
-"""Most pictures, and pairs of them, in a cell; any beyond are left as they are."""
+SLOTS = 8  # most pictures, and pairs of them, in a cell; any beyond are left as they are
 BOTH = 9
 """What is summed of two pictures at the seams in a cell: pixels, three colours of the first, three of the second, log
 ratio of their brightness and its square."""

@@ -9,14 +9,13 @@ for the negative weights, lies within 0 to 65,535; what is carried between lanes
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel, kernel
+from orthoswarm.model.arrays import Array, Indices
 from orthoswarm.mosaic.kernels.lens_arrays import K1, K2, K3, F, U, V
 from orthoswarm.mosaic.kernels.render_arrays import LATTICE_PX
 
-UNIT = 128
-"""Sum of the weights, and number of steps of a fraction of a pixel."""
+UNIT = 128  # sum of the weights, and number of steps of a fraction of a pixel
 BEFORE, AFTER = 1, 2
 """Pixels that interpolation takes before and after that which holds the place, across and down."""
 _LOW = 32  # a row's least value (-32) becomes 0
@@ -25,7 +24,7 @@ _BIAS2 = np.int64((2 * _LOW * UNIT) * (1 + (1 << 16) + (1 << 32)))
 _LANES = np.int64(0x01FF_01FF_01FF)
 
 
-def cubic_convolution(t: NDArray[np.float64]) -> NDArray[np.float64]:
+def cubic_convolution(t: Array) -> Array:
     """Weights of the samples at -1, 0, 1, 2 for places t (N,) between 0 and 1 (Keys 1981, a = -1/2), float64 (4, N)."""
     return np.stack(
         [
@@ -37,7 +36,7 @@ def cubic_convolution(t: NDArray[np.float64]) -> NDArray[np.float64]:
     )
 
 
-def cubic_weights() -> NDArray[np.int64]:
+def cubic_weights() -> Indices:
     """Weights at -1, 0, 1, 2 for every fraction k / UNIT, int64 (UNIT, 4), each row's sum UNIT."""
     t = np.arange(UNIT) / UNIT
     exact = cubic_convolution(t).T
@@ -140,21 +139,13 @@ def _columns_of(rows, chosen):  # type: ignore[no-untyped-def]
 
 @kernel
 def place(label, mark, window, position, rotation, lens, lattice, gsd, size, factor):  # type: ignore[no-untyped-def]
-    """Find a tile's pixels of one label in a picture.
-
-    The projection is render_arrays.project.
+    """Find a tile's pixels of one label in a picture, by the projection of render_arrays.
 
     Args:
-        label: int32 (T, T).
-        mark: the label.
-        window: int32 (4,), row0, row1, col0, col1 that hold the label.
-        position: float64 (3,), the camera in the tile's frame, see lattice.Shots.about.
-        rotation: float64 (3, 3), ground to camera.
-        lens: float64 (18,), see lattice.
-        lattice: float32, the tile's heights.
-        gsd: ground pixel, metres.
-        size: int32 (2,), columns and rows of the reduced picture.
-        factor: by which the picture is reduced.
+        label: int32 (T, T). mark: the label. window: int32 (4,), row0, row1, col0, col1 that hold it.
+        position, rotation, lens: the camera in the tile's frame, (3,), (3, 3), (18,), see render_arrays.Shots.about.
+        lattice: float32, the tile's heights. gsd: ground pixel, metres.
+        size: int32 (2,), columns and rows of the picture reduced by `factor`.
 
     Returns:
         For N pixels that the picture shows: int32 (N,), their numbers in the tile; int32 (2, N), their columns and rows
@@ -206,8 +197,7 @@ def widen(part, corner, box, size, lanes):  # type: ignore[no-untyped-def]
     """The colours in a box of a picture and around it as one word each; at the picture's border they repeat.
 
     Args:
-        part: uint8 (H, W, 3), a part of the picture.
-        corner: int32 (2,), column and row of its corner.
+        part: uint8 (H, W, 3), a part of the picture. corner: int32 (2,), column and row of its corner.
         box: int32 (4,), see `place`; `part` holds it, with BEFORE and AFTER as far as the picture goes.
         size: int32 (2,), columns and rows of the whole picture.
         lanes: int64 (rows, columns) of the box with BEFORE and AFTER added, set.

@@ -16,8 +16,7 @@ _HALF = np.uint32(0x00800080)
 _8 = np.uint32(8)
 _FULL = np.uint32(256)
 _FRACTION = np.uint32(255)
-RUN = 32
-"""Pixels that vector code handles at once."""
+RUN = 32  # pixels that vector code handles at once
 
 
 @kernel
@@ -27,14 +26,9 @@ def aim(position, rotation, corners, ground_z_m, least, west, north, gsd_m, plan
     The picture is clipped where its rays go down by less than `least` per unit of depth, so the footprint is finite.
 
     Args:
-        position: float64 (3,), easting, northing, height of the camera.
-        rotation: float64 (3, 3), camera to ground.
+        position: float64 (3,), easting, northing, height of the camera. rotation: float64 (3, 3), camera to ground.
         corners: float64 (4,), x low, x high, y low, y high of a box in undistorted normalised coordinates.
-        ground_z_m: height of the ground plane.
-        least: smallest descent of a ray.
-        west: easting of the canvas's left edge.
-        north: northing of its upper edge.
-        gsd_m: its ground pixel.
+        west, north, gsd_m: the canvas's left and upper edge, and its ground pixel.
         planes: float64 (8, 3), set to rows a, b, c with a column + b row <= c inside, canvas pixels.
         box: float64 (4,), set to the least and greatest column, least and greatest row.
     """
@@ -81,13 +75,7 @@ def aim(position, rotation, corners, ground_z_m, least, west, north, gsd_m, plan
 def row_span(planes, centre, radius, row, first, last):  # type: ignore[no-untyped-def]
     """Columns [first, last) cut down to the pixel centres in a convex polygon and a circle, on a row.
 
-    Args:
-        planes: float64 (K, 3), a column + b row <= c inside.
-        centre: float64 (2,), the circle's centre.
-        radius: its radius.
-        row: the row.
-        first: first column.
-        last: past the last column.
+    planes: float64 (K, 3), a column + b row <= c inside. centre: float64 (2,) and radius of the circle.
     """
     low, high = float(first), last - 1.0
     dy = row - centre[1]
@@ -232,9 +220,7 @@ def fuse(packed, score, part, picture, planes, centre, radius, matrix, lens, gsd
             picture coordinates.
         lens: float64 (10,), k1, k2, k3, focal length in pixels, principal column and row, least and greatest column
             used, least and greatest row used (they may lie half a pixel beyond the outermost centres).
-        gsd_m: ground pixel.
-        reals: float32 (3, T + RUN), scratch.
-        integers: uint32 (6, T + RUN), scratch.
+        gsd_m: ground pixel. reals: float32 (3, T + RUN), scratch. integers: uint32 (6, T + RUN), scratch.
     """
     row0, col0, rows, columns = part
     height, width = picture.shape

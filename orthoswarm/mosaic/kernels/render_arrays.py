@@ -5,20 +5,19 @@ heights as they are. Terrain enters as a lattice of heights every LATTICE_PX pix
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel
+from orthoswarm.model.arrays import Array, Flags, Ints
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import LEAST_RADIAL_SLOPE, Camera
 from orthoswarm.model.placement import Terrain
 from orthoswarm.mosaic.kernels.lens_arrays import K1, K2, K3, F, U, V, lens_row
 
-Array = NDArray[np.float64]
-LATTICE_PX = 2
-"""Pixels between heights of a tile's lattice (bilinear between them)."""
+LATTICE_PX = 2  # pixels between heights of a tile's lattice (bilinear between them)
 MARGIN_PX = 0.0
 """How far inside the outermost pixel centres a picture is used. At the very border the outermost pixels stand in for
 the neighbours that interpolation misses; a pixel's margin would cost a lone small picture 4 % of its ground."""
@@ -28,19 +27,15 @@ the neighbours that interpolation misses; a pixel's margin would cost a lone sma
 class Shots:
     """Cameras as arrays; positions are grid coordinates (subtract the tile's corner before use).
 
-    Attributes:
-        position: float64 (N, 3).
-        rotation: float64 (N, 3, 3), camera to ground.
-        lens: float64 (N, 18), see above.
-        size: int32 (N, 2), columns and rows of the pictures.
-        weak: bool (N,), used only where no other sees.
+    position: float64 (N, 3). rotation: float64 (N, 3, 3), camera to ground. lens: float64 (N, 18), see above. size:
+    int32 (N, 2), columns and rows of the pictures. weak: bool (N,), used only where no other sees.
     """
 
     position: Array
     rotation: Array
     lens: Array
-    size: NDArray[np.int32]
-    weak: NDArray[np.bool_]
+    size: Ints
+    weak: Flags
 
     @classmethod
     def of(cls, cameras: Sequence[Camera], weak: Sequence[bool], margin_px: float = MARGIN_PX) -> "Shots":
@@ -75,8 +70,10 @@ def crop(terrain: Terrain, bounds: BoundingBox) -> Terrain:
     r0 = int(np.clip(np.floor((bounds[1] - terrain.south) / terrain.step_m) - 2, 0, rows - 2))
     r1 = int(np.clip(np.ceil((bounds[3] - terrain.south) / terrain.step_m) + 3, r0 + 2, rows))
     step = terrain.step_m
-    bare = None if terrain.bare is None else terrain.bare[r0:r1, c0:c1].copy()
-    return Terrain(terrain.west + c0 * step, terrain.south + r0 * step, step, terrain.z[r0:r1, c0:c1].copy(), bare)
+    drawn = replace(terrain, tops=None)
+    return drawn.changed(
+        lambda z: z[r0:r1, c0:c1].copy(), west=terrain.west + c0 * step, south=terrain.south + r0 * step
+    )
 
 
 @in_place_kernel
@@ -94,13 +91,8 @@ def lattice_height(lattice, row, column):  # type: ignore[no-untyped-def]
 def project(position, rotation, lens, x, y, z):  # type: ignore[no-untyped-def]
     """Pixel (u, v) of a point in the tile's frame; (-1e9, -1e9) where it cannot be seen.
 
-    Args:
-        position: float64 (3,), see Shots.about.
-        rotation: float64 (3, 3), ground to camera.
-        lens: float64 (18,), a row as above.
-        x: metres east of the tile's corner.
-        y: metres SOUTH of it.
-        z: height.
+    position, rotation: float64 (3,), (3, 3), see Shots.about. lens: float64 (18,). x, y: metres east and SOUTH of the
+    tile's corner. z: height.
     """
     dx, dy, dz = x - position[0], y - position[1], z - position[2]
     depth = rotation[2, 0] * dx + rotation[2, 1] * dy + rotation[2, 2] * dz

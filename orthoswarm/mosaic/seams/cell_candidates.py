@@ -9,24 +9,18 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel, kernel
-from orthoswarm.mosaic.footprint import tan_limit
+from orthoswarm.model.arrays import Floats, Ints
+from orthoswarm.mosaic.footprint import TAN_LIMIT
 from orthoswarm.mosaic.kernels.lens_arrays import U_HIGH, U_LOW, V_HIGH, V_LOW
 from orthoswarm.mosaic.kernels.line_of_sight import HIDES_M, first_over
 from orthoswarm.mosaic.kernels.render_arrays import LATTICE_PX, Shots, lattice_height, project
 from orthoswarm.mosaic.seam_labels import OUTSIDE, block_heights, sight
 from orthoswarm.mosaic.seams.previews import GLARE_LEVEL, Previews
 
-Array = NDArray[np.float64]
-Floats = NDArray[np.float32]
-Ints = NDArray[np.int32]
-
-SLOTS = 5
-"""Candidates a cell: the cheapest ones."""
-BLOCK = 16
-"""Cells a side of the blocks at whose corners contrasts are compared."""
+SLOTS = 5  # candidates a cell: the cheapest ones
+BLOCK = 16  # cells a side of the blocks at whose corners contrasts are compared
 
 _WEAK_COST: Final = 1e6
 """Cost of a picture that is used only where no other sees: it is damaged, weakly determined, or something taller hides
@@ -65,9 +59,8 @@ class CandidateCells:
 class Region:
     """A square of cells on the ground.
 
-    Attributes:
-        west: easting of its left edge. north: northing of its upper edge. gsd_m: ground pixel. cell_px: pixels a cell.
-        side: cells a side. lattice: float32, its heights, see render_arrays.heights.
+    west: easting of its left edge. north: northing of its upper edge. gsd_m: ground pixel. cell_px: pixels a cell.
+    side: cells a side. lattice: float32, its heights, see render_arrays.heights.
     """
 
     west: float
@@ -81,11 +74,8 @@ class Region:
 def cell_candidates(region: Region, shots: Shots, tone: Floats, previews: Previews) -> CandidateCells:
     """The candidates of a region's cells.
 
-    Args:
-        region: the cells.
-        shots: N pictures that may see it.
-        tone: float32 (N, 6), factor of brightness over each picture (mean of the rows of radiometry.Field).
-        previews: of the N pictures; one that has none is not a candidate.
+    region: the cells. shots: N pictures that may see it. tone: float32 (N, 6), factor of brightness over each picture
+    (mean of the rows of radiometry.Field). previews: of the N pictures; one that has none is not a candidate.
     """
     position, rotation = shots.about(region.west, region.north)
     height = float(np.median(position[:, 2] - float(np.median(region.lattice)))) if len(position) else 1.0
@@ -103,26 +93,15 @@ def cell_candidates(region: Region, shots: Shots, tone: Floats, previews: Previe
         np.zeros(shape, np.float32),
         np.zeros(shape[:2], np.float32),
     )
-    arrays = (position, rotation, shots.lens, shots.size)
+    pictures = (position, rotation, shots.lens, shots.size, usable)
+    ground = (region.lattice, region.gsd_m, region.cell_px)
     nodes = -(-region.side // BLOCK) + 1
     haze = np.zeros((nodes, nodes, len(position)), np.float32)
-    _haze(
-        *arrays,
-        usable,
-        contrast,
-        region.lattice,
-        region.gsd_m,
-        region.cell_px,
-        np.float32(_HAZE_IGNORED_LOG),
-        haze,
-    )
+    _haze(pictures, contrast, ground, haze)
     haze *= np.float32(unit * _HAZE_COST)
-    _candidates(
-        *arrays, usable, penalty, haze, previews.gray, previews.rows, tone, region.lattice, region.gsd_m,
-        region.cell_px, unit * _OBLIQUENESS_COST, cells.candidate, cells.cost, cells.level,
-        np.ascontiguousarray(local, np.float32), cells.texture, unit * _GLARE_COST,
-        GLARE_LEVEL, _CANDIDATE_TAN2, tan_limit() ** 2, _WEAK_COST, HIDES_M,
-    )  # fmt: skip
+    grays = (previews.gray, previews.rows, tone, np.ascontiguousarray(local, np.float32))
+    costs = (penalty, haze, unit * _OBLIQUENESS_COST, unit * _GLARE_COST, TAN_LIMIT**2)
+    _candidates(pictures, ground, grays, costs, (cells.candidate, cells.cost, cells.level, cells.texture))
     return cells
 
 
@@ -134,8 +113,11 @@ def _smoothed(contrast: Floats) -> Floats:
 
 
 @in_place_kernel
-def _haze(position, rotation, lens, size, usable, contrast, lattice, gsd, cell, ignored, haze):  # type: ignore[no-untyped-def]
+def _haze(pictures, contrast, ground, haze):  # type: ignore[no-untyped-def]
     """Log of the contrast that each picture lacks against the clearest one, at the corners of blocks of cells."""
+    position, rotation, lens, size, usable = pictures
+    lattice, gsd, cell = ground
+    ignored = np.float32(_HAZE_IGNORED_LOG)
     last = (lattice.shape[0] - 1) * LATTICE_PX - 1
     rows, columns = contrast.shape[1], contrast.shape[2]
     for i in range(haze.shape[0]):
@@ -170,8 +152,8 @@ def _gray(gray, tone, u, v, width, height):  # type: ignore[no-untyped-def]
 
 
 @in_place_kernel
-def _hidden(lattice, position, x, y, z, gsd, top, above):  # type: ignore[no-untyped-def]
-    """Whether the ground stands more than `above` metres over the line from a point (x, y, z) to a camera.
+def _hidden(lattice, position, x, y, z, gsd, top):  # type: ignore[no-untyped-def]
+    """Whether the ground stands more than `HIDES_M` over the line from a point (x, y, z) to a camera.
 
     Nodes of the lattice are met at every step along the line, from the second on, up to the height `top`.
     """
@@ -179,40 +161,27 @@ def _hidden(lattice, position, x, y, z, gsd, top, above):  # type: ignore[no-unt
     dx, dy = position[0] - x, position[1] - y
     away = max(np.hypot(dx, dy), 1e-6)
     rise = (position[2] - z) / away * step
-    return first_over(lattice, y / step, x / step, dy / away, dx / away, z + above, rise, top, 1) >= 0
+    return first_over(lattice, y / step, x / step, dy / away, dx / away, z + HIDES_M, rise, top, 1) >= 0
 
 
 @kernel
-def _candidates(  # type: ignore[no-untyped-def]
-    position,
-    rotation,
-    lens,
-    size,
-    usable,
-    penalty,
-    haze,
-    gray,
-    record,
-    tone,
-    lattice,
-    gsd,
-    cell,
-    weight,
-    candidate,
-    cost,
-    level,
-    local,
-    texture,
-    glare,
-    glare_level,
-    spread,
-    tan2_limit,
-    hidden,
-    above,
-):
+def _candidates(pictures, ground, grays, costs, cells):  # type: ignore[no-untyped-def]
+    """Fill the cells with their cheapest candidates.
+
+    Args:
+        pictures: position, rotation, lens, size of all, and which are usable. ground: lattice, pixel, pixels a cell.
+        grays: all previews, which are meant, tone and local contrast.
+        costs: penalty and haze of each picture, weight of obliqueness, cost of glare, greatest squared tangent.
+        cells: candidate, cost, level and texture, changed.
+    """
+    position, rotation, lens, size, usable = pictures
+    lattice, gsd, cell = ground
+    gray, record, tone, local = grays
+    penalty, haze, weight, glare, tan2_limit = costs
+    candidate, cost, level, texture = cells
     side = candidate.shape[0]
     top = np.float64(lattice.max())
-    step = cell * gsd
+    step, spread = cell * gsd, np.float32(weight * _CANDIDATE_TAN2)
     least = np.empty(len(usable))
     for b0 in range(0, side, BLOCK):
         for b1 in range(0, side, BLOCK):
@@ -242,7 +211,7 @@ def _candidates(  # type: ignore[no-untyped-def]
                         fx = (c - b1 + 0.5) / BLOCK
                         z = lattice_height(lattice, (r + 0.5) * cell - 0.5, (c + 0.5) * cell - 0.5)
                         dx, dy, rise = x - position[k, 0], y - position[k, 1], position[k, 2] - z
-                        limit = min(cost[r, c, SLOTS - 1], cost[r, c, 0] + np.float32(weight * spread))
+                        limit = min(cost[r, c, SLOTS - 1], cost[r, c, 0] + spread)
                         tan2 = (dx * dx + dy * dy) / (rise * rise) if rise > 0.0 else np.inf
                         here = penalty[k] + weight * tan2
                         if here < limit and tan2 <= tan2_limit:
@@ -260,10 +229,10 @@ def _candidates(  # type: ignore[no-untyped-def]
                                 )
                                 if inside:
                                     g = _gray(gray[record[k]], tone[k], u, v, size[k, 0], size[k, 1])
-                                    if g >= glare_level:
+                                    if g >= GLARE_LEVEL:
                                         here += glare
-                                    if here < limit and _hidden(lattice, position[k], x, y, z, gsd, top, above):
-                                        here += hidden
+                                    if here < limit and _hidden(lattice, position[k], x, y, z, gsd, top):
+                                        here += _WEAK_COST
                                 if inside and here < limit:
                                     s = SLOTS - 1
                                     while s > 0 and cost[r, c, s - 1] > here:
@@ -277,5 +246,5 @@ def _candidates(  # type: ignore[no-untyped-def]
                                         i = min(int((v + 0.5) / size[k, 1] * local.shape[1]), local.shape[1] - 1)
                                         j = min(int((u + 0.5) / size[k, 0] * local.shape[2]), local.shape[2] - 1)
                                         texture[r, c] = local[k, i, j]
-                                    limit = min(cost[r, c, SLOTS - 1], cost[r, c, 0] + np.float32(weight * spread))
+                                    limit = min(cost[r, c, SLOTS - 1], cost[r, c, 0] + spread)
                         worst = max(worst, limit)

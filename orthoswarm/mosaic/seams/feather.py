@@ -1,12 +1,10 @@
 """The transition at a seam: a few pixels to either side take something of the other picture as well."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.canvas.tile_store import Key, TileStore
 from orthoswarm.compute.jit import in_place_kernel
-
-Ints = NDArray[np.int32]
+from orthoswarm.model.arrays import Floats, Ints
 
 
 def labels_around(store: TileStore, key: Key, border_px: int) -> Ints:
@@ -28,7 +26,7 @@ def labels_around(store: TileStore, key: Key, border_px: int) -> Ints:
     return around
 
 
-def transition(around: Ints, width_px: int) -> tuple[Ints, NDArray[np.float32]]:
+def transition(around: Ints, width_px: int) -> tuple[Ints, Floats]:
     """The other picture of each pixel near a seam.
 
     Args:

@@ -18,16 +18,12 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.canvas.tile_store import Key, Tile
+from orthoswarm.model.arrays import Array, Flags, Floats, Indices, Ints
 from orthoswarm.mosaic.kernels.leveling_kernels import BOTH, SLOTS, apply_factors, laplacian, sum_colors
 from orthoswarm.mosaic.overlap_colors import BRIGHT_LEVEL, DARK_LEVEL
-from orthoswarm.mosaic.radiometry import GREATEST_FACTOR
-
-Array = NDArray[np.float64]
-Floats = NDArray[np.float32]
-Integers = NDArray[np.int64]
+from orthoswarm.mosaic.radiometry import GREATEST_FACTOR, conjugate_gradients
 
 _LEVEL_CELLS: Final = 32
 """Cells across a picture in which it is corrected, about 3 m of the ground at a height of 75 m (the factor of a lawn
@@ -61,8 +57,7 @@ class CellSize:
 def cell_size(picture_px: float, tile_px: int, map_px: int) -> CellSize:
     """Cells for a map: about `_LEVEL_CELLS` across a picture.
 
-    Args:
-        picture_px: width of a picture, pixels of the map. tile_px: side of the tiles. map_px: pixels of the map.
+    picture_px: width of a picture, pixels of the map. tile_px: side of the tiles. map_px: pixels of the map.
     """
     wanted = max(picture_px / _LEVEL_CELLS, float(np.sqrt(map_px / _LEVEL_MOST_CELLS)), 4.0)
     fitting = [px for px in range(1, tile_px + 1) if tile_px % px == 0]
@@ -81,9 +76,9 @@ class TileColors:
         both: float32 (S, 9), sums over the pixels that both show, see sum_colors.
     """
 
-    place: Integers
+    place: Indices
     pixels: Floats
-    seam: Integers
+    seam: Indices
     both: Floats
 
 
@@ -106,14 +101,12 @@ def tile_colors(key: Key, tile: Tile, other: Tile | None, cell_px: int) -> TileC
 class TileFactors:
     """Factors of the pictures of a tile.
 
-    Attributes:
-        cell_px: side of the cells.
-        labels: int32 (R + 2, C + 2, SLOTS), pictures in the tile's cells and one beyond each border, 0 = none.
-        factors: float32 (R + 2, C + 2, SLOTS, 3), of their red, green and blue.
+    cell_px: side of the cells. labels: int32 (R + 2, C + 2, SLOTS), pictures in the tile's cells and one beyond each
+    border, 0 = none. factors: float32 (R + 2, C + 2, SLOTS, 3), of their red, green and blue.
     """
 
     cell_px: int
-    labels: NDArray[np.int32]
+    labels: Ints
     factors: Floats
 
     def apply(self, tile: Tile) -> None:
@@ -124,8 +117,7 @@ class TileFactors:
 class Leveling:
     """The correction of a whole map.
 
-    Args:
-        tiles: of all its tiles. columns: cells across the map (whole tiles). cells: their size.
+    tiles: of all its tiles. columns: cells across the map (whole tiles). cells: their size.
     """
 
     def __init__(self, tiles: Sequence[TileColors], columns: int, cells: CellSize) -> None:
@@ -156,15 +148,15 @@ class Leveling:
             factors[at] = np.exp(np.clip(self._log[part], -limit, limit))
         return TileFactors(self._cells.px, labels, factors)
 
-    def _key(self, row: Integers, column: Integers, label: Integers) -> Integers:
+    def _key(self, row: Indices, column: Indices, label: Indices) -> Indices:
         return (row * self._columns + column) * self._labels + label
 
-    def _index(self, key: Integers) -> tuple[Integers, NDArray[np.bool_]]:
+    def _index(self, key: Indices) -> tuple[Indices, Flags]:
         """Where keys are among the unknowns, and whether."""
         at = np.searchsorted(self._keys, key).clip(0, len(self._keys) - 1)
         return at, self._keys[at] == key
 
-    def _steps(self, seam: Integers, both: Array) -> tuple[Integers, Integers, Array, Array]:
+    def _steps(self, seam: Indices, both: Array) -> tuple[Indices, Indices, Array, Array]:
         """Pairs of unknowns at seams (S,), the log ratio of their colours (S, 3), and its weight (S,)."""
         one, found = self._index(self._key(seam[:, 0], seam[:, 1], seam[:, 2]))
         other, too = self._index(self._key(seam[:, 0], seam[:, 1], seam[:, 3]))
@@ -177,7 +169,7 @@ class Leveling:
         robust = np.exp(-0.5 * np.square(ratio.mean(1) / _LEVEL_STEP))  # Welsch's kernel
         return one, other, ratio, _LEVEL_RISE**2 / sigma2 * robust
 
-    def _solved(self, one: Integers, other: Integers, ratio: Array, weight: Array) -> Array:
+    def _solved(self, one: Indices, other: Indices, ratio: Array, weight: Array) -> Array:
         """Log factors (M, 3), by conjugate gradients."""
         firsts, seconds, weights = [one], [other], [weight]
         for ahead in (self._labels, self._columns * self._labels):  # the next cell to the east and to the south
@@ -194,27 +186,11 @@ class Leveling:
             pull = weight * ratio[:, channel]
             right[:, channel] = np.bincount(other, pull, count) - np.bincount(one, pull, count)
         diagonal = anchor + np.bincount(first, links, count) + np.bincount(second, links, count)
-        log = _conjugate_gradients(first, second, links, anchor=anchor, diagonal=diagonal, right=right)
+        image = np.empty_like(right)
+
+        def applied(x: Array) -> Array:
+            laplacian(first, second, links, anchor, x, image)
+            return image
+
+        log = conjugate_gradients(applied, diagonal[:, None], right, _LEVEL_TOLERANCE, _LEVEL_STEPS)
         return np.asarray(log - self._pixels @ log / self._pixels.sum())
-
-
-def _conjugate_gradients(
-    first: NDArray[np.int32], second: NDArray[np.int32], weight: Array, *, anchor: Array, diagonal: Array, right: Array
-) -> Array:
-    """The solution (M, 3) of the normal equations; their diagonal is the preconditioner."""
-    x, left, image = np.zeros_like(right), right.copy(), np.empty_like(right)
-    z = left / diagonal[:, None]
-    towards, product = z.copy(), (left * z).sum(0)
-    enough = _LEVEL_TOLERANCE**2 * product
-    for _ in range(_LEVEL_STEPS):
-        if (product <= enough).all():
-            break
-        laplacian(first, second, weight, anchor, towards, image)
-        curve = (towards * image).sum(0)
-        alpha = product / np.where(curve > 0.0, curve, 1.0)
-        x += alpha * towards
-        left -= alpha * image
-        z = left / diagonal[:, None]
-        last, product = product, (left * z).sum(0)
-        towards = z + product / np.where(last > 0.0, last, 1.0) * towards
-    return x

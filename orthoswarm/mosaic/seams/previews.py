@@ -13,14 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel
+from orthoswarm.model.arrays import Bytes, Flags, Floats, Ints
 from orthoswarm.model.errors import StorageError
 from orthoswarm.raster.picture_quality import LEAST_SIDE_PX, picture_quality
 
-Bytes = NDArray[np.uint8]
-
 ROWS, COLUMNS = 240, 320
-BLOCK_PX = 20
-"""Side of the blocks of which the local contrast is stated."""
+BLOCK_PX = 20  # side of the blocks of which the local contrast is stated
 RECORD = np.dtype(
     [
         ("gray", np.uint8, (ROWS, COLUMNS)),
@@ -38,9 +36,7 @@ _GLARE_SHARE: Final = 0.05  # a block of the preview with a larger share of glar
 class PreviewFile:
     """The previews of a set of pictures.
 
-    Attributes:
-        path: the file, made by `create`.
-        row: image -> number of its record.
+    path: the file, made by `create`. row: image -> number of its record.
     """
 
     path: Path
@@ -85,7 +81,7 @@ def make_preview(picture: Bytes) -> NDArray[np.void]:
     record = np.zeros(1, RECORD)
     gray = cv2.resize(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), (COLUMNS, ROWS), interpolation=cv2.INTER_AREA)
     record["gray"][0] = gray
-    _contrasts(record["gray"][0], GLARE_LEVEL, _GLARE_SHARE, record["contrast"][0])
+    _contrasts(record["gray"][0], record["contrast"][0])
     sharp = picture_quality(picture).sharpness if min(picture.shape[:2]) >= LEAST_SIDE_PX else 0.0
     record["sharpness"] = max(sharp, 1e-3)
     record["written"] = 1
@@ -93,7 +89,7 @@ def make_preview(picture: Bytes) -> NDArray[np.void]:
 
 
 @in_place_kernel
-def _contrasts(gray, glare_level, glare_share, contrast):  # type: ignore[no-untyped-def]
+def _contrasts(gray, contrast):  # type: ignore[no-untyped-def]
     """Standard deviation of each block of a preview, at least half a level; 0 where too much of it is glare."""
     pixels = np.int64(BLOCK_PX * BLOCK_PX)
     for i in range(contrast.shape[0]):
@@ -105,9 +101,9 @@ def _contrasts(gray, glare_level, glare_share, contrast):  # type: ignore[no-unt
                     level = np.int64(row[c])
                     total += level
                     square += level * level
-                    glare += np.int64(level >= glare_level)
+                    glare += np.int64(level >= GLARE_LEVEL)
             variance = (pixels * square - total * total) / (pixels * pixels)
-            contrast[i, j] = np.sqrt(max(variance, 0.25)) if glare <= glare_share * pixels else 0.0
+            contrast[i, j] = np.sqrt(max(variance, 0.25)) if glare <= _GLARE_SHARE * pixels else 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,15 +114,14 @@ class Previews:
         gray: uint8 (M, ROWS, COLUMNS), grey copies of all pictures of the file, mapped and not read.
         rows: int32 (N,), which of them are meant.
         contrast: float32 (N, ROWS / BLOCK_PX, COLUMNS / BLOCK_PX), of the parts of the pictures, levels.
-        sharpness: float32 (N,), see picture_quality.
-        written: bool (N,), whether there is a preview.
+        sharpness: float32 (N,), see picture_quality. written: bool (N,), whether there is a preview.
     """
 
     gray: Bytes
-    rows: NDArray[np.int32]
-    contrast: NDArray[np.float32]
-    sharpness: NDArray[np.float32]
-    written: NDArray[np.bool_]
+    rows: Ints
+    contrast: Floats
+    sharpness: Floats
+    written: Flags
 
     @classmethod
     def of(cls, records: NDArray[np.void], rows: NDArray[np.integer]) -> "Previews":
@@ -140,7 +135,7 @@ def read_previews(path: Path, rows: NDArray[np.integer]) -> Previews:
     return Previews.of(np.asarray(np.memmap(path, RECORD, mode="r")), rows)
 
 
-def unwritten(path: Path, rows: NDArray[np.integer]) -> NDArray[np.bool_]:
+def unwritten(path: Path, rows: NDArray[np.integer]) -> Flags:
     """Which of some records were never written, bool (N,)."""
     at = RECORD.fields["written"][1] if RECORD.fields is not None else 0
     missing = np.ones(len(rows), bool)

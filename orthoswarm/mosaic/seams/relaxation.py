@@ -9,18 +9,14 @@ Besag 1986, on several scales): a block the size of a house escapes minima in wh
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.compute.jit import in_place_kernel, kernel
+from orthoswarm.model.arrays import Floats, Ints
 from orthoswarm.mosaic.seams.cell_candidates import SLOTS, CandidateCells
-
-Ints = NDArray[np.int32]
-Floats = NDArray[np.float32]
 
 NONE, FOREIGN = -1, -2
 """Labels of cells that no picture sees, and of a neighbour's cells whose picture is not a candidate here."""
-_MOST_LABELS = 8
-"""Room for the labels in and around a block; a block of 8 cells seldom has more than four."""
+_MOST_LABELS = 8  # room for the labels in and around a block; a block of 8 cells seldom has more than four
 
 _SEAM_COST: Final = 3.0  # cost of a seam where pictures are alike: short and few; by looking at four sets
 _DIFFERENCE_SCALE: Final = 16.0  # the squared difference of the two pictures, in levels, is divided by this
@@ -37,10 +33,8 @@ _BLOCK_OFFSETS: Final = (0, 2, 1, 0)  # where the first of these blocks begins, 
 def relax(cells: CandidateCells, fixed: Ints, standing_m: Floats) -> Ints:
     """Labels int32 (rows, columns) of cells: indices of shots, NONE where there is no candidate.
 
-    Args:
-        cells: the candidates.
-        fixed: int32 (rows, columns), labels that are settled already (FOREIGN included), NONE elsewhere.
-        standing_m: float32 (rows, columns), height over the bare ground.
+    cells: the candidates. fixed: int32 (rows, columns), labels that are settled already (FOREIGN included), NONE
+    elsewhere. standing_m: float32 (rows, columns), height over the bare ground.
     """
     label = np.where(fixed == NONE, cells.candidate[..., 0], fixed).astype(np.int32)
     held = fixed != NONE
@@ -157,10 +151,8 @@ def _sweep(label, held, candidate, cost, level, scale, over, costs, side, offset
 def to_pixels(label, candidate, cell, border, pixels):  # type: ignore[no-untyped-def]
     """Draw the labels of cells (plus 1) on the pixels of a tile, seams rounded: each pixel by the nearest cells' vote.
 
-    Args:
-        label: int32 (side, side) of the region. candidate: its candidates. cell: pixels a cell.
-        border: cells of the region beyond the tile, to each side.
-        pixels: int32 (rows, columns), the tile; changed where a cell has a label.
+    label: int32 (side, side) of the region. candidate: its candidates. cell: pixels a cell. border: cells of the region
+    beyond the tile, to each side. pixels: int32 (rows, columns), the tile; changed where a cell has a label.
     """
     rows, columns = pixels.shape
     last = label.shape[0] - 1

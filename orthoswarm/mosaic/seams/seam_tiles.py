@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthoswarm.canvas.tile_store import Key, TileStore
+from orthoswarm.model.arrays import Floats, Ints
 from orthoswarm.model.placement import Terrain
 from orthoswarm.mosaic.kernels.drawn_heights import heights
 from orthoswarm.mosaic.kernels.render_arrays import Shots
@@ -15,8 +15,6 @@ from orthoswarm.mosaic.seams.cell_candidates import Region, cell_candidates
 from orthoswarm.mosaic.seams.feather import labels_around
 from orthoswarm.mosaic.seams.previews import COLUMNS, read_previews
 from orthoswarm.mosaic.seams.relaxation import FOREIGN, NONE, relax, to_pixels
-
-Ints = NDArray[np.int32]
 
 BORDER_PX: Final = 32
 """Pixels around a tile that its seams are chosen together with, so that they go on well in the next tile; a multiple of
@@ -38,7 +36,7 @@ class SeamCells:
 
     previews: Path
     rows: Ints
-    tone: NDArray[np.float32]
+    tone: Floats
     cell_px: int
     terrain: Terrain
 
@@ -46,8 +44,7 @@ class SeamCells:
 def cell_size_px(picture_width: int, picture_gsd_m: float, gsd_m: float) -> int:
     """Side of the cells, pixels of the map (within `_CELL_PX`): about a pixel of the previews.
 
-    Args:
-        picture_width: columns of the pictures. picture_gsd_m: their ground pixel at nadir. gsd_m: the map's.
+    picture_width: columns of the pictures. picture_gsd_m: their ground pixel at nadir. gsd_m: the map's.
     """
     wanted = picture_width / COLUMNS * picture_gsd_m / gsd_m
     size = 2 ** round(float(np.log2(max(wanted, 1.0))))
@@ -89,7 +86,7 @@ def _settled(store: TileStore, key: Key, cell: int, ids: Ints) -> Ints:
     return np.where(around < 0, NONE, fixed).astype(np.int32)
 
 
-def _standing(terrain: Terrain, region: Region) -> NDArray[np.float32]:
+def _standing(terrain: Terrain, region: Region) -> Floats:
     """Height of the drawn surface over the bare ground at each cell's centre."""
     if terrain.bare is None:
         return np.zeros((region.side, region.side), np.float32)

@@ -29,9 +29,8 @@ _DAMPING_SHARE: Final = 1e-6  # added to the diagonal of the cameras' equations,
 class MapTies:
     """Horizontal control points on the ground, found by matching pictures with the map, which displaces roofs.
 
-    Attributes:
-        point: int32 (Q,), tie point, each at most once. xy: float64 (Q, 2), its place on the map, local frame.
-        sigma_m: float64 (Q,).
+    point: int32 (Q,), tie point, each at most once. xy: float64 (Q, 2), its place on the map, local frame. sigma_m:
+    float64 (Q,).
     """
 
     point: Ints
@@ -48,9 +47,8 @@ class MapTies:
 class HeightPrior:
     """Prior on the points' heights.
 
-    Attributes:
-        height: float64 (P,) expected Z, metres. sigma: robust sigma, metres; soft_sigma: sigma of a second, weak prior
-            that is not robust, metres. c: robust scale of `sigma`, squared sigmas.
+    height: float64 (P,) expected Z, metres. sigma: robust sigma, metres; soft_sigma: sigma of a second, weak prior that
+    is not robust, metres. c: robust scale of `sigma`, squared sigmas.
     """
 
     height: Array

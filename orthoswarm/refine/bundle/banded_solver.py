@@ -94,9 +94,8 @@ def camera_order(tracks: Tracks, position: Array, points: int, free: Flags) -> t
     McKee (1969), and that along the longer side of the flown area, which is a seventh narrower for parallel legs: it
     advances in all of them together.
 
-    Args:
-        tracks: observations. position: float64 (N, 3) of the cameras, metres. points: how many there are.
-        free: bool (N,), False for cameras that are held.
+    tracks: observations. position: float64 (N, 3) of the cameras, metres. points: how many there are. free: bool (N,),
+    False for cameras that are held.
     """
     count = len(free)
     index = np.flatnonzero(free)

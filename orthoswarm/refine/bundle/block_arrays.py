@@ -13,17 +13,15 @@ from orthoswarm.model.camera import LEAST_RADIAL_SLOPE, Camera, Lens
 
 F, K1, K2, K3, CX, CY, WIDTH, HEIGHT = range(8)
 """Columns of CameraBlock.lens: focal length in px, radial terms, offset of the principal point in px, picture size."""
-LEAST_DEPTH_M = 1e-3
-"""Points less than this before a camera are not visible."""
+LEAST_DEPTH_M = 1e-3  # points less than this before a camera are not visible
 
 
 @dataclass(frozen=True, slots=True)
 class CameraBlock:
     """Cameras of one or several vehicles in a local frame (east, north, up about a common origin, metres).
 
-    Attributes:
-        position: float64 (N, 3). rotation: float64 (N, 3, 3), camera to ground (columns are the camera's x, y, z axes).
-        lens_id: int32 (N,), row of `lens`, float64 (L, 8), columns F, K1, K2, K3, CX, CY, WIDTH, HEIGHT.
+    position: float64 (N, 3). rotation: float64 (N, 3, 3), camera to ground (columns are the camera's x, y, z axes).
+    lens_id: int32 (N,), row of `lens`, float64 (L, 8), columns F, K1, K2, K3, CX, CY, WIDTH, HEIGHT.
     """
 
     position: Array
@@ -83,10 +81,8 @@ class CameraBlock:
 class Tracks:
     """Observations of tie points in pictures, from tracked corners or matched features, in any order.
 
-    Attributes:
-        camera: int32 (M,), index of the camera. point: int32 (M,), id of the track, 0..P-1.
-        uv: float64 (M, 2), column and row, distorted as in the picture, pixel centres at integers.
-        sigma_px: float32 (M,), one sigma.
+    camera: int32 (M,), index of the camera. point: int32 (M,), id of the track, 0..P-1. uv: float64 (M, 2), column and
+    row, distorted as in the picture, pixel centres at integers. sigma_px: float32 (M,), one sigma.
     """
 
     camera: Ints
@@ -196,13 +192,6 @@ def log_rotation(rotation: Array) -> Array:
     """Rotation vectors (N, 3) of rotation matrices (N, 3, 3)."""
     cosine = np.clip((np.trace(rotation, axis1=1, axis2=2) - 1.0) / 2.0, -1.0, 1.0)
     angle = np.arccos(cosine)
-    vector = np.stack(
-        [
-            rotation[:, 2, 1] - rotation[:, 1, 2],
-            rotation[:, 0, 2] - rotation[:, 2, 0],
-            rotation[:, 1, 0] - rotation[:, 0, 1],
-        ],
-        axis=1,
-    )
+    vector = (rotation - np.swapaxes(rotation, 1, 2))[:, [2, 0, 1], [1, 2, 0]]
     scale = np.where(angle < 1e-6, 0.5, angle / np.maximum(2.0 * np.sin(angle), 1e-9))
     return np.asarray(vector * scale[:, None])

@@ -1,10 +1,9 @@
 """Stated errors: the adjustment's covariance propagated to the ground, plus systematic errors outside its model.
 
-One of these is a map that is displaced from place to place, as its ties' residuals show it. Matching noise is
-independent from tie to tie, a displacement of the map is alike for neighbours: so the semivariogram of the residuals
-rises with distance (Cressie 1993, Statistics for Spatial Data, chapter 2). A block of pictures is nearly rigid: it
-follows a displaced map as a whole, by a shift, a turn and a scale, and leaves the rest in the residuals. What it
-followed is its error.
+One of these is a map that is displaced from place to place. Matching noise is independent from tie to tie, a
+displacement of the map is alike for neighbours: so the semivariogram of the residuals rises with distance (Cressie
+1993, Statistics for Spatial Data, chapter 2). A nearly rigid block follows a displaced map by a shift, a turn and a
+scale, and leaves the rest in the residuals. What it followed is its error.
 """
 
 from dataclasses import dataclass, replace
@@ -22,8 +21,7 @@ from orthoswarm.refine.bundle.adjustment import Adjustment, HeightPrior, MapTies
 from orthoswarm.refine.bundle.block_arrays import WIDTH, F
 from orthoswarm.refine.bundle.priors import Priors
 
-_LENS_CX = 4
-"""Column of the principal point's cx among a lens's unknowns, cy is the next (see priors.Priors)."""
+_LENS_CX = 4  # column of the principal point's cx among a lens's unknowns, cy is the next (see priors.Priors)
 
 RECEIVER_COMMON_SIGMA_M: Final = 1.5
 """The part of the error that all receivers at a place and time share, an axis: ionosphere and orbits. The GPS standard
@@ -47,8 +45,7 @@ _SCATTER_LEAST_TIES: Final = 40  # with fewer ties the adjustment follows them, 
 _SYSTEMATIC_LEAST_TIES: Final = 4  # with fewer ties about a photo a systematic offset of the map there is not estimated
 _SYSTEMATIC_REACH_PHOTOS: Final = 4  # ... which uses the ties of so many photos before and after, of the same leg
 _SYSTEMATIC_SIGMAS: Final = 2.0  # sigmas of the ties' median taken off before it counts as systematic
-_LN2 = float(np.log(2.0))
-"""Median of the squared length of a Gaussian vector of two axes, for one of its mean."""
+_LN2 = float(np.log(2.0))  # median of the squared length of a Gaussian vector of two axes, for one of its mean
 
 _VARIOGRAM_MOST_TIES: Final = 200  # of more ties every so many-th is used: pairs grow with their square (its cost)
 _VARIOGRAM_CLASSES: Final = 9  # classes of distance between ties; the first ends at ....
@@ -83,9 +80,8 @@ def stated_errors(
 ) -> StatedErrors:
     """Errors of pictures and lens: the adjustment's covariance, and what it does not contain.
 
-    Args:
-        adjustment: after its last step. c, heights, ties, tie_c: as for Adjustment.step.
-        floor_m: error common to all pictures, one sigma per axis.
+    adjustment: after its last step. c, heights, ties, tie_c: as for Adjustment.step. floor_m: error common to all
+    pictures, one sigma per axis.
     """
     n = len(adjustment.cameras)
     if ties is None:
@@ -109,9 +105,8 @@ def stated_errors(
 def with_seen_drift(adjustment: Adjustment) -> Priors:
     """Priors of an adjustment without a map whose receivers drift as much as this flight shows, not as much as any may.
 
-    Pictures show how a drift changes, not what it has in common over the flight. That is the receiver's bias, its own
-    and what all have in common, and the mean of what it drifted by since it was right: of a drift that grows evenly the
-    mean square is three times the variance about its mean.
+    Pictures show how a drift changes, not what it has in common over the flight: the receiver's bias, its own and what
+    all have in common, and the mean of what it drifted by since it was right (see `DRIFT_MEAN_SHARE`).
     """
     p, layout = adjustment.priors, adjustment.layout
     bias2 = RECEIVER_BIAS_SIGMA_M**2 + RECEIVER_COMMON_SIGMA_M**2
@@ -152,9 +147,8 @@ def with_distance_errors(pose: Floats, rotation: Array, distance_sigma_m: Array)
     Over level ground pictures show the ratio of both only. A camera with a wrong focal length then lies on its optical
     axis, so that the ground in its middle stays where it is.
 
-    Args:
-        pose: float32 (N, 6, 6) as in StatedErrors. rotation: float64 (N, 3, 3), camera to ground.
-        distance_sigma_m: float64 (N,), one sigma along the axis.
+    pose: float32 (N, 6, 6) as in StatedErrors. rotation: float64 (N, 3, 3), camera to ground. distance_sigma_m: float64
+    (N,), one sigma along the axis.
     """
     out = pose.copy()
     axis = rotation[:, :, 2] * distance_sigma_m[:, None]
@@ -168,8 +162,7 @@ def common_map_sigma(residual: Array, sigma_m: Array, gsd_m: float) -> float:
     A poor map (old, coarse, blurred) makes ties scatter and also shifts them together: the common shift grew with the
     scatter when maps of simulated cities were blurred and made noisy.
 
-    Args:
-        residual: float64 (Q, 2), of the ties, adjusted. sigma_m: float64 (Q,), prior. gsd_m: the map's pixel.
+    residual: float64 (Q, 2), of the ties, adjusted. sigma_m: float64 (Q,), prior. gsd_m: the map's pixel.
     """
     floor = MAP_FLOOR_PX * gsd_m
     if len(residual) == 0:
@@ -186,8 +179,7 @@ def systematic_tie_offset(leg: Ints, camera: NDArray[np.integer], residual: Arra
     A few deviating ties are wrong matches, or changed ground; if most of the ties around a picture are off by the same
     vector, the picture or the map is.
 
-    Args:
-        leg: int32 (N,), -1 in turns. camera: (Q,), picture of each tie. residual: float64 (Q, 2), metres.
+    leg: int32 (N,), -1 in turns. camera: (Q,), picture of each tie. residual: float64 (Q, 2), metres.
     """
     out, near = np.zeros(len(leg)), _SYSTEMATIC_REACH_PHOTOS
     order = np.argsort(camera, kind="stable")
@@ -210,8 +202,7 @@ def _ground_variance(adjustment: Adjustment, i: int, covariance: Array, common: 
     A principal point that is solved with the pictures is known far worse than the line of sight of that pixel: an error
     of it is one of the rotation, which makes up for it.
 
-    Args:
-        covariance: float64 (6, 6), the camera's. common: (size, size), of the common unknowns. between: (6, size).
+    covariance: float64 (6, 6), the camera's. common: (size, size), of the common unknowns. between: (6, size).
     """
     cameras = adjustment.cameras
     height = max(float(cameras.position[i, 2]), 1.0)
@@ -230,13 +221,11 @@ def _ground_variance(adjustment: Adjustment, i: int, covariance: Array, common: 
 def map_distortion_variance(place: Array, residual: Array, height_m: float) -> float:
     """Variance per axis of what a block is displaced by on a map displaced from place to place, m^2; 0 with few ties.
 
-    Noise and a displacement with a Gaussian correlation are fitted to the semivariogram of the residuals: their
-    variances by least squares, the correlation's length by trial. For each length it is known what a similarity fitted
-    to the ties follows of such a displacement, and what semivariogram the rest has. Medians instead of means of the
-    squared differences are used, as ties may be wrong.
+    Noise and a displacement with a Gaussian correlation are fitted to the semivariogram of the residuals: variances by
+    least squares, the correlation's length by trial, of which it is known what a similarity fitted to the ties follows,
+    and what semivariogram the rest has. By medians of the squared differences, as ties may be wrong.
 
-    Args:
-        place: float64 (Q, 2), positions of the ties, metres. residual: float64 (Q, 2), theirs. height_m: flying height.
+    place: float64 (Q, 2), positions of the ties, metres. residual: float64 (Q, 2), theirs. height_m: flying height.
     """
     step = max(1, -(-len(place) // _VARIOGRAM_MOST_TIES))
     place, residual = place[::step], residual[::step]

@@ -20,8 +20,7 @@ DRIFT_SIGMA_M: Final = 15.0  # drift of a receiver without corrections (made-up 
 _DRIFT_BEND_SIGMA_M: Final = 0.5  # sigma of the second difference of the drift's knots: it changes slowly
 _DRIFT_KNOT_PHOTOS: Final = 60  # photos between two knots of the piecewise linear drift
 LAG_SIGMA_S: Final = 0.5  # sigma of the delay of recorded positions behind the shutter (lags of up to 0.4 s are found)
-_HELD = 1e18
-"""Weight of an unknown that is held."""
+_HELD = 1e18  # weight of an unknown that is held
 
 _ATTITUDE_ROBUST_C: Final = 25.0  # robust scale of recorded attitudes, squared sigmas: wider than that of positions
 
@@ -56,7 +55,6 @@ class Priors:
         velocity: float64 (N, 2), ground velocity in m/s for the lag; zeros where time is unknown.
         group: int32 (N,). models: sigmas of each group.
         lens: float64 (L, 6), start of log f, k1, k2, k3, cx, cy. lens_sigma: float64 (L, 6), 0 fixes a parameter.
-        position_c: robust scale (squared sigmas) of the horizontal positions.
     """
 
     position: Array
@@ -68,16 +66,14 @@ class Priors:
     models: tuple[GroupPriors, ...]
     lens: Array
     lens_sigma: Array
-    position_c: float = POSITION_ROBUST_C
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Layout:
     """Columns of the common unknowns: lenses, then for each group bias (3), height, lag, drift knots (east, north).
 
-    Attributes:
-        lens_columns: 6 L. offset: first column of each group. knots: knots of each group. size: all columns.
-        knot_left: int32 (N,), index of the knot before each camera; knot_fraction: float64 (N,) of the way to the next.
+    lens_columns: 6 L. offset: first column of each group. knots: knots of each group. size: all columns. knot_left:
+    int32 (N,), index of the knot before each camera; knot_fraction: float64 (N,) of the way to the next.
     """
 
     lens_columns: int
@@ -213,7 +209,7 @@ def _add_positions(
     knots = np.asarray(layout.knots)[priors.group[index]]
     xy, rz = residual[:, :2], residual[:, 2]
     w = _weights(priors.position_sigma[index])
-    w[:, :2] *= robust_weights((xy * xy * w[:, :2]).sum(1), priors.position_c)[:, None]
+    w[:, :2] *= robust_weights((xy * xy * w[:, :2]).sum(1), POSITION_ROBUST_C)[:, None]
     left = layout.knot_left[index]
     fraction = layout.knot_fraction[index]
     for a in range(2):

@@ -68,9 +68,8 @@ def calibrate(
 ) -> Calibration:
     """Compare the flow of picture pairs along each leg with the flow that the records predict.
 
-    Args:
-        leg: int32 (N,), -1 in turns. gray: picture at working scale. size: its (width, height).
-        fov_start: assumed horizontal field of view, radians.
+    leg: int32 (N,), -1 in turns. gray: picture at working scale. size: its (width, height). fov_start: assumed
+    horizontal field of view, radians.
     """
     width = size[0]
     f0 = 0.5 * width / np.tan(0.5 * fov_start)

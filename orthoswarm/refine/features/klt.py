@@ -18,17 +18,14 @@ from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 from orthoswarm.compute.jit import in_place_kernel, kernel
+from orthoswarm.refine.features.shift_products import everywhere
 
-SIZE = 15
-"""Side of a window, pixels: a layout of the compiled code (Lucas and Kanade 1981)."""
-WIDE = SIZE + 2
-"""Side of a template: the window and the pixels around it, for its gradients."""
-LANES = 16
-"""Columns that are added at once: those of a window and one that is not used."""
+SIZE = 15  # side of a window, pixels: a layout of the compiled code (Lucas and Kanade 1981)
+WIDE = SIZE + 2  # side of a template: the window and the pixels around it, for its gradients
+LANES = 16  # columns that are added at once: those of a window and one that is not used
 _HALF = SIZE // 2
 
-_FLOAT, _INT = ir.FloatType(), ir.IntType(32)
-_VECTOR = ir.VectorType(_FLOAT, LANES)
+_VECTOR = ir.VectorType(ir.FloatType(), LANES)
 
 
 class _Lanes:
@@ -74,12 +71,6 @@ class _Lanes:
         for line, total in enumerate(totals):
             self.store(self.builder.load(total), array, ir.Constant(self.number, line), 0)
 
-    def everywhere(self, value: Any) -> Any:
-        """A vector of one value."""
-        undefined = ir.Constant(_VECTOR, ir.Undefined)
-        first = self.builder.insert_element(undefined, value, ir.Constant(_INT, 0))
-        return self.builder.shuffle_vector(first, undefined, ir.Constant(ir.VectorType(_INT, LANES), [0] * LANES))
-
 
 @intrinsic
 def add_gradients(typing, wide, gradient, sums):  # type: ignore[no-untyped-def]
@@ -106,15 +97,14 @@ def add_gradients(typing, wide, gradient, sums):  # type: ignore[no-untyped-def]
 def add_residuals(typing, under, wide, gradient, part_u, part_v, sums):  # type: ignore[no-untyped-def]
     """What a template differs from a picture by, e: sums of gx e, gy e, e, e e over its columns, (5, LANES).
 
-    Args:
-        under: float32 (SIZE + 1, LANES + 1), the picture from the pixel before the window's place on.
-        wide, gradient: of the template, see `add_gradients`. part_u, part_v: float32, part of a pixel to the place.
+    under: float32 (SIZE + 1, LANES + 1), the picture from the pixel before the window's place on. wide, gradient: of
+    the template, see `add_gradients`. part_u, part_v: float32, part of a pixel to the place.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         lanes = _Lanes(context, builder, signature, arguments)
         totals = lanes.totals(4)
-        u, v = lanes.everywhere(arguments[3]), lanes.everywhere(arguments[4])
+        u, v = (everywhere(builder, value, LANES) for value in arguments[3:5])
         with lanes.rows() as row:
             rows = []
             for k in range(2):

@@ -136,9 +136,8 @@ def nearby(centre: Complex, reach: Array, group: NDArray[np.integer], count: int
     Each photo chooses `count` partners in every direction, both of its own group and of others, preferring those whose
     distance is near the best one.
 
-    Args:
-        centre: complex (N,), east + i north of the ground at each photo's centre. group: integers (N,), leg or segment.
-        reach: float64 (N,), metres; two photos are near if their distance is below the mean of their reaches.
+    centre: complex (N,), east + i north of the ground at each photo's centre. group: integers (N,), leg or segment.
+    reach: float64 (N,), metres; two photos are near if their distance is below the mean of their reaches.
     """
     from scipy.spatial import cKDTree
 

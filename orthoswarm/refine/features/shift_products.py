@@ -15,13 +15,10 @@ from numba.extending import intrinsic
 from orthoswarm.compute import processor
 from orthoswarm.compute.jit import in_place_kernel
 
-LANES = 8
-"""Shifts of one vector: 32 bytes, which all x86 processors with AVX add at once; others take them in parts."""
-ROWS = 4
-"""Rows of shifts of one block: with three vectors each they fill the sixteen registers of AVX2."""
+LANES = 8  # shifts of one vector: 32 bytes, which all x86 processors with AVX add at once; others take them in parts
+ROWS = 4  # rows of shifts of one block: with three vectors each they fill the sixteen registers of AVX2
 
-_FLOAT, _INT = ir.FloatType(), ir.IntType(32)
-_VECTOR = ir.VectorType(_FLOAT, LANES)
+_VECTOR = ir.VectorType(ir.FloatType(), LANES)
 _FUSES = processor.fuses()
 
 
@@ -70,7 +67,7 @@ def _block(vectors: int) -> Any:
                 ]
                 for row in range(ROWS):
                     at = builder.sub(column.index, builder.mul(number(row), template_step))
-                    factor = _everywhere(builder, builder.load(builder.gep(own, [at])))
+                    factor = everywhere(builder, builder.load(builder.gep(own, [at])), LANES)
                     for value, total in zip(values, sums[row], strict=True):
                         builder.store(_product_and_sum(builder, factor, value, builder.load(total)), total)
         for row in range(ROWS):
@@ -94,11 +91,12 @@ def _product_and_sum(builder: Any, a: Any, b: Any, c: Any) -> Any:
     return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.fma.v{LANES}f32"), [a, b, c])
 
 
-def _everywhere(builder: Any, value: Any) -> Any:
-    """A vector of one value."""
-    undefined = ir.Constant(_VECTOR, ir.Undefined)
-    first = builder.insert_element(undefined, value, ir.Constant(_INT, 0))
-    return builder.shuffle_vector(first, undefined, ir.Constant(ir.VectorType(_INT, LANES), [0] * LANES))
+def everywhere(builder: Any, value: Any, lanes: int) -> Any:
+    """A vector of one value in so many lanes."""
+    number = ir.IntType(32)
+    undefined = ir.Constant(ir.VectorType(value.type, lanes), ir.Undefined)
+    first = builder.insert_element(undefined, value, ir.Constant(number, 0))
+    return builder.shuffle_vector(first, undefined, ir.Constant(ir.VectorType(number, lanes), [0] * lanes))
 
 
 _one, _two, _three, _four = _block(1), _block(2), _block(3), _block(4)

@@ -199,10 +199,7 @@ class Tracker:
             self._gray, self._half, gray, half, self._live.uv, predicted, np.linalg.inv(predicted), limits, guess,
             found, good,
         )  # fmt: skip
-        kept, expected = _gate(
-            guess, found, good, *gray.shape, _FLOW_INSIDE_PX, _FLOW_LEAST, _FLOW_MEDIAN_LIMIT_PX,
-            _FLOW_GATE_PX, _FLOW_CHANCE_SHARE,
-        )  # fmt: skip
+        kept, expected = _gate(guess, found, good, *gray.shape, _FLOW_CHANCE_SHARE)
         return _Flow(good, found, kept, expected)
 
     def _start(self, gray: Gray) -> None:
@@ -217,7 +214,7 @@ class Tracker:
         c = ((self._live.uv[:, 0] - left) // size).astype(int).clip(0, cols - 1)
         empty[r, c] = False
         uv = np.empty((rows * cols, 2), np.float32)
-        uv = uv[: strongest(gray, empty, size, top, left, _CORNER_WINDOW_PX, _BORDER_PX, _CORNER_FLOOR, uv)]
+        uv = uv[: strongest(gray, empty, size, top, left, uv)]
         if len(uv):
             ident = np.arange(self._next, self._next + len(uv))
             self._next += len(uv)
@@ -231,25 +228,25 @@ class Tracker:
 
 
 @kernel
-def _gate(guess, found, ok, rows, cols, margin, least, limit, gate, chance):  # type: ignore[no-untyped-def]
+def _gate(guess, found, ok, rows, cols, chance):  # type: ignore[no-untyped-def]
     """Keep flow close to the median residual, which must itself be close to the prediction, in ok, in place.
 
     None is kept where no more agree than corners on different ground would by chance (binomial, 3 sigma). Returns how
     many are kept, and how many were expected inside the picture.
     """
-    expected = 0
+    expected, margin = 0, _FLOW_INSIDE_PX
     for k in range(len(ok)):
         u, v = guess[k, 0], guess[k, 1]
         expected += u >= 0 and v >= 0 and u <= cols - 1 and v <= rows - 1
         u, v = found[k, 0], found[k, 1]
         ok[k] = ok[k] and u >= margin and v >= margin and u <= cols - 1 - margin and v <= rows - 1 - margin
     kept = 0
-    if ok.sum() >= least:
+    if ok.sum() >= _FLOW_LEAST:
         residual = (found - guess)[ok]
         u, v = np.median(residual[:, 0]), np.median(residual[:, 1])
-        if np.hypot(u, v) <= limit:
+        if np.hypot(u, v) <= _FLOW_MEDIAN_LIMIT_PX:
             for k in range(len(ok)):
-                ok[k] = ok[k] and np.hypot(found[k, 0] - guess[k, 0] - u, found[k, 1] - guess[k, 1] - v) < gate
+                ok[k] = ok[k] and np.hypot(found[k, 0] - guess[k, 0] - u, found[k, 1] - guess[k, 1] - v) < _FLOW_GATE_PX
                 kept += ok[k]
     if kept <= chance * expected + 3.0 * np.sqrt(chance * (1.0 - chance) * expected):
         ok[:], kept = False, 0
@@ -280,11 +277,10 @@ def _oldest_per_cell(uv, age, ident, cols, size):  # type: ignore[no-untyped-def
 def measured_homography(previous: Gray | None, gray: Gray, uv: Floats, predicted: Array) -> Array | None:
     """The homography that most of a flow over several octaves agrees on; None without agreement.
 
-    For a swaying camera whose angles are degrees off or not recorded. Starts from the prediction and, if that finds no
-    consensus (a heading more than ten degrees off), from no motion; after that from ORB corners.
+    For a swaying camera whose angles are degrees off or not recorded. From the prediction and, without a consensus (a
+    heading more than ten degrees off), from no motion; after that from ORB corners.
 
-    Args:
-        uv: float32 (K, 2), corners of the previous picture. predicted: 3x3 homography from its pixels.
+    uv: float32 (K, 2), corners of the previous picture. predicted: 3x3 homography from its pixels.
     """
     if previous is None or len(uv) < _HOMOGRAPHY_LEAST:
         return None
@@ -303,7 +299,7 @@ def _flow_homography(previous: Gray, gray: Gray, uv: Floats, start: Array) -> Ar
     warped = cv2.warpPerspective(previous, start, gray.shape[::-1], borderMode=cv2.BORDER_REPLICATE)
     window = (_PYRAMID_WINDOW_PX, _PYRAMID_WINDOW_PX)
     found, status, _ = cv2.calcOpticalFlowPyrLK(warped, gray, guess, None, winSize=window, maxLevel=_PYRAMID_OCTAVES)
-    ok = is_inside(guess, gray.shape, 0.0) & (status.ravel() == 1) & is_inside(found, gray.shape, 0.0)
+    ok = is_inside(guess, gray.shape) & (status.ravel() == 1) & is_inside(found, gray.shape)
     if ok.sum() < _HOMOGRAPHY_LEAST:
         return None
     return _agreed(uv[ok], found[ok], max(_HOMOGRAPHY_LEAST, _HOMOGRAPHY_SHARE * ok.sum()))
@@ -342,18 +338,17 @@ def shifted_prediction(previous: Gray | None, gray: Gray, predicted: Array) -> A
     return np.array([[1.0, 0, _PHASE_REDUCTION * dx], [0, 1.0, _PHASE_REDUCTION * dy], [0, 0, 1.0]]) @ predicted
 
 
-def is_inside(uv: Floats, shape: tuple[int, ...], margin: float) -> Flags:
-    """Which pixels (K, 2) lie in a picture of this shape, at least a margin inside its border."""
+def is_inside(uv: Floats, shape: tuple[int, ...]) -> Flags:
+    """Which pixels (K, 2) lie in a picture of this shape."""
     h, w = shape[:2]
-    return (uv[:, 0] >= margin) & (uv[:, 1] >= margin) & (uv[:, 0] <= w - 1 - margin) & (uv[:, 1] <= h - 1 - margin)
+    return (uv[:, 0] >= 0) & (uv[:, 1] >= 0) & (uv[:, 0] <= w - 1) & (uv[:, 1] <= h - 1)
 
 
 def predicted_homography(before: Array, after: Array, height_m: float, step: Array, matrix: Array) -> Array:
     """The homography of flat ground from one picture's pixels to the next one's, predicted from their records.
 
-    Args:
-        before, after: (3, 3) rotations, camera to ground. height_m: of the earlier camera above the ground.
-        step: (3,) its movement in metres, east, north, up. matrix: 3x3 calibration matrix.
+    before, after: (3, 3) rotations, camera to ground. height_m: of the earlier camera above the ground. step: (3,) its
+    movement in metres, east, north, up. matrix: 3x3 calibration matrix.
     """
     upward = before[2]  # the ground's normal in the earlier camera's axes
     relative = after.T @ before + np.outer(after.T @ step, upward) / height_m
@@ -365,9 +360,8 @@ def follow(
 ) -> tuple[Tracks, Array]:
     """The tracks of corners through pictures 0 .. count - 1, and the share that survived into each, float64 (count,).
 
-    Args:
-        read: returns picture i at working scale. cell_px: see Tracker.
-        prediction: 3x3 homography from picture i - 1 to i, None where tracking starts afresh.
+    read: returns picture i at working scale. cell_px: see Tracker. prediction: 3x3 homography from picture i - 1 to i,
+    None where tracking starts afresh.
     """
     tracker = Tracker(cell_px=cell_px)
     survived = np.ones(count)
@@ -377,24 +371,19 @@ def follow(
 
 
 @kernel
-def strongest(gray, empty, size, top, left, window, border, floor, uv):  # type: ignore[no-untyped-def]
+def strongest(gray, empty, size, top, left, uv):  # type: ignore[no-untyped-def]
     """The strongest corner of each wanted cell, into uv float32 (K, 2), column and row; returns how many.
 
-    Args:
-        gray: uint8 (rows, columns). empty: bool, which cells are wanted. size: of a cell; top, left: of the first one.
-        window: side of the square, odd. border: corners nearer to the picture's border are none.
-        floor: least measure; cells without texture give no corner.
+    gray: uint8 (rows, columns). empty: bool, which cells are wanted. size: of a cell; top, left: of the first one.
     """
     cells, cols = empty.shape[1], gray.shape[1]
     best, where, score = np.empty(cells, np.float32), np.empty((cells, 2), np.int64), np.empty(cols, np.float32)
-    sums = np.zeros((window + 3, 3, cols), np.float32)
-    return _search(gray, empty, size, top, left, window, border, floor, uv, best, where, score, sums)
+    sums = np.zeros((_CORNER_WINDOW_PX + 3, 3, cols), np.float32)
+    return _search(gray, empty, size, top, left, uv, best, where, score, sums)
 
 
 @in_place_kernel
-def _search(  # type: ignore[no-untyped-def]
-    gray, empty, size, top, left, window, border, floor, uv, best, where, score, sums,
-):  # fmt: skip
+def _search(gray, empty, size, top, left, uv, best, where, score, sums):  # type: ignore[no-untyped-def]
     """What `strongest` does.
 
     Args:
@@ -404,8 +393,9 @@ def _search(  # type: ignore[no-untyped-def]
             and their sums over columns.
     """
     rows, cols = gray.shape
+    window = _CORNER_WINDOW_PX
     reach = window // 2
-    margin = max(border, reach + 1)
+    margin = max(_BORDER_PX, reach + 1)
     scale = 1.0 / (4.0 * window * 255.0) ** 2
     found = 0
     lines, total, product, across = sums[:window], sums[window], sums[window + 1], sums[window + 2]
@@ -434,7 +424,7 @@ def _search(  # type: ignore[no-untyped-def]
                         _measure(total, x1 - x0, window, across, score)
                         _highest(score, x1 - x0, x0, y - reach, left, size, best, where)
             for cell in range(first, last):
-                if best[cell] * scale > floor:
+                if best[cell] * scale > _CORNER_FLOOR:
                     uv[found, 0], uv[found, 1] = where[cell, 0], where[cell, 1]
                     found += 1
             first = last

@@ -23,9 +23,8 @@ _SMALL_WIDTH_PX: Final = 160  # columns of the reduced pictures that stay in mem
 class Pictures:
     """Grey pictures by index; the most recently read ones stay in memory, reduced ones always do.
 
-    Attributes:
-        scale: full-resolution pixels per working pixel. size: (width, height) at working scale.
-        damaged: index -> reason why that picture cannot be used.
+    scale: full-resolution pixels per working pixel. size: (width, height) at working scale. damaged: index -> reason
+    why that picture cannot be used.
     """
 
     def __init__(

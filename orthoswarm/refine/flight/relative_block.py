@@ -129,13 +129,12 @@ def open_flight(
     """Track corners through a vehicle's pictures, in order, and set up its adjustment, without solving it.
 
     Args:
-        fov_start: assumed horizontal field of view, radians.
-        kept: where the tracks are kept; they are taken from there if they were made of the same before.
+        fov_start: assumed horizontal field of view, radians. kept: where the tracks are kept, and found again.
 
     Returns:
-        None where pictures cannot be tracked from one to the next and are matched in pairs instead (see
-        `open_sparse_flight`): too little overlap, a height that contradicts the scale, or, where no height was
-        recorded, a chain that breaks, or a single straight line, on which drift and scale cannot be separated.
+        None where pictures are matched in pairs instead (see `open_sparse_flight`): too little overlap, a height that
+        contradicts the scale, or, where no height was recorded, a chain that breaks, or a single straight line, on
+        which drift and scale cannot be separated.
     """
     if len(frames) < _FOLLOWED_PHOTOS:
         return None
@@ -320,9 +319,9 @@ def _climbed_to(records: FlightRecords) -> Flags:
 def with_measured_headings(records: FlightRecords, tracks: Tracks) -> FlightRecords:
     """Records whose assumed headings are those that most pictures around them agree on.
 
-    Without a recorded heading a picture is assumed to point along the path. Where the path bends, that may be off by
-    half a corner: an aircraft may turn before the picture, after it, or during several. Each picture's heading follows
-    from each neighbour's assumed one and from how the pictures turned between the two; the median is taken.
+    A picture without a recorded heading is assumed to point along the path, which at a bend may be half a corner off.
+    Each picture's heading follows from each neighbour's and from how the pictures turned between the two; the median is
+    taken.
     """
     if records.has_yaw.all():
         return records

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from orthoswarm.model.arrays import Flags
-from orthoswarm.model.robust import mad_sigma, mad_sigmas
+from orthoswarm.model.robust import MEDIAN_LENGTH_SIGMAS, mad_sigma, mad_sigmas
 from orthoswarm.refine.bundle.adjustment import Adjustment, HeightPrior
 from orthoswarm.refine.bundle.block_arrays import K1, WIDTH, F, log_rotation
 from orthoswarm.refine.bundle.height_consistency import UNKNOWN_HEIGHT_SIGMA_M, release_heights
@@ -19,11 +19,7 @@ from orthoswarm.refine.bundle.priors import HEIGHT_OFFSET_SIGMA_M, LAG_SIGMA_S, 
 from orthoswarm.refine.flight.relative_block import PRINCIPAL_POINT_SHARE, first_points
 from orthoswarm.refine.flight.sparse_start import SparseStart
 
-NO_PRIOR_SIGMA_M = 1e6
-"""A sigma that makes a prior's weight vanish, metres."""
-MEDIAN_LENGTH_SIGMAS = 1.1774
-"""Median length of a Gaussian residual of two axes, in sigmas of an axis: sqrt(2 ln 2)."""
-
+NO_PRIOR_SIGMA_M = 1e6  # a sigma that makes a prior's weight vanish, metres
 _SPARSE_STATED_OFFSET_SIGMA_M: Final = 0.1  # common offset of heights where positions state sigmas
 _SPARSE_STATED_LAG_SIGMA_S: Final = 0.2  # sigma of the lag of recorded positions where they state their sigmas
 _SPARSE_BIAS_SIGMA_DEG: Final = (15.0, 15.0, 5.0)

@@ -155,12 +155,9 @@ def open_sparse_flights(
 ) -> list[FlightBlock]:
     """Match the photos of several vehicles with each other and adjust them together, without a map.
 
-    Args:
-        units: frames of one vehicle and one lens each, in order of time. run, progress: see `sparse_start`.
-
-    Returns:
-        A flight for each unit. Its adjustment contains its own photos only, with priors at the joint solution: it
-        may be moved rigidly (onto a map), but keeps its shape.
+    units: frames of one vehicle and one lens each, in order of time. Returns a flight for each, whose adjustment
+    contains its own photos only, with priors at the joint solution: it may be moved rigidly (onto a map), but keeps its
+    shape.
     """
     if len(units) == 1:
         return [open_sparse_flight(units[0], grid, origin, read, run=run, progress=progress)]

@@ -2,6 +2,8 @@
 
 For photos that overlap too little or too irregularly for tracking: forward overlap under about
 80 %, corners, crosshatches, several sorties. Tags are evidence; the pictures decide.
+
+Thresholds without another source were chosen on four real flights.
 """
 
 from collections.abc import Sequence
@@ -40,10 +42,9 @@ _SPARSE_FREE_HEIGHT_SIGMA_M: Final = 1.5  # sigma of a height that was not recor
 _UNLIKE_SIGMAS: Final = 2.5  # vehicles' focal lengths that differ by more sigmas are of two lenses
 _UNLIKE_SHARE: Final = 0.06  # ... and by more than this share
 _ONE_WAY_CONCENTRATION: Final = 0.9  # mean unit vector of headings from which shapes give no focal length
-_SEGMENT_GAP_S: Final = 180.0  # a longer pause ends a segment: landing, battery (chosen on four real flights)
-_SEGMENT_CLIMB_M: Final = 5.0  # a larger jump of the recorded height ends a segment (chosen on four real flights)
-_SEGMENT_TILT_DEG: Final = 1.5
-"""A larger jump of the recorded tilt ends it: the gimbal was turned (chosen on four real flights)."""
+_SEGMENT_GAP_S: Final = 180.0  # a longer pause ends a segment: landing, battery
+_SEGMENT_CLIMB_M: Final = 5.0  # a larger jump of the recorded height ends a segment
+_SEGMENT_TILT_DEG: Final = 1.5  # A larger jump of the recorded tilt ends it: the gimbal was turned
 _SEGMENT_JUMP_SIGMAS: Final = 5.0  # a jump must exceed so many sigmas of the record's own noise as well
 _LEG_STILL_M: Final = 1.5  # shorter steps have no direction
 _LEG_TURN_DEG: Final = 35.0  # a leg ends where a step leaves the mean of its steps by more than this
@@ -87,9 +88,8 @@ def read_photo_records(
 ) -> PhotoRecords:
     """What frames recorded, as arrays in the local frame with its origin (2,).
 
-    Args:
-        frames: photos of one or several vehicles, of a vehicle in order of time.
-        share_lenses: True: vehicles with the same camera name and picture size share one lens.
+    frames: photos of one or several vehicles, of a vehicle in order of time. share_lenses: True: vehicles with the same
+    camera name and picture size share one lens.
     """
     lat, lon = (np.array([getattr(f.fix, name) for f in frames], float) for name in ("lat_deg", "lon_deg"))
     xy = grid.to_grid(lat, lon) - origin[:2]
@@ -263,13 +263,11 @@ def group_focal_lengths(log_focal: Array, sigma: Array, sure: Flags) -> Ints:
 def split_segments(group: NDArray[np.integer], time_s: Array, height_m: Array, pitch_rad: Array) -> Ints:
     """Number of the segment of each photo, int32 (N,), from 0 in order of first appearance.
 
-    A segment ends at a long pause (landing, battery), at a jump of the recorded height and at a jump of the recorded
-    tilt (the gimbal was moved) that exceeds the record's own noise. A jump that the next photo reverses is a
-    wrong tag and does not end a segment.
+    A segment ends at a long pause (landing, battery), and at a jump of the recorded height or tilt (the gimbal was
+    moved) that exceeds the record's own noise. A jump that the next photo reverses is a wrong tag and ends none.
 
-    Args:
-        group: integers (N,), vehicle and lens; photos of a group are in order of time. The others: float64 (N,), NaN
-            where unknown; height_m: height or altitude.
+    group: integers (N,), vehicle and lens; photos of a group are in order of time. The others: float64 (N,), NaN where
+    unknown; height_m: height or altitude.
     """
     tilt_rad = float(np.radians(_SEGMENT_TILT_DEG))
     segment = np.zeros(len(group), np.int32)
@@ -306,11 +304,9 @@ def _jumps(value: Array, limit: float) -> Flags:
 def photo_legs(position: Complex, segment: Ints, time_s: Array) -> Ints:
     """Leg of each photo, int32 (N,), numbered in order: runs of photos along a straight course; every photo has one.
 
-    For photos far apart: two photos make a leg, and the path from the last photo of one to the first of the next
-    belongs to neither. A leg lies in one segment, and a pause ends it.
-
-    Args:
-        position: complex (N,), east + i north, in order of time. segment: int32 (N,). time_s: float64 (N,), may be NaN.
+    For photos far apart: two photos make a leg, and the path between two legs belongs to neither. A leg lies in one
+    segment, and a pause ends it. position: complex (N,), east + i north, in order of time. time_s: float64 (N,), or
+    NaN.
     """
     turn_rad = float(np.radians(_LEG_TURN_DEG))
     leg = np.zeros(len(position), np.int32)

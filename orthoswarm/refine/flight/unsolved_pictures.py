@@ -31,9 +31,8 @@ _UNSOLVED_SIGMA_M: Final = 2.0  # added in squares to the largest sigma of those
 class RefinableSplit:
     """Recorded frames by whether a refiner can solve them, each in the frames' order, and warnings for the report.
 
-    Attributes:
-        fit: frames that it can solve. odd: too few of their camera and size, to be placed by their neighbours.
-        still: frames of vehicles that hovered for all pictures, which stay as recorded.
+    fit: frames that it can solve. odd: too few of their camera and size, to be placed by their neighbours. still:
+    frames of vehicles that hovered for all pictures, which stay as recorded.
     """
 
     fit: list[PlacedFrame]
@@ -95,9 +94,8 @@ def place_by_neighbours(
 ) -> list[PlacedFrame]:
     """Place frames by applying the refinement's changes of their nearest neighbours: position, attitude, focal length.
 
-    Args:
-        odd: as recorded; they stay so if nothing was refined.
-        recorded: the refined frames as recorded, with the same assumed field of view. refined: after refinement.
+    odd: as recorded; they stay so if nothing was refined. recorded: the refined frames as recorded, with the same
+    assumed field of view. refined: after refinement.
     """
     before = {p.frame.image: p for p in recorded}
     pairs = [(before[p.frame.image], p) for p in refined if p.frame.image in before]

@@ -60,9 +60,9 @@ def without_outliers(recorded: Array, leg: Ints) -> Array:
 def interpolate_weak(flight: FlightBlock, sigma_m: Array) -> Flags:
     """Interpolate weak cameras in place from strong ones before and after; returns which were interpolated.
 
-    Positions follow the recorded path where it agrees with the neighbours, else a straight line in time; the
-    attitude is the recorded one with the bias of the neighbours. Their sigma grows with the distance, and with the
-    difference of record and line.
+    Positions follow the recorded path where it agrees with the neighbours, else a straight line in time; the attitude
+    is the recorded one with the bias of the neighbours. Their sigma grows with the distance, and with what both differ
+    by.
     """
     adj = flight.adjustment
     n = len(flight.frames)

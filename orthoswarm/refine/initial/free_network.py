@@ -34,10 +34,8 @@ _ANCHOR_MOST: Final = 60  # so many observations of the ground take part in the 
 class Anchors:
     """What pixels of photos are known to show (M observations).
 
-    Attributes:
-        photo: int32 (M,). pixel: complex (M,), of the level picture, about its centre, y up. ground: complex (M,),
-            east + i north.
-        sigma_m: float64 (M,), of the ground point. sigma_px: float64 (M,), of the pixel.
+    photo: int32 (M,). pixel: complex (M,), of the level picture, about its centre, y up. ground: complex (M,), east + i
+    north. sigma_m: float64 (M,), of the ground point. sigma_px: float64 (M,), of the pixel.
     """
 
     photo: Ints

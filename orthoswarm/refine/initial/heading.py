@@ -108,9 +108,8 @@ def solve_headings(
     Each connected component is rotated to the angle that most courses support, then all headings are solved
     together, robustly.
 
-    Args:
-        component: int32 (N,). start: float64 (N,), relative headings within each component.
-        course: float64 (E,), absolute headings of the first photos; course_sigma: (E,), infinite where unknown.
+    component: int32 (N,). start: float64 (N,), relative headings within each component. course: float64 (E,), absolute
+    headings of the first photos; course_sigma: (E,), infinite where unknown.
     """
     yaw = start.copy()
     known = np.zeros(len(start), bool)

@@ -25,7 +25,7 @@ from orthoswarm.refine.initial.heading import (
     tag_heading,
 )
 from orthoswarm.refine.initial.planar_network import NetworkPriors, solve_network
-from orthoswarm.refine.initial.planar_similarity import PairGraph, PhotoRecords, level_from_nadir, rotation_of
+from orthoswarm.refine.initial.planar_similarity import PhotoRecords, level_from_nadir, rotation_of
 from orthoswarm.refine.initial.relative_scale import (
     RecordedHeights,
     first_scale,
@@ -66,7 +66,6 @@ class InitialOrientation:
         yaw_known: bool (N,), heading found from pairs. scale_known: bool (L,), ground scale found.
         recorded_focal: float64 (L,), focal length that the recorded heights imply, NaN where they are impossible.
         tags: the recorded heading that follows the pictures, for each vehicle.
-        graph: pairs between level pictures. misfit: median misfit of pairs in pixels, before and after levelling.
     """
 
     position: Complex
@@ -87,8 +86,6 @@ class InitialOrientation:
     scale_known: Flags
     recorded_focal: Array
     tags: tuple[TagHeading, ...]
-    graph: PairGraph
-    misfit: tuple[float, float]
 
     def rotation(self) -> Array:
         """Camera-to-ground rotations, float64 (N, 3, 3)."""
@@ -163,8 +160,6 @@ def find_initial_orientation(
         scale_known=scale_known,
         recorded_focal=focal_by_height(records, heights, metres, lens_of),
         tags=tags,
-        graph=graph,
-        misfit=shape.misfit,
     )
 
 

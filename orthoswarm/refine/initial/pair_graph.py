@@ -2,6 +2,8 @@
 
 Candidate pairs depend on where the photos look, hence on the tilt, which is only known from pairs: so pairs in order
 of time are matched first, then near ones, then more for photos with few pairs.
+
+Thresholds without another source were chosen on four real flights.
 """
 
 from collections.abc import Iterable, Sequence
@@ -22,15 +24,14 @@ from orthoswarm.refine.initial.initial_orientation import InitialOrientation, fi
 from orthoswarm.refine.initial.planar_similarity import PhotoRecords
 
 _SIFT_FINE_PIXELS: Final = 640 * 480  # pixels of reduced pictures that matched too few others (four real flights)
-_PAIR_REACH_SHARE: Final = 0.68
-"""Photos nearer than this share of the footprint's diagonal may overlap (chosen on four real flights)."""
+_PAIR_REACH_SHARE: Final = 0.68  # photos nearer than this share of the footprint's diagonal may overlap
 _WEAK_REACH_SHARE: Final = 0.8  # the same for photos with few matches
 _PAIRS_FIRST: Final = 3  # neighbours that each photo tries first, before the tilt is known
 _PAIRS_USUAL: Final = 6  # ... and then
 _PAIRS_MORE: Final = 12  # ... and for photos with few pairs
 _ENOUGH_PAIRS: Final = 5  # photos with fewer pairs try more neighbours
-_WEAK_PAIRS: Final = 2  # photos with fewer pairs get finer features (chosen on four real flights)
-_WEAK_MATCHES: Final = 40  # ... and those with fewer matches in all (chosen on four real flights)
+_WEAK_PAIRS: Final = 2  # photos with fewer pairs get finer features
+_WEAK_MATCHES: Final = 40  # ... and those with fewer matches in all
 _PAIRS_PER_TASK: Final = 64  # pairs that a worker matches at a time (for speed alone)
 _HEADER_SIZE_SHARE: Final = 0.02  # a picture's shape may differ from its header's by so much
 
@@ -39,10 +40,8 @@ _HEADER_SIZE_SHARE: Final = 0.02  # a picture's shape may differ from its header
 class PairGraphBuilder:
     """Features and matches of N photos, extended step by step.
 
-    Attributes:
-        run: executes the feature and matching tasks; results do not depend on it.
-        progress: called with stage, number done, total.
-        tried: pair -> match (empty where it failed). damaged: photo -> why it cannot be read.
+    run: executes the feature and matching tasks; results do not depend on it. progress: called with stage, number done,
+    total. tried: pair -> match (empty where it failed). damaged: photo -> why it cannot be read.
     """
 
     frames: Sequence[Frame]

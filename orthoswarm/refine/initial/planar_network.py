@@ -3,6 +3,8 @@
 Given the headings everything is linear: P(second) - P(first) = m R (z - o) of the first minus the same of the second,
 for the centre of a pair's matches, together with recorded positions. A wrong pair disagrees with the network, and so
 does a wrong position; as photos have several neighbours, the two can be distinguished.
+
+Thresholds without another source were chosen on four real flights.
 """
 
 from dataclasses import dataclass, field
@@ -18,14 +20,11 @@ from orthoswarm.model.arrays import Array, Complex, Flags, Indices, Ints
 from orthoswarm.refine.bundle.priors import LAG_SIGMA_S
 from orthoswarm.refine.initial.planar_similarity import PairGraph, PhotoRecords
 
-_NETWORK_SCHEDULE: Final = (400.0, 400.0, 36.0, 9.0, 9.0)
-"""Robust schedule of pairs and recorded positions (chosen on four real flights)."""
-NETWORK_GATE_SIGMAS: Final = 5.0
-"""Pairs and recorded positions farther off the network are wrong (chosen on four real flights)."""
-_PAIR_SIGMA_M: Final = 0.6  # sigma of a pair's vector (chosen on four real flights)
-_PAIR_SIGMA_SHARE: Final = 0.05
-"""... and this share of the distance of its matches from the nadirs (chosen on four real flights)."""
-LAG_SPREAD_S: Final = 0.3  # scatter of the delay of recorded positions along the way (chosen on four real flights)
+_NETWORK_SCHEDULE: Final = (400.0, 400.0, 36.0, 9.0, 9.0)  # robust schedule of pairs and recorded positions
+NETWORK_GATE_SIGMAS: Final = 5.0  # pairs and recorded positions farther off the network are wrong
+_PAIR_SIGMA_M: Final = 0.6  # sigma of a pair's vector
+_PAIR_SIGMA_SHARE: Final = 0.05  # ... and this share of the distance of its matches from the nadirs
+LAG_SPREAD_S: Final = 0.3  # scatter of the delay of recorded positions along the way
 _NETWORK_STILL_M_S: Final = 0.1  # a slower vehicle has no direction along the way
 
 

@@ -75,8 +75,7 @@ def first_scale(graph: PairGraph, records: PhotoRecords, lens_of: Ints, focal: A
     Only pairs of nearly equal heading are used if there are any, as their shift does not depend on the tilt. A lens
     without a pair uses its recorded height and focal length.
 
-    Args:
-        lens_of: int32 (S,), lens of each segment. focal: float64 (L,), pixels, as known so far.
+    lens_of: int32 (S,), lens of each segment. focal: float64 (L,), pixels, as known so far.
     """
     i, j = graph.first, graph.second
     way = np.abs(records.position[j] - records.position[i])

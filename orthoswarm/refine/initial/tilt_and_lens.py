@@ -36,9 +36,8 @@ _SHAPE_ROBUST_SCALE: Final = 2.0  # a match's weight falls to a quarter at so ma
 class PairMatches:
     """Matches of all pairs in one array: of pair e, rows start[e] to start[e + 1].
 
-    Attributes:
-        first: int32 (E,), photo; second: int32 (E,). start: int64 (E + 1,). count: int64 (E,), all matches of a pair.
-        p: complex (M,), pixels in the first about its centre, y up; q: in the second.
+    first: int32 (E,), photo; second: int32 (E,). start: int64 (E + 1,). count: int64 (E,), all matches of a pair. p:
+    complex (M,), pixels in the first about its centre, y up; q: in the second.
     """
 
     first: Ints
@@ -74,10 +73,8 @@ class PairMatches:
 class TiltAndLens:
     """Tilt and lens found from the shapes of matches.
 
-    Attributes:
-        level: float64 (N, 3, 3), camera to level camera. tilt_sigma: float64 (S,), radians.
-        log_focal: float64 (L,), of the focal length in pixels; log_focal_sigma: float64 (L,). k1: float64 (L,).
-        misfit: median misfit of all pairs in pixels before and after.
+    level: float64 (N, 3, 3), camera to level camera. tilt_sigma: float64 (S,), radians. log_focal: float64 (L,), of the
+    focal length in pixels; log_focal_sigma: float64 (L,). k1: float64 (L,).
     """
 
     level: Array
@@ -85,7 +82,6 @@ class TiltAndLens:
     log_focal: Array
     log_focal_sigma: Array
     k1: Array
-    misfit: tuple[float, float]
 
 
 def spaced(count: int, most: int) -> NDArray[np.intp]:
@@ -117,19 +113,12 @@ def solve_tilt_and_lens(
         [np.repeat(tilt_sigma, 2), np.stack([log_focal_sigma, np.full(lenses, _SHAPE_BEND_SIGMA)], 1).ravel()]
     )
     total = np.zeros(size)
-    first_misfit = float("nan")
     level = level.copy()
     lens = np.stack([log_focal, np.zeros(lenses), corner_radius(records) ** 2], axis=1)
-    normal, misfit = np.zeros((size, size)), np.zeros(len(matches.first))
     floor = _SHAPE_FLOOR_SHARE * records.width
     for _ in range(_SHAPE_ITERATIONS):
         normal, gradient = np.zeros((size, size)), np.zeros(size)
-        _accumulate(
-            matches.arrays, level, lens, records.lens, records.segment, floor, _SHAPE_ROUNDS, _SHAPE_ROBUST_SCALE,
-            normal, gradient, misfit,
-        )  # fmt: skip
-        if np.isnan(first_misfit) and len(misfit):
-            first_misfit = float(np.median(misfit))
+        _accumulate(matches.arrays, level, lens, records.lens, records.segment, floor, normal, gradient)
         normal = _SHAPE_INDEPENDENT_SHARE * normal + np.diag(sigma**-2)
         step = np.linalg.solve(normal, _SHAPE_INDEPENDENT_SHARE * gradient - total / sigma**2)
         step *= min(1.0, _SHAPE_TILT_STEP_RAD / float(np.abs(step[: 2 * segments]).max(initial=1e-9)))
@@ -142,14 +131,12 @@ def solve_tilt_and_lens(
         if np.abs(step).max() < _SHAPE_SETTLED:
             break
     deviation = np.sqrt(np.diag(np.linalg.inv(normal)))
-    last_misfit = float(np.median(misfit)) if len(misfit) else float("nan")
     return TiltAndLens(
         level=level,
         tilt_sigma=deviation[: 2 * segments].reshape(-1, 2).max(1),
         log_focal=lens[:, 0].copy(),
         log_focal_sigma=deviation[2 * segments :: 2].copy(),
         k1=lens[:, 1] * np.exp(2.0 * lens[:, 0]) / lens[:, 2],
-        misfit=(first_misfit, last_misfit),
     )
 
 
@@ -160,7 +147,7 @@ def similarities(matches: PairMatches, records: PhotoRecords, shape: TiltAndLens
     radius = corner_radius(records)
     lens = np.stack([shape.log_focal, shape.k1 * radius**2 * np.exp(-2.0 * shape.log_focal), radius**2], axis=1)
     floor = _SHAPE_FLOOR_SHARE * records.width
-    _similarities(matches.arrays, shape.level, lens, records.lens, floor, _SHAPE_ROUNDS, _SHAPE_ROBUST_SCALE, table)
+    _similarities(matches.arrays, shape.level, lens, records.lens, floor, table)
     return PairGraph(
         first=matches.first,
         second=matches.second,
@@ -209,13 +196,13 @@ def _flatten(z, level, focal, bend, radius2, right, up):  # type: ignore[no-unty
 
 
 @kernel
-def _fit(p, q, n, floor, rounds, robust, w):  # type: ignore[no-untyped-def]
+def _fit(p, q, n, floor, w):  # type: ignore[no-untyped-def]
     """Robust similarity q = a p + b: a, mean p, mean q, the misfit's scale (at least `floor`); w gets the weights."""
     misfit = np.empty(n)
     for k in range(n):
         w[k] = 1.0
     a, cp, cq, scale = 1.0 + 0.0j, 0.0j, 0.0j, floor
-    for _ in range(rounds):
+    for _ in range(_SHAPE_ROUNDS):
         total = 0.0
         cp, cq = 0.0j, 0.0j
         for k in range(n):
@@ -234,7 +221,7 @@ def _fit(p, q, n, floor, rounds, robust, w):  # type: ignore[no-untyped-def]
             misfit[k] = abs(q[k] - cq - a * (p[k] - cp))
         scale = max(np.median(misfit), floor)
         for k in range(n):
-            e = misfit[k] / (robust * scale)
+            e = misfit[k] / (_SHAPE_ROBUST_SCALE * scale)
             w[k] = robust_weight(e * e, 1.0, 1.0)
     return a, cp, cq, scale
 
@@ -268,7 +255,7 @@ def _project_out(g, p, cp, w, n):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _fit_pair(matches, e, level, lens, lens_id, floor, rounds, robust, zp, zq, w):  # type: ignore[no-untyped-def]
+def _fit_pair(matches, e, level, lens, lens_id, floor, zp, zq, w):  # type: ignore[no-untyped-def]
     """Flatten the matches of pair e into zp, zq and fit their similarity, see `_fit`."""
     first, second, start, p, q = matches
     i, j, n = first[e], second[e], start[e + 1] - start[e]
@@ -277,11 +264,11 @@ def _fit_pair(matches, e, level, lens, lens_id, floor, rounds, robust, zp, zq, w
     for k in range(n):
         zp[k] = _flatten(p[start[e] + k], level[i], fi, ki, ri, 0.0, 0.0)
         zq[k] = _flatten(q[start[e] + k], level[j], fj, kj, rj, 0.0, 0.0)
-    return _fit(zp, zq, n, floor[j], rounds, robust, w)
+    return _fit(zp, zq, n, floor[j], w)
 
 
 @kernel
-def _accumulate(matches, level, lens, lens_id, segment, floor, rounds, robust, normal, gradient, misfit):  # type: ignore[no-untyped-def]
+def _accumulate(matches, level, lens, lens_id, segment, floor, normal, gradient):  # type: ignore[no-untyped-def]
     """Normal equations of tilt (2 S) and lens (2 L) after each pair's similarity is projected out."""
     first, second, start, p, q = matches
     segments, most = segment.max() + 1, 0
@@ -295,8 +282,7 @@ def _accumulate(matches, level, lens, lens_id, segment, floor, rounds, robust, n
         pe, qe = p[start[e] : start[e + 1]], q[start[e] : start[e + 1]]
         fi, ki, ri = np.exp(lens[lens_id[i], 0]), lens[lens_id[i], 1], lens[lens_id[i], 2]
         fj, kj, rj = np.exp(lens[lens_id[j], 0]), lens[lens_id[j], 1], lens[lens_id[j], 2]
-        a, cp, cq, scale = _fit_pair(matches, e, level, lens, lens_id, floor, rounds, robust, zp, zq, w)
-        misfit[e] = scale
+        a, cp, cq, scale = _fit_pair(matches, e, level, lens, lens_id, floor, zp, zq, w)
         for k in range(n):
             r[k] = zq[k] - cq - a * (zp[k] - cp)
         _derivatives(pe, zp, level[i], fi, ki, ri, -a, g[:4])
@@ -323,12 +309,12 @@ def _accumulate(matches, level, lens, lens_id, segment, floor, rounds, robust, n
 
 
 @kernel
-def _similarities(matches, level, lens, lens_id, floor, rounds, robust, table):  # type: ignore[no-untyped-def]
+def _similarities(matches, level, lens, lens_id, floor, table):  # type: ignore[no-untyped-def]
     start = matches[2]
     for e in range(len(table)):
         n = start[e + 1] - start[e]
         zp, zq, w = np.empty(n, np.complex128), np.empty(n, np.complex128), np.empty(n)
-        a, cp, cq, scale = _fit_pair(matches, e, level, lens, lens_id, floor, rounds, robust, zp, zq, w)
+        a, cp, cq, scale = _fit_pair(matches, e, level, lens, lens_id, floor, zp, zq, w)
         spread = 0.0
         for k in range(n):
             spread += abs(zp[k] - cp) ** 2

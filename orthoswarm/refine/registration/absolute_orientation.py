@@ -113,9 +113,8 @@ def tie_matches(
 
     Ground is compared by its texture: strong edges belong to what leans and casts shadows.
 
-    Args:
-        cell_m: side of a cell. reach_m: search to each side. half_m: half a patch, None: as `tie_half_m`. All metres.
-        pictures: bool (N,), the ones to compare, None for all.
+    cell_m: side of a cell. reach_m: search to each side. half_m: half a patch, None: as `tie_half_m`. All metres.
+    pictures: bool (N,), the ones to compare, None for all.
     """
     adj = flight.adjustment
     seen = flight.best_views(pictures)
@@ -167,9 +166,9 @@ def _ground_matches(
 def edge_displacement(flight: FlightBlock, surface: GroundModel, ground: LoadedMap, matches: MapMatches) -> Array:
     """Mean displacement (2,), metres, of strong edges against texture at the same tie points; zero if it is not known.
 
-    Shadows of another hour and what leans in the map displace strong edges most, but texture, too, by as much as edges
-    differ from it. (Regression over simulated cities with exact truth: an error of 1.0 to 1.1 times this difference is
-    left in tie points by texture.) So subtracting it extrapolates to ground without edges.
+    Shadows of another hour and what leans in the map displace strong edges most, but texture, too, by 1.0 to 1.1 times
+    this difference (regression over simulated cities with exact truth). Subtracting it extrapolates to ground without
+    edges.
     """
     step = max(1, -(-len(matches.point) // _EDGE_MOST))
     some = matches.take(np.arange(0, len(matches.point), step))
@@ -208,9 +207,9 @@ def mode_shift(shift: Array) -> Array:
 def shifted_along(flight: FlightBlock, matches: MapMatches) -> MapMatches:
     """Shift the cameras to where their first matches lie; returns the matches with what is left of their shifts.
 
-    All cameras move by the mode of the shifts, but a leg whose own matches agree on another line of shifts moves along
-    that line. Where the tracks broke at a corner, the coarse corrections of the two legs are interpolated into each
-    other, and the adjustment would reject the right matches at the beginning of a leg as outliers.
+    All cameras move by the mode of the shifts, but a leg whose own matches agree on another line of shifts follows it:
+    where the tracks broke at a corner, the coarse corrections of two legs are interpolated into each other, and the
+    adjustment would reject the right matches at the beginning of a leg as outliers.
     """
     points = flight.adjustment.points[matches.point].copy()
     correction = leg_corrections(flight.leg, matches, mode_shift(matches.shift))
@@ -442,8 +441,7 @@ def evidence_log10(
 ) -> float:
     """Decimal logarithm of the expected number of false matches behind a flight's tie points.
 
-    Args:
-        matches: its tie points. half_m: half the side of what was compared. reach_m: how far each was searched.
+    matches: its tie points. half_m: half the side of what was compared. reach_m: how far each was searched.
     """
     return false_matches_log10(
         flight.adjustment.points[matches.point, :2],

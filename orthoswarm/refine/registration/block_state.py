@@ -210,10 +210,8 @@ def leg_states(state: VehicleState) -> list[Leg]:
     """How the map held each leg.
 
     Matched: tie points of its own agree with its place more often than by chance. Where that holds for no leg alone
-    (few photos a leg) but for all tie points of the vehicle together, the legs whose ties agree are matched. So are
-    those of a block that was shifted onto a coarse map by the evidence of all its pictures. Carried: legs without such
-    ties beside matched ones, of the vehicle itself or of neighbours. Failed: all others, as the vehicle lies where its
-    receiver says.
+    (few photos a leg) but for all ties together, the legs whose ties agree; and all of a block that was shifted onto a
+    coarse map. Carried: the others beside matched ones, of the vehicle itself or of neighbours. Failed: all others.
     """
     flight = state.flight
     residual = flight.adjustment.tie_residual

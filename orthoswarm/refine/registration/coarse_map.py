@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
 from orthoswarm.model.arrays import Array, Flags, Floats
-from orthoswarm.model.bounding_box import BoundingBox
-from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import MapWindow
 from orthoswarm.refine.flight.relative_block import FlightBlock
 from orthoswarm.refine.registration.map_evidence import FALSE_MATCHES
@@ -26,16 +24,17 @@ from orthoswarm.refine.registration.orientation_correlation import (
     PEAK_APART_PX,
     STRIP_BORDER_PX,
     STRIP_FEWEST_EDGES,
-    STRIP_MAP_SHARE,
+    Mosaic,
     OrientationField,
+    Search,
     correlation,
     highest,
+    on_map,
+    standing_out,
     strip_mosaic,
-    without_peak,
 )
 
-_STEP = 2
-"""Pixels of the correlation in one of the map's, and of the mosaic in one of the correlation."""
+_STEP = 2  # pixels of the correlation in one of the map's, and of the mosaic in one of the correlation
 
 _COARSE_MAP_GSD_M: Final = 4.5
 """On maps with larger pixels, metres, no tie points are searched. On three sets (0.47 m a pixel) maps of 4 m place
@@ -57,9 +56,8 @@ to 0.5 m at 10 m."""
 class CoarseMapShift:
     """One shift of a block onto a coarse map of pixel gsd_m: metres to add, and their sigma, an axis.
 
-    Attributes:
-        confidence: 1 minus the ratio of the second peak to the first.
-        false_matches: expected number of peaks as high on a map of other ground.
+    confidence: 1 minus the ratio of the second peak to the first. false_matches: expected number of peaks as high on a
+    map of other ground.
     """
 
     east: float
@@ -82,32 +80,22 @@ def shift_on_coarse_map(
     """Where vehicles that make one block lie on a coarse map, None if it shows no such place; ground_z: their level."""
     gsd = basemap.native_gsd_m / _STEP
     drawn = _mosaic(flights, ground_z, gsd)
-    if drawn is None:
+    strip = None if drawn is None else on_map(drawn, Search(basemap, origin, COARSE_REACH_M[0], gsd))
+    if strip is None:
         return None
-    grey, valid, west, north = drawn
-    reach = int(np.ceil(COARSE_REACH_M[0] / gsd))
-    rows, columns = (n + 2 * reach for n in grey.shape)
-    left, top = origin[0] + west - reach * gsd, origin[1] + north + reach * gsd
-    bounds = BoundingBox(left, top - rows * gsd, left + columns * gsd, top)
-    ground, known = basemap.gray(bounds, gsd)
-    ground, known = ground[:rows, :columns], known[:rows, :columns]
-    if ground.shape != (rows, columns) or known.mean() < STRIP_MAP_SHARE:
-        return None
-    moving, fixed = _texture(grey, valid), _texture(ground, known)
+    moving, fixed = _texture(strip.gray, strip.valid), _texture(strip.ground, strip.known)
     if min(np.count_nonzero(moving), np.count_nonzero(fixed)) < STRIP_FEWEST_EDGES:
         return None
-    score = correlation(moving, fixed, reach)
-    column, row, peak, ratio = highest(score, PEAK_APART_PX)
-    rest = without_peak(score, PEAK_APART_PX)
-    z = (peak - float(rest.mean())) / max(float(rest.std()), 1e-9)
+    score = correlation(moving, fixed, strip.reach)
+    column, row, _, ratio = highest(score, PEAK_APART_PX)
+    z = standing_out(score, PEAK_APART_PX)
     false_matches = float(np.exp(np.log(score.size) + log_ndtr(-z)))
     if false_matches > FALSE_MATCHES:
         return None
-    spread = _jackknife(moving, fixed, reach)
-    grid = GroundGrid.around(basemap.epsg, bounds, gsd)
+    spread = _jackknife(moving, fixed, strip.reach)
     return CoarseMapShift(
-        east=float(grid.west - bounds.west + gsd * column),
-        north=float(grid.north - bounds.north - gsd * row),
+        east=float(strip.offset[0] + gsd * column),
+        north=float(strip.offset[1] - gsd * row),
         sigma_m=float(np.hypot(gsd * spread, _COARSE_MAP_SIGMA_PX * basemap.native_gsd_m)),
         gsd_m=basemap.native_gsd_m,
         confidence=1.0 - ratio,
@@ -115,7 +103,7 @@ def shift_on_coarse_map(
     )
 
 
-def _mosaic(flights: Sequence[FlightBlock], ground_z: float, gsd_m: float) -> tuple[Floats, Flags, float, float] | None:
+def _mosaic(flights: Sequence[FlightBlock], ground_z: float, gsd_m: float) -> Mosaic | None:
     """Grey mosaic of all vehicles, averaged over the map's pixel, with its validity, west and north edges."""
     fine = gsd_m / _STEP
     parts = []

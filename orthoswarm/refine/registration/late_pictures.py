@@ -1,9 +1,9 @@
 """Pictures that arrive after their vehicle was refined: resected by its refined ones, which stay as they are.
 
-A picture starts from what the refinement changed in its neighbours. Its corners are followed into the neighbours'
-pictures, whose ground points resect it: six unknowns, so a few pictures need no second refinement. Measured on
-simulated flights over debris, water and haze (640x480 from 150 m): by the start alone 0.2 to 2.6 m off; by resection as
-accurate as its neighbours among them, 0.1 to 0.3 m worse beside or beyond them; 0.07 s a picture.
+A picture starts from what the refinement changed in its neighbours. Its corners are followed into their pictures, whose
+ground points resect it. Measured on simulated flights over debris, water and haze (640x480 from 150 m): by the start
+alone 0.2 to 2.6 m off; by resection as accurate as its neighbours among them, 0.1 to 0.3 m worse beside or beyond them;
+0.07 s a picture.
 """
 
 from collections.abc import Callable, Sequence
@@ -49,10 +49,10 @@ def register_late_pictures(
     """Place pictures of a vehicle that was refined without them; nothing of what is refined changes.
 
     Returns:
-        The placed frames in order of time, and image -> reason for those that cannot be placed. Those that too few
-        points resect are `weak`, placed by the neighbours' corrections alone. The sigma of the others combines that of
-        the neighbours, that of the resection, and the effect of corners above the terrain on a picture that has its
-        neighbours on one side: their height times the neighbours' distance over the flying height.
+        The placed frames in order of time, and image -> reason for the others. Those that too few points resect are
+        `weak`, placed by the neighbours' corrections alone. The sigma of the others combines that of the neighbours,
+        that of the resection, and the effect of corners above the terrain on a picture that has its neighbours on one
+        side.
     """
     late = {frame.image for frame in frames}
     everyone = sorted([*frames, *(p.frame for p in refined.placed)], key=lambda f: (f.time_s or 0.0, f.image))

@@ -1,10 +1,9 @@
 """Whether tie points show that a flight lies on a map, or only what any map would show by chance.
 
 An a-contrario test (Desolneux, Moisan, Morel: From Gestalt Theory to Image Analysis, 2008; for fitted models AC-RANSAC,
-Moisan and Stival 2004). On a map of other ground a tie point finds its best match anywhere in its search window, all
-places alike. So the number of tie points that agree with one shift by chance is binomial, and the number of models that
-were tried times its tail is the expected number of false matches: how many agreements as good as the one observed a
-wrong map would give. Ties that share ground are not independent; only one of a patch's size is counted.
+Moisan and Stival 2004). On a map of other ground a tie point's best match lies anywhere in its search window, so the
+number of those that agree with one shift by chance is binomial. The number of models tried times its tail is the
+expected number of false matches. Ties that share ground are not independent; only one of a patch's size is counted.
 """
 
 from typing import Final

@@ -1,9 +1,8 @@
 """Offset of the map against the vehicles' receivers, and whether the receivers' errors explain it.
 
-The orthoimage agrees with the map to centimetres. Whether the map itself is in the right place only the receivers show.
 Each vehicle's mean difference is one observation of the offset; its sigma consists of the receiver's own bias
-(multipath, the satellites it tracks) and of its drift during the flight. The error that all receivers share at a time
-and place (ionosphere) does not become smaller with more vehicles.
+(multipath, the satellites it tracks) and of its drift. The error that all receivers share at a time and place
+(ionosphere) does not become smaller with more vehicles.
 """
 
 from collections.abc import Sequence
@@ -27,9 +26,8 @@ _OFFSET_PROBABILITY: Final = 0.01  # a right map is doubted with this probabilit
 class MapOffset:
     """The map against the receivers.
 
-    Attributes:
-        east, north: metres from where the receivers say to where the map shows the same ground. sigma: of both.
-        vehicles: how many were compared. corrected: receivers state an accuracy that only corrections (RTK, PPK) give.
+    east, north: metres from where the receivers say to where the map shows the same ground. sigma: of both. vehicles:
+    how many were compared. corrected: receivers state an accuracy that only corrections (RTK, PPK) give.
     """
 
     east: float
@@ -86,9 +84,8 @@ class MapOffset:
 def control_warning(control: MapOffset, on_map: MapOffset | None, shift_m: Array | None) -> list[str]:
     """One sentence where neither the receivers' errors nor a map explain where control points lie, else none.
 
-    Args:
-        control: the frames that control points placed, against the receivers. on_map: the map against the receivers.
-        shift_m: float64 (2,), by which control points move what lies on the map; None without such photos.
+    control: the frames that control points placed, against the receivers. on_map: the map against the receivers.
+    shift_m: float64 (2,), by which control points move what lies on the map; None without such photos.
     """
     if not control.doubted:
         return []

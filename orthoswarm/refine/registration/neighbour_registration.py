@@ -95,10 +95,8 @@ def link_to_fixed(
 ) -> int:
     """Observe own points in fixed pictures and add these observations; the fixed cameras are appended to the block.
 
-    Args:
-        gsd_m: pixel in which they are compared. reach_px: how far a point is searched there.
-        pictures: bool (N,), own ones to compare, None for all. cell_m: one point a leg in each cell of this size,
-            None: as configured.
+    gsd_m: pixel in which they are compared. reach_px: how far a point is searched there. pictures: bool (N,), own ones
+    to compare, None for all. cell_m: one point a leg in each cell of this size, None: as configured.
     """
     adj = flight.adjustment
     n = len(adj.cameras)

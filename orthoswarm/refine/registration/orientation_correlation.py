@@ -18,6 +18,9 @@ from orthoswarm.refine.bundle.block_arrays import CameraBlock
 
 OrientationField = NDArray[np.complex64]
 
+Mosaic = tuple[Floats, Flags, float, float]
+"""Grey values (rows, columns), their validity, west and north edges, metres in the local frame."""
+
 Found = tuple[float, float, float, float]
 """Column and row of a shift from the centre, pixels, peak, and ratio of second peak to peak."""
 
@@ -45,9 +48,8 @@ _STACK_MAP_SHARE: Final = 0.7  # least share of the search area that the map cov
 class Match:
     """A window of consecutive pictures found on the map.
 
-    Attributes:
-        first, last: its pictures (inclusive). shift: (2,) east, north: what has to be added to the cameras, metres.
-        peak: correlation. ratio: second peak / peak (small is sure).
+    first, last: its pictures (inclusive). shift: (2,) east, north: what has to be added to the cameras, metres. peak:
+    correlation. ratio: second peak / peak (small is sure).
     """
 
     first: int
@@ -103,11 +105,12 @@ def highest(score: Floats, apart: int) -> Found:
     return c + dc - n // 2, r + dr - n // 2, peak, ratio
 
 
-def without_peak(score: Floats, apart: int) -> Floats:
-    """The values (n,) of a correlation that do not belong to its highest peak."""
+def standing_out(score: Floats, apart: int) -> float:
+    """How many standard deviations of the rest a correlation's peak stands over their mean."""
     r, c = np.unravel_index(int(score.argmax()), score.shape)
     rest = _without(score, int(r), int(c), apart)
-    return np.asarray(rest[rest != 0])
+    rest = rest[rest != 0]
+    return (float(score[r, c]) - float(rest.mean())) / max(float(rest.std()), 1e-9)
 
 
 def _without(score: Floats, row: int, column: int, apart: int) -> Floats:
@@ -118,10 +121,10 @@ def _without(score: Floats, row: int, column: int, apart: int) -> Floats:
 
 def strip_mosaic(
     cameras: CameraBlock, index: NDArray[np.integer], small: Callable[[int], Gray], ground_z: float, gsd_m: float
-) -> tuple[Floats, Flags, float, float] | None:
-    """Nearest-nadir mosaic of some pictures on a level plane: grey (rows, columns), validity, west and north edges.
+) -> Mosaic | None:
+    """Nearest-nadir mosaic of some pictures on a level plane; None where nothing is seen.
 
-    None where nothing is seen. small: reduced picture i; its scale is taken from its width.
+    small: reduced picture i; its scale is taken from its width.
     """
     corners, homographies = [], []
     for i in index:
@@ -197,10 +200,13 @@ def strip_and_map(
     cameras: CameraBlock, index: NDArray[np.integer], picture: Callable[[int], Gray], search: Search
 ) -> Strip | None:
     """Mosaic some consecutive pictures and read the map around them; None where either has nothing to show."""
+    mosaic = strip_mosaic(cameras, index, picture, 0.0, search.gsd_m)
+    return None if mosaic is None else on_map(mosaic, search)
+
+
+def on_map(mosaic: Mosaic, search: Search) -> Strip | None:
+    """A mosaic with the map around it; None where the map hardly covers that."""
     basemap, origin, gsd_m = search.basemap, search.origin, search.gsd_m
-    mosaic = strip_mosaic(cameras, index, picture, 0.0, gsd_m)
-    if mosaic is None:
-        return None
     gray, valid, west, north = mosaic
     reach = int(np.ceil(search.reach_m / gsd_m))
     rows, cols = gray.shape
@@ -227,7 +233,7 @@ def strip_and_map(
 
 
 def by_edges(strip: Strip) -> Found | None:
-    """Where a strip lies on its map, by their edges; None where there is nothing to find."""
+    """Where a strip lies on its map, by their edges."""
     fields = _edges(strip)
     return None if fields is None else highest(correlation(*fields, strip.reach), PEAK_APART_PX)
 
@@ -241,15 +247,12 @@ def _edges(strip: Strip) -> tuple[OrientationField, OrientationField] | None:
 
 
 def stacked(strips: Sequence[Strip]) -> tuple[Array, float, float] | None:
-    """Where strips of one flight lie on the map if one shift is right for all of them, by the sum of what each says.
+    """Where strips of one flight, at one pixel size and reach, lie on the map by the sum of what each says.
 
-    Strips that all lie a little wrong among themselves (tilt, field of view and drift are not known yet) have low and
+    Strips that lie a little wrong among themselves (tilt, field of view and drift are not known yet) have low and
     ragged peaks, each near the right place: blurred and summed they make one that stands out. Of 96 flights of 42
     pictures the windows of 37 had no consensus; 20 of those pass here, all at the right place, and none of 288 maps of
-    other ground (mirrored ones; the highest stood 4.6 standard deviations out).
-
-    Args:
-        strips: of one flight, at the same pixel size and reach.
+    other ground.
 
     Returns:
         Shift (2,) east, north in metres, peak in standard deviations of the rest, ratio of second peak to peak: a guess
@@ -266,9 +269,8 @@ def stacked(strips: Sequence[Strip]) -> tuple[Array, float, float] | None:
         total = score if total is None else total + score
     if total is None:
         return None
-    column, row, peak, ratio = highest(total, apart)
-    rest = without_peak(total, apart)
-    z = (peak - float(rest.mean())) / max(float(rest.std()), 1e-9)
+    column, row, _, ratio = highest(total, apart)
+    z = standing_out(total, apart)
     offset, gsd = np.mean([s.offset for s in strips], axis=0), strips[0].gsd_m
     return offset + gsd * np.array([column, -row]), z, ratio
 

@@ -54,16 +54,15 @@ _SEARCH_WIDE_PX: Final = 16  # searches of more pixels than this to each side on
 _SEARCH_PROMISING_SHARE: Final = 0.6
 """... and then where that correlates with at least this share of its highest value. Of 1,030 sure first ties 3 are not
 found or lie elsewhere with 0.5, 13 with 0.65, 38 with 0.8."""
-_GRADIENT_FLOOR: Final = 1e-3  # least median gradient, grey values: a blank patch has no texture to compress
+_GRADIENT_FLOOR: Final = np.float32(1e-3)  # least median gradient, grey values: a blank patch has no texture
 
 
 @dataclass(frozen=True, slots=True)
 class LoadedMap:
     """Grey map of an area in a local frame, in memory at one pixel size.
 
-    Attributes:
-        west, north: edges in the local frame (grid minus origin), metres. gsd_m: pixel.
-        gray: uint8 (rows, columns). valid: bool (rows, columns).
+    west, north: edges in the local frame (grid minus origin), metres. gsd_m: pixel. gray: uint8 (rows, columns). valid:
+    bool (rows, columns).
     """
 
     west: float
@@ -154,9 +153,7 @@ def match_points(
     for i, part in _by_picture(by):
         _search_map(
             cameras.position[i], cameras.rotation[i], cameras.lens[cameras.lens_id[i]], gray(i), place[part],
-            pixel[part], ground.gray, ground.valid, ground.gsd_m, half, reach, texture,
-            np.float32(_GRADIENT_FLOOR), _PEAK_EXCLUDE_PX, _MAP_WINDOW_SHARE,
-            _PATCH_SHARE, _SEARCH_WIDE_PX, _SEARCH_PROMISING_SHARE, found[part],
+            pixel[part], ground.gray, ground.valid, ground.gsd_m, half, reach, texture, found[part],
         )  # fmt: skip
     good = found[:, 2] > 0
     found, by = found[good], by[good]
@@ -179,8 +176,7 @@ def _by_picture(ascending: NDArray[np.integer]) -> Iterator[tuple[int, slice]]:
 def vote_lean(matches: MapMatches, height: Array, offset: Array) -> tuple[float, float] | None:
     """The map's lean, metres of shift east and north per metre of height, from roofs; None where too few of them agree.
 
-    Args:
-        height: float64 (Q,) of each matched point above the ground. offset: float64 (2,) shift of ground points now.
+    height: float64 (Q,) of each matched point above the ground. offset: float64 (2,) shift of ground points now.
     """
     if len(height) < _LEAN_FEWEST:
         return None
@@ -223,18 +219,16 @@ def link_legs(
 ) -> tuple[Ints, Ints, Array]:
     """Find points of one leg in the pictures of other legs: camera (K,), point (K,), pixel (K, 2) of new observations.
 
-    Args:
-        camera: (P,) reference picture of each point. leg: (N,) of each camera. candidates: cameras that may be linked.
-        most: other legs in which a point is observed, None: as configured. reach: search in pixels.
+    camera: (P,) reference picture of each point. leg: (N,) of each camera. candidates: cameras that may be linked.
+    most: other legs in which a point is observed, None: as configured. reach: search in pixels.
     """
     most, half = most or _LINK_PICTURES, _LINK_HALF_PX
-    floor = np.float32(_GRADIENT_FLOOR)
     chosen = chosen[np.argsort(camera[chosen], kind="stable")]
     _, number = np.unique(leg, return_inverse=True)
     views = np.empty((len(chosen), most), np.int64)
     _views_of_other_legs(
         cameras.position, cameras.rotation, cameras.lens_id, cameras.lens, points[chosen], number[camera[chosen]],
-        number, int(number.max(initial=-1)) + 1, np.asarray(candidates, np.int64), _LINK_MARGIN_PX, views,
+        number, int(number.max(initial=-1)) + 1, np.asarray(candidates, np.int64), views,
     )  # fmt: skip
     chosen, views = chosen[views[:, 0] >= 0], views[views[:, 0] >= 0]
     found = np.zeros((*views.shape, 4))
@@ -245,7 +239,7 @@ def link_legs(
         for i, part in _by_picture(camera[chosen[some]]):
             _templates(
                 cameras.position[i], cameras.rotation[i], cameras.lens[cameras.lens_id[i]], gray(i), own[part],
-                gsd_m, half, floor, _LINK_TEMPLATE_SHARE, fields[part],
+                gsd_m, half, fields[part],
             )  # fmt: skip
         shown = np.isfinite(fields[:, 0, 0, 0])
         point, view = np.nonzero((views[some] >= 0) & shown[:, None])
@@ -256,8 +250,7 @@ def link_legs(
         for i, part in _by_picture(by):
             _search_picture(
                 cameras.position[i], cameras.rotation[i], cameras.lens[cameras.lens_id[i]], gray(i),
-                own[point[part]], fields, point[part], gsd_m, half, reach, floor, _LINK_APART_PX,
-                _LINK_WINDOW_SHARE, result[part],
+                own[point[part]], fields, point[part], gsd_m, half, reach, result[part],
             )  # fmt: skip
         found[start + point, view] = result
     peak, second = found[..., 2], found[..., 3]
@@ -270,9 +263,8 @@ def link_legs(
 
 @kernel
 def _search_map(  # type: ignore[no-untyped-def]
-    position, rotation, lens, gray, place, pixel, ground, valid, gsd, half, reach, texture, floor, exclude,
-    window_share, patch_share, wide, share, found,
-):  # fmt: skip
+    position, rotation, lens, gray, place, pixel, ground, valid, gsd, half, reach, texture, found
+):
     """Find the surroundings of K points of one picture on the map.
 
     Args:
@@ -280,9 +272,7 @@ def _search_map(  # type: ignore[no-untyped-def]
         place: float64 (K, 3), centre of each patch on the map's lattice, and the height on which it is rectified.
         pixel: int64 (K, 2), the same in rows and columns of the map.
         ground, valid: uint8 and bool (rows, columns), the map. gsd: its pixel, metres.
-        half, reach: half the patch and the search, pixels. texture, floor: see `gradients`. exclude: see `locate`.
-        window_share, patch_share: least share of the window that the map, of the patch that the picture shows.
-        wide, share: searches of more than so many pixels look first at half size, see `promising_blocks`.
+        half, reach: half the patch and the search, pixels. texture: see `gradients`.
         found: float64 (K, 4) out, column and row of the shift, peak, second peak; peak 0 where there is none.
     """
     patch = np.empty((2 * half + 3, 2 * half + 3), np.float32)
@@ -301,44 +291,45 @@ def _search_map(  # type: ignore[no-untyped-def]
             for c in range(size):
                 known += counts[column + c]
                 to[c] = values[column + c] if counts[column + c] else np.nan
-        if known < window_share * size * size:
+        if known < _MAP_WINDOW_SHARE * size * size:
             continue
         shown = rectify(position, rotation, lens, gray, place[k, 0], place[k, 1], place[k, 2], gsd, half + 1, patch)
-        if shown < patch_share:
+        if shown < _PATCH_SHARE:
             continue
-        gradients(patch, texture, floor, template, ROWS - 1)
-        gradients(seen, texture, floor, window, 0)
-        if reach > wide:
-            wanted = promising_blocks(patch, seen, reach, texture, floor, share)
-            found[k, 0], found[k, 1], found[k, 2], found[k, 3] = locate_wanted(template, window, reach, exclude, wanted)
+        gradients(patch, texture, _GRADIENT_FLOOR, template, ROWS - 1)
+        gradients(seen, texture, _GRADIENT_FLOOR, window, 0)
+        if reach > _SEARCH_WIDE_PX:
+            wanted = promising_blocks(patch, seen, reach, texture, _GRADIENT_FLOOR, _SEARCH_PROMISING_SHARE)
+            best = locate_wanted(template, window, reach, _PEAK_EXCLUDE_PX, wanted)
         else:
-            found[k, 0], found[k, 1], found[k, 2], found[k, 3] = locate(template, window, reach, exclude)
+            best = locate(template, window, reach, _PEAK_EXCLUDE_PX)
+        found[k, 0], found[k, 1], found[k, 2], found[k, 3] = best
 
 
 @kernel
-def _templates(position, rotation, lens, gray, points, gsd, half, floor, least, fields):  # type: ignore[no-untyped-def]
+def _templates(position, rotation, lens, gray, points, gsd, half, fields):  # type: ignore[no-untyped-def]
     """Gradients of the surroundings of K points (K, 3) in one picture, into fields (K, ...), see `template_of`.
 
-    The first value of what the picture shows less of than the share `least` becomes NaN.
+    The first value of what the picture shows less of than `_LINK_TEMPLATE_SHARE` becomes NaN.
     """
     patch = np.empty((2 * half + 3, 2 * half + 3), np.float32)
     for k in range(len(points)):
         x, y, z = points[k, 0], points[k, 1], points[k, 2]
         shown = rectify(position, rotation, lens, gray, x, y, z, gsd, half + 1, patch)
-        gradients(patch, False, floor, fields[k], ROWS - 1)
-        if shown < least:
+        gradients(patch, False, _GRADIENT_FLOOR, fields[k], ROWS - 1)
+        if shown < _LINK_TEMPLATE_SHARE:
             fields[k, 0, 0, 0] = np.nan
 
 
 @kernel
 def _search_picture(  # type: ignore[no-untyped-def]
-    position, rotation, lens, gray, points, fields, field, gsd, half, reach, floor, exclude, least, found
+    position, rotation, lens, gray, points, fields, field, gsd, half, reach, found
 ):
     """Find K patches in one picture.
 
     Args:
         points: float64 (K, 3), their places. fields: of `_templates`. field: int64 (K,), the one of each place.
-        least: least share of the window that the picture shows. The others: as in `_search_map`.
+        The others: as in `_search_map`.
         found: float64 (K, 4) out, column and row of the shift, peak, second peak; peak 0 where there is none.
     """
     around = half + reach + 1
@@ -347,25 +338,25 @@ def _search_picture(  # type: ignore[no-untyped-def]
     for k in range(len(points)):
         found[k] = 0.0
         x, y, z = points[k, 0], points[k, 1], points[k, 2]
-        if rectify(position, rotation, lens, gray, x, y, z, gsd, around, seen) < least:
+        if rectify(position, rotation, lens, gray, x, y, z, gsd, around, seen) < _LINK_WINDOW_SHARE:
             continue
-        gradients(seen, False, floor, window, 0)
-        found[k, 0], found[k, 1], found[k, 2], found[k, 3] = locate(fields[field[k]], window, reach, exclude)
+        gradients(seen, False, _GRADIENT_FLOOR, window, 0)
+        best = locate(fields[field[k]], window, reach, _LINK_APART_PX)
+        found[k, 0], found[k, 1], found[k, 2], found[k, 3] = best
 
 
 @kernel
 def _views_of_other_legs(  # type: ignore[no-untyped-def]
-    position, rotation, lens_id, lens, points, own_leg, leg, legs, candidates, margin, views
+    position, rotation, lens_id, lens, points, own_leg, leg, legs, candidates, views
 ):
     """For each point (K, 3) the pictures of other legs that show it best, at most views.shape[1] of them.
 
     Of each leg the picture whose nadir is nearest, the nearest legs first.
 
-    Args:
-        own_leg: int64 (K,), the leg of each point. leg: int64 (N,), of each camera, 0 to legs - 1.
-        candidates: int64 (C,), cameras that may be taken. margin: pixels between the point and their border.
-        views: int64 (K, V) out, cameras; -1 where there are no more.
+    own_leg: int64 (K,), the leg of each point. leg: int64 (N,), of each camera, 0 to legs - 1. candidates: int64 (C,),
+    cameras that may be taken. views: int64 (K, V) out, cameras; -1 where there are no more.
     """
+    margin = _LINK_MARGIN_PX
     nearest, which = np.empty(legs), np.empty(legs, np.int64)
     for k in range(len(points)):
         x, y, z = points[k, 0], points[k, 1], points[k, 2]

@@ -1,9 +1,8 @@
 """The coarse map in flight: pictures of complete legs are adjusted as one block and registered on the map.
 
-Tracks and adjustment without a map as on completion, then the consensus shift of its windows on the map; no tie points,
-no second pass. On a single straight leg the receiver's drift and the camera's tilt are not separable, so the drift is
-held there. Measured on simulated flights with biases and drift: one leg is 2 to 4 m off on the map (up to 12 m, or not
-found at all, where the drift is not held), two legs in opposite directions 0.5 to 2 m.
+On a single straight leg the receiver's drift and the camera's tilt are not separable, so the drift is held there.
+Measured on simulated flights with biases and drift: one leg is 2 to 4 m off on the map (up to 12 m, or not found at
+all, where the drift is not held), two legs in opposite directions 0.5 to 2 m.
 """
 
 from collections.abc import Sequence
@@ -57,11 +56,8 @@ def place_in_flight(
 ) -> Solution:
     """Coarse placement of a vehicle's pictures so far; without a map they stay in the receiver's frame.
 
-    Args:
-        frames: pictures of finished legs of one vehicle, in order of time, with the turns between them.
-
-    Returns:
-        A solution of stage coarse without state; its legs say how the map holds them (failed where there is none).
+    frames: of finished legs of one vehicle, in order of time, with the turns between them. The solution is of stage
+    coarse without state; its legs say how the map holds them (failed where there is none).
 
     Raises:
         OrthoSwarmError: the block of pictures cannot be adjusted (yet); the message says why.

@@ -40,8 +40,8 @@ def join_unmapped(
     """Register vehicles that no map holds to each other.
 
     Vehicles whose receivers had corrections stay where they are, as do `others`; the rest is registered to them. A
-    block without any of these is placed by all its receivers together. Where a map is there that is too coarse to show
-    single pictures, blocks are shifted onto it.
+    block without any of these is placed by all its receivers together, or shifted onto a map too coarse to show single
+    pictures.
 
     Returns:
         The states in order; the numbers of the unmapped ones by block, each after those that it was registered to.

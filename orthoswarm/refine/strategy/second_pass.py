@@ -183,13 +183,10 @@ def map_heights(
     tie_sigma_m: Array,
     pictures: Flags | None = None,
 ) -> tuple[Array, Array]:
-    """Ground points (K, 3) and one sigma of their heights (K,), where this flight's views are oblique.
+    """Ground points (K, 3) and one sigma of their heights (K,), where an adjusted flight's views are oblique.
 
-    Args:
-        flight: adjusted on the map.
-        others: float64 (M, 2), where other vehicles' cameras were; ground that they see more steeply is left out.
-        tie_sigma_m: float64 (Q,), one sigma of the flight's ties to the map.
-        pictures: bool (N,), the ones to compare with the map, None for all on legs.
+    others: float64 (M, 2), where other vehicles' cameras were; ground that they see more steeply is left out.
+    tie_sigma_m: float64 (Q,), of the flight's ties. pictures: bool (N,), to compare with the map; None: all on legs.
     """
     cameras, own = flight.cameras(), np.flatnonzero((flight.leg >= 0) & (True if pictures is None else pictures))
     if not len(tie_sigma_m) or not len(own):

@@ -2,8 +2,6 @@
 
 First pass of each vehicle by itself -> vehicles that were not found on the map are registered on neighbours that were
 -> second pass on a common level with neighbours held -> one terrain.
-The relief displacement of the map's roofs (its lean) is voted over all vehicles for the report; tie points lie on the
-ground and are not displaced.
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -81,9 +79,8 @@ class SwarmRefiner(UnitRefiner):
     def again(self, solution: Solution, neighbours: Sequence[Solution], basemap: MapWindow | None) -> Solution:
         """Refine a vehicle again with neighbours that were not refined, or refined without a map, when it was.
 
-        Its second pass is repeated on their common level; a block that was not found on the map is registered on
-        neighbours that were. Its other pictures (late ones, those of another camera) move with the refined ones. The
-        earlier solution stays as it is, and is returned where the vehicle has no neighbours.
+        Its other pictures (late ones, those of another camera) move with the refined ones. The earlier solution stays
+        as it is, and is returned where the vehicle has no neighbours.
         """
         own = deepcopy(unit_states(solution))
         others = [state for n in neighbours for state in unit_states(n)]
@@ -239,11 +236,11 @@ def first_passes(
 ) -> tuple[list[VehicleState], dict[int, str]]:
     """Each vehicle by itself; those whose photos must be matched are matched and adjusted together first.
 
-    units: frames of one vehicle and one lens each. Returns the states of all units that could be adjusted, in order;
-    unit -> why not, of the others.
+    units: frames of one vehicle and one lens each. Returns the states of all units that could be adjusted, in order,
+    and unit -> why not, of the others.
     """
     # Learned matching is left to one process afterwards: its network takes 400 MB.
-    task = partial(refine_tracked, area=area, options=options, learned=False)
+    task = partial(refine_tracked, area=area, options=options)
     states: list[VehicleState | None] = []
     for n, state in enumerate(run(task, units)):
         states.append(state)
@@ -258,7 +255,7 @@ def first_passes(
         watch.lap("tracks")
         lost = {k: flight for k, flight in zip(unfollowed, opened, strict=True) if isinstance(flight, str)}
         flights = [flight for flight in opened if not isinstance(flight, str)]
-        place = partial(refine_matched, area=area, options=options, learned=False)
+        place = partial(refine_matched, area=area, options=options)
         for k, state in zip([k for k in unfollowed if k not in lost], run(place, flights), strict=True):
             state.timings["tracks"] = watch.seconds["tracks"] / len(unfollowed)
             states[k] = state

@@ -1,8 +1,7 @@
 """Photos without a recorded position (kites, old cameras, lost tags), placed by surveyed points that they show.
 
 The pictures tell how the photos lie to each other (`free_network`), surveyed points and the positions of other photos
-where on the ground. What comes out is a recorded position and heading with a sigma, as a receiver's would be: the
-refiner then adjusts these photos like all others.
+where on the ground. The result is a position and heading with a sigma, as a receiver's, for the refiner to adjust.
 """
 
 from collections.abc import Sequence
@@ -51,15 +50,14 @@ def place_unpositioned(
 ) -> PlacedPhotos:
     """Give photos the positions and angles that surveyed points and other photos tell.
 
-    Args:
-        photos: without positions (their latitude and longitude are NaN), of a vehicle in order of time.
-        positioned: photos with positions, which may show the same ground.
-        points: surveyed, with their marks in photos of either kind.
+    photos: without positions (their latitude and longitude are NaN), of a vehicle in order of time. positioned: photos
+    with positions, which may show the same ground. points: surveyed, with their marks in photos of either kind.
     """
-    grid = _grid(positioned, points)
-    if not photos or grid is None:
+    places = _known_places(positioned, points)
+    if not photos or not len(places):
         return PlacedPhotos([], [])
-    middle = _middle(positioned, points)
+    grid = LocalGrid(area_epsg(places[:, 0], places[:, 1]))
+    middle = places[int(np.argmin(((places - np.median(places, axis=0)) ** 2).sum(axis=1)))].tolist()
     origin = grid.to_grid(*middle)
     frames = [*(replace(f, fix=replace(f.fix, lat_deg=middle[0], lon_deg=middle[1])) for f in photos), *positioned]
     records = _each_its_own_tilt(read_photo_records(frames, grid, origin), len(photos))
@@ -100,21 +98,10 @@ def candidate_pairs(without: int, count: int) -> Ints:
     return pairs.astype(np.int32)
 
 
-def _grid(positioned: Sequence[Frame], points: Sequence[Checkpoint]) -> LocalGrid | None:
-    """The grid of the photos with positions and of the surveyed points; None without any."""
-    lat = [*(f.fix.lat_deg for f in positioned), *(p.surveyed[1] for p in points)]
-    lon = [*(f.fix.lon_deg for f in positioned), *(p.surveyed[0] for p in points)]
-    return LocalGrid(area_epsg(lat, lon)) if lat else None
-
-
-def _middle(positioned: Sequence[Frame], points: Sequence[Checkpoint]) -> tuple[float, float]:
-    """Latitude and longitude of one of the points or photos in the middle."""
-    places = np.array(
-        [*((f.fix.lat_deg, f.fix.lon_deg) for f in positioned), *((p.surveyed[1], p.surveyed[0]) for p in points)]
-    )
-    away = ((places - np.median(places, axis=0)) ** 2).sum(axis=1)
-    lat, lon = places[int(np.argmin(away))]
-    return float(lat), float(lon)
+def _known_places(positioned: Sequence[Frame], points: Sequence[Checkpoint]) -> Array:
+    """Latitudes and longitudes (n, 2) of the photos with positions and of the surveyed points."""
+    photos = [(f.fix.lat_deg, f.fix.lon_deg) for f in positioned]
+    return np.array([*photos, *((p.surveyed[1], p.surveyed[0]) for p in points)], float).reshape(-1, 2)
 
 
 def _anchors(

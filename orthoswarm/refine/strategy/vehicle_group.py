@@ -4,11 +4,11 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.placement import STATED_SIGMA_FACTOR, Terrain
 from orthoswarm.model.task_runner import Run, serial
+from orthoswarm.mosaic.extent import ground_of_nearest
 from orthoswarm.refine.flight.weakly_held_pictures import weakly_held
 from orthoswarm.refine.registration.block_state import VehicleState
 from orthoswarm.refine.registration.tie_points import MapMatches, vote_lean
@@ -54,9 +54,8 @@ def common_terrain(
 
     A given height model is shifted to their level; where the points contradict it, a warning says so.
 
-    Args:
-        states: vehicles that are drawn: what stands on the ground is measured where they have found raised points.
-        others: more that the ground is common to. near_own: without the ground of others alone.
+    states: vehicles that are drawn: what stands on the ground is measured where they have found raised points. others:
+    more that the ground is common to. near_own: without the ground of others alone.
     """
     own, states = states, [*states, *others]
     if not states:
@@ -106,30 +105,18 @@ def mapped_level(states: Sequence[VehicleState], terrain: Terrain | None) -> flo
 
 
 def coarse_terrain(states: Sequence[VehicleState]) -> Terrain | None:
-    """The ground before the map was used, in the local frame: everywhere that of the vehicle whose camera is nearest.
+    """The ground before the map was used, in the local frame; None where no vehicle has found its ground.
 
-    Each vehicle's ground belongs to its own cameras, on a level that no other shares yet, and the nearest camera is the
-    one that is drawn. None where no vehicle has found its ground.
+    Each vehicle's ground belongs to its own cameras, on a level that no other shares yet.
     """
-    found = [s.coarse_surface for s in states]
-    grounds = [None if surface.fit is None else surface.terrain() for surface in found]
+    grounds = [None if s.coarse_surface.fit is None else s.coarse_surface.terrain() for s in states]
     steps = [ground.step_m for ground in grounds if ground is not None]
     if not steps:
         return None
     paths = [s.coarse.position for s in states]
-    path = np.concatenate(paths)
-    reach = _TERRAIN_REACH_HEIGHTS * float(np.median(path[:, 2]))
-    low, high = path[:, :2].min(0) - reach, path[:, :2].max(0) + reach
-    step = max(min(steps), float(np.sqrt(np.prod(high - low) / _DRAWN_NODES)))
-    columns, rows = (np.ceil((high - low) / step).astype(int) + 1).tolist()
-    nodes = np.stack(np.meshgrid(low[0] + step * np.arange(columns), low[1] + step * np.arange(rows)), -1)
-    vehicle = np.repeat(np.arange(len(states)), [len(p) for p in paths])
-    nearest = vehicle[cKDTree(path[:, :2]).query(nodes)[1]]
-    z = np.zeros((rows, columns), np.float32)
-    for k, ground in enumerate(grounds):
-        if ground is not None:
-            z[nearest == k] = ground.height(nodes[nearest == k])
-    return Terrain(float(low[0]), float(low[1]), step, z)
+    reach = _TERRAIN_REACH_HEIGHTS * float(np.median(np.concatenate(paths)[:, 2]))
+    own = [path[:, :2] for path in paths]
+    return ground_of_nearest(grounds, own, reach, step_m=min(steps), most_nodes=_DRAWN_NODES)
 
 
 def _dem_warnings(dem: LocalDem, unused: bool, off_m: float, states: Sequence[VehicleState]) -> list[str]:

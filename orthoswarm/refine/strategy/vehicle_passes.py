@@ -103,14 +103,10 @@ _DECENTRED_SHARE: Final = 0.02
 class RefinerOptions:
     """How the refiner works.
 
-    Attributes:
-        fov_start_rad: field of view to start from where the tags hint at none.
-        dem: given height model, None to find the ground. read: reads a frame's grey picture; picklable.
-        kept: where tracks are kept for a refinement of the same pictures, None if they are not.
-        device: where networks run.
+    dem: given height model, None to find the ground. read: reads a frame's grey picture; picklable. kept: where tracks
+    are kept for a refinement of the same pictures, None if they are not. device: where networks run.
     """
 
-    fov_start_rad: float = field(default_factory=lambda: float(np.radians(START_FOV_DEG)))
     dem: HeightModel | None = None
     read: ReadGray = field(default_factory=lambda: read_frame)
     kept: KeptTracks | None = None
@@ -137,20 +133,15 @@ def refine_alone(frames: Sequence[Frame], *, area: WorkArea, options: RefinerOpt
         watch.lap("tracks")
         state = refine_matched(flight, area=area, options=options)
         watch.add_to(state.timings)
-    return state
+    return registered_by((state, learned_registration(state, area)), area=area) if state.unfound else state
 
 
 def refine_tracked(
-    frames: Sequence[Frame], *, area: WorkArea, options: RefinerOptions, learned: bool = True
+    frames: Sequence[Frame], *, area: WorkArea, options: RefinerOptions
 ) -> VehicleState | Continued[VehicleState | None] | None:
     """Refine one vehicle by itself, with corners tracked from picture to picture; continued on the map, if any.
 
-    Args:
-        learned: True: where correlation does not find it on the map, try learned matching in this process; False: the
-            caller does that, see `learned_registration`.
-
-    Returns:
-        None where the pictures cannot be tracked or the adjustment of the tracks fails; they are then matched in pairs.
+    None where the pictures cannot be tracked or the adjustment of the tracks fails; they are then matched in pairs.
     """
     watch = Stopwatch()
     copy_ahead(f.path for f in frames)
@@ -169,15 +160,15 @@ def refine_tracked(
         state = adjusted_state(flight, surface, watch)
     except AdjustmentError:
         return None
-    return Continued(partial(_registered, area=area, learned=learned), (state, flight.pictures.reduced()))
+    return Continued(partial(_registered, area=area), (state, flight.pictures.reduced()))
 
 
-def _registered(item: tuple[VehicleState, dict[int, Gray]], *, area: WorkArea, learned: bool) -> VehicleState | None:
+def _registered(item: tuple[VehicleState, dict[int, Gray]], *, area: WorkArea) -> VehicleState | None:
     """The second half of `refine_tracked`; item: the state, and its reduced pictures, which it does not take along."""
     state, reduced = item
     state.flight.pictures.restore(reduced, {})
     try:
-        register_on_map(state, area, learned=learned)
+        register_on_map(state, area)
     except AdjustmentError:
         return None
     return state
@@ -186,16 +177,14 @@ def _registered(item: tuple[VehicleState, dict[int, Gray]], *, area: WorkArea, l
 def tracked_flight(frames: Sequence[Frame], area: WorkArea, options: RefinerOptions) -> FlightBlock | None:
     """A vehicle's pictures with corners tracked from one to the next, see `open_flight`."""
     hints = [f.fov_hint_rad for f in frames if f.fov_hint_rad is not None]
-    start = float(np.median(hints)) if hints else options.fov_start_rad
+    start = float(np.median(hints)) if hints else float(np.radians(START_FOV_DEG))
     return open_flight(frames, area.grid, area.origin, options.read, start, kept=options.kept)
 
 
-def refine_matched(
-    flight: FlightBlock, *, area: WorkArea, options: RefinerOptions, learned: bool = True
-) -> VehicleState:
+def refine_matched(flight: FlightBlock, *, area: WorkArea, options: RefinerOptions) -> VehicleState:
     """Refine one vehicle whose photos were matched in pairs and adjusted together with those of others."""
     state = adjusted_state(flight, fit_surface(flight.adjustment, options.ground(area.origin)), Stopwatch())
-    register_on_map(state, area, learned=learned)
+    register_on_map(state, area)
     return state
 
 
@@ -220,15 +209,13 @@ def adjusted_state(flight: FlightBlock, surface: GroundModel, watch: Stopwatch) 
     )
 
 
-def register_on_map(state: VehicleState, area: WorkArea, *, learned: bool = True) -> None:
-    """Register an adjusted vehicle on the map, if any, and free its pictures' memory; learned: see `refine_tracked`."""
+def register_on_map(state: VehicleState, area: WorkArea) -> None:
+    """Register an adjusted vehicle on the map, if any, and free its pictures' memory."""
     flight, watch, basemap, origin = state.flight, Stopwatch(), area.basemap, area.origin
     if basemap is not None:
         state.had_map = not (is_coarse(flight, basemap) and had_corrections(flight.frames))
     if basemap is not None and not is_coarse(flight, basemap):
         state.unfound = not _onto_map(state, coarse_fits(flight, basemap, origin), basemap, origin, watch)
-        if state.unfound and learned:
-            _onto_map_by_learning(state, learned_fit(flight, basemap, origin, area.device), basemap, origin, watch)
     flight.pictures.drop()
     watch.add_to(state.timings)
 
@@ -357,29 +344,21 @@ def registered_by(item: tuple[VehicleState, CoarseFit | None], *, area: WorkArea
     """A flight registered by the result of `learned_registration`, if tie points confirm that."""
     state, fit = item
     watch = Stopwatch()
-    _onto_map_by_learning(state, fit, area.basemap, area.origin, watch)
+    state.unfound = False
+    if fit is not None and area.basemap is not None:
+        _onto_map(state, [fit], area.basemap, area.origin, watch)
     state.flight.pictures.drop()
     watch.add_to(state.timings)
     return state
 
 
-def _onto_map_by_learning(
-    state: VehicleState, fit: CoarseFit | None, basemap: MapWindow | None, origin: Array, watch: Stopwatch
-) -> None:
-    """Register a flight at the place that learned matching found, if tie points confirm it."""
-    state.unfound = False
-    if fit is not None and basemap is not None:
-        _onto_map(state, [fit], basemap, origin, watch)
-
-
 def _onto_map(
     state: VehicleState, fits: Iterable[CoarseFit], basemap: MapWindow, origin: Array, watch: Stopwatch
 ) -> bool:
-    """Register a flight at the first coarse registration that tie points confirm.
+    """Register a flight at the first coarse registration that tie points confirm; whether one was confirmed.
 
-    The flight stays as it was where none is confirmed, or where the confirmed one would need another field of view than
-    its pictures alone gave and its new tie points do not prove that: tags may have misled the pictures, no tag makes
-    the map agree. Returns whether one was confirmed.
+    The flight stays as it was where the confirmed one would need another field of view than its pictures alone gave and
+    its new tie points do not prove that: tags may have misled the pictures, no tag makes the map agree.
     """
     flight = state.flight
     before, ground_alone, sigma = flight.adjustment.copy(), state.surface, state.fov_sigma_deg
@@ -409,8 +388,7 @@ def _onto_map(
 def _proven(flight: FlightBlock, matches: MapMatches, false_matches: float) -> bool:
     """Whether new tie points of a flight that lies on the map speak for its place more than the first ones did.
 
-    Args:
-        matches: the new ones. false_matches: expected number of false matches behind the first.
+    matches: the new ones. false_matches: expected number of false matches behind the first.
     """
     first = float(np.log10(max(false_matches, float(np.finfo(float).tiny))))
     return evidence_log10(flight, matches, tie_half_m(flight), TIE_REACH_M) <= _NEW_EVIDENCE * first

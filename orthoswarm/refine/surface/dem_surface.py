@@ -1,9 +1,8 @@
 """Ground shaped by the user's height model (DEM), corrected where the pictures contradict it.
 
-The model's vertical datum differs from heights above takeoff, and it may be old (before a debris flow),
-coarse, or not cover the area. So a smooth surface is fitted to the points' heights above the model. Where
-that surface is level, as with a correct model, it is one vertical shift and the model's shape is used; where it is not,
-the pictures are used. A model that explains none of the relief is ignored.
+The model's vertical datum differs from heights above takeoff, and it may be old, coarse, or not cover the area. So a
+smooth surface is fitted to the points' heights above the model. Where that is level, it is one vertical shift and the
+model's shape is used; elsewhere the pictures are used. A model that explains none of the relief is ignored.
 """
 
 from dataclasses import dataclass, field, replace
@@ -101,7 +100,7 @@ class DemFit:
         """The ground for rectifying pictures."""
         if "drawn" not in self._made:
             shape = self._shape()
-            z = shape.z + self.rest.height(_nodes(shape)) + self.shift_m
+            z = shape.z + self.rest.height(shape.nodes()) + self.shift_m
             self._made["drawn"] = replace(shape, z=z.astype(np.float32))
         return self._made["drawn"]
 
@@ -140,16 +139,16 @@ def fit_over_dem(
         if int(on.sum()) < _DEM_LEAST_POINTS:
             return None, 0.0
         above = points[on, 2] - ground.terrain.height(points[on, :2])
-        beyond = _shifted(found.rendering(), -kernel_mode(above, _DEM_LEVEL_KERNEL_M))
+        beyond = _shifted(found.rendering(), -kernel_mode(above))
     shape = _completed(ground, beyond)
     over = points.copy()
     over[:, 2] -= shape.height(points[:, :2])
     left = fit_terrain(over, sigma_z, bounds, kappa=kappa, settings=settings)
-    nodes, known = left.terrain, left.support & ground.knows(_nodes(left.terrain))
+    nodes, known = left.terrain, left.support & ground.knows(left.terrain.nodes())
     if not known.any():
         return None, 0.0
-    sd = float((nodes.z + shape.height(_nodes(nodes)))[known].std())
-    shift = kernel_mode(nodes.z[known].astype(np.float64), _DEM_LEVEL_KERNEL_M)
+    sd = float((nodes.z + shape.height(nodes.nodes()))[known].std())
+    shift = kernel_mode(nodes.z[known].astype(np.float64))
     difference = nodes.z - np.float32(shift)
     off = float(np.median(np.abs(difference[known])))
     if float(difference[known].std()) > sd + _DEM_ROUGHER_M:
@@ -189,14 +188,6 @@ def _shifted(terrain: Terrain, by_m: float) -> Terrain:
     return replace(terrain, z=terrain.z + np.float32(by_m))
 
 
-def _nodes(terrain: Terrain) -> Array:
-    """Positions (rows, columns, 2) of a terrain's nodes."""
-    rows, columns = terrain.z.shape
-    east = terrain.west + terrain.step_m * np.arange(columns)
-    north = terrain.south + terrain.step_m * np.arange(rows)
-    return np.stack(np.meshgrid(east, north), -1)
-
-
 def _completed(ground: KnownGround, beyond: Terrain | None) -> Terrain:
     """The model's heights, filled with other ground where it has none, shifted to the model's level at the border."""
     t, known = ground.terrain, ground.known
@@ -204,7 +195,7 @@ def _completed(ground: KnownGround, beyond: Terrain | None) -> Terrain:
         return t
     from scipy.ndimage import distance_transform_edt, gaussian_filter
 
-    other = beyond.height(_nodes(t))
+    other = beyond.height(t.nodes())
     blur = _DEM_SEAM_M / 3.0 / t.step_m
     gap = gaussian_filter(np.where(known, t.z - other, 0.0), blur, mode="nearest")
     gap /= np.maximum(gaussian_filter(known.astype(np.float64), blur, mode="nearest"), 1e-6)
@@ -213,12 +204,12 @@ def _completed(ground: KnownGround, beyond: Terrain | None) -> Terrain:
     return replace(t, z=np.where(known, t.z, other).astype(np.float32))
 
 
-def kernel_mode(values: Array, kernel_m: float) -> float:
+def kernel_mode(values: Array) -> float:
     """Most frequent value: mean shift with a Gaussian kernel from the best of many starts."""
     starts = np.quantile(values, np.linspace(0.02, 0.98, 49))
-    near = np.exp(-0.5 * ((values[None, :] - starts[:, None]) / kernel_m) ** 2)
+    near = np.exp(-0.5 * ((values[None, :] - starts[:, None]) / _DEM_LEVEL_KERNEL_M) ** 2)
     at = float(starts[near.sum(1).argmax()])
     for _ in range(20):
-        w = np.exp(-0.5 * ((values - at) / kernel_m) ** 2)
+        w = np.exp(-0.5 * ((values - at) / _DEM_LEVEL_KERNEL_M) ** 2)
         at = float((w * values).sum() / w.sum())
     return at

@@ -58,10 +58,9 @@ def free_ground(
 ) -> LocusPoints:
     """Heights of the ground at free positions (see `draw_positions`), searched near the terrain with small patches.
 
-    Corners lie at the edges of raised objects: a surface through them is a little above the open ground, although every
-    point is right, and pictures rectified on it are displaced from the map by that height times the obliquity of the
-    view. Small patches away from corners measure the ground itself; large ones include rubble and find half of the
-    difference.
+    Corners lie at the edges of raised objects: a surface through them is a little above the open ground, and pictures
+    rectified on it are displaced from the map by that height times the obliquity of the view. Small patches away from
+    corners measure the ground itself; large ones include rubble and find half of the difference.
     """
     near = replace(Sweep.small(), reach_m=_FREE_REACH_M, height_step_m=_FREE_HEIGHT_STEP_M, rival_m=np.inf)
     sweep = near.at_height(height_above(cameras, terrain))

@@ -25,14 +25,12 @@ def level_corrections(ground: Sequence[Array]) -> Array:
 
     Each vehicle's datum puts the mode of its own points at the takeoff level. Rubble and bushes raise that mode above
     the ground, so a vehicle's ground can only be too low: where the levels differ little, the vehicle with the lowest
-    correction is right and stays (a low quantile if there are many, as their lowest is noise). Large differences come
-    from relief, where each vehicle put the median of its own ground at the takeoff level: then the mean is the best
-    guess. In between, the anchor changes gradually from one to the other, so that it does not jump when a vehicle is
-    added. Levels are not chained from the first vehicle, which more than doubled the map's error.
+    correction stays (a low quantile if there are many, as their lowest is noise). Large differences come from relief:
+    then the mean is the best guess. In between, the anchor changes gradually. Levels chained from the first vehicle
+    more than doubled the map's error.
 
-    Args:
-        ground: for each vehicle float64 (M, 3), its points on the ground, in a common horizontal frame. A vehicle
-            without ground in common with others gets 0.
+    ground: for each vehicle float64 (M, 3), its points on the ground, in a common horizontal frame; without ground in
+    common with others it gets 0.
     """
     count = len(ground)
     trees = [cKDTree(g[:, :2]) if len(g) >= _LEVEL_NEIGHBOURS else None for g in ground]

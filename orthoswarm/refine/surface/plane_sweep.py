@@ -23,8 +23,7 @@ from orthoswarm.refine.surface import plane_sweep_kernels as kernels
 from orthoswarm.refine.surface.seen_objects import seen_objects
 from orthoswarm.refine.surface.vertical_line_locus import REFERENCE_HEIGHT_M
 
-_LEAST_PICTURES = 3
-"""One and two others: of fewer the two most alike are none."""
+_LEAST_PICTURES = 3  # one and two others: of fewer the two most alike are none
 
 _TALL_BLOCK_NODES: Final = 48
 """Side of the blocks of nodes that are measured at a time, in the same pictures (measured: of 96 nodes 82.9 % of those
@@ -53,6 +52,7 @@ _TALL_EDGE_LEVELS: Final = 8.0  # difference of grey values that halves what is 
 _TALL_REACH_HEIGHTS: Final = 1.5  # pictures whose nadir points are farther away, in flying heights, are not compared
 _TALL_RIM_SHARE: Final = 0.05  # share of a picture's sides at its rim that a block's middle must not lie in
 _TALL_NEAR_M: Final = 18.0  # heights are measured within this distance of raised points at the reference height
+_UNDECIDED_M: Final = 3.0  # what stands near raised points may be so high where no height was found: a small house
 _TALL_ABOVE_M: Final = 2.0
 """... and up to so much above the highest of them (0 and larger distances change the share of nodes within 1 m by at
 most 0.008 on two scenes)."""
@@ -116,10 +116,8 @@ class _SweepTask:
 def tall_heights(views: Sequence[SweepViews], ground: Terrain, tallest: Floats, *, height_m: float, run: Run) -> Floats:
     """Heights above the ground, float32 (rows, columns) of its nodes, metres, 0 where it is the surface.
 
-    Args:
-        ground: its nodes are the cells whose heights are measured.
-        tallest: float32 (rows, columns), how high something may stand, metres; 0: the node is on the ground.
-        height_m: flying height above the ground.
+    ground: its nodes are the cells whose heights are measured. tallest: float32 (rows, columns), how high something may
+    stand, metres; 0: the node is on the ground. height_m: flying height above the ground.
     """
     out = np.zeros(tallest.shape, np.float32)
     tasks = list(_tasks(_Swath(views, ground, height_m), tallest))
@@ -272,9 +270,8 @@ def with_tall_surfaces(
 ) -> Terrain:
     """The bare ground plus the tops of what stands near raised points, where pictures see the ground behind it too.
 
-    Args:
-        points: float64 (K, 3) at free positions on the visible surface. height_m: flying height above the ground.
-        most_nodes: the ground gets no more nodes than this.
+    points: float64 (K, 3) at free positions on the visible surface. height_m: flying height above the ground.
+    most_nodes: the ground gets no more nodes than this.
     """
     over = points[:, 2] - ground.height(points[:, :2])
     raised = over > TALL_FROM_M
@@ -288,10 +285,9 @@ def with_tall_surfaces(
     tallest = _tallest(points[raised, :2], over[raised], fine, _TALL_NEAR_M * scale)
     heights = tall_heights(views, fine, tallest, height_m=height_m, run=run)
     heights[heights < TALL_FROM_M] = 0.0
-    if not heights.any():
-        return ground
     cameras = CameraBlock.joined([v.cameras.take(np.flatnonzero(v.usable)) for v in views])
-    return seen_objects(replace(fine, z=fine.z + heights, bare=fine.z), cameras)
+    may_stand = np.where((tallest > 0.0) & (heights == 0.0), np.float32(_UNDECIDED_M), heights)
+    return seen_objects(replace(fine, z=fine.z + heights, bare=fine.z, tops=fine.z + may_stand), cameras)
 
 
 def _finer(ground: Terrain, parts: int) -> Terrain:

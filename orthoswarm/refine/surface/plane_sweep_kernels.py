@@ -10,8 +10,7 @@ import numpy as np
 from orthoswarm.compute.jit import in_place_kernel, kernel
 from orthoswarm.model.arrays import Floats, Ints
 
-_FAR = np.float32(1e6)
-"""Cost of a height that a cell cannot have; finite, so that sums of it stay numbers."""
+_FAR = np.float32(1e6)  # cost of a height that a cell cannot have; finite, so that sums of it stay numbers
 _ZERO, _ONE, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
 
 

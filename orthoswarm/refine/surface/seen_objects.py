@@ -28,8 +28,7 @@ def seen_objects(terrain: Terrain, cameras: CameraBlock) -> Terrain:
 
     An object is what is raised and connected. It is put down as a whole, so that it is drawn in one piece.
 
-    Args:
-        terrain: with `bare`. cameras: all that may be drawn, in the terrain's frame.
+    terrain: with `bare`. cameras: all that may be drawn, in the terrain's frame.
     """
     assert terrain.bare is not None
     z, over = terrain.z, terrain.z - terrain.bare
@@ -42,10 +41,10 @@ def seen_objects(terrain: Terrain, cameras: CameraBlock) -> Terrain:
         dropped = hidden > _MOST_HIDDEN_SHARE * np.bincount(objects.ravel())
         dropped[0] = False  # the ground itself
         if not dropped.any():
-            return replace(terrain, z=z)
+            break
         z = np.where(dropped[objects], terrain.bare, z)
         doubtful = (by >= 0) | dropped[objects]  # what was seen before is seen past less, too
-    return terrain.bare_ground()
+    return replace(terrain, z=z)
 
 
 def hidden_by(terrain: Terrain, cameras: CameraBlock, wanted: Flags) -> Ints:

@@ -15,6 +15,7 @@ from orthoswarm.compute.jit import in_place_kernel, kernel
 from orthoswarm.compute.robust_kernel import robust_costs, robust_weight
 from orthoswarm.model.arrays import Array, Flags, Ints
 from orthoswarm.model.bounding_box import BoundingBox
+from orthoswarm.refine.bundle.banded_solver import factorise, solve_factored
 
 KAPPA_SPACING_M = 30.0
 """Kappa, the smoothness, is defined as the sigma of second differences between nodes this far apart, metres; for other
@@ -117,7 +118,7 @@ class Surface:
         share: float64 (P, 2), position within the cell (0 to 1), inner and outer. z, sigma: float64 (P,), heights.
         base: float64 (P,), weight of a point on the surface; 0 for points that do not count.
         support: bool (N,), nodes that have data in a cell next to them.
-        curvature, slope, level: float64 (N + 8, band + 8), penalties for unit sigma, see `solve_banded`.
+        curvature, slope, level: float64 (N, 2 inner + 1), penalties for unit sigma; [i, k] = A[i, i + k].
     """
 
     columns: int
@@ -148,7 +149,7 @@ class Surface:
         support: Flags = np.zeros(inner * outer, np.bool_)
         for k in (0, 1, inner, inner + 1):
             support[cell[good] + k] = True
-        size = (inner * outer + 8, 2 * inner + 8)
+        size = (inner * outer, 2 * inner + 1)
         curvature, slope, level = np.zeros(size), np.zeros(size), np.zeros(size)
         _penalties(inner, outer, support, curvature, slope, level)
         return cls(
@@ -185,8 +186,7 @@ class Surface:
             below = max(_ROBUST_BELOW_FACTOR * scale, _ROBUST_BELOW_LEAST_M)
             _robust(z, self.cell, self.share, inner, self.z, self.sigma, scale, below, weight)
             _assemble(penalty, self.cell, self.share, inner, self.z - start, base * weight, band, rhs)
-            solve_banded(band, 2 * inner, rhs)
-            z = rhs + start
+            z = solve_factored(factorise(band.T), rhs) + start
         return z
 
     def choose_kappa(self) -> float:
@@ -290,59 +290,6 @@ def _interpolate(z: Array, cell: Ints, share: Array, inner: int) -> Array:
     c, r = share[:, 0], share[:, 1]
     low = z[cell] * (1 - c) + z[cell + 1] * c
     return np.asarray(low * (1 - r) + (z[cell + inner] * (1 - c) + z[cell + inner + 1] * c) * r)
-
-
-@kernel
-def solve_banded(a, width, x):  # type: ignore[no-untyped-def]
-    """Solve a symmetric positive definite banded system in place: Cholesky, eight columns at a time.
-
-    Own kernel, because a threaded LAPACK is slow on small bands and rounds differently with each number of threads.
-
-    Args:
-        a: float64 (n + 8, width + 8), a[i, k] = A[i, i + k], zero beyond the band and in the last eight rows;
-            overwritten by the factor. width: number of diagonals above the main one.
-        x: float64 (n,), right-hand side; overwritten by the solution.
-    """
-    n = len(x)
-    for i in range(0, n, 8):
-        for p in range(min(8, n - i)):
-            column = a[i + p]
-            d = 1.0 / np.sqrt(max(column[0], 1e-300))
-            for k in range(width + 1):
-                column[k] *= d
-            for k in range(1, min(8 - p, n - i - p)):
-                m = width + 1 - k
-                f, t, source = column[k], a[i + p + k, :m], column[k : k + m]
-                for j in range(m):
-                    t[j] -= f * source[j]
-        for k in range(8, min(width + 8, n - i)):
-            m = width + 8 - k  # slices, since an index that is a sum is tested for being negative, and not vectorised
-            t = a[i + k, :m]
-            c0, c1 = _tail(a, i, k, m), _tail(a, i + 1, k - 1, m)
-            c2, c3 = _tail(a, i + 2, k - 2, m), _tail(a, i + 3, k - 3, m)
-            c4, c5 = _tail(a, i + 4, k - 4, m), _tail(a, i + 5, k - 5, m)
-            c6, c7 = _tail(a, i + 6, k - 6, m), _tail(a, i + 7, k - 7, m)
-            f0, f1, f2, f3, f4, f5, f6, f7 = c0[0], c1[0], c2[0], c3[0], c4[0], c5[0], c6[0], c7[0]
-            for j in range(m):
-                first = f0 * c0[j] + f1 * c1[j] + f2 * c2[j] + f3 * c3[j]
-                t[j] -= first + f4 * c4[j] + f5 * c5[j] + f6 * c6[j] + f7 * c7[j]
-    for i in range(n):
-        x[i] /= a[i, 0]
-        m = min(width, n - 1 - i)
-        row, below, known = a[i, 1 : m + 1], x[i + 1 : i + 1 + m], x[i]
-        for k in range(m):
-            below[k] -= row[k] * known
-    for i in range(n - 1, -1, -1):
-        m = min(width, n - 1 - i)
-        row, below, total = a[i, 1 : m + 1], x[i + 1 : i + 1 + m], x[i]
-        for k in range(m):
-            total -= row[k] * below[k]
-        x[i] = total / a[i, 0]
-
-
-@kernel
-def _tail(a, row, first, count):  # type: ignore[no-untyped-def]
-    return a[row, first : first + count]
 
 
 @in_place_kernel

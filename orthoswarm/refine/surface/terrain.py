@@ -14,11 +14,9 @@ from orthoswarm.model.arrays import Array, Flags
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.placement import Terrain
+from orthoswarm.model.robust import MEDIAN_LENGTH_SIGMAS
 from orthoswarm.mosaic.extent import FLAT_RELIEF_M
 from orthoswarm.refine.surface.smooth_surface import FitSettings, fit_nodes
-
-HALF_MAXIMUM_SIGMAS = 1.1774
-"""Half width of a Gaussian at half its maximum, in sigmas: sqrt(2 ln 2)."""
 
 _GROUND_MODE_KERNEL_M: Final = 0.15  # Gaussian kernel of the density of heights in which the ground's level is sought
 _GROUND_MODE_WINDOW_M: Final = 15.0  # heights farther than this from the median do not count for the ground's level
@@ -39,8 +37,7 @@ class TerrainFit:
             the mode of the heights (rubble, cars and bushes only raise points).
         points_above_m: height of the points' robust centre above that ground; with a height prior around
             level + points_above_m the ground itself is at the level.
-        support: bool (rows, columns), nodes with data in an adjacent cell.
-        settings: of the fit.
+        support: bool (rows, columns), nodes with data in an adjacent cell. settings: of the fit.
     """
 
     terrain: Terrain
@@ -78,15 +75,11 @@ def fit_terrain(
     kappa: float | None = None,
     settings: FitSettings | None = None,
 ) -> TerrainFit:
-    """Fit the ground under points that lie on it and on things above it.
-
-    Bilinear nodes; penalties on second differences (xx, yy, sqrt 2 xy; sigma kappa) and on first differences;
-    robust weights with a scale that shrinks over the solves and is wider below than above the surface.
+    """Fit the ground under points that lie on it and on things above it, see `smooth_surface`.
 
     Args:
         points: float64 (P, 3), east, north, up in metres. sigma_z: float64 (P,), one sigma of each height.
-        bounds: that the nodes must cover (points outside are not used).
-        kappa: smoothness; None finds it by hold-out of every fourth point.
+        bounds: that the nodes must cover (points outside are not used). kappa: smoothness; None finds it by hold-out.
 
     Raises:
         OrthoSwarmError: if no point lies within the bounds.
@@ -121,8 +114,8 @@ def lower_flank(height: Array, sigma: Array | None = None) -> float:
     """Level of the ground from heights of points that lie mostly on it and partly above it.
 
     The half-maximum point on the lower side of the mode, moved up by the half width that a peak of the heights' own
-    noise would have: a symmetric peak returns its mode, a peak skewed upwards returns its lower edge. Of
-    several peaks the lowest one of sufficient density is used, as many corners lie on car roofs.
+    noise would have: a symmetric peak returns its mode, one skewed upwards its lower edge. Of several peaks the lowest
+    one of sufficient density is used, as many corners lie on car roofs.
     """
     window_m, bin_m, kernel_m = _GROUND_MODE_WINDOW_M, _GROUND_MODE_BIN_M, _GROUND_MODE_KERNEL_M
     z = np.asarray(height, float)
@@ -148,7 +141,7 @@ def lower_flank(height: Array, sigma: Array | None = None) -> float:
     noise = kernel_m
     if sigma is not None and len(sigma):
         noise = float(np.hypot(kernel_m, np.median(sigma)))
-    return centre + float(min(flank + HALF_MAXIMUM_SIGMAS * noise, mode))
+    return centre + float(min(flank + MEDIAN_LENGTH_SIGMAS * noise, mode))
 
 
 def robust_centre(x: Array) -> float:

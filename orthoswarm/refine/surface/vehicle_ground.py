@@ -117,10 +117,8 @@ def fit_ground(
 def mapped_ground_level(terrain: Terrain | None, camera_position: Array, dense: Sequence[Array]) -> float:
     """Median height of the mapped ground, metres, in the datum of the cameras (N, 3); 0 without a terrain.
 
-    Points lie on the ground and on rubble, hedges and cars, which only raise them: so the open ground is at the lower
-    flank of their heights (`lower_flank`). On level ground these are heights above zero, else heights above the
-    terrain, whose median below the cameras and around them is added.
-
+    Rubble, hedges and cars only raise points: so the open ground is at the lower flank of their heights. On level
+    ground these are heights above zero, else above the terrain, whose median below and around the cameras is added.
     dense: ground points (K, 3) at free positions (not at corners), one array per vehicle.
     """
     if terrain is None or not len(camera_position):
@@ -130,9 +128,7 @@ def mapped_ground_level(terrain: Terrain | None, camera_position: Array, dense: 
     below = ground.height(position[:, :2])
     height = float(np.median(position[:, 2] - below))
     stride = max(1, int(_LEVEL_SPACING_M / ground.step_m))
-    z = ground.z[::stride, ::stride]
-    rows, columns = np.indices(z.shape) * stride
-    nodes = np.column_stack([columns.ravel(), rows.ravel()]) * ground.step_m + [ground.west, ground.south]
+    z, nodes = ground.z[::stride, ::stride], ground.nodes()[::stride, ::stride].reshape(-1, 2)
     near = cKDTree(position[:, :2]).query(nodes, distance_upper_bound=_LEVEL_REACH_HEIGHTS * height)[0]
     mapped = np.isfinite(near)
     heights = z.ravel()[mapped] if mapped.any() else below

@@ -1,10 +1,9 @@
 """Ground points between tie points: the vertical line locus method with several pictures.
 
-At a free position the picture nearest to nadir is the reference. Partners before and behind it on the same leg
-(where the leg ends too early, pictures of other legs) are compared with it at every height. A patch of the reference
-is rectified on the local plane of the terrain, and so is a strip of each partner along its epipolar line on that plane:
-there a change of height is a shift, so each picture is sampled once and all heights are tested by one correlation along
-the strip. Pictures are read one after the other along the legs, with only a window of them in memory.
+At a free position the picture nearest to nadir is the reference. Partners before and behind it on the same leg (where
+it ends too early, pictures of other legs) are compared with it at every height. A patch of the reference is rectified
+on the local plane of the terrain, and so is a strip of each partner along its epipolar line there, on which a change of
+height is a shift. Pictures are read one after the other along the legs, with only a window of them in memory.
 """
 
 from collections.abc import Callable, Sequence
@@ -55,8 +54,8 @@ class Sweep:
     Attributes:
         half: half width of the square patch in samples (7: 15 x 15 samples), step_m apart.
         reach_m: range searched above and below the terrain, in steps of height_step_m. min_score: least correlation.
-        rival_m: a second peak farther than this from the best one, above rival_share of it, makes the height
-            ambiguous; infinite switches the test off. sigma_m: one sigma of a height on open ground.
+        rival_m: a second peak farther than this from the best one, nearly as high, makes the height ambiguous;
+            infinite switches the test off. sigma_m: one sigma of a height on open ground.
         baselines_m: desired distances of the partners, on both sides of the reference.
         spacing_m: only pictures this far apart along a leg are used, to limit decoding.
     """
@@ -68,7 +67,6 @@ class Sweep:
     reach_m: float = _SWEEP_REACH_M
     height_step_m: float = _SWEEP_HEIGHT_STEP_M
     rival_m: float = _SWEEP_RIVAL_M
-    rival_share: float = _SWEEP_RIVAL_SHARE
     baselines_m: tuple[float, ...] = _SWEEP_BASELINES_M
     spacing_m: float = _SWEEP_SPACING_M
 
@@ -245,7 +243,7 @@ def _sweep_in_windows(
                 cameras.arrays, (window.stack, window.slot, factor), cells[block], plane[block], ref[block],
                 partner[block], s.heights, s.half, s.step_m, _SWEEP_LEAST_VARIANCE, curve,
             )  # fmt: skip
-            kernels.peaks(curve, s.heights, s.rival_m, s.rival_share, peak)
+            kernels.peaks(curve, s.heights, s.rival_m, _SWEEP_RIVAL_SHARE, peak)
             good = peak[:, 1] >= s.min_score
             found[block[good], :2], found[block[good], 2] = peak[good], s.sigma_m
             block = block[~good]

@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+from gcs_plugin.daemon import web_plans
 from gcs_plugin.daemon.web_plans import Plans
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.items import MOUNT_CONTROL
@@ -14,6 +15,26 @@ from tests.kit.plan_checks import on_globe
 SQUARE = on_globe([(0, 0), (200, 0), (200, 200), (0, 200)])
 AREA = {"type": "Polygon", "coordinates": [[[lon, lat] for lat, lon in [*SQUARE.shell, SQUARE.shell[0]]]]}
 BODY = {"area": AREA, "vehicles": 2, "altitude_m": 60, "fov_min_deg": 60}
+
+
+class Here:
+    """A pool of workers that is this process."""
+
+    def __init__(self, count):
+        self.count = count
+
+    def run(self, function, item):
+        return function(item)
+
+    def close(self):
+        pass
+
+
+@pytest.fixture(autouse=True)
+def _in_this_process(request, monkeypatch):
+    """One test plans in a process of its own, as the daemon does; the others need none."""
+    if "request_names_others" not in request.node.name:
+        monkeypatch.setattr(web_plans, "WorkerPool", Here)
 
 
 @pytest.mark.parametrize(

@@ -62,7 +62,7 @@ def solutions(daemon):
 
 def test_a_sortie_is_followed_while_its_last_pictures_may_come(tmp_path, flight, monkeypatch):
     dropped, drop = [], KeptPictures.drop
-    with Daemon(settings_of(tmp_path, flight, coarse=False)) as daemon:
+    with Daemon(settings_of(tmp_path, flight, coarse=False, silent_s=LIMIT_S)) as daemon:
 
         def noted_drop(*which):
             dropped.append(tracks(daemon))
@@ -105,7 +105,7 @@ def test_a_vehicle_that_is_silent_before_it_completes_is_followed_then(tmp_path,
 
 
 def test_a_picture_that_comes_meanwhile_is_refined_with_the_others(tmp_path, flight, monkeypatch):
-    with Daemon(settings_of(tmp_path, flight, coarse=False)) as daemon:
+    with Daemon(settings_of(tmp_path, flight, coarse=False, silent_s=LIMIT_S)) as daemon:
         last = [flight[0][27:]]
 
         wait = SortieRefinement.wait_drawn
@@ -130,7 +130,7 @@ def test_what_legs_left_is_not_needed_after_a_restart(tmp_path, flight):
     with Daemon(settings_of(tmp_path, flight, silent_s=0.5)) as daemon:
         post(daemon, flight[0][:20])
         until(lambda: sum(map(size, kept(daemon))) >= 14 * 240 * 180)
-    with Daemon(settings_of(tmp_path, flight, coarse=False)) as daemon:
+    with Daemon(settings_of(tmp_path, flight, coarse=False, silent_s=LIMIT_S)) as daemon:
         assert kept(daemon) == []
         post(daemon, flight[0][20:])
         complete(daemon)

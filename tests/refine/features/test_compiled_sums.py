@@ -64,7 +64,7 @@ def test_the_strongest_corner_of_each_empty_cell_is_opencvs():
     gray = cv2.GaussianBlur(rng.integers(0, 255, (200, 333)).astype(np.uint8), (0, 0), 2.0)
     empty = rng.random((5, 8)) < 0.6
     uv = np.empty((40, 2), np.float32)
-    count = strongest(gray, empty, 40, 0, 6, 5, 9, 1e-9, uv)
+    count = strongest(gray, empty, 40, 0, 6, uv)
     score = cv2.cornerMinEigenVal(gray, 5, ksize=3)
     inner = np.zeros_like(score)
     inner[9:-9, 9:-9] = score[9:-9, 9:-9]

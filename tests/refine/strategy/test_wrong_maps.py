@@ -25,6 +25,13 @@ def scene(twin):
     return scene_of(twin)
 
 
+@pytest.fixture(scope="module")
+def without(scene):
+    """The solutions without a map."""
+    vehicles, grid, *_ = scene
+    return refine_all(vehicles, None, grid).fine
+
+
 def with_map(twin, scene, change, folder):
     vehicles, grid, _, truth = scene
     altered(twin / "basemap.tif", folder / "map.tif", change)
@@ -32,9 +39,8 @@ def with_map(twin, scene, change, folder):
 
 
 @pytest.mark.parametrize("change", [mirror_ns, mirror_ew, blank, noise])
-def test_nothing_takes_its_place_from_a_map_of_other_ground(twin, scene, change, tmp_path):
+def test_nothing_takes_its_place_from_a_map_of_other_ground(twin, scene, without, change, tmp_path):
     vehicles, grid, wrong, _ = with_map(twin, scene, change, tmp_path)
-    without = refine_all(vehicles, None, grid).fine
     for solution, own in zip(refine_all(vehicles, wrong, grid).fine, without, strict=True):
         assert {leg.state for leg in solution.legs} == {"failed"}
         assert {p.stage for p in solution.placed} == {"coarse"}

@@ -11,7 +11,7 @@ from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.placement import Terrain
 from orthoswarm.refine.strategy.vehicle_group import coarse_terrain
-from orthoswarm.refine.surface.smooth_surface import FitSettings, fit_nodes, solve_banded
+from orthoswarm.refine.surface.smooth_surface import FitSettings, fit_nodes
 from orthoswarm.refine.surface.terrain import fit_terrain, lower_flank
 from orthoswarm.refine.surface.vehicle_ground import GroundModel
 
@@ -185,23 +185,6 @@ def test_tiles_without_points_go_on_from_their_neighbours():
     xy = rng.uniform((20, 20), (600, 600), (2000, 2))
     fit = fit_terrain(np.c_[xy, np.full(len(xy), 5.0)], np.full(len(xy), 0.2), BoundingBox(0.0, 0.0, 4000.0, 900.0))
     np.testing.assert_allclose(fit.terrain.z, 5.0, atol=0.2)
-
-
-@settings(max_examples=30, deadline=None)
-@given(st.integers(3, 60), st.integers(1, 20), st.integers(0, 1000))
-def test_the_banded_solver_solves(n, width, seed):
-    rng = np.random.default_rng(seed)
-    width = min(width, n - 1)
-    full = np.zeros((n, n))
-    band = np.zeros((n + 8, width + 8))
-    for k in range(width + 1):
-        diagonal = rng.normal(0, 1, n - k) + (3.0 * (width + 1) if k == 0 else 0.0)
-        band[: n - k, k] = diagonal
-        full += np.diag(diagonal, k) + (np.diag(diagonal, -k) if k else 0.0)
-    b = rng.normal(0, 1, n)
-    x = b.copy()
-    solve_banded(band, width, x)
-    np.testing.assert_allclose(full @ x, b, atol=1e-8)
 
 
 def test_the_ground_is_the_lowest_of_several_modes():

@@ -1,5 +1,7 @@
 """Height models from outside: any CRS, gaps, units, and files that are none."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import rasterio
@@ -7,7 +9,7 @@ from rasterio.transform import from_origin
 
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError
-from orthoswarm.raster.height_model import HeightModel, check_dem, read_dem
+from orthoswarm.raster.height_model import DEM_MOST_NODES, HeightModel
 
 EPSG = 32632
 WEST, SOUTH = 500_000.0, 5_400_000.0
@@ -48,11 +50,18 @@ def check(terrain, level, atol):
     np.testing.assert_allclose(terrain.height(p), ground(p[..., 0], p[..., 1]) - level, atol=atol)
 
 
+def read(path, cameras=(), level_m=None, epsg=EPSG, bounds=BOUNDS):
+    """The ground as terrain, relative to that below cameras (N, 2) or to a level."""
+    at = np.array([[*camera, np.nan] for camera in cameras]).reshape(-1, 3)
+    model = HeightModel.open(path, epsg, bounds, at)
+    return (model if level_m is None else replace(model, zero_m=level_m)).window(bounds, DEM_MOST_NODES).terrain
+
+
 def test_heights_are_relative_to_the_takeoff(tmp_path):
     z, transform = utm_dem()
     path = write(tmp_path / "dem.tif", z, transform=transform)
     takeoff = np.array([WEST + 50.0, SOUTH + 60.0])
-    terrain = read_dem(path, EPSG, BOUNDS, takeoff=takeoff)
+    terrain = read(path, [takeoff])
     check(terrain, ground(*takeoff), 0.05)
     assert terrain.height(takeoff) == pytest.approx(0.0, abs=0.02)
     assert terrain.step_m == 2.0
@@ -61,14 +70,14 @@ def test_heights_are_relative_to_the_takeoff(tmp_path):
 def test_a_stated_level_wins(tmp_path):
     z, transform = utm_dem()
     path = write(tmp_path / "dem.tif", z, transform=transform)
-    check(read_dem(path, EPSG, BOUNDS, level_m=290.0), 290.0, 0.05)
+    check(read(path, level_m=290.0), 290.0, 0.05)
 
 
 def test_the_median_of_several_positions_is_the_datum(tmp_path):
     z, transform = utm_dem()
     path = write(tmp_path / "dem.tif", z, transform=transform)
     cameras = np.array([[WEST + 50.0, SOUTH + 60.0], [WEST + 60.0, SOUTH + 60.0], [WEST + 300.0, SOUTH + 60.0]])
-    check(read_dem(path, EPSG, BOUNDS, takeoff=cameras), ground(*cameras[1]), 0.05)
+    check(read(path, cameras), ground(*cameras[1]), 0.05)
 
 
 def test_geographic_coordinates_are_warped(tmp_path):
@@ -81,16 +90,17 @@ def test_geographic_coordinates_are_warped(tmp_path):
     lons, lats = np.meshgrid(left + (np.arange(200) + 0.5) * step, top - (np.arange(150) + 0.5) * step)
     east, north = to_utm.transform(lons, lats)
     path = write(tmp_path / "geo.tif", ground(east, north).astype(np.float32), 4326, from_origin(left, top, step, step))
-    check(read_dem(path, EPSG, BOUNDS, level_m=300.0), 300.0, 0.1)
+    check(read(path, level_m=300.0), 300.0, 0.1)
 
 
 def test_a_fine_dem_is_averaged_and_a_coarse_one_interpolated(tmp_path):
     z, transform = utm_dem(gsd=0.5)
     noisy = (z + np.random.default_rng(0).normal(0, 1.0, z.shape)).astype(np.float32)
-    fine = read_dem(write(tmp_path / "fine.tif", noisy, transform=transform), EPSG, BOUNDS, level_m=300.0, step_m=10.0)
+    path = write(tmp_path / "fine.tif", noisy, transform=transform)
+    fine = HeightModel(path, EPSG, zero_m=300.0, cover=1.0).window(BOUNDS, most_nodes=1200).terrain  # 10 m apart
     check(fine, 300.0, 0.5)
     z, transform = utm_dem(gsd=20.0)
-    coarse = read_dem(write(tmp_path / "c.tif", z, transform=transform), EPSG, BOUNDS, level_m=300.0, step_m=5.0)
+    coarse = read(write(tmp_path / "c.tif", z, transform=transform), level_m=300.0)
     check(coarse, 300.0, 0.3)
 
 
@@ -126,14 +136,14 @@ def test_gaps_are_filled_from_around(tmp_path, nodata):
     z, transform = utm_dem()
     z[120:140, 150:180] = -9999.0
     path = write(tmp_path / "dem.tif", z, transform=transform, nodata=nodata)
-    check(read_dem(path, EPSG, BOUNDS, level_m=300.0), 300.0, 3.0)
+    check(read(path, level_m=300.0), 300.0, 3.0)
 
 
 @pytest.mark.parametrize("unit", ["ft", "Foot_US", "foot_us", "ftUS", "us-ft", "US survey foot", "U.S. Survey Feet"])
 def test_feet_become_metres(tmp_path, unit):
     z, transform = utm_dem(factor=1 / 0.3048)
     path = write(tmp_path / "feet.tif", z, transform=transform, unit=unit)
-    check(read_dem(path, EPSG, BOUNDS, level_m=300.0), 300.0, 0.05)
+    check(read(path, level_m=300.0), 300.0, 0.05)
 
 
 @pytest.mark.parametrize(
@@ -152,7 +162,7 @@ def test_feet_become_metres(tmp_path, unit):
 def test_a_unit_is_found_beside_what_else_is_written(tmp_path, unit, metres):
     z, transform = utm_dem(factor=1 / metres)
     path = write(tmp_path / "dem.tif", z, transform=transform, unit=unit)
-    check(read_dem(path, EPSG, BOUNDS, level_m=300.0), 300.0, 0.05)
+    check(read(path, level_m=300.0), 300.0, 0.05)
 
 
 @pytest.mark.parametrize("unit", ["fathom", "yd", "%", "degrees", "0.1 m", "1.5 m", "1/10 m", "10 cm"])
@@ -160,34 +170,34 @@ def test_an_unknown_unit_is_not_taken_for_metres(tmp_path, unit):
     z, transform = utm_dem()
     path = write(tmp_path / "dem.tif", z, transform=transform, unit=unit)
     with pytest.raises(InputError, match=f"heights in '{unit}', which is no known unit"):
-        read_dem(path, EPSG, BOUNDS)
+        read(path)
 
 
 def test_whole_numbers_are_read(tmp_path):
     z, transform = utm_dem(dtype="int16")
     path = write(tmp_path / "int.tif", z, transform=transform, nodata=-32768)
-    check(read_dem(path, EPSG, BOUNDS, level_m=300.0), 300.0, 1.1)
+    check(read(path, level_m=300.0), 300.0, 1.1)
 
 
 def test_what_cannot_be_used_is_refused_in_one_sentence(tmp_path):
     z, transform = utm_dem()
     with pytest.raises(InputError, match="does not exist"):
-        read_dem(tmp_path / "none.tif", EPSG, BOUNDS)
+        read(tmp_path / "none.tif")
     (tmp_path / "text.tif").write_text("no picture")
     with pytest.raises(InputError, match="not a readable height model"):
-        read_dem(tmp_path / "text.tif", EPSG, BOUNDS)
+        read(tmp_path / "text.tif")
     with pytest.raises(InputError, match="no CRS"):
-        read_dem(write(tmp_path / "bare.tif", z, None, transform), EPSG, BOUNDS)
+        read(write(tmp_path / "bare.tif", z, None, transform))
     away = BoundingBox(WEST + 10_000.0, SOUTH, WEST + 10_400.0, SOUTH + 300.0)
     with pytest.raises(InputError, match="covers"):
-        read_dem(write(tmp_path / "away.tif", z, transform=transform), EPSG, away)
+        read(write(tmp_path / "away.tif", z, transform=transform), bounds=away)
     picture = tmp_path / "rgb.tif"
     with rasterio.open(
         picture, "w", driver="GTiff", width=8, height=8, count=3, dtype="uint8", crs=f"EPSG:{EPSG}", transform=transform
     ) as dataset:
         dataset.write(np.zeros((3, 8, 8), np.uint8))
     with pytest.raises(InputError, match="is a picture"):
-        read_dem(picture, EPSG, BOUNDS)
+        read(picture)
 
 
 def test_a_real_ground_model_is_read(real_data):
@@ -195,7 +205,7 @@ def test_a_real_ground_model_is_read(real_data):
     with rasterio.open(path) as dataset:
         b = dataset.bounds
     bounds = BoundingBox(b.left + 200, b.bottom + 300, b.right - 200, b.top - 300)
-    terrain = read_dem(path, 32610, bounds)
+    terrain = read(path, epsg=32610, bounds=bounds)
     middle = terrain.height(np.array([[0.5 * (b.left + b.right), 0.5 * (b.bottom + b.top)]]))
     assert np.isfinite(middle).all()
     assert abs(np.median(terrain.z)) < 1e-3
@@ -204,8 +214,8 @@ def test_a_real_ground_model_is_read(real_data):
 def test_a_dem_in_another_unit_is_refused_before_it_buries_cameras(tmp_path):
     cameras = np.c_[np.random.default_rng(5).uniform(BOUNDS[:2], BOUNDS[2:], (40, 2)), np.full(40, 90.0)]
     z, transform = utm_dem()
-    check_dem(write(tmp_path / "dem.tif", z, transform=transform), EPSG, BOUNDS, cameras)
+    HeightModel.open(write(tmp_path / "dem.tif", z, transform=transform), EPSG, BOUNDS, cameras)
     steep = write(tmp_path / "steep.tif", 300.0 + 30.0 * (z - 300.0), transform=transform)
     with pytest.raises(InputError, match=r"steep\.tif the ground lies above \d+% of the cameras"):
-        check_dem(steep, EPSG, BOUNDS, cameras)
-    check_dem(steep, EPSG, BOUNDS, [])
+        HeightModel.open(steep, EPSG, BOUNDS, cameras)
+    HeightModel.open(steep, EPSG, BOUNDS, [])

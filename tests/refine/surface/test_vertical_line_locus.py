@@ -161,7 +161,7 @@ def test_the_open_ground_is_found_below_a_surface_that_lies_above_it(hilly):
         surface = Terrain(high.west, high.south, 5.0, (hill(np.stack([east, north], -1)) + offset).astype(np.float32))
         found = free_ground(cameras, gray, positions, surface, leg).points
         assert len(found) > 200
-        assert kernel_mode(found[:, 2] - surface.height(found[:, :2]), 0.2) == pytest.approx(-offset, abs=0.08)
+        assert kernel_mode(found[:, 2] - surface.height(found[:, :2])) == pytest.approx(-offset, abs=0.08)
 
 
 def test_positions_are_drawn_alike_every_time():
@@ -175,7 +175,7 @@ def test_positions_are_drawn_alike_every_time():
 def test_the_mode_ignores_a_long_tail():
     rng = np.random.default_rng(0)
     values = np.r_[rng.normal(-0.3, 0.1, 300), rng.uniform(-0.5, 8, 500)]
-    assert kernel_mode(values, 0.2) == pytest.approx(-0.28, abs=0.08)
+    assert kernel_mode(values) == pytest.approx(-0.28, abs=0.08)
 
 
 def test_a_wall_in_the_terrain_reads_no_pixel_outside_a_picture():

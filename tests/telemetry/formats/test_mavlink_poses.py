@@ -394,17 +394,17 @@ def without_heartbeats(component):
 
 
 OTHERS = {
-    "heartbeats of component 1": [*without_heartbeats(2), *(sent(T0 + t, 1, heartbeat()) for t in range(120))],
-    "one heartbeat of component 1": [*flight(autopilot=2), sent(T0 + 30.0, 1, heartbeat())],
-    "a rangefinder of component 1": [
+    "heartbeats of component 1": lambda: [*without_heartbeats(2), *(sent(T0 + t, 1, heartbeat()) for t in range(120))],
+    "one heartbeat of component 1": lambda: [*flight(autopilot=2), sent(T0 + 30.0, 1, heartbeat())],
+    "a rangefinder of component 1": lambda: [
         *flight(autopilot=25), sent(T0 + 30.0, 1, mavlink.MAVLink_rangefinder_message(30.0, 0.0))
     ],
-    "an attitude of component 1": [*flight(autopilot=25), sent(T0 + 30.0, 1, attitude(5000, yaw=77.0))],
-    "positions of another than the clock": [
+    "an attitude of component 1": lambda: [*flight(autopilot=25), sent(T0 + 30.0, 1, attitude(5000, yaw=77.0))],
+    "positions of another than the clock": lambda: [
         *(row for row in flight() if row[2].get_type() != "GLOBAL_POSITION_INT"),
         *(row for row in flight(autopilot=2) if row[2].get_type() == "GLOBAL_POSITION_INT"),
     ],
-    "positions of a companion, too": [
+    "positions of a companion, too": lambda: [
         *flight(), *(sent(T0 + t, COMPANION, position(1000 * t + 5000, 10.0)) for t in range(1, 120))
     ],
 }  # fmt: skip
@@ -412,7 +412,8 @@ OTHERS = {
 
 @pytest.mark.parametrize("case", OTHERS)
 def test_messages_of_other_components_take_no_position_away(tmp_path, case):
-    (log,) = read_log(tlog(tmp_path / "a.tlog", OTHERS[case]))
+    heard = OTHERS[case]()
+    (log,) = read_log(tlog(tmp_path / "a.tlog", heard))
     track = [s for s in log.samples if s.has_position]
     assert not log.findings
     assert len(track) == 1200
@@ -420,6 +421,6 @@ def test_messages_of_other_components_take_no_position_away(tmp_path, case):
     yaws = [s.flight_yaw_deg for s in log.samples if s.flight_yaw_deg is not None]
     assert yaws == pytest.approx([heading(i * 0.1) for i in range(1200)], abs=1e-3)
     live = LivePoses("v1")
-    for at, _, message in sorted(OTHERS[case], key=lambda row: row[0]):
+    for at, _, message in sorted(heard, key=lambda row: row[0]):
         live.feed(message, at)
     assert live.at(T0 + 100.05).lat_deg == pytest.approx(47.5 + 0.010005, abs=2e-6)

@@ -1,5 +1,6 @@
 """Photos and camera events of a log brought together under any clock; what cannot be told is marked."""
 
+import functools
 import math
 from datetime import UTC, datetime
 
@@ -17,6 +18,7 @@ from tests.telemetry.ingest.exposure_grid import exposures, flown_over, ground_o
 from tests.telemetry.ingest.test_photos import gps_exif, jpeg
 
 mavlink = pytest.importorskip("pymavlink.dialects.v20.ardupilotmega")
+log_of = functools.cache(read_log)
 
 
 # --- pairing ------------------------------------------------------------------------------------------------------
@@ -135,7 +137,7 @@ def photos_of(events, folder, *, offset_s, skip=()):
 @pytest.mark.parametrize("name", ["copter_cam_rtl_1x.BIN", "swarm_v2.tlog"])
 def test_photos_beside_a_log_get_the_poses_of_its_camera_events(real_data, tmp_path, name):
     source = real_data("sitl_logs") / name
-    (log,) = read_log(source)
+    (log,) = log_of(source)
     skip = {0, 7, 8}
     photos_of(log.events, tmp_path / "set" / "photos", offset_s=7200.0 + 15.0, skip=skip)
     (tmp_path / "set" / name).write_bytes(source.read_bytes())
@@ -155,7 +157,7 @@ def test_photos_beside_a_log_get_the_poses_of_its_camera_events(real_data, tmp_p
 def test_three_vehicles_find_their_own_logs(real_data, tmp_path):
     folder = real_data("sitl_logs")
     for n in (1, 2, 3):
-        (log,) = read_log(folder / f"swarm_v{n}.tlog")
+        (log,) = log_of(folder / f"swarm_v{n}.tlog")
         photos_of(log.events, tmp_path / "day" / f"camera{n}", offset_s=3600.0 * n + n)
         (tmp_path / "day" / f"swarm_v{n}.tlog").write_bytes((folder / f"swarm_v{n}.tlog").read_bytes())
     result = load([tmp_path / "day"])
@@ -166,7 +168,7 @@ def test_three_vehicles_find_their_own_logs(real_data, tmp_path):
 
 def test_photos_with_their_own_fields_keep_them(real_data, tmp_path):
     source = real_data("sitl_logs") / "swarm_v1.tlog"
-    (log,) = read_log(source)
+    (log,) = log_of(source)
     (tmp_path / "s").mkdir()
     for n, event in enumerate(log.events[:20]):
         local = datetime.fromtimestamp(event.time_s + 4.0, UTC).strftime("%Y:%m:%d %H:%M:%S")
@@ -226,7 +228,7 @@ def test_a_mission_that_was_flown_twice_is_paired_flight_by_flight(real_data, tm
     poses = {}
     for name, later in (("swarm_v1.tlog", 0), ("copter_cam_rtl_1x.BIN", 100)):
         source = real_data("sitl_logs") / name
-        (log,) = read_log(source)
+        (log,) = log_of(source)
         photos_of(log.events, tmp_path / "part", offset_s=3612.3)
         (tmp_path / "card").mkdir(exist_ok=True)
         for n, event in enumerate(log.events):
@@ -243,7 +245,7 @@ def test_a_mission_that_was_flown_twice_is_paired_flight_by_flight(real_data, tm
 def test_photos_that_fit_a_log_in_two_ways_and_in_one_have_no_event_get_no_place(real_data, tmp_path):
     """A mission flown twice, the second log alone: its events may be those of either flight, at other legs, too."""
     for name, later in (("swarm_v1.tlog", 0), ("copter_cam_rtl_1x.BIN", 100)):
-        (log,) = read_log(real_data("sitl_logs") / name)
+        (log,) = log_of(real_data("sitl_logs") / name)
         photos_of(log.events, tmp_path / "part", offset_s=3612.3)
         (tmp_path / "card").mkdir(exist_ok=True)
         for n in range(len(log.events)):

@@ -165,6 +165,9 @@ def test_photos_of_one_vehicle_take_no_places_from_two(tmp_path, monkeypatch, sy
     assert len(used) == 2 * len(TAKEN_S) and len(set(used)) == 2 if systems == (1, 1) else not used
 
 
+EACH = 18  # exposures of a flight
+
+
 def exposure_list(path, moments, east_m):
     rows = [
         f"47.5 {8.25 + (east_m + 8.0 * (t - moments[0])) * METRE / np.cos(np.radians(47.5)):.8f} 500" for t in moments
@@ -191,7 +194,7 @@ def test_photos_of_two_flights_are_paired_each_with_the_events_of_its_flight(
     Beside them lie second lists of the same flights, or those of another vehicle that took pictures at the same times.
     """
     rng = np.random.default_rng(7)
-    flights = [UTC_S + start + np.cumsum(rng.uniform(1.6, 3.1, 30)) for start in (0.0, 1500.0)]
+    flights = [UTC_S + start + np.cumsum(rng.uniform(1.6, 3.1, EACH)) for start in (0.0, 1500.0)]
     (tmp_path / "card").mkdir()
     for k, moments in enumerate(flights):
         exposure_list(tmp_path / "card" / f"{'ab'[k]}_events.pos", moments, 300.0 * k)
@@ -203,7 +206,7 @@ def test_photos_of_two_flights_are_paired_each_with_the_events_of_its_flight(
             shown = datetime.fromtimestamp(round(t + 7213.4 + (0.0 if one_clock else 40.0 * k), 2), UTC)
             local, fraction = shown.strftime("%Y:%m:%d %H:%M:%S"), f"{shown.microsecond // 10_000:02d}"
             jpeg(
-                tmp_path / "card" / f"P_{30 * k + i:03d}.JPG",
+                tmp_path / "card" / f"P_{EACH * k + i:03d}.JPG",
                 exif_bytes=gps_exif(0.0, 0.0, local=local, subsec=fraction),
             )
     if systems is not None:
@@ -212,9 +215,9 @@ def test_photos_of_two_flights_are_paired_each_with_the_events_of_its_flight(
     if not one_clock or beside == "another" or systems == (1, 2):
         assert not found.frames and "equally well" in found.rejected[0].reason
         return
-    assert len(found.frames) == 60 and any("photos are of 2 flights" in warning for warning in found.warnings)
+    assert len(found.frames) == 2 * EACH and any("photos are of 2 flights" in warning for warning in found.warnings)
     for frame in found.frames:
-        k, i = divmod(number(frame), 30)
+        k, i = divmod(number(frame), EACH)
         assert frame.time_s == pytest.approx(flights[k][i], abs=2e-3)
         assert frame.origin["position"].split("(")[1][0] in ("ax", "by")[k]
 
