@@ -1,6 +1,7 @@
 """Two implementations of the connection to vehicles: our own with pymavlink (the default), and MAVSDK."""
 
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 
 from gcs_plugin.backends.backend import Backend, DirectBackend
@@ -26,6 +27,8 @@ def open_backend(
     if name == "pymavlink":
         return DirectBackend(links, own=own, key=key, tlog=tlog)
     if name == "mavsdk":
+        if find_spec("mavsdk") is None:
+            raise InputError("the mavsdk backend needs MAVSDK: pip install 'orthoswarm[mavsdk]'")
         from gcs_plugin.backends.mavsdk import MavsdkBackend
 
         if key is not None or tlog is not None:

@@ -7,13 +7,16 @@ import io
 import os
 import re
 import signal
+import subprocess
 import sys
 import threading
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from pathlib import Path
 from types import FrameType
 from typing import Any
 
+import orthoswarm
 from orthoswarm import __version__
 from orthoswarm.model.errors import OrthoSwarmError
 
@@ -64,6 +67,20 @@ def _overview() -> str:
     return "\n".join(lines)
 
 
+def _commit() -> str:
+    """The commit in brackets: as the package was built with, or as git describes the checkout; else nothing."""
+    package = Path(orthoswarm.__file__).parent
+    with suppress(OSError):
+        return f" ({(package / 'commit.txt').read_text(encoding='utf-8').strip()})"
+    if not (package.parent / ".git").exists():
+        return ""
+    describe = ["git", "describe", "--always", "--dirty", "--exclude=*"]
+    with suppress(OSError):  # a machine without git
+        told = subprocess.run(describe, cwd=package.parent, capture_output=True, text=True, check=False).stdout.strip()
+        return f" ({told})" if told else ""
+    return ""
+
+
 def _open_streams() -> None:
     """Make sure that printing never fails.
 
@@ -98,7 +115,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(_overview())
         return 0 if args else 2
     if args[0] == "--version":
-        print(f"orthoswarm {__version__}")
+        print(f"orthoswarm {__version__}{_commit()}")
         return 0
     verb = args[0]
     if verb not in VERBS:

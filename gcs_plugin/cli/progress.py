@@ -1,9 +1,11 @@
-"""Progress bars with the time left, on stderr; where stderr is not a terminal, only one line per stage."""
+"""Progress bars with the time left, on stderr; where that is no terminal, a line every few seconds and per stage."""
 
 import sys
 import time
 from types import TracebackType
-from typing import Any
+from typing import Any, Final
+
+_LINE_S: Final = 5.0
 
 
 class ProgressBars:
@@ -12,7 +14,7 @@ class ProgressBars:
     def __init__(self) -> None:
         self._bars: Any = None
         self._tasks: dict[str, Any] = {}
-        self._shown = 0.0
+        self._shown = time.monotonic()
 
     def __enter__(self) -> "ProgressBars":
         if sys.stderr.isatty():
@@ -36,12 +38,15 @@ class ProgressBars:
 
     def __call__(self, what: str, done: int, total: int) -> None:
         """Show progress."""
+        now = time.monotonic()
         if self._bars is None:
             if done >= total > 0 and what not in self._tasks:
                 self._tasks[what] = True
                 print(f"{what}: {total}", file=sys.stderr, flush=True)
+            elif done < total and now - self._shown > _LINE_S:
+                self._shown = now
+                print(f"{what}: {done} of {total}", file=sys.stderr, flush=True)
             return
-        now = time.monotonic()
         if what not in self._tasks:
             self._tasks[what] = self._bars.add_task(what, total=total)
         elif now - self._shown < 0.1 and done < total:

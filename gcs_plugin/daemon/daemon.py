@@ -19,6 +19,7 @@ from gcs_plugin.daemon.flight_coverage.live_coverage import LiveCoverage
 from gcs_plugin.daemon.flight_coverage.picture_requests import FetchedPictures, PictureRequests
 from gcs_plugin.daemon.flight_coverage.picture_views import PictureViews
 from gcs_plugin.daemon.gap_flights import GapFlights
+from gcs_plugin.daemon.getting_ready import GettingReady
 from gcs_plugin.daemon.intake.can_reader import CanReader
 from gcs_plugin.daemon.intake.picture_intake import PictureIntake, RefusedPictures, VehicleIntake
 from gcs_plugin.daemon.intake.picture_sources import PictureSource
@@ -177,6 +178,7 @@ class Daemon:
             settings, self.journal, store=self.store, layers=self.layers, console=self.console, drawer=self.drawer,
             views=self.views, coverage=self.coverage, facts=facts,
         )  # fmt: skip
+        self.getting_ready = GettingReady(self.events)
         self.tak = TakFeed([settings.tak_address(text) for text in settings.tak], self.exports)
         handlers = {
             "refine": refinement.refine, "coarse": LegPlacement(publisher, self.store, kept).make,
@@ -218,6 +220,7 @@ class Daemon:
         """Start drawing and processing."""
         self.drawer.start()
         self.jobs.start()
+        self.getting_ready.start()
         threading.Thread(target=self.workers.warm_up, daemon=True).start()
         self.requests.continue_last(self.leg_watch)
         self.links.start()
@@ -229,6 +232,7 @@ class Daemon:
     def close(self) -> None:
         """Stop; unfinished work continues at the next start."""
         self.jobs.give_up()
+        self.getting_ready.close()
         self._close_sources()
         for background in (*self.buses, self.leg_watch, self.tak, self.picture_requests, *self.terrain):
             background.close()
@@ -258,6 +262,16 @@ class Daemon:
 
     def problems(self) -> list[str]:
         """The present problems, in words."""
-        own = (self.drawer.problem, self.drawer.overload, self.jobs.problem, self.tak.problem)
+        own = (
+            self.getting_ready.problem,
+            self.drawer.problem,
+            self.drawer.overload,
+            self.jobs.problem,
+            self.tak.problem,
+        )
         linked = self.links.fleet.problems()
-        return [text for text in (*own, *linked, *self.refused.problems(), *(s.problem for s in self.sources)) if text]
+        return [
+            text
+            for text in (*own, self.tak.problem, *linked, *self.refused.problems(), *(s.problem for s in self.sources))
+            if text
+        ]

@@ -24,12 +24,12 @@ class DemoSetting:
     """The demonstration's parameters.
 
     Attributes:
-        vehicles: how many. seed: of city, disaster and errors. speed: simulated seconds per real second.
+        vehicles: how many. seed: of city, disaster and errors. speed: simulated seconds per real second, at most.
     """
 
     vehicles: int = 3
     seed: int = 1
-    speed: float = 2.5
+    speed: float = 6.0
 
     @property
     def twin(self) -> TwinSpec:

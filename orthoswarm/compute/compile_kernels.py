@@ -19,7 +19,7 @@ from typing import Any, Final
 Report = Callable[[int, int], None]
 
 SIGNATURES: Final = Path(__file__).with_name("signatures.txt")
-_MADE_FOR: Final = Path(__file__).with_name("compiled") / "made_for.json"
+MADE_FOR: Final = Path(__file__).with_name("compiled") / "made_for.json"
 _PROCESSES: Final = 2  # the longest module takes a quarter of all the time: more would wait for it
 
 
@@ -47,9 +47,13 @@ def compile_all(report: Report) -> int:
     Returns:
         How many were compiled.
     """
+    from orthoswarm.compute.workers import prepare_worker
+
     modules = listed()
     done, total, compiled = 0, sum(map(len, modules.values())), 0
-    with ProcessPoolExecutor(min(_PROCESSES, os.cpu_count() or 1), get_context("spawn")) as pool:
+    report(0, total)
+    processes = min(_PROCESSES, os.cpu_count() or 1)
+    with ProcessPoolExecutor(processes, get_context("spawn"), initializer=prepare_worker) as pool:
         # Those with most arguments first, so that no process is left with a long one at the end.
         order = sorted(modules, key=lambda module: -sum(map(len, modules[module])))
         running = {pool.submit(_compile, module, modules[module]): module for module in order}
@@ -57,7 +61,7 @@ def compile_all(report: Report) -> int:
             compiled += task.result()
             done += len(modules[running[task]])
             report(done, total)
-        if compiled or not _MADE_FOR.exists():
+        if compiled or not MADE_FOR.exists():
             pool.submit(_tidy, order).result()
     return compiled
 
@@ -65,7 +69,7 @@ def compile_all(report: Report) -> int:
 def main() -> None:
     """Compile, and say how far it is; say nothing where all is compiled into the package."""
     _save_in_package()
-    if not missing()[0] and _MADE_FOR.exists():
+    if not missing()[0] and MADE_FOR.exists():
         return
     tenths = set()
 
@@ -86,10 +90,36 @@ def _save_in_package() -> None:
 
 def _compile(module: str, lines: list[str]) -> int:
     _save_in_package()
+    importlib.import_module(module)
+    _spare_inner()
     wanted = [found for line in lines if (found := _to_compile(module, line))]
     for kernel, types in wanted:
         kernel.compile(types)
     return len(wanted)
+
+
+def _spare_inner() -> None:
+    """Have kernels that only kernels call compiled into the package without a function for Python, until `_tidy`."""
+    from orthoswarm.compute.kernel_cache import KernelCache
+
+    called = {f"{module}.{line.split(' ', 1)[0]}" for module, lines in listed().items() for line in lines}
+    for kernel in _kernels() if KernelCache.filling else []:
+        name = f"{kernel.py_func.__module__}.{kernel.py_func.__name__}"
+        if name not in called and not _is_inner(kernel):
+            kernel.targetoptions["no_cpython_wrapper"] = True
+            kernel._cache.keep_inner()
+
+
+def _is_inner(kernel: Any) -> bool:
+    return "no_cpython_wrapper" in kernel.targetoptions
+
+
+def _kernels() -> list[Any]:
+    """All kernels of modules that are imported."""
+    from numba.core.dispatcher import Dispatcher
+
+    ours = [vars(module).values() for name, module in sys.modules.items() if name.startswith("orthoswarm.")]
+    return [value for values in ours for value in values if isinstance(value, Dispatcher)]
 
 
 def _to_compile(module: str, line: str) -> tuple[Any, Any] | None:
@@ -110,20 +140,13 @@ def _tidy(modules: list[str]) -> None:
 
     for name in modules:
         importlib.import_module(name)
-    found = [
-        value
-        for name, module in sys.modules.items()
-        if name.startswith("orthoswarm.")
-        for value in vars(module).values()
-    ]
-    caches = [cache for value in found if isinstance(cache := getattr(value, "_cache", None), KernelCache)]
-    kept = set().union(*(cache.files() for cache in caches))
+    kept = set().union(*(kernel._cache.files() for kernel in _kernels() if not _is_inner(kernel)))
     for file in FOLDER.rglob("*.nb[ci]"):
         if file not in kept:
             file.unlink(missing_ok=True)
     if KernelCache.filling:
         made = {"numba": numba.__version__, "python": sys.version_info[:2], "processor": numba.config.CPU_NAME}
-        _MADE_FOR.write_text(json.dumps(made), encoding="utf-8")
+        MADE_FOR.write_text(json.dumps(made), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -48,6 +48,10 @@ class KernelCache:
         """Keep a kernel that was just compiled."""
         (self._packaged if self.filling else self._numbas).save_overload(signature, result)
 
+    def keep_inner(self) -> None:
+        """Keep this kernel, which others alone call, in a folder that only the processes that compile those look in."""
+        self._packaged = _Inner(self._function)
+
     def has(self, types: tuple[Any, ...], codegen: Any) -> bool:
         """Whether a kernel is there for these types of arguments, as `load_overload` would find it."""
         where = [self._packaged] if self.filling else [self._packaged, self._numbas]
@@ -79,14 +83,14 @@ class KernelCache:
 class _InPackage:
     """What numba calls a locator: where a kernel's files lie in the package, and what they were made of."""
 
-    def __init__(self, function: Function) -> None:
-        self._function = function
+    def __init__(self, function: Function, folder: Path) -> None:
+        self._function, self._folder = function, folder
 
     def get_source_stamp(self) -> bytes:
         return compiled_in(self._function)
 
     def get_cache_path(self) -> str:
-        return str(FOLDER.joinpath(*self._function.__module__.split(".")[1:-1]))
+        return str(self._folder.joinpath(*self._function.__module__.split(".")[1:-1]))
 
     def ensure_cache_path(self) -> None:
         Path(self.get_cache_path()).mkdir(parents=True, exist_ok=True)
@@ -96,15 +100,25 @@ class _InPackage:
 
 
 class _PackagedCode(caching.CompileResultCacheImpl):  # type: ignore[misc]
+    folder = FOLDER
+
     def __init__(self, function: Function) -> None:
         """As numba's, but where the files lie is known."""
-        self._locator = _InPackage(function)
+        self._locator = _InPackage(function, self.folder)
         name = function.__module__.rpartition(".")[2]
         self._filename_base = self.get_filename_base(f"{name}.{function.__qualname__}", "")
 
 
 class _Packaged(caching.FunctionCache):  # type: ignore[misc]
     _impl_class = _PackagedCode
+
+
+class _InnerCode(_PackagedCode):
+    folder = FOLDER / "inner"
+
+
+class _Inner(_Packaged):
+    _impl_class = _InnerCode
 
 
 def compiled_in(function: Function) -> bytes:

@@ -53,6 +53,16 @@ class TwinSet:
     vehicles: int
 
 
+@dataclass(frozen=True, slots=True)
+class TwinScene:
+    """What photos are taken of and from: the scene after the disaster, its site, true flights and recorded ones."""
+
+    stage: PreparedScene
+    site: Site
+    flights: list[TrueFlight]
+    records: list[Record]
+
+
 def make_twin(
     spec: TwinSpec, folder: Path, *, workers: int = 1, progress: Progress | None = None, only: int | None = None
 ) -> TwinSet:
@@ -72,6 +82,15 @@ def make_twin(
         InputError: if the folder holds another set.
     """
     report = progress or (lambda *_: None)
+    made = make_scene(spec, folder, report)
+    total = spec.plan.vehicles * len(range(0, spec.plan.photos, spec.every))
+    shots = list(_missing(spec, made.flights, made.records, folder))[:only]
+    _render_all(spec, made.stage, made.site.grid, shots=shots, workers=workers, report=report)
+    return TwinSet(folder, total, len(shots), spec.plan.vehicles)
+
+
+def make_scene(spec: TwinSpec, folder: Path, report: Progress) -> TwinScene:
+    """Make all of a data set but its photos; arguments and errors as of `make_twin`."""
     truth = folder / "truth"
     truth.mkdir(parents=True, exist_ok=True)
     _claim(truth / "manifest.json", spec)
@@ -94,10 +113,7 @@ def make_twin(
     write_truth(spec, stage, zones, truth)
     write_plan(spec, site, folder / "plan.geojson")
     write_frames(spec, site, flights, truth / "frames.csv")
-    total = spec.plan.vehicles * len(range(0, spec.plan.photos, spec.every))
-    shots = list(_missing(spec, flights, records, folder))[:only]
-    _render_all(spec, stage, site.grid, shots=shots, workers=workers, report=report)
-    return TwinSet(folder, total, len(shots), spec.plan.vehicles)
+    return TwinScene(stage, site, flights, records)
 
 
 def _claim(manifest: Path, spec: TwinSpec) -> None:

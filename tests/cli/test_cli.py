@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 
@@ -54,7 +55,9 @@ def test_every_verb_has_help_with_an_example(verb, capsys):
 
 def test_exit_codes(capsys):
     assert main.main(["--version"]) == 0
-    assert capsys.readouterr().out.split() == ["orthoswarm", __version__]
+    assert re.fullmatch(
+        rf"orthoswarm {re.escape(__version__)}( \([0-9a-f]{{7,}}(-dirty)?\))?\n", capsys.readouterr().out
+    )
     assert main.main([]) == 2
     assert main.main(["fly"]) == 2
     assert "there is no verb 'fly'" in capsys.readouterr().err
@@ -91,10 +94,17 @@ def test_doctor_says_what_is_there(capsys, tmp_path):
     assert main.main(["doctor", "--json", "--workspace", str(tmp_path / "not" / "yet")]) == 0
     document = json.loads(capsys.readouterr().out)
     found = {c["name"]: c for c in document["checks"]}
+    assert re.search(r"torch \d+.* MB", found["installed"]["detail"])
     assert document["ok"] and {"python", "cores", "memory", "disk", "jpeg", "video", "gpu", "kernels"} <= set(found)
     assert all(c["cost"] for c in found.values() if not c["ok"])
     assert main.main(["doctor"]) == 0
     assert "map driver GTiff" in capsys.readouterr().out
+
+
+def test_what_maps_and_serves_loads_no_networks():
+    code = "import sys, orthoswarm.batch.pipeline, gcs_plugin.web.app, gcs_plugin.daemon.daemon; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert not {"torch", "kornia"} & set(done.stdout.split())
 
 
 def test_doctor_survives_what_it_looks_at(monkeypatch, tmp_path):

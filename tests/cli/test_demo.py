@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -10,8 +11,9 @@ import time
 import pytest
 
 from gcs_plugin.cli.main import main
-from gcs_plugin.demo.demonstration import PacedClock
+from gcs_plugin.demo.demonstration import PacedClock, vehicle_rate, wait_for
 from gcs_plugin.demo.setting import DemoSetting, Errors
+from orthoswarm.model.errors import OrthoSwarmError
 
 
 def test_a_folder_with_something_else_in_it_is_left_alone(tmp_path, capsys):
@@ -40,15 +42,36 @@ def test_vehicles_differ_and_stay_as_they_are():
     assert Errors.of(setting, 1) != Errors.of(setting, 2)
 
 
-def test_the_clock_runs_slower_while_cameras_are_behind(monkeypatch):
+def test_vehicles_fly_slower_while_pictures_wait():
+    assert vehicle_rate(8.0, 0, 0) == vehicle_rate(8.0, 4, 20) == 8.0
+    rates = [vehicle_rate(8.0, to_render, 0) for to_render in (4, 8, 16, 64, 1000)]
+    assert rates == sorted(rates, reverse=True) and rates[1] < 4.0
+    assert vehicle_rate(8.0, 0, 100) < 4.0
+    assert 0.0 < rates[-1] == vehicle_rate(8.0, 0, 10_000)  # heartbeats still come
+    assert vehicle_rate(0.2, 1000, 0) == 0.2
+
+
+def test_the_clock_runs_as_it_is_told(monkeypatch):
     now = [100.0]
     monkeypatch.setattr("gcs_plugin.demo.demonstration.time.monotonic", lambda: now[0])
     clock = PacedClock()
     now[0] += 2.0
     assert clock() == pytest.approx(2.0)
-    clock.slow = True
+    clock.share = 0.25
     now[0] += 2.0
-    assert 2.0 < clock() < 3.0
+    assert clock() == pytest.approx(2.5)
+
+
+def test_a_wait_lasts_as_long_as_anything_moves(monkeypatch):
+    """However slow: an hour between steps of nine minutes is waited out, ten minutes without a step are not."""
+    now, told = [0.0], []
+    monkeypatch.setattr("gcs_plugin.demo.demonstration.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("gcs_plugin.demo.demonstration.time.sleep", lambda _: now.__setitem__(0, now[0] + 60.0))
+    wait_for(lambda: now[0] >= 3600.0, "the map", lambda: now[0] // 540, lambda: told.append(now[0]))
+    assert len(told) == 60
+    with pytest.raises(OrthoSwarmError, match="the map: nothing has moved for 600 s"):
+        wait_for(lambda: False, "the map", lambda: 0, lambda: None)
+    assert now[0] < 4500.0
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="sends a signal to a group of processes")
@@ -90,3 +113,35 @@ def test_the_demonstration_maps_a_city_within_half_a_metre(tmp_path):
     assert report["accuracy"]["median_m"] < 0.3 * report["accuracy_realtime"]["median_m"]
     for name in ("orthoimage.tif", "realtime.tif", "report.html", "export/orthoimage.mbtiles", "export/orthoimage.kmz"):
         assert (out / name).exists()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="only Linux pins processes to a core")
+def test_a_demonstration_on_a_quarter_of_a_core_ends_well_and_says_how_far_it_is(tmp_path):
+    core = min(os.sched_getaffinity(0))
+    pinned = ["taskset", "-c", str(core), sys.executable]
+    busy = [subprocess.Popen([*pinned, "-c", "while True: pass"]) for _ in range(3)]
+    try:
+        command = [
+            *pinned,
+            "-m",
+            "gcs_plugin.cli",
+            "demo",
+            "--vehicles",
+            "1",
+            "--no-browser",
+            "--out",
+            "demo",
+            "--json",
+        ]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=1800)
+    finally:
+        for process in busy:
+            process.kill()
+            process.wait()
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    # A stream that was silent for ten seconds is opened again, without what was under way.
+    assert report["frames"]["used"] >= 0.9 * report["demo"]["pictures"] > 20
+    assert report["accuracy"]["median_m"] < 0.5
+    assert "instead of 6.0" in done.stderr and re.search(r"pictures on the map: \d+ of \d+", done.stderr)

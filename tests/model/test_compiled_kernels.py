@@ -75,6 +75,7 @@ if __name__ == "__main__":
              "--endurance", 12, "--method", method, "--out", method)
     load_kernels(Path("."))
     refine_something()
+    assert not {"torch", "kornia"} & set(sys.modules), "only learned matchers need networks"
 """
 
 

@@ -13,7 +13,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.epilog = (
         "A city after a disaster, a plan, vehicles that fly it, cameras that stream it, the daemon that maps it;\n"
-        "each vehicle is refined as it completes its mission. Ends by itself in a few minutes.\n\n"
+        "each vehicle is refined as it completes its mission. A slow machine flies slower; it ends by itself.\n\n"
         "example:\n  orthoswarm demo --vehicles 3 --out out/demo"
     )
     add = parser.add_argument
@@ -21,7 +21,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("--out", type=Path, default=Path("out/demo"), metavar="DIR", help="where the map goes (default out/demo)")
     add("--port", type=int, default=0, metavar="P", help="of the web page while it runs (default: any free one)")
     add("--seed", type=int, default=1, metavar="S", help="another city, another wind (default 1)")
-    add("--speed", type=float, default=2.5, metavar="X", help="simulated seconds in a second (default 2.5)")
+    add("--speed", type=float, default=6.0, metavar="X", help="simulated seconds in a second at most (default 6)")
     add("--median", type=float, metavar="M", help="fail if the map's median error is larger")
     add("--no-browser", action="store_true", help="do not open the page, even on a terminal with a display")
     add("--json", action="store_true", help="print the report as one JSON document on stdout")

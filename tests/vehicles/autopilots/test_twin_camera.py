@@ -59,7 +59,7 @@ class Pace:
         now = self.swarm.now
         self.flown_s += (now - self.last_s) if self.swarm.vehicles[1].flight.motion.up > 20.0 else 0.0
         self.last_s = now
-        self.clock.slow = RATE_HZ * self.flown_s - taken > 5.0
+        self.clock.share = 0.15 if RATE_HZ * self.flown_s - taken > 5.0 else 1.0
 
 
 @contextlib.contextmanager
