@@ -262,16 +262,6 @@ class Daemon:
 
     def problems(self) -> list[str]:
         """The present problems, in words."""
-        own = (
-            self.getting_ready.problem,
-            self.drawer.problem,
-            self.drawer.overload,
-            self.jobs.problem,
-            self.tak.problem,
-        )
-        linked = self.links.fleet.problems()
-        return [
-            text
-            for text in (*own, self.tak.problem, *linked, *self.refused.problems(), *(s.problem for s in self.sources))
-            if text
-        ]
+        own = (self.drawer.problem, self.drawer.overload, self.jobs.problem, self.tak.problem)
+        inputs = (*self.links.fleet.problems(), *self.refused.problems(), *(s.problem for s in self.sources))
+        return [text for text in (self.getting_ready.problem, *own, *inputs) if text]
