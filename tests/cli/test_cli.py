@@ -39,7 +39,7 @@ def test_help_answers_at_once():
 
 
 WITHIN = {
-    "bench": ("accuracy", "scaling", "peers"),
+    "bench": ("accuracy", "scaling"),
     "fleet": ("list", "upload", "start", "pause", "resume", "rtl", "watch"),
     "twin": ("make", "camera"),
     "weights": ("list", "import", "check"),

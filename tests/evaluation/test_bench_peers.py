@@ -15,8 +15,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rasterio.transform import from_origin
 
-from gcs_plugin.bench import georeferencing, peers
-from gcs_plugin.cli.main import main
+from benchmarks.peers import georeferencing
+from benchmarks.peers import programs as peers
+from benchmarks.peers.__main__ import main as compare
 from orthoswarm.model.camera import Camera, Lens, rotation_from_angles
 from orthoswarm.model.errors import OrthoSwarmError
 
@@ -246,11 +247,12 @@ def test_programs_are_run_judged_and_kept_and_a_failure_is_shown(tiny, tmp_path,
     ceiling = {"program": "truth", "every": 2, "photos": 6, "used": 6, "blocks": 81, "share_within_1m": 1.0}
     ceiling |= {"median_m": 0.01, "p95_m": 0.02, "unmatched_share": 0.0}
     (out / "tiny-truth-every2.json").write_text(json.dumps(ceiling))
-    command = ["bench", "peers", str(tiny), "--programs", ",".join(made), "--every", "2", "--limit-s", "1"]
+    command = [str(tiny), "--programs", ",".join(made), "--every", "2", "--limit-s", "1"]
     (tmp_path / "file").touch()  # where no environment can be made
-    command += ["--environments", str(tmp_path / "file"), "--out", str(out), "--json"]
-    assert main(command) == 0
-    result = json.loads(capsys.readouterr().out)
+    command += ["--environments", str(tmp_path / "file"), "--out", str(out)]
+    assert compare(command) == 0
+    capsys.readouterr()
+    result = json.loads((out / "peers-every2.json").read_text())
     rows = {r["program"]: r for r in result["rows"]}
     assert rows["good"]["succeeded"] and rows["good"]["median_m"] < 0.05 and rows["good"]["used"] == 7
     assert rows["good"]["photos"] == 6 and rows["good"]["peak_rss_mb"] > 0  # it ends within a look or two
@@ -262,7 +264,7 @@ def test_programs_are_run_judged_and_kept_and_a_failure_is_shown(tiny, tmp_path,
     assert (out / "peers-every2.jpg").stat().st_size > 5000
     kept = out / "tiny-good-every2.json"
     kept.write_text(json.dumps(json.loads(kept.read_text()) | {"median_m": 7.0}))
-    assert main(command[:-1]) == 0
+    assert compare(command) == 0
     table = capsys.readouterr().out
     assert "clear, paper, seed 1, 1 of 2 photos | a | b | 7 of 6 | yes | yes | 100.0 % | - | 7.00 |" in table
     assert "| 7 of 6 | no | yes (its shape) | - | 100.0 % | 0.0" in table
@@ -270,7 +272,7 @@ def test_programs_are_run_judged_and_kept_and_a_failure_is_shown(tiny, tmp_path,
 
 
 def test_wrong_arguments(tiny, tmp_path, capsys):
-    command = ["bench", "peers", str(tiny), "--out", str(tmp_path / "out")]
-    assert main([*command, "--programs", "magic"]) == 2
-    assert main([*command, "--every", "0"]) == 2
+    command = [str(tiny), "--out", str(tmp_path / "out")]
+    assert compare([*command, "--programs", "magic"]) == 2
+    assert compare([*command, "--every", "0"]) == 2
     assert "pycolmap" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""`orthoswarm bench`: accuracy and cost on sets with truth; how cost grows; other programs on the same photos.
+"""`orthoswarm bench`: accuracy and cost on sets with truth, and how cost grows.
 
 Every map is made by the `mosaic` verb in its own process, as by a user, so that times and memory are
 complete and comparable. Results are kept: an interrupted benchmark continues, and more sets can be added.
@@ -21,10 +21,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "each run; a run whose file is there is not repeated. Maps are removed unless --keep is given.\n\n"
         "example:\n  orthoswarm twin make debris --out sets/debris\n"
         "  orthoswarm bench accuracy sets/debris --out bench\n"
-        "  orthoswarm bench scaling sets/debris --vehicles 1,2,3 --images 85,170,339 --out bench\n"
-        "  orthoswarm bench peers sets/debris --every 3 --out bench"
+        "  orthoswarm bench scaling sets/debris --vehicles 1,2,3 --images 85,170,339 --out bench"
     )
-    kinds = parser.add_subparsers(dest="kind", required=True, metavar="accuracy|scaling|peers")
+    kinds = parser.add_subparsers(dest="kind", required=True, metavar="accuracy|scaling")
     accuracy = kinds.add_parser(
         "accuracy", help="do nothing, the paper, swarm, true poses: error, cost, memory",
         epilog="example:\n  orthoswarm bench accuracy sets/debris --methods swarm,truth --out bench",
@@ -42,32 +41,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     scaling.add_argument("--images", default="42,85,170,339", help="pictures a vehicle (default %(default)s)")
     scaling.add_argument("--refine", default="swarm", help="which refiner (default %(default)s)")
-    peers = kinds.add_parser(
-        "peers", help="other programs on the same photos (Table I)",
-        description="Runs other programs in environments of their own, made with pip on first use, and judges their "
-        "maps by the true map. Linux only.",
-        epilog="example:\n  orthoswarm bench peers sets/debris --every 3 --out bench",
-    )  # fmt: skip
-    peers.add_argument("sets", nargs="+", type=Path, metavar="SET", help="folders of `twin make`")
-    programs = "swarm,paper,pyorthomosaic,stitcher,pycolmap"
-    peers.add_argument("--programs", default=programs, metavar="LIST", help=f"some of {programs} (default all)")
-    peers.add_argument(
-        "--every", type=int, default=1, metavar="N", help="use every N-th photo of a vehicle (default 1)"
-    )
-    peers.add_argument(
-        "--limit-s", type=float, default=900.0, metavar="S", help="CPU seconds for a program and set (default 900)"
-    )
-    peers.add_argument(
-        "--environments", type=Path, metavar="DIR", help="where they are (default environments in --out)"
-    )
-    for sub in (scaling, peers):
-        sub.add_argument("--figures", type=Path, metavar="DIR", help="folder for pictures (default: that of --out)")
-    for sub in (accuracy, scaling, peers):
+    scaling.add_argument("--figures", type=Path, metavar="DIR", help="folder for pictures (default: that of --out)")
+    for sub in (accuracy, scaling):
         sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for results")
         sub.add_argument("--keep", action="store_true", help="keep the maps")
         sub.add_argument("--json", action="store_true", help="one JSON document on stdout")
-        what = "threads of each program (default 1)" if sub is peers else "processes at once (default: one a core)"
-        sub.add_argument("--workers", type=int, metavar="N", help=what)
+        sub.add_argument("--workers", type=int, metavar="N", help="processes at once (default: one a core)")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -82,12 +61,11 @@ def run(args: argparse.Namespace) -> int:
     args.out.mkdir(parents=True, exist_ok=True)
     before = signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that a measured program is ended, too
     try:
-        result, table = {"accuracy": _accuracy, "scaling": _scaling, "peers": _peers}[args.kind](args)
+        result, table = {"accuracy": _accuracy, "scaling": _scaling}[args.kind](args)
     finally:
         signal.signal(signal.SIGTERM, before)
-    thin = f"-every{args.every}" if args.kind == "peers" and args.every > 1 else ""
-    write_result(args.out / f"{args.kind}{thin}.json", result)
-    (args.out / f"{args.kind}{thin}.md").write_text(table, encoding="utf-8")
+    write_result(args.out / f"{args.kind}.json", result)
+    (args.out / f"{args.kind}.md").write_text(table, encoding="utf-8")
     print(json.dumps(result) if args.json else table)
     return 0 if any("error" not in row for row in result["rows"]) else 1
 
@@ -112,26 +90,6 @@ def _scaling(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
     )
     plot_scaling(result, args.figures or args.out)
     return result, scaling_table(result)
-
-
-def _peers(args: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    from gcs_plugin.bench.peers import PeerSettings, peers_sheet, peers_table, run_peers
-
-    if args.every < 1 or args.limit_s <= 0 or (args.workers or 1) < 1:
-        raise InputError("--every, --limit-s and --workers take numbers above 0")
-    settings = PeerSettings(
-        programs=tuple(_list(args.programs)),
-        out=args.out.absolute(),
-        environments=args.environments or args.out.absolute() / "environments",
-        limit_s=args.limit_s,
-        every=args.every,
-        threads=args.workers or 1,
-        keep_maps=args.keep,
-    )
-    result = run_peers(args.sets, settings)
-    thin = f"-every{args.every}" if args.every > 1 else ""
-    peers_sheet(result, settings, (args.figures or args.out) / f"peers{thin}.jpg")
-    return result, peers_table(result)
 
 
 def _list(text: str) -> list[str]:

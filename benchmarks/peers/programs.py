@@ -118,7 +118,7 @@ def _script(name: str) -> Callable[[PeerJob, Path], list[str]]:
 
 
 def _stitched(job: PeerJob) -> tuple[Path, int | None]:
-    from gcs_plugin.bench.georeferencing import lay_on_reference
+    from benchmarks.peers.georeferencing import lay_on_reference
 
     out = job.out / "laid.tif"  # the most favourable georeference that it could get
     lay_on_reference(job.out / "picture.png", job.folder / "truth" / "reference.tif", out)
@@ -129,8 +129,8 @@ def _pasted(job: PeerJob) -> tuple[Path, int | None]:
     import numpy as np
 
     import telemetry
+    from benchmarks.peers.georeferencing import placed_models
     from gcs_plugin.bench.accuracy import paste
-    from gcs_plugin.bench.georeferencing import placed_models
     from orthoswarm.model.geo import LocalGrid, area_epsg
     from orthoswarm.model.placement import PlacedFrame, Terrain
 
@@ -279,7 +279,7 @@ def _row(folder: Path, name: str, settings: PeerSettings) -> dict[str, Any]:
 
 def _shape(product: Path, job: PeerJob) -> dict[str, Any] | None:
     """The figures of a map after registration on the truth by one homography; None where that fails."""
-    from gcs_plugin.bench.georeferencing import lay_on_reference
+    from benchmarks.peers.georeferencing import lay_on_reference
 
     laid = job.out / "shape.tif"
     try:

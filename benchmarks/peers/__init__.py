@@ -1,0 +1,1 @@
+"""Other programs on the same photos, judged by the true map."""
