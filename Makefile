@@ -24,7 +24,7 @@ demo: kernels
 
 # Four processes, on two cores as well: tests with vehicles, of the daemon and of the page run one after the other in one
 # each, and mostly wait.
-# PYTEST="-n 4 --dist loadgroup -m 'not sitl'" runs the slow tests as well (an hour).
+# PYTEST="-n 4 --dist loadgroup -m 'not sitl and not loaded'" runs the slow tests as well (40 minutes).
 PYTEST ?= -n 4 --dist loadgroup
 test: check
 	@$(BIN)/python -m pytest $(PYTEST)

@@ -116,6 +116,7 @@ def test_the_demonstration_maps_a_city_within_half_a_metre(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.loaded
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="only Linux pins processes to a core")
 def test_a_demonstration_on_a_quarter_of_a_core_ends_well_and_says_how_far_it_is(tmp_path):
     core = min(os.sched_getaffinity(0))
