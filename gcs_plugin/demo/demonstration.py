@@ -27,7 +27,7 @@ _MARKER_FILE: Final = "demo.json"
 _DEMO_FILES: Final = (
     "journal.db", "journal.db-wal", "journal.db-shm", "pictures", "layers", "solutions", "plans", "videos", "twin",
     "token", "telemetry.tlog", "export", "report.json", "report.html", "frames.jsonl", "footprints.gpkg",
-    "realtime.tif", "coarse.tif", "orthoimage.tif", _MARKER_FILE,
+    "realtime.tif", "coarse.tif", "orthoimage.tif", "confidence.tif", _MARKER_FILE,
 )  # fmt: skip
 _STILL_S: Final = 600.0  # in which a machine that is twenty times slower than usual does the longest step
 ReportProgress = Callable[[str, int, int], None]

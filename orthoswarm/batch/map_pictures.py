@@ -20,7 +20,7 @@ from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.frame import last_time
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import PlacedFrame, Refinement, Solution, Terrain
-from orthoswarm.mosaic.confidence import confidence
+from orthoswarm.mosaic.confidence import confidence, drawn_cells
 from orthoswarm.mosaic.extent import drawn_window, ground_level, placed_bounds
 from orthoswarm.mosaic.footprint import default_gsd, rejection
 from orthoswarm.mosaic.oblique import stray_warning, strays, weakly_held_warning
@@ -230,7 +230,7 @@ def _write_about(
 ) -> None:
     """Write which picture shows which ground, and how far it can be trusted."""
     write_seamlines(run.out / SEAMLINES, canvas, [partial(describe_frame, p) for p in placed], run=run.drawers.map)
-    found = confidence(canvas, placed, terrain, state.gains)
+    found = confidence(*drawn_cells(canvas), placed, terrain, state.gains)
     write_confidence(run.out / CONFIDENCE, found)
     state.trust = found.figures()
 

@@ -9,6 +9,7 @@ sight through the measured surface: what the picture shows at a place is what th
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Final, NamedTuple
 
 import cv2
@@ -95,20 +96,15 @@ class Confidence(NamedTuple):
 
 
 def confidence(
-    canvas: Canvas, frames: Sequence[PlacedFrame], terrain: Terrain, gains: Mapping[str, Field]
+    grid: GroundGrid, shown: Ints, frames: Sequence[PlacedFrame], terrain: Terrain, gains: Mapping[str, Field]
 ) -> Confidence:
     """How far an orthoimage can be trusted.
 
     Args:
-        canvas: with the frames drawn on it (renderer.render). frames, terrain: what was drawn.
-        gains: image -> factors of its colours.
+        grid, shown: its cells, and which frame each shows: index plus 1, 0 where none, int32 (rows, columns); see
+            `drawn_cells`.
+        frames, terrain: what it was drawn from. gains: image -> factors of a frame's colours.
     """
-    cell_px = _cell_px(canvas)
-    shown = _shown(canvas, cell_px)
-    grid = GroundGrid(
-        epsg=canvas.grid.epsg, west=canvas.grid.west, north=canvas.grid.north, gsd_m=canvas.grid.gsd_m * cell_px,
-        width=shown.shape[1], height=shown.shape[0],
-    )  # fmt: skip
     row, column = np.nonzero(shown)
     of = shown[row, column] - 1
     place = np.array(grid.to_ground(np.column_stack([column, row]).astype(float)))
@@ -145,24 +141,29 @@ def _common_sigma(frames: Sequence[PlacedFrame]) -> float:
     return min((f.sigma_m for f in frames if f.stage == "coarse" and np.isfinite(f.sigma_m)), default=0.0)
 
 
-def _cell_px(canvas: Canvas) -> int:
-    """Side of a cell: a power of two, so that a tile holds whole ones."""
-    px, grid = 1, canvas.grid
-    while px < canvas.tile_px and (px * grid.gsd_m < _CELL_M or grid.width * grid.height > px * px * _MOST_CELLS):
+def cell_grid(grid: GroundGrid, most_px: int) -> tuple[GroundGrid, int]:
+    """Cells of an orthoimage's pixels, and the side of each: a power of two, so that a tile holds whole ones.
+
+    most_px: side that a cell may have, that of a tile.
+    """
+    px = 1
+    while px < most_px and (px * grid.gsd_m < _CELL_M or grid.width * grid.height > px * px * _MOST_CELLS):
         px *= 2
-    return px
+    width, height = -(-grid.width // px), -(-grid.height // px)
+    return replace(grid, gsd_m=grid.gsd_m * px, width=width, height=height), px
 
 
-def _shown(canvas: Canvas, cell_px: int) -> Ints:
-    """Which frame is drawn at the middle of each cell: its index plus 1, 0 where none, int32 (rows, columns)."""
+def drawn_cells(canvas: Canvas) -> tuple[GroundGrid, Ints]:
+    """Cells of a canvas (renderer.render), and which frame is drawn in the middle of each, as of `confidence`."""
     grid, t = canvas.grid, canvas.tile_px
-    out = np.zeros((-(-grid.height // cell_px), -(-grid.width // cell_px)), np.int32)
+    cells, px = cell_grid(grid, t)
+    out = np.zeros((cells.height, cells.width), np.int32)
     for r, c in canvas.changed_since(0):
         plane = canvas.read_plane(r * t, min(r * t + t, grid.height), c * t, min(c * t + t, grid.width))
-        some = plane[cell_px // 2 :: cell_px, cell_px // 2 :: cell_px]
-        r0, c0 = r * t // cell_px, c * t // cell_px
+        some = plane[px // 2 :: px, px // 2 :: px]
+        r0, c0 = r * t // px, c * t // px
         out[r0 : r0 + some.shape[0], c0 : c0 + some.shape[1]] = some
-    return out
+    return cells, out
 
 
 def _pictures(grid: GroundGrid, frames: Sequence[PlacedFrame], terrain: Terrain) -> Ints:

@@ -11,7 +11,7 @@ from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import Terrain
 from orthoswarm.mosaic.footprint import footprint_boxes
 from orthoswarm.mosaic.kernels.drawn_heights import heights
-from orthoswarm.mosaic.kernels.render_arrays import Shots
+from orthoswarm.mosaic.kernels.render_arrays import MARGIN_PX, Shots
 from orthoswarm.mosaic.seam_labels import label_tile
 
 _PART = 512
@@ -22,21 +22,33 @@ def coverage(cameras: Sequence[Camera], grid: GroundGrid, terrain: Terrain | Non
 
     Seen means: within the picture up to its very edge, distortion and terrain honoured, at most 75 degrees off nadir.
 
-    cameras: where the pictures were taken. grid: the cells; metres to tens of metres wide, since the mask is in memory.
-    terrain: the ground; level at 0 if None.
+    Args:
+        cameras: where the pictures were taken.
+        grid: the cells; metres to tens of metres wide, since the mask is in memory.
+        terrain: the ground; level at 0 if None.
     """
-    ground = terrain or Terrain.flat()
-    mask = np.zeros((grid.height, grid.width), bool)
-    shots = Shots.of(cameras, [False] * len(cameras), margin_px=-0.5)
-    for (r, c), ids in by_tile(cameras, grid, _PART, ground).items():
+    return nearest_cameras(cameras, [False] * len(cameras), grid, terrain or Terrain.flat(), margin_px=-0.5) > 0
+
+
+def nearest_cameras(
+    cameras: Sequence[Camera], weak: Sequence[bool], grid: GroundGrid, terrain: Terrain, *, margin_px: float = MARGIN_PX
+) -> Ints:
+    """Which camera shows each cell's centre in a map without seams: its index plus 1, 0 where none sees it.
+
+    Args:
+        cameras, grid, terrain: as of `coverage`. weak: cameras that show only what no other sees.
+        margin_px: of the pictures that is not shown.
+    """
+    nearest = np.zeros((grid.height, grid.width), np.int32)
+    shots = Shots.of(cameras, list(weak), margin_px=margin_px)
+    for (r, c), ids in by_tile(cameras, grid, _PART, terrain).items():
         r1, c1 = min(grid.height, r + _PART), min(grid.width, c + _PART)
         west, north = grid.west + c * grid.gsd_m, grid.north - r * grid.gsd_m
         label = np.zeros((r1 - r, c1 - c), np.int32)
-        lattice = heights(ground, west, north, grid.gsd_m, _PART)
-        marks = np.ones(len(ids), np.int32)
-        label_tile(label, shots.take(ids), marks, lattice=lattice, west=west, north=north, gsd_m=grid.gsd_m)
-        mask[r:r1, c:c1] = label > 0
-    return mask
+        lattice = heights(terrain, west, north, grid.gsd_m, _PART)
+        label_tile(label, shots.take(ids), ids + 1, lattice=lattice, west=west, north=north, gsd_m=grid.gsd_m)
+        nearest[r:r1, c:c1] = label
+    return nearest
 
 
 def by_tile(cameras: Sequence[Camera], grid: GroundGrid, tile_px: int, terrain: Terrain) -> dict[tuple[int, int], Ints]:

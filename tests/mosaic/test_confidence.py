@@ -7,7 +7,7 @@ import pytest
 
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.model.placement import Terrain
-from orthoswarm.mosaic.confidence import ORIENTATION_ONLY, confidence
+from orthoswarm.mosaic.confidence import ORIENTATION_ONLY, confidence, drawn_cells
 from orthoswarm.mosaic.renderer import render
 from tests.kit import mosaic_scene as scene
 
@@ -30,7 +30,7 @@ def drawn(tmp_path):
         frames = [replace(f, **{"sigma_m": 0.02, "stage": "fine"} | of_frames) for f in flight.frames]
         canvas = Canvas.create(tmp_path / "canvas", scene.grid(260.0), plane="frame", tile_px=128)
         render(frames, terrain, canvas, read=flight.read)
-        found = confidence(canvas, frames, terrain, {})
+        found = confidence(*drawn_cells(canvas), frames, terrain, {})
         canvas.close()
         return frames, found
 

@@ -23,7 +23,7 @@ from orthoswarm.export.tactical.places import Place
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.frame import Frame, Rejection, last_time
 from orthoswarm.model.geo import LocalGrid
-from orthoswarm.model.placement import PlacedFrame, Solution
+from orthoswarm.model.placement import PlacedFrame, Solution, Terrain
 from orthoswarm.raster.basemap import Basemap
 
 if TYPE_CHECKING:
@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 FORMATS: Final = tuple(name for name, form in FORMS.items() if form.daemon)
 PRODUCTS: Final = ("cog", "gpkg")
 """The formats that are written without being asked for."""
+_CONFIDENCE_STEP_M: Final = 1.25  # distance of the nodes on which tall things are looked at: theirs at 100 m height
+_CONFIDENCE_NODES: Final = 2_000_000  # farther apart where there would be more (memory)
 _MOST_JOBS: Final = 1000  # the latest ones
 _OTHER_STAGES: Final = {
     "coarse: in flight": "coarse", "fine: neighbours together": "together", "final: tones": "tones",
@@ -78,6 +80,7 @@ def write_products(task: ExportTask) -> dict[str, str]:
     from orthoswarm.export.product_files import write_frames, write_json
     from orthoswarm.refine.registration.map_offset import measure_map_offset
     from orthoswarm.report.page import write_page
+    from orthoswarm.report.trust import headline
 
     out = task.workspace
     recorded = _recorded(task)
@@ -92,6 +95,9 @@ def write_products(task: ExportTask) -> dict[str, str]:
     write_frames(out, placed, rejected, LocalGrid(task.epsg), level)
     report = _report(task, solutions, placed, rejected, level, assumed=recorded.warnings)
     report |= {"area_ha": area_ha, "until": "fine", "root": None}
+    if refined:
+        report["trust"] = _trust(task, refined)
+        report["headline"] = headline(report)
     report["unrefined"] = _unrefined(placed, refined)
     report["map_offset_m"] = None if offset is None else offset.document()
     report["warnings"] += [] if offset is None else offset.warning()
@@ -135,6 +141,32 @@ def _pictures(task: ExportTask, time_s: float | None) -> tuple[list[str], float]
             shutil.copyfile(task.workspace / "coarse.tif", part)
         made.append("orthoimage.tif")
     return made, area_ha
+
+
+def _trust(task: ExportTask, refined: list[Solution]) -> dict[str, object]:
+    """Write how far the refined layer can be trusted, and return its figures."""
+    from orthoswarm.export.value_raster import write_confidence
+    from orthoswarm.mosaic.confidence import cell_grid, confidence
+    from orthoswarm.mosaic.extent import ground_of_nearest
+    from orthoswarm.mosaic.visible_ground import nearest_cameras
+
+    placed = [p for solution in refined for p in solution.placed]
+    grounds = [s.terrain or Terrain.flat(s.ground_z_m) for s in refined]
+    paths = [np.array([p.camera.nadir for p in s.placed]).reshape(-1, 2) for s in refined]
+    reach = max(float(p.camera.position[2]) for p in placed)
+
+    def joined(grounds: list[Terrain]) -> Terrain:
+        return ground_of_nearest(grounds, paths, reach, step_m=_CONFIDENCE_STEP_M, most_nodes=_CONFIDENCE_NODES)
+
+    drawn, bare = joined(grounds), joined([g.bare_ground() for g in grounds])
+    tops = joined([g if g.tops is None else replace(g, z=g.tops) for g in grounds])
+    terrain = replace(drawn, bare=bare.z, tops=tops.z)
+    with Canvas.open(next(reversed(task.canvases.values())), writable=False) as canvas:
+        grid, _ = cell_grid(canvas.grid, canvas.tile_px)
+    shown = nearest_cameras([p.camera for p in placed], [p.weak for p in placed], grid, terrain)
+    found = confidence(grid, shown, placed, terrain, {})
+    write_confidence(task.workspace / "confidence.tif", found)
+    return found.figures()
 
 
 def _drawn_ha(canvas: Canvas) -> float:

@@ -108,11 +108,24 @@ def products_are_written(served, workspace):
     assert report["frames"]["used"] > 10
     assert [row["vehicle"] for row in report["completions"]] == ["v1", "v2"]
     assert any("no basemap" in text for text in report["warnings"])
+    assert (
+        report["headline"].startswith("Distances are good to about")
+        and "the whole map lies within" in report["headline"]
+    )
+    assert report["trust"]["good_to_m"]["2"] > 0.3
     stages = {row["name"]: row for row in report["stages"]}
     assert stages["realtime"]["items"] == report["frames"]["used"]
     if sys.platform == "linux":  # elsewhere other processes are not counted
         assert report["cpu_s"] > stages["realtime"]["cpu_s"] and report["peak_rss_mb"] > 200
-    for name in ("realtime.tif", "coarse.tif", "orthoimage.tif", "frames.jsonl", "footprints.gpkg", "report.html"):
+    for name in (
+        "realtime.tif",
+        "coarse.tif",
+        "orthoimage.tif",
+        "frames.jsonl",
+        "footprints.gpkg",
+        "confidence.tif",
+        "report.html",
+    ):
         assert (workspace / name).stat().st_size > 1000
     assert served.command("/api/export", {"formats": ["exe"]}).status_code == 422
     assert served.get("/api/export/9999/cog").status_code == 404
