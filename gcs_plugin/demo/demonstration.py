@@ -2,8 +2,6 @@
 
 import contextlib
 import json
-import multiprocessing.process
-import multiprocessing.resource_tracker
 import shutil
 import signal
 import socket
@@ -17,7 +15,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final
 
 from gcs_plugin.demo.setting import FOV_MIN_DEG, HEIGHT_M, DemoSetting
-from orthoswarm.compute.workers import spawn_context
+from orthoswarm.compute.workers import spawn_context, starting_processes
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 
 if TYPE_CHECKING:
@@ -90,7 +88,8 @@ class _Simulator:
         context = spawn_context()
         self._pipe, theirs = context.Pipe()
         self._process = context.Process(target=simulate, args=(setting, folder, theirs), name="simulator", daemon=True)
-        _start(self._process)
+        with starting_processes():
+            self._process.start()
         theirs.close()
         self.addresses: dict[str, list[str]] = {}
         self.stage: tuple[str, int, int] = ("city", 0, 1)
@@ -129,22 +128,6 @@ class _Simulator:
         if self._process.is_alive():
             self._process.terminate()
             self._process.join(10.0)
-
-
-def _start(process: multiprocessing.process.BaseProcess) -> None:
-    """Start a process that ignores Ctrl-C in the terminal; this process terminates it.
-
-    SIGINT is blocked meanwhile, not ignored: one that arrives now is delivered afterwards.
-    """
-    if not hasattr(signal, "pthread_sigmask"):  # Windows: the simulator ignores the signal itself once it runs
-        process.start()
-        return
-    multiprocessing.resource_tracker.ensure_running()  # starting it later would unblock the signal
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        process.start()
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _clear(out: Path) -> None:

@@ -47,7 +47,7 @@ def compile_all(report: Report) -> int:
     Returns:
         How many were compiled.
     """
-    from orthoswarm.compute.workers import prepare_worker
+    from orthoswarm.compute.workers import prepare_worker, starting_processes
 
     modules = listed()
     done, total, compiled = 0, sum(map(len, modules.values())), 0
@@ -56,11 +56,16 @@ def compile_all(report: Report) -> int:
     with ProcessPoolExecutor(processes, get_context("spawn"), initializer=prepare_worker) as pool:
         # Those with most arguments first, so that no process is left with a long one at the end.
         order = sorted(modules, key=lambda module: -sum(map(len, modules[module])))
-        running = {pool.submit(_compile, module, modules[module]): module for module in order}
-        for task in as_completed(running):
-            compiled += task.result()
-            done += len(modules[running[task]])
-            report(done, total)
+        with starting_processes():
+            running = {pool.submit(_compile, module, modules[module]): module for module in order}
+        try:
+            for task in as_completed(running):
+                compiled += task.result()
+                done += len(modules[running[task]])
+                report(done, total)
+        except BaseException:  # what is being compiled is finished, the rest is not begun
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
         if compiled or not MADE_FOR.exists():
             pool.submit(_tidy, order).result()
     return compiled

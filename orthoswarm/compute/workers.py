@@ -13,6 +13,7 @@ import gc
 import io
 import math
 import multiprocessing
+import multiprocessing.resource_tracker
 import os
 import pickle
 import signal
@@ -390,6 +391,23 @@ def _here(function: Callable[[Item], Result], item: Item) -> "Future[_Outcome[Re
     except Exception as error:
         future.set_exception(error)
     return future
+
+
+@contextlib.contextmanager
+def starting_processes() -> Iterator[None]:
+    """Processes that are started within it never see Ctrl-C; this one sees afterwards what came meanwhile.
+
+    On Windows they have to ignore the signal themselves.
+    """
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    multiprocessing.resource_tracker.ensure_running()  # starting it later would unblock the signal
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def prepare_worker() -> None:
