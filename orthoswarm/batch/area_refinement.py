@@ -18,7 +18,7 @@ from orthoswarm.model.errors import AdjustmentError
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import MapWindow, PlacedFrame, Refinement, Refiner, Solution, Terrain
-from orthoswarm.mosaic.extent import solved_level
+from orthoswarm.mosaic.extent import joined_grounds, solved_level
 from orthoswarm.refine.flight.vehicle_refinement import unrefined
 from orthoswarm.trajectory.near_paths import NearPaths
 
@@ -246,12 +246,8 @@ def merged_ground(grounds: Sequence[Terrain | None], nadirs: Sequence[Array]) ->
                 part[:] = at.height(np.stack(np.meshgrid(east, north), -1))
         return z
 
-    def joined_where(name: str) -> Floats | None:
-        known = any(getattr(ground, name) is not None for ground in found)
-        return joined(lambda g: g.z if getattr(g, name) is None else getattr(g, name)) if known else None
-
-    z, bare, tops = joined(lambda g: g.z), joined_where("bare"), joined_where("tops")
-    return Terrain(float(low[0]), float(low[1]), step, z, bare=bare, tops=tops)
+    place = Terrain(float(low[0]), float(low[1]), step, np.zeros((rows, columns), np.float32))
+    return joined_grounds(place, found, joined)
 
 
 def _nearest_areas(low: Array, step: float, shape: tuple[int, int], nadirs: Sequence[Array]) -> NDArray[np.intp]:

@@ -230,7 +230,8 @@ def _write_about(
 ) -> None:
     """Write which picture shows which ground, and how far it can be trusted."""
     write_seamlines(run.out / SEAMLINES, canvas, [partial(describe_frame, p) for p in placed], run=run.drawers.map)
-    found = confidence(*drawn_cells(canvas), placed, terrain, state.gains)
+    gains = [state.gains.get(p.frame.image) for p in placed]
+    found = confidence(*drawn_cells(canvas), placed, terrain, gains)
     write_confidence(run.out / CONFIDENCE, found)
     state.trust = found.figures()
 

@@ -8,7 +8,7 @@ stands there without being drawn on its top, which leans away from the camera. T
 sight through the measured surface: what the picture shows at a place is what that line meets first.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final, NamedTuple
 
@@ -30,7 +30,7 @@ three 94, 98 and 99 of 100 are drawn as near as this to where they are; houses t
 ORIENTATION_ONLY: Final = np.float32(99.0)  # what is not within the last of them
 _LENGTH_SIGMAS: Final = 2.2  # 98 % of errors are shorter: 2.8 sigmas of an axis, see STATED_SIGMA_FACTOR
 _LOW_THINGS_M: Final = 0.3  # sigma of the height of what is not measured: kerbs, cars, shrubs
-_UNMEASURED_M: Final = 3.0  # what may stand where too few pictures see the ground to measure heights: a hedge, a roof
+UNMEASURED_M: Final = 3.0  # what may stand where heights were not measured, or not found: a hedge, a small house
 _LEAST_PICTURES: Final = 3  # that heights are measured from
 _LEANS_M: Final = 0.5  # what stands may be so far from where it is drawn: more than the half of a car
 _CELL_M: Final = 1.0  # least side of a cell
@@ -96,14 +96,14 @@ class Confidence(NamedTuple):
 
 
 def confidence(
-    grid: GroundGrid, shown: Ints, frames: Sequence[PlacedFrame], terrain: Terrain, gains: Mapping[str, Field]
+    grid: GroundGrid, shown: Ints, frames: Sequence[PlacedFrame], terrain: Terrain, gains: Sequence[Field | None]
 ) -> Confidence:
     """How far an orthoimage can be trusted.
 
     Args:
         grid, shown: its cells, and which frame each shows: index plus 1, 0 where none, int32 (rows, columns); see
             `drawn_cells`.
-        frames, terrain: what it was drawn from. gains: image -> factors of a frame's colours.
+        frames, terrain: what it was drawn from. gains: factors of each frame's colours, None where unchanged.
     """
     row, column = np.nonzero(shown)
     of = shown[row, column] - 1
@@ -115,7 +115,7 @@ def confidence(
     common = _common_sigma(frames)
     sigma = np.array([f.sigma_m for f in frames])
     sigma = np.sqrt(sigma**2 - np.array([common**2 if f.stage == "coarse" else 0.0 for f in frames]))[of]
-    unmeasured = np.where(pictures[row, column] < _LEAST_PICTURES, _UNMEASURED_M, 0.0) * tan
+    unmeasured = np.where(pictures[row, column] < _LEAST_PICTURES, UNMEASURED_M, 0.0) * tan
     lean, hidden = _lean(terrain, place, to_camera)
     lean = np.maximum(lean, unmeasured)
     error = _LENGTH_SIGMAS * np.hypot(sigma, _LOW_THINGS_M * tan) + lean
@@ -126,7 +126,7 @@ def confidence(
         out[row, column] = values
         return out
 
-    changed = np.array([_changed(gains.get(f.frame.image)) for f in frames])
+    changed = np.array([_changed(gain) for gain in gains])
     objects, cut = _cut_objects(terrain, grid, shown)
     return Confidence(
         grid, cells(good), np.where(shown > 0, pictures, 0), cells(np.degrees(np.arctan(tan))), cells(sigma),

@@ -1,13 +1,13 @@
 """Extents: bounds of pictures and ground, drawn part of a canvas, level of the ground, overlap with a map."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
 from orthoswarm.canvas.canvas import Canvas
-from orthoswarm.model.arrays import Array
+from orthoswarm.model.arrays import Array, Floats
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.placement import MapWindow, PlacedFrame, Solution, Terrain
@@ -58,10 +58,32 @@ def ground_of_nearest(
     out = Terrain(box.west, box.south, step, np.zeros((rows, columns), np.float32))
     nodes = out.nodes()
     nearest = np.repeat(np.arange(len(paths)), [len(own) for own in paths])[cKDTree(path).query(nodes)[1]]
-    for k, ground in enumerate(grounds):
-        if ground is not None:
-            out.z[nearest == k] = ground.height(nodes[nearest == k])
-    return out
+
+    def joined(heights: Callable[[Terrain], Floats]) -> Floats:
+        z = np.zeros((rows, columns), np.float32)
+        for k, ground in enumerate(grounds):
+            if ground is not None:
+                z[nearest == k] = replace(ground, z=heights(ground)).height(nodes[nearest == k])
+        return z
+
+    return joined_grounds(out, grounds, joined)
+
+
+def joined_grounds(
+    place: Terrain, grounds: Sequence[Terrain | None], joined: Callable[[Callable[[Terrain], Floats]], Floats]
+) -> Terrain:
+    """Several grounds on the nodes of one: as drawn, and bare and up to their tops where any of them has these.
+
+    joined: gives each node the height that its ground has by a function; called for each of the three.
+    """
+    bare = any(ground is not None and ground.bare is not None for ground in grounds)
+    tops = any(ground is not None and ground.tops is not None for ground in grounds)
+    return replace(
+        place,
+        z=joined(lambda g: g.z),
+        bare=joined(lambda g: g.z if g.bare is None else g.bare) if bare else None,
+        tops=joined(lambda g: g.z if g.tops is None else g.tops) if tops else None,
+    )
 
 
 def solved_level(solutions: Sequence[Solution]) -> float:

@@ -7,10 +7,10 @@ from typing import Any, Final
 
 import numpy as np
 
+from orthoswarm.mosaic.confidence import GOOD_TO_M, ORIENTATION_ONLY
 from orthoswarm.report.report_pictures import Picture, pale, scale_bar
 
-TRUST_COLOURS: Final = {0.2: (0, 140, 90), 0.5: (120, 190, 60), 2.0: (230, 159, 0), 99.0: (190, 30, 60)}
-"""Of each class of confidence.tif, metres; 99: only for orientation."""
+_COLOURS: Final = ((0, 140, 90), (120, 190, 60), (230, 159, 0), (190, 30, 60))  # of the classes, best first
 _TINT: Final = 0.5
 _MOST: Final = 0.5  # a class is said of the map if so much of it is as good, of what is not only for orientation
 _SOME: Final = 0.02  # less of the map is not worth a word
@@ -77,7 +77,7 @@ def trust_picture(confidence: Path, ortho: Picture) -> Picture:
         WarpedVRT(file, crs=file.crs, transform=grid.affine(), width=grid.width, height=grid.height) as view,
     ):
         good = view.read(1)
-    for value, colour in TRUST_COLOURS.items():
+    for value, colour in zip((*GOOD_TO_M, ORIENTATION_ONLY), _COLOURS, strict=True):
         of_class = (np.abs(good - value) < 1e-3) & out.seen
         out.rgb[of_class] = ((1 - _TINT) * out.rgb[of_class] + _TINT * np.array(colour)).astype(np.uint8)
     scale_bar(out)

@@ -30,7 +30,7 @@ def drawn(tmp_path):
         frames = [replace(f, **{"sigma_m": 0.02, "stage": "fine"} | of_frames) for f in flight.frames]
         canvas = Canvas.create(tmp_path / "canvas", scene.grid(260.0), plane="frame", tile_px=128)
         render(frames, terrain, canvas, read=flight.read)
-        found = confidence(*drawn_cells(canvas), frames, terrain, {})
+        found = confidence(*drawn_cells(canvas), frames, terrain, [None] * len(frames))
         canvas.close()
         return frames, found
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from gcs_plugin.daemon.jobs.solution_file import read_solution
+from gcs_plugin.daemon.jobs.solution_file import SolutionFile, read_solution
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
 from gcs_plugin.daemon.store.job_rows import latest_jobs
 from gcs_plugin.daemon.store.journal import Journal
@@ -23,7 +23,7 @@ from orthoswarm.export.tactical.places import Place
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.frame import Frame, Rejection, last_time
 from orthoswarm.model.geo import LocalGrid
-from orthoswarm.model.placement import PlacedFrame, Solution, Terrain
+from orthoswarm.model.placement import PlacedFrame, Solution
 from orthoswarm.raster.basemap import Basemap
 
 if TYPE_CHECKING:
@@ -87,7 +87,8 @@ def write_products(task: ExportTask) -> dict[str, str]:
     made, area_ha = _pictures(task, last_time(p.frame for p in recorded.placed))
     if not made:
         raise InputError("there is no map yet; wait for pictures")
-    refined = [read_solution(path).solution for path in task.solutions]
+    refined_files = [read_solution(path) for path in task.solutions]
+    refined = [file.solution for file in refined_files]
     solutions = [*(read_solution(path).solution for path in task.coarse), *refined]
     placed, rejected = _placements(task, recorded, solutions)
     offset = measure_map_offset(recorded.placed, placed)
@@ -96,7 +97,8 @@ def write_products(task: ExportTask) -> dict[str, str]:
     report = _report(task, solutions, placed, rejected, level, assumed=recorded.warnings)
     report |= {"area_ha": area_ha, "until": "fine", "root": None}
     if refined:
-        report["trust"] = _trust(task, refined)
+        best = next(layer for layer in reversed(_FILES) if layer in task.canvases)
+        report["trust"] = _trust(task, best, refined_files)
         report["headline"] = headline(report)
     report["unrefined"] = _unrefined(placed, refined)
     report["map_offset_m"] = None if offset is None else offset.document()
@@ -143,28 +145,24 @@ def _pictures(task: ExportTask, time_s: float | None) -> tuple[list[str], float]
     return made, area_ha
 
 
-def _trust(task: ExportTask, refined: list[Solution]) -> dict[str, object]:
-    """Write how far the refined layer can be trusted, and return its figures."""
+def _trust(task: ExportTask, layer: str, refined: list[SolutionFile]) -> dict[str, object]:
+    """Write how far a refined layer can be trusted, and return its figures."""
     from orthoswarm.export.value_raster import write_confidence
     from orthoswarm.mosaic.confidence import cell_grid, confidence
     from orthoswarm.mosaic.extent import ground_of_nearest
     from orthoswarm.mosaic.visible_ground import nearest_cameras
 
-    placed = [p for solution in refined for p in solution.placed]
-    grounds = [s.terrain or Terrain.flat(s.ground_z_m) for s in refined]
-    paths = [np.array([p.camera.nadir for p in s.placed]).reshape(-1, 2) for s in refined]
-    reach = max(float(p.camera.position[2]) for p in placed)
-
-    def joined(grounds: list[Terrain]) -> Terrain:
-        return ground_of_nearest(grounds, paths, reach, step_m=_CONFIDENCE_STEP_M, most_nodes=_CONFIDENCE_NODES)
-
-    drawn, bare = joined(grounds), joined([g.bare_ground() for g in grounds])
-    tops = joined([g if g.tops is None else replace(g, z=g.tops) for g in grounds])
-    terrain = replace(drawn, bare=bare.z, tops=tops.z)
-    with Canvas.open(next(reversed(task.canvases.values())), writable=False) as canvas:
+    placed = [p for file in refined for p in file.solution.placed]
+    gains = [file.gains.get(p.frame.image) for file in refined for p in file.solution.placed]
+    paths = [np.array([p.camera.nadir for p in file.solution.placed]).reshape(-1, 2) for file in refined]
+    terrain = ground_of_nearest(
+        [file.terrain for file in refined], paths, max(float(p.camera.position[2]) for p in placed),
+        step_m=_CONFIDENCE_STEP_M, most_nodes=_CONFIDENCE_NODES,
+    )  # fmt: skip
+    with Canvas.open(task.canvases[layer], writable=False) as canvas:
         grid, _ = cell_grid(canvas.grid, canvas.tile_px)
     shown = nearest_cameras([p.camera for p in placed], [p.weak for p in placed], grid, terrain)
-    found = confidence(grid, shown, placed, terrain, {})
+    found = confidence(grid, shown, placed, terrain, gains)
     write_confidence(task.workspace / "confidence.tif", found)
     return found.figures()
 

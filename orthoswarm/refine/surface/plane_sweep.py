@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from orthoswarm.model.arrays import Array, Flags, Floats, Gray, Ints
 from orthoswarm.model.placement import Terrain
 from orthoswarm.model.task_runner import Run
+from orthoswarm.mosaic.confidence import UNMEASURED_M
 from orthoswarm.refine.bundle.block_arrays import HEIGHT, WIDTH, CameraBlock, F
 from orthoswarm.refine.features.working_pictures import Pictures, shrunk
 from orthoswarm.refine.surface import plane_sweep_kernels as kernels
@@ -52,7 +53,6 @@ _TALL_EDGE_LEVELS: Final = 8.0  # difference of grey values that halves what is 
 _TALL_REACH_HEIGHTS: Final = 1.5  # pictures whose nadir points are farther away, in flying heights, are not compared
 _TALL_RIM_SHARE: Final = 0.05  # share of a picture's sides at its rim that a block's middle must not lie in
 _TALL_NEAR_M: Final = 18.0  # heights are measured within this distance of raised points at the reference height
-_UNDECIDED_M: Final = 3.0  # what stands near raised points may be so high where no height was found: a small house
 _TALL_ABOVE_M: Final = 2.0
 """... and up to so much above the highest of them (0 and larger distances change the share of nodes within 1 m by at
 most 0.008 on two scenes)."""
@@ -286,7 +286,7 @@ def with_tall_surfaces(
     heights = tall_heights(views, fine, tallest, height_m=height_m, run=run)
     heights[heights < TALL_FROM_M] = 0.0
     cameras = CameraBlock.joined([v.cameras.take(np.flatnonzero(v.usable)) for v in views])
-    may_stand = np.where((tallest > 0.0) & (heights == 0.0), np.float32(_UNDECIDED_M), heights)
+    may_stand = np.where((tallest > 0.0) & (heights == 0.0), np.float32(UNMEASURED_M), heights)
     return seen_objects(replace(fine, z=fine.z + heights, bare=fine.z, tops=fine.z + may_stand), cameras)
 
 
