@@ -20,6 +20,7 @@ from orthoswarm.compute.jit import in_place_kernel
 from orthoswarm.model.arrays import Array, Flags, Floats, Ints
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import PlacedFrame, Terrain
+from orthoswarm.mosaic.extent import drawn_window
 from orthoswarm.mosaic.footprint import footprint
 from orthoswarm.mosaic.kernels.line_of_sight import HIDES_M
 from orthoswarm.mosaic.radiometry import Field
@@ -141,28 +142,28 @@ def _common_sigma(frames: Sequence[PlacedFrame]) -> float:
     return min((f.sigma_m for f in frames if f.stage == "coarse" and np.isfinite(f.sigma_m)), default=0.0)
 
 
-def cell_grid(grid: GroundGrid, most_px: int) -> tuple[GroundGrid, int]:
-    """Cells of an orthoimage's pixels, and the side of each: a power of two, so that a tile holds whole ones.
-
-    most_px: side that a cell may have, that of a tile.
-    """
-    px = 1
-    while px < most_px and (px * grid.gsd_m < _CELL_M or grid.width * grid.height > px * px * _MOST_CELLS):
+def cell_grid(canvas: Canvas) -> tuple[GroundGrid, int]:
+    """Cells of what is drawn on a canvas, and their side in pixels: a power of two, so that a tile holds whole ones."""
+    row0, row1, col0, col1 = drawn_window(canvas)
+    grid, px = canvas.grid, 1
+    while px < canvas.tile_px and (px * grid.gsd_m < _CELL_M or (row1 - row0) * (col1 - col0) > px * px * _MOST_CELLS):
         px *= 2
-    width, height = -(-grid.width // px), -(-grid.height // px)
-    return replace(grid, gsd_m=grid.gsd_m * px, width=width, height=height), px
+    cells = replace(
+        grid, west=grid.west + col0 * grid.gsd_m, north=grid.north - row0 * grid.gsd_m, gsd_m=grid.gsd_m * px,
+        width=-(-(col1 - col0) // px), height=-(-(row1 - row0) // px),
+    )  # fmt: skip
+    return cells, px
 
 
 def drawn_cells(canvas: Canvas) -> tuple[GroundGrid, Ints]:
     """Cells of a canvas (renderer.render), and which frame is drawn in the middle of each, as of `confidence`."""
-    grid, t = canvas.grid, canvas.tile_px
-    cells, px = cell_grid(grid, t)
+    cells, px = cell_grid(canvas)
     out = np.zeros((cells.height, cells.width), np.int32)
-    for r, c in canvas.changed_since(0):
-        plane = canvas.read_plane(r * t, min(r * t + t, grid.height), c * t, min(c * t + t, grid.width))
+    row0, row1, col0, col1 = drawn_window(canvas)
+    for row in range(row0, row1, canvas.tile_px):  # a row of tiles at a time, for memory
+        plane = canvas.read_plane(row, min(row + canvas.tile_px, row1), col0, col1)
         some = plane[px // 2 :: px, px // 2 :: px]
-        r0, c0 = r * t // px, c * t // px
-        out[r0 : r0 + some.shape[0], c0 : c0 + some.shape[1]] = some
+        out[(row - row0) // px :][: len(some), : some.shape[1]] = some
     return cells, out
 
 

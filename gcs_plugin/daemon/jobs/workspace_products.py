@@ -160,7 +160,7 @@ def _trust(task: ExportTask, layer: str, refined: list[SolutionFile]) -> dict[st
         step_m=_CONFIDENCE_STEP_M, most_nodes=_CONFIDENCE_NODES,
     )  # fmt: skip
     with Canvas.open(task.canvases[layer], writable=False) as canvas:
-        grid, _ = cell_grid(canvas.grid, canvas.tile_px)
+        grid, _ = cell_grid(canvas)
     shown = nearest_cameras([p.camera for p in placed], [p.weak for p in placed], grid, terrain)
     found = confidence(grid, shown, placed, terrain, gains)
     write_confidence(task.workspace / "confidence.tif", found)

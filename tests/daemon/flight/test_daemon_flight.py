@@ -5,6 +5,7 @@ import sys
 
 import httpx
 import pytest
+import rasterio
 
 from gcs_plugin.sim.multirotor import Airframe
 from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
@@ -113,6 +114,8 @@ def products_are_written(served, workspace):
         and "the whole map lies within" in report["headline"]
     )
     assert report["trust"]["good_to_m"]["2"] > 0.3
+    with rasterio.open(workspace / "confidence.tif") as file:
+        assert file.res[0] < 3.0  # cells of what is drawn, not of all the layer's grid
     stages = {row["name"]: row for row in report["stages"]}
     assert stages["realtime"]["items"] == report["frames"]["used"]
     if sys.platform == "linux":  # elsewhere other processes are not counted
