@@ -12,7 +12,7 @@ from orthoswarm.report.report_pictures import Picture, pale, scale_bar
 
 _COLOURS: Final = ((0, 140, 90), (120, 190, 60), (230, 159, 0), (190, 30, 60))  # of the classes, best first
 _TINT: Final = 0.5
-_MOST: Final = 0.5  # a class is said of the map if so much of it is as good, of what is not only for orientation
+_MOST: Final = 0.5  # so much of a map must be more than for orientation, and so much of that as good as is said
 _SOME: Final = 0.02  # less of the map is not worth a word
 
 
@@ -22,7 +22,8 @@ def headline(report: Mapping[str, Any]) -> str:
     if not trust:
         return ""
     known = max(trust["good_to_m"].values())
-    usual = next((name for name, share in trust["good_to_m"].items() if share >= _MOST * known > 0.0), None)
+    least = _MOST * known if known >= _MOST else math.inf
+    usual = next((name for name, share in trust["good_to_m"].items() if share >= least), None)
     on_map, whole = bool(report["basemap"]) and trust["whole_good_to_m"] == 0.0, trust["whole_good_to_m"]
     rough = 1.0 - known
     good = "for orientation only"
