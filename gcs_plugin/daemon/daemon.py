@@ -35,6 +35,7 @@ from gcs_plugin.daemon.layers.layers import NAMES, MapLayer
 from gcs_plugin.daemon.layers.map_site import ExpectedPlace, MapSite
 from gcs_plugin.daemon.layers.realtime_layer import Drawer
 from gcs_plugin.daemon.layers.web_tiles import TileServer
+from gcs_plugin.daemon.pilots import Pilots
 from gcs_plugin.daemon.settings import Settings
 from gcs_plugin.daemon.store.console_state import ConsoleState
 from gcs_plugin.daemon.store.daemon_events import (
@@ -52,6 +53,7 @@ from gcs_plugin.daemon.store.daemon_events import (
     VehicleSilent,
 )
 from gcs_plugin.daemon.store.journal import Journal
+from gcs_plugin.daemon.store.people_rows import People
 from gcs_plugin.daemon.store.picture_store import KeptPictures, PictureStore
 from gcs_plugin.daemon.store.workspace_lock import distrust_after_power_cut, take_over
 from gcs_plugin.daemon.takeoffs import Takeoffs
@@ -102,6 +104,8 @@ class Daemon:
         self.tiles = TileServer(self.layers, settings.basemap)
         self.refused = RefusedPictures(self.events)
         self.console = ConsoleState(self.journal, self.events)
+        self.people = People(self.journal, self.events)
+        self.pilots = Pilots(self.people, self.events)
 
     def _open_vehicles(self) -> None:
         """The vehicles on their links, and their takeoffs."""
@@ -176,7 +180,7 @@ class Daemon:
         facts = RunFacts(self.journal, self.started, (self.workers, self.background))
         self.exports = Exports(
             settings, self.journal, store=self.store, layers=self.layers, console=self.console, drawer=self.drawer,
-            views=self.views, coverage=self.coverage, facts=facts,
+            views=self.views, coverage=self.coverage, facts=facts, people=self.people,
         )  # fmt: skip
         self.getting_ready = GettingReady(self.events)
         self.tak = TakFeed([settings.tak_address(text) for text in settings.tak], self.exports)

@@ -32,11 +32,12 @@ from gcs_plugin.daemon.stoppable_thread import Background
 from gcs_plugin.daemon.store.console_state import ConsoleState, FindRow
 from gcs_plugin.daemon.store.frame_rows import all_frames, frame_number, frame_path
 from gcs_plugin.daemon.store.journal import Change, Journal, no_change
+from gcs_plugin.daemon.store.people_rows import People
 from gcs_plugin.daemon.store.picture_store import PictureStore
 from gcs_plugin.daemon.store.sortie_rows import coarse_only, placed_sorties
 from gcs_plugin.daemon.vehicle_names import VehicleRow
 from gcs_plugin.daemon.views import Views
-from orthoswarm.export.atomic_file import atomic_write
+from orthoswarm.export.atomic_file import atomic_write, write_file
 from orthoswarm.export.tactical.cursor_on_target import TakAddress, TakSender, event
 from orthoswarm.export.tactical.places import Place, sightings
 from orthoswarm.model.errors import InputError, OrthoSwarmError
@@ -87,7 +88,7 @@ class Exports:
 
     Args:
         layers: by name. drawer: knows the map's area. views: has the vehicles. coverage: its cells and figures are
-            part of the report. facts: of the daemon, for the report.
+            part of the report. facts: of the daemon, for the report. people: whose log goes into the pack.
     """
 
     def __init__(
@@ -102,10 +103,12 @@ class Exports:
         views: Views,
         coverage: LiveCoverage,
         facts: RunFacts,
+        people: People,
     ) -> None:
         self._settings, self._journal, self._store = settings, journal, store
         self._layers, self._console = layers, console
         self._drawer, self._views, self._coverage, self._facts = drawer, views, coverage, facts
+        self._people = people
         self._written: tuple[dict[str, int], dict[str, str]] = ({}, {})  # the layers' versions, and the files of them
 
     def write(self, run: RunningJob) -> Change:
@@ -133,6 +136,8 @@ class Exports:
             ]
             places = tuple(self.places(shown))
             task = replace(task, facts=self._report_facts(), places=places, cells=self._coverage.png)
+            if "pack" in task.formats:
+                write_file(self._settings.workspace / "log.csv", self._people.table())
             job.detail["files"] = files = run.run(write_products, task)
             self._written = versions, {name: files[name] for name in PRODUCTS}
         return no_change

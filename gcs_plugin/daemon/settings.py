@@ -14,6 +14,7 @@ from orthoswarm.model.errors import InputError
 
 FILE: Final = "orthoswarm.toml"
 PORT: Final = 8650
+BIND: Final = "127.0.0.1"
 NO_IDS: Final = frozenset({"all", ".", ".."})
 """Ids that the address of a command cannot have: `all` means every vehicle, and browsers leave out the others."""
 
@@ -22,6 +23,10 @@ TEMPLATE: Final = """\
 
 # port = 8650
 # bind = "127.0.0.1"              # another address needs the token for everything
+# lan = true                      # HTTPS for other machines, and people with roles
+# open_reading = true             # with lan: everybody in the network may look
+# certificate = "post.pem"        # with lan: instead of the daemon's own; chain and key in PEM
+# key = "post-key.pem"
 # basemap = "before.tif"          # GeoTIFF, COG, MBTiles or folder z/x/y.png; relative to this file
 # dem = "heights.tif"             # height model: plans follow the ground, and vehicles get their terrain data from it
 # links = ["udpin:0.0.0.0:14550", "serial:/dev/ttyUSB0:57600"]
@@ -68,6 +73,8 @@ class Settings:
 
     Attributes:
         workspace: its folder. bind, port: where HTTP is served (port 0: any free one).
+        lan: HTTPS, and people with roles. open_reading: with it, everybody may read.
+        certificate, key: PEM files for it, None for the daemon's own.
         links: MAVLink links. basemap: the map before the disaster, or None. dem: height model of the ground, or None.
         fov_min_deg: theta-hat. gsd_m: ground pixel, from the first pictures if None.
         workers: processes that refine. coarse: True to place legs in flight.
@@ -83,8 +90,12 @@ class Settings:
     """
 
     workspace: Path
-    bind: str = "127.0.0.1"
+    bind: str = BIND
     port: int = PORT
+    lan: bool = False
+    open_reading: bool = False
+    certificate: Path | None = None
+    key: Path | None = None
     links: tuple[str, ...] = ()
     basemap: Path | None = None
     dem: Path | None = None
@@ -130,6 +141,10 @@ class Settings:
         """
         if not 0 <= self.port <= 65535:
             raise InputError(f"port {self.port} is not a port; give 1 to 65535, or 0 for any free one")
+        if (self.certificate is None) != (self.key is None):
+            raise InputError("a certificate needs its key, and a key its certificate; give both, or none for one's own")
+        if not self.lan and (self.open_reading or self.certificate is not None):
+            raise InputError("open reading and a certificate are for other machines; give --lan as well")
         if self.basemap is not None and not self.basemap.exists():
             raise InputError(f"the basemap {self.basemap} does not exist; check the path")
         if self.dem is not None and not self.dem.is_file():
@@ -161,7 +176,8 @@ class Settings:
 
 
 _KINDS: Final[dict[str, tuple[type, ...]]] = {
-    "bind": (str,), "port": (int,), "links": (list,), "basemap": (str,), "dem": (str,), "fov_min_deg": (int, float),
+    "bind": (str,), "port": (int,), "lan": (bool,), "open_reading": (bool,), "certificate": (str,), "key": (str,),
+    "links": (list,), "basemap": (str,), "dem": (str,), "fov_min_deg": (int, float),
     "gsd_m": (int, float), "workers": (int,), "coarse": (bool,), "lost_after_s": (int, float), "vehicle": (list,),
     "picture_folder": (str,), "picture_bytes_s": (int, float),
     "tak": (list,), "tak_certificate": (str,), "tak_authority": (str,),
@@ -191,7 +207,7 @@ def read_settings(workspace: Path) -> Settings:
         document["links"] = tuple(str(link) for link in document["links"])
     if "tak" in document:
         document["tak"] = tuple(str(address) for address in document["tak"])
-    for key in ("basemap", "dem", "tak_certificate", "tak_authority"):
+    for key in ("basemap", "dem", "tak_certificate", "tak_authority", "certificate", "key"):
         if key in document:
             document[key] = workspace / document[key]
     return replace(Settings(workspace=workspace), vehicles=vehicles, **document)

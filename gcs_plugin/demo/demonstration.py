@@ -170,7 +170,7 @@ class Served:
         import uvicorn
 
         from gcs_plugin.web.app import make_app
-        from gcs_plugin.web.guard import take_token
+        from gcs_plugin.web.guard import Access, take_token
 
         token = take_token(daemon.settings.workspace / "token")
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
@@ -183,7 +183,7 @@ class Served:
             raise InputError(f"port {port} cannot be served ({error.strerror}); choose another --port") from None
         self.url = f"http://127.0.0.1:{self._socket.getsockname()[1]}/#token={token}"
         config = uvicorn.Config(
-            make_app(daemon, token), log_level="warning", access_log=False, server_header=False,
+            make_app(daemon, Access(token)), log_level="warning", access_log=False, server_header=False,
             timeout_graceful_shutdown=2,
         )  # fmt: skip
         self._server = uvicorn.Server(config)

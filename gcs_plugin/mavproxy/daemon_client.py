@@ -1,5 +1,6 @@
 """Commands to a running daemon, words in and lines out, for consoles such as MAVProxy's."""
 
+import contextlib
 import json
 import urllib.error
 import urllib.request
@@ -15,10 +16,15 @@ _TIMEOUT_S: Final = 240.0
 
 
 class Client:
-    """Talks to the daemon at a url (no slash at the end); commands need its token."""
+    """Talks to the daemon at a url (no slash at the end); commands need its token.
 
-    def __init__(self, url: str = "http://127.0.0.1:8650", token: str = "") -> None:
-        self.url, self.token = url.rstrip("/"), token
+    `certificate` is the daemon's if it is served over TLS: its file, or the workspace that has its own one.
+    """
+
+    def __init__(
+        self, url: str = "http://127.0.0.1:8650", token: str = "", certificate: Path | None = None
+    ) -> None:  # fmt: skip
+        self.url, self.token, self.certificate = url.rstrip("/"), token, certificate
 
     def ask(self, path: str, body: dict[str, Any] | None = None) -> Any:
         """The JSON answer of a route; errors as of `fetch`."""
@@ -39,8 +45,8 @@ class Client:
         if body is not None:
             request.add_header("Content-Type", "application/json")
             data = json.dumps(body).encode()
-        opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
         try:
+            opener = urllib.request.build_opener(urllib.request.ProxyHandler({}), *self._encryption())
             with opener.open(request, data, timeout=_TIMEOUT_S) as answer:
                 return bytes(answer.read())
         except urllib.error.HTTPError as error:
@@ -50,6 +56,15 @@ class Client:
                 f"the daemon at {self.url} does not answer ({error}); start one with 'orthoswarm serve', "
                 "or connect to another"
             ) from None
+
+    def _encryption(self) -> list[urllib.request.HTTPSHandler]:
+        """What trusts the daemon's certificate and no other; nothing where it is not known."""
+        from gcs_plugin.web.certificate import CERTIFICATE, client_context
+
+        if self.certificate is None or not self.url.startswith("https"):
+            return []
+        file = self.certificate / CERTIFICATE if self.certificate.is_dir() else self.certificate
+        return [urllib.request.HTTPSHandler(context=client_context(file))]
 
 
 def _detail(error: urllib.error.HTTPError) -> str:
@@ -97,7 +112,11 @@ class Commands:
     def connect(self, words: list[str]) -> list[str]:
         """`connect URL TOKEN`, or `connect WORKSPACE` with the token in its file."""
         if len(words) == 1 and Path(words[0]).is_dir():
-            self.client.token = (Path(words[0]) / "token").read_text().strip()
+            workspace = Path(words[0])
+            self.client.token = (workspace / "token").read_text().strip()
+            with contextlib.suppress(OSError):
+                self.client.url = (workspace / "address").read_text().strip().rstrip("/")
+            self.client.certificate = workspace
         elif len(words) == 2:
             self.client.url, self.client.token = words[0].rstrip("/"), words[1]
         else:

@@ -23,7 +23,8 @@ from gcs_plugin.web.answers import JsonAnswer, in_thread, install_error_answers,
 from gcs_plugin.web.areas import read_area
 from gcs_plugin.web.command_routes import CommandRoutes
 from gcs_plugin.web.event_stream import Standstill, stream_events
-from gcs_plugin.web.guard import Guard
+from gcs_plugin.web.guard import Access, Guard
+from gcs_plugin.web.people_routes import PeopleRoutes
 from gcs_plugin.web.uploads import UploadRoute
 from orthoswarm import __version__
 from orthoswarm.compute.workers import peak_rss_mb
@@ -299,9 +300,9 @@ _FORM: Final = {
 }
 
 
-def make_app(daemon: Daemon, token: str, bind: str = "127.0.0.1") -> Any:
-    """The ASGI application of a running daemon."""
-    routes = HttpRoutes(daemon)
+def make_app(daemon: Daemon, access: Access, address: str = "") -> Any:
+    """The ASGI application of a running daemon; `address`: of its page, for those who are invited."""
+    routes, people = HttpRoutes(daemon), PeopleRoutes(daemon, access, address)
 
     @contextlib.asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
@@ -335,10 +336,19 @@ def make_app(daemon: Daemon, token: str, bind: str = "127.0.0.1") -> Any:
     add("/api/places", routes.places)
     add("/api/finds/{number}", routes.change_find, methods=["PUT"])
     add("/api/finds/{number}", routes.delete_find, methods=["DELETE"], status_code=204)
-    add("/tiles/{layer}/{z}/{x}/{y}.{suffix}", routes.tile, methods=["GET", "HEAD"])
+    add("/tiles/{layer}/{z}/{x}/{y}.{suffix}", routes.tile)
+    add("/tiles/{layer}/{z}/{x}/{y}.{suffix}", routes.tile, methods=["HEAD"], include_in_schema=False)
     add("/api/coverage", routes.coverage)
     add("/api/coverage/gaps.geojson", routes.gaps)
     add("/api/coverage/cells.png", routes.cells)
+    add("/api/me", people.me)
+    add("/api/session", people.join, methods=["POST"])
+    add("/api/people", people.people)
+    add("/api/people", people.invite, methods=["POST"], status_code=201)
+    add("/api/people/{number}", people.revoke, methods=["DELETE"], status_code=204)
+    add("/api/holds", people.holds)
+    add("/api/holds/{vehicle:path}", people.hold, methods=["POST"])
+    add("/api/log", people.log)
     app.add_api_websocket_route("/api/events", routes.events)
     if STATIC.is_dir():
         app.mount("/static", StaticFiles(directory=STATIC), name="static")
@@ -355,7 +365,7 @@ def make_app(daemon: Daemon, token: str, bind: str = "127.0.0.1") -> Any:
     async def icon() -> Response:
         return Response(status_code=204)
 
-    return Guard(app, token, bind)
+    return Guard(app, access, daemon.people)
 
 
 def prometheus(daemon: Daemon, uploads_waiting: int = 0) -> str:

@@ -8,6 +8,7 @@ not sent twice.
 """
 
 import asyncio
+import contextlib
 import math
 import time
 from collections import OrderedDict
@@ -22,13 +23,15 @@ from fastapi import HTTPException, Request, Response
 from gcs_plugin.config import COMMAND
 from gcs_plugin.daemon.daemon import Daemon
 from gcs_plugin.daemon.store.daemon_events import CommandDone
-from gcs_plugin.daemon.takeoffs import Takeoffs, names_of
+from gcs_plugin.daemon.store.people_rows import Deed, Person
+from gcs_plugin.daemon.takeoffs import names_of
 from gcs_plugin.daemon.vehicles import VehicleLinks
 from gcs_plugin.fleet.commands import URGENT, VERBS, CommandResult, new_id
 from gcs_plugin.fleet.separation.returns import VERB as RETURN_VERB
 from gcs_plugin.mission.exchange import Verdict
 from gcs_plugin.web.answers import JsonAnswer, in_thread, json_body
 from gcs_plugin.web.event_stream import RUN, Standstill, clock_with_sleep
+from gcs_plugin.web.guard import act_of
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 
 Rows = list[dict[str, Any]]
@@ -93,11 +96,14 @@ class CommandRoutes:
         body = await json_body(request)
         self._require_links()
         issue = self._issue(body)
-        task = self._known_task(issue.id, (vehicle, verb))
+        task, act = self._known_task(issue.id, (vehicle, verb)), act_of(request.scope)
+        is_new = task is None
         if task is None:
-            task = asyncio.ensure_future(in_thread(self._threads, self._carry_out, vehicle, verb, issue, body))
+            carry_out = partial(self._carry_out, vehicle, verb, issue, body, act.person)
+            task = asyncio.ensure_future(in_thread(self._threads, carry_out))
             self._remember(issue.id, (vehicle, verb), task)
         rows = await asyncio.shield(task)
+        act.deeds = [Deed(r["command"], r["vehicle"], r["outcome"], r["reason"]) for r in rows if is_new]
         return JsonAnswer({"id": issue.id, "results": rows} if vehicle == ALL else rows[0])
 
     def _remember(self, number: str, what: tuple[str, str], task: "asyncio.Task[Any]") -> None:
@@ -131,7 +137,7 @@ class CommandRoutes:
             return Issue(number, -math.inf)  # given to a run of the daemon that has ended
         return Issue(number, now - self._standstill.length_s())
 
-    def _carry_out(self, vehicle: str, verb: str, issue: Issue, body: dict[str, Any]) -> Rows:
+    def _carry_out(self, vehicle: str, verb: str, issue: Issue, body: dict[str, Any], pilot: Person) -> Rows:
         """Execute a command and publish its outcome; runs in a thread."""
         links = self._daemon.links
         names = links.heard() if vehicle == ALL else [vehicle]
@@ -140,13 +146,33 @@ class CommandRoutes:
             rows = [CommandResult(issue.id, name, verb, Verdict.NOT_SENT, late).document() for name in names]
         elif verb == RETURN_VERB:
             rows = links.return_in_turn(command_id=issue.id)
-        elif verb == "upload":
-            rows = [self._upload(vehicle, issue, body)]
         else:
             override = _override(body, vehicle)
+            rows = [] if verb in _ENDS else self._held(pilot, names, verb, issue)
+            free = [name for name in names if name not in {row["vehicle"] for row in rows}]
             began = links.clock() - max(0.0, issue.age_s)
-            rows = links.commands(verb, names, given_s=began, command_id=issue.id, override=override)
+            if verb == "upload":
+                rows += [self._upload(name, issue, body) for name in free]
+            elif free:
+                rows += links.commands(verb, free, given_s=began, command_id=issue.id, override=override)
         return self._told(rows)
+
+    def _held(self, pilot: Person, names: Collection[str], verb: str, issue: Issue) -> Rows:
+        """The refusals of vehicles that another pilot has; the others are this pilot's now."""
+        known = self._ids(names)
+        held = self._daemon.pilots.claim(pilot, known.values())
+        return [
+            CommandResult(issue.id, name, verb, Verdict.REFUSED, held[vehicle]).document()
+            for name, vehicle in known.items() if vehicle in held
+        ]  # fmt: skip
+
+    def _ids(self, names: Collection[str]) -> dict[str, str]:
+        """The ids of vehicles on the links, by what a request calls them: one has a number, too."""
+        fleet, known = self._daemon.links.fleet, {}
+        for name in names:
+            with contextlib.suppress(OrthoSwarmError):
+                known[name] = fleet.names.name_of(fleet.system_of(name))
+        return known
 
     def _told(self, rows: Rows) -> Rows:
         for row in rows:
@@ -201,7 +227,7 @@ class CommandRoutes:
         task = self._known_task(issue.id, what)
         if task is None:
             begin = partial(
-                _begin, self._daemon.takeoffs, issue, number,
+                self._begin, issue, number, act_of(request.scope).person,
                 sortie=sortie, names=names, override=_override(body, ALL),
             )  # fmt: skip
             task = asyncio.ensure_future(in_thread(self._threads, begin))
@@ -230,28 +256,24 @@ class CommandRoutes:
                 rows = await in_thread(self._threads, self._pause, list(seconds), pause)
         return JsonAnswer({"plan": number, "results": rows})
 
+    def _begin(
+        self, issue: Issue, number: str, pilot: Person, *,
+        sortie: int, names: dict[str, str], override: Mapping[str, Collection[str]],
+    ) -> dict[str, float]:  # fmt: skip
+        late = _late(issue, "start")
+        if late is not None:
+            raise OrthoSwarmError(f"{late}; no vehicle was started")
+        flown = [names.get(vehicle, vehicle) for vehicle in self._daemon.plans.starts(number, sortie)]
+        self._daemon.pilots.claim(pilot, self._ids(flown).values(), whole=True)
+        began = VehicleLinks.clock() - max(0.0, issue.age_s)
+        return self._daemon.takeoffs.begin(number, sortie, names, override, number=issue.id, given_s=began)
+
     def _pause(self, vehicles: list[str], issue: Issue) -> Rows:
         return self._told(self._daemon.links.commands("pause", vehicles, command_id=issue.id))
 
     def _require_links(self) -> None:
         if not self._daemon.settings.links:
             raise HTTPException(409, "the daemon has no links; start it with --link")
-
-
-def _begin(
-    takeoffs: Takeoffs,
-    issue: Issue,
-    number: str,
-    *,
-    sortie: int,
-    names: dict[str, str],
-    override: Mapping[str, Collection[str]],
-) -> dict[str, float]:
-    late = _late(issue, "start")
-    if late is not None:
-        raise OrthoSwarmError(f"{late}; no vehicle was started")
-    began = VehicleLinks.clock() - max(0.0, issue.age_s)
-    return takeoffs.begin(number, sortie, names, override, number=issue.id, given_s=began)
 
 
 def _seconds(body: Mapping[str, Any], key: str) -> float | None:

@@ -1,23 +1,31 @@
-"""Access control: same-origin pages and local programs; commands, and all requests of other machines, need the token.
+"""Access control: who makes a request, whether that role may (`roles`), and the log of what came of it.
+
+The operator sends the daemon's token in a header, which no foreign form can set. People who were invited have a session
+in a cookie (HttpOnly, SameSite=Strict, this host's alone); what changes something must then state its Origin, too.
+Everybody else may do nothing; on this machine, or where the operator lets all read, they may read.
 
 A page of another site cannot reach the daemon: a foreign Origin is refused (cross-site requests), and so is a Host
-that is not the daemon's address (DNS rebinding). Commands need the token in a header, which no foreign form can set.
+that is not the daemon's address (DNS rebinding; over TLS no other name has the certificate).
 """
 
+import contextlib
 import hmac
+import json
 import os
 import secrets
+from dataclasses import dataclass
+from http.cookies import CookieError, SimpleCookie
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 from urllib.parse import parse_qs, urlsplit
 
+from gcs_plugin.daemon.store.people_rows import NOBODY, OPERATOR, Deed, People, Person, Role
+from gcs_plugin.web.roles import EDIT_PLAN, LOCAL_PROGRAMS, Need, need_of, route_of
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 
 LOOPBACK: Final = frozenset({"127.0.0.1", "localhost", "::1"})
-_OPEN: Final = frozenset({"/healthz", "/", "/favicon.ico"})
-_OPEN_FOLDERS: Final = ("/static/",)
-_WITHOUT_TOKEN: Final = frozenset({"/api/frames", "/api/areas"})
-"""What local programs may send without the token: pictures, and area files to be read."""
+_READER: Final = Person(-1, "", Role.VIEWER)
+_MOST_REASON: Final = 4096  # bytes of a refusal, for the log
 _SAFE: Final = frozenset({"GET", "HEAD", "OPTIONS"})
 _HEADERS: Final = [
     (b"x-content-type-options", b"nosniff"),
@@ -45,17 +53,58 @@ def take_token(path: Path) -> str:
                 raise InputError(f"{path} contains no token; put at least eight characters there, or remove it")
             return token
         token = secrets.token_urlsafe(24)
-        part = path.with_name(f".{path.name}.part")
-        part.unlink(missing_ok=True)
-        descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-        with os.fdopen(descriptor, "w", encoding="ascii") as file:
-            file.write(token + "\n")
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(part, path)
+        write_secret(path, token.encode() + b"\n")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"the token file {path} cannot be used ({error}); name another with --token-file") from None
     return token
+
+
+def write_secret(path: Path, content: bytes) -> None:
+    """Write a file that only its owner can read, and that appears when it is complete and on the disk.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    part = path.with_name(f".{path.name}.part")
+    part.unlink(missing_ok=True)
+    descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    with os.fdopen(descriptor, "wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(part, path)
+
+
+@dataclass(slots=True)
+class Act:
+    """A request under way, as `act_of` gives it to its route.
+
+    Attributes:
+        person: who makes it. deeds: what came of it where the route says so; else (None) the answer's status tells.
+    """
+
+    person: Person
+    deeds: list[Deed] | None = None
+
+
+def act_of(scope: Any) -> Act:
+    """The act of a request that the guard has let through."""
+    act: Act = scope["act"]
+    return act
+
+
+class Access(NamedTuple):
+    """Who may reach the daemon: `lan`, over TLS from other machines; `open_reading`, all may read without a session."""
+
+    token: str
+    bind: str = "127.0.0.1"
+    lan: bool = False
+    open_reading: bool = False
+
+    @property
+    def is_local(self) -> bool:
+        """Whether only programs of this machine reach it."""
+        return not self.lan and self.bind.strip("[]") in LOOPBACK
 
 
 class Guard:
@@ -63,14 +112,14 @@ class Guard:
 
     Args:
         app: the application.
-        token: required for commands.
-        bind: the address that is served; if it is not a loopback address, all requests need the token.
+        access: the token, and from where requests may come.
+        people: the sessions, and the log.
     """
 
-    def __init__(self, app: Any, token: str, bind: str = "127.0.0.1") -> None:
-        self.app, self._token = app, token
-        self.local = bind.strip("[]") in LOOPBACK
-        self._hosts = LOOPBACK | {bind.strip("[]").lower()}
+    def __init__(self, app: Any, access: Access, people: People) -> None:
+        self.app, self._access, self._people = app, access, people
+        self._hosts = LOOPBACK | {access.bind.strip("[]").lower()}
+        self._anybody = _READER if access.is_local or access.open_reading else NOBODY
 
     async def __call__(self, scope: dict[str, Any], receive: Any, send: Any) -> None:
         """Handle one connection."""
@@ -80,42 +129,116 @@ class Guard:
         headers: dict[str, str] = {}
         for name, value in scope["headers"]:
             headers.setdefault(name.decode("latin-1").lower(), value.decode("latin-1"))
-        refusal = self._refusal(scope, headers)
-        if refusal is None:
-            await self.app(scope, receive, _with_headers(send) if scope["type"] == "http" else send)
-        elif scope["type"] == "websocket":
-            await send({"type": "websocket.close", "code": 1008, "reason": refusal[1][:100]})
-        else:
-            await _answer(send, *refusal)
+        method = "WS" if scope["type"] == "websocket" else scope["method"]
+        route = route_of(method, scope["path"])
+        need, sent = need_of(route), _sent_token(scope, headers)
+        person = self._person(scope, headers, sent)
+        refusal = self._foreign(scope, headers, person) or self._missing_role(route, need, person, sent)
+        if refusal is not None:
+            await _refuse(scope, send, *refusal)
+            return
+        self._people.seen(person)
+        scope["act"] = act = Act(person)
+        if method == "WS":
+            await self.app(scope, receive, self._while_allowed(send, person))
+            return
+        answer = _Answer(send)
+        try:
+            await self.app(scope, receive, answer)
+        finally:
+            if need.action and person.id >= 0:
+                values = "/".join(map(str, scope.get("path_params", {}).values()))
+                told = [Deed(need.action, values, *answer.outcome())]
+                self._people.note(person, told if act.deeds is None else act.deeds, edit=need.action == EDIT_PLAN)
 
-    def _refusal(self, scope: dict[str, Any], headers: dict[str, str]) -> tuple[int, str] | None:
+    def _person(self, scope: dict[str, Any], headers: dict[str, str], sent: str) -> Person:
+        """Who makes a request: by the token, else by a session's cookie."""
+        # latin-1 is what headers are decoded by; a token is ASCII
+        if sent and hmac.compare_digest(sent.encode("utf-8", "replace"), self._access.token.encode()):
+            return OPERATOR
+        secret = _session(headers.get("cookie", ""), session_cookie(scope)) if self._access.lan else ""
+        return (self._people.of_session(secret) if secret else None) or self._anybody
+
+    def _foreign(self, scope: dict[str, Any], headers: dict[str, str], person: Person) -> tuple[int, str] | None:
+        """Status and reason if a request comes from another site's page."""
         host = headers.get("host", "")
-        if self.local and _host_name(host) not in self._hosts:
+        if self._access.is_local and _host_name(host) not in self._hosts:
             return 403, "the Host header does not name this daemon; use the address that it printed"
         origin = headers.get("origin")
-        if origin is not None and not _is_same_site(origin, host):
+        if origin is not None and not _is_same_site(origin, host, encrypted=self._access.lan):
             return 403, "pages of other sites may not use this daemon; open its own page"
-        path = scope["path"]
-        if not self.local and path not in _OPEN and not path.startswith(_OPEN_FOLDERS):
-            return self._token_refusal(scope, headers, query=True)
-        unsafe = scope["type"] == "http" and scope["method"] not in _SAFE
-        if unsafe and path not in _WITHOUT_TOKEN:
-            return self._token_refusal(scope, headers, query=False)
+        by_cookie = person.id > OPERATOR.id
+        if by_cookie and origin is None and (scope["type"] == "websocket" or scope["method"] not in _SAFE):
+            return 403, "a request with a session's cookie has to state its Origin; use the daemon's own page"
         return None
 
-    def _token_refusal(self, scope: dict[str, Any], headers: dict[str, str], *, query: bool) -> tuple[int, str] | None:
-        """HTTP status and reason if a request's token is missing or wrong, else None.
+    def _missing_role(self, route: str, need: Need, person: Person, sent: str) -> tuple[int, str] | None:
+        """Status and reason if a person may not make a request."""
+        if person.role >= need.role or (self._access.is_local and route in LOCAL_PROGRAMS):
+            return None
+        if person.id > OPERATOR.id:
+            word = need.role.word
+            return 403, f"{person.name} is here as {person.role.word}, this takes a role of {word}; ask the operator"
+        return _TOKEN_WRONG if sent else _TOKEN_MISSING
 
-        It comes in a header or, with `query` and for requests that change nothing (tiles, events), in the address.
-        """
-        sent = headers.get("authorization", "").removeprefix("Bearer ").strip() or headers.get("x-token", "")
-        reading = scope["type"] == "websocket" or scope["method"] in _SAFE
-        if not sent and query and reading:
-            sent = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
-        if not sent:
-            return _TOKEN_MISSING
-        # latin-1 is what headers are decoded by; a token is ASCII
-        return None if hmac.compare_digest(sent.encode("utf-8", "replace"), self._token.encode()) else _TOKEN_WRONG
+    def _while_allowed(self, send: Any, person: Person) -> Any:
+        """A WebSocket's send that ends the connection of somebody who was revoked."""
+
+        async def sending(message: dict[str, Any]) -> None:
+            if person.id >= 0:
+                if self._people.find(person.id) is None:
+                    await send({"type": "websocket.close", "code": 1008, "reason": "revoked"})
+                    raise RuntimeError("revoked")
+                self._people.seen(person)
+            await send(message)
+
+        return sending
+
+
+class _Answer:
+    """An ASGI send that adds the headers of all answers, and remembers how the request ended."""
+
+    def __init__(self, send: Any) -> None:
+        self._send, self._status, self._text = send, 500, b""
+
+    async def __call__(self, message: dict[str, Any]) -> None:
+        """Send a part of the answer."""
+        if message["type"] == "http.response.start":
+            self._status = message["status"]
+            message = {**message, "headers": [*message.get("headers", []), *_HEADERS]}
+        elif self._status >= 400 and len(self._text) < _MOST_REASON:
+            self._text += message.get("body", b"")
+        await self._send(message)
+
+    def outcome(self) -> tuple[str, str]:
+        """`done`, or `refused` with the reason."""
+        if self._status < 400:
+            return "done", ""
+        with contextlib.suppress(ValueError, KeyError, TypeError):
+            return "refused", str(json.loads(self._text)["detail"])
+        return "refused", f"status {self._status}"
+
+
+def session_cookie(scope: Any) -> str:
+    """The name of the session's cookie: of this host alone, and of this port, since cookies know no ports."""
+    return f"__Host-orthoswarm-{(scope.get('server') or ('', 0))[1]}"
+
+
+def _session(cookies: str, name: str) -> str:
+    try:
+        found = SimpleCookie(cookies).get(name)
+    except CookieError:
+        return ""
+    return found.value if found else ""
+
+
+def _sent_token(scope: dict[str, Any], headers: dict[str, str]) -> str:
+    """The token of a request, empty without: in a header or, of one that changes nothing (tiles), in the address."""
+    sent = headers.get("authorization", "").removeprefix("Bearer ").strip() or headers.get("x-token", "")
+    reading = scope["type"] == "websocket" or scope["method"] in _SAFE
+    if not sent and reading:
+        sent = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
+    return sent
 
 
 _SHOW: Final = "`orthoswarm serve --show-token --workspace DIR` prints"
@@ -123,13 +246,13 @@ _TOKEN_MISSING: Final = (401, f"send the daemon's token as the header 'Authoriza
 _TOKEN_WRONG: Final = (401, f"this is not this daemon's token, each workspace has its own; {_SHOW} the right one")
 
 
-def _is_same_site(origin: str, host: str) -> bool:
-    """Whether an Origin header names the daemon itself; an unreadable one is foreign."""
+def _is_same_site(origin: str, host: str, *, encrypted: bool) -> bool:
+    """Whether an Origin header names the daemon itself; an unreadable one is foreign, and over TLS a plain one."""
     try:
         parts = urlsplit(origin)
     except ValueError:
         return False
-    return parts.scheme in ("http", "https") and parts.netloc.lower() == host.lower()
+    return parts.scheme in (("https",) if encrypted else ("http", "https")) and parts.netloc.lower() == host.lower()
 
 
 def _host_name(host: str) -> str:
@@ -139,18 +262,10 @@ def _host_name(host: str) -> str:
         return ""
 
 
-def _with_headers(send: Any) -> Any:
-    async def sending(message: dict[str, Any]) -> None:
-        if message["type"] == "http.response.start":
-            message = {**message, "headers": [*message.get("headers", []), *_HEADERS]}
-        await send(message)
-
-    return sending
-
-
-async def _answer(send: Any, status: int, text: str) -> None:
-    import json
-
+async def _refuse(scope: dict[str, Any], send: Any, status: int, text: str) -> None:
+    if scope["type"] == "websocket":
+        await send({"type": "websocket.close", "code": 1008, "reason": text[:100]})
+        return
     body = json.dumps({"detail": text}).encode()
     headers = [(b"content-type", b"application/json"), (b"content-length", str(len(body)).encode())]
     if status == 401:

@@ -227,7 +227,7 @@ def start(workspace: Path, *arguments: str, port: int = 0, limit_s: float = 240.
         if text is None:
             process.wait()
             raise AssertionError(f"serve ended with {process.returncode}: {''.join(said)}")
-        found = re.search(r"map: (http://\S+?)/(#|\s|$)", text)
+        found = re.search(r"map: (https?://\S+?)/(#|\s|$)", text)
         url = found[1] if found else ""
     token = (workspace / "token").read_text().strip() if (workspace / "token").exists() else ""
     served = Served(process, url, token, said)

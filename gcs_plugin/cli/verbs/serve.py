@@ -8,7 +8,10 @@ from typing import TYPE_CHECKING, Final
 from gcs_plugin.cli.arguments import add_config
 
 if TYPE_CHECKING:
+    from ssl import SSLContext
+
     from gcs_plugin.daemon.settings import Settings
+    from gcs_plugin.web.guard import Access
 
 
 ADDRESS_FILE: Final = "address"
@@ -36,6 +39,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     add("--port", type=int, metavar="P", help="of HTTP (default 8650; 0 takes any free one)")
     add("--bind", metavar="ADDRESS", help="address of HTTP (default 127.0.0.1; any other needs the token)")
+    add("--lan", action="store_true", default=None, help="serve other machines: HTTPS, and people with roles")
+    add("--open-reading", action="store_true", default=None, help="with --lan: everybody in the network may look")
+    add("--certificate", type=Path, metavar="FILE", help="with --lan: PEM certificate (default: one is made)")
+    add("--key", type=Path, metavar="FILE", help="of that certificate")
     add("--token-file", type=Path, metavar="FILE", help="where the token is, or goes (default: in the workspace)")
     add("--fov-min", type=float, metavar="DEG", help="smallest horizontal field of view in the swarm (default 70)")
     add("--gsd", type=float, metavar="M", help="ground pixel of the map (default: that of the first pictures)")
@@ -51,6 +58,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("--tak", action="append", default=[], metavar="URL", help="send vehicles and finds there: udp://239.2.3.1:6969")
     add_config(parser)
     add("--show-token", action="store_true", help="print the page's link with the workspace's token and end")
+    add("--invite", metavar="NAME=ROLE", help="print an invitation of a running daemon's (viewer, analyst, pilot)")
     add(
         "--end-with-input",
         action="store_true",
@@ -85,19 +93,41 @@ def run(args: argparse.Namespace) -> int:
     except OSError as error:
         raise disk_error(error, args.workspace) from None
     settings = settings_of(args)
+    if args.invite:
+        return _invite(settings, args.invite)
     return _show_token(settings) if args.show_token else serve(settings, end_with_input=args.end_with_input)
 
 
 def _show_token(settings: "Settings") -> int:
     """Print the page's link with the workspace's token, for a running or future daemon."""
-    import contextlib
-
     from gcs_plugin.web.guard import take_token
 
-    token, url = take_token(_token_file(settings)), _url(settings, settings.port)
+    token = take_token(_token_file(settings))
+    _print_link(_address(settings), token)
+    return 0
+
+
+def _address(settings: "Settings") -> str:
+    """Where the workspace's daemon was served last, or will be."""
+    import contextlib
+
     with contextlib.suppress(OSError, UnicodeDecodeError):  # a daemon was started there, perhaps on another port
-        url = (settings.workspace / ADDRESS_FILE).read_text(encoding="utf-8").strip() or url
-    _print_link(url, token)
+        return (settings.workspace / ADDRESS_FILE).read_text(encoding="utf-8").strip() or _url(settings, settings.port)
+    return _url(settings, settings.port)
+
+
+def _invite(settings: "Settings", text: str) -> int:
+    """Have the running daemon invite somebody, and print the link."""
+    from gcs_plugin.mavproxy.daemon_client import Client
+    from gcs_plugin.web.guard import take_token
+    from orthoswarm.model.errors import OrthoSwarmError
+
+    name, _, role = text.rpartition("=")
+    client = Client(_address(settings), take_token(_token_file(settings)), settings.certificate or settings.workspace)
+    try:
+        _print_qr(client.ask("/api/people", {"name": name, "role": role})["link"], f"{role} {name}")
+    except RuntimeError as error:
+        raise OrthoSwarmError(str(error)) from None
     return 0
 
 
@@ -106,13 +136,30 @@ def _print_link(url: str, token: str) -> None:
     print(f"token: {token}", flush=True)
 
 
+def _print_qr(link: str, what: str) -> None:
+    """Print a link, on a terminal as a QR code, too."""
+    import sys
+
+    import segno
+
+    print(f"{what}: {link}", flush=True)
+    if sys.stdout.isatty():
+        segno.make(link, micro=False).terminal(border=2, compact=True)
+
+
 def _token_file(settings: "Settings") -> Path:
     return settings.token_file or settings.workspace / "token"
 
 
 def _url(settings: "Settings", port: int) -> str:
-    host = f"[{settings.bind}]" if ":" in settings.bind else settings.bind
-    return f"http://{host}:{port}/"
+    """The page's address; where all addresses are served, by the first by which others reach this machine."""
+    from gcs_plugin.web.certificate import own_addresses
+
+    bind = settings.bind
+    if bind in ("0.0.0.0", "::"):
+        bind = next(iter(own_addresses()), "127.0.0.1")
+    host = f"[{bind}]" if ":" in bind else bind
+    return f"http{'s' if settings.lan else ''}://{host}:{port}/"
 
 
 def settings_of(args: argparse.Namespace) -> "Settings":
@@ -120,7 +167,7 @@ def settings_of(args: argparse.Namespace) -> "Settings":
     from dataclasses import replace
 
     from gcs_plugin.daemon.intake.can_reader import CAN
-    from gcs_plugin.daemon.settings import VehicleSettings, read_settings
+    from gcs_plugin.daemon.settings import BIND, VehicleSettings, read_settings
     from orthoswarm.compute.workers import cores
     from orthoswarm.config import read_config
     from orthoswarm.matchers.network_device import require_device
@@ -132,10 +179,13 @@ def settings_of(args: argparse.Namespace) -> "Settings":
         "bind": args.bind, "port": args.port, "basemap": args.basemap, "dem": args.dem, "fov_min_deg": args.fov_min,
         "gsd_m": args.gsd, "workers": args.workers, "token_file": args.token_file, "links": tuple(args.link) or None,
         "tak": tuple(args.tak) or None, "config": config,
+        "lan": args.lan, "open_reading": args.open_reading, "certificate": args.certificate, "key": args.key,
     }  # fmt: skip
     if args.workers is None and settings.workers == 1:
         flags["workers"] = max(1, cores() - 1)
     settings = replace(settings, **{key: value for key, value in flags.items() if value is not None})
+    if settings.lan and settings.bind == BIND and args.bind is None:
+        settings = replace(settings, bind="0.0.0.0")
     vehicles = {vehicle.id: vehicle for vehicle in settings.vehicles}
     for text in args.source:
         name, _, where = text.partition("=")
@@ -162,26 +212,37 @@ def serve(settings: "Settings", *, end_with_input: bool = False) -> int:
     from gcs_plugin.daemon.daemon import Daemon
     from gcs_plugin.daemon.intake.picture_sources import STREAM_THREAD
     from gcs_plugin.web.app import make_app
-    from gcs_plugin.web.connections import ConnectionLimits, Connections, bounded_protocol, open_files, open_listener
-    from gcs_plugin.web.guard import take_token
+    from gcs_plugin.web.connections import (
+        ConnectionLimits,
+        Connections,
+        Server,
+        bounded_protocol,
+        open_files,
+        open_listener,
+    )
+    from gcs_plugin.web.guard import Access, take_token
 
     logging.basicConfig(stream=sys.stderr, level=logging.INFO, format="%(levelname)s %(message)s")
     os.umask(0o077)  # pictures, plans and the token are readable by their owner only
     limits = ConnectionLimits.of_files(open_files())
     listener = open_listener(settings.bind, settings.port)
     url = _url(settings, listener.getsockname()[1])
+    encryption = _encryption(settings)
     with Daemon(settings) as daemon, listener:
-        token = take_token(_token_file(settings))
+        access = Access(take_token(_token_file(settings)), settings.bind, settings.lan, settings.open_reading)
         config = uvicorn.Config(
-            make_app(daemon, token, settings.bind), log_level="warning", access_log=False, server_header=False,
+            make_app(daemon, access, url), log_level="warning", access_log=False, server_header=False,
             timeout_graceful_shutdown=3, ws_max_size=1 << 16, lifespan="on", backlog=limits.waiting,
             http=bounded_protocol(Connections(limits)),
         )  # fmt: skip
+        config.load()
+        config.ssl = encryption
         # a client may connect as soon as it reads the address, and waits until it is served
         listener.listen(config.backlog)
         (settings.workspace / ADDRESS_FILE).write_text(url + "\n", encoding="utf-8")
-        _print_link(url, token)
-        server = uvicorn.Server(config)
+        _print_link(url, access.token)
+        _print_reach(settings, access, url)
+        server = Server(config)
 
         def end(*_: object) -> None:
             """End at a signal, at once at the second, and do not raise it again: the daemon has to be closed, too."""
@@ -197,6 +258,36 @@ def serve(settings: "Settings", *, end_with_input: bool = False) -> int:
         sys.stderr.flush()
         os._exit(0)
     return 0
+
+
+def _encryption(settings: "Settings") -> "SSLContext | None":
+    """The TLS of a command post, None in clear; a certificate of its own is made where none was given."""
+    from gcs_plugin.web.certificate import own_names, server_context, take_certificate
+    from orthoswarm.export.atomic_file import disk_error
+
+    if not settings.lan:
+        return None
+    if settings.certificate is not None and settings.key is not None:
+        return server_context(settings.certificate, settings.key)
+    try:
+        own = take_certificate(settings.workspace, own_names())
+    except OSError as error:
+        raise disk_error(error, settings.workspace) from None
+    return server_context(own, own)
+
+
+def _print_reach(settings: "Settings", access: "Access", url: str) -> None:
+    """Print how others reach the daemon, and by what they know that it is this one."""
+    import logging
+
+    from gcs_plugin.web.certificate import KEY, fingerprint, spoken
+
+    if settings.lan:
+        digits = fingerprint(settings.certificate or settings.workspace / KEY)
+        print(f"certificate, SHA-256: {digits}\n  begins with: {spoken(digits)}", flush=True)
+        _print_qr(url, "for others")
+    elif not access.is_local:
+        logging.warning("traffic is not encrypted, whoever shares the network reads the token; use --lan instead")
 
 
 def _when_input_ends(end: Callable[[], None]) -> None:

@@ -261,6 +261,21 @@ class PlanChanged(_RowEvent):
 
 
 @dataclass(frozen=True, slots=True)
+class PeopleChanged(Event):
+    """Somebody was invited, has joined or was revoked, or the log has grown."""
+
+    page = "people"
+
+
+@dataclass(frozen=True, slots=True)
+class HoldsChanged(Event):
+    """Who has which vehicle; `rows`: see `Pilots.rows`."""
+
+    page = "holds"
+    rows: list[dict[str, Any]]
+
+
+@dataclass(frozen=True, slots=True)
 class CoverageChanged(_RowEvent):
     """Gaps were looked for again: their number, the shares, and the version of /api/coverage."""
 

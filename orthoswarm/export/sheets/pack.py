@@ -41,6 +41,7 @@ _PURPOSES: Final = {
     "places.gpx": "For CalTopo and receivers: finds and vehicles (GPX)",
     "places.csv": "Finds and vehicles as a table (CSV)",
     "report.html": "Report of the map",
+    "log.csv": "Who did what when (CSV)",
 }
 _STORED: Final = frozenset({".tif", ".webp", ".kmz", ".pdf", ".zip", ".mbtiles", ".pmtiles"})
 
@@ -51,8 +52,8 @@ def write_pack(
     """Write the pack of a map.
 
     Args:
-        cog: the orthoimage; the surface model, footprints.gpkg, seamlines.gpkg, confidence.tif and report.html beside
-            it go in if there.
+        cog: the orthoimage; the surface model, footprints.gpkg, seamlines.gpkg, confidence.tif, report.html and log.csv
+            beside it go in if there.
         path: the ZIP. places: finds and vehicles. progress: called with steps done and steps in all.
 
     Raises:
@@ -107,7 +108,8 @@ def _copy(cog: Path, folder: Path) -> None:
     surface = surface_path(cog.parent)
     if surface is not None:
         shutil.copyfile(surface, folder / SURFACE)
-    for name in ("footprints.gpkg", "seamlines.gpkg", "confidence.tif", "report.html", "report.json", "frames.jsonl"):
+    products = ("footprints.gpkg", "seamlines.gpkg", "confidence.tif", "report.html", "report.json", "frames.jsonl")
+    for name in (*products, "log.csv"):
         if (cog.parent / name).is_file():
             shutil.copyfile(cog.parent / name, folder / name)
 

@@ -157,11 +157,12 @@ def write_csv(places: Iterable[Place], path: Path) -> None:
     rows.writerow(_COLUMNS)
     for place in places:
         values = [getattr(place, key) for key in _COLUMNS[:-1]]
-        rows.writerow(_cell(value) for value in [*values, " ".join(place.pictures)])
+        rows.writerow(spreadsheet_cell(value) for value in [*values, " ".join(place.pictures)])
     write_file(path, out.getvalue().encode())
 
 
-def _cell(value: object) -> object:
+def spreadsheet_cell(value: object) -> object:
+    """A value of a CSV table; a text that a spreadsheet would take for a formula gets an apostrophe before it."""
     if value is None:
         return ""
     return f"'{value}" if isinstance(value, str) and value.startswith(_FORMULA) else value

@@ -10,6 +10,7 @@ from gcs_plugin.daemon.intake.posted_pose import frame_of, parse_pose
 from gcs_plugin.daemon.settings import Settings
 from gcs_plugin.daemon.store.daemon_events import PictureStored
 from gcs_plugin.web.app import make_app
+from gcs_plugin.web.guard import Access
 from tests.kit.daemon_kit import SIZE, Shot, camera_at, form, jpeg, pose_of
 
 _WAITING = 1900
@@ -28,7 +29,7 @@ def test_an_upload_does_not_wait_for_pictures_that_are_to_be_drawn(tmp_path: Pat
         assert daemon.drawer.backlog == _WAITING
 
         async def upload() -> int:
-            transport = httpx.ASGITransport(make_app(daemon, "a-token-of-tests"))
+            transport = httpx.ASGITransport(make_app(daemon, Access("a-token-of-tests")))
             async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1") as client:
                 shot = Shot(pose_of(camera_at(), "new.jpg", "v2"), jpeg(camera_at()))
                 async with asyncio.timeout(120.0):

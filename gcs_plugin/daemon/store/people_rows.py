@@ -1,0 +1,253 @@
+"""The people of a command post: invitations, sessions and roles, and the log of who did what when.
+
+A secret (of an invitation, of a session) is given out once; the journal has its hash alone. Secrets are random, so one
+round of SHA-256 hides them.
+"""
+
+import csv
+import hashlib
+import io
+import logging
+import secrets
+import sqlite3
+import threading
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any, Final, NamedTuple
+
+from gcs_plugin.daemon.store.daemon_events import Events, PeopleChanged
+from gcs_plugin.daemon.store.journal import Journal, packed, unpacked
+from orthoswarm.export.product_files import iso_time
+from orthoswarm.export.tactical.places import spreadsheet_cell
+from orthoswarm.model.errors import InputError
+
+_INVITED_S: Final = 24 * 3600.0  # an invitation that nobody has opened by then is void: it may lie in a chat for ever
+_MOST_NAME: Final = 60  # characters
+_MOST_PEOPLE: Final = 500  # invitations ever made in a workspace; beyond that something makes them by itself
+_LATEST: Final = 500  # entries of the log that a page gets
+_JOINED_UP_S: Final = 60.0  # drawing saves the plan with each corner: such edits of one person are one entry
+_COLUMNS: Final = ("time", "name", "role", "action", "target", "outcome", "reason", "count")
+_log = logging.getLogger(__name__)
+
+
+class Role(IntEnum):
+    """What somebody may do; each may do what those before may. The operator has the daemon's token."""
+
+    ANYBODY = 0
+    VIEWER = 1
+    ANALYST = 2
+    PILOT = 3
+    OPERATOR = 4
+
+    @property
+    def word(self) -> str:
+        """Its name for people and in JSON."""
+        return self.name.lower()
+
+
+INVITED: Final = {role.word: role for role in (Role.VIEWER, Role.ANALYST, Role.PILOT)}
+"""The roles that an invitation can give, by word."""
+
+
+@dataclass(frozen=True, slots=True)
+class Person:
+    """Who makes a request; `id` 0 is the operator."""
+
+    id: int
+    name: str
+    role: Role
+
+
+NOBODY: Final = Person(-1, "", Role.ANYBODY)
+OPERATOR: Final = Person(0, "operator", Role.OPERATOR)
+
+
+class Deed(NamedTuple):
+    """What came of a request, for the log: `target` names a vehicle, a plan, a find."""
+
+    action: str
+    target: str
+    outcome: str
+    reason: str = ""
+
+
+class People:
+    """Invitations, sessions and the log.
+
+    Args:
+        journal: keeps them. events: tells pages of changes. clock: seconds that nobody sets.
+    """
+
+    def __init__(self, journal: Journal, events: Events, clock: Callable[[], float] = time.monotonic) -> None:
+        self._journal, self._events, self._clock = journal, events, clock
+        self._lock = threading.Lock()
+        self._sessions: dict[bytes, Person] = {}
+        self._known: dict[int, Person] = {}
+        self._seen: dict[int, float] = {}
+        self._read()
+
+    def _read(self) -> None:
+        rows = self._journal.rows("SELECT * FROM people WHERE session IS NOT NULL AND revoked IS NULL")
+        self._sessions = {
+            bytes(row["session"]): Person(row["id"], unpacked(row["name"]), INVITED[row["role"]]) for row in rows
+        }
+        self._known = {person.id: person for person in (OPERATOR, *self._sessions.values())}
+
+    def invite(self, name: object, role: object) -> tuple[int, str]:
+        """Invite somebody; returns the person's id and the invitation's secret.
+
+        Raises:
+            InputError: there is no such role, the name is empty, too long or taken, or there are too many people.
+        """
+        if not isinstance(name, str) or not 0 < len(name.strip()) <= _MOST_NAME or not name.isprintable():
+            raise InputError(f"name is not a name of 1 to {_MOST_NAME} printable characters; send one")
+        if not isinstance(role, str) or role not in INVITED:
+            raise InputError(f"there is no such role; choose {', '.join(INVITED)}")
+        name, secret = name.strip(), secrets.token_urlsafe(24)
+        values = (packed(name), role, _hash(secret), time.time())
+        with self._lock:
+            rows = self.rows()
+            if name == OPERATOR.name or any(row["name"] == name and row["state"] != "revoked" for row in rows):
+                raise InputError(f"{name} is here already; choose another name, or revoke the first invitation")
+            if len(rows) >= _MOST_PEOPLE:
+                raise InputError(f"{_MOST_PEOPLE} people were invited already; begin another workspace")
+            number = self._journal.write(
+                lambda db: db.execute("INSERT INTO people (name, role, invitation, made) VALUES (?, ?, ?, ?)", values)
+            ).lastrowid
+        self._events.publish(PeopleChanged())
+        return int(number or 0), secret
+
+    def join(self, invitation: object) -> tuple[Person, str] | None:
+        """Exchange an invitation for a session's secret, once; None if it is void."""
+        if not isinstance(invitation, str):
+            return None
+        secret, now = secrets.token_urlsafe(24), time.time()
+        known = _hash(invitation)
+
+        def change(db: sqlite3.Connection) -> sqlite3.Row | None:
+            found: sqlite3.Row | None = db.execute(
+                "UPDATE people SET session = ?, joined = ? WHERE invitation = ? AND session IS NULL"
+                " AND revoked IS NULL AND made > ? RETURNING *",
+                (_hash(secret), now, known, now - _INVITED_S),
+            ).fetchone()
+            return found
+
+        with self._lock:
+            row = self._journal.write(change)
+            if row is None:
+                return None
+            self._read()
+        person = Person(row["id"], unpacked(row["name"]), INVITED[row["role"]])
+        self._events.publish(PeopleChanged())
+        return person, secret
+
+    def revoke(self, number: int) -> bool:
+        """Make somebody's invitation and session void, at once; False if there is no such person."""
+        if not 0 < number < 2**62:
+            return False
+        values = (time.time(), number)
+        with self._lock:
+            change = "UPDATE people SET revoked = ? WHERE id = ? AND revoked IS NULL"
+            done = self._journal.write(lambda db: db.execute(change, values)).rowcount > 0
+            self._read()
+        self._events.publish(PeopleChanged())
+        return done
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Everybody ever invited, as JSON values: `id`, `name`, `role`, `state`, `made`, `here`.
+
+        `state`: invited, expired (not opened in time), joined or revoked. `here`: whether the page is open now.
+        """
+        rows, now = self._journal.rows("SELECT * FROM people ORDER BY id"), time.time()
+
+        def state(row: sqlite3.Row) -> str:
+            if row["revoked"] is not None:
+                return "revoked"
+            if row["session"] is not None:
+                return "joined"
+            return "invited" if row["made"] > now - _INVITED_S else "expired"
+
+        return [
+            {
+                "id": row["id"], "name": unpacked(row["name"]), "role": row["role"], "state": state(row),
+                "made": iso_time(row["made"]), "here": self.is_here(row["id"], 5.0),
+            }
+            for row in rows
+        ]  # fmt: skip
+
+    def of_session(self, secret: str) -> Person | None:
+        """Whose session a secret is of, None if it is of none (any more)."""
+        return self._sessions.get(_hash(secret))
+
+    def find(self, number: int) -> Person | None:
+        """A person who can make requests, by id."""
+        return self._known.get(number)
+
+    @property
+    def has_several_pilots(self) -> bool:
+        """Whether somebody besides the operator may command vehicles."""
+        return sum(person.role >= Role.PILOT for person in self._known.values()) > 1
+
+    def seen(self, person: Person) -> None:
+        """Note that somebody's page or program is there."""
+        self._seen[person.id] = self._clock()
+
+    def is_here(self, number: int, within_s: float) -> bool:
+        """Whether somebody was seen in the last seconds."""
+        return self._clock() - self._seen.get(number, float("-inf")) < within_s
+
+    # -- the log ---------------------------------------------------------------------------------------------------
+
+    def note(self, person: Person, deeds: Sequence[Deed], *, edit: bool = False) -> None:
+        """Add to the log, without waiting for the disk; `edit`: it is one entry with the same just before it."""
+        rows = [
+            (packed(person.name), person.role.word, deed.action, *map(packed, (deed.target, deed.outcome, deed.reason)))
+            for deed in deeds
+        ]
+        now = time.time()
+
+        def change(db: sqlite3.Connection) -> None:
+            for row in rows:
+                if edit and db.execute(_SAME, (now, *row, now - _JOINED_UP_S)).rowcount:
+                    continue
+                db.execute(_NOTE, (now, *row))
+
+        self._journal.submit(change).add_done_callback(self._noted)
+
+    def _noted(self, future: "Future[None]") -> None:
+        if (problem := future.exception()) is not None:
+            _log.warning("who did what was not noted: %s", problem)
+        self._events.publish(PeopleChanged())
+
+    def log(self, most: int | None = _LATEST) -> list[dict[str, Any]]:
+        """The log as JSON values, newest first: `time`, `name`, `role`, `action`, `target`, `outcome`, `reason`."""
+        rows = self._journal.rows("SELECT * FROM deeds ORDER BY id DESC LIMIT ?", (-1 if most is None else most,))
+        texts = ("name", "target", "outcome", "reason")
+        return [
+            {key: unpacked(row[key]) if key in texts else row[key] for key in _COLUMNS[1:]}
+            | {"time": iso_time(row["time"])}
+            for row in rows
+        ]
+
+    def table(self) -> str:
+        """The whole log as CSV, oldest first."""
+        out = io.StringIO(newline="")
+        writer = csv.writer(out)
+        writer.writerow(_COLUMNS)
+        for row in reversed(self.log(None)):
+            writer.writerow([spreadsheet_cell(row[key]) for key in _COLUMNS])
+        return out.getvalue()
+
+
+_NOTE: Final = "INSERT INTO deeds (time, name, role, action, target, outcome, reason) VALUES (?, ?, ?, ?, ?, ?, ?)"
+_SAME: Final = """
+UPDATE deeds SET time = ?, count = count + 1 WHERE id = (SELECT max(id) FROM deeds)
+    AND name = ? AND role = ? AND action = ? AND target = ? AND outcome = ? AND reason = ? AND time > ?
+"""
+
+
+def _hash(secret: str) -> bytes:
+    return hashlib.sha256(secret.encode("utf-8", "surrogatepass")).digest()
