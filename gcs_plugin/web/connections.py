@@ -12,8 +12,10 @@ import socket
 import time
 from collections import defaultdict
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Final
 
+import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from orthoswarm.model.errors import InputError
@@ -21,6 +23,8 @@ from orthoswarm.model.errors import InputError
 _WANTED_FILES: Final = 8192
 _USUAL_FILES: Final = 1024  # where the system does not say
 _SAY_AGAIN_S: Final = 60.0
+REQUEST_S: Final = 10.0
+"""Whoever has said nothing for so long after connecting is no client: a slow radio link takes a second or two."""
 _log = logging.getLogger(__name__)
 
 
@@ -37,7 +41,7 @@ class ConnectionLimits:
     most: int
     share: int
     waiting: int = 2048
-    request_s: float = 10.0
+    request_s: float = REQUEST_S
 
     @classmethod
     def of_files(cls, files: int) -> "ConnectionLimits":
@@ -126,6 +130,17 @@ def bounded_protocol(connections: Connections) -> type[H11Protocol]:
                 self.transport.abort()
 
     return Bounded
+
+
+class Server(uvicorn.Server):  # type: ignore[misc]
+    """Uvicorn's server, whose connections have as little time for their handshake as for their first request."""
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Begin to serve."""
+        if self.config.ssl is not None:
+            loop: Any = asyncio.get_running_loop()
+            loop.create_server = partial(loop.create_server, ssl_handshake_timeout=REQUEST_S)
+        await super().startup(sockets)
 
 
 def open_listener(address: str, port: int) -> socket.socket:
