@@ -11,7 +11,6 @@ from typing import Any, Final, NamedTuple, TypeVar
 
 from fastapi import FastAPI, HTTPException, Query, Request, Response, WebSocket
 from starlette.responses import FileResponse
-from starlette.staticfiles import StaticFiles
 
 from gcs_plugin.daemon.daemon import Daemon
 from gcs_plugin.daemon.exports import zipped_folder
@@ -21,6 +20,7 @@ from gcs_plugin.daemon.store.frame_rows import stage_counts
 from gcs_plugin.daemon.store.job_rows import job_counts
 from gcs_plugin.web.answers import JsonAnswer, in_thread, install_error_answers, json_body
 from gcs_plugin.web.areas import read_area
+from gcs_plugin.web.assets import Assets, Packed
 from gcs_plugin.web.command_routes import CommandRoutes
 from gcs_plugin.web.event_stream import Standstill, stream_events
 from gcs_plugin.web.guard import Access, Guard
@@ -350,22 +350,13 @@ def make_app(daemon: Daemon, access: Access, address: str = "") -> Any:
     add("/api/holds/{vehicle:path}", people.hold, methods=["POST"])
     add("/api/log", people.log)
     app.add_api_websocket_route("/api/events", routes.events)
-    if STATIC.is_dir():
-        app.mount("/static", StaticFiles(directory=STATIC), name="static")
-
-    @app.get("/docs", include_in_schema=False)
-    async def docs() -> Response:
-        return Response((STATIC / "docs.html").read_bytes(), media_type="text/html")
-
-    @app.get("/", include_in_schema=False)
-    async def page() -> Response:
-        return Response((STATIC / "index.html").read_bytes(), media_type="text/html")
-
-    @app.get("/favicon.ico", include_in_schema=False)
-    async def icon() -> Response:
-        return Response(status_code=204)
-
-    return Guard(app, access, daemon.people)
+    assets = Assets(STATIC)
+    for path, answer in (
+        ("/", lambda: assets.page("index.html")), ("/docs", lambda: assets.page("docs.html")),
+        ("/favicon.ico", lambda: Response(status_code=204)), ("/static/{path:path}", assets.file),
+    ):  # fmt: skip
+        add(path, answer, include_in_schema=False)
+    return Guard(Packed(app), access, daemon.people)
 
 
 def prometheus(daemon: Daemon, uploads_waiting: int = 0) -> str:

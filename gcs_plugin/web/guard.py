@@ -27,15 +27,15 @@ LOOPBACK: Final = frozenset({"127.0.0.1", "localhost", "::1"})
 _READER: Final = Person(-1, "", Role.VIEWER)
 _MOST_REASON: Final = 4096  # bytes of a refusal, for the log
 _SAFE: Final = frozenset({"GET", "HEAD", "OPTIONS"})
+CONTENT_POLICY: Final = (
+    "default-src 'self'; img-src 'self' blob: data:; worker-src 'self' blob:; style-src 'self' 'unsafe-inline';"
+    " connect-src 'self'; object-src 'none'; base-uri 'none'; frame-ancestors 'none'"
+)
 _HEADERS: Final = [
     (b"x-content-type-options", b"nosniff"),
     (b"x-frame-options", b"DENY"),
     (b"referrer-policy", b"no-referrer"),
-    (
-        b"content-security-policy",
-        b"default-src 'self'; img-src 'self' blob: data:; worker-src 'self' blob:; style-src 'self' 'unsafe-inline';"
-        b" connect-src 'self'; object-src 'none'; base-uri 'none'; frame-ancestors 'none'",
-    ),
+    (b"content-security-policy", CONTENT_POLICY.encode()),
 ]
 
 
@@ -205,7 +205,9 @@ class _Answer:
         """Send a part of the answer."""
         if message["type"] == "http.response.start":
             self._status = message["status"]
-            message = {**message, "headers": [*message.get("headers", []), *_HEADERS]}
+            own = list(message.get("headers", []))
+            given = {name for name, _ in own}
+            message = {**message, "headers": own + [row for row in _HEADERS if row[0] not in given]}
         elif self._status >= 400 and len(self._text) < _MOST_REASON:
             self._text += message.get("body", b"")
         await self._send(message)

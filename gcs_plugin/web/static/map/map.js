@@ -5,7 +5,7 @@ import { tileRequest } from "/static/core/api.js";
 import { onSettings, settings } from "/static/core/settings.js";
 import { FREE_LEG, LEGS } from "/static/map/colours.js";
 
-maplibregl.setWorkerUrl("/static/vendor/maplibre-gl-worker.mjs");
+maplibregl.setWorkerUrl(import.meta.resolve("/static/vendor/maplibre-gl-worker.mjs"));
 export { maplibregl };
 
 export const EMPTY = { type: "FeatureCollection", features: [] };
