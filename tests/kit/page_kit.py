@@ -105,7 +105,8 @@ def standing(*rows: dict[str, Any]) -> Iterator[Station]:
     station = Station()
     station.gets = {
         "/api/vehicles": list(rows), "/api/layers": [], "/api/jobs": [], "/api/completions": [], "/api/finds": [],
-        "/api/traffic": [],
+        "/api/traffic": [], "/api/holds": [],
+        "/api/me": {"id": 0, "name": "operator", "role": "operator", "several": False, "invites": False},
         "/api/legs": {"type": "FeatureCollection", "features": []},
         "/api/coverage": {"state": "no area", "seen_share": None},
         "/healthz": {"status": "ok", "problems": []},

@@ -262,9 +262,16 @@ class PlanChanged(_RowEvent):
 
 @dataclass(frozen=True, slots=True)
 class PeopleChanged(Event):
-    """Somebody was invited, has joined or was revoked, or the log has grown."""
+    """Somebody was invited, has joined or was revoked."""
 
     page = "people"
+
+
+@dataclass(frozen=True, slots=True)
+class LogGrew(Event):
+    """Somebody has done something."""
+
+    page = "log"
 
 
 @dataclass(frozen=True, slots=True)

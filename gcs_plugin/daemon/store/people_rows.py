@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, Final, NamedTuple
 
-from gcs_plugin.daemon.store.daemon_events import Events, PeopleChanged
+from gcs_plugin.daemon.store.daemon_events import Events, LogGrew, PeopleChanged
 from gcs_plugin.daemon.store.journal import Journal, packed, unpacked
 from orthoswarm.export.product_files import iso_time
 from orthoswarm.export.tactical.places import spreadsheet_cell
@@ -220,7 +220,7 @@ class People:
     def _noted(self, future: "Future[None]") -> None:
         if (problem := future.exception()) is not None:
             _log.warning("who did what was not noted: %s", problem)
-        self._events.publish(PeopleChanged())
+        self._events.publish(LogGrew())
 
     def log(self, most: int | None = _LATEST) -> list[dict[str, Any]]:
         """The log as JSON values, newest first: `time`, `name`, `role`, `action`, `target`, `outcome`, `reason`."""

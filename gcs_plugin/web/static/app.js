@@ -10,6 +10,9 @@ import { settingsDialog } from "/static/core/settings_dialog.js";
 import { changed, state } from "/static/core/store.js";
 import { listen } from "/static/core/stream.js";
 import { t } from "/static/core/strings.js";
+import { peopleButton, peopleDialog } from "/static/people/dialog.js";
+import { holdBox } from "/static/people/holds.js";
+import { roleBanner } from "/static/people/me.js";
 
 const MODES = ["plan", "fly", "map"];
 
@@ -17,13 +20,14 @@ applyTheme();
 document.title = t("app.title");
 const tabs = MODES.map((mode) => make("button", { type: "button", role: "tab", id: `tab-${mode}`, "aria-controls": `panel-${mode}`, onclick: () => setMode(mode) }, t(`mode.${mode}`)));
 const settingsBox = settingsDialog(refresh);
+const peopleBox = peopleDialog();
 const fold = button("", () => { setSetting("folded", !settings.folded); setMode(settings.mode); }, { class: "fold" });
 const grow = button("", () => { setSetting("tall", !settings.tall); setMode(settings.mode); }, { class: "fold grow" });
-const header = make("header", {}, make("h1", {}, t("app.title")), make("div", { class: "tabs", role: "tablist", "aria-label": t("mode.title") }, ...tabs), problemList(), linkStatus(),
+const header = make("header", {}, make("h1", {}, t("app.title")), make("div", { class: "tabs", role: "tablist", "aria-label": t("mode.title") }, ...tabs), problemList(), linkStatus(), peopleButton(peopleBox.open),
   button("⚙", settingsBox.open, { class: "icon", "aria-label": t("settings.title") }));
 byId("top").replaceWith(header);
-document.body.prepend(linkBanner());
-document.body.append(settingsBox.box);
+document.body.prepend(linkBanner(), roleBanner());
+document.body.append(settingsBox.box, peopleBox.box);
 
 // The map is loaded after the bar of commands: a browser without WebGL still commands vehicles.
 const { commandBar } = await import("/static/fly/command_bar.js");
@@ -34,7 +38,7 @@ const panels = Object.fromEntries(MODES.map((mode) => [mode, make("div", { class
 setAttribute(byId("side"), "aria-label", t("panel.title"));
 byId("side").append(grow, fold, ...Object.values(panels));
 panels.fly.append(stripOf());
-byId("stage").append(make("div", { class: "corner" }, alarmList(), noticeBox()));
+byId("stage").append(make("div", { class: "corner" }, holdBox(), alarmList(), noticeBox()));
 
 let setEditing = () => {};
 function setMode(mode) {

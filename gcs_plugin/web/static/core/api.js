@@ -1,11 +1,10 @@
 // The daemon's HTTP: token, requests, and failures that say what to do.
 
 const KEY = "orthoswarm-token";
-const given = new URLSearchParams(location.hash.slice(1)).get("token");
-if (given) {
-  sessionStorage.setItem(KEY, given);
-  history.replaceState(null, "", location.pathname);
-}
+const fragment = new URLSearchParams(location.hash.slice(1));
+const [given, invitation] = ["token", "invitation"].map((name) => fragment.get(name));
+if (given) sessionStorage.setItem(KEY, given);
+if (given || invitation) history.replaceState(null, "", location.pathname);
 
 export const token = () => sessionStorage.getItem(KEY) || "";
 export const setToken = (text) => sessionStorage.setItem(KEY, text.trim());
@@ -50,3 +49,10 @@ export const get = (path) => request("GET", path);
 export const post = (path, body = {}, limit_ms = 60_000) => request("POST", path, body, limit_ms);
 export const withToken = (path) => (token() ? `${path}?token=${encodeURIComponent(token())}` : path);
 export const tileRequest = (url) => ({ url: new URL(url, location.href).href, headers: headers() });
+
+// An invitation is exchanged once for a cookie, which no script reads; before that nothing else is asked.
+export let joinProblem = "";
+if (invitation) {
+  sessionStorage.removeItem(KEY); // this tab belongs to who was invited
+  await request("POST", "/api/session", { invitation }).catch((error) => { joinProblem = error.message; });
+}

@@ -1,9 +1,10 @@
 // The English catalogue.
 
 import { coverageWords } from "/static/coverage/words.js";
+import { peopleWords } from "/static/people/words.js";
 
 export const english = {
-  ...coverageWords,
+  ...coverageWords, ...peopleWords,
   "app.title": "OrthoSwarm", "app.nomap": "The map cannot be shown ({why}); commands to vehicles work. Use a browser with WebGL.",
   "app.token": "The token is missing or wrong: open Settings and enter the one that `orthoswarm serve --show-token` prints.",
   "mode.title": "Mode", "mode.plan": "Plan", "mode.fly": "Fly", "mode.map": "Map", "panel.title": "Panel", "panel.fold": "Hide the panel", "panel.open": "Show the panel", "panel.taller": "Taller panel", "panel.lower": "Lower panel",

@@ -61,6 +61,8 @@ const takeJob = (job) => { if (job?.id != null) { state.jobs.set(job.id, job); c
 const heardJob = heard("/api/jobs", takeJob);
 
 const READS = {
+  "/api/me": (body) => { state.me = body; changed("me"); },
+  "/api/holds": (rows) => { state.holds = list(rows); changed("holds"); },
   "/api/vehicles": takeVehicles,
   "/api/layers": (rows) => { state.layers = list(rows); changed("layers"); },
   "/api/jobs": takeJobs,
@@ -109,7 +111,7 @@ function soon(...paths) {
 
 const KINDS = {
   resync: () => { refresh(); changed("plan"); changed("finds-changed"); },
-  unwelcome: () => read("/api/vehicles"),
+  unwelcome: () => { read("/api/me"); read("/api/vehicles"); },
   vehicle: heard("/api/vehicles", takeVehicle),
   vehicle_event: (event) => {
     const row = state.vehicles.get(String(event.vehicle));
@@ -131,6 +133,9 @@ const KINDS = {
   completion: () => soon("/api/completions", "/api/vehicles"),
   plan: () => changed("plan"),
   finds: () => changed("finds-changed"),
+  holds: (event) => { state.holds = list(event.rows); changed("holds"); },
+  people: () => { changed("people"); soon("/api/me"); },
+  log: () => changed("people"),
   command: heardCommand,
   alarm: announce,
   problem: () => read("/healthz"),

@@ -14,6 +14,8 @@ export const state = {
   commands: [], // newest first; fly/commands.js
   alarms: new Map(), // key -> alarm; fly/alarms.js
   finds: [],
+  me: null, // who this page is to the station: /api/me
+  holds: [], // which pilot has which vehicle: /api/holds
   traffic: [], // other aircraft, as core/values.js cleans them
   link: "connecting", // connecting, live, late, lost
   silent_s: 0,
