@@ -89,5 +89,5 @@ export function peopleDialog() {
 export function peopleButton(open) {
   const word = make("span", { class: "me" });
   subscribe("me", "person", () => setText(word, state.me?.id > 0 ? `${state.me.name}, ${t(`role.${state.me.role}`)}` : ""));
-  return make("button", { type: "button", class: "icon people-button", "aria-label": t("people.title"), onclick: open }, make("span", { "aria-hidden": "true" }, "☺"), word);
+  return make("button", { type: "button", class: "people-button", "aria-label": t("people.title"), onclick: open }, make("span", { "aria-hidden": "true" }, "☺"), word);
 }
