@@ -51,6 +51,8 @@ def calls(daemon: Daemon) -> list[Call]:
     views, plans, console = daemon.views, daemon.plans, daemon.console
     return [
         Call("/api/vehicles", "vehicles", views.vehicles, "Every vehicle that was heard on a link or sent pictures."),
+        Call("/api/routes", "routes", daemon.links.routes,
+             "The missions that vehicles hold, as points [item, longitude, latitude]; `route` as in /api/vehicles."),
         Call("/api/layers", "layers", views.layers,
              "Layers with versions, bounds (west, south, east, north in degrees) and tile addresses."),
         Call("/api/jobs", "jobs", daemon.jobs.documents, "The latest jobs, oldest first."),

@@ -6,7 +6,8 @@ from tests.page.test_operation import accessible
 RING = [[8.560, 47.400], [8.561, 47.400], [8.561, 47.401], [8.560, 47.401], [8.560, 47.400]]
 SHARES = {"seen_share": 0.9, "poor_share": 0.04, "missed_share": 0.05, "planned_share": 0.01}
 COVERAGE = {
-    "state": "in flight", "version": 3, **SHARES, "recorded": SHARES, "pictures": {"placed": 60, "recorded": 12},
+    "state": "in flight", "version": 3, "plan": "plan-0", **SHARES, "recorded": SHARES,
+    "pictures": {"placed": 60, "recorded": 12},
     "offers": [{"vehicle": "v2", "legs": 3, "length_m": 900.0}], "warnings": [],
     "gaps": [
         {"area_m2": 3200.0, "cause": "not triggered", "detail": "", "confidence": 0.95, "vehicle": "v1",

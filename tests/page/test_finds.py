@@ -48,7 +48,7 @@ def test_the_ground_under_a_vehicle_can_be_marked(browser):
         station.answer = lambda method, path, body: (200, {"id": 1} | body)
         page.wait_for_selector(".vehicle")
         page.click("#tab-map")
-        page.fill("input[aria-label='Note of the find']", "Under a vehicle")
+        page.fill("input[aria-label='Note of the marker']", "Under a vehicle")
         page.click("text=Mark on the map")
         box = page.locator("button.vehicle").bounding_box()
         with page.expect_request(lambda request: request.method == "POST" and request.url.endswith("/api/finds")):
@@ -153,7 +153,7 @@ def test_a_find_that_could_not_be_saved_keeps_its_place(browser):
         station.answer = lambda method, path, body: (201, body)
         page.wait_for_selector(".vehicle")
         page.click("#tab-map")
-        page.fill("input[aria-label='Note of the find']", "Person")
+        page.fill("input[aria-label='Note of the marker']", "Person")
         page.click("text=Mark on the map")
         page.context.set_offline(True)
         page.mouse.click(700, 300)
