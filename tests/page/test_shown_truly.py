@@ -211,3 +211,34 @@ def test_what_the_station_says_is_in_the_units_of_the_person(browser, units):
         page.evaluate(f"""import('/static/core/settings.js').then((m) => m.setSetting("units", "{units}"))""")
         words = "100 m from v2 at 10 m/s (2.5 km)" if units == "metric" else "328 ft from v2 at 22 mph (1.55 mi)"
         page.wait_for_selector(f".tile .why:has-text('{words}')")
+
+
+def test_the_map_says_where_it_is_not_to_be_trusted_once_that_was_exported(browser):
+    w, south, e, north = BOUNDS
+    corners = [[w, north], [e, north], [e, south], [w, south]]
+    trust = {"version": 7, "headline": "Places lie within 20 cm.", "corners": corners}
+    with standing(vehicle(1)) as station, opened(browser, station.url) as page:
+        page.click("#tab-map")
+        page.wait_for_selector("text=Known once a vehicle is refined")
+        station.gets["/api/trust"] = trust
+        send(page, {"type": "job", "id": 9, "kind": "export", "state": "done", "progress": 1, "message": ""})
+        page.wait_for_selector("text=Places lie within 20 cm.")
+        page.wait_for_function("orthoswarm.map.getLayer('trust')")
+        assert not visible(page, "trust")
+        page.check("#panel-map [name=shown-trust]")
+        poll(page, lambda: visible(page, "trust"))
+
+
+def test_a_pilot_sees_attitude_climb_and_gimbal_and_what_a_picture_will_show(browser):
+    about = {"climb_m_s": -1.5, "roll_deg": 4, "pitch_deg": -7, "heading_deg": 90.0, "gimbal_pitch_deg": -30}
+    with standing(vehicle(1, **about)) as station:
+        keep_plans(station)
+        with opened(browser, station.url) as page:
+            page.click(".tile")
+            page.wait_for_selector(".details:has-text('roll 4°, pitch -7°, heading 90°')")
+            words = page.inner_text(".details")
+            assert "sinks 1.5 m/s" in words and "-30° (-90 is down)" in words
+            page.click("#tab-plan")
+            page.fill("[name=altitude_m]", "100")
+            page.fill("[name=fov_min_deg]", "90")
+            page.wait_for_selector("text=A picture shows 200.0 m across; with 4000 pixels, 5.0 cm a pixel.")

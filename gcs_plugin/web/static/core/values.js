@@ -55,7 +55,7 @@ export function vehicle(message, before, now, whole = false) {
     linked: number(row.system, 0, 255) != null, state: text(row.state), mode: text(row.mode), armed: row.armed === true, landed: text(row.landed),
     alarm: typeof row.alarm === "string" ? text(row.alarm, 300) : null, behind: text(row.behind, 300), ordered: row.behind_ordered === true, alt_m: number(row.alt_m, -5000, 60000),
     flight: flight(row), position: moved ?? before?.position ?? null, height_m: number(row.height_m, -5000, 50000),
-    speed_m_s: number(row.speed_m_s, 0, 1000), heading_deg: number(row.heading_deg, -720, 720), battery,
+    speed_m_s: number(row.speed_m_s, 0, 1000), climb_m_s: number(row.climb_m_s, -100, 100), roll_deg: number(row.roll_deg, -180, 180), pitch_deg: number(row.pitch_deg, -180, 180), gimbal_deg: number(row.gimbal_pitch_deg, -180, 180), heading_deg: number(row.heading_deg, -720, 720), battery,
     battery_left_s: number(row.battery_left_s, 0, 1e6), gps_fix: number(row.gps_fix, 0, 10), satellites: number(row.satellites, 0, 254),
     link: text(row.link), silent_s: number(row.silent_s, 0) ?? 0, at: now, photos: count(row.photos),
     came_s: number(row.came_s, 0), frames: { frames: count(frames.frames), fine: count(frames.fine), coarse: count(frames.coarse), rejected: count(frames.rejected) },

@@ -16,6 +16,7 @@ import { measurePanel } from "/static/map/measure.js";
 import { shownBox } from "/static/map/shown.js";
 import { setSwipe, swipeParts } from "/static/map/swipe.js";
 import "/static/map/traffic_markers.js";
+import { trustPanel } from "/static/map/trust.js";
 import "/static/map/vehicle_markers.js";
 import { setEditing } from "/static/plan/editor.js";
 import { loadPlan, planPanel } from "/static/plan/panel.js";
@@ -49,7 +50,7 @@ export async function withMap(panels) {
   const swipe = make("input", { type: "checkbox", id: "swipe-on", onchange: () => setSwipe(swipe.checked) });
   byId("stage").append(...swipeParts(), olderNote(), make("div", { class: "under" }, button(t("map.all"), showAll), ...shownBox(), cursorLine()), detailsPanel());
   panels.plan.append(planPanel());
-  panels.map.append(layerPanel(), make("section", {}, make("label", { class: "check" }, swipe, make("span", {}, t("swipe.on")))), coveragePanel(), legPanel(), measurePanel(), findPanel(), jobPanel(), exportPanel());
+  panels.map.append(layerPanel(), make("section", {}, make("label", { class: "check" }, swipe, make("span", {}, t("swipe.on")))), coveragePanel(), trustPanel(), legPanel(), measurePanel(), findPanel(), jobPanel(), exportPanel());
   document.body.append(preflightDialog(), gapFlightDialog());
   await ready;
   subscribe("plan", "the shared plan", () => loadPlan());
