@@ -242,3 +242,29 @@ def test_a_pilot_sees_attitude_climb_and_gimbal_and_what_a_picture_will_show(bro
             page.fill("[name=altitude_m]", "100")
             page.fill("[name=fov_min_deg]", "90")
             page.wait_for_selector("text=A picture shows 200.0 m across; with 4000 pixels, 5.0 cm a pixel.")
+
+
+@pytest.mark.parametrize(
+    ("typed", "lon", "lat"),
+    [
+        ("47.3977, 8.5456", 8.5456, 47.3977),
+        ("-33.8568 151.2153", 151.2153, -33.8568),
+        ("47°23'51.7\"N 8°32'44.2\"E", 8.545611, 47.397694),
+        ("S 33 51 24.5, E 151 12 55.1", None, None),  # no signs between degrees and minutes: it could mean anything
+        ("32T 465711 E 5249461 N", 8.5456, 47.3977),
+        ("32T MT 65711 49460", 8.5456, 47.3977),
+        ("56H LH 34900 52288", 151.2153, -33.8568),
+        ("nowhere", None, None),
+    ],
+)
+def test_a_place_is_found_by_its_coordinates(browser, typed, lon, lat):
+    with standing(vehicle(1)) as station, opened(browser, station.url) as page:
+        page.click("#tab-map")
+        page.fill("[name=go-to]", typed)
+        page.press("[name=go-to]", "Enter")
+        if lon is None:
+            page.wait_for_selector("text=These are no coordinates")
+        else:
+            page.wait_for_function("orthoswarm.map.getZoom() >= 18")
+            there = page.evaluate("orthoswarm.map.getCenter().toArray()")
+            assert there == pytest.approx([lon, lat], abs=2e-5), there

@@ -58,7 +58,7 @@ export function vehicle(message, before, now, whole = false) {
     speed_m_s: number(row.speed_m_s, 0, 1000), climb_m_s: number(row.climb_m_s, -100, 100), roll_deg: number(row.roll_deg, -180, 180), pitch_deg: number(row.pitch_deg, -180, 180), gimbal_deg: number(row.gimbal_pitch_deg, -180, 180), heading_deg: number(row.heading_deg, -720, 720), battery,
     battery_left_s: number(row.battery_left_s, 0, 1e6), gps_fix: number(row.gps_fix, 0, 10), satellites: number(row.satellites, 0, 254),
     link: text(row.link), silent_s: number(row.silent_s, 0) ?? 0, at: now, photos: count(row.photos),
-    came_s: number(row.came_s, 0), frames: { frames: count(frames.frames), fine: count(frames.fine), coarse: count(frames.coarse), rejected: count(frames.rejected) },
+    came_s: number(row.came_s, 0), last_seq: number(row.last_seq, 0), last_frame: text(row.last_frame), frames: { frames: count(frames.frames), fine: count(frames.fine), coarse: count(frames.coarse), rejected: count(frames.rejected) },
     sortie: count(row.sortie), route: count(row.route), item: count(object(row.mission).item), phase: text(object(row.mission).phase), returnsAfter: Array.isArray(row.returns_after) ? row.returns_after.map(String) : null, takeoff: row.takeoff ? { in_s: number(row.takeoff.in_s), failed: text(row.takeoff.failed) } : null,
     texts: Array.isArray(message.texts) ? messages(message.texts) : (before?.texts ?? []), home: Array.isArray(row.home) ? position(row.home[1], row.home[0]) : null, trail, autopilot: text(row.autopilot), fence: fence(row.fence),
     faults: { lost: number(object(row.faults).lost_share, 0, 1) ?? 0, damaged: count(object(row.faults).damaged), impossible: count(object(row.faults).impossible) },

@@ -9,6 +9,7 @@ import { t } from "/static/core/strings.js";
 import * as units from "/static/core/units.js";
 import { inAir, need } from "/static/fly/need.js";
 import { askOne } from "/static/fly/command_bar.js";
+import { latestPicture } from "/static/fly/latest_picture.js";
 import { wordOf } from "/static/fly/tiles.js";
 import { lengthOf } from "/static/map/geodesy.js";
 import { map } from "/static/map/map.js";
@@ -42,7 +43,7 @@ export function detailsPanel() {
     make("div", { class: "row" }, name, button("×", () => select(null), { class: "close", "aria-label": t("details.close") })),
     why, linked, make("div", { class: "verbs" }, button(t("details.show"), () => chosen()?.position && map.flyTo({ center: chosen().position, zoom: Math.max(16, map.getZoom()), duration: 0 })),
       button(t("details.refine"), () => chosen() && refine(chosen().id))),
-    facts, heading, silent, messages);
+    latestPicture(), facts, heading, silent, messages);
   // In Plan and Map it covers the map only if it was opened there.
   let shownFor = null;
   let openedIn = "fly";

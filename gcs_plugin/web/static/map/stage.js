@@ -13,6 +13,7 @@ import { layerPanel, mappedBounds } from "/static/map/layers.js";
 import { legPanel } from "/static/map/legs.js";
 import { boundsOf, fit, isReady, map, ready } from "/static/map/map.js";
 import { measurePanel } from "/static/map/measure.js";
+import { goToForm } from "/static/map/go_to.js";
 import { shownBox } from "/static/map/shown.js";
 import { setSwipe, swipeParts } from "/static/map/swipe.js";
 import "/static/map/traffic_markers.js";
@@ -50,7 +51,7 @@ export async function withMap(panels) {
   const swipe = make("input", { type: "checkbox", id: "swipe-on", onchange: () => setSwipe(swipe.checked) });
   byId("stage").append(...swipeParts(), olderNote(), make("div", { class: "under" }, button(t("map.all"), showAll), ...shownBox(), cursorLine()), detailsPanel());
   panels.plan.append(planPanel());
-  panels.map.append(layerPanel(), make("section", {}, make("label", { class: "check" }, swipe, make("span", {}, t("swipe.on")))), coveragePanel(), trustPanel(), legPanel(), measurePanel(), findPanel(), jobPanel(), exportPanel());
+  panels.map.append(goToForm(), layerPanel(), make("section", {}, make("label", { class: "check" }, swipe, make("span", {}, t("swipe.on")))), coveragePanel(), trustPanel(), legPanel(), measurePanel(), findPanel(), jobPanel(), exportPanel());
   document.body.append(preflightDialog(), gapFlightDialog());
   await ready;
   subscribe("plan", "the shared plan", () => loadPlan());
