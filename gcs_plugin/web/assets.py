@@ -4,7 +4,6 @@ The page is loaded over radio links of some hundred kilobits a second: packed it
 name each other by "/static/...", which an import map in the page turns into the versioned addresses.
 """
 
-import asyncio
 import base64
 import gzip
 import hashlib
@@ -13,6 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from fastapi import HTTPException, Request, Response
+from starlette.middleware.gzip import GZipMiddleware
 
 from gcs_plugin.web.guard import CONTENT_POLICY
 
@@ -20,7 +20,7 @@ _PACKED: Final = frozenset({".js", ".mjs", ".css", ".html", ".txt", ".md", ".svg
 _KEPT: Final = "public, max-age=31536000, immutable"
 _ASKED: Final = "no-cache"  # the ETag is asked for each time
 _WORTH_BYTES: Final = 1400  # what fits in one packet comes no sooner for being smaller
-_LARGE_BYTES: Final = 200_000  # takes longer than some milliseconds, in which others would wait
+_PICTURES: Final = ("/picture", "/view", ".png")
 _LEVEL: Final = 1  # 100 MB a second; higher ones save a tenth and take four times as long
 
 
@@ -67,44 +67,13 @@ class Assets:
 
 
 class Packed:
-    """ASGI middleware that compresses JSON for those who take it; tiles and pictures are compressed as they are."""
+    """ASGI middleware that compresses answers in JSON; pictures, tiles and exports are compressed as they are."""
 
     def __init__(self, app: Any) -> None:
-        self.app = app
+        self.app, self._packed = app, GZipMiddleware(app, minimum_size=_WORTH_BYTES, compresslevel=_LEVEL)
 
     async def __call__(self, scope: dict[str, Any], receive: Any, send: Any) -> None:
         """Handle one request."""
-        taken = next((value for name, value in scope.get("headers", ()) if name == b"accept-encoding"), b"")
-        packing = scope["type"] == "http" and b"gzip" in taken
-        await self.app(scope, receive, _Packing(send) if packing else send)
-
-
-class _Packing:
-    """An ASGI send that compresses a body of JSON that comes in one piece."""
-
-    def __init__(self, send: Any) -> None:
-        self._send = send
-        self._start: dict[str, Any] | None = None
-
-    async def __call__(self, message: dict[str, Any]) -> None:
-        """Send a part of the answer; the start of JSON waits for its body."""
-        if message["type"] == "http.response.start":
-            headers = dict(message.get("headers", ()))
-            if message["status"] < 400 and b"json" in headers.get(b"content-type", b""):
-                self._start = message
-                return
-        elif self._start is not None:
-            start, self._start = self._start, None
-            body = message.get("body", b"")
-            if len(body) >= _WORTH_BYTES and not message.get("more_body"):
-                packed = gzip.compress(body, _LEVEL) if len(body) < _LARGE_BYTES else await _in_thread(body)
-                others = [row for row in start["headers"] if row[0] != b"content-length"]
-                about = [(b"content-length", str(len(packed)).encode()), (b"content-encoding", b"gzip")]
-                start = {**start, "headers": [*others, *about, (b"vary", b"accept-encoding")]}
-                message = {**message, "body": packed}
-            await self._send(start)
-        await self._send(message)
-
-
-async def _in_thread(body: bytes) -> bytes:
-    return await asyncio.to_thread(gzip.compress, body, _LEVEL)
+        path = scope.get("path", "")
+        is_text = path.startswith("/api/") and not path.endswith(_PICTURES) and not path.startswith("/api/export/")
+        await (self._packed if is_text else self.app)(scope, receive, send)

@@ -38,6 +38,7 @@ Rows = list[dict[str, Any]]
 
 ALL: Final = "all"
 _PLAN: Final = "start of a plan"
+_UPLOADS: Final = ("upload", "fence")
 _ALL_VERBS: Final = ("pause", "resume", "rtl", "return", "land")
 _ENDS: Final = URGENT | {RETURN_VERB}
 _AHEAD_S: Final = 2.0
@@ -83,14 +84,17 @@ class CommandRoutes:
     async def mission(self, vehicle: str, verb: str, request: Request) -> Response:
         """Send a command: `upload` ({"plan": id, "mission": "v1"}), `start`, `pause`, `resume`, `rtl`, `land`.
 
+        `fence` ({"plan": id}) puts the plan's no-fly zones into the vehicle's geofence, in place of its zones to stay
+        out of.
+
         Body: `id`, and `given_clock_s` with `run`, or `given_s` (see above). Answers once the outcome is known, with
         `id`, `vehicle`, `command`, `outcome` (`done`, `refused`, `not_sent`, `unknown`) and `reason`. The vehicle `all`
         stands for all on the links (not for upload and start); its answer has `id` and `results`, a row a vehicle.
         `return` is for all only: those whose ways home come near each other return one after the other (`rtl` sends all
         at once).
         """
-        if verb not in (*VERBS, "upload") and (vehicle, verb) != (ALL, RETURN_VERB):
-            raise HTTPException(404, f"there is no such command; choose upload, {', '.join(VERBS)}")
+        if verb not in (*VERBS, *_UPLOADS) and (vehicle, verb) != (ALL, RETURN_VERB):
+            raise HTTPException(404, f"there is no such command; choose {', '.join((*_UPLOADS, *VERBS))}")
         if vehicle == ALL and verb not in _ALL_VERBS:
             raise HTTPException(404, f"all vehicles at once can {', '.join(_ALL_VERBS)}; start a plan, or one vehicle")
         body = await json_body(request)
@@ -151,8 +155,8 @@ class CommandRoutes:
             rows = [] if verb in _ENDS else self._held(pilot, names, verb, issue)
             free = [name for name in names if name not in {row["vehicle"] for row in rows}]
             began = links.clock() - max(0.0, issue.age_s)
-            if verb == "upload":
-                rows += [self._upload(name, issue, body) for name in free]
+            if verb in _UPLOADS:
+                rows += [self._upload(name, verb, issue, body) for name in free]
             elif free:
                 rows += links.commands(verb, free, given_s=began, command_id=issue.id, override=override)
         return self._told(rows)
@@ -179,19 +183,22 @@ class CommandRoutes:
             self._daemon.events.publish(CommandDone(row))
         return rows
 
-    def _upload(self, vehicle: str, issue: Issue, body: dict[str, Any]) -> dict[str, Any]:
-        links = self._daemon.links
+    def _upload(self, vehicle: str, verb: str, issue: Issue, body: dict[str, Any]) -> dict[str, Any]:
+        links, plans = self._daemon.links, self._daemon.plans
 
         def result(outcome: Verdict, reason: str) -> dict[str, Any]:
-            return CommandResult(issue.id, vehicle, "upload", outcome, reason).document()
+            return CommandResult(issue.id, vehicle, verb, outcome, reason).document()
 
         try:
             system = links.fleet.system_of(vehicle)
         except OrthoSwarmError as error:
             return result(Verdict.NOT_SENT, str(error))
-        mission = self._daemon.plans.mission(body, vehicle, links.fleet.vehicles[system].autopilot)
+        if verb == "fence":
+            put = partial(links.upload_fence, system, plans.keep_out(body.get("plan")))
+        else:
+            put = partial(links.upload, system, plans.mission(body, vehicle, links.fleet.vehicles[system].autopilot))
         try:
-            return result(Verdict.DONE, links.upload(system, mission))
+            return result(Verdict.DONE, put())
         except OrthoSwarmError as error:
             return result(Verdict.REFUSED, str(error))
 

@@ -17,45 +17,20 @@ class Need(NamedTuple):
     action: str = ""
 
 
-_READ: Final = Need(Role.VIEWER)
-_OPEN: Final = Need(Role.ANYBODY)
 EDIT_PLAN: Final = "edit plan"
-
+_OPEN: Final = "/ /favicon.ico /healthz /static/{path:path} /api/me"
+_READING: Final = """
+    /docs /openapi.json /metrics /tiles/{layer}/{z}/{x}/{y}.{suffix} /api/vehicles /api/layers /api/jobs /api/legs
+    /api/completions /api/frames /api/routes /api/frames/{seq}/picture /api/frames/{seq}/view /api/plans
+    /api/plans/{number}/map /api/plan /api/traffic /api/finds /api/finds/{number}/pictures /api/places /api/trust
+    /api/trust.png /api/coverage /api/coverage/gaps.geojson /api/coverage/cells.png /api/coverage/vehicles
+    /api/export/{job}/{kind} /api/holds /api/log
+"""
 NEEDS: Final[dict[str, Need]] = {
-    "GET /": _OPEN,
-    "GET /favicon.ico": _OPEN,
-    "GET /healthz": _OPEN,
-    "GET /static/{path:path}": _OPEN,
-    "GET /api/me": _OPEN,
-    "POST /api/session": _OPEN,
-    # reading
-    "GET /docs": _READ,
-    "GET /openapi.json": _READ,
-    "GET /metrics": _READ,
-    "GET /tiles/{layer}/{z}/{x}/{y}.{suffix}": _READ,
-    "GET /api/vehicles": _READ,
-    "GET /api/layers": _READ,
-    "GET /api/jobs": _READ,
-    "GET /api/legs": _READ,
-    "GET /api/completions": _READ,
-    "GET /api/frames": _READ,
-    "GET /api/frames/{seq}/picture": _READ,
-    "GET /api/frames/{seq}/view": _READ,
-    "GET /api/plans": _READ,
-    "GET /api/plans/{number}/map": _READ,
-    "GET /api/plan": _READ,
-    "GET /api/traffic": _READ,
-    "GET /api/finds": _READ,
-    "GET /api/finds/{number}/pictures": _READ,
-    "GET /api/places": _READ,
-    "GET /api/coverage": _READ,
-    "GET /api/coverage/gaps.geojson": _READ,
-    "GET /api/coverage/cells.png": _READ,
-    "GET /api/coverage/vehicles": _READ,
-    "GET /api/export/{job}/{kind}": _READ,
-    "GET /api/holds": _READ,
-    "GET /api/log": _READ,
-    "WS /api/events": _READ,
+    **{f"GET {path}": Need(Role.ANYBODY) for path in _OPEN.split()},
+    **{f"GET {path}": Need(Role.VIEWER) for path in _READING.split()},
+    "WS /api/events": Need(Role.VIEWER),
+    "POST /api/session": Need(Role.ANYBODY),
     # areas, plans, finds, the map
     "POST /api/frames": Need(Role.ANALYST),
     "POST /api/areas": Need(Role.ANALYST),
@@ -78,18 +53,17 @@ NEEDS: Final[dict[str, Need]] = {
     "POST /api/people": Need(Role.OPERATOR, "invite"),
     "DELETE /api/people/{number}": Need(Role.OPERATOR, "revoke"),
 }
-"""Method and path of each route, the most particular first where two fit -> what it needs."""
+"""Method and path of each route -> what it needs."""
 
 LOCAL_PROGRAMS: Final = frozenset({"POST /api/frames", "POST /api/areas"})
 """What programs of this machine may send without the token: pictures, and area files to be read."""
 
-_READING: Final = frozenset({"HEAD", "OPTIONS"})
 _PATTERNS: Final = [(name, name.split(" ", 1)[0], compile_path(name.split(" ", 1)[1])[0]) for name in NEEDS]
 
 
 def route_of(method: str, path: str) -> str:
     """The row of the table for a request ("GET /api/jobs"), or the request itself if it has none."""
-    method = "GET" if method in _READING else method
+    method = "GET" if method in ("HEAD", "OPTIONS") else method
     exact = f"{method} {path}"
     if exact in NEEDS:
         return exact

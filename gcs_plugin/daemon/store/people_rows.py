@@ -125,24 +125,14 @@ class People:
         if not isinstance(invitation, str):
             return None
         secret, now = secrets.token_urlsafe(24), time.time()
-        known = _hash(invitation)
-
-        def change(db: sqlite3.Connection) -> sqlite3.Row | None:
-            found: sqlite3.Row | None = db.execute(
-                "UPDATE people SET session = ?, joined = ? WHERE invitation = ? AND session IS NULL"
-                " AND revoked IS NULL AND made > ? RETURNING *",
-                (_hash(secret), now, known, now - _INVITED_S),
-            ).fetchone()
-            return found
-
+        values = (_hash(secret), now, _hash(invitation), now - _INVITED_S)
         with self._lock:
-            row = self._journal.write(change)
-            if row is None:
-                return None
+            row = self._journal.write(lambda db: db.execute(_JOIN, values).fetchone())
             self._read()
-        person = Person(row["id"], unpacked(row["name"]), INVITED[row["role"]])
+        if row is None:
+            return None
         self._events.publish(PeopleChanged())
-        return person, secret
+        return self._known[row["id"]], secret
 
     def revoke(self, number: int) -> bool:
         """Make somebody's invitation and session void, at once; False if there is no such person."""
@@ -161,22 +151,12 @@ class People:
 
         `state`: invited, expired (not opened in time), joined or revoked. `here`: whether the page is open now.
         """
-        rows, now = self._journal.rows("SELECT * FROM people ORDER BY id"), time.time()
-
-        def state(row: sqlite3.Row) -> str:
-            if row["revoked"] is not None:
-                return "revoked"
-            if row["session"] is not None:
-                return "joined"
-            return "invited" if row["made"] > now - _INVITED_S else "expired"
-
+        rows = self._journal.rows(_EVERYBODY, (time.time() - _INVITED_S,))
         return [
-            {
-                "id": row["id"], "name": unpacked(row["name"]), "role": row["role"], "state": state(row),
-                "made": iso_time(row["made"]), "here": self.is_here(row["id"], 5.0),
-            }
+            {key: row[key] for key in ("id", "role", "state")}
+            | {"name": unpacked(row["name"]), "made": iso_time(row["made"]), "here": self.is_here(row["id"], 5.0)}
             for row in rows
-        ]  # fmt: skip
+        ]
 
     def of_session(self, secret: str) -> Person | None:
         """Whose session a secret is of, None if it is of none (any more)."""
@@ -242,6 +222,14 @@ class People:
         return out.getvalue()
 
 
+_EVERYBODY: Final = """
+SELECT *, CASE WHEN revoked IS NOT NULL THEN 'revoked' WHEN session IS NOT NULL THEN 'joined'
+    WHEN made > ? THEN 'invited' ELSE 'expired' END AS state FROM people ORDER BY id
+"""
+_JOIN: Final = """
+UPDATE people SET session = ?, joined = ? WHERE invitation = ? AND session IS NULL AND revoked IS NULL AND made > ?
+    RETURNING id
+"""
 _NOTE: Final = "INSERT INTO deeds (time, name, role, action, target, outcome, reason) VALUES (?, ?, ?, ?, ?, ?, ?)"
 _SAME: Final = """
 UPDATE deeds SET time = ?, count = count + 1 WHERE id = (SELECT max(id) FROM deeds)
