@@ -142,7 +142,7 @@ async def send_pictures(url: str, token: str, vehicles: int, until: float) -> No
                 data, east, north, yaw = course(vehicle, number)
                 lat, lon = (float(v) for v in grid.to_geographic([EAST + east, NORTH + north]))
                 pose = {
-                    "vehicle": f"v{vehicle}", "image": f"{number}.jpg", "time": time.time(), "lat_deg": lat,
+                    "vehicle": f"v{vehicle}", "image": f"{round(until)}-{number}.jpg", "time": time.time(), "lat_deg": lat,
                     "lon_deg": lon, "height_m": HEIGHT_M, "yaw_deg": yaw, "pitch_deg": -90.0, "roll_deg": 0.0,
                 }  # fmt: skip
                 files = {"image": ("p.jpg", data, "image/jpeg")}

@@ -17,10 +17,6 @@ GONE_S: Final = 20.0
 less, and RTL, pause and land are open to everybody meanwhile."""
 
 
-class HeldError(OrthoSwarmError):
-    """Another pilot has a vehicle."""
-
-
 @dataclass(slots=True)
 class _Hold:
     """A vehicle's pilot, and who has asked for it."""
@@ -57,7 +53,7 @@ class Pilots:
             person: who commands them. vehicles: their ids. whole: take none if another has one.
 
         Raises:
-            HeldError: with `whole`, another pilot has one.
+            OrthoSwarmError: with `whole`, another pilot has one.
         """
         refused: dict[str, str] = {}
         with self._lock:
@@ -72,7 +68,7 @@ class Pilots:
                     )
             if refused and whole:
                 self._holds = before
-                raise HeldError("; ".join(refused.values()))
+                raise OrthoSwarmError("; ".join(refused.values()))
             changed = before != self._holds
         if changed:
             self._tell()
@@ -86,34 +82,28 @@ class Pilots:
 
         Raises:
             InputError: there is no such act.
-            HeldError: it is not this pilot's, or nobody has asked.
+            OrthoSwarmError: it is not this pilot's, or nobody has asked.
         """
         with self._lock:
             hold = self._held(vehicle)
-            if act == "take":
-                if hold is None:
-                    self._holds[vehicle] = _Hold(person)
-                elif hold.pilot.id != person.id:
-                    hold.asked = person
-            elif act in ("give", "keep", "free"):
-                if hold is None or hold.pilot.id != person.id:
-                    raise HeldError(f"you do not have {vehicle}; take it first")
-                self._end(vehicle, hold, act)
-            else:
+            if act not in ("take", "give", "keep", "free"):
                 raise InputError("there is no such act; send take, give, keep or free")
-            mine = self._holds.get(vehicle)
+            if act == "take":
+                hold = self._holds[vehicle] = hold or _Hold(person)
+                hold.asked = hold.asked if hold.pilot.id == person.id else person
+            elif hold is None or hold.pilot.id != person.id:
+                raise OrthoSwarmError(f"you do not have {vehicle}; take it first")
+            elif act == "keep":
+                hold.asked = None
+            elif act == "free":
+                del self._holds[vehicle]
+            elif hold.asked is None or self._people.find(hold.asked.id) is None:
+                raise OrthoSwarmError(f"nobody asks for {vehicle} now; free it, and anybody can take it")
+            else:
+                self._holds[vehicle] = _Hold(hold.asked)
+            now = self._held(vehicle)
         self._tell()
-        return mine is not None and mine.pilot.id == person.id
-
-    def _end(self, vehicle: str, hold: _Hold, act: str) -> None:
-        if act == "free":
-            del self._holds[vehicle]
-        elif act == "keep":
-            hold.asked = None
-        elif hold.asked is None or self._people.find(hold.asked.id) is None:
-            raise HeldError(f"nobody asks for {vehicle} now; free it, and anybody can take it")
-        else:
-            self._holds[vehicle] = _Hold(hold.asked)
+        return now is not None and now.pilot.id == person.id
 
     def _held(self, vehicle: str) -> _Hold | None:
         """The hold of a vehicle whose pilot is here and may still command."""

@@ -2,11 +2,11 @@
 
 import pytest
 
-from gcs_plugin.daemon.pilots import GONE_S, HeldError, Pilots
+from gcs_plugin.daemon.pilots import GONE_S, Pilots
 from gcs_plugin.daemon.store.daemon_events import Events, HoldsChanged
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.daemon.store.people_rows import OPERATOR, People, Person
-from orthoswarm.model.errors import InputError
+from orthoswarm.model.errors import InputError, OrthoSwarmError
 
 
 class Post:
@@ -49,7 +49,7 @@ def test_the_first_who_commands_a_vehicle_has_it(post):
 
 def test_a_plan_takes_all_its_vehicles_or_none(post):
     post.pilots.claim(post.anna, ["v2"])
-    with pytest.raises(HeldError, match="Anna has v2"):
+    with pytest.raises(OrthoSwarmError, match="Anna has v2"):
         post.pilots.claim(post.ben, ["v1", "v2", "v3"], whole=True)
     assert [row["vehicle"] for row in post.pilots.rows()] == ["v2"]
 
@@ -60,13 +60,13 @@ def test_a_vehicle_is_handed_over_by_its_pilot(post):
     assert post.pilots.rows()[0]["asked"] == {"id": post.ben.id, "name": "Ben"}
     assert post.pilots.change(post.anna, "v1", "keep")
     assert post.pilots.rows()[0]["asked"] is None
-    with pytest.raises(HeldError, match="nobody asks"):
+    with pytest.raises(OrthoSwarmError, match="nobody asks"):
         post.pilots.change(post.anna, "v1", "give")
     post.pilots.change(post.ben, "v1", "take")
     assert not post.pilots.change(post.anna, "v1", "give")
     assert "Ben has v1" in post.pilots.claim(post.anna, ["v1"])["v1"]
     for act in ("give", "keep", "free"):
-        with pytest.raises(HeldError, match="take it first"):
+        with pytest.raises(OrthoSwarmError, match="take it first"):
             post.pilots.change(post.anna, "v1", act)
     with pytest.raises(InputError):
         post.pilots.change(post.ben, "v1", "steal")
@@ -88,7 +88,7 @@ def test_who_is_revoked_has_no_vehicle(post):
     post.pilots.claim(post.anna, ["v1"])
     post.pilots.change(post.ben, "v1", "take")
     post.people.revoke(post.ben.id)
-    with pytest.raises(HeldError, match="nobody asks"):
+    with pytest.raises(OrthoSwarmError, match="nobody asks"):
         post.pilots.change(post.anna, "v1", "give")
     post.people.revoke(post.anna.id)
     assert post.pilots.rows() == []

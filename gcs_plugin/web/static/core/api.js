@@ -59,6 +59,6 @@ export const tileRequest = (url) => ({ url: new URL(url, location.href).href, he
 // An invitation is exchanged once for a cookie, which no script reads; before that nothing else is asked.
 export let joinProblem = "";
 if (invitation) {
-  sessionStorage.removeItem(KEY); // this tab belongs to who was invited
-  await request("POST", "/api/session", { invitation }).catch((error) => { joinProblem = error.message; });
+  // from then on this tab belongs to who was invited
+  await request("POST", "/api/session", { invitation }).then(() => sessionStorage.removeItem(KEY), (error) => { joinProblem = error.message; });
 }

@@ -46,6 +46,6 @@ export function roleBanner() {
     setText(banner, joinProblem || t(state.me?.role ? "people.look" : "people.out"));
     setAttribute(document.documentElement, "data-may", state.me ? state.me.role ?? "nobody" : null);
   });
-  subscribe("me tick ready", "locks", () => { if (state.me) lock(); });
+  subscribe("me tick ready", "locks", () => { if (!may("pilot") || document.querySelector("[data-locked=true]")) lock(); });
   return banner;
 }
