@@ -57,7 +57,10 @@ class Page:
     def __init__(self, url: str, session: tuple[str, str], seen: Figures) -> None:
         self._url, self._cookie, self._seen = url, "=".join(session), seen
         headers = {"Cookie": self._cookie, "Origin": url}
-        self._client = httpx.AsyncClient(base_url=url, headers=headers, verify=False, timeout=60.0, trust_env=False)
+        limits = httpx.Limits(max_connections=6, keepalive_expiry=3.0)  # as browsers; the server waits 5 s
+        self._client = httpx.AsyncClient(
+            base_url=url, headers=headers, verify=False, timeout=60.0, trust_env=False, limits=limits
+        )
         self._etags: dict[str, str] = {}
         self._changed = asyncio.Event()
 
@@ -142,7 +145,7 @@ async def send_pictures(url: str, token: str, vehicles: int, until: float) -> No
                 data, east, north, yaw = course(vehicle, number)
                 lat, lon = (float(v) for v in grid.to_geographic([EAST + east, NORTH + north]))
                 pose = {
-                    "vehicle": f"v{vehicle}", "image": f"{round(until)}-{number}.jpg", "time": time.time(), "lat_deg": lat,
+                    "vehicle": f"v{vehicle}", "image": f"{until:.0f}-{number}.jpg", "time": time.time(), "lat_deg": lat,
                     "lon_deg": lon, "height_m": HEIGHT_M, "yaw_deg": yaw, "pitch_deg": -90.0, "roll_deg": 0.0,
                 }  # fmt: skip
                 files = {"image": ("p.jpg", data, "image/jpeg")}

@@ -10,6 +10,7 @@ import math
 import threading
 from collections import OrderedDict
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Final
 
@@ -35,6 +36,7 @@ DEEPEST: Final = 24  # zoom: 1 cm at the equator
 _HALF_WORLD_M: Final = 0.5 * WEB_MERCATOR_M
 _NODES: Final = 9  # a side between which coordinates are interpolated
 _CACHE_BYTES: Final = 64 << 20
+_BOXES: Final = 20_000  # tiles whose ground is remembered (4 MB): those of some pages at several zooms
 _local = threading.local()
 
 
@@ -91,6 +93,12 @@ def _box(patch: Array) -> BoundingBox | None:
     if not np.isfinite(patch).all():
         return None
     return BoundingBox.around_points(patch)
+
+
+@lru_cache(_BOXES)
+def _box_of(tile: TileAddress, epsg: int) -> BoundingBox | None:
+    """The ground of a tile, which takes 7 ms to compute: each page asks for its ETag with each change of the map."""
+    return _box(ground_patch(tile, epsg)[0])
 
 
 def canvas_tile(canvas: Canvas, tile: TileAddress) -> Bytes | None:
@@ -233,8 +241,7 @@ class TileServer:
         with layer.reading() as canvas:
             if canvas is None:
                 return "-"
-            patch, _ = ground_patch(tile, canvas.grid.epsg)
-            box = _box(patch)
+            box = _box_of(tile, canvas.grid.epsg)
             newest = canvas.newest(box) if box is not None else 0
             # an unchanged tile keeps its version through generations on one grid; another grid begins to count anew
             return f"{canvas.grid}/{newest}" if newest else "empty"
