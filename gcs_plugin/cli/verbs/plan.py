@@ -40,8 +40,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
     heading_help = "of the lines: degrees from true north, along the wind, or along the area's longest side"
     add("--heading", metavar="DEG|wind|longest", help=heading_help)
     add("--cross", action="store_true", help="cover the area a second time by lines across the first")
-    autopilot_help = "for mission format and flight times; again for vehicles in turn (default ardupilot)"
-    add("--autopilot", dest="autopilots", action="append", choices=["ardupilot", "px4"], help=autopilot_help)
+    autopilot_help = (
+        "for mission format and flight times: ardupilot, px4, or a drone that DJI's Pilot 2 or Litchi flies (m300,\n"
+        "m300-p1, m350, m350-p1, m30, m30t, m3e, m3t, m4e, m4t, litchi); again for vehicles in turn (default ardupilot)"
+    )
+    add("--autopilot", dest="autopilots", action="append", metavar="NAME", help=autopilot_help)
+    dji_help = "missions for DJI's Pilot 2, too, one .kmz a vehicle and flight: --autopilot m300 in short"
+    add("--dji", dest="autopilots", action="append_const", const="m300", help=dji_help)
     add_config(parser)
     add("--json", action="store_true", help="one JSON document on stdout")
     add("--dem", type=Path, metavar="FILE", help="height model; --altitude is then above the ground (needs --start)")
