@@ -17,6 +17,7 @@ import shapely
 
 from gcs_plugin.mission.makers.litchi import is_litchi
 from gcs_plugin.mission.makers.maker_files import read_mission_file
+from gcs_plugin.mission.mission_files import SurveySettings
 from orthoswarm.model.coordinate_system import to_degrees
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.plan import Fence
@@ -49,11 +50,12 @@ _SQLITE: Final = b"SQLite format 3\0"
 
 
 class AreaFile(NamedTuple):
-    """What a file holds: its shapes, rings of its exclusion fences, and all its fences (missions have them)."""
+    """What a file holds: its shapes; of missions rings of exclusion fences, all fences, and how a survey is flown."""
 
     shapes: Shapes
     no_fly: list[Ring]
     fences: tuple[Fence, ...] = ()
+    survey: SurveySettings = SurveySettings()
 
 
 def read_shapes(path: Path, name: str | None = None, *, any_size: bool = False) -> AreaFile:
@@ -89,7 +91,8 @@ def read_shapes(path: Path, name: str | None = None, *, any_size: bool = False) 
     for fence in mission.fences:
         if fence.radius_m is None:
             ring(fence.points, name)
-    return AreaFile(Shapes(polygons, lines), [ring(zone, name) for zone in mission.no_fly], mission.fences)
+    zones = [ring(zone, name) for zone in mission.no_fly]
+    return AreaFile(Shapes(polygons, lines), zones, mission.fences, mission.survey)
 
 
 def _kind(path: Path, name: str) -> str:

@@ -229,7 +229,7 @@ def _made(request: PlanRequest, progress: Callable[[str], None]) -> tuple[Plan, 
         if directed:
             raise InputError("gaps are flown in the direction that suits each; leave out --heading and --cross")
         return _gap_plan(request, options, progress)
-    shapes, rings, fences = read_shapes(request.area)
+    shapes, rings, fences, _ = read_shapes(request.area)
     covers = bool(shapes.areas) and not request.follow
     if directed and not covers:
         raise InputError("lines that are followed have their own direction; leave out --heading and --cross")

@@ -10,17 +10,18 @@ from gcs_plugin.mission.makers.wpml import DjiDrone, parse_wpml, wpml_kmz
 from gcs_plugin.mission.mission_files import FileItem, MissionFile, parse_mission
 
 LITCHI: Final = "litchi"
+# Drones with their cameras: a Matrice 300 or 350 has a Zenmuse H20, or a P1.
 DJI_DRONES: Final[Mapping[str, DjiDrone]] = {
-    "m300": DjiDrone("Matrice 300 RTK with H20", "1.0.2", (60, 0), 42, "wide"),
-    "m300-p1": DjiDrone("Matrice 300 RTK with P1", "1.0.2", (60, 0), 50),
-    "m350": DjiDrone("Matrice 350 RTK with H20", "1.0.2", (89, 0), 42, "wide"),
-    "m350-p1": DjiDrone("Matrice 350 RTK with P1", "1.0.2", (89, 0), 50),
-    "m30": DjiDrone("Matrice 30", "1.0.2", (67, 0), 52, "wide"),
-    "m30t": DjiDrone("Matrice 30T", "1.0.2", (67, 1), 53, "wide"),
-    "m3e": DjiDrone("Mavic 3E", "1.0.2", (77, 0), 66, "wide"),
-    "m3t": DjiDrone("Mavic 3T", "1.0.2", (77, 1), 67, "wide"),
-    "m4e": DjiDrone("Matrice 4E", "1.0.6", (99, 0), 88, "wide"),
-    "m4t": DjiDrone("Matrice 4T", "1.0.6", (99, 1), 89, "wide"),
+    "m300": DjiDrone("1.0.2", (60, 0), 42, "wide"),
+    "m300-p1": DjiDrone("1.0.2", (60, 0), 50),
+    "m350": DjiDrone("1.0.2", (89, 0), 42, "wide"),
+    "m350-p1": DjiDrone("1.0.2", (89, 0), 50),
+    "m30": DjiDrone("1.0.2", (67, 0), 52, "wide"),
+    "m30t": DjiDrone("1.0.2", (67, 1), 53, "wide"),
+    "m3e": DjiDrone("1.0.2", (77, 0), 66, "wide"),
+    "m3t": DjiDrone("1.0.2", (77, 1), 67, "wide"),
+    "m4e": DjiDrone("1.0.6", (99, 0), 88, "wide"),
+    "m4t": DjiDrone("1.0.6", (99, 1), 89, "wide"),
 }
 MAKERS: Final[Mapping[str, str]] = {**dict.fromkeys(DJI_DRONES, ".kmz"), LITCHI: ".csv"}
 """What can be named as a vehicle's autopilot, where a maker's app flies it -> suffix of its mission files."""

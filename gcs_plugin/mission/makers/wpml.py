@@ -33,9 +33,8 @@ _HEADING: Final = {"waypointHeadingMode": "followWayline", "waypointHeadingPathM
 
 
 class DjiDrone(NamedTuple):
-    """A drone with its camera as WPML numbers them, `lens` of a camera with several, and WPML's version for it."""
+    """WPML's version for a drone, and its numbers of drone and camera; `lens` of a camera that has several."""
 
-    title: str
     version: str
     kind: tuple[int, int]
     camera: int

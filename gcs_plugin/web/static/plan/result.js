@@ -1,7 +1,7 @@
 // The plan that was made: its figures, which vehicle flies what, upload, and the way to the preflight check.
 
-import { get } from "/static/core/api.js";
-import { button, choice, keyedList, make, setHidden, setText } from "/static/core/dom.js";
+import { get, withToken } from "/static/core/api.js";
+import { button, choice, keyedList, labelled, make, setHidden, setText } from "/static/core/dom.js";
 import { notice } from "/static/core/notices.js";
 import { state, subscribe } from "/static/core/store.js";
 import { t } from "/static/core/strings.js";
@@ -30,8 +30,16 @@ const wrong = make("p", { class: "wrong", role: "status" });
 export function planResult() {
   const upload = button(t("plan.upload"), uploadAll);
   const start = button(t("plan.start"), () => assigned() && openPreflight(plan, names, problemSince(plan, names)), { class: "primary" });
-  box.append(make("h2", {}, t("plan.result")), summary, warnings, list, wrong, make("div", { class: "row wrap" }, upload, start));
+  box.append(make("h2", {}, t("plan.result")), summary, warnings, list, wrong, make("div", { class: "row wrap" }, upload, start), drones());
   return box;
+}
+
+// What the link loads: the plan's flights for a drone that its maker's app flies.
+function drones() {
+  const titles = { m300: "DJI Matrice 300", "m300-p1": "DJI Matrice 300, P1", m350: "DJI Matrice 350", "m350-p1": "DJI Matrice 350, P1", m30: "DJI Matrice 30", m30t: "DJI Matrice 30T", m3e: "DJI Mavic 3E", m3t: "DJI Mavic 3T", m4e: "DJI Matrice 4E", m4t: "DJI Matrice 4T", litchi: "Litchi" };
+  const drone = choice(Object.entries(titles), "m300", () => {});
+  const link = make("a", { href: "#", download: "", onclick: () => { link.href = withToken(`/api/plans/${plan.id}/files/${drone.value}`); } }, t("plan.drone.load"));
+  return make("div", { class: "row wrap" }, labelled(t("plan.drone"), drone), link);
 }
 
 const draw = keyedList(list, (row) => make("li", {}, make("i", { class: "swatch", "aria-hidden": "true" }), make("b", {}), make("span", {}), make("span", { class: "pick" })), (item, row) => {
