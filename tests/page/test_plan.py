@@ -156,10 +156,10 @@ def test_a_survey_fills_the_fields_and_a_plan_is_had_for_a_drones_own_app(browse
         page.click("text=Overlap")
         assert page.input_value("[name=side_overlap]") == "65" and page.input_value("[name=forward_overlap]") == "75"
         page.click("text=Make plan")
-        page.wait_for_selector(".plan-result a:visible")
+        page.wait_for_selector("text=Missions for a DJI drone")
         page.select_option(".plan-result label.field select", "m3e")
         page.evaluate("document.querySelector('.plan-result a').addEventListener('click', (e) => e.preventDefault())")
-        page.click(".plan-result a")
+        page.click(".plan-result button:text-is('Download')")
         assert "/api/plans/plan-1/files/m3e" in page.get_attribute(".plan-result a", "href")
 
 

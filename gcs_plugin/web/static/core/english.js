@@ -77,7 +77,7 @@ export const english = {
   "plan.nobody": "no vehicle yet", "plan.flies": "Who flies part {n}", "plan.twice": "{name} was given two parts: give one of them to another vehicle.", "plan.missing": "No vehicle flies {parts}: choose one for each.",
   "plan.outdated": "The plan is older than the drawing: make the plan again, and upload it.", "plan.reset": "The plan was made with other settings ({list}): make it again, or set them back.", "plan.was": "{name}: {value}", "plan.empty": "empty", "plan.on": "on", "plan.off": "off", "plan.reassigned": "The plan, or who flies it, was changed on another page: close this, look at it, and check again.", "plan.upload": "Upload missions", "plan.start": "Check and start…",
 
-  "plan.drone": "For a drone's own app", "plan.drone.load": "Download missions",
+  "plan.drone": "Missions for a DJI drone or Litchi", "plan.drone.load": "Download",
 
   "map.all": "Show all", "traffic.one": "Aircraft {name}, {height} above sea level", "map.vehicle": "Vehicle {name}", "cursor.copy": "Coordinates; press to copy", "cursor.mark": "Mark {place}", "cursor.centre": "Centre {place}", "cursor.copied": "Copied: {place}", "cursor.uncopied": "Not copied, write it down: {place}",
   "layers.title": "Layers", "layers.basemap": "Before", "layers.realtime": "Live", "layers.coarse": "Aligned to each other", "layers.fine": "On the map", "layers.opacity": "Opacity of {name}", "layers.none": "nothing yet", "layers.flight": "Legs, trails and footprints",

@@ -34,12 +34,13 @@ export function planResult() {
   return box;
 }
 
-// What the link loads: the plan's flights for a drone that its maker's app flies.
+// The plan's flights for a drone that its maker's app flies.
+const DRONES = { m300: "M300, H20", "m300-p1": "M300, P1", m350: "M350, H20", "m350-p1": "M350, P1", m30: "M30", m30t: "M30T", m3e: "Mavic 3E", m3t: "Mavic 3T", m4e: "M4E", m4t: "M4T", litchi: "Litchi" };
 function drones() {
-  const titles = { m300: "DJI Matrice 300", "m300-p1": "DJI Matrice 300, P1", m350: "DJI Matrice 350", "m350-p1": "DJI Matrice 350, P1", m30: "DJI Matrice 30", m30t: "DJI Matrice 30T", m3e: "DJI Mavic 3E", m3t: "DJI Mavic 3T", m4e: "DJI Matrice 4E", m4t: "DJI Matrice 4T", litchi: "Litchi" };
-  const drone = choice(Object.entries(titles), "m300", () => {});
-  const link = make("a", { href: "#", download: "", onclick: () => { link.href = withToken(`/api/plans/${plan.id}/files/${drone.value}`); } }, t("plan.drone.load"));
-  return make("div", { class: "row wrap" }, labelled(t("plan.drone"), drone), link);
+  const drone = choice(Object.entries(DRONES), "m300", () => {});
+  const link = make("a", { download: "", hidden: true });
+  const load = button(t("plan.drone.load"), () => { link.href = withToken(`/api/plans/${plan.id}/files/${drone.value}`); link.click(); });
+  return make("div", {}, labelled(t("plan.drone"), drone), load, link);
 }
 
 const draw = keyedList(list, (row) => make("li", {}, make("i", { class: "swatch", "aria-hidden": "true" }), make("b", {}), make("span", {}), make("span", { class: "pick" })), (item, row) => {
