@@ -40,8 +40,8 @@ def maker_file(items: Sequence[FileItem], drone: str, return_height_m: float | N
     route = route_of(items)
     if drone == LITCHI:
         return litchi_text(route).encode()
-    top_m = max(route.climb_m, *(point.height_m for point in route.points), return_height_m or 0.0)
-    return wpml_kmz(route, DJI_DRONES[drone], math.ceil(top_m))
+    top_m = max(route.climb_m, *(point.height_m for point in route.points))
+    return wpml_kmz(route, DJI_DRONES[drone], math.ceil(return_height_m or top_m))
 
 
 def read_mission_file(data: bytes, name: str = "the file") -> MissionFile:

@@ -264,8 +264,11 @@ steps = st.tuples(st.floats(-300, 300), st.floats(-300, 300), st.floats(20, 120)
     pitch_deg=st.sampled_from([None, -90.0, -60.5]),
     drone=st.sampled_from(sorted(MAKERS)),
     dialect=st.sampled_from(["ardupilot", "px4"]),
+    starts_there=st.booleans(),
 )
-def test_a_mission_that_is_written_is_read_as_the_same_route(steps, home, legs, wait_s, end, pitch_deg, drone, dialect):
+def test_a_mission_that_is_written_is_read_as_the_same_route(
+    steps, home, legs, wait_s, end, pitch_deg, drone, dialect, starts_there
+):
     points, (lat, lon) = [], home
     for k, (east, north, height_m) in enumerate(steps):
         lat, lon = lat + north / 111_000.0, lon + east / 111_000.0 / math.cos(math.radians(lat))
@@ -273,8 +276,10 @@ def test_a_mission_that_is_written_is_read_as_the_same_route(steps, home, legs, 
         camera = (k % 2 == 0) if k // 2 in legs and 2 * (k // 2) + 1 < len(steps) else None
         points.append(Waypoint(lat_deg=lat, lon_deg=lon, height_m=height_m, camera=camera))
     points[-1] = replace(points[-1], wait_s=wait_s)
+    climb_m = points[0].height_m if starts_there else 40.0
+    home = (points[0].lat_deg, points[0].lon_deg) if starts_there else home
     sortie = Sortie(
-        home_lat_deg=home[0], home_lon_deg=home[1], takeoff_height_m=40.0, waypoints=tuple(points), start_s=0.0,
+        home_lat_deg=home[0], home_lon_deg=home[1], takeoff_height_m=climb_m, waypoints=tuple(points), start_s=0.0,
         time_s=0.0, length_m=0.0, turns=0, photos=0,
     )  # fmt: skip
     plan = replace(small_plan(end), gimbal_pitch_deg=pitch_deg, vehicles=(VehiclePlan(1, (sortie,)),))
