@@ -75,6 +75,10 @@ class Fences:
                     fence.read = self._fleet.read_fence(system)
                     under_way += 1
 
+    def read_again(self, system: int) -> None:
+        """Read a vehicle's geofence at the next look: it was changed."""
+        self._fences[system].due = self._clock()
+
     def zones(self) -> dict[int, tuple[FenceZone, ...]]:
         """The zones of each vehicle whose fence has been read, by system id; from any thread."""
         return {s: fence.zones for s, fence in list(self._fences.items()) if fence.zones is not None}

@@ -15,8 +15,10 @@ class VehicleRow(TypedDict, total=False):
     """What is known of a vehicle, as JSON values: of one on the links, of one that sent pictures, or of both.
 
     On the links it has `Vehicle.summary` and more. `alarm`: what is wrong with how and where it flies, and what to do.
-    `behind`: by how much it is behind its plan, in words. `fence`: see `Fences.of`. `takeoff` is null where none waits
-    or failed; `returns_after` names those that it waits for until it returns, null where it does not wait.
+    `behind`: by how much it is behind its plan, in words; `behind_ordered`: because it was paused. `fence`: see
+    `Fences.of`. `takeoff` is null where none waits or failed; `returns_after` names those that it waits for until it
+    returns, null where it does not wait. `route`: the number of what it holds (`VehicleLinks.routes`), 0 while that is
+    not known.
     """
 
     id: str
@@ -38,13 +40,17 @@ class VehicleRow(TypedDict, total=False):
     returns_after: Any
     alarm: str
     behind: str
+    behind_ordered: bool
     fence: dict[str, Any] | None
+    route: int
+    photos: int
     trail: list[tuple[float, float]]
     texts: list[dict[str, Any]]
     sortie: int
     frames: dict[str, int]
     height_m: float | None
     last_frame: str | None
+    last_seq: int | None
     came_s: float
     pictures: dict[str, Any]
     can: dict[str, Any]

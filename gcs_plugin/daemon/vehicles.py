@@ -11,7 +11,7 @@ import logging
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from functools import partial
@@ -31,6 +31,7 @@ from gcs_plugin.daemon.store.daemon_events import (
     VehicleChanged,
     VehicleReported,
 )
+from gcs_plugin.daemon.store.frame_rows import exposure_times
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.daemon.store.sortie_rows import (
     completion_refined,
@@ -41,17 +42,21 @@ from gcs_plugin.daemon.store.sortie_rows import (
 )
 from gcs_plugin.daemon.vehicle_names import VehicleRow
 from gcs_plugin.fleet.commands import URGENT, VERBS, CommandResult, Order, Verb, new_id
+from gcs_plugin.fleet.fence_limits import FenceLimits, fence_limits
 from gcs_plugin.fleet.fleet import Fleet
 from gcs_plugin.fleet.fleet_events import FleetEvent
 from gcs_plugin.fleet.flight_state import summary
 from gcs_plugin.fleet.preflight import CONTINUED, ITEMS
 from gcs_plugin.fleet.separation.returns import Returns
 from gcs_plugin.fleet.vehicle_state import Vehicle
+from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.links.signing import find_key
 from gcs_plugin.mission.completion import CompletionDetector, Phase
 from gcs_plugin.mission.exchange import Verdict
+from gcs_plugin.mission.geofence import FenceZone
 from gcs_plugin.mission.items import Mission
 from gcs_plugin.mission.plan_folder import NO_NEEDS, PlanNeeds
+from gcs_plugin.mission.track import route_of
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 from telemetry.live.live_poses import LinkPoses, LivePoses
 
@@ -67,10 +72,18 @@ _log = logging.getLogger(__name__)
 
 @dataclass(slots=True, kw_only=True)
 class _VehicleRecord:
-    """The daemon's own data about a vehicle, besides the fleet's."""
+    """The daemon's own data about a vehicle, besides the fleet's.
+
+    Attributes:
+        photos: pictures that it had reported before the daemon was started. holds: the mission of its route, which has
+            the number `route`; another mission gets another number.
+    """
 
     id: str
     poses: LivePoses
+    photos: int
+    holds: Mission | None = None
+    route: int = 0
     trail: list[tuple[float, float]] = field(default_factory=list)
     texts: deque[dict[str, Any]] = field(default_factory=lambda: deque(maxlen=_MOST_TEXTS))
     sent: dict[str, Any] = field(default_factory=dict)
@@ -166,6 +179,19 @@ class VehicleLinks:
         for row in rows:
             row["takeoff"], row["returns_after"] = takeoffs.get(row["id"]), returns.get(row["id"])
         return rows
+
+    def routes(self) -> list[dict[str, Any]]:
+        """What the vehicles hold, as read from each or written and read back.
+
+        A row has `vehicle`, `route` (its number in the vehicle's row), and `points`: [sequence number of the item,
+        longitude, latitude in degrees], in the order of flight.
+        """
+        held = [(self._records[s], self._records[s].holds) for s in sorted(self._records)]
+        return [
+            {"vehicle": record.id, "route": record.route, "points": route_of(mission)}
+            for record, mission in held
+            if mission is not None
+        ]
 
     @staticmethod
     def clock() -> float:
@@ -329,6 +355,22 @@ class VehicleLinks:
         """
         return self.finish(self.fleet.call(partial(self.fleet.upload, system, mission)))
 
+    def upload_fence(self, system: int, keep_out: Sequence[FenceZone]) -> str:
+        """Put zones to stay out of into a vehicle's geofence, in place of those that it holds; zones to stay in stay.
+
+        Raises:
+            OrthoSwarmError: its geofence has not been read, it is in the air, refused, or did not answer.
+        """
+        held = self._fences.zones().get(system)
+        if held is None:
+            raise OrthoSwarmError(f"the geofence of vehicle {system} has not been read yet; wait until it is shown")
+        zones = [zone for zone in held if zone.kind == "inclusion"] + list(keep_out)
+        text = self.finish(self.fleet.call(partial(self.fleet.upload_fence, system, zones)))
+        self.fleet.call(partial(self._fences.read_again, system)).result(_SOON_S)
+        off = fence_limits(self.fleet.vehicles[system]) == FenceLimits()  # of PX4 all are None, and zones count
+        off = off and self.fleet.vehicles[system].autopilot is Autopilot.ARDUPILOT
+        return f"{text}; it keeps to it once FENCE_ENABLE is 1" if off else text
+
     def finish(self, begun: Future[Any], timeout_s: float = 180.0) -> str:
         """Wait for the end of a dialogue that the fleet begins; returns the final text.
 
@@ -368,7 +410,8 @@ class VehicleLinks:
     def _record(self, system: int) -> _VehicleRecord:
         if system not in self._records:
             name = self.names.name_of(system)
-            self._records[system] = _VehicleRecord(id=name, poses=self._poses.of(name))
+            taken = len(exposure_times(self._journal, name))
+            self._records[system] = _VehicleRecord(id=name, poses=self._poses.of(name), photos=taken)
         return self._records[system]
 
     def _message(self, vehicle: Vehicle, message: Any, utc: float) -> None:
@@ -465,12 +508,17 @@ class VehicleLinks:
         near = self.fleet.separation.text(vehicle.system)
         row["alarm"] = "; ".join(text for text in (near, vehicle.danger and f"{record.id} {vehicle.danger}") if text)
         row["behind"] = self.fleet.behind(vehicle.system)
+        row["behind_ordered"] = self.fleet.behind_ordered(vehicle.system)
         row["yaw_deg"] = row["heading_deg"]
         if vehicle.lat_deg is not None and vehicle.lon_deg is not None:
             point = (round(vehicle.lon_deg, 7), round(vehicle.lat_deg, 7))
             if not record.trail or record.trail[-1] != point:
                 record.trail.append(point)
                 del record.trail[:-_TRAIL]
+        if record.holds is not vehicle.mission:
+            record.holds, record.route = vehicle.mission, record.route + 1
+        row["route"] = 0 if record.holds is None else record.route
+        row["photos"] += record.photos
         row["fence"] = self._fences.of(vehicle.system)
         row["trail"], row["texts"] = record.trail[-_TRAIL:], list(record.texts)
         return row

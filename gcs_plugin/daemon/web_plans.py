@@ -16,12 +16,13 @@ from typing import Any, Final, Protocol
 
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
 from gcs_plugin.links.mavlink import Autopilot
+from gcs_plugin.mission.geofence import FenceZone
 from gcs_plugin.mission.items import Mission
 from gcs_plugin.mission.makers.maker_files import MAKERS, maker_file, read_mission_file
 from gcs_plugin.mission.mission_builder import build_mission, read_mission
 from gcs_plugin.mission.mission_files import parse_mission
 from gcs_plugin.mission.plan_folder import PlanNeeds, plan_needs
-from gcs_plugin.plans.no_fly import refuse_no_zones
+from gcs_plugin.plans.no_fly import read_zones, refuse_no_zones
 from gcs_plugin.plans.plan_files import write_plan
 from gcs_plugin.plans.plan_request import AUTOPILOTS, ENDS, METHODS, RELIEFS, PlanRequest, make_plan
 from orthoswarm.config import DEFAULT, Config
@@ -197,6 +198,20 @@ class Plans:
             if path.is_file():
                 return read_mission(path, autopilot)
         raise InputError(f"{folder.name} has no mission {name}; see /api/plans")
+
+    def keep_out(self, name: Any) -> list[FenceZone]:
+        """A plan's no-fly zones for the geofences of its vehicles; empty if it has none.
+
+        Raises:
+            InputError: there is no such plan.
+        """
+        path = self._path(name) / _NO_FLY_FILE
+        if not path.is_file():
+            return []
+        shapes = read_zones(path).shapes
+        rings = [[(float(lon), float(lat)) for lat, lon in polygon.shell] for polygon in shapes.polygons]
+        zones = [FenceZone("exclusion", tuple(ring[:-1] if ring[0] == ring[-1] else ring)) for ring in rings]
+        return zones + [FenceZone("exclusion", ((c.lon_deg, c.lat_deg),), c.radius_m) for c in shapes.circles]
 
     def starts(self, name: Any, sortie: int = 1) -> dict[str, float]:
         """Vehicle -> takeoff of a flight in seconds after the swarm's start.

@@ -34,7 +34,7 @@ class CommandResult:
     Attributes:
         id: of the command; a command to several vehicles has one id.
         vehicle: its name: v1, or as the operator calls it.
-        command: one of VERBS, or `upload`.
+        command: one of VERBS, `upload` or `fence`.
         reason: one sentence; if not done, the reason and what to do.
     """
 

@@ -148,7 +148,7 @@ class Dialogues:
 
     def _note_mission(self, job: Exchange) -> None:
         vehicle = self._vehicles.get(job.vehicle.system)
-        if vehicle is None:
+        if vehicle is None or job.mission_type != MISSION:
             return
         if isinstance(job, MissionUpload) and job.announced:  # from then on its old mission is no longer whole
             vehicle.unbegun = True
@@ -160,7 +160,7 @@ class Dialogues:
         mission = None
         if job.outcome is not None and not job.outcome.ok and _in_background(job):
             vehicle.read_at = min(vehicle.read_at, self._clock() + _ON_THE_WAY_S)  # something else came in between
-        if isinstance(job, MissionDownload) and job.list_type == MISSION and job.items is not None:
+        if isinstance(job, MissionDownload) and job.items is not None:
             mission = Mission(vehicle.autopilot, tuple(job.items))
         elif isinstance(job, Start):
             mission = job.arm.mission

@@ -31,7 +31,7 @@ from gcs_plugin.mission.completion import Phase
 from gcs_plugin.mission.download import AT_ONCE, MissionDownload
 from gcs_plugin.mission.exchange import GROUND_STATION, MISSION, Address, Exchange, Verdict
 from gcs_plugin.mission.flight_modes import why_no_missions
-from gcs_plugin.mission.geofence import FENCE
+from gcs_plugin.mission.geofence import FENCE, FenceZone, fence_mission
 from gcs_plugin.mission.items import Mission
 from gcs_plugin.mission.start_dialogue import Expected, break_off, start_mission
 from gcs_plugin.mission.upload import MissionUpload
@@ -229,6 +229,17 @@ class Fleet:
             leave.expires = self._clock() + COMMAND.fresh_s
         return self.begin(MissionUpload(vehicle.address, self.own, mission=mission, leave=leave))
 
+    def upload_fence(self, system: int, zones: Sequence[FenceZone]) -> MissionUpload:
+        """Put a geofence into a vehicle, in place of the one that it holds, and read it back.
+
+        Raises:
+            OrthoSwarmError: the vehicle is not there, is in the air, or is busy.
+        """
+        vehicle = self._free(system)
+        if vehicle.flying:
+            raise OrthoSwarmError(f"vehicle {system} is in the air: its geofence is changed on the ground only")
+        return self.begin(MissionUpload(vehicle.address, self.own, mission=fence_mission(zones, vehicle.autopilot)))
+
     def download(self, system: int) -> MissionDownload:
         """Read the mission of a vehicle, and ask for the settings that a check compares with it."""
         vehicle = self._free(system)
@@ -302,6 +313,10 @@ class Fleet:
         """How far a vehicle is behind its plan, in words; empty if it is not."""
         return self._reception.behind(system)
 
+    def behind_ordered(self, system: int) -> bool:
+        """Whether a vehicle is behind its plan because it was paused, and for no other reason."""
+        return self._reception.behind_ordered(system)
+
     def busy(self, system: int) -> bool:
         """True while a dialogue with a vehicle is under way."""
         return self._dialogues.busy(system)
@@ -338,6 +353,7 @@ class Fleet:
         goes_on = None if verb not in ("resume", "continue") else self._goes_on(vehicle, verb)
         self._dialogues.make_way(system)
         self._pauses.pop(system, None)
+        vehicle.told_to_stay = verb == "pause"
         if verb in ("rtl", "land"):
             self._told_home[system] = self._clock()
         if starting and verb in URGENT and not vehicle.flying:

@@ -309,9 +309,9 @@ def _height(mission: Mission | None, wanted: Wanted) -> Item:
     if top is None:
         return Item("height", Level.OK, "no height above takeoff in its mission")
     if top > wanted.legal_height_m:
-        text = f"goes up to {top:.0f} m, above {wanted.legal_height_m:.0f} m; allow it if you may fly there"
+        text = f"highest point {top:.0f} m above takeoff, over {wanted.legal_height_m:.0f} m; allow it if you may"
         return Item("height", Level.RED, text)
-    return Item("height", Level.OK, f"goes up to {top:.0f} m")
+    return Item("height", Level.OK, f"highest point {top:.0f} m above takeoff")
 
 
 def _return(vehicle: Vehicle, needed_m: float | None) -> Item:
@@ -327,7 +327,7 @@ def _return(vehicle: Vehicle, needed_m: float | None) -> Item:
         return Item("return", Level.WARNING, text)
     if found is None:
         text = "it has not said at what height it flies home"
-        return Item("return", Level.OK, text) if least is None else Item("return", Level.WARNING, f"{text}; {least}")
+        return Item("return", Level.WARNING, text if least is None else f"{text}; {least}")
     rally = vehicle.settings.get(Setting.RALLY_POINTS)
     if rally is not None and rally.value > 0.0:
         text = f"it may return to one of its {rally.value:.0f} rally points ({rally.name}) instead of home"
@@ -338,8 +338,8 @@ def _return(vehicle: Vehicle, needed_m: float | None) -> Item:
 def _way_home(height: SetTo) -> str:
     """At what height a vehicle flies home, in words."""
     if not height.value:
-        return f"flies home at the height at which it is ({height.name} is 0)"
-    return f"flies home {height.value:g} m above home, or higher where it is higher ({height.name})"
+        return f"RTL altitude: the current one ({height.name} is 0)"
+    return f"RTL altitude {height.value:g} m above home, or current if higher ({height.name})"
 
 
 def _too_low(vehicle: Vehicle, needed_m: float) -> str:
@@ -367,7 +367,7 @@ def _failsafe(vehicle: Vehicle) -> Item:
     if alone is not None and alone.action and spared is not None and spared.spares_missions:
         text += f", but not on a mission ({spared.name})"
     if low is None:
-        return Item("failsafe", Level.OK, f"it has not said what it does when its battery is low{text}")
+        return Item("failsafe", Level.WARNING, f"it has not said what it does when its battery is low{text}")
     if not low.action:
         return Item("failsafe", Level.WARNING, f"it does nothing when its battery is low; set {low.name}{text}")
     return Item("failsafe", Level.OK, f"when its battery is low it {low.action} ({low.name}){text}")
@@ -412,7 +412,7 @@ def _speed(vehicle: Vehicle, mission: Mission | None) -> Item:
         return Item("speed", Level.OK, "its mission leaves the speed to it")
     found = vehicle.settings.get(Setting.SPEED)
     if found is None:
-        return Item("speed", Level.OK, f"asks for {asked:g} m/s; the vehicle has not said what it is set to")
+        return Item("speed", Level.WARNING, f"asks for {asked:g} m/s; the vehicle has not said what it is set to")
     name, most = found.name, found.value
     if asked <= most + _SAME_M_S:
         return Item("speed", Level.OK, f"asks for {asked:g} m/s, {name} is {most:g} m/s")

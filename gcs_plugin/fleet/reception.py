@@ -10,7 +10,7 @@ from typing import Final
 from gcs_plugin.config import HEARING
 from gcs_plugin.fleet.dialogues import Dialogues
 from gcs_plugin.fleet.fleet_events import FleetEvent, Pair, mission_event
-from gcs_plugin.fleet.flight_state import danger_of
+from gcs_plugin.fleet.flight_state import Word, danger_of, flight_state
 from gcs_plugin.fleet.heard_messages import HEARD, MESSAGE_IDS, HeardMessage, rates_of
 from gcs_plugin.fleet.link_hub import Hub, Side
 from gcs_plugin.fleet.message_rates import Streams
@@ -276,7 +276,10 @@ class Reception:
             if watched.behind:
                 self._event("caught_up", vehicle, "is no longer behind its plan: it has ended its mission")
             return
-        if over or phase is Phase.SUSPENDED or mission is None or vehicle.place is None:
+        stays = phase is Phase.SUSPENDED or (vehicle.told_to_stay and flight_state(vehicle).word is Word.PAUSED)
+        if stays and watched is not None:
+            watched.rest(vehicle.time_boot_s)
+        if over or stays or mission is None or vehicle.place is None:
             return
         if watched is None:
             watched = self._lateness[vehicle.system] = Lateness(mission)
@@ -292,8 +295,14 @@ class Reception:
         watched = self._lateness.get(system)
         if watched is None or not watched.behind:
             return ""
-        text = f"is {watched.late_s:.0f} s behind its plan, which keeps others apart for {watched.allowed_s:.0f} s"
-        return f"{text}: watch its distances, and pause it before it comes near another"
+        why = " after its pause" if watched.ordered else ""
+        text = f"is {watched.late_s:.0f} s late{why}; its plan keeps others apart up to {watched.allowed_s:.0f} s"
+        return f"{text}: watch its distances, consider pausing it"
+
+    def behind_ordered(self, system: int) -> bool:
+        """Whether a vehicle is behind its plan because it was paused, and for no other reason."""
+        watched = self._lateness.get(system)
+        return watched is not None and watched.behind and watched.ordered
 
     def _compare_routes(self, vehicle: Vehicle, now: float) -> None:
         """Decide by the clocks whether one vehicle is on two links, or several vehicles share a system id."""

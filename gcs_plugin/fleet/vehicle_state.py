@@ -62,6 +62,7 @@ class Vehicle:
         danger: what endangers it by itself, in words; empty if nothing does.
         failsafe: whether it reports one (MAV_STATE_CRITICAL, MAV_STATE_EMERGENCY). had_failsafe: in this flight, ever.
         unbegun: it was given that mission here and has not begun it.
+        told_to_stay: a pause was given to it here, and nothing since.
         photos: pictures that it has reported.
         gimbal_pitch_deg: where its gimbal looks, -90 straight down, 0 the horizon; None if it reports none.
         received: packets; missed: packets lost according to its counters.
@@ -121,6 +122,7 @@ class Vehicle:
     mission_seq: int = 0
     mission_total: int = 0
     paused_in_mission: bool = False
+    told_to_stay: bool = False
     photos: int = 0
     gimbal_pitch_deg: float | None = None
     received: int = 0

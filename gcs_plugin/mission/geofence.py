@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
-from gcs_plugin.links.mavlink import dialect
-from gcs_plugin.mission.items import Mission, MissionItem
+from gcs_plugin.links.mavlink import Autopilot, dialect
+from gcs_plugin.mission.items import FRAME_GLOBAL, Mission, MissionItem
 
 _ROUNDING_M: Final = 0.5
 """A way along the edge of a zone may lie so far on the wrong side: places are rounded."""
@@ -40,6 +40,23 @@ class FenceZone:
         if self.radius_m is None:
             return {"kind": self.kind, "ring": [list(point) for point in self.points]}
         return {"kind": self.kind, "center": list(self.points[0]), "radius_m": self.radius_m}
+
+
+_COMMANDS: Final = {(kind, False): command for command, kind in _POLYGONS.items()} | {
+    (kind, True): command for command, kind in _CIRCLES.items()
+}
+
+
+def fence_mission(zones: "Sequence[FenceZone]", autopilot: Autopilot) -> Mission:
+    """Zones as the list that is put into a vehicle."""
+    items = []
+    for zone in zones:
+        command = _COMMANDS[zone.kind, zone.radius_m is not None]
+        first = float(len(zone.points)) if zone.radius_m is None else zone.radius_m
+        for lon, lat in zone.points:
+            params = (first, 0.0, 0.0, 0.0)
+            items.append(MissionItem.at(command, lat, lon, 0.0, params=params, frame=FRAME_GLOBAL))
+    return Mission(autopilot, tuple(items), list_type=FENCE)
 
 
 def breach(mission: Mission, zones: "Sequence[FenceZone]", *, in_all: bool = False) -> str:

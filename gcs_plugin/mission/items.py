@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from gcs_plugin.links.mavlink import Autopilot, Message, command_name, dialect
+from gcs_plugin.mission.exchange import MISSION
 
 FRAME_GLOBAL = int(dialect.MAV_FRAME_GLOBAL)
 FRAME_MISSION = int(dialect.MAV_FRAME_MISSION)
@@ -119,9 +120,7 @@ class MissionItem:
         """The command in words."""
         return command_name(self.command)
 
-    def message(
-        self, seq: int, system: int, component: int, mission_type: int = dialect.MAV_MISSION_TYPE_MISSION
-    ) -> Message:
+    def message(self, seq: int, system: int, component: int, mission_type: int = MISSION) -> Message:
         """The MISSION_ITEM_INT that carries it to a vehicle, or from it."""
         return dialect.MAVLink_mission_item_int_message(
             system, component, seq, self.frame, self.command, 0, int(self.autocontinue), *self.params,
@@ -153,24 +152,30 @@ class Ending(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class Mission:
-    """A mission for one vehicle, item by item as it goes on the wire.
+    """A mission for one vehicle, or its geofence, item by item as it goes on the wire.
 
     Attributes:
-        items: all items; for ArduPilot item 0 is home (the vehicle overwrites it), for PX4 it is flown.
-        name: for messages to the user.
+        items: all items; for ArduPilot item 0 of a mission is home (the vehicle overwrites it), for PX4 it is flown.
+        name: for messages to the user. list_type: MAV_MISSION_TYPE, of a mission or of a geofence.
     """
 
     autopilot: Autopilot
     items: tuple[MissionItem, ...]
     name: str = ""
+    list_type: int = MISSION
+
+    @property
+    def kind(self) -> str:
+        """What it is, in a word."""
+        return "mission" if self.list_type == MISSION else "geofence"
 
     def __len__(self) -> int:
         return len(self.items)
 
     @property
     def first_seq(self) -> int:
-        """Sequence number of the first item that is flown."""
-        return self.autopilot.first_seq
+        """Sequence number of the first item that is flown, or that counts."""
+        return self.autopilot.first_seq if self.list_type == MISSION else 0
 
     @property
     def final_seq(self) -> int | None:

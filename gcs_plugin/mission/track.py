@@ -109,7 +109,7 @@ def flight_path(mission: Mission, origin: tuple[float, float]) -> tuple[Array, A
     base = _ground_m(mission)
     if home is not None:
         points.append((*metres(*home, origin), 0.0))
-    for item in _flown(mission):
+    for _, item in _flown(mission):
         if item.command == CHANGE_SPEED and item.params[1] > 0.0:
             speed = item.params[1]
         elif item.command == RTL and home is not None and points:
@@ -133,8 +133,8 @@ def flight_path(mission: Mission, origin: tuple[float, float]) -> tuple[Array, A
     return np.array(points, float).reshape(-1, 3), before, speed
 
 
-def _flown(mission: Mission) -> Iterator[MissionItem]:
-    """The items in the order in which they are flown, with jumps carried out."""
+def _flown(mission: Mission) -> Iterator[tuple[int, MissionItem]]:
+    """The items with their sequence numbers in the order in which they are flown, with jumps carried out."""
     items, seq, jumped = mission.items, mission.first_seq, dict[int, int]()
     for _ in range(_MOST_FLOWN):
         if seq >= len(items):
@@ -142,7 +142,7 @@ def _flown(mission: Mission) -> Iterator[MissionItem]:
         item = items[seq]
         target, times = item.params[:2]
         if item.command != JUMP:
-            yield item
+            yield seq, item
         elif 0 <= target < len(items) and jumped.get(seq, 0) < (_FOREVER if times < 0 else times):
             jumped[seq] = jumped.get(seq, 0) + 1
             seq = int(target)
@@ -179,6 +179,16 @@ def heights_m(mission: Mission) -> list[tuple[MissionItem, float]]:
     """The items of a mission that have a place, each with its height above takeoff, metres."""
     base = _ground_m(mission)
     return [(i, _height_m(i, base)) for i in mission.items[mission.first_seq :] if i.is_nav and i.has_place]
+
+
+def route_of(mission: Mission) -> list[tuple[int, float, float]]:
+    """Where a mission leads, in the order of flight: sequence number of the item, longitude and latitude in degrees."""
+    home, route = home_of(mission), list[tuple[int, float, float]]()
+    for seq, item in _flown(mission):
+        place = home if item.command == RTL else item.place if item.is_nav and item.has_place else None
+        if place is not None:
+            route.append((seq, place[1], place[0]))
+    return route
 
 
 def highest_m(mission: Mission) -> float | None:
@@ -379,12 +389,14 @@ class Lateness:
     Attributes:
         late_s: how far it is behind, seconds of its own clock; negative: ahead. While its plan waits in one place,
             every moment of that fits where the vehicle is: this is kept then unless it must be more.
-        behind: True while it is later than plans allow for.
+        behind: True while it is later than plans allow for. paused_s: for how long it was told to stay.
     """
 
     mission: Mission
     late_s: float = field(default=0.0, init=False)
     behind: bool = field(default=False, init=False)
+    paused_s: float = field(default=0.0, init=False)
+    _rests_since: float | None = field(default=None, init=False)
     _track: Track | None = field(default=None, init=False)
     _home: tuple[float, float] = field(default=(0.0, 0.0), init=False)
     _begun_s: float | None = field(default=None, init=False)
@@ -401,8 +413,21 @@ class Lateness:
         """How late it may be, seconds."""
         return self._track.autopilot.schedule_slack_s if self._track is not None else float("inf")
 
+    @property
+    def ordered(self) -> bool:
+        """True if it is behind because it was told to stay, and for no other reason."""
+        return self.late_s - self.paused_s <= self.allowed_s
+
+    def rest(self, time_s: float) -> None:
+        """Count a pause; time of the vehicle's clock, seconds."""
+        since, self._rests_since = self._rests_since, time_s
+        self.paused_s += max(0.0, time_s - since) if since is not None else 0.0
+
     def look(self, time_s: float, lat_deg: float, lon_deg: float, height_m: float) -> None:
         """Compare a position at a time of the vehicle's clock, seconds; degrees, and metres over its takeoff."""
+        if self._rests_since is not None:
+            self.rest(time_s)
+            self._rests_since = None
         track = self._track
         if track is None or len(track.places) < 2:
             return

@@ -25,7 +25,6 @@ from gcs_plugin.mission.exchange import (
     ERROR,
     INVALID,
     INVALID_SEQUENCE,
-    MISSION,
     NO_SPACE,
     UNSUPPORTED,
     UNSUPPORTED_FRAME,
@@ -75,7 +74,7 @@ class UploadStage(enum.Enum):
 
 @dataclass(slots=True)
 class MissionUpload(Exchange):
-    """One upload; its outcome is ok only if the mission read back from the vehicle is this one.
+    """One upload of a mission or a geofence; its outcome is ok only if what is read back from the vehicle is this one.
 
     Attributes:
         patience_s: silence after which it gives up.
@@ -172,6 +171,11 @@ class MissionUpload(Exchange):
             self.leave.took()
 
     @property
+    def mission_type(self) -> int:
+        """See Exchange."""
+        return self.mission.list_type
+
+    @property
     def announced(self) -> bool:
         """Whether the vehicle was told of the mission, so that it may have dropped what it held."""
         return self._begun > 0
@@ -203,12 +207,14 @@ class MissionUpload(Exchange):
 
     def _count_message(self) -> Message:
         to = self.vehicle
-        return dialect.MAVLink_mission_count_message(to.system, to.component, len(self.mission), MISSION)
+        return dialect.MAVLink_mission_count_message(to.system, to.component, len(self.mission), self.mission_type)
 
     def _announce(self, now: float) -> list[Message]:
         self._begun += 1
         if self._begun > self.attempts:
-            self._fail(self._mixed or f"did not take the mission in {self.attempts} attempts; check the link")
+            self._fail(
+                self._mixed or f"did not take the {self.mission.kind} in {self.attempts} attempts; check the link"
+            )
             return []
         self.stage, self._reading, self._doubt = UploadStage.COUNT, None, None
         self._served, self._ahead, self._repeated = -1, -1, False
@@ -238,7 +244,7 @@ class MissionUpload(Exchange):
         return [self._item(seq)]
 
     def _item(self, seq: int) -> Message:
-        return self.mission.items[seq].message(seq, self.vehicle.system, self.vehicle.component)
+        return self.mission.items[seq].message(seq, self.vehicle.system, self.vehicle.component, self.mission_type)
 
     @property
     def _all_sent(self) -> bool:
@@ -295,7 +301,7 @@ class MissionUpload(Exchange):
             return self._pause(now, _DENIED_AGAIN_S)
         if self._refused is not None and (self._refused.code, self._refused.item) == (refusal.code, refusal.item):
             self.refusal = refusal
-            self._fail(f"refused the mission: {refusal.reason}")
+            self._fail(f"refused the {self.mission.kind}: {refusal.reason}")
             return []
         self._refused, self._doubt = refusal, None
         # Once may be a late acknowledgement of an upload before; twice is an answer.
@@ -305,7 +311,7 @@ class MissionUpload(Exchange):
 
     def _verify(self, now: float) -> list[Message]:
         self.stage = UploadStage.VERIFY
-        self._reading = MissionDownload(self.vehicle, self.own, patience_s=self.patience_s)
+        self._reading = MissionDownload(self.vehicle, self.own, patience_s=self.patience_s, list_type=self.mission_type)
         self._reading.pace = self.pace
         return self._read(self._reading.start(now), now)
 
@@ -322,12 +328,15 @@ class MissionUpload(Exchange):
         wrong = difference(self.mission, reading.items)
         if not wrong:
             self.stage = UploadStage.DONE
-            self._end(True, f"vehicle {self.vehicle.system} holds the mission: {len(self.mission)} items, read back")
+            self._end(
+                True,
+                f"vehicle {self.vehicle.system} holds the {self.mission.kind}: {len(self.mission)} items, read back",
+            )
             return messages
         if self._doubt is not None:
             return messages + self._nack(self._doubt, now)
         self._mixtures += 1
-        self._mixed = f"holds another mission than was sent: {wrong}; upload again before flying"
+        self._mixed = f"holds another {self.mission.kind} than was sent: {wrong}; upload again before flying"
         if self._mixtures >= _MIXTURES:
             self._fail(self._mixed)
         else:
@@ -342,19 +351,20 @@ class MissionUpload(Exchange):
             return []
         self.deadline = now + _COUNT_AGAIN_S
         to = self.vehicle
-        return [dialect.MAVLink_mission_clear_all_message(to.system, to.component, MISSION)]
+        return [dialect.MAVLink_mission_clear_all_message(to.system, to.component, self.mission_type)]
 
     def _unknown(self, what: str) -> None:
         self.stage = UploadStage.DONE
-        name = f"vehicle {self.vehicle.system}"
-        text = f"{name}: its mission could not be read back and {what}; what it holds is not known: upload again"
+        name = f"vehicle {self.vehicle.system}: its {self.mission.kind}"
+        text = f"{name} could not be read back and {what}; what it holds is not known: upload again"
         self._end(False, text, Verdict.UNKNOWN)
 
     def _fail(self, text: str, failure: Verdict = Verdict.REFUSED) -> None:
         self.stage = UploadStage.DONE
         # ArduPilot writes items as they come; `_mixed` says by itself what it then holds.
         mixture = self._touched and self.mission.autopilot is Autopilot.ARDUPILOT and text != self._mixed
-        warning = "; it may now hold a mixture of two missions, so upload again before flying" if mixture else ""
+        two = f"two {self.mission.kind}s"
+        warning = f"; it may now hold a mixture of {two}, so upload again before flying" if mixture else ""
         self._end(False, f"vehicle {self.vehicle.system} {text}{warning}", failure)
         if (why := self.refusal) is not None and self.outcome is not None:
             self.outcome = replace(self.outcome, item=why.item, field=why.field, code=why.code)

@@ -47,7 +47,7 @@ class MissionStore:
 
     Attributes:
         items: the stored mission; for ArduPilot item 0 is home.
-        fence: the items of its geofence, which can be read only.
+        fence: the items of its geofence; taken as they come, without what missions are checked for.
         generation: rises whenever an upload or a clear has ended, so that the flight logic can notice.
         stored_at: when the last upload ended, in the time of `feed`.
     """
@@ -59,6 +59,7 @@ class MissionStore:
     generation: int = 0
     stored_at: float = -math.inf
     _transfer: _Transfer | None = None
+    _fence_transfer: _Transfer | None = None
     _sent_to: Address | None = None
     _sent_at: float = 0.0
     _next_sent: int = 0
@@ -66,7 +67,7 @@ class MissionStore:
     def feed(self, message: Message, sender: Address, now: float) -> list[Message]:
         """Process a message of the mission protocol for this vehicle; returns the answers."""
         if getattr(message, "mission_type", _MISSION) == FENCE:
-            return self._hand_out_fence(message, sender)
+            return self._fence(message, sender, now)
         if getattr(message, "mission_type", _MISSION) != _MISSION:
             return [self._ack(sender, UNSUPPORTED, int(message.mission_type))]
         match message.get_type():
@@ -128,7 +129,8 @@ class MissionStore:
             return [self._ack(to, ERROR)]
         return [self.items[seq].message(seq, to.system, to.component)]
 
-    def _hand_out_fence(self, message: Message, to: Address) -> list[Message]:
+    def _fence(self, message: Message, to: Address, now: float) -> list[Message]:
+        transfer = self._fence_transfer
         match message.get_type():
             case "MISSION_REQUEST_LIST":
                 return [dialect.MAVLink_mission_count_message(to.system, to.component, len(self.fence), FENCE)]
@@ -136,7 +138,21 @@ class MissionStore:
                 return [self.fence[message.seq].message(int(message.seq), to.system, to.component, FENCE)]
             case "MISSION_ACK":
                 return []
-        return [self._ack(to, UNSUPPORTED, FENCE)]
+            case "MISSION_COUNT" if message.count == 0:
+                self.fence = []
+                return [self._ack(to, ACCEPTED, FENCE)]
+            case "MISSION_COUNT":
+                transfer = _Transfer(partner=to, count=int(message.count), wanted=0, asked_at=now, heard_at=now)
+                self._fence_transfer = transfer
+            case "MISSION_ITEM_INT" if transfer is not None and message.seq == transfer.wanted:
+                transfer.items.append(MissionItem.of(message))
+                transfer.wanted += 1
+                if transfer.wanted == transfer.count:
+                    self.fence, self._fence_transfer = transfer.items, None
+                    return [self._ack(to, ACCEPTED, FENCE)]
+            case _:
+                return [self._ack(to, UNSUPPORTED, FENCE)]
+        return [dialect.MAVLink_mission_request_int_message(to.system, to.component, transfer.wanted, FENCE)]
 
     def _count(self, count: int, sender: Address, now: float) -> list[Message]:
         transfer = self._transfer

@@ -19,7 +19,7 @@ from gcs_plugin.daemon.intake.posted_pose import parse_time
 from gcs_plugin.daemon.layers.web_tiles import TileAddress
 from gcs_plugin.daemon.store.frame_rows import stage_counts
 from gcs_plugin.daemon.store.job_rows import job_counts
-from gcs_plugin.web.answers import JsonAnswer, in_thread, install_error_answers, json_body
+from gcs_plugin.web.answers import JsonAnswer, in_thread, install_error_answers, json_body, parse_json
 from gcs_plugin.web.areas import read_area
 from gcs_plugin.web.command_routes import CommandRoutes
 from gcs_plugin.web.event_stream import Standstill, stream_events
@@ -28,6 +28,7 @@ from gcs_plugin.web.uploads import UploadRoute
 from orthoswarm import __version__
 from orthoswarm.compute.workers import peak_rss_mb
 from orthoswarm.export.tactical.places import feature
+from orthoswarm.report.trust import trust_overlay
 
 Result = TypeVar("Result")
 STATIC: Final = Path(__file__).parent / "static"
@@ -51,6 +52,8 @@ def calls(daemon: Daemon) -> list[Call]:
     views, plans, console = daemon.views, daemon.plans, daemon.console
     return [
         Call("/api/vehicles", "vehicles", views.vehicles, "Every vehicle that was heard on a link or sent pictures."),
+        Call("/api/routes", "routes", daemon.links.routes,
+             "The missions that vehicles hold, as points [item, longitude, latitude]; `route` as in /api/vehicles."),
         Call("/api/layers", "layers", views.layers,
              "Layers with versions, bounds (west, south, east, north in degrees) and tile addresses."),
         Call("/api/jobs", "jobs", daemon.jobs.documents, "The latest jobs, oldest first."),
@@ -175,6 +178,28 @@ class HttpRoutes:
         if f'"{version}"' in request.headers.get("if-none-match", ""):
             return Response(status_code=304, headers=headers)
         return Response(data, media_type="image/png", headers=headers)
+
+    def _trusted(self) -> tuple[int, Path]:
+        """Where not to trust the map: the raster of the last export, and its version, 0 if there is none."""
+        path = self.daemon.settings.workspace / "confidence.tif"
+        return (path.stat().st_mtime_ns // 1_000_000 if path.is_file() else 0), path
+
+    async def trust(self) -> Response:
+        """How far the map can be trusted, as of the last export: `version` (0: nothing yet), `headline`, `corners`."""
+        version, path = self._trusted()
+        if not version:
+            return JsonAnswer({"version": 0, "headline": "", "corners": None})
+        _, corners = await self.work(trust_overlay, path)
+        report = parse_json((path.parent / "report.json").read_bytes())
+        return JsonAnswer({"version": version, "headline": report.get("headline", ""), "corners": corners})
+
+    async def trust_picture(self) -> Response:
+        """Its classes as a PNG, an overlay with the `corners` of /api/trust."""
+        version, path = self._trusted()
+        if not version:
+            raise HTTPException(404, "nothing was refined and exported yet; see /api/jobs")
+        data, _ = await self.work(trust_overlay, path)
+        return Response(data, media_type="image/png", headers={"ETag": f'"{version}"', "Cache-Control": "no-cache"})
 
     async def gaps(self) -> Response:
         """The gaps as GeoJSON, as `orthoswarm coverage` writes them; `orthoswarm plan --gaps` reads them."""
@@ -343,6 +368,8 @@ def make_app(daemon: Daemon, token: str, bind: str = "127.0.0.1") -> Any:
     add("/api/finds/{number}", routes.change_find, methods=["PUT"])
     add("/api/finds/{number}", routes.delete_find, methods=["DELETE"], status_code=204)
     add("/tiles/{layer}/{z}/{x}/{y}.{suffix}", routes.tile, methods=["GET", "HEAD"])
+    add("/api/trust", routes.trust)
+    add("/api/trust.png", routes.trust_picture)
     add("/api/coverage", routes.coverage)
     add("/api/coverage/gaps.geojson", routes.gaps)
     add("/api/coverage/cells.png", routes.cells)

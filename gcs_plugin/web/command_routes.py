@@ -35,6 +35,7 @@ Rows = list[dict[str, Any]]
 
 ALL: Final = "all"
 _PLAN: Final = "start of a plan"
+_UPLOADS: Final = ("upload", "fence")
 _ALL_VERBS: Final = ("pause", "resume", "rtl", "return", "land")
 _ENDS: Final = URGENT | {RETURN_VERB}
 _AHEAD_S: Final = 2.0
@@ -80,14 +81,17 @@ class CommandRoutes:
     async def mission(self, vehicle: str, verb: str, request: Request) -> Response:
         """Send a command: `upload` ({"plan": id, "mission": "v1"}), `start`, `pause`, `resume`, `rtl`, `land`.
 
+        `fence` ({"plan": id}) puts the plan's no-fly zones into the vehicle's geofence, in place of its zones to stay
+        out of.
+
         Body: `id`, and `given_clock_s` with `run`, or `given_s` (see above). Answers once the outcome is known, with
         `id`, `vehicle`, `command`, `outcome` (`done`, `refused`, `not_sent`, `unknown`) and `reason`. The vehicle `all`
         stands for all on the links (not for upload and start); its answer has `id` and `results`, a row a vehicle.
         `return` is for all only: those whose ways home come near each other return one after the other (`rtl` sends all
         at once).
         """
-        if verb not in (*VERBS, "upload") and (vehicle, verb) != (ALL, RETURN_VERB):
-            raise HTTPException(404, f"there is no such command; choose upload, {', '.join(VERBS)}")
+        if verb not in (*VERBS, *_UPLOADS) and (vehicle, verb) != (ALL, RETURN_VERB):
+            raise HTTPException(404, f"there is no such command; choose {', '.join((*_UPLOADS, *VERBS))}")
         if vehicle == ALL and verb not in _ALL_VERBS:
             raise HTTPException(404, f"all vehicles at once can {', '.join(_ALL_VERBS)}; start a plan, or one vehicle")
         body = await json_body(request)
@@ -140,8 +144,8 @@ class CommandRoutes:
             rows = [CommandResult(issue.id, name, verb, Verdict.NOT_SENT, late).document() for name in names]
         elif verb == RETURN_VERB:
             rows = links.return_in_turn(command_id=issue.id)
-        elif verb == "upload":
-            rows = [self._upload(vehicle, issue, body)]
+        elif verb in _UPLOADS:
+            rows = [self._upload(vehicle, verb, issue, body)]
         else:
             override = _override(body, vehicle)
             began = links.clock() - max(0.0, issue.age_s)
@@ -153,19 +157,22 @@ class CommandRoutes:
             self._daemon.events.publish(CommandDone(row))
         return rows
 
-    def _upload(self, vehicle: str, issue: Issue, body: dict[str, Any]) -> dict[str, Any]:
-        links = self._daemon.links
+    def _upload(self, vehicle: str, verb: str, issue: Issue, body: dict[str, Any]) -> dict[str, Any]:
+        links, plans = self._daemon.links, self._daemon.plans
 
         def result(outcome: Verdict, reason: str) -> dict[str, Any]:
-            return CommandResult(issue.id, vehicle, "upload", outcome, reason).document()
+            return CommandResult(issue.id, vehicle, verb, outcome, reason).document()
 
         try:
             system = links.fleet.system_of(vehicle)
         except OrthoSwarmError as error:
             return result(Verdict.NOT_SENT, str(error))
-        mission = self._daemon.plans.mission(body, vehicle, links.fleet.vehicles[system].autopilot)
+        if verb == "fence":
+            put = partial(links.upload_fence, system, plans.keep_out(body.get("plan")))
+        else:
+            put = partial(links.upload, system, plans.mission(body, vehicle, links.fleet.vehicles[system].autopilot))
         try:
-            return result(Verdict.DONE, links.upload(system, mission))
+            return result(Verdict.DONE, put())
         except OrthoSwarmError as error:
             return result(Verdict.REFUSED, str(error))
 

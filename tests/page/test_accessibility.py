@@ -101,7 +101,7 @@ def test_legs_without_a_basemap_are_not_called_failed(browser):
     legs = {"type": "FeatureCollection", "features": [leg(0, "failed"), leg(1, "carried")]}
     for layers, words, shown in (
         ([layer], "This station has no basemap", ""),
-        ([layer | {"name": "basemap"}, layer], "No leg was found on the basemap", "carried,failed"),
+        ([layer | {"name": "basemap"}, layer], "No line was found on the basemap", "carried,failed"),
     ):
         with standing() as station:
             station.gets |= {"/api/legs": legs, "/api/layers": layers}
@@ -109,6 +109,7 @@ def test_legs_without_a_basemap_are_not_called_failed(browser):
                 page.evaluate("orthoswarm.map.jumpTo({ center: [8.5456, 47.3977], zoom: 17 })")
                 page.click("#tab-map")
                 page.wait_for_selector(f"#panel-map:has-text('{words}')")
+                page.check("#panel-map [name=shown-legs]")
                 page.wait_for_function("orthoswarm.map.queryRenderedFeatures({ layers: ['legs-refined'] }).length > 1")
                 page.wait_for_function(f"{SIGNS} === '{shown}'")
                 assert page.locator("p.leg:visible").count() == (3 if shown else 0)
@@ -137,8 +138,9 @@ def test_legs_and_vehicles_are_told_apart_without_seeing_all_colours(browser):
         station.gets["/api/legs"] = {"type": "FeatureCollection", "features": legs}
         with opened(browser, station.url) as page:
             page.evaluate("orthoswarm.map.jumpTo({ center: [8.5456, 47.3977], zoom: 17 })")
-            page.wait_for_function(f"{SIGNS} === '{','.join(states)}'")  # a sign on each, not the colour alone
             page.click("#tab-map")
+            page.check("#panel-map [name=shown-legs]")
+            page.wait_for_function(f"{SIGNS} === '{','.join(states)}'")  # a sign on each, not the colour alone
             titles = [row.inner_text() for row in page.locator("p.leg b").all()]
             assert [title.split()[0] for title in titles] == ["✓", "≈", "✕"]
             vehicles, of_legs = page.evaluate(COLOURS)

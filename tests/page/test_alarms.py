@@ -28,7 +28,7 @@ def change(page, **what):
 def test_an_alarm_that_was_seen_and_gets_worse_is_an_alarm_again(browser):
     with standing(vehicle(1, battery=0.22)) as station, opened(browser, station.url) as page:
         page.evaluate(SOUNDS)
-        page.wait_for_selector(".alarms:has-text('WATCH v1: battery low')")
+        page.wait_for_selector(".alarms:has-text('CAUTION v1: battery low')")
         seen(page)
         page.wait_for_selector(".alarms", state="hidden")
         page.wait_for_timeout(800)
@@ -45,17 +45,21 @@ def test_an_alarm_that_was_seen_and_gets_worse_is_an_alarm_again(browser):
 
 
 def test_seen_is_for_the_alarms_that_are_listed(browser):
-    rows = [vehicle(k, battery=0.1) for k in range(1, 10)]
+    """One cause is one line, whoever it concerns; what does not fit on the screen is not seen."""
+    rows = [vehicle(k, battery=0.1, alarm=f"v{k} is in a failsafe {k}") for k in range(1, 8)]
     with standing(*rows) as station, opened(browser, station.url) as page:
-        page.wait_for_selector(".alarms:has-text('and 4 more')")
+        page.wait_for_selector(".alarms:has-text('and 3 more')")
         first = texts(page)
         assert len(first) == 5
+        assert "DANGER Battery: v1, v2, v3, v4, v5, v6, v7" in first
         seen(page)
-        page.wait_for_function("() => document.querySelectorAll('.alarms li').length === 4")
+        page.wait_for_function("() => document.querySelectorAll('.alarms li').length === 3")
         assert not set(first) & set(texts(page))
         assert "more" not in page.inner_text(".alarms")
         seen(page)
         page.wait_for_selector(".alarms", state="hidden")
+        page.click("summary:has-text('Alarms so far: 14')")
+        page.wait_for_selector(".past li:has-text('DANGER v7: battery 10 %')")
 
 
 NEAR = "v1 and v2 are 4.0 m apart and 1.0 m in height: pause v2"
@@ -83,12 +87,37 @@ def test_a_page_that_is_opened_while_two_are_too_near_raises_the_alarm(browser):
 
 
 def test_a_vehicle_behind_its_plan_is_an_alarm_on_every_page_until_it_has_caught_up(browser):
-    late = "is 12 s behind its plan, which keeps others apart for 8 s: watch its distances"
+    late = "is 12 s late; its plan keeps others apart up to 8 s: watch its distances, consider pausing it"
     with standing(vehicle(1, behind=late), vehicle(2)) as station, opened(browser, station.url) as page:
-        page.wait_for_selector(".alarms:has-text('12 s behind its plan')")
+        page.wait_for_selector(".alarms:has-text('CAUTION v1: is 12 s late')")
         assert len(texts(page)) == 1
+        assert ", 0 in danger, 1 to watch" in page.inner_text("#panel-fly .strip > p")
         send(page, {"type": "vehicle", "id": "v1", "system": 1, "behind": ""})
         page.wait_for_selector(".alarms", state="hidden")
+
+
+def test_what_the_operator_paused_is_late_and_no_alarm(browser):
+    late = "is 59 s late after its pause; its plan keeps others apart up to 10 s: watch its distances"
+    rows = vehicle(1, behind=late, behind_ordered=True), vehicle(2)
+    with standing(*rows) as station, opened(browser, station.url) as page:
+        page.wait_for_selector(".tile .why:has-text('59 s late after its pause')")
+        page.wait_for_timeout(500)
+        assert texts(page) == []
+
+
+def test_without_the_station_nobody_knows_of_the_vehicles_links(browser):
+    """GIVEN eight vehicles WHEN the station is lost THEN that is the alarm, once; and in danger is who has one."""
+    with standing(*[vehicle(k) for k in range(1, 9)]) as station, opened(browser, station.url) as page:
+        page.wait_for_selector(".tile >> nth=7")
+        page.evaluate("window.station.beats = false")
+        page.wait_for_selector(".banner:visible")
+        page.wait_for_timeout(6000)  # longer than a vehicle may be silent
+        assert texts(page) == ["DANGER Nothing received from the ground station"]
+        assert "8 in the air, 0 in danger" in page.inner_text("#panel-fly .strip > p")
+        page.evaluate("window.station.beats = true")
+        page.wait_for_selector(".banner", state="hidden")
+        send(page, event("text", "Crash: Disarming", severity=0))
+        page.wait_for_selector(".strip > p:has-text('1 in danger')")
 
 
 @pytest.mark.slow

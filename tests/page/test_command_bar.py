@@ -63,12 +63,12 @@ def test_one_press_and_one_confirmation_send_once_to_all(browser):
     with standing(vehicle(1), vehicle(2)) as station, opened(browser, station.url) as page:
         ok_for_all(station)
         page.wait_for_selector(".tile >> nth=1")
-        page.dblclick(".command[data-verb=rtl]")
-        assert station.commands("rtl") == []  # a double press is not a confirmation
+        page.dblclick(".command[data-verb=land]")
+        assert station.commands("land") == []  # a double press is not a confirmation
         confirm(page)
         page.wait_for_function("() => document.querySelectorAll('[data-outcome=done]').length == 2")
-        assert [path for _, path, _ in station.heard] == ["/api/missions/all/rtl"]
-        body = station.commands("rtl")[0]
+        assert [path for _, path, _ in station.heard] == ["/api/missions/all/land"]
+        body = station.commands("land")[0]
         assert body["id"]
         assert abs(body["given_s"] - page.evaluate("Date.now() / 1000")) < 3600
 
@@ -247,7 +247,7 @@ def test_red_items_stop_a_start_until_each_is_allowed(browser):
             page.click("text=Check and start")
             page.wait_for_selector(".checks section")
             words = page.inner_text("dialog[aria-labelledby=preflight-title]")
-            for said in ("Falcon", "plan-1", "80 m", "5:12", "0 % left, the mission needs about 40 %"):
+            for said in ("Falcon flies Route A", "80 m", "5:12", "0 % left, the mission needs about 40 %"):
                 assert said in words
             start = page.locator("dialog[aria-labelledby=preflight-title] .primary")
             assert start.is_disabled()
@@ -429,8 +429,8 @@ def test_vehicles_of_one_start_can_return_one_after_the_other(browser):
         page.click(".command[data-verb=rtl]")
         assert "may meet there" in page.inner_text("#confirm-question")
         page.wait_for_timeout(400)
-        page.keyboard.press("ArrowLeft")
-        assert page.inner_text("*:focus").startswith("One by one")
+        page.keyboard.press("ArrowRight")
+        assert page.inner_text("*:focus").startswith("One by one")  # recommended, and the first
         page.keyboard.press("Enter")
         page.wait_for_function("() => document.querySelectorAll('[data-outcome=done]').length == 2")
         assert [path for _, path, _ in station.heard] == ["/api/missions/all/return"]

@@ -6,7 +6,8 @@ from tests.page.test_operation import accessible
 RING = [[8.560, 47.400], [8.561, 47.400], [8.561, 47.401], [8.560, 47.401], [8.560, 47.400]]
 SHARES = {"seen_share": 0.9, "poor_share": 0.04, "missed_share": 0.05, "planned_share": 0.01}
 COVERAGE = {
-    "state": "in flight", "version": 3, **SHARES, "recorded": SHARES, "pictures": {"placed": 60, "recorded": 12},
+    "state": "in flight", "version": 3, "plan": "plan-0", **SHARES, "recorded": SHARES,
+    "pictures": {"placed": 60, "recorded": 12},
     "offers": [{"vehicle": "v2", "legs": 3, "length_m": 900.0}], "warnings": [],
     "gaps": [
         {"area_m2": 3200.0, "cause": "not triggered", "detail": "", "confidence": 0.95, "vehicle": "v1",
@@ -49,7 +50,7 @@ def test_gaps_are_listed_and_flown_only_after_a_confirmation(browser):
             page.click("#tab-map")
             words = page.locator(".coverage")
             page.wait_for_function("document.querySelector('.gaps button')?.textContent.includes('not triggered')")
-            assert "90.0 %" in words.inner_text() and "3 legs" in words.inner_text()
+            assert "90.0 %" in words.inner_text() and "3 lines" in words.inner_text()
             assert "2 pictures not arrived (the first: event 7)" in words.inner_text()
             page.locator(".gaps button").click()
             page.wait_for_function("Math.abs(orthoswarm.map.getCenter().lng - 8.5605) < 1e-3")

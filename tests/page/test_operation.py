@@ -153,7 +153,7 @@ def operate(page, folder, area, *, vehicles, altitude_m, fov_deg, way_home=False
     page.screenshot(path=folder / "5-flown.png")
     page.click("#tab-map")
     page.click("text=Show all")
-    page.fill("input[aria-label='Note of the find']", "Collapsed roof")
+    page.fill("input[aria-label='Note of the marker']", "Collapsed roof")
     page.click("text=Mark on the map")
     box = page.locator("#stage").bounding_box()
     page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)

@@ -330,7 +330,7 @@ def test_without_a_height_model_the_page_says_how_to_get_one(browser):
         planning(page)
         draw(page, (600, 250), (900, 250), (900, 550))
         opened_groups(page)
-        page.wait_for_selector("text=Start it with --dem FILE")
+        page.wait_for_selector("text=To follow the ground, start it with one")
         assert not page.is_visible("[name=relief]")
         page.click("text=Make plan")
         page.wait_for_selector(".notice")

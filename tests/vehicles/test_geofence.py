@@ -7,9 +7,10 @@ from dataclasses import replace
 import pytest
 
 from gcs_plugin.links.mavlink import Autopilot, dialect
-from gcs_plugin.mission.geofence import zones_of
-from gcs_plugin.mission.items import FRAME_GLOBAL, MissionItem
+from gcs_plugin.mission.geofence import FenceZone, zones_of
+from gcs_plugin.mission.items import FRAME_GLOBAL, WAYPOINT, MissionItem
 from gcs_plugin.sim.simulated_swarm import make_swarm
+from orthoswarm.model.errors import OrthoSwarmError
 from tests.vehicles.test_fleet_cli import HOME, folder  # noqa: F401
 from tests.vehicles.test_vehicle_links import AP, PX4, open_links, ready, upload_all, wait  # noqa: F401
 
@@ -88,3 +89,56 @@ def test_an_upload_does_not_wait_for_a_fence_that_is_being_read(open_links, fold
     assert begun.is_set()
     upload_all(links, folder)  # raises if the vehicle is busy
     assert links.fleet.vehicles[1].mission is not None
+
+
+def test_zones_to_stay_out_of_are_put_into_vehicles_and_those_to_stay_in_stay(open_links, folder) -> None:  # noqa: F811
+    vehicles = make_swarm(2, autopilots=(AP, PX4), home=HOME)
+    for vehicle in vehicles:
+        vehicle.store.fence = list(FENCE)
+    links = open_links(vehicles)
+    ready(links, 2)
+    upload_all(links, folder)
+    missions = [len(vehicle.store.items) for vehicle in vehicles]
+    wait(lambda: all(row["fence"] is not None for row in links.rows()))
+    other = FenceZone("exclusion", ((8.02, 47.02), (8.03, 47.02), (8.03, 47.03)))
+    round_ = FenceZone("exclusion", ((8.05, 47.05),), 40.0)
+    for system in (1, 2):
+        assert f"vehicle {system} holds the geofence: 8 items, read back" in links.upload_fence(system, [other, round_])
+    wanted = [ZONES[0], other.document(), round_.document()]
+    wait(lambda: all(row["fence"]["zones"] == wanted for row in links.rows()))
+    for vehicle in vehicles:
+        assert [zone.document() for zone in zones_of(vehicle.store.fence)] == wanted
+    assert [len(vehicle.store.items) for vehicle in vehicles] == missions
+    assert "holds the geofence: 4 items" in links.upload_fence(1, [])  # none to stay out of
+
+
+def test_a_geofence_is_not_changed_in_the_air_nor_before_it_was_read(open_links) -> None:  # noqa: F811
+    vehicles = make_swarm(1, autopilots=(AP,), home=HOME)
+    links = open_links(vehicles)
+    ready(links, 1)
+    links._fences._fences.clear()
+    with pytest.raises(OrthoSwarmError, match="has not been read yet"):
+        links.upload_fence(1, [])
+    wait(lambda: links.rows()[0]["fence"] is not None)
+    vehicle = links.fleet.vehicles[1]
+    vehicle.armed, vehicle.landed = True, "in air"
+    with pytest.raises(OrthoSwarmError, match="changed on the ground only"):
+        links.fleet.upload_fence(1, [])
+
+
+def test_the_routes_are_what_the_vehicles_hold(open_links, folder) -> None:  # noqa: F811
+    vehicles = make_swarm(2, autopilots=(AP, PX4), home=HOME)
+    links = open_links(vehicles)
+    ready(links, 2)
+    assert links.routes() == [] and [row["route"] for row in links.rows()] == [0, 0]
+    upload_all(links, folder)
+    numbers = [row["route"] for row in links.rows()]
+    assert [(row["vehicle"], row["route"]) for row in links.routes()] == [("v1", numbers[0]), ("v2", numbers[1])]
+    for system, row in enumerate(links.routes(), start=1):
+        items = links.fleet.vehicles[system].mission.items
+        flown = [(k, items[k].lon_deg, items[k].lat_deg) for k in range(len(items)) if items[k].command == WAYPOINT]
+        assert [point for point in row["points"] if point in flown][-1] == flown[-1]
+        assert row["points"][-1][0] == len(items) - 1  # the way home, by the last item
+        assert row["points"][-1][1:] == pytest.approx(row["points"][0][1:], abs=1e-4)
+    upload_all(links, folder)  # the same again
+    assert all(row["route"] > number for row, number in zip(links.rows(), numbers, strict=True))

@@ -10,6 +10,7 @@ import pytest
 from gcs_plugin.daemon.airspace import Traffic
 from gcs_plugin.daemon.settings import Settings, VehicleSettings
 from gcs_plugin.daemon.store.daemon_events import Events
+from gcs_plugin.daemon.store.frame_rows import exposures_added
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.daemon.takeoffs import Takeoffs
 from gcs_plugin.daemon.vehicles import VehicleLinks
@@ -294,3 +295,14 @@ def test_nobody_waits_for_links_that_have_ended(open_links, caplog):
     links.close()
     assert not {"watch", "links"} & {thread.name for thread in threading.enumerate()}
     assert "watching vehicles" not in caplog.text
+
+
+def test_pictures_that_were_reported_before_a_restart_are_counted_on(open_links, tmp_path):
+    journal = Journal(tmp_path / "journal.sqlite")
+    journal.write(exposures_added([("v1", number, 1.78e9 + number, None, None) for number in range(1, 54)]))
+    journal.close()
+    links = open_links(make_swarm(2, home=HOME))
+    ready(links, 2)
+    assert [row["photos"] for row in links.rows()] == [53, 0]
+    links.fleet.vehicles[1].photos = 6  # in this run
+    assert [row["photos"] for row in links.rows()] == [59, 0]

@@ -267,6 +267,9 @@ class FlownLegs:
                 self.down.add(vehicle)
                 if row["state"] != "lost" and not row["armed"]:
                     self.grounded.add(vehicle)
+                if row["mission"]["phase"] == "complete":  # its turn into a leg may have been wide
+                    begun = self.legs.sorties <= self.flights[vehicle]
+                    self.flown |= begun & (np.array(self.legs.vehicles) == vehicle)
 
     def all_over(self, rows: list[VehicleRow], now_s: float) -> bool:
         """Whether the operation is over: nobody flies, and all legs are finished or no picture came for a minute."""

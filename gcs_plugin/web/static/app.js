@@ -29,11 +29,11 @@ document.body.append(settingsBox.box);
 const { commandBar } = await import("/static/fly/command_bar.js");
 byId("bottom").replaceWith(commandBar());
 const { stripOf } = await import("/static/fly/tiles.js");
-const { alarmList } = await import("/static/fly/alarms.js");
+const { alarmList, pastAlarms } = await import("/static/fly/alarms.js");
 const panels = Object.fromEntries(MODES.map((mode) => [mode, make("div", { class: "panel", role: "tabpanel", id: `panel-${mode}`, "aria-labelledby": `tab-${mode}`, tabindex: "0" })]));
 setAttribute(byId("side"), "aria-label", t("panel.title"));
 byId("side").append(grow, fold, ...Object.values(panels));
-panels.fly.append(stripOf());
+panels.fly.append(stripOf(), pastAlarms());
 byId("stage").append(make("div", { class: "corner" }, alarmList(), noticeBox()));
 
 let setEditing = () => {};

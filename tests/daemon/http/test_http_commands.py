@@ -117,6 +117,33 @@ def test_all_vehicles_are_commanded_at_once_with_an_outcome_each(flying, verb):
     assert flying.command("/api/missions/v1/return").status_code == 404  # one vehicle has no turn
 
 
+def test_a_plans_zones_go_into_geofences_and_what_vehicles_hold_can_be_drawn(flying):
+    def square(east, north, side):
+        corners = [(0, 0), (side, 0), (side, side), (0, side), (0, 0)]
+        places = GRID.to_geographic([[EAST + east + x, NORTH + north + y] for x, y in corners])
+        return {"type": "Polygon", "coordinates": [[[float(lon), float(lat)] for lat, lon in places]]}
+
+    wanted = {"vehicles": 2, "altitude_m": 80, "fov_min_deg": 70, "area": square(50, 50, 200)}
+    plan = flying.command("/api/plans", wanted | {"no_fly": square(120, 120, 40)}).json()
+    flying.until("/api/vehicles", lambda rows: all(row["fence"] for row in rows))
+    for vehicle in ("v1", "v2"):
+        row = flying.command(f"/api/missions/{vehicle}/fence", {"plan": plan["id"]}).json()
+        assert (row["command"], row["outcome"]) == ("fence", "done"), row
+        assert "holds the geofence: 4 items, read back" in row["reason"]
+        body = {"plan": plan["id"], "mission": vehicle}
+        assert flying.command(f"/api/missions/{vehicle}/upload", body).json()["outcome"] == "done"
+    zones = flying.until("/api/vehicles", lambda rows: all(len(row["fence"]["zones"]) == 1 for row in rows))
+    assert {row["fence"]["zones"][0]["kind"] for row in zones} == {"exclusion"}
+    routes = {row["vehicle"]: row for row in flying.get("/api/routes").json()}
+    assert {row["id"]: row["route"] for row in zones} == {v: routes[v]["route"] for v in ("v1", "v2")}
+    planned = flying.get(f"/api/plans/{plan['id']}/map").json()["features"]
+    ends = [f["geometry"]["coordinates"][0] for f in planned if f["properties"].get("kind") == "leg"]
+    held = [tuple(round(v, 6) for v in point[1:]) for row in routes.values() for point in row["points"]]
+    assert ends and all(tuple(round(v, 6) for v in end[:2]) in held for end in ends)
+    assert flying.command("/api/missions/v1/fence", {"plan": "none"}).status_code == 422
+    assert flying.command("/api/missions/all/fence", {"plan": plan["id"]}).status_code == 404
+
+
 @pytest.mark.slow
 def test_what_lay_in_a_frozen_daemons_socket_is_not_executed_after_the_thaw(flying):
     """SIGSTOP, an RTL without a time, SIGCONT: nobody can tell how old it is, so the vehicle never gets it."""

@@ -56,7 +56,6 @@ def test_the_map_appears_as_pictures_come(page):
     page.wait_for_selector(".tile:has-text('falcon <b>')")  # a name is a text, not a piece of the page
     page.click("#tab-map")
     page.wait_for_selector("[data-layer=realtime][data-empty=false]")
-    page.uncheck("text=Legs, trails and footprints")
     until(page, lambda: colours(page) > before + 0.004)
     shown = colours(page)
     levels = {int(tile.split("/")[1]) for tile in page.tiles}
@@ -82,7 +81,7 @@ def test_an_area_is_drawn_and_planned(page):
     page.wait_for_selector(".plan-result:not([hidden])")
     until(page, lambda: page.locator(".assignments li").count() == 2)
     page.click("text=Upload missions")
-    page.wait_for_selector(".notice[data-level=bad]:has-text('No vehicle flies v1, v2')")  # nobody was heard
+    page.wait_for_selector(".notice[data-level=bad]:has-text('No vehicle flies Route A, Route B')")  # nobody was heard
     page.wait_for_timeout(2500)
     page.click(".notice button")  # it stays until it is dismissed
     page.wait_for_selector(".notice", state="detached")

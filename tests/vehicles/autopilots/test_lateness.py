@@ -71,9 +71,27 @@ def test_a_vehicle_that_falls_behind_its_plan_is_said_once(make_world, autopilot
     said = [event for event in world.events if event.kind in ("behind", "caught_up")]
     assert [event.kind for event in said] == ["behind", "caught_up"]
     allowed_s = DEFAULT.times(autopilot.value).schedule_slack_s
-    late_s = float(said[0].text.split(" s behind")[0].split()[-1])
+    late_s = float(said[0].text.split(" s late")[0].split()[-1])
     assert allowed_s <= late_s <= allowed_s + 2.0
-    assert f"for {allowed_s:.0f} s" in said[0].text
+    assert f"up to {allowed_s:.0f} s" in said[0].text and "pause;" not in said[0].text
+
+
+@BOTH
+def test_a_vehicle_that_was_paused_is_late_by_order_until_it_is_late_besides(make_world, autopilot):
+    frame = replace(Airframe().as_flown(DEFAULT.times(autopilot.value)), top_m_s=10.0)
+    world = make_world(SimVehicle(system=1, autopilot=autopilot, airframe=frame))
+    world.meet()
+    fleet = world.fleet
+    assert world.finish(fleet.upload(1, lines(autopilot, 10.0)))[0].ok
+    assert world.finish(fleet.start(1))[0].ok
+    assert world.until(lambda: fleet.vehicles[1].mission_seq >= 4, 100.0)
+    assert world.finish(fleet.pause(1))[0].ok
+    world.wait(60.0)
+    assert world.finish(fleet.resume(1))[0].ok
+    assert world.until(lambda: bool(fleet.behind(1)), 30.0)
+    assert fleet.behind_ordered(1) and " s late after its pause; its plan" in fleet.behind(1)
+    fleet._reception._lateness[1].paused_s -= 40.0  # as if it had stood for longer than it was told to
+    assert not fleet.behind_ordered(1) and "after its pause" not in fleet.behind(1)
 
 
 @BOTH

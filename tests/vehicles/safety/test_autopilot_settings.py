@@ -85,7 +85,7 @@ def test_a_way_home_through_the_ground_is_red(make_world, autopilot):
     world.wait(1.0)
     name = "RTL_ALT" if autopilot is AP else "RTL_RETURN_ALT"
     found = items_of(world, high)["return"]
-    assert found.level is Level.RED and f"15 m above home, or higher where it is higher ({name})" in found.reason
+    assert found.level is Level.RED and f"15 m above home, or current if higher ({name})" in found.reason
     native = "4000" if autopilot is AP else "40"  # RTL_ALT counts centimetres
     assert "needs 40 m" in found.reason and f"set {name} to {native}" in found.reason
     assert items_of(world, Wanted(needs=PlanNeeds(return_height_m=15.0)))["return"].level is Level.OK
@@ -157,9 +157,11 @@ def test_a_vehicle_that_does_nothing_at_a_low_battery_is_warned_about(make_world
     world.wait(1.0)
     vehicle = world.fleet.vehicles[1]
     name = "BATT_FS_LOW_ACT" if autopilot is AP else "COM_LOW_BAT_ACT"
-    found = items_of(world, Wanted())["failsafe"]  # the simulated one has no such parameter
+    assert items_of(world, Wanted())["failsafe"].level is Level.OK
+    del vehicle.settings[Setting.LOW_BATTERY]  # one that does not answer
+    found = items_of(world, Wanted())["failsafe"]
     assert (
-        found.level is Level.OK
+        found.level is Level.WARNING
         and "has not said" in found.reason
         and "without a ground station it goes on" in found.reason
     )

@@ -210,7 +210,7 @@ def test_no_vehicle_is_started_into_its_fence_from_the_command_line(folder, caps
         fences = [next(i for i in row["items"] if i["name"] == "fence") for row in said["vehicles"]]
         assert code == 1 and [item["state"] for item in fences] == ["red", "red"]
         returns = [next(i["reason"] for i in row["items"] if i["name"] == "return") for row in said["vehicles"]]
-        assert all("flies home 15 m above home" in reason for reason in returns), returns
+        assert all("RTL altitude 15 m above home" in reason for reason in returns), returns
         assert "FENCE_RADIUS" in fences[0]["reason"] and "leaves its geofence" in fences[1]["reason"]
         words = ["start", "--vehicle", 1, "--override", "home", "--override", "separation", *links, "--json"]
         code, said = fleet(capsys, *words)

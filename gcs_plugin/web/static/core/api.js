@@ -48,5 +48,11 @@ export async function request(method, path, body, limit_ms = 30_000) {
 
 export const get = (path) => request("GET", path);
 export const post = (path, body = {}, limit_ms = 60_000) => request("POST", path, body, limit_ms);
+// A picture of the daemon for an <img>, without the token in its address.
+export async function picture(path) {
+  const response = await fetch(path, { headers: headers() });
+  if (!response.ok) throw new ApiError(`the daemon answered ${response.status}`, "http", response.status);
+  return URL.createObjectURL(await response.blob());
+}
 export const withToken = (path) => (token() ? `${path}?token=${encodeURIComponent(token())}` : path);
 export const tileRequest = (url) => ({ url: new URL(url, location.href).href, headers: headers() });

@@ -5,10 +5,10 @@ import { nowMs } from "/static/core/clock.js";
 import { guarded } from "/static/core/guard.js";
 import { changed, state } from "/static/core/store.js";
 import { t } from "/static/core/strings.js";
-import { aircraft, messages, MOST_TEXTS, ring, vehicle } from "/static/core/values.js";
+import { aircraft, messages, MOST_TEXTS, ring, route, vehicle } from "/static/core/values.js";
 import { announce, happened, near } from "/static/fly/alarms.js";
 import { heardCommand } from "/static/fly/commands.js";
-import { inAir } from "/static/fly/need.js";
+import { heldRoute, inAir } from "/static/fly/need.js";
 
 const HEALTH_MS = 5000;
 const list = (value) => (Array.isArray(value) ? value : []);
@@ -17,7 +17,10 @@ const takeVehicle = guarded("a vehicle", (message, whole, at = nowMs()) => {
   const id = message?.id == null ? "" : String(message.id);
   if (!id) return;
   if (!state.vehicles.has(id) && message.state === undefined) { soon("/api/vehicles"); return; } // only what has changed of one not known yet
-  state.vehicles.set(id, vehicle(message, state.vehicles.get(id), at, whole === true));
+  const before = state.vehicles.get(id);
+  const row = vehicle(message, before, at, whole === true);
+  state.vehicles.set(id, row);
+  if (row.route && row.route !== before?.route && !heldRoute(row)) soon("/api/routes");
   changed("vehicles");
 });
 
@@ -62,6 +65,7 @@ const heardJob = heard("/api/jobs", takeJob);
 
 const READS = {
   "/api/vehicles": takeVehicles,
+  "/api/routes": (rows) => { state.routes = list(rows).map(route); changed("routes"); },
   "/api/layers": (rows) => { state.layers = list(rows); changed("layers"); },
   "/api/jobs": takeJobs,
   "/api/legs": (body) => { state.legs = list(body?.features); changed("legs"); },

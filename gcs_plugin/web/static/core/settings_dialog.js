@@ -10,10 +10,10 @@ const CHOICES = { theme: ["dark", "sunlight"], units: ["metric", "us"], coordina
 
 export function settingsDialog(onToken) {
   const secret = make("input", { type: "password", autocomplete: "off", value: token() });
-  const sound = make("input", { type: "checkbox", checked: settings.sound, onchange: () => setSetting("sound", sound.checked) });
+  const flag = (name) => { const on = make("input", { type: "checkbox", checked: settings[name], onchange: () => setSetting(name, on.checked) }); return make("label", { class: "check" }, on, make("span", {}, t(`settings.${name}`))); };
   const dialog = dialogBox({ class: "settings", "aria-labelledby": "settings-title" }, make("h2", { id: "settings-title" }, t("settings.title")),
     ...Object.entries(CHOICES).map(([name, values]) => labelled(t(`settings.${name}`), choice(values.map((value) => [value, t(`settings.${name}.${value}`)]), settings[name], (value) => setSetting(name, value)))),
-    make("label", { class: "check" }, sound, make("span", {}, t("settings.sound"))),
+    flag("sound"), flag("speak"),
     labelled(t("settings.token"), secret, t("settings.token.hint")),
     make("div", { class: "row wrap" }, button(t("settings.close"), () => dialog.close(), { class: "primary" })));
   secret.onchange = () => { setToken(secret.value); onToken(); };

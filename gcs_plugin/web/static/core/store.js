@@ -7,6 +7,8 @@ export const state = {
   jobs: new Map(), // id -> job
   layers: [], // rows of /api/layers
   legs: [], // GeoJSON features
+  routes: [], // what vehicles hold, as core/values.js cleans it
+  trust: null, // /api/trust
   coverage: null, // /api/coverage
   completions: [],
   outlines: new Map(), // vehicle -> ring of the last picture

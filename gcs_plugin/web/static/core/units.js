@@ -40,3 +40,7 @@ export function numberOf(text) {
 export const lengthUnit = () => (us() ? "ft" : "m");
 export const toMetres = (value) => (us() ? value * FOOT : value);
 export const fromMetres = (metres) => (us() ? metres / FOOT : metres);
+
+// Lengths and speeds in the station's words, which are metric.
+export const inUnits = (text) => (!us() ? text : text.replace(/(\d+(?:\.\d+)?) (m\/s|km|m)(?![\w²/])/g, (_, number, unit) =>
+  (unit === "m/s" ? speed(Number(number)) : unit === "km" ? distance(1000 * number) : height(Number(number)))));

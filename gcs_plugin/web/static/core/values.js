@@ -53,13 +53,13 @@ export function vehicle(message, before, now, whole = false) {
   return {
     raw: row, id: text(row.id), name: text(row.name) || before?.name || text(row.id), system: number(row.system, 0, 255),
     linked: number(row.system, 0, 255) != null, state: text(row.state), mode: text(row.mode), armed: row.armed === true, landed: text(row.landed),
-    alarm: typeof row.alarm === "string" ? text(row.alarm, 300) : null, behind: text(row.behind, 300), alt_m: number(row.alt_m, -5000, 60000),
+    alarm: typeof row.alarm === "string" ? text(row.alarm, 300) : null, behind: text(row.behind, 300), ordered: row.behind_ordered === true, alt_m: number(row.alt_m, -5000, 60000),
     flight: flight(row), position: moved ?? before?.position ?? null, height_m: number(row.height_m, -5000, 50000),
-    speed_m_s: number(row.speed_m_s, 0, 1000), heading_deg: number(row.heading_deg, -720, 720), battery,
+    speed_m_s: number(row.speed_m_s, 0, 1000), climb_m_s: number(row.climb_m_s, -100, 100), roll_deg: number(row.roll_deg, -180, 180), pitch_deg: number(row.pitch_deg, -180, 180), gimbal_deg: number(row.gimbal_pitch_deg, -180, 180), heading_deg: number(row.heading_deg, -720, 720), battery,
     battery_left_s: number(row.battery_left_s, 0, 1e6), gps_fix: number(row.gps_fix, 0, 10), satellites: number(row.satellites, 0, 254),
     link: text(row.link), silent_s: number(row.silent_s, 0) ?? 0, at: now, photos: count(row.photos),
-    came_s: number(row.came_s, 0), frames: { frames: count(frames.frames), fine: count(frames.fine), coarse: count(frames.coarse), rejected: count(frames.rejected) },
-    sortie: count(row.sortie), phase: text(object(row.mission).phase), returnsAfter: Array.isArray(row.returns_after) ? row.returns_after.map(String) : null, takeoff: row.takeoff ? { in_s: number(row.takeoff.in_s), failed: text(row.takeoff.failed) } : null,
+    came_s: number(row.came_s, 0), last_seq: number(row.last_seq, 0), last_frame: text(row.last_frame), frames: { frames: count(frames.frames), fine: count(frames.fine), coarse: count(frames.coarse), rejected: count(frames.rejected) },
+    sortie: count(row.sortie), route: count(row.route), item: count(object(row.mission).item), phase: text(object(row.mission).phase), returnsAfter: Array.isArray(row.returns_after) ? row.returns_after.map(String) : null, takeoff: row.takeoff ? { in_s: number(row.takeoff.in_s), failed: text(row.takeoff.failed) } : null,
     texts: Array.isArray(message.texts) ? messages(message.texts) : (before?.texts ?? []), home: Array.isArray(row.home) ? position(row.home[1], row.home[0]) : null, trail, autopilot: text(row.autopilot), fence: fence(row.fence),
     faults: { lost: number(object(row.faults).lost_share, 0, 1) ?? 0, damaged: count(object(row.faults).damaged), impossible: count(object(row.faults).impossible) },
   };
@@ -71,6 +71,12 @@ function fence(given) {
   const zones = (Array.isArray(given.zones) ? given.zones : []).map(object).map((zone) => ({ inside: zone.kind === "inclusion", ring: points(zone.ring),
     center: Array.isArray(zone.center) ? position(zone.center[0], zone.center[1]) : null, radius_m: number(zone.radius_m, 0, 1e6) }));
   return { read_s: number(given.read_s), zones: zones.filter((zone) => zone.ring.length > 2 || (zone.center && zone.radius_m)) };
+}
+
+// A mission that a vehicle holds: points [item, longitude, latitude].
+export function route(row) {
+  const points = (Array.isArray(row?.points) ? row.points : []).filter((p) => Array.isArray(p) && number(p[0], 0) != null && position(p[1], p[2]));
+  return { vehicle: text(row?.vehicle), route: number(row?.route, 0) ?? 0, points };
 }
 
 // An aircraft that carries ADS-B, as the daemon heard of it.

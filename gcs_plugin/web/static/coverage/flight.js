@@ -17,12 +17,16 @@ const nameOf = (id) => state.vehicles.get(id)?.name || id;
 const title = make("h2", { id: "gap-flight-title" }, t("gapflight.title"));
 const list = make("ul", { class: "gap-vehicles" });
 const status = make("p", { role: "status" });
+const height = numberField({ oninput: () => setPlan(null) });
+const heightLabel = make("span", {});
+const heightRow = make("label", { class: "field" }, heightLabel, height);
 const warnings = make("ul", { class: "warnings" });
 const summary = make("ul", {});
 const planButton = button(t("gapflight.plan"), () => makePlan());
 const go = button(t("gapflight.confirm"), () => confirm(), { class: "primary" });
-const dialog = dialogBox({ class: "preflight", "aria-labelledby": "gap-flight-title" }, title, make("p", { class: "quiet" }, t("gapflight.about")), list, status, summary, warnings,
+const dialog = dialogBox({ class: "preflight", "aria-labelledby": "gap-flight-title" }, title, make("p", { class: "quiet" }, t("gapflight.about")), list, heightRow, status, summary, warnings,
   make("div", { class: "row wrap" }, planButton, button(t("confirm.no"), () => dialog.close()), go));
+dialog.box.addEventListener("close", () => show("gap-plan", []));
 export const gapFlightDialog = () => dialog.box;
 
 let rows = [];
@@ -34,13 +38,15 @@ function setPlan(made) {
   setHidden(summary, !plan);
   summary.replaceChildren(...(plan?.vehicles ?? []).map((row) => make("li", {}, t("gapflight.part", { name: nameOf(plan.names[row.id]), length: units.distance(row.length_m), time: units.clock(row.time_s), photos: row.photos, sorties: row.sorties }))));
   const paused = (plan?.inAir ?? []).map((id) => t("gapflight.pauses", { name: nameOf(id) }));
-  warnings.replaceChildren(...[...paused, ...(plan?.warnings ?? [])].map((text) => make("li", {}, text)));
+  warnings.replaceChildren(...[...paused, ...(plan?.warnings ?? [])].map((text) => make("li", {}, units.inUnits(text))));
 }
 
 export async function openGapFlight() {
   setPlan(null);
   list.replaceChildren();
   setText(status, "");
+  setText(heightLabel, t("plan.altitude_m.takeoff", { unit: units.lengthUnit() }));
+  setHidden(heightRow, Boolean(state.coverage?.plan)); // that of the plan, else
   dialog.open();
   try {
     const vehicles = await get("/api/coverage/vehicles");
@@ -63,16 +69,18 @@ async function makePlan() {
   const chosen = rows.filter((row) => row.on.checked);
   const asked = chosen.find((row) => !(units.numberOf(row.minutes.value) > 0));
   if (asked) { setText(status, t("gapflight.unknown", { name: nameOf(asked.id) })); asked.minutes.focus(); return; }
+  const metres = units.toMetres(units.numberOf(height.value));
+  if (!heightRow.hidden && !(metres >= 1)) { setText(status, t("gapflight.height")); height.focus(); return; }
   planButton.disabled = true;
   setText(status, t("plan.making"));
   try {
     const inAir = chosen.filter((row) => row.inAir).map((row) => row.id);
-    const wanted = { vehicles: Object.fromEntries(chosen.map((row) => [row.id, units.numberOf(row.minutes.value)])) };
+    const wanted = { vehicles: Object.fromEntries(chosen.map((row) => [row.id, units.numberOf(row.minutes.value)])), ...(heightRow.hidden ? {} : { altitude_m: metres }) };
     const made = await post("/api/coverage/flight", inAir.length ? { ...wanted, in_air: inAir } : wanted, 120_000);
     setPlan({ ...made, inAir });
     setText(status, "");
     const features = (await get(`/api/plans/${made.id}/map`)).features ?? [];
-    show("plan", features.filter((feature) => feature.geometry?.type === "LineString").map((feature) => ({ ...feature, properties: { ...feature.properties, colour: colourOf(made.names[feature.properties.vehicle]) } })));
+    show("gap-plan", features.filter((feature) => feature.geometry?.type === "LineString").map((feature) => ({ ...feature, properties: { ...feature.properties, colour: colourOf(made.names[feature.properties.vehicle]) } })));
   } catch (error) {
     setText(status, t("gapflight.failed", { why: error.message }));
   } finally {

@@ -5,8 +5,10 @@ import { state, subscribe } from "/static/core/store.js";
 import { t } from "/static/core/strings.js";
 import * as units from "/static/core/units.js";
 import { openGapFlight } from "/static/coverage/flight.js";
-import { showCoverage } from "/static/coverage/layer.js";
+import "/static/coverage/layer.js";
+import { drawnSince } from "/static/plan/outdated.js";
 import { boundsOf, fit } from "/static/map/map.js";
+import { shownSwitch } from "/static/map/shown.js";
 
 const MOST = 30;
 const STATES = ["seen", "poor", "missed", "planned"];
@@ -69,8 +71,7 @@ export function coveragePanel() {
   const drawAsked = keyedList(asked, makeRequests, drawRequests);
   const offers = make("ul", { class: "warnings" });
   const fly = button(t("coverage.fly"), openGapFlight);
-  const shown = make("input", { type: "checkbox", checked: true, onchange: () => showCoverage(shown.checked) });
-  const toggle = make("label", { class: "check" }, shown, make("span", {}, t("coverage.show")));
+  const toggle = shownSwitch("coverage", t("coverage.show"));
   const drawGaps = keyedList(list, () => { const row = make("li", {}, button("", () => zoom(row.gap))); return row; }, (row, gap) => {
     row.gap = gap;
     const cause = [gap.cause, gap.detail && `(${gap.detail})`, gap.vehicle && nameOf(gap.vehicle)].filter(Boolean).join(" ");
@@ -80,12 +81,12 @@ export function coveragePanel() {
   });
   const drawMissing = keyedList(missing, () => make("li", {}), (row, group) => setText(row, t("coverage.missing.row", { name: nameOf(group.vehicle), n: group.n, cause: group.cause, first: group.n > 1 ? t("coverage.missing.first", { image: group.image }) : group.image })));
   const box = make("section", { class: "coverage" }, make("h2", {}, t("coverage.title")), shares, legend, recorded, toggle, offers, gapsTitle, list, more, fly, missing, asked);
-  subscribe("coverage vehicles", "coverage", () => {
+  subscribe("coverage vehicles zones", "coverage", () => {
     const now = state.coverage;
     const known = now?.seen_share != null;
     for (const part of [legend, recorded, toggle, offers, gapsTitle, list, more, fly, missing, asked]) setHidden(part, !known);
     if (!known) { setText(shares, t("coverage.none")); return; }
-    setText(shares, t(`coverage.state.${now.state}`));
+    setText(shares, [t(`coverage.state.${now.state}`), now.plan && drawnSince() ? t("coverage.older") : ""].filter(Boolean).join(" "));
     for (const key of STATES) setText(figures[key], percent(now[`${key}_share`]));
     setText(recorded, t("coverage.recorded", { seen: percent(now.recorded.seen_share), placed: now.pictures.placed, left: now.pictures.recorded }));
     setText(gapsTitle, now.gaps.length ? t("coverage.gaps", { n: now.gaps.length, size: units.area(now.gaps.reduce((sum, gap) => sum + gap.area_m2, 0)) }) : t("coverage.nogaps"));

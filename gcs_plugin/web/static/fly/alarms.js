@@ -1,5 +1,5 @@
-// Alarms by word, colour and sound: what needs a person now. A sound repeats until somebody has seen it; what was seen and
-// gets worse is an alarm again, and Seen is for what is on the screen.
+// Alarms by word, colour and sound: what needs a person now, one line a cause. A sound repeats until somebody has seen it;
+// what was seen and gets worse is an alarm again, and Seen is for what is on the screen. What the operator has ordered is none.
 
 import { nowMs, timeOfDay } from "/static/core/clock.js";
 import { button, keyedList, make, setAttribute, setHidden, setText } from "/static/core/dom.js";
@@ -7,6 +7,7 @@ import { settings } from "/static/core/settings.js";
 import { changed, select, state, subscribe } from "/static/core/store.js";
 import { given } from "/static/core/stream.js";
 import { t } from "/static/core/strings.js";
+import * as units from "/static/core/units.js";
 import { inAir, need } from "/static/fly/need.js";
 import { aircraftNear } from "/static/fly/aircraft.js";
 
@@ -37,20 +38,31 @@ function beep(level) {
 
 const worse = (level, than) => level === "bad" && than !== "bad";
 
-function raise(key, level, text, vehicle) {
+function say(text) {
+  if (settings.speak && window.speechSynthesis) speechSynthesis.speak(Object.assign(new SpeechSynthesisUtterance(text), { lang: document.documentElement.lang }));
+}
+
+// cause: what alarms of several vehicles have in common; they are one line then.
+function raise(key, level, text, vehicle, cause) {
   const known = state.alarms.get(key);
-  if (!known) {
-    state.alarms.set(key, { key, level, text, vehicle, seen: false, shown: null });
+  if (!known || worse(level, known.level)) {
     beep(level);
+    say(`${t(`alarm.${level}`)}. ${text}`);
+  }
+  if (!known) {
+    state.alarms.set(key, { key, level, text, vehicle, cause, seen: false, shown: null });
+    past.unshift({ key, level, text, begun: Date.now(), ended: null });
+    past.splice(MOST_PAST);
   } else {
-    if (worse(level, known.level)) {
-      Object.assign(known, { seen: false, shown: null });
-      beep(level);
-    }
+    if (worse(level, known.level)) Object.assign(known, { seen: false, shown: null });
     Object.assign(known, { level, text });
   }
   return key;
 }
+
+// What was an alarm since the page was opened, newest first.
+const MOST_PAST = 300;
+const past = [];
 
 // Alarms that events raise by themselves stay as long as the daemon says.
 const announced = new Map();
@@ -108,12 +120,12 @@ function tell(vehicle, level, words, time_s) {
   const [known, now] = [once.get(key), nowMs()];
   const name = state.vehicles.get(vehicle)?.name ?? vehicle;
   if (known && state.alarms.get(key)?.seen && now - known.at > AGAIN_MS) state.alarms.delete(key);
-  once.set(key, { level, text: `${clockText(time_s)}${name}: ${words}`, vehicle, at: now });
+  once.set(key, { level, text: `${clockText(time_s)}${name}: ${words}`, vehicle, words, at: now });
   changed("alarms");
 }
 
 function said(vehicle, message) {
-  if (message.severity > SEVERE || (CHECKS.test(message.text) && !state.vehicles.get(vehicle)?.armed)) return;
+  if (message.severity > SEVERE || CHECKS.test(message.text)) return;
   tell(vehicle, "bad", t("alarm.said", { text: message.text }), message.time);
 }
 
@@ -142,54 +154,97 @@ subscribe("vehicles tick commands alarms link traffic", "alarms", () => {
   for (const row of state.vehicles.values()) {
     for (const item of need(row, now).why) {
       if (item.level === "stale" || item.quiet) continue;
-      standing.add(raise(`${row.id}/${item.key}`, item.level, `${row.name}: ${item.words}`, row.id));
+      standing.add(raise(`${row.id}/${item.key}`, item.level, `${row.name}: ${item.words}`, row.id, item.key));
     }
-    if (row.behind) standing.add(raise(`behind/${row.id}`, "bad", `${row.name} ${row.behind}`, row.id));
     earlier(row, given().given_s);
   }
-  for (const [key, alarm] of [...announced, ...tooNear(now), ...aircraftNear()]) standing.add(raise(key, alarm.level, alarm.text, alarm.vehicle));
+  for (const [key, alarm] of [...announced, ...tooNear(now), ...aircraftNear()]) standing.add(raise(key, alarm.level, units.inUnits(alarm.text), alarm.vehicle, key)); // each says what to do: a line of its own
   for (const [key, alarm] of once) {
     if (state.alarms.get(key)?.seen && now - alarm.at > AGAIN_MS) once.delete(key);
-    else standing.add(raise(key, alarm.level, alarm.text, alarm.vehicle));
+    else standing.add(raise(key, alarm.level, alarm.text, alarm.vehicle, alarm.words));
   }
-  if (state.link === "lost") standing.add(raise("daemon", "bad", t("link.banner.short")));
+  if (state.link === "lost") standing.add(raise("daemon", "bad", t("link.banner.short"), undefined, "station"));
   for (const entry of state.commands) {
-    if (entry.outcome === "unknown" || entry.outcome === "not_sent") standing.add(raise(entry.key, "bad", `${entry.name}: ${t(`verb.${entry.verb}`)} ${t(`outcome.${entry.outcome}`)}`, entry.vehicle));
+    if (entry.outcome === "unknown" || entry.outcome === "not_sent") standing.add(raise(entry.key, "bad", `${entry.name}: ${t(`verb.${entry.verb}`)} ${t(`outcome.${entry.outcome}`)}`, entry.vehicle, `${entry.verb}/${entry.outcome}`));
   }
-  for (const key of [...state.alarms.keys()]) if (!standing.has(key)) state.alarms.delete(key);
+  for (const key of [...state.alarms.keys()]) {
+    if (standing.has(key)) continue;
+    state.alarms.delete(key);
+    for (const one of past) if (one.key === key) one.ended ??= Date.now();
+  }
   changed("alarm-list");
 });
 
 const rows = () => (innerHeight <= 450 ? 2 : innerWidth <= 700 || innerHeight <= 600 ? 3 : 5); // what fits without scrolling
 const READ_MS = 300; // what came up just before the press was not read
+const MOST_NAMES = 12;
+
+// Alarms with one cause as one: {key, level, text, all}.
+function grouped(alarms) {
+  const groups = new Map();
+  for (const alarm of alarms) {
+    const key = `${alarm.level}/${alarm.cause}`;
+    if (!groups.has(key)) groups.set(key, []);
+    groups.get(key).push(alarm);
+  }
+  return [...groups].map(([key, all]) => {
+    const names = [...new Set(all.map((alarm) => state.vehicles.get(alarm.vehicle)?.name ?? alarm.vehicle))];
+    const title = t(`alarm.of.${all[0].cause}`);
+    const listed = names.slice(0, MOST_NAMES).join(", ") + (names.length > MOST_NAMES ? ` ${t("alarm.more", { n: names.length - MOST_NAMES })}` : "");
+    const words = title === `alarm.of.${all[0].cause}` ? all[0].text.replace(/^.*?: /, "") : title;
+    return { key, level: all[0].level, all, text: all.length === 1 ? all[0].text : `${words}: ${listed}` };
+  });
+}
 
 export function alarmList() {
   const list = make("ul", {});
   let drawn = [];
   const seen = button(t("alarm.seen"), () => {
-    for (const alarm of drawn) if (nowMs() - alarm.shown > READ_MS) alarm.seen = true;
+    for (const alarm of drawn.flatMap((group) => group.all)) if (nowMs() - alarm.shown > READ_MS) alarm.seen = true;
     changed("alarm-list");
   }, { class: "small" });
   const title = make("b", {});
   const more = make("p", { class: "more" });
   const box = make("section", { class: "alarms", "aria-label": t("alarm.title"), role: "alert", hidden: true }, make("div", { class: "row" }, title, seen), list, more);
-  const draw = keyedList(list, (alarm) => make("li", {}, button("", () => alarm.vehicle && select(alarm.vehicle), { class: "alarm" })), (row, alarm) => {
-    setText(row.firstChild, `${t(`alarm.${alarm.level}`)} ${alarm.text}`);
-    setAttribute(row, "data-level", alarm.level);
+  const draw = keyedList(list, (group) => { const row = make("li", {}, button("", () => row.vehicle && select(row.vehicle), { class: "alarm" })); return row; }, (row, group) => {
+    row.vehicle = group.all[0].vehicle;
+    setText(row.firstChild, `${t(`alarm.${group.level}`)} ${group.text}`);
+    setAttribute(row, "data-level", group.level);
   });
   subscribe("alarm-list", "list of alarms", () => {
-    const fresh = [...state.alarms.values()].filter((alarm) => !alarm.seen).sort((a, b) => (a.level === "bad" ? 0 : 1) - (b.level === "bad" ? 0 : 1));
-    drawn = fresh.slice(0, rows());
-    for (const alarm of fresh) alarm.shown = drawn.includes(alarm) ? alarm.shown ?? nowMs() : null;
+    const fresh = [...state.alarms.values()].filter((alarm) => !alarm.seen);
+    const groups = grouped(fresh).sort((a, b) => (a.level === "bad" ? 0 : 1) - (b.level === "bad" ? 0 : 1));
+    drawn = groups.slice(0, rows());
+    const listed = new Set(drawn.flatMap((group) => group.all));
+    for (const alarm of fresh) alarm.shown = listed.has(alarm) ? alarm.shown ?? nowMs() : null;
     setText(title, t("alarm.count", { n: fresh.length }));
-    draw(drawn.map((alarm) => [alarm.key, alarm]));
-    setText(more, fresh.length > drawn.length ? t("alarm.more", { n: fresh.length - drawn.length }) : "");
-    setHidden(more, fresh.length === drawn.length);
+    draw(drawn.map((group) => [group.key, group]));
+    setText(more, groups.length > drawn.length ? t("alarm.more", { n: groups.length - drawn.length }) : "");
+    setHidden(more, groups.length === drawn.length);
     setHidden(box, fresh.length === 0);
   });
   setInterval(() => {
     const loud = [...state.alarms.values()].find((alarm) => !alarm.seen && alarm.level === "bad");
     if (loud) beep("bad");
   }, REPEAT_MS);
+  return box;
+}
+
+// What was an alarm and is over, or still is, with its times.
+export function pastAlarms() {
+  const list = make("ul", { class: "past" });
+  const title = make("summary", {});
+  const box = make("details", { hidden: true }, title, list);
+  const draw = keyedList(list, () => make("li", {}), (row, one) => {
+    const time = (ms) => timeOfDay(ms, { seconds: true });
+    setText(row, `${time(one.begun)}${one.ended ? ` – ${time(one.ended)}` : ""} ${t(`alarm.${one.level}`)} ${one.text}`);
+    setAttribute(row, "data-level", one.level);
+  });
+  subscribe("alarm-list", "alarms so far", () => {
+    setText(title, t("alarm.past", { n: past.length }));
+    setHidden(box, !past.length);
+    if (box.open) draw(past.map((one) => [`${one.key}/${one.begun}`, one]));
+  });
+  box.addEventListener("toggle", () => changed("alarm-list"));
   return box;
 }

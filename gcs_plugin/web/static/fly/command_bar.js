@@ -30,8 +30,9 @@ function askAll(verb) {
   const aloft = [...state.vehicles.values()].filter((row) => onLink(row) && inAir(row));
   const inTurn = verb === "rtl" && aloft.length > 1;
   const meet = inTurn && neighbours(aloft) ? ` ${t("confirm.meet")}` : "";
-  confirm.ask(question + meet, t(inTurn ? "confirm.yes.together" : `confirm.yes.${verb}`), TONES[verb], () => commandAll(verb),
-    inTurn ? { label: t("confirm.yes.return"), tone: TONES.rtl, work: () => commandAll("return") } : null);
+  if (!inTurn) { confirm.ask(question, t(`confirm.yes.${verb}`), TONES[verb], () => commandAll(verb)); return; }
+  // What is recommended comes first, in its colour.
+  confirm.ask(question + meet, t("confirm.yes.return"), TONES.rtl, () => commandAll("return"), { label: t("confirm.yes.together"), tone: "plain", work: () => commandAll(verb) });
 }
 
 // Whether two have their homes so near each other that they may meet there, on straight ways at one height.

@@ -3,6 +3,7 @@
 import { button, keyedList, make, setAttribute, setHidden, setText } from "/static/core/dom.js";
 import { changed, state, subscribe } from "/static/core/store.js";
 import { t } from "/static/core/strings.js";
+import { inUnits } from "/static/core/units.js";
 import { forget } from "/static/fly/commands.js";
 
 const DONE_S = 12;
@@ -18,7 +19,7 @@ export function commandLog() {
     const [name, outcome, reason] = row.children;
     setText(name, `${entry.name}: ${t(`verb.${entry.verb}`)}${entry.elsewhere ? ` (${t("command.elsewhere")})` : ""}`);
     setText(outcome, t(`outcome.${entry.outcome}`));
-    setText(reason, entry.outcome === "waiting" ? "" : entry.reason);
+    setText(reason, entry.outcome === "waiting" ? "" : inUnits(entry.reason));
     setAttribute(row, "data-outcome", entry.outcome);
   });
   const RANK = { unknown: 0, not_sent: 1, refused: 2, waiting: 3, done: 4 };

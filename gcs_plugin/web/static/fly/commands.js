@@ -6,7 +6,7 @@ import { connected, given } from "/static/core/stream.js";
 import { t } from "/static/core/strings.js";
 import { onLink } from "/static/fly/need.js";
 
-const ANSWER_MS = { pause: 9_000, resume: 9_000, rtl: 9_000, return: 20_000, land: 9_000, start: 60_000, upload: 190_000 };
+const ANSWER_MS = { pause: 9_000, resume: 9_000, rtl: 9_000, return: 20_000, land: 9_000, start: 60_000, upload: 190_000, fence: 190_000 };
 const MOST = 300;
 const OUTCOMES = new Set(["done", "refused", "not_sent", "unknown"]);
 const ALL = "all";

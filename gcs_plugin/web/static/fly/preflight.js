@@ -11,6 +11,7 @@ import { given } from "/static/core/stream.js";
 import { t } from "/static/core/strings.js";
 import * as units from "/static/core/units.js";
 import { newId } from "/static/fly/commands.js";
+import { routeName } from "/static/plan/route_names.js";
 
 const CHECK_MS = 60_000;
 const REPEAT_MS = 5_000;
@@ -82,7 +83,7 @@ function drawFacts() {
   facts.replaceChildren(...plan.vehicles.map((part) => {
     const row = (rows ?? []).find((checked) => checked.vehicle === names[part.id]);
     return make("li", {}, make("b", {}, nameOf(names[part.id])), t("preflight.fact", {
-      mission: `${plan.id} ${part.id}`, height: units.height(row?.height_m), at: units.clock((part.flights?.[0]?.start_s ?? 0) - first), time: units.clock(row?.time_s ?? part.time_s), photos: part.photos }));
+      route: routeName(part.id), height: units.height(row?.height_m), at: units.clock((part.flights?.[0]?.start_s ?? 0) - first), time: units.clock(row?.time_s ?? part.time_s), photos: part.photos }));
   }));
 }
 
@@ -118,7 +119,7 @@ function drawLine(row, item) {
   const [word, reason, box] = row.children;
   setAttribute(row, "data-level", item.state);
   setText(word, t(`preflight.${item.state}`));
-  setText(reason, `${t(`preflight.item.${item.name}`)}: ${item.reason}`);
+  setText(reason, `${t(`preflight.item.${item.name}`)}: ${units.inUnits(item.reason)}`);
   setHidden(box, item.state !== "red");
   if (item.state !== "red") allowed[item.vehicle]?.delete(item.name); // red again later asks again
   box.firstChild.checked = allowed[item.vehicle]?.has(item.name) ?? false;

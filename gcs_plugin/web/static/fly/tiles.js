@@ -104,7 +104,7 @@ function order() {
   });
 }
 
-subscribe("vehicles selected tick", "vehicle tiles", () => {
+subscribe("vehicles selected tick alarm-list", "vehicle tiles", () => {
   const now = nowMs();
   const before = tiles.size;
   for (const [id, tile] of tiles) if (!state.vehicles.has(id)) { tile.item.remove(); tiles.delete(id); }
@@ -113,7 +113,9 @@ subscribe("vehicles selected tick", "vehicle tiles", () => {
   setHidden(nothing, tiles.size > 0);
   setAttribute(list, "data-size", tiles.size > 24 ? "many" : tiles.size > 6 ? "some" : "few");
   const rows = [...state.vehicles.values()];
-  const of = (level) => rows.filter((row) => need(row, now).level === level).length;
+  const alarmed = new Set([...state.alarms.values()].filter((alarm) => alarm.level === "bad").map((alarm) => alarm.vehicle));
+  const level = (row) => (alarmed.has(row.id) ? "bad" : need(row, now).level);
+  const of = (wanted) => rows.filter((row) => level(row) === wanted).length;
   setText(count, rows.length ? t("fly.count", { n: rows.length, air: rows.filter(inAir).length, bad: of("bad"), warn: of("warn") }) : "");
   if (filter.value !== "all") refilter();
 });

@@ -5,10 +5,9 @@ import { tileRequest } from "/static/core/api.js";
 import { guarded } from "/static/core/guard.js";
 import { state, subscribe } from "/static/core/store.js";
 import { t } from "/static/core/strings.js";
-import { boundsOf, FIRST_OVERLAY, FLIGHT_LAYERS, fit, inView, isMoved, isReady, map } from "/static/map/map.js";
+import { addInOrder, boundsOf, fit, inView, isMoved, isReady, map, RASTERS } from "/static/map/map.js";
 
 const FLOWN = ["realtime", "coarse", "fine"];
-const RASTERS = ["basemap", "realtime", "coarse", "fine"];
 const address = (name) => tileRequest(`/tiles/${name}/{z}/{x}/{y}.webp`).url.replaceAll("%7B", "{").replaceAll("%7D", "}");
 export const rasterSource = (name) => ({ type: "raster", tiles: [address(name)], tileSize: 256, maxzoom: 22 });
 export const rasterLayer = (name) => ({ id: name, type: "raster", source: name, paint: { "raster-fade-duration": 0 } });
@@ -18,6 +17,7 @@ const versions = new Map();
 const stale = new Set();
 const rows = new Map();
 let fitted = "";
+let contrast = 0;
 
 function setOpacity(name, share) {
   shares.set(name, share);
@@ -41,9 +41,15 @@ setInterval(guarded("tiles", () => {
 function showRaster(name) {
   if (map.getSource(name)) return;
   map.addSource(name, rasterSource(name));
-  const above = [...RASTERS.slice(RASTERS.indexOf(name) + 1), FIRST_OVERLAY].find((id) => map.getLayer(id));
-  map.addLayer(rasterLayer(name), above);
+  addInOrder(rasterLayer(name));
+  if (contrast && FLOWN.includes(name)) setContrast(contrast);
   if (shares.has(name)) setOpacity(name, shares.get(name));
+}
+
+// For eyes in the sun, and for haze: of what was flown.
+function setContrast(share) {
+  contrast = share;
+  for (const name of FLOWN) if (map.getLayer(name)) map.setPaintProperty(name, "raster-contrast", share);
 }
 
 export function layerPanel() {
@@ -57,8 +63,8 @@ export function layerPanel() {
     rows.set(name, { row, about });
     return row;
   };
-  const over = make("input", { type: "checkbox", checked: true, onchange: () => FLIGHT_LAYERS.forEach((id) => map.setLayoutProperty(id, "visibility", over.checked ? "visible" : "none")) });
-  return make("section", {}, make("h2", {}, t("layers.title")), ...[...RASTERS].reverse().map(line), make("label", { class: "check" }, over, make("span", {}, t("layers.flight"))));
+  return make("section", {}, make("h2", {}, t("layers.title")), ...[...RASTERS].reverse().map(line),
+    make("label", { class: "layer" }, make("span", {}, t("layers.contrast")), make("input", { type: "range", min: -50, max: 80, value: 0, name: "contrast", oninput: (event) => setContrast(event.target.value / 100) })));
 }
 
 subscribe("layers ready", "layers", () => {

@@ -6,6 +6,7 @@ import { t } from "/static/core/strings.js";
 import * as units from "/static/core/units.js";
 import { LEGS } from "/static/map/colours.js";
 import { map, maplibregl, show } from "/static/map/map.js";
+import { shownSwitch } from "/static/map/shown.js";
 import { tool } from "/static/map/tools.js";
 
 const STATES = ["matched", "carried", "failed"];
@@ -17,7 +18,7 @@ const withoutMap = () => state.layers.length > 0 && !state.layers.some((layer) =
 export function legPanel() {
   const lines = STATES.map((key) => [key, make("b", {}), make("small", {}, t(`legs.${key}.about`))]);
   const accuracy = make("p", {});
-  const box = make("section", {}, make("h2", {}, t("legs.title")), accuracy,
+  const box = make("section", {}, make("h2", {}, t("legs.title")), shownSwitch("legs", t("legs.show")), accuracy,
     ...lines.map(([key, title, about]) => make("p", { class: "leg", dataset: { state: key } }, make("i", { "aria-hidden": "true" }), title, about)), make("p", { class: "quiet" }, t("legs.dashed")));
   subscribe("legs layers ready", "legs", () => {
     const legs = state.legs.filter((leg) => leg?.geometry && leg.properties);

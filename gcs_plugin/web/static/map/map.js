@@ -3,6 +3,7 @@
 import * as maplibregl from "/static/vendor/maplibre-gl.mjs";
 import { tileRequest } from "/static/core/api.js";
 import { onSettings, settings } from "/static/core/settings.js";
+import { changed } from "/static/core/store.js";
 import { FREE_LEG, LEGS } from "/static/map/colours.js";
 
 maplibregl.setWorkerUrl("/static/vendor/maplibre-gl-worker.mjs");
@@ -14,6 +15,7 @@ export const feature = (type, coordinates, properties = {}) => ({ type: "Feature
 const STATE = ["match", ["get", "state"], "matched", LEGS.matched.colour, "carried", LEGS.carried.colour, "failed", LEGS.failed.colour, FREE_LEG];
 const COLOUR = ["coalesce", ["get", "colour"], "#16202a"];
 const SIGN = ["match", ["get", "state"], "matched", "leg-matched", "carried", "leg-carried", "failed", "leg-failed", ""];
+const OLD = ["==", ["get", "old"], true]; // a plan that is not of the area and settings any more
 // id, type, paint, filter, source if it is not the id, layout
 const OVERLAYS = [
   ["footprints", "fill", { "fill-color": COLOUR, "fill-opacity": 0.12, "fill-outline-color": COLOUR }],
@@ -31,16 +33,28 @@ const OVERLAYS = [
   ["fences-edge", "line", { "line-color": ["case", ["get", "inside"], "#ffc44d", "#ff8a80"], "line-width": 2.5, "line-dasharray": [4, 2] }, null, "fences"],
   ["no-fly", "fill", { "fill-color": "#c92a2a", "fill-opacity": 0.28 }],
   ["no-fly-edge", "line", { "line-color": "#c92a2a", "line-width": 2.5, "line-dasharray": [3, 1.5] }, null, "no-fly"],
-  ["plan-edge", "line", { "line-color": "#fff", "line-width": 5, "line-opacity": 0.7 }, null, "plan"],
-  ["plan", "line", { "line-color": COLOUR, "line-width": ["match", ["get", "kind"], "leg", 3, 1.5] }],
+  ["plan-edge", "line", { "line-color": "#fff", "line-width": 4, "line-opacity": ["case", OLD, 0.2, 0.6] }, null, "plan"],
+  ["plan", "line", { "line-color": ["case", OLD, "#8a94a0", COLOUR], "line-width": ["match", ["get", "kind"], "leg", 3, 1.5], "line-dasharray": [1.2, 1.2] }],
+  ["gap-plan-edge", "line", { "line-color": "#fff", "line-width": 4, "line-opacity": 0.6 }, null, "gap-plan"],
+  ["gap-plan", "line", { "line-color": COLOUR, "line-width": ["match", ["get", "kind"], "leg", 3, 1.5], "line-dasharray": [1.2, 1.2] }],
+  ["routes-flown", "line", { "line-color": COLOUR, "line-width": 1.5, "line-opacity": 0.5 }, ["==", ["get", "part"], "flown"], "routes"],
+  ["routes-edge", "line", { "line-color": "#fff", "line-width": 5, "line-opacity": 0.7 }, ["==", ["get", "part"], "left"], "routes"],
+  ["routes-left", "line", { "line-color": COLOUR, "line-width": 3 }, ["==", ["get", "part"], "left"], "routes"],
+  ["routes-ways", "symbol", {}, ["==", ["get", "part"], "left"], "routes", { "symbol-placement": "line", "symbol-spacing": 120, "icon-image": "way", "icon-overlap": "never", "icon-padding": 20 }],
+  ["waypoints", "circle", { "circle-radius": 7, "circle-color": "transparent", "circle-stroke-width": 3, "circle-stroke-color": COLOUR }],
   ["homes", "circle", { "circle-radius": 6, "circle-color": "#fff", "circle-stroke-width": 3, "circle-stroke-color": COLOUR }],
   ["ellipses", "fill", { "fill-color": "#d6409f", "fill-opacity": 0.2, "fill-outline-color": "#d6409f" }],
   ["measure-area", "fill", { "fill-color": "#ffd43b", "fill-opacity": 0.25 }, null, "measure"],
   ["measure-edge", "line", { "line-color": "#000", "line-width": 5, "line-opacity": 0.6 }, null, "measure"],
   ["measure-line", "line", { "line-color": "#ffd43b", "line-width": 3 }, null, "measure"],
 ];
-export const FLIGHT_LAYERS = ["footprints", "trails-edge", "trails", "legs", "legs-refined", "legs-flying", "legs-signs", "homes", "fences", "fences-under", "fences-edge"];
-export const FIRST_OVERLAY = OVERLAYS[0][0];
+export const RASTERS = ["basemap", "realtime", "coarse", "fine"];
+// From the ground up, in whatever order they come.
+const ORDER = ["ground", ...RASTERS, "trust", "coverage", ...OVERLAYS.map(([id]) => id)];
+export function addInOrder(layer) {
+  map.addLayer(layer, ORDER.slice(ORDER.indexOf(layer.id) + 1).find((id) => map.getLayer(id)));
+  changed("overlays");
+}
 
 // Where no layer has pixels: no glare at night.
 const ground = () => (settings.theme === "sunlight" ? "#cfd6dc" : "#3d4751");
@@ -57,10 +71,26 @@ onSettings((name) => { if (name === "theme") map.setPaintProperty("ground", "bac
 map.touchZoomRotate.disableRotation();
 map.keyboard.disableRotation();
 
+const canvas = (size) => Object.assign(document.createElement("canvas"), { width: size, height: size }).getContext("2d");
+
+// The direction of flight: along a line, pictures point to the right.
+function arrowPicture() {
+  const pen = canvas(28);
+  pen.moveTo(6, 4);
+  pen.lineTo(24, 14);
+  pen.lineTo(6, 24);
+  pen.lineTo(11, 14);
+  pen.closePath();
+  Object.assign(pen, { fillStyle: "#000", strokeStyle: "#fff", lineWidth: 3, lineJoin: "round" });
+  pen.stroke();
+  pen.fill();
+  return pen.getImageData(0, 0, 28, 28);
+}
+
 // A sign in a disc, drawn here: the map's own texts would need fonts from a server.
 function signPicture({ colour, sign }) {
   const size = 44;
-  const pen = Object.assign(document.createElement("canvas"), { width: size, height: size }).getContext("2d");
+  const pen = canvas(size);
   pen.beginPath();
   pen.arc(size / 2, size / 2, size / 2 - 2, 0, 2 * Math.PI);
   Object.assign(pen, { fillStyle: "#fff", strokeStyle: colour, lineWidth: 4, font: "bold 30px system-ui, sans-serif", textAlign: "center", textBaseline: "middle" });
@@ -77,8 +107,9 @@ export const ready = new Promise((resolve) => {
   map.on("load", () => {
     for (const id of new Set(OVERLAYS.map(([name, , , , source]) => source || name))) map.addSource(id, { type: "geojson", data: EMPTY });
     for (const [key, leg] of Object.entries(LEGS)) map.addImage(`leg-${key}`, signPicture(leg), { pixelRatio: 2 });
+    map.addImage("way", arrowPicture(), { pixelRatio: 2 });
     for (const [id, type, paint, filter, source, layout] of OVERLAYS) {
-      map.addLayer({ id, type, source: source || id, paint, ...(filter ? { filter } : {}), ...(layout ? { layout } : {}) });
+      addInOrder({ id, type, source: source || id, paint, ...(filter ? { filter } : {}), ...(layout ? { layout } : {}) });
     }
     loaded = true;
     resolve();
@@ -102,9 +133,10 @@ let moved = false;
 map.on("movestart", (event) => { moved ||= Boolean(event.originalEvent); });
 export const isMoved = () => moved;
 
+const PADDING = { top: 40, bottom: 84, left: 40, right: 56 }; // what lies over the map's edges
 export function fit([west, south, east, north]) {
   if (![west, south, east, north].every(Number.isFinite)) return;
-  map.fitBounds([[west, south], [east, north]], { padding: 40, duration: 0, maxZoom: 19 });
+  map.fitBounds([[west, south], [east, north]], { padding: PADDING, duration: 0, maxZoom: 19 });
 }
 
 export function inView([west, south, east, north]) {

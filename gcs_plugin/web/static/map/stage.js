@@ -5,6 +5,7 @@ import { guarded } from "/static/core/guard.js";
 import { t } from "/static/core/strings.js";
 import { detailsPanel } from "/static/fly/details.js";
 import "/static/fly/overlays.js";
+import "/static/fly/routes.js";
 import { preflightDialog } from "/static/fly/preflight.js";
 import { cursorLine } from "/static/map/cursor.js";
 import { circle } from "/static/map/geodesy.js";
@@ -12,11 +13,15 @@ import { layerPanel, mappedBounds } from "/static/map/layers.js";
 import { legPanel } from "/static/map/legs.js";
 import { boundsOf, fit, isReady, map, ready } from "/static/map/map.js";
 import { measurePanel } from "/static/map/measure.js";
+import { goToForm } from "/static/map/go_to.js";
+import { shownBox } from "/static/map/shown.js";
 import { setSwipe, swipeParts } from "/static/map/swipe.js";
 import "/static/map/traffic_markers.js";
+import { trustPanel } from "/static/map/trust.js";
 import "/static/map/vehicle_markers.js";
 import { setEditing } from "/static/plan/editor.js";
 import { loadPlan, planPanel } from "/static/plan/panel.js";
+import { olderNote } from "/static/plan/result.js";
 import { exportPanel } from "/static/work/exports.js";
 import { findPanel, loadFinds } from "/static/work/finds.js";
 import { jobPanel } from "/static/work/jobs.js";
@@ -44,9 +49,9 @@ subscribe("vehicles ready", "first look", () => {
 
 export async function withMap(panels) {
   const swipe = make("input", { type: "checkbox", id: "swipe-on", onchange: () => setSwipe(swipe.checked) });
-  byId("stage").append(...swipeParts(), make("div", { class: "under" }, button(t("map.all"), showAll), cursorLine()), detailsPanel());
+  byId("stage").append(...swipeParts(), olderNote(), make("div", { class: "under" }, button(t("map.all"), showAll), ...shownBox(), cursorLine()), detailsPanel());
   panels.plan.append(planPanel());
-  panels.map.append(layerPanel(), make("section", {}, make("label", { class: "check" }, swipe, make("span", {}, t("swipe.on")))), coveragePanel(), legPanel(), measurePanel(), findPanel(), jobPanel(), exportPanel());
+  panels.map.append(goToForm(), layerPanel(), make("section", {}, make("label", { class: "check" }, swipe, make("span", {}, t("swipe.on")))), coveragePanel(), trustPanel(), legPanel(), measurePanel(), findPanel(), jobPanel(), exportPanel());
   document.body.append(preflightDialog(), gapFlightDialog());
   await ready;
   subscribe("plan", "the shared plan", () => loadPlan());

@@ -39,8 +39,23 @@ const place = (row, now) => {
   setAttribute(element, "data-selected", state.selected === row.id);
 };
 
+// Names that would lie over each other: the one that needs attention, or is selected, is shown.
+const [LABEL_W, LABEL_H] = [56, 18];
+function untangle(now) {
+  const rank = (row) => (state.selected === row.id ? 9 : need(row, now).weight);
+  const rows = [...state.vehicles.values()].filter((row) => markers.has(row.id)).map((row) => ({ row, at: map.project(markers.get(row.id).getLngLat()), rank: rank(row) })).sort((a, b) => b.rank - a.rank);
+  const kept = [];
+  for (const { row, at } of rows) {
+    const free = kept.every((other) => Math.abs(other.x - at.x) > LABEL_W || Math.abs(other.y - at.y) > LABEL_H);
+    if (free) kept.push(at);
+    setAttribute(markers.get(row.id).getElement(), "data-crowded", !free);
+  }
+}
+map.on("moveend", guarded("names on the map", () => untangle(nowMs())));
+
 subscribe("vehicles selected tick", "vehicles on the map", () => {
   const now = nowMs();
   for (const [id, marker] of markers) if (!state.vehicles.has(id)) { marker.remove(); markers.delete(id); }
   for (const row of state.vehicles.values()) guarded(`${row.id} on the map`, place)(row, now);
+  untangle(now);
 });

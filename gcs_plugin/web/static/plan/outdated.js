@@ -23,9 +23,11 @@ export function setMade(values) {
   madeWith = values?.made_with && typeof values.made_with === "object" ? values.made_with : null;
 }
 
+export const drawnSince = () => madeOf != null && madeOf !== drawnNow();
+
 // Why the plan is not what area and form say; empty if it is.
 export function outdated() {
-  if (madeOf != null && madeOf !== drawnNow()) return t("plan.outdated");
+  if (drawnSince()) return t("plan.outdated");
   const other = madeWith == null ? [] : differences(madeWith);
   return other.length ? t("plan.reset", { list: other.join("; ") }) : "";
 }

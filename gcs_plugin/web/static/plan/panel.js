@@ -1,7 +1,7 @@
 // Plan mode: the area, what is wanted, the plan, and which vehicle flies what.
 
 import { get, post } from "/static/core/api.js";
-import { button, make, setHidden, setText } from "/static/core/dom.js";
+import { button, keyedList, make, setAttribute, setHidden, setText } from "/static/core/dom.js";
 import { notice } from "/static/core/notices.js";
 import { onSettings, settings } from "/static/core/settings.js";
 import { state } from "/static/core/store.js";
@@ -11,7 +11,7 @@ import { ring } from "/static/core/values.js";
 import { inAir, onLink } from "/static/fly/need.js";
 import * as area from "/static/plan/area.js";
 import * as editor from "/static/plan/editor.js";
-import { fillFields, followsTerrain, inFieldNames, planFields, planValues, rawValues, relabelFields, setDem } from "/static/plan/fields.js";
+import { fillFields, followsTerrain, inFieldNames, planFields, planValues, rawValues, relabelFields, setDem, showFootprint } from "/static/plan/fields.js";
 import { acceptDrops, KINDS, readArea } from "/static/plan/import.js";
 import { madeNow, nowMade, setMade } from "/static/plan/outdated.js";
 import { hidePlan, lookAtPlan, planResult, redraw, showPlan } from "/static/plan/result.js";
@@ -27,10 +27,10 @@ const ringsOf = (polygon) => {
   return rings.length > 1 || rings[0]?.length ? rings : [];
 };
 
-export async function loadPlan() {
-  if (!mayLoad()) return;
+export async function loadPlan(merged = null) {
+  if (!merged && !mayLoad()) return;
   const kept = ringsOf(keptArea());
-  const body = await loadShared();
+  const body = merged ?? await loadShared();
   if (!body) return;
   const rings = ringsOf(body.area);
   setMade(body.plan ? body.settings : null);
@@ -49,6 +49,7 @@ export async function loadPlan() {
     else hidePlan();
   }
   redraw();
+  showFootprint();
   if (unsaved) save();
 }
 
@@ -65,7 +66,10 @@ export function planPanel() {
   const file = make("input", { type: "file", accept: KINDS, class: "hidden-file", "aria-label": t("import.label"), onchange: () => { if (file.files[0]) read(file.files[0]); file.value = ""; } });
   const open = button(t("import.open"), () => file.click());
   const go = make("button", { type: "submit", class: "primary" }, t("plan.make"));
-  const form = make("form", { novalidate: true, onsubmit: submit, oninput: redraw, onchange: redraw }, ...planFields(save), go);
+  let turn = 0;
+  let givenUp = () => {};
+  const stop = button(t("plan.stop"), () => givenUp(), { hidden: true });
+  const form = make("form", { novalidate: true, onsubmit: submit, oninput: () => { redraw(); showFootprint(); }, onchange: () => { redraw(); showFootprint(); } }, ...planFields(save), go, stop);
   async function read(dropped) {
     try {
       const { rings, unused, fields } = await readArea(dropped);
@@ -88,7 +92,11 @@ export function planPanel() {
     const wrong = area.problem();
     if (wrong) { notice("bad", wrong); return; }
     go.disabled = true;
+    setHidden(stop, false);
+    const began = performance.now();
+    const clock = setInterval(() => setText(go, t("plan.making.for", { time: units.clock((performance.now() - began) / 1000) })), 1000);
     setText(go, t("plan.making"));
+    const mine = ++turn;
     try {
       const body = { ...planValues(), area: area.outline(), no_fly: area.zones() };
       const heard = [...state.vehicles.values()].filter((row) => onLink(row) && row.position);
@@ -96,7 +104,9 @@ export function planPanel() {
       const flies = heard.slice(0, body.vehicles).some(inAir); // it takes off elsewhere; the daemon warns
       if ((heard.length >= body.vehicles && !flies) || followsTerrain()) body.starts = heard.slice(0, body.vehicles).map((row) => [row.position[1], row.position[0]]);
       const now = nowMade();
-      made = await post("/api/plans", body, PLANNING_MS);
+      const plan = await Promise.race([post("/api/plans", body, PLANNING_MS), new Promise((_, no) => { givenUp = () => no(new Error(t("plan.stopped"))); })]);
+      if (mine !== turn) return;
+      made = plan;
       setMade(now);
       names = Object.fromEntries(made.vehicles.map((row, k) => [row.id, heard.length >= made.vehicles.length ? heard[k].id : ""]));
       save();
@@ -105,11 +115,20 @@ export function planPanel() {
     } catch (error) {
       notice("bad", t("plan.failed", { why: inFieldNames(error.message) }));
     } finally {
+      clearInterval(clock);
+      setHidden(stop, true);
       go.disabled = false;
       setText(go, t("plan.make"));
     }
   }
+  const zones = make("ul", { class: "zones" });
+  const drawZones = keyedList(zones, () => { const row = make("li", {}, make("span", {}), button(t("area.zone.delete"), () => { editor.stopDrawing(); area.change((rings) => rings.splice(row.ring, 1)); }, { class: "small" })); return row; }, (row, ring) => {
+    row.ring = ring;
+    setText(row.firstChild, t("area.hole", { n: ring }));
+    setAttribute(row.lastChild, "aria-label", `${t("area.zone.delete")}: ${t("area.hole", { n: ring })}`);
+  });
   const refresh = (why) => {
+    drawZones(area.area.rings.slice(1).map((_, k) => [k, k + 1]));
     const wrong = area.problem();
     setText(hint, editor.isDrawing() ? t("area.drawing") : wrong || t("area.ready", { size: units.area(area.size_m2()) }));
     setText(drawing, t(editor.isDrawing() ? "area.done" : area.area.rings.length ? "area.more" : "area.draw"));
@@ -121,7 +140,7 @@ export function planPanel() {
   };
   area.onArea(refresh);
   editor.onDrawing(() => refresh("drawing"));
-  onSettings((name) => { if (name === "units") { refresh("units"); relabelFields(); } });
+  onSettings((name) => { if (name === "units") { refresh("units"); relabelFields(); showFootprint(); } });
   document.addEventListener("keydown", (event) => {
     if (settings.mode !== "plan" || !(event.ctrlKey || event.metaKey) || /INPUT|TEXTAREA|SELECT/.test(event.target.tagName)) return;
     if (event.key.toLowerCase() === "z") { event.preventDefault(); event.shiftKey ? area.redo() : area.undo(); }
@@ -129,6 +148,7 @@ export function planPanel() {
   });
   acceptDrops(document.body, read);
   refresh("made");
-  return make("div", {}, make("section", {}, make("h2", {}, t("area.title")), hint, make("div", { class: "row wrap" }, drawing, open, hole, undo, redo, clear), file, make("p", { class: "quiet" }, t("area.files")), make("p", { class: "quiet" }, t("area.help"))),
+  showFootprint();
+  return make("div", {}, make("section", {}, make("h2", {}, t("area.title")), hint, make("div", { class: "row wrap" }, drawing, open, hole, undo, redo, clear), zones, file, make("p", { class: "quiet" }, t("area.files")), make("p", { class: "quiet" }, t("area.help"))),
     make("section", {}, make("h2", {}, t("plan.title")), form), planResult());
 }

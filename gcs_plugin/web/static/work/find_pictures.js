@@ -1,6 +1,6 @@
 // The pictures that show a find, best first, with the place marked in each. The box is not modal: commands stay in reach.
 
-import { get, withToken } from "/static/core/api.js";
+import { get, picture } from "/static/core/api.js";
 import { button, make, setText } from "/static/core/dom.js";
 import { state } from "/static/core/store.js";
 import { text } from "/static/core/values.js";
@@ -30,10 +30,14 @@ export function picturesDialog() {
   return { box, show };
 }
 
+// A press shows it as wide as the box, with the place marked, and small again.
 function figure(row) {
   const name = t("finds.pictures.one", { image: text(row.image), name: state.vehicles.get(row.vehicle)?.name ?? text(row.vehicle) });
-  const image = make("img", { src: withToken(`/api/frames/${row.seq}/view`), alt: name, loading: "lazy" });
+  const image = make("img", { alt: name });
   const mark = make("i", {});
-  image.addEventListener("load", () => { mark.style.left = `${(100 * row.column) / image.naturalWidth}%`; mark.style.top = `${(100 * row.row) / image.naturalHeight}%`; });
-  return make("li", {}, make("figure", {}, make("a", { href: image.getAttribute("src"), target: "_blank", rel: "noopener" }, image, mark), make("figcaption", {}, name)));
+  image.addEventListener("load", () => { mark.style.left = `${(100 * row.column) / image.naturalWidth}%`; mark.style.top = `${(100 * row.row) / image.naturalHeight}%`; URL.revokeObjectURL(image.src); });
+  const larger = make("button", { type: "button", "aria-pressed": "false", "aria-label": name, onclick: () => larger.setAttribute("aria-pressed", String(larger.getAttribute("aria-pressed") === "false")) }, image, mark);
+  const item = make("li", {}, make("figure", {}, larger, make("figcaption", {}, name)));
+  picture(`/api/frames/${row.seq}/view`).then((url) => { image.src = url; }, (error) => { item.textContent = `${name}: ${error.message}`; });
+  return item;
 }

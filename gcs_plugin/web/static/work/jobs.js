@@ -21,6 +21,14 @@ export async function refine(vehicle) {
 // Work in the background comes and goes by itself: only what is under way, or went wrong, is worth a line.
 const worth = (job) => !["coarse", "together", "tones"].includes(job.kind) || job.state === "running" || job.state === "failed";
 
+// A refinement that found none of its lines on the basemap is done, and its pictures lie where the receiver says.
+const mapped = () => state.layers.some((layer) => layer.name === "basemap");
+function unmatched(job) {
+  if (!["refine", "coarse"].includes(job.kind) || job.state !== "done" || !mapped()) return false;
+  const legs = state.legs.filter(({ properties: leg }) => leg?.vehicle === job.vehicle && leg.sortie === job.sortie);
+  return legs.length > 0 && legs.every(({ properties: leg }) => leg.state === "failed");
+}
+
 // An export waits for refinements, so that it holds their result.
 const refining = () => [...state.jobs.values()].some((job) => job.kind === "refine" && ["queued", "running"].includes(job.state));
 
@@ -31,11 +39,12 @@ export function jobPanel() {
     const [title, words, bar] = row.children;
     setText(title, `${t(`jobs.${job.kind}`)} ${nameOf(job.vehicle)}${job.sortie > 1 ? ` ${t("jobs.sortie", { n: job.sortie })}` : ""}`);
     const behind = job.kind === "export" && job.state === "queued" && refining();
-    setText(words, [t(behind ? "jobs.behind" : `jobs.state.${job.state}`), job.message, ...(job.detail?.warnings ?? []), job.detail?.seconds ? `${job.detail.seconds.toFixed(1)} s` : ""].filter(Boolean).join(", "));
+    const lost = unmatched(job);
+    setText(words, [t(behind ? "jobs.behind" : lost ? "jobs.unmatched" : `jobs.state.${job.state}`), job.message, ...(job.detail?.warnings ?? []), job.detail?.seconds ? `${job.detail.seconds.toFixed(1)} s` : ""].filter(Boolean).join(", "));
     setStyle(bar.firstChild, "transform", `scaleX(${Math.max(0, Math.min(1, job.progress || 0))})`);
-    setAttribute(row, "data-state", job.state);
+    setAttribute(row, "data-state", lost ? "unmatched" : job.state);
   });
-  subscribe("jobs vehicles", "jobs", () => {
+  subscribe("jobs vehicles legs", "jobs", () => {
     const rows = [...state.jobs.values()].filter(worth).sort((a, b) => b.id - a.id).slice(0, MOST);
     draw(rows.map((job) => [job.id, job]));
     setHidden(nothing, rows.length > 0);
