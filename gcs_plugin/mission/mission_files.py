@@ -38,7 +38,6 @@ _NOT_PLANNED = {
     "HoverAndCapture": "that it stops for each picture",
     "CameraTriggerInTurnAround": "pictures in turns",
     "flyAlternateTransects": "every second line first",
-    "splitConcavePolygons": "the division of its outline",
 }
 _MOST_NAME = 60  # characters of a camera's name
 _ALTITUDE_MODE = {FRAME_GLOBAL_RELATIVE: 1, FRAME_TERRAIN: 4}  # QGroundControl's AltModeRelative, AltModeTerrainFrame

@@ -8,21 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
-from gcs_plugin.mission.mission_files import (
-    DO_CHANGE_SPEED,
-    DO_MOUNT_CONTROL,
-    DO_SET_CAM_TRIGG_DIST,
-    FRAME_GLOBAL_RELATIVE,
-    NAV_LAND,
-    NAV_LOITER_TIME,
-    NAV_RTL,
-    NAV_TAKEOFF,
-    NAV_WAYPOINT,
-    FileItem,
-    MissionFile,
-    gimbal_items,
-    with_gimbal_items_of,
-)
+from gcs_plugin.mission import mission_files
+from gcs_plugin.mission.mission_files import NAV_LAND, NAV_LOITER_TIME, NAV_RTL, NAV_TAKEOFF, NAV_WAYPOINT, FileItem
 from orthoswarm.model.angles import wrap_deg
 from orthoswarm.model.earth import DEGREE_M
 from orthoswarm.model.errors import InputError
@@ -75,20 +62,20 @@ def route_of(items: Sequence[FileItem]) -> DroneRoute:
     """
     points = list[RoutePoint]()
     speed_m_s, every_m, pitch_deg, end = 0.0, 0.0, None, None
-    for item in with_gimbal_items_of("ardupilot", items):
+    for item in mission_files.with_gimbal_items_of("ardupilot", items):
         if item.command in (NAV_TAKEOFF, NAV_WAYPOINT, NAV_LOITER_TIME):
-            if item.frame != FRAME_GLOBAL_RELATIVE:
+            if item.frame != mission_files.FRAME_GLOBAL_RELATIVE:
                 raise InputError("a DJI mission states heights above takeoff only; plan again without --terrain-items")
             point = RoutePoint(item.lat_deg, item.lon_deg, item.alt_m, every_m)
             if points and _same(points[-1], point):
                 point = points.pop()
             points.append(point._replace(wait_s=item.params[0]) if item.command == NAV_LOITER_TIME else point)
-        elif item.command == DO_SET_CAM_TRIGG_DIST and points:
+        elif item.command == mission_files.DO_SET_CAM_TRIGG_DIST and points:
             every_m = max(item.params[0], 0.0)
             points[-1] = points[-1]._replace(every_m=every_m)
-        elif item.command == DO_CHANGE_SPEED:
+        elif item.command == mission_files.DO_CHANGE_SPEED:
             speed_m_s = item.params[1]
-        elif item.command == DO_MOUNT_CONTROL:
+        elif item.command == mission_files.DO_MOUNT_CONTROL:
             pitch_deg = item.params[0]
         elif item.command in _ENDS:
             end = _ENDS[item.command]
@@ -117,7 +104,7 @@ def east_north_m(one: RoutePoint, other: RoutePoint) -> tuple[float, float]:
     return DEGREE_M * math.cos(math.radians(one.lat_deg)) * east_deg, DEGREE_M * (other.lat_deg - one.lat_deg)
 
 
-def mission_of(route: DroneRoute, name: str) -> MissionFile:
+def mission_of(route: DroneRoute, name: str) -> mission_files.MissionFile:
     """The mission of a route that was read, in the words of ArduPilot; an upload turns them into those of a PX4.
 
     Raises:
@@ -127,26 +114,30 @@ def mission_of(route: DroneRoute, name: str) -> MissionFile:
 
     def nav(command: int, point: RoutePoint, wait_s: float = 0.0) -> FileItem:
         place: dict[str, Any] = {"lat_deg": point.lat_deg, "lon_deg": point.lon_deg, "alt_m": point.height_m}
-        return FileItem(command=command, frame=FRAME_GLOBAL_RELATIVE, params=(wait_s, 0.0, 0.0, 0.0), **place)
+        return FileItem(
+            command=command, frame=mission_files.FRAME_GLOBAL_RELATIVE, params=(wait_s, 0.0, 0.0, 0.0), **place
+        )
 
     start, last = route.points[0], route.points[-1]
     items = [nav(NAV_TAKEOFF, start._replace(height_m=route.climb_m))]
-    items.append(FileItem(command=DO_CHANGE_SPEED, params=(1.0, route.speed_m_s, -1.0, 0.0)))
-    items += [] if route.pitch_deg is None else gimbal_items(route.pitch_deg, "ardupilot")
+    items.append(FileItem(command=mission_files.DO_CHANGE_SPEED, params=(1.0, route.speed_m_s, -1.0, 0.0)))
+    items += [] if route.pitch_deg is None else mission_files.gimbal_items(route.pitch_deg, "ardupilot")
     every_m = 0.0
     for number, point in enumerate(route.points):
         if number or point.every_m or point.wait_s or abs(point.height_m - route.climb_m) >= _SAME_M:
             items.append(nav(NAV_WAYPOINT, point))
         if point.every_m != every_m:
             every_m, at_once = point.every_m, float(point.every_m > 0.0)
-            items.append(FileItem(command=DO_SET_CAM_TRIGG_DIST, params=(every_m, 0.0, at_once, 0.0)))
+            items.append(FileItem(command=mission_files.DO_SET_CAM_TRIGG_DIST, params=(every_m, 0.0, at_once, 0.0)))
         if point.wait_s:
             items.append(nav(NAV_LOITER_TIME, point, point.wait_s))
     if route.end == "rtl":
         items.append(FileItem(command=NAV_RTL))
     else:
         items.append(nav(NAV_LAND, last._replace(height_m=0.0)) if route.end == "land" else nav(NAV_WAYPOINT, last))
-    return MissionFile(items=tuple(items), home=(start.lat_deg, start.lon_deg, 0.0), speed_m_s=route.speed_m_s)
+    return mission_files.MissionFile(
+        items=tuple(items), home=(start.lat_deg, start.lon_deg, 0.0), speed_m_s=route.speed_m_s
+    )
 
 
 def _check(route: DroneRoute, name: str) -> None:

@@ -161,11 +161,6 @@ def _gimbal(pitch_deg: float) -> dict[str, Any]:
     return base | pitch | roll | yaw | {"gimbalRotateTimeEnable": 0, "gimbalRotateTime": 0}
 
 
-def is_wpml(names: Sequence[str]) -> bool:
-    """Whether a ZIP with these files in it is a route of DJI's."""
-    return any(name.endswith("waylines.wpml") for name in names)
-
-
 def parse_wpml(data: bytes, name: str) -> DroneRoute:
     """The route of a KMZ that Pilot 2 or this program wrote.
 
@@ -174,7 +169,7 @@ def parse_wpml(data: bytes, name: str) -> DroneRoute:
     """
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            found = [info for info in archive.infolist() if is_wpml([info.filename])]
+            found = [info for info in archive.infolist() if info.filename.endswith("waylines.wpml")]
             if not found or found[0].file_size > _LARGEST_BYTES:
                 raise InputError(f"{name} holds no route of Pilot 2 (waylines.wpml), or a huge one; export it again")
             root = ElementTree.fromstring(archive.read(found[0]))
@@ -216,10 +211,8 @@ def _read_route(root: Element, folder: Element) -> DroneRoute:
         turned = actions.get("gimbalRotate")
         if turned is not None and turned.findtext("gimbalPitchRotateEnable") == "1":
             pitch_deg = _number(turned, "gimbalPitchRotateAngle")
-    finish = root.findtext(".//finishAction")
-    climb_m = _number(root, ".//takeOffSecurityHeight")
-    ends: list[End] = [end for end, action in _FINISH.items() if action == finish]
-    end = ends[0] if ends else "hover"
+    finish, climb_m = root.findtext(".//finishAction"), _number(root, ".//takeOffSecurityHeight")
+    end: End = next((end for end, action in _FINISH.items() if action == finish), "hover")
     return DroneRoute(points=tuple(points), speed_m_s=speed_m_s, climb_m=climb_m, pitch_deg=pitch_deg, end=end)
 
 
