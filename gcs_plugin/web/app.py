@@ -247,6 +247,12 @@ class HttpRoutes:
         """A plan as GeoJSON: area, legs, ways, starts."""
         return Response(await self.work(self.daemon.plans.geojson, number), media_type="application/geo+json")
 
+    async def plan_files(self, number: str, drone: str) -> Response:
+        """A plan for a drone that a maker's app flies (m300, m3e, litchi ...): a ZIP of its flights and their times."""
+        data = await self.work(self.daemon.plans.maker_files, number, drone)
+        name = {"Content-Disposition": f'attachment; filename="{number}-{drone}.zip"'}
+        return Response(data, media_type="application/zip", headers=name)
+
     # -- state shared by all open pages ---------------------------------------------------------------------------
 
     async def console_plan(self) -> Response:
@@ -349,6 +355,7 @@ def make_app(daemon: Daemon, access: Access, address: str = "") -> Any:
     add("/api/export", routes.export, methods=["POST"], status_code=202)
     add("/api/export/{job}/{kind}", routes.exported)
     add("/api/plans/{number}/map", routes.plan_map)
+    add("/api/plans/{number}/files/{drone}", routes.plan_files)
     add("/api/plans/{number}/preflight", routes.commands.preflight, methods=["POST"])
     add("/api/plans/{number}/start", routes.commands.start_plan, methods=["POST"], status_code=202)
     add("/api/plans/{number}/start", routes.commands.cancel_start, methods=["DELETE"])

@@ -79,6 +79,8 @@ export const english = {
   "plan.nobody": "no vehicle yet", "plan.flies": "Who flies {route}", "plan.twice": "{name} was given two routes: give one of them to another vehicle.", "plan.missing": "No vehicle flies {parts}: choose one for each.",
   "plan.outdated": "The plan is older than the drawing: make the plan again, and upload it.", "plan.reset": "The plan was made with other settings ({list}): make it again, or set them back.", "plan.was": "{name}: {value}", "plan.empty": "empty", "plan.on": "on", "plan.off": "off", "plan.reassigned": "The plan, or who flies it, was changed on another page: close this, look at it, and check again.", "plan.upload": "Upload missions", "plan.fence": "Upload the zones to {n} {n|geofence|geofences}", "plan.unfenced": "The no-fly zones are not in the geofence of {list}: only the routes avoid them. Uploading replaces the zones that it must stay out of.", "plan.start": "Check and start…",
 
+  "plan.drone": "Missions for a DJI drone or Litchi", "plan.drone.load": "Download",
+
   "map.all": "Show all", "traffic.one": "Aircraft {name}, {height} above sea level", "map.vehicle": "Vehicle {name}", "cursor.copy": "Coordinates; press to copy", "cursor.mark": "Mark {place}", "cursor.centre": "Centre {place}", "cursor.copied": "Copied: {place}", "cursor.uncopied": "Not copied, write it down: {place}",
   "layers.title": "Layers", "layers.basemap": "Basemap", "layers.realtime": "Raw", "layers.coarse": "Preliminary", "layers.fine": "Final", "layers.opacity": "Opacity of {name}", "layers.none": "nothing yet",
   "layers.basemap.about": "from before the disaster", "layers.realtime.about": "placed by GPS, seconds after arrival", "layers.coarse.about": "lines aligned in flight", "layers.fine.about": "aligned after landing",

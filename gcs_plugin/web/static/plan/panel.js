@@ -72,10 +72,11 @@ export function planPanel() {
   const form = make("form", { novalidate: true, onsubmit: submit, oninput: () => { redraw(); showFootprint(); }, onchange: () => { redraw(); showFootprint(); } }, ...planFields(save), go, stop);
   async function read(dropped) {
     try {
-      const { rings, unused } = await readArea(dropped);
+      const { rings, unused, fields } = await readArea(dropped);
       const given = new Set(rings.map((points) => JSON.stringify(points)));
       const kept = area.area.rings.slice(1).filter((points) => points.length > 2 && !given.has(JSON.stringify(points)));
       editor.stopDrawing();
+      fillFields(fields); // saved with the area
       area.change((old) => old.splice(0, old.length, ...rings, ...kept)); // a zone goes only if somebody deletes it
       fit(boundsOf(rings[0]));
       if (kept.length) notice("warn", t("import.kept", { n: kept.length }));
