@@ -8,22 +8,12 @@ import pytest
 from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
 from tests.kit.daemon_kit import GRID, serving
 from tests.kit.mosaic_scene import EAST, NORTH
-from tests.kit.page_kit import CHROMIUM, DESK, FLAGS, PHONE, TABLET, ok_for_all, opened, poll, send, standing, vehicle
+from tests.kit.page_kit import DESK, PHONE, TABLET, ok_for_all, opened, poll, send, standing, vehicle
 from tests.page.test_command_bar import confirm
 
 playwright = pytest.importorskip("playwright.sync_api")
-if CHROMIUM is None:
-    pytest.skip("no Chromium is installed", allow_module_level=True)
 LOCKED = "() => [...document.querySelectorAll('[data-locked=true]')].filter((e) => e.checkVisibility()).length"
 NOBODY = {"id": -1, "name": "", "role": "viewer", "several": False, "invites": False}
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with playwright.sync_playwright() as play:
-        browser = play.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        yield browser
-        browser.close()
 
 
 def person(role, number=7, name="Anna"):
