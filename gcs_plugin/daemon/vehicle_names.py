@@ -50,6 +50,7 @@ class VehicleRow(TypedDict, total=False):
     frames: dict[str, int]
     height_m: float | None
     last_frame: str | None
+    last_seq: int | None
     came_s: float
     pictures: dict[str, Any]
     can: dict[str, Any]

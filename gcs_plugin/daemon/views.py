@@ -56,7 +56,7 @@ class Views:
         found, newest = senders(self._journal), newest_frames(self._journal)
         for sender in found:
             document: VehicleRow = {"id": sender.vehicle, "state": "pictures", "sortie": sender.sortie}
-            document["frames"] = sender.frames
+            document["frames"], document["last_seq"] = sender.frames, sender.last
             if sender.last in newest:
                 last = newest[sender.last]
                 document["lat_deg"], document["lon_deg"] = last.pose.get("lat_deg"), last.pose.get("lon_deg")

@@ -1,13 +1,16 @@
 """Plans made over HTTP: one folder each in the workspace, with the files of `orthoswarm plan`."""
 
 import contextlib
+import io
 import json
 import re
 import shutil
 import time
+import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -15,6 +18,7 @@ from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.mission.geofence import FenceZone
 from gcs_plugin.mission.items import Mission
+from gcs_plugin.mission.makers.maker_files import MAKERS, maker_file, read_mission_file
 from gcs_plugin.mission.mission_builder import build_mission, read_mission
 from gcs_plugin.mission.mission_files import parse_mission
 from gcs_plugin.mission.plan_folder import PlanNeeds, plan_needs
@@ -158,6 +162,25 @@ class Plans:
         """
         return (self._path(name) / "all.geojson").read_bytes()
 
+    def maker_files(self, name: str, drone: str) -> bytes:
+        """A ZIP of all flights of a plan for a drone that its maker's app flies, and of when each takes off.
+
+        Raises:
+            InputError: there is no such plan or drone, or its app cannot fly it.
+        """
+        if drone not in MAKERS:
+            raise InputError(f"drone is none of {', '.join(MAKERS)}; choose one")
+        folder, rows, data = self._path(name), ["file,takeoff_s,time_s"], io.BytesIO()
+        with zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED) as archive:
+            for flight in chain.from_iterable(self._flights(name).values()):
+                mission = folder / flight["files"][0]
+                items = parse_mission(mission.read_text(encoding="utf-8"), mission.name).items
+                file = mission.stem + MAKERS[drone]
+                archive.writestr(file, maker_file(items, drone, plan_needs(folder).return_height_m))
+                rows.append(f"{file},{flight['start_s']},{flight['time_s']}")
+            archive.writestr("takeoffs.csv", "\n".join([*rows, ""]))
+        return data.getvalue()
+
     def mission(self, body: Mapping[str, Any], vehicle: str, autopilot: Autopilot) -> Mission:
         """The mission of an upload request: `plan` with `mission` (default: the vehicle's own), or `text`.
 
@@ -165,7 +188,7 @@ class Plans:
             InputError: there is none, or the text is not a mission file.
         """
         if isinstance(body.get("text"), str):
-            parsed = parse_mission(body["text"], "the mission")
+            parsed = read_mission_file(body["text"].encode(errors="replace"), "the mission")
             return build_mission(autopilot, parsed.items, parsed.home, "the mission")
         folder = self._path(body.get("plan"))
         name = body.get("mission", vehicle)

@@ -27,6 +27,7 @@ from gcs_plugin.mission.items import (
     Mission,
     MissionItem,
 )
+from gcs_plugin.mission.makers.maker_files import read_mission_file
 from orthoswarm.config.autopilot import ARDUPILOT
 from orthoswarm.model.errors import InputError
 
@@ -73,16 +74,16 @@ def unflyable(items: Sequence[MissionItem], autopilot: Autopilot, *, in_air: boo
 
 
 def read_mission(path: Path, autopilot: Autopilot) -> Mission:
-    """The mission in a `.plan` or `.waypoints` file, for one autopilot whichever it was written for.
+    """The mission in a file of any kind (see `read_mission_file`), for one autopilot whichever it was written for.
 
     Raises:
         InputError: the file cannot be read or is not a mission.
     """
     try:
-        text = path.read_text(encoding="utf-8", errors="replace")
+        data = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path} cannot be read ({error.strerror}); check the name") from None
-    parsed = mission_files.parse_mission(text, path.name)
+    parsed = read_mission_file(data, path.name)
     return build_mission(autopilot, parsed.items, parsed.home, path.name)
 
 

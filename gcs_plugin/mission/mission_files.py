@@ -9,7 +9,7 @@ import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from orthoswarm.model.earth import ring_around
 from orthoswarm.model.errors import InputError
@@ -32,6 +32,14 @@ _CORNERS = 32  # of the polygon around a circular fence
 _WITH_POSITION = {*range(16, 20), 21, 22, 31, 82, 84, 85, 94}
 _FIRMWARE: dict[Autopilot, int] = {"ardupilot": 3, "px4": 12}
 _MULTIROTOR = 2  # MAV_TYPE
+_ABOVE_SEA, _ABOVE_GROUND = 2, (3, 4)  # QGroundControl's AltMode
+_LENS = ("SensorWidth", "FocalLength", "ImageWidth", "ImageHeight")
+_NOT_PLANNED = {
+    "HoverAndCapture": "that it stops for each picture",
+    "CameraTriggerInTurnAround": "pictures in turns",
+    "flyAlternateTransects": "every second line first",
+}
+_MOST_NAME = 60  # characters of a camera's name
 _ALTITUDE_MODE = {FRAME_GLOBAL_RELATIVE: 1, FRAME_TERRAIN: 4}  # QGroundControl's AltModeRelative, AltModeTerrainFrame
 
 
@@ -60,6 +68,22 @@ class FileItem:
         return self.command in _WITH_POSITION and (self.lat_deg != 0.0 or self.lon_deg != 0.0)
 
 
+class SurveyValue(NamedTuple):
+    """A value of a survey as a field of the request that a plan is made of, and in words."""
+
+    field: str
+    value: float | bool
+    words: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SurveySettings:
+    """How a survey item of QGroundControl is to be flown; and what of that no plan is made of, in words."""
+
+    values: tuple[SurveyValue, ...] = ()
+    left: tuple[str, ...] = ()
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MissionFile:
     """A mission file's content; all outlines and lines are (latitude, longitude) in degrees.
@@ -70,6 +94,7 @@ class MissionFile:
         surveys: outlines of survey items. polylines: centre lines of corridor items.
         no_fly: rings of exclusion fences. fences: all fences, of both kinds.
         speed_m_s: speed set in the file, or None.
+        survey: how the first survey is to be flown.
     """
 
     items: tuple[FileItem, ...]
@@ -79,6 +104,7 @@ class MissionFile:
     no_fly: tuple[tuple[LatLon, ...], ...] = field(default=())
     speed_m_s: float | None = None
     fences: tuple[Fence, ...] = ()
+    survey: SurveySettings = SurveySettings()
 
     def lines(self) -> tuple[tuple[LatLon, ...], ...]:
         """The lines to be photographed: the sections flown with the camera triggering by distance, if any, else all.
@@ -341,11 +367,13 @@ def _parse_plan(document: Mapping[str, Any]) -> MissionFile:
     mission = document["mission"]
     items: list[FileItem] = []
     surveys: list[tuple[LatLon, ...]] = []
+    settings: list[SurveySettings] = []
     polylines: list[tuple[LatLon, ...]] = []
     for entry in mission["items"]:
         if entry.get("type") == "ComplexItem":
             if "polygon" in entry:
                 surveys.append(_ring(entry["polygon"]))
+                settings.append(_survey_settings(entry))
             if "polyline" in entry:
                 polylines.append(_ring(entry["polyline"]))
             style = entry.get("TransectStyleComplexItem") or {}
@@ -365,6 +393,11 @@ def _parse_plan(document: Mapping[str, Any]) -> MissionFile:
     no_fly = [f.points if f.radius_m is None else ring_around(*f.points[0], f.radius_m, _CORNERS) for f in out]
     home = mission.get("plannedHomePosition")
     speed = mission.get("hoverSpeed") or mission.get("cruiseSpeed")
+    survey = settings[0] if settings else SurveySettings()
+    if any(other.values != survey.values for other in settings):
+        survey = replace(survey, left=(*survey.left, "other settings of further surveys"))
+    if survey.values and speed:
+        survey = replace(survey, left=(*survey.left, f"the speed of {float(speed):g} m/s"))
     return MissionFile(
         items=tuple(items),
         home=(float(home[0]), float(home[1]), float(home[2] if len(home) > 2 else 0.0)) if home else None,
@@ -373,7 +406,64 @@ def _parse_plan(document: Mapping[str, Any]) -> MissionFile:
         no_fly=tuple(no_fly),
         speed_m_s=float(speed) if speed else None,
         fences=tuple(fences),
+        survey=survey,
     )
+
+
+def _survey_settings(entry: Mapping[str, Any]) -> SurveySettings:
+    """Settings of a survey item (version 5, with a TransectStyleComplexItem)."""
+    style = entry.get("TransectStyleComplexItem") or {}
+    camera = style.get("CameraCalc") or {}
+    found, left = list[SurveyValue](), list[str]()
+    height_m, mode = _amount(camera, "DistanceToSurface"), camera.get("DistanceMode", 1)
+    if height_m and mode == _ABOVE_SEA:
+        left.append(f"the height of {height_m:g} m above the sea")
+    elif height_m:
+        found.append(SurveyValue("altitude_m", height_m, f"height {height_m:g} m"))
+        left += ["that it follows the ground"] if mode in _ABOVE_GROUND or style.get("FollowTerrain") else []
+    lens = _lens_values(camera)
+    found += lens
+    left += ["the distances of its lines and pictures, as it names no lens"] if camera and not lens else []
+    angle, turn_m = entry.get("angle"), _amount(style, "TurnAroundDistance")
+    if camera and isinstance(angle, int | float) and math.isfinite(angle):
+        found.append(SurveyValue("heading", angle % 180.0, f"lines at {angle % 180.0:g} degrees"))
+    if turn_m:
+        found.append(SurveyValue("run_in_m", turn_m, f"{turn_m:g} m to turn around"))
+    if style.get("Refly90Degrees") is True:
+        found.append(SurveyValue("cross", True, "a second time across"))
+    left += [word for key, word in _NOT_PLANNED.items() if style.get(key, entry.get(key)) is True]
+    return SurveySettings(values=tuple(found), left=tuple(left))
+
+
+def _lens_values(camera: Mapping[str, Any]) -> list[SurveyValue]:
+    """What a survey's lens sees, as QGroundControl has it: pixels are square, upright pictures lie across by height."""
+    width, focal, columns, rows = (_amount(camera, key) for key in _LENS)
+    if not (width and focal and columns and rows):
+        return []
+    landscape = camera.get("Landscape", True) is not False
+    aspect = columns / rows if landscape else rows / columns
+    across = width if landscape else width * aspect
+    fov_deg = math.degrees(2.0 * math.atan(across / (2.0 * focal)))
+    name = str(camera.get("CameraName") or "camera")[:_MOST_NAME]
+    overlaps = {"side_overlap": ("side", "SideOverlap"), "forward_overlap": ("forward", "FrontalOverlap")}
+    said = [(field_name, word, _amount(camera, key)) for field_name, (word, key) in overlaps.items()]
+    return [
+        SurveyValue("fov_min_deg", round(fov_deg, 3), f"{name} ({fov_deg:.1f} degrees)"),
+        SurveyValue("aspect", round(aspect, 5), f"pictures {aspect:.3g} times as wide as high"),
+        *(
+            SurveyValue(name, part / 100.0, f"{word} overlap {part:g} %")
+            for name, word, part in said
+            if part is not None
+        ),
+    ]
+
+
+def _amount(values: Mapping[str, Any], key: str) -> float | None:
+    """A number that is not negative, None for anything else."""
+    value = values.get(key)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    return float(value) if 0.0 <= value < 1e9 else None
 
 
 def _read_item(entry: Mapping[str, Any]) -> FileItem:

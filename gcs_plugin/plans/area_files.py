@@ -1,6 +1,6 @@
 """Areas, lines and no-fly zones from files.
 
-GeoJSON, KML, KMZ, zipped shapefile, GeoPackage, QGroundControl `.plan` and `.waypoints`.
+GeoJSON, KML, KMZ, zipped shapefile, GeoPackage, QGroundControl `.plan` and `.waypoints`, routes of Pilot 2 and Litchi.
 """
 
 import codecs
@@ -15,7 +15,9 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import shapely
 
-from gcs_plugin.mission.mission_files import parse_mission
+from gcs_plugin.mission.makers.litchi import is_litchi
+from gcs_plugin.mission.makers.maker_files import read_mission_file
+from gcs_plugin.mission.mission_files import SurveySettings
 from orthoswarm.model.coordinate_system import to_degrees
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.plan import Fence
@@ -39,18 +41,21 @@ _KINDS: Final = {
     ".gpkg": "a GeoPackage",
     ".plan": "a mission",
     ".waypoints": "a mission",
+    ".csv": "a mission",
 }
 _LARGEST_BYTES: Final = 50_000_000
 _SHAPEFILE: Final = b"\x00\x00\x27\x0a"
+_ROUTE: Final = "waylines.wpml"
 _SQLITE: Final = b"SQLite format 3\0"
 
 
 class AreaFile(NamedTuple):
-    """What a file holds: its shapes, rings of its exclusion fences, and all its fences (missions have them)."""
+    """What a file holds: its shapes; of missions rings of exclusion fences, all fences, and how a survey is flown."""
 
     shapes: Shapes
     no_fly: list[Ring]
     fences: tuple[Fence, ...] = ()
+    survey: SurveySettings = SurveySettings()
 
 
 def read_shapes(path: Path, name: str | None = None, *, any_size: bool = False) -> AreaFile:
@@ -75,18 +80,19 @@ def read_shapes(path: Path, name: str | None = None, *, any_size: bool = False) 
         return AreaFile(
             Shapes.joined([_shapes(f"/vsizip/{{{path}}}/{info.filename}", name, any_size) for info in inside]), []
         )
-    texts = _texts(path, name)
     if kind == "GeoJSON":
-        return AreaFile(parse_geojson(texts[0], name, any_size=any_size), [])
-    if kind in ("KML", "KMZ"):
-        return AreaFile(Shapes.joined([parse_kml(text, name, any_size=any_size) for text in texts]), [])
-    mission = parse_mission(texts[0], name)
+        return AreaFile(parse_geojson(_texts(path, name)[0], name, any_size=any_size), [])
+    route = kind == "KMZ" and bool(_inside(path, name, _ROUTE))
+    if kind in ("KML", "KMZ") and not route:
+        return AreaFile(Shapes.joined([parse_kml(t, name, any_size=any_size) for t in _texts(path, name)]), [])
+    mission = read_mission_file(path.read_bytes() if route else _texts(path, name)[0].encode(), name)
     polygons = tuple(Polygon(ring(survey, name)) for survey in mission.surveys)
     lines = tuple(ring(line, name, 2) for line in (mission.polylines or mission.lines()))
     for fence in mission.fences:
         if fence.radius_m is None:
             ring(fence.points, name)
-    return AreaFile(Shapes(polygons, lines), [ring(zone, name) for zone in mission.no_fly], mission.fences)
+    zones = [ring(zone, name) for zone in mission.no_fly]
+    return AreaFile(Shapes(polygons, lines), zones, mission.fences, mission.survey)
 
 
 def _kind(path: Path, name: str) -> str:
@@ -101,7 +107,7 @@ def _kind(path: Path, name: str) -> str:
     if head.startswith(b"PK\x03\x04"):
         if _inside(path, name, ".shp"):
             return "a zipped shapefile"
-        if not _inside(path, name, ".kml"):
+        if not _inside(path, name, (".kml", _ROUTE)):
             raise InputError(f"{name} is a ZIP without a KML or a shapefile in it; export it again")
         return "KMZ"
     if head == _SQLITE:
@@ -109,7 +115,7 @@ def _kind(path: Path, name: str) -> str:
     if head.startswith(_SHAPEFILE):
         raise InputError(f"{name} is one file of a shapefile; put its .shp, .shx, .dbf and .prj into one ZIP")
     text = _texts(path, name)[0].lstrip()
-    if text.startswith("QGC WPL"):
+    if text.startswith("QGC WPL") or is_litchi(text):
         return "a mission"
     if text.startswith("<"):
         return "KML"
@@ -119,7 +125,7 @@ def _kind(path: Path, name: str) -> str:
     raise InputError(f"{name} holds neither {kinds}; export the polygon again")
 
 
-def _inside(path: Path, name: str, suffix: str) -> list[zipfile.ZipInfo]:
+def _inside(path: Path, name: str, suffix: str | tuple[str, ...]) -> list[zipfile.ZipInfo]:
     """The files in a ZIP with a suffix; InputError if it is broken, or unpacks to too much."""
     try:
         with zipfile.ZipFile(path) as archive:

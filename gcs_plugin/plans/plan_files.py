@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 import shapely
 
+from gcs_plugin.mission.makers.maker_files import MAKERS, maker_file
 from gcs_plugin.mission.mission_files import Autopilot, plan_text, sortie_items, waypoints_text
-from gcs_plugin.plans.plan_request import PlanRequest, sortie_path
+from gcs_plugin.plans.plan_request import PlanRequest, flown_by, sortie_path
 from orthoswarm.config import changes
 from orthoswarm.coverage.gaps import PlannedFlight
 from orthoswarm.model.angles import wrap_deg
@@ -35,26 +36,32 @@ def sortie_name(vehicle: VehiclePlan, index: int) -> str:
     return vehicle.id if len(vehicle.sorties) == 1 else f"{vehicle.id}-sortie{index + 1}"
 
 
-def mission_files(plan: Plan, autopilots: Sequence[Autopilot]) -> dict[str, str]:
-    """Texts of all `.plan` and `.waypoints` files by name, in the dialects that the vehicles are given in turn."""
-    texts = {}
+def mission_files(plan: Plan, autopilots: Sequence[str]) -> dict[str, str | bytes]:
+    """All mission files by name, in the dialects that the vehicles are given in turn.
+
+    A vehicle that a maker's app flies has that app's file, too; its others show the same flight in QGroundControl.
+
+    Raises:
+        InputError: a mission has something that the file of a maker's app cannot say.
+    """
+    files: dict[str, str | bytes] = {}
     for vehicle in plan.vehicles:
-        autopilot = _autopilot(vehicle, autopilots)
+        autopilot = flown_by(vehicle, autopilots)
+        dialect: Autopilot = "px4" if autopilot == "px4" else "ardupilot"
         for index, sortie in enumerate(vehicle.sorties):
             name = sortie_name(vehicle, index)
             home = (sortie.home_lat_deg, sortie.home_lon_deg, 0.0)
-            items = sortie_items(plan, sortie, autopilot)
-            texts[f"{name}.plan"] = plan_text(items, home, autopilot, plan.speed_m_s, plan.fences)
-            texts[f"{name}.waypoints"] = waypoints_text(items, home)
-    return texts
-
-
-def _autopilot(vehicle: VehiclePlan, autopilots: Sequence[Autopilot]) -> Autopilot:
-    return autopilots[(vehicle.number - 1) % len(autopilots)]
+            items = sortie_items(plan, sortie, dialect)
+            files[f"{name}.plan"] = plan_text(items, home, dialect, plan.speed_m_s, plan.fences)
+            files[f"{name}.waypoints"] = waypoints_text(items, home)
+            if autopilot in MAKERS:
+                return_height_m = plan.over_ground.return_height_m if plan.over_ground else None
+                files[name + MAKERS[autopilot]] = maker_file(items, autopilot, return_height_m)
+    return files
 
 
 def report(
-    plan: Plan, autopilots: Sequence[Autopilot], fov_min_deg: float, endurance_min: float | None = None
+    plan: Plan, autopilots: Sequence[str], fov_min_deg: float, endurance_min: float | None = None
 ) -> dict[str, Any]:
     """The plan's figures as JSON: per vehicle and altogether.
 
@@ -84,7 +91,7 @@ def report(
         "separation_m": None if plan.apart is None else plan.apart.distance_m,
         "height_step_m": None if plan.apart is None else plan.apart.height_m,
         "over_ground": None if plan.over_ground is None else _over_ground(plan.over_ground),
-        "vehicles": [_vehicle(vehicle, _autopilot(vehicle, autopilots)) for vehicle in plan.vehicles],
+        "vehicles": [_vehicle(vehicle, flown_by(vehicle, autopilots)) for vehicle in plan.vehicles],
         "gaps": [{"lat_deg": g.lat_deg, "lon_deg": g.lon_deg, "area_m2": g.area_m2} for g in plan.gaps],
         "warnings": list(plan.warnings),
     }
@@ -105,10 +112,11 @@ def _over_ground(over: OverGround) -> dict[str, Any]:
     }
 
 
-def _vehicle(vehicle: VehiclePlan, autopilot: Autopilot) -> dict[str, Any]:
+def _vehicle(vehicle: VehiclePlan, autopilot: str) -> dict[str, Any]:
+    suffixes = [*MISSION_SUFFIXES, *([MAKERS[autopilot]] if autopilot in MAKERS else [])]
     flights = [
         {
-            "files": [sortie_name(vehicle, index) + suffix for suffix in MISSION_SUFFIXES],
+            "files": [sortie_name(vehicle, index) + suffix for suffix in suffixes],
             "start_s": round(sortie.start_s, 1),
             "time_s": round(sortie.time_s, 1),
             "length_m": round(sortie.length_m, 1),
@@ -229,7 +237,7 @@ def write_plan(
     figures["warnings"] = [*notes, *figures["warnings"]]
     if changed := changes(request.config):
         figures["config"] = changed
-    files: dict[str, str | bytes] = dict(mission_files(plan, request.autopilots))
+    files = mission_files(plan, request.autopilots)
     files["all.geojson"] = geojson(plan, area)
     files["plan.json"] = json.dumps(figures, indent=1) + "\n"
     if picture:
@@ -276,9 +284,8 @@ def write_folder(folder: Path, files: Mapping[str, str | bytes]) -> None:
             temporary.chmod(0o755)
             os.replace(temporary, folder)
             return
-        for old in _missions(folder):
-            if old.name not in files:
-                old.unlink()
+        for old in _own_missions(folder) - files.keys():
+            (folder / old).unlink(missing_ok=True)
         # The report names the missions that are ours, so it goes last (an earlier one still names the old ones).
         for name in sorted(files, key=lambda name: name == REPORT):
             os.replace(temporary / name, folder / name)
@@ -295,7 +302,8 @@ def _missions(folder: Path) -> list[Path]:
 def _own_missions(folder: Path) -> set[str]:
     try:
         document = json.loads((folder / REPORT).read_text(encoding="utf-8"))
-        return {name for vehicle in document["vehicles"] for flight in vehicle["flights"] for name in flight["files"]}
+        names = [name for vehicle in document["vehicles"] for flight in vehicle["flights"] for name in flight["files"]]
+        return {Path(name).name for name in names}
     except (OSError, ValueError, KeyError, TypeError):
         return set()
 

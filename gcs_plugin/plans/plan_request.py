@@ -12,7 +12,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from gcs_plugin.mission.mission_files import Autopilot
+from gcs_plugin.mission.makers.litchi import MOST_POINTS
+from gcs_plugin.mission.makers.maker_files import LITCHI, MAKERS
 from gcs_plugin.plans.area_files import read_shapes
 from gcs_plugin.plans.no_fly import NoFly, read_no_fly
 from orthoswarm.config import DEFAULT, Config
@@ -21,7 +22,7 @@ from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid, area_epsg
 from orthoswarm.model.placement import Terrain
-from orthoswarm.model.plan import APART, End, Fence, Plan, Sortie
+from orthoswarm.model.plan import APART, End, Fence, Plan, Sortie, VehiclePlan
 from orthoswarm.planning.area.area import Area, make_area
 from orthoswarm.planning.area.shape_files import Polygon, Ring, Shapes, counted, parse_geojson
 from orthoswarm.planning.lines.candidates import Method
@@ -34,7 +35,7 @@ from orthoswarm.planning.sorties.flight_heights import BESIDE_M, FlightHeights
 from orthoswarm.planning.sorties.flight_time import Motion
 from orthoswarm.raster.height_model import DEM_MOST_NODES, HeightModel
 
-AUTOPILOTS: Final[tuple[Autopilot, ...]] = ("ardupilot", "px4")
+AUTOPILOTS: Final = ("ardupilot", "px4", *MAKERS)
 METHODS: Final = ("columns", "bcd", "tmstc")
 WITH_TERRAIN: Final = frozenset({"ardupilot"})
 """Autopilots whose missions can state heights above the ground (MAV_FRAME_GLOBAL_TERRAIN_ALT)."""
@@ -68,7 +69,7 @@ class PlanRequest:
         vehicles: how many. altitude_m: height of the lines above takeoff, with a `dem` above the ground.
         fov_min_deg: theta-hat, the smallest horizontal field of view in the swarm.
         method: how lines are laid. end: what follows the last line.
-        autopilots: whose dialect and times of flight; several are given to the vehicles in turn.
+        autopilots: of `AUTOPILOTS`, whose dialect and times of flight; several are given to the vehicles in turn.
         starts: takeoff points (latitude, longitude) in degrees; none: where each vehicle's first line begins.
         speed_m_s: ground speed, None for the default. run_in_m: straight flight before a leg's first picture.
         endurance_min: longest flight, None without a limit. endurances_min: of each vehicle, where they differ.
@@ -96,7 +97,7 @@ class PlanRequest:
     fov_min_deg: float
     no_fly: Sequence[Path] = ()
     method: Method = "bcd"
-    autopilots: Sequence[Autopilot] = ("ardupilot",)
+    autopilots: Sequence[str] = ("ardupilot",)
     end: End = "rtl"
     starts: Sequence[tuple[float, float]] = ()
     speed_m_s: float | None = None
@@ -144,6 +145,8 @@ class PlanRequest:
         Raises:
             InputError: a value means nothing.
         """
+        if unknown := [name for name in self.autopilots if name not in AUTOPILOTS]:
+            raise InputError(f"'{unknown[0]}' flies no mission of ours; choose one of {', '.join(AUTOPILOTS)}")
         if not 0.0 <= self.swap_min < math.inf:
             raise InputError(f"the time to change a battery is {self.swap_min:g} min; give 0 or more")
         ceiling = self.altitude_m + 4 * self.height_step_m if self.ceiling_m is None else self.ceiling_m
@@ -168,13 +171,20 @@ class PlanRequest:
                 launch_s=self.config.planning.launch_s,
                 in_turn_share=self.config.planning.in_turn_share,
             ),
-            most_items=min(self.config.times(name).most_items for name in self.autopilots),
+            most_items=min(
+                MOST_POINTS if name == LITCHI else self.config.times(name).most_items for name in self.autopilots
+            ),
             run_in_m=self.run_in_m,
             wait_s=60.0 * self.wait_min,
             heading=self.heading,
             cross=self.cross,
             quickest_s=self.config.planning.quickest_s,
         )
+
+
+def flown_by(vehicle: VehiclePlan, autopilots: Sequence[str]) -> str:
+    """The autopilot of a vehicle of those that are given in turn."""
+    return autopilots[(vehicle.number - 1) % len(autopilots)]
 
 
 def make_plan(request: PlanRequest, progress: Callable[[str], None] = lambda _: None) -> tuple[Plan, Area | None]:
@@ -198,6 +208,9 @@ def make_plan(request: PlanRequest, progress: Callable[[str], None] = lambda _: 
     if area is not None:
         area = replace(area, circles_wider_m=no_fly.circles_wider_m)
     notes = [*no_fly.notes]
+    if by_hand := [vehicle.id for vehicle in plan.vehicles if flown_by(vehicle, request.autopilots) in MAKERS]:
+        fenced = ", which holds no geofence" if fences else ""
+        notes.append(f"{', '.join(by_hand)}: started by hand at its takeoff time, in the app of its maker{fenced}")
     if pitch_deg is not None and pitch_deg + 90.0 > _STILL_DOWN_DEG:
         notes.append(f"what is covered is reckoned for a camera that looks straight down, not {pitch_deg:g} degrees")
     plan = replace(plan, fences=tuple(fences), gimbal_pitch_deg=pitch_deg, warnings=(*notes, *plan.warnings))
@@ -216,7 +229,7 @@ def _made(request: PlanRequest, progress: Callable[[str], None]) -> tuple[Plan, 
         if directed:
             raise InputError("gaps are flown in the direction that suits each; leave out --heading and --cross")
         return _gap_plan(request, options, progress)
-    shapes, rings, fences = read_shapes(request.area)
+    shapes, rings, fences, _ = read_shapes(request.area)
     covers = bool(shapes.areas) and not request.follow
     if directed and not covers:
         raise InputError("lines that are followed have their own direction; leave out --heading and --cross")
@@ -420,10 +433,10 @@ def zone_fences(area: Area, fences: Sequence[Fence]) -> list[Fence]:
     return [Fence(inclusion=False, points=tuple((float(lat), float(lon)) for lat, lon in ring)) for ring in places]
 
 
-def refuse_outside(plan: Plan, fences: Sequence[Fence], autopilots: Sequence[Autopilot]) -> None:
+def refuse_outside(plan: Plan, fences: Sequence[Fence], autopilots: Sequence[str]) -> None:
     """Refuse a plan of which a flight leaves the inclusion fences.
 
-    An ArduPilot must stay inside all of them (unless FENCE_OPTIONS says otherwise), a PX4 inside any.
+    An ArduPilot must stay inside all of them (unless FENCE_OPTIONS says otherwise), a PX4 inside any; others in all.
 
     Raises:
         InputError: a flight leaves them, or they have no ground in common.
@@ -432,7 +445,7 @@ def refuse_outside(plan: Plan, fences: Sequence[Fence], autopilots: Sequence[Aut
     allowed = [_shape(fence, grid) for fence in fences if fence.inclusion]
     if not allowed:
         return
-    all_of_them = "ardupilot" in autopilots
+    all_of_them = any(name != "px4" for name in autopilots)
     inside = shapely.intersection_all(allowed) if all_of_them else shapely.union_all(allowed)
     if inside.is_empty:
         raise InputError("the inclusion fences have no ground in common, where ArduPilot could fly; leave one of them")

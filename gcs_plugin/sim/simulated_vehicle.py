@@ -516,14 +516,19 @@ def _severity_of(text: str) -> int:
 
 
 def _factory_parameters(autopilot: Autopilot, top_m_s: float) -> dict[str, float]:
-    """What a ground station asks for, as it leaves the factory; integers are those that the autopilot keeps as such."""
+    """What a ground station asks for, as it leaves the factory, but it returns when its battery is low.
+
+    Integers are those that the autopilot keeps as such.
+    """
     if autopilot is Autopilot.PX4:
         return {
             "MPC_XY_VEL_MAX": top_m_s, "RTL_RETURN_ALT": RTL_HEIGHT_M, "RTL_TYPE": 0, "NAV_DLL_ACT": 0,
+            "COM_LOW_BAT_ACT": 3,
             "GF_MAX_HOR_DIST": 0.0, "GF_MAX_VER_DIST": 0.0,
         }  # fmt: skip
     return {
         "WPNAV_SPEED": 100.0 * _WPNAV_SPEED_M_S, "RTL_ALT": 100.0 * RTL_HEIGHT_M, "RTL_ALT_TYPE": 0, "FS_GCS_ENABLE": 0,
+        "BATT_FS_LOW_ACT": 2,
         "FENCE_ENABLE": 0, "FENCE_AUTOENABLE": 0, "FENCE_TYPE": 7, "FENCE_ACTION": 1, "FENCE_RADIUS": 300.0,
         "FENCE_ALT_MAX": 100.0, "FENCE_ALT_MIN": -10.0, "FENCE_MARGIN": 2.0,
     }  # fmt: skip

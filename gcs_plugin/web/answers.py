@@ -13,6 +13,7 @@ from starlette.requests import ClientDisconnect
 
 from gcs_plugin.web.guard import TooLarge, bounded
 from orthoswarm.export.atomic_file import FULL
+from orthoswarm.export.json_values import json_text
 from orthoswarm.model.errors import DiskFullError, InputError, OrthoSwarmError
 
 Result = TypeVar("Result")
@@ -22,13 +23,13 @@ _BODY_S: Final = 30.0
 
 
 class JsonAnswer(Response):
-    """JSON in ASCII, so that any text, even with lone surrogates, can be sent."""
+    """JSON in ASCII, so that any text, even with lone surrogates, can be sent; what is no number is null."""
 
     media_type = "application/json"
 
     def render(self, content: Any) -> bytes:
         """The body."""
-        return json.dumps(content, separators=(",", ":"), allow_nan=False).encode("ascii")
+        return json_text(content, compact=True).encode("ascii")
 
 
 def status_of(error: OrthoSwarmError) -> int:

@@ -19,7 +19,7 @@ from gcs_plugin.daemon.intake.posted_pose import parse_time
 from gcs_plugin.daemon.layers.web_tiles import TileAddress
 from gcs_plugin.daemon.store.frame_rows import stage_counts
 from gcs_plugin.daemon.store.job_rows import job_counts
-from gcs_plugin.web.answers import JsonAnswer, in_thread, install_error_answers, json_body
+from gcs_plugin.web.answers import JsonAnswer, in_thread, install_error_answers, json_body, parse_json
 from gcs_plugin.web.areas import read_area
 from gcs_plugin.web.command_routes import CommandRoutes
 from gcs_plugin.web.event_stream import Standstill, stream_events
@@ -28,6 +28,7 @@ from gcs_plugin.web.uploads import UploadRoute
 from orthoswarm import __version__
 from orthoswarm.compute.workers import peak_rss_mb
 from orthoswarm.export.tactical.places import feature
+from orthoswarm.report.trust import trust_overlay
 
 Result = TypeVar("Result")
 STATIC: Final = Path(__file__).parent / "static"
@@ -178,6 +179,28 @@ class HttpRoutes:
             return Response(status_code=304, headers=headers)
         return Response(data, media_type="image/png", headers=headers)
 
+    def _trusted(self) -> tuple[int, Path]:
+        """Where not to trust the map: the raster of the last export, and its version, 0 if there is none."""
+        path = self.daemon.settings.workspace / "confidence.tif"
+        return (path.stat().st_mtime_ns // 1_000_000 if path.is_file() else 0), path
+
+    async def trust(self) -> Response:
+        """How far the map can be trusted, as of the last export: `version` (0: nothing yet), `headline`, `corners`."""
+        version, path = self._trusted()
+        if not version:
+            return JsonAnswer({"version": 0, "headline": "", "corners": None})
+        _, corners = await self.work(trust_overlay, path)
+        report = parse_json((path.parent / "report.json").read_bytes())
+        return JsonAnswer({"version": version, "headline": report.get("headline", ""), "corners": corners})
+
+    async def trust_picture(self) -> Response:
+        """Its classes as a PNG, an overlay with the `corners` of /api/trust."""
+        version, path = self._trusted()
+        if not version:
+            raise HTTPException(404, "nothing was refined and exported yet; see /api/jobs")
+        data, _ = await self.work(trust_overlay, path)
+        return Response(data, media_type="image/png", headers={"ETag": f'"{version}"', "Cache-Control": "no-cache"})
+
     async def gaps(self) -> Response:
         """The gaps as GeoJSON, as `orthoswarm coverage` writes them; `orthoswarm plan --gaps` reads them."""
         return JsonAnswer(self.daemon.coverage.gaps, media_type="application/geo+json")
@@ -222,6 +245,12 @@ class HttpRoutes:
     async def plan_map(self, number: str) -> Response:
         """A plan as GeoJSON: area, legs, ways, starts."""
         return Response(await self.work(self.daemon.plans.geojson, number), media_type="application/geo+json")
+
+    async def plan_files(self, number: str, drone: str) -> Response:
+        """A plan for a drone that a maker's app flies (m300, m3e, litchi ...): a ZIP of its flights and their times."""
+        data = await self.work(self.daemon.plans.maker_files, number, drone)
+        name = {"Content-Disposition": f'attachment; filename="{number}-{drone}.zip"'}
+        return Response(data, media_type="application/zip", headers=name)
 
     # -- state shared by all open pages ---------------------------------------------------------------------------
 
@@ -325,6 +354,7 @@ def make_app(daemon: Daemon, token: str, bind: str = "127.0.0.1") -> Any:
     add("/api/export", routes.export, methods=["POST"], status_code=202)
     add("/api/export/{job}/{kind}", routes.exported)
     add("/api/plans/{number}/map", routes.plan_map)
+    add("/api/plans/{number}/files/{drone}", routes.plan_files)
     add("/api/plans/{number}/preflight", routes.commands.preflight, methods=["POST"])
     add("/api/plans/{number}/start", routes.commands.start_plan, methods=["POST"], status_code=202)
     add("/api/plans/{number}/start", routes.commands.cancel_start, methods=["DELETE"])
@@ -338,6 +368,8 @@ def make_app(daemon: Daemon, token: str, bind: str = "127.0.0.1") -> Any:
     add("/api/finds/{number}", routes.change_find, methods=["PUT"])
     add("/api/finds/{number}", routes.delete_find, methods=["DELETE"], status_code=204)
     add("/tiles/{layer}/{z}/{x}/{y}.{suffix}", routes.tile, methods=["GET", "HEAD"])
+    add("/api/trust", routes.trust)
+    add("/api/trust.png", routes.trust_picture)
     add("/api/coverage", routes.coverage)
     add("/api/coverage/gaps.geojson", routes.gaps)
     add("/api/coverage/cells.png", routes.cells)

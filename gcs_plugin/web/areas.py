@@ -22,6 +22,8 @@ MOST_BYTES: Final = 20_000_000
 _MOST_NAME: Final = 200  # characters
 _LARGE_BYTES: Final = 300_000
 """Larger files take longer than a tenth of a second (chosen), less than the start of a process."""
+_FIELDS: Final = frozenset({"altitude_m", "fov_min_deg", "side_overlap", "forward_overlap"})
+"""What of a survey has a field on the page."""
 _ZIP: Final = b"PK\x03\x04"  # whose size says nothing of what is in it
 _ELSEWHERE: Final = ThreadPoolExecutor(1, thread_name_prefix="areas")  # one such process at a time
 
@@ -32,8 +34,8 @@ async def read_area(
     """Read an area file, sent as the body.
 
     GeoJSON, KML, KMZ, zipped shapefile, GeoPackage, QGroundControl .plan. Answers `polygons` (each a list of closed
-    rings of [longitude, latitude], the outline first), `lines`, `no_fly` (closed rings: exclusion fences), and what
-    else it holds in words, `unused`.
+    rings of [longitude, latitude], the outline first), `lines`, `no_fly` (closed rings: exclusion fences), `settings`
+    of a survey as fields of a plan's request, and in words what else it holds, `unused`.
     """
     data = await body_of(request, MOST_BYTES)
     named = (data, name[:_MOST_NAME])
@@ -64,12 +66,15 @@ def area_of(data: bytes, name: str) -> dict[str, Any]:
         suffix = PurePath(name).suffix.lower()
         path = Path(folder) / f"area{suffix if suffix.isascii() and suffix[1:].isalnum() else ''}"
         path.write_bytes(data)
-        shapes, zones, _ = read_shapes(path, name)
+        shapes, zones, _, survey = read_shapes(path, name)
+    settings = {value.field: value.value for value in survey.values if value.field in _FIELDS}
+    unplanned = [value.words for value in survey.values if value.field not in _FIELDS]
     return {
         "polygons": [[_closed(ring) for ring in (polygon.shell, *polygon.holes)] for polygon in shapes.areas],
         "lines": [[[lon, lat] for lat, lon in line.tolist()] for line in shapes.lines],
         "no_fly": [_closed(zone) for zone in zones],
-        "unused": list(shapes.left),
+        "settings": settings,
+        "unused": [*shapes.left, *unplanned, *survey.left],
     }
 
 

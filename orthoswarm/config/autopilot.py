@@ -3,7 +3,7 @@
 Measured in flights of both firmwares in simulation: 44 of ArduCopter 4.7 and 8 of PX4 1.17 (docs/vehicles.md).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 from orthoswarm.config.ranges import above_zero, from_zero
@@ -75,3 +75,12 @@ PX4: Final = AutopilotTimes(
     most_items=1900,  # the table of its dataman
 )
 """PX4 multicopters."""
+DJI: Final = replace(
+    PX4,  # not measured: missions have it stop at each corner, as a PX4 nearly does
+    speed_share=1.0,
+    schedule_slack_s=30.0,  # chosen, as these: a person starts it
+    takeoff_slack_s=15.0,
+    landing_slack_s=30.0,
+    most_items=65_535,  # the indices of WPML
+)
+"""DJI drones on missions of Pilot 2 or Litchi; nobody sets these."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Final
 
-from orthoswarm.config.autopilot import ARDUPILOT, PX4, AutopilotTimes
+from orthoswarm.config.autopilot import ARDUPILOT, DJI, PX4, AutopilotTimes
 from orthoswarm.config.mapping import (
     ComputeConfig,
     MatchersConfig,
@@ -35,8 +35,8 @@ class Config:
     compute: ComputeConfig = field(default_factory=ComputeConfig)
 
     def times(self, autopilot: str) -> AutopilotTimes:
-        """Those of PX4 if the name is `px4`, otherwise those of ArduCopter."""
-        return self.px4 if autopilot == "px4" else self.ardupilot
+        """Those of PX4 or ArduCopter by these names, `px4` and `ardupilot`; of any other, those of DJI's drones."""
+        return {"px4": self.px4, "ardupilot": self.ardupilot}.get(autopilot, DJI)
 
 
 DEFAULT: Final = Config()

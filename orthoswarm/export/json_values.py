@@ -11,12 +11,13 @@ def finite(value: float | None) -> float | None:
     return None if value is None or not math.isfinite(value) else float(value)
 
 
-def json_text(document: Any, indent: int | None = None) -> str:
-    """A document as JSON in which numbers that are not finite are null."""
+def json_text(document: Any, indent: int | None = None, *, compact: bool = False) -> str:
+    """A document as JSON in which numbers that are not finite are null; compact: without spaces, in ASCII alone."""
+    form: dict[str, Any] = {"separators": (",", ":")} if compact else {"indent": indent, "ensure_ascii": False}
     try:
-        return json.dumps(document, indent=indent, ensure_ascii=False, allow_nan=False)
+        return json.dumps(document, allow_nan=False, **form)
     except ValueError:
-        return json.dumps(_with_nulls(document), indent=indent, ensure_ascii=False, allow_nan=False)
+        return json.dumps(_with_nulls(document), allow_nan=False, **form)
 
 
 def _with_nulls(value: Any) -> Any:

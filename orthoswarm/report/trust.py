@@ -7,12 +7,15 @@ from typing import Any, Final
 
 import numpy as np
 
+from orthoswarm.model.errors import InputError
+from orthoswarm.model.geo import LocalGrid
 from orthoswarm.mosaic.confidence import GOOD_TO_M, ORIENTATION_ONLY
 from orthoswarm.report.report_pictures import Picture, pale, scale_bar
 
 _COLOURS: Final = ((0, 140, 90), (120, 190, 60), (230, 159, 0), (190, 30, 60))  # of the classes, best first
 _TINT: Final = 0.5
 _MOST: Final = 0.5  # so much of a map must be more than for orientation, and so much of that as good as is said
+_OVERLAY_PX: Final = 2048
 _SOME: Final = 0.02  # less of the map is not worth a word
 
 
@@ -83,6 +86,38 @@ def trust_picture(confidence: Path, ortho: Picture) -> Picture:
         out.rgb[of_class] = ((1 - _TINT) * out.rgb[of_class] + _TINT * np.array(colour)).astype(np.uint8)
     scale_bar(out)
     return out
+
+
+def trust_overlay(confidence: Path) -> tuple[bytes, list[list[float]]]:
+    """The classes of a confidence.tif as a PNG to be laid over a map.
+
+    Returns:
+        The PNG, at most _OVERLAY_PX on its longer side, transparent where nothing is drawn; and the longitude and
+        latitude of its corners in degrees: top left, top right, bottom right, bottom left.
+
+    Raises:
+        InputError: the file cannot be read.
+    """
+    import io
+
+    import rasterio
+    from PIL import Image
+
+    try:
+        with rasterio.open(confidence) as file:
+            step = max(1.0, max(file.shape) / _OVERLAY_PX)
+            size = tuple(max(1, round(side / step)) for side in file.shape)
+            good = file.read(1, out_shape=size, resampling=rasterio.enums.Resampling.nearest)
+            box, epsg = file.bounds, file.crs.to_epsg()
+    except rasterio.errors.RasterioError as error:
+        raise InputError(f"{confidence.name} cannot be read ({error}); export again") from None
+    out = np.zeros((*good.shape, 4), np.uint8)
+    for value, colour in zip((*GOOD_TO_M, ORIENTATION_ONLY), _COLOURS, strict=True):
+        out[np.abs(good - value) < 1e-3] = (*colour, 255 * _TINT)
+    data = io.BytesIO()
+    Image.fromarray(out, "RGBA").save(data, "PNG")
+    ring = [[box.left, box.top], [box.right, box.top], [box.right, box.bottom], [box.left, box.bottom]]
+    return data.getvalue(), [[float(lon), float(lat)] for lat, lon in LocalGrid(epsg).to_geographic(ring)]
 
 
 def _length(metres: float) -> str:

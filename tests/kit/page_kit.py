@@ -19,7 +19,7 @@ CHROMIUM = next(filter(None, map(shutil.which, BROWSERS)), None)
 FLAGS = ["--no-sandbox", "--disable-gpu", "--use-gl=swiftshader", "--enable-unsafe-swiftshader"]
 FLAGS += ["--disable-background-networking", "--disable-component-update", "--disable-sync", "--no-first-run"]
 DESK, TABLET, PHONE = (1440, 900), (1024, 768), (390, 844)
-LIMIT_MS = 15_000
+LIMIT_MS = 120_000
 
 # Stands in for the station's event stream: the test sends each message, and decides whether the heart beats.
 SOCKET = """

@@ -50,7 +50,7 @@ def test_gaps_are_listed_and_flown_only_after_a_confirmation(browser):
             page.click("#tab-map")
             words = page.locator(".coverage")
             page.wait_for_function("document.querySelector('.gaps button')?.textContent.includes('not triggered')")
-            assert "90.0 %" in words.inner_text() and "3 legs" in words.inner_text()
+            assert "90.0 %" in words.inner_text() and "3 lines" in words.inner_text()
             assert "2 pictures not arrived (the first: event 7)" in words.inner_text()
             page.locator(".gaps button").click()
             page.wait_for_function("Math.abs(orthoswarm.map.getCenter().lng - 8.5605) < 1e-3")

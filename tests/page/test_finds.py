@@ -103,7 +103,7 @@ def test_text_and_place_of_a_find_can_be_changed(browser):
             page.click(".find-edit >> text=Save")
             page.wait_for_selector(".finds li:has-text('Two persons') >> text=accuracy not known")
             page.wait_for_selector(".find-edit", state="detached")
-            page.wait_for_selector("[aria-label='Find: Two persons']")
+            page.wait_for_selector("[aria-label='Marker: Two persons']")
             changed, other = station.gets["/api/finds"]
             assert (changed["id"], changed["time"], other["note"]) == (1, FIND["time"], "Car")
             assert abs(changed["lon_deg"] - wanted[0]) < 1e-6 and abs(changed["lat_deg"] - wanted[1]) < 1e-6
@@ -141,7 +141,7 @@ def test_a_find_that_was_removed_can_be_put_back(browser):
         station.gets["/api/finds"], station.answer = [FIND], answer
         with opened(browser, station.url, TABLET) as page:
             page.click("#tab-map")
-            page.click("[aria-label='Remove this find']")
+            page.click("[aria-label='Remove this marker']")
             page.wait_for_selector(".finds li", state="detached")
             page.click("text=Put back")
             page.wait_for_selector(".finds li:has-text('Roof')")
@@ -175,7 +175,7 @@ def test_a_later_notice_is_seen_beside_those_that_wait_for_a_press(browser):
             page.click("#tab-map")
             page.wait_for_selector(".finds li >> nth=3")
             for k in range(4):
-                page.locator(f".finds li:has-text('Roof {k}') [aria-label='Remove this find']").click()
+                page.locator(f".finds li:has-text('Roof {k}') [aria-label='Remove this marker']").click()
                 page.wait_for_selector(f".notice:has-text('Roof {k}')")
             page.click("#tab-plan")
             page.click("text=Make plan")

@@ -132,6 +132,37 @@ def made_plan(number="plan-1"):
     return {"id": number, "covered_share": 1.0, "makespan_s": 312, "spacing_m": 20, "vehicles": [part]}
 
 
+SURVEY = {"polygon": [[47.397, 8.544], [47.397, 8.547], [47.399, 8.547]], "angle": 30, "type": "ComplexItem",
+          "TransectStyleComplexItem": {"CameraCalc": {
+              "DistanceToSurface": 55, "DistanceMode": 1, "FocalLength": 16, "SensorWidth": 23.5, "ImageWidth": 6000,
+              "ImageHeight": 4000, "SideOverlap": 65, "FrontalOverlap": 75, "CameraName": "A"}}}  # fmt: skip
+
+
+@pytest.mark.slow
+def test_a_survey_fills_the_fields_and_a_plan_is_had_for_a_drones_own_app(browser):
+    document = {"fileType": "Plan", "mission": {"items": [SURVEY]}}
+
+    def answer(method, path, body):
+        return (200, area_of(json.dumps(body).encode(), "s.plan")) if "/areas" in path else (201, made_plan())
+
+    with standing(vehicle(1)) as station, opened(browser, station.url) as page:
+        station.answer = answer
+        planning(page)
+        file = {"name": "s.plan", "mimeType": "text/plain", "buffer": json.dumps(document).encode()}
+        page.set_input_files("input[type=file]", files=[file])
+        page.wait_for_selector(".notice:has-text('lines at 30 degrees')")
+        shown = {key: page.input_value(f"[name={key}]") for key in ("altitude_m", "fov_min_deg")}
+        assert shown == {"altitude_m": "55", "fov_min_deg": "72.5"}
+        page.click("text=Overlap")
+        assert page.input_value("[name=side_overlap]") == "65" and page.input_value("[name=forward_overlap]") == "75"
+        page.click("text=Make plan")
+        page.wait_for_selector("text=Missions for a DJI drone")
+        page.select_option(".plan-result label.field select", "m3e")
+        page.evaluate("document.querySelector('.plan-result a').addEventListener('click', (e) => e.preventDefault())")
+        page.click(".plan-result button:text-is('Download')")
+        assert "/api/plans/plan-1/files/m3e" in page.get_attribute(".plan-result a", "href")
+
+
 @pytest.mark.slow
 def test_a_zone_that_is_drawn_after_the_plan_stops_its_upload_and_start(browser):
     older = "The plan is older than the drawing: make the plan again"
@@ -299,7 +330,7 @@ def test_without_a_height_model_the_page_says_how_to_get_one(browser):
         planning(page)
         draw(page, (600, 250), (900, 250), (900, 550))
         opened_groups(page)
-        page.wait_for_selector("text=Start it with --dem FILE")
+        page.wait_for_selector("text=To follow the ground, start it with one")
         assert not page.is_visible("[name=relief]")
         page.click("text=Make plan")
         page.wait_for_selector(".notice")

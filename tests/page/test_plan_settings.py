@@ -58,7 +58,7 @@ def test_a_plan_may_take_minutes(browser):
         page.click("text=Make plan")
         poll(page, lambda: held)
         page.clock.fast_forward("05:00")
-        page.wait_for_selector("button:text-is('Planning…')")
+        page.wait_for_selector("button:has-text('Planning…')")
         assert page.locator(".notice:has-text('No plan was made')").count() == 0
         held[0].fulfill(json=PLAN, status=201)
         is_right(page)

@@ -211,3 +211,60 @@ def test_what_the_station_says_is_in_the_units_of_the_person(browser, units):
         page.evaluate(f"""import('/static/core/settings.js').then((m) => m.setSetting("units", "{units}"))""")
         words = "100 m from v2 at 10 m/s (2.5 km)" if units == "metric" else "328 ft from v2 at 22 mph (1.55 mi)"
         page.wait_for_selector(f".tile .why:has-text('{words}')")
+
+
+def test_the_map_says_where_it_is_not_to_be_trusted_once_that_was_exported(browser):
+    w, south, e, north = BOUNDS
+    corners = [[w, north], [e, north], [e, south], [w, south]]
+    trust = {"version": 7, "headline": "Places lie within 20 cm.", "corners": corners}
+    with standing(vehicle(1)) as station, opened(browser, station.url) as page:
+        page.click("#tab-map")
+        page.wait_for_selector("text=Known once a vehicle is refined")
+        station.gets["/api/trust"] = trust
+        send(page, {"type": "job", "id": 9, "kind": "export", "state": "done", "progress": 1, "message": ""})
+        page.wait_for_selector("text=Places lie within 20 cm.")
+        page.wait_for_function("orthoswarm.map.getLayer('trust')")
+        assert not visible(page, "trust")
+        page.check("#panel-map [name=shown-trust]")
+        poll(page, lambda: visible(page, "trust"))
+
+
+def test_a_pilot_sees_attitude_climb_and_gimbal_and_what_a_picture_will_show(browser):
+    about = {"climb_m_s": -1.5, "roll_deg": 4, "pitch_deg": -7, "heading_deg": 90.0, "gimbal_pitch_deg": -30}
+    with standing(vehicle(1, **about)) as station:
+        keep_plans(station)
+        with opened(browser, station.url) as page:
+            page.click(".tile")
+            page.wait_for_selector(".details:has-text('roll 4°, pitch -7°, heading 90°')")
+            words = page.inner_text(".details")
+            assert "sinks 1.5 m/s" in words and "-30° (-90 is down)" in words
+            page.click("#tab-plan")
+            page.fill("[name=altitude_m]", "100")
+            page.fill("[name=fov_min_deg]", "90")
+            page.wait_for_selector("text=A picture shows 200.0 m across; with 4000 pixels, 5.0 cm a pixel.")
+
+
+@pytest.mark.parametrize(
+    ("typed", "lon", "lat"),
+    [
+        ("47.3977, 8.5456", 8.5456, 47.3977),
+        ("-33.8568 151.2153", 151.2153, -33.8568),
+        ("47°23'51.7\"N 8°32'44.2\"E", 8.545611, 47.397694),
+        ("S 33 51 24.5, E 151 12 55.1", None, None),  # no signs between degrees and minutes: it could mean anything
+        ("32T 465711 E 5249461 N", 8.5456, 47.3977),
+        ("32T MT 65711 49460", 8.5456, 47.3977),
+        ("56H LH 34900 52288", 151.2153, -33.8568),
+        ("nowhere", None, None),
+    ],
+)
+def test_a_place_is_found_by_its_coordinates(browser, typed, lon, lat):
+    with standing(vehicle(1)) as station, opened(browser, station.url) as page:
+        page.click("#tab-map")
+        page.fill("[name=go-to]", typed)
+        page.press("[name=go-to]", "Enter")
+        if lon is None:
+            page.wait_for_selector("text=These are no coordinates")
+        else:
+            page.wait_for_function("orthoswarm.map.getZoom() >= 18")
+            there = page.evaluate("orthoswarm.map.getCenter().toArray()")
+            assert there == pytest.approx([lon, lat], abs=2e-5), there

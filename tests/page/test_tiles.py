@@ -123,7 +123,7 @@ def test_silence_is_shown_with_its_age_and_a_banner(browser):
         assert "not heard for" in page.inner_text(".tile .why")
         page.wait_for_selector(".banner")
         assert "commands may not arrive" in page.inner_text(".banner")
-        assert page.inner_text(".link") == "No link"
+        assert page.inner_text(".link") == "Station lost"
         assert page.locator(".command[data-verb=rtl]").is_visible()
         page.evaluate("station.beats = true")
         page.wait_for_selector(".banner", state="hidden")

@@ -1,6 +1,8 @@
 """`orthoswarm plan --dem`: legs over hills, spaced for what pictures see there, and never lower than 20 m."""
 
+import io
 import json
+import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -11,6 +13,7 @@ import rasterio
 from rasterio.transform import from_origin
 
 from gcs_plugin.cli.main import main
+from gcs_plugin.mission.makers.maker_files import read_mission_file
 from gcs_plugin.mission.mission_files import FRAME_TERRAIN, NAV_WAYPOINT, parse_mission
 from gcs_plugin.mission.plan_folder import plan_needs
 from tests.kit.flown_area import CORNER, EPSG, FlownArea
@@ -196,12 +199,21 @@ def test_arducopter_gets_heights_above_the_ground_where_it_is_to_keep_them_itsel
     assert len(flown) <= 3 * legs + 4  # no points put in for their height alone
 
 
-def test_px4_has_no_heights_above_the_ground_and_gets_those_over_takeoff(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("autopilot", ["px4", "m300"])
+def test_others_have_no_heights_above_the_ground_and_get_those_over_takeoff(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], autopilot: str
 ) -> None:
     dem = _dem(tmp_path / "dem.tif", _hill(60.0))
-    given = ("--dem", dem, "--relief", "follow", "--terrain-items", "--autopilot", "px4")
+    given = ("--dem", dem, "--relief", "follow", "--terrain-items", "--autopilot", autopilot)
     out = _planned(tmp_path, capsys, 80, *given)
-    assert not out["over_ground"]["terrain_items"] and any("px4 has no items" in w for w in out["warnings"])
+    assert not out["over_ground"]["terrain_items"] and any(f"{autopilot} has no items" in w for w in out["warnings"])
     items = parse_mission((tmp_path / "p" / "v1.plan").read_text()).items
     assert FRAME_TERRAIN not in {i.frame for i in items}
+    if autopilot == "m300":
+        data = (tmp_path / "p" / "v1.kmz").read_bytes()
+        heights = [[i.alt_m for i in m if i.has_position] for m in (items, read_mission_file(data).items)]
+        assert heights[1] == pytest.approx(heights[0], abs=0.05) and np.ptp(heights[1]) > 30.0
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            text = archive.read("wpmz/waylines.wpml").decode()
+        assert f"<wpml:globalRTHHeight>{out['over_ground']['return_height_m']:.0f}<" in text
+        assert text.count("coordinateTurn") >= 3  # points for the height alone, passed without a stop

@@ -310,7 +310,7 @@ def test_a_height_above_the_legal_one_is_asked_about(folder, capsys):  # noqa: F
         path.write_text((folder / "v1.waypoints").read_text().replace("\t60.000\t", "\t400.000\t"))
         assert fleet(capsys, "upload", path, "--vehicle", 1, "--link", link)[0] == 0
         code, said = fleet(capsys, "start", "--vehicle", 1, "--link", link, "--json")
-        assert code == 1 and "above 120 m" in said["vehicles"][0]["text"]
+        assert code == 1 and "over 120 m" in said["vehicles"][0]["text"]
         assert fleet(capsys, "check", "--vehicle", 1, "--link", link)[0] == 1
         assert fleet(capsys, "check", "--vehicle", 1, "--max-height", 500, "--link", link)[0] == 0
         assert fleet(capsys, "start", "--vehicle", 1, "--max-height", 500, "--link", link)[0] == 0

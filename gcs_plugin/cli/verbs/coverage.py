@@ -59,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
         if value is not None and not 0.0 < value < 1000.0:
             raise InputError(f"{name} is {value:g}; give metres larger than 0")
     flown = read_map(args.map)
-    shapes, fences, _ = read_shapes(args.area)
+    shapes, fences, *_ = read_shapes(args.area)
     if not shapes.areas:
         raise InputError(f"{args.area} holds no polygon; draw the area that was to be mapped")
     area = make_area(shapes.areas, fences, LocalGrid(flown.epsg))

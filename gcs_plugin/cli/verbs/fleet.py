@@ -75,7 +75,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         verb = verbs.add_parser(name, help=text, description=about, epilog=example)
         _common(verb)
         if name == "upload":
-            missions_help = "folder of a plan, or .plan or .waypoints files"
+            missions_help = "folder of a plan, or mission files (.plan, .waypoints, of Pilot 2 or Litchi)"
             verb.add_argument("missions", nargs="+", type=Path, metavar="MISSION", help=missions_help)
             verb.add_argument("--sortie", type=int, default=1, metavar="N", help="which flight of a plan (default 1)")
         if name in ("start", "check"):

@@ -3,6 +3,7 @@
 import argparse
 import json
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -18,7 +19,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.epilog = (
         "AREA is a polygon (GeoJSON, KML, KMZ, or the survey of a QGroundControl .plan), or a line to follow\n"
-        "(GeoJSON, KML, .plan, .waypoints). Holes, and exclusion fences of a .plan, are no-fly zones.\n\n"
+        "(GeoJSON, KML, .plan, .waypoints, a mission of Pilot 2 or Litchi). Holes, and exclusion fences of a .plan,\n"
+        "are no-fly zones.\n\n"
         "example:\n  orthoswarm plan town.geojson --vehicles 8 --altitude 80 --fov-min 60 \\\n"
         "      --start 48.1371,11.5754 --out missions"
     )
@@ -33,15 +35,20 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     add("--fly-not-arrived", action="store_true", help="fly gaps, too, whose pictures were taken but have not arrived")
     add("--vehicles", type=int, required=True, metavar="N", help="how many vehicles")
-    altitude_help = "height of the lines above takeoff, with --dem above the ground"
-    add("--altitude", dest="altitude_m", type=float, required=True, metavar="M", help=altitude_help)
+    altitude_help = "height of the lines above takeoff, with --dem above the ground (default: that of a survey in AREA)"
+    add("--altitude", dest="altitude_m", type=float, metavar="M", help=altitude_help)
     add("--out", type=Path, required=True, metavar="DIR", help="folder for missions, report and picture")
     add("--method", choices=["columns", "bcd", "tmstc"], help="how to lay lines (default bcd)")
     heading_help = "of the lines: degrees from true north, along the wind, or along the area's longest side"
     add("--heading", metavar="DEG|wind|longest", help=heading_help)
     add("--cross", action="store_true", help="cover the area a second time by lines across the first")
-    autopilot_help = "for mission format and flight times; again for vehicles in turn (default ardupilot)"
-    add("--autopilot", dest="autopilots", action="append", choices=["ardupilot", "px4"], help=autopilot_help)
+    autopilot_help = (
+        "for mission format and flight times: ardupilot, px4, or a drone that DJI's Pilot 2 or Litchi flies (m300,\n"
+        "m300-p1, m350, m350-p1, m30, m30t, m3e, m3t, m4e, m4t, litchi); again for vehicles in turn (default ardupilot)"
+    )
+    add("--autopilot", dest="autopilots", action="append", metavar="NAME", help=autopilot_help)
+    dji_help = "missions for DJI's Pilot 2, too, one .kmz a vehicle and flight: --autopilot m300 in short"
+    add("--dji", dest="autopilots", action="append_const", const="m300", help=dji_help)
     add_config(parser)
     add("--json", action="store_true", help="one JSON document on stdout")
     add("--dem", type=Path, metavar="FILE", help="height model; --altitude is then above the ground (needs --start)")
@@ -94,29 +101,29 @@ def run(args: argparse.Namespace) -> int:
     from gcs_plugin.plans.plan_request import make_plan
 
     check_folder(args.out)
-    request = _request(args)
+    request, notes = _request(args)
     plan, area = make_plan(request, _say)
     _say("files")
-    figures = write_plan(args.out, plan, area, request)
+    figures = write_plan(args.out, plan, area, request, notes=notes)
     _say("")
     if args.json:
         print(json.dumps(figures))
     else:
-        _print(plan, args.out)
+        _print(plan, args.out, figures["warnings"])
         if not args.start:
             print("no --start was given: each vehicle is meant to take off where its first line begins")
     return 0
 
 
-def _request(args: argparse.Namespace) -> "PlanRequest":
-    """The plan request of the arguments."""
+def _request(args: argparse.Namespace) -> tuple["PlanRequest", list[str]]:
+    """The plan request of the arguments, and of a survey where these leave it open; and what of one was used."""
     from gcs_plugin.plans.plan_request import PlanRequest
     from orthoswarm.config import read_config
 
     if (args.area is None) == (args.gaps is None):
         raise InputError("give either an AREA or --gaps GAPS.geojson")
-    if (args.fov_min_deg is None) == (args.map is None):
-        raise InputError("give the smallest field of view with --fov-min, or with --map the map that it was solved in")
+    if args.fov_min_deg is not None and args.map is not None:
+        raise InputError("give the smallest field of view with --fov-min or the map that it was solved in, not both")
     values = given(args, PlanRequest) | {
         "area": args.area or args.gaps, "gaps": args.gaps is not None, "config": read_config(args.config),
         "starts": [_position(text) for text in args.start],
@@ -129,7 +136,29 @@ def _request(args: argparse.Namespace) -> "PlanRequest":
         values["gimbal_pitch_deg"] = None if args.gimbal_pitch == "none" else _degrees(args.gimbal_pitch, "none")
     if args.aspect is not None:
         values["aspect"] = _aspect(args.aspect)
-    return PlanRequest(**values)
+    surveyed, notes = _survey(values) if values["area"].suffix.lower() == ".plan" and not args.gaps else ({}, [])
+    values = surveyed | values
+    if "altitude_m" not in values:
+        raise InputError("give the height of the lines with --altitude, metres")
+    if "fov_min_deg" not in values:
+        raise InputError("give the smallest field of view with --fov-min, or with --map the map that it was solved in")
+    return PlanRequest(**values), notes
+
+
+def _survey(given_values: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
+    """What a survey in the area's file says that was not given, and a sentence of that and of what is left."""
+    from gcs_plugin.plans.area_files import read_shapes
+
+    shapes, _, _, survey = read_shapes(given_values["area"])
+    apart = {"heading", "cross"} if given_values.get("follow") or given_values.get("method") == "tmstc" else set()
+    apart |= {"aspect"} if "fov_min_deg" in given_values else set()  # that of another camera
+    if not shapes.areas or not (survey.values or survey.left):
+        return {}, []
+    used = [value for value in survey.values if value.field not in given_values and value.field not in apart]
+    left = [value.words for value in survey.values if value not in used] + list(survey.left)
+    said = [("taken", [value.words for value in used]), ("not taken", left)]
+    told = "; ".join(f"{how}: {', '.join(words)}" for how, words in said if words)
+    return {value.field: value.value for value in used}, [f"of the survey in {given_values['area'].name} {told}"]
 
 
 def _fov_of_map(folder: Path, heights_over_level_ground: bool) -> float:
@@ -175,7 +204,7 @@ def _say(stage: str) -> None:
         print(f"\r\033[K{stage}", end="", file=sys.stderr, flush=True)
 
 
-def _print(plan: "Plan", out: Path) -> None:
+def _print(plan: "Plan", out: Path, warnings: Sequence[str]) -> None:
     from rich.console import Console
     from rich.table import Table
 
@@ -194,7 +223,7 @@ def _print(plan: "Plan", out: Path) -> None:
     console.print(f"lines at most {plan.spacing_m:.1f} m apart, a picture every {plan.trigger_m:.1f} m")
     console.print(f"all done after {_clock(plan.makespan_s)} min; longest path {plan.balance:.2f} x mean")
     console.print(f"apart: {plan.separation}", soft_wrap=True)
-    for warning in plan.warnings:
+    for warning in warnings:
         console.print(f"warning: {warning}", style="yellow", soft_wrap=True)
 
 

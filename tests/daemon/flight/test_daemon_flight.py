@@ -113,6 +113,9 @@ def products_are_written(served, workspace):
     with rasterio.open(workspace / "confidence.tif") as file:
         assert file.res[0] < 3.0  # cells of what is drawn, not of all the layer's grid
         good = file.read(1, masked=True)
+    trust = served.get("/api/trust").json()
+    assert trust["version"] > 0 and trust["headline"] == report["headline"] and len(trust["corners"]) == 4
+    assert served.get("/api/trust.png").content.startswith(b"\x89PNG")
     known = report["trust"]["good_to_m"]["2"]
     assert known == pytest.approx((good <= 2.0).sum() / good.count(), abs=1e-3)
     assert report["headline"].startswith("Distances are good to about" if known >= 0.5 else "For orientation only")

@@ -7,7 +7,7 @@ import httpx
 import pytest
 from fastapi import FastAPI
 
-from gcs_plugin.web.answers import install_error_answers
+from gcs_plugin.web.answers import JsonAnswer, install_error_answers
 
 FULL = Path("/dev/full")
 
@@ -34,3 +34,9 @@ def test_a_disk_that_is_full_anywhere_is_told_in_words():
 
 def test_other_failures_of_the_system_are_not_taken_for_a_full_disk(tmp_path):
     assert answered(lambda: (tmp_path / "absent").read_text()).status_code == 500
+
+
+def test_a_number_that_is_none_is_null_and_no_failure():
+    answer = answered(lambda: JsonAnswer({"lat_deg": float("nan"), "sigma_m": [float("inf"), 1.5], "name": "\ud800"}))
+    assert answer.status_code == 200
+    assert answer.text == '{"lat_deg":null,"sigma_m":[null,1.5],"name":"\\ud800"}'

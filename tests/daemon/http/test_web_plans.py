@@ -1,13 +1,16 @@
 """Plans as the page asks for them: for the autopilots that are on the links."""
 
+import io
 import json
+import zipfile
 
 import pytest
 
 from gcs_plugin.daemon import web_plans
 from gcs_plugin.daemon.web_plans import Plans
 from gcs_plugin.links.mavlink import Autopilot
-from gcs_plugin.mission.items import MOUNT_CONTROL
+from gcs_plugin.mission.items import MOUNT_CONTROL, WAYPOINT
+from gcs_plugin.mission.makers.maker_files import read_mission_file
 from orthoswarm.model.errors import InputError
 from tests.daemon.on_links import OnLinks
 from tests.kit.plan_checks import on_globe
@@ -66,6 +69,33 @@ def test_a_request_leaves_the_gimbal_alone_and_gives_lines_a_direction(tmp_path)
     for wrong in ("up", 10**400, True, [30]):
         with pytest.raises(InputError, match="heading is no number, wind or longest"):
             plans.make(BODY | {"heading": wrong})
+
+
+@pytest.mark.parametrize("drone", ["m300", "litchi"])
+def test_a_plan_is_had_as_files_for_a_makers_app_with_its_takeoff_times(tmp_path, drone):
+    plans = Plans(tmp_path, None, OnLinks(places={"v1": SQUARE.shell[0], "v2": SQUARE.shell[0]}))
+    made = plans.make(BODY | {"autopilot": ["ardupilot", "px4"]})
+    with zipfile.ZipFile(io.BytesIO(plans.maker_files(made["id"], drone))) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    head, *rows = files.pop("takeoffs.csv").decode().splitlines()
+    assert head == "file,takeoff_s,time_s" and [row.split(",")[0] for row in rows] == list(files)
+    assert [float(row.split(",")[1]) for row in rows] == [v["flights"][0]["start_s"] for v in made["vehicles"]]
+    for vehicle, data in zip(("v1", "v2"), files.values(), strict=True):
+        flown = [(i.lat_deg, i.lon_deg) for i in read_mission_file(data).items if i.command == WAYPOINT]
+        sent = plans.mission({"plan": made["id"]}, vehicle, Autopilot.PX4).items
+        wanted = [(i.lat_deg, i.lon_deg) for i in sent if i.command == WAYPOINT]
+        assert flown[: len(wanted)] == [pytest.approx(place, abs=1e-7) for place in wanted]
+    for name, kind in (("plan-1", drone), (made["id"], "m5")):
+        with pytest.raises(InputError, match=r"no such plan|none of m300"):
+            plans.maker_files(name, kind)
+
+
+def test_a_request_may_name_drones_of_a_makers_app(tmp_path):
+    plans = Plans(tmp_path, None, OnLinks(kinds={}))
+    made = plans.make(BODY | {"autopilot": ["m4e", "ardupilot"]})
+    assert [v["autopilot"] for v in made["vehicles"]] == ["m4e", "ardupilot"]
+    assert (tmp_path / made["id"] / "v1.kmz").is_file() and not (tmp_path / made["id"] / "v2.kmz").exists()
+    assert any("by hand" in text for text in made["warnings"])
 
 
 STANDING = {"v1": SQUARE.shell[0], "v2": SQUARE.shell[1]}

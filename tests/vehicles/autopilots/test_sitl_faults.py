@@ -9,6 +9,7 @@ import struct
 import threading
 import time
 
+import numpy as np
 import pytest
 
 from gcs_plugin.fleet.fleet import Fleet
@@ -16,6 +17,7 @@ from gcs_plugin.fleet.flight_state import flight_state
 from gcs_plugin.fleet.preflight import Level
 from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.mission.exchange import Address
+from gcs_plugin.mission.geofence import FenceZone, zones_of
 from gcs_plugin.mission.items import RTL
 from gcs_plugin.mission.mission_files import FileItem
 from gcs_plugin.sim.lossy_radio import Faults
@@ -134,6 +136,30 @@ def test_a_mission_beyond_the_geofence_is_red_before_it_is_flown(site, parameter
         item = found()
         assert item.level is Level.RED and words in item.reason, item
         print(item.reason)
+
+
+def test_zones_are_put_into_the_geofence_and_read_back(site):
+    """Polygons and a circle, in place of what was held; PX4 and ArduPilot read back the same."""
+    home = site.vehicle.home
+
+    def away(north_m, east_m):
+        return home[1] + east_m / 111_320.0 / math.cos(math.radians(home[0])), home[0] + north_m / 111_320.0
+
+    square = FenceZone("exclusion", tuple(away(*corner) for corner in ((300, 300), (300, 400), (400, 400), (400, 300))))
+    round_ = FenceZone("exclusion", (away(-300.0, 0.0),), 25.0)
+    corners = ((-900, -900), (-900, 900), (900, 900), (900, -900))
+    inside = FenceZone("inclusion", tuple(away(*corner) for corner in corners))
+    for zones in ([square, round_, inside], [round_], []):
+        assert site.finish(site.fleet.upload_fence(site.system, zones)).ok
+        read = site.fleet.read_fence(site.system)
+        assert site.place.until(lambda read=read: read.outcome is not None, 30.0)
+        found = zones_of(read.items)
+        print(site.vehicle.autopilot.value, [zone.document() for zone in found])
+        assert [(zone.kind, len(zone.points), zone.radius_m) for zone in found] == [
+            (zone.kind, len(zone.points), zone.radius_m) for zone in zones
+        ]
+        for one, other in zip(found, zones, strict=True):
+            assert np.allclose(one.points, other.points, atol=2e-7)
 
 
 def test_a_battery_failsafe_ends_the_mission_without_completing_it(site, parameters):

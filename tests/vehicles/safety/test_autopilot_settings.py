@@ -157,7 +157,9 @@ def test_a_vehicle_that_does_nothing_at_a_low_battery_is_warned_about(make_world
     world.wait(1.0)
     vehicle = world.fleet.vehicles[1]
     name = "BATT_FS_LOW_ACT" if autopilot is AP else "COM_LOW_BAT_ACT"
-    found = items_of(world, Wanted())["failsafe"]  # the simulated one has no such parameter
+    assert items_of(world, Wanted())["failsafe"].level is Level.OK
+    del vehicle.settings[Setting.LOW_BATTERY]  # one that does not answer
+    found = items_of(world, Wanted())["failsafe"]
     assert (
         found.level is Level.WARNING
         and "has not said" in found.reason

@@ -8,6 +8,7 @@ export const state = {
   layers: [], // rows of /api/layers
   legs: [], // GeoJSON features
   routes: [], // what vehicles hold, as core/values.js cleans it
+  trust: null, // /api/trust
   coverage: null, // /api/coverage
   completions: [],
   outlines: new Map(), // vehicle -> ring of the last picture

@@ -43,7 +43,7 @@ export function numberOf(text) {
   return /^[-+]?(\d+([.,]\d*)?|[.,]\d+)$/.test(words) && !AMBIGUOUS.test(words) ? Number(words.replace(",", ".")) : NaN;
 }
 
-// A number as numberOf reads it, for an input field; other texts as they are.
+// A number with the decimals that it has, as numberOf reads it; other texts as they are.
 export const typed = (value) => (String(Number(value)) === String(value) ? String(value).replace(".", DECIMAL) : value);
 
 // Input fields hold what the person reads; these turn it into metres and back.

@@ -9,14 +9,15 @@ import { t } from "/static/core/strings.js";
 import * as units from "/static/core/units.js";
 import { inAir, need } from "/static/fly/need.js";
 import { askOne } from "/static/fly/command_bar.js";
+import { latestPicture } from "/static/fly/latest_picture.js";
 import { wordOf } from "/static/fly/tiles.js";
 import { lengthOf } from "/static/map/geodesy.js";
 import { map } from "/static/map/map.js";
 import { refine } from "/static/work/jobs.js";
 
 // What only a vehicle on a link can say.
-const OF_A_LINK = ["speed", "battery", "gps", "home", "fence", "mission"];
-const FACTS = ["state", "position", "height", "speed", "battery", "gps", "link", "faults", "home", "fence", "mission", "pictures", "refined"];
+const OF_A_LINK = ["speed", "attitude", "gimbal", "battery", "gps", "home", "fence", "mission"];
+const FACTS = ["state", "position", "height", "speed", "attitude", "gimbal", "battery", "gps", "link", "faults", "home", "fence", "mission", "pictures", "refined"];
 
 const WARNING = 4; // MAV_SEVERITY: graver ones are lower
 
@@ -42,7 +43,7 @@ export function detailsPanel() {
     make("div", { class: "row" }, name, button("×", () => select(null), { class: "close", "aria-label": t("details.close") })),
     why, linked, make("div", { class: "verbs" }, button(t("details.show"), () => chosen()?.position && map.flyTo({ center: chosen().position, zoom: Math.max(16, map.getZoom()), duration: 0 })),
       button(t("details.refine"), () => chosen() && refine(chosen().id))),
-    facts, heading, silent, messages);
+    latestPicture(), facts, heading, silent, messages);
   // In Plan and Map it covers the map only if it was opened there.
   let shownFor = null;
   let openedIn = "fly";
@@ -63,7 +64,9 @@ export function detailsPanel() {
     const values = {
       state: row.linked ? [wordOf(row), row.mode, row.armed ? t("details.armed") : t("details.disarmed")].filter(Boolean).join(", ") : wordOf(row),
       position: row.position ? positionText(row.position[1], row.position[0], settings.coordinates) : "–",
-      height: units.height(row.height_m), speed: units.speed(row.speed_m_s),
+      height: units.height(row.height_m), speed: `${units.speed(row.speed_m_s)}${row.climb_m_s ? `, ${t(row.climb_m_s > 0 ? "details.climbs" : "details.sinks", { speed: units.speed(Math.abs(row.climb_m_s)) })}` : ""}`,
+      attitude: row.roll_deg == null || row.pitch_deg == null ? "–" : t("details.attitude.is", { roll: row.roll_deg, pitch: row.pitch_deg, heading: Math.round(row.heading_deg ?? 0) }),
+      gimbal: row.gimbal_deg == null ? t("details.gimbal.none") : t(row.gimbal_deg < -80 ? "details.gimbal.down" : "details.gimbal.is", { pitch: row.gimbal_deg }),
       battery: `${units.percent(row.battery)}${row.battery_left_s == null ? "" : `, ${t("details.left", { time: units.clock(row.battery_left_s) })}`}`,
       gps: row.satellites == null ? "–" : t("details.satellites", { n: row.satellites }),
       link: row.linked ? `${row.link || "–"}, ${t("tile.heard", { age: units.ageText(Math.floor(wanted.age_s * 2) / 2) })}` : t("details.unlinked"),

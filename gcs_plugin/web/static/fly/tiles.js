@@ -104,7 +104,7 @@ function order() {
   });
 }
 
-subscribe("vehicles selected tick alarm-list", "vehicle tiles", () => {
+subscribe("vehicles selected tick", "vehicle tiles", () => {
   const now = nowMs();
   const before = tiles.size;
   for (const [id, tile] of tiles) if (!state.vehicles.has(id)) { tile.item.remove(); tiles.delete(id); }

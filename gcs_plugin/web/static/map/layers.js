@@ -17,6 +17,7 @@ const versions = new Map();
 const stale = new Set();
 const rows = new Map();
 let fitted = "";
+let contrast = 0;
 
 function setOpacity(name, share) {
   shares.set(name, share);
@@ -41,7 +42,14 @@ function showRaster(name) {
   if (map.getSource(name)) return;
   map.addSource(name, rasterSource(name));
   addInOrder(rasterLayer(name));
+  if (contrast && FLOWN.includes(name)) setContrast(contrast);
   if (shares.has(name)) setOpacity(name, shares.get(name));
+}
+
+// For eyes in the sun, and for haze: of what was flown.
+function setContrast(share) {
+  contrast = share;
+  for (const name of FLOWN) if (map.getLayer(name)) map.setPaintProperty(name, "raster-contrast", share);
 }
 
 export function layerPanel() {
@@ -55,7 +63,8 @@ export function layerPanel() {
     rows.set(name, { row, about });
     return row;
   };
-  return make("section", {}, make("h2", {}, t("layers.title")), ...[...RASTERS].reverse().map(line));
+  return make("section", {}, make("h2", {}, t("layers.title")), ...[...RASTERS].reverse().map(line),
+    make("label", { class: "layer" }, make("span", {}, t("layers.contrast")), make("input", { type: "range", min: -50, max: 80, value: 0, name: "contrast", oninput: (event) => setContrast(event.target.value / 100) })));
 }
 
 subscribe("layers ready", "layers", () => {

@@ -51,7 +51,7 @@ const OVERLAYS = [
 ];
 export const RASTERS = ["basemap", "realtime", "coarse", "fine"];
 // From the ground up, in whatever order they come.
-const ORDER = ["ground", ...RASTERS, "coverage", ...OVERLAYS.map(([id]) => id)];
+const ORDER = ["ground", ...RASTERS, "trust", "coverage", ...OVERLAYS.map(([id]) => id)];
 export function addInOrder(layer) {
   map.addLayer(layer, ORDER.slice(ORDER.indexOf(layer.id) + 1).find((id) => map.getLayer(id)));
   changed("overlays");
@@ -135,9 +135,10 @@ let moved = false;
 map.on("movestart", (event) => { moved ||= Boolean(event.originalEvent); });
 export const isMoved = () => moved;
 
+const PADDING = { top: 40, bottom: 84, left: 40, right: 56 }; // what lies over the map's edges
 export function fit([west, south, east, north]) {
   if (![west, south, east, north].every(Number.isFinite)) return;
-  map.fitBounds([[west, south], [east, north]], { padding: 40, duration: 0, maxZoom: 19 });
+  map.fitBounds([[west, south], [east, north]], { padding: PADDING, duration: 0, maxZoom: 19 });
 }
 
 export function inView([west, south, east, north]) {

@@ -51,11 +51,11 @@ function untangle(now) {
     setAttribute(markers.get(row.id).getElement(), "data-crowded", !free);
   }
 }
-map.on("moveend", guarded("names on the map", () => untangle(nowMs())));
+map.on("moveend", () => untangle(nowMs()));
+subscribe("selected tick", "names on the map", () => untangle(nowMs()));
 
 subscribe("vehicles selected tick", "vehicles on the map", () => {
   const now = nowMs();
   for (const [id, marker] of markers) if (!state.vehicles.has(id)) { marker.remove(); markers.delete(id); }
   for (const row of state.vehicles.values()) guarded(`${row.id} on the map`, place)(row, now);
-  untangle(now);
 });

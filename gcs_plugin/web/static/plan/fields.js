@@ -15,6 +15,16 @@ const SHARES = new Set(["side_overlap", "forward_overlap"]);
 const CHOICES = { end: ["rtl", "land", "hover"], relief: ["auto", "follow", "level"] };
 const LENSES = [["", ""], ["84", "wide"], ["70", "usual"], ["46", "narrow"], ["25", "tele"]];
 const inputs = {};
+const shows = make("p", { class: "quiet" });
+const PIXELS = 4000; // of most drone cameras' width, to the nearest thousand
+
+// What a picture shows of level ground with these values.
+export function showFootprint() {
+  const [metres, fov] = [units.toMetres(units.numberOf(inputs.altitude_m.value)), units.numberOf(inputs.fov_min_deg.value)];
+  const width = 2 * metres * Math.tan((fov * Math.PI) / 360);
+  setText(shows, width > 0 && fov < 170 ? t("plan.shows", { width: units.distance(width), gsd: units.fixed((100 * width) / PIXELS, 1) }) : "");
+}
+
 let terrain = null; // the section that needs a height model
 let noTerrain = null;
 let hasDem = false;
@@ -43,11 +53,11 @@ const group = (key, ...parts) => make("details", {}, make("summary", {}, t(`plan
 export function planFields(onChange) {
   changed = onChange;
   const vehicles = number("vehicles"), altitude = number("altitude_m"), fov = number("fov_min_deg");
-  const lens = choice(LENSES.map(([value, key]) => [value, t(`plan.lens.${key || "none"}`)]), "", (value) => { if (value) { inputs.fov_min_deg.value = value; changed(); } });
+  const lens = choice(LENSES.map(([value, key]) => [value, t(`plan.lens.${key || "none"}`)]), "", (value) => { if (value) { inputs.fov_min_deg.value = value; showFootprint(); changed(); } });
   inputs.terrain_items = make("input", { type: "checkbox", name: "terrain_items", onchange: () => changed() });
   terrain = make("div", { hidden: true }, chosen("relief"), number("height_tolerance_m"), make("label", { class: "check" }, inputs.terrain_items, make("span", {}, t("plan.terrain_items"))), make("p", { class: "quiet" }, t("plan.terrain.about")));
   noTerrain = make("p", { class: "quiet" }, t("plan.terrain.none"));
-  return [vehicles, altitude, fov, labelled(t("plan.lens"), lens), chosen("end"),
+  return [vehicles, altitude, fov, labelled(t("plan.lens"), lens), shows, chosen("end"),
     group("flight", number("speed_m_s"), number("endurance_min"), number("wait_min"), make("p", { class: "quiet" }, t("plan.wait.about"))),
     group("wind", number("wind_m_s"), number("wind_from_deg"), make("p", { class: "quiet" }, t("plan.wind.about"))),
     group("terrain", noTerrain, terrain),

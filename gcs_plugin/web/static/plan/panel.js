@@ -11,7 +11,7 @@ import { ring } from "/static/core/values.js";
 import { inAir, onLink } from "/static/fly/need.js";
 import * as area from "/static/plan/area.js";
 import * as editor from "/static/plan/editor.js";
-import { fillFields, followsTerrain, inFieldNames, planFields, planValues, rawValues, relabelFields, setDem } from "/static/plan/fields.js";
+import { fillFields, followsTerrain, inFieldNames, planFields, planValues, rawValues, relabelFields, setDem, showFootprint } from "/static/plan/fields.js";
 import { acceptDrops, KINDS, readArea } from "/static/plan/import.js";
 import { madeNow, nowMade, setMade } from "/static/plan/outdated.js";
 import { hidePlan, lookAtPlan, planResult, redraw, showPlan } from "/static/plan/result.js";
@@ -49,6 +49,7 @@ export async function loadPlan(merged = null) {
     else hidePlan();
   }
   redraw();
+  showFootprint();
   if (unsaved) save();
 }
 
@@ -68,13 +69,14 @@ export function planPanel() {
   let turn = 0;
   let givenUp = () => {};
   const stop = button(t("plan.stop"), () => givenUp(), { hidden: true });
-  const form = make("form", { novalidate: true, onsubmit: submit, oninput: redraw, onchange: redraw }, ...planFields(save), go, stop);
+  const form = make("form", { novalidate: true, onsubmit: submit, oninput: () => { redraw(); showFootprint(); }, onchange: () => { redraw(); showFootprint(); } }, ...planFields(save), go, stop);
   async function read(dropped) {
     try {
-      const { rings, unused } = await readArea(dropped);
+      const { rings, unused, fields } = await readArea(dropped);
       const given = new Set(rings.map((points) => JSON.stringify(points)));
       const kept = area.area.rings.slice(1).filter((points) => points.length > 2 && !given.has(JSON.stringify(points)));
       editor.stopDrawing();
+      fillFields(fields); // saved with the area
       area.change((old) => old.splice(0, old.length, ...rings, ...kept)); // a zone goes only if somebody deletes it
       fit(boundsOf(rings[0]));
       if (kept.length) notice("warn", t("import.kept", { n: kept.length }));
@@ -138,7 +140,7 @@ export function planPanel() {
   };
   area.onArea(refresh);
   editor.onDrawing(() => refresh("drawing"));
-  onSettings((name) => { if (name === "units") { refresh("units"); relabelFields(); } });
+  onSettings((name) => { if (name === "units") { refresh("units"); relabelFields(); showFootprint(); } });
   document.addEventListener("keydown", (event) => {
     if (settings.mode !== "plan" || !(event.ctrlKey || event.metaKey) || /INPUT|TEXTAREA|SELECT/.test(event.target.tagName)) return;
     if (event.key.toLowerCase() === "z") { event.preventDefault(); event.shiftKey ? area.redo() : area.undo(); }
@@ -146,6 +148,7 @@ export function planPanel() {
   });
   acceptDrops(document.body, read);
   refresh("made");
+  showFootprint();
   return make("div", {}, make("section", {}, make("h2", {}, t("area.title")), hint, make("div", { class: "row wrap" }, drawing, open, hole, undo, redo, clear), zones, file, make("p", { class: "quiet" }, t("area.files")), make("p", { class: "quiet" }, t("area.help"))),
     make("section", {}, make("h2", {}, t("plan.title")), form), planResult());
 }

@@ -1,7 +1,7 @@
 // The plan that was made: its figures, which vehicle flies what, upload, and the way to the preflight check.
 
-import { get } from "/static/core/api.js";
-import { button, choice, keyedList, make, setHidden, setText } from "/static/core/dom.js";
+import { get, withToken } from "/static/core/api.js";
+import { button, choice, keyedList, labelled, make, setHidden, setText } from "/static/core/dom.js";
 import { notice } from "/static/core/notices.js";
 import { onSettings, settings } from "/static/core/settings.js";
 import { state, subscribe } from "/static/core/store.js";
@@ -36,8 +36,17 @@ onSettings((name) => { if (name === "mode") redraw(); });
 export function planResult() {
   const upload = button(t("plan.upload"), uploadAll);
   const start = button(t("plan.start"), () => assigned() && openPreflight(plan, names, problemSince(plan, names)), { class: "primary" });
-  box.append(make("h2", {}, t("plan.result")), summary, warnings, list, unfenced, wrong, make("div", { class: "row wrap" }, upload, fences, start));
+  box.append(make("h2", {}, t("plan.result")), summary, warnings, list, unfenced, wrong, make("div", { class: "row wrap" }, upload, fences, start), drones());
   return box;
+}
+
+// The plan's flights for a drone that its maker's app flies.
+const DRONES = { m300: "M300, H20", "m300-p1": "M300, P1", m350: "M350, H20", "m350-p1": "M350, P1", m30: "M30", m30t: "M30T", m3e: "Mavic 3E", m3t: "Mavic 3T", m4e: "M4E", m4t: "M4T", litchi: "Litchi" };
+function drones() {
+  const drone = choice(Object.entries(DRONES), "m300", () => {});
+  const link = make("a", { download: "", hidden: true });
+  const load = button(t("plan.drone.load"), () => { link.href = withToken(`/api/plans/${plan.id}/files/${drone.value}`); link.click(); });
+  return make("div", {}, labelled(t("plan.drone"), drone), load, link);
 }
 
 const draw = keyedList(list, (row) => make("li", {}, make("i", { class: "swatch", "aria-hidden": "true" }), make("b", {}), make("span", {}), make("span", { class: "pick" })), (item, row) => {

@@ -55,7 +55,7 @@ function merge(mine, theirs, before) {
     lost ||= !same(a?.[key], c?.[key]) && !same(a?.[key], b?.[key]);
     return b?.[key];
   };
-  const each = (sides) => Object.fromEntries([...new Set(sides.flatMap(Object.keys))].map((name) => [name, pick(name, sides)]).filter(([, value]) => value !== undefined));
+  const each = (sides) => Object.fromEntries([...new Set(sides.flatMap(Object.keys))].map((name) => [name, pick(name, sides)]).filter(([, value]) => value != null));
   const sides = [mine, theirs, before];
   const of = (key) => sides.map((side) => object(side?.[key]));
   const plan = pick("plan", sides) ?? null;
