@@ -98,7 +98,7 @@ def test_one_operator_notices_nothing_of_it(browser):
             page.wait_for_timeout(300)
             assert not page.locator(".corner .holds").is_visible() and page.evaluate(LOCKED) == 0
             page.click("button[aria-label=People]")
-            assert re.search("operator, operator: rtl v1: done", page.inner_text(".log li"))
+            assert re.search("operator, operator: return v1: done", page.inner_text(".log li"))
             assert not page.locator(".people-dialog .holds").is_visible()
             assert "--lan" in page.inner_text(".people-dialog")
 
@@ -195,7 +195,7 @@ def test_three_people_on_one_station(browser, tmp_path):
 
         operator.click("button[aria-label=People]")
         operator.wait_for_selector(".log li:has-text('Paul, pilot: take v1: asked')")
-        operator.wait_for_selector(".log li:has-text('operator, operator: give v1: done')")
+        operator.wait_for_selector(".log li:has-text('operator, operator: hand over v1: done')")
         operator.click(".people li:has-text('Paul') >> text=Take back")
         pilot.wait_for_selector(".role-banner, .banner:not([hidden])")
         assert pilot.evaluate(status) == 401

@@ -11,7 +11,8 @@ from starlette.routing import Route, WebSocketRoute
 from gcs_plugin.daemon.daemon import Daemon
 from gcs_plugin.daemon.settings import Settings
 from gcs_plugin.daemon.store.people_rows import Role
-from gcs_plugin.web.app import make_app
+from gcs_plugin.fleet.commands import VERBS
+from gcs_plugin.web.app import STATIC, make_app
 from gcs_plugin.web.guard import Access
 from gcs_plugin.web.roles import LOCAL_PROGRAMS, NEEDS, need_of, route_of
 
@@ -229,3 +230,9 @@ def test_what_was_done_is_noted_with_name_role_and_outcome(daemon, ask):
     assert "lat_deg" in rows[2]["reason"] and {row["role"] for row in rows} == {"analyst"}
     lines = daemon.people.table().splitlines()
     assert lines[0].startswith("time,name,role") and "'=Anna,analyst,remove find" in lines[-1]
+
+
+def test_every_word_of_the_log_is_in_the_catalogue():
+    words = (STATIC / "people" / "words.js").read_text(encoding="utf-8")
+    noted = {need.action for need in NEEDS.values() if need.action} | {*VERBS, "upload", "fence", "return", "take"}
+    assert {action for action in noted if words.count(f'"log.act.{action}"') != 2} == set()

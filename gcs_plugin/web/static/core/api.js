@@ -1,5 +1,7 @@
 // The daemon's HTTP: token, requests, and failures that say what to do.
 
+import { t } from "/static/core/strings.js";
+
 const KEY = "orthoswarm-token";
 const fragment = new URLSearchParams(location.hash.slice(1));
 const [given, invitation] = ["token", "invitation"].map((name) => fragment.get(name));
@@ -34,12 +36,12 @@ export async function request(method, path, body, limit_ms = 30_000) {
     let answer = null;
     try { answer = text ? JSON.parse(text) : null; } catch { /* no JSON: the status says enough */ }
     if (response.ok) return answer;
-    const detail = typeof answer?.detail === "string" ? answer.detail : `the daemon answered ${response.status}`;
+    const detail = typeof answer?.detail === "string" ? answer.detail : t("api.status", { status: response.status });
     throw new ApiError(detail, "http", response.status);
   } catch (error) {
     if (error instanceof ApiError) throw error;
-    if (error?.name === "AbortError") throw new ApiError("the daemon did not answer in time", "time");
-    throw new ApiError("the daemon cannot be reached", "network");
+    if (error?.name === "AbortError") throw new ApiError(t("api.late"), "time");
+    throw new ApiError(t("api.unreachable"), "network");
   } finally {
     clearTimeout(timer);
   }
@@ -50,7 +52,7 @@ export const post = (path, body = {}, limit_ms = 60_000) => request("POST", path
 // A picture of the daemon for an <img>, without the token in its address.
 export async function picture(path) {
   const response = await fetch(path, { headers: headers() });
-  if (!response.ok) throw new ApiError(`the daemon answered ${response.status}`, "http", response.status);
+  if (!response.ok) throw new ApiError(t("api.status", { status: response.status }), "http", response.status);
   return URL.createObjectURL(await response.blob());
 }
 export const withToken = (path) => (token() ? `${path}?token=${encodeURIComponent(token())}` : path);

@@ -5,6 +5,9 @@ import { peopleWords } from "/static/people/words.js";
 
 export const english = {
   ...coverageWords, ...peopleWords,
+  "number.decimal": ".", "number.groups": ",",
+  "api.status": "the ground station answered {status}", "api.late": "the ground station did not answer in time", "api.unreachable": "the ground station cannot be reached",
+  "confirm.hold": "(hold 1 s)", "map.title": "Map", "map.zoomin": "Zoom in", "map.zoomout": "Zoom out", "map.marker": "Map marker", "map.popup.close": "Close",
   "app.title": "OrthoSwarm", "app.nomap": "The map cannot be shown ({why}); commands to vehicles work. Use a browser with WebGL.",
   "app.token": "The token is missing or wrong: open Settings and enter the one that `orthoswarm serve --show-token` prints.",
   "mode.title": "Mode", "mode.plan": "Plan", "mode.fly": "Fly", "mode.map": "Map", "panel.title": "Panel", "panel.fold": "Hide the panel", "panel.open": "Show the panel", "panel.taller": "Taller panel", "panel.lower": "Lower panel",
@@ -102,5 +105,6 @@ export const english = {
   "export.go": "Export", "export.choose": "Choose at least one.", "export.begun": "Export has begun; files appear here.", "export.refused": "Not exported: {why}", "export.older": "older than the map, export again",
   "settings.title": "Settings", "settings.close": "Close", "settings.theme": "Theme", "settings.theme.dark": "Dark", "settings.theme.sunlight": "Sunlight", "settings.units": "Units", "settings.units.metric": "Metric", "settings.units.us": "US",
   "settings.coordinates": "Coordinates", "settings.coordinates.decimal": "Decimal degrees", "settings.coordinates.dms": "Degrees, minutes, seconds", "settings.coordinates.utm": "UTM", "settings.coordinates.mgrs": "MGRS / USNG",
+  "settings.language": "Language", "settings.language.auto": "Automatic", "settings.language.en": "English", "settings.language.de": "Deutsch", "settings.language.hint": "What the ground station itself says (states, reasons, warnings) stays English.",
   "settings.sound": "Sound of alarms", "settings.speak": "Speak alarms", "settings.token": "Token", "settings.token.hint": "Commands need it. The ground station prints it when it is started.",
 };

@@ -1,7 +1,7 @@
 // What this person prefers, kept in this browser.
 
 const KEY = "orthoswarm-settings";
-const DEFAULTS = { theme: "dark", units: "metric", coordinates: "decimal", sound: true, speak: false, mode: "fly", sort: "name", folded: false, tall: false };
+const DEFAULTS = { theme: "dark", language: "auto", units: "metric", coordinates: "decimal", sound: true, speak: false, mode: "fly", sort: "name", folded: false, tall: false };
 
 function load() {
   try {

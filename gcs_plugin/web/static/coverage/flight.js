@@ -52,8 +52,8 @@ export async function openGapFlight() {
     const vehicles = await get("/api/coverage/vehicles");
     rows = vehicles.map((row) => {
       const on = make("input", { type: "checkbox", checked: !row.busy, disabled: Boolean(row.busy) && !row.in_air, onchange: () => setPlan(null) });
-      const minutes = numberField({ value: row.minutes ?? "", "aria-label": t("gapflight.minutes", { name: nameOf(row.id) }), oninput: () => setPlan(null) });
-      const left = t(row.minutes == null ? "gapflight.ask" : "gapflight.left", { battery: row.battery == null ? "?" : `${Math.round(100 * row.battery)} %` });
+      const minutes = numberField({ value: units.typed(row.minutes ?? ""), "aria-label": t("gapflight.minutes", { name: nameOf(row.id) }), oninput: () => setPlan(null) });
+      const left = t(row.minutes == null ? "gapflight.ask" : "gapflight.left", { battery: row.battery == null ? "?" : units.percent(row.battery) });
       const words = row.in_air ? `${t("gapflight.inair")} ${left}` : row.busy || left;
       list.append(make("li", {}, make("label", { class: "check" }, on, make("b", {}, nameOf(row.id))), make("small", {}, words), on.disabled ? null : minutes));
       return { id: row.id, on, minutes, inAir: Boolean(row.in_air) };

@@ -12,7 +12,7 @@ import { shownSwitch } from "/static/map/shown.js";
 
 const MOST = 30;
 const STATES = ["seen", "poor", "missed", "planned"];
-const percent = (share) => `${(100 * (share ?? 0)).toFixed(share > 0.999 && share < 1 ? 2 : 1)} %`;
+const percent = (share) => units.percent(share ?? 0, share > 0.999 && share < 1 ? 2 : 1);
 const nameOf = (id) => state.vehicles.get(id)?.name ?? id;
 
 function zoom(gap) {

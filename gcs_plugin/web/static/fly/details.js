@@ -98,5 +98,5 @@ function fenceText(fence) {
 
 function refinedText(vehicle) {
   const last = state.completions.filter((row) => row.vehicle === vehicle && row.refine_ended_s).pop();
-  return last ? t("details.refined_s", { s: (last.refine_ended_s - last.complete_s).toFixed(1) }) : "–";
+  return last ? t("details.refined_s", { s: units.fixed(last.refine_ended_s - last.complete_s, 1) }) : "–";
 }

@@ -22,7 +22,7 @@ window.addEventListener("blur", () => down.clear());
 
 // A button of the question: one press of a mouse or a key, or a hold of a finger, carries out what it offers.
 function choice(css, settled, carryOut) {
-  const element = make("button", { type: "button", class: css, "aria-describedby": "confirm-question" }, make("span", {}), make("i", { "aria-hidden": "true" }));
+  const element = make("button", { type: "button", class: css, "aria-describedby": "confirm-question" }, make("span", { dataset: { hold: ` ${t("confirm.hold")}` } }), make("i", { "aria-hidden": "true" }));
   const fingers = new Set(); // pointers on the button
   let work = null;
   let touch = false;

@@ -4,6 +4,7 @@ import * as maplibregl from "/static/vendor/maplibre-gl.mjs";
 import { tileRequest } from "/static/core/api.js";
 import { onSettings, settings } from "/static/core/settings.js";
 import { changed } from "/static/core/store.js";
+import { t } from "/static/core/strings.js";
 import { FREE_LEG, LEGS } from "/static/map/colours.js";
 
 maplibregl.setWorkerUrl(import.meta.resolve("/static/vendor/maplibre-gl-worker.mjs"));
@@ -63,6 +64,7 @@ export const mapOptions = (container) => ({
   container, center: [0, 20], zoom: 1.5, maxZoom: 23, attributionControl: false, dragRotate: false, pitchWithRotate: false,
   style: { version: 8, sources: {}, layers: [{ id: "ground", type: "background", paint: { "background-color": ground() } }] },
   transformRequest: tileRequest, fadeDuration: 0, trackResize: true,
+  locale: { "Map.Title": t("map.title"), "Marker.Title": t("map.marker"), "NavigationControl.ZoomIn": t("map.zoomin"), "NavigationControl.ZoomOut": t("map.zoomout"), "Popup.Close": t("map.popup.close") },
 });
 
 export const map = new maplibregl.Map(mapOptions("map"));

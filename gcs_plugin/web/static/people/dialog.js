@@ -60,7 +60,7 @@ export function peopleDialog() {
   const dialog = dialogBox({ class: "people-dialog", "aria-labelledby": "people-title" }, make("h2", { id: "people-title" }, t("people.title")), you, holdList(), invited.box, alone,
     make("section", {}, make("h3", {}, t("log.title")), nothing, log), make("div", { class: "row wrap" }, button(t("people.close"), () => dialog.close(), { class: "primary" })));
   const draw = keyedList(log, () => make("li", {}), (item, row) => {
-    const first = t("log.row", { ...row, time: timeOfDay(Date.parse(row.time), { seconds: true }), role: t(`role.${row.role}`) }).trim();
+    const first = t("log.row", { ...row, action: t(`log.act.${row.action}`), time: timeOfDay(Date.parse(row.time), { seconds: true }), role: t(`role.${row.role}`) }).trim();
     setText(item, [`${first}: ${t(`log.outcome.${row.outcome}`)}`, row.count > 1 && t("log.count", row), row.reason].filter(Boolean).join(" "));
     setAttribute(item, "data-outcome", row.outcome);
   });

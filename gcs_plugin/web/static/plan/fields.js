@@ -22,7 +22,7 @@ const PIXELS = 4000; // of most drone cameras' width, to the nearest thousand
 export function showFootprint() {
   const [metres, fov] = [units.toMetres(units.numberOf(inputs.altitude_m.value)), units.numberOf(inputs.fov_min_deg.value)];
   const width = 2 * metres * Math.tan((fov * Math.PI) / 360);
-  setText(shows, width > 0 && fov < 170 ? t("plan.shows", { width: units.distance(width), gsd: ((100 * width) / PIXELS).toFixed(1) }) : "");
+  setText(shows, width > 0 && fov < 170 ? t("plan.shows", { width: units.distance(width), gsd: units.fixed((100 * width) / PIXELS, 1) }) : "");
 }
 
 let terrain = null; // the section that needs a height model
@@ -109,6 +109,9 @@ function raw(key, input) {
 }
 export const rawValues = () => Object.fromEntries(Object.entries(inputs).map(([key, input]) => [key, raw(key, input)]));
 
+// Metres as a field shows them.
+const inTenths = (metres) => units.typed(Number(units.fromMetres(metres).toFixed(1)));
+
 // The fields that hold something else than `before` (as of rawValues), each with what it held then. The same metres in
 // other units are the same: a field shows tenths.
 export function differences(before) {
@@ -117,7 +120,7 @@ export function differences(before) {
     if (value === "") return t("plan.empty");
     if (CHOICES[key]) return t(`plan.${key}.${value}`);
     if (typeof value === "boolean") return t(value ? "plan.on" : "plan.off");
-    return NUMBERS[key]?.[3] && Number.isFinite(value) ? Number(units.fromMetres(value).toFixed(1)) : value;
+    return NUMBERS[key]?.[3] && Number.isFinite(value) ? inTenths(value) : units.typed(value);
   };
   return Object.entries(rawValues()).filter(([key, value]) => before[key] !== undefined && same(key, value) !== same(key, before[key]))
     .map(([key]) => t("plan.was", { name: nameOf(key), value: shown(key, before[key]) }));
@@ -129,7 +132,7 @@ export function fillFields(values) {
     if (!input || input === typedIn) continue;
     if (input.type === "checkbox") input.checked = value === true;
     else if (CHOICES[key]) { if (CHOICES[key].includes(value)) input.value = value; }
-    else input.value = NUMBERS[key][3] && Number.isFinite(value) ? Number(units.fromMetres(value).toFixed(1)) : value ?? "";
+    else input.value = NUMBERS[key][3] && Number.isFinite(value) ? inTenths(value) : units.typed(value ?? "");
   }
 }
 
@@ -141,7 +144,7 @@ export function relabelFields() {
     const shown = units.numberOf(input.value);
     if (Number.isFinite(shown)) {
       const metres = settings.units === "us" ? shown : shown * 0.3048;
-      input.value = Number(units.fromMetres(metres).toFixed(1));
+      input.value = inTenths(metres);
     }
     setText(input.closest("label").firstChild, nameOf(key));
   }

@@ -134,7 +134,7 @@ export async function showPlan(made, assignment, onNames) {
   names = assignment;
   changedNames = onNames;
   const km = plan.spacing_m == null ? "" : t("plan.spacing", { m: units.distance(plan.spacing_m) });
-  setText(summary, t("plan.summary", { share: `${(100 * plan.covered_share).toFixed(1)} %`, time: units.clock(plan.makespan_s), photos: plan.vehicles.reduce((n, row) => n + row.photos, 0), spacing: km }));
+  setText(summary, t("plan.summary", { share: units.percent(plan.covered_share, 1), time: units.clock(plan.makespan_s), photos: plan.vehicles.reduce((n, row) => n + row.photos, 0), spacing: km }));
   warnings.replaceChildren(...(plan.warnings ?? []).map((text) => make("li", {}, units.inUnits(inRoutes(text)))));
   setHidden(box, false);
   redraw();

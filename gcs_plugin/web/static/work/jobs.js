@@ -5,6 +5,7 @@ import { button, keyedList, make, setAttribute, setHidden, setStyle, setText } f
 import { notice } from "/static/core/notices.js";
 import { state, subscribe } from "/static/core/store.js";
 import { t } from "/static/core/strings.js";
+import { fixed } from "/static/core/units.js";
 
 const MOST = 12;
 const nameOf = (id) => state.vehicles.get(id)?.name ?? id ?? "";
@@ -40,7 +41,7 @@ export function jobPanel() {
     setText(title, `${t(`jobs.${job.kind}`)} ${nameOf(job.vehicle)}${job.sortie > 1 ? ` ${t("jobs.sortie", { n: job.sortie })}` : ""}`);
     const behind = job.kind === "export" && job.state === "queued" && refining();
     const lost = unmatched(job);
-    setText(words, [t(behind ? "jobs.behind" : lost ? "jobs.unmatched" : `jobs.state.${job.state}`), job.message, ...(job.detail?.warnings ?? []), job.detail?.seconds ? `${job.detail.seconds.toFixed(1)} s` : ""].filter(Boolean).join(", "));
+    setText(words, [t(behind ? "jobs.behind" : lost ? "jobs.unmatched" : `jobs.state.${job.state}`), job.message, ...(job.detail?.warnings ?? []), job.detail?.seconds ? `${fixed(job.detail.seconds, 1)} s` : ""].filter(Boolean).join(", "));
     setStyle(bar.firstChild, "transform", `scaleX(${Math.max(0, Math.min(1, job.progress || 0))})`);
     setAttribute(row, "data-state", lost ? "unmatched" : job.state);
   });
