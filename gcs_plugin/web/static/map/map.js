@@ -135,7 +135,7 @@ let moved = false;
 map.on("movestart", (event) => { moved ||= Boolean(event.originalEvent); });
 export const isMoved = () => moved;
 
-const PADDING = { top: 40, bottom: 84, left: 40, right: 56 }; // what lies over the map's edges
+const PADDING = { top: 84, bottom: 84, left: 56, right: 56 }; // buttons lie over the map's edges; even, so that the centre stays the centre
 export function fit([west, south, east, north]) {
   if (![west, south, east, north].every(Number.isFinite)) return;
   map.fitBounds([[west, south], [east, north]], { padding: PADDING, duration: 0, maxZoom: 19 });
