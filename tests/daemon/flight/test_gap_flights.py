@@ -71,8 +71,17 @@ def test_legs_of_a_vehicle_that_came_home_early_are_over_and_offered_and_those_o
     assert not flown.over.any() and not flown.remaining()
     flown.look([_row("v1", "returning"), _row("v2", "lost", state="lost")])
     assert flown.over.all() and flown.remaining() == {"v1": [0, 2], "v2": [1, 3]}
-    flown.look([_landed("v1"), _row("v2")])
+    early = _row("v1", "on ground", armed=False, mission={"phase": "aborted"})
+    flown.look([early, _row("v2")])
     assert flown.over.tolist() == [True, False, True, False] and flown.remaining() == {"v1": [0, 2]}
+
+
+def test_a_mission_that_is_complete_leaves_no_leg_behind_though_its_turns_were_wide() -> None:
+    flown = FlownLegs(legs=_legs(), reach_m=20.0, ahead_m=15.0)
+    flown.look([_row("v1"), _row("v2")])
+    _fly(flown, "v1", [(0.0, 40.0), (0.0, 330.0)])  # into its first leg too late
+    flown.look([_landed("v1"), _row("v2")])
+    assert flown.flown.tolist() == [True, False, True, False] and flown.remaining() == {"v1": []}
 
 
 def test_what_is_over_survives_a_restart() -> None:

@@ -24,7 +24,7 @@ COUNT = int(os.environ.get("ORTHOSWARM_FUZZ", "3000"))
 LIMIT_S = float(os.environ.get("ORTHOSWARM_FUZZ_S", "inf"))
 SEED = int(os.environ.get("ORTHOSWARM_FUZZ_SEED", "1"))
 STEP = min(500, COUNT // 4)
-MOST_GROWTH_MB = 60.0
+MOST_GROWTH_MB = 40.0
 
 NUMBERS = (0, -1, 1, 2, 255, 2**31, 2**63 - 1, 2**63, 10**30, 10**400, 0.5, -1e308, 1e-308, True)
 WORDS = (
@@ -143,4 +143,6 @@ def test_no_request_ends_in_500_and_memory_stays_flat(tmp_path):
             assert client.get("/healthz").status_code == 200
             assert "Traceback" not in "".join(served.said), "".join(served.said)[-3000:]
             print(sum(asked.values()), "requests, resident megabytes", sizes)
-            assert sizes[-1] - sizes[len(sizes) // 4] < MOST_GROWTH_MB, sizes
+            assert sizes[-1] - sizes[len(sizes) // 2] < MOST_GROWTH_MB, (
+                sizes
+            )  # by then each route has loaded its modules
