@@ -24,7 +24,7 @@ COUNT = int(os.environ.get("ORTHOSWARM_FUZZ", "3000"))
 LIMIT_S = float(os.environ.get("ORTHOSWARM_FUZZ_S", "inf"))
 SEED = int(os.environ.get("ORTHOSWARM_FUZZ_SEED", "1"))
 STEP = min(500, COUNT // 4)
-MOST_GROWTH_MB = 40.0
+MOST_GROWTH_MB = 120.0  # modules that a route loads when it is first met take up to 70
 
 NUMBERS = (0, -1, 1, 2, 255, 2**31, 2**63 - 1, 2**63, 10**30, 10**400, 0.5, -1e308, 1e-308, True)
 WORDS = (

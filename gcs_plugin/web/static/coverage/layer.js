@@ -14,5 +14,5 @@ subscribe("coverage ready", "the coverage on the map", () => {
   const picture = { url: tileRequest(`/api/coverage/cells.png?version=${version}`).url, coordinates: coverage.corners };
   if (map.getSource(ID)) { map.getSource(ID).updateImage(picture); return; }
   map.addSource(ID, { type: "image", ...picture });
-  addInOrder({ id: ID, type: "raster", source: ID, paint: { "raster-fade-duration": 0, "raster-resampling": "nearest" } });
+  addInOrder({ id: ID, type: "raster", source: ID, paint: { "raster-fade-duration": 0, "raster-resampling": "nearest" }, layout: { visibility: "none" } }); // until it is known whether it is wanted
 });

@@ -30,7 +30,7 @@ subscribe("trust ready", "where not to trust, on the map", () => {
   const picture = { url: tileRequest(`/api/trust.png?version=${shown}`).url, coordinates: state.trust.corners };
   if (map.getSource(ID)) { map.getSource(ID).updateImage(picture); return; }
   map.addSource(ID, { type: "image", ...picture });
-  addInOrder({ id: ID, type: "raster", source: ID, paint: { "raster-fade-duration": 0, "raster-resampling": "nearest" } });
+  addInOrder({ id: ID, type: "raster", source: ID, paint: { "raster-fade-duration": 0, "raster-resampling": "nearest" }, layout: { visibility: "none" } }); // until it is known whether it is wanted
 });
 
 // An export writes it.
