@@ -56,7 +56,7 @@ from gcs_plugin.mission.exchange import Verdict
 from gcs_plugin.mission.geofence import FenceZone
 from gcs_plugin.mission.items import Mission
 from gcs_plugin.mission.plan_folder import NO_NEEDS, PlanNeeds
-from gcs_plugin.mission.track import route_of
+from gcs_plugin.mission.track import route_points
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 from telemetry.live.live_poses import LinkPoses, LivePoses
 
@@ -188,7 +188,7 @@ class VehicleLinks:
         """
         held = [(self._records[s], self._records[s].holds) for s in sorted(self._records)]
         return [
-            {"vehicle": record.id, "route": record.route, "points": route_of(mission)}
+            {"vehicle": record.id, "route": record.route, "points": route_points(mission)}
             for record, mission in held
             if mission is not None
         ]
@@ -367,8 +367,8 @@ class VehicleLinks:
         zones = [zone for zone in held if zone.kind == "inclusion"] + list(keep_out)
         text = self.finish(self.fleet.call(partial(self.fleet.upload_fence, system, zones)))
         self.fleet.call(partial(self._fences.read_again, system)).result(_SOON_S)
-        off = fence_limits(self.fleet.vehicles[system]) == FenceLimits()  # of PX4 all are None, and zones count
-        off = off and self.fleet.vehicles[system].autopilot is Autopilot.ARDUPILOT
+        vehicle = self.fleet.vehicles[system]  # zones of a PX4 count always
+        off = vehicle.autopilot is Autopilot.ARDUPILOT and fence_limits(vehicle) == FenceLimits()
         return f"{text}; it keeps to it once FENCE_ENABLE is 1" if off else text
 
     def finish(self, begun: Future[Any], timeout_s: float = 180.0) -> str:

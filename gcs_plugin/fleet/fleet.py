@@ -379,6 +379,7 @@ class Fleet:
         vehicle = self._flies_missions(order.system)
         if vehicle.detector.phase is Phase.ACTIVE and vehicle.armed:
             raise OrthoSwarmError(f"vehicle {order.system} is flying its mission already")
+        vehicle.told_to_stay = False
         then = order.standing or vehicle.standing
         if why := vehicle.changed_since(then):
             raise OrthoSwarmError(f"vehicle {order.system} {why} since its start was given, so it was not started")

@@ -181,7 +181,7 @@ def heights_m(mission: Mission) -> list[tuple[MissionItem, float]]:
     return [(i, _height_m(i, base)) for i in mission.items[mission.first_seq :] if i.is_nav and i.has_place]
 
 
-def route_of(mission: Mission) -> list[tuple[int, float, float]]:
+def route_points(mission: Mission) -> list[tuple[int, float, float]]:
     """Where a mission leads, in the order of flight: sequence number of the item, longitude and latitude in degrees."""
     home, route = home_of(mission), list[tuple[int, float, float]]()
     for seq, item in _flown(mission):

@@ -25,6 +25,7 @@ from gcs_plugin.mission.exchange import (
     ERROR,
     INVALID,
     INVALID_SEQUENCE,
+    MISSION,
     NO_SPACE,
     UNSUPPORTED,
     UNSUPPORTED_FRAME,
@@ -380,11 +381,12 @@ def explain(code: int, mission: Mission, item: int | None) -> Refusal:
     if code == DENIED:
         return Refusal(code, None, "", "another ground station is uploading to it; wait until that has ended")
     if code == NO_SPACE:
-        return Refusal(code, None, "", f"its memory does not hold {len(mission)} items; split the mission into sorties")
+        less = "split the mission into sorties" if mission.list_type == MISSION else "draw zones with fewer corners"
+        return Refusal(code, None, "", f"its memory does not hold {len(mission)} items; {less}")
     if code == CANCELLED:
         return Refusal(code, None, "", "it gave up because items did not arrive; come closer or try again")
     if item is None or item >= len(mission):
-        return Refusal(code, None, "", f"it refused the mission ({_result_name(code)})")
+        return Refusal(code, None, "", f"it refused the {mission.kind} ({_result_name(code)})")
     what = f"item {item} ({mission.items[item].name})"
     if code == UNSUPPORTED:
         return Refusal(code, item, "command", f"{what} is a command that it does not know; leave it out")

@@ -6,6 +6,7 @@ import os
 import time
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeVar
 
@@ -183,14 +184,15 @@ class HttpRoutes:
     def _trusted(self) -> tuple[int, Path]:
         """Where not to trust the map: the raster of the last export, and its version, 0 if there is none."""
         path = self.daemon.settings.workspace / "confidence.tif"
-        return (path.stat().st_mtime_ns // 1_000_000 if path.is_file() else 0), path
+        exported = path.is_file() and path.with_name("report.json").is_file()  # which is written after it
+        return (path.stat().st_mtime_ns // 1_000_000 if exported else 0), path
 
     async def trust(self) -> Response:
         """How far the map can be trusted, as of the last export: `version` (0: nothing yet), `headline`, `corners`."""
         version, path = self._trusted()
         if not version:
             return JsonAnswer({"version": 0, "headline": "", "corners": None})
-        _, corners = await self.work(trust_overlay, path)
+        _, corners = await self.work(_overlay, path, version)
         report = parse_json((path.parent / "report.json").read_bytes())
         return JsonAnswer({"version": version, "headline": report.get("headline", ""), "corners": corners})
 
@@ -199,7 +201,7 @@ class HttpRoutes:
         version, path = self._trusted()
         if not version:
             raise HTTPException(404, "nothing was refined and exported yet; see /api/jobs")
-        data, _ = await self.work(trust_overlay, path)
+        data, _ = await self.work(_overlay, path, version)
         return Response(data, media_type="image/png", headers={"ETag": f'"{version}"', "Cache-Control": "no-cache"})
 
     async def gaps(self) -> Response:
@@ -298,6 +300,12 @@ class HttpRoutes:
     async def events(self, socket: WebSocket) -> None:
         """Live events, and a heartbeat each second."""
         await stream_events(socket, self.daemon.events)
+
+
+@lru_cache(maxsize=1)
+def _overlay(path: Path, _version: int) -> tuple[bytes, list[list[float]]]:
+    """See trust_overlay: computed once a version, for all pages and both routes."""
+    return trust_overlay(path)
 
 
 def _moment(text: str) -> float | None:

@@ -196,6 +196,11 @@ function grouped(alarms) {
   });
 }
 
+function makeLine() {
+  const row = make("li", {}, button("", () => row.vehicle && select(row.vehicle), { class: "alarm" }));
+  return row;
+}
+
 export function alarmList() {
   const list = make("ul", {});
   let drawn = [];
@@ -206,7 +211,7 @@ export function alarmList() {
   const title = make("b", {});
   const more = make("p", { class: "more" });
   const box = make("section", { class: "alarms", "aria-label": t("alarm.title"), role: "alert", hidden: true }, make("div", { class: "row" }, title, seen), list, more);
-  const draw = keyedList(list, (group) => { const row = make("li", {}, button("", () => row.vehicle && select(row.vehicle), { class: "alarm" })); return row; }, (row, group) => {
+  const draw = keyedList(list, makeLine, (row, group) => {
     row.vehicle = group.all[0].vehicle;
     setText(row.firstChild, `${t(`alarm.${group.level}`)} ${group.text}`);
     setAttribute(row, "data-level", group.level);

@@ -24,7 +24,7 @@ const ONLY = { draft: ["plan"], legs: ["map"], trust: ["map"] }; // in other mod
 const FILLS = { area: "plan" }; // a fill tints what lies under it
 
 const offered = (group) => !ONLY[group] || ONLY[group].includes(settings.mode);
-export const isShown = (group) => offered(group) && (settings.shown?.[settings.mode]?.[group] ?? FIRST[settings.mode].includes(group));
+const isShown = (group) => offered(group) && (settings.shown?.[settings.mode]?.[group] ?? FIRST[settings.mode].includes(group));
 
 function setShown(group, on) {
   setSetting("shown", { ...settings.shown, [settings.mode]: { ...settings.shown?.[settings.mode], [group]: on } });
