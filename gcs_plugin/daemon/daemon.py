@@ -43,6 +43,7 @@ from gcs_plugin.daemon.store.daemon_events import (
     CardRead,
     DrawingRestarted,
     Events,
+    FirstPicturesCame,
     JobEnded,
     LayerPublished,
     LegsOver,
@@ -50,6 +51,7 @@ from gcs_plugin.daemon.store.daemon_events import (
     PictureDrawn,
     PictureRejected,
     PictureStored,
+    VehicleLookedFor,
     VehicleSilent,
 )
 from gcs_plugin.daemon.store.journal import Journal
@@ -141,8 +143,9 @@ class Daemon:
             for v in settings.vehicles if v.can
         ]  # fmt: skip
         self.views = Views(
-            self.journal, self.links, tiles=self.tiles, sources=self.sources, buses=self.buses, poses=self.poses
-        )
+            self.journal, self.links, tiles=self.tiles, sources=self.sources, buses=self.buses, poses=self.poses,
+            solutions=folder / "solutions",
+        )  # fmt: skip
         canvases = folder / "layers"
         canvases.mkdir(exist_ok=True)
         fov_rad = None if settings.fov_min_deg is None else math.radians(settings.fov_min_deg)
@@ -151,7 +154,8 @@ class Daemon:
             expected=ExpectedPlace(self.tiles, self.plans), events=self.events,
             memory_mb=settings.config.compute.live_canvas_mb,
         )  # fmt: skip
-        self.drawer = Drawer(self.journal, self.store, site, self.events)
+        live = settings.basemap if settings.coarse else None
+        self.drawer = Drawer(self.journal, self.store, site, self.events, basemap=live)
         self.leg_watch = LegWatch(self.events, silent_s=settings.silent_s)
         self.coverage = LiveCoverage(
             self.journal, self.events, views=PictureViews(self.journal, self.store, folder / "solutions", fov_rad),
@@ -185,12 +189,14 @@ class Daemon:
         self.getting_ready = GettingReady(self.events)
         self.tak = TakFeed([settings.tak_address(text) for text in settings.tak], self.exports)
         handlers = {
-            "refine": refinement.refine, "coarse": LegPlacement(publisher, self.store, kept).make,
+            "refine": refinement.refine, "coarse": LegPlacement(publisher, self.store, kept, self.events).make,
             "together": JointRefinement(publisher, settings.redraw_px).solve, "tones": ToneBalance(publisher).balance,
             "export": self.exports.write, "redraw": publisher.draw_again,
         }  # fmt: skip
         self.jobs = Jobs(self.journal, self.events, handlers, self.workers, self.background)
-        self.requests = JobRequests(self.journal, self.jobs, coarse=settings.coarse)
+        self.requests = JobRequests(
+            self.journal, self.jobs, coarse=settings.coarse, basemap=settings.basemap is not None
+        )
         if publisher.lost:
             self.jobs.add("redraw")
         for whose in publisher.outdated:
@@ -206,6 +212,8 @@ class Daemon:
         on(PictureRejected, self.refused.picture_rejected)
         on(AreaChanged, self.tiles.area_changed)  # MapSite
         on(DrawingRestarted, self.drawer.draw_anew)
+        on(FirstPicturesCame, self.requests.first_pictures_came)  # Drawer
+        on(VehicleLookedFor, self.drawer.vehicle_looked_for)  # LegPlacement
         on(LegsOver, self.requests.legs_over)  # LegWatch
         on(VehicleSilent, self.requests.vehicle_silent)
         on(CardRead, self.requests.card_read)  # VehicleIntake

@@ -1,22 +1,45 @@
 """The daemon's state for the API: frames, vehicles, legs and layers as JSON values."""
 
 import time
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
 
 from gcs_plugin.daemon.intake.can_reader import CanReader
 from gcs_plugin.daemon.intake.picture_sources import PictureSource
+from gcs_plugin.daemon.jobs.solution_file import read_solution
 from gcs_plugin.daemon.layers.layers import drawn_bounds
 from gcs_plugin.daemon.layers.web_tiles import TileServer
-from gcs_plugin.daemon.store.frame_rows import FrameRow, arrived_frames, newest_frames
+from gcs_plugin.daemon.store.frame_rows import (
+    POSE_KEYS,
+    FrameRow,
+    Whose,
+    arrived_frames,
+    newest_frames,
+    unplaced_frames,
+)
 from gcs_plugin.daemon.store.journal import Journal
-from gcs_plugin.daemon.store.sortie_rows import coarse_only, completion_rows, placed_sorties, senders
+from gcs_plugin.daemon.store.sortie_rows import (
+    REFINED,
+    coarse_only,
+    completion_rows,
+    placed_sorties,
+    senders,
+    solution_paths,
+)
 from gcs_plugin.daemon.vehicle_names import VehicleRow
 from gcs_plugin.daemon.vehicles import VehicleLinks
-from orthoswarm.export.product_files import iso_time
+from orthoswarm.export.product_files import frame_row, iso_time
 from orthoswarm.model.bounding_box import BoundingBox
+from orthoswarm.model.earth import DEGREE_M
 from orthoswarm.model.geo import LocalGrid
+from orthoswarm.trajectory.legs import split_legs
 from telemetry.live.live_poses import LinkPoses
+
+_MOST_LIVE: Final = 5000  # pictures in flight whose legs are told, the newest
 
 
 class Views:
@@ -24,16 +47,42 @@ class Views:
 
     def __init__(
         self, journal: Journal, links: VehicleLinks, *, tiles: TileServer, sources: Sequence[PictureSource],
-        buses: Sequence[CanReader], poses: LinkPoses,
+        buses: Sequence[CanReader], poses: LinkPoses, solutions: Path,
     ) -> None:  # fmt: skip
+        """Views of a journal's workspace; `solutions`: the folder of its solution files."""
         self._journal, self._links, self._tiles = journal, links, tiles
-        self._sources, self._buses, self._poses = sources, buses, poses
+        self._sources, self._buses, self._poses, self._solutions = sources, buses, poses, solutions
 
     def frames(
-        self, vehicle: str | None = None, since: float | None = None, limit: int | None = None
+        self,
+        vehicle: str | None = None,
+        since: float | None = None,
+        limit: int | None = None,
+        *,
+        poses: bool = False,
     ) -> list[dict[str, Any]]:
-        """Frames in the order of arrival, those that were taken at a time (UTC epoch seconds) or later."""
-        return [_frame(row) for row in arrived_frames(self._journal, vehicle, since, limit)]
+        """Frames in the order of arrival, those that were taken at a time (UTC epoch seconds) or later.
+
+        poses: with their grid and homography, see `POSE_KEYS`.
+        """
+        rows = arrived_frames(self._journal, vehicle, since, limit)
+        if not poses:
+            return [_frame(row) for row in rows]
+        refined = self._refined_poses({(row.vehicle, row.sortie) for row in rows if row.stage in REFINED})
+        return [_frame(row) | refined.get((row.vehicle, row.image), row.placed.get("pose", {})) for row in rows]
+
+    def _refined_poses(self, wanted: Collection[Whose]) -> dict[tuple[str, str], dict[str, Any]]:
+        """What `POSE_KEYS` names, of the refined frames of sorties, by vehicle and image."""
+        poses: dict[tuple[str, str], dict[str, Any]] = {}
+        area = self._journal.fact("area")
+        for whose, path in solution_paths(self._journal, "coarse", "solutions").items() if area else ():
+            if whose not in wanted:
+                continue
+            solution = read_solution(self._solutions / path).solution
+            for placed in solution.placed:
+                row = frame_row(placed, LocalGrid(area["epsg"]), solution.ground_z_m)
+                poses[whose[0], placed.frame.image] = {key: row[key] for key in POSE_KEYS if key in row}
+        return poses
 
     def vehicles(self) -> list[VehicleRow]:
         """All vehicles that were heard, that sent pictures, or that are configured; see the HTTP API."""
@@ -76,7 +125,9 @@ class Views:
                 about |= {key: leg[key] for key in ("state", "confidence", "sigma_m")}
                 geometry = {"type": "LineString", "coordinates": leg["line"]}
                 features.append({"type": "Feature", "properties": about, "geometry": geometry})
-        return {"type": "FeatureCollection", "features": features}
+        shown = {row.whose for _, row in refined}
+        live = [] if self._tiles.basemap is None else unplaced_frames(self._journal, _MOST_LIVE)
+        return {"type": "FeatureCollection", "features": features + _live_legs(live[::-1], shown)}
 
     def completions(self) -> list[dict[str, Any]]:
         """Completions of vehicles and their results."""
@@ -104,12 +155,39 @@ class Views:
         return rows
 
 
+def _live_legs(rows: Sequence[FrameRow], refined: Collection[Whose]) -> list[dict[str, Any]]:
+    """Legs in flight by how their pictures (in the order of arrival) were placed, as GeoJSON lines."""
+    flown: dict[Whose, list[FrameRow]] = defaultdict(list)
+    for row in rows:
+        if row.placed and (row.vehicle, row.sortie) not in refined:
+            flown[row.vehicle, row.sortie].append(row)
+    features = []
+    for (vehicle, sortie), own in flown.items():
+        path = np.array([[row.pose["lon_deg"], row.pose["lat_deg"]] for row in own])
+        metres = DEGREE_M * (path - path[0]) * [np.cos(np.radians(path[0, 1])), 1.0]
+        leg_of = split_legs(metres)
+        for leg in range(int(leg_of.max()) + 1):
+            members = np.flatnonzero(leg_of == leg)
+            share = float(np.mean([own[i].placed["placed_by"] == "map" for i in members]))
+            about = {
+                "vehicle": vehicle, "sortie": sortie, "leg": leg + 1, "stage": "realtime", "confidence": share,
+                "state": "matched" if share > 0.5 else "failed",
+                "sigma_m": float(np.median([own[i].sigma_m or np.nan for i in members])),
+            }  # fmt: skip
+            line = {"type": "LineString", "coordinates": path[members[[0, -1]]].tolist()}
+            features.append({"type": "Feature", "properties": about, "geometry": line})
+    return features
+
+
 def _waiting(vehicle: str) -> VehicleRow:
     return {"id": vehicle, "state": "waiting", "frames": {}, "sortie": 1}
 
 
 def _frame(row: FrameRow) -> dict[str, Any]:
+    by = "refined" if row.stage in REFINED else row.placed.get("placed_by")
+    after_s = row.placed.get("first", row.placed).get("placed_after_s")
     return {
+        "placed_by": by, "placed_after_s": after_s,
         "seq": row.seq, "image": row.image, "vehicle": row.vehicle, "time": iso_time(row.time_s), "stage": row.stage,
         "sigma_m": row.sigma_m, "reason": row.reason, "sortie": row.sortie,
         "on_map": row.drawn and row.reason is None, "width": row.size[0], "height": row.size[1], **row.pose,

@@ -6,7 +6,7 @@ import os
 import time
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeVar
 
@@ -16,6 +16,7 @@ from starlette.responses import FileResponse
 from gcs_plugin.daemon.daemon import Daemon
 from gcs_plugin.daemon.exports import zipped_folder
 from gcs_plugin.daemon.intake.posted_pose import parse_time
+from gcs_plugin.daemon.layers.realtime_layer import LATENCY_S
 from gcs_plugin.daemon.layers.web_tiles import TileAddress
 from gcs_plugin.daemon.store.frame_rows import stage_counts
 from gcs_plugin.daemon.store.job_rows import job_counts
@@ -144,11 +145,12 @@ class HttpRoutes:
         vehicle: str | None = None,
         since: str | None = Query(None, description="ISO 8601, or epoch seconds: frames taken then or later"),
         limit: int | None = Query(None, ge=0),
+        poses: bool = Query(False, description="with epsg and homography, as in frames.jsonl"),
     ) -> Response:
         """Frames in the order of their arrival."""
         moment = None if since is None else await self.work(_moment, since)
         most = None if limit is None else min(limit, 2**62)  # larger ones do not fit the journal's integers
-        rows = await self.work(self.daemon.views.frames, vehicle, moment, most)
+        rows = await self.work(partial(self.daemon.views.frames, vehicle, moment, most, poses=poses))
         return JsonAnswer(rows)
 
     async def tile(self, request: Request, *, layer: str, z: int, x: int, y: int, suffix: str) -> Response:
@@ -429,6 +431,13 @@ def prometheus(daemon: Daemon, uploads_waiting: int = 0) -> str:
     single("draw_put_off", "gauge", "Frames that wait because they would show least.", drawer.put_off)
     text = "Longest time for which newer pictures of a vehicle have come than any that is drawn."
     single("draw_behind_seconds", "gauge", text, drawer.behind_s)
+    text = "From a picture's arrival to its pixels in the tiles."
+    name, below = "placed_after_seconds", 0
+    lines += [f"# HELP orthoswarm_{name} {text}", f"# TYPE orthoswarm_{name} histogram"]
+    for bound, count in zip((*map(str, LATENCY_S), "+Inf"), drawer.latency_counts, strict=True):
+        below += count
+        lines.append(f'orthoswarm_{name}_bucket{{le="{bound}"}} {below}')
+    lines += [f"orthoswarm_{name}_sum {drawer.latency_sum:.3f}", f"orthoswarm_{name}_count {below}"]
     recent = sorted(drawer.latencies)
     metric(
         "draw_latency_seconds", "gauge", "From arrival to the map, of the last thousand frames.",

@@ -28,7 +28,8 @@ from orthoswarm.mosaic.seams.previews import PreviewFile
 from orthoswarm.raster.picture_file import read_rgb
 from orthoswarm.raster.picture_parts import PictureParts
 
-_WEAK = 1e6  # metres for micrometres: farther than any other
+_BY_RECEIVER = 1e4  # as if it were so many times farther: it loses against any that is not
+_WEAK = 1e8  # farther than any other
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +64,15 @@ class RealtimeMosaic:
         self._reals = np.empty((3, canvas.tile_px + RUN), np.float32)
         self._integers = np.empty((6, canvas.tile_px + RUN), np.uint32)
 
-    def add(self, picture: Bytes, camera: Camera, ground_z_m: float = 0.0, *, weak: bool = False) -> Added:
+    def add(
+        self,
+        picture: Bytes,
+        camera: Camera,
+        ground_z_m: float = 0.0,
+        *,
+        weak: bool = False,
+        by_receiver: bool = False,
+    ) -> Added:
         """Draw one frame.
 
         Args:
@@ -71,6 +80,8 @@ class RealtimeMosaic:
             camera: where it was; its lens has the picture's size.
             ground_z_m: height of the ground plane, same datum as the camera.
             weak: True to draw it only where no picture is yet, and to give way to any that comes.
+            by_receiver: True to draw it only where no picture is yet that lies on the basemap by evidence, and to give
+                way to any that does.
 
         Raises:
             ValueError: if the picture has not the lens's size.
@@ -100,7 +111,7 @@ class RealtimeMosaic:
             radius=reach(camera, ground_z_m) / grid.gsd_m,
             matrix=ground_to_camera(camera, ground_z_m, grid.gsd_m),
             lens=_reduced_lens(camera, factor),
-            handicap=_WEAK if weak else 1.0,
+            handicap=_WEAK if weak else _BY_RECEIVER if by_receiver else 1.0,
         )
         counts = [self._draw(key, shot) for key in keys]
         return Added([key for key, count in zip(keys, counts) if count], sum(counts))

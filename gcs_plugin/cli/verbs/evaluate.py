@@ -28,7 +28,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     add = parser.add_argument
     add(
-        "ortho", type=Path, metavar="ORTHO.tif|OUT",
+        "ortho", type=Path, metavar="ORTHO.tif|OUT", nargs="?",
         help="the orthoimage (alpha or nodata says where it has ground), or the output folder that holds it",
     )  # fmt: skip
     add("--reference", type=Path, metavar="REF.tif", help="a picture of the true ground to measure it against")
@@ -48,6 +48,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     add("--poses", type=Path, metavar="FRAMES.jsonl", help="placed frames of the same product")
     add("--truth", type=Path, metavar="FRAMES.csv", help="the true cameras")
+    add(
+        "--live", type=Path, metavar="WORKSPACE",
+        help="with --truth: where a daemon drew pictures first, in flight, by what placed them",
+    )  # fmt: skip
     add("--gsd", type=float, metavar="M", help="pixel at which both are compared (default 0.3, or what they have)")
     add("--search", type=float, default=8.0, metavar="M", help="largest displacement that is looked for (default 8)")
     add("--field", type=Path, metavar="FIELD.csv", help="write the field of displacements")
@@ -60,6 +64,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure and print."""
+    if args.live is not None:
+        return _live(args)
+    if args.ortho is None:
+        raise InputError("say what to evaluate: an orthoimage or the folder that holds it, or --live WORKSPACE")
     if (args.poses is None) != (args.truth is None):
         raise InputError("--poses and --truth belong together; give both or none")
     if args.reference is None and args.checkpoints is None:
@@ -90,6 +98,25 @@ def run(args: argparse.Namespace) -> int:
         print(json_text(figures))
     else:
         _print(figures)
+    return 0
+
+
+def _live(args: argparse.Namespace) -> int:
+    """Print where pictures were drawn first."""
+    if args.truth is None or args.ortho is not None:
+        raise InputError("--live WORKSPACE needs --truth FRAMES.csv, and no orthoimage")
+    from gcs_plugin.bench.live_errors import live_errors
+
+    found = live_errors(args.live, args.truth)
+    if args.json:
+        print(json_text(found))
+        return 0
+    for by, f in found.items():
+        print(
+            f"{by}: {f['pictures']} pictures, {f['median_m']:.2f} m median, {f['p95_m']:.2f} m 95 %; within one and two "
+            f"sigma {f['sigma_1']:.0f} and {f['sigma_2']:.0f} %; on the map after {f['after_median_s']:.2f} s, "
+            f"95 % within {f['after_p95_s']:.2f} s"
+        )
     return 0
 
 

@@ -20,6 +20,7 @@ from gcs_plugin.daemon.jobs.workspace_products import FORMATS, PRODUCTS
 from gcs_plugin.daemon.store.daemon_events import (
     CardRead,
     Events,
+    FirstPicturesCame,
     JobChanged,
     JobEnded,
     LegsOver,
@@ -319,8 +320,8 @@ def _lane(job: Job) -> tuple[str, str | None]:
 class JobRequests:
     """Asks for jobs."""
 
-    def __init__(self, journal: Journal, jobs: Jobs, *, coarse: bool) -> None:
-        self._journal, self._jobs, self._coarse = journal, jobs, coarse
+    def __init__(self, journal: Journal, jobs: Jobs, *, coarse: bool, basemap: bool) -> None:
+        self._journal, self._jobs, self._coarse, self._basemap = journal, jobs, coarse, basemap
 
     def refine(self, vehicle: str | None = None) -> list[Job]:
         """Queue the refinement of a vehicle's last sortie, or of all sorties that have pictures.
@@ -356,9 +357,18 @@ class JobRequests:
 
     # -- what has happened ----------------------------------------------------------------------------------------
 
-    def legs_over(self, event: LegsOver) -> None:
-        """Queue the coarse map of a sortie that is still flown."""
+    def first_pictures_came(self, event: FirstPicturesCame) -> None:
+        """Have a vehicle looked for on the basemap."""
         if self._coarse and not is_complete(self._journal, (event.vehicle, event.sortie)):
+            self._jobs.add("coarse", event.vehicle, event.sortie, first=True)
+
+    def legs_over(self, event: LegsOver) -> None:
+        """Queue the coarse map of a sortie that is still flown; on a basemap it is registered picture by picture."""
+        if (
+            self._coarse
+            and (event.silent or not self._basemap)
+            and not is_complete(self._journal, (event.vehicle, event.sortie))
+        ):
             self._jobs.add("coarse", event.vehicle, event.sortie, **({"over": True} if event.silent else {}))
 
     def vehicle_silent(self, event: VehicleSilent) -> None:

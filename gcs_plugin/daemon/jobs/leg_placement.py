@@ -15,7 +15,10 @@ import numpy as np
 
 from gcs_plugin.daemon.jobs.job_queue import Preempted, RunningJob
 from gcs_plugin.daemon.jobs.publisher import Publisher, detail_of, frames_of
-from gcs_plugin.daemon.jobs.worker_tasks import SortieResult, SortieTask, coarse_after, follow, near, place
+from gcs_plugin.daemon.jobs.solution_file import read_solution
+from gcs_plugin.daemon.jobs.worker_tasks import SortieResult, SortieTask, coarse_after, follow, look_for, near, place
+from gcs_plugin.daemon.layers.live_registration import MOST_LOOKED_FOR
+from gcs_plugin.daemon.store.daemon_events import Events, VehicleLookedFor
 from gcs_plugin.daemon.store.job_rows import Job, refinement_is_open
 from gcs_plugin.daemon.store.journal import Change, no_change
 from gcs_plugin.daemon.store.picture_store import KeptPictures, PictureStore
@@ -41,15 +44,21 @@ _log = logging.getLogger(__name__)
 
 @dataclass(slots=True)
 class LegPlacement:
-    """Does the jobs `coarse`; `kept`: what is kept of the pictures in `store` until they are refined."""
+    """Does the jobs `coarse`; `kept`: what is kept of the pictures in `store` until they are refined.
+
+    `events`: told what came of a vehicle that was looked for.
+    """
 
     publisher: Publisher
     store: PictureStore
     kept: KeptPictures
+    events: Events
 
     def make(self, run: RunningJob) -> Change:
         """The handler of `coarse`."""
         began = time.monotonic()
+        if "first" in run.job.detail:
+            return self._first(run)
         try:
             with self.publisher.new_solution("coarse") as target:
                 (self._after if "after" in run.job.detail else self._legs)(run, target)
@@ -59,6 +68,24 @@ class LegPlacement:
             run.job.detail["note"] = str(error)  # the map in flight stays as it is until the refinement
         else:
             run.job.detail["seconds"] = round(time.monotonic() - began, 3)
+        return no_change
+
+    def _first(self, run: RunningJob) -> Change:
+        """Look for a vehicle's newest pictures on the basemap, and tell what came of it."""
+        job, publisher, solution = run.job, self.publisher, None
+        area = publisher.area()
+        with publisher.new_solution("live") as target:
+            try:
+                frames = frames_of(publisher.journal, self.store, job)[0][-MOST_LOOKED_FOR:]
+                run.report(0.1, f"looking for {len(frames)} pictures on the basemap")
+                solved = run.run(look_for, publisher.task(target, frames=frames))
+                job.detail |= {"frames": len(frames), "solve_cpu_s": round(solved, 3)}
+                solution = read_solution(target).solution
+            except (Preempted, WorkerStoppedError, StorageError):
+                raise
+            except OrthoSwarmError as error:
+                job.detail["note"] = str(error)
+        self.events.publish(VehicleLookedFor(str(job.vehicle), int(job.sortie or 0), area.epsg, solution))
         return no_change
 
     # -- in flight ------------------------------------------------------------------------------------------------
@@ -71,6 +98,10 @@ class LegPlacement:
             return
         everything, thumbnails = frames_of(publisher.journal, self.store, job)
         kept = self.kept.of(job.whose, everything)
+        if publisher.basemap is not None:  # its pictures are registered as they come
+            if kept is not None:
+                self._follow(run, publisher.task(target, frames=everything, kept=kept))
+            return
         frames, count = newest_legs(everything, area.epsg, over=bool(job.detail.get("over")))
         if not frames:
             raise OrthoSwarmError("no leg is over yet")

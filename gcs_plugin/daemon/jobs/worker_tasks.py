@@ -28,6 +28,7 @@ from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.compute.threads import on_threads
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import Camera
+from orthoswarm.model.errors import OrthoSwarmError
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import GroundGrid, LocalGrid
 from orthoswarm.model.placement import Leg, PlacedFrame, Solution
@@ -264,6 +265,26 @@ def place(task: SortieTask) -> SortieResult:
     sortie.write(task.target)
     changed = visible_ground([*solution.placed, *moved], sortie.terrain)
     return watch.solved(solution, task.frames, sortie, changed)
+
+
+def look_for(task: SortieTask) -> float:
+    """Refine a vehicle's first pictures on the basemap, with the state that goes on from there; CPU seconds used.
+
+    Raises:
+        OrthoSwarmError: they are not found there.
+    """
+    from orthoswarm.refine.flight.vehicle_refinement import split_units
+    from orthoswarm.refine.registration.block_state import WorkArea, to_solution
+    from orthoswarm.refine.strategy.vehicle_passes import refine_alone
+
+    began, origin = time.process_time(), np.array(task.origin)
+    newest = max(split_units({"": task.frames}), key=lambda unit: unit[-1].time_s or 0.0)
+    area = WorkArea(task.epsg, origin, task.open_basemap(task.frames), task.device)
+    state = refine_alone(newest, area=area, options=replace(_options(task), kept=None))
+    if not state.on_map:
+        raise OrthoSwarmError(f"{len(newest)} pictures were not found on the basemap")
+    SolutionFile(to_solution(state, origin, None)).write(task.target)
+    return time.process_time() - began
 
 
 def coarse_after(task: SortieTask) -> SortieResult:

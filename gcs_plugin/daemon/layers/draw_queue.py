@@ -1,4 +1,4 @@
-"""The queue of frames to be drawn, bounded in number, in order of their use for the map.
+"""The queue of frames to be drawn, bounded in number, in order of arrival while few wait, else of their use for the map.
 
 A map pixel shows the picture with the nearest nadir point, so a frame gains fewer pixels the nearer its nadir lies
 to one that is drawn already: its share of the map is its cell of the Voronoi diagram of all nadirs. That distance, in
@@ -15,6 +15,7 @@ from orthoswarm.model.earth import DEGREE_M
 from orthoswarm.model.frame import DEFAULT_HEIGHT_M, Frame
 
 LEVELS: Final = 8  # of spacing, the coarsest first
+_IN_ORDER: Final = 32  # while no more wait, none is put off: a quarter of a second of work
 _STEP_SHARE: Final = 0.06  # of the height above ground: distance of pictures on the finest level
 
 
@@ -54,10 +55,14 @@ class MapDelay:
 
 
 class DrawQueue:
-    """The queue; it is not thread-safe."""
+    """The queue; it is not thread-safe.
 
-    def __init__(self, most: int) -> None:
-        self.most = most
+    Args:
+        most: how many may wait. in_order: while no more wait, the first that came is the next.
+    """
+
+    def __init__(self, most: int, in_order: int = _IN_ORDER) -> None:
+        self.most, self._in_order = most, in_order
         self._queues: list[deque[PendingFrame]] = [deque() for _ in range(LEVELS)]
         self._drawn: set[tuple[int, int]] = set()
         self._step_m = 0.0
@@ -82,7 +87,18 @@ class DrawQueue:
         return left
 
     def take(self) -> PendingFrame | None:
-        """The frame to be drawn next, counted as drawn from now on; None if there is none."""
+        """The frame to be drawn next, counted as drawn from now on; None if there is none.
+
+        The first that came while few wait: each is registered by the one before.
+        """
+        if self._count <= self._in_order:
+            waiting = [queue for queue in self._queues if queue]
+            if not waiting:
+                return None
+            self._count -= 1
+            pending = min(waiting, key=lambda queue: queue[0].seq).popleft()
+            self._drawn.add(self._cell(pending.frame))
+            return pending
         for level in range(LEVELS - 1, -1, -1):
             queue = self._queues[level]
             while queue:

@@ -10,9 +10,10 @@ import shutil
 import sqlite3
 import threading
 import time
+from bisect import bisect_left
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 from gcs_plugin.daemon.intake.posted_pose import frame_of_row
 from gcs_plugin.daemon.layers.draw_queue import DrawQueue, MapDelay, PendingFrame
 from gcs_plugin.daemon.layers.layers import MapArea, new_name
+from gcs_plugin.daemon.layers.live_registration import LiveRegistration
 from gcs_plugin.daemon.layers.map_site import MapSite
 from gcs_plugin.daemon.stoppable_thread import Background
 from gcs_plugin.daemon.store.daemon_events import (
@@ -32,10 +34,14 @@ from gcs_plugin.daemon.store.daemon_events import (
     PictureRejected,
     PictureStored,
     Problem,
+    VehicleLookedFor,
 )
 from gcs_plugin.daemon.store.frame_rows import (
+    POSE_KEYS,
     Drawn,
+    Moved,
     frames_drawn,
+    frames_moved,
     sortie_is_drawn,
     undrawn_before,
     undrawn_frames,
@@ -43,6 +49,7 @@ from gcs_plugin.daemon.store.frame_rows import (
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.daemon.store.picture_store import PictureStore
 from orthoswarm.canvas.canvas import Canvas
+from orthoswarm.export.product_files import frame_row
 from orthoswarm.model.camera import NADIR_PITCH_RAD, Camera, Lens, rotation_from_angles
 from orthoswarm.model.errors import OrthoSwarmError, StorageError
 from orthoswarm.model.geo import GroundGrid
@@ -56,6 +63,7 @@ _IN_MEMORY: Final = 2000  # frames that wait; the journal has the others
 _AT_ONCE: Final = 16  # pictures drawn between two looks at the queue
 _LATE_S: Final = 1.0
 _LOOK_S: Final = 0.5
+LATENCY_S: Final = (0.1, 0.25, 0.5, 1.0, 1.5, 2.5, 5.0, 10.0, 30.0)  # bounds of the histogram in /metrics
 _log = logging.getLogger(__name__)
 Bytes = NDArray[np.uint8]
 
@@ -66,7 +74,8 @@ class Drawer(Background):
     Attributes:
         drawn: frames drawn since the start. late: drawn later than a second after they came.
         put_off: frames that wait longer than a second, because they would show least of the waiting ones.
-        latencies: seconds from arrival to the map, of the last thousand frames.
+        latencies: seconds from arrival to the map, of the last thousand frames. latency_counts: how many frames took
+            up to each of LATENCY_S, and longer; latency_sum: seconds in all.
     """
 
     def __init__(
@@ -80,6 +89,7 @@ class Drawer(Background):
         late_s: float = _LATE_S,
         look_s: float = _LOOK_S,
         read: Callable[[Path], Bytes] = read_rgba,
+        basemap: Path | None = None,
     ) -> None:
         """Continue where the last daemon stopped; `start` begins to draw.
 
@@ -89,8 +99,10 @@ class Drawer(Background):
             late_s: a frame drawn later than this after its arrival is late, seconds.
             look_s: time between looks for late frames, seconds.
             read: reads a picture file, uint8 (rows, columns, 4).
+            basemap: where pictures are registered before they are drawn, None for nowhere.
         """
         super().__init__("drawing", join_s=None)
+        self.registration = LiveRegistration(basemap, events, read)
         self._in_memory, self._late_s, self._look_s, self._read = in_memory, late_s, look_s, read
         self._journal, self._store, self._site, self._events = journal, store, site, events
         self._begun = 0
@@ -98,10 +110,11 @@ class Drawer(Background):
         self._delay = MapDelay()
         self._waiting: set[int] = set()
         self._looked = 0.0
-        self._more = True
+        self._more, self._found = True, False
         self._condition = threading.Condition()
         self.drawn = self.late = self.put_off = 0
         self.latencies: list[float] = []
+        self.latency_counts, self.latency_sum = [0] * (len(LATENCY_S) + 1), 0.0
         self.problem = ""
 
     # -- from outside ---------------------------------------------------------------------------------------------
@@ -119,6 +132,13 @@ class Drawer(Background):
             self._delay.came(event.frame.vehicle, event.arrived_s)
             if event.seq not in self._waiting:
                 self._put(PendingFrame(event.seq, event.arrived_s, event.sortie, event.frame))
+            self._condition.notify_all()
+
+    def vehicle_looked_for(self, event: VehicleLookedFor) -> None:
+        """Draw a vehicle's pictures again where they were found on the basemap."""
+        self.registration.vehicle_looked_for(event)
+        with self._condition:
+            self._found = True
             self._condition.notify_all()
 
     @property
@@ -152,12 +172,13 @@ class Drawer(Background):
         load_kernels(self._site.folder)
         while True:
             with self._condition:
-                while not len(self._queue) and not self._more and not self._stop.is_set():
+                while not (len(self._queue) or self._more or self._found or self._stop.is_set()):
                     self._condition.wait()
                 if self._stop.is_set():
                     return
             try:
                 self._refill()
+                self._draw_found()
                 self._draw_some()
                 self._tell_overload()
                 self.problem = ""
@@ -251,6 +272,22 @@ class Drawer(Background):
             self._waiting.difference_update(seqs)
             self._condition.notify_all()
 
+    def _draw_found(self) -> None:
+        """Draw pictures of vehicles that have been found on the basemap where they lie there."""
+        with self._condition:
+            found, self._found = self._found, False
+        area, mosaic = self._site.area, self._site.mosaic
+        if not found or area is None or mosaic is None:
+            return
+        done = []
+        for pending, pose in self.registration.found(area):
+            if mosaic.add(self._read(pending.frame.path), pose.camera, pose.ground_z_m).reason is None:
+                camera = self._document(pending, pose.camera, pose.ground_z_m, pose.sigma_m, "map")
+                done.append(Moved(pending.seq, pose.sigma_m, camera))
+        if done:
+            self._journal.write(frames_moved(done))
+            self._events.publish(LayerDrawn("realtime", self._site.layer.version))
+
     def _note(self, pending: PendingFrame, result: Drawn) -> None:
         took = time.time() - pending.arrived
         with self._condition:
@@ -258,11 +295,14 @@ class Drawer(Background):
         self.drawn += 1
         self.late += took > self._late_s
         self.latencies.append(took)
+        self.latency_counts[bisect_left(LATENCY_S, took)] += 1
+        self.latency_sum += took
         del self.latencies[:-1000]
 
     def draw_anew(self, _: DrawingRestarted) -> None:
         """All frames are drawn again, by what the journal says."""
         self._begun += 1
+        self.registration.forget()
         with self._condition:
             self._queue.forget_drawn()
             self._more = True
@@ -280,7 +320,11 @@ class Drawer(Background):
             picture = self._read(frame.path)
             mosaic = self._site.mosaic
             assert mosaic is not None
-            added = mosaic.add(picture, camera, weak=frame.damaged)
+            pose, level = self.registration.place(pending, picture, len(self._queue)), 0.0
+            if pose is not None:
+                camera, level, sigma = pose.camera, pose.ground_z_m, pose.sigma_m
+            by_receiver = pose is None and self.registration.works
+            added = mosaic.add(picture, camera, level, weak=frame.damaged, by_receiver=by_receiver)
         except StorageError:  # the disk is full, or gone: later
             raise
         except OrthoSwarmError as error:
@@ -292,9 +336,18 @@ class Drawer(Background):
         quality = _quality(picture)
         if added.reason is None:
             self._events.publish(PictureDrawn(PlacedFrame(frame, camera, "realtime", sigma), quality))
-        return self._report(
-            pending, Drawn(pending.seq, added.reason, sigma, thumbnail(picture).tobytes(), quality), camera
-        )
+        by = "receiver" if pose is None else "map"
+        document = None if added.reason else self._document(pending, camera, level, sigma, by)
+        small = thumbnail(picture).tobytes()
+        return self._report(pending, Drawn(pending.seq, added.reason, sigma, small, quality, document), camera)
+
+    def _document(self, pending: PendingFrame, camera: Camera, level: float, sigma_m: float, by: str) -> dict[str, Any]:
+        """What the journal keeps of a drawn picture's place: by what, how soon, and its homography."""
+        assert self._site.grid is not None
+        row = frame_row(PlacedFrame(pending.frame, camera, "realtime", sigma_m), self._site.grid, level)
+        pose = {key: row[key] for key in POSE_KEYS if key in row} | {"ground_z_m": level}
+        after_s = round(time.time() - pending.arrived, 3)
+        return {"placed_by": by, "placed_after_s": after_s, "sigma_m": sigma_m, "pose": pose}
 
     def _report(self, pending: PendingFrame, drawn: Drawn, camera: Camera | None) -> Drawn:
         frame, fix = pending.frame, pending.frame.fix

@@ -16,7 +16,7 @@ from typing import Any, ClassVar, Final, TypeVar
 
 from gcs_plugin.daemon.store.job_rows import Job
 from orthoswarm.model.frame import Frame
-from orthoswarm.model.placement import PlacedFrame
+from orthoswarm.model.placement import PlacedFrame, Solution
 from orthoswarm.raster.picture_quality import PictureQuality
 
 
@@ -81,9 +81,32 @@ class DrawingRestarted(Event):
 
 
 @dataclass(frozen=True, slots=True)
+class FirstPicturesCame(Event):
+    """There are enough pictures of a sortie to look for them on the basemap."""
+
+    vehicle: str
+    sortie: int
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleLookedFor(Event):
+    """A sortie's pictures were looked for on the basemap.
+
+    Attributes:
+        solution: their refinement, with its state; None where they were not found. epsg: of the grid on which it lies.
+    """
+
+    vehicle: str
+    sortie: int
+    epsg: int
+    solution: Solution | None
+
+
+@dataclass(frozen=True, slots=True)
 class LegsOver(Event):
     """Legs of a sortie are finished; `silent`: because its vehicle has fallen silent."""
 
+    page: ClassVar[str] = "legs"
     vehicle: str
     sortie: int
     silent: bool

@@ -12,6 +12,8 @@ from orthoswarm.raster.picture_quality import PictureQuality
 
 Whose = tuple[str, int]
 """A vehicle and the number of its sortie."""
+POSE_KEYS: Final = ("epsg", "homography", "k1", "k2", "cx", "cy", "k3", "ground_z_m")
+"""What `/api/frames?poses=1` tells of a line of frames.jsonl."""
 Exposed = tuple[str, int, float, float | None, float | None]
 """Vehicle, number, UTC epoch seconds, latitude and longitude in degrees (None where the camera had no position)."""
 
@@ -24,6 +26,7 @@ class FrameRow:
         time_s, arrived_s: when it was taken, None if unknown, and when it came; UTC epoch seconds.
         path: of its file in the store. size: columns and rows. pose: `PostedPose.values`, with `origin`.
         stage: realtime, coarse, fine or rejected. sigma_m: its error estimate. reason: why it was rejected.
+        placed: where it was drawn, see `Drawn`; empty before.
         thumbnail, quality: of a drawn one, where they were asked for; see `Drawn`.
     """
 
@@ -40,6 +43,7 @@ class FrameRow:
     stage: str
     sigma_m: float | None
     reason: str | None
+    placed: dict[str, Any]
     thumbnail: bytes | None = None
     quality: PictureQuality | None = None
 
@@ -49,7 +53,7 @@ def _frame(row: sqlite3.Row, **more: Any) -> FrameRow:
         seq=row["seq"], vehicle=unpacked(row["vehicle"]), image=unpacked(row["image"]), sortie=row["sortie"],
         time_s=row["time"], arrived_s=row["arrived"], path=row["path"], size=(row["width"], row["height"]),
         pose=json.loads(row["pose"]), drawn=bool(row["drawn"]), stage=row["stage"], sigma_m=row["sigma"],
-        reason=row["reason"], **more,
+        reason=row["reason"], placed=json.loads(row["camera"] or "{}"), **more,
     )  # fmt: skip
 
 
@@ -282,6 +286,8 @@ class Drawn:
         reason: why it was rejected, None if it was not. sigma_m: its error estimate, metres.
         thumbnail: bytes of uint8 (12, 16, 3), for balancing gains; None for a picture that was not read.
         quality: its sharpness and damage, None for a picture that was not read or is too small.
+        placed: `placed_by` (receiver or map), `placed_after_s` (seconds from arrival to the map), `sigma_m`, and `pose`:
+            of its line in frames.jsonl what `POSE_KEYS` names.
     """
 
     seq: int
@@ -289,19 +295,42 @@ class Drawn:
     sigma_m: float | None
     thumbnail: bytes | None = None
     quality: PictureQuality | None = None
+    placed: dict[str, Any] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Moved:
+    """A drawn frame that was drawn again elsewhere: its error estimate in metres, and `placed` as of `Drawn`."""
+
+    seq: int
+    sigma_m: float
+    placed: dict[str, Any]
+
+
+def frames_moved(results: Sequence[Moved]) -> Change:
+    """The change that records where frames were drawn again; where and when they were drawn first is kept as `first`."""
+    return statements(
+        "UPDATE frames SET camera = json_set(?, '$.first', json(coalesce(json_extract(camera, '$.first'), camera))),"
+        " sigma = CASE WHEN stage IN ('coarse', 'fine') THEN sigma ELSE ? END WHERE seq = ?",
+        [(json.dumps(m.placed), m.sigma_m, m.seq) for m in results],
+    )
 
 
 def frames_drawn(results: Iterable[Drawn]) -> Change:
     """The change that records frames as drawn in real time; frames refined meanwhile are left unchanged."""
     done = list(results)
-    rows = [(d.reason, "rejected" if d.reason else "realtime", d.sigma_m, d.seq) for d in done]
+    rows = [
+        (d.reason, "rejected" if d.reason else "realtime", d.sigma_m, d.placed and json.dumps(d.placed), d.seq)
+        for d in done
+    ]
     thumbnails = [(d.seq, d.thumbnail) for d in done if d.thumbnail is not None]
     qualities = [(d.seq, *astuple(d.quality)) for d in done if d.quality is not None]
 
     return all_changes(
         statements(
             "UPDATE frames SET drawn = 1, reason = ?, stage = CASE WHEN stage IN ('coarse', 'fine') THEN stage"
-            " ELSE ? END, sigma = CASE WHEN stage IN ('coarse', 'fine') THEN sigma ELSE ? END WHERE seq = ?",
+            " ELSE ? END, sigma = CASE WHEN stage IN ('coarse', 'fine') THEN sigma ELSE ? END, camera = ?"
+            " WHERE seq = ?",
             rows,
         ),
         statements("INSERT OR REPLACE INTO thumbnails VALUES (?, ?)", thumbnails),

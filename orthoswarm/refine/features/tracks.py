@@ -129,6 +129,11 @@ class Tracker:
         self._gray, self._half = gray, half
         return survived
 
+    def latest(self) -> tuple[Indices, Floats]:
+        """Ids and pixels (K, 2) of the last picture's tracks; what is known of all pictures so far is forgotten."""
+        self._log.clear()
+        return self._live.ident.copy(), self._live.uv.copy()
+
     def tracks(self) -> Tracks:
         """Observations of all tracks that are long enough, in working pixels."""
         if not self._log:

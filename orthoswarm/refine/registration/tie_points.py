@@ -80,6 +80,12 @@ class LoadedMap:
         grid = GroundGrid.around(basemap.epsg, world, gsd_m)
         return cls(grid.west - east, grid.north - north, gsd_m, np.clip(gray + 0.5, 0, 255).astype(np.uint8), valid)
 
+    @property
+    def bounds(self) -> BoundingBox:
+        """West, south, east, north in the local frame."""
+        rows, columns = self.gray.shape
+        return BoundingBox(self.west, self.north - rows * self.gsd_m, self.west + columns * self.gsd_m, self.north)
+
     def pixel_centres(self, xy: Array) -> tuple[Indices, Array]:
         """Row and column (K, 2) of the pixels that hold points (K, 2), and the coordinates (K, 2) of their middles."""
         column = ((xy[:, 0] - self.west) // self.gsd_m).astype(np.int64)

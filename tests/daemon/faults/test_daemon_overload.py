@@ -52,15 +52,24 @@ def drained(queue):
 
 
 def test_while_it_keeps_up_frames_are_drawn_as_they_come():
-    queue = DrawQueue(100)
+    queue = DrawQueue(100, in_order=0)
     for seq in range(20):
         queue.put(pending(seq, 4.0 * seq))
         assert queue.take().seq == seq
     assert len(queue) == 0
 
 
+def test_pictures_are_drawn_as_they_came_while_few_wait():
+    queue = DrawQueue(100, in_order=3)
+    for seq, east in ((1, 3.0), (2, 6.0), (3, 400.0), (4, 6.1)):
+        queue.put(pending(seq, east))
+    assert queue.take().seq == 1  # four wait: all of them show new ground
+    assert [queue.take().seq for _ in range(3)] == [2, 3, 4]
+    assert queue.take() is None
+
+
 def test_ground_that_is_empty_goes_first():
-    queue = DrawQueue(100)
+    queue = DrawQueue(100, in_order=0)
     queue.put(pending(0, 0.0))
     assert queue.take().seq == 0
     for seq, east in ((1, 3.0), (2, 6.0), (3, 400.0), (4, 20.0), (5, 403.0)):
@@ -73,7 +82,7 @@ def test_ground_that_is_empty_goes_first():
 
 def test_the_first_few_of_a_jam_are_spread_over_its_ground():
     """Of 400 frames along 800 m, the first 40 that are drawn leave no gap as wide as the 40 that came first would."""
-    queue = DrawQueue(1000)
+    queue = DrawQueue(1000, in_order=0)
     for seq in range(400):
         queue.put(pending(seq, 2.0 * seq))
     first = sorted(2.0 * queue.take().seq for _ in range(40))
@@ -82,7 +91,7 @@ def test_the_first_few_of_a_jam_are_spread_over_its_ground():
 
 def test_in_a_jam_the_map_follows_every_vehicle():
     """96 vehicles send 192 pictures a second, 96 can be drawn: no vehicle's newest waits for two seconds."""
-    queue, delay, behind = DrawQueue(2000), MapDelay(), []
+    queue, delay, behind = DrawQueue(2000, in_order=0), MapDelay(), []
     for turn in range(20):  # each half a second
         for vehicle in range(96):
             seq, arrived = 96 * turn + vehicle, 0.5 * turn + vehicle / 192
@@ -117,7 +126,7 @@ def test_what_a_later_picture_shows_does_not_count_as_waiting():
 @settings(deadline=None, max_examples=40)
 @given(st.lists(st.integers(0, 300), min_size=1, max_size=60), st.integers(1, 30))
 def test_nothing_disappears_from_the_queue(places, most):
-    queue, left = DrawQueue(most), set()
+    queue, left = DrawQueue(most, in_order=0), set()
     for seq, place in enumerate(places):
         out = queue.put(pending(seq, float(place)))
         if out is not None:
@@ -130,7 +139,7 @@ def test_nothing_disappears_from_the_queue(places, most):
 
 
 def test_a_full_queue_lets_go_of_what_shows_least():
-    queue = DrawQueue(3)
+    queue = DrawQueue(3, in_order=0)
     queue.put(pending(0, 0.0))
     assert queue.take().seq == 0
     for seq, east in ((1, 2.0), (2, 300.0), (3, 600.0)):

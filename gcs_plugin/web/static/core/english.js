@@ -86,7 +86,7 @@ export const english = {
 
   "map.all": "Show all", "traffic.one": "Aircraft {name}, {height} above sea level", "map.vehicle": "Vehicle {name}", "cursor.copy": "Coordinates; press to copy", "cursor.mark": "Mark {place}", "cursor.centre": "Centre {place}", "cursor.copied": "Copied: {place}", "cursor.uncopied": "Not copied, write it down: {place}",
   "layers.title": "Layers", "layers.basemap": "Basemap", "layers.realtime": "Raw", "layers.coarse": "Preliminary", "layers.fine": "Final", "layers.opacity": "Opacity of {name}", "layers.none": "nothing yet",
-  "layers.basemap.about": "from before the disaster", "layers.realtime.about": "placed by GPS, seconds after arrival", "layers.coarse.about": "lines aligned in flight", "layers.fine.about": "aligned after landing",
+  "layers.basemap.about": "from before the disaster", "layers.realtime.about": "in flight: on the basemap once it is found there, by GPS before", "layers.coarse.about": "aligned roughly, before the final adjustment", "layers.fine.about": "aligned after landing",
   "layers.contrast": "Contrast", "goto.label": "Go to coordinates", "goto.go": "Go", "goto.wrong": "These are no coordinates: give degrees (latitude first), UTM or MGRS.",
   "details.picture": "Its latest picture", "details.picture.of": "Latest picture of {name}, {time}",
   "shown.title": "Overlays", "shown.routes": "Missions the vehicles hold", "shown.draft": "Plan (draft)", "shown.area": "Area", "shown.zones": "No-fly zones of the plan", "shown.fences": "Geofences of the vehicles", "shown.trails": "Trails", "shown.homes": "Homes", "shown.footprints": "Latest pictures' outlines", "shown.coverage": "Coverage", "shown.trust": "Where not to trust", "shown.legs": "Alignment of the lines",

@@ -131,6 +131,7 @@ const KINDS = {
   },
   traffic: (event) => takeTraffic(event.rows),
   layer: () => soon("/api/layers"),
+  legs: () => soon("/api/legs"),
   job: (event) => { heardJob(event); if (event.state === "done" || event.state === "failed") soon("/api/legs", "/api/completions", "/api/vehicles", "/api/layers"); },
   coverage: () => soon("/api/coverage"),
   requests: () => soon("/api/coverage"),
