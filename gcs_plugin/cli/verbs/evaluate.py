@@ -113,8 +113,8 @@ def _live(args: argparse.Namespace) -> int:
         return 0
     for by, f in found.items():
         print(
-            f"{by}: {f['pictures']} pictures, {f['median_m']:.2f} m median, {f['p95_m']:.2f} m 95 %; within one and two "
-            f"sigma {f['sigma_1']:.0f} and {f['sigma_2']:.0f} %; on the map after {f['after_median_s']:.2f} s, "
+            f"{by}: {f['pictures']} pictures, {f['median_m']:.2f} m median, {f['p95_m']:.2f} m 95 %; within one and "
+            f"two sigma {f['sigma_1']:.0f} and {f['sigma_2']:.0f} %; on the map after {f['after_median_s']:.2f} s, "
             f"95 % within {f['after_p95_s']:.2f} s"
         )
     return 0

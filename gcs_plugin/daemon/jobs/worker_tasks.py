@@ -250,7 +250,6 @@ def place(task: SortieTask) -> SortieResult:
         task.frames,
         epsg=task.epsg,
         origin=np.array(task.origin),
-        basemap=task.open_basemap(task.frames),
         options=options,
     )
     mine = {frame.image for frame in task.frames}

@@ -1,4 +1,4 @@
-"""The queue of frames to be drawn, bounded in number, in order of arrival while few wait, else of their use for the map.
+"""The queue of frames to be drawn, bounded; in order of arrival while few wait, else of their use for the map.
 
 A map pixel shows the picture with the nearest nadir point, so a frame gains fewer pixels the nearer its nadir lies
 to one that is drawn already: its share of the map is its cell of the Voronoi diagram of all nadirs. That distance, in

@@ -27,7 +27,7 @@ from orthoswarm.model.geo import LocalGrid
 from orthoswarm.raster.basemap import Basemap
 
 if TYPE_CHECKING:
-    from orthoswarm.refine.live.live_block import LiveBlock, LivePose
+    from orthoswarm.refine.sequential.live_block import LiveBlock, LivePose
 
 Bytes = NDArray[np.uint8]
 
@@ -138,7 +138,7 @@ class LiveRegistration:
         self, flown: _Flown, event: VehicleLookedFor, area: MapArea
     ) -> "Iterator[tuple[PendingFrame, LivePose]]":
         """Begin a vehicle's block; its first pictures, then those that have come since."""
-        from orthoswarm.refine.live.live_block import LiveBlock
+        from orthoswarm.refine.sequential.live_block import LiveBlock
 
         assert event.solution is not None and self._basemap is not None
         state, origin = event.solution.state, np.array(area.origin)

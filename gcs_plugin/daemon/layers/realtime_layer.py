@@ -39,7 +39,7 @@ from gcs_plugin.daemon.store.daemon_events import (
 from gcs_plugin.daemon.store.frame_rows import (
     POSE_KEYS,
     Drawn,
-    Moved,
+    DrawnAgain,
     frames_drawn,
     frames_moved,
     sortie_is_drawn,
@@ -283,7 +283,7 @@ class Drawer(Background):
         for pending, pose in self.registration.found(area):
             if mosaic.add(self._read(pending.frame.path), pose.camera, pose.ground_z_m).reason is None:
                 camera = self._document(pending, pose.camera, pose.ground_z_m, pose.sigma_m, "map")
-                done.append(Moved(pending.seq, pose.sigma_m, camera))
+                done.append(DrawnAgain(pending.seq, pose.sigma_m, camera))
         if done:
             self._journal.write(frames_moved(done))
             self._events.publish(LayerDrawn("realtime", self._site.layer.version))
@@ -339,7 +339,9 @@ class Drawer(Background):
         by = "receiver" if pose is None else "map"
         document = None if added.reason else self._document(pending, camera, level, sigma, by)
         small = thumbnail(picture).tobytes()
-        return self._report(pending, Drawn(pending.seq, added.reason, sigma, small, quality, document), camera)
+        return self._report(
+            pending, Drawn(pending.seq, added.reason, sigma, thumbnail=small, quality=quality, placed=document), camera
+        )
 
     def _document(self, pending: PendingFrame, camera: Camera, level: float, sigma_m: float, by: str) -> dict[str, Any]:
         """What the journal keeps of a drawn picture's place: by what, how soon, and its homography."""

@@ -4,7 +4,7 @@ import json
 import sqlite3
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import KW_ONLY, astuple, dataclass
 from typing import Any, Final
 
 from gcs_plugin.daemon.store.journal import Change, Journal, all_changes, packed, statements, unpacked
@@ -286,20 +286,21 @@ class Drawn:
         reason: why it was rejected, None if it was not. sigma_m: its error estimate, metres.
         thumbnail: bytes of uint8 (12, 16, 3), for balancing gains; None for a picture that was not read.
         quality: its sharpness and damage, None for a picture that was not read or is too small.
-        placed: `placed_by` (receiver or map), `placed_after_s` (seconds from arrival to the map), `sigma_m`, and `pose`:
-            of its line in frames.jsonl what `POSE_KEYS` names.
+        placed: `placed_by` (receiver or map), `placed_after_s` (seconds from arrival to the map), `sigma_m`, and
+            `pose`: of its line in frames.jsonl what `POSE_KEYS` names.
     """
 
     seq: int
     reason: str | None
     sigma_m: float | None
+    _: KW_ONLY
     thumbnail: bytes | None = None
     quality: PictureQuality | None = None
     placed: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class Moved:
+class DrawnAgain:
     """A drawn frame that was drawn again elsewhere: its error estimate in metres, and `placed` as of `Drawn`."""
 
     seq: int
@@ -307,8 +308,8 @@ class Moved:
     placed: dict[str, Any]
 
 
-def frames_moved(results: Sequence[Moved]) -> Change:
-    """The change that records where frames were drawn again; where and when they were drawn first is kept as `first`."""
+def frames_moved(results: Sequence[DrawnAgain]) -> Change:
+    """The change that records where frames were drawn again; what was of their first drawing is kept as `first`."""
     return statements(
         "UPDATE frames SET camera = json_set(?, '$.first', json(coalesce(json_extract(camera, '$.first'), camera))),"
         " sigma = CASE WHEN stage IN ('coarse', 'fine') THEN sigma ELSE ? END WHERE seq = ?",

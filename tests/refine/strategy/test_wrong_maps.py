@@ -9,7 +9,8 @@ from benchmarks.accuracy.other_dates import other_detail
 from benchmarks.robustness.wrong_maps import altered, blank, darkened, mirror_ew, mirror_ns, noise, season
 from orthoswarm.model.geo import local_origin
 from orthoswarm.raster.basemap import Basemap
-from orthoswarm.refine.strategy.in_flight import place_in_flight
+from orthoswarm.refine.registration.block_state import WorkArea
+from orthoswarm.refine.strategy.vehicle_passes import RefinerOptions, refine_alone
 from tests.kit.refine import refine_all
 from tests.kit.scenes import scene_of, tiny_twin
 from tests.refine.strategy.test_swarm_refiner import errors
@@ -60,5 +61,5 @@ def test_a_right_map_that_looks_otherwise_is_used(twin, scene, change, tmp_path)
 def test_in_flight_a_map_of_other_ground_is_refused_as_well(twin, scene, tmp_path):
     vehicles, grid, wrong, _ = with_map(twin, scene, mirror_ns, tmp_path)
     frames = next(iter(vehicles.values()))
-    solution = place_in_flight(frames, epsg=grid.epsg, origin=local_origin(grid, frames), basemap=wrong)
-    assert {leg.state for leg in solution.legs} == {"failed"}
+    area = WorkArea(grid.epsg, local_origin(grid, frames), wrong)
+    assert not refine_alone(frames[:20], area=area, options=RefinerOptions()).on_map

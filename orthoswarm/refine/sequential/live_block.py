@@ -19,6 +19,7 @@ from orthoswarm.model.frame import UNSTATED_SIGMA_M, Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import STATED_SIGMA_FACTOR, MapWindow, PlacedFrame
 from orthoswarm.model.robust import mad_sigmas
+from orthoswarm.raster.map_cache import TiledMap
 from orthoswarm.refine.bundle.adjustment import TRACK_ROBUST_C
 from orthoswarm.refine.bundle.block_arrays import (
     CX,
@@ -33,7 +34,6 @@ from orthoswarm.refine.bundle.block_arrays import (
 from orthoswarm.refine.bundle.flight_records import FlightRecords, read_records
 from orthoswarm.refine.bundle.normal_equations import room_of_a_point
 from orthoswarm.refine.features.tracks import Tracker, predicted_homography
-from orthoswarm.refine.live.window_adjustment import adjust_window
 from orthoswarm.refine.registration.absolute_orientation import (
     TIE_HALF_PX,
     TIE_REACH_M,
@@ -45,6 +45,7 @@ from orthoswarm.refine.registration.absolute_orientation import (
 )
 from orthoswarm.refine.registration.block_state import VehicleState, full_resolution
 from orthoswarm.refine.registration.tie_points import LoadedMap, match_points
+from orthoswarm.refine.sequential.window_adjustment import adjust_window
 
 _WINDOW: Final = 12  # pictures that are adjusted together
 _NEWEST: Final = 6  # of them those whose records count; what is older has its last estimate
@@ -59,22 +60,22 @@ _TIE_SLOPE: Final = 0.7
 _TIE_HEIGHT_M: Final = 3.0  # points farther above or below the ground are not compared
 _TRACK_SIGMA_PX: Final = 0.35  # as of the refinement's tracks
 _FIRST_SCALE: Final = 100.0  # robust scale before a new picture is adjusted, squared sigmas
-_SURE_TIES: Final = 12  # with so many ties in the window the map holds the vehicle
+_SURE_TIES: Final = 20  # with so many ties in the window the map holds the vehicle
 _GUIDE: Final = 8  # pictures whose corrections predict the next one's
 _LEAP_M: Final = 5.0  # a record that leaves the flown path by more is an outlier
 _HEIGHT_SIGMA_M: Final = 0.3  # least sigma of a corrected height
 _TURN_SIGMA_RAD: Final = float(np.radians(0.2))  # least sigma of a corrected attitude
-_FLOOR_M: Final = 0.1  # what no residual shows: the map, and what stands on the ground
+_FLOOR_M: Final = 0.06  # what no residual shows: the map, and what stands on the ground
 _BEGUN_M: Final = 0.2  # sigma of the first pictures, refined with ties (0.02 to 0.15 m off in simulation)
-_UNHELD_M: Final = 0.05  # growth of the error a picture while the map does not hold the vehicle (0.06 in simulation)
-_LOST_M: Final = 3.0  # with a larger sigma the vehicle is lost
+_UNHELD_M: Final = 0.08  # growth of the error a picture while the map does not hold the vehicle (0.06 in simulation)
+_LOST_M: Final = 5.0  # with a larger sigma the vehicle is lost
 _FEWEST_TRACKS: Final = 15  # a picture with fewer corners from the one before is not connected to it
 _LEAST_DOWN: Final = 0.3  # least downward part of an optical axis whose error on the ground is told
-_MAP_MARGIN_M: Final = 200.0  # the map is read so far around a picture at once
+_MAP_MARGIN_M: Final = 100.0  # the map is taken out of the cache so far around a picture
 
 
-@dataclass(slots=True)
-class _View:
+@dataclass(slots=True, kw_only=True)
+class _WindowPicture:
     """A picture of the window: its record and pose in the local frame, its tracks, its sigma on the ground."""
 
     frame: Frame
@@ -113,14 +114,15 @@ class LiveBlock:
 
     def __init__(self, state: VehicleState, grid: LocalGrid, origin: Array, basemap: MapWindow) -> None:
         flight = state.flight
-        self._grid, self._origin, self._basemap, self._surface = grid, origin, basemap, state.surface
+        self._grid, self._origin, self._surface = grid, origin, state.surface
         self._map_gsd_m, self._half_m = map_gsd(flight, basemap), tie_half_m(flight)
+        self._basemap = TiledMap(basemap, self._map_gsd_m)
         self._map: LoadedMap | None = None
         self.size = flight.pictures.size
         cameras = flight.cameras()
         self._lens, self._full_lens = cameras.lens[:1].copy(), full_resolution(cameras, flight).lens[:1].copy()
         self._tracker = Tracker(cell_px=max(1, round(self.size[0] / _CELLS)))
-        self._views: list[_View] = []
+        self._views: list[_WindowPicture] = []
         self._ids, self._points = np.zeros(0, np.int64), np.zeros((0, 3))
         self._seen = np.zeros(0, np.int64)
         self._tie_ids, self._tie_xy, self._tried = np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, np.int64)
@@ -168,7 +170,7 @@ class LiveBlock:
         self._add_points()
         self._adjust(_FIRST_SCALE, TRACK_ROBUST_C)
         if self._compare(gray):
-            self._adjust(TRACK_ROBUST_C, TRACK_ROBUST_C)
+            self._adjust(TRACK_ROBUST_C)
         self._unheld = 0 if len(self._tie_ids) >= _SURE_TIES else self._unheld + 1
         view.sigma_m = self._sigma_m()
         return self._pose(view.position, view.rotation, view.sigma_m) if view.sigma_m < _LOST_M else None
@@ -208,7 +210,7 @@ class LiveBlock:
 
     def _followed(
         self, frame: Frame, gray: Gray, records: FlightRecords, index: int, pose: tuple[Array, Array]
-    ) -> _View:
+    ) -> _WindowPicture:
         """A picture with the corners that were followed into it, and new ones."""
         position, rotation = pose
         predicted = None
@@ -220,10 +222,12 @@ class LiveBlock:
             predicted = predicted_homography(before.rotation, rotation, self._height(before), step, matrix)
         self._tracker.add(0, gray, predicted)
         ident, uv = self._tracker.latest()
-        record = records.position[index], records.rotation()[index]
-        return _View(frame, *record, position, rotation, ident, uv, float("nan"))
+        return _WindowPicture(
+            frame=frame, record=records.position[index], record_rotation=records.rotation()[index],
+            position=position, rotation=rotation, ident=ident, uv=uv, sigma_m=float("nan"),
+        )  # fmt: skip
 
-    def _height(self, view: _View) -> float:
+    def _height(self, view: _WindowPicture) -> float:
         return float(view.position[2] - self._surface.height(view.position[None, :2])[0])
 
     def _cameras(self) -> CameraBlock:
@@ -294,10 +298,11 @@ class LiveBlock:
         scatter = np.maximum(mad_sigmas(turn - bias), _TURN_SIGMA_RAD)
         position, rotation = record + usual, recorded @ exp_rotation(bias[None])[0]
         weight, turning = np.tile(spread**-2.0, (len(views), 1)), np.tile(scatter**-2.0, (len(views), 1))
-        for i, v in enumerate(views[:-_NEWEST]):
-            sigma = _OLDER_SHARE * v.sigma_m
-            position[i], rotation[i] = v.position, v.rotation
-            weight[i], turning[i] = sigma**-2.0, (sigma / self._height(v)) ** -2.0
+        older = views[:-_NEWEST]
+        if older:
+            position[: len(older)], rotation[: len(older)] = [v.position for v in older], [v.rotation for v in older]
+            sigma = _OLDER_SHARE * np.array([[v.sigma_m] for v in older])
+            weight[: len(older)], turning[: len(older)] = sigma**-2.0, (sigma / self._height(views[-1])) ** -2.0
         return position, weight, rotation, turning
 
     # -- the map --------------------------------------------------------------------------------------------------
@@ -353,7 +358,7 @@ class LiveBlock:
 
 
 def spread_points(xy: Array, most: int) -> Indices:
-    """At most so many of the points (M, 2), as far from each other as they are: the next is farthest from those taken."""
+    """At most so many of the points (M, 2): each is the one farthest from those taken before."""
     if len(xy) <= most:
         return np.arange(len(xy))
     chosen = [int(((xy - xy.mean(0)) ** 2).sum(1).argmax())]
