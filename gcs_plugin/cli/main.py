@@ -25,6 +25,7 @@ VERBS = {
     "plan": "make missions that cover an area, or follow lines, with a swarm",
     "mosaic": "make a georeferenced orthoimage from drone photos",
     "coverage": "say which ground of an area was seen well, what was missed, and why",
+    "change": "say where the ground is no longer what the pre-disaster map shows, and what has become of it",
     "inspect": "say what photos, videos and logs contain, and what is suspicious about them",
     "frames": "take the pictures of a video, with their poses in EXIF and XMP",
     "fleet": "list vehicles on their links, upload missions, start, pause, resume, bring home, watch",
