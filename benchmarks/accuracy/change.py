@@ -128,9 +128,11 @@ def measure(folder, kind):
 
 def outline_distance(stated, changed):
     """Median distance of the stated outline of large areas from the true one, cells."""
+
     def outline(mask):
         opened = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((9, 9), np.uint8))
         return opened != cv2.erode(opened, np.ones((3, 3), np.uint8))
+
     own, true = outline(stated), outline(changed)
     if not own.any() or not true.any():
         return float("nan")
@@ -160,7 +162,10 @@ def fit(folders, kinds, target):
             print(folder.name, kind, len(k), flush=True)
     x, y = np.concatenate(values), np.concatenate(cases)
     mean, spread = x.mean(0), x.std(0) + 1e-6
-    inputs, wanted = torch.tensor(np.clip((x - mean) / spread, -likelihood.MOST, likelihood.MOST)), torch.tensor(y).long()
+    inputs, wanted = (
+        torch.tensor(np.clip((x - mean) / spread, -likelihood.MOST, likelihood.MOST)),
+        torch.tensor(y).long(),
+    )
     torch.manual_seed(0)
     net = torch.nn.Sequential(torch.nn.Linear(x.shape[1], HIDDEN), torch.nn.Tanh(), torch.nn.Linear(HIDDEN, 4))
     steps = torch.optim.Adam(net.parameters(), 5e-3, weight_decay=1e-5)

@@ -69,7 +69,8 @@ def _write_raster(path: Path, found: ChangeMap) -> None:
         plain = Path(scratch) / "plain.tif"  # overviews are made of a whole file
         with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True):
             with rasterio.open(plain, "w", **profile) as file:
-                file.write(np.where(found.visible, found.probability, 0).astype(np.uint8), 1)
+                hidden = found.inside & ~found.visible  # masked, and not the 0 of what lies outside
+                file.write(np.where(found.visible, found.probability, hidden).astype(np.uint8), 1)
                 file.write_mask(found.visible)
                 file.set_band_description(1, "probability that the ground changed, 0 to 255")
                 file.update_tags(TIFFTAG_SOFTWARE=software())

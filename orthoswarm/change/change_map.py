@@ -27,7 +27,7 @@ _MARGIN: Final = 16  # cells around it that are measured, too: two sigmas of the
 _MOST_CELLS: Final = 16_000_000  # cells are larger where there would be more (memory)
 _SCENE_CELLS: Final = 1_000_000  # of the whole scene, on which its tones are compared
 _APART: Final = 0.25  # distance of the pictures that are used, in heights above the ground: four see each place
-_THICK: Final = 0.8  # share of haze that hides the ground
+_THICK: Final = 0.6  # share of haze that hides the ground
 _SEEN: Final = 0.5  # share of a cell that pictures must see
 _DISTORTED_PX: Final = 1.0  # offsets of the map below this are those of what leans, not of the map
 
@@ -172,7 +172,9 @@ def _above_ground(grid: GroundGrid, terrain: Terrain) -> Floats:
 
 def _thinned(views: Sequence[View], terrain: Terrain) -> list[View]:
     """Pictures some way apart, refined and sure ones first: all of a flight's see each place many times."""
-    order = sorted(range(len(views)), key=lambda i: (not views[i].placed, round(np.nan_to_num(views[i].sigma_m, nan=9), 1), i))
+    order = sorted(
+        range(len(views)), key=lambda i: (not views[i].placed, round(np.nan_to_num(views[i].sigma_m, nan=9), 1), i)
+    )
     taken: dict[tuple[int, int], list[View]] = {}
     out: list[View] = []
     level = float(np.median(terrain.z))

@@ -54,7 +54,9 @@ def find_objects(
     labels = np.zeros(changed.shape, np.int32)
     count = 0
     for part in (wet, changed & ~wet):
-        number, own, stats, _ = cv2.connectedComponentsWithStats(part.astype(np.uint8), connectivity=8, ltype=cv2.CV_32S)
+        number, own, stats, _ = cv2.connectedComponentsWithStats(
+            part.astype(np.uint8), connectivity=8, ltype=cv2.CV_32S
+        )
         large = np.flatnonzero(stats[:, cv2.CC_STAT_AREA] * cell_m2 >= LEAST_M2)
         large = large[large > 0]
         new = np.zeros(number, np.int32)

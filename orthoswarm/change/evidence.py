@@ -23,6 +23,7 @@ _LITTLE: Final = 0.1  # power of structure that is as good as none
 _AROUND_DARKEST_M: Final = 24.0
 _DARK: Final = 55.0  # grey value of the darkest place around on a clear day
 _WHITE: Final = 225.0  # grey value of haze
+_LEAST_WEIGHT: Final = 0.005  # of pictures: one that sees a place 50 degrees off nadir counts so little
 _SAME: Final = 0.3  # what has so much in common is the same ground
 _ENOUGH: Final = 200  # cells that tell the usual ratio of contrasts
 
@@ -53,7 +54,7 @@ class Measured(NamedTuple):
     Attributes:
         values: float32 (rows, columns, features), what the probability is computed from.
         seen: float32 (rows, columns), 0 to 1, how much of it pictures see and the map has. veil: share of its light
-            that is haze.
+            that is haze, less that of the map (large white roofs are no haze).
     """
 
     values: Floats
@@ -77,9 +78,9 @@ def measured(block: Block, tone: ToneModel) -> Measured:
     """Measure the cells of a block; `tone`: the scene's."""
     seen, before, per_cell, cell_m = block.seen, block.before, block.per_cell, block.cell_m
     gsd_m = cell_m / per_cell
-    both = ((seen.weight > 0.02) & block.valid).astype(np.float32)
+    both = ((seen.weight > _LEAST_WEIGHT) & block.valid).astype(np.float32)
     now, veil = unveiled(seen.contrast, np.where(both > 0, seen.gray, 255.0).astype(np.float32), gsd_m)
-    then, _ = unveiled(before.contrast, np.where(block.valid, block.gray, 255.0).astype(np.float32), gsd_m)
+    then, clear = unveiled(before.contrast, np.where(block.valid, block.gray, 255.0).astype(np.float32), gsd_m)
     product = before.field * seen.field
     parts = [
         product[..., 0] + product[..., 1], product[..., 2] + product[..., 3], before.power,
@@ -97,9 +98,7 @@ def measured(block: Block, tone: ToneModel) -> Measured:
     values += [np.log(mean_around(far, scale / cell_m, known) + 0.2) for scale in _HUE_SCALES_M]
     difference = mean_around(difference, _HUE_SCALES_M[0] / cell_m, known)
     values += [difference, np.log(difference + 0.01)]
-    return Measured(
-        np.stack(values, -1).astype(np.float32), count, on_cells(veil, per_cell)
-    )
+    return Measured(np.stack(values, -1).astype(np.float32), count, on_cells(np.maximum(veil - clear, 0.0), per_cell))
 
 
 def _structure_values(cells: Floats, count: Floats, cell_m: float) -> list[Floats]:
@@ -117,4 +116,3 @@ def _structure_values(cells: Floats, count: Floats, cell_m: float) -> list[Float
         ratio = mean[..., 5] - np.float32(usual)
         out += [*shares(mean), np.maximum(mean[..., 4], 0.0), np.maximum(ratio, 0.0), np.maximum(-ratio, 0.0)]
     return out
-

@@ -46,7 +46,9 @@ def cell_looks(picture: Bytes) -> CellLooks:
     cube = 1.0 / (length * length * length)
     order = [(real * real - imaginary * imaginary) * cube, 2 * real * imaginary * cube, length]
     color = on_cells(picture, FINE).astype(np.float32)
-    return CellLooks(color, on_cells(length, FINE), on_cells(spots, FINE), np.dstack([on_cells(o, FINE) for o in order]))
+    return CellLooks(
+        color, on_cells(length, FINE), on_cells(spots, FINE), np.dstack([on_cells(o, FINE) for o in order])
+    )
 
 
 def order_of(order: Floats) -> Floats:
@@ -119,7 +121,9 @@ class ToneModel(NamedTuple):
         wanted = self.linear[0] + b @ self.linear[1:] + self.shift[nearest]
         rest = (a - wanted)[..., 1:]
         far = ((rest / self.spread[nearest][..., 1:]) ** 2).sum(-1)
-        return np.asarray(np.minimum(far, _MOST), np.float32), np.asarray(np.hypot(rest[..., 0], rest[..., 1]), np.float32)
+        return np.asarray(np.minimum(far, _MOST), np.float32), np.asarray(
+            np.hypot(rest[..., 0], rest[..., 1]), np.float32
+        )
 
 
 _SAMPLES: Final = 20_000

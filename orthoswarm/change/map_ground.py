@@ -63,7 +63,9 @@ def shifted(values: Floats, offset: Floats) -> Floats:
     """Values taken at each pixel plus an offset (columns, rows), float32 (rows, columns, 2)."""
     row, column = (a.astype(np.float32) for a in np.indices(values.shape[:2]))
     return np.asarray(
-        cv2.remap(values, column + offset[..., 0], row + offset[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+        cv2.remap(
+            values, column + offset[..., 0], row + offset[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
+        )
     )
 
 

@@ -151,8 +151,6 @@ def _on_ground(
     gray = cv2.remap(picture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float32)
     tan2 = (x * x + (y * y)[:, None]) / np.maximum(z * z, 1.0)
     counts = 1.0 / (1.0 + (tan2 / np.float32(_HALVED**2)) ** 2)
-    border = np.minimum(
-        np.minimum(u, picture.shape[1] - 1 - u), np.minimum(v, picture.shape[0] - 1 - v)
-    )
+    border = np.minimum(np.minimum(u, picture.shape[1] - 1 - u), np.minimum(v, picture.shape[0] - 1 - v))
     counts *= (border > _BORDER_PX) & (depth > 1.0) & (tan2 < np.float32(_STEEPEST**2))
     return gray, counts

@@ -187,9 +187,7 @@ def collapse(scene: Scene, seed: int) -> None:
         hit = own & (side > np.quantile(side[own], cut))
         depth[window][hit] = 9.0
         floor[window][hit] += 0.45 * tall
-    _bury(
-        scene.albedo, scene.kind, scene.dsm, floor, scene.wall, scene.facade, depth, 1.0, 0.0, seed * 17 + 7
-    )
+    _bury(scene.albedo, scene.kind, scene.dsm, floor, scene.wall, scene.facade, depth, 1.0, 0.0, seed * 17 + 7)
 
 
 def flood(scene: Scene, zone: DamagedGround, seed: int) -> None:

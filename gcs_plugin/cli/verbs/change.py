@@ -34,6 +34,7 @@ def run(args: argparse.Namespace) -> int:
     from gcs_plugin.cli.progress import ProgressBars
     from orthoswarm.change.of_folder import change_of
     from orthoswarm.compute.workers import prepare_process
+    from orthoswarm.report.change_section import put_section
 
     if not 0.25 <= args.want_m < 1000.0:
         raise InputError(f"--want-m is {args.want_m:g}; give metres, 0.25 or more")
@@ -45,6 +46,7 @@ def run(args: argparse.Namespace) -> int:
         figures = change_of(
             args.map, args.out, basemap=args.basemap, want_m=args.want_m, threshold=args.threshold, progress=bars
         )
+    put_section(args.map, args.out)
     if args.json:
         print(json_text(figures))
     else:

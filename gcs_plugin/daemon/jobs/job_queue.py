@@ -2,7 +2,7 @@
 
 A job that was queued or running when the daemon ended is queued again; it must be repeatable up to the
 journal change that also marks it as done. Refinements have their own threads; background jobs
-(coarse maps in flight, joint refinements of neighbours, tones, exports) run one at a time in another thread. They
+(coarse maps in flight, joint refinements of neighbours, tones, exports, changes) run one at a time in another thread. They
 start only while no refinement waits or runs, and give way to one that begins; drawing a layer again does not wait.
 `JobRequests` asks for jobs when something has happened: a leg is over, a mission complete, a refinement done.
 """
@@ -49,7 +49,7 @@ Result = TypeVar("Result")
 
 _MOST_ATTEMPTS: Final = 3  # of a job whose worker stopped
 _MOST_LISTED: Final = 1000  # finished jobs
-_BACKGROUND: Final = frozenset({"coarse", "together", "tones", "redraw", "export"})
+_BACKGROUND: Final = frozenset({"coarse", "together", "tones", "redraw", "export", "change"})
 _AFTER_REFINEMENT: Final = _BACKGROUND - {"redraw"}
 """An export that was asked for during a refinement holds its result."""
 _GIVES_WAY: Final = _AFTER_REFINEMENT - {"export"}
@@ -380,8 +380,10 @@ class JobRequests:
         self._jobs.wake()
 
     def job_ended(self, event: JobEnded) -> None:
-        """Export the products again once nothing is left to refine."""
+        """Export the products again once nothing is left to refine, then compare them with the map."""
         job = event.job
+        if job.kind == "export" and job.state == "done" and "after" in job.detail and "note" not in job.detail:
+            self._jobs.add("change")
         if job.kind == "refine":
             self._jobs.wake()
         elif job.kind not in ("together", "tones", "redraw") and (job.kind != "coarse" or "after" not in job.detail):
