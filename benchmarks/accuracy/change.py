@@ -5,17 +5,20 @@
     python -m benchmarks.accuracy.change measure SET... [--maps same season hour ...]
     python -m benchmarks.accuracy.change fit SET... [--weights FILE]
 
-Each set is compared with its own map and with others made of it: another season and sensor, darker, other detail (plants,
-cars and ruts of another year), averaged to 1 and 3 m a pixel, distorted by up to 3 m. Changed is what the twin's
-disaster struck; haze has changed nothing. A line a set and map: average precision by cell; objects of 100 m2 and more
-that were found (a quarter of their cells at least); the share of unchanged ground that is called changed at p = 0.5, and
-such objects a square kilometre; how far the changed ground's outline lies from the true one (median); the share that is
-really changed of cells stated at 0 to 20 %, ... 80 to 100 %. `fit` takes sets of other seeds than those that are measured.
+Each set is compared with its own map and with others made of it: another season and sensor, darker, other detail
+(plants, cars and ruts of another year), averaged to 1 and 3 m a pixel, distorted by up to 3 m. Changed is what the
+twin's disaster struck; haze has changed nothing. A line a set and map: average precision by cell; objects of 100 m2 and
+more that were found (a quarter of their cells at least); the share of unchanged ground that is called changed at
+p = 0.5, and such objects a square kilometre; how far the changed ground's outline lies from the true one (median); the
+share that is really changed of cells stated at 0 to 20 %, ... 80 to 100 %. `fit` takes sets of other seeds than those
+that are measured.
 """
 
 import argparse
 import json
+import shutil
 import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -50,8 +53,8 @@ def distorted(picture, gsd_m, most_m=3.0):
     return np.stack([cv2.remap(b, column + shift[0], row + shift[1], cv2.INTER_LINEAR) for b in picture])
 
 
-MAPS = {
-    "same": None, "season": partial(altered, change=season), "darker": partial(altered, change=darkened),
+MAPS: dict[str, Callable] = {
+    "same": shutil.copyfile, "season": partial(altered, change=season), "darker": partial(altered, change=darkened),
     "detail": partial(altered, change=KINDS["half of the detail"]),
     "all detail": partial(altered, change=KINDS["all detail, another season"]),
     "distorted": partial(altered, change=distorted),
@@ -61,10 +64,8 @@ MAPS = {
 
 def scene(folder, kind):
     """The scene of a set with a kind of map, and its views."""
-    path = folder / "basemap.tif"
-    if MAPS[kind] is not None:
-        path = folder / f"basemap-{kind.replace(' ', '-')}.tif"
-        MAPS[kind](folder / "basemap.tif", path)
+    path = folder / f"basemap-{kind.replace(' ', '-')}.tif"
+    MAPS[kind](folder / "basemap.tif", path)
     flown = read_map(folder / "out")
     return scene_of(folder / "out", flown, basemap=path)[0], flown
 
@@ -120,7 +121,9 @@ def measure(folder, kind):
         "false_share": round(float((stated & ~changed)[seen].sum() / max((~changed)[seen].sum(), 1)), 4),
         "false_km2": round(float(false) / (seen.sum() * cell_m2 / 1e6), 1),
         "outline_m": outline_distance(stated & seen, changed & seen) * found.grid.gsd_m if large else None,
-        "reliability": [round(float(changed[seen][bins == k].mean()), 2) if (bins == k).any() else None for k in range(5)],
+        "reliability": [
+            round(float(changed[seen][bins == k].mean()), 2) if (bins == k).any() else None for k in range(5)
+        ],
         "not_visible": round(1 - seen.sum() / found.inside.sum(), 3), "kinds": {k: round(v) for k, v in kinds.items()},
         "cpu_s": round(cpu, 2),
     }  # fmt: skip

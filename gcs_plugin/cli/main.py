@@ -39,6 +39,8 @@ VERBS = {
     "weights": "list, import and check the weights of learned matchers",
     "doctor": "show what this machine has (codecs, weights, cores, disk), and what does not work without the rest",
 }
+_FOLDERS = {"change": "ground.", "coverage": "ground."}
+"""Where a verb's module lies, if not beside the others."""
 
 _NEGATIVE = re.compile(r"-[0-9.]")
 _INTERRUPT_AGAIN_S = 0.05  # well below what a person notices
@@ -122,7 +124,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if verb not in VERBS:
         print(f"orthoswarm: there is no verb '{verb}'; choose one of: {', '.join(VERBS)}", file=sys.stderr)
         return 2
-    module = importlib.import_module(f"gcs_plugin.cli.verbs.{verb}")
+    module = importlib.import_module(f"gcs_plugin.cli.verbs.{_FOLDERS.get(verb, '')}{verb}")
     parser = _Parser(prog=f"orthoswarm {verb}", description=VERBS[verb][0].upper() + VERBS[verb][1:] + ".")
     module.configure(parser)
     try:

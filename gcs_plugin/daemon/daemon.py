@@ -192,7 +192,9 @@ class Daemon:
             "export": self.exports.write, "redraw": publisher.draw_again, "change": self.changes.find,
         }  # fmt: skip
         self.jobs = Jobs(self.journal, self.events, handlers, self.workers, self.background)
-        self.requests = JobRequests(self.journal, self.jobs, coarse=settings.coarse)
+        self.requests = JobRequests(
+            self.journal, self.jobs, coarse=settings.coarse, compare=settings.basemap is not None
+        )
         if publisher.lost:
             self.jobs.add("redraw")
         for whose in publisher.outdated:

@@ -56,7 +56,9 @@ def write_products(
     surface = None
     if run.options.surface is not None:
         surface = make_surface(run, state, stated, z - level, refinement)
-    if GROUND in _made(run, state.fault is not None) and state.terrain is not None:
+    if state.terrain is None:  # left by an earlier run
+        (run.out / GROUND).unlink(missing_ok=True)
+    elif GROUND in _made(run, state.fault is not None):
         write_ground(run.out / GROUND, state.terrain.changed(lambda h: h + np.float32(z - level)), state.grid.epsg)
     with run.clock.stage("final: report", len(placed)) as stage:
         write_frames(run.out, stated, list(state.rejected.values()), state.grid, z, covariance=run.options.covariance)

@@ -1,10 +1,9 @@
 """The change of an area against its pre-disaster map, block by block of cells, so that memory is bounded."""
 
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -33,12 +32,12 @@ _DISTORTED_PX: Final = 1.0  # offsets of the map below this are those of what le
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Scene:
+class ComparedScene:
     """What is compared.
 
     Attributes:
         views: refined pictures, in the map's grid. terrain: the ground they lie on. basemap: the pre-disaster map.
-        orthoimage: the refined orthoimage. read: gives a view's grey values. lean: of the map, metres a metre of height.
+        orthoimage: the refined one. read: gives a view's grey values. lean: of the map, metres a metre of height.
     """
 
     views: Sequence[View]
@@ -49,7 +48,7 @@ class Scene:
     lean: tuple[float, float]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ChangeMap:
     """The change of an area; all (rows, columns).
 
@@ -70,8 +69,10 @@ class ChangeMap:
     def blank(cls, grid: GroundGrid) -> "ChangeMap":
         """A map of nothing."""
         shape = (grid.height, grid.width)
-        byte, flag = (lambda: np.zeros(shape, np.uint8)), (lambda: np.zeros(shape, bool))
-        return cls(grid, byte(), flag(), flag(), byte(), np.zeros(shape, np.float32))
+        chance, case = np.zeros((2, *shape), np.uint8)
+        visible, inside = np.zeros((2, *shape), bool)
+        height = np.zeros(shape, np.float32)
+        return cls(grid=grid, probability=chance, visible=visible, inside=inside, case=case, height=height)
 
 
 class MeasuredBlock(NamedTuple):
@@ -91,7 +92,7 @@ class MeasuredBlock(NamedTuple):
 
 
 def map_change(
-    scene: Scene, *, want_m: float, progress: Callable[[int, int], None] = lambda done, of: None
+    scene: ComparedScene, *, want_m: float, progress: Callable[[int, int], None] = lambda done, of: None
 ) -> ChangeMap:
     """Find where the ground is no longer what the map shows.
 
@@ -114,7 +115,7 @@ def map_change(
     return out
 
 
-def cells_of(scene: Scene, want_m: float) -> GroundGrid:
+def cells_of(scene: ComparedScene, want_m: float) -> GroundGrid:
     """The cells of what both the orthoimage and the map show."""
     import rasterio
 
@@ -124,7 +125,7 @@ def cells_of(scene: Scene, want_m: float) -> GroundGrid:
     return GroundGrid.around(scene.basemap.epsg, bounds, max(want_m, scene.basemap.native_gsd_m, most))
 
 
-def measured_blocks(scene: Scene, grid: GroundGrid) -> Iterator[MeasuredBlock]:
+def measured_blocks(scene: ComparedScene, grid: GroundGrid) -> Iterator[MeasuredBlock]:
     """Measure the cells of a scene, block by block."""
     per_cell = 2 if grid.gsd_m >= 1.5 * scene.basemap.native_gsd_m else 1
     scene, tone = replace(scene, views=_thinned(scene.views, scene.terrain)), _tone(scene, grid)
@@ -132,13 +133,13 @@ def measured_blocks(scene: Scene, grid: GroundGrid) -> Iterator[MeasuredBlock]:
         for column in range(0, grid.width, _BLOCK):
             rows = slice(row, min(row + _BLOCK, grid.height))
             columns = slice(column, min(column + _BLOCK, grid.width))
-            yield _measured_block(scene, tone, grid, rows, columns, per_cell)
+            yield _measured_block(scene, tone, grid, (rows, columns), per_cell)
 
 
 def _measured_block(
-    scene: Scene, tone: ToneModel, grid: GroundGrid, rows: slice, columns: slice, per_cell: int
+    scene: ComparedScene, tone: ToneModel, grid: GroundGrid, window: tuple[slice, slice], per_cell: int
 ) -> MeasuredBlock:
-    cell = grid.gsd_m
+    (rows, columns), cell = window, grid.gsd_m
     own = replace(
         grid, west=grid.west + (columns.start - _MARGIN) * cell, north=grid.north - (rows.start - _MARGIN) * cell,
         width=columns.stop - columns.start + 2 * _MARGIN, height=rows.stop - rows.start + 2 * _MARGIN,
@@ -148,14 +149,15 @@ def _measured_block(
     pixels = replace(own, gsd_m=cell / per_cell, width=own.width * per_cell, height=own.height * per_cell)
     terrain, views = scene.terrain, scene.views if drawn.any() else ()
     seen = seen_ground(views, pixels, heights_on(pixels, terrain, terrain.z), scene.read)
-    gray, valid = scene.basemap.gray(BoundingBox(*pixels.bounds), pixels.gsd_m)
+    fine, known = scene.basemap.rgb(BoundingBox(*own.bounds), cell / FINE)
+    gray = on_cells(cv2.cvtColor(fine, cv2.COLOR_RGB2GRAY), FINE // per_cell).astype(np.float32)
+    valid = on_cells(known.astype(np.float32), FINE // per_cell) > _SEEN
     before = structure(gray, pixels.gsd_m)
     offset = local_offsets(before.field, seen.field)
     if float(np.abs(offset).max()) > _DISTORTED_PX:
         offset[np.hypot(offset[..., 0], offset[..., 1]) < _DISTORTED_PX] = 0.0
         gray = shifted(gray, offset)
         before = structure(gray, pixels.gsd_m)
-    fine, _ = scene.basemap.rgb(BoundingBox(*own.bounds), cell / FINE)
     block = Block(seen, before, gray, valid, cell_looks(picture), cell_looks(fine), drawn, per_cell, cell)
     height = _above_ground(own, terrain)
     inner = np.s_[_MARGIN:-_MARGIN, _MARGIN:-_MARGIN]
@@ -188,7 +190,7 @@ def _thinned(views: Sequence[View], terrain: Terrain) -> list[View]:
     return out
 
 
-def _tone(scene: Scene, grid: GroundGrid) -> ToneModel:
+def _tone(scene: ComparedScene, grid: GroundGrid) -> ToneModel:
     """How the scene's colours have changed where it is the same."""
     factor = max(2.0, float(np.sqrt(grid.width * grid.height / _SCENE_CELLS)))
     coarse = GroundGrid.around(grid.epsg, grid.bounds, grid.gsd_m * factor)
@@ -200,16 +202,27 @@ def _tone(scene: Scene, grid: GroundGrid) -> ToneModel:
 def orthoimage_window(path: Path, cells: GroundGrid, per_cell: int) -> tuple[Bytes, Bytes]:
     """Colours (rows, columns, 3) and alpha (rows, columns) of an orthoimage on the pixels of cells, uint8."""
     import rasterio
-    from rasterio.enums import Resampling
-    from rasterio.vrt import WarpedVRT
+    from rasterio.windows import Window
 
-    place = cells.affine() * rasterio.Affine.scale(1.0 / per_cell)
-    size: dict[str, Any] = {"width": cells.width * per_cell, "height": cells.height * per_cell}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        with (
-            rasterio.open(path) as file,
-            WarpedVRT(file, crs=file.crs, transform=place, resampling=Resampling.bilinear, **size) as view,
-        ):
-            bands = view.read((1, 2, 3, 4))
-    return np.ascontiguousarray(np.moveaxis(bands[:3], 0, 2)), bands[3]
+    pixel = cells.gsd_m / per_cell
+    rows, columns = cells.height * per_cell, cells.width * per_cell
+    with rasterio.open(path) as file:
+        gsd, left, top = float(file.res[0]), file.bounds.left, file.bounds.top
+        factor = max(1, 2 ** int(np.floor(np.log2(max(pixel / gsd, 1.0)))))  # an overview that is finer
+        size = np.array([file.width, file.height])
+        low = (np.array([cells.west - left, top - cells.north]) / gsd).astype(int) // factor * factor - factor
+        high = low + np.ceil(np.array([columns, rows]) * pixel / gsd / factor).astype(int) * factor + 3 * factor
+        low, high = np.clip(low, 0, size), np.clip(high, 0, size)
+        wide, tall = (int(v) for v in -(-(high - low) // factor))
+        if wide < 1 or tall < 1:
+            return np.zeros((rows, columns, 3), np.uint8), np.zeros((rows, columns), np.uint8)
+        window = Window(int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1]))
+        bands = np.moveaxis(file.read((1, 2, 3, 4), window=window, out_shape=(4, tall, wide)), 0, 2)
+    # Where the pixels of the cells lie in what was read.
+    step = gsd * (high - low) / [wide, tall]
+    scale = pixel / step
+    first = (np.array([cells.west - left, top - cells.north]) - low * gsd) / step + 0.5 * scale - 0.5
+    place = np.array([[scale[0], 0.0, first[0]], [0.0, scale[1], first[1]]])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    out = cv2.warpAffine(np.ascontiguousarray(bands), place, (columns, rows), flags=flags)
+    return np.ascontiguousarray(out[..., :3]), out[..., 3]

@@ -15,6 +15,7 @@ NEW_OBJECT, CHANGED = "new object", "changed"
 _STANDS_M: Final = 1.5  # a new object is higher
 _SURE: Final = 0.6  # share of an object's cells that make it of a kind
 _PHOTOS: Final = 3
+_NEAREST: Final = 40  # views below which a place is looked for
 _OUTLINE_CELLS: Final = 0.6  # the outline may be so far beside the cells' edges
 
 
@@ -94,12 +95,16 @@ def _kind(found: ChangeMap, cells: tuple[np.ndarray, ...]) -> str:
 
 def best_photos(views: Sequence[View], place: np.ndarray) -> tuple[tuple[str, str], ...]:
     """Vehicle and name of the photos that have a place (3,) nearest to their middle, the best first."""
+    if not views:
+        return ()
+    away = np.array([view.position[:2] for view in views]) - place[:2]
     ranked = []
-    for view in views:
+    for k in np.argsort((away**2).sum(1))[:_NEAREST]:
+        view = views[int(k)]
         x, y, depth = view.to_camera @ (place - view.position)
         if depth <= 0.0:
             continue
-        u, v = view.lens.distort(np.array([x, y]) / depth) * view.lens.focal_px
+        u, v = np.array([x, y]) / depth * view.lens.focal_px
         if abs(u) < 0.48 * view.lens.width and abs(v) < 0.48 * view.lens.height:
             ranked.append((float(np.hypot(u, v)) / view.lens.width, view.vehicle, view.image))
     return tuple((vehicle, image) for _, vehicle, image in sorted(ranked)[:_PHOTOS])

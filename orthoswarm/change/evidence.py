@@ -14,7 +14,7 @@ import numpy as np
 from orthoswarm.change.looks import CellLooks, ToneModel, mean_around, on_cells, order_of
 from orthoswarm.change.seen_ground import SeenGround
 from orthoswarm.change.structure import NOISE_GRAY, Structure, blurred
-from orthoswarm.model.arrays import Bytes, Flags, Floats
+from orthoswarm.model.arrays import Flags, Floats
 
 SCALES_M: Final = (2.0, 4.0, 8.0)  # sigmas of the surroundings of structure
 _FINE_SCALES_M: Final = (2.0, 4.0)  # of roughness and order
@@ -23,7 +23,7 @@ _LITTLE: Final = 0.1  # power of structure that is as good as none
 _AROUND_DARKEST_M: Final = 24.0
 _DARK: Final = 55.0  # grey value of the darkest place around on a clear day
 _WHITE: Final = 225.0  # grey value of haze
-_LEAST_WEIGHT: Final = 0.005  # of pictures: one that sees a place 50 degrees off nadir counts so little
+_LEAST_WEIGHT: Final = 0.02  # of pictures: one that sees a place 43 degrees off nadir counts so little
 _SAME: Final = 0.3  # what has so much in common is the same ground
 _ENOUGH: Final = 200  # cells that tell the usual ratio of contrasts
 
@@ -87,7 +87,9 @@ def measured(block: Block, tone: ToneModel) -> Measured:
         np.maximum(seen.same, 0.0), seen.power - seen.same, np.log((now + NOISE_GRAY) / (then + NOISE_GRAY)),
     ]  # fmt: skip
     count = on_cells(both, per_cell)
-    cells = np.dstack([on_cells(part * both, per_cell) for part in parts]) / np.maximum(count, 1e-3)[..., None]
+    cells = (
+        np.dstack([on_cells(part * both, per_cell) for part in parts]) / np.maximum(count, np.float32(1e-3))[..., None]
+    )
     values = _structure_values(cells, count, cell_m)
     known = count * block.drawn
     for scale in _FINE_SCALES_M:
@@ -97,7 +99,7 @@ def measured(block: Block, tone: ToneModel) -> Measured:
     far, difference = tone.differs(block.then.color, block.now.color)
     values += [np.log(mean_around(far, scale / cell_m, known) + 0.2) for scale in _HUE_SCALES_M]
     difference = mean_around(difference, _HUE_SCALES_M[0] / cell_m, known)
-    values += [difference, np.log(difference + 0.01)]
+    values += [difference, np.log(difference + 0.01), np.log(on_cells(seen.weight, per_cell) + _LEAST_WEIGHT)]
     return Measured(np.stack(values, -1).astype(np.float32), count, on_cells(np.maximum(veil - clear, 0.0), per_cell))
 
 

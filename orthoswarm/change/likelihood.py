@@ -1,7 +1,7 @@
 """From what is measured of cells to the probabilities of what has become of them.
 
 Four cases exclude each other: unchanged; under water; buried or ploughed up; a building gone or its roof torn. Their
-log-likelihoods, but for a constant, are a smooth function of what is measured: sums of HIDDEN sigmoids of weighted sums.
+log-likelihoods, but for a constant, are smooth functions of what is measured: sums of some sigmoids of weighted sums.
 The weights were fitted by maximum likelihood on simulated cities, whose maps were also given in another season, darker,
 with other detail and coarser (`python -m benchmarks.accuracy.change fit`), and stand in weights.npz.
 """

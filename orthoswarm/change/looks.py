@@ -1,9 +1,10 @@
 """How cells look in one picture of the ground: colour, roughness, and whether edges lie along two directions."""
 
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from orthoswarm.change.structure import blurred
 from orthoswarm.model.arrays import Bytes, Flags, Floats
@@ -27,7 +28,7 @@ class CellLooks(NamedTuple):
     order: Floats
 
 
-def on_cells(values: Floats, per_cell: int) -> Floats:
+def on_cells(values: NDArray[Any], per_cell: int) -> Floats:
     """Means over the cells of per_cell x per_cell pixels; rows and columns must be multiples of it."""
     if per_cell == 1:
         return values
@@ -93,7 +94,8 @@ class ToneModel(NamedTuple):
                 spread = 1.48 * np.median(np.abs(rest), 0) + 0.01
                 weight = 1.0 / (1.0 + ((rest / spread / 2.0) ** 2).sum(1))
         if len(b) < _FEWEST:
-            return cls(linear, np.zeros((1, 3), np.float32), np.zeros((1, 3)), np.full((1, 3), np.inf))
+            nothing = np.zeros((1, 3), np.float32)
+            return cls(linear.astype(np.float32), nothing, nothing, nothing + np.float32(np.inf))
         cv2.setRNGSeed(1)
         ends = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 20, 1e-3)
         _, label, classes = cv2.kmeans(b * _HUE_WEIGHT, _CLASSES, None, ends, 1, cv2.KMEANS_PP_CENTERS)

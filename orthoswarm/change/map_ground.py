@@ -1,9 +1,10 @@
-"""The pre-disaster map on a block of ground: its small local offsets taken off, and what leaning buildings hide on it."""
+"""The pre-disaster map on a block of ground: its small local offsets, and what leaning buildings hide on it."""
 
-from typing import Final
+from typing import Any, Final
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from orthoswarm.change.structure import blurred
 from orthoswarm.model.arrays import Flags, Floats
@@ -39,8 +40,8 @@ def local_offsets(before: Floats, now: Floats) -> Floats:
     return np.asarray(cv2.resize(smooth.astype(np.float32), size, interpolation=cv2.INTER_LINEAR))
 
 
-def _peak(before: Floats, now: Floats) -> tuple[float, float, float]:
-    """Offset of one part, columns and rows, and its weight, 0 where it is not clear."""
+def _peak(before: NDArray[Any], now: NDArray[Any]) -> tuple[float, float, float]:
+    """Offset of one part, columns and rows, and its weight, 0 where it is not clear; complex gradients."""
     both = np.fft.ifft2(np.fft.fft2(before) * np.conj(np.fft.fft2(now))).real
     spread = float(both.std())
     n = _FARTHEST_PX
@@ -84,5 +85,8 @@ def hidden_on_map(height: Floats, lean: tuple[float, float], gsd_m: float) -> Fl
     for k in range(1, int(np.ceil(top * slope / gsd_m)) + 1):
         away = k * gsd_m / slope
         dx, dy = round(-lean[0] / slope * k), round(lean[1] / slope * k)
-        hidden |= cv2.warpAffine(height, np.float32([[1, 0, -dx], [0, 1, -dy]]), height.shape[::-1]) > away + _HIDES_M
+        hidden |= (
+            cv2.warpAffine(height, np.array([[1, 0, -dx], [0, 1, -dy]], np.float32), height.shape[::-1])
+            > away + _HIDES_M
+        )
     return hidden

@@ -8,7 +8,7 @@ from typing import Any, Final
 import cv2
 
 from orthoswarm.change.change_files import write_change
-from orthoswarm.change.change_map import Scene, map_change
+from orthoswarm.change.change_map import ComparedScene, map_change
 from orthoswarm.change.changed_objects import find_objects
 from orthoswarm.coverage.map_folder import MapFolder, read_map
 from orthoswarm.coverage.view import View
@@ -72,7 +72,7 @@ def scene_of(
     want_m: float = WANT_M,
     find: Callable[[str, str], Path | None] | None = None,
     missing: set[str] | None = None,
-) -> tuple[Scene, list[str]]:
+) -> tuple[ComparedScene, list[str]]:
     """What is compared, and warnings; arguments and errors as of `change_of`, `missing` takes pictures not readable."""
     orthoimage = product_file(folder, "orthoimage.tif")
     if orthoimage is None:
@@ -105,7 +105,7 @@ def scene_of(
             unread.add(view.image)
             return None
 
-    scene = Scene(
+    scene = ComparedScene(
         views=flown.views, terrain=terrain, basemap=before, orthoimage=orthoimage, read=read, lean=_lean(report)
     )
     return scene, warnings

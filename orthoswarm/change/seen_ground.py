@@ -13,7 +13,7 @@ import numpy as np
 
 from orthoswarm.change.structure import structure
 from orthoswarm.coverage.view import View
-from orthoswarm.model.arrays import Bytes, Flags, Floats
+from orthoswarm.model.arrays import Array, Bytes, Flags, Floats
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import Terrain
 
@@ -25,7 +25,7 @@ Read = Callable[[View], Bytes | None]
 """A view's grey picture, uint8 (rows, columns), perhaps reduced; None where it cannot be read."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SeenGround:
     """What pictures show of a grid; float32 (rows, columns), 0 where none sees it.
 
@@ -83,7 +83,8 @@ def seen_ground(views: Sequence[View], grid: GroundGrid, height: Floats, read: R
         if picture is None:
             continue
         rows, columns = window
-        own, counts = _on_ground(view, picture, grid, height[rows, columns], rows.start, columns.start)
+        corner = grid.to_ground(np.array([columns.start, rows.start], float))
+        own, counts = _on_ground(view, picture, corner, height[rows, columns], grid.gsd_m)
         if not counts.any():
             continue
         found = structure(own, grid.gsd_m)
@@ -93,14 +94,17 @@ def seen_ground(views: Sequence[View], grid: GroundGrid, height: Floats, read: R
         contrast[rows, columns] += found.contrast * counts
         weight[rows, columns] += counts
         twice[rows, columns] += counts * counts
-    scale = 1.0 / np.maximum(weight, 1e-3)
+    scale = (1.0 / np.maximum(weight, 1e-3)).astype(np.float32)
     field *= scale[..., None]
     power *= scale
     # |mean|^2 = same + (power - same) * share, since pictures agree with themselves
-    share = np.clip(twice * scale * scale, 0.0, 1.0)
+    share = np.clip(twice * scale * scale, 0.0, 1.0).astype(np.float32)
     mean = field[..., 0] ** 2 + field[..., 1] ** 2
     same = np.where(share < _ALONE, (mean - power * share) / (1.0 - np.minimum(share, _ALONE)), power)
-    return SeenGround(field, power, gray * scale, contrast * scale, weight, same.astype(np.float32))
+    return SeenGround(
+        field=field, power=power, gray=gray * scale, contrast=contrast * scale, weight=weight,
+        same=same.astype(np.float32),
+    )  # fmt: skip
 
 
 def _window(view: View, grid: GroundGrid, level: float) -> tuple[slice, slice] | None:
@@ -124,14 +128,12 @@ def _window(view: View, grid: GroundGrid, level: float) -> tuple[slice, slice] |
     return None if rows.start >= rows.stop or columns.start >= columns.stop else (rows, columns)
 
 
-def _on_ground(
-    view: View, picture: Bytes, grid: GroundGrid, height: Floats, row: int, column: int
-) -> tuple[Floats, Floats]:
-    """A picture's grey values on a window of the grid, float32, and by how much each counts."""
+def _on_ground(view: View, picture: Bytes, corner: Array, height: Floats, gsd_m: float) -> tuple[Floats, Floats]:
+    """A picture's grey values on pixels of the ground, float32, and their weights; corner: where they begin."""
     rows, columns = height.shape
-    corner = grid.to_ground(np.array([column, row], float)) - view.position[:2]
-    x = np.float32(corner[0]) + np.float32(grid.gsd_m) * np.arange(columns, dtype=np.float32)
-    y = np.float32(corner[1]) - np.float32(grid.gsd_m) * np.arange(rows, dtype=np.float32)
+    corner = corner - view.position[:2]
+    x = np.float32(corner[0]) + np.float32(gsd_m) * np.arange(columns, dtype=np.float32)
+    y = np.float32(corner[1]) - np.float32(gsd_m) * np.arange(rows, dtype=np.float32)
     z = height - np.float32(view.position[2])
     m = view.to_camera.astype(np.float32)
     depth = m[2, 0] * x + (m[2, 1] * y)[:, None] + m[2, 2] * z
@@ -150,7 +152,7 @@ def _on_ground(
     v = v * np.float32(focal) + np.float32(cy)
     gray = cv2.remap(picture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float32)
     tan2 = (x * x + (y * y)[:, None]) / np.maximum(z * z, 1.0)
-    counts = 1.0 / (1.0 + (tan2 / np.float32(_HALVED**2)) ** 2)
+    counts = (1.0 / (1.0 + (tan2 / np.float32(_HALVED**2)) ** 2)).astype(np.float32)
     border = np.minimum(np.minimum(u, picture.shape[1] - 1 - u), np.minimum(v, picture.shape[0] - 1 - v))
     counts *= (border > _BORDER_PX) & (depth > 1.0) & (tan2 < np.float32(_STEEPEST**2))
     return gray, counts

@@ -143,7 +143,7 @@ def test_a_scene_too_small_to_tell_its_tones_tells_nothing_by_hue():
 
 @given(st.integers(0, 1000))
 def test_probabilities_of_the_cases_add_up_to_one(seed):
-    values = np.random.default_rng(seed).normal(0.0, 20.0, (4, 5, 35)).astype(np.float32)
+    values = np.random.default_rng(seed).normal(0.0, 20.0, (4, 5, 36)).astype(np.float32)
     found = probabilities(values)
     assert found.shape == (4, 5, len(CASES)) and np.allclose(found.sum(-1), 1.0, atol=1e-5) and (found >= 0.0).all()
 

@@ -1,8 +1,8 @@
 """The queue of long jobs, stored in the journal from request to result, so that none is lost or done twice.
 
 A job that was queued or running when the daemon ended is queued again; it must be repeatable up to the
-journal change that also marks it as done. Refinements have their own threads; background jobs
-(coarse maps in flight, joint refinements of neighbours, tones, exports, changes) run one at a time in another thread. They
+journal change that also marks it as done. Refinements have their own threads; background jobs (coarse maps in flight,
+joint refinements of neighbours, tones, exports, comparisons with the basemap) run one at a time in another thread. They
 start only while no refinement waits or runs, and give way to one that begins; drawing a layer again does not wait.
 `JobRequests` asks for jobs when something has happened: a leg is over, a mission complete, a refinement done.
 """
@@ -317,10 +317,10 @@ def _lane(job: Job) -> tuple[str, str | None]:
 
 
 class JobRequests:
-    """Asks for jobs."""
+    """Asks for jobs; coarse: in flight, too. compare: with the basemap, once the products are written."""
 
-    def __init__(self, journal: Journal, jobs: Jobs, *, coarse: bool) -> None:
-        self._journal, self._jobs, self._coarse = journal, jobs, coarse
+    def __init__(self, journal: Journal, jobs: Jobs, *, coarse: bool, compare: bool = False) -> None:
+        self._journal, self._jobs, self._coarse, self._compare = journal, jobs, coarse, compare
 
     def refine(self, vehicle: str | None = None) -> list[Job]:
         """Queue the refinement of a vehicle's last sortie, or of all sorties that have pictures.
@@ -382,7 +382,8 @@ class JobRequests:
     def job_ended(self, event: JobEnded) -> None:
         """Export the products again once nothing is left to refine, then compare them with the map."""
         job = event.job
-        if job.kind == "export" and job.state == "done" and "after" in job.detail and "note" not in job.detail:
+        fresh = job.state == "done" and "after" in job.detail and "note" not in job.detail
+        if job.kind == "export" and fresh and self._compare:
             self._jobs.add("change")
         if job.kind == "refine":
             self._jobs.wake()

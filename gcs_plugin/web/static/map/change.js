@@ -26,7 +26,7 @@ export function changePanel(compare) {
   const words = make("span", {});
   const slider = make("input", { type: "range", min: 20, max: 95, step: 5, value: 50, name: "change-from", oninput: () => { from = slider.value / 100; clearTimeout(timer); timer = setTimeout(() => changed("change"), WAIT_MS); } });
   const legend = make("ul", { class: "shares" }, ...LEGEND.map((key) => make("li", {}, make("i", { class: "swatch", "aria-hidden": "true", dataset: { change: key } }), make("span", {}, t(`change.${key}`)))));
-  const list = make("ul", { class: "gaps" });
+  const list = make("ul", { class: "gaps changes" });
   const more = make("p", { class: "quiet" });
   const go = (row) => { fit(boundsOf([row.bounds.slice(0, 2), row.bounds.slice(2)])); compare(); };
   const draw = keyedList(list, () => { const line = make("li", {}, button("", () => go(line.row)), make("small", { class: "quiet" })); return line; }, (line, row) => {

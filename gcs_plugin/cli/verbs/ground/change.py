@@ -12,18 +12,18 @@ from orthoswarm.model.errors import InputError
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the verb's arguments."""
     parser.epilog = (
-        "OUT is the output folder of `orthoswarm mosaic`, or a workspace of `orthoswarm serve`. DIR gets change.tif (the\n"
-        "probability that the ground changed, 0 to 255; masked where it cannot be said), change.gpkg (changed ground as\n"
-        "polygons with area, probability, kind and photos) and change.json. With --out OUT, the exports of the map and\n"
-        "its report have them, too.\n\n"
+        "OUT is the output folder of `orthoswarm mosaic`, or a workspace of `orthoswarm serve`. DIR gets change.tif\n"
+        "(the probability that the ground changed, 0 to 255; masked where it cannot be said), change.gpkg (changed\n"
+        "ground as polygons with area, probability, kind and photos) and change.json. With --out OUT, the exports of\n"
+        "the map have them, too.\n\n"
         "example:\n  orthoswarm change map --out map"
     )
     add = parser.add_argument
     add("map", type=Path, metavar="OUT", help="folder with orthoimage.tif, frames.jsonl and report.json")
     add("--basemap", type=Path, metavar="MAP", help="the pre-disaster map (default: that of OUT)")
     add("--want-m", type=float, default=2.0, metavar="M", help="side of a cell (default 2)")
-    add("--threshold", type=float, default=0.5, metavar="P",
-        help="list ground from this probability on: lower for fewer misses, higher for fewer false alarms (default 0.5)")  # fmt: skip
+    threshold_help = "list ground from this probability on: lower misses less, higher errs less (default 0.5)"
+    add("--threshold", type=float, default=0.5, metavar="P", help=threshold_help)
     add("--out", type=Path, required=True, metavar="DIR", help="folder for the results")
     add("--json", action="store_true", help="one JSON document on stdout")
 
