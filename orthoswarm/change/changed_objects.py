@@ -86,11 +86,11 @@ def find_objects(
 
 def _kind(found: ChangeMap, cells: tuple[np.ndarray, ...]) -> str:
     """The kind of an object where it is sure."""
-    if float(np.median(found.height[cells])) > _STANDS_M:
-        return NEW_OBJECT
     shares = np.bincount(found.case[cells], minlength=len(CASES)) / len(cells[0])
     case = int(shares.argmax())
-    return CASES[case] if shares[case] >= _SURE else CHANGED
+    if shares[case] >= _SURE:
+        return CASES[case]
+    return NEW_OBJECT if float(np.median(found.height[cells])) > _STANDS_M else CHANGED
 
 
 def best_photos(views: Sequence[View], place: np.ndarray) -> tuple[tuple[str, str], ...]:

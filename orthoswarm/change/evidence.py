@@ -87,9 +87,8 @@ def measured(block: Block, tone: ToneModel) -> Measured:
         np.maximum(seen.same, 0.0), seen.power - seen.same, np.log((now + NOISE_GRAY) / (then + NOISE_GRAY)),
     ]  # fmt: skip
     count = on_cells(both, per_cell)
-    cells = (
-        np.dstack([on_cells(part * both, per_cell) for part in parts]) / np.maximum(count, np.float32(1e-3))[..., None]
-    )
+    sums = np.dstack([on_cells(part * both, per_cell) for part in parts])
+    cells = np.asarray(sums / np.maximum(count, 1e-3)[..., None], np.float32)
     values = _structure_values(cells, count, cell_m)
     known = count * block.drawn
     for scale in _FINE_SCALES_M:
