@@ -25,6 +25,7 @@ VERBS = {
     "plan": "make missions that cover an area, or follow lines, with a swarm",
     "mosaic": "make a georeferenced orthoimage from drone photos",
     "coverage": "say which ground of an area was seen well, what was missed, and why",
+    "change": "say where the ground is no longer what the pre-disaster map shows, and what has become of it",
     "inspect": "say what photos, videos and logs contain, and what is suspicious about them",
     "frames": "take the pictures of a video, with their poses in EXIF and XMP",
     "fleet": "list vehicles on their links, upload missions, start, pause, resume, bring home, watch",
@@ -38,6 +39,8 @@ VERBS = {
     "weights": "list, import and check the weights of learned matchers",
     "doctor": "show what this machine has (codecs, weights, cores, disk), and what does not work without the rest",
 }
+_FOLDERS = {"change": "ground.", "coverage": "ground."}
+"""Where a verb's module lies, if not beside the others."""
 
 _NEGATIVE = re.compile(r"-[0-9.]")
 _INTERRUPT_AGAIN_S = 0.05  # well below what a person notices
@@ -121,7 +124,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if verb not in VERBS:
         print(f"orthoswarm: there is no verb '{verb}'; choose one of: {', '.join(VERBS)}", file=sys.stderr)
         return 2
-    module = importlib.import_module(f"gcs_plugin.cli.verbs.{verb}")
+    module = importlib.import_module(f"gcs_plugin.cli.verbs.{_FOLDERS.get(verb, '')}{verb}")
     parser = _Parser(prog=f"orthoswarm {verb}", description=VERBS[verb][0].upper() + VERBS[verb][1:] + ".")
     module.configure(parser)
     try:

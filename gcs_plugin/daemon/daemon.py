@@ -12,6 +12,7 @@ import time
 from typing import Any, Final
 
 from gcs_plugin.daemon.airspace import TerrainData
+from gcs_plugin.daemon.changes import GroundChanges
 from gcs_plugin.daemon.exports import Exports, TakFeed
 from gcs_plugin.daemon.flight_coverage.exposure_journal import MESSAGES as EVENT_MESSAGES
 from gcs_plugin.daemon.flight_coverage.exposure_journal import EventRequests, ExposureJournal
@@ -186,12 +187,13 @@ class Daemon:
             settings, self.journal, store=self.store, layers=self.layers, console=self.console, drawer=self.drawer,
             views=self.views, coverage=self.coverage, facts=facts, people=self.people,
         )  # fmt: skip
+        self.changes = GroundChanges(settings, self.journal, self.store)
         self.getting_ready = GettingReady(self.events)
         self.tak = TakFeed([settings.tak_address(text) for text in settings.tak], self.exports)
         handlers = {
             "refine": refinement.refine, "coarse": LegPlacement(publisher, self.store, kept, self.events).make,
             "together": JointRefinement(publisher, settings.redraw_px).solve, "tones": ToneBalance(publisher).balance,
-            "export": self.exports.write, "redraw": publisher.draw_again,
+            "export": self.exports.write, "redraw": publisher.draw_again, "change": self.changes.find,
         }  # fmt: skip
         self.jobs = Jobs(self.journal, self.events, handlers, self.workers, self.background)
         self.requests = JobRequests(

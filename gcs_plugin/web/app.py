@@ -72,6 +72,9 @@ def calls(daemon: Daemon) -> list[Call]:
              "Other aircraft that the vehicles' ADS-B receivers hear."),
         Call("/api/plan", "put_console_plan", console.put_plan,
              "Replace the operator's plan; 409 if it has another `version` than the one that was changed.", "PUT"),
+        Call("/api/change", "change", daemon.changes.document,
+             "Ground that changed since the basemap, as of the last export: `version` (0: nothing yet), shares,"
+             " `objects`, the largest first (area, probability, kind, bounds, photos), `corners` of /api/change.png."),
         Call("/api/finds", "finds", console.finds, "Marked finds, oldest first."),
         Call("/api/finds", "add_find", console.add_find,
              "Mark a find: `lat_deg`, `lon_deg`, `sigma_m`, `note`; `time` (ISO 8601) if it was marked before now.",
@@ -205,6 +208,15 @@ class HttpRoutes:
             raise HTTPException(404, "nothing was refined and exported yet; see /api/jobs")
         data, _ = await self.work(_overlay, path, version)
         return Response(data, media_type="image/png", headers={"ETag": f'"{version}"', "Cache-Control": "no-cache"})
+
+    async def change_picture(self, threshold: float = Query(0.5, gt=0.0, lt=1.0, alias="from")) -> Response:
+        """Ground that changed since the basemap, from a probability on, as a PNG with the `corners` of /api/change."""
+        found = await self.work(self.daemon.changes.picture, round(threshold, 2))
+        if found is None:
+            raise HTTPException(404, "nothing was compared with the basemap yet; see /api/jobs")
+        data, version = found
+        headers = {"ETag": f'"{version}-{threshold:.2f}"', "Cache-Control": "no-cache"}
+        return Response(data, media_type="image/png", headers=headers)
 
     async def gaps(self) -> Response:
         """The gaps as GeoJSON, as `orthoswarm coverage` writes them; `orthoswarm plan --gaps` reads them."""
@@ -382,6 +394,7 @@ def make_app(daemon: Daemon, access: Access, address: str = "") -> Any:
     add("/tiles/{layer}/{z}/{x}/{y}.{suffix}", routes.tile, methods=["HEAD"], include_in_schema=False)
     add("/api/trust", routes.trust)
     add("/api/trust.png", routes.trust_picture)
+    add("/api/change.png", routes.change_picture)
     add("/api/coverage", routes.coverage)
     add("/api/coverage/gaps.geojson", routes.gaps)
     add("/api/coverage/cells.png", routes.cells)

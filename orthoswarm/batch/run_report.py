@@ -24,6 +24,7 @@ from orthoswarm.batch.run_state import (
 from orthoswarm.config import changes
 from orthoswarm.evaluation.checkpoints import control_rows, evaluate_checkpoints
 from orthoswarm.export.catalog.tiled_raster import remove_collection, remove_product, tiles_of
+from orthoswarm.export.ground_file import GROUND, write_ground
 from orthoswarm.export.product_files import (
     image_root,
     iso_time,
@@ -55,6 +56,10 @@ def write_products(
     surface = None
     if run.options.surface is not None:
         surface = make_surface(run, state, stated, z - level, refinement)
+    if state.terrain is None:  # left by an earlier run
+        (run.out / GROUND).unlink(missing_ok=True)
+    elif GROUND in _made(run, state.fault is not None):
+        write_ground(run.out / GROUND, state.terrain.changed(lambda h: h + np.float32(z - level)), state.grid.epsg)
     with run.clock.stage("final: report", len(placed)) as stage:
         write_frames(run.out, stated, list(state.rejected.values()), state.grid, z, covariance=run.options.covariance)
         report = _report(run, state, placed, refinement, z) | {"surface": surface}
@@ -98,7 +103,7 @@ def _add_checkpoints(run: RunContext, state: RunState, report: dict[str, Any], g
 def _made(run: RunContext, faulty: bool) -> set[str]:
     names = set(PRODUCTS)
     if run.options.until != "fine" or faulty:
-        names -= {ORTHOIMAGE, SEAMLINES, CONFIDENCE}
+        names -= {ORTHOIMAGE, SEAMLINES, CONFIDENCE, GROUND}
     if run.options.until == "realtime" or faulty:
         names.discard(COARSE)
     return names

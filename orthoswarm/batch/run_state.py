@@ -13,6 +13,7 @@ from orthoswarm.config import DEFAULT, Config
 from orthoswarm.control.ground_control import GroundControl
 from orthoswarm.evaluation.checkpoints import Checkpoint
 from orthoswarm.export.catalog.tiled_raster import FOLDER, Tiles, is_tile_or_collection
+from orthoswarm.export.ground_file import GROUND
 from orthoswarm.model.arrays import Bytes, Floats
 from orthoswarm.model.frame import Ingest, Rejection
 from orthoswarm.model.geo import LocalGrid
@@ -41,6 +42,7 @@ PRODUCTS = (
     "footprints.gpkg",
     SEAMLINES,
     CONFIDENCE,
+    GROUND,
     "report.json",
     "report.html",
 )

@@ -65,14 +65,15 @@ class MapExport:
 
     @cached_property
     def all_places(self) -> "Sequence[Place]":
-        """Finds and vehicles.
+        """Finds and vehicles, and the largest changes that `orthoswarm change` has found.
 
         Raises:
             InputError: the folder's list was changed to something else.
         """
-        from orthoswarm.export.tactical.places import read_places
+        from orthoswarm.export.tactical.places import changed_places, read_places
 
-        return read_places(self.folder) if self.places is None else self.places
+        own = read_places(self.folder) if self.places is None else self.places
+        return [*own, *changed_places(self.folder)]
 
     def file(self, suffix: str) -> Path:
         """Where a file goes that is named as the picture."""

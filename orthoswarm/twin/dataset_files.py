@@ -18,7 +18,7 @@ from orthoswarm.twin.city.builder import ParkingPlace
 from orthoswarm.twin.city.city import place_cars
 from orthoswarm.twin.city.scene import TEXEL_M, WATER, Scene
 from orthoswarm.twin.city.sunlight import change_season, lit_texture
-from orthoswarm.twin.disaster import DamagedGround, debris_flow, flood, haze_opacity, zone_mask
+from orthoswarm.twin.disaster import DamagedGround, collapse, debris_flow, flood, haze_opacity, zone_mask
 from orthoswarm.twin.flights import TrueFlight
 from orthoswarm.twin.presets import TwinSpec
 from orthoswarm.twin.ray_marching import PreparedScene, make_stage, satellite_view
@@ -88,6 +88,8 @@ def after_disaster(
         debris_flow(scene, zones["debris"], spec.seed)
     if "water" in zones:
         flood(scene, zones["water"], spec.seed)
+    if "collapse" in zones:
+        collapse(scene, spec.seed)
     if "haze" in zones:
         haze = haze_opacity(scene, zones["haze"], spec.seed)
     sun = light_of(spec, 1)

@@ -1,6 +1,7 @@
-"""Disasters between the date of the map and the flight: debris flow, waterlogging, haze (paper IV.A)."""
+"""Disasters between the map and the flight: debris flow, waterlogging, haze (paper IV.A), collapsed buildings."""
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
@@ -8,11 +9,16 @@ from orthoswarm.compute.jit import in_place_kernel, kernel
 from orthoswarm.model.arrays import Flags, Floats
 from orthoswarm.twin.city import scene as kinds
 from orthoswarm.twin.city.procedural_noise import hash01, lattice, noise_field
-from orthoswarm.twin.city.scene import TEXEL_M, Scene
+from orthoswarm.twin.city.scene import CELL_M, TEXEL_M, Scene
 from orthoswarm.twin.ray_marching import HAZE_CELL_M
 
 SIZES_M = {"debris": (400.0, 880.0), "water": (330.0, 320.0), "haze": (440.0, 190.0)}
 """Extent of each disaster across and along, metres (paper IV.A)."""
+
+_GONE: Final = 0.16  # share of the houses that are gone
+_TORN: Final = 0.1  # share whose roofs are torn open
+_FALLS_M: Final = 14.0  # higher buildings stand
+_FALLS_M2: Final = (30.0, 700.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,6 +156,40 @@ def debris_flow(scene: Scene, zone: DamagedGround, seed: int) -> None:
     )  # fmt: skip
 
 
+def collapse(scene: Scene, seed: int) -> None:
+    """Make buildings all over the scene rubble, in place: some are gone, of others a part of the roof is torn open.
+
+    What is hit is of kind RUBBLE afterwards; houses only, since towers and halls rarely fall (_FALLS_M, _FALLS_M2).
+    """
+    import cv2
+
+    above = scene.above_ground()
+    roof = (scene.kind[::2, ::2] == kinds.ROOF) & (above > 2.0)
+    count, house, stats, _ = cv2.connectedComponentsWithStats(roof.astype(np.uint8), connectivity=4)
+    rng = np.random.default_rng([seed, 37])
+    depth, floor = np.full(roof.shape, -1.0, np.float32), scene.dtm.copy()
+    ragged = noise_field(roof.shape, CELL_M, 3.0, 2, seed * 13 + 5)
+    for k in range(1, count):
+        chance, turn, cut = rng.random(), rng.uniform(0.0, 2.0 * np.pi), rng.uniform(0.1, 0.45)
+        left, top, width, height, cells = (int(v) for v in stats[k])
+        window = np.s_[max(top - 4, 0) : top + height + 4, max(left - 4, 0) : left + width + 4]
+        own = house[window] == k
+        tall = float(above[window][own].max())
+        if not _FALLS_M2[0] <= cells * CELL_M**2 <= _FALLS_M2[1] or tall > _FALLS_M or chance > _GONE + _TORN:
+            continue
+        if chance < _GONE:  # rubble lies up to two metres around the walls
+            beside = cv2.distanceTransform((~own).astype(np.uint8), cv2.DIST_L2, 3) * CELL_M
+            hit = (beside < 1.2 + 0.8 * ragged[window]) & (own | (above[window] < 1.0))
+            depth[window][hit] = 9.0
+            continue
+        rows, columns = np.indices(own.shape)
+        side = columns * np.cos(turn) + rows * np.sin(turn) + 3.0 * ragged[window]
+        hit = own & (side > np.quantile(side[own], cut))
+        depth[window][hit] = 9.0
+        floor[window][hit] += 0.45 * tall
+    _bury(scene.albedo, scene.kind, scene.dsm, floor, scene.wall, scene.facade, depth, 1.0, 0.0, seed * 17 + 7)
+
+
 def flood(scene: Scene, zone: DamagedGround, seed: int) -> None:
     """Flood a zone with muddy water, whose only texture is moving glints, in place; the water is at ground level."""
     depth = zone_depth(scene, zone, 2, seed * 13 + 2)
@@ -169,6 +209,8 @@ def haze_opacity(scene: Scene, zone: DamagedGround, seed: int) -> Floats:
 
 
 def zone_mask(scene: Scene, zone: DamagedGround, disaster: str, seed: int) -> Flags:
-    """Cells of the height fields inside the zone of a disaster ("debris", "water" or "haze"), bool."""
+    """Cells of the height fields that a disaster (of SIZES_M, or "collapse") has struck, bool."""
+    if disaster == "collapse":
+        return np.asarray(scene.kind[::2, ::2] == kinds.RUBBLE)
     salt = {"debris": 1, "water": 2, "haze": 3}[disaster]
     return np.asarray(zone_depth(scene, zone, 2, seed * 13 + salt) > 0.0)

@@ -34,7 +34,7 @@ class TwinSpec:
     Attributes:
         preset: name of the preset that it is based on.
         seed: of all random numbers.
-        disaster: none, debris, water, haze, or all three.
+        disaster: none, debris, water, haze, all three of them, or collapse (of houses).
         noise_name: kind of noise; noise: its values.
         plan: the flight. motion: how calmly it is flown.
         relief_m: ground relief, +- metres (procedural city only).

@@ -57,8 +57,10 @@ def disaster_zones(spec: TwinSpec, site: Site) -> dict[str, DamagedGround]:
     if spec.disaster == "all":
         thirds = zip(SIZES_M, (0.3, 0.0, -0.3), strict=True)
         return {name: _zone(spec, site, name, place) for name, place in thirds}
+    if spec.disaster == "collapse":  # all over the area
+        return {spec.disaster: DamagedGround(*site.center, *spec.plan.extent_m, 0.0)}
     if spec.disaster not in SIZES_M:
-        raise InputError(f"there is no disaster '{spec.disaster}'; choose none, all, {', '.join(SIZES_M)}")
+        raise InputError(f"there is no disaster '{spec.disaster}'; choose none, all, collapse, {', '.join(SIZES_M)}")
     return {spec.disaster: _zone(spec, site, spec.disaster, 0.0)}
 
 

@@ -258,6 +258,7 @@ def test_other_options_do_not_continue_an_interrupted_run(flight, tmp_path):
         "orthoimage.tif",
         "seamlines.gpkg",
         "confidence.tif",
+        "ground.tif",
     }
 
 
@@ -270,6 +271,7 @@ def test_what_a_killed_run_left_half_written_is_cleared(flight, tmp_path):
         "orthoimage.tif",
         "seamlines.gpkg",
         "confidence.tif",
+        "ground.tif",
     }
 
 
@@ -318,6 +320,7 @@ def test_a_fault_in_the_refinement_leaves_the_real_time_map_and_exit_1(flight, t
         "coarse.tif",
         "seamlines.gpkg",
         "confidence.tif",
+        "ground.tif",
     }
     report = json.loads((out / "report.json").read_text())
     assert any("ZeroDivisionError" in w for w in report["warnings"]) and report["refine"] == "none"
@@ -346,6 +349,7 @@ def test_stopping_early_makes_what_was_asked(flight, tmp_path):
         "orthoimage.tif",
         "seamlines.gpkg",
         "confidence.tif",
+        "ground.tif",
     }
     rows = rows_of(tmp_path / "r")
     assert {r["stage"] for r in rows.values()} == {"realtime", "rejected"}
@@ -358,6 +362,7 @@ def test_stopping_early_makes_what_was_asked(flight, tmp_path):
         "orthoimage.tif",
         "seamlines.gpkg",
         "confidence.tif",
+        "ground.tif",
     }
     assert {r["stage"] for r in rows_of(tmp_path / "c").values()} == {"coarse", "rejected"}
     page = (tmp_path / "c" / "report.html").read_text()  # nothing was searched for on the map, so nothing failed

@@ -263,8 +263,9 @@ def serving(workspace: Path, *arguments: str, port: int = 0):
 
 
 def exported(jobs: list[dict]) -> bool:
-    """Whether products were written last of all, and nothing else is to be done; coarse maps in flight change none."""
-    makers = [job for job in jobs if job["kind"] != "export" and (job["kind"] != "coarse" or "after" in job["detail"])]
+    """Whether products were written last of all that changes them, and nothing else is to be done."""
+    after = [job for job in jobs if job["kind"] not in ("export", "change")]
+    makers = [job for job in after if job["kind"] != "coarse" or "after" in job["detail"]]
     others = [job["ended"] for job in makers if job["state"] in ("done", "failed")]
     wrote = [job["started"] for job in jobs if job["kind"] == "export" and job["state"] == "done"]
     over = all(job["state"] in ("done", "failed") for job in jobs)

@@ -64,7 +64,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("--out", type=Path, required=True, metavar="DIR", help="folder of the set; an interrupted run goes on there")
     add("--seed", type=int, default=1, help="which city, flight and noise (default 1)")
     add("--noise", default="paper", metavar="KIND", help="none, paper, hard, drift, wind or curves (default paper)")
-    add("--disaster", choices=("none", "debris", "water", "haze", "all"), help="instead of the preset's")
+    add("--disaster", choices=("none", "debris", "water", "haze", "collapse", "all"), help="instead of the preset's")
     add("--lens", metavar="K1,K2", help="radial distortion of all lenses, in units of f (write --lens=-0.05,0.01)")
     add("--relief", type=float, default=0.0, metavar="M", help="smooth ground relief of +-M metres")
     add("--follow-ground", action="store_true", help="legs keep --height-m above the bare ground instead of one level")

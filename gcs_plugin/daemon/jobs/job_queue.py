@@ -1,8 +1,8 @@
 """The queue of long jobs, stored in the journal from request to result, so that none is lost or done twice.
 
 A job that was queued or running when the daemon ended is queued again; it must be repeatable up to the
-journal change that also marks it as done. Refinements have their own threads; background jobs
-(coarse maps in flight, joint refinements of neighbours, tones, exports) run one at a time in another thread. They
+journal change that also marks it as done. Refinements have their own threads; background jobs (coarse maps in flight,
+joint refinements of neighbours, tones, exports, comparisons with the basemap) run one at a time in another thread. They
 start only while no refinement waits or runs, and give way to one that begins; drawing a layer again does not wait.
 `JobRequests` asks for jobs when something has happened: a leg is over, a mission complete, a refinement done.
 """
@@ -50,7 +50,7 @@ Result = TypeVar("Result")
 
 _MOST_ATTEMPTS: Final = 3  # of a job whose worker stopped
 _MOST_LISTED: Final = 1000  # finished jobs
-_BACKGROUND: Final = frozenset({"coarse", "together", "tones", "redraw", "export"})
+_BACKGROUND: Final = frozenset({"coarse", "together", "tones", "redraw", "export", "change"})
 _AFTER_REFINEMENT: Final = _BACKGROUND - {"redraw"}
 """An export that was asked for during a refinement holds its result."""
 _GIVES_WAY: Final = _AFTER_REFINEMENT - {"export"}
@@ -318,7 +318,7 @@ def _lane(job: Job) -> tuple[str, str | None]:
 
 
 class JobRequests:
-    """Asks for jobs."""
+    """Asks for jobs; coarse: in flight, too. basemap: there is one, with which the products are compared once they are written."""
 
     def __init__(self, journal: Journal, jobs: Jobs, *, coarse: bool, basemap: bool) -> None:
         self._journal, self._jobs, self._coarse, self._basemap = journal, jobs, coarse, basemap
@@ -390,8 +390,11 @@ class JobRequests:
         self._jobs.wake()
 
     def job_ended(self, event: JobEnded) -> None:
-        """Export the products again once nothing is left to refine."""
+        """Export the products again once nothing is left to refine, then compare them with the map."""
         job = event.job
+        fresh = job.state == "done" and "after" in job.detail and "note" not in job.detail
+        if job.kind == "export" and fresh and self._basemap:
+            self._jobs.add("change")
         if job.kind == "refine":
             self._jobs.wake()
         elif job.kind not in ("together", "tones", "redraw") and (job.kind != "coarse" or "after" not in job.detail):

@@ -78,6 +78,7 @@ def write_products(task: ExportTask) -> dict[str, str]:
         OrthoSwarmError: the disk is full.
     """
     from orthoswarm.export.product_files import write_frames, write_json
+    from orthoswarm.mosaic.extent import solved_level
     from orthoswarm.refine.registration.map_offset import measure_map_offset
     from orthoswarm.report.page import write_page
     from orthoswarm.report.trust import headline
@@ -98,7 +99,7 @@ def write_products(task: ExportTask) -> dict[str, str]:
     report |= {"area_ha": area_ha, "until": "fine", "root": None}
     if refined:
         best = next(layer for layer in reversed(_FILES) if layer in task.canvases)
-        report["trust"] = _trust(task, best, refined_files)
+        report["trust"] = _trust(task, best, refined_files, level - solved_level(solutions))
         report["headline"] = headline(report)
     report["unrefined"] = _unrefined(placed, refined)
     report["map_offset_m"] = None if offset is None else offset.document()
@@ -145,8 +146,12 @@ def _pictures(task: ExportTask, time_s: float | None) -> tuple[list[str], float]
     return made, area_ha
 
 
-def _trust(task: ExportTask, layer: str, refined: list[SolutionFile]) -> dict[str, object]:
-    """Write how far a refined layer can be trusted, and return its figures."""
+def _trust(task: ExportTask, layer: str, refined: list[SolutionFile], moved_m: float) -> dict[str, object]:
+    """Write the ground, and how far a refined layer can be trusted, and return its figures.
+
+    moved_m: by how much stated heights are higher than solved ones.
+    """
+    from orthoswarm.export.ground_file import GROUND, write_ground
     from orthoswarm.export.value_raster import write_confidence
     from orthoswarm.mosaic.confidence import cell_grid, confidence
     from orthoswarm.mosaic.extent import ground_of_nearest
@@ -164,6 +169,7 @@ def _trust(task: ExportTask, layer: str, refined: list[SolutionFile]) -> dict[st
     shown = nearest_cameras([p.camera for p in placed], [p.weak for p in placed], grid, terrain)
     found = confidence(grid, shown, placed, terrain, gains)
     write_confidence(task.workspace / "confidence.tif", found)
+    write_ground(task.workspace / GROUND, terrain.changed(lambda z: z + np.float32(moved_m)), task.epsg)
     return found.figures()
 
 

@@ -22,7 +22,7 @@ class Job:
     """One job.
 
     Attributes:
-        kind: refine, together, tones, coarse, redraw or export. vehicle: None for all.
+        kind: refine, together, tones, coarse, redraw, export or change. vehicle: None for all.
         state: queued, running, done or failed. progress: 0 to 1. message: the present step, or why it failed.
         created, started, ended: UTC epoch seconds. attempts: number of starts. detail: JSON values.
     """

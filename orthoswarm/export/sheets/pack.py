@@ -30,6 +30,8 @@ _PURPOSES: Final = {
     "footprints.gpkg": "For QGIS: footprints of the pictures (GeoPackage)",
     "seamlines.gpkg": "For QGIS: which picture shows which ground (GeoPackage)",
     "confidence.tif": "For QGIS: how far each place can be trusted (GeoTIFF)",
+    "change.tif": "For QGIS: where the ground changed (GeoTIFF)",
+    "change.gpkg": "For QGIS: changed ground with area, kind and photos (GeoPackage)",
     SURFACE: "For QGIS: heights of the surface (GeoTIFF)",
     "orthoimage.mbtiles": "For phones and tablets (MBTiles)",
     "orthoimage.pmtiles": "For web maps (PMTiles)",
@@ -52,8 +54,8 @@ def write_pack(
     """Write the pack of a map.
 
     Args:
-        cog: the orthoimage; the surface model, footprints.gpkg, seamlines.gpkg, confidence.tif, report.html and log.csv
-            beside it go in if there.
+        cog: the orthoimage; the surface model, footprints.gpkg, seamlines.gpkg, confidence.tif, change.tif and .gpkg,
+            report.html and log.csv beside it go in if there.
         path: the ZIP. places: finds and vehicles. progress: called with steps done and steps in all.
 
     Raises:
@@ -109,7 +111,7 @@ def _copy(cog: Path, folder: Path) -> None:
     if surface is not None:
         shutil.copyfile(surface, folder / SURFACE)
     products = ("footprints.gpkg", "seamlines.gpkg", "confidence.tif", "report.html", "report.json", "frames.jsonl")
-    for name in (*products, "log.csv"):
+    for name in (*products, "log.csv", "change.tif", "change.gpkg"):
         if (cog.parent / name).is_file():
             shutil.copyfile(cog.parent / name, folder / name)
 

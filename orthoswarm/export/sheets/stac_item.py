@@ -53,7 +53,7 @@ def write_stac_item(cog: Path, path: Path, *, copy_of: Path | None = None) -> No
         grid, identifier=f"{source.resolve().parent.name or 'map'}-{source.stem}", href=_relative(cog, path),
         title="Orthoimage", properties=_properties(source), asset="orthoimage", bands=bands,
     )  # fmt: skip
-    item["assets"] |= surface_assets(cog.parent, path)
+    item["assets"] |= surface_assets(cog.parent, path) | _change_asset(cog.parent, path)
     write_json(path, item)
 
 
@@ -119,6 +119,15 @@ def time_span(folder: Path) -> str:
     """First and last minute of a map's pictures, as "2026-05-28 20:26 to 2026-05-28 20:31 UTC"; empty if not known."""
     first, last = (None if time is None else time[:16].replace("T", " ") for time in picture_times(folder))
     return "" if first is None else f"{first} to {last} UTC"
+
+
+def _change_asset(folder: Path, document: Path) -> dict[str, Any]:
+    """The asset of a change map beside the orthoimage; empty without one."""
+    path = folder / "change.tif"
+    if not path.is_file():
+        return {}
+    title = "Probability that the ground changed since the pre-disaster map, 0 to 255"
+    return {"change": {"href": _relative(path, document), "type": _COG, "roles": ["data"], "title": title}}
 
 
 def surface_path(folder: Path) -> Path | None:

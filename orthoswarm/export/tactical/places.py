@@ -64,6 +64,7 @@ def utc_text(time_s: float) -> str:
     return datetime.fromtimestamp(time_s, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
+_MOST_CHANGES: Final = 50  # more would hide what people have marked
 _OPTIONAL: Final = ("height_m", "sigma_m", "course_deg", "speed_m_s")
 
 
@@ -100,6 +101,24 @@ def read_places(folder: Path) -> list[Place]:
         return [_place(row) for row in json.loads(path.read_text(encoding="utf-8"))["features"]]
     except (ValueError, KeyError, TypeError, AttributeError):
         raise InputError(f"{path} is not a list of places; remove it, and export again") from None
+
+
+def changed_places(folder: Path) -> list[Place]:
+    """The largest changes against the pre-disaster map in a map's folder, as finds; none without a change map."""
+    try:
+        figures = json.loads((folder / "change.json").read_text(encoding="utf-8"))
+        when = datetime.fromisoformat(figures["time"]).timestamp()
+        return [
+            Place(
+                uid=f"orthoswarm-{folder.resolve().name}-change-{number}", kind="find",
+                name=f"{row['kind']}, {row['area_m2']:.0f} m2", lat_deg=row["lat_deg"], lon_deg=row["lon_deg"],
+                time_s=when, note=f"changed since the map, {100 * row['probability']:.0f} % sure",
+                pictures=tuple(photo["image"] for photo in row["photos"]),
+            )
+            for number, row in enumerate(figures["objects"][:_MOST_CHANGES], start=1)
+        ]  # fmt: skip
+    except (OSError, ValueError, KeyError, TypeError):
+        return []
 
 
 def _place(row: Mapping[str, Any]) -> Place:

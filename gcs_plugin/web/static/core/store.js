@@ -9,6 +9,7 @@ export const state = {
   legs: [], // GeoJSON features
   routes: [], // what vehicles hold, as core/values.js cleans it
   trust: null, // /api/trust
+  change: null, // /api/change
   coverage: null, // /api/coverage
   completions: [],
   outlines: new Map(), // vehicle -> ring of the last picture

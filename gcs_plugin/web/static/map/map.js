@@ -51,7 +51,7 @@ const OVERLAYS = [
 ];
 export const RASTERS = ["basemap", "realtime", "coarse", "fine"];
 // From the ground up, in whatever order they come.
-const ORDER = ["ground", ...RASTERS, "trust", "coverage", ...OVERLAYS.map(([id]) => id)];
+const ORDER = ["ground", ...RASTERS, "trust", "change", "coverage", ...OVERLAYS.map(([id]) => id)];
 export function addInOrder(layer) {
   map.addLayer(layer, ORDER.slice(ORDER.indexOf(layer.id) + 1).find((id) => map.getLayer(id)));
   changed("overlays");

@@ -17,10 +17,11 @@ const LAYERS = {
   footprints: ["footprints"],
   coverage: ["coverage"],
   trust: ["trust"],
+  change: ["change"],
   legs: ["legs", "legs-refined", "legs-flying", "legs-signs"],
 };
-const FIRST = { plan: ["routes", "draft", "area", "zones", "fences", "homes"], fly: ["routes", "area", "zones", "fences", "trails", "homes", "footprints"], map: [] };
-const ONLY = { draft: ["plan"], legs: ["map"], trust: ["map"] }; // in other modes they are not offered
+const FIRST = { plan: ["routes", "draft", "area", "zones", "fences", "homes"], fly: ["routes", "area", "zones", "fences", "trails", "homes", "footprints"], map: ["change"] };
+const ONLY = { draft: ["plan"], legs: ["map"], trust: ["map"], change: ["map"] }; // in other modes they are not offered
 const FILLS = { area: "plan" }; // a fill tints what lies under it
 
 const offered = (group) => !ONLY[group] || ONLY[group].includes(settings.mode);

@@ -18,6 +18,7 @@ import { shownBox } from "/static/map/shown.js";
 import { setSwipe, swipeParts } from "/static/map/swipe.js";
 import "/static/map/traffic_markers.js";
 import { trustPanel } from "/static/map/trust.js";
+import { changePanel } from "/static/map/change.js";
 import "/static/map/vehicle_markers.js";
 import { setEditing } from "/static/plan/editor.js";
 import { loadPlan, planPanel } from "/static/plan/panel.js";
@@ -49,9 +50,10 @@ subscribe("vehicles ready", "first look", () => {
 
 export async function withMap(panels) {
   const swipe = make("input", { type: "checkbox", id: "swipe-on", onchange: () => setSwipe(swipe.checked) });
+  const compare = () => { if (!swipe.checked) swipe.click(); };
   byId("stage").append(...swipeParts(), olderNote(), make("div", { class: "under" }, button(t("map.all"), showAll), ...shownBox(), cursorLine()), detailsPanel());
   panels.plan.append(planPanel());
-  panels.map.append(goToForm(), layerPanel(), make("section", {}, make("label", { class: "check" }, swipe, make("span", {}, t("swipe.on")))), coveragePanel(), trustPanel(), legPanel(), measurePanel(), findPanel(), jobPanel(), exportPanel());
+  panels.map.append(goToForm(), layerPanel(), make("section", {}, make("label", { class: "check" }, swipe, make("span", {}, t("swipe.on")))), changePanel(compare), coveragePanel(), trustPanel(), legPanel(), measurePanel(), findPanel(), jobPanel(), exportPanel());
   document.body.append(preflightDialog(), gapFlightDialog());
   await ready;
   subscribe("plan", "the shared plan", () => loadPlan());

@@ -20,7 +20,7 @@ export async function refine(vehicle) {
 }
 
 // Work in the background comes and goes by itself: only what is under way, or went wrong, is worth a line.
-const worth = (job) => !["coarse", "together", "tones"].includes(job.kind) || job.state === "running" || job.state === "failed";
+const worth = (job) => !["coarse", "together", "tones", "change"].includes(job.kind) || job.state === "running" || job.state === "failed";
 
 // A refinement that found none of its lines on the basemap is done, and its pictures lie where the receiver says.
 const mapped = () => state.layers.some((layer) => layer.name === "basemap");

@@ -1,0 +1,113 @@
+"""The files of a change map: change.tif, change.gpkg, change.json."""
+
+import tempfile
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from orthoswarm.change.change_map import ChangeMap
+from orthoswarm.change.changed_objects import ChangedObject
+from orthoswarm.export.atomic_file import atomic_write
+from orthoswarm.export.cog import copy_dataset, software
+from orthoswarm.export.footprint_layer import append_polygons, gpkg_file
+from orthoswarm.export.product_files import write_json
+from orthoswarm.model.geo import LocalGrid
+
+RASTER, OBJECTS, FIGURES = "change.tif", "change.gpkg", "change.json"
+FILES: Final = (RASTER, OBJECTS, FIGURES)
+_LARGEST: Final = 10
+_LISTED: Final = 500
+_COG: Final = {"driver": "COG", "compress": "deflate", "overview_resampling": "average", "blocksize": "256"}
+_COLUMNS: Final = {
+    "area_m2": np.float64, "probability": np.float64, "kind": np.object_, "photos": np.object_,
+}  # fmt: skip
+
+
+def write_change(
+    folder: Path, found: ChangeMap, objects: Sequence[ChangedObject], basemap: str, warnings: Sequence[str]
+) -> dict[str, Any]:
+    """Write the three files and return the figures of `--json`.
+
+    Args:
+        folder: made if absent. found, objects: the map and its objects. basemap: its name. warnings: for the user.
+
+    Raises:
+        OrthoSwarmError: if the disk is full or the folder cannot be written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    _write_raster(folder / RASTER, found)
+    rows = [
+        {"area_m2": one.area_m2, "probability": round(one.probability, 3), "kind": one.kind,
+         "photos": " ".join(image for _, image in one.photos)}
+        for one in objects
+    ]  # fmt: skip
+    with gpkg_file(folder / OBJECTS) as part:
+        shapes = np.array([_multi(one.outline) for one in objects], object)
+        append_polygons(part, "change", shapes, rows=rows, columns=_COLUMNS, epsg=found.grid.epsg)
+    figures = figures_of(found, objects) | {"basemap": basemap, "warnings": list(warnings)}
+    write_json(folder / FIGURES, figures)
+    return figures
+
+
+def _multi(outline: Any) -> Any:
+    import shapely
+
+    return outline if outline.geom_type == "MultiPolygon" else shapely.MultiPolygon([outline])
+
+
+def _write_raster(path: Path, found: ChangeMap) -> None:
+    import rasterio
+
+    profile = {
+        "driver": "GTiff", "width": found.grid.width, "height": found.grid.height, "count": 1, "dtype": "uint8",
+        "crs": f"EPSG:{found.grid.epsg}", "transform": found.grid.affine(), "tiled": True,
+    }  # fmt: skip
+    with atomic_write(path) as part, tempfile.TemporaryDirectory(dir=path.parent, prefix=".change") as scratch:
+        plain = Path(scratch) / "plain.tif"  # overviews are made of a whole file
+        with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True):
+            with rasterio.open(plain, "w", **profile) as file:
+                hidden = found.inside & ~found.visible  # masked, and not the 0 of what lies outside
+                file.write(np.where(found.visible, found.probability, hidden).astype(np.uint8), 1)
+                file.write_mask(found.visible)
+                file.set_band_description(1, "probability that the ground changed, 0 to 255")
+                file.update_tags(TIFFTAG_SOFTWARE=software())
+            with rasterio.open(plain) as file:
+                copy_dataset(file, part, **_COG)
+
+
+def figures_of(found: ChangeMap, objects: Sequence[ChangedObject]) -> dict[str, Any]:
+    """Shares and the list of objects, as JSON values; `largest` has the ten largest, `objects` more."""
+    grid, visible = LocalGrid(found.grid.epsg), found.visible
+    inside, seen = int(found.inside.sum()), int(visible.sum())
+    changed = int((visible & (found.probability > 127)).sum())
+    rows = [
+        {
+            "area_m2": round(one.area_m2, 1), "probability": round(one.probability, 3), "kind": one.kind,
+            "lat_deg": lat, "lon_deg": lon, "bounds": _corners(one, grid),
+            "photos": [{"vehicle": vehicle, "image": image} for vehicle, image in one.photos],
+        }
+        for one in objects[:_LISTED]
+        for lat, lon in [[round(float(v), 7) for v in grid.to_geographic(one.place[:2])]]
+    ]  # fmt: skip
+    return {
+        "changed_share": changed / max(seen, 1),
+        "not_visible_share": 1.0 - seen / max(inside, 1),
+        "changed_m2": changed * found.grid.gsd_m**2,
+        "area_m2": inside * found.grid.gsd_m**2,
+        "cell_m": found.grid.gsd_m,
+        "epsg": found.grid.epsg,
+        "count": len(objects),
+        "largest": rows[:_LARGEST],
+        "objects": rows,
+        "time": datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
+    }
+
+
+def _corners(one: ChangedObject, grid: LocalGrid) -> list[float]:
+    """West, south, east, north of an object, degrees."""
+    west, south, east, north = one.outline.bounds
+    places = grid.to_geographic(np.array([[west, south], [east, north]]))
+    return [round(float(v), 7) for v in (places[0, 1], places[0, 0], places[1, 1], places[1, 0])]

@@ -1,0 +1,228 @@
+"""The change of an area against its pre-disaster map, block by block of cells, so that memory is bounded."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import cv2
+import numpy as np
+
+from orthoswarm.change.evidence import Block, Measured, measured
+from orthoswarm.change.likelihood import probabilities
+from orthoswarm.change.looks import FINE, ToneModel, cell_looks, on_cells
+from orthoswarm.change.map_ground import hidden_on_map, local_offsets, shifted
+from orthoswarm.change.seen_ground import Read, heights_on, seen_ground
+from orthoswarm.change.structure import structure
+from orthoswarm.coverage.view import View
+from orthoswarm.model.arrays import Bytes, Flags, Floats
+from orthoswarm.model.bounding_box import BoundingBox
+from orthoswarm.model.geo import GroundGrid
+from orthoswarm.model.placement import Terrain
+from orthoswarm.raster.basemap import Basemap
+
+_BLOCK: Final = 448  # cells along the side of a block
+_MARGIN: Final = 16  # cells around it that are measured, too: two sigmas of the largest surroundings
+_MOST_CELLS: Final = 16_000_000  # cells are larger where there would be more (memory)
+_SCENE_CELLS: Final = 1_000_000  # of the whole scene, on which its tones are compared
+_APART: Final = 0.25  # distance of the pictures that are used, in heights above the ground: four see each place
+_THICK: Final = 0.6  # share of haze that hides the ground
+_SEEN: Final = 0.5  # share of a cell that pictures must see
+_DISTORTED_PX: Final = 1.0  # offsets of the map below this are those of what leans, not of the map
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ComparedScene:
+    """What is compared.
+
+    Attributes:
+        views: refined pictures, in the map's grid. terrain: the ground they lie on. basemap: the pre-disaster map.
+        orthoimage: the refined one. read: gives a view's grey values. lean: of the map, metres a metre of height.
+    """
+
+    views: Sequence[View]
+    terrain: Terrain
+    basemap: Basemap
+    orthoimage: Path
+    read: Read
+    lean: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChangeMap:
+    """The change of an area; all (rows, columns).
+
+    Attributes:
+        grid: its cells. probability: uint8, that the ground changed, 0 to 255. visible: bool, where that can be said.
+        inside: bool, where the orthoimage shows the ground. case: uint8, the likeliest of CASES but the first.
+        height: float32, what stands above the bare ground now, metres.
+    """
+
+    grid: GroundGrid
+    probability: Bytes
+    visible: Flags
+    inside: Flags
+    case: Bytes
+    height: Floats
+
+    @classmethod
+    def blank(cls, grid: GroundGrid) -> "ChangeMap":
+        """A map of nothing."""
+        shape = (grid.height, grid.width)
+        chance, case = np.zeros((2, *shape), np.uint8)
+        visible, inside = np.zeros((2, *shape), bool)
+        height = np.zeros(shape, np.float32)
+        return cls(grid=grid, probability=chance, visible=visible, inside=inside, case=case, height=height)
+
+
+class MeasuredBlock(NamedTuple):
+    """What is measured of a block of an area's cells.
+
+    Attributes:
+        rows, columns: which cells. found: of these. drawn, hidden: bool, where the orthoimage shows them, and where the
+            map shows what stands before them. height: float32, what stands above the bare ground now, metres.
+    """
+
+    rows: slice
+    columns: slice
+    found: Measured
+    drawn: Flags
+    hidden: Flags
+    height: Floats
+
+
+def map_change(
+    scene: ComparedScene, *, want_m: float, progress: Callable[[int, int], None] = lambda done, of: None
+) -> ChangeMap:
+    """Find where the ground is no longer what the map shows.
+
+    Args:
+        scene: what is compared. want_m: side of a cell, metres; that of the map's pixel where it is larger.
+        progress: called with blocks done and in all.
+    """
+    grid = cells_of(scene, want_m)
+    out = ChangeMap.blank(grid)
+    of = -(-grid.height // _BLOCK) * -(-grid.width // _BLOCK)
+    for done, block in enumerate(measured_blocks(scene, grid), start=1):
+        window, found = (block.rows, block.columns), block.found
+        chance = probabilities(found.values)
+        out.inside[window] = block.drawn
+        out.probability[window] = np.round(255 * (1.0 - chance[..., 0]))
+        out.visible[window] = block.drawn & (found.seen > _SEEN) & (found.veil < _THICK) & ~block.hidden
+        out.case[window] = 1 + cv2.medianBlur(chance[..., 1:].argmax(-1).astype(np.uint8), 5)
+        out.height[window] = block.height
+        progress(done, of)
+    return out
+
+
+def cells_of(scene: ComparedScene, want_m: float) -> GroundGrid:
+    """The cells of what both the orthoimage and the map show."""
+    import rasterio
+
+    with rasterio.open(scene.orthoimage) as file:
+        bounds = BoundingBox(*file.bounds).intersection(scene.basemap.bounds)
+    most = float(np.sqrt(max(bounds.width * bounds.height, 0.0) / _MOST_CELLS))
+    return GroundGrid.around(scene.basemap.epsg, bounds, max(want_m, scene.basemap.native_gsd_m, most))
+
+
+def measured_blocks(scene: ComparedScene, grid: GroundGrid) -> Iterator[MeasuredBlock]:
+    """Measure the cells of a scene, block by block."""
+    per_cell = 2 if grid.gsd_m >= 1.5 * scene.basemap.native_gsd_m else 1
+    scene, tone = replace(scene, views=_thinned(scene.views, scene.terrain)), _tone(scene, grid)
+    for row in range(0, grid.height, _BLOCK):
+        for column in range(0, grid.width, _BLOCK):
+            rows = slice(row, min(row + _BLOCK, grid.height))
+            columns = slice(column, min(column + _BLOCK, grid.width))
+            yield _measured_block(scene, tone, grid, (rows, columns), per_cell)
+
+
+def _measured_block(
+    scene: ComparedScene, tone: ToneModel, grid: GroundGrid, window: tuple[slice, slice], per_cell: int
+) -> MeasuredBlock:
+    (rows, columns), cell = window, grid.gsd_m
+    own = replace(
+        grid, west=grid.west + (columns.start - _MARGIN) * cell, north=grid.north - (rows.start - _MARGIN) * cell,
+        width=columns.stop - columns.start + 2 * _MARGIN, height=rows.stop - rows.start + 2 * _MARGIN,
+    )  # fmt: skip
+    picture, alpha = orthoimage_window(scene.orthoimage, own, FINE)
+    drawn = on_cells((alpha > 127).astype(np.float32), FINE) > _SEEN
+    pixels = replace(own, gsd_m=cell / per_cell, width=own.width * per_cell, height=own.height * per_cell)
+    terrain, views = scene.terrain, scene.views if drawn.any() else ()
+    seen = seen_ground(views, pixels, heights_on(pixels, terrain, terrain.z), scene.read)
+    fine, known = scene.basemap.rgb(BoundingBox(*own.bounds), cell / FINE)
+    gray = on_cells(cv2.cvtColor(fine, cv2.COLOR_RGB2GRAY), FINE // per_cell).astype(np.float32)
+    valid = on_cells(known.astype(np.float32), FINE // per_cell) > _SEEN
+    before = structure(gray, pixels.gsd_m)
+    offset = local_offsets(before.field, seen.field)
+    if float(np.abs(offset).max()) > _DISTORTED_PX:
+        offset[np.hypot(offset[..., 0], offset[..., 1]) < _DISTORTED_PX] = 0.0
+        gray = shifted(gray, offset)
+        before = structure(gray, pixels.gsd_m)
+    block = Block(seen, before, gray, valid, cell_looks(picture), cell_looks(fine), drawn, per_cell, cell)
+    height = _above_ground(own, terrain)
+    inner = np.s_[_MARGIN:-_MARGIN, _MARGIN:-_MARGIN]
+    found = Measured(*(part[inner] for part in measured(block, tone)))
+    hidden = hidden_on_map(height, scene.lean, cell)
+    return MeasuredBlock(rows, columns, found, drawn[inner], hidden[inner], height[inner])
+
+
+def _above_ground(grid: GroundGrid, terrain: Terrain) -> Floats:
+    if terrain.bare is None:
+        return np.zeros((grid.height, grid.width), np.float32)
+    return heights_on(grid, terrain, terrain.z - terrain.bare)
+
+
+def _thinned(views: Sequence[View], terrain: Terrain) -> list[View]:
+    """Pictures some way apart, refined and sure ones first: all of a flight's see each place many times."""
+    order = sorted(
+        range(len(views)), key=lambda i: (not views[i].placed, round(np.nan_to_num(views[i].sigma_m, nan=9), 1), i)
+    )
+    taken: dict[tuple[int, int], list[View]] = {}
+    out: list[View] = []
+    level = float(np.median(terrain.z))
+    apart = _APART * float(np.median([max(v.position[2] - level, 1.0) for v in views]))
+    for view in (views[i] for i in order):
+        key = (int(view.position[0] // apart), int(view.position[1] // apart))
+        near = (v for i in (-1, 0, 1) for j in (-1, 0, 1) for v in taken.get((key[0] + i, key[1] + j), ()))
+        if all(np.hypot(*(v.position[:2] - view.position[:2])) >= apart for v in near):
+            taken.setdefault(key, []).append(view)
+            out.append(view)
+    return out
+
+
+def _tone(scene: ComparedScene, grid: GroundGrid) -> ToneModel:
+    """How the scene's colours have changed where it is the same."""
+    factor = max(2.0, float(np.sqrt(grid.width * grid.height / _SCENE_CELLS)))
+    coarse = GroundGrid.around(grid.epsg, grid.bounds, grid.gsd_m * factor)
+    picture, alpha = orthoimage_window(scene.orthoimage, coarse, 1)
+    before, valid = scene.basemap.rgb(BoundingBox(*coarse.bounds), coarse.gsd_m)
+    return ToneModel.of(before.astype(np.float32), picture.astype(np.float32), (alpha > 127) & valid)
+
+
+def orthoimage_window(path: Path, cells: GroundGrid, per_cell: int) -> tuple[Bytes, Bytes]:
+    """Colours (rows, columns, 3) and alpha (rows, columns) of an orthoimage on the pixels of cells, uint8."""
+    import rasterio
+    from rasterio.windows import Window
+
+    pixel = cells.gsd_m / per_cell
+    rows, columns = cells.height * per_cell, cells.width * per_cell
+    with rasterio.open(path) as file:
+        gsd, left, top = float(file.res[0]), file.bounds.left, file.bounds.top
+        factor = max(1, 2 ** int(np.floor(np.log2(max(pixel / gsd, 1.0)))))  # an overview that is finer
+        size = np.array([file.width, file.height])
+        low = (np.array([cells.west - left, top - cells.north]) / gsd).astype(int) // factor * factor - factor
+        high = low + np.ceil(np.array([columns, rows]) * pixel / gsd / factor).astype(int) * factor + 3 * factor
+        low, high = np.clip(low, 0, size), np.clip(high, 0, size)
+        wide, tall = (int(v) for v in -(-(high - low) // factor))
+        if wide < 1 or tall < 1:
+            return np.zeros((rows, columns, 3), np.uint8), np.zeros((rows, columns), np.uint8)
+        window = Window(int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1]))
+        bands = np.moveaxis(file.read((1, 2, 3, 4), window=window, out_shape=(4, tall, wide)), 0, 2)
+    # Where the pixels of the cells lie in what was read.
+    step = gsd * (high - low) / [wide, tall]
+    scale = pixel / step
+    first = (np.array([cells.west - left, top - cells.north]) - low * gsd) / step + 0.5 * scale - 0.5
+    place = np.array([[scale[0], 0.0, first[0]], [0.0, scale[1], first[1]]])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    out = cv2.warpAffine(np.ascontiguousarray(bands), place, (columns, rows), flags=flags)
+    return np.ascontiguousarray(out[..., :3]), out[..., 3]

@@ -1,0 +1,119 @@
+"""The probability that cells have changed, from the structure, roughness and hue of map and pictures.
+
+What both have in common is measured as 2 <m, p> / (<m, m> + <p, p> + f), with <> the mean over the surroundings of a
+cell at several scales: 1 where they are alike, 0 where they differ, and also where neither has any structure, which
+the share of structure, (<m, m> + <p, p>) / (<m, m> + <p, p> + f), tells apart. The log-likelihood ratio is linear in
+these and the others; its coefficients were fitted on simulated cities (see benchmarks/accuracy/change.py).
+"""
+
+from typing import Final, NamedTuple
+
+import cv2
+import numpy as np
+
+from orthoswarm.change.looks import CellLooks, ToneModel, mean_around, on_cells, order_of
+from orthoswarm.change.seen_ground import SeenGround
+from orthoswarm.change.structure import NOISE_GRAY, Structure, blurred
+from orthoswarm.model.arrays import Flags, Floats
+
+SCALES_M: Final = (2.0, 4.0, 8.0)  # sigmas of the surroundings of structure
+_FINE_SCALES_M: Final = (2.0, 4.0)  # of roughness and order
+_HUE_SCALES_M: Final = (1.5, 3.0, 6.0)
+_LITTLE: Final = 0.1  # power of structure that is as good as none
+_AROUND_DARKEST_M: Final = 24.0
+_DARK: Final = 55.0  # grey value of the darkest place around on a clear day
+_WHITE: Final = 225.0  # grey value of haze
+_LEAST_WEIGHT: Final = 0.02  # of pictures: one that sees a place 43 degrees off nadir counts so little
+_SAME: Final = 0.3  # what has so much in common is the same ground
+_ENOUGH: Final = 200  # cells that tell the usual ratio of contrasts
+
+
+class Block(NamedTuple):
+    """A block of cells: what the pictures show of it, and what the map does.
+
+    Attributes:
+        seen, before: structure on pixels. gray: of the map, on the same pixels. valid: where the map has them.
+        now, then: looks of cells in the orthoimage and on the map. drawn: bool, where the orthoimage shows the cells.
+        per_cell: pixels along a cell. cell_m: side of a cell.
+    """
+
+    seen: SeenGround
+    before: Structure
+    gray: Floats
+    valid: Flags
+    now: CellLooks
+    then: CellLooks
+    drawn: Flags
+    per_cell: int
+    cell_m: float
+
+
+class Measured(NamedTuple):
+    """What is measured of each cell.
+
+    Attributes:
+        values: float32 (rows, columns, features), what the probability is computed from.
+        seen: float32 (rows, columns), 0 to 1, how much of it pictures see and the map has. veil: share of its light
+            that is haze, less that of the map (large white roofs are no haze).
+    """
+
+    values: Floats
+    seen: Floats
+    veil: Floats
+
+
+def unveiled(contrast: Floats, gray: Floats, gsd_m: float) -> tuple[Floats, Floats]:
+    """Contrast as it would be without haze, and the share of light that is haze, both float32 (rows, columns).
+
+    The darkest place around is as dark as the haze before it lets it be (the dark channel of He, Sun, Tang 2009).
+    """
+    side = round(_AROUND_DARKEST_M / gsd_m) | 1
+    darkest = cv2.erode(gray, np.ones((side, side), np.uint8), borderType=cv2.BORDER_REFLECT)
+    darkest = blurred(darkest, 0.25 * side)
+    veil = np.clip((darkest - _DARK) / (_WHITE - _DARK), 0.0, 0.9)
+    return np.asarray(contrast / (1.0 - veil)), np.asarray(veil)
+
+
+def measured(block: Block, tone: ToneModel) -> Measured:
+    """Measure the cells of a block; `tone`: the scene's."""
+    seen, before, per_cell, cell_m = block.seen, block.before, block.per_cell, block.cell_m
+    gsd_m = cell_m / per_cell
+    both = ((seen.weight > _LEAST_WEIGHT) & block.valid).astype(np.float32)
+    now, veil = unveiled(seen.contrast, np.where(both > 0, seen.gray, 255.0).astype(np.float32), gsd_m)
+    then, clear = unveiled(before.contrast, np.where(block.valid, block.gray, 255.0).astype(np.float32), gsd_m)
+    product = before.field * seen.field
+    parts = [
+        product[..., 0] + product[..., 1], product[..., 2] + product[..., 3], before.power,
+        np.maximum(seen.same, 0.0), seen.power - seen.same, np.log((now + NOISE_GRAY) / (then + NOISE_GRAY)),
+    ]  # fmt: skip
+    count = on_cells(both, per_cell)
+    sums = np.dstack([on_cells(part * both, per_cell) for part in parts])
+    cells = np.asarray(sums / np.maximum(count, 1e-3)[..., None], np.float32)
+    values = _structure_values(cells, count, cell_m)
+    known = count * block.drawn
+    for scale in _FINE_SCALES_M:
+        for looks in (block.now, block.then):
+            mean = [mean_around(v, scale / cell_m, known) for v in (looks.spots, looks.edges, looks.order)]
+            values += [np.log(mean[0] + 1.0), np.log(mean[1] + 1.0), order_of(mean[2])]
+    far, difference = tone.differs(block.then.color, block.now.color)
+    values += [np.log(mean_around(far, scale / cell_m, known) + 0.2) for scale in _HUE_SCALES_M]
+    difference = mean_around(difference, _HUE_SCALES_M[0] / cell_m, known)
+    values += [difference, np.log(difference + 0.01), np.log(on_cells(seen.weight, per_cell) + _LEAST_WEIGHT)]
+    return Measured(np.stack(values, -1).astype(np.float32), count, on_cells(np.maximum(veil - clear, 0.0), per_cell))
+
+
+def _structure_values(cells: Floats, count: Floats, cell_m: float) -> list[Floats]:
+    """Structure in common at each scale, with its share, what pictures do not agree on, and the ratio of contrasts."""
+    means = [mean_around(cells, scale / cell_m, count) for scale in SCALES_M]
+
+    def shares(mean: Floats) -> tuple[Floats, Floats, Floats]:
+        total = mean[..., 2] + mean[..., 3]
+        return 2 * mean[..., 0] / (total + _LITTLE), 2 * mean[..., 1] / (total + _LITTLE), total / (total + _LITTLE)
+
+    same = (shares(means[-1])[1] > _SAME) & (count > 0.5)
+    usual = float(np.median(means[-1][..., 5][same])) if same.sum() > _ENOUGH else 0.0
+    out: list[Floats] = []
+    for mean in means:
+        ratio = mean[..., 5] - np.float32(usual)
+        out += [*shares(mean), np.maximum(mean[..., 4], 0.0), np.maximum(ratio, 0.0), np.maximum(-ratio, 0.0)]
+    return out
