@@ -26,6 +26,7 @@ from telemetry.formats.video.sei import read_sei_layout, register
 from telemetry.ingest.discovery import Discovery, Folder, discover, natural_key
 from telemetry.ingest.log_choice import LogSource
 from telemetry.ingest.log_ingest import add_logs, read_logs
+from telemetry.ingest.picture_kinds import Reasons, of_other_kinds, of_other_sources, of_second_cameras
 from telemetry.ingest.side_files import read_control_points
 from telemetry.ingest.survey import LoadOptions, SourceInfo, Survey
 from telemetry.ingest.track_poses import SHIFTED, clock_went_back, in_order
@@ -33,7 +34,7 @@ from telemetry.ingest.video_ingest import read_videos
 from telemetry.photos.flight_checks import OTHER_DAY_S, flight_findings, times_without_zone
 from telemetry.photos.maker_angles import Angles
 from telemetry.photos.photo_frames import frame_without_position, frames_of, settle_positions
-from telemetry.photos.photo_tags import SENSORS, Photo, read_photos, with_sidecar
+from telemetry.photos.photo_tags import Photo, read_photos, with_sidecar
 from telemetry.samples.course import local_metres
 from telemetry.samples.findings import Finding, metres, plural
 from telemetry.samples.held_fixes import LOST_SIGMA_M, held_fixes, is_one_fix, matters, stated_sigma_m
@@ -41,9 +42,6 @@ from telemetry.samples.unreadable import Unreadable, read_or_reason
 from telemetry.samples.wild_fixes import doubtful_finding, wild_fixes
 
 __all__ = ["LoadOptions", "SourceInfo", "Survey", "load", "survey"]
-
-_BANDS = ("", "green", "red", "blue", "nir", "red edge", "rededge")
-"""Spectral bands by how well they show the ground; "" is a colour picture."""
 
 _CONTRADICTION_M: Final = 500.0  # table that puts a photo so far from its tags, or from another table, contradicts them
 
@@ -54,9 +52,8 @@ _NOT_MEASURED: Final = (
 _FEW_SHARE: Final = 0.1  # strangers are at most this share of a folder's photos
 _OTHER_CAMERA_MOST: Final = 2  # photos of another camera: more are a flight's second camera
 _SMALLER: Final = 0.75  # a copy has at most this share of the photo's columns
+_SAME_SHAPE: Final = 0.02  # ... and its sides' ratio, but for rounding (logarithm)
 _ELSEWHERE_M: Final = 500.0  # ... and elsewhere, if they are farther than this from all others
-Reasons = dict[int, tuple[str, str]]
-"""Photos by their index: why they are left out, one reason for all that share it, and a detail."""
 
 
 def load(inputs: Sequence[Path], *, progress: Progress | None = None, options: LoadOptions | None = None) -> Ingest:
@@ -112,6 +109,10 @@ def survey(inputs: Sequence[Path], *, progress: Progress | None = None, options:
                 _photo_folder(folder, own, found, tables=tables, logs=logs, result=result, options=options)
             if folder.videos or folder.subtitles:
                 read_videos(folder, found, logs, options=options, progress=progress, result=result)
+    for source, reason in of_other_sources(result.sources, options.camera, options.band):
+        result.rejected += [Rejection(f.image, reason, f.vehicle, f.time_s) for f in source.frames]
+        source.frames.clear()
+        source.counts["frames"] = 0
     result.findings += [*_logs_apart(found, logs), *_unread(found, needed=bool(result.unpositioned))]
     if not result.sources and not result.rejected:
         result.findings.append(Finding("nothing", "no picture was found in the inputs"))
@@ -280,12 +281,15 @@ def _photo_folder(
         photos = sorted(groups[vehicle], key=lambda p: natural_key(p.path.name))
         photos.sort(key=lambda p: math.inf if p.time_s is None else p.time_s)
         add_logs(photos, folder.path, vehicle, logs=logs, findings=source.findings, workers=options.workers)
-        photos = _one_kind(photos, vehicle, options.camera, found, result)
-        photos = _of_the_flight(photos, vehicle, found, result)
+        others = of_other_kinds(photos, options.camera, options.band)
+        photos = _without(others, photos, vehicle, found, result)
+        photos = _without(strangers(photos), photos, vehicle, found, result)
+        photos = _without(of_second_cameras(photos), photos, vehicle, found, result)
         photos = _with_position(photos, vehicle, found, result)
         photos = in_order(photos, vehicle, source.findings)
         source.findings += settle_positions(photos, vehicle, found.name)
         photos = _where_it_can_be(photos, vehicle, found, source, result)
+        source.sees = (photos[0].sensor, photos[0].band) if photos else source.sees
         frames = frames_of(photos, vehicle, found.name, source.findings)
         source.frames += frames
         source.findings += flight_findings(photos, frames, vehicle)
@@ -303,39 +307,8 @@ def _with_sidecar(photo: Photo, sidecar: Path, found: Discovery, source: SourceI
         return photo
 
 
-def _one_kind(photos: Sequence[Photo], vehicle: str, camera: str, found: Discovery, result: Survey) -> list[Photo]:
-    """Keep the pictures of one kind of a camera that takes several: one sensor, and colour or one spectral band.
-
-    A zoom's pictures stay beside those of the wide camera unless both were taken at one press.
-
-    Args:
-        camera: the sensor that is wanted, one of SENSORS; "" for the widest that sees colours.
-    """
-    reasons: dict[Path, str] = {}
-    sensors = {photo.sensor for photo in photos if photo.sensor}
-    if len(sensors) > 1 or (camera and sensors and camera not in sensors):
-        wanted = camera or next(sensor for sensor in SENSORS if sensor in sensors)
-        pressed = Counter(photo.path.stem.rpartition("_")[0] for photo in photos)
-        beside = {"wide", "zoom"} if not camera and max(pressed.values()) < 2 else {wanted}
-        said = f"of each exposure the {wanted} pictures are mapped (--camera)"
-        others = [photo for photo in photos if photo.sensor and photo.sensor not in beside]
-        reasons |= {photo.path: f"a picture of the {photo.sensor} camera; {said}" for photo in others}
-    bands = {photo.band.lower() for photo in photos if photo.path not in reasons}
-    if len(bands) > 1:
-        mapped = next((band for band in _BANDS if band in bands), min(bands))
-        said = f"of each exposure {f'band {mapped}' if mapped else 'the colour pictures'} is mapped"
-        others = [photo for photo in photos if photo.path not in reasons and photo.band.lower() != mapped]
-        reasons |= {
-            photo.path: f"a picture of one spectral band ({photo.band or 'colour'}); {said}" for photo in others
-        }
-    left = [photo for photo in photos if photo.path in reasons]
-    result.rejected += [Rejection(found.name(p.path), reasons[p.path], vehicle, p.time_s) for p in left]
-    return [photo for photo in photos if photo.path not in reasons]
-
-
-def _of_the_flight(photos: Sequence[Photo], vehicle: str, found: Discovery, result: Survey) -> list[Photo]:
-    """Photos without strangers, which are rejected."""
-    odd = strangers(photos)
+def _without(odd: Reasons, photos: Sequence[Photo], vehicle: str, found: Discovery, result: Survey) -> list[Photo]:
+    """Photos without some, which are rejected."""
     result.rejected += [
         Rejection(found.name(photos[i].path), why, vehicle, photos[i].time_s, detail=detail)
         for i, (why, detail) in odd.items()
@@ -505,9 +478,15 @@ def _smaller_copies(photos: Sequence[Photo]) -> Reasons:
     for group in same.values():
         largest = max(group, key=lambda i: photos[i].width * photos[i].height)
         for i in group:
-            if photos[i].width <= _SMALLER * photos[largest].width:
+            if photos[i].width <= _SMALLER * photos[largest].width and _one_shape(photos[i], photos[largest]):
                 found[i] = "a smaller picture of the same exposure as another one here", photos[largest].path.name
     return found
+
+
+def _one_shape(one: Photo, other: Photo) -> bool:
+    """Whether two pictures have the same sides but for their size; either may be turned."""
+    shapes = [max(p.width, p.height) / max(1, min(p.width, p.height)) for p in (one, other)]
+    return abs(math.log(shapes[0] / shapes[1])) < _SAME_SHAPE
 
 
 def _other_camera(photos: Sequence[Photo]) -> Reasons:
