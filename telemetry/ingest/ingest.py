@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 
 from orthoswarm.model.earth import distance_m
-from orthoswarm.model.frame import Ingest, Rejection
+from orthoswarm.model.frame import UNSTATED_SIGMA_M, Ingest, Rejection
 from orthoswarm.model.task_runner import Progress
 from orthoswarm.stores.local_copies import local_file
 from telemetry.formats.table import geo_txt, pose_csv
@@ -37,7 +37,7 @@ from telemetry.photos.photo_frames import frame_without_position, frames_of, set
 from telemetry.photos.photo_tags import Photo, read_photos, with_sidecar
 from telemetry.samples.course import local_metres
 from telemetry.samples.findings import Finding, metres, plural
-from telemetry.samples.held_fixes import LOST_SIGMA_M, held_fixes, is_one_fix, matters, stated_sigma_m
+from telemetry.samples.held_fixes import LOST_SIGMA_M, coarse_m, held_fixes, matters, one_fix, stated_sigma_m
 from telemetry.samples.unreadable import Unreadable, read_or_reason
 from telemetry.samples.wild_fixes import doubtful_finding, wild_fixes
 
@@ -49,6 +49,8 @@ _CONTRADICTION_M: Final = 500.0  # table that puts a photo so far from its tags,
 _NOT_MEASURED: Final = (
     "the picture has no position: its receiver stood still; put a geo.txt next to it, or give its log as well"
 )
+_COARSE_TOLD_M: Final = 3.0  # steps of coordinates that are more than receivers err
+_ROUNDED: Final = 12.0**-0.5  # sigma of what was rounded, in its steps
 _FEW_SHARE: Final = 0.1  # strangers are at most this share of a folder's photos
 _OTHER_CAMERA_MOST: Final = 2  # photos of another camera: more are a flight's second camera
 _SMALLER: Final = 0.75  # a copy has at most this share of the photo's columns
@@ -373,9 +375,10 @@ def _measured(
     """Photos whose receiver measured; others lie between those before and after, or are left out without a position."""
     places = [(p.lat_deg or 0.0, p.lon_deg or 0.0) for p in photos]
     held = held_fixes([p.time_s for p in photos], places)
-    lost = set(range(len(photos))) if is_one_fix(places) else set()
+    lost = set(one_fix(places))
     if lost:
-        text = f"all {len(photos)} photos tell one place to the last digit: the receiver stood still, it is not used"
+        many = f"all {len(photos)}" if len(lost) == len(photos) else f"{len(lost)} of {len(photos)}"
+        text = f"{many} photos tell one place to the last digit: the receiver stood still, it is not used"
         source.findings.append(Finding("position-held", text, vehicle))
     for i, lat, lon, sigma in held.each():
         if sigma > LOST_SIGMA_M:
@@ -387,6 +390,14 @@ def _measured(
     if matters(held):
         whose = f"{plural(len(photos), 'photo')} ({found.name(photos[held.index[0]].path)} first)"
         source.findings.append(replace(held.finding(whose), vehicle=vehicle))
+    steps_m = coarse_m(places)
+    if steps_m > _COARSE_TOLD_M:
+        for photo in photos:
+            photo.position_sigma_m = math.hypot(photo.position_sigma_m or UNSTATED_SIGMA_M, _ROUNDED * steps_m)
+        text = (
+            f"positions are written in steps of {metres(steps_m)}: they are known to half of that, as their sigma says"
+        )
+        source.findings.append(Finding("position-coarse", text, vehicle))
     for i in sorted(lost):
         _leave_out(photos[i], vehicle, found.name(photos[i].path), _NOT_MEASURED, result)
     return [photo for i, photo in enumerate(photos) if i not in lost]

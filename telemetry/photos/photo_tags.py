@@ -47,6 +47,7 @@ _SAME_BANDS: Final = {
     "red-edge": "red edge", "near infrared": "nir", "near-infrared": "nir", "nearinfrared": "nir", "lwir": "thermal",
 }  # fmt: skip
 CONTRADICTS_M: Final = 30.0  # positions of one photo's tags that are farther apart are of two places
+ALTITUDE_CONTRADICTS_M: Final = 120.0  # above sea and ellipsoid differ by at most 107 m (EGM96)
 _MOST_HEIGHT_M: Final = 12_000.0  # recorded heights above this are not heights above ground
 
 
@@ -58,7 +59,8 @@ class Photo:
         path: the file. width: columns as stored; height: rows.
         lat_deg: latitude, None without a position; lon_deg: longitude.
         other_position: another latitude and longitude that the photo's tags state, far from that.
-        altitude_m: absolute altitude. height_m: height above takeoff.
+        altitude_m: absolute altitude. other_altitude_m: another one that the photo's tags state, far from that.
+        height_m: height above takeoff.
         height_is_ground: whether height_m is above the ground instead.
         time_s: UTC epoch seconds.
         camera_deg: yaw, pitch, roll of the camera (gimbal), pitch -90 looking straight down.
@@ -83,6 +85,7 @@ class Photo:
     lon_deg: float | None = None
     other_position: tuple[float, float] | None = None
     altitude_m: float | None = None
+    other_altitude_m: float | None = None
     height_m: float | None = None
     height_is_ground: bool = False
     time_s: float | None = None
@@ -236,9 +239,12 @@ def _xmp_position(found: xmp.Properties) -> tuple[float, float] | None:
 
 
 def _heights(photo: Photo, tags: exif.Exif, found: xmp.Properties) -> None:
-    photo.altitude_m = exif.gps_altitude(tags.gps)
-    if photo.altitude_m is None:
-        photo.altitude_m = xmp.number(found, "drone-dji:AbsoluteAltitude", "exif:GPSAltitude")
+    altitude, other = exif.gps_altitude(tags.gps), xmp.number(found, *_ABSOLUTE_ALTITUDES)
+    if altitude is None or (other is not None and abs(altitude + other) < 1.0):  # the reference is one wrong number
+        altitude, other = other, altitude
+    photo.altitude_m = altitude
+    if altitude is not None and other is not None and abs(altitude - other) > ALTITUDE_CONTRADICTS_M:
+        photo.other_altitude_m = other
     ground = xmp.number(found, "Camera:AboveGroundAltitude")
     if ground is not None and 0.0 < ground < _MOST_HEIGHT_M:
         photo.height_m, photo.height_is_ground = ground, True
@@ -252,6 +258,7 @@ def _heights(photo: Photo, tags: exif.Exif, found: xmp.Properties) -> None:
 
 
 _POSITION_PREFIXES = ("drone-dji", "drone", "drone-skydio")
+_ABSOLUTE_ALTITUDES = (*(f"{prefix}:AbsoluteAltitude" for prefix in _POSITION_PREFIXES), "exif:GPSAltitude")
 _RELATIVE_ALTITUDES = (
     *(f"{prefix}:RelativeAltitude" for prefix in ("drone-dji", "drone-parrot", "drone", "drone-skydio")),
     "drone-yuneec:AboveHomeAltitude",
