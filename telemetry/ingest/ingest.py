@@ -9,12 +9,9 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from contextlib import closing
 from dataclasses import replace
-from datetime import UTC, datetime
 from itertools import islice
 from pathlib import Path
 from typing import Final
-
-import numpy as np
 
 from orthoswarm.model.earth import distance_m
 from orthoswarm.model.frame import UNSTATED_SIGMA_M, Ingest, Rejection
@@ -28,14 +25,14 @@ from telemetry.ingest.log_choice import LogSource
 from telemetry.ingest.log_ingest import add_logs, read_logs
 from telemetry.ingest.picture_kinds import Reasons, of_other_kinds, of_other_sources, of_second_cameras
 from telemetry.ingest.side_files import read_control_points
+from telemetry.ingest.strangers import copies_in_other_folders, strangers
 from telemetry.ingest.survey import LoadOptions, SourceInfo, Survey
 from telemetry.ingest.track_poses import SHIFTED, clock_went_back, in_order
 from telemetry.ingest.video_ingest import read_videos
-from telemetry.photos.flight_checks import OTHER_DAY_S, flight_findings, times_without_zone
+from telemetry.photos.flight_checks import flight_findings, times_without_zone
 from telemetry.photos.maker_angles import Angles
 from telemetry.photos.photo_frames import frame_without_position, frames_of, settle_positions
 from telemetry.photos.photo_tags import Photo, read_photos, with_sidecar
-from telemetry.samples.course import local_metres
 from telemetry.samples.findings import Finding, metres, plural
 from telemetry.samples.held_fixes import LOST_SIGMA_M, coarse_m, held_fixes, matters, one_fix, stated_sigma_m
 from telemetry.samples.unreadable import Unreadable, read_or_reason
@@ -51,11 +48,6 @@ _NOT_MEASURED: Final = (
 )
 _COARSE_TOLD_M: Final = 3.0  # steps of coordinates that are more than receivers err
 _ROUNDED: Final = 12.0**-0.5  # sigma of what was rounded, in its steps
-_FEW_SHARE: Final = 0.1  # strangers are at most this share of a folder's photos
-_OTHER_CAMERA_MOST: Final = 2  # photos of another camera: more are a flight's second camera
-_SMALLER: Final = 0.75  # a copy has at most this share of the photo's columns
-_SAME_SHAPE: Final = 0.02  # ... and its sides' ratio, but for rounding (logarithm)
-_ELSEWHERE_M: Final = 500.0  # ... and elsewhere, if they are farther than this from all others
 
 
 def load(inputs: Sequence[Path], *, progress: Progress | None = None, options: LoadOptions | None = None) -> Ingest:
@@ -111,6 +103,10 @@ def survey(inputs: Sequence[Path], *, progress: Progress | None = None, options:
                 _photo_folder(folder, own, found, tables=tables, logs=logs, result=result, options=options)
             if folder.videos or folder.subtitles:
                 read_videos(folder, found, logs, options=options, progress=progress, result=result)
+    for source, lost in copies_in_other_folders(result.sources):
+        source.frames = [frame for frame in source.frames if frame.image not in lost]
+        source.counts["frames"] = len(source.frames)
+        result.rejected += lost.values()
     for source, reason in of_other_sources(result.sources, options.camera, options.band):
         result.rejected += [Rejection(f.image, reason, f.vehicle, f.time_s) for f in source.frames]
         source.frames.clear()
@@ -445,91 +441,3 @@ def _merge_tables(
             photo.origin["angles"] = kind
             photo.yaw_is_stated |= angles[0] is not None
     return vehicle
-
-
-def strangers(photos: Sequence[Photo]) -> Reasons:
-    """The photos of a folder that are not of its flight: screenshots, smaller copies, another camera's, another day's.
-
-    Each would be drawn as if the flight's camera had taken it. What most photos of the folder are is the flight; only
-    few others are strangers: as many as the flight's are another flight, which is mapped, too.
-    """
-    found: Reasons = {}
-    for rule in (_without_camera, _smaller_copies, _other_camera, _other_day):
-        left = [i for i in range(len(photos)) if i not in found]
-        found |= {left[k]: why for k, why in rule([photos[i] for i in left]).items()}
-    return found
-
-
-def _few(count: int, photos: Sequence[Photo]) -> bool:
-    return 0 < count <= _FEW_SHARE * len(photos)
-
-
-def _without_camera(photos: Sequence[Photo]) -> Reasons:
-    """Pictures of another size of which no tag says anything: they have neither camera, time nor position."""
-    sizes = {(p.width, p.height) for p in photos if p.make or p.model}
-    why = "the picture has no position; it has no camera's tags either, as a screenshot or an edited picture"
-    return {
-        i: (why, "")
-        for i, p in enumerate(photos)
-        if sizes
-        and (p.width, p.height) not in sizes
-        and not (p.make or p.model)
-        and p.time_s is None
-        and p.lat_deg is None
-    }
-
-
-def _smaller_copies(photos: Sequence[Photo]) -> Reasons:
-    """Pictures of the same camera, time and place to the last digit as a larger one."""
-    same: dict[tuple[object, ...], list[int]] = {}
-    for i, p in enumerate(photos):
-        if p.time_s is not None and p.lat_deg is not None:
-            same.setdefault((p.make, p.model, p.time_s, p.lat_deg, p.lon_deg), []).append(i)
-    found: Reasons = {}
-    for group in same.values():
-        largest = max(group, key=lambda i: photos[i].width * photos[i].height)
-        for i in group:
-            if photos[i].width <= _SMALLER * photos[largest].width and _one_shape(photos[i], photos[largest]):
-                found[i] = "a smaller picture of the same exposure as another one here", photos[largest].path.name
-    return found
-
-
-def _one_shape(one: Photo, other: Photo) -> bool:
-    """Whether two pictures have the same sides but for their size; either may be turned."""
-    shapes = [max(p.width, p.height) / max(1, min(p.width, p.height)) for p in (one, other)]
-    return abs(math.log(shapes[0] / shapes[1])) < _SAME_SHAPE
-
-
-def _other_camera(photos: Sequence[Photo]) -> Reasons:
-    """The odd photo of another camera that knows neither its height nor where it looks: a phone's, from the ground."""
-    counts = Counter((p.make, p.model) for p in photos)
-    flown, _ = counts.most_common(1)[0] if counts else (("", ""), 0)
-    found: Reasons = {}
-    for i, p in enumerate(photos):
-        key = p.make, p.model
-        odd = any(key) and key != flown and counts[key] <= _OTHER_CAMERA_MOST and _few(counts[key], photos)
-        if odd and p.height_m is None and p.camera_deg == p.flight_deg == (None, None, None):
-            why = "taken with another camera than the flight's, which tells neither height nor direction"
-            found[i] = why, " ".join(key).strip()
-    return found
-
-
-def _other_day(photos: Sequence[Photo]) -> Reasons:
-    """The few photos of another day that were taken elsewhere."""
-    known = [i for i, p in enumerate(photos) if p.time_s is not None and p.lat_deg is not None]
-    if len(known) < 2:
-        return {}
-    order = sorted(known, key=lambda i: photos[i].time_s or 0.0)
-    times = np.array([photos[i].time_s for i in order], float)
-    days = np.split(np.array(order), np.flatnonzero(np.diff(times) > OTHER_DAY_S) + 1)
-    flight = max(days, key=len)
-    ground = local_metres([photos[i].lat_deg or 0.0 for i in known], [photos[i].lon_deg or 0.0 for i in known])
-    at = dict(zip(known, ground))
-    flown = np.array([at[i] for i in flight.tolist()])
-    found: Reasons = {}
-    for day in days:
-        away = np.array([np.hypot(*(flown - at[i]).T).min() for i in day.tolist()])
-        if day is not flight and _few(len(day), photos) and (away > _ELSEWHERE_M).all():
-            dates = {i: f"{datetime.fromtimestamp(photos[i].time_s or 0.0, UTC):%Y-%m-%d}" for i in day.tolist()}
-            found |= {i: ("taken on another day and elsewhere than the others here", date) for i, date in dates.items()}
-    return found
