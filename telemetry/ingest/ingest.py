@@ -111,6 +111,8 @@ def survey(inputs: Sequence[Path], *, progress: Progress | None = None, options:
         result.rejected += [Rejection(f.image, reason, f.vehicle, f.time_s) for f in source.frames]
         source.frames.clear()
         source.counts["frames"] = 0
+    if result.unpositioned:  # then a table that nobody understands is no side issue
+        result.findings = [replace(f, note=f.note and f.code != "table-unknown") for f in result.findings]
     result.findings += [*_logs_apart(found, logs), *_unread(found, needed=bool(result.unpositioned))]
     if not result.sources and not result.rejected:
         result.findings.append(Finding("nothing", "no picture was found in the inputs"))
