@@ -95,7 +95,7 @@ def share_in_area(system: str, x: ArrayLike, y: ArrayLike) -> float:
     lon_lat, _ = to_degrees(system, x, y)
     if area is None or not lon_lat.size:
         return 1.0
-    lon, lat = lon_lat[..., 0], lon_lat[..., 1]
+    lon, lat = np.moveaxis(np.where(np.isfinite(lon_lat), lon_lat, 1e3), -1, 0)  # no place is in no area
     half = 0.5 * ((area.east - area.west) % 360.0 or 360.0)
     near = np.abs((lon - area.west - half + 180.0) % 360.0 - 180.0) <= half + _BESIDE_AREA_DEG
     near &= (lat >= area.south - _BESIDE_AREA_DEG) & (lat <= area.north + _BESIDE_AREA_DEG) & (np.abs(lat) <= 90.0)
