@@ -1,5 +1,6 @@
 """The daemon's settings: from flags, and from `orthoswarm.toml` in its workspace."""
 
+import re
 import tomllib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -25,6 +26,7 @@ TEMPLATE: Final = """\
 # bind = "127.0.0.1"              # another address needs the token for everything
 # lan = true                      # HTTPS for other machines, and people with roles
 # open_reading = true             # with lan: everybody in the network may look
+# allow_origins = ["https://maps.example"]  # pages of other sites that may read the map's tiles
 # certificate = "post.pem"        # with lan: instead of the daemon's own; chain and key in PEM
 # key = "post-key.pem"
 # basemap = "before.tif"          # GeoTIFF, COG, MBTiles or folder z/x/y.png; relative to this file
@@ -74,6 +76,7 @@ class Settings:
     Attributes:
         workspace: its folder. bind, port: where HTTP is served (port 0: any free one).
         lan: HTTPS, and people with roles. open_reading: with it, everybody may read.
+        allow_origins: of pages of other sites that may read tiles.
         certificate, key: PEM files for it, None for the daemon's own.
         links: MAVLink links. basemap: the map before the disaster, or None. dem: height model of the ground, or None.
         fov_min_deg: theta-hat. gsd_m: ground pixel, from the first pictures if None.
@@ -94,6 +97,7 @@ class Settings:
     port: int = PORT
     lan: bool = False
     open_reading: bool = False
+    allow_origins: tuple[str, ...] = ()
     certificate: Path | None = None
     key: Path | None = None
     links: tuple[str, ...] = ()
@@ -145,6 +149,9 @@ class Settings:
             raise InputError("a certificate needs its key, and a key its certificate; give both, or none for one's own")
         if not self.lan and (self.open_reading or self.certificate is not None):
             raise InputError("open reading and a certificate are for other machines; give --lan as well")
+        for origin in self.allow_origins:
+            if not re.fullmatch(r"https?://[^/\s?#@*]+", origin):
+                raise InputError(f"'{origin}' is no origin; give scheme and host, for example https://maps.example")
         if self.basemap is not None and not self.basemap.exists():
             raise InputError(f"the basemap {self.basemap} does not exist; check the path")
         if self.dem is not None and not self.dem.is_file():
@@ -176,7 +183,8 @@ class Settings:
 
 
 _KINDS: Final[dict[str, tuple[type, ...]]] = {
-    "bind": (str,), "port": (int,), "lan": (bool,), "open_reading": (bool,), "certificate": (str,), "key": (str,),
+    "bind": (str,), "port": (int,), "lan": (bool,), "open_reading": (bool,), "allow_origins": (list,),
+    "certificate": (str,), "key": (str,),
     "links": (list,), "basemap": (str,), "dem": (str,), "fov_min_deg": (int, float),
     "gsd_m": (int, float), "workers": (int,), "coarse": (bool,), "lost_after_s": (int, float), "vehicle": (list,),
     "picture_folder": (str,), "picture_bytes_s": (int, float),
@@ -205,8 +213,9 @@ def read_settings(workspace: Path) -> Settings:
     vehicles = tuple(_vehicle(entry, path) for entry in document.pop("vehicle", ()))
     if "links" in document:
         document["links"] = tuple(str(link) for link in document["links"])
-    if "tak" in document:
-        document["tak"] = tuple(str(address) for address in document["tak"])
+    for key in ("tak", "allow_origins"):
+        if key in document:
+            document[key] = tuple(str(address) for address in document[key])
     for key in ("basemap", "dem", "tak_certificate", "tak_authority", "certificate", "key"):
         if key in document:
             document[key] = workspace / document[key]

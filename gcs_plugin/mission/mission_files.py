@@ -32,6 +32,7 @@ _CORNERS = 32  # of the polygon around a circular fence
 _WITH_POSITION = {*range(16, 20), 21, 22, 31, 82, 84, 85, 94}
 _FIRMWARE: dict[Autopilot, int] = {"ardupilot": 3, "px4": 12}
 _MULTIROTOR = 2  # MAV_TYPE
+_WINGED = frozenset({1, *range(19, 26)})  # MAV_TYPE: fixed wings, VTOLs
 _ABOVE_SEA, _ABOVE_GROUND = 2, (3, 4)  # QGroundControl's AltMode
 _LENS = ("SensorWidth", "FocalLength", "ImageWidth", "ImageHeight")
 _NOT_PLANNED = {
@@ -398,6 +399,8 @@ def _parse_plan(document: Mapping[str, Any]) -> MissionFile:
         survey = replace(survey, left=(*survey.left, "other settings of further surveys"))
     if survey.values and speed:
         survey = replace(survey, left=(*survey.left, f"the speed of {float(speed):g} m/s"))
+    if survey.values and mission.get("vehicleType") in _WINGED:
+        survey = replace(survey, left=(*survey.left, "that it is for a vehicle that does not hover (its turns)"))
     return MissionFile(
         items=tuple(items),
         home=(float(home[0]), float(home[1]), float(home[2] if len(home) > 2 else 0.0)) if home else None,

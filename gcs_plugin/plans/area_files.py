@@ -9,6 +9,7 @@ import re
 import warnings
 import zipfile
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from typing import Any, Final, NamedTuple
 
@@ -22,30 +23,35 @@ from orthoswarm.model.coordinate_system import to_degrees
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.plan import Fence
 from orthoswarm.planning.area.shape_files import (
+    SIZES,
+    Circle,
     Polygon,
     Ring,
     Shapes,
+    circle_of,
     counted,
     parse_geojson,
     parse_kml,
     refuse_many_corners,
     ring,
+    strip_of,
 )
 
 _KINDS: Final = {
-    ".geojson": "GeoJSON",
-    ".json": "GeoJSON",
-    ".kml": "KML",
-    ".kmz": "KMZ",
-    ".zip": "a zipped shapefile",
-    ".gpkg": "a GeoPackage",
-    ".plan": "a mission",
-    ".waypoints": "a mission",
-    ".csv": "a mission",
+    ".geojson": ("GeoJSON",),
+    ".json": ("GeoJSON",),
+    ".kml": ("KML", "KMZ"),
+    ".kmz": ("KMZ", "KML"),
+    ".zip": ("a zipped shapefile", "KMZ", "zipped GeoJSON"),
+    ".gpkg": ("a GeoPackage",),
+    ".plan": ("a mission",),
+    ".waypoints": ("a mission",),
+    ".csv": ("a mission",),
 }
 _LARGEST_BYTES: Final = 50_000_000
 _SHAPEFILE: Final = b"\x00\x00\x27\x0a"
 _ROUTE: Final = "waylines.wpml"
+_GEOJSON: Final = (".geojson", ".json")
 _SQLITE: Final = b"SQLite format 3\0"
 
 
@@ -70,18 +76,18 @@ def read_shapes(path: Path, name: str | None = None, *, any_size: bool = False) 
     """
     name = name or str(path)
     kind = _kind(path, name)
-    promised = _KINDS.get(path.suffix.lower(), kind)
-    if promised != kind:
-        raise InputError(f"{name} is {promised} by its name but holds {kind}; rename it or give the right file")
+    promised = _KINDS.get(path.suffix.lower(), (kind,))
+    if kind not in promised:
+        raise InputError(f"{name} is {promised[0]} by its name but holds {kind}; rename it or give the right file")
     if kind == "a GeoPackage":
         return AreaFile(_shapes(str(path), name, any_size), [])
     if kind == "a zipped shapefile":  # in whatever folder of it
         inside = _inside(path, name, ".shp")
-        return AreaFile(
-            Shapes.joined([_shapes(f"/vsizip/{{{path}}}/{info.filename}", name, any_size) for info in inside]), []
-        )
-    if kind == "GeoJSON":
-        return AreaFile(parse_geojson(_texts(path, name)[0], name, any_size=any_size), [])
+        places = [info.filename.replace("\\", "/") for info in inside]  # GDAL sees those of Windows so, too
+        return AreaFile(Shapes.joined([_shapes(f"/vsizip/{{{path}}}/{place}", name, any_size) for place in places]), [])
+    if kind in ("GeoJSON", "zipped GeoJSON"):
+        texts = _texts(path, name, _GEOJSON)
+        return AreaFile(Shapes.joined([parse_geojson(text, name, any_size=any_size) for text in texts]), [])
     route = kind == "KMZ" and bool(_inside(path, name, _ROUTE))
     if kind in ("KML", "KMZ") and not route:
         return AreaFile(Shapes.joined([parse_kml(t, name, any_size=any_size) for t in _texts(path, name)]), [])
@@ -107,9 +113,11 @@ def _kind(path: Path, name: str) -> str:
     if head.startswith(b"PK\x03\x04"):
         if _inside(path, name, ".shp"):
             return "a zipped shapefile"
-        if not _inside(path, name, (".kml", _ROUTE)):
-            raise InputError(f"{name} is a ZIP without a KML or a shapefile in it; export it again")
-        return "KMZ"
+        if _inside(path, name, (".kml", _ROUTE)):
+            return "KMZ"
+        if _inside(path, name, _GEOJSON):
+            return "zipped GeoJSON"
+        raise InputError(f"{name} is a ZIP without a KML, a GeoJSON or a shapefile in it; export it again")
     if head == _SQLITE:
         return "a GeoPackage"
     if head.startswith(_SHAPEFILE):
@@ -119,7 +127,7 @@ def _kind(path: Path, name: str) -> str:
         return "a mission"
     if text.startswith("<"):
         return "KML"
-    if text.startswith("{"):
+    if text.startswith(("{", "[")):
         return "a mission" if _is_mission(text, name) else "GeoJSON"
     kinds = "GeoJSON, KML, KMZ, zipped shapefile, GeoPackage, a .plan nor a .waypoints mission"
     raise InputError(f"{name} holds neither {kinds}; export the polygon again")
@@ -142,8 +150,8 @@ def _left_by_macos(name: str) -> bool:
     return name.startswith("__MACOSX/") or PurePosixPath(name).name.startswith("._")
 
 
-def _texts(path: Path, name: str) -> list[str]:
-    """The text of a file, those of a KMZ's KML files, in the encoding that it has or that its XML declares.
+def _texts(path: Path, name: str, suffix: str | tuple[str, ...] = ".kml") -> list[str]:
+    """The text of a file, those of a ZIP's files with a suffix, in the encoding that it has or that its XML declares.
 
     Raises:
         InputError: it is not text.
@@ -152,7 +160,7 @@ def _texts(path: Path, name: str) -> list[str]:
         data = [path.read_bytes()]
         if data[0].startswith(b"PK\x03\x04"):
             with zipfile.ZipFile(path) as archive:
-                data = [archive.read(entry) for entry in _inside(path, name, ".kml")]
+                data = [archive.read(entry) for entry in _inside(path, name, suffix)]
         return [_decoded(text) for text in data]
     except (UnicodeError, LookupError, zipfile.BadZipFile, NotImplementedError, RuntimeError):
         raise InputError(
@@ -163,9 +171,16 @@ def _texts(path: Path, name: str) -> list[str]:
 def _decoded(data: bytes) -> str:
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return data.decode("utf-16")
+    if data[:4].count(b"\0") == 2:  # UTF-16 of ASCII without its mark
+        return data.decode("utf-16-be" if data.startswith(b"\0") else "utf-16-le")
     declared = re.match(rb"""\s*<\?xml[^>]*encoding=["']([\w.:-]+)""", data)
     encoding = declared[1].decode().lower() if declared else "utf-8"
-    return data.decode("utf-8-sig" if encoding == "utf-8" else encoding)
+    try:
+        return data.decode("utf-8-sig" if encoding == "utf-8" else encoding)
+    except UnicodeDecodeError:
+        if encoding != "utf-8" or b"\0" in data:
+            raise
+        return data.decode("cp1252")  # names as Windows wrote them; coordinates are the same in both
 
 
 def _is_mission(text: str, name: str) -> bool:
@@ -184,36 +199,56 @@ def _shapes(source: str, name: str, any_size: bool) -> Shapes:
     """
     from pyogrio import list_layers
     from pyogrio.errors import DataLayerError, DataSourceError, FeatureError, FieldError, GeometryError
-    from pyogrio.raw import read
 
-    polygons, lines, unused = list[Polygon](), list[Ring](), Counter[str]()
+    polygons, lines, circles, unused = list[Polygon](), list[Ring](), list[Circle](), Counter[str]()
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # of OGR, about what it reads all the same
-            layers = [read(source, layer=layer, columns=[], force_2d=True) for layer, _ in list_layers(source)]
-            parts = [(m["crs"], part) for m, _, g, _ in layers for part in _parts(shapely.from_wkb(g))]
+            # A layer without a kind of geometry is a table, as QGIS keeps its styles in one.
+            layers = [layer for layer, kind in list_layers(source) if kind is not None]
+            parts = [part for layer in layers for part in _parts_of(source, layer)]
     except (DataSourceError, DataLayerError, FeatureError, FieldError, GeometryError, shapely.GEOSException):
         needs = "a shapefile's ZIP needs .shp, .shx, .dbf and .prj"
         raise InputError(f"{name} is damaged or incomplete; export it again ({needs})") from None
-    for crs, part in parts:
-        if part.geom_type == "Polygon" and not part.is_empty:
+    for crs, part, said in parts:
+        if part.is_empty:
+            unused["feature without a shape"] += 1
+        elif part.geom_type == "Polygon":
             shell, *holes = [_degrees(r.coords, crs, name) for r in (part.exterior, *part.interiors)]
             polygons.append(Polygon(shell, tuple(holes)))
-        elif part.geom_type == "LineString" and not part.is_empty:
-            lines.append(_degrees(part.coords, crs, name, 2))
+        elif part.geom_type == "LineString":
+            line = _degrees(part.coords, crs, name, 2)
+            strip = strip_of(line, said, name)
+            polygons += strip
+            lines += [] if strip else [line]
+        elif part.geom_type == "Point" and (circle := _circle(part, crs, said, name)) is not None:
+            circles.append(circle)
         else:
-            unused["feature without a shape" if part.is_empty else part.geom_type.lower()] += 1
+            unused[part.geom_type.lower()] += 1
+    found = Shapes(tuple(polygons), tuple(lines), tuple(circles), unused=counted(unused))
     if not any_size:
-        refuse_many_corners([*polygons, *lines], name)
-    return Shapes(tuple(polygons), tuple(lines), unused=counted(unused))
+        refuse_many_corners([*found.areas, *lines], name)
+    return found
 
 
-def _parts(geometries: Any) -> list[Any]:
-    """Single shapes of features; an empty one where a feature has none."""
-    empty = shapely.Point()
-    return [
-        part for g in geometries for part in (shapely.get_parts(g) if g is not None and not g.is_empty else [empty])
-    ]
+def _circle(point: Any, crs: str | None, said: dict[str, Any], name: str) -> Circle | None:
+    [lat, lon] = _degrees(point.coords, crs, name, 1)[0]
+    return circle_of(float(lat), float(lon), said, name)
+
+
+def _parts_of(source: str, layer: str) -> Iterator[tuple[str | None, Any, dict[str, Any]]]:
+    """Coordinate system, single shape and stated size of a layer's features; an empty shape where one has none."""
+    from pyogrio import read_info
+    from pyogrio.raw import read
+
+    sizes = [field for field in read_info(source, layer=layer)["fields"] if field.lower() in SIZES]
+    meta, _, geometries, values = read(source, layer=layer, columns=sizes, force_2d=True)
+    said = {field.lower(): column for field, column in zip(meta["fields"], values, strict=True)}
+    for k, geometry in enumerate(shapely.from_wkb(geometries)):
+        stated = {field: column[k] for field, column in said.items() if column[k] == column[k]}  # not NaN
+        empty = geometry is None or geometry.is_empty
+        for part in [shapely.Point()] if empty else shapely.get_parts(geometry):
+            yield meta["crs"], part, stated
 
 
 def _degrees(points: object, crs: str | None, name: str, least: int = 3) -> Ring:

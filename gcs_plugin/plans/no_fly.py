@@ -41,6 +41,11 @@ class Reach:
         grown = grown_m / self._metres
         return bool((low - grown <= self._high).all() and (high + grown >= self._low).all())
 
+    def touches_exchanged(self, shapes: Shapes) -> bool:
+        """Whether it would touch shapes whose latitudes were their longitudes."""
+        centres = [np.array([[circle.lat_deg, circle.lon_deg]]) for circle in shapes.circles]
+        return any(self.touches(ring[:, ::-1]) for ring in [*(p.shell for p in shapes.polygons), *centres])
+
     def near(self, shapes: Shapes) -> Shapes:
         """The polygons and circles of shapes that it touches."""
         polygons = tuple(p for p in shapes.polygons if self.touches(p.shell))
@@ -96,6 +101,10 @@ def read_no_fly(paths: Sequence[Path], flown: Ring, clearance_m: float | None) -
         file = read_zones(path)
         near = reach.near(file.shapes)
         far = len(file.shapes.polygons) + len(file.shapes.circles) - len(near.polygons) - len(near.circles)
+        if far and not near.polygons and not near.circles and reach.touches_exchanged(file.shapes):
+            raise InputError(
+                f"{path.name} has zones at the flights if latitude and longitude are exchanged; longitude comes first"
+            )
         if far:
             notes.append(f"of {path.name}, {', '.join(counted({'zone': far}))} far from the flights: not used")
         rings += [p.shell for p in near.polygons] + [c.polygon(beyond_m).shell for c in near.circles] + file.no_fly

@@ -264,11 +264,17 @@ def _not_flown(path: Path, shapes: Shapes, *, lines: bool = False) -> list[str]:
     beside += counted({"line": len(shapes.lines)} if shapes.lines and not lines else {})
     left = [*shapes.left, *beside]
     notes = [f"of {path.name} this is not flown: {', '.join(left)}"] if left else []
-    if lines and any(len(line) > 3 and (line[0] == line[-1]).all() for line in shapes.lines):
+    if lines and any(map(_closed, shapes.lines)):
         notes.append(
             f"{path.name} has a closed path, which is flown as a line; draw a polygon to cover what it surrounds"
         )
     return notes
+
+
+def _closed(line: Ring) -> bool:
+    """Whether a line ends where it began, but for a hundredth of its way: an outline drawn by hand."""
+    steps = np.hypot(*(np.diff(np.r_[line, line[:1]], axis=0) * [1.0, np.cos(np.radians(line[0, 0]))]).T)
+    return len(line) > 3 and bool(steps[-1] <= 0.01 * steps.sum())
 
 
 def _over_ground(

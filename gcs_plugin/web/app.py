@@ -26,6 +26,7 @@ from gcs_plugin.web.assets import Assets, Packed
 from gcs_plugin.web.command_routes import CommandRoutes
 from gcs_plugin.web.event_stream import Standstill, stream_events
 from gcs_plugin.web.guard import Access, Guard
+from gcs_plugin.web.map_services import MapServices
 from gcs_plugin.web.people_routes import PeopleRoutes
 from gcs_plugin.web.uploads import UploadRoute
 from orthoswarm import __version__
@@ -355,7 +356,7 @@ _FORM: Final = {
 
 def make_app(daemon: Daemon, access: Access, address: str = "") -> Any:
     """The ASGI application of a running daemon; `address`: of its page, for those who are invited."""
-    routes, people = HttpRoutes(daemon), PeopleRoutes(daemon, access, address)
+    routes, people, services = HttpRoutes(daemon), PeopleRoutes(daemon, access, address), MapServices(daemon)
 
     @contextlib.asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
@@ -392,6 +393,8 @@ def make_app(daemon: Daemon, access: Access, address: str = "") -> Any:
     add("/api/finds/{number}", routes.delete_find, methods=["DELETE"], status_code=204)
     add("/tiles/{layer}/{z}/{x}/{y}.{suffix}", routes.tile)
     add("/tiles/{layer}/{z}/{x}/{y}.{suffix}", routes.tile, methods=["HEAD"], include_in_schema=False)
+    add("/tiles/{layer}.json", services.tilejson)
+    add("/wmts", services.wmts)
     add("/api/trust", routes.trust)
     add("/api/trust.png", routes.trust_picture)
     add("/api/change.png", routes.change_picture)

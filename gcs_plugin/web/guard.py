@@ -4,8 +4,9 @@ The operator sends the daemon's token in a header, which no foreign form can set
 in a cookie (HttpOnly, SameSite=Strict, this host's alone); what changes something must then state its Origin, too.
 Everybody else may do nothing; on this machine, or where the operator lets all read, they may read.
 
-A page of another site cannot reach the daemon: a foreign Origin is refused (cross-site requests), and so is a Host
-that is not the daemon's address (DNS rebinding; over TLS no other name has the certificate).
+A page of another site cannot reach the daemon: a foreign Origin is refused (cross-site requests), but for the map
+where the operator named it (`--allow-origin`), and so is a Host that is not the daemon's address (DNS rebinding; over
+TLS no other name has the certificate).
 """
 
 import contextlib
@@ -20,7 +21,7 @@ from typing import Any, Final, NamedTuple
 from urllib.parse import parse_qs, urlsplit
 
 from gcs_plugin.daemon.store.people_rows import NOBODY, OPERATOR, Deed, People, Person, Role
-from gcs_plugin.web.roles import EDIT_PLAN, LOCAL_PROGRAMS, Need, need_of, route_of
+from gcs_plugin.web.roles import EDIT_PLAN, FOR_OTHER_SITES, LOCAL_PROGRAMS, Need, need_of, route_of
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 
 LOOPBACK: Final = frozenset({"127.0.0.1", "localhost", "::1"})
@@ -94,12 +95,16 @@ def act_of(scope: Any) -> Act:
 
 
 class Access(NamedTuple):
-    """Who may reach the daemon: `lan`, over TLS from other machines; `open_reading`, all may read without a session."""
+    """Who may reach the daemon: `lan`, over TLS from other machines; `open_reading`, all may read without a session.
+
+    origins: of pages of other sites that may read the map.
+    """
 
     token: str
     bind: str = "127.0.0.1"
     lan: bool = False
     open_reading: bool = False
+    origins: frozenset[str] = frozenset()
 
     @property
     def is_local(self) -> bool:
@@ -133,7 +138,8 @@ class Guard:
         route = route_of(method, scope["path"])
         need, sent = need_of(route), _sent_token(scope, headers)
         person = self._person(scope, headers, sent)
-        refusal = self._foreign(scope, headers, person) or self._missing_role(route, need, person, sent)
+        other_site = self._other_site(route, headers)
+        refusal = self._foreign(scope, headers, person, other_site) or self._missing_role(route, need, person, sent)
         if refusal is not None:
             await _refuse(scope, send, *refusal)
             return
@@ -142,7 +148,7 @@ class Guard:
         if method == "WS":
             await self.app(scope, receive, self._while_allowed(send, person))
             return
-        answer = _Answer(send)
+        answer = _Answer(send, other_site)
         try:
             await self.app(scope, receive, answer)
         finally:
@@ -159,13 +165,20 @@ class Guard:
         secret = _session(headers.get("cookie", ""), session_cookie(scope)) if self._access.lan else ""
         return (self._people.of_session(secret) if secret else None) or self._anybody
 
-    def _foreign(self, scope: dict[str, Any], headers: dict[str, str], person: Person) -> tuple[int, str] | None:
+    def _other_site(self, route: str, headers: dict[str, str]) -> str:
+        """The other site whose page may read what it asks for; "" if none asks, or may."""
+        origin = headers.get("origin", "")
+        return origin if origin.lower() in self._access.origins and route in FOR_OTHER_SITES else ""
+
+    def _foreign(
+        self, scope: dict[str, Any], headers: dict[str, str], person: Person, allowed: str
+    ) -> tuple[int, str] | None:
         """Status and reason if a request comes from another site's page."""
         host = headers.get("host", "")
         if self._access.is_local and _host_name(host) not in self._hosts:
             return 403, "the Host header does not name this daemon; use the address that it printed"
         origin = headers.get("origin")
-        if origin is not None and not _is_same_site(origin, host, encrypted=self._access.lan):
+        if origin is not None and not allowed and not _is_same_site(origin, host, encrypted=self._access.lan):
             return 403, "pages of other sites may not use this daemon; open its own page"
         by_cookie = person.id > OPERATOR.id
         if by_cookie and origin is None and (scope["type"] == "websocket" or scope["method"] not in _SAFE):
@@ -198,8 +211,10 @@ class Guard:
 class _Answer:
     """An ASGI send that adds the headers of all answers, and remembers how the request ended."""
 
-    def __init__(self, send: Any) -> None:
+    def __init__(self, send: Any, other_site: str = "") -> None:
         self._send, self._status, self._text = send, 500, b""
+        leave = [(b"access-control-allow-origin", other_site.encode("latin-1")), (b"vary", b"Origin")]
+        self._headers = _HEADERS + leave if other_site else _HEADERS
 
     async def __call__(self, message: dict[str, Any]) -> None:
         """Send a part of the answer."""
@@ -207,7 +222,7 @@ class _Answer:
             self._status = message["status"]
             own = list(message.get("headers", []))
             given = {name for name, _ in own}
-            message = {**message, "headers": own + [row for row in _HEADERS if row[0] not in given]}
+            message = {**message, "headers": own + [row for row in self._headers if row[0] not in given]}
         elif self._status >= 400 and len(self._text) < _MOST_REASON:
             self._text += message.get("body", b"")
         await self._send(message)

@@ -20,7 +20,8 @@ class Need(NamedTuple):
 EDIT_PLAN: Final = "edit plan"
 _OPEN: Final = "/ /favicon.ico /healthz /static/{path:path} /api/me"
 _READING: Final = """
-    /docs /openapi.json /metrics /tiles/{layer}/{z}/{x}/{y}.{suffix} /api/vehicles /api/layers /api/jobs /api/legs
+    /docs /openapi.json /metrics /tiles/{layer}/{z}/{x}/{y}.{suffix} /tiles/{layer}.json /wmts
+    /api/vehicles /api/layers /api/jobs /api/legs
     /api/completions /api/frames /api/routes /api/frames/{seq}/picture /api/frames/{seq}/view /api/plans
     /api/plans/{number}/map /api/plans/{number}/files/{drone} /api/plan /api/traffic /api/finds
     /api/finds/{number}/pictures /api/places /api/trust /api/trust.png /api/change /api/change.png
@@ -55,6 +56,11 @@ NEEDS: Final[dict[str, Need]] = {
     "DELETE /api/people/{number}": Need(Role.OPERATOR, "revoke"),
 }
 """Method and path of each route -> what it needs."""
+
+FOR_OTHER_SITES: Final = frozenset(
+    {"GET /tiles/{layer}/{z}/{x}/{y}.{suffix}", "GET /tiles/{layer}.json", "GET /wmts", "GET /api/layers"}
+)
+"""What pages of the origins that the operator named may read (`serve --allow-origin`): the map, nothing else."""
 
 LOCAL_PROGRAMS: Final = frozenset({"POST /api/frames", "POST /api/areas"})
 """What programs of this machine may send without the token: pictures, and area files to be read."""

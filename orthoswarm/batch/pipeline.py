@@ -29,7 +29,7 @@ from orthoswarm.evaluation.misread_points import require_places
 from orthoswarm.export.atomic_file import disk_error
 from orthoswarm.export.catalog.tiled_raster import product_file
 from orthoswarm.model.errors import InputError, OrthoSwarmError
-from orthoswarm.model.frame import Frame, Ingest
+from orthoswarm.model.frame import Frame, Ingest, Rejection
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.model.placement import PlacedFrame, Terrain
 from orthoswarm.model.task_runner import Progress
@@ -44,11 +44,13 @@ from orthoswarm.raster.height_model import HeightModel
 from orthoswarm.raster.picture_file import read_gray, reduction
 from orthoswarm.raster.picture_parts import PictureParts
 from orthoswarm.refine.flight.record_findings import NAMED_MOST
-from orthoswarm.refine.strategy.unpositioned_photos import place_unpositioned
+from orthoswarm.refine.flight.unsolved_pictures import hovering_vehicles
+from orthoswarm.refine.strategy.unpositioned_photos import pictures_moved, place_unpositioned
 from orthoswarm.stores.addresses import address_of
 from orthoswarm.stores.listing import exists
 from orthoswarm.trajectory.legs import split_legs
 
+_SPOT_DEG: Final = 0.001  # records farther apart than 110 m are none of a vehicle that hovers
 _BESIDE_PHOTOS: Final = 15
 """Photos with a position before and after, of the same flight, that may show the ground of one without (its cost)."""
 
@@ -133,7 +135,7 @@ def _load(run: RunContext, load: Load) -> RunState:
         ingest = load(run.progress)
     except OSError as error:  # pictures of videos are written
         raise disk_error(error, run.out) from None
-    ingest = in_one_area(ingest)
+    ingest = without_false_spots(run, in_one_area(ingest))
     beside = bool(ingest.frames) and run.options.until != "realtime"  # photos that may tell where others were taken
     if ingest.unpositioned and (beside or run.options.control is not None):
         ingest = with_found_positions(run, ingest)
@@ -276,6 +278,52 @@ def legs_as_vehicles(frames: Sequence[Frame], grid: LocalGrid) -> list[Frame]:
             last = number if number >= 0 else last
             out.append(replace(frame, vehicle=f"{vehicle}/leg{last + 1}"))
     return out
+
+
+def without_false_spots(run: RunContext, ingest: Ingest) -> Ingest:
+    """Inputs whose vehicles recorded one spot only where they hovered; others' photos have no position.
+
+    Their pictures drawn on one another would be no map.
+    """
+    members: dict[str, list[Frame]] = {}
+    for frame in ingest.frames:
+        members.setdefault(frame.vehicle, []).append(frame)
+    lost = [own for own in members.values() if _at_one_spot(own) and _moved(run, own)]
+    if not lost:
+        return ingest
+    images = {frame.image for own in lost for frame in own}
+    why = (
+        "the picture has no position: its receiver told one spot, but the pictures show that it flew on; put a geo.txt "
+        "next to it, or give its log as well"
+    )
+    told = [
+        f"{own[0].vehicle}: all {len(own)} pictures were recorded at one spot, but they show that it flew on: these "
+        "positions are not used"
+        for own in lost
+    ]
+    return replace(
+        ingest,
+        frames=[f for f in ingest.frames if f.image not in images],
+        rejected=[*ingest.rejected, *(Rejection(f.image, why, f.vehicle, f.time_s, True) for own in lost for f in own)],
+        unpositioned=[*ingest.unpositioned, *(_nowhere(f) for own in lost for f in own)],
+        warnings=[*ingest.warnings, *told],
+    )
+
+
+def _nowhere(frame: Frame) -> Frame:
+    return replace(frame, fix=replace(frame.fix, lat_deg=math.nan, lon_deg=math.nan, position_sigma_m=None))
+
+
+def _at_one_spot(frames: Sequence[Frame]) -> bool:
+    """Whether a vehicle hovered by its records."""
+    north, east = np.ptp([(f.fix.lat_deg, f.fix.lon_deg) for f in frames], axis=0)
+    if max(north, east * math.cos(math.radians(frames[0].fix.lat_deg))) > _SPOT_DEG:
+        return False
+    return bool(hovering_vehicles(recorded_cameras(frames, area_grid(frames)).placed))
+
+
+def _moved(run: RunContext, frames: Sequence[Frame]) -> bool:
+    return pictures_moved(frames, read_gray=_reduced, run=run.workers.map)
 
 
 def with_found_positions(run: RunContext, ingest: Ingest) -> Ingest:

@@ -16,6 +16,7 @@ from orthoswarm.model.errors import InputError
 Array = NDArray[np.float64]
 
 _TOLD_M: Final = 1.0  # PROJ states 1 m where datums are the same but for the drift of continents: ETRS89
+_BESIDE_AREA_DEG: Final = 6.0  # systems are used so far beyond their area: the neighbouring zone of UTM
 _GEOCENTRIC_AXIS_M: Final = 6378137.0  # semi-major axis of WGS 84 and GRS 80, the ellipsoids of today's datums
 _SOUTH_BANDS: Final = "CDEFGHJKLMS"
 """Letters behind a UTM zone that mean the south: bands of MGRS, and S, which nearly everybody writes for south."""
@@ -68,6 +69,37 @@ def require_datum(system: str, name: str) -> None:
         _transformer(system)
     except InputError as error:
         raise InputError(f"{name}: {error}") from None
+
+
+def metres_of_heights(system: str) -> float:
+    """Metres in one unit of the heights of a system with a vertical axis ("EPSG:32610+6360": feet); 1 without one."""
+    from pyproj import CRS
+    from pyproj.exceptions import CRSError
+
+    try:
+        axes = CRS.from_user_input(projection_of(system) or system).axis_info
+    except CRSError:
+        return 1.0
+    return float(axes[2].unit_conversion_factor) if len(axes) > 2 else 1.0
+
+
+def share_in_area(system: str, x: ArrayLike, y: ArrayLike) -> float:
+    """Share of points (N,) that lie about where a system is used; x, y: east and north, or longitude and latitude."""
+    from pyproj import CRS
+    from pyproj.exceptions import CRSError
+
+    try:
+        area = CRS.from_user_input(projection_of(system) or system).area_of_use
+    except CRSError:
+        area = None
+    lon_lat, _ = to_degrees(system, x, y)
+    if area is None or not lon_lat.size:
+        return 1.0
+    lon, lat = np.moveaxis(np.where(np.isfinite(lon_lat), lon_lat, 1e3), -1, 0)  # no place is in no area
+    half = 0.5 * ((area.east - area.west) % 360.0 or 360.0)
+    near = np.abs((lon - area.west - half + 180.0) % 360.0 - 180.0) <= half + _BESIDE_AREA_DEG
+    near &= (lat >= area.south - _BESIDE_AREA_DEG) & (lat <= area.north + _BESIDE_AREA_DEG) & (np.abs(lat) <= 90.0)
+    return float(near.mean())
 
 
 @lru_cache(maxsize=64)

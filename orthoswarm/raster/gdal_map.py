@@ -307,8 +307,8 @@ def luma(data: Bytes) -> Bytes:
 
 
 def _crs_of(source: Any, path: Path) -> Any:
-    """The raster's CRS, from its ground control points where it has no transform."""
-    crs = source.crs or source.gcps[1]
+    """The raster's CRS, from its ground control points where it has no transform, or of a .prj beside a world file."""
+    crs = source.crs or source.gcps[1] or (None if source.transform.is_identity else _crs_beside(path))
     if source.crs and source.transform.is_identity and not source.gcps[0] and not source.rpcs:
         crs = None
     if not crs:
@@ -318,6 +318,20 @@ def _crs_of(source: Any, path: Path) -> Any:
         )
     require_datum(crs.to_wkt(), f"the basemap {path.name}")
     return crs
+
+
+def _crs_beside(path: Path) -> Any:
+    """The CRS of a .prj file as shapefiles have them, which GDAL does not read of pictures; None without one."""
+    from rasterio.crs import CRS
+    from rasterio.errors import CRSError
+
+    beside = path.with_suffix(".prj")
+    if is_stored(path) or not beside.is_file():
+        return None
+    try:
+        return CRS.from_user_input(beside.read_text("utf-8", "replace").strip())
+    except CRSError:
+        return None
 
 
 def _band_roles(source: Any) -> tuple[list[int], int | None, Bytes | None]:
@@ -373,7 +387,7 @@ def _affine_of(source: Any) -> Any:
     """From pixels to the raster's CRS; fitted to its ground control points where it has no transform."""
     from rasterio.transform import from_gcps
 
-    return source.transform if source.crs else from_gcps(source.gcps[0])
+    return from_gcps(source.gcps[0]) if source.gcps[0] and not source.crs else source.transform
 
 
 def _apply(affine: Any, x: float, y: float) -> tuple[float, float]:

@@ -34,10 +34,17 @@ _SUFFIXES: Final = (".png", ".jpg", ".jpeg", ".webp")
 _PART_BYTES: Final = 256  # of a tile's middle, by which tiles of one size are compared
 Place = tuple[int, int, int]
 """Zoom, column, and row from the north."""
+_ORDERS: Final[tuple[Callable[[Place], Place], ...]] = (
+    lambda place: place,
+    lambda place: (place[0], place[1], 2 ** place[0] - 1 - place[2]),  # TMS: rows from the south
+    lambda place: (place[0], place[2], place[1]),  # ArcGIS: rows before columns
+)
+_PLAIN_TILE: Final = 0.5  # share of one colour in a placeholder with a text that no other has ...
+_PLAIN_GROUND: Final = 0.25  # ... over ground that the level above shows with less of one colour
 
 
 class TileMap:
-    """Tiles of one or several zoom levels; XYZ order, or TMS (rows from the south), whichever fits the area.
+    """Tiles of one or several zoom levels; in the order of XYZ, TMS or ArcGIS, whichever fits the area.
 
     The finest level that covers the flight is the map; what it lacks comes from the levels beside it. Placeholders of
     a server, tiles of one colour and half downloads are lacking.
@@ -56,8 +63,8 @@ class TileMap:
         if not self._tiles:
             raise InputError(f"{path} holds no map tiles z/x/y.png (or jpg, webp); give a map")
         zooms = sorted(levels)
-        if near is not None and self._rows_from_south(near, zooms):
-            self._tiles = {(z, c, 2**z - 1 - r): key for (z, c, r), key in self._tiles.items()}
+        order = _ORDERS[0] if near is None else self._order(near, zooms)
+        self._tiles = {order(place): key for place, key in self._tiles.items()}
         compared = next((p for p in (self._within(around), self._within(near)) if len(p) <= _MOST_COMPARED), [])
         lacking = _placeholders(self._source, [self._tiles[place] for place in compared])
         self._tiles = {place: key for place, key in self._tiles.items() if key not in lacking}
@@ -125,13 +132,15 @@ class TileMap:
         row = np.floor((WEB_MERCATOR_M / 2 - xy[:, 1]) / side)
         return int(column.min()), int(column.max()), int(row.min()), int(row.max())
 
-    def _rows_from_south(self, near: BoundingBox, zooms: Sequence[int]) -> bool:
-        """True if the area has tiles only when rows count from the south."""
+    def _order(self, near: BoundingBox, zooms: Sequence[int]) -> Callable[[Place], Place]:
+        """The first order of numbers by which the area has tiles; as they are if it has none by any."""
         ranges = {zoom: self._tile_range(near, zoom) for zoom in zooms}
-        rows = [(*ranges[z][2:], r, 2**z - 1 - r) for z, c, r in self._tiles if ranges[z][0] <= c <= ranges[z][1]]
-        return not any(top <= r <= bottom for top, bottom, r, _ in rows) and any(
-            top <= flipped <= bottom for top, bottom, _, flipped in rows
-        )
+
+        def inside(place: Place) -> bool:
+            left, right, top, bottom = ranges[place[0]]
+            return left <= place[1] <= right and top <= place[2] <= bottom
+
+        return next((order for order in _ORDERS if any(inside(order(place)) for place in self._tiles)), _ORDERS[0])
 
     def _ground_bounds(self, around: BoundingBox | None) -> BoundingBox:
         """Bounds of the used tiles in the grid, those within some kilometres of the area."""
@@ -208,7 +217,11 @@ class TileMap:
         if key is None:
             return None
         if place not in decoded:
-            decoded[place] = _decode(self._source.read(key))
+            tile = _decode(self._source.read(key))
+            if tile is not None and _plain_share(tile) > _PLAIN_TILE:
+                above = self._part_of_coarser(place, decoded)
+                tile = tile if above is None or _plain_share(above) > _PLAIN_GROUND else None
+            decoded[place] = tile
         return decoded[place]
 
     def _part_of_coarser(self, place: Place, decoded: dict[Place, Bytes | None]) -> Bytes | None:
@@ -262,6 +275,13 @@ def _decode(data: bytes) -> Bytes | None:
     if image.ndim == 2:
         return np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2RGBA))
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGBA if image.shape[2] == 3 else cv2.COLOR_BGRA2RGBA))
+
+
+def _plain_share(tile: Bytes) -> float:
+    """Share of a tile's most common colour, in steps of what JPEG leaves alike."""
+    coarse = tile[..., :3].astype(np.int32) >> 3
+    colours = coarse[..., 0] << 10 | coarse[..., 1] << 5 | coarse[..., 2]
+    return float(np.bincount(colours.ravel()).max() / colours.size)
 
 
 def _placeholders(source: "_Folder | _Mbtiles", keys: Iterable[Any]) -> set[Any]:

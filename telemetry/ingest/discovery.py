@@ -16,7 +16,7 @@ from orthoswarm.stores.addresses import address_of, is_stored
 from orthoswarm.stores.listing import exists, is_file, list_folder
 from telemetry.formats.log.can_log import SUFFIXES as CAN_LOGS
 from telemetry.formats.log.receiver_track import TRACK_SUFFIXES
-from telemetry.photos.photo_tags import read_photo
+from telemetry.photos.photo_tags import read_photo, sensor_of_name
 from telemetry.samples.unreadable import Unreadable, read_or_reason
 
 VIDEO_SUFFIXES = frozenset(
@@ -32,6 +32,8 @@ UNREAD_SUFFIXES = frozenset(
 _UNREAD_PICTURES = frozenset({".heic", ".heif", ".avif"})
 _TABLES = frozenset({".txt", ".csv"})
 _SUBTITLES = frozenset({".srt"})
+_OF_SYSTEMS: Final = frozenset({"@eaDir", "#recycle", "$RECYCLE.BIN", "System Volume Information", "__MACOSX"})
+"""Folders of thumbnails, of what was deleted, and of macOS's twins that storage and systems add."""
 _COPY = "a copy of another photo in its folder"
 _ALREADY = "which is in the input already"
 _OTHER_NAME = f"the same file as one of another name, {_ALREADY}"
@@ -203,7 +205,9 @@ def _walk(top: Path, outside: set[str], unreadable: dict[Path, str]) -> list[Pat
 
     for folder, below, files in os.walk(top, onerror=failed):
         below[:] = sorted(
-            name for name in below if not name.startswith(".") and os.path.join(folder, name) not in outside
+            name
+            for name in below
+            if not name.startswith(".") and name not in _OF_SYSTEMS and os.path.join(folder, name) not in outside
         )
         found += [Path(folder, name) for name in sorted(files, key=natural_key)]
     return found
@@ -214,7 +218,7 @@ def _stored(top: Path, outside: set[str]) -> list[Path]:
 
     def hidden(path: Path) -> bool:
         folders = [folder for folder in path.parents if folder != top and folder.is_relative_to(top)]
-        return any(folder.name.startswith(".") or str(folder) in outside for folder in folders)
+        return any(f.name.startswith(".") or f.name in _OF_SYSTEMS or str(f) in outside for f in folders)
 
     files = [path for path in list_folder(top) if not hidden(path)]
     return sorted(files, key=lambda path: (path.parent.parts, natural_key(path.name)))
@@ -331,15 +335,20 @@ def copies_among(photos: Sequence[Path]) -> Copies:
 
 
 def _within(alike: Sequence[Path]) -> dict[Path, Path]:
-    """Of equal files those that have another one in their folder and are named after it: IMG_1 (1), Copy of IMG_1."""
+    """Of equal files those that have another one in their folder; the one with a number is the camera's own.
+
+    Exposures are copies under any name that does not merely differ by its numbers, others if named after it.
+    """
     found: dict[Path, Path] = {}
     for folder in dict.fromkeys(path.parent for path in alike):
-        first, *others = sorted((p for p in alike if p.parent == folder), key=lambda p: (len(p.name), p.name))
+        own = [path for path in alike if path.parent == folder]
+        first, *others = sorted(own, key=lambda p: (not any(map(str.isdigit, p.stem)), len(p.name), p.name))
         exposure = bool(others) and _is_exposure(first)
         for path in others:
             before, named, after = path.stem.partition(first.stem)
-            more = before + after
-            if named and (not more.isdigit() if exposure else _COPY_NAME.fullmatch(more)):
+            numbered = _DIGITS.sub("#", path.stem) == _DIGITS.sub("#", first.stem)
+            another = exposure and not numbered and sensor_of_name(path.stem) == sensor_of_name(first.stem)
+            if another or (named and _COPY_NAME.fullmatch(before + after)):
                 found[path] = first
     return found
 

@@ -9,15 +9,12 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from contextlib import closing
 from dataclasses import replace
-from datetime import UTC, datetime
 from itertools import islice
 from pathlib import Path
 from typing import Final
 
-import numpy as np
-
 from orthoswarm.model.earth import distance_m
-from orthoswarm.model.frame import Ingest, Rejection
+from orthoswarm.model.frame import UNSTATED_SIGMA_M, Ingest, Rejection
 from orthoswarm.model.task_runner import Progress
 from orthoswarm.stores.local_copies import local_file
 from telemetry.formats.table import geo_txt, pose_csv
@@ -26,24 +23,22 @@ from telemetry.formats.video.sei import read_sei_layout, register
 from telemetry.ingest.discovery import Discovery, Folder, discover, natural_key
 from telemetry.ingest.log_choice import LogSource
 from telemetry.ingest.log_ingest import add_logs, read_logs
+from telemetry.ingest.picture_kinds import Reasons, of_other_kinds, of_other_sources, of_second_cameras
 from telemetry.ingest.side_files import read_control_points
+from telemetry.ingest.strangers import copies_in_other_folders, strangers
 from telemetry.ingest.survey import LoadOptions, SourceInfo, Survey
 from telemetry.ingest.track_poses import SHIFTED, clock_went_back, in_order
 from telemetry.ingest.video_ingest import read_videos
-from telemetry.photos.flight_checks import OTHER_DAY_S, flight_findings, times_without_zone
+from telemetry.photos.flight_checks import flight_findings, times_without_zone
 from telemetry.photos.maker_angles import Angles
 from telemetry.photos.photo_frames import frame_without_position, frames_of, settle_positions
-from telemetry.photos.photo_tags import SENSORS, Photo, read_photos, with_sidecar
-from telemetry.samples.course import local_metres
+from telemetry.photos.photo_tags import Photo, read_photos, with_sidecar
 from telemetry.samples.findings import Finding, metres, plural
-from telemetry.samples.held_fixes import LOST_SIGMA_M, held_fixes, is_one_fix, matters, stated_sigma_m
+from telemetry.samples.held_fixes import LOST_SIGMA_M, coarse_m, held_fixes, matters, one_fix, stated_sigma_m
 from telemetry.samples.unreadable import Unreadable, read_or_reason
 from telemetry.samples.wild_fixes import doubtful_finding, wild_fixes
 
 __all__ = ["LoadOptions", "SourceInfo", "Survey", "load", "survey"]
-
-_BANDS = ("", "green", "red", "blue", "nir", "red edge", "rededge")
-"""Spectral bands by how well they show the ground; "" is a colour picture."""
 
 _CONTRADICTION_M: Final = 500.0  # table that puts a photo so far from its tags, or from another table, contradicts them
 
@@ -51,12 +46,8 @@ _CONTRADICTION_M: Final = 500.0  # table that puts a photo so far from its tags,
 _NOT_MEASURED: Final = (
     "the picture has no position: its receiver stood still; put a geo.txt next to it, or give its log as well"
 )
-_FEW_SHARE: Final = 0.1  # strangers are at most this share of a folder's photos
-_OTHER_CAMERA_MOST: Final = 2  # photos of another camera: more are a flight's second camera
-_SMALLER: Final = 0.75  # a copy has at most this share of the photo's columns
-_ELSEWHERE_M: Final = 500.0  # ... and elsewhere, if they are farther than this from all others
-Reasons = dict[int, tuple[str, str]]
-"""Photos by their index: why they are left out, one reason for all that share it, and a detail."""
+_COARSE_TOLD_M: Final = 3.0  # steps of coordinates that are more than receivers err
+_ROUNDED: Final = 12.0**-0.5  # sigma of what was rounded, in its steps
 
 
 def load(inputs: Sequence[Path], *, progress: Progress | None = None, options: LoadOptions | None = None) -> Ingest:
@@ -112,6 +103,16 @@ def survey(inputs: Sequence[Path], *, progress: Progress | None = None, options:
                 _photo_folder(folder, own, found, tables=tables, logs=logs, result=result, options=options)
             if folder.videos or folder.subtitles:
                 read_videos(folder, found, logs, options=options, progress=progress, result=result)
+    for source, lost in copies_in_other_folders(result.sources):
+        source.frames = [frame for frame in source.frames if frame.image not in lost]
+        source.counts["frames"] = len(source.frames)
+        result.rejected += lost.values()
+    for source, reason in of_other_sources(result.sources, options.camera, options.band):
+        result.rejected += [Rejection(f.image, reason, f.vehicle, f.time_s) for f in source.frames]
+        source.frames.clear()
+        source.counts["frames"] = 0
+    if result.unpositioned:  # then a table that nobody understands is no side issue
+        result.findings = [replace(f, note=f.note and f.code != "table-unknown") for f in result.findings]
     result.findings += [*_logs_apart(found, logs), *_unread(found, needed=bool(result.unpositioned))]
     if not result.sources and not result.rejected:
         result.findings.append(Finding("nothing", "no picture was found in the inputs"))
@@ -280,12 +281,15 @@ def _photo_folder(
         photos = sorted(groups[vehicle], key=lambda p: natural_key(p.path.name))
         photos.sort(key=lambda p: math.inf if p.time_s is None else p.time_s)
         add_logs(photos, folder.path, vehicle, logs=logs, findings=source.findings, workers=options.workers)
-        photos = _one_kind(photos, vehicle, options.camera, found, result)
-        photos = _of_the_flight(photos, vehicle, found, result)
+        others = of_other_kinds(photos, options.camera, options.band)
+        photos = _without(others, photos, vehicle, found, result)
+        photos = _without(strangers(photos), photos, vehicle, found, result)
+        photos = _without(of_second_cameras(photos), photos, vehicle, found, result)
         photos = _with_position(photos, vehicle, found, result)
         photos = in_order(photos, vehicle, source.findings)
         source.findings += settle_positions(photos, vehicle, found.name)
         photos = _where_it_can_be(photos, vehicle, found, source, result)
+        source.sees = (photos[0].sensor, photos[0].band) if photos else source.sees
         frames = frames_of(photos, vehicle, found.name, source.findings)
         source.frames += frames
         source.findings += flight_findings(photos, frames, vehicle)
@@ -303,39 +307,8 @@ def _with_sidecar(photo: Photo, sidecar: Path, found: Discovery, source: SourceI
         return photo
 
 
-def _one_kind(photos: Sequence[Photo], vehicle: str, camera: str, found: Discovery, result: Survey) -> list[Photo]:
-    """Keep the pictures of one kind of a camera that takes several: one sensor, and colour or one spectral band.
-
-    A zoom's pictures stay beside those of the wide camera unless both were taken at one press.
-
-    Args:
-        camera: the sensor that is wanted, one of SENSORS; "" for the widest that sees colours.
-    """
-    reasons: dict[Path, str] = {}
-    sensors = {photo.sensor for photo in photos if photo.sensor}
-    if len(sensors) > 1 or (camera and sensors and camera not in sensors):
-        wanted = camera or next(sensor for sensor in SENSORS if sensor in sensors)
-        pressed = Counter(photo.path.stem.rpartition("_")[0] for photo in photos)
-        beside = {"wide", "zoom"} if not camera and max(pressed.values()) < 2 else {wanted}
-        said = f"of each exposure the {wanted} pictures are mapped (--camera)"
-        others = [photo for photo in photos if photo.sensor and photo.sensor not in beside]
-        reasons |= {photo.path: f"a picture of the {photo.sensor} camera; {said}" for photo in others}
-    bands = {photo.band.lower() for photo in photos if photo.path not in reasons}
-    if len(bands) > 1:
-        mapped = next((band for band in _BANDS if band in bands), min(bands))
-        said = f"of each exposure {f'band {mapped}' if mapped else 'the colour pictures'} is mapped"
-        others = [photo for photo in photos if photo.path not in reasons and photo.band.lower() != mapped]
-        reasons |= {
-            photo.path: f"a picture of one spectral band ({photo.band or 'colour'}); {said}" for photo in others
-        }
-    left = [photo for photo in photos if photo.path in reasons]
-    result.rejected += [Rejection(found.name(p.path), reasons[p.path], vehicle, p.time_s) for p in left]
-    return [photo for photo in photos if photo.path not in reasons]
-
-
-def _of_the_flight(photos: Sequence[Photo], vehicle: str, found: Discovery, result: Survey) -> list[Photo]:
-    """Photos without strangers, which are rejected."""
-    odd = strangers(photos)
+def _without(odd: Reasons, photos: Sequence[Photo], vehicle: str, found: Discovery, result: Survey) -> list[Photo]:
+    """Photos without some, which are rejected."""
     result.rejected += [
         Rejection(found.name(photos[i].path), why, vehicle, photos[i].time_s, detail=detail)
         for i, (why, detail) in odd.items()
@@ -400,9 +373,10 @@ def _measured(
     """Photos whose receiver measured; others lie between those before and after, or are left out without a position."""
     places = [(p.lat_deg or 0.0, p.lon_deg or 0.0) for p in photos]
     held = held_fixes([p.time_s for p in photos], places)
-    lost = set(range(len(photos))) if is_one_fix(places) else set()
+    lost = set(one_fix(places))
     if lost:
-        text = f"all {len(photos)} photos tell one place to the last digit: the receiver stood still, it is not used"
+        many = f"all {len(photos)}" if len(lost) == len(photos) else f"{len(lost)} of {len(photos)}"
+        text = f"{many} photos tell one place to the last digit: the receiver stood still, it is not used"
         source.findings.append(Finding("position-held", text, vehicle))
     for i, lat, lon, sigma in held.each():
         if sigma > LOST_SIGMA_M:
@@ -414,6 +388,14 @@ def _measured(
     if matters(held):
         whose = f"{plural(len(photos), 'photo')} ({found.name(photos[held.index[0]].path)} first)"
         source.findings.append(replace(held.finding(whose), vehicle=vehicle))
+    steps_m = coarse_m(places)
+    if steps_m > _COARSE_TOLD_M:
+        for photo in photos:
+            photo.position_sigma_m = math.hypot(photo.position_sigma_m or UNSTATED_SIGMA_M, _ROUNDED * steps_m)
+        text = (
+            f"positions are written in steps of {metres(steps_m)}: they are known to half of that, as their sigma says"
+        )
+        source.findings.append(Finding("position-coarse", text, vehicle))
     for i in sorted(lost):
         _leave_out(photos[i], vehicle, found.name(photos[i].path), _NOT_MEASURED, result)
     return [photo for i, photo in enumerate(photos) if i not in lost]
@@ -461,85 +443,3 @@ def _merge_tables(
             photo.origin["angles"] = kind
             photo.yaw_is_stated |= angles[0] is not None
     return vehicle
-
-
-def strangers(photos: Sequence[Photo]) -> Reasons:
-    """The photos of a folder that are not of its flight: screenshots, smaller copies, another camera's, another day's.
-
-    Each would be drawn as if the flight's camera had taken it. What most photos of the folder are is the flight; only
-    few others are strangers: as many as the flight's are another flight, which is mapped, too.
-    """
-    found: Reasons = {}
-    for rule in (_without_camera, _smaller_copies, _other_camera, _other_day):
-        left = [i for i in range(len(photos)) if i not in found]
-        found |= {left[k]: why for k, why in rule([photos[i] for i in left]).items()}
-    return found
-
-
-def _few(count: int, photos: Sequence[Photo]) -> bool:
-    return 0 < count <= _FEW_SHARE * len(photos)
-
-
-def _without_camera(photos: Sequence[Photo]) -> Reasons:
-    """Pictures of another size of which no tag says anything: they have neither camera, time nor position."""
-    sizes = {(p.width, p.height) for p in photos if p.make or p.model}
-    why = "the picture has no position; it has no camera's tags either, as a screenshot or an edited picture"
-    return {
-        i: (why, "")
-        for i, p in enumerate(photos)
-        if sizes
-        and (p.width, p.height) not in sizes
-        and not (p.make or p.model)
-        and p.time_s is None
-        and p.lat_deg is None
-    }
-
-
-def _smaller_copies(photos: Sequence[Photo]) -> Reasons:
-    """Pictures of the same camera, time and place to the last digit as a larger one."""
-    same: dict[tuple[object, ...], list[int]] = {}
-    for i, p in enumerate(photos):
-        if p.time_s is not None and p.lat_deg is not None:
-            same.setdefault((p.make, p.model, p.time_s, p.lat_deg, p.lon_deg), []).append(i)
-    found: Reasons = {}
-    for group in same.values():
-        largest = max(group, key=lambda i: photos[i].width * photos[i].height)
-        for i in group:
-            if photos[i].width <= _SMALLER * photos[largest].width:
-                found[i] = "a smaller picture of the same exposure as another one here", photos[largest].path.name
-    return found
-
-
-def _other_camera(photos: Sequence[Photo]) -> Reasons:
-    """The odd photo of another camera that knows neither its height nor where it looks: a phone's, from the ground."""
-    counts = Counter((p.make, p.model) for p in photos)
-    flown, _ = counts.most_common(1)[0] if counts else (("", ""), 0)
-    found: Reasons = {}
-    for i, p in enumerate(photos):
-        key = p.make, p.model
-        odd = any(key) and key != flown and counts[key] <= _OTHER_CAMERA_MOST and _few(counts[key], photos)
-        if odd and p.height_m is None and p.camera_deg == p.flight_deg == (None, None, None):
-            why = "taken with another camera than the flight's, which tells neither height nor direction"
-            found[i] = why, " ".join(key).strip()
-    return found
-
-
-def _other_day(photos: Sequence[Photo]) -> Reasons:
-    """The few photos of another day that were taken elsewhere."""
-    known = [i for i, p in enumerate(photos) if p.time_s is not None and p.lat_deg is not None]
-    if len(known) < 2:
-        return {}
-    order = sorted(known, key=lambda i: photos[i].time_s or 0.0)
-    times = np.array([photos[i].time_s for i in order], float)
-    days = np.split(np.array(order), np.flatnonzero(np.diff(times) > OTHER_DAY_S) + 1)
-    flight = max(days, key=len)
-    ground = local_metres([photos[i].lat_deg or 0.0 for i in known], [photos[i].lon_deg or 0.0 for i in known])
-    at = dict(zip(known, ground))
-    flown = np.array([at[i] for i in flight.tolist()])
-    found: Reasons = {}
-    for day in days:
-        away = np.array([np.hypot(*(flown - at[i]).T).min() for i in day.tolist()])
-        if day is not flight and _few(len(day), photos) and (away > _ELSEWHERE_M).all():
-            dates = {i: f"{datetime.fromtimestamp(photos[i].time_s or 0.0, UTC):%Y-%m-%d}" for i in day.tolist()}
-            found |= {i: ("taken on another day and elsewhere than the others here", date) for i, date in dates.items()}
-    return found

@@ -27,6 +27,7 @@ class LoadOptions:
         run: maps a function over items in processes, for many photos; None: read in threads.
         sei_layouts: files that describe private SEI messages; see `telemetry.formats.video.sei`.
         camera: which sensor of cameras with several is mapped: wide, zoom or thermal; "" for the widest in colour.
+        band: which spectral band of multispectral cameras is mapped; "" for colour, else the one that shows most.
         decode: False to read only the metadata of videos, without extracting pictures (for `inspect`).
     """
 
@@ -36,6 +37,7 @@ class LoadOptions:
     exclude: tuple[Path, ...] = ()
     workers: int = field(default_factory=lambda: min(8, (os.cpu_count() or 1) * 2))
     camera: str = ""
+    band: str = ""
     decode: bool = True
     run: Callable[..., Iterator[Any]] | None = None
     sei_layouts: tuple[Path, ...] = ()
@@ -50,6 +52,7 @@ class SourceInfo:
         counts: `frames`, `sei`, `klv`, `camera_events`. findings: what is suspicious about it.
         frames: the frames. tracks: for sources without frames, the poses of each vehicle in order.
         shown: number of pictures of each vehicle if it differs from the number of its frames.
+        sees: sensor and band of its pictures, as `Photo` has them.
     """
 
     path: str
@@ -59,6 +62,7 @@ class SourceInfo:
     frames: list[Frame] = field(default_factory=list)
     tracks: dict[str, list[Sample]] = field(default_factory=dict)
     shown: dict[str, int] = field(default_factory=dict)
+    sees: tuple[str, str] = ("", "")
 
 
 @dataclass(slots=True, kw_only=True)

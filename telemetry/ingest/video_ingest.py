@@ -27,6 +27,7 @@ from telemetry.ingest.pairing.clock_offset import (
 )
 from telemetry.ingest.survey import LoadOptions, SourceInfo, Survey
 from telemetry.photos.photo_frames import frames_of
+from telemetry.photos.photo_tags import sensor_of_name
 from telemetry.samples.findings import Finding, plural
 from telemetry.samples.sample import Sample
 from telemetry.samples.unreadable import Unreadable, read_or_reason, reason_of
@@ -66,7 +67,8 @@ def read_videos(
         if isinstance(scanned, Unreadable):
             result.rejected.append(Rejection(name, str(scanned), found.videos[path]))
             continue
-        source = SourceInfo(path=name, kind="video", counts=Counter(frames=len(scanned.pictures)))
+        sees = sensor_of_name(path.stem), ""
+        source = SourceInfo(path=name, kind="video", counts=Counter(frames=len(scanned.pictures)), sees=sees)
         source.counts["sei"] = scanned.sei_count
         source.counts["klv"] = len(scanned.klv_packets)
         result.sources.append(source)

@@ -142,6 +142,13 @@ def _heights(photos: Sequence[Photo], findings: list[Finding], vehicle: str) -> 
         count = f"{missing} of {plural(len(photos), 'photo')}"
         text = f"{count} without a height above ground; it is estimated from the distance flown"
         findings.append(Finding("height-missing", text, vehicle))
+    two = [(p.altitude_m or 0.0, p.other_altitude_m) for p in photos if p.other_altitude_m is not None]
+    if two:
+        text = (
+            f"the tags of {plural(len(two), 'photo')} state two altitudes, {two[0][0]:.0f} and {two[0][1]:.0f} m in "
+            "the first; that of the EXIF counts, but for its sign"
+        )
+        findings.append(Finding("altitude-contradicts", text, vehicle))
     altitudes = np.array([p.altitude_m for p in photos if p.altitude_m is not None], dtype=np.float64)
     wrong = altitudes[(altitudes < 0.0) | (altitudes > 15_000.0)]
     if len(wrong):

@@ -37,8 +37,17 @@ _CHUNK = 64
 
 SENSORS: Final = {"wide": ("wide", "visible"), "zoom": ("zoom",), "thermal": ("infrared", "thermal")}
 """Sensors of cameras with several, the ones that are mapped first first, and what XMP calls them."""
-_SENSOR_LETTER: Final = re.compile(r"_\d{14}_\d{4}_(?:D_)?([WVZT])$")  # DJI_20260504100000_0001_V
+_SENSOR_LETTER: Final = re.compile(r"_\d{4}_(?:D_)?([WVZT])(?:_|$)")  # DJI_20260504100000_0001_V_Waypoint3, DJI_0001_T
+_SENSOR_WORD: Final = re.compile(r"[_-](thermal|infrared|visible|wide|zoom)$", re.IGNORECASE)
+_BAND_NAME: Final = re.compile(r"_(?:MS_(G|R|RE|NIR)|(GRE|RED|REG|NIR))(?:_|$)")  # DJI's and Parrot's file names
+_MICASENSE_NUMBER: Final = re.compile(r"IMG_\d{4}_(\d{1,2})$")
+_MICASENSE_BANDS: Final = ("blue", "green", "red", "nir", "red edge")  # its RedEdge and Altum number them so
+_SAME_BANDS: Final = {
+    "g": "green", "gre": "green", "r": "red", "b": "blue", "re": "red edge", "reg": "red edge", "rededge": "red edge",
+    "red-edge": "red edge", "near infrared": "nir", "near-infrared": "nir", "nearinfrared": "nir", "lwir": "thermal",
+}  # fmt: skip
 CONTRADICTS_M: Final = 30.0  # positions of one photo's tags that are farther apart are of two places
+ALTITUDE_CONTRADICTS_M: Final = 120.0  # above sea and ellipsoid differ by at most 107 m (EGM96)
 _MOST_HEIGHT_M: Final = 12_000.0  # recorded heights above this are not heights above ground
 
 
@@ -50,7 +59,8 @@ class Photo:
         path: the file. width: columns as stored; height: rows.
         lat_deg: latitude, None without a position; lon_deg: longitude.
         other_position: another latitude and longitude that the photo's tags state, far from that.
-        altitude_m: absolute altitude. height_m: height above takeoff.
+        altitude_m: absolute altitude. other_altitude_m: another one that the photo's tags state, far from that.
+        height_m: height above takeoff.
         height_is_ground: whether height_m is above the ground instead.
         time_s: UTC epoch seconds.
         camera_deg: yaw, pitch, roll of the camera (gimbal), pitch -90 looking straight down.
@@ -75,6 +85,7 @@ class Photo:
     lon_deg: float | None = None
     other_position: tuple[float, float] | None = None
     altitude_m: float | None = None
+    other_altitude_m: float | None = None
     height_m: float | None = None
     height_is_ground: bool = False
     time_s: float | None = None
@@ -228,9 +239,12 @@ def _xmp_position(found: xmp.Properties) -> tuple[float, float] | None:
 
 
 def _heights(photo: Photo, tags: exif.Exif, found: xmp.Properties) -> None:
-    photo.altitude_m = exif.gps_altitude(tags.gps)
-    if photo.altitude_m is None:
-        photo.altitude_m = xmp.number(found, "drone-dji:AbsoluteAltitude", "exif:GPSAltitude")
+    altitude, other = exif.gps_altitude(tags.gps), xmp.number(found, *_ABSOLUTE_ALTITUDES)
+    if altitude is None or (other is not None and abs(altitude + other) < 1.0):  # the reference is one wrong number
+        altitude, other = other, altitude
+    photo.altitude_m = altitude
+    if altitude is not None and other is not None and abs(altitude - other) > ALTITUDE_CONTRADICTS_M:
+        photo.other_altitude_m = other
     ground = xmp.number(found, "Camera:AboveGroundAltitude")
     if ground is not None and 0.0 < ground < _MOST_HEIGHT_M:
         photo.height_m, photo.height_is_ground = ground, True
@@ -244,6 +258,7 @@ def _heights(photo: Photo, tags: exif.Exif, found: xmp.Properties) -> None:
 
 
 _POSITION_PREFIXES = ("drone-dji", "drone", "drone-skydio")
+_ABSOLUTE_ALTITUDES = (*(f"{prefix}:AbsoluteAltitude" for prefix in _POSITION_PREFIXES), "exif:GPSAltitude")
 _RELATIVE_ALTITUDES = (
     *(f"{prefix}:RelativeAltitude" for prefix in ("drone-dji", "drone-parrot", "drone", "drone-skydio")),
     "drone-yuneec:AboveHomeAltitude",
@@ -291,9 +306,7 @@ def _lens(photo: Photo, tags: exif.Exif, found: xmp.Properties) -> None:
     focal = exif.number(tags.exif.get(exif.FOCAL_MM))
     focal_35 = exif.number(tags.exif.get(exif.FOCAL_35MM))
     zoom = exif.number(tags.exif.get(exif.DIGITAL_ZOOM)) or 1.0
-    photo.band = found.get("Camera:BandName", found.get("drone-dji:BandName", ""))
-    if photo.band.strip("{}").upper() in ("RGB", "R,G,B"):
-        photo.band = ""
+    photo.band = _band(photo, found.get("Camera:BandName", found.get("drone-dji:BandName", "")))
     sensor = found.get("drone-dji:ImageSource", "")
     photo.sensor = _sensor(sensor, photo.path.stem)
     length, zoomed = f"{focal:.1f}mm" if focal else "", f"zoom{zoom:.1f}" if zoom > 1.0 else ""
@@ -307,13 +320,35 @@ def _lens(photo: Photo, tags: exif.Exif, found: xmp.Properties) -> None:
 
 
 def _sensor(source: str, stem: str) -> str:
-    """Which sensor took a picture, a key of SENSORS or "", by XMP's ImageSource, else by the end of DJI's file name."""
+    """Which sensor took a picture, a key of SENSORS or "", by XMP's ImageSource, else by the end of the file's name."""
     said = source.lower()
-    for sensor, words in SENSORS.items():
-        if any(word in said for word in words):
-            return sensor
+    return next((sensor for sensor, words in SENSORS.items() if any(w in said for w in words)), sensor_of_name(stem))
+
+
+def sensor_of_name(stem: str) -> str:
+    """Which of a camera's sensors took a picture or video, by its name without suffix; "" if it does not say."""
+    if word := _SENSOR_WORD.search(stem):
+        return next(sensor for sensor, words in SENSORS.items() if word[1].lower() in words)
     match = _SENSOR_LETTER.search(stem)
     return {"W": "wide", "V": "wide", "Z": "zoom", "T": "thermal"}[match[1]] if match else ""
+
+
+def _band(photo: Photo, said: str) -> str:
+    """The spectral band, "" for colour, by XMP's BandName, else by the file's name as its maker's cameras write it."""
+    if said.strip("{}").upper() in ("RGB", "R,G,B"):
+        return ""
+    if not said and photo.make.upper().startswith(("DJI", "PARROT")):
+        match = _BAND_NAME.search(photo.path.stem)
+        said = (match[1] or match[2]) if match else ""
+    elif not said and photo.make.upper().startswith("MICASENSE"):
+        match = _MICASENSE_NUMBER.search(photo.path.stem)
+        said = (match and dict(enumerate(_MICASENSE_BANDS, 1)).get(int(match[1]), f"number {match[1]}")) or ""
+    return band_name(said)
+
+
+def band_name(said: str) -> str:
+    """One name for a spectral band that is written in several ways ("RE", "Red edge"), in lower case."""
+    return _SAME_BANDS.get(said.strip().lower(), said.strip().lower())
 
 
 def _confirmed(hints: Sequence[tuple[float, str]]) -> tuple[float, str]:

@@ -6,7 +6,7 @@ have gone from it, at the speed it flies around that time. Otherwise the vehicle
 has no place but between those measured before and after, with the sigma of a way that nobody saw.
 """
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
@@ -23,15 +23,22 @@ from telemetry.samples.sample import Sample
 LOST_SIGMA_M: Final = 20.0  # a place that is known no better is none: a picture would be drawn beside its ground
 _NEWS_M: Final = 3.0  # shorter ways are a receiver's noise
 _NEWS_QUANTA: Final = 3.0  # ... or so many steps of coarse coordinates
-_COARSE_DECIMALS: Final = 6  # degrees with fewer decimals are coarse: steps of a metre and more
-_USUAL_REPEATS: Final = 3.0  # fixes are repeated at their own rate; those that are told last so many times longer
+_COARSE_STEPS: Final = (1, 10, 60, 100, 600, 1000, 3600, 6000, 10_000, 36_000, 60_000, 100_000)
+"""Steps of a degree in coarse coordinates, of a metre and more: decimals of degrees, minutes and seconds."""
+_COARSE_LEAST: Final = 3  # fewer coordinates have few decimals by chance
+_USUAL_REPEATS: Final = 3.0  # fixes are repeated at their own rate; those that are told last so many times longer ...
+_SLOWEST_S: Final = 2.0  # ... or longer than this: no receiver of a vehicle measures less often
 _FASTER: Final = 3.0  # so many times the speed around it, no way is flown
 _LIKE: Final = 1.5  # ways flown agree with the speed around them within this factor
 _FORETOLD_SHARE: Final = 0.3  # what is foretold is right to this share of what fixes of the same flight usually are
 _FORETOLD_LEAST: Final = 3  # by chance fewer fixes in a row are foretold
+_ONE_FIX_SHARE: Final = 0.8  # ... or this share of a flight's
 _ONE_FIX_LEAST: Final = 5  # fewer photos may be taken while a receiver with a filter stands still
 _FORETOLD_LONGEST_S: Final = 30.0  # receivers foretell for so long
 _TURN_M_S2: Final = 3.0  # acceleration in turns of small drones: a way bends away from its chord by it
+_STRAIGHT_SHARE: Final = (
+    0.8  # ... unless the chord is shorter than this share of the way: then it turned back meanwhile
+)
 _ASTRAY_SHARE: Final = 0.6  # sigma of a way that nobody saw, to the next measured fix: a right angle is 1.5 of it off
 _FASTEST_M_S: Final = 100.0  # steps of times that were rounded to one second
 _AROUND: Final = 3  # steps before and after by which the speed around a fix is told
@@ -101,7 +108,10 @@ def held_fixes(times_s: Sequence[float | None], places: Sequence[tuple[float, fl
     until = np.where(right < len(news), times[news[right.clip(0, len(news) - 1)]] - times[held], np.inf)
     near, both = np.minimum(since, until), np.isfinite(since) & np.isfinite(until)
     flown = speed[held] * near
-    sigma = np.where(both, np.minimum(_ASTRAY_SHARE * flown, 0.5 * _TURN_M_S2 * near**2), flown)
+    before, after = news[(right - 1).clip(0)], news[right.clip(0, len(news) - 1)]
+    straight = np.hypot(*(ground[after] - ground[before]).T) >= _STRAIGHT_SHARE * speed[held] * (since + until)
+    bend = np.where(straight, 0.5 * _TURN_M_S2 * near**2, np.inf)
+    sigma = np.where(both, np.minimum(_ASTRAY_SHARE * flown, bend), flown)
     at = np.stack([np.interp(times[held], times[news], ground[news, k]) for k in range(2)], axis=1)
     first = places[order[0]]
     lat = first[0] + np.degrees(at[:, 1] / MEAN_RADIUS_M)
@@ -111,16 +121,28 @@ def held_fixes(times_s: Sequence[float | None], places: Sequence[tuple[float, fl
     return HeldFixes([order[i] for i in held.tolist()], lat, lon, sigma, longest)
 
 
-def is_one_fix(places: Sequence[tuple[float, float]]) -> bool:
-    """Whether a whole flight tells one place, in fine coordinates: latitude and longitude in degrees."""
-    return len(places) >= _ONE_FIX_LEAST and len(set(places)) == 1 and not _quantum_m(np.array(places))
+def one_fix(places: Sequence[tuple[float, float]]) -> list[int]:
+    """The photos of a flight that tell one place, if nearly all do; places: degrees.
+
+    In coordinates with steps of some metres a vehicle at rest tells one place, too, and all are believed.
+    """
+    place, count = Counter(places).most_common(1)[0] if places else ((0.0, 0.0), 0)
+    if count < max(_ONE_FIX_LEAST, _ONE_FIX_SHARE * len(places)) or 0.0 < _quantum_m(np.array(places)) <= _NEWS_M:
+        return []
+    return [i for i, told in enumerate(places) if told == place]
+
+
+def coarse_m(places: Sequence[tuple[float, float]]) -> float:
+    """The steps in which a flight's coordinates were written, metres; 0 where they are fine; places: degrees."""
+    return _quantum_m(np.array(places)) if len(places) >= _COARSE_LEAST else 0.0
 
 
 def _quantum_m(degrees: Array) -> float:
-    """The steps of coordinates (N, 2) in degrees with few decimals, metres; 0 where they are fine."""
-    for decimals in range(_COARSE_DECIMALS):
-        if np.abs(degrees - degrees.round(decimals)).max() < 1e-9:
-            return DEGREE_M * 10.0**-decimals
+    """The steps of coordinates (N, 2) with few decimals of degrees, minutes or seconds, metres; 0 where fine."""
+    for steps in _COARSE_STEPS:
+        scaled = degrees * steps
+        if np.abs(scaled - scaled.round()).max() < 1e-9 * steps:
+            return DEGREE_M / steps
     return 0.0
 
 
@@ -139,7 +161,8 @@ def _mark_repeated(times: Array, ground: Array, speed: Array, news_m: float) -> 
     standing = _over(way, times[first[1:]] - times[last[:-1]])
     around = _around(flying)
     lasted = times[last] - times[first]
-    for k in np.flatnonzero(lasted > _USUAL_REPEATS * float(np.median(lasted))).tolist():
+    usual_s = min(_USUAL_REPEATS * float(np.median(lasted)), _SLOWEST_S)
+    for k in np.flatnonzero(lasted > usual_s).tolist():
         a, b = int(first[k]), int(last[k]) + 1
         if k == len(way):  # nothing follows: it is as old as the vehicle was fast
             before = float(np.median(flying[-_AROUND:]))

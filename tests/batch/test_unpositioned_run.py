@@ -76,6 +76,22 @@ def test_one_point_cannot_place_them(flight, tmp_path, capsys):
     assert "has no position" in capsys.readouterr().err and not out.exists()
 
 
+@pytest.mark.parametrize("flies", [True, False])
+def test_pictures_recorded_at_one_spot_are_a_map_only_if_they_show_one(tmp_path, flies, capsys):
+    """A receiver that wanders about one place while the vehicle flies, and a vehicle that hovers there."""
+    rng, shots = np.random.default_rng(2), legs(count=2, photos=5, noise=0.0)
+    noise = rng.normal(scale=0.4, size=(len(shots), 2))
+    if flies:
+        shots = [replace(s, recorded=(e - s.east, n - s.north)) for s, (e, n) in zip(shots, noise, strict=True)]
+    else:
+        shots = [replace(s, east=e, north=n, yaw=s.yaw + k) for k, (s, (e, n)) in enumerate(zip(shots, noise))]
+    Scene().fly(tmp_path / "photos", shots)
+    assert mosaic(tmp_path, "photos", tmp_path / "out") == (1 if flies else 0)
+    if flies:
+        assert "told one spot, but the pictures show that it flew on" in capsys.readouterr().err
+    assert (tmp_path / "out" / "orthoimage.tif").exists() != flies
+
+
 @pytest.fixture(scope="module")
 def kite(tmp_path_factory):
     """Photos that each look another way from another height, and points that one photo shows, marked in no other."""

@@ -3,6 +3,7 @@
 import asyncio
 import io
 import json
+import sqlite3
 import zipfile
 
 import numpy as np
@@ -59,16 +60,17 @@ def written(folder, name, crs, driver):
     return path
 
 
-@pytest.mark.parametrize("kind", ["geojson", "kml", "kmz", "gpkg", "zip", "plan"])
+@pytest.mark.parametrize("kind", ["geojson", "kml", "kmz", "gpkg", "zip", "plan", "kmz.zip", "json.zip"])
 def test_the_same_area_comes_out_of_every_kind_of_file(tmp_path, kind):
     if kind == "gpkg":
         data = written(tmp_path, "area.gpkg", "EPSG:2056", "GPKG").read_bytes()
     elif kind == "zip":
         shape = written(tmp_path, "area.shp", "EPSG:32632", "ESRI Shapefile")
-        parts = {f"inner/{p.name}": p.read_bytes() for p in shape.parent.glob("area.*")}
+        parts = {f"inner\\{p.name}": p.read_bytes() for p in shape.parent.glob("area.*")}
         data = zipped(**parts)
     else:
-        data = {"geojson": GEOJSON, "kml": KML, "kmz": zipped(doc__kml=KML), "plan": PLAN}[kind]
+        data = {"geojson": GEOJSON, "kml": KML, "kmz": zipped(doc__kml=KML), "plan": PLAN,
+                "kmz.zip": zipped(doc__kml=KML), "json.zip": zipped(a__json=GEOJSON)}[kind]  # fmt: skip
     found = area_of(data, f"area.{kind}")
     rings = [*found["polygons"][0], *found["no_fly"]]
     assert len(found["polygons"]) == 1 and len(rings) == 2
@@ -80,7 +82,7 @@ def test_the_same_area_comes_out_of_every_kind_of_file(tmp_path, kind):
 @pytest.mark.parametrize(
     ("name", "data", "words"),
     [
-        ("a.zip", zipped(readme__txt=b"x"), "without a KML or a shapefile"),
+        ("a.zip", zipped(readme__txt=b"x"), "without a KML, a GeoJSON or a shapefile"),
         ("a.zip", GEOJSON, "by its name but holds GeoJSON"),
         ("a.zip", b"PK\x03\x04 broken", "damaged ZIP"),
         ("a.shp", b"\x00\x00\x27\x0a" + bytes(96), "one ZIP"),
@@ -96,6 +98,24 @@ def test_a_file_of_no_use_is_refused_in_one_sentence_that_names_it(name, data, w
         area_of(data, name)
     assert str(refused.value).startswith(name)
     assert "/tmp" not in str(refused.value)
+
+
+def test_a_table_without_shapes_in_a_geopackage_is_passed_over_and_sizes_are_read(tmp_path):
+    path = tmp_path / "a.gpkg"
+    point, line = shapely.Point(8.544, 47.397), shapely.LineString(RING[:2])
+    for shape, kind, field, size in ((point, "Point", "RADIUS_M", 100.0), (line, "LineString", "width_m", 50.0)):
+        pyogrio.raw.write(path, np.array([shapely.to_wkb(shape)], object), [np.array([size])], [field], layer=kind,
+                          geometry_type=kind, crs="EPSG:4326", driver="GPKG", append=path.exists())  # fmt: skip
+    with sqlite3.connect(path) as file:
+        file.execute("CREATE TABLE layer_styles (id INTEGER PRIMARY KEY, style TEXT)")  # as QGIS keeps them
+        file.execute("INSERT INTO gpkg_contents (table_name, data_type) VALUES ('layer_styles', 'attributes')")
+    found = area_of(path.read_bytes(), "a.gpkg")
+    assert not found["unused"] and not found["lines"]
+    circle, strip = sorted(make_area([Polygon(np.array(ring)[:-1, ::-1])]).size_m2 for [ring] in found["polygons"])[
+        ::-1
+    ]
+    assert circle == pytest.approx(np.pi * 100.0**2, rel=0.02)
+    assert strip == pytest.approx(50.0 * 226.0 + np.pi * 25.0**2, rel=0.02)
 
 
 def test_a_shapefile_without_its_coordinate_system_is_refused(tmp_path):

@@ -67,6 +67,19 @@ ZONES = {
         "properties": {"radius": 150},
         "geometry": {"type": "Point", "coordinates": [8.5, 47.4]},
     },
+    "a radius with its unit": {"type": "Feature", "properties": {"Radius": "0.15 km"}, "geometry": CENTRE},
+    "a radius and a unit": {"type": "Feature", "properties": {"radius": 0.15, "units": "KM"}, "geometry": CENTRE},
+    "a list of zones": [
+        {
+            "identifier": "X1",
+            "geometry": [
+                {
+                    "uomDimensions": "NM",
+                    "horizontalProjection": {"type": "Circle", "center": [8.5, 47.4], "radius": 150.0 / 1852.0},
+                }
+            ],
+        }
+    ],
 }
 
 
@@ -100,6 +113,9 @@ KML_POLYGON = (
         ("z.json", json.dumps({"type": "GeometryCollection", "geometries": [POLYGON, CENTRE]}), "a point"),
         ("z.json", json.dumps({"type": "GeometryCollection", "geometries": [POLYGON, LINE, LINE]}), "holds 2 lines,"),
         ("z.json", json.dumps({"type": "Feature", "properties": {}, "geometry": None}), "a feature without a shape"),
+        ("z.json", json.dumps({"type": "Feature", "properties": {"radius": 0.1}, "geometry": CENTRE}), "of 0.1 m"),
+        ("z.json", json.dumps({"type": "Feature", "properties": {"radius": "9 rods"}, "geometry": CENTRE}), "'rods'"),
+        ("z.json", json.dumps({"type": "Polygon", "coordinates": []}), "a feature without a shape"),
         ("z.kml", KML.format("Point", KML_POLYGON.format("")), "a point"),
         ("z.kml", KML.format("LineString", KML_POLYGON.format("")), "a line"),
     ],
@@ -130,6 +146,40 @@ def test_kml_is_read_in_the_encoding_that_it_declares(tmp_path, encoding):
     text = f'<?xml version="1.0" encoding="{declared}"?><kml><Placemark><name>Fl\u00e4che</name></Placemark>'
     (tmp_path / "a.kml").write_bytes((text + KML_POLYGON.format("") + "</kml>").encode(encoding))
     assert len(read_shapes(tmp_path / "a.kml")[0].polygons) == 1
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ("", ""),
+        ("9,48 ", "9, 48\n"),
+        ("<kml>", "<kml><name>M\u00fcller & S\u00f6hne&nbsp;</name>"),
+        ("<kml>", "\n <kml>"),
+        ("</kml>", "</kml>\0\0"),
+        ("<kml>", '\n<?xml version="1.0"?><kml>'),
+    ],
+)
+@pytest.mark.parametrize("encoding", ["utf-8", "cp1252", "utf-16-le"])
+def test_kml_is_read_as_people_write_it(tmp_path, before, after, encoding):
+    text = f"<kml>{KML_POLYGON.format('')}</kml>".replace(before, after, 1)
+    (tmp_path / "a.kml").write_bytes(text.encode(encoding))
+    [polygon] = read_shapes(tmp_path / "a.kml")[0].polygons
+    assert polygon.shell.tolist() == [[48.0, 9.0], [48.0, 9.1], [48.1, 9.1]]
+
+
+def test_zones_with_latitude_and_longitude_exchanged_are_refused(tmp_path):
+    ring = [[47.4, 8.5], [47.41, 8.5], [47.41, 8.51], [47.4, 8.5]]
+    (tmp_path / "z.json").write_text(json.dumps({"type": "Polygon", "coordinates": [ring]}))
+    with pytest.raises(InputError, match="longitude are exchanged"):
+        read_no_fly([tmp_path / "z.json"], np.array([[47.4, 8.5], [47.41, 8.51]]), None)
+
+
+@pytest.mark.parametrize("gap_deg", [0.0, 1e-5])
+def test_a_path_drawn_round_an_area_is_asked_about(tmp_path, gap_deg):
+    path = [[8.5, 47.4], [8.51, 47.4], [8.51, 47.41], [8.5 + gap_deg, 47.4]]
+    (tmp_path / "a.json").write_text(json.dumps({"type": "LineString", "coordinates": path}))
+    plan, _ = make_plan(PlanRequest(area=tmp_path / "a.json", vehicles=1, altitude_m=60.0, fov_min_deg=60.0))
+    assert any("draw a polygon" in warning for warning in plan.warnings)
 
 
 def test_elements_of_an_undeclared_name_space_are_passed_over(tmp_path):

@@ -218,6 +218,15 @@ def test_a_folder_of_tiles(tmp_path, suffix, tms, size):
         assert_same_ground(basemap, gsd, tolerance=6.0)
 
 
+def test_a_folder_of_tiles_whose_rows_come_first(tmp_path):
+    web_tiles(tmp_path / "xyz", 18)
+    for tile in (tmp_path / "xyz" / "18").rglob("*.png"):
+        turned = tmp_path / "zyx" / "18" / tile.stem / f"{tile.parent.name}.png"
+        turned.parent.mkdir(parents=True, exist_ok=True)
+        tile.rename(turned)
+    assert_same_ground(Basemap.open(tmp_path / "zyx", EPSG, AREA), 0.5, tolerance=6.0)
+
+
 def test_mbtiles(tmp_path):
     zoom = 19
     side = 2 * np.pi * 6378137.0 / 2**zoom
@@ -462,9 +471,10 @@ def lacking(folder, zoom, how):
     """Spoil the eastern half of a level."""
     columns = sorted((folder / str(zoom)).iterdir())
     for number, file in enumerate(f for column in columns[len(columns) // 2 :] for f in sorted(column.iterdir())):
-        if how == "placeholders":
+        if how in ("placeholders", "placeholders of their own"):
             sign = np.full((256, 256, 3), 204, np.uint8)
-            cv2.putText(sign, "no data yet", (20, 120), cv2.FONT_HERSHEY_SIMPLEX, 1.0, (90, 90, 90), 2)
+            text = "no data yet" if how == "placeholders" else f"no tile {number}"
+            cv2.putText(sign, text, (20, 120), cv2.FONT_HERSHEY_SIMPLEX, 1.0, (90, 90, 90), 2)
             cv2.imwrite(str(file), sign)
         elif how == "one colour":
             cv2.imwrite(str(file), np.full((256, 256, 3), 100 + number, np.uint8))
@@ -478,7 +488,9 @@ def lacking(folder, zoom, how):
 
 @pytest.mark.parametrize("mbtiles", [False, True])
 @pytest.mark.parametrize("suffix", ["jpg", *(pytest.param(s, marks=pytest.mark.slow) for s in ("png", "webp"))])
-@pytest.mark.parametrize("how", ["placeholders", "one colour", "half downloads", "pages", "none"])
+@pytest.mark.parametrize(
+    "how", ["placeholders", "placeholders of their own", "one colour", "half downloads", "pages", "none"]
+)
 def test_what_the_finest_level_lacks_comes_from_the_others(tmp_path, how, suffix, mbtiles):
     folder = tmp_path / "xyz"
     for zoom in (18, 19):

@@ -1,11 +1,13 @@
 """Maps with files beside them: world file and .aux.xml of a PNG, external masks and overviews."""
 
 import numpy as np
+import pyproj
 import pytest
 import rasterio
 from rasterio.transform import from_origin
 
 from orthoswarm.model.bounding_box import BoundingBox
+from orthoswarm.model.errors import InputError
 from orthoswarm.raster.basemap import Basemap
 from tests.raster.test_basemap import EAST, EPSG, NORTH, expected, picture, write
 
@@ -20,6 +22,18 @@ def test_a_picture_with_a_world_file_is_a_map(tmp_path, suffix):
     driver = {"png": "PNG", "jpg": "JPEG"}[suffix]
     write(path, bands, AFFINE, driver=driver, worldfile=True)
     assert path.with_name(path.name + ".aux.xml").exists()
+    gray, valid = Basemap.open(path, EPSG, AREA).gray(AREA, 0.5)
+    assert valid.all() and np.abs(gray - expected(AREA, 0.5)).mean() < 4.0
+
+
+def test_the_system_of_a_picture_with_a_world_file_comes_from_a_prj_beside_it(tmp_path):
+    path = tmp_path / "map.jpg"
+    write(path, np.repeat(picture(AFFINE, 400, 400)[None], 3, axis=0).round().astype(np.uint8), AFFINE, driver="JPEG",
+          worldfile=True)  # fmt: skip
+    path.with_name(path.name + ".aux.xml").unlink()
+    with pytest.raises(InputError, match="no coordinate system"):
+        Basemap.open(path, EPSG, AREA)
+    path.with_suffix(".prj").write_text(pyproj.CRS.from_epsg(EPSG).to_wkt("WKT1_ESRI"))
     gray, valid = Basemap.open(path, EPSG, AREA).gray(AREA, 0.5)
     assert valid.all() and np.abs(gray - expected(AREA, 0.5)).mean() < 4.0
 

@@ -74,6 +74,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--camera", choices=("wide", "zoom", "thermal"), default="",
         help="which sensor's photos are mapped, of cameras with several (default: the widest in colour)",
     )  # fmt: skip
+    add(
+        "--band", default="", metavar="NAME",
+        help="which spectral band of a multispectral camera is mapped: green, nir, 'red edge' ... (default: colour)",
+    )  # fmt: skip
     add("--split", choices=("legs",), help="treat each straight leg of a flight as a vehicle of its own")
     add("--no-gains", dest="gains", action="store_false", help="leave brightness as it is in each picture")
     add(
@@ -127,6 +131,7 @@ def run(args: argparse.Namespace) -> int:
     from orthoswarm.stores.addresses import is_stored
     from orthoswarm.stores.local_copies import compare_from_now
     from orthoswarm.stores.published_folder import PublishedFolder
+    from telemetry.photos.photo_tags import band_name
 
     compare_from_now()
     _check(args)
@@ -141,6 +146,7 @@ def run(args: argparse.Namespace) -> int:
             cache=out / ".work" / VIDEO,
             exclude=(args.out,),
             camera=args.camera,
+            band=band_name(args.band),
             sei_layouts=tuple(args.sei_layout),
             run=None if pool is None or (args.cluster and drawers is None) else pool.map,
         )

@@ -41,6 +41,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("--bind", metavar="ADDRESS", help="address of HTTP (default 127.0.0.1; any other needs the token)")
     add("--lan", action="store_true", default=None, help="serve other machines: HTTPS, and people with roles")
     add("--open-reading", action="store_true", default=None, help="with --lan: everybody in the network may look")
+    add(
+        "--allow-origin", action="append", default=[], metavar="ORIGIN",
+        help="pages of this origin (https://maps.example) may read tiles, TileJSON, WMTS and /api/layers",
+    )  # fmt: skip
     add("--certificate", type=Path, metavar="FILE", help="with --lan: PEM certificate (default: one is made)")
     add("--key", type=Path, metavar="FILE", help="of that certificate")
     add("--token-file", type=Path, metavar="FILE", help="where the token is, or goes (default: in the workspace)")
@@ -178,7 +182,7 @@ def settings_of(args: argparse.Namespace) -> "Settings":
     flags = {
         "bind": args.bind, "port": args.port, "basemap": args.basemap, "dem": args.dem, "fov_min_deg": args.fov_min,
         "gsd_m": args.gsd, "workers": args.workers, "token_file": args.token_file, "links": tuple(args.link) or None,
-        "tak": tuple(args.tak) or None, "config": config,
+        "tak": tuple(args.tak) or None, "config": config, "allow_origins": tuple(args.allow_origin) or None,
         "lan": args.lan, "open_reading": args.open_reading, "certificate": args.certificate, "key": args.key,
     }  # fmt: skip
     if args.workers is None and settings.workers == 1:
@@ -229,7 +233,9 @@ def serve(settings: "Settings", *, end_with_input: bool = False) -> int:
     url = _url(settings, listener.getsockname()[1])
     encryption = _encryption(settings)
     with Daemon(settings) as daemon, listener:
-        access = Access(take_token(_token_file(settings)), settings.bind, settings.lan, settings.open_reading)
+        origins = frozenset(origin.lower() for origin in settings.allow_origins)
+        token = take_token(_token_file(settings))
+        access = Access(token, settings.bind, settings.lan, settings.open_reading, origins)
         config = uvicorn.Config(
             make_app(daemon, access, url), log_level="warning", access_log=False, server_header=False,
             timeout_graceful_shutdown=3, ws_max_size=1 << 16, lifespan="on", backlog=limits.waiting,

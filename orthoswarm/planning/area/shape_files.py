@@ -2,6 +2,7 @@
 
 GeoJSON has no circles; they come as points with a radius: in geozone files (EUROCAE ED-269, ED-318), or with the
 property `radius_m` or `radius`. A line with `width_m` is a strip. What is none of these is named, never passed over.
+Lengths are metres unless a unit is said, in their text or in a property of its own.
 """
 
 import json
@@ -27,8 +28,17 @@ MOST_CORNERS: Final = 50_000
 number: 13 s for a star of so many, four times that for one of twice as many (measured); a circle of so many is planned
 in a minute."""
 _ROUND_M = 0.2  # a circle's polygon lies so far outside it at most
-_MOST_RADIUS_M = 100_000.0
-_FOOT_M = 0.3048
+_LEAST_M: Final = 1.0  # shorter radii and widths are in another unit, or none
+_MOST_M: Final = 100_000.0
+_UNITS_M: Final = {
+    **dict.fromkeys(("", "m", "meter", "meters", "metre", "metres"), 1.0),
+    **dict.fromkeys(("ft", "foot", "feet"), 0.3048),
+    **dict.fromkeys(("km", "kilometer", "kilometers", "kilometre", "kilometres"), 1000.0),
+    **dict.fromkeys(("nm", "nmi", "nautical miles"), 1852.0),
+}
+SIZES: Final = ("radius_m", "radius", "width_m")
+"""Properties with a size, by their names in lower case; in the first two a point's radius, the last a line's width."""
+_UNIT_NAMES: Final = ("unit", "units", "uom", "uomdimensions", "radius_unit", "radius_units")
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,6 +167,8 @@ def parse_geojson(text: str, name: str = "the GeoJSON file", *, any_size: bool =
         document = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise InputError(f"{name} is not valid JSON ({error}); export it again") from None
+    if isinstance(document, list) and document:  # features, or zones, without the collection around them
+        document = {"features": document}
     zones = isinstance(document, dict) and isinstance(document.get("features", document.get("UASZoneList")), list)
     if not isinstance(document, dict) or not (zones or "type" in document):
         raise InputError(f"{name} is JSON but no GeoJSON (it has no 'type'); export a polygon as GeoJSON")
@@ -166,20 +178,21 @@ def parse_geojson(text: str, name: str = "the GeoJSON file", *, any_size: bool =
     polygons, lines, circles, unused = list[Polygon](), list[Ring](), list[Circle](), Counter[str]()
     try:
         for kind, coordinates, said in _geometries(document, {}):
-            if kind in ("Polygon", "MultiPolygon"):
+            if coordinates == [] and kind in _SHAPES:
+                unused["feature without a shape"] += 1
+            elif kind in ("Polygon", "MultiPolygon"):
                 for part in [coordinates] if kind == "Polygon" else coordinates:
                     shell, *holes = [ring(_lat_lon(r), name) for r in part]
                     polygons.append(Polygon(shell, tuple(holes)))
             elif kind in ("LineString", "MultiLineString"):
                 for part in [coordinates] if kind == "LineString" else coordinates:
                     line = ring(_lat_lon(part), name, 2)
-                    if "width_m" in said:
-                        polygons += _strip(line, said["width_m"], name)
-                    else:
-                        lines.append(line)
-            elif kind == "Point" and "radius_m" in said and coordinates != []:
-                circles.append(_circle(*_lat_lon([coordinates])[0], said["radius_m"], name))
-            elif coordinates != []:
+                    strip = strip_of(line, said, name)
+                    polygons += strip
+                    lines += [] if strip else [line]
+            elif kind == "Point" and (circle := circle_of(*_lat_lon([coordinates])[0], said, name)) is not None:
+                circles.append(circle)
+            else:
                 unused[_NOUNS.get(kind, f"shape of kind '{kind}'")] += 1
     except (TypeError, ValueError, KeyError, IndexError, AttributeError, RecursionError, OverflowError):
         raise InputError(f"{name} is GeoJSON with a broken geometry; export it again") from None
@@ -189,6 +202,7 @@ def parse_geojson(text: str, name: str = "the GeoJSON file", *, any_size: bool =
     return found
 
 
+_SHAPES = ("Polygon", "MultiPolygon", "LineString", "MultiLineString", "Point", "MultiPoint")
 _NOUNS = {"Point": "point", "MultiPoint": "group of points", "": "feature without a shape"}
 
 
@@ -198,28 +212,52 @@ def counted(nouns: Mapping[str, int]) -> tuple[str, ...]:
     return tuple(f"{n} {head}s{gap}{rest}" if n > 1 else f"a {head}{gap}{rest}" for n, head, gap, rest in words)
 
 
-def _circle(lat: float, lon: float, radius: Any, name: str) -> Circle:
-    """A circle, checked."""
-    radius_m = float(radius)
-    if not 0.0 < radius_m <= _MOST_RADIUS_M:
-        raise InputError(f"{name} has a circle with a radius of {radius_m:g} m; correct it")
+def circle_of(lat: float, lon: float, said: Mapping[str, Any], name: str) -> Circle | None:
+    """The circle around a point, by its properties (names in lower case); None if they state no radius.
+
+    Raises:
+        InputError: none that a zone can have, or in an unknown unit.
+    """
+    radius = said.get("radius_m", said.get("radius"))
+    if radius is None:
+        return None
     ring([(lat, lon)], name, 1)
-    return Circle(lat, lon, radius_m)
+    return Circle(lat, lon, _metres(radius, said, f"{name} has a circle with a radius"))
 
 
-def _strip(line: Ring, width: Any, name: str) -> Iterator[Polygon]:
-    """The ground within half a width of a line."""
-    width_m = float(width)
-    if not 0.0 < width_m <= _MOST_RADIUS_M:
-        raise InputError(f"{name} has a line with a width of {width_m:g} m; correct it")
+def strip_of(line: Ring, said: Mapping[str, Any], name: str) -> list[Polygon]:
+    """The ground within half a width of a line, by its properties; nothing if they state no width.
+
+    Raises:
+        InputError: none that a zone can have, or in an unknown unit.
+    """
+    if said.get("width_m") is None:
+        return []
+    width_m = _metres(said["width_m"], said, f"{name} has a line with a width")
     grid = LocalGrid(area_epsg(line[:, 0], line[:, 1]))
+    strips = list[Polygon]()
     for part in shapely.get_parts(shapely.LineString(grid.to_grid(*line.T)).buffer(0.5 * width_m)):
-        rings = [grid.to_geographic(np.array(r.coords)[:-1]) for r in (part.exterior, *part.interiors)]
-        yield Polygon(rings[0], tuple(rings[1:]))
+        shell, *holes = [grid.to_geographic(np.array(r.coords)[:-1]) for r in (part.exterior, *part.interiors)]
+        strips.append(Polygon(shell, tuple(holes)))
+    return strips
+
+
+def _metres(size: Any, said: Mapping[str, Any], of_what: str) -> float:
+    """A radius or width in metres, with its unit in its text or in another property."""
+    match = re.fullmatch(r"\s*([-+.\deE]+)\s*([A-Za-z ]*)", str(size))
+    if match is None:
+        raise InputError(f"{of_what} of '{str(size)[:20]}'; write a number of metres")
+    unit = match[2].strip() or next((str(said[key]) for key in _UNIT_NAMES if said.get(key)), "")
+    if unit.lower() not in _UNITS_M:
+        raise InputError(f"{of_what} in '{unit[:20]}', which is no unit that is known; write it in metres")
+    metres = float(match[1]) * _UNITS_M[unit.lower()]
+    if not _LEAST_M <= metres <= _MOST_M:
+        raise InputError(f"{of_what} of {metres:g} m; correct it, or its unit")
+    return metres
 
 
 def _geometries(node: Mapping[str, Any], said: Mapping[str, Any]) -> Iterator[tuple[str, Any, Mapping[str, Any]]]:
-    """Kind, coordinates, and the radius or width that is said, of each geometry; kind "" where there is none."""
+    """Kind, coordinates and properties (names in lower case) of each geometry; kind "" where there is none."""
     kind = node.get("type")
     zones = node.get("features", node.get("UASZoneList"))
     if isinstance(zones, list):
@@ -227,15 +265,13 @@ def _geometries(node: Mapping[str, Any], said: Mapping[str, Any]) -> Iterator[tu
             yield from _geometries(feature, {})
     elif isinstance(node.get("geometry"), list):  # a zone of ED-269: volumes
         for volume in node["geometry"]:
-            flat, unit = volume["horizontalProjection"], _FOOT_M if volume.get("uomDimensions") == "FT" else 1.0
+            flat = volume["horizontalProjection"]
             if flat["type"] == "Circle":
-                yield "Point", flat["center"], {"radius_m": unit * float(flat["radius"])}
+                yield "Point", flat["center"], {"radius": flat["radius"], "uom": volume.get("uomDimensions")}
             else:
                 yield str(flat["type"]), flat["coordinates"], {}
     elif kind == "Feature":
-        values = node.get("properties") or {}
-        radius = values.get("radius_m", values.get("radius"))
-        said = ({} if radius is None else {"radius_m": radius}) | {k: values[k] for k in ("width_m",) if k in values}
+        said = {str(key).lower(): value for key, value in (node.get("properties") or {}).items()}
         yield from _geometries(node["geometry"], said) if node["geometry"] is not None else [("", None, said)]
     elif kind == "GeometryCollection":
         for geometry in node["geometries"]:
@@ -243,7 +279,7 @@ def _geometries(node: Mapping[str, Any], said: Mapping[str, Any]) -> Iterator[tu
     else:
         extent = node.get("extent") or {}  # ED-318
         if extent.get("subType") == "Circle":
-            said = {"radius_m": extent["radius"]}
+            said = {str(key).lower(): value for key, value in extent.items()}
         yield str(node["type"]), node["coordinates"], said
 
 
@@ -258,7 +294,7 @@ def parse_kml(text: str | bytes, name: str = "the KML file", *, any_size: bool =
         InputError: no XML, no KML, or coordinates that are not longitude and latitude.
     """
     try:
-        root = ElementTree.fromstring(_with_name_spaces(text))
+        root = ElementTree.fromstring(_mended(text))
     except (ElementTree.ParseError, ValueError) as error:
         raise InputError(f"{name} is not valid XML ({error}); export it again") from None
     if _tag(root).lower().startswith("aixm"):
@@ -272,7 +308,7 @@ def parse_kml(text: str | bytes, name: str = "the KML file", *, any_size: bool =
     waiting = [(root, True)]
     while waiting:  # in the file's order, without recursion: depths are a stranger's
         node, shown = waiting.pop()
-        shown = shown and not any(_tag(n) == "visibility" and (n.text or "").strip() == "0" for n in node)
+        shown = shown and not any(_tag(n) == "visibility" and (n.text or "").strip() in ("0", "false") for n in node)
         if _tag(node) == "Polygon":
             outer = _coordinates(node, "outerBoundaryIs")
             if not outer:
@@ -299,10 +335,11 @@ _KML_NOUNS = {
 }  # fmt: skip
 
 
-def _with_name_spaces(text: str | bytes) -> str | bytes:
-    """XML with prefixes that nobody declared declared, as Google Earth reads it."""
+def _mended(text: str | bytes) -> str | bytes:
+    """XML as Google Earth reads it: blanks around it, a bare "&" in names, and prefixes that nobody declared."""
     if isinstance(text, bytes):
         return text
+    text = re.sub(r"&(?!(#\d+|#x[0-9A-Fa-f]+|amp|lt|gt|quot|apos);)", "&amp;", text.strip(" \t\r\n\0"))
     used = set(re.findall(r"[<\s]/?([A-Za-z_][\w.-]*):[A-Za-z_]", re.sub(r">[^<]*<", "><", text))) - {"xml", "xmlns"}
     missing = sorted(prefix for prefix in used if f"xmlns:{prefix}" not in text)
     declared = "".join(f' xmlns:{prefix}="urn:undeclared:{prefix}"' for prefix in missing)
@@ -324,7 +361,7 @@ def _coordinates(node: ElementTree.Element, boundary: str | None = None) -> list
 
 def _numbers(text: str, name: str) -> list[tuple[float, float]]:
     try:
-        tuples = [t.split(",") for t in text.split()]
+        tuples = [t.split(",") for t in re.sub(r"\s*,\s*", ",", text).split()]
         return [(float(t[1]), float(t[0])) for t in tuples]
     except (ValueError, IndexError):
         raise InputError(f"{name} has KML coordinates that are not 'lon,lat[,alt]'; export it again") from None

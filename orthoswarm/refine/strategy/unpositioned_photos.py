@@ -32,6 +32,13 @@ width: tilts of three degrees at a field of view of 60."""
 _FREE_MOST_PAIRS: Final = 40_000  # most pairs tried where nothing tells overlaps: 280 photos, two minutes of CPU
 
 
+_MOVED_SHARE: Final = 0.1
+"""Pictures that shift by more of their width from one to the next were not taken at one spot: that is 14 % of the
+height or so, and vehicles count as hovering up to 5 %."""
+_MOVED_PAIRS: Final = (3, 12)  # fewest pairs that show it, and most that are matched (time)
+_LEVEL_PITCH_RAD: Final = -1.05  # a camera that looks farther ahead may turn at its spot
+
+
 class PlacedPhotos(NamedTuple):
     """Photos with the positions that were found, and images that show ground in common but could not be placed."""
 
@@ -78,6 +85,29 @@ def place_unpositioned(
     source = SURVEYED if points else BY_OTHERS
     told = {"position": source, "height": source, "angles": source}
     return PlacedPhotos([replace(frame, origin={**frame.origin, **told}) for frame in found], left)
+
+
+def pictures_moved(photos: Sequence[Frame], *, read_gray: ReadGray, run: Run) -> bool:
+    """Whether a vehicle's photos, in order of time and all recorded at one spot, show that it flew on meanwhile."""
+    pitch = [frame.fix.pitch_rad for frame in photos if frame.fix.pitch_rad is not None]
+    if pitch and float(np.median(pitch)) > _LEVEL_PITCH_RAD:
+        return False
+    fewest, most = _MOVED_PAIRS
+    frames = list(photos[: most + 1])
+    grid = LocalGrid(area_epsg([frames[0].fix.lat_deg], [frames[0].fix.lon_deg]))
+    origin = grid.to_grid(frames[0].fix.lat_deg, frames[0].fix.lon_deg)
+    records = read_photo_records(frames, grid, origin)
+    builder = PairGraphBuilder(frames=frames, records=records, read_gray=read_gray, run=run, progress=None)
+    builder.detect_all()
+    builder.try_pairs(np.column_stack([np.arange(len(frames) - 1), np.arange(1, len(frames))]).astype(np.int32))
+    pairs = builder.pairs()
+    if len(pairs) < fewest:
+        return False
+    matches = PairMatches.of(pairs, builder.features)
+    graph = similarities(matches, records, shape_of(matches, records, *focal_by_hint(records)))
+    turn = graph.factor / np.abs(graph.factor)
+    shift = np.abs(graph.centre_first - np.conj(turn) * graph.centre_second) / records.width[graph.first]
+    return len(shift) >= fewest and bool(np.median(shift) > _MOVED_SHARE)
 
 
 def _each_its_own_tilt(records: PhotoRecords, without: int) -> PhotoRecords:

@@ -11,7 +11,7 @@ Angles of 0 0 0 stand for unknown ones. Source: OpenDroneMap's documentation, "I
 import math
 from pathlib import Path
 
-from orthoswarm.model.coordinate_system import projection_of, to_degrees
+from orthoswarm.model.coordinate_system import metres_of_heights, projection_of, share_in_area, to_degrees
 from orthoswarm.model.errors import InputError
 from telemetry.formats.table.pose_table import PoseTable, as_path, decoded, pitch_by_value, read_text, words_of_name
 from telemetry.samples.sample import Sample, is_position
@@ -67,13 +67,25 @@ def to_geographic(table: PoseTable, projection: str, path: Path) -> None:
     """Turn coordinates of a projection (x in lon_deg, y in lat_deg) into degrees; impossible ones become None.
 
     Raises:
-        InputError: the projection is not understood, or has no datum.
+        InputError: the projection is not understood or has no datum, or the coordinates are exchanged.
     """
     x_y = [[math.nan if v is None else v for v in (r.lon_deg, r.lat_deg)] for r in table.values()]
+    x, y = [x for x, _ in x_y], [y for _, y in x_y]
     try:
-        places, table.doubt = to_degrees(projection, [x for x, _ in x_y], [y for _, y in x_y])
+        places, table.doubt = to_degrees(projection, x, y)
+        there = share_in_area(projection, x, y) > 0.0
+        exchanged = not there and share_in_area(projection, y, x) > 0.5
     except InputError as error:
         raise InputError(f"{path.name}: {error}") from None
+    if exchanged:
+        raise InputError(
+            f"{path.name} has its two coordinates exchanged; in '{projection[:60]}' east or longitude comes first"
+        )
+    if not there:
+        table.doubt = f"its places lie far from where '{projection[:60]}' is used; check the coordinate system"
+    height = metres_of_heights(projection)
+    for row in table.values():
+        row.altitude_m = None if row.altitude_m is None else height * row.altitude_m
     for row, (x, y) in zip(table.values(), places, strict=True):
         if is_position(y, x):
             row.lon_deg, row.lat_deg = float(x), float(y)

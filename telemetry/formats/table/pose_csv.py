@@ -37,12 +37,15 @@ from telemetry.samples.unreadable import beginning
 
 _HEAD_BYTES = 1 << 14
 _NAMES = {
-    "image": "image imagename image_name filename file_name file name photo photo_name label sourcefile photoid",
-    "lat_deg": "lat_deg lat latitude y/latitude latitude/y gpslatitude",
-    "lon_deg": "lon_deg lon lng long longitude x/longitude longitude/x gpslongitude",
-    "x": "x x/easting x/east easting",
-    "y": "y y/northing y/north northing",
-    "altitude_m": "altitude_m alt_m altitude alt z z/altitude height/z gpsaltitude ellipsoidal_height",
+    "image": "image imagename image_name filename file_name file name photo photo_name label sourcefile photoid "
+    "bild bildname foto datei dateiname fichier nom_fichier imagen archivo",
+    "lat_deg": "lat_deg lat latitude y/latitude latitude/y gpslatitude breite breitengrad latitud",
+    "lon_deg": "lon_deg lon lng long longitude x/longitude longitude/x gpslongitude "
+    "l\u00e4nge laenge l\u00e4ngengrad laengengrad longitud",
+    "x": "x x/easting x/east easting rechtswert ostwert",
+    "y": "y y/northing y/north northing hochwert nordwert",
+    "altitude_m": "altitude_m alt_m altitude alt z z/altitude height/z gpsaltitude ellipsoidal_height "
+    "h\u00f6he hoehe altitud elevation",
     "height_m": "height_m relativealtitude height_agl agl",
     "yaw_deg": "yaw_deg yaw gimbalyawdegree heading",
     "pitch_deg": "pitch_deg pitch gimbalpitchdegree",

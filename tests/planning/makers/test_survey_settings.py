@@ -46,6 +46,13 @@ def test_a_survey_says_how_it_is_flown():
     assert height_m * (1.0 - values["forward_overlap"]) == pytest.approx(CAMERA["AdjustedFootprintFrontal"], rel=2e-3)
 
 
+@pytest.mark.parametrize(("kind", "told"), [(1, True), (22, True), (2, False), (13, False), (0, False)])
+def test_that_a_survey_is_for_a_fixed_wing_or_vtol_is_told(kind, told):
+    document = surveyed()
+    document["mission"]["vehicleType"] = kind
+    assert any("does not hover" in text for text in settings_of(document)[1]) == told
+
+
 def test_an_upright_camera_lies_across_by_its_height():
     values, _ = settings_of(surveyed({"Landscape": False}))
     assert values["aspect"] == pytest.approx(3040 / 4056, abs=1e-4)

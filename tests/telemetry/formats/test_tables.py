@@ -114,10 +114,41 @@ def test_coordinates_without_a_projection_are_named_and_a_prj_beside_them_is_rea
     assert (frame.fix.lat_deg, frame.fix.lon_deg) == pytest.approx((47.5, 8.25), abs=1e-6)
 
 
-def test_a_table_of_pictures_that_nobody_knows_is_named(tmp_path):
+def test_a_table_of_pictures_that_nobody_knows_is_named_and_a_warning_where_photos_have_no_position(tmp_path):
     jpeg(tmp_path / "a.JPG")
     (tmp_path / "notes.csv").write_text("photo;operator;battery\na.JPG;Ann;80\n")
-    assert any(f.code == "table-unknown" and "notes.csv" in f.message for f in survey([tmp_path]).findings)
+    (finding,) = [f for f in survey([tmp_path]).findings if f.code == "table-unknown"]
+    assert "notes.csv" in finding.message and not finding.note
+    (tmp_path / "geo.txt").write_text("EPSG:4326\na.JPG 8.25 47.5\n")
+    (finding,) = [f for f in survey([tmp_path]).findings if f.code == "table-unknown"]
+    assert finding.note
+
+
+@pytest.mark.parametrize(
+    ("system", "place", "words"),
+    [
+        ("EPSG:4326", "47.5 128.25", "exchanged"),
+        ("EPSG:32632", "5261002.307 443515.066", "exchanged"),
+        ("EPSG:2193", "443515.066 5261002.307", "far from where 'EPSG:2193' is used"),
+        ("EPSG:32632", "443515.066 5261002.307", ""),
+    ],
+)
+def test_coordinates_beside_the_area_of_their_system_are_told(tmp_path, system, place, words):
+    jpeg(tmp_path / "a.JPG")
+    (tmp_path / "geo.txt").write_text(f"{system}\na.JPG {place} 90\n")
+    warnings = load([tmp_path]).warnings
+    assert any(words in warning for warning in warnings) if words else not any("geo.txt" in w for w in warnings)
+
+
+def test_heights_of_a_vertical_system_in_feet_are_metres(tmp_path):
+    (tmp_path / "geo.txt").write_text("EPSG:32632+6360\na.JPG 443515.066 5261002.307 1000\n")
+    assert read_geo_txt(tmp_path / "geo.txt")["a.jpg"].altitude_m == pytest.approx(304.8006)
+
+
+def test_titles_and_decimal_commas_of_other_languages_are_read(tmp_path):
+    (tmp_path / "a.csv").write_text("Bild;Breite;L\u00e4nge;H\u00f6he\na.JPG;47,5;8,25;250,5\n", encoding="cp1252")
+    table = read_pose_csv(tmp_path / "a.csv")
+    assert (table["a.jpg"].place, table["a.jpg"].altitude_m) == ((47.5, 8.25), 250.5)
 
 
 @given(st.floats(-179, 179), st.floats(-160, -20), st.floats(-30, 30))

@@ -56,6 +56,19 @@ def test_where_nothing_tells_which_place_is_right_that_is_said(tmp_path):
     assert any("nothing tells which is right: give a geo.txt" in warning for warning in ingest.warnings)
 
 
+@pytest.mark.parametrize(("stated", "altitude"), [("+1250.0", 250.0), ("-250.0", -250.0), ("+251.0", 250.0)])
+def test_two_altitudes_of_one_photo_are_told(tmp_path, stated, altitude):
+    tags = Image.Exif()
+    tags.load(gps_exif())
+    tags.get_ifd(0x8825)[6] = 250.0
+    packet = f'<x:xmpmeta><a drone-dji:AbsoluteAltitude="{stated}"/></x:xmpmeta>'.encode()
+    jpeg(tmp_path / "a.jpg", xmp_packet=packet, exif_bytes=tags.tobytes())
+    ingest = load([tmp_path])
+    assert ingest.frames[0].fix.altitude_m == altitude  # the number that states its sign counts
+    told = any("state two altitudes" in warning for warning in ingest.warnings)
+    assert told == (stated != "+251.0")
+
+
 @pytest.mark.parametrize("signs", [(-1.0, -1.0, -1.0), (-1.0, 1.0, 1.0), (1.0, 1.0, 1.0)])
 def test_degrees_minutes_and_seconds_may_all_have_a_sign(signs):
     west = tuple(sign * value for sign, value in zip(signs, (123.0, 4.0, 8.22), strict=True))

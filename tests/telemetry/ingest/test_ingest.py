@@ -201,8 +201,8 @@ def test_geo_txt_without_projection_is_a_warning_that_says_what_to_do(tmp_path):
 
 
 def test_lines_of_a_table_that_say_nothing_are_named(tmp_path):
-    for name in ("a.jpg", "b.jpg", "c.jpg"):
-        photo(tmp_path / name)
+    for k, name in enumerate(("a.jpg", "b.jpg", "c.jpg")):
+        photo(tmp_path / name, second=k)
     (tmp_path / "geo.txt").write_text("EPSG:4326\na.jpg nan 47.5\nb.jpg 8.2 95.0\nc.jpg 8.2\nd.jpg 8.2 47.5\n")
     findings = {f.code: str(f) for source in survey([tmp_path]).sources for f in source.findings}
     assert "3 lines of geo.txt" in findings["table-lines"]

@@ -39,10 +39,10 @@ def jpeg(path: Path, *, xmp_packet: bytes = b"", exif_bytes: bytes = b"", size=(
 
 
 def gps_exif(
-    lat=47.5, lon=8.25, *, local="2024:05:06 12:00:01", subsec="250", offset=None, gps_utc=None, make="DJI"
+    lat=47.5, lon=8.25, *, local="2024:05:06 12:00:01", subsec="250", offset=None, gps_utc=None, make="DJI", model="FC1"
 ) -> bytes:
     tags = Image.Exif()
-    tags[0x010F], tags[0x0110] = make, "FC1"
+    tags[0x010F], tags[0x0110] = make, model
     inner = tags.get_ifd(0x8769)
     inner[0x9003], inner[0x9291] = local, subsec
     inner[0xA405] = 24
@@ -170,7 +170,7 @@ def test_attitude_height_and_accuracy_are_read_as_each_maker_writes_them(tmp_pat
     assert photo.camera_deg == pytest.approx(angles)
     assert (photo.height_m, photo.height_is_ground) == height
     assert photo.position_sigma_m == sigma
-    assert photo.band == ("Green" if maker == "micasense" else "")
+    assert photo.band == ("green" if maker == "micasense" else "")
 
 
 def test_position_comes_from_xmp_where_exif_has_none(tmp_path):

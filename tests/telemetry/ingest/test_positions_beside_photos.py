@@ -137,7 +137,7 @@ def test_xmp_beside_photos_is_read(tmp_path, named):
 
 def test_xmp_within_photos_is_read(tmp_path):
     folder = photos(tmp_path / "card", xmp_packet=PACKET.format("44,3,21.6N", "123,4,12W").encode())
-    frames = load([folder]).frames
+    frames = load([folder / "P_0.JPG"]).frames
     assert frames[0].fix.lat_deg == pytest.approx(44.056) and frames[0].fix.lon_deg == pytest.approx(-123.07)
 
 

@@ -3,6 +3,7 @@
 import shutil
 
 import pytest
+from PIL import Image
 
 from telemetry import load
 from tests.telemetry.ingest.test_photos import gps_exif, jpeg
@@ -39,7 +40,7 @@ def left_out(folder):
     return {r.image: r.text for r in found.rejected}, found
 
 
-@pytest.mark.parametrize("name", ["{} (1)", "{}(2)", "{} - Copy", "{}_copy", "Kopie von {}"])
+@pytest.mark.parametrize("name", ["{} (1)", "{}(2)", "{} - Copy", "{}_copy", "Kopie von {}", "north of {}"])
 def test_copies_within_a_folder_count_once(tmp_path, name):
     photos = flight(tmp_path / "card")
     for photo in photos[3:5]:
@@ -47,6 +48,35 @@ def test_copies_within_a_folder_count_once(tmp_path, name):
     reasons, found = left_out(tmp_path / "card")
     assert {f.image for f in found.frames} == {photo.name for photo in photos}
     assert set(reasons.values()) == {f"a copy of another photo in its folder (DJI_000{k}.JPG)" for k in (3, 4)}
+
+
+def test_an_equal_file_under_an_unrelated_name_counts_once(tmp_path):
+    photos = flight(tmp_path / "card")
+    shutil.copy(photos[3], tmp_path / "card" / "best.JPG")
+    reasons, found = left_out(tmp_path / "card")
+    assert reasons == {"best.JPG": "a copy of another photo in its folder (DJI_0003.JPG)"} and len(found.frames) == 24
+
+
+@pytest.mark.parametrize("name", ["{}_edited.JPG", "{}.tif", "{}.JPEG"])
+@pytest.mark.parametrize("tagged", [True, False])
+def test_other_files_of_an_exposure_are_left_out(tmp_path, name, tagged):
+    photos = flight(tmp_path / "card")
+    for photo in photos[3:5]:
+        with Image.open(photo) as picture:
+            exif = {"exif": picture.getexif()} if tagged else {}
+            picture.convert("RGB").save(photo.with_name(name.format(photo.stem)), **exif)
+    reasons, found = left_out(tmp_path / "card")
+    assert {f.image for f in found.frames} == {photo.name for photo in photos}
+    assert len(reasons) == 2 and not found.unpositioned
+
+
+def test_thumbnails_in_folders_of_their_own_are_left_out(tmp_path):
+    flight(tmp_path / "card")
+    flight(tmp_path / "card" / "thumbnails", size=(32, 24))
+    flight(tmp_path / "card" / "@eaDir")
+    reasons, found = left_out(tmp_path / "card")
+    assert {f.image for f in found.frames} == {f"DJI_{k:04d}.JPG" for k in range(24)}
+    assert reasons["thumbnails/DJI_0003.JPG"].startswith("a smaller picture of the same exposure as one in another")
 
 
 def test_copies_without_tags_are_told_by_their_names_and_equal_pictures_are_none(tmp_path):

@@ -67,6 +67,14 @@ def test_a_turn_that_nobody_saw_is_within_the_stated_sigma():
     assert (off_m(found, truth) < 2.0 * found.sigma_m).all()
 
 
+def test_a_receiver_that_measures_seldom_has_places_between_its_fixes():
+    truth = flown()
+    track = truth[np.arange(100) // 3 * 3]  # six seconds each
+    found = held(track)
+    assert found.index == [k for k in range(100) if k % 3]
+    assert off_m(found, truth)[:-2].max() < 2.0
+
+
 @given(seed=st.integers(0, 50), first=st.integers(5, 80), count=st.integers(3, 12), exact=st.booleans())
 def test_standing_is_no_held_fix(seed, first, count, exact):
     """The vehicle stops for a while, its receiver wanders or says the same to the last digit; then it flies on."""
@@ -231,6 +239,31 @@ def test_a_flight_that_tells_one_place_to_the_last_digit_has_none(tmp_path):
     found = load([tmp_path])
     assert not found.frames and len(found.unpositioned) == 6
     assert any("all 6 photos tell one place to the last digit" in w for w in found.warnings)
+
+
+def test_all_but_a_few_at_one_place_have_none(tmp_path):
+    for k in range(20):
+        photo(tmp_path / f"p{k:02d}.JPG", 47.5012345 if k < 18 else 47.5012345 + 3e-4 * k, 8.25, 2 * k)
+    found = load([tmp_path])
+    assert [frame.image for frame in found.frames] == ["p18.JPG", "p19.JPG"]
+    assert any("18 of 20 photos tell one place" in warning for warning in found.warnings)
+
+
+@pytest.mark.parametrize(("steps", "step_m"), [(1000, 111.2), (3600, 30.9)])
+def test_coarse_coordinates_are_told_and_their_sigma_says_so(tmp_path, steps, step_m):
+    for k in range(12):
+        lat, lon = 47.5 + 3e-4 * k, 8.25 + 1e-3 * (k % 5)
+        photo(tmp_path / f"p{k:02d}.JPG", round(lat * steps) / steps, round(lon * steps) / steps, 4 * k)
+    found = load([tmp_path])
+    sigma = [frame.fix.position_sigma_m for frame in found.frames]
+    assert sigma == pytest.approx([np.hypot(1.5, step_m / np.sqrt(12.0))] * len(sigma), rel=0.02)
+    assert any("written in steps of" in warning for warning in found.warnings)
+
+
+def test_photos_at_one_place_in_coarse_coordinates_have_none(tmp_path):
+    for k in range(12):
+        photo(tmp_path / f"p{k:02d}.JPG", 47.5, 8.25, 4 * k)
+    assert not load([tmp_path]).frames
 
 
 def test_frames_that_came_live_are_refined_from_where_they_flew(tmp_path):
