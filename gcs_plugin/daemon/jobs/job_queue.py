@@ -318,7 +318,7 @@ def _lane(job: Job) -> tuple[str, str | None]:
 
 
 class JobRequests:
-    """Asks for jobs; coarse: in flight, too. basemap: there is one, with which the products are compared once they are written."""
+    """Asks for jobs; coarse: in flight, too. basemap: there is one, with which written products are compared."""
 
     def __init__(self, journal: Journal, jobs: Jobs, *, coarse: bool, basemap: bool) -> None:
         self._journal, self._jobs, self._coarse, self._basemap = journal, jobs, coarse, basemap

@@ -46,7 +46,7 @@ def test_a_comparison_is_asked_for_once_new_products_are_written_and_only_with_a
     for compare in (True, False):
         journal, events = Journal(tmp_path / f"{compare}.db"), Events()
         jobs = Jobs(journal, events, {}, WorkerPool(1), WorkerPool(1))
-        requests = JobRequests(journal, jobs, coarse=False, compare=compare)
+        requests = JobRequests(journal, jobs, coarse=False, basemap=compare)
         for detail in ({"after": "all"}, {"after": "all", "note": "the last one has everything"}, {}):
             job = jobs.add("export", formats=["cog"], **detail)
             job.state, job.detail = "done", {"formats": ["cog"], **detail}
