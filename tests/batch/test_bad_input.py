@@ -354,7 +354,8 @@ def test_names_that_are_no_text_and_files_that_are_no_files(scene, tmp_path, mos
         expected.add("pipe.JPG")
     try:
         (photos / os.fsdecode(b"caf\xe9.JPG")).write_bytes(shot)
-        expected.add("caf\\udce9.JPG")
+        files[2].unlink()  # of which that would be a copy
+        expected = expected - {files[2].name} | {"caf\\udce9.JPG"}
     except OSError:  # not every file system takes such a name
         pass
     code, rows, _, _ = mosaic(photos, photos, until="realtime")
