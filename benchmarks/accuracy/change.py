@@ -11,7 +11,8 @@ twin's disaster struck; haze has changed nothing. A line a set and map: average 
 more that were found (a quarter of their cells at least); the share of unchanged ground that is called changed at
 p = 0.5, and such objects a square kilometre; how far the changed ground's outline lies from the true one (median); the
 share that is really changed of cells stated at 0 to 20 %, ... 80 to 100 %. `fit` takes sets of other seeds than those
-that are measured.
+that are measured. `draw SET:EAST,NORTH,SIDE ... --out FILE.jpg` puts before, after, what was found (by `orthoswarm
+change SET/out --out SET/out`) and the truth side by side, of places in metres from the middle of the map.
 """
 
 import argparse
@@ -32,6 +33,7 @@ from orthoswarm.change import likelihood
 from orthoswarm.change.change_map import cells_of, map_change, measured_blocks
 from orthoswarm.change.changed_objects import LEAST_M2, find_objects
 from orthoswarm.change.of_folder import WANT_M, scene_of
+from orthoswarm.change.overlay import overlay_pixels
 from orthoswarm.coverage.map_folder import read_map
 
 LARGE_M2 = 100.0
@@ -184,18 +186,66 @@ def fit(folders, kinds, target):
     np.savez_compressed(target, mean=mean, spread=spread, first=layers[0], second=layers[1])
 
 
+PX = 260
+TRUE = (0, 190, 255)
+
+
+def window(path, bounds, bands):
+    """A part of a raster, PX square."""
+    with rasterio.open(path) as file:
+        part = rasterio.windows.from_bounds(*bounds, file.transform)
+        data = file.read(bands, window=part, boundless=True, fill_value=0)
+    return cv2.resize(np.moveaxis(data, 0, 2), (PX, PX), interpolation=cv2.INTER_AREA)
+
+
+def row(text):
+    """The four pictures of a part."""
+    name, _, place = text.rpartition(":")
+    folder, (east, north, side) = Path(name), (float(v) for v in place.split(","))
+    with rasterio.open(folder / "out" / "change.tif") as file:
+        box = file.bounds
+    east, north = east + (box.left + box.right) / 2, north + (box.bottom + box.top) / 2
+    bounds = (east - side / 2, north - side / 2, east + side / 2, north + side / 2)
+    before = window(folder / "basemap.tif", bounds, (1, 2, 3))
+    after = window(folder / "out" / "orthoimage.tif", bounds, (1, 2, 3))
+    paint, _ = overlay_pixels(folder / "out", 0.5, bounds, (PX, PX))
+    share = paint[..., 3:] / 255.0
+    shown = np.round(after * (1 - share) + paint[..., :3] * share).astype(np.uint8)
+    real = after.copy()
+    truth = folder / "truth" / "disaster_mask.tif"
+    if truth.exists():
+        mask = (window(truth, bounds, [1]).reshape(PX, PX) > 127).astype(np.uint8)
+        outlines, _ = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+        cv2.drawContours(real, outlines, -1, TRUE, 2)
+    gap = np.full((PX, 6, 3), 255, np.uint8)
+    return np.hstack([before, gap, after, gap, shown, gap, real])
+
+
+def draw(parts, target):
+    """Write the pictures of all parts, one below the other."""
+    rows = [row(part) for part in parts]
+    gap = np.full((6, rows[0].shape[1], 3), 255, np.uint8)
+    picture = np.vstack([part for one in rows for part in (one, gap)][:-1])
+    cv2.imwrite(str(target), picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 70])
+
+
 def main() -> None:
-    """Measure or fit."""
+    """Measure, fit or draw."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("measure", "fit"))
-    parser.add_argument("sets", nargs="+", type=Path)
+    parser.add_argument("what", choices=("measure", "fit", "draw"))
+    parser.add_argument("sets", nargs="+", metavar="SET")
     parser.add_argument("--maps", nargs="+", choices=MAPS, default=None)
     parser.add_argument("--weights", type=Path, default=Path(likelihood.__file__).with_name("weights.npz"))
+    parser.add_argument("--out", type=Path, default=Path("change.jpg"))
     args = parser.parse_args()
-    if args.what == "fit":
-        fit(args.sets, args.maps or ["same", "season", "darker", "all detail", "3 m"], args.weights)
+    if args.what == "draw":
+        draw(args.sets, args.out)
         return
-    for folder in args.sets:
+    folders = [Path(name) for name in args.sets]
+    if args.what == "fit":
+        fit(folders, args.maps or ["same", "season", "darker", "all detail", "3 m"], args.weights)
+        return
+    for folder in folders:
         for kind in args.maps or MAPS:
             print(json.dumps(measure(folder, kind)), flush=True)
 

@@ -50,6 +50,10 @@ class GroundChanges:
         if basemap is None or not (workspace / "orthoimage.tif").exists():
             run.job.detail["note"] = "nothing is refined on a basemap"
             return no_change
+        compared = workspace / FIGURES
+        if compared.exists() and compared.stat().st_mtime_ns >= (workspace / "orthoimage.tif").stat().st_mtime_ns:
+            run.job.detail["note"] = "the last one has everything"
+            return no_change
         run.report(0.1, "comparing with the basemap")
         pictures = {
             (writable(row.vehicle), writable(row.image)): self._store.path(row.path)

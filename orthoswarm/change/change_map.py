@@ -28,6 +28,7 @@ _SCENE_CELLS: Final = 1_000_000  # of the whole scene, on which its tones are co
 _APART: Final = 0.25  # distance of the pictures that are used, in heights above the ground: four see each place
 _THICK: Final = 0.6  # share of haze that hides the ground
 _SEEN: Final = 0.5  # share of a cell that pictures must see
+_RIM_M: Final = 3.0  # along the edges of the map's data there are edges that the ground does not have
 _DISTORTED_PX: Final = 1.0  # offsets of the map below this are those of what leans, not of the map
 
 
@@ -152,6 +153,8 @@ def _measured_block(
     fine, known = scene.basemap.rgb(BoundingBox(*own.bounds), cell / FINE)
     gray = on_cells(cv2.cvtColor(fine, cv2.COLOR_RGB2GRAY), FINE // per_cell).astype(np.float32)
     valid = on_cells(known.astype(np.float32), FINE // per_cell) > _SEEN
+    rim = 2 * int(np.ceil(_RIM_M / pixels.gsd_m)) + 1
+    valid = cv2.erode(valid.astype(np.uint8), np.ones((rim, rim), np.uint8), borderValue=1) > 0
     before = structure(gray, pixels.gsd_m)
     offset = local_offsets(before.field, seen.field)
     if float(np.abs(offset).max()) > _DISTORTED_PX:

@@ -13,7 +13,7 @@ import numpy as np
 
 from orthoswarm.change.structure import structure
 from orthoswarm.coverage.view import View
-from orthoswarm.model.arrays import Array, Bytes, Flags, Floats
+from orthoswarm.model.arrays import Array, Bytes, Floats
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import Terrain
 
@@ -41,11 +41,6 @@ class SeenGround:
     contrast: Floats
     weight: Floats
     same: Floats
-
-    @property
-    def seen(self) -> Flags:
-        """Where any picture sees the ground."""
-        return np.asarray(self.weight > 1e-3)
 
 
 def heights_on(grid: GroundGrid, terrain: Terrain, of: Floats) -> Floats:

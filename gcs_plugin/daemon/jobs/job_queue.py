@@ -54,6 +54,7 @@ _BACKGROUND: Final = frozenset({"coarse", "together", "tones", "redraw", "export
 _AFTER_REFINEMENT: Final = _BACKGROUND - {"redraw"}
 """An export that was asked for during a refinement holds its result."""
 _GIVES_WAY: Final = _AFTER_REFINEMENT - {"export"}
+_CHANGE_PRODUCTS: Final = ("refine", "together", "tones", "coarse", "redraw")
 _REPLACED: Final = "dropped: the vehicle's refinement takes its place"
 _COMPLETE: Final = "dropped: the vehicle is complete, its refinement takes its place"
 _WATCHED_AGAIN: Final = 2000  # pictures of the last daemon
@@ -392,12 +393,12 @@ class JobRequests:
     def job_ended(self, event: JobEnded) -> None:
         """Export the products again once nothing is left to refine, then compare them with the map."""
         job = event.job
-        fresh = job.state == "done" and "after" in job.detail and "note" not in job.detail
-        if job.kind == "export" and fresh and self._basemap:
+        written = job.kind == "export" and job.state == "done" and "after" in job.detail
+        if written and self._basemap and not self._jobs.open(*_CHANGE_PRODUCTS, "export"):
             self._jobs.add("change")
         if job.kind == "refine":
             self._jobs.wake()
         elif job.kind not in ("together", "tones", "redraw") and (job.kind != "coarse" or "after" not in job.detail):
             return
-        if not self._jobs.open("refine", "together", "tones", "coarse", "redraw"):
+        if not self._jobs.open(*_CHANGE_PRODUCTS):
             self._jobs.add("export", formats=list(PRODUCTS), after="all")

@@ -80,6 +80,7 @@ def write_products(task: ExportTask) -> dict[str, str]:
     from orthoswarm.export.product_files import write_frames, write_json
     from orthoswarm.mosaic.extent import solved_level
     from orthoswarm.refine.registration.map_offset import measure_map_offset
+    from orthoswarm.report.change_section import put_section
     from orthoswarm.report.page import write_page
     from orthoswarm.report.trust import headline
 
@@ -106,6 +107,7 @@ def write_products(task: ExportTask) -> dict[str, str]:
     report["warnings"] += [] if offset is None else offset.warning()
     basemap = None if task.basemap is None else Basemap.open(task.basemap, task.epsg)
     report["against_map_m"] = write_page(out, report, placed, rejected=rejected, basemap=basemap, cells=task.cells)
+    put_section(out, out)  # of the last comparison, until the next one
     write_json(out / "report.json", report)
     places.write_geojson(task.places, out / places.FILE)
     files = {"cog": made[-1], "gpkg": "footprints.gpkg"}

@@ -45,7 +45,7 @@ export function changePanel(compare) {
     setHidden(more, rows.length > 0 && rows.length <= MOST);
     setText(more, rows.length ? t("change.more", { n: rows.length - MOST }) : t("change.nothing"));
   });
-  return make("section", { class: "change" }, make("h2", {}, t("change.title")), about, toggle, clear, legend, make("label", { class: "layer" }, words, slider), list, more);
+  return make("section", { class: "change" }, make("h2", {}, t("change.title")), about, make("div", { class: "layer" }, toggle, clear), legend, make("label", { class: "layer" }, words, slider), list, more);
 }
 
 subscribe("change ready", "what changed, on the map", () => {
