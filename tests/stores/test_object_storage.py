@@ -20,6 +20,7 @@ from tests.kit.scene import Scene, legs
 from tests.kit.servers.ports import free_port
 from tests.kit.servers.store_server import KINDS, FaultyProxy, store_server
 
+REPORTS = ("report.json", "report.html")
 PRODUCTS = ("realtime.tif", "coarse.tif", "orthoimage.tif", "frames.jsonl")
 UPLOADS = ("PUT", "POST")
 
@@ -91,7 +92,7 @@ def test_the_same_map_as_from_folders(bucket, site, tmp_path):
     report = json.loads(content(path_of(f"{out}/report.json")))
     assert report["root"] == f"{address}/site/photos" and report["basemap"] == f"{address}/site/before.tif"
     left = {path.name for path in list_folder(path_of(out))}
-    assert left == {*PRODUCTS, "footprints.gpkg", "seamlines.gpkg", "confidence.tif", "report.json", "report.html"}
+    assert left == {*PRODUCTS, "footprints.gpkg", "seamlines.gpkg", "confidence.tif", "ground.tif", *REPORTS}
     assert not list((cache_folder() / "maps").glob("*"))  # nothing stays on this machine but copies
 
 

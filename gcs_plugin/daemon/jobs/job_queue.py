@@ -365,16 +365,16 @@ class JobRequests:
 
     def legs_over(self, event: LegsOver) -> None:
         """Queue the coarse map of a sortie that is still flown; on a basemap it is registered picture by picture."""
-        if (
-            self._coarse
-            and (event.silent or not self._basemap)
-            and not is_complete(self._journal, (event.vehicle, event.sortie))
-        ):
+        whose = (event.vehicle, event.sortie)
+        if self._coarse and not self._basemap and not is_complete(self._journal, whose):
             self._jobs.add("coarse", event.vehicle, event.sortie, **({"over": True} if event.silent else {}))
 
     def vehicle_silent(self, event: VehicleSilent) -> None:
-        """Have pictures placed that came after their vehicle's refinement, over a slow link."""
-        self._refine_late((event.vehicle, event.sortie))
+        """Have late pictures placed that came over a slow link; before a refinement, have all tracked for it."""
+        whose = (event.vehicle, event.sortie)
+        self._refine_late(whose)
+        if self._coarse and self._basemap and not is_complete(self._journal, whose):
+            self._jobs.add("coarse", *whose, over=True)
 
     def card_read(self, event: CardRead) -> None:
         """Have the sortie refined with the pictures of a card that was read after landing."""

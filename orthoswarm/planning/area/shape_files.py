@@ -178,6 +178,8 @@ def parse_geojson(text: str, name: str = "the GeoJSON file", *, any_size: bool =
     polygons, lines, circles, unused = list[Polygon](), list[Ring](), list[Circle](), Counter[str]()
     try:
         for kind, coordinates, said in _geometries(document, {}):
+            if coordinates == [] and kind == document.get("type") and kind.startswith("Multi"):
+                continue  # a bare list of none, as programs write it
             if coordinates == [] and kind in _SHAPES:
                 unused["feature without a shape"] += 1
             elif kind in ("Polygon", "MultiPolygon"):
