@@ -23,6 +23,7 @@ from gcs_plugin.daemon.store.daemon_events import Events, FirstPicturesCame, Veh
 from gcs_plugin.daemon.store.frame_rows import Whose
 from orthoswarm.model.arrays import Gray
 from orthoswarm.model.errors import OrthoSwarmError
+from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import LocalGrid
 from orthoswarm.raster.basemap import Basemap
 
@@ -40,11 +41,12 @@ _MOST_BETWEEN: Final = 3  # most pictures in a row that are: corners have to be 
 _log = logging.getLogger(__name__)
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class _Flown:
-    """A sortie: its pictures that are not registered, and its live block once it is on the basemap."""
+    """A sortie: its newest pictures that are not registered, how many there were, and its block once it is found."""
 
     waiting: list[PendingFrame] = field(default_factory=list)
+    came: int = 0
     block: "LiveBlock | None" = None
     wanted: int = _FIRST
     asked_s: float = -_ANSWER_S
@@ -89,12 +91,15 @@ class LiveRegistration:
             return None
         whose = (pending.frame.vehicle, pending.sortie)
         flown = self._flown.setdefault(whose, _Flown())
+        if flown.block is not None and _size(flown.block.newest) != _size(pending.frame):
+            return None  # another lens than the one that was found
         pose = None if flown.block is None else self._next(flown, pending, picture, waiting)
         if pose is None:
             flown.waiting.append(pending)
+            flown.came += 1
             del flown.waiting[: -2 * MOST_LOOKED_FOR]
             now = time.monotonic()
-            if len(flown.waiting) >= flown.wanted and now > flown.asked_s + _ANSWER_S:
+            if flown.came >= flown.wanted and now > flown.asked_s + _ANSWER_S:
                 flown.asked_s = now
                 self._events.publish(FirstPicturesCame(*whose))
         return pose
@@ -114,7 +119,7 @@ class LiveRegistration:
             _log.info("%s is lost on the basemap: %s", frame.vehicle, error)
             pose = None
         if pose is None:
-            flown.block, flown.waiting, flown.wanted = None, [], _FIRST
+            flown.block, flown.waiting, flown.came, flown.wanted = None, [], 0, _FIRST
         return pose
 
     def found(self, area: MapArea) -> "Iterator[tuple[PendingFrame, LivePose]]":
@@ -126,7 +131,7 @@ class LiveRegistration:
                 continue
             flown.asked_s = -_ANSWER_S
             if event.solution is None or event.epsg != area.epsg:
-                flown.wanted = int(_MORE * max(len(flown.waiting), flown.wanted))
+                flown.wanted = int(_MORE * max(flown.came, flown.wanted))
                 continue
             try:
                 yield from self._begun(flown, event, area)
@@ -155,7 +160,7 @@ class LiveRegistration:
                 continue
             pose = self._next(flown, pending, self._read(pending.frame.path), 0)
             if pose is None:
-                flown.waiting = waiting[n:]
+                flown.waiting, flown.came = waiting[n:], len(waiting) - n
                 return
             yield pending, pose
 
@@ -166,6 +171,10 @@ def grey(picture: Bytes, size: tuple[int, int]) -> Gray:
     if gray.shape[::-1] != size:
         gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
     return np.asarray(gray, np.uint8)
+
+
+def _size(frame: Frame) -> tuple[int, int]:
+    return frame.width, frame.height
 
 
 def _order(time_s: float | None) -> float:

@@ -81,43 +81,41 @@ class DrawingRestarted(Event):
 
 
 @dataclass(frozen=True, slots=True)
-class FirstPicturesCame(Event):
-    """There are enough pictures of a sortie to look for them on the basemap."""
+class _SortieEvent(Event):
+    """Something about a vehicle's sortie."""
 
     vehicle: str
     sortie: int
 
 
 @dataclass(frozen=True, slots=True)
-class VehicleLookedFor(Event):
+class FirstPicturesCame(_SortieEvent):
+    """There are enough pictures of a sortie to look for them on the basemap."""
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleLookedFor(_SortieEvent):
     """A sortie's pictures were looked for on the basemap.
 
     Attributes:
         solution: their refinement, with its state; None where they were not found. epsg: of the grid on which it lies.
     """
 
-    vehicle: str
-    sortie: int
     epsg: int
     solution: Solution | None
 
 
 @dataclass(frozen=True, slots=True)
-class LegsOver(Event):
+class LegsOver(_SortieEvent):
     """Legs of a sortie are finished; `silent`: because its vehicle has fallen silent."""
 
     page: ClassVar[str] = "legs"
-    vehicle: str
-    sortie: int
     silent: bool
 
 
 @dataclass(frozen=True, slots=True)
-class VehicleSilent(Event):
+class VehicleSilent(_SortieEvent):
     """No picture of a vehicle has come for a while."""
-
-    vehicle: str
-    sortie: int
 
 
 @dataclass(frozen=True, slots=True)

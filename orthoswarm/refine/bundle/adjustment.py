@@ -20,7 +20,7 @@ _LENS_COLUMNS = [F, K1, K2, K3, CX, CY]
 
 TRACK_ROBUST_C: Final = 9.0  # robust scale of image observations near the minimum, squared sigmas: 3 sigmas
 TIE_ROBUST_C: Final = 9.0  # robust scale of ties to the map, squared sigmas, where a step names no other
-_POINT_STEP_LIMIT_M: Final = 50.0  # longest move of a point in one step; near-parallel rays would throw it far
+POINT_STEP_LIMIT_M: Final = 50.0  # longest move of a point in one step; near-parallel rays would throw it far
 _HEIGHT_ROBUST_C: Final = 4.0  # robust scale of the points' height prior, squared sigmas, where it names no other
 _DAMPING_SHARE: Final = 1e-6  # added to the diagonal of the cameras' equations, as a share (Levenberg 1944)
 
@@ -152,7 +152,7 @@ class Adjustment:
             (system.w_obs, system.w_lens, self.point_inverse, system.b_point),
             step_camera,
             step_common[: self.layout.lens_columns],
-            _POINT_STEP_LIMIT_M,
+            POINT_STEP_LIMIT_M,
         )
         return float(np.abs(step_camera.reshape(-1, 6)[:, :3]).max()) if len(step_camera) else 0.0
 

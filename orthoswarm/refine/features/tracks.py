@@ -25,7 +25,7 @@ from orthoswarm.refine.features.flow_calibration import phase_shift
 _BORDER_PX: Final = 9  # corners nearer to the picture's border are not begun: the window of the flow would leave it
 _CORNER_WINDOW_PX: Final = 5  # window of the minimum-eigenvalue corner measure (Shi and Tomasi 1994)
 _CORNER_FLOOR: Final = 1e-4  # least corner measure, as of OpenCV's cornerMinEigenVal: below it there is no texture
-_FLOW_SIGMA_PX: Final = 0.35
+FLOW_SIGMA_PX: Final = 0.35
 """Sigma of a followed corner in working pixels: 0.05 of noise and a drift along the track (measured together on
 simulated flights; it gave the best adjustments)."""
 _TRACK_LEAST_OBSERVATIONS: Final = 3  # shorter tracks are dropped: two rays cannot be checked
@@ -142,7 +142,7 @@ class Tracker:
         ident = np.concatenate([ident for _, ident, _ in self._log])
         uv = np.concatenate([uv for _, _, uv in self._log]).astype(np.float64)
         keep = np.bincount(ident, minlength=self._next)[ident] >= _TRACK_LEAST_OBSERVATIONS
-        sigma = np.full(len(ident), _FLOW_SIGMA_PX, np.float32)
+        sigma = np.full(len(ident), FLOW_SIGMA_PX, np.float32)
         return Tracks(camera, ident.astype(np.int32), uv, sigma).take(keep).renumbered()
 
     def _go_on(self, homography: Array | None) -> None:

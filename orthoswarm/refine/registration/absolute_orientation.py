@@ -29,10 +29,10 @@ _MAP_GSD_FINE_M: Final = 0.4  # pictures of finer pixels are compared at the coa
 _MAP_GSD_COARSE_M: Final = 0.5  # least ground pixel for all other pictures
 _MAP_MARGIN_SHARE: Final = 1.1  # the map is read so many half diagonals beyond the cameras (pictures tilt) ...
 _MAP_MARGIN_M: Final = 40.0  # ... and this: the search and a patch
-_TIE_VIEWS: Final = 3  # fewest pictures that show a point which is compared with the map ...
+TIE_VIEWS: Final = 3  # fewest pictures that show a point which is compared with the map ...
 _TIE_VIEWS_SPARSE: Final = 2  # ... and of photos that are matched in pairs
 _TIE_VIEW_WEIGHT: Final = 0.4  # least mean robust weight of its observations
-_TIE_HEIGHT_M: Final = 3.0  # points farther above or below the ground are not compared: what is around them leans
+TIE_HEIGHT_M: Final = 3.0  # points farther above or below the ground are not compared: what is around them leans
 _TIE_HALF_SHARE: Final = 0.1
 """Half a patch, as a share of the flying height. Measured with half patches of 10, 13, 16 and 20 m from 150 m: on maps
 of another date (benchmarks/accuracy/other_dates.py) errors fall up to 16 m, on relief of 25 m they stay ..."""
@@ -48,7 +48,7 @@ _FIRST_TIE_CELL_SPARSE_M: Final = 25.0  # first ties of photos matched in pairs:
 _TIE_CELL_SPARSE_M: Final = 15.0  # later ties of photos matched in pairs: one in each cell of this size
 _TIE_PEAK: Final = 0.2  # least correlation of a tie point
 _TIE_RATIO: Final = 0.75  # largest ratio of the second peak to the first
-_TIE_SIGMA_M: Final = 0.35  # sigma of a tie point, an axis, before their residuals tell it
+TIE_SIGMA_M: Final = 0.35  # sigma of a tie point, an axis, before their residuals tell it
 _TIE_SIGMA_LIMITS_M: Final = (0.1, 1.0)  # limits of the sigma by their residuals
 _TIE_FEWEST_FOR_SIGMA: Final = 20  # fewer residuals tell no sigma
 _EDGE_FEWEST: Final = 60  # fewer tie points do not tell how far strong edges are displaced from texture
@@ -119,9 +119,9 @@ def tie_matches(
     adj = flight.adjustment
     seen = flight.best_views(pictures)
     height = adj.points[:, 2] - surface.height(adj.points[:, :2])
-    fewest = _TIE_VIEWS_SPARSE if flight.sparse else _TIE_VIEWS
+    fewest = _TIE_VIEWS_SPARSE if flight.sparse else TIE_VIEWS
     usable = (seen.camera >= 0) & (seen.count >= fewest) & (seen.mean_weight > _TIE_VIEW_WEIGHT)
-    usable &= np.abs(height) < _TIE_HEIGHT_M
+    usable &= np.abs(height) < TIE_HEIGHT_M
     leg = flight.leg[np.maximum(seen.camera, 0)]
     chosen = one_per_cell(adj.points, leg, np.where(usable, np.abs(height), np.inf), cell_m)
     return _ground_matches(
@@ -252,7 +252,7 @@ def _line(t: Array, shift: Array) -> tuple[Array, Flags]:
 
 def as_ties(matches: MapMatches, points: Array) -> MapTies:
     """Tie points with their places on the map and a first sigma; what was compared is ground, which does not lean."""
-    sigma = np.full(len(matches.point), _TIE_SIGMA_M)
+    sigma = np.full(len(matches.point), TIE_SIGMA_M)
     return MapTies(matches.point, points[matches.point, :2] + matches.shift, sigma)
 
 

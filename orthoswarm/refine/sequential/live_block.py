@@ -33,12 +33,15 @@ from orthoswarm.refine.bundle.block_arrays import (
 )
 from orthoswarm.refine.bundle.flight_records import FlightRecords, read_records
 from orthoswarm.refine.bundle.normal_equations import room_of_a_point
-from orthoswarm.refine.features.tracks import Tracker, predicted_homography
+from orthoswarm.refine.features.tracks import FLOW_SIGMA_PX, Tracker, predicted_homography
 from orthoswarm.refine.registration.absolute_orientation import (
     TIE_HALF_PX,
+    TIE_HEIGHT_M,
     TIE_REACH_M,
     TIE_REACH_PX,
     TIE_SCALES,
+    TIE_SIGMA_M,
+    TIE_VIEWS,
     clear_matches,
     map_gsd,
     tie_half_m,
@@ -52,13 +55,9 @@ _NEWEST: Final = 6  # of them those whose records count; what is older has its l
 _OLDER_SHARE: Final = 2.5  # sigma of an older picture's estimate, in its own: errors of neighbours are alike
 _CELLS: Final = 11  # cells side by side in a picture, a corner is followed in each (16 are no better, 8 a third worse)
 _TIES: Final = 12  # points of a picture that are compared with the map (for its time)
-_TIE_SIGMA_M: Final = 0.35  # as of the first ties of a refinement
-_TIE_VIEWS: Final = 3  # fewest pictures that show such a point
 _TIE_SLOPE: Final = 0.7
 """Farthest place of such a point from the nadir, over the height: farther out, what stands on the ground displaces it.
 """
-_TIE_HEIGHT_M: Final = 3.0  # points farther above or below the ground are not compared
-_TRACK_SIGMA_PX: Final = 0.35  # as of the refinement's tracks
 _FIRST_SCALE: Final = 100.0  # robust scale before a new picture is adjusted, squared sigmas
 _SURE_TIES: Final = 20  # with so many ties in the window the map holds the vehicle
 _GUIDE: Final = 8  # pictures whose corrections predict the next one's
@@ -270,11 +269,11 @@ class LiveBlock:
         solved = adjust_window(
             cameras.arrays,
             self._points,
-            (np.searchsorted(point, np.arange(count + 1)), camera, uv, np.full(len(uv), _TRACK_SIGMA_PX**-2.0)),
+            (np.searchsorted(point, np.arange(count + 1)), camera, uv, np.full(len(uv), FLOW_SIGMA_PX**-2.0)),
             np.arange(len(views), dtype=np.int32),
             np.array(scales),
             (heights.height, 1.0 / heights.sigma**2, heights.c, 1.0 / heights.soft_sigma**2),
-            (tie_of_point, self._tie_xy, np.full(ties, _TIE_SIGMA_M**-2.0), TIE_SCALES[-1]),
+            (tie_of_point, self._tie_xy, np.full(ties, TIE_SIGMA_M**-2.0), TIE_SCALES[-1]),
             self._priors(),
             room_of_a_point(),
             (weight, np.zeros((ties, 2)), self._covariance),
@@ -311,10 +310,10 @@ class LiveBlock:
         """Compare points of the newest picture with the map, each point once; how many were found."""
         view, ground = self._views[-1], self._loaded_map()
         at = np.searchsorted(self._ids, view.ident).clip(0, len(self._ids) - 1)
-        at = at[(self._ids[at] == view.ident) & (self._seen[at] >= _TIE_VIEWS) & ~np.isin(self._ids[at], self._tried)]
+        at = at[(self._ids[at] == view.ident) & (self._seen[at] >= TIE_VIEWS) & ~np.isin(self._ids[at], self._tried)]
         level = self._surface.height(self._points[:, :2])
         away = np.hypot(*(self._points[at, :2] - view.position[:2]).T) / (view.position[2] - self._points[at, 2])
-        at = at[(away < _TIE_SLOPE) & (np.abs(self._points[at, 2] - level[at]) < _TIE_HEIGHT_M)]
+        at = at[(away < _TIE_SLOPE) & (np.abs(self._points[at, 2] - level[at]) < TIE_HEIGHT_M)]
         if not len(at):
             return 0
         at = at[spread_points(self._points[at, :2], _TIES)]

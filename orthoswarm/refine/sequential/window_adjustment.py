@@ -8,10 +8,9 @@ import numpy as np
 
 from orthoswarm.compute.jit import in_place_kernel, kernel
 from orthoswarm.compute.robust_kernel import robust_weight
+from orthoswarm.refine.bundle.adjustment import POINT_STEP_LIMIT_M
 from orthoswarm.refine.bundle.normal_equations import back_substitute, build
-
-_POINT_STEP_LIMIT_M = 50.0  # longest move of a point in one step, as in `adjustment`
-_PRIOR_C = 9.0  # robust scale of recorded positions, squared sigmas, as in `priors`
+from orthoswarm.refine.bundle.priors import POSITION_ROBUST_C
 
 
 @kernel
@@ -54,7 +53,7 @@ def adjust_window(cameras, points, observations, slot, scales, heights, ties, pr
             _move(position[i], rotation[i], rhs[6 * i : 6 * i + 6])
         back_substitute(
             points, (observations[0], observations[1], slot), (w_obs, w_lens, v_inverse, b_point), rhs, step_lens,
-            _POINT_STEP_LIMIT_M,
+            POINT_STEP_LIMIT_M,
         )  # fmt: skip
     unit = np.zeros(n)
     for k in range(6):
@@ -71,7 +70,7 @@ def _add_record(position, rotation, place, place_weight, attitude, attitude_weig
     e2 = 0.0
     for a in range(2):
         e2 += (position[a] - place[a]) ** 2 * place_weight[a]
-    robust = robust_weight(e2, _PRIOR_C, 1.0)
+    robust = robust_weight(e2, POSITION_ROBUST_C, 1.0)
     for a in range(3):
         weight = place_weight[a] * (robust if a < 2 else 1.0)
         band[0, at + a] += weight

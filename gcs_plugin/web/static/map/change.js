@@ -1,12 +1,13 @@
 // What changed since the basemap: its layer with opacity, and a list that begins with the largest; a press goes there, with
 // before and after to swipe between.
 
-import { get, tileRequest } from "/static/core/api.js";
+import { tileRequest } from "/static/core/api.js";
 import { button, keyedList, make, setHidden, setText } from "/static/core/dom.js";
 import { changed, state, subscribe } from "/static/core/store.js";
 import { t } from "/static/core/strings.js";
 import * as units from "/static/core/units.js";
-import { addInOrder, boundsOf, fit, isReady, map } from "/static/map/map.js";
+import { boundsOf, fit, isReady, map } from "/static/map/map.js";
+import { readAfter, showPicture } from "/static/map/picture_layer.js";
 import { shownSwitch } from "/static/map/shown.js";
 
 const ID = "change";
@@ -16,7 +17,6 @@ const LEGEND = ["likely", "sure", "hidden"];
 let from = 0.5; // probability from which ground is shown
 let opacity = 1;
 let shown = ""; // version and probability that are on the map
-let asked = 0; // the comparison after which it was asked for
 let timer = null;
 
 export function changePanel(compare) {
@@ -53,16 +53,7 @@ subscribe("change ready", "what changed, on the map", () => {
   if (!isReady() || !state.change?.corners || key === shown) return;
   shown = key;
   const picture = { url: tileRequest(`/api/change.png?from=${from}&version=${state.change.version}`).url, coordinates: state.change.corners };
-  if (map.getSource(ID)) { map.getSource(ID).updateImage(picture); return; }
-  map.addSource(ID, { type: "image", ...picture });
-  addInOrder({ id: ID, type: "raster", source: ID, paint: { "raster-fade-duration": 0, "raster-resampling": "nearest", "raster-opacity": opacity }, layout: { visibility: "none" } }); // until it is known whether it is wanted
+  showPicture(ID, picture, { "raster-opacity": opacity });
 });
 
-// A job writes it.
-subscribe("jobs ready", "news of what changed", async () => {
-  const newest = Math.max(0, ...[...state.jobs.values()].filter((job) => job.kind === "change" && job.state === "done").map((job) => job.id));
-  if (newest === asked) return;
-  asked = newest;
-  try { state.change = await get("/api/change"); } catch { state.change = null; }
-  changed("change");
-});
+readAfter("change", "change");

@@ -1,16 +1,16 @@
 // Where the map is not to be trusted: the classes of confidence.tif over the imagery, as of the last export.
 
-import { get, tileRequest } from "/static/core/api.js";
+import { tileRequest } from "/static/core/api.js";
 import { make, setHidden, setText } from "/static/core/dom.js";
-import { changed, state, subscribe } from "/static/core/store.js";
+import { state, subscribe } from "/static/core/store.js";
 import { t } from "/static/core/strings.js";
-import { addInOrder, isReady, map } from "/static/map/map.js";
+import { isReady } from "/static/map/map.js";
+import { readAfter, showPicture } from "/static/map/picture_layer.js";
 import { shownSwitch } from "/static/map/shown.js";
 
 const ID = "trust";
 const CLASSES = ["0.2", "0.5", "2", "rough"];
 let shown = 0;
-let asked = 0; // the export after which it was asked for
 
 export function trustPanel() {
   const headline = make("p", {});
@@ -28,17 +28,7 @@ subscribe("trust ready", "where not to trust, on the map", () => {
   if (!isReady() || !state.trust?.corners || state.trust.version === shown) return;
   shown = state.trust.version;
   const picture = { url: tileRequest(`/api/trust.png?version=${shown}`).url, coordinates: state.trust.corners };
-  if (map.getSource(ID)) { map.getSource(ID).updateImage(picture); return; }
-  map.addSource(ID, { type: "image", ...picture });
-  addInOrder({ id: ID, type: "raster", source: ID, paint: { "raster-fade-duration": 0, "raster-resampling": "nearest" }, layout: { visibility: "none" } }); // until it is known whether it is wanted
+  showPicture(ID, picture);
 });
 
-// An export writes it.
-subscribe("jobs ready", "news of it", async () => {
-  const newest = Math.max(0, ...[...state.jobs.values()].filter((job) => job.kind === "export" && job.state === "done").map((job) => job.id));
-  if (newest === asked) return;
-  asked = newest;
-  try { state.trust = await get("/api/trust"); } catch { state.trust = null; }
-  changed("trust");
-});
-
+readAfter("export", "trust");
