@@ -109,7 +109,7 @@ def test_points_without_parallax_are_not_thrown_farther_than_the_limit(monkeypat
     before = adj.points.copy()
     adj.points[:, 2] = -400.0
     before = adj.points.copy()
-    monkeypatch.setattr(adjustment, "_POINT_STEP_LIMIT_M", 7.0)
+    monkeypatch.setattr(adjustment, "POINT_STEP_LIMIT_M", 7.0)
     adj.step(1e4, level(len(adj.points)))
     assert np.linalg.norm(adj.points - before, axis=1).max() == pytest.approx(7.0)
 
