@@ -20,23 +20,23 @@ from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import Terrain
 from orthoswarm.mosaic.kernels.downsampling import bearable, reduced, reduced_exactly
 from orthoswarm.mosaic.kernels.drawn_heights import heights
-from orthoswarm.mosaic.kernels.pixel_sampling import AFTER, BEFORE, WEIGHTS, blend, drawn_again, place, widen
+from orthoswarm.mosaic.kernels.pixel_sampling import AFTER, BEFORE, SPOT_PX, WEIGHTS, blend, drawn_again, place, widen
 from orthoswarm.mosaic.kernels.render_arrays import Shots
 from orthoswarm.mosaic.seam_labels import label_tile, label_windows, write_labels
 from orthoswarm.mosaic.seams.feather import labels_around, mix, transition
 from orthoswarm.mosaic.seams.leveling import TileColors, TileFactors, tile_colors
-from orthoswarm.mosaic.seams.previews import write_preview
+from orthoswarm.mosaic.seams.previews import COLUMNS, ROWS, write_preview
 from orthoswarm.mosaic.seams.seam_tiles import SeamCells, seam_labels
 from orthoswarm.raster.picture_file import PictureError
 from orthoswarm.raster.picture_parts import Box, Part, PictureParts
 from orthoswarm.stores.local_copies import copy_ahead
 
-Read = Callable[[Path], Bytes]
+Read = Callable[[Path, int], Bytes]
+"""Reads a picture, uint8 (rows, columns, 3), reduced to the longer side that is given, see picture_file.read_rgb."""
 
 THUMBNAIL = (12, 16)  # rows and columns of a picture's thumbnail
 TWICE_M: Final = 0.5  # what a picture shows at places farther apart than this is drawn twice, metres
 _NUMBERS = 8  # frame, row and column of the tile, rows and columns of the window (4), pixels
-_SPOT_PX: Final = 2  # pixels of a picture along each side that count as one
 _TILES_MB: Final = 64.0  # memory that a drawing task keeps of the tiles that it writes
 
 
@@ -275,7 +275,7 @@ def preview_pass(task: PreviewTask) -> None:
     copy_ahead(path for path, _ in task.pictures)
     for path, row in task.pictures:
         with contextlib.suppress(PictureError):
-            write_preview(task.previews, row, task.read(path))
+            write_preview(task.previews, row, task.read(path, max(ROWS, COLUMNS)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -376,12 +376,12 @@ class _Ground:
         if not own:
             return 0
         boxes, side = np.array([box for *_, box in own]), self.layer.place.tile_px
-        low = (boxes[:, [2, 0]].min(0) // _SPOT_PX).astype(np.int32)
-        first = np.full((*(boxes[:, [3, 1]].max(0) // _SPOT_PX - low + 1), 2), -1, np.int32)
-        far_px = TWICE_M / self.layer.place.grid.gsd_m + 2 * _SPOT_PX
+        low = (boxes[:, [2, 0]].min(0) // SPOT_PX).astype(np.int32)
+        first = np.full((*(boxes[:, [3, 1]].max(0) // SPOT_PX - low + 1), 2), -1, np.int32)
+        far_px = TWICE_M / self.layer.place.grid.gsd_m + 2 * SPOT_PX
         corners = [np.array(key, np.int32) * np.int32(side) for key, *_ in own]
         return sum(
-            drawn_again(index, spots, side, corner, _SPOT_PX, far_px, low, first)
+            drawn_again(index, spots, side, corner, far_px, low, first)
             for corner, (_, index, spots, *_) in zip(corners, own, strict=True)
         )
 
@@ -478,7 +478,7 @@ def sample_pass(task: SampleTask) -> list[Sampled]:
 
 
 def _read(read: Read, path: Path, size: Ints) -> Bytes:
-    picture = read(path)
+    picture = read(path, int(size.max()))
     if picture.shape[:2] != (size[1], size[0]):
         raise PictureError.of(
             path,

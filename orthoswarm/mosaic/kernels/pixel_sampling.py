@@ -171,23 +171,32 @@ def place(label, mark, window, position, rotation, lens, lattice, gsd, size, fac
     return index, spots, sights, box
 
 
+SPOT_PX = 2  # pixels of a picture along each side that count as one part
+_SPOT_BITS = (UNIT * SPOT_PX).bit_length() - 1
+
+
 @in_place_kernel
-def drawn_again(index, spots, side, corner, spot_px, far_px, low, first):  # type: ignore[no-untyped-def]
+def drawn_again(index, spots, side, corner, far_px, low, first):  # type: ignore[no-untyped-def]
     """How many pixels show a part of a picture that is drawn elsewhere already.
 
     Args:
-        index, spots: of the pixels, see `place`. side: of the tile, pixels. corner: int32 (2,), its first row, column.
-        spot_px: pixels of the picture along each side of a part. far_px: pixels of the map from which on two places
-        count as two. low: int32 (2,), row and column of the least part.
+        index, spots: of the pixels, see `place`, in ascending order. side: of the tile, pixels.
+        corner: int32 (2,), its first row, column. far_px: pixels of the map from which on two places count as two.
+        low: int32 (2,), row and column of the least part, of SPOT_PX.
         first: int32 (rows, columns, 2), row and column where a part was drawn first, -1 where it was not; changed.
     """
     again = 0
+    us, vs = spots[0], spots[1]
+    row, start = np.int64(corner[0]), np.int64(0)
     for n in range(index.shape[0]):
-        i, j = spots[1, n] // UNIT // spot_px - low[0], spots[0, n] // UNIT // spot_px - low[1]
-        row, column = corner[0] + index[n] // side, corner[1] + index[n] % side
-        if first[i, j, 0] < 0:
-            first[i, j, 0], first[i, j, 1] = row, column
-        elif max(abs(first[i, j, 0] - row), abs(first[i, j, 1] - column)) > far_px:
+        while index[n] >= start + side:  # a division costs more than all the rest
+            start += side
+            row += 1
+        at = first[(vs[n] >> _SPOT_BITS) - low[0], (us[n] >> _SPOT_BITS) - low[1]]
+        column = corner[1] + index[n] - start
+        if at[0] < 0:
+            at[0], at[1] = row, column
+        elif max(abs(at[0] - row), abs(at[1] - column)) > far_px:
             again += 1
     return again
 

@@ -361,17 +361,29 @@ def predicted_homography(before: Array, after: Array, height_m: float, step: Arr
 
 
 def follow(
-    count: int, read: Callable[[int], Gray], prediction: Callable[[int], Array | None], cell_px: int
-) -> tuple[Tracks, Array]:
+    count: int,
+    read: Callable[[int], Gray],
+    prediction: Callable[[int], Array | None],
+    cell_px: int,
+    hopeless: Callable[[Array], bool],
+) -> tuple[Tracks, Array] | None:
     """The tracks of corners through pictures 0 .. count - 1, and the share that survived into each, float64 (count,).
 
-    read: returns picture i at working scale. cell_px: see Tracker. prediction: 3x3 homography from picture i - 1 to i,
-    None where tracking starts afresh.
+    Args:
+        read: returns picture i at working scale.
+        prediction: 3x3 homography from picture i - 1 to i, None where tracking starts afresh.
+        cell_px: see Tracker.
+        hopeless: whether to give up, by the shares so far; the rest of them are 1.
+
+    Returns:
+        None if it was given up.
     """
     tracker = Tracker(cell_px=cell_px)
     survived = np.ones(count)
     for i in range(count):
         survived[i] = tracker.add(i, read(i), prediction(i))
+        if hopeless(survived):
+            return None
     return tracker.tracks(), survived
 
 
