@@ -88,8 +88,7 @@ def test_nothing_is_compiled_in_an_installation_that_carries_the_kernels(install
 _ONE = """
 import numpy as np
 from orthoswarm.canvas import overviews
-out = np.zeros((4, 4, 4), np.uint8)
-overviews._reduce(np.full((8, 8, 4), 255, np.uint8), 1, out)
+out = overviews.reduce_rgba(np.full((8, 8, 4), 255, np.uint8), 2)
 print("SUM", out.sum())
 """
 
