@@ -1,5 +1,6 @@
 """The rasters of a run: selection of the frames of each, and rendering as COGs."""
 
+import os
 import shutil
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -37,13 +38,17 @@ from orthoswarm.refine.flight.record_findings import NAMED_MOST
 _PREVIEW_PX: Final = 4000
 """Pixels along the path of a real-time picture that refined ones follow: as much as is looked at meanwhile."""
 
+_QUICK: Final = 4.0  # ground pixel of a quick look, in those of the map
+
 _Map = tuple[Sequence[PlacedFrame], Terrain | None]
 """Frames and the ground under them: what a map is drawn from."""
 
 
 def refined_pictures(run: RunContext, state: RunState, refinement: Refinement | None) -> list[PlacedFrame]:
     """Draw coarse.tif and orthoimage.tif; returns the frames as last placed."""
+    coarser = _QUICK if run.options.quick else 1.0
     if refinement is None:
+        state.gsd_m *= coarser
         placed = _looking_down(run, state, state.recorded.placed)
         name = ORTHOIMAGE if run.options.until == "fine" else COARSE
         with run.clock.stage(f"final: {name.removesuffix('.tif')}", len(placed)):
@@ -69,6 +74,7 @@ def refined_pictures(run: RunContext, state: RunState, refinement: Refinement | 
     state.warnings += weakly_held_warning(fine, state.odd)
     if run.options.gsd_m is None:
         state.gsd_m = default_gsd([p.camera for p in fine], ground_level(fine, terrain))
+    state.gsd_m *= coarser
     if run.options.gains:
         with run.clock.stage("final: gains", len(fine)):
             tone = state.basemap if run.options.tone == "map" and with_map and on_map else None
@@ -131,8 +137,9 @@ def _both(run: RunContext, state: RunState, coarse: _Map, fine: _Map) -> None:
         _write_about(run, state, second, fine[0], fine_ground)
     run.space.clear_scratch()
     state.drawn = stats[1].drawn
-    run.space.remember(ORTHOIMAGE, (stats[1].rejected, state.drawn, state.trust, stage))
-    run.space.remember(COARSE, (stats[0].rejected, stats[0].drawn, {}, replace(stage, wall_s=0.0, cpu_s=0.0)))
+    if not run.options.quick:
+        run.space.remember(ORTHOIMAGE, (stats[1].rejected, state.drawn, state.trust, stage))
+        run.space.remember(COARSE, (stats[0].rejected, stats[0].drawn, {}, replace(stage, wall_s=0.0, cpu_s=0.0)))
     for s in stats:
         state.leave_out(s.rejected, fine[0])
 
@@ -150,7 +157,8 @@ def _picture(
         with run.clock.stage(f"final: {label}", len(placed)) as stage:
             stats = draw(run, name, placed, terrain or Terrain.flat(), state)
         rejected, state.drawn = stats.rejected, stats.drawn
-        run.space.remember(name, (rejected, state.drawn, state.trust, stage))
+        if not run.options.quick:
+            run.space.remember(name, (rejected, state.drawn, state.trust, stage))
     state.leave_out(rejected, placed)
 
 
@@ -272,10 +280,15 @@ def _write_about(
 
 
 def _copy_coarse(run: RunContext, state: RunState) -> None:
-    """Without a map the orthoimage is the coarse product, too."""
-    if (run.out / ORTHOIMAGE).exists():
-        with atomic_write(run.out / COARSE) as part:
-            shutil.copyfile(run.out / ORTHOIMAGE, part)
+    """Without a map the orthoimage is the coarse product, too: one file under both names where the disk can do that."""
+    whole, coarse = run.out / ORTHOIMAGE, run.out / COARSE
+    if whole.exists():
+        if not (coarse.exists() and coarse.samefile(whole)):
+            with atomic_write(coarse) as part:
+                try:
+                    os.link(whole, part)
+                except OSError:
+                    shutil.copyfile(whole, part)
         remove_tiles(run.out, COARSE)
     else:
         copy_tiled(run.out, ORTHOIMAGE, COARSE)

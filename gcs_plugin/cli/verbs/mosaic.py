@@ -34,6 +34,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("--out", type=path_of, required=True, metavar="DIR", help="output folder; an interrupted run goes on there")
     refiners = _refiners()
     add("--refine", choices=refiners, default=refiners[0], help=f"how pictures are refined (default {refiners[0]})")
+    add(
+        "--quick", action="store_true",
+        help="draw the refined map at a quarter of the detail; the same command without it goes on from there",
+    )  # fmt: skip
     add("--until", choices=("realtime", "coarse", "fine"), default="fine", help="last stage to run (default fine)")
     add(
         "--fov-min",
@@ -251,6 +255,8 @@ def _check(args: argparse.Namespace) -> None:
             raise InputError("--tone map takes brightness and hue from a basemap; give one with --basemap")
         if not args.gains or args.until != "fine":
             raise InputError("--tone map needs balanced, refined pictures; leave out --no-gains and --until")
+    if args.quick and (args.until == "realtime" or args.surface is not None):
+        raise InputError("--quick draws the refined map; leave out --until realtime and --surface")
     if args.control is not None and args.until == "realtime":
         raise InputError("--control moves refined pictures; leave out --until realtime")
     if not args.pixel_scale > 0.0:
