@@ -12,16 +12,7 @@ if TYPE_CHECKING:
     from gcs_plugin.plans.plan_files import write_plan
     from gcs_plugin.plans.plan_request import PlanRequest, make_plan
 
-__all__ = [
-    "Fleet",
-    "FleetEvent",
-    "Mission",
-    "MissionItem",
-    "PlanRequest",
-    "make_plan",
-    "read_mission",
-    "write_plan",
-]
+__all__ = ["Fleet", "FleetEvent", "Mission", "MissionItem", "PlanRequest", "make_plan", "read_mission", "write_plan"]
 
 __getattr__ = on_first_use(
     __name__,

@@ -46,11 +46,7 @@ class Backend(abc.ABC):
 
     @abc.abstractmethod
     def vehicle(self, system: int) -> Vehicle:
-        """One of them.
-
-        Raises:
-            InputError: it was not found.
-        """
+        """One of them; raises InputError: it was not found."""
 
     @abc.abstractmethod
     def is_known(self, vehicle: Vehicle) -> bool:

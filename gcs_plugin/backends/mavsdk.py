@@ -74,11 +74,7 @@ class MavsdkBackend(Backend):
     name = "mavsdk"
 
     def __init__(self, links: Sequence[str], *, own: Address) -> None:
-        """Open the links.
-
-        Raises:
-            InputError: MAVSDK is missing, or an address is wrong.
-        """
+        """Open the links; raises InputError: MAVSDK is missing, or an address is wrong."""
         try:
             from mavsdk import Configuration, ConnectionResult, Mavsdk, log_subscribe
         except ImportError as error:

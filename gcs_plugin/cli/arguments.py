@@ -64,11 +64,7 @@ def require_folder_for(flag: str, target: Path) -> None:
 
 
 def require_no_file(flag: str, folder: Path) -> None:
-    """Refuse a folder for products that is a file, or lies below one.
-
-    Raises:
-        InputError: it is.
-    """
+    """Refuse a folder for products that is a file, or lies below one; raises InputError: it is."""
     blocked = next((p for p in (folder, *folder.parents) if p.exists() and not p.is_dir()), None)
     if blocked is not None:
         raise InputError(f"{flag} {folder}: {blocked} is a file; choose a folder")

@@ -163,11 +163,7 @@ class Exports:
         return rows
 
     def picture(self, seq: int) -> Path:
-        """The file of a picture.
-
-        Raises:
-            InputError: there is no such picture.
-        """
+        """The file of a picture; raises InputError: there is no such picture."""
         name = frame_path(self._journal, seq)
         if name is None or not self._store.path(name).is_file():
             raise InputError(f"there is no picture {seq}; see /api/frames")

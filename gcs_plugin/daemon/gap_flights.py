@@ -124,12 +124,7 @@ def _may_go_on(row: VehicleRow) -> bool:
 
 
 def _minutes(wanted: Any, known: Mapping[str, GapFlyer], in_air: Any) -> dict[str, float]:
-    """Vehicle -> minutes that it can fly; for one in the air less the way from where it is to its home.
-
-    Raises:
-        InputError: no vehicle, an unknown one, or one whose battery is not known.
-        OrthoSwarmError: a vehicle is still flying, or lost.
-    """
+    """Vehicle -> minutes that it can fly; for one in the air less the way from where it is to its home."""
     if not isinstance(in_air, list | tuple) or not all(isinstance(vehicle, str) for vehicle in in_air):
         raise InputError('in_air is not a list of vehicles; send for example ["v1"], or nothing')
     if not isinstance(wanted, dict) or not wanted:

@@ -26,11 +26,7 @@ class _Hold:
 
 
 class Pilots:
-    """Who has which vehicle.
-
-    Args:
-        people: knows who is here. events: tells pages.
-    """
+    """Who has which vehicle; `people`: knows who is here. `events`: tells pages."""
 
     def __init__(self, people: People, events: Events) -> None:
         self._people, self._events = people, events

@@ -54,12 +54,7 @@ class Views:
         self._sources, self._buses, self._poses, self._solutions = sources, buses, poses, solutions
 
     def frames(
-        self,
-        vehicle: str | None = None,
-        since: float | None = None,
-        limit: int | None = None,
-        *,
-        poses: bool = False,
+        self, vehicle: str | None = None, since: float | None = None, limit: int | None = None, *, poses: bool = False
     ) -> list[dict[str, Any]]:
         """Frames in the order of arrival, those that were taken at a time (UTC epoch seconds) or later.
 

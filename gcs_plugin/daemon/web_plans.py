@@ -155,11 +155,7 @@ class Plans:
         return found
 
     def geojson(self, name: str) -> bytes:
-        """A plan as GeoJSON.
-
-        Raises:
-            InputError: there is no such plan.
-        """
+        """A plan as GeoJSON; raises InputError: there is no such plan."""
         return (self._path(name) / "all.geojson").read_bytes()
 
     def maker_files(self, name: str, drone: str) -> bytes:
@@ -243,11 +239,7 @@ class Plans:
         return {vehicle["id"]: vehicle["flights"] for vehicle in figures["vehicles"]}
 
     def needs(self, name: Any) -> PlanNeeds:
-        """What a plan relies on.
-
-        Raises:
-            InputError: there is no such plan.
-        """
+        """What a plan relies on; raises InputError: there is no such plan."""
         return plan_needs(self._path(name))
 
     def newest_bounds(self) -> GeographicBounds | None:
@@ -268,11 +260,7 @@ class Plans:
 
 
 def _zones(no_fly: Any) -> Mapping[str, Any] | None:
-    """The no-fly zones of a request, None if it has none: any GeoJSON, of which nothing is left out without a word.
-
-    Raises:
-        InputError: it is not GeoJSON, or holds something that no vehicle could be kept out of.
-    """
+    """The no-fly zones of a request, None if it has none: any GeoJSON, of which nothing is left out without a word."""
     if no_fly is None:
         return None
     if not isinstance(no_fly, dict):
@@ -283,11 +271,7 @@ def _zones(no_fly: Any) -> Mapping[str, Any] | None:
 
 
 def _values(body: Mapping[str, Any]) -> dict[str, Any]:
-    """The request's values as fields of a PlanRequest.
-
-    Raises:
-        InputError: one is missing or invalid.
-    """
+    """The request's values as fields of a PlanRequest; raises InputError: one is missing or invalid."""
     count = body.get("vehicles")
     if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= 250:
         raise InputError("vehicles is missing; send a number from 1 to 250")
@@ -322,11 +306,7 @@ def _values(body: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _autopilots(value: Any) -> list[str]:
-    """One autopilot for all vehicles, or a list that they are given in turn.
-
-    Raises:
-        InputError: there is no such autopilot.
-    """
+    """One autopilot for all vehicles, or a list that they are given in turn."""
     names = value if isinstance(value, list) else [value]
     if not names or not all(isinstance(name, str) and name in AUTOPILOTS for name in names):
         raise InputError(f"autopilot is none of {', '.join(AUTOPILOTS)} and no list of these; choose one")

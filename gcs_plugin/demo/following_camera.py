@@ -54,11 +54,7 @@ _WAIT_S: Final = 0.5
 
 
 class Outlet(Protocol):
-    """Destination of a vehicle's pictures.
-
-    Attributes:
-        url: its address.
-    """
+    """Destination of a vehicle's pictures; `url`: its address."""
 
     url: str
 

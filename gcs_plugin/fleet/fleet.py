@@ -94,13 +94,7 @@ class Fleet:
         self._told_home: dict[int, float] = {}
         self._dialogues = Dialogues(self.vehicles, self.hub, clock, signed=self.signed)
         self._reception = Reception(
-            self.vehicles,
-            self.hub,
-            dialogues=self._dialogues,
-            own=own,
-            event=self._publish,
-            wall=wall,
-            names=names,
+            self.vehicles, self.hub, dialogues=self._dialogues, own=own, event=self._publish, wall=wall, names=names
         )
         self.separation = self._reception.separation
         self.takeoffs, self.names = takeoffs, names
@@ -371,11 +365,7 @@ class Fleet:
         return resumed(vehicle) if verb == "resume" else continued(vehicle)
 
     def _start(self, order: Order) -> Exchange:
-        """The dialogue of a start.
-
-        Raises:
-            OrthoSwarmError: the vehicle cannot be started, or is not what it was when the start was given.
-        """
+        """The dialogue of a start."""
         vehicle = self._flies_missions(order.system)
         if vehicle.detector.phase is Phase.ACTIVE and vehicle.armed:
             raise OrthoSwarmError(f"vehicle {order.system} is flying its mission already")

@@ -235,10 +235,7 @@ class Airspace:
 
     @classmethod
     def of(
-        cls,
-        missions: Mapping[int, Mission],
-        levels_m: Mapping[int, float] | None = None,
-        needs: PlanNeeds = NO_NEEDS,
+        cls, missions: Mapping[int, Mission], levels_m: Mapping[int, float] | None = None, needs: PlanNeeds = NO_NEEDS
     ) -> "Airspace":
         """Of missions by system id.
 

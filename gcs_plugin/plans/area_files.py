@@ -151,11 +151,7 @@ def _left_by_macos(name: str) -> bool:
 
 
 def _texts(path: Path, name: str, suffix: str | tuple[str, ...] = ".kml") -> list[str]:
-    """The text of a file, those of a ZIP's files with a suffix, in the encoding that it has or that its XML declares.
-
-    Raises:
-        InputError: it is not text.
-    """
+    """The text of a file, those of a ZIP's files with a suffix, in the encoding that it has or that its XML declares."""
     try:
         data = [path.read_bytes()]
         if data[0].startswith(b"PK\x03\x04"):
@@ -192,11 +188,7 @@ def _is_mission(text: str, name: str) -> bool:
 
 
 def _shapes(source: str, name: str, any_size: bool) -> Shapes:
-    """Polygons and lines of all layers of a file that OGR reads.
-
-    Raises:
-        InputError: it cannot, the file says no coordinate system, or its coordinates are of no use.
-    """
+    """Polygons and lines of all layers of a file that OGR reads."""
     from pyogrio import list_layers
     from pyogrio.errors import DataLayerError, DataSourceError, FeatureError, FieldError, GeometryError
 

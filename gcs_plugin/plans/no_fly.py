@@ -71,11 +71,7 @@ class NoFly:
     notes: list[str]
 
     def refuse_beyond(self, plan: Plan) -> None:
-        """Refuse a plan that leads to where zones were not used.
-
-        Raises:
-            InputError: it does.
-        """
+        """Refuse a plan that leads to where zones were not used; raises InputError: it does."""
         points = [(w.lat_deg, w.lon_deg) for v in plan.vehicles for s in v.sorties for w in s.waypoints]
         if self.notes and not all(self.reach.touches(np.array([point])) for point in points):
             raise InputError(

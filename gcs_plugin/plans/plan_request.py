@@ -140,11 +140,7 @@ class PlanRequest:
         return Motion(self.speed_m_s, wind_m_s=wind, autopilot=autopilot)
 
     def flight_options(self) -> PlanOptions:
-        """How the flights are to be.
-
-        Raises:
-            InputError: a value means nothing.
-        """
+        """How the flights are to be; raises InputError: a value means nothing."""
         if unknown := [name for name in self.autopilots if name not in AUTOPILOTS]:
             raise InputError(f"'{unknown[0]}' flies no mission of ours; choose one of {', '.join(AUTOPILOTS)}")
         if not 0.0 <= self.swap_min < math.inf:
@@ -277,20 +273,12 @@ def _closed(line: Ring) -> bool:
     return len(line) > 3 and bool(steps[-1] <= 0.01 * steps.sum())
 
 
-def _over_ground(
-    request: PlanRequest,
-    cover: Callable[..., Plan],
-    wanted: shapely.Geometry,
-    grid: LocalGrid,
-) -> Plan:
+def _over_ground(request: PlanRequest, cover: Callable[..., Plan], wanted: shapely.Geometry, grid: LocalGrid) -> Plan:
     """The plan over the height model of a request, or over level ground without one.
 
     Args:
         request: as given. cover: plans at a height above ground, with its footprint and the `heights` of the flights.
         wanted: what is to be flown over, metres of the grid.
-
-    Raises:
-        InputError: the height model cannot be used, there is no start, or as `cover`.
     """
 
     def make(above_m: float, foot: Footprint, heights: FlightHeights | None) -> Plan:

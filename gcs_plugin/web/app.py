@@ -90,11 +90,7 @@ def calls(daemon: Daemon) -> list[Call]:
 
 
 class HttpRoutes:
-    """The functions of the routes.
-
-    Args:
-        daemon: the daemon that they call.
-    """
+    """The functions of the routes; `daemon`: the daemon that they call."""
 
     def __init__(self, daemon: Daemon) -> None:
         self.daemon = daemon

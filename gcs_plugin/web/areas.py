@@ -57,11 +57,7 @@ def _answer(named: tuple[bytes, str]) -> bytes:
 
 
 def area_of(data: bytes, name: str) -> dict[str, Any]:
-    """The content of an area file as JSON values; see `read_area`.
-
-    Raises:
-        InputError: it cannot be read.
-    """
+    """The content of an area file as JSON values; see `read_area`; raises InputError: it cannot be read."""
     with tempfile.TemporaryDirectory(prefix="orthoswarm-") as folder:
         suffix = PurePath(name).suffix.lower()
         path = Path(folder) / f"area{suffix if suffix.isascii() and suffix[1:].isalnum() else ''}"

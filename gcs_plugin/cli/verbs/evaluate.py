@@ -131,11 +131,7 @@ def _of_the_drawing(ortho: Path) -> dict[str, Any]:
 
 
 def _wait(args: argparse.Namespace) -> None:
-    """Wait until the orthoimage is there and, in a daemon's workspace, was written after the last refinement.
-
-    Raises:
-        OrthoSwarmError: that takes longer. InputError: there is nothing to wait for, or to measure it against.
-    """
+    """Wait until the orthoimage is there and, in a daemon's workspace, was written after the last refinement."""
     from gcs_plugin.daemon.store.journal import wrote_refined
     from orthoswarm.export.catalog.tiled_raster import product_file
 

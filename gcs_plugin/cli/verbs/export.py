@@ -71,11 +71,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _require_report(path: Path) -> None:
-    """Refuse a damaged report before the work; formats that need none accept that there is none.
-
-    Raises:
-        InputError: it is there and cannot be read.
-    """
+    """Refuse a damaged report before the work; formats that need none accept that there is none."""
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:

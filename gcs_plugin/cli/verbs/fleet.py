@@ -236,11 +236,7 @@ class _Prepared:
 
 
 def parse_systems(texts: Sequence[str]) -> list[int]:
-    """System ids in `3`, `v3` or `1,2,5`.
-
-    Raises:
-        InputError: not a system id.
-    """
+    """System ids in `3`, `v3` or `1,2,5`; raises InputError: not a system id."""
     systems: list[int] = []
     for text in texts:
         for part in text.split(","):

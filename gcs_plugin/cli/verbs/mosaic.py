@@ -84,12 +84,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--tone", choices=("photos", "map"), default="photos",
         help="brightness and hue of large areas: as the photos have it (default), or as the basemap has",
     )  # fmt: skip
-    add(
-        "--blend",
-        choices=("none", "seam"),
-        default="seam",
-        help="blend pictures over a few pixels at seams, or not",
-    )
+    add("--blend", choices=("none", "seam"), default="seam", help="blend pictures over a few pixels at seams, or not")
     add("--covariance", action="store_true", help="add covariances of position and rotation to frames.jsonl")
     add(
         "--tiles", choices=("auto", "yes", "no"), default="auto",

@@ -132,11 +132,7 @@ _POSITIVE = ("map_gsd", "spacing_m", "leg_spacing_m", "height_m", "speed_m_s")
 
 
 def _check(args: argparse.Namespace) -> None:
-    """Refuse values of which no set can be made.
-
-    Raises:
-        InputError: one is out of range, or --out is a file.
-    """
+    """Refuse values of which no set can be made; raises InputError: one is out of range, or --out is a file."""
     from gcs_plugin.cli.arguments import require_no_file
 
     for name, least in _LEAST.items():

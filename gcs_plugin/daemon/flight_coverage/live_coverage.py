@@ -137,11 +137,7 @@ _NOTHING: Final = _Result(
 
 
 class LinkedVehicles(Protocol):
-    """The vehicles on the links.
-
-    Attributes:
-        latest: their rows, at most half a second old.
-    """
+    """The vehicles on the links; `latest`: their rows, at most half a second old."""
 
     latest: Rows
 

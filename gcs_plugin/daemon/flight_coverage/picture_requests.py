@@ -191,9 +191,6 @@ class FetchedPictures:
         """The position of a camera event, with height and angles of the vehicle's picture nearest in time.
 
         For pictures that the links' poses, which go back some minutes, do not reach.
-
-        Raises:
-            InputError: the event has no position.
         """
         place = exposure_place(self._journal, wanted.vehicle, wanted.number, wanted.time_s)
         if place is None:

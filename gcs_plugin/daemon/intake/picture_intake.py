@@ -46,11 +46,7 @@ class _Refusals:
 
 
 class RefusedPictures:
-    """Counts them since the daemon's start; any thread.
-
-    Args:
-        events: told of each. clock: UTC epoch seconds.
-    """
+    """Counts them since the daemon's start; any thread; `events`: told of each. `clock`: UTC epoch seconds."""
 
     def __init__(self, events: Events, clock: Callable[[], float] = time.time) -> None:
         self._events, self._clock = events, clock
@@ -58,11 +54,7 @@ class RefusedPictures:
         self._by_cause: dict[str, _Refusals] = {}
 
     def note(self, cause: str, reason: str, vehicle: str = "", image: str = "") -> None:
-        """Count one.
-
-        Args:
-            cause: one of CAUSES. reason: in a sentence. vehicle, image: as far as known.
-        """
+        """Count one; `cause`: one of CAUSES. `reason`: in a sentence. `vehicle, image`: as far as known."""
         with self._lock:
             before = self._by_cause.get(cause)
             count = 1 if before is None else before.count + 1

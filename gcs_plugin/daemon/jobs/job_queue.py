@@ -338,11 +338,7 @@ class JobRequests:
         return [self._jobs.add("refine", *whose) for whose in wanted]
 
     def export(self, formats: list[str]) -> Job:
-        """Queue an export.
-
-        Raises:
-            InputError: an unknown format.
-        """
+        """Queue an export; raises InputError: an unknown format."""
         unknown = [name for name in formats if name not in FORMATS]
         if unknown or not formats:
             raise InputError(f"there is no format {unknown or 'given'}; choose from: {', '.join(FORMATS)}")

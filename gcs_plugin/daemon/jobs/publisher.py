@@ -137,11 +137,7 @@ class Publisher:
         return {path for table in _TABLES for path in solution_paths(self.journal, table).values()}
 
     def area(self) -> MapArea:
-        """The map's area.
-
-        Raises:
-            OrthoSwarmError: there is no map yet.
-        """
+        """The map's area; raises OrthoSwarmError: there is no map yet."""
         if self._drawer.area is None:
             raise OrthoSwarmError("there is no map yet; wait for pictures")
         return self._drawer.area

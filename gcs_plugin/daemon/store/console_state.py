@@ -78,11 +78,7 @@ class ConsoleState:
         return found
 
     def add_find(self, body: Mapping[str, Any]) -> FindRow:
-        """Add a find; returns it with its id.
-
-        Raises:
-            InputError: a field is invalid, or there are too many finds.
-        """
+        """Add a find; returns it with its id; raises InputError: a field is invalid, or there are too many finds."""
         row = _find(body)
         row["time"], row["version"] = _time_of(body), 1
         with self._lock:
@@ -135,11 +131,7 @@ class ConsoleState:
 
 
 def _find(body: Mapping[str, Any]) -> FindRow:
-    """Place and note of a find.
-
-    Raises:
-        InputError: a field is invalid.
-    """
+    """Place and note of a find; raises InputError: a field is invalid."""
     note = body.get("note") or ""
     if not isinstance(note, str) or len(note) > _MOST_NOTE:
         raise InputError(f"note is not a text of at most {_MOST_NOTE} characters; send a shorter one")
