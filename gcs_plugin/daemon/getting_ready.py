@@ -5,7 +5,7 @@ import sys
 import threading
 from typing import Final
 
-from gcs_plugin.daemon.store.daemon_events import Events, Problem
+from gcs_plugin.daemon.store.daemon_events import Events
 from orthoswarm.compute.compile_kernels import MADE_FOR
 
 _COMMAND: Final = (sys.executable, "-m", "orthoswarm.compute.compile_kernels")
@@ -43,6 +43,7 @@ class GettingReady:
         with process.stderr as lines:
             for line in lines:
                 self.problem = f"getting ready, {line.strip()}; {_MEANWHILE}"
-                self._events.publish(Problem(self.problem))
+                self._events.tell("problem", text=self.problem)
         self.problem = ""
-        self._events.publish(Problem("ready" if process.wait() == 0 else "kernels are compiled when they are needed"))
+        text = "ready" if process.wait() == 0 else "kernels are compiled when they are needed"
+        self._events.tell("problem", text=text)

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Final
 
-from gcs_plugin.daemon.store.daemon_events import Events, HoldsChanged
+from gcs_plugin.daemon.store.daemon_events import Events
 from gcs_plugin.daemon.store.people_rows import People, Person
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 
@@ -109,7 +109,7 @@ class Pilots:
         return hold if self._people.is_here(hold.pilot.id, GONE_S) else None
 
     def _tell(self) -> None:
-        self._events.publish(HoldsChanged(self.rows()))
+        self._events.tell("holds", rows=self.rows())
 
 
 def _row(person: Person | None) -> dict[str, Any] | None:

@@ -21,16 +21,7 @@ from typing import Any, Final, cast
 from gcs_plugin.daemon.airspace import Fences, Traffic
 from gcs_plugin.daemon.settings import Settings
 from gcs_plugin.daemon.start_checks import CheckRow, StartChecks, WaitingTakeoffs, red_items
-from gcs_plugin.daemon.store.daemon_events import (
-    CommandDone,
-    CompletionRefined,
-    Events,
-    JobEnded,
-    MissionNoted,
-    TrafficChanged,
-    VehicleChanged,
-    VehicleReported,
-)
+from gcs_plugin.daemon.store.daemon_events import Events, JobEnded, MissionNoted
 from gcs_plugin.daemon.store.frame_rows import exposure_times
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.daemon.store.sortie_rows import (
@@ -400,10 +391,10 @@ class VehicleLinks:
             "still_flying_after": [r["id"] for r in self.rows() if r["mission"]["phase"] == "active"],
         }  # fmt: skip
         self._journal.write(completion_refined(job.whose, facts))
-        self._events.publish(CompletionRefined({"vehicle": job.vehicle, "sortie": job.sortie, **facts}))
+        self._events.tell("completion", vehicle=job.vehicle, sortie=job.sortie, **facts)
 
     def _told(self, row: dict[str, Any]) -> None:
-        self._events.publish(CommandDone(row))
+        self._events.tell("command", **row)
 
     # -- what vehicles say (in the fleet's thread) ------------------------------------------------------------------
 
@@ -445,7 +436,7 @@ class VehicleLinks:
         grave = event.kind == "danger" or event.severity <= _FAULT
         if grave or event.kind != "text":
             _log.log(logging.WARNING if grave else logging.INFO, "%s", text)
-        self._events.publish(VehicleReported(about))
+        self._events.tell("vehicle_event", **about)
 
     def _found(self, vehicle: Vehicle, name: str) -> None:
         """Record a detected vehicle; its detector continues from the state stored by an earlier daemon."""
@@ -467,7 +458,7 @@ class VehicleLinks:
                 self.fleet.call(self._fences.look).result(_SOON_S)
                 self._publish_rows(complete=number % _COMPLETE_EVERY == 0)
                 if self.traffic.changed():
-                    self._events.publish(TrafficChanged(self.traffic.rows()))
+                    self._events.tell("traffic", rows=self.traffic.rows())
                 self._give_up_silent()
             except Exception as error:  # an unexpected state of one vehicle must not end the watch
                 _log.warning("watching vehicles: %s", str(error) or type(error).__name__)
@@ -484,7 +475,7 @@ class VehicleLinks:
             fresh = now if complete else {k: v for k, v in now.items() if k not in sent or sent[k] != v}
             sent.update(now)
             always = {"id": row["id"], "name": row["name"], "silent_s": row["silent_s"]}
-            self._events.publish(VehicleChanged(fresh | always))
+            self._events.tell("vehicle", **fresh | always)
 
     def _give_up_silent(self) -> None:
         """Refine the incomplete sortie of a vehicle that has been silent for long during its mission."""

@@ -151,7 +151,7 @@ def _left_by_macos(name: str) -> bool:
 
 
 def _texts(path: Path, name: str, suffix: str | tuple[str, ...] = ".kml") -> list[str]:
-    """The text of a file, those of a ZIP's files with a suffix, in the encoding that it has or that its XML declares."""
+    """The text of a file, or of those in a ZIP with a suffix, in the encoding that it has or that its XML declares."""
     try:
         data = [path.read_bytes()]
         if data[0].startswith(b"PK\x03\x04"):

@@ -33,7 +33,7 @@ from gcs_plugin.daemon.flight_coverage.picture_views import FlawedPictures, Meas
 from gcs_plugin.daemon.layers.realtime_layer import Drawer
 from gcs_plugin.daemon.stoppable_thread import Background
 from gcs_plugin.daemon.store.console_state import ConsoleState
-from gcs_plugin.daemon.store.daemon_events import CoverageChanged, Events, PictureDrawn
+from gcs_plugin.daemon.store.daemon_events import Events, PictureDrawn
 from gcs_plugin.daemon.store.frame_rows import last_drawn_arrival
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.daemon.vehicle_names import VehicleRow
@@ -345,7 +345,7 @@ class LiveCoverage(Background):
         self._rest_until = time.monotonic() + _LEAST_PAUSE * (time.thread_time() - cpu)
         found = self._result.document
         told: dict[str, Any] = {key: found[key] for key in _TOLD}
-        self._events.publish(CoverageChanged({"gaps": len(found["gaps"]), **told}))
+        self._events.tell("coverage", gaps=len(found["gaps"]), **told)
 
     def _found(self, here: _Followed) -> _Result:
         cover, grid = here.cover, here.covered.area.grid

@@ -22,7 +22,7 @@ from gcs_plugin.daemon.flight_coverage.live_coverage import LiveCoverage, Missin
 from gcs_plugin.daemon.intake.picture_intake import PictureIntake
 from gcs_plugin.daemon.intake.posted_pose import PostedPose, linked_pose
 from gcs_plugin.daemon.stoppable_thread import Background
-from gcs_plugin.daemon.store.daemon_events import Events, RequestsChanged
+from gcs_plugin.daemon.store.daemon_events import Events
 from gcs_plugin.daemon.store.frame_rows import dated_images, exposure_place, exposure_times, pose_near
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.fleet.fleet import Fleet
@@ -185,7 +185,7 @@ class FetchedPictures:
 
     def changed(self) -> None:
         """Tell the pages that a request's state has changed."""
-        self._events.publish(RequestsChanged())
+        self._events.tell("requests")
 
     def _event_pose(self, wanted: WantedPicture, name: str) -> PostedPose:
         """The position of a camera event, with height and angles of the vehicle's picture nearest in time.

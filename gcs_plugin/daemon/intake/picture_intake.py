@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from gcs_plugin.daemon.intake.posted_pose import PostedPose, frame_of, linked_pose
-from gcs_plugin.daemon.store.daemon_events import Events, PictureRefused, PictureRejected, PictureStored
+from gcs_plugin.daemon.store.daemon_events import Events, PictureRejected, PictureStored
 from gcs_plugin.daemon.store.frame_rows import add_frame, frame_by_key
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.daemon.store.picture_store import PictureStore, frame_key, picture_size
@@ -59,7 +59,7 @@ class RefusedPictures:
             before = self._by_cause.get(cause)
             count = 1 if before is None else before.count + 1
             self._by_cause[cause] = _Refusals(count, vehicle, image, reason, self._clock())
-        self._events.publish(PictureRefused(cause, count, vehicle, image, reason))
+        self._events.tell("refused", cause=cause, count=count, vehicle=vehicle, image=image, reason=reason)
 
     def picture_rejected(self, event: PictureRejected) -> None:
         """Count a stored picture that cannot be on the map."""

@@ -21,11 +21,9 @@ from gcs_plugin.daemon.store.daemon_events import (
     CardRead,
     Events,
     FirstPicturesCame,
-    JobChanged,
     JobEnded,
     LegsOver,
     MissionNoted,
-    Problem,
     VehicleSilent,
 )
 from gcs_plugin.daemon.store.frame_rows import Whose, late_frames, newest_seq, photographed_sorties, unplaced_frames
@@ -85,7 +83,7 @@ class RunningJob:
     def report(self, share: float, message: str) -> None:
         """Tell the pages its progress, 0 to 1, and what is being done."""
         self.job.progress, self.job.message = share, message
-        self._events.publish(JobChanged(self.job.document()))
+        self._events.tell("job", **self.job.document())
 
     def run(self, function: Callable[[Any], Result], item: Any) -> Result:
         """Run a function of one argument in a worker process, see `WorkerPool.run`.
@@ -115,7 +113,7 @@ class Jobs:
     """The queue of jobs.
 
     Args:
-        events: hears of every change; see JobChanged, JobEnded.
+        events: hears of every change, and JobEnded.
         handlers: kind -> function that does the job.
         workers: compute refinements, as many at once as it has processes. Two more may be at a step that needs none
             (waiting for a vehicle's last pictures, publishing). background: computes the others, and nothing else.
@@ -162,7 +160,7 @@ class Jobs:
     def add(self, kind: str, vehicle: str | None = None, sortie: int | None = None, **detail: Any) -> Job:
         """Queue a job; returns an equal waiting one if there is one."""
         job = self._journal.write(new_job(kind, vehicle, sortie, detail))
-        self._events.publish(JobChanged(job.document()))
+        self._events.tell("job", **job.document())
         self.wake()
         return job
 
@@ -240,7 +238,7 @@ class Jobs:
             job.detail["newest_seq"] = newest_seq(self._journal)  # pictures that arrive later are late
             self._make_way(job)
         self._journal.write(job_started(job))
-        self._events.publish(JobChanged(job.document()))
+        self._events.tell("job", **job.document())
         try:
             outcome = self._outcome(run)
             if outcome is None or not self._write_end(*outcome):
@@ -251,7 +249,7 @@ class Jobs:
                 self._running.pop(job.id, None)
                 self._unwanted.pop(job.id, None)
                 self._condition.notify_all()
-        self._events.publish(JobChanged(ended.document()))
+        self._events.tell("job", **ended.document())
         try:
             self._events.publish(JobEnded(ended))
         except OrthoSwarmError as error:
@@ -293,7 +291,7 @@ class Jobs:
             except StorageError as error:
                 if not self.problem:
                     _log.error("the end of job %d (%s) waits: %s", job.id, job.kind, error)
-                    self._events.publish(Problem(str(error)))
+                    self._events.tell("problem", text=str(error))
                 self.problem = str(error)
             else:
                 self.problem = ""

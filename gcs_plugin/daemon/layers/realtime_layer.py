@@ -27,13 +27,9 @@ from gcs_plugin.daemon.stoppable_thread import Background
 from gcs_plugin.daemon.store.daemon_events import (
     DrawingRestarted,
     Events,
-    FrameReported,
-    LayerDrawn,
-    Overload,
     PictureDrawn,
     PictureRejected,
     PictureStored,
-    Problem,
     VehicleLookedFor,
 )
 from gcs_plugin.daemon.store.frame_rows import (
@@ -191,7 +187,7 @@ class Drawer(Background):
         if problem != self.problem:
             self.problem = problem
             _log.error("drawing waits: %s", problem)
-            self._events.publish(Problem(problem))
+            self._events.tell("problem", text=problem)
         with self._condition:
             self._waiting = self._queue.seqs()
             self._more = True
@@ -215,7 +211,7 @@ class Drawer(Background):
             else:
                 _log.info("all pictures are on the map again")
         if before != self.put_off:
-            self._events.publish(Overload(self.put_off, self.overload))
+            self._events.tell("overload", put_off=self.put_off, text=self.overload)
 
     @property
     def overload(self) -> str:
@@ -267,7 +263,7 @@ class Drawer(Background):
             self._note(pending, result)
         if done:
             self._journal.write(frames_drawn(done))
-            self._events.publish(LayerDrawn("realtime", self._site.layer.version))
+            self._events.tell("layer", layer="realtime", version=self._site.layer.version)
         with self._condition:
             self._waiting.difference_update(seqs)
             self._condition.notify_all()
@@ -286,7 +282,7 @@ class Drawer(Background):
                 done.append(DrawnAgain(pending.seq, pose.sigma_m, camera))
         if done:
             self._journal.write(frames_moved(done))
-            self._events.publish(LayerDrawn("realtime", self._site.layer.version))
+            self._events.tell("layer", layer="realtime", version=self._site.layer.version)
 
     def _note(self, pending: PendingFrame, result: Drawn) -> None:
         took = time.time() - pending.arrived
@@ -358,11 +354,11 @@ class Drawer(Background):
             corners = camera.corners()
             if np.isfinite(corners).all():
                 outline = [[float(lon), float(lat)] for lat, lon in grid.to_geographic(corners)]
-        self._events.publish(FrameReported(
-            seq=drawn.seq, vehicle=frame.vehicle, image=frame.image, sortie=pending.sortie,
+        self._events.tell(
+            "frame", seq=drawn.seq, vehicle=frame.vehicle, image=frame.image, sortie=pending.sortie,
             stage="rejected" if drawn.reason else "realtime", reason=drawn.reason, sigma_m=drawn.sigma_m,
             lat_deg=fix.lat_deg, lon_deg=fix.lon_deg, outline=outline,
-        ))  # fmt: skip
+        )  # fmt: skip
         return drawn
 
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, Final, NamedTuple
 
-from gcs_plugin.daemon.store.daemon_events import Events, LogGrew, PeopleChanged
+from gcs_plugin.daemon.store.daemon_events import Events
 from gcs_plugin.daemon.store.journal import Journal, packed, unpacked
 from orthoswarm.export.product_files import iso_time
 from orthoswarm.export.tactical.places import spreadsheet_cell
@@ -117,7 +117,7 @@ class People:
             number = self._journal.write(
                 lambda db: db.execute("INSERT INTO people (name, role, invitation, made) VALUES (?, ?, ?, ?)", values)
             ).lastrowid
-        self._events.publish(PeopleChanged())
+        self._events.tell("people")
         return int(number or 0), secret
 
     def join(self, invitation: object) -> tuple[Person, str] | None:
@@ -131,7 +131,7 @@ class People:
             self._read()
         if row is None:
             return None
-        self._events.publish(PeopleChanged())
+        self._events.tell("people")
         return self._known[row["id"]], secret
 
     def revoke(self, number: int) -> bool:
@@ -143,7 +143,7 @@ class People:
             change = "UPDATE people SET revoked = ? WHERE id = ? AND revoked IS NULL"
             done = self._journal.write(lambda db: db.execute(change, values)).rowcount > 0
             self._read()
-        self._events.publish(PeopleChanged())
+        self._events.tell("people")
         return done
 
     def rows(self) -> list[dict[str, Any]]:
@@ -200,7 +200,7 @@ class People:
     def _noted(self, future: "Future[None]") -> None:
         if (problem := future.exception()) is not None:
             _log.warning("who did what was not noted: %s", problem)
-        self._events.publish(LogGrew())
+        self._events.tell("log")
 
     def log(self, most: int | None = _LATEST) -> list[dict[str, Any]]:
         """The log as JSON values, newest first: `time`, `name`, `role`, `action`, `target`, `outcome`, `reason`."""

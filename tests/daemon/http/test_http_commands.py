@@ -17,7 +17,7 @@ import pytest
 
 from gcs_plugin.daemon.intake.picture_intake import RefusedPictures
 from gcs_plugin.daemon.settings import Settings, VehicleSettings
-from gcs_plugin.daemon.store.daemon_events import Events, PictureRefused
+from gcs_plugin.daemon.store.daemon_events import Events, Told
 from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
 from gcs_plugin.web.connections import open_listener
 from gcs_plugin.web.event_stream import Standstill
@@ -374,12 +374,12 @@ def test_a_broken_link_and_two_vehicles_of_one_system_id_are_in_health(tmp_path)
 
 def test_old_refusals_are_counted_but_no_news():
     now, told, events = [0.0], [], Events()
-    events.on(PictureRefused, told.append)
+    events.on(Told, told.append)
     refused = RefusedPictures(events, lambda: now[0])
     refused.note("disk", "the disk is full", "v1", "a.jpg")
     refused.note("disk", "the disk is full", "v1", "b.jpg")
     assert refused.problems() == ["2 pictures refused or not on the map: the disk is full"]
-    assert [event.image for event in told] == ["a.jpg", "b.jpg"]
+    assert [event.told["image"] for event in told] == ["a.jpg", "b.jpg"]
     now[0] = 601.0
     assert refused.problems() == []
     assert refused.counts["disk"] == 2

@@ -9,7 +9,7 @@ import pytest
 
 from gcs_plugin.daemon.intake.can_reader import CanReader
 from gcs_plugin.daemon.settings import Settings, VehicleSettings
-from gcs_plugin.daemon.store.daemon_events import Events, Note
+from gcs_plugin.daemon.store.daemon_events import Events, Told
 from gcs_plugin.fleet.fleet import Fleet
 from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.sim.multirotor import Airframe
@@ -251,7 +251,7 @@ def test_a_vehicles_own_bus_comes_through_its_link(tmp_path):
 
 def test_a_bus_that_is_not_there_is_said_once_and_tried_again():
     said, events, fleet = [], Events(), Fleet([])
-    events.on(Note, said.append)
+    events.on(Told, said.append)
     reader = CanReader("v1", "socketcan:nothing0", poses=LivePoses("v1"), events=events, fleet=fleet, system=None)
     reader.start()
     end = time.monotonic() + 120.0

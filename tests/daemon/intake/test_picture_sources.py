@@ -16,7 +16,7 @@ from gcs_plugin.daemon.intake.picture_intake import VehicleIntake
 from gcs_plugin.daemon.intake.picture_sources import PictureSource
 from gcs_plugin.daemon.intake.posted_pose import frame_of
 from gcs_plugin.daemon.intake.watched_folder import is_complete, is_video_complete
-from gcs_plugin.daemon.store.daemon_events import Events, Note
+from gcs_plugin.daemon.store.daemon_events import Events, Told
 from gcs_plugin.daemon.store.picture_store import frame_key
 from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.links.tlog_writer import TlogWriter, read_tlog, write_link_log
@@ -93,7 +93,7 @@ class Workspace:
 def source_to(workspace, where, said, cache):
     """A vehicle's source of pictures; what it says is added to a list."""
     events = Events()
-    events.on(Note, lambda note: said.append(note.text))
+    events.on(Told, lambda note: said.append(note.told["text"]))
     log = cache / "telemetry.tlog"
     intake = VehicleIntake("v1", workspace, events, poses=LinkPoses(), tlog=log, system=None, cache=cache)
     return PictureSource(where, intake)
