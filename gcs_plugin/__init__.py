@@ -6,7 +6,7 @@ from orthoswarm.model.lazy_names import on_first_use
 
 if TYPE_CHECKING:
     from gcs_plugin.fleet.fleet import Fleet
-    from gcs_plugin.fleet.fleet_events import FleetEvent
+    from gcs_plugin.fleet.reception import FleetEvent
     from gcs_plugin.mission.items import Mission, MissionItem
     from gcs_plugin.mission.mission_builder import read_mission
     from gcs_plugin.plans.plan_files import write_plan

@@ -10,9 +10,9 @@ from typing import Any
 from gcs_plugin.config import HEARING
 from gcs_plugin.fleet.commands import Order, Verb
 from gcs_plugin.fleet.fleet import Fleet
-from gcs_plugin.fleet.fleet_events import FleetEvent
 from gcs_plugin.fleet.flight_state import Word, flight_state, summary
 from gcs_plugin.fleet.preflight import Check, preflight_all
+from gcs_plugin.fleet.reception import FleetEvent
 from gcs_plugin.fleet.separation.takeoff_schedule import TakeoffSchedule
 from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.mavlink import Autopilot, Message

@@ -12,61 +12,42 @@ import time
 from typing import Any, Final
 
 from gcs_plugin.daemon.airspace import TerrainData
-from gcs_plugin.daemon.changes import GroundChanges
-from gcs_plugin.daemon.exports import Exports, TakFeed
+from gcs_plugin.daemon.exports import Exports, GroundChanges, TakFeed
 from gcs_plugin.daemon.flight_coverage.exposure_journal import MESSAGES as EVENT_MESSAGES
 from gcs_plugin.daemon.flight_coverage.exposure_journal import EventRequests, ExposureJournal
 from gcs_plugin.daemon.flight_coverage.live_coverage import LiveCoverage
 from gcs_plugin.daemon.flight_coverage.picture_requests import FetchedPictures, PictureRequests
 from gcs_plugin.daemon.flight_coverage.picture_views import PictureViews
-from gcs_plugin.daemon.gap_flights import GapFlights
-from gcs_plugin.daemon.getting_ready import GettingReady
 from gcs_plugin.daemon.intake.can_reader import CanReader
 from gcs_plugin.daemon.intake.picture_intake import PictureIntake, RefusedPictures, VehicleIntake
 from gcs_plugin.daemon.intake.picture_sources import PictureSource
-from gcs_plugin.daemon.jobs.job_queue import JobRequests, Jobs
+from gcs_plugin.daemon.jobs.job_queue import JobRequests, Jobs, LegWatch
 from gcs_plugin.daemon.jobs.leg_placement import LegPlacement
-from gcs_plugin.daemon.jobs.leg_watch import LegWatch
 from gcs_plugin.daemon.jobs.neighbours import JointRefinement, ToneBalance
 from gcs_plugin.daemon.jobs.publisher import Publisher
 from gcs_plugin.daemon.jobs.sortie_refinement import SortieRefinement
-from gcs_plugin.daemon.jobs.worker_pool import LAST, WorkerPool
+from gcs_plugin.daemon.jobs.worker_pool import LAST, GettingReady, WorkerPool
 from gcs_plugin.daemon.jobs.workspace_products import RunFacts
 from gcs_plugin.daemon.layers.layers import NAMES, MapLayer
 from gcs_plugin.daemon.layers.map_site import ExpectedPlace, MapSite
 from gcs_plugin.daemon.layers.realtime_layer import Drawer
 from gcs_plugin.daemon.layers.web_tiles import TileServer
-from gcs_plugin.daemon.pilots import Pilots
 from gcs_plugin.daemon.settings import Settings
+from gcs_plugin.daemon.store import daemon_events as happened
 from gcs_plugin.daemon.store.console_state import ConsoleState
-from gcs_plugin.daemon.store.daemon_events import (
-    AreaChanged,
-    CardRead,
-    DrawingRestarted,
-    Events,
-    FirstPicturesCame,
-    JobEnded,
-    LayerPublished,
-    LegsOver,
-    MissionNoted,
-    PictureDrawn,
-    PictureRejected,
-    PictureStored,
-    VehicleLookedFor,
-    VehicleSilent,
-)
+from gcs_plugin.daemon.store.daemon_events import Events
 from gcs_plugin.daemon.store.journal import Journal
-from gcs_plugin.daemon.store.people_rows import People
+from gcs_plugin.daemon.store.people_rows import People, Pilots
 from gcs_plugin.daemon.store.picture_store import KeptPictures, PictureStore
 from gcs_plugin.daemon.store.workspace_lock import distrust_after_power_cut, take_over
 from gcs_plugin.daemon.takeoffs import Takeoffs
 from gcs_plugin.daemon.vehicles import VehicleLinks
 from gcs_plugin.daemon.views import Views
-from gcs_plugin.daemon.web_plans import Plans
+from gcs_plugin.daemon.web_plans import GapFlights, Plans
 from orthoswarm.compute.workers import prepare_process
 from telemetry.live.live_poses import LinkPoses
 
-_FEW: Final = 10  # posted pictures of a vehicle, after which the kernels of a refinement are compiled
+_FEW: Final = 10  # posted pictures of a vehicle, after which the process for background jobs is started
 _SOURCES_S: Final = 1.0
 _log = logging.getLogger(__name__)
 
@@ -94,7 +75,7 @@ class Daemon:
             self._open_jobs()
             self._subscribe()
             if self.drawer.area is not None:
-                self.events.publish(AreaChanged(self.drawer.area.epsg))
+                self.events.publish(happened.AreaChanged(self.drawer.area.epsg))
             undone.pop_all()
 
     def _open_records(self) -> None:
@@ -207,27 +188,26 @@ class Daemon:
     def _subscribe(self) -> None:
         """Who hears what, in this order, in the thread of the part that tells it."""
         on = self.events.on
-        on(PictureStored, self.drawer.picture_stored)  # told by: PictureIntake
-        on(PictureStored, self.leg_watch.picture_stored)
-        on(PictureStored, self._warm_up)
-        on(PictureDrawn, self.coverage.picture_drawn)  # Drawer
-        on(PictureRejected, self.refused.picture_rejected)
-        on(AreaChanged, self.tiles.area_changed)  # MapSite
-        on(DrawingRestarted, self.drawer.draw_anew)
-        on(FirstPicturesCame, self.requests.first_pictures_came)  # Drawer
-        on(VehicleLookedFor, self.drawer.vehicle_looked_for)  # LegPlacement
-        on(LegsOver, self.requests.legs_over)  # LegWatch
-        on(VehicleSilent, self.requests.vehicle_silent)
-        on(CardRead, self.requests.card_read)  # VehicleIntake
-        on(MissionNoted, self.requests.mission_noted)  # VehicleLinks
-        on(LayerPublished, self.coverage.look)  # Publisher
-        on(JobEnded, self.links.job_ended)  # Jobs
-        on(JobEnded, self.requests.job_ended)
+        on(happened.PictureStored, self.drawer.picture_stored)  # told by: PictureIntake
+        on(happened.PictureStored, self.leg_watch.picture_stored)
+        on(happened.PictureStored, self._warm_up)
+        on(happened.PictureDrawn, self.coverage.picture_drawn)  # Drawer
+        on(happened.PictureRejected, self.refused.picture_rejected)
+        on(happened.AreaChanged, self.tiles.area_changed)  # MapSite
+        on(happened.DrawingRestarted, self.drawer.draw_anew)
+        on(happened.FirstPicturesCame, self.requests.first_pictures_came)  # Drawer
+        on(happened.VehicleLookedFor, self.drawer.vehicle_looked_for)  # LegPlacement
+        on(happened.LegsOver, self.requests.legs_over)  # LegWatch
+        on(happened.VehicleSilent, self.requests.vehicle_silent)
+        on(happened.CardRead, self.requests.card_read)  # VehicleIntake
+        on(happened.MissionNoted, self.requests.mission_noted)  # VehicleLinks
+        on(happened.LayerPublished, self.coverage.look)  # Publisher
+        on(happened.JobEnded, self.links.job_ended)  # Jobs
+        on(happened.JobEnded, self.requests.job_ended)
 
-    def _warm_up(self, event: PictureStored) -> None:
-        """Have the kernels of a refinement compiled, as one is to come."""
+    def _warm_up(self, event: happened.PictureStored) -> None:
+        """Start the process of what is done in the background, as a vehicle is soon to be looked for on the map."""
         if event.count == _FEW:
-            self.workers.warm_kernels()
             self.background.warm_up()
 
     def start(self) -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final
 
-from gcs_plugin.demo.setting import FOV_MIN_DEG, HEIGHT_M, DemoSetting
+from gcs_plugin.demo.simulated_camera import FOV_MIN_DEG, HEIGHT_M, DemoSetting
 from orthoswarm.compute.workers import spawn_context, starting_processes
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 

@@ -18,10 +18,9 @@ from typing import Final, TypeVar
 from gcs_plugin.config import COMMAND
 from gcs_plugin.fleet.commands import URGENT, Order, Verb
 from gcs_plugin.fleet.dialogues import Dialogues, continued, resumed
-from gcs_plugin.fleet.fleet_events import FleetEvent
 from gcs_plugin.fleet.heard_messages import MESSAGE_IDS
 from gcs_plugin.fleet.link_hub import Hub
-from gcs_plugin.fleet.reception import Handler, Reception
+from gcs_plugin.fleet.reception import FleetEvent, Handler, Reception
 from gcs_plugin.fleet.separation.separation_watch import NUMBERED, VehicleNames
 from gcs_plugin.fleet.vehicle_state import Vehicle
 from gcs_plugin.links.mavlink import Autopilot, Message

@@ -22,20 +22,8 @@ from gcs_plugin.mission.mission_files import SurveySettings
 from orthoswarm.model.coordinate_system import to_degrees
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.plan import Fence
-from orthoswarm.planning.area.shape_files import (
-    SIZES,
-    Circle,
-    Polygon,
-    Ring,
-    Shapes,
-    circle_of,
-    counted,
-    parse_geojson,
-    parse_kml,
-    refuse_many_corners,
-    ring,
-    strip_of,
-)
+from orthoswarm.planning.area import shape_files
+from orthoswarm.planning.area.shape_files import Circle, Polygon, Ring, Shapes
 
 _KINDS: Final = {
     ".geojson": ("GeoJSON",),
@@ -87,17 +75,19 @@ def read_shapes(path: Path, name: str | None = None, *, any_size: bool = False) 
         return AreaFile(Shapes.joined([_shapes(f"/vsizip/{{{path}}}/{place}", name, any_size) for place in places]), [])
     if kind in ("GeoJSON", "zipped GeoJSON"):
         texts = _texts(path, name, _GEOJSON)
-        return AreaFile(Shapes.joined([parse_geojson(text, name, any_size=any_size) for text in texts]), [])
+        return AreaFile(Shapes.joined([shape_files.parse_geojson(text, name, any_size=any_size) for text in texts]), [])
     route = kind == "KMZ" and bool(_inside(path, name, _ROUTE))
     if kind in ("KML", "KMZ") and not route:
-        return AreaFile(Shapes.joined([parse_kml(t, name, any_size=any_size) for t in _texts(path, name)]), [])
+        return AreaFile(
+            Shapes.joined([shape_files.parse_kml(t, name, any_size=any_size) for t in _texts(path, name)]), []
+        )
     mission = read_mission_file(path.read_bytes() if route else _texts(path, name)[0].encode(), name)
-    polygons = tuple(Polygon(ring(survey, name)) for survey in mission.surveys)
-    lines = tuple(ring(line, name, 2) for line in (mission.polylines or mission.lines()))
+    polygons = tuple(Polygon(shape_files.ring(survey, name)) for survey in mission.surveys)
+    lines = tuple(shape_files.ring(line, name, 2) for line in (mission.polylines or mission.lines()))
     for fence in mission.fences:
         if fence.radius_m is None:
-            ring(fence.points, name)
-    zones = [ring(zone, name) for zone in mission.no_fly]
+            shape_files.ring(fence.points, name)
+    zones = [shape_files.ring(zone, name) for zone in mission.no_fly]
     return AreaFile(Shapes(polygons, lines), zones, mission.fences, mission.survey)
 
 
@@ -210,22 +200,22 @@ def _shapes(source: str, name: str, any_size: bool) -> Shapes:
             polygons.append(Polygon(shell, tuple(holes)))
         elif part.geom_type == "LineString":
             line = _degrees(part.coords, crs, name, 2)
-            strip = strip_of(line, said, name)
+            strip = shape_files.strip_of(line, said, name)
             polygons += strip
             lines += [] if strip else [line]
         elif part.geom_type == "Point" and (circle := _circle(part, crs, said, name)) is not None:
             circles.append(circle)
         else:
             unused[part.geom_type.lower()] += 1
-    found = Shapes(tuple(polygons), tuple(lines), tuple(circles), unused=counted(unused))
+    found = Shapes(tuple(polygons), tuple(lines), tuple(circles), unused=shape_files.counted(unused))
     if not any_size:
-        refuse_many_corners([*found.areas, *lines], name)
+        shape_files.refuse_many_corners([*found.areas, *lines], name)
     return found
 
 
 def _circle(point: Any, crs: str | None, said: dict[str, Any], name: str) -> Circle | None:
     [lat, lon] = _degrees(point.coords, crs, name, 1)[0]
-    return circle_of(float(lat), float(lon), said, name)
+    return shape_files.circle_of(float(lat), float(lon), said, name)
 
 
 def _parts_of(source: str, layer: str) -> Iterator[tuple[str | None, Any, dict[str, Any]]]:
@@ -233,7 +223,7 @@ def _parts_of(source: str, layer: str) -> Iterator[tuple[str | None, Any, dict[s
     from pyogrio import read_info
     from pyogrio.raw import read
 
-    sizes = [field for field in read_info(source, layer=layer)["fields"] if field.lower() in SIZES]
+    sizes = [field for field in read_info(source, layer=layer)["fields"] if field.lower() in shape_files.SIZES]
     meta, _, geometries, values = read(source, layer=layer, columns=sizes, force_2d=True)
     said = {field.lower(): column for field, column in zip(meta["fields"], values, strict=True)}
     for k, geometry in enumerate(shapely.from_wkb(geometries)):
@@ -252,4 +242,4 @@ def _degrees(points: object, crs: str | None, name: str, least: int = 3) -> Ring
         lon_lat, _ = to_degrees(crs, array[:, 0], array[:, 1])
     except InputError as error:
         raise InputError(f"{name}: {error}; or export it in WGS 84 (EPSG:4326)") from None
-    return ring(lon_lat[:, ::-1], name, least)
+    return shape_files.ring(lon_lat[:, ::-1], name, least)

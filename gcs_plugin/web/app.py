@@ -21,14 +21,13 @@ from gcs_plugin.daemon.layers.web_tiles import TileAddress
 from gcs_plugin.daemon.store.frame_rows import stage_counts
 from gcs_plugin.daemon.store.job_rows import job_counts
 from gcs_plugin.web.answers import JsonAnswer, in_thread, install_error_answers, json_body, parse_json
-from gcs_plugin.web.areas import read_area
 from gcs_plugin.web.assets import Assets, Packed
 from gcs_plugin.web.command_routes import CommandRoutes
 from gcs_plugin.web.event_stream import Standstill, stream_events
 from gcs_plugin.web.guard import Access, Guard
 from gcs_plugin.web.map_services import MapServices
 from gcs_plugin.web.people_routes import PeopleRoutes
-from gcs_plugin.web.uploads import UploadRoute
+from gcs_plugin.web.uploads import UploadRoute, read_area
 from orthoswarm import __version__
 from orthoswarm.compute.workers import peak_rss_mb
 from orthoswarm.export.tactical.places import feature

@@ -2,7 +2,7 @@
 
 import pytest
 
-from gcs_plugin.sim.lossy_radio import Faults
+from gcs_plugin.sim.simulated_swarm import Faults
 from tests.kit.vehicles.memory_link import World
 
 

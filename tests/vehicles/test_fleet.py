@@ -18,8 +18,7 @@ from gcs_plugin.links.transports import UdpLink
 from gcs_plugin.mission.completion import CompletionDetector
 from gcs_plugin.mission.exchange import Address
 from gcs_plugin.mission.items import RTL, MissionItem
-from gcs_plugin.sim.lossy_radio import Faults
-from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
+from gcs_plugin.sim.simulated_swarm import Faults, SimSwarm, make_swarm
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 from tests.vehicles.test_sim import mission

@@ -18,8 +18,7 @@ from gcs_plugin.fleet.separation.separation_watch import Near, SeparationWatch
 from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.mission.mission_builder import read_mission
 from gcs_plugin.mission.plan_folder import plan_needs
-from gcs_plugin.sim.lossy_radio import NO_FAULTS, Faults
-from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
+from gcs_plugin.sim.simulated_swarm import NO_FAULTS, Faults, SimSwarm, make_swarm
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 from telemetry.live.live_poses import LinkPoses
 from tests.vehicles.test_fleet_cli import HOME, folder  # noqa: F401

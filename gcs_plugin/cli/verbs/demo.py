@@ -33,10 +33,10 @@ def run(args: argparse.Namespace) -> int:
 
     prepare_process()
 
-    from gcs_plugin.cli.progress import ProgressBars
+    from gcs_plugin.cli.arguments import ProgressBars
     from gcs_plugin.cli.verbs.doctor import compile_cold_kernels
     from gcs_plugin.demo.demonstration import run_demo
-    from gcs_plugin.demo.setting import DemoSetting
+    from gcs_plugin.demo.simulated_camera import DemoSetting
 
     if not 1 <= args.vehicles <= 12:
         raise InputError(f"{args.vehicles} vehicles are not possible here; choose 1 to 12")

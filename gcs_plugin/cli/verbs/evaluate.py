@@ -105,7 +105,7 @@ def _live(args: argparse.Namespace) -> int:
     """Print where pictures were drawn first."""
     if args.truth is None or args.ortho is not None:
         raise InputError("--live WORKSPACE needs --truth FRAMES.csv, and no orthoimage")
-    from gcs_plugin.bench.live_errors import live_errors
+    from gcs_plugin.bench.accuracy import live_errors
 
     found = live_errors(args.live, args.truth)
     if args.json:

@@ -33,8 +33,7 @@ def run(args: argparse.Namespace) -> int:
 
     prepare_process()
 
-    from gcs_plugin.cli.arguments import require_no_file
-    from gcs_plugin.cli.progress import ProgressBars
+    from gcs_plugin.cli.arguments import ProgressBars, require_no_file
 
     if not 1 <= args.quality <= 100:
         raise InputError(f"--quality {args.quality} is out of range; give 1 to 100")

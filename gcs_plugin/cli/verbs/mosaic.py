@@ -117,7 +117,7 @@ def run(args: argparse.Namespace) -> int:
     from functools import partial
 
     import telemetry
-    from gcs_plugin.cli.progress import ProgressBars
+    from gcs_plugin.cli.arguments import ProgressBars
     from orthoswarm.batch.pipeline import run as run_pipeline
     from orthoswarm.batch.run_state import is_written
     from orthoswarm.batch.workspace import VIDEO, missing, unmake

@@ -5,44 +5,32 @@ journal change that also marks it as done. Refinements have their own threads; b
 joint refinements of neighbours, tones, exports, comparisons with the basemap) run one at a time in another thread. They
 start only while no refinement waits or runs, and give way to one that begins; drawing a layer again does not wait.
 `JobRequests` asks for jobs when something has happened: a leg is over, a mission complete, a refinement done.
+`LegWatch` detects legs that are over in flight, and vehicles that fall silent.
 """
 
 import logging
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Final, TypeVar
 
-from gcs_plugin.daemon.jobs.leg_watch import LegWatch
+import numpy as np
+
+from gcs_plugin.config import SORTIE
 from gcs_plugin.daemon.jobs.worker_pool import WorkerPool
 from gcs_plugin.daemon.jobs.workspace_products import FORMATS, PRODUCTS
-from gcs_plugin.daemon.store.daemon_events import (
-    CardRead,
-    Events,
-    FirstPicturesCame,
-    JobEnded,
-    LegsOver,
-    MissionNoted,
-    VehicleSilent,
-)
+from gcs_plugin.daemon.stoppable_thread import Background
+from gcs_plugin.daemon.store import daemon_events as happened
+from gcs_plugin.daemon.store import job_rows
+from gcs_plugin.daemon.store.daemon_events import Events
 from gcs_plugin.daemon.store.frame_rows import Whose, late_frames, newest_seq, photographed_sorties, unplaced_frames
-from gcs_plugin.daemon.store.job_rows import (
-    Job,
-    find_job,
-    interrupted_jobs_queued,
-    job_ended,
-    job_started,
-    latest_jobs,
-    new_job,
-    open_jobs,
-    queued_jobs,
-    refinement_is_open,
-    waiting_jobs_dropped,
-)
+from gcs_plugin.daemon.store.job_rows import Job
 from gcs_plugin.daemon.store.journal import Change, Journal, all_changes
 from gcs_plugin.daemon.store.sortie_rows import complete_sorties, is_complete, present_sortie
+from orthoswarm.model.earth import DEGREE_M
 from orthoswarm.model.errors import InputError, OrthoSwarmError, StorageError, WorkerStoppedError
+from orthoswarm.trajectory.legs import ended_legs
 
 Result = TypeVar("Result")
 
@@ -138,7 +126,7 @@ class Jobs:
             for n in range(workers.count + _WAITING_THREADS)
         ]
         self._threads.append(threading.Thread(target=self._run, args=(True,), name="background jobs", daemon=True))
-        journal.write(interrupted_jobs_queued)
+        journal.write(job_rows.interrupted_jobs_queued)
 
     def start(self) -> None:
         """Start working."""
@@ -159,14 +147,14 @@ class Jobs:
 
     def add(self, kind: str, vehicle: str | None = None, sortie: int | None = None, **detail: Any) -> Job:
         """Queue a job; returns an equal waiting one if there is one."""
-        job = self._journal.write(new_job(kind, vehicle, sortie, detail))
+        job = self._journal.write(job_rows.new_job(kind, vehicle, sortie, detail))
         self._events.tell("job", **job.document())
         self.wake()
         return job
 
     def drop(self, kind: str, vehicle: str, why: str) -> None:
         """Cancel a vehicle's jobs of a kind: waiting ones end at once, a running one is abandoned."""
-        self._journal.write(waiting_jobs_dropped(kind, vehicle, why))
+        self._journal.write(job_rows.waiting_jobs_dropped(kind, vehicle, why))
         with self._condition:
             found = [run for run in self._running.values() if (run.job.kind, run.job.vehicle) == (kind, vehicle)]
             dropped = [run for run in found if "after" not in run.job.detail]
@@ -181,7 +169,7 @@ class Jobs:
 
     def all(self) -> list[Job]:
         """The latest jobs, oldest first."""
-        found = latest_jobs(self._journal, _MOST_LISTED)
+        found = job_rows.latest_jobs(self._journal, _MOST_LISTED)
         with self._condition:
             return [self._running[job.id].job if job.id in self._running else job for job in found]
 
@@ -191,11 +179,11 @@ class Jobs:
 
     def find(self, number: int) -> Job | None:
         """A job by its number."""
-        return find_job(self._journal, number)
+        return job_rows.find_job(self._journal, number)
 
     def open(self, *kinds: str) -> int:
         """Number of waiting and running jobs of these kinds (all, if none is given), without coarse maps in flight."""
-        return sum(not kinds or kind in kinds for kind in open_jobs(self._journal))
+        return sum(not kinds or kind in kinds for kind in job_rows.open_jobs(self._journal))
 
     # -- the threads ----------------------------------------------------------------------------------------------
 
@@ -218,7 +206,7 @@ class Jobs:
 
     def _next(self, background: bool) -> RunningJob | None:
         """Take the next background job, or the next refinement; the jobs of a vehicle run one after the other."""
-        queued = queued_jobs(self._journal)
+        queued = job_rows.queued_jobs(self._journal)
         busy = {_lane(run.job) for run in self._running.values()}
         refining = any(kind == "refine" for kind, _ in busy) or any(job.kind == "refine" for job in queued)
         for job in queued:
@@ -237,7 +225,7 @@ class Jobs:
         if job.kind == "refine":
             job.detail["newest_seq"] = newest_seq(self._journal)  # pictures that arrive later are late
             self._make_way(job)
-        self._journal.write(job_started(job))
+        self._journal.write(job_rows.job_started(job))
         self._events.tell("job", **job.document())
         try:
             outcome = self._outcome(run)
@@ -251,7 +239,7 @@ class Jobs:
                 self._condition.notify_all()
         self._events.tell("job", **ended.document())
         try:
-            self._events.publish(JobEnded(ended))
+            self._events.publish(happened.JobEnded(ended))
         except OrthoSwarmError as error:
             _log.error("after job %d: %s", job.id, error)
 
@@ -271,7 +259,7 @@ class Jobs:
             if self._stop.is_set():
                 return None
             ended = replace(job, state="done", progress=1.0, message="", ended=time.time())
-            return ended, all_changes(change, job_ended(ended))
+            return ended, all_changes(change, job_rows.job_ended(ended))
         except Exception as error:
             if self._stop.is_set():  # its worker was stopped
                 return None
@@ -281,7 +269,7 @@ class Jobs:
                 ended = replace(job, state="queued", progress=0.0, started=None, attempts=job.attempts - 1)
             else:
                 ended = _failed(job, error)
-            return ended, job_ended(ended)
+            return ended, job_rows.job_ended(ended)
 
     def _write_end(self, job: Job, change: Change) -> bool:
         """Write a job's end, retrying while the disk is full; False if the daemon stops before that."""
@@ -314,6 +302,93 @@ def _failed(job: Job, error: Exception) -> Job:
 def _lane(job: Job) -> tuple[str, str | None]:
     """The lane of a job: of jobs in one lane only one runs at a time."""
     return ("background", None) if job.kind in _BACKGROUND else (job.kind, job.vehicle)
+
+
+_LOOK_S: Final = 0.5
+
+
+@dataclass(slots=True)
+class _Path:
+    """Times and positions of a sortie's pictures since the last leg that was asked for."""
+
+    times: list[float] = field(default_factory=list)
+    places: list[tuple[float, float]] = field(default_factory=list)
+    heard: float = 0.0
+    dirty: bool = False
+
+
+class LegWatch(Background):
+    """Watches the paths of all vehicles, in a thread.
+
+    Args:
+        events: told of finished legs, and of a vehicle that falls silent, however few pictures it sent before.
+
+    Attributes:
+        silent_s: a vehicle is silent when no picture has arrived for so long, seconds.
+    """
+
+    def __init__(self, events: Events, *, silent_s: float) -> None:
+        super().__init__("legs")
+        self._events, self.silent_s = events, silent_s
+        self._lock = threading.Lock()
+        self._paths: dict[tuple[str, int], _Path] = {}
+
+    def picture_stored(self, event: happened.PictureStored) -> None:
+        """Record a picture that has come; one without a position says nothing of the path."""
+        if event.has_fix:
+            frame = event.frame
+            time_s = event.arrived_s if frame.time_s is None else frame.time_s
+            self.add(frame.vehicle, event.sortie, time_s, frame.fix.lat_deg, frame.fix.lon_deg)
+
+    def add(self, vehicle: str, sortie: int, time_s: float, lat_deg: float, lon_deg: float) -> None:
+        """Record a picture; any thread."""
+        with self._lock:
+            path = self._paths.setdefault((vehicle, sortie), _Path())
+            path.times.append(time_s)
+            path.places.append((lat_deg, lon_deg))
+            path.heard, path.dirty = time.monotonic(), True
+
+    def _run(self) -> None:
+        while not self._stop.wait(min(_LOOK_S, 0.25 * self.silent_s)):
+            now = time.monotonic()
+            with self._lock:
+                due = [
+                    (key, path)
+                    for key, path in self._paths.items()
+                    if (path.dirty and len(path.times) >= SORTIE.coarse_map_pictures)
+                    or 0 < path.heard < now - self.silent_s
+                ]
+            for key, path in due:
+                try:
+                    self._look(key, path, now)
+                except Exception:  # an error in one path must not end the watch of the others
+                    _log.exception("the legs of %s", key[0])
+
+    def _look(self, key: tuple[str, int], path: _Path, now: float) -> None:
+        with self._lock:
+            order = sorted(range(len(path.times)), key=path.times.__getitem__)
+            times = [path.times[k] for k in order]
+            places = [path.places[k] for k in order]
+            silent = now - path.heard > self.silent_s
+            path.dirty = False
+            if silent:
+                path.heard = 0.0  # reported once
+        if silent:
+            self._events.publish(happened.VehicleSilent(*key))
+        if len(times) < SORTIE.coarse_map_pictures:
+            return
+        lat, lon = np.array(places).T
+        north = (lat - lat[0]) * DEGREE_M
+        east = (lon - lon[0]) * DEGREE_M * np.cos(np.radians(lat[0]))
+        legs = ended_legs(np.column_stack([east, north]), np.array(times), over=silent)
+        if sum(last + 1 - first for first, last in legs) < SORTIE.coarse_map_pictures:
+            return
+        with self._lock:
+            past = set(times[: legs[-1][1] + 1])
+            keep = [k for k, t in enumerate(path.times) if t not in past]
+            path.times = [path.times[k] for k in keep]
+            path.places = [path.places[k] for k in keep]
+        self._events.publish(happened.LegsOver(*key, silent))
 
 
 class JobRequests:
@@ -352,39 +427,39 @@ class JobRequests:
 
     # -- what has happened ----------------------------------------------------------------------------------------
 
-    def first_pictures_came(self, event: FirstPicturesCame) -> None:
+    def first_pictures_came(self, event: happened.FirstPicturesCame) -> None:
         """Have a vehicle looked for on the basemap."""
         if self._coarse and not is_complete(self._journal, (event.vehicle, event.sortie)):
             self._jobs.add("coarse", event.vehicle, event.sortie, first=True)
 
-    def legs_over(self, event: LegsOver) -> None:
+    def legs_over(self, event: happened.LegsOver) -> None:
         """Queue the coarse map of a sortie that is still flown; on a basemap it is registered picture by picture."""
         whose = (event.vehicle, event.sortie)
         if self._coarse and not self._basemap and not is_complete(self._journal, whose):
             self._jobs.add("coarse", event.vehicle, event.sortie, **({"over": True} if event.silent else {}))
 
-    def vehicle_silent(self, event: VehicleSilent) -> None:
+    def vehicle_silent(self, event: happened.VehicleSilent) -> None:
         """Have late pictures placed that came over a slow link; before a refinement, have all tracked for it."""
         whose = (event.vehicle, event.sortie)
         self._refine_late(whose)
         if self._coarse and self._basemap and not is_complete(self._journal, whose):
             self._jobs.add("coarse", *whose, over=True)
 
-    def card_read(self, event: CardRead) -> None:
+    def card_read(self, event: happened.CardRead) -> None:
         """Have the sortie refined with the pictures of a card that was read after landing."""
         self._refine_late((event.vehicle, present_sortie(self._journal, event.vehicle)))
 
     def _refine_late(self, whose: Whose) -> None:
-        if not refinement_is_open(self._journal, whose, "queued") and late_frames(self._journal, *whose):
+        if not job_rows.refinement_is_open(self._journal, whose, "queued") and late_frames(self._journal, *whose):
             self._jobs.add("refine", *whose, trigger="late")
 
-    def mission_noted(self, event: MissionNoted) -> None:
+    def mission_noted(self, event: happened.MissionNoted) -> None:
         """Begin the refinement that a completion has queued; the vehicle's coarse maps are not needed any more."""
         if event.kind == "complete":
             self._jobs.drop("coarse", event.vehicle, _COMPLETE)
         self._jobs.wake()
 
-    def job_ended(self, event: JobEnded) -> None:
+    def job_ended(self, event: happened.JobEnded) -> None:
         """Export the products again once nothing is left to refine, then compare them with the map."""
         job = event.job
         written = job.kind == "export" and job.state == "done" and "after" in job.detail

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from gcs_plugin.daemon.flight_coverage.flown_legs import BatteryUse, FlownLegs, PlannedLegs
-from gcs_plugin.daemon.gap_flights import GapFlights
-from gcs_plugin.daemon.web_plans import Plans
+from gcs_plugin.daemon.web_plans import GapFlights, Plans
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 from orthoswarm.model.geo import LocalGrid
 from tests.daemon.on_links import OnLinks

@@ -7,7 +7,7 @@ from gcs_plugin.daemon.flight_coverage.picture_requests import PictureNames, Pic
 from gcs_plugin.links.file_transfer import FtpPayload, Nak, Opcode, file_crc32
 from gcs_plugin.links.mavlink import Autopilot
 from gcs_plugin.sim.file_server import FileServer
-from gcs_plugin.sim.lossy_radio import NO_FAULTS, Faults
+from gcs_plugin.sim.simulated_swarm import NO_FAULTS, Faults
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
 from orthoswarm.model.errors import DiskFullError, InputError
 from tests.kit.vehicles.memory_link import World

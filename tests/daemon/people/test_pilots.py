@@ -2,10 +2,9 @@
 
 import pytest
 
-from gcs_plugin.daemon.pilots import GONE_S, Pilots
 from gcs_plugin.daemon.store.daemon_events import Events, Told
 from gcs_plugin.daemon.store.journal import Journal
-from gcs_plugin.daemon.store.people_rows import OPERATOR, People, Person
+from gcs_plugin.daemon.store.people_rows import GONE_S, OPERATOR, People, Person, Pilots
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 
 

@@ -12,9 +12,8 @@ from gcs_plugin.fleet.preflight import Level, Wanted, preflight
 from gcs_plugin.links.mavlink import Autopilot, dialect
 from gcs_plugin.mission.items import FRAME_GLOBAL, FRAME_TERRAIN, RTL, TAKEOFF, WAYPOINT, Mission, MissionItem
 from gcs_plugin.mission.mission_builder import read_mission
-from gcs_plugin.sim.lossy_radio import Faults
 from gcs_plugin.sim.multirotor import Chart
-from gcs_plugin.sim.simulated_swarm import SimSwarm, make_swarm
+from gcs_plugin.sim.simulated_swarm import Faults, SimSwarm, make_swarm
 from gcs_plugin.sim.simulated_vehicle import SimVehicle
 from tests.kit.servers.ports import free_port
 from tests.vehicles.test_fleet_cli import HOME, fleet, folder  # noqa: F401
