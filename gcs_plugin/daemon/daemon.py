@@ -7,8 +7,10 @@ Parts are made in an order in which each needs only those before it. What happen
 import contextlib
 import logging
 import math
+import os
 import threading
 import time
+from pathlib import Path
 from typing import Any, Final
 
 from gcs_plugin.daemon.airspace import TerrainData
@@ -36,19 +38,21 @@ from gcs_plugin.daemon.settings import Settings
 from gcs_plugin.daemon.store import daemon_events as happened
 from gcs_plugin.daemon.store.console_state import ConsoleState
 from gcs_plugin.daemon.store.daemon_events import Events
-from gcs_plugin.daemon.store.journal import Journal
+from gcs_plugin.daemon.store.journal import Journal, all_changes, drawn_forgotten, fact_change, statement
 from gcs_plugin.daemon.store.people_rows import People, Pilots
 from gcs_plugin.daemon.store.picture_store import KeptPictures, PictureStore
-from gcs_plugin.daemon.store.workspace_lock import distrust_after_power_cut, take_over
 from gcs_plugin.daemon.takeoffs import Takeoffs
 from gcs_plugin.daemon.vehicles import VehicleLinks
 from gcs_plugin.daemon.views import Views
 from gcs_plugin.daemon.web_plans import GapFlights, Plans
+from orthoswarm.batch.workspace import Workspace
 from orthoswarm.compute.workers import prepare_process
+from orthoswarm.model.errors import InputError
 from telemetry.live.live_poses import LinkPoses
 
 _FEW: Final = 10  # posted pictures of a vehicle, after which the process for background jobs is started
 _SOURCES_S: Final = 1.0
+_LOCK_S: Final = 5.0
 _log = logging.getLogger(__name__)
 
 
@@ -259,3 +263,50 @@ class Daemon:
         own = (self.drawer.problem, self.drawer.overload, self.jobs.problem, self.tak.problem)
         inputs = (*self.links.fleet.problems(), *self.refused.problems(), *(s.problem for s in self.sources))
         return [text for text in (self.getting_ready.problem, *own, *inputs) if text]
+
+
+def take_over(workspace: Path) -> Workspace:
+    """Take the workspace's lock, waiting for a daemon that is just ending.
+
+    The folder becomes accessible to its owner only, as it contains the token, pictures, and positions.
+
+    Raises:
+        InputError: another daemon holds it.
+    """
+    end = time.monotonic() + _LOCK_S
+    while True:
+        try:
+            lock = Workspace(workspace)
+            with contextlib.suppress(OSError):  # another user's folder, or a file system without permissions
+                workspace.chmod(0o700)
+            return lock
+        except InputError:
+            if workspace.is_file() or time.monotonic() > end:
+                raise
+            time.sleep(0.1)
+
+
+def distrust_after_power_cut(journal: Journal) -> bool:
+    """After a power cut, have the real-time layer drawn again, as its last pixels may be lost.
+
+    Pictures and journal are synced before they are acknowledged, solution files before they are published; canvases are
+    not, for speed.
+
+    Returns:
+        Whether canvases can be trusted.
+    """
+    boot = _boot_id()
+    clean = bool(journal.fact("clean") or journal.fact("boot") in (None, boot))
+    forgotten = () if clean else (drawn_forgotten, statement("DELETE FROM meta WHERE key = 'realtime'", ()))
+    journal.write(all_changes(fact_change("boot", boot), fact_change("clean", False), *forgotten))
+    if not clean:
+        _log.warning("the machine was switched off without a shutdown; the real-time layer is drawn again")
+    return clean
+
+
+def _boot_id() -> str:
+    """Identifies this boot of the machine."""
+    try:
+        return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    except OSError:
+        return str(round((time.time() - time.monotonic()) / 60.0)) if os.name == "nt" else ""

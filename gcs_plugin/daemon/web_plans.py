@@ -29,7 +29,7 @@ from gcs_plugin.mission.makers.maker_files import MAKERS, maker_file, read_missi
 from gcs_plugin.mission.mission_builder import build_mission, read_mission
 from gcs_plugin.mission.mission_files import parse_mission
 from gcs_plugin.mission.plan_folder import PlanNeeds, plan_needs
-from gcs_plugin.plans.no_fly import read_zones, refuse_no_zones
+from gcs_plugin.plans.area_files import read_zones, refuse_no_zones
 from gcs_plugin.plans.plan_files import write_plan
 from gcs_plugin.plans.plan_request import AUTOPILOTS, ENDS, METHODS, RELIEFS, PlanRequest, make_plan
 from orthoswarm.config import DEFAULT, Config

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from gcs_plugin.mission.makers.litchi import MOST_POINTS
 from gcs_plugin.mission.makers.maker_files import LITCHI, MAKERS
-from gcs_plugin.plans.area_files import read_shapes
-from gcs_plugin.plans.no_fly import NoFly, read_no_fly
+from gcs_plugin.plans.area_files import NoFly, read_no_fly, read_shapes
 from orthoswarm.config import DEFAULT, Config
 from orthoswarm.coverage.missing_pictures import Cause
 from orthoswarm.model.bounding_box import BoundingBox

@@ -8,8 +8,7 @@ import pytest
 import shapely
 
 from gcs_plugin.plans import area_files
-from gcs_plugin.plans.area_files import read_shapes
-from gcs_plugin.plans.no_fly import Reach, read_no_fly, read_zones
+from gcs_plugin.plans.area_files import Reach, read_no_fly, read_shapes, read_zones
 from gcs_plugin.plans.plan_files import geojson, read_planned_flight, write_plan
 from gcs_plugin.plans.plan_request import PlanRequest, make_plan
 from orthoswarm.model.errors import InputError

@@ -15,9 +15,10 @@ from gcs_plugin.links import outgoing
 from gcs_plugin.links.mavlink import dialect
 from gcs_plugin.links.packets import Framer, checksum
 from gcs_plugin.links.signing import Signing, find_key, key_from, signing_time
-from gcs_plugin.links.tlog_writer import TlogWriter, read_tlog
+from gcs_plugin.links.tlog_writer import TlogWriter
 from gcs_plugin.links.transports import LinkAddress, SerialLink, TcpLink, UdpLink, parse_address, parse_link
 from orthoswarm.model.errors import InputError
+from tests.kit.vehicles.telemetry_log import read_tlog
 
 KEY = bytes(range(32))
 NOW = 1_760_000_000.0

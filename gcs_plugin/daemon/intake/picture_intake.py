@@ -18,7 +18,6 @@ from gcs_plugin.daemon.store.frame_rows import add_frame, frame_by_key
 from gcs_plugin.daemon.store.journal import Journal
 from gcs_plugin.daemon.store.picture_store import PictureStore, frame_key, picture_size
 from gcs_plugin.daemon.store.sortie_rows import present_sortie
-from gcs_plugin.daemon.store.workspace_lock import require_space
 from gcs_plugin.links.tlog_writer import write_link_log
 from orthoswarm.export.product_files import iso_time
 from orthoswarm.model.errors import OrthoSwarmError, StorageError
@@ -135,7 +134,7 @@ class PictureIntake:
             return known[0], False
         width, height, suffix = picture_size(data)
         pose = self._with_fix(pose)
-        require_space(self._store.folder.parent, len(data))
+        self._store.require_space(len(data))
         time_s = came if pose.time_s is None else pose.time_s
         path, size = self._store.put(key, suffix, data), (width, height)
         values = pose.values | ({"origin": pose.origin} if pose.origin else {})

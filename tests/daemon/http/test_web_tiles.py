@@ -15,10 +15,10 @@ from gcs_plugin.daemon.layers.web_tiles import (
     canvas_tile,
     encode,
     ground_patch,
+    open_basemap,
     over,
     resampled,
 )
-from gcs_plugin.daemon.store.workspace_lock import open_basemap
 from orthoswarm.canvas.canvas import Canvas
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError, OrthoSwarmError
