@@ -189,7 +189,8 @@ class Backend(abc.ABC):
             ended = {event.system for event in self.events if event.kind in ("complete", "aborted")}
             vehicles = self.vehicles()
             followed = set(systems) or set(vehicles)
-            if followed and followed <= ended and not any(_comes_home(v) for s, v in vehicles.items() if s in followed):
+            words = {flight_state(vehicle).word for system, vehicle in vehicles.items() if system in followed}
+            if followed and followed <= ended and not words & {Word.RETURNING, Word.LANDING}:
                 return True
             if time.monotonic() >= end:
                 return False
@@ -199,10 +200,6 @@ class Backend(abc.ABC):
     @abc.abstractmethod
     def close(self) -> None:
         """Close the links."""
-
-
-def _comes_home(vehicle: Vehicle) -> bool:
-    return flight_state(vehicle).word in (Word.RETURNING, Word.LANDING)
 
 
 def command_all(

@@ -141,7 +141,9 @@ class Exports:
                 for find in self._console.finds()
             ]
             places = tuple(self.places(shown))
-            task = replace(task, facts=self._report_facts(), places=places, cells=self._coverage.png)
+            covered = self._coverage.document
+            facts = self._facts.document() | ({} if covered["state"] == "no area" else {"coverage": covered})
+            task = replace(task, facts=facts, places=places, cells=self._coverage.png)
             if "pack" in task.formats:
                 write_file(self._settings.workspace / "log.csv", self._people.table())
             job.detail["files"] = files = run.run(write_products, task)
@@ -187,10 +189,6 @@ class Exports:
         import simplejpeg
 
         return bytes(simplejpeg.encode_jpeg(picture_file.read_rgb(path), _VIEW_QUALITY, "RGB"))
-
-    def _report_facts(self) -> dict[str, Any]:
-        covered = self._coverage.document
-        return self._facts.document() | ({} if covered["state"] == "no area" else {"coverage": covered})
 
     def _task(self, area: MapArea) -> ExportTask:
         """The export task of the workspace, without layers and formats."""

@@ -32,7 +32,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("inputs", nargs="+", type=path_of, metavar="INPUT", help="folders of photos, photos, videos")
     add("--basemap", type=path_of, metavar="MAP", help="pre-disaster map: GeoTIFF, COG, MBTiles or folder z/x/y.png")
     add("--out", type=path_of, required=True, metavar="DIR", help="output folder; an interrupted run goes on there")
-    refiners = _refiners()
+    refiners = ["swarm", "paper"] if find_spec("orthoswarm.paper") else ["swarm"]
     add("--refine", choices=refiners, default=refiners[0], help=f"how pictures are refined (default {refiners[0]})")
     add("--until", choices=("realtime", "coarse", "fine"), default="fine", help="last stage to run (default fine)")
     add(
@@ -99,11 +99,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--cluster", metavar="URL", help="work on a Dask cluster, for example tcp://192.168.1.10:8786 (docs/cluster.md)"
     )
     add("--json", action="store_true", help="print the report as one JSON document on stdout")
-
-
-def _refiners() -> list[str]:
-    """The refiners that are installed."""
-    return ["swarm", "paper"] if find_spec("orthoswarm.paper") else ["swarm"]
 
 
 def run(args: argparse.Namespace) -> int:

@@ -355,7 +355,8 @@ class LiveCoverage(Background):
         states = cover.states(self._due)
         placed = [v for v in cover.views if v.placed]
         document: CoverageDocument = {
-            "state": self._state(cover), "version": self._version, "time": iso_time(time.time()),
+            "state": "complete" if self._due is True else "in flight" if cover.views else "planned",
+            "version": self._version, "time": iso_time(time.time()),
             "plan": here.covered.plan, **_shares(cover.shares(self._due)),  # type: ignore[typeddict-item]
             "recorded": _shares(here.recorded.shares(self._due)),
             "pictures": {"placed": len(placed), "recorded": len(cover.views) - len(placed)},
@@ -378,11 +379,6 @@ class LiveCoverage(Background):
             events = [event for event in events if event.time_s <= last]
         found = missing_by_events(here.cover.views, events, self._views.rejected())
         return found.pictures, found.warnings
-
-    def _state(self, cover: CoverageGrid) -> str:
-        if self._due is True:
-            return "complete"
-        return "in flight" if cover.views else "planned"
 
 
 def _with_flaws(views: Iterable[View], flaws: FlawedPictures) -> list[View]:

@@ -91,15 +91,12 @@ class PictureNames:
                 return "", "its files have other names than the pictures that have arrived"
             pictures = same_form
         found = [path for path in pictures if number_of(path) == number + self.shift]
-        same = [path for path in found if path.rpartition("/")[0] in self._folders(files)]
+        arrived = {path.rpartition("/")[0] for path in files if path.rpartition("/")[2] in self.images}
+        same = [path for path in found if path.rpartition("/")[0] in arrived]
         found = same or found
         if len(found) > 1:
             return "", f"several of its files have number {number + self.shift}"
         return (found[0], "") if found else ("", f"it has no picture file with number {number + self.shift}")
-
-    def _folders(self, files: Mapping[str, int]) -> set[str]:
-        """The folders with pictures that have arrived."""
-        return {path.rpartition("/")[0] for path in files if path.rpartition("/")[2] in self.images}
 
 
 def _form(name: str) -> str:
