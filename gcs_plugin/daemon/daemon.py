@@ -137,7 +137,7 @@ class Daemon:
         fov_rad = None if settings.fov_min_deg is None else math.radians(settings.fov_min_deg)
         site = MapSite(
             self.journal, self.layers["realtime"], canvases, gsd_m=settings.gsd_m, fov_rad=fov_rad,
-            expected=ExpectedPlace(self.tiles, self.plans), events=self.events,
+            expected=ExpectedPlace(self.tiles, self.plans.newest_bounds), events=self.events,
             memory_mb=settings.config.compute.live_canvas_mb,
         )  # fmt: skip
         live = settings.basemap if settings.coarse else None
@@ -145,8 +145,8 @@ class Daemon:
         self.leg_watch = LegWatch(self.events, silent_s=settings.silent_s)
         self.coverage = LiveCoverage(
             self.journal, self.events, views=PictureViews(self.journal, self.store, folder / "solutions", fov_rad),
-            console=self.console, plans=self.plans.folder, drawer=self.drawer, vehicles=self.links,
-            exposures=self.exposures,
+            console=self.console, plans=self.plans.folder, drawer=self.drawer,
+            on_links=lambda: self.links.latest, exposures=self.exposures,
         )  # fmt: skip
         self.gap_flights = GapFlights(self.coverage, self.plans, self.links)
         fetched = FetchedPictures(

@@ -141,9 +141,9 @@ class Exports:
                 for find in self._console.finds()
             ]
             places = tuple(self.places(shown))
-            covered = self._coverage.document
+            covered = self._coverage.result.document
             facts = self._facts.document() | ({} if covered["state"] == "no area" else {"coverage": covered})
-            task = replace(task, facts=facts, places=places, cells=self._coverage.png)
+            task = replace(task, facts=facts, places=places, cells=self._coverage.result.png)
             if "pack" in task.formats:
                 write_file(self._settings.workspace / "log.csv", self._people.table())
             job.detail["files"] = files = run.run(write_products, task)

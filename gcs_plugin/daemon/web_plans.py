@@ -15,7 +15,7 @@ from contextlib import closing
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Any, Final, Protocol, TypedDict
+from typing import Any, Final, TypedDict
 
 from gcs_plugin.config import LIMITS
 from gcs_plugin.daemon.flight_coverage.live_coverage import LiveCoverage
@@ -54,16 +54,6 @@ Place = tuple[float, float]
 """Latitude and longitude in degrees."""
 
 
-class PlannedVehicles(Protocol):
-    """The vehicles on the links."""
-
-    def autopilots(self) -> Mapping[str, str]:
-        """The autopilot of each, by id."""
-
-    def standing(self) -> Mapping[str, Place | str]:
-        """Where each stands, or why that is not known, in words."""
-
-
 class Plans:
     """The plans of a workspace.
 
@@ -72,7 +62,7 @@ class Plans:
         vehicles: on the links; a plan is made for these unless its request names others. config: margins and times.
     """
 
-    def __init__(self, folder: Path, dem: Path | None, vehicles: PlannedVehicles, config: Config = DEFAULT) -> None:
+    def __init__(self, folder: Path, dem: Path | None, vehicles: VehicleLinks, config: Config = DEFAULT) -> None:
         self.folder, self.dem, self._vehicles, self._config = folder, dem, vehicles, config
         self._bounds: tuple[Path, GeographicBounds] | None = None
 
@@ -419,13 +409,13 @@ class GapFlights:
             "fly_not_arrived": body.get("fly_not_arrived") is True,
             "autopilots": self._plans.autopilots_of(ordered),
         }  # fmt: skip
-        made = self._plans.make_in("gaps.geojson", self._coverage.gaps, self._coverage.no_fly, values, notes)
+        made = self._plans.make_in("gaps.geojson", self._coverage.result.gaps, self._coverage.no_fly, values, notes)
         names = dict(zip([f"v{k}" for k in range(1, len(ordered) + 1)], ordered, strict=True))
         return made | {"names": {row["id"]: names[row["id"]] for row in made["vehicles"]}}
 
     def _camera(self, vehicles: list[str], body: Mapping[str, Any]) -> tuple[float, float, list[str]]:
         """Field of view in degrees, altitude in metres, and notes about them."""
-        plan = self._coverage.document["plan"]
+        plan = self._coverage.result.document["plan"]
         figures = {} if plan is None else json.loads((self._plans.folder / plan / "plan.json").read_text("utf-8"))
         over = figures.get("over_ground") or {"nominal_m": figures.get("altitude_m")}
         altitude = body.get("altitude_m", over["nominal_m"])

@@ -169,18 +169,17 @@ class HttpRoutes:
 
         `requests`: the pictures that were asked from vehicles, each with `state`, `reason`, `percent`.
         """
-        return JsonAnswer(self.daemon.coverage.document | {"requests": self.daemon.picture_requests.rows()})
+        return JsonAnswer(self.daemon.coverage.result.document | {"requests": self.daemon.picture_requests.rows()})
 
     async def cells(self, request: Request) -> Response:
         """The states of the cells as a PNG, an overlay with the `corners` of /api/coverage."""
-        data: bytes = self.daemon.coverage.png
-        if not data:
+        found = self.daemon.coverage.result
+        if not found.png:
             raise HTTPException(404, "there is no area yet; plan one, or draw it")
-        version: Any = self.daemon.coverage.document["version"]
-        headers = {"ETag": f'"{version}"', "Cache-Control": "no-cache"}
-        if f'"{version}"' in request.headers.get("if-none-match", ""):
+        headers = {"ETag": f'"{found.document["version"]}"', "Cache-Control": "no-cache"}
+        if headers["ETag"] in request.headers.get("if-none-match", ""):
             return Response(status_code=304, headers=headers)
-        return Response(data, media_type="image/png", headers=headers)
+        return Response(found.png, media_type="image/png", headers=headers)
 
     def _trusted(self) -> tuple[int, Path]:
         """Where not to trust the map: the raster of the last export, and its version, 0 if there is none."""
@@ -216,7 +215,7 @@ class HttpRoutes:
 
     async def gaps(self) -> Response:
         """The gaps as GeoJSON, as `orthoswarm coverage` writes them; `orthoswarm plan --gaps` reads them."""
-        return JsonAnswer(self.daemon.coverage.gaps, media_type="application/geo+json")
+        return JsonAnswer(self.daemon.coverage.result.gaps, media_type="application/geo+json")
 
     # -- commands -------------------------------------------------------------------------------------------------
 
@@ -466,7 +465,7 @@ def prometheus(daemon: Daemon, uploads_waiting: int = 0) -> str:
         [({"cause": cause}, count) for cause, count in daemon.refused.counts.items()],
     )  # fmt: skip
     single("uploads_waiting", "gauge", "Posted pictures that wait for their turn.", uploads_waiting)
-    covered = daemon.coverage.document
+    covered = daemon.coverage.result.document
     names = ("seen", "poor", "missed", "planned")
     shares = {name: covered[f"{name}_share"] for name in names}  # type: ignore[literal-required]
     metric(

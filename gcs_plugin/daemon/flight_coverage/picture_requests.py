@@ -165,7 +165,7 @@ class FetchedPictures:
 
     def wanted(self) -> Iterable[WantedPicture]:
         """The pictures that were taken and have not arrived."""
-        return wanted_pictures(self._coverage.document["missing_pictures"])
+        return wanted_pictures(self._coverage.result.document["missing_pictures"])
 
     def names(self, vehicle: str) -> PictureNames:
         """The names of a vehicle's pictures that have arrived, and how their numbers match its camera events."""

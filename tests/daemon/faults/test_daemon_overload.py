@@ -172,7 +172,7 @@ def drawing(folder, read, **options):
     events, layer = RecordedEvents(), MapLayer("realtime")
     journal, store = Journal(folder / "journal.db"), PictureStore(folder / "p")
     (folder / "layers").mkdir()
-    expected = ExpectedPlace(TileServer({}), Plans(folder / "plans", None, None))
+    expected = ExpectedPlace(TileServer({}), Plans(folder / "plans", None, None).newest_bounds)
     site = MapSite(
         journal, layer, folder / "layers", gsd_m=0.5, fov_rad=None, expected=expected, events=events, memory_mb=64.0
     )
