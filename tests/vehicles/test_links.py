@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gcs_plugin.links import outgoing
+from gcs_plugin.links import outgoing, transports
 from gcs_plugin.links.mavlink import dialect
 from gcs_plugin.links.packets import Framer, checksum
 from gcs_plugin.links.signing import Signing, find_key, key_from, signing_time
@@ -304,8 +304,9 @@ def test_a_serial_line_that_takes_nothing_holds_up_nobody_and_its_commands_are_n
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="pseudo terminals are POSIX")
-def test_a_serial_line_opened_behind_a_thousand_files_is_opened_again_when_there_are_fewer(loop):
+def test_a_serial_line_opened_behind_a_thousand_files_is_opened_again_when_there_are_fewer(loop, monkeypatch):
     """select() knows descriptors up to 1,023."""
+    monkeypatch.setattr(transports, "_RETRY_S", 0.1)
     pytest.importorskip("serial")
     resource = pytest.importorskip("resource")
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)

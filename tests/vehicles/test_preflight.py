@@ -27,6 +27,7 @@ from tests.vehicles.test_mission_builder import make_plan
 from tests.vehicles.test_sim import mission
 
 AP, PX4 = Autopilot.ARDUPILOT, Autopilot.PX4
+pytestmark = pytest.mark.usefixtures("in_vehicle_time")
 BOTH = pytest.mark.parametrize("autopilot", [AP, PX4])
 CHART = Chart(47.397742, 8.545594, 488.0)
 
