@@ -52,7 +52,7 @@ def _compiled(installed: Path, folder: Path, code: str) -> list[str]:
 _ALL_OF_IT = """
 import json, sys
 from pathlib import Path
-sys.path.append({root!r})
+sys.path.insert(2, {root!r})  # behind the installation, before other packages named tests
 from tests.kit.made_up_ground import draw_something, refine_something
 
 if __name__ == "__main__":
