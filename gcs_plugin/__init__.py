@@ -18,7 +18,7 @@ __getattr__ = on_first_use(
     __name__,
     {
         "fleet.fleet": ("Fleet",),
-        "fleet.fleet_events": ("FleetEvent",),
+        "fleet.reception": ("FleetEvent",),
         "mission.items": ("Mission", "MissionItem"),
         "mission.mission_builder": ("read_mission",),
         "plans.plan_files": ("write_plan",),

@@ -1,4 +1,4 @@
-"""Access control: who makes a request, whether that role may (`roles`), and the log of what came of it.
+"""Access control: who makes a request, whether that role may (`NEEDS`), and the log of what came of it.
 
 The operator sends the daemon's token in a header, which no foreign form can set. People who were invited have a session
 in a cookie (HttpOnly, SameSite=Strict, this host's alone); what changes something must then state its Origin, too.
