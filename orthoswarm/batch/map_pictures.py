@@ -122,10 +122,10 @@ def _both(run: RunContext, state: RunState, coarse: _Map, fine: _Map) -> None:
     coarse_ground, fine_ground = coarse[1] or Terrain.flat(), fine[1] or Terrain.flat()
     with (
         run.clock.stage("final: coarse and orthoimage", len(fine[0])) as stage,
-        _canvas(run, ORTHOIMAGE, fine[0], fine_ground, state, state.gsd_m) as second,
+        _canvas(run, ORTHOIMAGE, fine[0], fine_ground, state, gsd_m=state.gsd_m) as second,
     ):
-        with _canvas(run, COARSE, coarse[0], coarse_ground, state, state.gsd_m) as first:
-            reading, gains = _Reading(state.gsd_m, [*coarse[0], *fine[0]], fine_ground), state.gains
+        with _canvas(run, COARSE, coarse[0], coarse_ground, state, gsd_m=state.gsd_m) as first:
+            reading, gains = _DecodedSizes(state.gsd_m, [*coarse[0], *fine[0]], fine_ground), state.gains
             drawn = [reading.frames(frames) for frames in (coarse[0], fine[0])]
             layers = [
                 Layer(frames=drawn[0], terrain=coarse_ground, canvas=first, gains=gains),
@@ -174,8 +174,8 @@ def draw(
     """Render frames on their own canvas and write it as a COG."""
     preview = realtime and run.options.until != "realtime" and run.options.gsd_m is None
     gsd_m = _preview_gsd(placed) if preview else state.gsd_m
-    reading = _Reading(gsd_m, placed, terrain)
-    with _canvas(run, name, placed, terrain, state, gsd_m) as canvas:
+    reading = _DecodedSizes(gsd_m, placed, terrain)
+    with _canvas(run, name, placed, terrain, state, gsd_m=gsd_m) as canvas:
         how = reading.how(run, state, f"drawing {name.removesuffix('.tif')}")
         if realtime:
             stats = mosaic(reading.frames(placed), canvas, previews=state.previews, **how)
@@ -201,7 +201,7 @@ def _seams(run: RunContext, state: RunState) -> Seams | None:
     )
 
 
-class _Reading:
+class _DecodedSizes:
     """How pictures are read for a map: reduced as they are decoded where its pixel is coarse enough for that.
 
     gsd_m: the map's pixel. placed: the frames. terrain: under them.
@@ -242,7 +242,7 @@ def _preview_gsd(placed: Sequence[PlacedFrame]) -> float:
 
 
 def _canvas(
-    run: RunContext, name: str, placed: Sequence[PlacedFrame], terrain: Terrain, state: RunState, gsd_m: float
+    run: RunContext, name: str, placed: Sequence[PlacedFrame], terrain: Terrain, state: RunState, *, gsd_m: float
 ) -> Canvas:
     """An empty canvas for a product of these frames."""
     low, high = float(terrain.z.min()), float(terrain.z.max())

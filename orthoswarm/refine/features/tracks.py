@@ -204,7 +204,7 @@ class Tracker:
             self._gray, self._half, gray, half, self._live.uv, predicted, np.linalg.inv(predicted), limits, guess,
             found, good,
         )  # fmt: skip
-        kept, expected = _gate(guess, found, good, gray.shape[0], gray.shape[1], _FLOW_CHANCE_SHARE)
+        kept, expected = _gate(guess, found, good, gray.shape)
         return _Flow(good, found, kept, expected)
 
     def _start(self, gray: Gray) -> None:
@@ -232,13 +232,13 @@ class Tracker:
             )
 
 
-def _gate(guess: Floats, found: Floats, ok: Flags, rows: int, cols: int, chance: float) -> tuple[int, int]:
+def _gate(guess: Floats, found: Floats, ok: Flags, shape: tuple[int, ...]) -> tuple[int, int]:
     """Keep flow close to the median residual, which must itself be close to the prediction, in ok, in place.
 
     None is kept where no more agree than corners on different ground would by chance (binomial, 3 sigma). Returns how
     many are kept, and how many were expected inside the picture.
     """
-    last, margin = np.array([cols - 1, rows - 1]), _FLOW_INSIDE_PX
+    last, margin, chance = np.array(shape[1::-1]) - 1, _FLOW_INSIDE_PX, _FLOW_CHANCE_SHARE
     expected = int(((guess >= 0) & (guess <= last)).all(1).sum())
     ok &= ((found >= margin) & (found <= last - margin)).all(1)
     kept = 0
