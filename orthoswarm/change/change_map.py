@@ -34,37 +34,26 @@ _DISTORTED_PX: Final = 1.0  # offsets of the map below this are those of what le
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ComparedScene:
-    """What is compared.
+    """What is compared."""
 
-    Attributes:
-        views: refined pictures, in the map's grid. terrain: the ground they lie on. basemap: the pre-disaster map.
-        orthoimage: the refined one. read: gives a view's grey values. lean: of the map, metres a metre of height.
-    """
-
-    views: Sequence[View]
-    terrain: Terrain
-    basemap: Basemap
-    orthoimage: Path
-    read: Read
-    lean: tuple[float, float]
+    views: Sequence[View]  # refined pictures, in the map's grid
+    terrain: Terrain  # the ground they lie on
+    basemap: Basemap  # the pre-disaster map
+    orthoimage: Path  # the refined one
+    read: Read  # gives a view's grey values
+    lean: tuple[float, float]  # of the map, metres a metre of height
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChangeMap:
-    """The change of an area; all (rows, columns).
+    """The change of an area; all (rows, columns)."""
 
-    Attributes:
-        grid: its cells. probability: uint8, that the ground changed, 0 to 255. visible: bool, where that can be said.
-        inside: bool, where the orthoimage shows the ground. case: uint8, the likeliest of CASES but the first.
-        height: float32, what stands above the bare ground now, metres.
-    """
-
-    grid: GroundGrid
-    probability: Bytes
-    visible: Flags
-    inside: Flags
-    case: Bytes
-    height: Floats
+    grid: GroundGrid  # its cells
+    probability: Bytes  # uint8, that the ground changed, 0 to 255
+    visible: Flags  # bool, where that can be said
+    inside: Flags  # bool, where the orthoimage shows the ground
+    case: Bytes  # uint8, the likeliest of CASES but the first
+    height: Floats  # float32, what stands above the bare ground now, metres
 
     @classmethod
     def blank(cls, grid: GroundGrid) -> "ChangeMap":
@@ -77,19 +66,15 @@ class ChangeMap:
 
 
 class MeasuredBlock(NamedTuple):
-    """What is measured of a block of an area's cells.
+    """What is measured of a block of an area's cells."""
 
-    Attributes:
-        rows, columns: which cells. found: of these. drawn, hidden: bool, where the orthoimage shows them, and where the
-            map shows what stands before them. height: float32, what stands above the bare ground now, metres.
-    """
-
-    rows: slice
-    columns: slice
-    found: Measured
+    rows: slice  # which cells
+    columns: slice  # which cells
+    found: Measured  # of these
+    # drawn, hidden: bool, where the orthoimage shows them, and where the map shows what stands before them
     drawn: Flags
     hidden: Flags
-    height: Floats
+    height: Floats  # float32, what stands above the bare ground now, metres
 
 
 def map_change(

@@ -29,37 +29,25 @@ _ENOUGH: Final = 200  # cells that tell the usual ratio of contrasts
 
 
 class Block(NamedTuple):
-    """A block of cells: what the pictures show of it, and what the map does.
+    """A block of cells: what the pictures show of it, and what the map does."""
 
-    Attributes:
-        seen, before: structure on pixels. gray: of the map, on the same pixels. valid: where the map has them.
-        now, then: looks of cells in the orthoimage and on the map. drawn: bool, where the orthoimage shows the cells.
-        per_cell: pixels along a cell. cell_m: side of a cell.
-    """
-
-    seen: SeenGround
-    before: Structure
-    gray: Floats
-    valid: Flags
-    now: CellLooks
-    then: CellLooks
-    drawn: Flags
-    per_cell: int
-    cell_m: float
+    seen: SeenGround  # structure on pixels
+    before: Structure  # structure on pixels
+    gray: Floats  # of the map, on the same pixels
+    valid: Flags  # where the map has them
+    now: CellLooks  # looks of cells in the orthoimage and on the map
+    then: CellLooks  # looks of cells in the orthoimage and on the map
+    drawn: Flags  # bool, where the orthoimage shows the cells
+    per_cell: int  # pixels along a cell
+    cell_m: float  # side of a cell
 
 
 class Measured(NamedTuple):
-    """What is measured of each cell.
+    """What is measured of each cell."""
 
-    Attributes:
-        values: float32 (rows, columns, features), what the probability is computed from.
-        seen: float32 (rows, columns), 0 to 1, how much of it pictures see and the map has. veil: share of its light
-            that is haze, less that of the map (large white roofs are no haze).
-    """
-
-    values: Floats
-    seen: Floats
-    veil: Floats
+    values: Floats  # float32 (rows, columns, features), what the probability is computed from
+    seen: Floats  # float32 (rows, columns), 0 to 1, how much of it pictures see and the map has
+    veil: Floats  # share of its light that is haze, less that of the map (large white roofs are no haze)
 
 
 def unveiled(contrast: Floats, gray: Floats, gsd_m: float) -> tuple[Floats, Floats]:

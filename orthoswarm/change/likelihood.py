@@ -20,17 +20,12 @@ _FILE: Final = Path(__file__).with_name("weights.npz")
 
 
 class Weights(NamedTuple):
-    """Weights of the likelihoods.
+    """Weights of the likelihoods."""
 
-    Attributes:
-        mean, spread: (features,), of what is measured. first: (features + 1, hidden), second: (hidden + 1, cases);
-            the last rows are constants.
-    """
-
-    mean: Floats
-    spread: Floats
-    first: Floats
-    second: Floats
+    mean: Floats  # (features,), of what is measured
+    spread: Floats  # (features,), of what is measured
+    first: Floats  # (features + 1, hidden)
+    second: Floats  # (hidden + 1, cases); the last rows are constants
 
 
 @lru_cache(maxsize=1)

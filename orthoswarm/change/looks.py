@@ -14,18 +14,12 @@ _DARK: Final = 12.0  # grey values that noise and haze add: dark colours have no
 
 
 class CellLooks(NamedTuple):
-    """Looks of cells, all float32 (rows, columns) but `color` (rows, columns, 3) and `order`.
+    """Looks of cells, all float32 (rows, columns) but `color` (rows, columns, 3) and `order`."""
 
-    Attributes:
-        color: mean red, green, blue, 0 to 255. edges: mean gradient, grey values a pixel. spots: mean of how much a
-            pixel differs from those around it. order: (rows, columns, 3), gradients with their angles times four, and
-            their lengths.
-    """
-
-    color: Floats
-    edges: Floats
-    spots: Floats
-    order: Floats
+    color: Floats  # mean red, green, blue, 0 to 255
+    edges: Floats  # mean gradient, grey values a pixel
+    spots: Floats  # mean of how much a pixel differs from those around it
+    order: Floats  # (rows, columns, 3), gradients with their angles times four, and their lengths
 
 
 def on_cells(values: NDArray[Any], per_cell: int) -> Floats:
@@ -69,15 +63,12 @@ class ToneModel(NamedTuple):
 
     A linear map of all, and for each of some classes of colours what its ground differs from that, and how much it
     varies; found by robust means, as most of the ground is unchanged.
-
-    Attributes:
-        linear: (4, 3). classes: (K, 3), hues of the map. shift, spread: (K, 3).
     """
 
-    linear: Floats
-    classes: Floats
-    shift: Floats
-    spread: Floats
+    linear: Floats  # (4, 3)
+    classes: Floats  # (K, 3), hues of the map
+    shift: Floats  # (K, 3)
+    spread: Floats  # (K, 3)
 
     @classmethod
     def of(cls, before: Floats, now: Floats, both: Flags) -> "ToneModel":

@@ -24,21 +24,14 @@ _SHIFT_SIGMA_M: Final = 100.0  # what is known of the shift before the control p
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ControlFit:
-    """A similarity and the residuals of the control points.
+    """A similarity and the residuals of the control points."""
 
-    Attributes:
-        similarity: from the block to the ground.
-        used: the observations used. residual: float64 (n, 2), of each of them, block minus survey.
-        left_out: observations rejected as outliers.
-        contradiction: True where the observations disagree, but are too few to find the outlier.
-        scatter_m: how far points whose sigma is not stated scatter more than was assumed, one sigma of an axis.
-    """
-
-    similarity: Similarity
-    used: list[ControlObservation]
-    residual: Array
-    left_out: list[ControlObservation]
-    contradiction: bool
+    similarity: Similarity  # from the block to the ground
+    used: list[ControlObservation]  # the observations used
+    residual: Array  # float64 (n, 2), of each of them, block minus survey
+    left_out: list[ControlObservation]  # observations rejected as outliers
+    contradiction: bool  # True where the observations disagree, but are too few to find the outlier
+    # how far points whose sigma is not stated scatter more than was assumed, one sigma of an axis
     scatter_m: float = 0.0
 
 

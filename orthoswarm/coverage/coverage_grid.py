@@ -52,28 +52,19 @@ class CellState(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Demands:
-    """Requirements for ground to count as well seen.
+    """Requirements for ground to count as well seen."""
 
-    Attributes:
-        gsd_m: largest GSD, None for any. sigma_m: largest sigma of a picture's position, None for any.
-    """
-
-    gsd_m: float | None = None
-    sigma_m: float | None = None
+    gsd_m: float | None = None  # largest GSD, None for any
+    sigma_m: float | None = None  # largest sigma of a picture's position, None for any
 
 
 @dataclass(frozen=True, slots=True)
 class Cells:
-    """The cells of an area.
-
-    Attributes:
-        grid: their grid. wanted: bool (rows, columns), cells whose centre is to be mapped. excluded: bool, cells in
-            no-fly zones within the area's outline.
-    """
+    """The cells of an area."""
 
     grid: GroundGrid
-    wanted: Flags
-    excluded: Flags
+    wanted: Flags  # bool (rows, columns), cells whose centre is to be mapped
+    excluded: Flags  # bool, cells in no-fly zones within the area's outline
 
     @classmethod
     def of_area(cls, epsg: int, ground: Geometry, no_fly: Geometry = None, cell_m: float = _CELL_M) -> "Cells":

@@ -23,49 +23,33 @@ _BY_IMPORTANCE = (Flaw.DAMAGED, Flaw.BLURRED, Flaw.HAZE, Flaw.POSITION, Flaw.COA
 
 @dataclass(frozen=True, slots=True)
 class PlannedFlight:
-    """The planned flight.
+    """The planned flight."""
 
-    Attributes:
-        legs: float64 (n, 2, 2), first and last ground point of each leg in the grid of the cells, metres.
-        width_m: ground that the narrowest camera sees across a leg; height_m along it.
-        fov_rad: theta-hat, the horizontal field of view that the plan relies on.
-    """
-
-    legs: Array
-    width_m: float
+    legs: Array  # float64 (n, 2, 2), first and last ground point of each leg in the grid of the cells, metres
+    width_m: float  # ground that the narrowest camera sees across a leg; height_m along it
     height_m: float
-    fov_rad: float
+    fov_rad: float  # theta-hat, the horizontal field of view that the plan relies on
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CoverageGap:
-    """A gap.
+    """A gap."""
 
-    Attributes:
-        polygon: shapely Polygon in the grid of the cells. area_m2: its size.
-        cause: why. detail: the flaw, for ground seen poorly; else empty. confidence: of the cause, 0 to 1.
-        vehicle: the vehicle whose pictures are missing or narrow, empty if unknown.
-    """
-
-    polygon: Geometry
-    area_m2: float
+    polygon: Geometry  # shapely Polygon in the grid of the cells
+    area_m2: float  # its size
     cause: Cause
-    detail: str
-    confidence: float
-    vehicle: str = ""
+    detail: str  # the flaw, for ground seen poorly; else empty
+    confidence: float  # of the cause, 0 to 1
+    vehicle: str = ""  # the vehicle whose pictures are missing or narrow, empty if unknown
 
 
 @dataclass(frozen=True, slots=True)
 class Gaps:
-    """All gaps, largest first.
+    """All gaps, largest first."""
 
-    Attributes:
-        gaps: those of at least the smallest size. small: how many smaller ones there are; small_m2: their total size.
-    """
-
-    gaps: list[CoverageGap]
-    small: int
-    small_m2: float
+    gaps: list[CoverageGap]  # those of at least the smallest size
+    small: int  # how many smaller ones there are
+    small_m2: float  # their total size
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,20 +25,13 @@ from orthoswarm.stores.addresses import path_of
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapFolder:
-    """The pictures of a finished map.
+    """The pictures of a finished map."""
 
-    Attributes:
-        epsg: grid of the map. ground_z_m: level of the mapped ground, same datum as the cameras.
-        views: placed pictures. rejected: files that were not placed, with a time.
-        root: folder that names of pictures are relative to, None if the report does not state it.
-        warnings: for the user.
-    """
-
-    epsg: int
-    ground_z_m: float
-    views: list[View]
-    rejected: list[Exposure]
-    root: Path | None
+    epsg: int  # grid of the map
+    ground_z_m: float  # level of the mapped ground, same datum as the cameras
+    views: list[View]  # placed pictures
+    rejected: list[Exposure]  # files that were not placed, with a time
+    root: Path | None  # folder that names of pictures are relative to, None if the report does not state it
     warnings: list[str]
 
 

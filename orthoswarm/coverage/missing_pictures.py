@@ -40,30 +40,21 @@ class Cause(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Exposure:
-    """A camera event recorded by the vehicle, or a picture file that could not be used.
-
-    Attributes:
-        vehicle: its id. time_s: UTC epoch seconds. image: name of the file, empty for an event without one.
-    """
+    """A camera event recorded by the vehicle, or a picture file that could not be used."""
 
     vehicle: str
-    time_s: float
-    image: str = ""
+    time_s: float  # UTC epoch seconds
+    image: str = ""  # name of the file, empty for an event without one
 
 
 @dataclass(frozen=True, slots=True)
 class MissingPicture:
-    """A missing picture.
+    """A missing picture."""
 
-    Attributes:
-        view: its expected camera; its image is the name of the file where that is known.
-        after: name of the picture before the hole. cause: why it is missing. confidence: 0 to 1.
-    """
-
-    view: View
-    after: str
-    cause: Cause
-    confidence: float
+    view: View  # its expected camera; its image is the name of the file where that is known
+    after: str  # name of the picture before the hole
+    cause: Cause  # why it is missing
+    confidence: float  # 0 to 1
 
 
 def missing_pictures(views: Sequence[View], exposures: Iterable[Exposure] = ()) -> list[MissingPicture]:
@@ -143,31 +134,22 @@ def _number(image: str) -> int | None:
 
 @dataclass(frozen=True, slots=True)
 class CameraEvent:
-    """An exposure as a vehicle reported it.
-
-    Attributes:
-        vehicle: its id. number: as counted by the vehicle. time_s: UTC epoch seconds.
-        position: float64 (3,), east, north in the grid of the views, and a height that is not used (vehicles count it
-            from another level than maps do); None where the event has none.
-    """
+    """An exposure as a vehicle reported it."""
 
     vehicle: str
-    number: int
-    time_s: float
+    number: int  # as counted by the vehicle
+    time_s: float  # UTC epoch seconds
+    # float64 (3,), east, north in the grid of the views, and a height that is not used (vehicles count it from another
+    # level than maps do); None where the event has none
     position: Array | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Missing:
-    """Missing pictures.
+    """Missing pictures."""
 
-    Attributes:
-        pictures: missing pictures; those that have not arrived are named by their event's number.
-        warnings: reasons why events could not be used.
-    """
-
-    pictures: list[MissingPicture]
-    warnings: list[str]
+    pictures: list[MissingPicture]  # missing pictures; those that have not arrived are named by their event's number
+    warnings: list[str]  # reasons why events could not be used
 
 
 def missing_by_events(

@@ -46,33 +46,21 @@ FLAW_NAMES = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class View:
-    """A picture's data for the coverage.
-
-    Attributes:
-        image: its name. vehicle: id. time_s: UTC epoch seconds, None if unknown.
-        position: float64 (3,), east, north, height, metres (heights share the datum of the ground).
-        to_camera: float64 (3, 3), from ground point minus position to camera axes (x right, y down, z = depth, m).
-        lens: its lens.
-        sigma_m: horizontal error of its place on the ground, one sigma per axis.
-        focal_sigma: relative error of the focal length, one sigma.
-        flaws: flaws of the complete picture.
-        placed: True for a refined pose, False for a recorded one.
-        ground: the terrain with which the camera was solved, in the datum of its position; None for that of the grid.
-        recorded_height_m: recorded height above the takeoff level, None if unknown.
-    """
+    """A picture's data for the coverage."""
 
     image: str
     vehicle: str
-    time_s: float | None
-    position: Array
-    to_camera: Array
+    time_s: float | None  # UTC epoch seconds, None if unknown
+    position: Array  # float64 (3,), east, north, height, metres (heights share the datum of the ground)
+    to_camera: Array  # float64 (3, 3), from ground point minus position to camera axes (x right, y down, z = depth, m)
     lens: Lens
-    sigma_m: float
-    focal_sigma: float = 0.0
-    flaws: Flaw = NO_FLAW
-    placed: bool = True
+    sigma_m: float  # horizontal error of its place on the ground, one sigma per axis
+    focal_sigma: float = 0.0  # relative error of the focal length, one sigma
+    flaws: Flaw = NO_FLAW  # flaws of the complete picture
+    placed: bool = True  # True for a refined pose, False for a recorded one
+    # the terrain with which the camera was solved, in the datum of its position; None for that of the grid
     ground: Terrain | None = None
-    recorded_height_m: float | None = None
+    recorded_height_m: float | None = None  # recorded height above the takeoff level, None if unknown
 
     @classmethod
     def of_camera(

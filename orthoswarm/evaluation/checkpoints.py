@@ -82,50 +82,34 @@ class Mark:
 
 @dataclass(slots=True)
 class Checkpoint:
-    """A surveyed point.
+    """A surveyed point."""
 
-    Attributes:
-        name: of the point. surveyed: float64 (2,), longitude and latitude (WGS 84).
-        sigma_m: of the survey, an axis; 0 where it is not stated.
-        marks: where photos show it. on_map: longitude and latitude at which the orthoimage shows it.
-        written: its coordinates as the table has them. doubt: what is uncertain about their datum, "" if nothing is.
-    """
-
-    name: str
-    surveyed: Array
-    sigma_m: float = 0.0
-    marks: list[Mark] = field(default_factory=list)
-    on_map: Array | None = None
+    name: str  # of the point
+    surveyed: Array  # float64 (2,), longitude and latitude (WGS 84)
+    sigma_m: float = 0.0  # of the survey, an axis; 0 where it is not stated
+    marks: list[Mark] = field(default_factory=list)  # where photos show it
+    on_map: Array | None = None  # longitude and latitude at which the orthoimage shows it
     _: KW_ONLY
-    written: Coordinates | None = None
-    doubt: str = ""
+    written: Coordinates | None = None  # its coordinates as the table has them
+    doubt: str = ""  # what is uncertain about their datum, "" if nothing is
 
 
 @dataclass(frozen=True, slots=True)
 class CheckpointAccuracy:
-    """What the checkpoints say.
+    """What the checkpoints say."""
 
-    Attributes:
-        names: of the points that could be measured.
-        error: float64 (n, 2), map minus survey, east and north, metres.
-        survey_m: root mean square of the survey's own horizontal error, metres.
-        unused: names of the points that no mapped photo shows, and of those that lie elsewhere.
-        how: `photos`, `orthoimage` or both.
-        control: names of the points that were left out because they had placed the map.
-        findings: marks that contradict each other, points that cannot be where they are said to be, and what is
-            uncertain about their datum, in plain words.
-        miss_m: root mean square by which the rays of each point miss it, metres; None where it was measured on the
-            orthoimage.
-    """
-
-    names: list[str]
-    error: Array
-    survey_m: float
-    unused: list[str]
-    how: str
+    names: list[str]  # of the points that could be measured
+    error: Array  # float64 (n, 2), map minus survey, east and north, metres
+    survey_m: float  # root mean square of the survey's own horizontal error, metres
+    unused: list[str]  # names of the points that no mapped photo shows, and of those that lie elsewhere
+    how: str  # `photos`, `orthoimage` or both
     _: KW_ONLY
+    # names of the points that were left out because they had placed the map
     control: list[str] = field(default_factory=list)
+    # marks that contradict each other, points that cannot be where they are said to be, and what is uncertain about
+    # their datum, in plain words
     findings: list[str] = field(default_factory=list)
+    # root mean square by which the rays of each point miss it, metres; None where it was measured on the orthoimage
     miss_m: list[float | None] = field(default_factory=list)
 
     @property
@@ -400,15 +384,11 @@ def _epsg(points: Iterable[Checkpoint]) -> int:
 
 @dataclass(frozen=True, slots=True)
 class _Views:
-    """The mapped photos of a product, by name.
+    """The mapped photos of a product, by name."""
 
-    Attributes:
-        rows: lines of frames.jsonl by image. epsg: their grid. ground_z_m: level of their homographies.
-    """
-
-    rows: dict[str, dict[str, Any]]
+    rows: dict[str, dict[str, Any]]  # lines of frames.jsonl by image
     epsg: int
-    ground_z_m: float
+    ground_z_m: float  # level of their homographies
 
     @classmethod
     def read(cls, folder: Path, ground_z_m: float | None) -> "_Views":

@@ -20,43 +20,28 @@ Mask = Flags
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FieldSettings:
-    """How displacements are measured.
+    """How displacements are measured."""
 
-    Attributes:
-        gsd_m: pixel of the grid on which both pictures are compared.
-        block_m: side of a block. step_m: distance of blocks.
-        search_m: largest displacement that is looked for, each way.
-        min_peak: least correlation of a match. max_second: largest second peak, as a share of the first.
-        apart_m: a peak farther away than this is another one.
-        min_cover: least share of a block that both pictures must cover.
-    """
-
-    gsd_m: float = 0.3
-    block_m: float = 36.0
-    step_m: float = 20.0
-    search_m: float = 8.0
-    min_peak: float = 0.25
-    max_second: float = 0.8
-    apart_m: float = 2.0
-    min_cover: float = 0.6
+    gsd_m: float = 0.3  # pixel of the grid on which both pictures are compared
+    block_m: float = 36.0  # side of a block
+    step_m: float = 20.0  # distance of blocks
+    search_m: float = 8.0  # largest displacement that is looked for, each way
+    min_peak: float = 0.25  # least correlation of a match
+    max_second: float = 0.8  # largest second peak, as a share of the first
+    apart_m: float = 2.0  # a peak farther away than this is another one
+    min_cover: float = 0.6  # least share of a block that both pictures must cover
 
 
 @dataclass(frozen=True, slots=True)
 class Displacements:
-    """A field of displacements of an orthoimage against a reference.
+    """A field of displacements of an orthoimage against a reference."""
 
-    Attributes:
-        position: float64 (N, 2), column and row of the blocks' centres on the common grid.
-        shift_m: float64 (N, 2), where the orthoimage has it minus where the reference has it: east, north, metres;
-            NaN where unmatched.
-        peak: float64 (N,), height of the correlation's peak.
-        contrast: float64 (N,), strength of the orthoimage's gradients as a share of the reference's.
-    """
-
-    position: Array
+    position: Array  # float64 (N, 2), column and row of the blocks' centres on the common grid
+    # float64 (N, 2), where the orthoimage has it minus where the reference has it: east, north, metres; NaN where
+    # unmatched
     shift_m: Array
-    peak: Array
-    contrast: Array
+    peak: Array  # float64 (N,), height of the correlation's peak
+    contrast: Array  # float64 (N,), strength of the orthoimage's gradients as a share of the reference's
 
     @property
     def matched(self) -> Mask:
@@ -201,15 +186,10 @@ def displacement_field(
 
 @dataclass(frozen=True, slots=True)
 class Completeness:
-    """What share of the ground an orthoimage covers.
+    """What share of the ground an orthoimage covers."""
 
-    Attributes:
-        share: covered share of the reference's valid ground within the convex hull of the orthoimage's coverage.
-        area_m2: ground that the orthoimage covers.
-    """
-
-    share: float
-    area_m2: float
+    share: float  # covered share of the reference's valid ground within the convex hull of the orthoimage's coverage
+    area_m2: float  # ground that the orthoimage covers
 
 
 def completeness(ortho_valid: Mask, reference_valid: Mask, gsd_m: float) -> Completeness:
@@ -228,32 +208,20 @@ def completeness(ortho_valid: Mask, reference_valid: Mask, gsd_m: float) -> Comp
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Accuracy:
-    """The figures of an orthoimage against a reference; lengths in metres.
+    """The figures of an orthoimage against a reference; lengths in metres."""
 
-    Attributes:
-        median_m: median displacement of the matched blocks.
-        p90_m: 90 % of them are below; p95_m: 95 %; max_m: the largest.
-        mean_east_m: mean shift east; mean_north_m: north.
-        unmatched_share: share of the covered blocks that found no place.
-        share_within_1m: share of all covered blocks, unmatched ones included, that lie within a metre.
-        blocks: covered blocks.
-        completeness: covered share of the ground within the coverage's hull.
-        sharpness: strength of gradients as a share of the reference's, median.
-        seam_p95_m: 95 % of the jumps between neighbouring blocks are below.
-    """
-
-    median_m: float
-    p90_m: float
-    p95_m: float
-    max_m: float
-    mean_east_m: float
-    mean_north_m: float
-    unmatched_share: float
-    share_within_1m: float
-    blocks: int
-    completeness: float
-    sharpness: float
-    seam_p95_m: float
+    median_m: float  # median displacement of the matched blocks
+    p90_m: float  # 90 % of them are below
+    p95_m: float  # 95 %
+    max_m: float  # the largest
+    mean_east_m: float  # mean shift east
+    mean_north_m: float  # north
+    unmatched_share: float  # share of the covered blocks that found no place
+    share_within_1m: float  # share of all covered blocks, unmatched ones included, that lie within a metre
+    blocks: int  # covered blocks
+    completeness: float  # covered share of the ground within the coverage's hull
+    sharpness: float  # strength of gradients as a share of the reference's, median
+    seam_p95_m: float  # 95 % of the jumps between neighbouring blocks are below
     field: Displacements = field(repr=False, compare=False)
 
     def figures(self) -> dict[str, float | int | None]:

@@ -57,26 +57,16 @@ def _size(row: dict[str, str], truth: Path) -> tuple[int, int]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PoseErrors:
-    """Errors of placed frames, arrays over the compared frames (NaN where not stated).
+    """Errors of placed frames, arrays over the compared frames (NaN where not stated)."""
 
-    Attributes:
-        image: names. vehicle: ids.
-        position_m: float64 (N, 3), camera's east, north, up minus truth.
-        angle_deg: float64 (N, 3), grid yaw, pitch, roll minus truth.
-        fov_deg: float64 (N,), minus truth.
-        center_m: float64 (N, 2), ground point of the picture's centre minus truth, on the mean ground level.
-        nadir_m: float64 (N, 2), the same at the pixel that truly looks straight down (no height plays a part).
-        sigma_m: float64 (N,), stated.
-    """
-
-    image: list[str]
-    vehicle: list[str]
-    position_m: Array
-    angle_deg: Array
-    fov_deg: Array
-    center_m: Array
-    nadir_m: Array
-    sigma_m: Array
+    image: list[str]  # names
+    vehicle: list[str]  # ids
+    position_m: Array  # float64 (N, 3), camera's east, north, up minus truth
+    angle_deg: Array  # float64 (N, 3), grid yaw, pitch, roll minus truth
+    fov_deg: Array  # float64 (N,), minus truth
+    center_m: Array  # float64 (N, 2), ground point of the picture's centre minus truth, on the mean ground level
+    nadir_m: Array  # float64 (N, 2), the same at the pixel that truly looks straight down (no height plays a part)
+    sigma_m: Array  # float64 (N,), stated
 
     def figures(self) -> dict[str, Any]:
         """Numbers for a report: medians, 95 % values, FoV per vehicle, honesty of the stated sigma.
@@ -179,18 +169,13 @@ def camera_from_homography(homography: Array, lens: Lens, ground_z_m: float) -> 
 
 @dataclass(frozen=True, slots=True)
 class Placement:
-    """A frame as a product places it.
+    """A frame as a product places it."""
 
-    Attributes:
-        image: name. vehicle: id. homography: 3x3, undistorted pixel to (east, north) on a plane.
-        fov_deg: its field of view, None if not stated. sigma_m: its own estimate of the ground error, None if none.
-    """
-
-    image: str
+    image: str  # name
     vehicle: str
-    homography: Array
-    fov_deg: float | None
-    sigma_m: float | None
+    homography: Array  # 3x3, undistorted pixel to (east, north) on a plane
+    fov_deg: float | None  # its field of view, None if not stated
+    sigma_m: float | None  # its own estimate of the ground error, None if none
 
 
 def _median_p95(values: Array) -> tuple[float | None, float | None]:

@@ -29,16 +29,11 @@ _MOST_STEM: Final = 120  # characters; file systems take names of 255 bytes
 
 @dataclass(frozen=True, slots=True)
 class OrientedPicture:
-    """A placed picture of a map.
+    """A placed picture of a map."""
 
-    Attributes:
-        name: unique plain file name. row: its line in frames.jsonl.
-        camera: position in the map's grid (east, north, height), orientation and lens.
-    """
-
-    name: str
-    row: Row
-    camera: Camera
+    name: str  # unique plain file name
+    row: Row  # its line in frames.jsonl
+    camera: Camera  # position in the map's grid (east, north, height), orientation and lens
 
 
 def camera_of(row: Row) -> Camera:

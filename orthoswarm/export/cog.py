@@ -205,19 +205,13 @@ _WORST_TILE = _TILE_BYTES + _TILE_BYTES // 64 + 1024  # deflate stores what it c
 
 @dataclass(frozen=True, slots=True)
 class _Form:
-    """The two forms of a TIFF, which differ in the width of offsets and counts.
+    """The two forms of a TIFF, which differ in the width of offsets and counts."""
 
-    Attributes:
-        header: of the file, without the offset of its first directory.
-        word: bytes of an offset or of an entry's count. count: struct format of a directory's number of entries.
-        place: struct format of an offset. place_kind: TIFF type of an offset.
-    """
-
-    header: bytes
-    word: int
-    count: str
-    place: str
-    place_kind: int
+    header: bytes  # of the file, without the offset of its first directory
+    word: int  # bytes of an offset or of an entry's count
+    count: str  # struct format of a directory's number of entries
+    place: str  # struct format of an offset
+    place_kind: int  # TIFF type of an offset
 
     @property
     def entry(self) -> int:

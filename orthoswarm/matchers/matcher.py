@@ -14,16 +14,11 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class Matches:
-    """Pairs of points that show the same ground.
+    """Pairs of points that show the same ground."""
 
-    Attributes:
-        a: float64 (N, 2), column and row in the first picture, pixel centres at integers; b: in the second.
-        score: float64 (N,), confidence 0 to 1; comparable only within one matcher.
-    """
-
-    a: Array
-    b: Array
-    score: Array
+    a: Array  # float64 (N, 2), column and row in the first picture, pixel centres at integers
+    b: Array  # in the second
+    score: Array  # float64 (N,), confidence 0 to 1; comparable only within one matcher
 
     def __len__(self) -> int:
         return len(self.a)

@@ -29,19 +29,13 @@ _SHIFT_SHARE: Final = 0.1  # least share of matches with the common shift
 
 @dataclass(frozen=True, slots=True)
 class Registration:
-    """Registration of a patch in a window of the map.
+    """Registration of a patch in a window of the map."""
 
-    Attributes:
-        homography: float64 (3, 3), patch pixel to window pixel, last element 1.
-        matches: tiles that agree. share: of all tiles with ground on both sides, those that agree.
-        rms_px: root mean square of their residuals per axis. tiles: how many tiles were tried.
-    """
-
-    homography: Array
-    matches: Matches
-    share: float
-    rms_px: float
-    tiles: int
+    homography: Array  # float64 (3, 3), patch pixel to window pixel, last element 1
+    matches: Matches  # tiles that agree
+    share: float  # of all tiles with ground on both sides, those that agree
+    rms_px: float  # root mean square of their residuals per axis
+    tiles: int  # how many tiles were tried
 
 
 Keep = Callable[[Matches, Array], Mask]

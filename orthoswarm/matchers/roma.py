@@ -65,15 +65,10 @@ def _network(device: Any) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class Roma:
-    """Patch to map by RoMa: the patch against the window, matches beyond the reach dropped.
+    """Patch to map by RoMa: the patch against the window, matches beyond the reach dropped."""
 
-    Attributes:
-        network: something with `match(image, image)`, `sample(warp, certainty)` and `to_pixel_coordinates`.
-        device: where it runs, see `network_device`.
-    """
-
-    network: Any
-    device: str = "auto"
+    network: Any  # something with `match(image, image)`, `sample(warp, certainty)` and `to_pixel_coordinates`
+    device: str = "auto"  # where it runs, see `network_device`
 
     @classmethod
     def make(cls, device: str) -> "Roma":

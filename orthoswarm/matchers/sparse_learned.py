@@ -103,14 +103,10 @@ def padded_tensor(gray: Gray, stride: int, device: str, channels: int = 1) -> An
 
 @dataclass(frozen=True, slots=True)
 class Learned:
-    """Keypoints of one network, matched by LightGlue.
+    """Keypoints of one network, matched by LightGlue."""
 
-    Attributes:
-        kind: which network. device: where it runs, see `network_device`.
-    """
-
-    kind: Kind = "xfeat"
-    device: str = "auto"
+    kind: Kind = "xfeat"  # which network
+    device: str = "auto"  # where it runs, see `network_device`
 
     @classmethod
     def make(cls, kind: Kind, device: str) -> "Learned":

@@ -14,23 +14,16 @@ from orthoswarm.model.errors import InputError
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WeightFile:
-    """A file of weights.
+    """A file of weights."""
 
-    Attributes:
-        name: its name in this program. file: its name on disk; also: other common names of the same file.
-        package: the distribution that contains it, None if no package does. folder: inside that package.
-        sha256: of the published file, None if any training is accepted.
-        used_by: matchers that need it. licence: of the weights.
-    """
-
-    name: str
-    file: str
-    also: tuple[str, ...]
-    package: str | None
-    folder: str
-    sha256: str | None
-    used_by: tuple[str, ...]
-    licence: str
+    name: str  # its name in this program
+    file: str  # its name on disk
+    also: tuple[str, ...]  # other common names of the same file
+    package: str | None  # the distribution that contains it, None if no package does
+    folder: str  # inside that package
+    sha256: str | None  # of the published file, None if any training is accepted
+    used_by: tuple[str, ...]  # matchers that need it
+    licence: str  # of the weights
 
 
 KNOWN = {

@@ -27,39 +27,27 @@ _UNKNOWN_FOV_SIGMA_DEG: Final = 10.0  # sigma of a field of view that could not 
 
 @dataclass(frozen=True, slots=True)
 class PaperOptions:
-    """How the paper's refiner works.
+    """How the paper's refiner works."""
 
-    Attributes:
-        device: where matchers' networks run, see `network_device`.
-        picture_matcher, map_matcher: their names; None for the best available.
-    """
-
-    device: str = "auto"
-    picture_matcher: str | None = None
-    map_matcher: str | None = None
+    device: str = "auto"  # where matchers' networks run, see `network_device`
+    picture_matcher: str | None = None  # their names; None for the best available
+    map_matcher: str | None = None  # their names; None for the best available
 
 
 @dataclass(slots=True, kw_only=True)
 class CoarseVehicle:
-    """One vehicle after the coarse stage (III.C).
-
-    Attributes:
-        vehicle: id. frames: in order. leg: int32 (N,), -1 in turns. lines: of each leg.
-        cameras: cameras in the local frame, lens in pixels of the stored pictures; ground at height 0.
-        sigma_m: float64 (N,), own error estimates. fov_sigma_rad: of the field of view.
-        damaged: index -> why its picture cannot be used. warnings: findings. cpu_s: CPU seconds.
-    """
+    """One vehicle after the coarse stage (III.C)."""
 
     vehicle: str
-    frames: list[Frame]
-    leg: Ints
-    lines: list[Line]
-    cameras: CameraBlock
-    sigma_m: Array
-    fov_sigma_rad: float
-    damaged: dict[int, str] = field(default_factory=dict)
-    warnings: list[str] = field(default_factory=list)
-    cpu_s: float = 0.0
+    frames: list[Frame]  # in order
+    leg: Ints  # int32 (N,), -1 in turns
+    lines: list[Line]  # of each leg
+    cameras: CameraBlock  # cameras in the local frame, lens in pixels of the stored pictures; ground at height 0
+    sigma_m: Array  # float64 (N,), own error estimates
+    fov_sigma_rad: float  # of the field of view
+    damaged: dict[int, str] = field(default_factory=dict)  # index -> why its picture cannot be used
+    warnings: list[str] = field(default_factory=list)  # findings
+    cpu_s: float = 0.0  # CPU seconds
 
     def members(self, leg: int) -> Ints:
         """Indices of a leg's frames whose pictures can be used."""

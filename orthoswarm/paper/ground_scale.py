@@ -25,15 +25,11 @@ _OUTLIER_ROUNDS: Final = 20  # most rounds of it
 
 @dataclass(frozen=True, slots=True)
 class Gaussian:
-    """Mean and standard deviation of the inliers.
+    """Mean and standard deviation of the inliers."""
 
-    Attributes:
-        mean, sigma: of the inliers. inliers: how many.
-    """
-
-    mean: float
-    sigma: float
-    inliers: int
+    mean: float  # of the inliers
+    sigma: float  # of the inliers
+    inliers: int  # how many
 
 
 def gaussian(samples: Array) -> Gaussian:
@@ -95,17 +91,13 @@ def field_of_view(scale_m: float, width: int, height_m: float, tilt_rad: float =
 
 @dataclass(frozen=True, slots=True)
 class ScaleTask:
-    """A pair of frames of one leg that gives one measurement of the scale.
+    """A pair of frames of one leg that gives one measurement of the scale."""
 
-    Attributes:
-        first, second: indices. flown_m: along the line. height_m: mean height. tilt_rad: mean tilt of the camera.
-    """
-
-    first: int
-    second: int
-    flown_m: float
-    height_m: float
-    tilt_rad: float
+    first: int  # indices
+    second: int  # indices
+    flown_m: float  # along the line
+    height_m: float  # mean height
+    tilt_rad: float  # mean tilt of the camera
 
 
 def choose_pairs(along: Array, height: Array, tilt: Array, members: NDArray[np.integer], count: int) -> list[ScaleTask]:

@@ -18,16 +18,11 @@ _LINE_SIGMAS: Final = 3.0  # ... or within so many standard deviations of its ph
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """The straight line of a leg.
+    """The straight line of a leg."""
 
-    Attributes:
-        point: float64 (2,), a point on it (the middle of the positions). direction: float64 (2,), unit, along flight.
-        sigma_m: standard deviation of the positions across it.
-    """
-
-    point: Array
-    direction: Array
-    sigma_m: float
+    point: Array  # float64 (2,), a point on it (the middle of the positions)
+    direction: Array  # float64 (2,), unit, along flight
+    sigma_m: float  # standard deviation of the positions across it
 
     def project(self, position: Array) -> Array:
         """Eq. 3: the foot points (N, 2) of positions (N, 2) on the line."""

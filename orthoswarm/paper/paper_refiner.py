@@ -28,25 +28,17 @@ _CARRIED_SIGMA_M: Final = 2.0  # least sigma of a correction carried from other 
 
 @dataclass(frozen=True, slots=True)
 class PaperState:
-    """What a solved unit passes on to later calls.
+    """What a solved unit passes on to later calls."""
 
-    Attributes:
-        found: centre and shift of each leg that was found on the map, for neighbours. frames: those that were placed.
-    """
-
-    found: list[tuple[Array, Array]]
-    frames: list[Frame]
+    found: list[tuple[Array, Array]]  # centre and shift of each leg that was found on the map, for neighbours
+    frames: list[Frame]  # those that were placed
 
 
 @dataclass(frozen=True, slots=True)
 class PaperRefiner(UnitRefiner):
-    """The paper's refiner behind the interface `placement.Refiner`.
+    """The paper's refiner behind the interface `placement.Refiner`."""
 
-    Attributes:
-        options: see PaperOptions.
-    """
-
-    options: PaperOptions = field(default_factory=PaperOptions)
+    options: PaperOptions = field(default_factory=PaperOptions)  # see PaperOptions
 
     def solve(self, units: list[list[Frame]], neighbours: Sequence[Solution], basemap: MapWindow | None) -> Solution:
         """All steps for one vehicle; if none of its legs is found on the map, it gets its neighbours' correction."""

@@ -42,16 +42,11 @@ _EDGE_ROUNDS: Final = 12  # bisections of the highest ground between two places 
 
 @dataclass(frozen=True)
 class _Over:
-    """What a plan's flights lie over.
+    """What a plan's flights lie over."""
 
-    Attributes:
-        above_m: height above level ground at which `foot` was made. foot: footprint of the narrowest camera.
-        heights: of the flights.
-    """
-
-    above_m: float
-    foot: Footprint
-    heights: FlightHeights
+    above_m: float  # height above level ground at which `foot` was made
+    foot: Footprint  # footprint of the narrowest camera
+    heights: FlightHeights  # of the flights
 
     def missed(self, wanted: planned_coverage.Geometry, slots: list[list[Slot]]) -> planned_coverage.Geometry:
         """What of the wanted ground no picture is certain to see, a shapely geometry."""

@@ -27,17 +27,11 @@ _LIGHT = np.array([-1.0, 1.0, 1.4]) / np.sqrt(1.0 + 1.0 + 1.4**2)
 
 @dataclass(slots=True)
 class Picture:
-    """Colours on the ground.
+    """Colours on the ground."""
 
-    Attributes:
-        rgb: uint8 (rows, columns, 3), empty ground in the page's colour.
-        seen: bool (rows, columns), where there is something.
-        grid: where it lies.
-    """
-
-    rgb: Bytes
-    seen: Flags
-    grid: GroundGrid
+    rgb: Bytes  # uint8 (rows, columns, 3), empty ground in the page's colour
+    seen: Flags  # bool (rows, columns), where there is something
+    grid: GroundGrid  # where it lies
 
     def on(self, grid: GroundGrid) -> "Picture":
         """Resampled to another grid, as far as it reaches."""
@@ -269,17 +263,11 @@ _BAND_PX: Final = 500_000  # pixels that are compared at once (memory: gradients
 
 @dataclass(frozen=True, slots=True)
 class Moved:
-    """Where blocks of the map are found in the orthoimage.
+    """Where blocks of the map are found in the orthoimage."""
 
-    Attributes:
-        at: float64 (K, 2), places in the orthoimage, on the ground.
-        shift: float64 (K, 2), from there to the same thing in the map, metres.
-        blocks: how many blocks were tried.
-    """
-
-    at: Array
-    shift: Array
-    blocks: int
+    at: Array  # float64 (K, 2), places in the orthoimage, on the ground
+    shift: Array  # float64 (K, 2), from there to the same thing in the map, metres
+    blocks: int  # how many blocks were tried
 
     @classmethod
     def joined(cls, parts: "Sequence[Moved]") -> "Moved":

@@ -22,14 +22,10 @@ _SERVER_PARTS = 3
 
 @dataclass(frozen=True, slots=True)
 class StoredFile:
-    """A file in a store.
+    """A file in a store."""
 
-    Attributes:
-        size: bytes, None where the store does not tell. version: changes with the content.
-    """
-
-    size: int | None
-    version: str
+    size: int | None  # bytes, None where the store does not tell
+    version: str  # changes with the content
 
 
 _known: dict[Path, StoredFile] = {}

@@ -23,19 +23,13 @@ _FALLS_M2: Final = (30.0, 700.0)
 
 @dataclass(frozen=True, slots=True)
 class DamagedGround:
-    """An irregular patch of ground.
+    """An irregular patch of ground."""
 
-    Attributes:
-        east: easting of its centre; north: northing.
-        across_m: its extent at right angles to its axis; along_m: along it.
-        angle_rad: direction of its axis, anticlockwise from east.
-    """
-
-    east: float
-    north: float
-    across_m: float
-    along_m: float
-    angle_rad: float
+    east: float  # easting of its centre
+    north: float  # northing
+    across_m: float  # its extent at right angles to its axis
+    along_m: float  # along it
+    angle_rad: float  # direction of its axis, anticlockwise from east
 
 
 def zone_depth(scene: Scene, zone: DamagedGround, step: int, seed: int) -> Floats:

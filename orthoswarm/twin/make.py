@@ -39,18 +39,12 @@ A half-made set is continued only by the version that began it.
 
 @dataclass(frozen=True, slots=True)
 class TwinSet:
-    """Summary of a data set after `make_twin`.
+    """Summary of a data set after `make_twin`."""
 
-    Attributes:
-        folder: of the set.
-        photos: pictures of the set; made: those rendered in this run (the others existed).
-        vehicles: number of vehicles.
-    """
-
-    folder: Path
-    photos: int
-    made: int
-    vehicles: int
+    folder: Path  # of the set
+    photos: int  # pictures of the set
+    made: int  # those rendered in this run (the others existed)
+    vehicles: int  # number of vehicles
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,24 +23,15 @@ BLOCK = 16
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PreparedScene:
-    """A scene prepared for rendering.
+    """A scene prepared for rendering."""
 
-    Attributes:
-        scene: heights and kinds.
-        levels: lit colours at 0.25, 0.5 and 1 m, uint8 (rows, columns, 3) each.
-        tiles: float32, highest point of each tile, plus 0.3 m for tilted tops.
-        sun: unit vector to the sun (columns, rows, up), for walls; ambient: light in the shade.
-        haze: float32 on 4 m cells, opacity of the haze, 0 to 1; shape (0, 0) without haze.
-        noise: float32 (1024, 1024), read with wrap-around, for moving glints and haze.
-    """
-
-    scene: Scene
-    levels: tuple[Bytes, Bytes, Bytes]
-    tiles: Floats
-    sun: tuple[float, float, float]
-    ambient: float
-    haze: Floats
-    noise: Floats
+    scene: Scene  # heights and kinds
+    levels: tuple[Bytes, Bytes, Bytes]  # lit colours at 0.25, 0.5 and 1 m, uint8 (rows, columns, 3) each
+    tiles: Floats  # float32, highest point of each tile, plus 0.3 m for tilted tops
+    sun: tuple[float, float, float]  # unit vector to the sun (columns, rows, up), for walls
+    ambient: float  # light in the shade
+    haze: Floats  # float32 on 4 m cells, opacity of the haze, 0 to 1; shape (0, 0) without haze
+    noise: Floats  # float32 (1024, 1024), read with wrap-around, for moving glints and haze
 
 
 def make_stage(

@@ -44,23 +44,18 @@ _COPIED_LEAST: Final = 3  # two folders with so many photos in common may be one
 
 @dataclass(slots=True, kw_only=True)
 class Folder:
-    """One folder that contains usable files.
+    """One folder that contains usable files."""
 
-    Attributes:
-        path: of the folder. vehicle: id of the vehicle whose photos it contains.
-        pictures: files with a picture's suffix; videos; logs; subtitles (SRT); tables (text and CSV), in natural order.
-        sidecars: XMP beside pictures. unread: other files that may say something about pictures.
-    """
-
-    path: Path
-    vehicle: str
+    path: Path  # of the folder
+    vehicle: str  # id of the vehicle whose photos it contains
+    # files with a picture's suffix; videos; logs; subtitles (SRT); tables (text and CSV), in natural order
     pictures: list[Path] = field(default_factory=list)
     videos: list[Path] = field(default_factory=list)
     logs: list[Path] = field(default_factory=list)
     subtitles: list[Path] = field(default_factory=list)
     tables: list[Path] = field(default_factory=list)
-    sidecars: dict[Path, Path] = field(default_factory=dict)
-    unread: list[Path] = field(default_factory=list)
+    sidecars: dict[Path, Path] = field(default_factory=dict)  # XMP beside pictures
+    unread: list[Path] = field(default_factory=list)  # other files that may say something about pictures
 
     def take_sidecars(self) -> None:
         """Match XMP files with the pictures that they are named like: `DJI_0001.xmp` or `DJI_0001.JPG.xmp`."""
@@ -76,24 +71,19 @@ class Folder:
 
 @dataclass(frozen=True, slots=True)
 class Discovery:
-    """All folders of the inputs, and the root of picture names.
+    """All folders of the inputs, and the root of picture names."""
 
-    Attributes:
-        root: names are relative to it. folders: those with usable files.
-        left_out: files with a picture's suffix that are not read, the reason (one for all that share it) and a detail.
-        videos: the vehicle of each video, unless its metadata names another.
-        unreadable: folders that cannot be listed -> the system's reason.
-        copies: photos that are the same files as photos in another folder, with these.
-        everywhere: tables and logs given by themselves or in folders without pictures and videos.
-    """
-
-    root: Path
-    folders: list[Folder]
+    root: Path  # names are relative to it
+    folders: list[Folder]  # those with usable files
+    # files with a picture's suffix that are not read, the reason (one for all that share it) and a detail
     left_out: list[tuple[Path, str, str]] = field(default_factory=list)
+    # the vehicle of each video, unless its metadata names another
     videos: dict[Path, str] = field(default_factory=dict)
+    # tables and logs given by themselves or in folders without pictures and videos
     everywhere: frozenset[Path] = frozenset()
     _: KW_ONLY
-    unreadable: dict[Path, str] = field(default_factory=dict)
+    unreadable: dict[Path, str] = field(default_factory=dict)  # folders that cannot be listed -> the system's reason
+    # photos that are the same files as photos in another folder, with these
     copies: dict[Path, Path] = field(default_factory=dict)
 
     def scope(self, path: Path) -> Path:

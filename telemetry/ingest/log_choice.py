@@ -44,21 +44,15 @@ class LogSource:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LogMatch:
-    """A log that fits some pictures.
+    """A log that fits some pictures."""
 
-    Attributes:
-        entry: the log. offset_s: the pictures' clock minus UTC. how: what it fits by, for messages.
-        rank: 0 for the strongest evidence. misfit: in it, smaller is better; differences up to `margin` decide nothing.
-        by_positions: whether the misfit is a distance, metres.
-    """
-
-    entry: LogSource
-    offset_s: float
-    how: str
-    rank: int
-    misfit: float = 0.0
+    entry: LogSource  # the log
+    offset_s: float  # the pictures' clock minus UTC
+    how: str  # what it fits by, for messages
+    rank: int  # 0 for the strongest evidence
+    misfit: float = 0.0  # in it, smaller is better; differences up to `margin` decide nothing
     margin: float = 0.0
-    by_positions: bool = False
+    by_positions: bool = False  # whether the misfit is a distance, metres
 
 
 def best_log(matches: Sequence[LogMatch], what: str, is_named: Callable[[FlightLog], bool]) -> LogMatch | Finding:

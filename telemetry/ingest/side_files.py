@@ -9,18 +9,13 @@ from telemetry.samples.findings import Finding
 
 @dataclass(frozen=True, slots=True)
 class ControlPoints:
-    """Summary of an ODM control point file.
+    """Summary of an ODM control point file."""
 
-    Attributes:
-        rows: number of observations. points: number of points. heights: their z values.
-        widest: largest column of a pixel. images: lower-case names of pictures.
-    """
-
-    rows: int
-    points: int
-    heights: tuple[float, ...]
-    widest: float
-    images: frozenset[str]
+    rows: int  # number of observations
+    points: int  # number of points
+    heights: tuple[float, ...]  # their z values
+    widest: float  # largest column of a pixel
+    images: frozenset[str]  # lower-case names of pictures
 
 
 def read_control_points(path: Path) -> ControlPoints | None:

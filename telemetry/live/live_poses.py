@@ -111,13 +111,10 @@ class _Sources:
 
 @dataclass(frozen=True, slots=True)
 class LinkPose:
-    """A pose at a time, and its sources.
+    """A pose at a time, and its sources."""
 
-    Attributes:
-        sample: the pose. origin: source of its `position`, `height`, `angles` and `flight_yaw`, as far as known.
-    """
-
-    sample: Sample
+    sample: Sample  # the pose
+    # source of its `position`, `height`, `angles` and `flight_yaw`, as far as known
     origin: dict[str, str] = field(default_factory=dict)
 
 

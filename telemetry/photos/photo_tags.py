@@ -53,56 +53,35 @@ _MOST_HEIGHT_M: Final = 12_000.0  # recorded heights above this are not heights 
 
 @dataclass(slots=True, kw_only=True)
 class Photo:
-    """One photo with its tags, and what tables and logs add to them.
+    """One photo with its tags, and what tables and logs add to them."""
 
-    Attributes:
-        path: the file. width: columns as stored; height: rows.
-        lat_deg: latitude, None without a position; lon_deg: longitude.
-        other_position: another latitude and longitude that the photo's tags state, far from that.
-        altitude_m: absolute altitude. other_altitude_m: another one that the photo's tags state, far from that.
-        height_m: height above takeoff.
-        height_is_ground: whether height_m is above the ground instead.
-        time_s: UTC epoch seconds.
-        camera_deg: yaw, pitch, roll of the camera (gimbal), pitch -90 looking straight down.
-        flight_deg: yaw, pitch, roll of the airframe.
-        position_sigma_m: horizontal, one sigma, where stated.
-        make: manufacturer; model: of the camera. camera: key of the lens (model, size, zoom, sensor).
-        band: name of the spectral band, "" for a colour picture.
-        sensor: which of a camera's several took it, a key of SENSORS; "" if it has one.
-        fov_hint_rad: horizontal field of view from focal length tags.
-        dewarp_k1: radial distortion that the tags state for a picture which still has it.
-        yaw_is_stated: True if the source defines its yaw as the picture's, so that there is no choice.
-        origin: field -> its source.
-        damaged: True for a picture of a video that lost parts.
-        ambiguous: True where it may belong to another camera event of a log.
-        unplaced: why the logs that are there give it no position (one for all with that reason), and a detail.
-    """
-
-    path: Path
-    width: int
-    height: int
-    lat_deg: float | None = None
-    lon_deg: float | None = None
+    path: Path  # the file
+    width: int  # columns as stored
+    height: int  # rows
+    lat_deg: float | None = None  # latitude, None without a position
+    lon_deg: float | None = None  # longitude
+    # another latitude and longitude that the photo's tags state, far from that
     other_position: tuple[float, float] | None = None
-    altitude_m: float | None = None
-    other_altitude_m: float | None = None
-    height_m: float | None = None
-    height_is_ground: bool = False
-    time_s: float | None = None
-    camera_deg: Angles = (None, None, None)
-    flight_deg: Angles = (None, None, None)
-    position_sigma_m: float | None = None
-    make: str = ""
-    model: str = ""
-    camera: str = ""
-    band: str = ""
-    sensor: str = ""
-    fov_hint_rad: float | None = None
-    dewarp_k1: float | None = None
-    yaw_is_stated: bool = False
-    origin: dict[str, str] = field(default_factory=dict)
-    damaged: bool = False
-    ambiguous: bool = False
+    altitude_m: float | None = None  # absolute altitude
+    other_altitude_m: float | None = None  # another one that the photo's tags state, far from that
+    height_m: float | None = None  # height above takeoff
+    height_is_ground: bool = False  # whether height_m is above the ground instead
+    time_s: float | None = None  # UTC epoch seconds
+    camera_deg: Angles = (None, None, None)  # yaw, pitch, roll of the camera (gimbal), pitch -90 looking straight down
+    flight_deg: Angles = (None, None, None)  # yaw, pitch, roll of the airframe
+    position_sigma_m: float | None = None  # horizontal, one sigma, where stated
+    make: str = ""  # manufacturer
+    model: str = ""  # of the camera
+    camera: str = ""  # key of the lens (model, size, zoom, sensor)
+    band: str = ""  # name of the spectral band, "" for a colour picture
+    sensor: str = ""  # which of a camera's several took it, a key of SENSORS; "" if it has one
+    fov_hint_rad: float | None = None  # horizontal field of view from focal length tags
+    dewarp_k1: float | None = None  # radial distortion that the tags state for a picture which still has it
+    yaw_is_stated: bool = False  # True if the source defines its yaw as the picture's, so that there is no choice
+    origin: dict[str, str] = field(default_factory=dict)  # field -> its source
+    damaged: bool = False  # True for a picture of a video that lost parts
+    ambiguous: bool = False  # True where it may belong to another camera event of a log
+    # why the logs that are there give it no position (one for all with that reason), and a detail
     unplaced: tuple[str, str] = ("", "")
 
 

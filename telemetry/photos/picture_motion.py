@@ -39,15 +39,11 @@ class PictureFile:
 
 @dataclass(frozen=True, slots=True)
 class PictureFeatures:
-    """PictureFeatures of one picture at reduced size.
+    """PictureFeatures of one picture at reduced size."""
 
-    Attributes:
-        points: (N, 2) column and row. descriptors: (N, 128) float32. centre: (2,) column and row of the middle.
-    """
-
-    points: Array
-    descriptors: Floats
-    centre: Array
+    points: Array  # (N, 2) column and row
+    descriptors: Floats  # (N, 128) float32
+    centre: Array  # (2,) column and row of the middle
 
 
 def features(picture: PictureFile, *, width: int, most: int) -> PictureFeatures | None:
@@ -69,14 +65,10 @@ def features(picture: PictureFile, *, width: int, most: int) -> PictureFeatures 
 
 @dataclass(frozen=True, slots=True)
 class Shift:
-    """How the ground in the middle of one picture moves to another.
+    """How the ground in the middle of one picture moves to another."""
 
-    Attributes:
-        pixels: (2,) columns and rows at the reduced size. turned_rad: clockwise as seen.
-    """
-
-    pixels: Array
-    turned_rad: float
+    pixels: Array  # (2,) columns and rows at the reduced size
+    turned_rad: float  # clockwise as seen
 
 
 def centre_shift(one: PictureFeatures, two: PictureFeatures) -> Shift | None:

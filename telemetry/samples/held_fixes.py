@@ -46,18 +46,14 @@ _AROUND: Final = 3  # steps before and after by which the speed around a fix is 
 
 @dataclass(frozen=True, slots=True)
 class HeldFixes:
-    """Fixes (H of them) that were not measured.
+    """Fixes (H of them) that were not measured."""
 
-    Attributes:
-        index: of each in the caller's order. lat_deg, lon_deg: float64 (H,), between the measured ones, or the nearest
-            one. sigma_m: float64 (H,), one sigma of that. longest_s: the longest time without a measured fix.
-    """
-
-    index: list[int]
+    index: list[int]  # of each in the caller's order
+    # lat_deg, lon_deg: float64 (H,), between the measured ones, or the nearest one
     lat_deg: Array
     lon_deg: Array
-    sigma_m: Array
-    longest_s: float = 0.0
+    sigma_m: Array  # float64 (H,), one sigma of that
+    longest_s: float = 0.0  # the longest time without a measured fix
 
     def __len__(self) -> int:
         return len(self.index)

@@ -9,41 +9,25 @@ FLIGHT_ANGLES = ("flight_yaw_deg", "flight_pitch_deg", "flight_roll_deg")
 
 @dataclass(slots=True, kw_only=True)
 class Sample:
-    """Position and attitude of a camera at one time, degrees and metres; None where unknown.
+    """Position and attitude of a camera at one time, degrees and metres; None where unknown."""
 
-    Attributes:
-        time_s: UTC epoch seconds.
-        lat_deg: latitude, WGS 84; lon_deg: longitude.
-        height_m: height above takeoff, or above the ground where height_is_ground.
-        altitude_m: absolute altitude.
-        yaw_deg: of the picture's up direction at nadir, clockwise from true north.
-        pitch_deg: -90 looks straight down. roll_deg: > 0 right side down.
-        flight_yaw_deg: heading of the airframe; flight_pitch_deg, flight_roll_deg: its attitude.
-        fov_deg: horizontal field of view.
-        zoom: focal length in a unit of the source, which is only comparable within one flight.
-        sigma_m: one sigma of the horizontal position.
-        vehicle: id of the vehicle.
-        height_is_ground: whether height_m is above the ground below.
-        number: number of the picture or exposure as the source counts them.
-    """
-
-    time_s: float | None = None
-    lat_deg: float | None = None
-    lon_deg: float | None = None
-    height_m: float | None = None
-    altitude_m: float | None = None
-    yaw_deg: float | None = None
-    pitch_deg: float | None = None
-    roll_deg: float | None = None
-    flight_yaw_deg: float | None = None
-    flight_pitch_deg: float | None = None
-    flight_roll_deg: float | None = None
-    fov_deg: float | None = None
-    zoom: float | None = None
-    sigma_m: float | None = None
-    vehicle: str | None = None
-    height_is_ground: bool = False
-    number: int | None = None
+    time_s: float | None = None  # UTC epoch seconds
+    lat_deg: float | None = None  # latitude, WGS 84
+    lon_deg: float | None = None  # longitude
+    height_m: float | None = None  # height above takeoff, or above the ground where height_is_ground
+    altitude_m: float | None = None  # absolute altitude
+    yaw_deg: float | None = None  # of the picture's up direction at nadir, clockwise from true north
+    pitch_deg: float | None = None  # -90 looks straight down
+    roll_deg: float | None = None  # > 0 right side down
+    flight_yaw_deg: float | None = None  # heading of the airframe
+    flight_pitch_deg: float | None = None  # its attitude
+    flight_roll_deg: float | None = None  # its attitude
+    fov_deg: float | None = None  # horizontal field of view
+    zoom: float | None = None  # focal length in a unit of the source, which is only comparable within one flight
+    sigma_m: float | None = None  # one sigma of the horizontal position
+    vehicle: str | None = None  # id of the vehicle
+    height_is_ground: bool = False  # whether height_m is above the ground below
+    number: int | None = None  # number of the picture or exposure as the source counts them
 
     @property
     def has_position(self) -> bool:

@@ -22,16 +22,11 @@ _WILD_MOST_PIECES: Final = 10_000  # a track broken at more places has wrong tim
 
 @dataclass(frozen=True, slots=True)
 class WildFixes:
-    """The fixes of a track that no aircraft can have reached.
+    """The fixes of a track that no aircraft can have reached."""
 
-    Attributes:
-        indices: of the wild ones, in order of time. away_m: how far the farthest lies from its neighbours, metres.
-        doubtful: how many cannot be reached, where these are too many to be wild fixes.
-    """
-
-    indices: list[int]
-    away_m: float = 0.0
-    doubtful: int = 0
+    indices: list[int]  # of the wild ones, in order of time
+    away_m: float = 0.0  # how far the farthest lies from its neighbours, metres
+    doubtful: int = 0  # how many cannot be reached, where these are too many to be wild fixes
 
 
 def wild_fixes(times_s: Sequence[float | None], places: Sequence[tuple[float, float]]) -> WildFixes:

@@ -40,19 +40,13 @@ class Extraction:
 
 @dataclass(frozen=True, slots=True)
 class _WrittenPicture:
-    """One picture in the cache folder.
+    """One picture in the cache folder."""
 
-    Attributes:
-        number: of the picture in the video, in order of presentation.
-        packet: index of its packet, None if the decoder did not report it.
-        columns: width in pixels; rows: height. damaged: whether it lost parts.
-    """
-
-    number: int
-    packet: int | None
-    columns: int
-    rows: int
-    damaged: bool = False
+    number: int  # of the picture in the video, in order of presentation
+    packet: int | None  # index of its packet, None if the decoder did not report it
+    columns: int  # width in pixels
+    rows: int  # height
+    damaged: bool = False  # whether it lost parts
 
     @property
     def name(self) -> str:
@@ -61,19 +55,13 @@ class _WrittenPicture:
 
 @dataclass(slots=True)
 class _Written:
-    """The pictures in the cache folder, and what became of the others.
+    """The pictures in the cache folder, and what became of the others."""
 
-    Attributes:
-        pictures: the extracted ones. seen: number decoded. without_pose: number left out for lack of a position.
-        on_ground: number left out because they were taken on the ground.
-        damaged: number that lost parts or could not be decoded.
-    """
-
-    pictures: list[_WrittenPicture] = field(default_factory=list)
-    seen: int = 0
-    without_pose: int = 0
-    on_ground: int = 0
-    damaged: int = 0
+    pictures: list[_WrittenPicture] = field(default_factory=list)  # the extracted ones
+    seen: int = 0  # number decoded
+    without_pose: int = 0  # number left out for lack of a position
+    on_ground: int = 0  # number left out because they were taken on the ground
+    damaged: int = 0  # number that lost parts or could not be decoded
 
 
 def decoded(found: VideoScan, damage: Damage | None = None) -> Iterator[tuple[int, int | None, Any]]:

@@ -106,52 +106,37 @@ class NotAVideo(Unreadable):
 
 @dataclass(slots=True)
 class PictureNote:
-    """Metadata of one picture's packet.
+    """Metadata of one picture's packet."""
 
-    Attributes:
-        video_s: its time in the video. sample: its own pose. decoders: names of the decoders that understood it.
-        position: offset of the packet in the file, None if the container does not give it.
-    """
-
-    video_s: float | None
-    sample: Sample | None = None
-    decoders: tuple[str, ...] = ()
-    position: int | None = None
+    video_s: float | None  # its time in the video
+    sample: Sample | None = None  # its own pose
+    decoders: tuple[str, ...] = ()  # names of the decoders that understood it
+    position: int | None = None  # offset of the packet in the file, None if the container does not give it
 
 
 @dataclass(slots=True, kw_only=True)
 class VideoScan:
-    """All metadata of a video file.
+    """All metadata of a video file."""
 
-    Attributes:
-        path: the file. codec: of the pictures. width: columns; height: rows.
-        rate: pictures a second, None if not given.
-        created_s: UTC epoch seconds of the container's creation time.
-        pictures: one for each video packet, in order of the file.
-        klv_packets: video time (None if unknown), number of video packets before it, packet.
-        djmd_samples, gpmf_samples: video time and sample. cues: of a subtitle track.
-        unknown_sei: (UUID, size) -> number of private SEI messages without a decoder.
-        joints_s: times at which the file's clock starts again (recordings joined); times continue over them.
-        aspect: width of a pixel over its height. others: width and height of other video streams.
-        turn: how a player turns the pictures.
-    """
-
-    path: Path
-    codec: str
-    width: int
-    height: int
-    rate: float | None = None
-    created_s: float | None = None
-    pictures: list[PictureNote] = field(default_factory=list)
+    path: Path  # the file
+    codec: str  # of the pictures
+    width: int  # columns
+    height: int  # rows
+    rate: float | None = None  # pictures a second, None if not given
+    created_s: float | None = None  # UTC epoch seconds of the container's creation time
+    pictures: list[PictureNote] = field(default_factory=list)  # one for each video packet, in order of the file
+    # video time (None if unknown), number of video packets before it, packet
     klv_packets: list[tuple[float | None, int, klv.KlvPacket]] = field(default_factory=list)
-    djmd_samples: list[tuple[float, Sample]] = field(default_factory=list)
-    gpmf_samples: list[tuple[float, Sample]] = field(default_factory=list)
-    cues: srt.Subtitles = field(default_factory=srt.Subtitles)
+    djmd_samples: list[tuple[float, Sample]] = field(default_factory=list)  # video time and sample
+    gpmf_samples: list[tuple[float, Sample]] = field(default_factory=list)  # video time and sample
+    cues: srt.Subtitles = field(default_factory=srt.Subtitles)  # of a subtitle track
+    # (UUID, size) -> number of private SEI messages without a decoder
     unknown_sei: Counter[tuple[str, int]] = field(default_factory=Counter)
+    # times at which the file's clock starts again (recordings joined); times continue over them
     joints_s: list[float] = field(default_factory=list)
-    aspect: float = 1.0
-    others: list[tuple[int, int]] = field(default_factory=list)
-    turn: Turn = AS_CODED
+    aspect: float = 1.0  # width of a pixel over its height
+    others: list[tuple[int, int]] = field(default_factory=list)  # width and height of other video streams
+    turn: Turn = AS_CODED  # how a player turns the pictures
 
     @property
     def has_times(self) -> bool:

@@ -35,19 +35,14 @@ _INK, _GRID, _MARK = (20, 24, 28), (28, 100, 176), (214, 64, 159)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Frame:
-    """The map's frame on the page.
+    """The map's frame on the page."""
 
-    Attributes:
-        page: width and height of the page in pixels. box: left, top, right, bottom of the frame in pixels.
-        scale: denominator. west, north: grid metres of the frame's upper left corner. metres: of a pixel.
-    """
-
-    page: tuple[int, int]
-    box: tuple[int, int, int, int]
-    scale: int
-    west: float
-    north: float
-    metres: float
+    page: tuple[int, int]  # width and height of the page in pixels
+    box: tuple[int, int, int, int]  # left, top, right, bottom of the frame in pixels
+    scale: int  # denominator
+    west: float  # grid metres of the frame's upper left corner
+    north: float  # grid metres of the frame's upper left corner
+    metres: float  # of a pixel
 
     def pixel(self, east_m: float, north_m: float) -> tuple[float, float]:
         """Column and row on the page."""

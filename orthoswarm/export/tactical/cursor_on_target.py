@@ -87,18 +87,13 @@ def write_data_package(places: Iterable[Place], path: Path, name: str = "OrthoSw
 
 @dataclass(frozen=True, slots=True)
 class TakAddress:
-    """Where events go.
+    """Where events go."""
 
-    Attributes:
-        kind: `udp` (one datagram an event), `tcp` or `tls` (a stream of events). host, port: the receiver's.
-        certificate: PEM file with the client's certificate and key, for `tls`. authority: PEM file of the server's CA.
-    """
-
-    kind: str
-    host: str
-    port: int
-    certificate: Path | None = None
-    authority: Path | None = None
+    kind: str  # `udp` (one datagram an event), `tcp` or `tls` (a stream of events)
+    host: str  # the receiver's
+    port: int  # the receiver's
+    certificate: Path | None = None  # PEM file with the client's certificate and key, for `tls`
+    authority: Path | None = None  # PEM file of the server's CA
 
     @classmethod
     def parse(cls, text: str, certificate: Path | None = None, authority: Path | None = None) -> "TakAddress":

@@ -29,29 +29,20 @@ _FORMULA: Final = ("=", "+", "-", "@", "\t", "\r")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Place:
-    """A find or a vehicle.
+    """A find or a vehicle."""
 
-    Attributes:
-        uid: unique and lasting. kind: what it is. name: for people.
-        lat_deg, lon_deg: WGS 84. height_m: above the WGS 84 ellipsoid, None if unknown.
-        sigma_m: standard deviation of each horizontal coordinate, None if unknown.
-        time_s: when it was there, UTC epoch seconds. note: more, in words.
-        course_deg: from true north, None if unknown. speed_m_s: over ground.
-        pictures: names of pictures that show it.
-    """
-
-    uid: str
-    kind: Literal["find", "vehicle"]
-    name: str
-    lat_deg: float
-    lon_deg: float
-    time_s: float
-    height_m: float | None = None
-    sigma_m: float | None = None
-    note: str = ""
-    course_deg: float | None = None
-    speed_m_s: float | None = None
-    pictures: tuple[str, ...] = ()
+    uid: str  # unique and lasting
+    kind: Literal["find", "vehicle"]  # what it is
+    name: str  # for people
+    lat_deg: float  # WGS 84
+    lon_deg: float  # WGS 84
+    time_s: float  # when it was there, UTC epoch seconds
+    height_m: float | None = None  # above the WGS 84 ellipsoid, None if unknown
+    sigma_m: float | None = None  # standard deviation of each horizontal coordinate, None if unknown
+    note: str = ""  # more, in words
+    course_deg: float | None = None  # from true north, None if unknown
+    speed_m_s: float | None = None  # over ground
+    pictures: tuple[str, ...] = ()  # names of pictures that show it
 
     @property
     def time(self) -> str:
@@ -132,16 +123,12 @@ def _place(row: Mapping[str, Any]) -> Place:
 
 @dataclass(frozen=True, slots=True)
 class Sighting:
-    """A picture that shows a place.
+    """A picture that shows a place."""
 
-    Attributes:
-        placed: the picture. column, row: where in it, pixels. off_centre: distance from its middle in half diagonals.
-    """
-
-    placed: PlacedFrame
-    column: float
-    row: float
-    off_centre: float
+    placed: PlacedFrame  # the picture
+    column: float  # where in it, pixels
+    row: float  # where in it, pixels
+    off_centre: float  # distance from its middle in half diagonals
 
 
 def sightings(placed: Iterable[PlacedFrame], point: ArrayLike) -> list[Sighting]:

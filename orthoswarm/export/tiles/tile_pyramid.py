@@ -106,15 +106,12 @@ class TileRange:
 
 @dataclass(frozen=True, slots=True)
 class Pyramid:
-    """The tiles of an orthoimage.
+    """The tiles of an orthoimage."""
 
-    Attributes:
-        bounds: west, south, east, north of the orthoimage in degrees; east is beyond 180 where the map lies on that
-            meridian, and columns are beyond the last one there.
-        levels: from the finest zoom to the one where a single tile holds all, or zoom 1 with a tile on either side.
-    """
-
+    # west, south, east, north of the orthoimage in degrees; east is beyond 180 where the map lies on that meridian, and
+    # columns are beyond the last one there
     bounds: tuple[float, float, float, float]
+    # from the finest zoom to the one where a single tile holds all, or zoom 1 with a tile on either side
     levels: tuple[TileRange, ...]
 
     @property
@@ -156,18 +153,13 @@ class Pyramid:
 
 @dataclass(frozen=True, slots=True)
 class Quad:
-    """Four tiles, those that the tile `zoom`, `x`, `y` is made of.
+    """Four tiles, those that the tile `zoom`, `x`, `y` is made of."""
 
-    Attributes:
-        zoom: of the parent; -1 for the one tile of zoom 0. x, y: column, and row from the north, of the parent; the
-            column as `Pyramid` counts.
-        rgba: uint8 (512, 512, 4), something drawn.
-    """
-
-    zoom: int
+    zoom: int  # of the parent; -1 for the one tile of zoom 0
+    # x, y: column, and row from the north, of the parent; the column as `Pyramid` counts
     x: int
     y: int
-    rgba: Bytes
+    rgba: Bytes  # uint8 (512, 512, 4), something drawn
 
     def tiles(self) -> Iterator[tuple[int, int, Bytes]]:
         """Column, row from the north and pixels, uint8 (256, 256, 4), of its tiles where something is drawn.

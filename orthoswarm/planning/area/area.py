@@ -23,19 +23,12 @@ a map have fewer, and 4,000 cost no second)."""
 
 @dataclass(frozen=True)
 class Area:
-    """Ground to be mapped and zones that no path may cross.
+    """Ground to be mapped and zones that no path may cross."""
 
-    Attributes:
-        grid: UTM grid of the area.
-        ground: shapely (Multi)Polygon in grid metres, no-fly zones taken out.
-        no_fly: shapely (Multi)Polygon in grid metres, perhaps empty: the polygons' holes and further zones.
-        circles_wider_m: so much outside a circle that its polygon in `no_fly` is drawn around lies that.
-    """
-
-    grid: LocalGrid
-    ground: Geometry
-    no_fly: Geometry
-    circles_wider_m: float = 0.0
+    grid: LocalGrid  # UTM grid of the area
+    ground: Geometry  # shapely (Multi)Polygon in grid metres, no-fly zones taken out
+    no_fly: Geometry  # shapely (Multi)Polygon in grid metres, perhaps empty: the polygons' holes and further zones
+    circles_wider_m: float = 0.0  # so much outside a circle that its polygon in `no_fly` is drawn around lies that
 
     @property
     def size_m2(self) -> float:

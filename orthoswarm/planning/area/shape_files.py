@@ -43,15 +43,10 @@ _UNIT_NAMES: Final = ("unit", "units", "uom", "uomdimensions", "radius_unit", "r
 
 @dataclass(frozen=True, slots=True)
 class Polygon:
-    """A polygon on the globe.
+    """A polygon on the globe."""
 
-    Attributes:
-        shell: outer ring, float64 (n, 2), latitude and longitude in degrees, not closed.
-        holes: inner rings of the same form.
-    """
-
-    shell: Ring
-    holes: tuple[Ring, ...] = ()
+    shell: Ring  # outer ring, float64 (n, 2), latitude and longitude in degrees, not closed
+    holes: tuple[Ring, ...] = ()  # inner rings of the same form
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,21 +66,13 @@ class Circle:
 
 @dataclass(frozen=True, slots=True)
 class Shapes:
-    """What a file holds.
+    """What a file holds."""
 
-    Attributes:
-        polygons: its polygons, strips of lines with a width among them.
-        lines: its polylines, each float64 (n, 2), latitude and longitude in degrees.
-        circles: its circles.
-        hidden: polygons that are switched off in the file (KML's visibility).
-        unused: what else it holds, in words ("2 points").
-    """
-
-    polygons: tuple[Polygon, ...] = ()
-    lines: tuple[Ring, ...] = ()
-    circles: tuple[Circle, ...] = ()
-    hidden: tuple[Polygon, ...] = ()
-    unused: tuple[str, ...] = ()
+    polygons: tuple[Polygon, ...] = ()  # its polygons, strips of lines with a width among them
+    lines: tuple[Ring, ...] = ()  # its polylines, each float64 (n, 2), latitude and longitude in degrees
+    circles: tuple[Circle, ...] = ()  # its circles
+    hidden: tuple[Polygon, ...] = ()  # polygons that are switched off in the file (KML's visibility)
+    unused: tuple[str, ...] = ()  # what else it holds, in words ("2 points")
 
     @property
     def areas(self) -> tuple[Polygon, ...]:

@@ -83,13 +83,9 @@ def _cut(polygon: Geometry, corner: Array) -> Geometry:
 
 @dataclass(frozen=True)
 class _Sweep:
-    """The lines of one cell.
+    """The lines of one cell."""
 
-    Attributes:
-        lines: per line, its legs from low to high y, float64 (k, 2, 2).
-    """
-
-    lines: list[Array]
+    lines: list[Array]  # per line, its legs from low to high y, float64 (k, 2, 2)
 
     def variants(self) -> list[Array]:
         """Four ways to fly the cell: beginning at the first or the last line, upwards or downwards."""

@@ -29,15 +29,10 @@ _HOPELESS: Final = 1.08  # gaps are not filled for a direction whose path is so 
 
 @dataclass(frozen=True)
 class LineCandidate:
-    """One way to lay lines.
+    """One way to lay lines."""
 
-    Attributes:
-        legs: float64 (n, 2, 2) in flying order, grid metres, gaps mended.
-        stretches: among how many vehicles the legs, without those that mend gaps, can be shared.
-    """
-
-    legs: Array
-    stretches: int
+    legs: Array  # float64 (n, 2, 2) in flying order, grid metres, gaps mended
+    stretches: int  # among how many vehicles the legs, without those that mend gaps, can be shared
 
     def then(self, other: "LineCandidate") -> "LineCandidate":
         """The lines of this one, and then those of another, from the end that is nearer."""

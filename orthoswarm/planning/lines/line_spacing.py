@@ -11,20 +11,13 @@ HIGHEST_M = 10_000.0
 
 @dataclass(frozen=True, slots=True)
 class Footprint:
-    """Ground covered by one picture of the narrowest camera, straight down, its width across the leg.
+    """Ground covered by one picture of the narrowest camera, straight down, its width across the leg."""
 
-    Attributes:
-        width_m: across the leg, 2 h tan(FoV / 2).
-        height_m: along the leg, width over the aspect ratio.
-        spacing_m: largest distance between neighbouring lines, width (1 - side overlap).
-        trigger_m: distance between pictures on a leg, height (1 - forward overlap).
-        slant_m: how much less far pictures see along the leg at its strip's edge, as they are turned against it.
-    """
-
-    width_m: float
-    height_m: float
-    spacing_m: float
-    trigger_m: float
+    width_m: float  # across the leg, 2 h tan(FoV / 2)
+    height_m: float  # along the leg, width over the aspect ratio
+    spacing_m: float  # largest distance between neighbouring lines, width (1 - side overlap)
+    trigger_m: float  # distance between pictures on a leg, height (1 - forward overlap)
+    # how much less far pictures see along the leg at its strip's edge, as they are turned against it
     slant_m: float = 0.0
 
     @property

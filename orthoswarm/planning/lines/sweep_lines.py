@@ -32,15 +32,10 @@ _SHORTEST_M: Final = 0.01  # shorter parts of lines are rounding
 
 @dataclass(frozen=True)
 class Turned:
-    """A frame turned against the grid about a point.
+    """A frame turned against the grid about a point."""
 
-    Attributes:
-        angle_rad: counter-clockwise from grid east to the frame's +x axis.
-        centre: grid coordinates of its origin.
-    """
-
-    angle_rad: float
-    centre: tuple[float, float]
+    angle_rad: float  # counter-clockwise from grid east to the frame's +x axis
+    centre: tuple[float, float]  # grid coordinates of its origin
 
     @cached_property
     def _matrix(self) -> Array:
@@ -62,15 +57,10 @@ class Turned:
 
 @dataclass(frozen=True)
 class Field:
-    """Ground and obstacles in one frame.
+    """Ground and obstacles in one frame."""
 
-    Attributes:
-        ground: what is to be covered, shapely, metres.
-        obstacles: what no leg may cross, shapely, metres.
-    """
-
-    ground: Geometry
-    obstacles: Geometry
+    ground: Geometry  # what is to be covered, shapely, metres
+    obstacles: Geometry  # what no leg may cross, shapely, metres
 
     def turned(self, frame: Turned) -> "Field":
         """Ground and obstacles in a turned frame."""

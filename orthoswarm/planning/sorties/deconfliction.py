@@ -32,25 +32,17 @@ _LAYER_PRICE_S: Final = 3.0  # price of each further height layer, in seconds of
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Separation:
-    """How far apart vehicles stay.
+    """How far apart vehicles stay."""
 
-    Attributes:
-        distance_m: horizontally, or
-        height_m: vertically, the height of a layer.
-        layers: how many layers there are above the legs' height.
-        slack_s: how much earlier or later than planned a vehicle may be. Around a start that vehicles share, it is
-            what their autopilots need there (`takeoff_slack_s`, `landing_slack_s`), at most this.
-        launch_s: time between takeoffs, and between landings, at one start.
-        swap_s: time on the ground between a vehicle's sorties.
-        in_turn_share: vehicles of one start take off and land in turn if all takes at most so much longer by that.
-    """
-
-    distance_m: float = APART.distance_m
-    height_m: float = APART.height_m
-    layers: int = 4
+    distance_m: float = APART.distance_m  # horizontally, or
+    height_m: float = APART.height_m  # vertically, the height of a layer
+    layers: int = 4  # how many layers there are above the legs' height
+    # how much earlier or later than planned a vehicle may be. Around a start that vehicles share, it is what their
+    # autopilots need there (`takeoff_slack_s`, `landing_slack_s`), at most this
     slack_s: float = ARDUPILOT.schedule_slack_s
-    launch_s: float = PLANNING.launch_s
-    swap_s: float = 120.0
+    launch_s: float = PLANNING.launch_s  # time between takeoffs, and between landings, at one start
+    swap_s: float = 120.0  # time on the ground between a vehicle's sorties
+    # vehicles of one start take off and land in turn if all takes at most so much longer by that
     in_turn_share: float = PLANNING.in_turn_share
 
     @property
@@ -61,51 +53,32 @@ class Separation:
 
 @dataclass(frozen=True)
 class Slot:
-    """What a sortie was given.
+    """What a sortie was given."""
 
-    Attributes:
-        out_layer: layer of its way out, 0 is the legs' height.
-        home_layer: layer of its way home.
-        start_s: its takeoff, seconds after the swarm's start.
-        flight: its path.
-    """
-
-    out_layer: int
-    home_layer: int
-    start_s: float
-    flight: Flight
+    out_layer: int  # layer of its way out, 0 is the legs' height
+    home_layer: int  # layer of its way home
+    start_s: float  # its takeoff, seconds after the swarm's start
+    flight: Flight  # its path
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """What all sorties were given.
+    """What all sorties were given."""
 
-    Attributes:
-        slots: per vehicle and sortie.
-        in_turn: vehicles of one start keep apart in height as they take off and land; if not, in time alone.
-        saved_s: by at least how much all is done sooner without that, 0 if they do.
-    """
-
-    slots: list[list[Slot]]
-    in_turn: bool = True
-    saved_s: float = 0.0
+    slots: list[list[Slot]]  # per vehicle and sortie
+    in_turn: bool = True  # vehicles of one start keep apart in height as they take off and land; if not, in time alone
+    saved_s: float = 0.0  # by at least how much all is done sooner without that, 0 if they do
 
 
 @dataclass(frozen=True)
 class _Track:
-    """Positions every half second in the air.
+    """Positions every half second in the air."""
 
-    Attributes:
-        home: float64 (2,), where it takes off. ground: so many samples pass on the ground before the first.
-        places: float64 (n, 3). pad: bool (n,), around its home.
-        slack: int64 (n,), off schedule by so many samples where it shares its start: less as it takes off.
-    """
-
-    home: Array
-    ground: int
-    places: Array
-    pad: Flags
-    slack: Indices
+    home: Array  # float64 (2,), where it takes off
+    ground: int  # so many samples pass on the ground before the first
+    places: Array  # float64 (n, 3)
+    pad: Flags  # bool (n,), around its home
+    slack: Indices  # int64 (n,), off schedule by so many samples where it shares its start: less as it takes off
 
 
 def _sampled(flight: Flight, motion: Motion, apart: Separation) -> _Track:

@@ -18,32 +18,19 @@ _STRAIGHT_COS: Final = 0.985  # a vehicle comes straight into a leg up to this a
 
 @dataclass(frozen=True, kw_only=True)
 class Flight:
-    """The path of one sortie.
+    """The path of one sortie."""
 
-    Attributes:
-        home: float64 (2,), where it takes off.
-        climb_m: height to climb to at home.
-        points: float64 (n, 3), waypoints: easting, northing, height (see `flight_heights`).
-        camera: int8 (n,): 1 at a leg's first point, -1 at its last, else 0.
-        returns: the last point is above home, and the vehicle comes down there.
-        home_z_m: height of the ground at home.
-        above_m: float64 (n,), nominal height above the ground of each point; NaN where heights do not follow the
-            ground.
-        between: bool (n,), points on a straight way, put in for their height alone.
-        wait_s: how long it stays where its last leg ends before it comes home.
-        ground_by_vehicle: the vehicle keeps its height above the ground by itself, without those points.
-    """
-
-    home: Array
-    climb_m: float
-    points: Array
-    camera: NDArray[np.int8]
-    returns: bool
-    home_z_m: float
+    home: Array  # float64 (2,), where it takes off
+    climb_m: float  # height to climb to at home
+    points: Array  # float64 (n, 3), waypoints: easting, northing, height (see `flight_heights`)
+    camera: NDArray[np.int8]  # int8 (n,): 1 at a leg's first point, -1 at its last, else 0
+    returns: bool  # the last point is above home, and the vehicle comes down there
+    home_z_m: float  # height of the ground at home
+    # float64 (n,), nominal height above the ground of each point; NaN where heights do not follow the ground
     above_m: Array
-    between: Flags
-    ground_by_vehicle: bool = False
-    wait_s: float = 0.0
+    between: Flags  # bool (n,), points on a straight way, put in for their height alone
+    ground_by_vehicle: bool = False  # the vehicle keeps its height above the ground by itself, without those points
+    wait_s: float = 0.0  # how long it stays where its last leg ends before it comes home
 
     def track(self) -> Array:
         """The whole path from the ground on, (n, 3)."""

@@ -17,24 +17,16 @@ _RAMP = 5  # places at which a change of speed is followed
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """A multirotor: constant speed on straights, and what its autopilot loses in turns, takeoff and landing.
+    """A multirotor: constant speed on straights, and what its autopilot loses in turns, takeoff and landing."""
 
-    Attributes:
-        speed_m_s: ground speed without wind.
-        climb_m_s: rate of climb.
-        descent_m_s: rate of descent.
-        wind_m_s: where the wind blows to, east and north. The speed is then that through the air.
-        autopilot: acceleration in turns, and the times of takeoff and landing.
-        lands: its flights end with LAND; if not, with a return to launch, which waits above home first.
-    """
-
-    speed_m_s: float = 10.0
+    speed_m_s: float = 10.0  # ground speed without wind
     _: KW_ONLY
-    climb_m_s: float = 2.5
-    descent_m_s: float = 1.5
+    climb_m_s: float = 2.5  # rate of climb
+    descent_m_s: float = 1.5  # rate of descent
+    # where the wind blows to, east and north. The speed is then that through the air
     wind_m_s: tuple[float, float] = (0.0, 0.0)
-    autopilot: AutopilotTimes = ARDUPILOT
-    lands: bool = False
+    autopilot: AutopilotTimes = ARDUPILOT  # acceleration in turns, and the times of takeoff and landing
+    lands: bool = False  # its flights end with LAND; if not, with a return to launch, which waits above home first
 
     @property
     def crab_rad(self) -> float:

@@ -27,19 +27,12 @@ _CUTS_PER_SHARE: Final = 24  # possible cuts in a share (for its time)
 
 @dataclass(frozen=True)
 class Row:
-    """Legs in flying order, cut at every place where a piece may end.
+    """Legs in flying order, cut at every place where a piece may end."""
 
-    Attributes:
-        parts: float64 (n, 2, 2), straight parts of legs.
-        leg: int64 (n,), the leg that each part belongs to.
-        begin_s: float64 (n,), time at which each part begins when the whole row is flown; end_s when it ends.
-        end_s: float64 (n,).
-    """
-
-    parts: Array
-    leg: Indices
-    begin_s: Array
-    end_s: Array
+    parts: Array  # float64 (n, 2, 2), straight parts of legs
+    leg: Indices  # int64 (n,), the leg that each part belongs to
+    begin_s: Array  # float64 (n,), time at which each part begins when the whole row is flown; end_s when it ends
+    end_s: Array  # float64 (n,)
 
     def legs(self, begin: int, end: int) -> Array:
         """Parts begin to end - 1 put together to legs again: float64 (m, 2, 2)."""
@@ -84,19 +77,13 @@ def cut(
 
 @dataclass(frozen=True)
 class Limits:
-    """What a single flight may cost.
+    """What a single flight may cost."""
 
-    Attributes:
-        endurance_s: longest flight, one for all vehicles or float64 (vehicles,); infinite without a limit.
-        fixed_s: climb and descent, in every flight.
-        swap_s: time on the ground between flights.
-        most_legs: legs that one mission can hold.
-    """
-
+    # longest flight, one for all vehicles or float64 (vehicles,); infinite without a limit
     endurance_s: float | Array = np.inf
-    fixed_s: float = 0.0
-    swap_s: float = 0.0
-    most_legs: int = 1_000_000
+    fixed_s: float = 0.0  # climb and descent, in every flight
+    swap_s: float = 0.0  # time on the ground between flights
+    most_legs: int = 1_000_000  # legs that one mission can hold
 
 
 @kernel

@@ -22,27 +22,16 @@ KINDS = 12
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scene:
-    """Colours on a 0.25 m grid and heights on a 0.5 m grid over the same bounds (multiples of 3 m).
+    """Colours on a 0.25 m grid and heights on a 0.5 m grid over the same bounds (multiples of 3 m)."""
 
-    Attributes:
-        grid: the texture's grid, CRS and place.
-        albedo: uint8 (rows, columns, 3), colours without light and shadow, seen from straight above.
-        kind: uint8 (rows, columns), kind of surface of each texel.
-        dsm: float32 (rows/2, columns/2), height of the surface with all that stands on it, metres over takeoff.
-        dtm: float32 (rows/2, columns/2), height of the bare ground.
-        wall: uint8 (rows/2, columns/2, 3), colour of a vertical face below the cell's top.
-        facade: uint8 (rows/2, columns/2), 1 where the vertical face has windows.
-        angle_rad: main direction of the walls, anticlockwise from east.
-    """
-
-    grid: GroundGrid
-    albedo: Bytes
-    kind: Bytes
-    dsm: Floats
-    dtm: Floats
-    wall: Bytes
-    facade: Bytes
-    angle_rad: float = 0.0
+    grid: GroundGrid  # the texture's grid, CRS and place
+    albedo: Bytes  # uint8 (rows, columns, 3), colours without light and shadow, seen from straight above
+    kind: Bytes  # uint8 (rows, columns), kind of surface of each texel
+    dsm: Floats  # float32 (rows/2, columns/2), height of the surface with all that stands on it, metres over takeoff
+    dtm: Floats  # float32 (rows/2, columns/2), height of the bare ground
+    wall: Bytes  # uint8 (rows/2, columns/2, 3), colour of a vertical face below the cell's top
+    facade: Bytes  # uint8 (rows/2, columns/2), 1 where the vertical face has windows
+    angle_rad: float = 0.0  # main direction of the walls, anticlockwise from east
 
     @classmethod
     def blank(cls, grid: GroundGrid, angle_rad: float = 0.0) -> "Scene":

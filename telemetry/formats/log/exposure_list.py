@@ -88,18 +88,13 @@ def _event(time_s: float, number: int, sample: Sample) -> list[ExposureEvent]:
 
 @dataclass(frozen=True, slots=True)
 class _PositionColumns:
-    """What the header says.
+    """What the header says."""
 
-    Attributes:
-        ahead_s: time scale less UTC. words: number of words of a position.
-        position: latitude, longitude (degrees), height (metres) of these words as numbers.
-        deviations: number of the standard deviations that say something about the horizontal position.
-    """
-
-    ahead_s: float
-    words: int
+    ahead_s: float  # time scale less UTC
+    words: int  # number of words of a position
+    # latitude, longitude (degrees), height (metres) of these words as numbers
     position: Callable[[Sequence[float]], tuple[float, float, float]]
-    deviations: int = 2
+    deviations: int = 2  # number of the standard deviations that say something about the horizontal position
 
 
 def _positions(text: str) -> list[Sample]:

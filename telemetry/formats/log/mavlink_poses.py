@@ -48,36 +48,24 @@ _NO_VEHICLES = frozenset({6, 26, 30})
 
 @dataclass(slots=True)
 class ExposureEvent:
-    """One exposure that an autopilot reported.
+    """One exposure that an autopilot reported."""
 
-    Attributes:
-        time_s: UTC epoch seconds, None where only the time since boot is known.
-        boot_s: seconds since boot, None where unknown.
-        number: image index as the autopilot counts. sample: the pose it reported. kind: name of the message.
-    """
-
-    time_s: float | None
-    boot_s: float | None
-    number: int | None
-    sample: Sample
-    kind: str
+    time_s: float | None  # UTC epoch seconds, None where only the time since boot is known
+    boot_s: float | None  # seconds since boot, None where unknown
+    number: int | None  # image index as the autopilot counts
+    sample: Sample  # the pose it reported
+    kind: str  # name of the message
 
 
 @dataclass(slots=True, kw_only=True)
 class MavlinkPoses:
-    """Turns one vehicle's messages into samples and camera events.
+    """Turns one vehicle's messages into samples and camera events."""
 
-    Attributes:
-        heading_deg: of the airframe, latest. has_gimbal: whether a gimbal reported.
-        home_altitude_m: altitude of home above sea level.
-        position_sigma_m: horizontal sigma stated by the receiver, None if it states none. clocks: of all components.
-    """
-
-    heading_deg: float | None = None
-    has_gimbal: bool = False
-    home_altitude_m: float | None = None
-    position_sigma_m: float | None = None
-    clocks: SenderClocks = field(default_factory=SenderClocks, repr=False)
+    heading_deg: float | None = None  # of the airframe, latest
+    has_gimbal: bool = False  # whether a gimbal reported
+    home_altitude_m: float | None = None  # altitude of home above sea level
+    position_sigma_m: float | None = None  # horizontal sigma stated by the receiver, None if it states none
+    clocks: SenderClocks = field(default_factory=SenderClocks, repr=False)  # of all components
     _arrival_s: float | None = field(default=None, repr=False)
 
     def feed(self, message: Any, arrival_s: float | None = None) -> Sample | ExposureEvent | None:

@@ -88,24 +88,19 @@ class _Pictures:
 
 @dataclass(slots=True, kw_only=True)
 class SenderClocks:
-    """Converts the times since boot of all components of a vehicle to its autopilot's.
+    """Converts the times since boot of all components of a vehicle to its autopilot's."""
 
-    Attributes:
-        boot_s: the autopilot's latest time since boot. utc_minus_boot_s: UTC less that, None while unknown.
-        reboots: number of times that it went back.
-        bases: number of times that times since boot began to count from another moment: at a reboot, and where
-            the autopilot turned out to be another component than was thought.
-        fliers: components whose HEARTBEAT is an autopilot's. One is chosen once it sends more than that.
-    """
-
-    boot_s: float = 0.0
-    utc_minus_boot_s: float | None = None
-    reboots: int = 0
+    boot_s: float = 0.0  # the autopilot's latest time since boot
+    utc_minus_boot_s: float | None = None  # UTC less that, None while unknown
+    reboots: int = 0  # number of times that it went back
+    # number of times that times since boot began to count from another moment: at a reboot, and where the autopilot
+    # turned out to be another component than was thought
     bases: int = 0
     _autopilot: int = field(default=0, repr=False)
     _rank: int = field(default=0, repr=False)
     _heard: bool = field(default=False, repr=False)
     _arrival_s: float | None = field(default=None, repr=False)
+    # components whose HEARTBEAT is an autopilot's. One is chosen once it sends more than that
     fliers: set[int] = field(default_factory=set, repr=False)
     _positioned: list[int] = field(default_factory=list, repr=False)
     _others: dict[int, _Difference] = field(default_factory=dict, repr=False)

@@ -41,15 +41,11 @@ _MOST_NOTE_ENTRIES = 256
 
 @dataclass(slots=True)
 class Exif:
-    """The tags of the three directories that are used, by number.
+    """The tags of the three directories that are used, by number."""
 
-    Attributes:
-        main: IFD0. exif: the EXIF IFD. gps: the GPS IFD.
-    """
-
-    main: Tags = field(default_factory=dict)
-    exif: Tags = field(default_factory=dict)
-    gps: Tags = field(default_factory=dict)
+    main: Tags = field(default_factory=dict)  # IFD0
+    exif: Tags = field(default_factory=dict)  # the EXIF IFD
+    gps: Tags = field(default_factory=dict)  # the GPS IFD
 
 
 def parse_tiff(data: Buffer) -> Exif:

@@ -74,17 +74,11 @@ _PIX4D_COLUMNS = {
 
 @dataclass(frozen=True, slots=True)
 class _Layout:
-    """How the lines of a table are written.
+    """How the lines of a table are written."""
 
-    Attributes:
-        separator: between cells; a blank stands for any number of blanks.
-        keys: field of each column, "" for one that is not used.
-        factors: metres or degrees in one unit of each column.
-    """
-
-    separator: str
-    keys: Sequence[str]
-    factors: Sequence[float]
+    separator: str  # between cells; a blank stands for any number of blanks
+    keys: Sequence[str]  # field of each column, "" for one that is not used
+    factors: Sequence[float]  # metres or degrees in one unit of each column
 
 
 @dataclass(frozen=True, slots=True)

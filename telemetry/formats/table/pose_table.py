@@ -16,18 +16,12 @@ _MOST_FOLDERS = 64
 
 
 class PoseTable(dict[str, Sample]):
-    """Lower-case picture name (or relative path with forward slashes) -> row.
+    """Lower-case picture name (or relative path with forward slashes) -> row."""
 
-    Attributes:
-        useless: number of lines that name a picture without a valid position.
-        refused: number of cells that were not understood; first_refused: the first of them.
-        doubt: what is uncertain about the datum of its positions, "" if nothing is.
-    """
-
-    useless: int = 0
-    refused: int = 0
-    first_refused: str = ""
-    doubt: str = ""
+    useless: int = 0  # number of lines that name a picture without a valid position
+    refused: int = 0  # number of cells that were not understood
+    first_refused: str = ""  # the first of them
+    doubt: str = ""  # what is uncertain about the datum of its positions, "" if nothing is
 
     def refuse(self, cell: str) -> None:
         """Count a cell that is not understood."""

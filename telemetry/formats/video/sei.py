@@ -60,17 +60,12 @@ _FIELD = re.compile(r"(\w+)(?:\*([+-]?[\d.]+(?:e[+-]?\d+)?))?([+-][\d.]+)?", re.
 
 @dataclass(frozen=True, slots=True)
 class Decoder:
-    """One kind of SEI payload.
+    """One kind of SEI payload."""
 
-    Attributes:
-        name: shown as the origin of a picture's fields. payload_type: SEI payload type.
-        uuid: the 16 bytes that lead a payload of type 5, None for other types (or for any UUID).
-        decode: from the payload (after the UUID) to a sample, None where it is not understood.
-    """
-
-    name: str
-    payload_type: int
-    uuid: bytes | None
+    name: str  # shown as the origin of a picture's fields
+    payload_type: int  # SEI payload type
+    uuid: bytes | None  # the 16 bytes that lead a payload of type 5, None for other types (or for any UUID)
+    # from the payload (after the UUID) to a sample, None where it is not understood
     decode: Callable[[bytes], Sample | None]
 
 

@@ -31,15 +31,11 @@ _MOST_TILT_DEG: Final = 60.0  # pictures that look farther from nadir than this 
 
 @dataclass(frozen=True, slots=True)
 class PictureMotion:
-    """What the pictures show of the way; they are read only where times do not decide.
+    """What the pictures show of the way; they are read only where times do not decide."""
 
-    Attributes:
-        path_m: (M,) way along the track to each event, of what the camera looks at, metres.
-        shifts_px: for photos (indices, in order of time) the pixels that the ground moves from each to the next, NaN
-            where the two do not match.
-    """
-
-    path_m: Array
+    path_m: Array  # (M,) way along the track to each event, of what the camera looks at, metres
+    # for photos (indices, in order of time) the pixels that the ground moves from each to the next, NaN where the two
+    # do not match
     shifts_px: Callable[[Sequence[int]], Array]
 
     def subset(self, photos: Sequence[int], events: Sequence[int]) -> "PictureMotion":
@@ -49,27 +45,19 @@ class PictureMotion:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Chains:
-    """Photos by chain; a photo without a measured step is a chain of its own without any evidence.
+    """Photos by chain; a photo without a measured step is a chain of its own without any evidence."""
 
-    Attributes:
-        number: (N,) of each photo's chain. along_px: (N,) way from the middle of its chain.
-        path_m: (K,) way of each single event. e: (K,) times of the events. p: (N,) middle of each photo's interval.
-        resolution_s: of the photos' clock. metres_a_pixel, sigma_m: of a photo's way, one sigma.
-        step_m: usual way between events.
-        phases_s, scales: (C,) hypotheses.
-    """
-
-    number: Indices
-    along_px: Array
-    path_m: Array
-    e: Array
-    p: Array
-    resolution_s: float
-    metres_a_pixel: float
-    sigma_m: float
-    step_m: float
-    phases_s: Array
-    scales: Array
+    number: Indices  # (N,) of each photo's chain
+    along_px: Array  # (N,) way from the middle of its chain
+    path_m: Array  # (K,) way of each single event
+    e: Array  # (K,) times of the events
+    p: Array  # (N,) middle of each photo's interval
+    resolution_s: float  # of the photos' clock
+    metres_a_pixel: float  # of a photo's way, one sigma
+    sigma_m: float  # of a photo's way, one sigma
+    step_m: float  # usual way between events
+    phases_s: Array  # (C,) hypotheses
+    scales: Array  # (C,) hypotheses
 
     @property
     def linked(self) -> bool:

@@ -51,26 +51,16 @@ _LEAST_PROBABILITY: Final = 0.02  # events that a photo has with less probabilit
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SequenceMatch:
-    """Probabilities of pairings.
+    """Probabilities of pairings."""
 
-    Attributes:
-        events: (K,) index of each event, without repetitions.
-        first: (N,) index into `events` of column 0 of a photo's row.
-        probability: (N, B) of each photo and event.
-        offset_s: photo time minus event time in the middle of the events. drift: rate of the photo's clock minus one.
-        resolution_s: of the photo's clock.
-        by_pictures: whether the pictures were asked, too.
-        other_clock: probability that the clocks differ by another offset, some intervals away.
-    """
-
-    events: Indices
-    first: Indices
-    probability: Array
-    offset_s: float
-    drift: float
-    resolution_s: float
-    by_pictures: bool = False
-    other_clock: float = 0.0
+    events: Indices  # (K,) index of each event, without repetitions
+    first: Indices  # (N,) index into `events` of column 0 of a photo's row
+    probability: Array  # (N, B) of each photo and event
+    offset_s: float  # photo time minus event time in the middle of the events
+    drift: float  # rate of the photo's clock minus one
+    resolution_s: float  # of the photo's clock
+    by_pictures: bool = False  # whether the pictures were asked, too
+    other_clock: float = 0.0  # probability that the clocks differ by another offset, some intervals away
 
     def pairs(self) -> list[tuple[int, int, float]]:
         """The alignment with the most expected matches: photo, event (both increasing) and probability.
