@@ -41,8 +41,7 @@ def check_control(
 ) -> None:
     """Refuse unusable control points before the work begins.
 
-    Raises:
-        InputError: no point is marked in a photo or on the basemap, or one is far from all photos.
+    Raises InputError: no point is marked in a photo or on the basemap, or one is far from all photos.
     """
     images = {p.frame.image: p for p in recorded}
     seen = [p for p in points if (has_map and p.on_map is not None) or _photos(p, images)]
@@ -115,8 +114,7 @@ def on_basemap(points: Iterable[Checkpoint], grid: LocalGrid, map_gsd_m: float) 
 def _photos(point: Checkpoint, images: dict[str, PlacedFrame]) -> list[tuple[PlacedFrame, Array]]:
     """The photos that show a point, and its pixel (2,) in each.
 
-    Raises:
-        InputError: a pixel lies outside its photo, or a name belongs to several photos.
+    Raises InputError: a pixel lies outside its photo, or a name belongs to several photos.
     """
     out = []
     for mark in point.marks:

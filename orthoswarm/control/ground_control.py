@@ -75,10 +75,7 @@ def place_on_control(
 ) -> tuple[Refinement, GroundControl]:
     """Move the fine cameras and their terrain onto control points; the given refinement is not modified.
 
-    map_gsd_m: the basemap's pixel, None without a basemap.
-
-    Raises:
-        InputError: a point's pixel lies outside its photo.
+    map_gsd_m: the basemap's pixel, None without a basemap. Raises InputError: a point's pixel lies outside its photo.
     """
     placed = [p for s in refinement.fine for p in s.placed]
     terrain = refinement.terrain or Terrain.flat()

@@ -70,8 +70,7 @@ class Cells:
     def of_area(cls, epsg: int, ground: Geometry, no_fly: Geometry = None, cell_m: float = _CELL_M) -> "Cells":
         """Cells of at most `cell_m` over shapely (Multi)Polygons in the grid of `epsg`.
 
-        Raises:
-            InputError: the area is empty, or would have more than `_MOST_CELLS`.
+        Raises InputError: the area is empty, or would have more than `_MOST_CELLS`.
         """
         from rasterio.features import rasterize
 

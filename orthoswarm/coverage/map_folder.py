@@ -36,11 +36,7 @@ class MapFolder:
 
 
 def read_map(folder: Path) -> MapFolder:
-    """Read a map's pictures.
-
-    Raises:
-        InputError: there is no frames.jsonl or report.json, or they cannot be used.
-    """
+    """Read a map's pictures. Raises InputError: there is no frames.jsonl or report.json, or they cannot be used."""
     report, rows = _documents(folder)
     placed = [row for row in rows if row.get("stage") != "rejected"]
     if not placed:

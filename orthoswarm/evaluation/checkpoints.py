@@ -68,11 +68,7 @@ class Mark:
     row: float
 
     def check_inside(self, width: int, height: int) -> None:
-        """Refuse a mark outside its photo.
-
-        Raises:
-            InputError: it lies more than a pixel outside.
-        """
+        """Refuse a mark outside its photo. Raises InputError: it lies more than a pixel outside."""
         if not (-1.0 <= self.column <= width and -1.0 <= self.row <= height):
             raise InputError(
                 f"{self.image} has {width} x {height} pixels, a point is marked at {self.column:.0f}, {self.row:.0f}; "
@@ -234,11 +230,7 @@ def _control_of(folder: Path) -> Sequence[Surveyed]:
 
 
 def read_checkpoints(table: Path, pixel_scale: float = 1.0) -> list[Checkpoint]:
-    """The points of a table, see the module.
-
-    Raises:
-        InputError: if it cannot be read, with the line.
-    """
+    """The points of a table, see the module. Raises InputError: if it cannot be read, with the line."""
     try:
         lines = table.read_text("utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:

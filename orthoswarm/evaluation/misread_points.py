@@ -38,8 +38,7 @@ def is_place(lon_lat: Array) -> bool:
 def require_places(points: Iterable[tuple[str, Array]]) -> None:
     """Refuse points, each a name with longitude and latitude (2,), of which one is at no place of the Earth.
 
-    Raises:
-        InputError: with their names.
+    Raises InputError: with their names.
     """
     names = [name for name, lon_lat in points if not is_place(lon_lat)]
     if names:

@@ -22,8 +22,7 @@ from orthoswarm.model.geo import LocalGrid
 def read_truth(path: Path) -> dict[str, tuple[str, int, Camera]]:
     """True cameras of a twin's frames.csv: image -> (vehicle, EPSG, camera).
 
-    Raises:
-        InputError: if the file is not such a table.
+    Raises InputError: if the file is not such a table.
     """
     try:
         with path.open(newline="") as file:
@@ -101,8 +100,7 @@ def evaluate_poses(poses: Path, truth: Path) -> PoseErrors:
     The plane of the homographies is `ground_z_m` of report.json in the folder of frames.jsonl (0 without one); the true
     ground level is the median of dtm.tif in the folder of the truth, at the cameras' nadirs (0 without one).
 
-    Raises:
-        InputError: if nothing in common can be read.
+    Raises InputError: if nothing in common can be read.
     """
     true = read_truth(truth)
     placed, cameras = [], []

@@ -56,11 +56,7 @@ def _grid(epsg: int) -> LocalGrid:
 
 
 def placed_rows(rows: Iterable[Row]) -> list[Row]:
-    """The lines of placed pictures.
-
-    Raises:
-        InputError: there is none.
-    """
+    """The lines of placed pictures. Raises InputError: there is none."""
     placed = [row for row in rows if row["stage"] != "rejected" and "camera" in row]
     if not placed:
         raise InputError("the map has no placed picture to export; make it again")
@@ -75,8 +71,7 @@ def stated_sigma_m(row: Row) -> float:
 def oriented_pictures(rows: Iterable[Row]) -> list[OrientedPicture]:
     """The placed pictures of a map.
 
-    Raises:
-        InputError: there is none, or the map was made before cameras held their lens.
+    Raises InputError: there is none, or the map was made before cameras held their lens.
     """
     placed = placed_rows(rows)
     if any("focal_px" not in row["camera"] for row in placed):
@@ -115,8 +110,7 @@ def link_pictures(
 ) -> list[bool]:
     """Link the pictures' files into a new folder under their names; returns for each whether it was there.
 
-    Raises:
-        OrthoSwarmError: if the disk is full.
+    Raises OrthoSwarmError: if the disk is full.
     """
     folder.mkdir(parents=True)
     there = []
@@ -139,8 +133,7 @@ def link_oriented(pictures: Sequence[OrientedPicture], find: Find, folder: Path,
 def _link(file: Path, target: Path) -> None:
     """Link a file under another name, or copy it if the file system has no links.
 
-    Raises:
-        FileExistsError: the name is taken. A copy there would be written into the file that it is linked to.
+    Raises FileExistsError: the name is taken. A copy there would be written into the file that it is linked to.
     """
     try:
         os.link(file, target)

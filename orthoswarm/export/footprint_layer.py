@@ -57,8 +57,7 @@ def write_footprints(path: Path, features: Iterable[Feature], epsg: int) -> None
 def gpkg_file(path: Path) -> Iterator[Path]:
     """A path to write a GeoPackage to, which appears under its name when it is complete.
 
-    Raises:
-        OrthoSwarmError: if the disk is full or the folder cannot be written.
+    Raises OrthoSwarmError: if the disk is full or the folder cannot be written.
     """
     import pyogrio
 

@@ -39,11 +39,7 @@ class MapExport:
 
     @cached_property
     def picture(self) -> Path:
-        """The raster to export.
-
-        Raises:
-            InputError: there is none.
-        """
+        """The raster to export. Raises InputError: there is none."""
         from orthoswarm.export.catalog.tiled_raster import product_file
 
         names = [self.layer] if self.layer else ["orthoimage", "coarse", "realtime"]
@@ -58,8 +54,7 @@ class MapExport:
     def all_places(self) -> "Sequence[Place]":
         """Finds and vehicles, and the largest changes that `orthoswarm change` has found.
 
-        Raises:
-            InputError: the folder's list was changed to something else.
+        Raises InputError: the folder's list was changed to something else.
         """
         from orthoswarm.export.tactical.places import changed_places, read_places
 

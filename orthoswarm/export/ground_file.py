@@ -16,8 +16,7 @@ _NO_DATA: Final = -9999.0
 def write_ground(path: Path, terrain: Terrain, epsg: int) -> None:
     """Write a terrain as a COG of three bands, float32, metres, on the datum of the stated cameras.
 
-    Raises:
-        StorageError: if the disk is full or the folder cannot be written.
+    Raises StorageError: if the disk is full or the folder cannot be written.
     """
     rows, columns = terrain.z.shape
     half, step = 0.5 * terrain.step_m, terrain.step_m

@@ -288,7 +288,6 @@ def image_root(frames: Sequence[Frame]) -> str | None:
 def write_json(path: Path, document: Mapping[str, Any]) -> None:
     """Write one JSON document that appears when it is complete.
 
-    Raises:
-        OrthoSwarmError: if the disk is full or the folder cannot be written.
+    Raises OrthoSwarmError: if the disk is full or the folder cannot be written.
     """
     write_file(path, json_text(document, 1) + "\n")

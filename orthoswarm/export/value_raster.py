@@ -61,8 +61,7 @@ def write_values(
 def write_confidence(path: Path, found: Confidence) -> None:
     """Write how far an orthoimage can be trusted, a COG; -1 where nothing is drawn.
 
-    Raises:
-        StorageError: if the disk is full or the folder cannot be written.
+    Raises StorageError: if the disk is full or the folder cannot be written.
     """
     bands = {
         "good to so many metres: 0.2, 0.5, 2; 99: only for orientation": found.good_to_m,

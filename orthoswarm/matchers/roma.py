@@ -25,8 +25,7 @@ _ROMA_CERTAINTY: Final = 0.3  # least certainty of a match
 def load(state: dict[str, Any], backbone: dict[str, Any], device: Any) -> Any:
     """The network from its own state and that of its DINOv2 backbone, on a torch device.
 
-    Raises:
-        UnavailableError: if the package is missing or the states do not fit it.
+    Raises UnavailableError: if the package is missing or the states do not fit it.
     """
     try:
         from romatch import roma_outdoor
@@ -74,8 +73,7 @@ class Roma:
     def make(cls, device: str) -> "Roma":
         """A matcher with the weights of this machine.
 
-        Raises:
-            UnavailableError: if the package or the weights are missing.
+        Raises UnavailableError: if the package or the weights are missing.
         """
         return cls(_network(network_device(device)), device)
 

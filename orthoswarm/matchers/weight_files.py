@@ -143,8 +143,7 @@ def find(name: str) -> Path | None:
 def require(name: str) -> Path:
     """Path of a weight file, by its name in this program.
 
-    Raises:
-        UnavailableError: if it is not on this machine; the message says where to get it.
+    Raises UnavailableError: if it is not on this machine; the message says where to get it.
     """
     path = find(name)
     if path is None:
@@ -177,8 +176,7 @@ def identify(path: Path) -> WeightFile | None:
 def import_weights(source: Path) -> list[tuple[WeightFile, Path]]:
     """Copy a weight file, or all known ones of a folder, to the user's own folder.
 
-    Raises:
-        InputError: if there is no known weight file, or one is damaged.
+    Raises InputError: if there is no known weight file, or one is damaged.
     """
     if not source.exists():
         raise InputError(f"{source} does not exist; give a file of weights or a folder with some")

@@ -60,8 +60,7 @@ class _Over:
     def checked(self, slots: list[list[Slot]]) -> OverGround | None:
         """How the flights lie over the height model, None without one.
 
-        Raises:
-            InputError: lower than `heights.least_above_m` above it.
+        Raises InputError: lower than `heights.least_above_m` above it.
         """
         if self.heights.ground is None:
             return None

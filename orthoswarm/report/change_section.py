@@ -19,8 +19,7 @@ _SHOWN: Final = 0.5  # probability from which ground is painted
 def put_section(folder: Path, change: Path) -> bool:
     """Put the change map of a folder into report.html of a map, in the place of an earlier one; False without a report.
 
-    Raises:
-        OrthoSwarmError: the disk is full.
+    Raises OrthoSwarmError: the disk is full.
     """
     report, figures = folder / "report.html", figures_in(change)
     orthoimage = product_file(folder, "orthoimage.tif")

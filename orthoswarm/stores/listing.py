@@ -44,8 +44,7 @@ def remember(sizes: Mapping[Path, StoredFile]) -> None:
 def look_up(path: Path) -> StoredFile:
     """Size and version of one file, as they are now.
 
-    Raises:
-        NotStoredError: if it is not there. Else see `requests.request`.
+    Raises NotStoredError: if it is not there. Else see `requests.request`.
     """
     info = request(path, lambda system, key: system.info(key))
     if info.get("type") == "directory":
@@ -58,8 +57,7 @@ def look_up(path: Path) -> StoredFile:
 def list_folder(folder: Path) -> list[Path]:
     """All files below a folder in a store, in the order of their paths; empty if there are none.
 
-    Raises:
-        OrthoSwarmError: see `requests.request`.
+    Raises OrthoSwarmError: see `requests.request`.
     """
     if folder.parts[1].startswith("http"):
         return sorted(_web_folder(folder))
@@ -74,8 +72,7 @@ def list_folder(folder: Path) -> list[Path]:
 def exists(path: Path) -> bool:
     """Whether there is a file or folder, local or in a store.
 
-    Raises:
-        InputError: if its store refuses to tell. Else see `requests.request`.
+    Raises InputError: if its store refuses to tell. Else see `requests.request`.
     """
     if not is_stored(path):
         return path.exists()

@@ -91,8 +91,7 @@ class PublishedFolder:
 
         Whoever leaves it early, as Ctrl-C does, waits for the files under way only.
 
-        Raises:
-            OrthoSwarmError: when those that were under way have ended, if a file cannot be uploaded.
+        Raises OrthoSwarmError: when those that were under way have ended, if a file cannot be uploaded.
         """
         failed: BaseException | None = None
         with ThreadPoolExecutor(CONNECTIONS) as pool:

@@ -87,8 +87,7 @@ class _StoredParts:
 def open_parts(path: Path) -> Iterator[Parts]:
     """A file for reading parts of it; closed at the end of the context.
 
-    Raises:
-        OSError: if a local file cannot be opened or read. Else see `requests.request`.
+    Raises OSError: if a local file cannot be opened or read. Else see `requests.request`.
     """
     if is_stored(path):
         size = (known(path) or look_up(path)).size

@@ -76,8 +76,7 @@ PRESETS: dict[str, TwinSpec] = {
 def spec(preset: str, *, seed: int = 1, noise: str = "paper", **changes: Any) -> TwinSpec:
     """A preset with a seed, a kind of noise, and further fields of TwinSpec replaced.
 
-    Raises:
-        InputError: for a preset or a kind of noise that does not exist.
+    Raises InputError: for a preset or a kind of noise that does not exist.
     """
     if preset not in PRESETS:
         raise InputError(f"there is no preset '{preset}'; choose one of: {', '.join(PRESETS)}")

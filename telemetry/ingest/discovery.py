@@ -120,8 +120,7 @@ def discover(inputs: Sequence[Path], exclude: Sequence[Path] = ()) -> Discovery:
     A video or photo given by itself includes the files next to it that describe its pose: the SRT of the same name,
     geo.txt and CSV. Logs must be given, as those of other flights may be there.
 
-    Raises:
-        InputError: no input, or one that does not exist or is a folder that cannot be listed.
+    Raises InputError: no input, or one that does not exist or is a folder that cannot be listed.
     """
     if not inputs:
         raise InputError("no input was given; name a folder of photos or a video")

@@ -53,8 +53,7 @@ _ROUNDED: Final = 12.0**-0.5  # sigma of what was rounded, in its steps
 def load(inputs: Sequence[Path], *, progress: Progress | None = None, options: LoadOptions | None = None) -> Ingest:
     """Read inputs into frames: folders of photos (recursive; each folder with photos is one vehicle), photos, videos.
 
-    Raises:
-        InputError: an input does not exist or is of no known kind, or a SEI layout is wrong.
+    Raises InputError: an input does not exist or is of no known kind, or a SEI layout is wrong.
     """
     found = survey(inputs, progress=progress, options=options)
     told = [str(finding) for finding in found.findings if not finding.note]

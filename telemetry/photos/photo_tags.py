@@ -88,8 +88,7 @@ class Photo:
 def read_photo(path: Path) -> Photo | None:
     """Read the tags of one photo; None for a georeferenced raster, which is not a photo.
 
-    Raises:
-        NotAPicture: the file is not a readable picture; its text is the reason.
+    Raises NotAPicture: the file is not a readable picture; its text is the reason.
     """
     container = read_container(path)
     if container.georeferenced:
@@ -104,8 +103,7 @@ def read_photo(path: Path) -> Photo | None:
 def with_sidecar(path: Path, sidecar: Path) -> Photo:
     """The tags of a photo and of an XMP file beside it, which counts where both state something.
 
-    Raises:
-        NotAPicture: the photo is not readable. OSError: the other file is not.
+    Raises NotAPicture: the photo is not readable; OSError: the other file is not.
     """
     container = read_container(path)
     with sidecar.open("rb") as handle:

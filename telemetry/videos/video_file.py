@@ -150,11 +150,7 @@ class VideoScan:
 
 
 def open_video(path: Path | str, **options: Any) -> Any:
-    """Open a file or a URL with PyAV.
-
-    Raises:
-        NotAVideo: it cannot be opened or holds no video.
-    """
+    """Open a file or a URL with PyAV. Raises NotAVideo: it cannot be opened or holds no video."""
     import av
 
     try:
@@ -240,11 +236,7 @@ def _reason(error: Exception) -> str:
 
 
 def scan(path: Path) -> VideoScan:
-    """Read all metadata of a file, without decoding pictures.
-
-    Raises:
-        NotAVideo: it is not a video.
-    """
+    """Read all metadata of a file, without decoding pictures. Raises NotAVideo: it is not a video."""
     if path.stat().st_size == 0:
         raise NotAVideo("the file is empty; copy it again")
     with open_video(path) as container:

@@ -23,8 +23,7 @@ Entry = tuple[int, int, int, bytes]
 def with_pose(jpeg: bytes, frame: Frame) -> bytes:
     """A JPEG with a frame's pose; existing EXIF and XMP are replaced, the picture data is unchanged.
 
-    Raises:
-        ValueError: the bytes are not a JPEG.
+    Raises ValueError: the bytes are not a JPEG.
     """
     if jpeg[:2] != b"\xff\xd8":
         raise ValueError("no JPEG")

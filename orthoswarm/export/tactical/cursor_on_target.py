@@ -97,11 +97,7 @@ class TakAddress:
 
     @classmethod
     def parse(cls, text: str, certificate: Path | None = None, authority: Path | None = None) -> "TakAddress":
-        """From `udp://HOST:PORT`, `tcp://HOST:PORT` or `tls://HOST:PORT`.
-
-        Raises:
-            InputError: it is none of these.
-        """
+        """From `udp://HOST:PORT`, `tcp://HOST:PORT` or `tls://HOST:PORT`. Raises InputError: it is none of these."""
         try:
             parts = urlsplit(text)
             host, port = parts.hostname, parts.port
@@ -126,11 +122,7 @@ class TakSender:
         self._socket: socket.socket | None = None
 
     def send(self, event: bytes) -> None:
-        """Send one event.
-
-        Raises:
-            OrthoSwarmError: the receiver cannot be reached.
-        """
+        """Send one event. Raises OrthoSwarmError: the receiver cannot be reached."""
         to = self._address
         try:
             if self._socket is None:

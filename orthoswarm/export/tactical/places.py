@@ -70,11 +70,7 @@ def feature(place: Place) -> dict[str, Any]:
 
 
 def write_geojson(places: Iterable[Place], path: Path) -> None:
-    """Write places as GeoJSON.
-
-    Raises:
-        OrthoSwarmError: the disk is full.
-    """
+    """Write places as GeoJSON. Raises OrthoSwarmError: the disk is full."""
     document = {"type": "FeatureCollection", "features": [feature(place) for place in places]}
     write_file(path, json.dumps(document, ensure_ascii=False, indent=1) + "\n")
 
@@ -82,8 +78,7 @@ def write_geojson(places: Iterable[Place], path: Path) -> None:
 def read_places(folder: Path) -> list[Place]:
     """The places that `write_geojson` kept in a map's folder; none if it has no such file.
 
-    Raises:
-        InputError: the file was changed to something else.
+    Raises InputError: the file was changed to something else.
     """
     path = folder / FILE
     if not path.exists():
@@ -155,8 +150,7 @@ def sightings(placed: Iterable[PlacedFrame], point: ArrayLike) -> list[Sighting]
 def write_csv(places: Iterable[Place], path: Path) -> None:
     """Write a row a place. Texts that a spreadsheet would take for a formula get an apostrophe before them.
 
-    Raises:
-        OrthoSwarmError: the disk is full.
+    Raises OrthoSwarmError: the disk is full.
     """
     out = io.StringIO(newline="")
     rows = csv.writer(out)
@@ -175,11 +169,7 @@ def spreadsheet_cell(value: object) -> object:
 
 
 def write_gpx(places: Iterable[Place], path: Path) -> None:
-    """Write places as waypoints of GPX 1.1 (topografix.com/GPX/1/1).
-
-    Raises:
-        OrthoSwarmError: the disk is full.
-    """
+    """Write places as waypoints of GPX 1.1 (topografix.com/GPX/1/1). Raises OrthoSwarmError: the disk is full."""
     points = [
         element(
             "wpt",
@@ -201,8 +191,7 @@ def write_kml(places: Iterable[Place], path: Path) -> None:
     Descriptions and balloons are HTML, in which Google Earth would run what a note holds; so texts are escaped as such.
     A name is plain text, but the usual balloon repeats it as HTML: each place has its own.
 
-    Raises:
-        OrthoSwarmError: the disk is full.
+    Raises OrthoSwarmError: the disk is full.
     """
     marks = []
     for place in places:

@@ -97,8 +97,7 @@ def _in_grid(shapes: Sequence[Polygon], grid: LocalGrid) -> list[Geometry]:
 def _refuse_inside(outlines: Sequence[Geometry], forbidden: Geometry) -> None:
     """Refuse an outline of which no-fly zones leave nothing; each is compared with the zones near it only.
 
-    Raises:
-        InputError: there is such an outline.
+    Raises InputError: there is such an outline.
     """
     zones = shapely.get_parts(forbidden)  # which do not overlap
     outline, zone = shapely.STRtree(zones).query(outlines, predicate="intersects")
@@ -113,8 +112,7 @@ def _refuse_inside(outlines: Sequence[Geometry], forbidden: Geometry) -> None:
 def _check(polygon: Geometry, shell: Ring, grid: LocalGrid, name: str) -> None:
     """Refuse a polygon in grid metres that is none; `shell` is its outline in degrees.
 
-    Raises:
-        InputError: it says what is wrong.
+    Raises InputError: it says what is wrong.
     """
     if not np.isfinite(shapely.get_coordinates(polygon)).all():
         raise InputError(f"{name} reaches too far for one UTM grid; plan a smaller area")

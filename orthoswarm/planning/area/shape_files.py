@@ -204,8 +204,7 @@ def counted(nouns: Mapping[str, int]) -> tuple[str, ...]:
 def circle_of(lat: float, lon: float, said: Mapping[str, Any], name: str) -> Circle | None:
     """The circle around a point, by its properties (names in lower case); None if they state no radius.
 
-    Raises:
-        InputError: none that a zone can have, or in an unknown unit.
+    Raises InputError: none that a zone can have, or in an unknown unit.
     """
     radius = said.get("radius_m", said.get("radius"))
     if radius is None:
@@ -217,8 +216,7 @@ def circle_of(lat: float, lon: float, said: Mapping[str, Any], name: str) -> Cir
 def strip_of(line: Ring, said: Mapping[str, Any], name: str) -> list[Polygon]:
     """The ground within half a width of a line, by its properties; nothing if they state no width.
 
-    Raises:
-        InputError: none that a zone can have, or in an unknown unit.
+    Raises InputError: none that a zone can have, or in an unknown unit.
     """
     if said.get("width_m") is None:
         return []
@@ -279,8 +277,7 @@ def _lat_lon(positions: Sequence[Sequence[float]]) -> list[tuple[float, float]]:
 def parse_kml(text: str | bytes, name: str = "the KML file", *, any_size: bool = False) -> Shapes:
     """Polygons and lines of a KML text (OGC KML 2.x; any namespace); any_size: see `parse_geojson`.
 
-    Raises:
-        InputError: no XML, no KML, or coordinates that are not longitude and latitude.
+    Raises InputError: no XML, no KML, or coordinates that are not longitude and latitude.
     """
     try:
         root = ElementTree.fromstring(_mended(text))

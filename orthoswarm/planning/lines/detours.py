@@ -148,8 +148,7 @@ class Router:
     def path(self, start: ArrayLike, end: ArrayLike) -> Array:
         """The shortest free path, float64 (k, 2) with both ends.
 
-        Raises:
-            InputError: there is none (one end lies in an obstacle).
+        Raises InputError: there is none (one end lies in an obstacle).
         """
         p, q = np.asarray(start, np.float64).reshape(1, 2), np.asarray(end, np.float64).reshape(1, 2)
         if not self.blocked(p, q)[0]:

@@ -143,11 +143,7 @@ def _at_least(obstacles: Geometry, x: float, ends: tuple[float, float], length: 
 
 
 def line_count(width_m: float, spacing_m: float) -> int:
-    """Lines that a width needs.
-
-    Raises:
-        InputError: far more than any swarm can fly.
-    """
+    """Lines that a width needs. Raises InputError: far more than any swarm can fly."""
     count = max(1, int(np.ceil(width_m / spacing_m - 1e-6)))
     if count > MOST_LINES:
         raise InputError(

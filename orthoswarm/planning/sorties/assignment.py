@@ -89,8 +89,7 @@ class PlanOptions:
     def check(self) -> None:
         """Refuse values that mean nothing.
 
-        Raises:
-            InputError: a value that is not larger than 0 or out of reach, or a start that is not a position.
+        Raises InputError: a value that is not larger than 0 or out of reach, or a start that is not a position.
         """
         speed = self.motion.speed_m_s
         if not _SLOWEST_M_S <= speed <= _FASTEST_M_S:

@@ -55,8 +55,7 @@ class _Format:
 def read_dataflash(path: Path) -> FlightLog:
     """Read a DataFlash log; damaged parts are skipped.
 
-    Raises:
-        OSError: it cannot be read. NotALog: it is not a DataFlash log.
+    Raises OSError: it cannot be read; NotALog: it is not a DataFlash log.
     """
     with mapped(path) as data:
         rows = _rows(data)

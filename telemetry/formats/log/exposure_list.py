@@ -43,11 +43,7 @@ _MOST_STEP_S = 1.0
 
 
 def read_exposure_list(path: Path) -> FlightLog:
-    """Read a list of exposures, or a receiver's track.
-
-    Raises:
-        OSError: it cannot be read. NotALog: it is neither.
-    """
+    """Read a list of exposures, or a receiver's track. Raises OSError: it cannot be read; NotALog: it is neither."""
     with path.open("rb") as handle:
         text = handle.read(MOST_TEXT_BYTES).decode("utf-8-sig", "replace")
     if path.suffix.lower() == ".mrk":
@@ -100,8 +96,7 @@ class _PositionColumns:
 def _positions(text: str) -> list[Sample]:
     """The positions of a solution, in the order of the file; times are UTC.
 
-    Raises:
-        NotALog: it states no positions on the earth.
+    Raises NotALog: it states no positions on the earth.
     """
     columns = _PositionColumns(GPS_MINUS_UTC_S, 3, _degrees)
     found = []
@@ -166,11 +161,7 @@ def _sample(words: Sequence[str], columns: _PositionColumns) -> Sample | None:
 
 
 def _time(words: Sequence[str]) -> float:
-    """Seconds of the line's own scale, counted like UTC since 1970.
-
-    Raises:
-        ValueError: it is no time.
-    """
+    """Seconds of the line's own scale, counted like UTC since 1970. Raises ValueError: it is no time."""
     written = epoch_of(" ".join(words[:2]))
     return GPS_EPOCH_S + int(words[0]) * WEEK_S + float(words[1]) if written is None else written
 

@@ -29,8 +29,7 @@ __all__ = ["FlightLog", "NotALog", "read_log", "read_tlog"]
 def read_log(path: Path) -> list[FlightLog]:
     """Read a log of any kind; returns one entry for each vehicle in it.
 
-    Raises:
-        NotALog: it is not a flight log, or holds nothing that can be used.
+    Raises NotALog: it is not a flight log, or holds nothing that can be used.
     """
     of_one_vehicle: dict[str, Callable[[Path], FlightLog]] = {
         ".bin": read_dataflash, ".ulg": read_ulog, ".pos": read_exposure_list, ".mrk": read_exposure_list,
@@ -102,8 +101,7 @@ _MAX_RECORDS = 100_000_000
 def read_tlog(path: Path) -> list[FlightLog]:
     """Read a tlog: 8 bytes of arrival time (microseconds, big-endian) before each MAVLink packet.
 
-    Raises:
-        OSError: it cannot be read. NotALog: no packet in it.
+    Raises OSError: it cannot be read; NotALog: no packet in it.
     """
     os.environ.setdefault("MAVLINK20", "1")
     from pymavlink.dialects.v20 import ardupilotmega as mavlink

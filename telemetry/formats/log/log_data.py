@@ -47,11 +47,7 @@ class FlightLog:
 
 @contextlib.contextmanager
 def mapped(path: Path) -> Iterator[mmap.mmap]:
-    """A log's bytes without reading them all into memory.
-
-    Raises:
-        OSError: it cannot be read.
-    """
+    """A log's bytes without reading them all into memory. Raises OSError: it cannot be read."""
     with path.open("rb") as handle, mmap.mmap(handle.fileno(), 0, access=mmap.ACCESS_READ) as data:
         yield data
 

@@ -28,11 +28,7 @@ _SENTENCE = re.compile(r"\$([A-Z]{2})(RMC|GGA|GNS|ZDA),([^*$\r\n]*)(?:\*([0-9A-F
 
 
 def read_track(path: Path) -> FlightLog:
-    """Read a GPX file or NMEA sentences.
-
-    Raises:
-        OSError: it cannot be read. NotALog: it holds no dated position.
-    """
+    """Read a GPX file or NMEA sentences. Raises OSError: it cannot be read; NotALog: it holds no dated position."""
     with path.open("rb") as handle:
         text = handle.read(MOST_TEXT_BYTES).decode("utf-8-sig", "replace")
     gpx = path.suffix.lower() == ".gpx"

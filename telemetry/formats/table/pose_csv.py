@@ -93,8 +93,7 @@ class _Line:
 def read_pose_csv(path: Path) -> PoseTable | None:
     """Read a table of poses; None if the file is some other text.
 
-    Raises:
-        InputError: it is a table of poses that cannot be read: no projection, too large.
+    Raises InputError: it is a table of poses that cannot be read: no projection, too large.
     """
     # Most tables next to pictures are not tables of poses, and may be large.
     head = decoded(beginning(path, _HEAD_BYTES)).splitlines()

@@ -116,11 +116,7 @@ def decoded(data: bytes) -> str:
 
 
 def read_text(path: Path) -> str:
-    """A table's text.
-
-    Raises:
-        InputError: it is too large, or cannot be read.
-    """
+    """A table's text. Raises InputError: it is too large, or cannot be read."""
     try:
         if path.stat().st_size > MOST_TEXT_BYTES:
             raise InputError(f"{path.name} is larger than {MOST_TEXT_BYTES >> 20} MB; split it")

@@ -347,8 +347,7 @@ def read_sei_layout(path: Path) -> Decoder:
     `flight_yaw_deg`, `fov_deg`, `sigma_m`, `time_s`), each with a factor and an offset if its unit is another one
     ("pitch_deg*0.01-90"); "" leaves a value out. The payload may be longer than the struct.
 
-    Raises:
-        InputError: the file cannot be read, or does not describe a message; names the wrong entry.
+    Raises InputError: the file cannot be read, or does not describe a message; names the wrong entry.
     """
     try:
         entries = tomllib.loads(path.read_text("utf-8"))

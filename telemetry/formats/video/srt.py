@@ -76,11 +76,7 @@ class Subtitles:
 
 
 def read_srt(path: Path) -> Subtitles:
-    """Read an SRT file; blocks that are not understood are left out.
-
-    Raises:
-        OSError: the file cannot be read.
-    """
+    """Read an SRT file; blocks that are not understood are left out. Raises OSError: the file cannot be read."""
     with path.open("rb") as handle:
         data = handle.read(MOST_TEXT_BYTES)
     encoding = "utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
