@@ -12,8 +12,7 @@ from gcs_plugin.daemon.settings import Settings
 from gcs_plugin.daemon.store.frame_rows import all_frames
 from gcs_plugin.daemon.store.journal import Change, Journal, no_change
 from gcs_plugin.daemon.store.picture_store import PictureStore
-from orthoswarm.change.change_files import FIGURES
-from orthoswarm.change.overlay import change_overlay, figures_in
+from orthoswarm.change.change_files import FIGURES, change_overlay, figures_in
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +27,7 @@ class ChangeTask:
 def find_change(task: ChangeTask) -> dict[str, Any]:
     """Compare the products of a workspace with its basemap; returns the shares."""
     from orthoswarm.change.of_folder import change_of
-    from orthoswarm.report.change_section import put_section
+    from orthoswarm.report.page import put_section
 
     figures = change_of(
         task.workspace, task.workspace, basemap=task.basemap,

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from orthoswarm.change.change_map import ChangeMap
-from orthoswarm.change.likelihood import CASES
+from orthoswarm.change.evidence import CASES
 from orthoswarm.coverage.view import View
 
 LEAST_M2: Final = 25.0  # smaller objects are not listed

@@ -2,10 +2,16 @@
 
 What both have in common is measured as 2 <m, p> / (<m, m> + <p, p> + f), with <> the mean over the surroundings of a
 cell at several scales: 1 where they are alike, 0 where they differ, and also where neither has any structure, which
-the share of structure, (<m, m> + <p, p>) / (<m, m> + <p, p> + f), tells apart. The log-likelihood ratio is linear in
-these and the others; its coefficients were fitted on simulated cities (see benchmarks/accuracy/change.py).
+the share of structure, (<m, m> + <p, p>) / (<m, m> + <p, p> + f), tells apart.
+
+Four cases exclude each other: unchanged; under water; buried or ploughed up; a building gone or its roof torn. Their
+log-likelihoods, but for a constant, are smooth functions of what is measured: sums of some sigmoids of weighted sums.
+The weights were fitted by maximum likelihood on simulated cities, whose maps were also given in another season, darker,
+with other detail and coarser (`python -m benchmarks.accuracy.change fit`), and stand in weights.npz.
 """
 
+from functools import lru_cache
+from pathlib import Path
 from typing import Final, NamedTuple
 
 import cv2
@@ -26,6 +32,9 @@ _WHITE: Final = 225.0  # grey value of haze
 _LEAST_WEIGHT: Final = 0.02  # of pictures: one that sees a place 43 degrees off nadir counts so little
 _SAME: Final = 0.3  # what has so much in common is the same ground
 _ENOUGH: Final = 200  # cells that tell the usual ratio of contrasts
+CASES: Final = ("unchanged", "water", "rubble or earth", "building gone or roof damaged")
+MOST: Final = 5.0  # values farther from the usual ones, in standard deviations, say no more
+_FILE: Final = Path(__file__).with_name("weights.npz")
 
 
 class Block(NamedTuple):
@@ -105,3 +114,29 @@ def _structure_values(cells: Floats, count: Floats, cell_m: float) -> list[Float
         ratio = mean[..., 5] - np.float32(usual)
         out += [*shares(mean), np.maximum(mean[..., 4], 0.0), np.maximum(ratio, 0.0), np.maximum(-ratio, 0.0)]
     return out
+
+
+class Weights(NamedTuple):
+    """Weights of the likelihoods."""
+
+    mean: Floats  # (features,), of what is measured
+    spread: Floats  # (features,), of what is measured
+    first: Floats  # (features + 1, hidden)
+    second: Floats  # (hidden + 1, cases); the last rows are constants
+
+
+@lru_cache(maxsize=1)
+def fitted() -> Weights:
+    """The weights that were fitted."""
+    with np.load(_FILE) as file:
+        return Weights(*(file[name] for name in Weights._fields))
+
+
+def probabilities(values: Floats, weights: Weights | None = None) -> Floats:
+    """Probabilities of the CASES, float32 (..., cases), of what is measured, float32 (..., features)."""
+    w = weights or fitted()
+    x = np.clip((values - w.mean) / w.spread, -MOST, MOST)
+    hidden = np.tanh(x @ w.first[:-1] + w.first[-1])
+    z = hidden @ w.second[:-1] + w.second[-1]
+    z = np.exp(z - z.max(-1, keepdims=True))
+    return np.asarray(z / z.sum(-1, keepdims=True), np.float32)

@@ -13,7 +13,7 @@ from orthoswarm.change.changed_objects import find_objects
 from orthoswarm.coverage.map_folder import MapFolder, read_map
 from orthoswarm.coverage.view import View
 from orthoswarm.export.catalog.tiled_raster import product_file
-from orthoswarm.export.ground_file import GROUND, read_ground
+from orthoswarm.export.value_raster import GROUND, read_ground
 from orthoswarm.model.arrays import Bytes
 from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.errors import InputError

@@ -12,8 +12,7 @@ from typing import Any, Final
 import numpy as np
 
 from orthoswarm.control.control_observations import in_photos, on_basemap
-from orthoswarm.control.moved_block import moved_camera, moved_terrain
-from orthoswarm.control.similarity import ControlFit, fit_similarity
+from orthoswarm.control.similarity import ControlFit, fit_similarity, moved_camera, moved_terrain
 from orthoswarm.evaluation.checkpoints import RECEIVERS_LOCAL_SIGMA_M, Checkpoint
 from orthoswarm.model.arrays import Array
 from orthoswarm.model.geo import LocalGrid

@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from orthoswarm.coverage.missing_pictures import Exposure
-from orthoswarm.coverage.picture_flaws import picture_flaws
-from orthoswarm.coverage.view import View
+from orthoswarm.coverage.view import View, picture_flaws
 from orthoswarm.export.product_files import read_frames
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid

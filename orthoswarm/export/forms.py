@@ -30,8 +30,8 @@ class MapExport:
     # `images`, or where they were when the map was made
     find: Callable[[Mapping[str, Any]], Path | None] | None = None
     images: Path | None = None
-    tile_format: Literal["png", "webp", "jpg"] = "png"  # of MBTiles, and of JPEG and WebP, 1 to 100
-    quality: int = 85  # of MBTiles, and of JPEG and WebP, 1 to 100
+    tile_format: Literal["png", "webp", "jpg"] = "png"  # of MBTiles
+    quality: int = 85  # of JPEG and WebP, 1 to 100
     epsg: int | None = None  # of the COG
     jpeg: bool = False  # of the COG
     tell: Callable[[int, int], None] = lambda done, of: None  # called with steps done and in all

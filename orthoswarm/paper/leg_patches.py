@@ -8,8 +8,7 @@ import numpy as np
 
 from orthoswarm.matchers import Matches, map_matcher
 from orthoswarm.matchers.matcher import Mask
-from orthoswarm.matchers.patch_registration import Registration, apply, register
-from orthoswarm.matchers.second_opinion import LEAST_TILES, TRUSTED_SHARE
+from orthoswarm.matchers.patch_registration import LEAST_TILES, TRUSTED_SHARE, Registration, apply, register
 from orthoswarm.model.arrays import Array, Floats
 from orthoswarm.model.frame import Frame
 from orthoswarm.model.geo import GroundGrid

@@ -23,9 +23,15 @@ from telemetry.formats.video.sei import read_sei_layout, register
 from telemetry.ingest.discovery import Discovery, Folder, discover, natural_key
 from telemetry.ingest.log_choice import LogSource
 from telemetry.ingest.log_ingest import add_logs, read_logs
-from telemetry.ingest.picture_kinds import Reasons, of_other_kinds, of_other_sources, of_second_cameras
-from telemetry.ingest.side_files import read_control_points
-from telemetry.ingest.strangers import copies_in_other_folders, strangers
+from telemetry.ingest.strangers import (
+    Reasons,
+    copies_in_other_folders,
+    of_other_kinds,
+    of_other_sources,
+    of_second_cameras,
+    strangers,
+)
+from telemetry.ingest.summary import read_control_points
 from telemetry.ingest.survey import LoadOptions, SourceInfo, Survey
 from telemetry.ingest.track_poses import SHIFTED, clock_went_back, in_order
 from telemetry.ingest.video_ingest import read_videos

@@ -1,6 +1,6 @@
 """A photo and its tags: position, attitude, time and lens of its camera.
 
-Tags are only collected here, with their values unchanged; `telemetry.photos.attitude` decides which of several
+Tags are only collected here, with their values unchanged; `telemetry.photos.photo_frames` decides which of several
 yaws is the picture's, and `telemetry.ingest` merges photos with other sources.
 """
 

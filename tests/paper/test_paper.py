@@ -12,8 +12,8 @@ from orthoswarm.model.bounding_box import BoundingBox
 from orthoswarm.model.camera import Camera, Lens, focal_px, rotation_from_angles
 from orthoswarm.model.geo import GroundGrid, local_origin
 from orthoswarm.paper import PaperOptions, PaperRefiner, coarse_cameras, leg_patches
+from orthoswarm.paper.coarse_cameras import find_legs, fit_line
 from orthoswarm.paper.ground_scale import choose_pairs, field_of_view, gaussian, metres_per_pixel, orthogonal_centre
-from orthoswarm.paper.leg_lines import find_legs, fit_line
 from orthoswarm.paper.leg_patches import HeightFilter
 from orthoswarm.paper.paper_refiner import carried_shift, fit_camera, pixel_grid
 from orthoswarm.raster.basemap import Basemap
