@@ -227,8 +227,7 @@ def local_offsets(before: Floats, now: Floats) -> Floats:
 
     Parts of _TILE_PX are correlated; what is not clear is taken from its neighbours, 0 where there is none.
 
-    Args:
-        before, now: structure of map and pictures, float32 (rows, columns, 2 or more), gradients first.
+    before, now: structure of map and pictures, float32 (rows, columns, 2 or more), gradients first.
     """
     rows, columns = (max(1, side // _TILE_PX) for side in before.shape[:2])
     found = np.zeros((rows, columns, 3), np.float32)

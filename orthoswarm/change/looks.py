@@ -101,8 +101,7 @@ class ToneModel(NamedTuple):
     def differs(self, before: Floats, now: Floats) -> tuple[Floats, Floats]:
         """How far colours (rows, columns, 3) are from what they should have become.
 
-        Returns:
-            In spreads, squared, at most _MOST, and as a difference of hues; float32 (rows, columns).
+        Returns in spreads, squared, at most _MOST, and as a difference of hues; float32 (rows, columns).
         """
         b, a = hue(before), hue(now)
         nearest, least = np.zeros(b.shape[:2], np.intp), np.full(b.shape[:2], np.inf, np.float32)

@@ -125,8 +125,7 @@ def _would_see(cover: CoverageGrid, views: Sequence[Any]) -> Flags:
 def below_legs(cells: Cells, plan: PlannedFlight, legs: Array) -> Flags:
     """Cells that a plan's pictures of some of its legs would show, bool (rows, columns).
 
-    Args:
-        cells: of the area. plan: with the size of its pictures. legs: float64 (n, 2, 2), ends of legs, grid metres.
+    cells: of the area. plan: with the size of its pictures. legs: float64 (n, 2, 2), ends of legs, grid metres.
     """
     import shapely
     from rasterio.features import rasterize

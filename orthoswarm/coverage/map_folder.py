@@ -95,8 +95,7 @@ def with_flaws(
 ) -> tuple[list[View], int]:
     """The views with the flaws of their pictures, which are decoded for it; and how many could not be read.
 
-    Args:
-        views: placed pictures. root: folder that their names are relative to. progress: called with done and total.
+    views: placed pictures. root: folder that their names are relative to. progress: called with done and total.
     """
 
     def measured(view: View) -> PictureQuality | None:

@@ -65,8 +65,7 @@ def missing_pictures(views: Sequence[View], exposures: Iterable[Exposure] = ()) 
     have not arrived. Without recorded exposures the numbers in file names decide: skipped numbers mean pictures that
     have not arrived, consecutive ones that the camera was not triggered.
 
-    Args:
-        views: pictures that were placed. exposures: of any vehicle, in any order, also of pictures that are in `views`.
+    views: pictures that were placed. exposures: of any vehicle, in any order, also of pictures that are in `views`.
     """
     known = {(v.vehicle, v.image) for v in views}
     lost: dict[str, list[Exposure]] = defaultdict(list)
@@ -157,8 +156,7 @@ def missing_by_events(
 ) -> Missing:
     """Missing pictures of all vehicles; for vehicles without events only from holes in their legs.
 
-    Args:
-        views: pictures that were placed. events: in any order. rejected: files that could not be used.
+    views: pictures that were placed. events: in any order. rejected: files that could not be used.
     """
     lost = list(rejected)
     by_vehicle: dict[str, list[CameraEvent]] = defaultdict(list)

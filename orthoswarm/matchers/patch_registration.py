@@ -59,8 +59,7 @@ def register(
 ) -> Registration | None:
     """Find a patch in a window of the map (see MapMatcher for the frames).
 
-    Returns:
-        None where no homography is found; else the result, whose `share` may still be too low to trust it.
+    Returns None where no homography is found; else the result, whose `share` may still be too low to trust it.
     """
     first = matcher.match(patch, valid, window, known, reach)
     fit = magsac(first, _COARSE_AGREEMENT_PX)

@@ -306,9 +306,7 @@ def pixel_grid(camera: Camera, columns: int = 6, rows: int = 5) -> Array:
 def carried_shift(index: Array, matched: Sequence[tuple[float, Array]]) -> Array:
     """Corrections (N, 2) of frames between matched legs of the same vehicle, interpolated by frame number.
 
-    Args:
-        index: float64 (N,), frame numbers.
-        matched: middle frame number and shift (2,) of each leg that was found.
+    index: float64 (N,), frame numbers. matched: middle frame number and shift (2,) of each leg that was found.
     """
     order = sorted(matched, key=lambda m: m[0])
     at = np.array([m[0] for m in order])

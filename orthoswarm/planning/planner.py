@@ -452,8 +452,7 @@ def _sampled(path: Array, *grounds: Terrain) -> Array:
 def _half_widths(points: Array, ground: Terrain, slope: float) -> tuple[Array, Array]:
     """How far pictures reach to the left and to the right of a leg's points (n, 3), metres; and the unit vector left.
 
-    Args:
-        slope: half a footprint's width over the height above ground.
+    slope: half a footprint's width over the height above ground.
     """
     way = points[-1, :2] - points[0, :2]
     left = np.array([-way[1], way[0]]) / max(float(np.hypot(*way)), 1e-9)

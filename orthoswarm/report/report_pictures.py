@@ -211,11 +211,7 @@ def relief(height_m: NDArray[np.floating[Any]], cell_m: float) -> Bytes:
 
 
 def surface_picture(surface: Mapping[str, Any]) -> tuple[Bytes, str]:
-    """The picture of a surface model, and what it shows.
-
-    Args:
-        surface: `surface` of report.json.
-    """
+    """The picture of a surface model, and what it shows. surface: `surface` of report.json."""
     import rasterio
     from rasterio.enums import Resampling
 

@@ -127,8 +127,7 @@ class Ahead:
 
     Threads end when nothing is announced any more. What is wanted before its turn is left to the one who wants it.
 
-    Args:
-        copy: copies one; raises nothing that matters, since whoever wants the file copies it again and finds out.
+    copy: copies one; raises nothing that matters, since whoever wants the file copies it again and finds out.
     """
 
     def __init__(self, copy: Callable[[Path], object]) -> None:

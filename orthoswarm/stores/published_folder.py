@@ -36,9 +36,7 @@ class PublishedFolder:
     Attributes:
         address: where the map is to lie. local: the folder to write to, of the same name.
 
-    Raises:
-        InputError: if nothing can be written at the address.
-        StoreLostError: if the store cannot be reached.
+    Raises InputError: if nothing can be written at the address; StoreLostError: if the store cannot be reached.
     """
 
     def __init__(self, address: Path) -> None:

@@ -17,9 +17,7 @@ from orthoswarm.model.arrays import Bytes, Floats
 class Sensor:
     """A small drone camera with automatic exposure.
 
-    Args:
-        width: columns; height: rows.
-        seed: of the noise array; each picture uses another part of it.
+    width: columns; height: rows. seed: of the noise array; each picture uses another part of it.
     """
 
     def __init__(self, width: int, height: int, seed: int) -> None:

@@ -61,8 +61,7 @@ def best_log(matches: Sequence[LogMatch], what: str, is_named: Callable[[FlightL
     Where logs of several vehicles fit equally well, only one that is named like the pictures (`is_named`) is taken: the
     vehicles of a swarm fly at the same time, so that a guess would put pictures elsewhere without a sign of it.
 
-    Args:
-        matches: at least one. what: the pictures, for messages ("a.mp4").
+    matches: at least one. what: the pictures, for messages ("a.mp4").
     """
     best = min(matches, key=lambda match: (match.rank, match.misfit))
     rivals = [m for m in matches if m.rank == best.rank and m.misfit <= best.misfit + best.margin]

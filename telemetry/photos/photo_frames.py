@@ -38,9 +38,7 @@ def frames_of(
 ) -> list[Frame]:
     """Frames of one vehicle's photos (in order of time), after comparing their tags.
 
-    Args:
-        photos: with positions. vehicle: id. name: maps a file to its name in the products.
-        findings: are appended here.
+    photos: with positions. vehicle: id. name: maps a file to its name in the products. findings: are appended here.
     """
     ground = ground_track(photos)
     course = courses_deg(ground)
@@ -184,8 +182,7 @@ class Decided:
 def decide(photos: Sequence[Photo], course_deg: Array, vehicle: str) -> Decided:
     """Choose the picture's angles for the photos of one vehicle and model.
 
-    Args:
-        photos: in order of time. course_deg: (N,) course over ground, NaN where unknown. vehicle: for messages.
+    photos: in order of time. course_deg: (N,) course over ground, NaN where unknown. vehicle: for messages.
     """
     findings: list[Finding] = []
     camera = _filled("gimbal", [p.camera_deg for p in photos], 1, findings)

@@ -55,8 +55,7 @@ def in_tiles(wanted: Tiles, window: tuple[int, int, int, int]) -> bool:
 def product_file(folder: Path, name: str) -> Path | None:
     """The raster `name` (`orthoimage.tif`) of a map's folder, as one file or as the virtual raster of its tiles.
 
-    Returns:
-        None if the folder holds neither.
+    Returns None if the folder holds neither.
     """
     single, virtual = folder / name, _virtual(folder, name)
     return single if single.exists() else virtual if virtual.exists() else None

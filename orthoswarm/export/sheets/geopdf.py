@@ -282,8 +282,7 @@ def grid_zone(zone: int, lat_deg: float) -> str:
 def square(zone: int, east_m: float, north_m: float) -> str:
     """The two letters of the square of 100 km.
 
-    Args:
-        zone: of UTM. east_m, north_m: grid metres, on the south with the false northing of 10,000 km.
+    zone: of UTM. east_m, north_m: grid metres, on the south with the false northing of 10,000 km.
     """
     column = _COLUMNS[(zone - 1) % 3][(math.floor(east_m / _SQUARE_M) - 1) % 8]
     return column + _ROWS[(math.floor(north_m / _SQUARE_M) + (0 if zone % 2 else 5)) % 20]

@@ -111,11 +111,7 @@ class TakAddress:
 
 
 class TakSender:
-    """Sends events to one receiver; a broken connection is opened again with the next event.
-
-    Args:
-        address: the receiver.
-    """
+    """Sends events to one receiver; a broken connection is opened again with the next event. address: the receiver."""
 
     def __init__(self, address: TakAddress) -> None:
         self._address = address

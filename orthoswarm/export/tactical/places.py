@@ -129,8 +129,7 @@ class Sighting:
 def sightings(placed: Iterable[PlacedFrame], point: ArrayLike) -> list[Sighting]:
     """The pictures that show a point, those that have it nearest to their middle first.
 
-    Args:
-        placed: pictures with their cameras. point: (3,) east, north and height in the cameras' grid, metres.
+    placed: pictures with their cameras. point: (3,) east, north and height in the cameras' grid, metres.
     """
     found = []
     at = np.asarray(point, dtype=np.float64)

@@ -32,11 +32,7 @@ class ReducedRaster(contextlib.ExitStack):
     The overviews of our orthoimages are means of 2 x 2 pixels, so that nothing is lost against reading all pixels; they
     are opened when they are first asked for. Not for several threads at once.
 
-    Args:
-        path: the raster.
-
-    Raises:
-        RasterioError: it cannot be read.
+    path: the raster. Raises RasterioError: it cannot be read.
     """
 
     def __init__(self, path: Path) -> None:
@@ -51,8 +47,7 @@ class ReducedRaster(contextlib.ExitStack):
     def at(self, factor: float) -> tuple[Any, float]:
         """The dataset whose pixels are the largest that are at most `factor` pixels of the raster wide.
 
-        Returns:
-            The dataset, and how many of its pixels `factor` is.
+        Returns the dataset, and how many of its pixels `factor` is.
         """
         import rasterio
 

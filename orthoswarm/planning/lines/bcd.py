@@ -34,8 +34,7 @@ _ROW_ROUNDS: Final = (20, 2)  # ... in so many rounds at most, with more cells i
 def cells(ground: Geometry) -> list[Geometry]:
     """Cells of a polygon for a sweep along +x (lines along y): shapely polygons that together are the ground.
 
-    Args:
-        ground: shapely (Multi)Polygon, metres.
+    ground: shapely (Multi)Polygon, metres.
     """
     tilt = Turned(_HAIR_RAD, (0.0, 0.0))
     found = []
@@ -151,8 +150,7 @@ def order_cells(ways: Array) -> list[int]:
     Few cells are ordered exactly (Held and Karp 1962). Of many: nearest neighbours from every cell, the best row
     improved by moving cells; which of its four ways each cell is flown follows exactly, by dynamic programming over it.
 
-    Args:
-        ways: float64 (4 n, 4 n), from exit of cell and way to entry of cell and way, metres.
+    ways: float64 (4 n, 4 n), from exit of cell and way to entry of cell and way, metres.
     """
     n = len(ways) // 4
     if n == 1:

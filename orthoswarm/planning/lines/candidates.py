@@ -151,8 +151,7 @@ def _finished(
 def chained(loops: list[Array]) -> Array:
     """Closed rows of legs one after the other: the first opened at its widest gap, others near the one before.
 
-    Args:
-        loops: float64 (n, 2, 2) each.
+    loops: float64 (n, 2, 2) each.
     """
     if not loops:
         return np.empty((0, 2, 2))

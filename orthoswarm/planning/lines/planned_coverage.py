@@ -26,10 +26,7 @@ _GAP_LEG_PRICE: Final = 0.02  # price of a line spacing of flight, in shares of 
 def bands(legs: Array, width_m: float, reach_m: float) -> Geometry:
     """The ground seen from each leg: an array of n shapely rectangles.
 
-    Args:
-        legs: float64 (n, 2, 2).
-        width_m: width across the leg.
-        reach_m: how far a band goes on beyond the leg's ends.
+    legs: float64 (n, 2, 2). width_m: width across the leg. reach_m: how far a band goes on beyond the leg's ends.
     """
     step = legs[:, 1] - legs[:, 0]
     along = step / np.maximum(np.hypot(*step.T), 1e-9)[:, None]

@@ -97,8 +97,7 @@ class Motion:
         Where time is lost is known as well as how much: slow first metres of the climb, a wait above home, gathering
         speed; slowing down, a wait above home, slow last metres.
 
-        Args:
-            points: float64 (n, 3), the path. waits_s: float64 (n,), seconds that it stays before each point.
+        points: float64 (n, 3), the path. waits_s: float64 (n,), seconds that it stays before each point.
         """
         times = self.times(points) + (0.0 if waits_s is None else np.cumsum(waits_s))
         step = np.diff(points, axis=0)
@@ -177,8 +176,7 @@ class Motion:
 def start_slack_s(near_start: Flags, autopilot: AutopilotTimes) -> Array:
     """Seconds off schedule that a plan allows a flight around a start that vehicles share, float64 (n,).
 
-    Args:
-        near_start: bool (n,), which of its samples are there. Before it has left it first it takes off, then it lands.
+    near_start: bool (n,), which of its samples are there. Before it has left it first it takes off, then it lands.
     """
     takes_off = np.arange(len(near_start)) < np.argmin(near_start)
     return np.where(takes_off, autopilot.takeoff_slack_s, autopilot.landing_slack_s)

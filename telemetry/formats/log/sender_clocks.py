@@ -183,8 +183,7 @@ class SenderClocks:
         It tells the difference of the clocks only as long as nothing is known that the sender sends at once. The sender
         was restarted if its time goes back and the picture is none of before by its number.
 
-        Args:
-            number: the picture's. kind: of the message; each has its own numbers.
+        number: the picture's. kind: of the message; each has its own numbers.
         """
         if boot_s > 0.0 and component == self._autopilot:
             return boot_s

@@ -218,9 +218,7 @@ def _by_both(clock: float, stamp: float) -> tuple[float, str] | None:
     - The stamp is more than a year early, but not so: the receiver had no fix.
     - Otherwise the clock was set wrongly, or never, as clocks start in a past year. The stamp is right.
 
-    Args:
-        clock: the camera's time as if it were UTC, epoch seconds.
-        stamp: GPSDateStamp and GPSTimeStamp, epoch seconds.
+    clock: the camera's time as if it were UTC, epoch seconds. stamp: GPSDateStamp and GPSTimeStamp, epoch seconds.
     """
     days = _days_early(clock - stamp)
     if days > _YEAR_DAYS:

@@ -249,8 +249,7 @@ def _has_point(line: _Line) -> bool:
 def _with_points(line: _Line, marks: bool, separator: str) -> _Line:
     """A line with points for decimal commas.
 
-    Args:
-        line: as written. marks: the commas in the table's numbers are decimal marks. separator: between cells.
+    line: as written. marks: the commas in the table's numbers are decimal marks. separator: between cells.
     """
     replaced = _NUMBERS if marks else frozenset()
     if separator != ",":  # the comma before fractions of a second says nothing about other numbers

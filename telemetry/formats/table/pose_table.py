@@ -79,8 +79,7 @@ def leave_out_folder(table: PoseTable, pictures: Collection[str]) -> str:
 def take_base_names(table: PoseTable, pictures: Collection[str]) -> int:
     """Rename rows to the only picture of their file name, where no other row has it either; returns how many.
 
-    Args:
-        table: no name of which is a picture's. pictures: paths relative to the table's folder.
+    table: no name of which is a picture's. pictures: paths relative to the table's folder.
     """
     places: dict[str, list[str]] = {}
     for picture in pictures:

@@ -117,9 +117,7 @@ def chains_of(
 ) -> Chains | None:
     """Chains from the steps (N - 1,) in pixels between photos, NaN where unknown; None where there are too few.
 
-    Args:
-        p, e, resolution_s: as in `Chains`. path_m: (K,) way of each event.
-        offset, drift: a clock that is about right.
+    p, e, resolution_s: as in `Chains`. path_m: (K,) way of each event. offset, drift: a clock that is about right.
     """
     ways = np.interp((p - offset) / (1.0 + drift), e, path_m)
     scale = _scale(_split(steps_px), ways)
