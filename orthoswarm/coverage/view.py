@@ -106,8 +106,7 @@ class View:
 
         Args:
             row: the line; needs `homography`, `camera`, `fov_deg`, `width` and `height`.
-            ground_z_m: height of the plane of its homography.
-            grid: the grid of its homography.
+            ground_z_m: height of the plane of its homography. grid: the grid of its homography.
 
         Raises:
             InputError: something in the line is missing or no number.

@@ -29,10 +29,8 @@ from orthoswarm.model.coordinate_system import to_degrees
 from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid, area_epsg
 
-STANDARD_COUNT = 30
-"""Checkpoints that a statement by the standard needs at least."""
-_SAME_PLACE_M = 0.02
-"""Lines of one point may round its coordinates differently."""
+STANDARD_COUNT = 30  # checkpoints that a statement by the standard needs at least
+_SAME_PLACE_M = 0.02  # lines of one point may round its coordinates differently
 _DECIMAL_COMMA = re.compile(r"^([-+]?\d+),(\d+)$")
 
 SURVEY_SIGMA_M: Final = 0.05
@@ -287,7 +285,19 @@ def _csv(lines: Sequence[str], name: str, scale: _Scale, separator: str) -> list
         if separator == ";":  # spreadsheets in many countries write decimal commas then
             cells = {key: _DECIMAL_COMMA.sub(r"\1.\2", value) for key, value in cells.items()}
         try:
-            point = _csv_row(cells, name, scale)
+            written = _coordinates(cells, "")
+            if written is None:
+                raise KeyError("it has no coordinates")
+            sigma_m = _number(cells.get("sigma_m") or "0")
+            if sigma_m < 0.0:
+                raise ValueError(f"sigma_m is {sigma_m:g}, but cannot be less than 0")
+            surveyed, doubt = _in_degrees(written, name)
+            shown = _coordinates(cells, "map_")
+            on_map = None if shown is None else _in_degrees(shown, name)[0]
+            title = cells.get("name") or f"{surveyed[1]:.7f} {surveyed[0]:.7f}"
+            point = Checkpoint(title, surveyed, sigma_m, on_map=on_map, written=written, doubt=doubt)
+            if cells.get("image"):
+                point.marks.append(scale.mark(cells["image"], _number(cells["column"]), _number(cells["row"])))
         except (KeyError, ValueError) as error:
             raise InputError(
                 f"{name}, line {number}: {_reason(error)}; columns are name, lat_deg, lon_deg (or east_m, north_m, "
@@ -317,23 +327,6 @@ def _merged(lines: Iterable[Checkpoint]) -> list[Checkpoint]:
         for number, point in enumerate(several if len(several) > 1 else (), 1):
             point.name = f"{name} ({number})"
     return points
-
-
-def _csv_row(cells: Mapping[str, str], name: str, scale: _Scale) -> Checkpoint:
-    written = _coordinates(cells, "")
-    if written is None:
-        raise KeyError("it has no coordinates")
-    sigma_m = _number(cells.get("sigma_m") or "0")
-    if sigma_m < 0.0:
-        raise ValueError(f"sigma_m is {sigma_m:g}, but cannot be less than 0")
-    surveyed, doubt = _in_degrees(written, name)
-    shown = _coordinates(cells, "map_")
-    on_map = None if shown is None else _in_degrees(shown, name)[0]
-    title = cells.get("name") or f"{surveyed[1]:.7f} {surveyed[0]:.7f}"
-    point = Checkpoint(title, surveyed, sigma_m, on_map=on_map, written=written, doubt=doubt)
-    if cells.get("image"):
-        point.marks.append(scale.mark(cells["image"], _number(cells["column"]), _number(cells["row"])))
-    return point
 
 
 def _coordinates(cells: Mapping[str, str], prefix: str) -> Coordinates | None:

@@ -67,8 +67,7 @@ def gradient_field(gray: Floats, valid: Mask) -> tuple[NDArray[np.complex64], Fl
     """Gradients east + i south, zero where invalid, and their squared length before normalisation.
 
     Args:
-        gray: float32 (rows, columns).
-        valid: bool of the same shape.
+        gray: float32 (rows, columns). valid: bool of the same shape.
 
     Returns:
         complex64 of the same shape, normalised by |g| + the median |g| of valid pixels; float32 |g|^2.
@@ -142,11 +141,8 @@ def displacement_field(
 
     Args:
         ortho: float32 (rows, columns), grey; either as large as the reference or larger by the search radius in
-            pixels on every side.
-        ortho_valid: where it shows ground.
-        reference: float32 (rows, columns), grey.
-        reference_valid: where it may be compared.
-        settings: how to measure.
+            pixels on every side. ortho_valid: where it shows ground. reference: float32 (rows, columns), grey.
+        reference_valid: where it may be compared. settings: how to measure.
         offset: row and column of the reference's first pixel on a larger grid.
 
     Returns:
@@ -235,8 +231,7 @@ def accuracy(displacements: Displacements, cover: Completeness, step_px: float) 
     """The figures of a field of displacements.
 
     Args:
-        displacements: of all covered blocks.
-        cover: completeness.
+        displacements: of all covered blocks. cover: completeness.
         step_px: distance of neighbouring blocks in pixels of the positions.
     """
     length, matched = displacements.length_m, displacements.matched

@@ -51,10 +51,8 @@ def evaluate_ortho(
     """Measure an orthoimage file against a reference file; memory stays small whatever their size.
 
     Args:
-        ortho: RGB(A) or grey GeoTIFF.
-        reference: the same, any CRS.
-        mask: raster that is not 0 where blocks may be compared.
-        settings: how to measure; its gsd_m is replaced.
+        ortho: RGB(A) or grey GeoTIFF. reference: the same, any CRS.
+        mask: raster that is not 0 where blocks may be compared. settings: how to measure; its gsd_m is replaced.
         gsd_m: pixel of the comparison, None for 0.3 m or the coarser of both if that is more.
 
     Raises:

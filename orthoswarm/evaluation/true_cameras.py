@@ -147,8 +147,7 @@ def camera_from_homography(homography: Array, lens: Lens, ground_z_m: float) -> 
 
     Args:
         homography: 3x3, pixel (column, row, 1) to (east, north).
-        lens: its focal length and principal point (distortion plays no part).
-        ground_z_m: height of the plane.
+        lens: its focal length and principal point (distortion plays no part). ground_z_m: height of the plane.
     """
     u, v = lens.principal_point
     center = homography @ np.array([u, v, 1.0])
@@ -197,8 +196,7 @@ def pose_errors(
     """Compare placed frames with their true cameras, in the same grid and order.
 
     Args:
-        placed: frames as placed.
-        truth: the true camera of each.
+        placed: frames as placed. truth: the true camera of each.
         ground_z_m: height of the plane of the homographies, in the product's heights.
         true_ground_z_m: the mean ground level in the truth's heights.
     """

@@ -10,8 +10,7 @@ from typing import Final
 
 from orthoswarm.model.errors import DiskFullError, StorageError
 
-FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
-"""What the system says of a full disk, or of a used quota."""
+FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT})  # what the system says of a full disk, or of a used quota
 
 
 @contextmanager

@@ -20,8 +20,7 @@ from orthoswarm.model.errors import InputError
 from orthoswarm.model.geo import LocalGrid
 
 Row = Mapping[str, Any]
-Find = Callable[[Row], Path | None]
-"""Returns the picture file of a row, None if it is missing."""
+Find = Callable[[Row], Path | None]  # returns the picture file of a row, None if it is missing
 Tell = Callable[[int, int], None]
 _UNKNOWN_SIGMA_M: Final = 10.0  # stated for a picture of which no error is known: a receiver's in a bad place
 _MOST_STEM: Final = 120  # characters; file systems take names of 255 bytes

@@ -22,8 +22,7 @@ _COG: Final = {
 }  # fmt: skip
 GROUND: Final = "ground.tif"
 _NO_DATA: Final = -9999.0
-NO_DATA = -9999.0
-"""What other programs expect for "no height"."""
+NO_DATA = -9999.0  # what other programs expect for "no height"
 _UNITS: Final = ("m", "m", "")
 _DATUM: Final = "that of the altitudes in the photos: the ellipsoid, the geoid or another one, as their maker has it"
 _NO_DATUM: Final = "none: heights are over the takeoff level"

@@ -94,12 +94,9 @@ def match_tiles(
     """Match tiles of a patch's features near where they are expected in a window's features.
 
     Args:
-        patch: (D, h, w) features.
-        window: (D, H, W) features.
-        valid: bool (h, w) of the patch.
+        patch: (D, h, w) features. window: (D, H, W) features. valid: bool (h, w) of the patch.
         predict: float64 (N, 2), expected column and row in the window of each tile's centre.
-        centres: int64 (N, 2), column and row of the tiles' centres.
-        search: reach about the expectation, pixels.
+        centres: int64 (N, 2), column and row of the tiles' centres. search: reach about the expectation, pixels.
 
     Returns:
         One match for each tile with a clear peak; the score is the peak.

@@ -47,11 +47,9 @@ class MapMatcher(Protocol):
         """Matches from the patch (a) to the window (b).
 
         Args:
-            patch: float32 (h, w), grey 0 to 255.
-            valid: bool (h, w), where the patch has ground.
+            patch: float32 (h, w), grey 0 to 255. valid: bool (h, w), where the patch has ground.
             window: float32 (h + 2 reach, w + 2 reach), the map; the prior puts patch pixel (c, r) at window pixel
-                (c + reach, r + reach).
-            known: bool, the same shape, where the map has ground.
+                (c + reach, r + reach). known: bool, the same shape, where the map has ground.
             reach: the largest shift from the prior that is looked for, pixels.
         """
 

@@ -8,8 +8,7 @@ from orthoswarm.model.errors import InputError
 if TYPE_CHECKING:
     import torch
 
-DEVICES = ("auto", "cpu", "cuda")
-"""What may be asked for."""
+DEVICES = ("auto", "cpu", "cuda")  # what may be asked for
 
 
 def network_device(wanted: str = "auto") -> "torch.device":

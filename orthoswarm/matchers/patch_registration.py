@@ -168,8 +168,7 @@ def second_opinion(
     """Position of a rectified strip of pictures on the map by learned matching.
 
     Args:
-        patch: float32 (h, w), grey values of the strip.
-        valid: bool (h, w), where it has ground.
+        patch: float32 (h, w), grey values of the strip. valid: bool (h, w), where it has ground.
         window: float32 (h + 2 reach, w + 2 reach), the map at the same pixel size.
         known: bool, where the map has ground.
         reach: largest shift from the prior, pixels; the networks work best at 0.3 to 1 m per pixel.

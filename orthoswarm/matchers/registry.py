@@ -16,10 +16,8 @@ from orthoswarm.matchers.matcher import MapMatcher, PictureMatcher, UnavailableE
 from orthoswarm.model.errors import InputError
 
 GROUP = "orthoswarm.matchers"
-PICTURE_ORDER = ("xfeat", "sift")
-"""Default matcher of pictures: the first of these that is available."""
-MAP_ORDER = ("xfeat-window", "cfog")
-"""Default matcher of patches on the map: the first of these that is available."""
+PICTURE_ORDER = ("xfeat", "sift")  # default matcher of pictures: the first of these that is available
+MAP_ORDER = ("xfeat-window", "cfog")  # default matcher of patches on the map: the first of these that is available
 
 
 def _learned(kind: Any, device: str) -> PictureMatcher:

@@ -56,8 +56,7 @@ def metres_per_pixel(matches: Matches, centre: tuple[float, float], reach_px: fl
     """Ground sampling distance at the orthogonal centre from two frames of a leg: distance flown / image shift.
 
     Args:
-        matches: between the two pictures.
-        centre: column and row of the orthogonal centre (straight below).
+        matches: between the two pictures. centre: column and row of the orthogonal centre (straight below).
         reach_px: matches farther from the centre are not used, since relief and tilt distort them.
         flown_m: distance between the two frames along the leg's line.
 
@@ -104,10 +103,8 @@ def choose_pairs(along: Array, height: Array, tilt: Array, members: NDArray[np.i
     """Up to `count` pairs, evenly spread over a leg, with a distance near `_SCALE_PAIR_HEIGHTS` flying heights.
 
     Args:
-        along: float64 (n,), distance along the line of the leg's frames, in flying order.
-        height: float64 (n,), metres.
-        tilt: float64 (n,), radians from straight down.
-        members: (n,), the frames' indices in the vehicle.
+        along: float64 (n,), distance along the line of the leg's frames, in flying order. height: float64 (n,), metres.
+        tilt: float64 (n,), radians from straight down. members: (n,), the frames' indices in the vehicle.
         count: how many pairs.
     """
     n, ratio = len(along), _SCALE_PAIR_HEIGHTS
@@ -143,12 +140,8 @@ def estimate_fov(
     """The field of view (radians) of a camera from pairs of frames, outliers suppressed; None if too few agree.
 
     Args:
-        tasks: pairs.
-        gray: picture i.
-        rotation: float64 (N, 3, 3).
-        size: width and height of the pictures.
-        start_rad: first guess, used only to place the orthogonal centre.
-        matcher: for the pairs.
+        tasks: pairs. gray: picture i. rotation: float64 (N, 3, 3). size: width and height of the pictures.
+        start_rad: first guess, used only to place the orthogonal centre. matcher: for the pairs.
     """
     focal = focal_px(start_rad, size[0])
     found = []

@@ -285,7 +285,9 @@ def fit_camera(camera: Camera, corrected: Array, pixels: Array) -> CorrectedCame
         projected = current.project(points)
         jacobian = np.empty((2 * len(points), 6))
         for k in range(6):
-            jacobian[:, k] = ((_moved(current, k, 1e-5).project(points) - projected) / 1e-5).ravel()
+            change = np.zeros(6)
+            change[k] = 1e-5
+            jacobian[:, k] = ((_apply_step(current, change).project(points) - projected) / 1e-5).ravel()
         step, *_ = np.linalg.lstsq(jacobian, (pixels - projected).ravel(), rcond=None)
         if not np.isfinite(step).all():
             break
@@ -312,12 +314,6 @@ def carried_shift(index: Array, matched: Sequence[tuple[float, Array]]) -> Array
     at = np.array([m[0] for m in order])
     shift = np.array([m[1] for m in order])
     return np.column_stack([np.interp(index, at, shift[:, k]) for k in range(2)])
-
-
-def _moved(camera: Camera, k: int, step: float) -> Camera:
-    change = np.zeros(6)
-    change[k] = step
-    return _apply_step(camera, change)
 
 
 def _apply_step(camera: Camera, step: Array) -> Camera:

@@ -81,14 +81,10 @@ def plan_area(
     """Missions that cover an area.
 
     Args:
-        area: ground and no-fly zones.
-        vehicles: how many.
+        area: ground and no-fly zones. vehicles: how many.
         altitude_m: height of the legs above takeoff, metres; with `heights`, that above level ground at which `foot`
-            was made.
-        foot: footprint of the narrowest camera at that height.
-        method: how lines are laid and ordered.
-        options: the rest.
-        progress: called with what is being done.
+            was made. foot: footprint of the narrowest camera at that height. method: how lines are laid and ordered.
+        options: the rest. progress: called with what is being done.
         heights: of the flights over a height model; None for level ground at takeoff.
 
     Raises:
@@ -244,8 +240,7 @@ def plan_lines(
 
     Args:
         lines: float64 (n, 2) each, latitude and longitude in degrees, flown in the order given. Stretches shorter
-            than two trigger distances are flown without pictures: they are turns.
-        vehicles: how many share the lines.
+            than two trigger distances are flown without pictures: they are turns. vehicles: how many share the lines.
         no_fly: an area whose no-fly zones hold here, too.
 
     Raises:

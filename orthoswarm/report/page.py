@@ -57,8 +57,7 @@ PALETTE = (
 """Colours that stay apart on photographs and in print: five of Okabe and Ito's, and others that differ from all before
 by at least 16 (CIE 1976), also as seen without red, green or blue cones (Machado and others 2009)."""
 _LEGS = {"matched": (0, 158, 115), "carried": (230, 159, 0), "failed": (163, 32, 13)}
-_LEG_WIDTHS = {"matched": 2, "carried": 4, "failed": 7}
-"""Pixels: which is which can be seen without the colours."""
+_LEG_WIDTHS = {"matched": 2, "carried": 4, "failed": 7}  # pixels: which is which can be seen without the colours
 
 _LEAST_PICTURE_PX: Final = 200
 """Side that pictures of the report have at least where a map's pixel is large (one of 640 m would leave nothing to
@@ -89,11 +88,8 @@ def write_page(
     """Write report.html beside the products.
 
     Args:
-        out: output folder with the products.
-        report: content of report.json.
-        placed: the frames as last placed.
-        rejected: the pictures that were left out.
-        basemap: the map, if there is one.
+        out: output folder with the products. report: content of report.json. placed: the frames as last placed.
+        rejected: the pictures that were left out. basemap: the map, if there is one.
         cells: picture of the cells of the coverage (PNG), empty without one.
 
     Returns:

@@ -284,11 +284,8 @@ def moved(ortho: Bytes, seen: Flags, basemap: Bytes, valid: Flags, grid: GroundG
     than a wrong one.
 
     Args:
-        ortho: grey orthoimage (rows, columns).
-        seen: where it is drawn.
-        basemap: grey map on the same grid.
-        valid: where the map means something.
-        grid: of both.
+        ortho: grey orthoimage (rows, columns). seen: where it is drawn. basemap: grey map on the same grid.
+        valid: where the map means something. grid: of both.
     """
     step = max(_BLOCK_PX, float(np.sqrt(seen.sum() / _MOST_BLOCKS)))
     settings = FieldSettings(

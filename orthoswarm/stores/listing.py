@@ -16,8 +16,7 @@ from orthoswarm.stores.addresses import address_of, is_stored
 from orthoswarm.stores.requests import NotStoredError, RefusedError, request
 
 MANIFEST = "files.txt"
-_SERVER_PARTS = 3
-"""Parts of the path of a server itself: root, scheme, host."""
+_SERVER_PARTS = 3  # parts of the path of a server itself: root, scheme, host
 
 
 @dataclass(frozen=True, slots=True)

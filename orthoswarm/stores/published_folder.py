@@ -50,8 +50,7 @@ class PublishedFolder:
 
         Args:
             written: whether runs write files of such a name (path in the folder); those of an earlier run that this one
-                has not written are removed from the store.
-            progress: called during the upload.
+                has not written are removed from the store. progress: called during the upload.
 
         Raises:
             OrthoSwarmError: if a file cannot be uploaded; the local files stay, and the next run uploads the rest.

@@ -66,16 +66,7 @@ def separate_places(lat_deg: Array, lon_deg: Array, gap_m: float, gap_steps: flo
     if gap_steps:
         nearest = np.asarray(cKDTree(place).query(place, k=2)[0])[:, 1]
         gap_m = max(gap_m, gap_steps * float(np.median(nearest)))
-    label = _connected(place, gap_m)
-    _, first, number = np.unique(label, return_index=True, return_inverse=True)
-    return np.argsort(np.argsort(first)).astype(np.int32)[number]
-
-
-def _connected(place: Array, gap_m: float) -> Ints:
-    """A label of each place (N, 3): the same for those that are linked by steps shorter than the gap.
-
-    Places of one cell, whose diagonal is the gap, are linked; of two cells the nearest places decide.
-    """
+    # Places of one cell, whose diagonal is the gap, are linked; of two cells the nearest places decide.
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
@@ -91,4 +82,6 @@ def _connected(place: Array, gap_m: float) -> Ints:
     ]
     rows, columns = np.array(linked, np.intp).reshape(-1, 2).T
     graph = coo_array((np.ones(len(rows), np.int8), (rows, columns)), shape=(len(cells), len(cells)))
-    return np.asarray(connected_components(graph, directed=False)[1], np.int32)[cell.ravel()]
+    label = np.asarray(connected_components(graph, directed=False)[1], np.int32)[cell.ravel()]
+    _, first, number = np.unique(label, return_index=True, return_inverse=True)
+    return np.argsort(np.argsort(first)).astype(np.int32)[number]

@@ -36,9 +36,7 @@ def zone_depth(scene: Scene, zone: DamagedGround, step: int, seed: int) -> Float
     """Signed distance of each cell from a zone's ragged edge, metres, positive inside; float32 (rows, columns).
 
     Args:
-        scene: gives the grid.
-        zone: the patch of ground.
-        step: side of a cell of the result, in texels.
+        scene: gives the grid. zone: the patch of ground. step: side of a cell of the result, in texels.
         seed: of the ragged edge.
     """
     rows, cols = scene.grid.height // step, scene.grid.width // step

@@ -11,8 +11,7 @@ from orthoswarm.model.camera import Lens, focal_px
 from orthoswarm.model.placement import Terrain
 
 _START_S: Final = 1_750_000_000.0  # UTC epoch seconds of the first vehicle's first picture
-FOVS_DEG = (85.0, 90.0, 95.0, 100.0, 105.0)
-"""The paper's cameras (IV.A)."""
+FOVS_DEG = (85.0, 90.0, 95.0, 100.0, 105.0)  # the paper's cameras (IV.A)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -182,12 +181,9 @@ def fly(
     """One vehicle's true flight.
 
     Args:
-        plan: the swarm's flight plan.
-        motion: deviations from it, the wind and the curvature of legs.
-        center: grid coordinates of the area's centre.
-        vehicle: its number.
-        seed: of the set; each vehicle draws its own numbers from it.
-        lens_k: radial distortion k1, k2 of all lenses.
+        plan: the swarm's flight plan. motion: deviations from it, the wind and the curvature of legs.
+        center: grid coordinates of the area's centre. vehicle: its number.
+        seed: of the set; each vehicle draws its own numbers from it. lens_k: radial distortion k1, k2 of all lenses.
     """
     rng = np.random.default_rng([seed, 41, vehicle])
     n = plan.photos

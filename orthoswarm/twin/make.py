@@ -66,9 +66,7 @@ def make_twin(
     dtm.tif, masks and manifest.json. The same spec gives the same bytes.
 
     Args:
-        spec: what to make.
-        folder: where to put it.
-        workers: threads that render.
+        spec: what to make. folder: where to put it. workers: threads that render.
         progress: called with a stage's name, the number of finished items and their total.
         only: stop after this many new pictures (None: all).
 

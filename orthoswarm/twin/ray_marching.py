@@ -310,10 +310,8 @@ def render(stage: PreparedScene, camera: Camera, rays: Floats, motion: Array) ->
     """One picture, float32 (rows, columns, 3), red first, before the sensor.
 
     Args:
-        stage: the scene with its light.
-        camera: in the scene's grid; heights over takeoff.
-        rays: from `lens_rays` of the camera's lens.
-        motion: float64 (8,), offsets of waves and haze at this moment.
+        stage: the scene with its light. camera: in the scene's grid; heights over takeoff.
+        rays: from `lens_rays` of the camera's lens. motion: float64 (8,), offsets of waves and haze at this moment.
     """
     s = stage.scene
     out = np.empty((camera.lens.height, camera.lens.width, 3), np.float32)

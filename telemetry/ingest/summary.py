@@ -97,21 +97,18 @@ def _of_frames(vehicle: str, frames: Sequence[Frame], source: SourceInfo) -> dic
 def _of_samples(vehicle: str, samples: Sequence[Sample], shown: int) -> dict[str, Any]:
     placed = [s for s in samples if s.lat_deg is not None and s.lon_deg is not None]
     times = [s.time_s for s in samples if s.time_s is not None]
-    return {
-        "id": vehicle,
-        "frames": shown,
-        **_flown(_thinned(ground_track(placed)), times),
-        **_ranges(height_m=[s.height_m for s in samples], pitch_deg=[s.pitch_deg for s in samples]),
-    }
-
-
-def _thinned(ground: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Positions thinned to a least distance; the legs of a dense track are those of its thinned one."""
+    # The legs of a dense track are those of one thinned to a least distance.
+    ground = ground_track(placed)
     spaced: list[int] = []
     for i, point in enumerate(ground):
         if not spaced or np.hypot(*(point - ground[spaced[-1]])) >= _THINNED_M:
             spaced.append(i)
-    return ground[spaced] if spaced else np.zeros((0, 2))
+    return {
+        "id": vehicle,
+        "frames": shown,
+        **_flown(ground[spaced] if spaced else np.zeros((0, 2)), times),
+        **_ranges(height_m=[s.height_m for s in samples], pitch_deg=[s.pitch_deg for s in samples]),
+    }
 
 
 def _flown(ground: NDArray[np.float64], times: Sequence[float]) -> dict[str, Any]:

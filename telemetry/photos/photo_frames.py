@@ -189,7 +189,12 @@ def decide(photos: Sequence[Photo], course_deg: Array, vehicle: str) -> Decided:
     flight = _filled("flight", [p.flight_deg for p in photos], 2, findings)
     _repair_upside_down(camera, findings)
     yaw, origin = _choose_yaw(camera[:, 0], flight[:, 0], course_deg, photos, findings)
-    _note_oblique(camera[:, 1], findings)
+    pitch = camera[:, 1]
+    known = pitch[np.isfinite(pitch)]
+    off = float(np.median(np.abs(known + 90.0))) if len(known) else 0.0
+    if off > 5.0:
+        text = f"the camera looks {off:.0f} degrees off nadir (median of the recorded pitch)"
+        findings.append(Finding("oblique", text))
     angles: list[Angles] = [
         (_or_none(y), _or_none(p), _or_none(r)) for y, p, r in zip(wrap_deg(yaw), camera[:, 1], camera[:, 2])
     ]
@@ -314,11 +319,3 @@ def check_legs(yaw_deg: Array, legs: Sequence[Straight], vehicle: str) -> list[F
 def _circular_mean_deg(angle: Array) -> float:
     known = np.radians(angle[np.isfinite(angle)])
     return float(np.degrees(np.angle(np.exp(1j * known).sum()))) if len(known) else float("nan")
-
-
-def _note_oblique(pitch: Array, findings: list[Finding]) -> None:
-    known = pitch[np.isfinite(pitch)]
-    off = float(np.median(np.abs(known + 90.0))) if len(known) else 0.0
-    if off > 5.0:
-        text = f"the camera looks {off:.0f} degrees off nadir (median of the recorded pitch)"
-        findings.append(Finding("oblique", text))

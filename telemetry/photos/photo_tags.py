@@ -25,8 +25,7 @@ from telemetry.samples.sample import is_position
 from telemetry.samples.times import ZONE_UNKNOWN, epoch_of, parse_time
 from telemetry.samples.unreadable import Unreadable, read_or_reason
 
-Run = Callable[..., Iterator[Any]]
-"""Maps a function over items, in order."""
+Run = Callable[..., Iterator[Any]]  # maps a function over items, in order
 
 HEMISPHERE_UNKNOWN = "without hemisphere, taken as north and east"
 """End of the origin of a position whose signs are not known."""

@@ -221,8 +221,7 @@ def extract(
     Args:
         name: of the video relative to the inputs; names its folder in `cache`, the folder for the pictures.
         poses: of its pictures, including those from other files; None for those in the file itself.
-        every_m: spacing in metres. every_s: in seconds.
-        progress: called with pictures decoded and their number.
+        every_m: spacing in metres. every_s: in seconds. progress: called with pictures decoded and their number.
         found: the file's metadata if it was scanned already.
         vehicle: id of the vehicle if the metadata names none; None for the file's name.
 

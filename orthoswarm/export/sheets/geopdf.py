@@ -28,8 +28,7 @@ _FOOT_MM: Final = 46.0
 _SCALES: Final = tuple(int(m * 10**k) for k in range(2, 6) for m in (1, 1.5, 2, 2.5, 3, 4, 5, 7.5))
 _STEPS_M: Final = tuple(m * 10**k for k in range(5) for m in (1, 2, 5))
 _STEP_MM: Final = 30.0
-_MOST_LINES: Final = 3
-"""Of the statement on accuracy: so many leave room for the scale bar above the page's edge."""
+_MOST_LINES: Final = 3  # of the statement on accuracy: so many leave room for the scale bar above the page's edge
 _INK, _GRID, _MARK = (20, 24, 28), (28, 100, 176), (214, 64, 159)
 
 

@@ -21,8 +21,7 @@ EXTENSIONS: Final = [
 ]
 _COG: Final = "image/tiff; application=geotiff; profile=cloud-optimized"
 _COLOURS: Final = ("red", "green", "blue", "alpha")
-SURFACE: Final = "dsm.tif"
-"""Its name in a pack, whatever the run was asked to write."""
+SURFACE: Final = "dsm.tif"  # its name in a pack, whatever the run was asked to write
 _SURFACE_BANDS: Final = (("height", "m"), ("sigma", "m"), ("pairs", None))
 
 
@@ -172,8 +171,7 @@ def surface_assets(folder: Path, document: Path) -> dict[str, Any]:
 
 # -- outlines in GeoJSON (RFC 7946) ------------------------------------------------------------------------------------
 
-_DECIMALS = 8
-"""Of degrees: a millimetre."""
+_DECIMALS = 8  # of degrees: a millimetre
 
 
 def outline(lat_lon: ArrayLike) -> dict[str, Any]:

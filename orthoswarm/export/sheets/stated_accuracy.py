@@ -19,8 +19,7 @@ class StatedAccuracy:
     values: dict[str, float | int | str]  # for programs, lengths in metres
 
 
-_LAYERS = ("orthoimage", "coarse", "realtime")
-"""From the last stage to the first."""
+_LAYERS = ("orthoimage", "coarse", "realtime")  # from the last stage to the first
 
 
 def stated_accuracy(folder: Path, layer: str = "") -> StatedAccuracy | None:

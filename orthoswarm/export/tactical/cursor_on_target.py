@@ -21,12 +21,10 @@ from orthoswarm.export.tactical.places import Place, utc_text
 from orthoswarm.export.xml_elements import element, xml_bytes
 from orthoswarm.model.errors import InputError, OrthoSwarmError
 
-_TYPES: Final = {"vehicle": "a-f-A-M-H-Q", "find": "b-m-p-s-m"}
-"""Friendly unmanned rotary wing; spot map marker."""
+_TYPES: Final = {"vehicle": "a-f-A-M-H-Q", "find": "b-m-p-s-m"}  # friendly unmanned rotary wing; spot map marker
 _UNKNOWN: Final = "9999999.0"
 _STALE_S: Final = {"vehicle": 30.0, "find": 7 * 86_400.0}
-_MAGENTA: Final = "-65281"
-"""ARGB of a find's marker as a signed 32-bit integer."""
+_MAGENTA: Final = "-65281"  # ARGB of a find's marker as a signed 32-bit integer
 _HOPS: Final = 1
 _WAIT_S: Final = 5.0
 

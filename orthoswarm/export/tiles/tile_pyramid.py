@@ -62,13 +62,11 @@ class ReducedRaster(contextlib.ExitStack):
 
 Tell = Callable[[int, int], None]
 SIDE: Final = 256
-_STEP: Final = 32
-"""Pixels between exactly transformed points: a tile bends by less than 1e-4 of a pixel between them."""
+_STEP: Final = 32  # pixels between exactly transformed points: a tile bends by less than 1e-4 of a pixel between them
 _BLOCK_ZOOMS: Final = 3
 _DEEPEST: Final = 23
 _ENCODERS: Final = 2
-_AHEAD: Final = 32
-"""Quads of 1 MB that wait to be encoded."""
+_AHEAD: Final = 32  # quads of 1 MB that wait to be encoded
 
 
 @dataclass(frozen=True, slots=True)
@@ -335,8 +333,7 @@ class _Drawing:
 # -- drawing ------------------------------------------------------------------------------------------------------
 
 _LEAST_WEIGHT: Final = 1e-5
-_FAR: Final = -1e9
-"""A place outside every raster, for points that the source's system does not have."""
+_FAR: Final = -1e9  # A place outside every raster, for points that the source's system does not have
 
 
 def _warp(raster: Any, nodes: Array, step: int) -> Bytes | None:

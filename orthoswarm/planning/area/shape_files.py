@@ -95,8 +95,7 @@ def ring(points: Any, name: str, least: int = 3) -> Ring:
     """A ring or line of (latitude, longitude) degrees, checked; closing and repeated points dropped.
 
     Args:
-        points: array-like (n, 2).
-        name: how to call the source in an error.
+        points: array-like (n, 2). name: how to call the source in an error.
         least: points that must remain: 3 for a ring (which then is not closed), 2 for a line.
 
     Raises:

@@ -43,7 +43,8 @@ def cells(ground: Geometry) -> list[Geometry]:
         cuts = [_cut(polygon, corner) for corner in critical_points(polygon)]
         lines = shapely.union_all([polygon.boundary, *[c for c in cuts if c is not None]], grid_size=_SNAP_M)
         for cell in shapely.get_parts(shapely.polygonize(shapely.get_parts(lines))):
-            if shapely.contains_xy(polygon, *_point_in(cell)):
+            point = shapely.point_on_surface(cell)
+            if shapely.contains_xy(polygon, *(point.x, point.y)):
                 found.append(shapely.transform(cell, tilt.to_grid))
     return found
 
@@ -60,11 +61,6 @@ def critical_points(polygon: Geometry) -> Array:
         reflex = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0] < 0
         found.append(at[reflex & (before[:, 0] * after[:, 0] < 0)])
     return np.concatenate(found)
-
-
-def _point_in(cell: Geometry) -> tuple[float, float]:
-    point = shapely.point_on_surface(cell)
-    return point.x, point.y
 
 
 def _cut(polygon: Geometry, corner: Array) -> Geometry:
@@ -100,10 +96,8 @@ def bcd_legs(field: Field, angle_rad: float, foot: Footprint, router: Router, mu
     """Legs of all cells in flying order.
 
     Args:
-        field: ground and obstacles, grid metres.
-        angle_rad: direction of the sweep, from grid east, counter-clockwise.
-        foot: footprint of the narrowest camera.
-        router: measures the ways between cells.
+        field: ground and obstacles, grid metres. angle_rad: direction of the sweep, from grid east, counter-clockwise.
+        foot: footprint of the narrowest camera. router: measures the ways between cells.
         multiple: make the number of lines a multiple of this, by laying them closer.
 
     Returns:

@@ -59,10 +59,8 @@ def candidates(
     Args:
         field: ground and obstacles, grid metres.
         vehicles: where few lines are shared by many vehicles, a multiple of them shares out more evenly.
-        foot: footprint of the narrowest camera.
-        method: how to lay and order lines.
-        turn_m: what a turn costs, in metres.
-        router: measures ways around obstacles.
+        foot: footprint of the narrowest camera. method: how to lay and order lines.
+        turn_m: what a turn costs, in metres. router: measures ways around obstacles.
         reach_m: how far pictures count beyond a leg's ends when looking for gaps.
         sweep_rad: direction of the sweep, across the lines, from grid east, counter-clockwise; None to try several.
         cross: each is followed by lines across its own.

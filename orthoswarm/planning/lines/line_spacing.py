@@ -54,10 +54,8 @@ def footprint(
     """The footprint of theta-hat, the field of view below the smallest that any camera of the swarm has (paper III.A).
 
     Args:
-        altitude_m: height of the legs above ground, metres.
-        fov_min_rad: theta-hat, horizontal, radians.
-        aspect: picture's width over its height.
-        side: overlap of neighbouring lines' pictures, 0 to 0.95.
+        altitude_m: height of the legs above ground, metres. fov_min_rad: theta-hat, horizontal, radians.
+        aspect: picture's width over its height. side: overlap of neighbouring lines' pictures, 0 to 0.95.
         forward: overlap of consecutive pictures, 0 to 0.95.
 
     Raises:

@@ -70,10 +70,8 @@ def mend(field: Field, legs: Array, foot: Footprint, *, router: Router, reach_m:
     Gaps arise beside obstacles with slanted walls, where a line must stop although its band's edge could go on.
 
     Args:
-        field: ground and obstacles, grid metres.
-        legs: float64 (n, 2, 2) in flying order.
-        foot: footprint of the narrowest camera.
-        router: measures detours.
+        field: ground and obstacles, grid metres. legs: float64 (n, 2, 2) in flying order.
+        foot: footprint of the narrowest camera. router: measures detours.
         reach_m: how far pictures count beyond a leg's ends.
         angle_rad: the sweep's direction, one of those tried for further legs.
     """
@@ -148,10 +146,8 @@ def insert(legs: Array, ways: Array, leg: Array, router: Router) -> tuple[Array,
     """Put a further leg, in its better direction, where the row grows least.
 
     Args:
-        legs: float64 (n, 2, 2) in flying order, at least one.
-        ways: float64 (n - 1,), lengths of the ways between them.
-        leg: float64 (2, 2).
-        router: measures ways around obstacles.
+        legs: float64 (n, 2, 2) in flying order, at least one. ways: float64 (n - 1,), lengths of the ways between them.
+        leg: float64 (2, 2). router: measures ways around obstacles.
 
     Returns:
         Legs and ways with the new one.

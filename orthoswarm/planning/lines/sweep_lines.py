@@ -81,8 +81,7 @@ def strip_legs(field: Field, box: tuple[float, float, float, float], foot: Footp
     Where an obstacle lies on the line, the leg ends before it and another begins behind it.
 
     Args:
-        field: ground and obstacles; lines run along y.
-        box: x0, y0, x1, y1.
+        field: ground and obstacles; lines run along y. box: x0, y0, x1, y1.
         foot: footprint; legs overshoot by what it needs and are at least a trigger distance long where there is room.
         merge_m: gaps between ground shorter than this are flown over with the camera on.
 

@@ -268,9 +268,7 @@ def separate(sorties: Sequence[Sequence[Maker]], motions: Sequence[Motion], apar
 
     Args:
         sorties: per vehicle and sortie, what makes its flight with the way out, and the way home, so many metres
-            higher than the legs.
-        motions: say where each vehicle is when.
-        apart: the distances to keep.
+            higher than the legs. motions: say where each vehicle is when. apart: the distances to keep.
     """
     usual = _Placing(sorties, motions, apart)
     if not usual.shares_starts:

@@ -84,13 +84,9 @@ def make_flight(
     """The flight over a row of legs.
 
     Args:
-        legs: float64 (n, 2, 2) in flying order.
-        home: float64 (2,).
-        heights: of the legs and of the ways between them.
-        router: finds ways around obstacles.
-        returns: fly back above home at the end.
-        out_m: how much higher the way out is.
-        home_m: how much higher the way home is.
+        legs: float64 (n, 2, 2) in flying order. home: float64 (2,). heights: of the legs and of the ways between them.
+        router: finds ways around obstacles. returns: fly back above home at the end.
+        out_m: how much higher the way out is. home_m: how much higher the way home is.
         run_in_m: length of a straight, in line with the leg, before its first picture; left out where an obstacle or
             the start lies in the way, and where the vehicle comes straight on.
     """

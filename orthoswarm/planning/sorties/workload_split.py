@@ -48,11 +48,8 @@ def cut(
     """A row of legs with places to cut.
 
     Args:
-        legs: float64 (n, 2, 2) in flying order.
-        router: measures the ways between legs.
-        motion: gives times.
-        shares: into how many pieces the row is meant to be cut.
-        least_m: shortest part of a leg.
+        legs: float64 (n, 2, 2) in flying order. router: measures the ways between legs. motion: gives times.
+        shares: into how many pieces the row is meant to be cut. least_m: shortest part of a leg.
         step_m: longest part; by default a small fraction of a share.
     """
     length = np.hypot(*(legs[:, 1] - legs[:, 0]).T)
@@ -182,12 +179,9 @@ def share(
     """Which parts each vehicle flies: begin and end (exclusive) per vehicle; None where the limits allow no way.
 
     Args:
-        row: the legs with places to cut.
-        vehicles: how many.
+        row: the legs with places to cut. vehicles: how many.
         starts: float64 (vehicles, 2), each vehicle's start; None puts it where its piece begins.
-        returns: vehicles fly back to their start.
-        router: measures the ways out and home.
-        motion: gives times.
+        returns: vehicles fly back to their start. router: measures the ways out and home. motion: gives times.
         limits: of a single flight; a piece may take several.
     """
     nothing = np.zeros((vehicles, len(row.parts)))
@@ -225,12 +219,8 @@ def sorties(
     """Fewest flights from one start that fly a whole row within the limits, evenly cut; None where there is no way.
 
     Args:
-        row: one vehicle's legs with places to cut.
-        start: float64 (2,).
-        returns: each flight goes back to the start.
-        router: measures the ways out and home.
-        motion: gives times.
-        limits: of each flight; one endurance.
+        row: one vehicle's legs with places to cut. start: float64 (2,). returns: each flight goes back to the start.
+        router: measures the ways out and home. motion: gives times. limits: of each flight; one endurance.
     """
     out = router.distances(start, row.parts[:, 0]) / motion.even_speed_m_s
     home = router.distances(start, row.parts[:, 1]) / motion.even_speed_m_s * returns

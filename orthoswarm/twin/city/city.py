@@ -33,8 +33,7 @@ def build_city(grid: GroundGrid, seed: int, *, relief_m: float = 0.0) -> tuple[S
     """A city on a texture grid, without cars, and its parking places.
 
     Args:
-        grid: from `scene_grid`.
-        seed: of the random city.
+        grid: from `scene_grid`. seed: of the random city.
         relief_m: smooth ground relief of about +-relief_m around height 0.
     """
     rng = np.random.default_rng([seed, 11])

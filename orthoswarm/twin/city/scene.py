@@ -8,12 +8,9 @@ from orthoswarm.model.arrays import Bytes, Floats
 from orthoswarm.model.geo import GroundGrid
 from orthoswarm.model.placement import Terrain
 
-TEXEL_M = 0.25
-"""Side of a texture pixel, metres."""
-CELL_M = 0.5
-"""Side of a cell of the height fields, metres: two texels."""
-TILE_CELLS = 16
-"""Cells along the side of a tile of the renderer's table of highest points."""
+TEXEL_M = 0.25  # side of a texture pixel, metres
+CELL_M = 0.5  # side of a cell of the height fields, metres: two texels
+TILE_CELLS = 16  # cells along the side of a tile of the renderer's table of highest points
 
 GRASS, ASPHALT, CONCRETE, SOIL, FIELD, WATER, ROOF, TREE, CAR, MARK, RUBBLE, PHOTO = range(12)
 """Kinds of surface; they decide texture, seasonal colour, and whether the surface moves (WATER)."""

@@ -13,8 +13,7 @@ from telemetry.samples.sample import Sample, checked
 from telemetry.samples.timeline import Timeline
 from telemetry.samples.unreadable import Unreadable
 
-Row = dict[str, Any]
-"""One record of a binary log."""
+Row = dict[str, Any]  # one record of a binary log
 
 
 LEAST_STEP_S = 0.04

@@ -24,8 +24,7 @@ _YAW_LOCK, _YAW_IN_VEHICLE, _YAW_IN_EARTH = 16, 32, 64
 _LEAST_HEIGHT_M = 0.5
 _DOWNWARD = 25
 _MOST_H_ACC_MM = 1_000_000
-_LOOKS_DOWN = 0.7
-"""Sine of 45 degrees: no airframe flies that far nose down."""
+_LOOKS_DOWN = 0.7  # sine of 45 degrees: no airframe flies that far nose down
 
 TYPES = frozenset(
     {
@@ -40,8 +39,7 @@ _TIMED = frozenset({"SYSTEM_TIME", "GLOBAL_POSITION_INT", "ATTITUDE", "ATTITUDE_
 """Types by which autopilots tell their time since boot."""
 _OF_AUTOPILOT = _TIMED | {"HOME_POSITION", "GPS_RAW_INT"}
 """Types that count only from the autopilot: a gimbal's ATTITUDE is not the airframe's, and MAVROS sends SYSTEM_TIME."""
-_NO_AUTOPILOT = 8
-"""MAV_AUTOPILOT_INVALID, which HEARTBEATs of everything but autopilots contain."""
+_NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID, which HEARTBEATs of everything but autopilots contain
 _NO_VEHICLES = frozenset({6, 26, 30})
 """MAV_TYPE of ground stations, gimbals and cameras, some of which fill in an autopilot nevertheless."""
 

@@ -10,8 +10,7 @@ from collections import deque
 from dataclasses import dataclass, field
 from typing import Final
 
-AUTOPILOT: Final = 1
-"""MAV_COMP_ID_AUTOPILOT1. Component 0, of messages that came over no link, counts as it."""
+AUTOPILOT: Final = 1  # MAV_COMP_ID_AUTOPILOT1. Component 0, of messages that came over no link, counts as it.
 
 _ANY, _ID_ONLY, _POSITIONED, _FLIES, _BY_ID = range(1, 6)
 """What makes a component the autopilot, from weak to strong: nothing better was heard; its id is an autopilot's; it
@@ -21,10 +20,8 @@ _SAME_CLOCK_S = 0.25
 """A component whose clock differs by less keeps the autopilot's: arrivals of a radio link tell no better."""
 _CLOCK_STEP_S = 2.0
 """A change of the difference beyond this is a restart of the component, or one message that came late."""
-_SMOOTHED = 50
-"""Messages over which the difference is averaged: quartz clocks drift by milliseconds in that time."""
-_REMEMBERED = 1000
-"""Pictures whose numbers and times are remembered, to tell old ones from those of a restarted camera."""
+_SMOOTHED = 50  # messages over which the difference is averaged: quartz clocks drift by milliseconds in that time
+_REMEMBERED = 1000  # pictures whose numbers and times are remembered, to tell old ones from those of a restarted camera
 
 
 @dataclass(slots=True)

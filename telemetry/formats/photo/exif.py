@@ -29,8 +29,7 @@ DATE_ORIGINAL, OFFSET_TIME, OFFSET_ORIGINAL, SUBSEC, SUBSEC_ORIGINAL = 0x9003, 0
 MAKER_NOTE, FOCAL_MM, FOCAL_PLANE_X, FOCAL_PLANE_UNIT = 0x927C, 0x920A, 0xA20E, 0xA210
 PIXEL_X, FOCAL_35MM, DIGITAL_ZOOM = 0xA002, 0xA405, 0xA404
 
-_WRITTEN_CHARACTERS = 19
-"""Length of a time in EXIF, without the zero after it."""
+_WRITTEN_CHARACTERS = 19  # length of a time in EXIF, without the zero after it
 
 _LARGE_MAIN = frozenset({XMP})
 _LARGE_EXIF = frozenset({MAKER_NOTE})
@@ -200,8 +199,7 @@ def exposure_time(exif: Exif) -> tuple[float, str] | None:
 
 
 _DAY_S, _QUARTER_S, _MOST_LAG_S = 86_400.0, 900.0, 120.0
-_WEST, _EAST = -11 * 4, 14 * 4
-"""The time zones in which people live, in quarters of an hour east of UTC."""
+_WEST, _EAST = -11 * 4, 14 * 4  # the time zones in which people live, in quarters of an hour east of UTC
 _ROLLOVER_DAYS = 1024 * 7
 """A receiver that counts weeks with ten bits is early by so much when they overflow (IS-GPS-200, 20.3.3.3.1.1)."""
 _YEAR_DAYS = 366

@@ -162,7 +162,11 @@ def _read(path: Path, header_at: int, layout: _Layout, title: str) -> PoseTable:
     named = [line for line in found if line is not None]
     marks = layout.separator != "," and not any(map(_has_point, named))
     for line in named:
-        _add_row(table, _with_points(line, marks, layout.separator))
+        replaced = _NUMBERS if marks else frozenset()
+        if layout.separator != ",":  # the comma before fractions of a second says nothing about other numbers
+            replaced = replaced | {"time"}
+        cells = {key: _COMMA.sub(".", cell) if key in replaced else cell for key, cell in line.cells.items()}
+        _add_row(table, _Line(line.name, cells, line.factors))
     unclear = table.useless
     if "lat_deg" not in layout.keys:
         to_geographic(table, _projection(path, lines[: header_at + 1], table), path)
@@ -244,19 +248,6 @@ def _is_shifted(separator: str, found: Mapping[str, str], extra: Sequence[str]) 
 def _has_point(line: _Line) -> bool:
     """Whether a number of a line has a decimal point; the point in 1.047,5 divides thousands."""
     return any(_POINT.search(cell) and not _COMMA.search(cell) for key, cell in line.cells.items() if key in _NUMBERS)
-
-
-def _with_points(line: _Line, marks: bool, separator: str) -> _Line:
-    """A line with points for decimal commas.
-
-    line: as written. marks: the commas in the table's numbers are decimal marks. separator: between cells.
-    """
-    replaced = _NUMBERS if marks else frozenset()
-    if separator != ",":  # the comma before fractions of a second says nothing about other numbers
-        replaced = replaced | {"time"}
-    return _Line(
-        line.name, {k: _COMMA.sub(".", c) if k in replaced else c for k, c in line.cells.items()}, line.factors
-    )
 
 
 def _add_row(table: PoseTable, line: _Line) -> None:

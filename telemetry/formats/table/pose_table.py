@@ -11,8 +11,7 @@ from orthoswarm.raster.picture_file import PICTURE_SUFFIXES
 from telemetry.samples.sample import Sample
 from telemetry.samples.unreadable import MOST_TEXT_BYTES
 
-_MOST_FOLDERS = 64
-"""Folders of a path that may be left out: more are no path."""
+_MOST_FOLDERS = 64  # folders of a path that may be left out: more are no path
 
 
 class PoseTable(dict[str, Sample]):
@@ -56,8 +55,7 @@ def leave_out_folder(table: PoseTable, pictures: Collection[str]) -> str:
 
     Args:
         table: no name of which is a picture's. Changed where leaving out the first folders that all rows share makes
-            most of its paths those of pictures.
-        pictures: paths relative to the table's folder.
+            most of its paths those of pictures. pictures: paths relative to the table's folder.
 
     Returns:
         the folders that were left out, with a slash at the end; "" if nothing matched.

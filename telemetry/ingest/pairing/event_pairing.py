@@ -224,15 +224,11 @@ def _parts_between_jumps(photos: Array, events: Array) -> list[slice]:
     starts = [0]
     for before, after in pairwise(clocks):
         if abs(after - before) > allowed:
-            starts.append(_first_after(photos, events, before, after, starts[-1]))
+            start = starts[-1]  # under the clock of their part photos are nearest to events
+            far = SAME_EXPOSURE_SHARE * float(np.median(np.diff(events)))
+            own, other = (np.minimum(_apart(photos[start:] - clock, events), far) for clock in (before, after))
+            starts.append(start + int(np.argmin(np.concatenate([[0.0], np.cumsum(own - other)]))))
     return [slice(a, b) for a, b in zip(starts, [*starts[1:], count], strict=True) if b > a]
-
-
-def _first_after(photos: Array, events: Array, before: float, after: float, start: int) -> int:
-    """Index of the first photo of the later clock: under the clock of their part photos are nearest to events."""
-    far = SAME_EXPOSURE_SHARE * float(np.median(np.diff(events)))
-    own, other = (np.minimum(_apart(photos[start:] - clock, events), far) for clock in (before, after))
-    return start + int(np.argmin(np.concatenate([[0.0], np.cumsum(own - other)])))
 
 
 def _apart(times: Array, events: Array) -> Array:

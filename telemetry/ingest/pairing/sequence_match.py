@@ -24,8 +24,7 @@ from telemetry.ingest.pairing.sequence_model import (
     posterior,
 )
 
-Clock = tuple[float, float]
-"""Offset in seconds and drift."""
+Clock = tuple[float, float]  # offset in seconds and drift
 
 CERTAIN: Final = 1.0 - 1e-4  # probability from which on a pairing counts as certain
 _OTHER_CLOCK_INTERVALS: Final = 10.0  # clocks that differ by more usual intervals are two ways to pair a flight
@@ -289,11 +288,6 @@ def _plausible(model: SequenceModel) -> tuple[SequenceModel, list[Clock]]:
     return model, windows
 
 
-def _window(model: SequenceModel, centre: Clock) -> ClockGrid:
-    """A fine grid of clocks around one."""
-    return clock_grid(model, *centre, 2.0 * FIRST_JITTER_S + 0.3 * _reach_s(model), _WINDOW_DRIFT_S)
-
-
 def _inside(model: SequenceModel, centre: Clock, offset: Array, drift: Array, *, share: float = 1.0) -> Flags:
     """Which clocks lie in a share of the window around one."""
     half = max(0.5 * float(np.ptp(model.e)), 1e-3)
@@ -336,7 +330,7 @@ def _probabilities(model: SequenceModel, windows: list[Clock]) -> tuple[Indices,
     """
     scored = []
     for number, centre in enumerate(windows):
-        grid = _window(model, centre)
+        grid = clock_grid(model, *centre, 2.0 * FIRST_JITTER_S + 0.3 * _reach_s(model), _WINDOW_DRIFT_S)
         fresh = np.ones(len(grid.offset), dtype=bool)
         for other in windows[:number]:
             fresh &= ~_inside(model, other, grid.offset, grid.drift)
