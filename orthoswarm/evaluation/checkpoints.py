@@ -16,7 +16,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import numpy as np
 
@@ -43,18 +43,6 @@ RECEIVERS_LOCAL_SIGMA_M: Final = 0.4
 sigma and 90 to 100 % within two."""
 _ONE_PLACE_M: Final = 0.05  # checkpoint within this distance of a control point is that point (as surveys differ) ...
 _SAME_NAME_M: Final = 10.0  # ... and within this one if it has its name
-
-
-class Surveyed(Protocol):
-    """A point with its name and its place: longitude and latitude in degrees."""
-
-    @property
-    def name(self) -> str:
-        """Name of the point."""
-
-    @property
-    def surveyed(self) -> Any:
-        """Longitude and latitude (2,)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,13 +140,9 @@ class CheckpointAccuracy:
 
 
 def evaluate_checkpoints(
-    out: Path,
-    table: Path,
-    pixel_scale: float = 1.0,
-    ground_z_m: float | None = None,
-    *,
-    control: Sequence[Surveyed] | None = None,
-) -> CheckpointAccuracy:
+    out: Path, table: Path, pixel_scale: float = 1.0, ground_z_m: float | None = None, *,
+    control: Sequence[Checkpoint] | None = None,
+) -> CheckpointAccuracy:  # fmt: skip
     """Errors of a product at surveyed points.
 
     Args:
@@ -218,11 +202,11 @@ def evaluate_checkpoints(
     )
 
 
-def _control_of(folder: Path) -> Sequence[Surveyed]:
+def _control_of(folder: Path) -> Sequence[Checkpoint]:
     """The control points of a map; none where it has no report that can be read (see _Views.read for its message)."""
     try:
-        report = json.loads((folder / "report.json").read_text("utf-8"))
-        return control_of_report(report.get("control_points") or [])
+        rows = json.loads((folder / "report.json").read_text("utf-8")).get("control_points") or []
+        return [Checkpoint(str(row["name"]), np.array([row["lon_deg"], row["lat_deg"]], float)) for row in rows]
     except (OSError, ValueError, AttributeError, KeyError, TypeError):
         return []
 
@@ -236,28 +220,22 @@ def read_checkpoints(table: Path, pixel_scale: float = 1.0) -> list[Checkpoint]:
     lines = [line for line in lines if line.strip() and not line.startswith("#")]
     if not lines:
         raise InputError(f"{table.name} holds no points")
-    scaled = _Scale(pixel_scale)
     separator = max(";,", key=lines[0].count)
     if separator not in lines[0]:
-        points = _gcp_list(lines, table.name, scaled)
+        points = _gcp_list(lines, table.name, pixel_scale)
     else:
-        points = _csv(lines, table.name, scaled, separator)
+        points = _csv(lines, table.name, pixel_scale, separator)
     if not points:
         raise InputError(f"{table.name} holds no points below its first line")
     return points
 
 
-@dataclass(frozen=True, slots=True)
-class _Scale:
-    """From pixels of the photos in which points were measured to those of the mapped photos."""
-
-    factor: float
-
-    def mark(self, image: str, column: float, row: float) -> Mark:
-        return Mark(image, (column + 0.5) * self.factor - 0.5, (row + 0.5) * self.factor - 0.5)
+def _mark(scale: float, image: str, column: float, row: float) -> Mark:
+    """A mark in the mapped photo; scale: its pixels to one of the photo in which the point was measured."""
+    return Mark(image, (column + 0.5) * scale - 0.5, (row + 0.5) * scale - 0.5)
 
 
-def _gcp_list(lines: Sequence[str], name: str, scale: _Scale) -> list[Checkpoint]:
+def _gcp_list(lines: Sequence[str], name: str, scale: float) -> list[Checkpoint]:
     """ODM's gcp_list.txt; lines with the same coordinates, and name if there are names, are one point."""
     system = lines[0].strip()
     points: list[Checkpoint] = []
@@ -272,13 +250,12 @@ def _gcp_list(lines: Sequence[str], name: str, scale: _Scale) -> list[Checkpoint
         key = words[6] if len(words) > 6 else f"{words[0]} {words[1]}"
         written = Coordinates(east, north, system)
         place, doubt = _in_degrees(written, name)
-        point = Checkpoint(key, place, written=written, doubt=doubt)
-        point.marks.append(scale.mark(image, column, row))
-        points.append(point)
+        marks = [_mark(scale, image, column, row)]
+        points.append(Checkpoint(key, place, marks=marks, written=written, doubt=doubt))
     return _merged(points)
 
 
-def _csv(lines: Sequence[str], name: str, scale: _Scale, separator: str) -> list[Checkpoint]:
+def _csv(lines: Sequence[str], name: str, scale: float, separator: str) -> list[Checkpoint]:
     points: list[Checkpoint] = []
     for number, row in enumerate(csv.DictReader(lines, skipinitialspace=True, delimiter=separator), 2):
         cells = {(key or "").strip().lower(): (value or "").strip() for key, value in row.items() if key is not None}
@@ -297,10 +274,11 @@ def _csv(lines: Sequence[str], name: str, scale: _Scale, separator: str) -> list
             title = cells.get("name") or f"{surveyed[1]:.7f} {surveyed[0]:.7f}"
             point = Checkpoint(title, surveyed, sigma_m, on_map=on_map, written=written, doubt=doubt)
             if cells.get("image"):
-                point.marks.append(scale.mark(cells["image"], _number(cells["column"]), _number(cells["row"])))
+                point.marks.append(_mark(scale, cells["image"], _number(cells["column"]), _number(cells["row"])))
         except (KeyError, ValueError) as error:
+            reason = f"column {error} is missing" if isinstance(error, KeyError) else str(error)
             raise InputError(
-                f"{name}, line {number}: {_reason(error)}; columns are name, lat_deg, lon_deg (or east_m, north_m, "
+                f"{name}, line {number}: {reason}; columns are name, lat_deg, lon_deg (or east_m, north_m, "
                 "epsg), sigma_m, and image, column, row (or map_lat_deg, map_lon_deg)"
             ) from None
         points.append(point)
@@ -337,10 +315,6 @@ def _coordinates(cells: Mapping[str, str], prefix: str) -> Coordinates | None:
         system = f"EPSG:{int(cells['epsg'])}"
         return Coordinates(_number(cells[f"{prefix}east_m"]), _number(cells[f"{prefix}north_m"]), system)
     return None
-
-
-def _reason(error: Exception) -> str:
-    return f"column {error} is missing" if isinstance(error, KeyError) else str(error)
 
 
 def _number(text: str) -> float:
@@ -422,15 +396,7 @@ class _Views:
         return Ray(row["image"], position, away / np.linalg.norm(away), pixel_rad, float(own or 0.0))
 
 
-@dataclass(frozen=True, slots=True)
-class KnownPoint:
-    """A surveyed point as a report holds it."""
-
-    name: str
-    surveyed: tuple[float, float]
-
-
-def control_rows(points: Iterable[Surveyed]) -> list[dict[str, Any]]:
+def control_rows(points: Iterable[Checkpoint]) -> list[dict[str, Any]]:
     """`control_points` of report.json."""
     return [
         {"name": point.name, "lat_deg": float(point.surveyed[1]), "lon_deg": float(point.surveyed[0])}
@@ -438,23 +404,17 @@ def control_rows(points: Iterable[Surveyed]) -> list[dict[str, Any]]:
     ]
 
 
-def control_of_report(rows: Iterable[dict[str, Any]]) -> list[KnownPoint]:
-    """The points of such rows."""
-    return [KnownPoint(str(row["name"]), (float(row["lon_deg"]), float(row["lat_deg"]))) for row in rows]
-
-
-def shared_points(checkpoints: Sequence[Surveyed], control: Sequence[Surveyed], table: str) -> list[str]:
+def shared_points(checkpoints: Sequence[Checkpoint], control: Sequence[Checkpoint], table: str) -> list[str]:
     """Names of the checkpoints that are control points: at the same place, or near by with the same name.
 
-    A name alone does not tell: many a table counts its points from 1.
-
-    Args:
-        checkpoints: those of a table. control: the points that placed the map. table: its name, for the message.
-
-    Raises:
-        InputError: all of them are.
+    A name alone does not tell: many a table counts its points from 1. Raises InputError: all of the `table` are.
     """
-    shared = [point.name for point in checkpoints if any(_same(point, other) for other in control)]
+
+    def same(point: Checkpoint, other: Checkpoint) -> bool:
+        away = away_m(point.surveyed, other.surveyed)
+        return away <= (_SAME_NAME_M if point.name == other.name else _ONE_PLACE_M)
+
+    shared = [point.name for point in checkpoints if any(same(point, other) for other in control)]
     if checkpoints and len(shared) == len(checkpoints):
         raise InputError(
             f"all points of {table} are control points, which tell nothing about the map's error; keep some points out "
@@ -472,8 +432,3 @@ def shared_warning(shared: Sequence[str], count: int) -> list[str]:
         f"{len(shared)} of {count} checkpoints were left out, as they are control points ({names}): the map was placed "
         "on them"
     ]
-
-
-def _same(point: Surveyed, other: Surveyed) -> bool:
-    away = away_m(np.asarray(point.surveyed), np.asarray(other.surveyed))
-    return away <= (_SAME_NAME_M if point.name == other.name else _ONE_PLACE_M)

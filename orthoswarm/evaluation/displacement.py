@@ -180,26 +180,17 @@ def displacement_field(
     return Displacements(table[:, :2], table[:, 2:4], table[:, 4], table[:, 5])
 
 
-@dataclass(frozen=True, slots=True)
-class Completeness:
-    """What share of the ground an orthoimage covers."""
-
-    share: float  # covered share of the reference's valid ground within the convex hull of the orthoimage's coverage
-    area_m2: float  # ground that the orthoimage covers
-
-
-def completeness(ortho_valid: Mask, reference_valid: Mask, gsd_m: float) -> Completeness:
+def completeness(ortho_valid: Mask, reference_valid: Mask) -> float:
     """Covered share of the reference's valid ground inside the hull of the orthoimage's own coverage."""
     import cv2
 
     points = cv2.findNonZero(ortho_valid.astype(np.uint8))
     if points is None:
-        return Completeness(0.0, 0.0)
+        return 0.0
     hull = np.zeros(ortho_valid.shape, np.uint8)
     cv2.fillConvexPoly(hull, cv2.convexHull(points), 1)
     ground = (hull > 0) & reference_valid
-    covered = float((ground & ortho_valid).sum())
-    return Completeness(covered / max(float(ground.sum()), 1.0), float(ortho_valid.sum()) * gsd_m**2)
+    return float((ground & ortho_valid).sum()) / max(float(ground.sum()), 1.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -227,48 +218,29 @@ class Accuracy:
         return {n: (None if isinstance(v, float) and not np.isfinite(v) else v) for n, v in values.items()}
 
 
-def accuracy(displacements: Displacements, cover: Completeness, step_px: float) -> Accuracy:
-    """The figures of a field of displacements.
+def accuracy(displacements: Displacements, complete: float, step_px: float) -> Accuracy:
+    """The figures of a field of displacements of all covered blocks; step_px: distance of neighbouring blocks.
 
-    Args:
-        displacements: of all covered blocks. cover: completeness.
-        step_px: distance of neighbouring blocks in pixels of the positions.
+    Where no block is matched, displacements are NaN.
     """
     length, matched = displacements.length_m, displacements.matched
-    count = len(matched)
-    nan = float("nan")
-    if not len(length):
-        return Accuracy(
-            median_m=nan,
-            p90_m=nan,
-            p95_m=nan,
-            max_m=nan,
-            mean_east_m=nan,
-            mean_north_m=nan,
-            unmatched_share=1.0,
-            share_within_1m=0.0,
-            blocks=count,
-            completeness=cover.share,
-            sharpness=nan,
-            seam_p95_m=nan,
-            field=displacements,
-        )
-    p50, p90, p95 = (float(x) for x in np.percentile(length, [50, 90, 95]))
-    east, north = (float(x) for x in displacements.shift_m[matched].mean(0))
+    count, found = len(matched), len(length) > 0
+    east, north = displacements.shift_m[matched].mean(0).tolist() if found else (np.nan, np.nan)
+    p50, p90, p95, most = np.percentile(length, [50, 90, 95, 100]).tolist() if found else [np.nan] * 4
     jumps = np.array(list(_jumps(displacements, step_px)))
     return Accuracy(
         median_m=p50,
         p90_m=p90,
         p95_m=p95,
-        max_m=float(length.max()),
+        max_m=most,
         mean_east_m=east,
         mean_north_m=north,
-        unmatched_share=1.0 - len(length) / count,
-        share_within_1m=float((length <= 1.0).sum()) / count,
+        unmatched_share=1.0 - len(length) / count if found else 1.0,
+        share_within_1m=float((length <= 1.0).sum()) / max(count, 1),
         blocks=count,
-        completeness=cover.share,
-        sharpness=float(np.median(displacements.contrast[matched])),
-        seam_p95_m=float(np.percentile(jumps, 95)) if len(jumps) else nan,
+        completeness=complete,
+        sharpness=float(np.median(displacements.contrast[matched])) if found else np.nan,
+        seam_p95_m=float(np.percentile(jumps, 95)) if len(jumps) else np.nan,
         field=displacements,
     )
 

@@ -3,7 +3,7 @@
 import csv
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -207,7 +207,8 @@ def pose_errors(
         middle = np.array(true.lens.principal_point)
         center[i] = _apply(frame.homography, middle) - true.to_ground(middle, true_ground_z_m)
         down = true.position - np.array([0, 0, 1.0])
-        pinhole = Camera(true.position, true.rotation, _without_distortion(true.lens))
+        undistorted = replace(true.lens, k1=0.0, k2=0.0, k3=0.0)
+        pinhole = Camera(true.position, true.rotation, undistorted)
         nadir[i] = _apply(frame.homography, pinhole.project(down)) - true.position[:2]
         sigma[i] = np.nan if frame.sigma_m is None else frame.sigma_m
         if frame.fov_deg is None:
@@ -234,7 +235,3 @@ def pose_errors(
 def _apply(homography: Array, pixel: Array) -> Array:
     p = homography @ np.array([pixel[0], pixel[1], 1.0])
     return np.asarray(p[:2] / p[2])
-
-
-def _without_distortion(lens: Lens) -> Lens:
-    return Lens(lens.width, lens.height, lens.focal_px, cx=lens.cx, cy=lens.cy)
