@@ -45,6 +45,8 @@ def write_change(
     Raises:
         OrthoSwarmError: if the disk is full or the folder cannot be written.
     """
+    from shapely import MultiPolygon
+
     folder.mkdir(parents=True, exist_ok=True)
     _write_raster(folder / RASTER, found)
     rows = [
@@ -53,17 +55,11 @@ def write_change(
         for one in objects
     ]  # fmt: skip
     with gpkg_file(folder / OBJECTS) as part:
-        shapes = np.array([_multi(one.outline) for one in objects], object)
+        shapes = np.array([MultiPolygon(getattr(one.outline, "geoms", [one.outline])) for one in objects], object)
         append_polygons(part, "change", shapes, rows=rows, columns=_COLUMNS, epsg=found.grid.epsg)
     figures = figures_of(found, objects) | {"basemap": basemap, "warnings": list(warnings)}
     write_json(folder / FIGURES, figures)
     return figures
-
-
-def _multi(outline: Any) -> Any:
-    import shapely
-
-    return outline if outline.geom_type == "MultiPolygon" else shapely.MultiPolygon([outline])
 
 
 def _write_raster(path: Path, found: ChangeMap) -> None:

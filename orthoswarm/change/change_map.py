@@ -153,17 +153,13 @@ def _measured_block(
         gray = shifted(gray, offset)
         before = structure(gray, pixels.gsd_m)
     block = Block(seen, before, gray, valid, cell_looks(picture), cell_looks(fine), drawn, per_cell, cell)
-    height = _above_ground(own, terrain)
+    height = np.zeros(drawn.shape, np.float32)
+    if terrain.bare is not None:
+        height = heights_on(own, terrain, terrain.z - terrain.bare)
     inner = np.s_[_MARGIN:-_MARGIN, _MARGIN:-_MARGIN]
     found = Measured(*(part[inner] for part in measured(block, tone)))
     hidden = hidden_on_map(height, scene.lean, cell)
     return MeasuredBlock(rows, columns, found, drawn[inner], hidden[inner], height[inner])
-
-
-def _above_ground(grid: GroundGrid, terrain: Terrain) -> Floats:
-    if terrain.bare is None:
-        return np.zeros((grid.height, grid.width), np.float32)
-    return heights_on(grid, terrain, terrain.z - terrain.bare)
 
 
 def _thinned(views: Sequence[View], terrain: Terrain) -> list[View]:

@@ -76,17 +76,15 @@ class ToneModel(NamedTuple):
         b, a = hue(before[both]), hue(now[both])
         step = max(1, len(b) // _SAMPLES)
         b, a = b[::step], a[::step]
-        design, weight = np.c_[np.ones(len(b)), b], np.ones(len(b))
-        linear = np.zeros((4, 3))
-        if len(b) >= _FEWEST:
-            for _ in range(8):
-                linear = np.linalg.lstsq(design * weight[:, None], a * weight[:, None], rcond=None)[0]
-                rest = a - design @ linear
-                spread = 1.48 * np.median(np.abs(rest), 0) + 0.01
-                weight = 1.0 / (1.0 + ((rest / spread / 2.0) ** 2).sum(1))
         if len(b) < _FEWEST:
             nothing = np.zeros((1, 3), np.float32)
-            return cls(linear.astype(np.float32), nothing, nothing, nothing + np.float32(np.inf))
+            return cls(np.zeros((4, 3), np.float32), nothing, nothing, nothing + np.float32(np.inf))
+        design, weight = np.c_[np.ones(len(b)), b], np.ones(len(b))
+        for _ in range(8):
+            linear = np.linalg.lstsq(design * weight[:, None], a * weight[:, None], rcond=None)[0]
+            rest = a - design @ linear
+            spread = 1.48 * np.median(np.abs(rest), 0) + 0.01
+            weight = 1.0 / (1.0 + ((rest / spread / 2.0) ** 2).sum(1))
         cv2.setRNGSeed(1)
         ends = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 20, 1e-3)
         _, label, classes = cv2.kmeans(b * _HUE_WEIGHT, _CLASSES, None, ends, 1, cv2.KMEANS_PP_CENTERS)

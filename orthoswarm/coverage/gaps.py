@@ -98,9 +98,12 @@ def find_gaps(
                 )
     if plan is not None:
         for vehicle in vehicles:
-            narrow = [
-                v for v in cover.views if v.vehicle == vehicle and _is_narrow(v.fov_rad, v.focal_sigma, plan.fov_rad)
-            ]
+            planned = math.tan(0.5 * plan.fov_rad)
+            narrow = [  # by more than two sigma, and half a percent
+                v for v in cover.views
+                if v.vehicle == vehicle
+                and math.tan(0.5 * v.fov_rad) < planned * (1.0 - max(0.005, 2.0 * v.focal_sigma))
+            ]  # fmt: skip
             if narrow:
                 wide = _would_see(cover, [v.with_fov(plan.fov_rad) for v in narrow])
                 explained.enter(missed & wide, Cause.NARROW_LENS, 0.9, vehicles.index(vehicle))
@@ -108,12 +111,6 @@ def find_gaps(
         explained.enter(missed, Cause.NOT_PLANNED, 0.9)
     explained.enter(missed, Cause.NOT_FLOWN, 0.5)
     return _polygons(cover, explained, vehicles, _SMALLEST_GAP_M2)
-
-
-def _is_narrow(fov_rad: float, focal_sigma: float, planned_rad: float) -> bool:
-    """Narrower than planned by more than two sigma (and half a percent)."""
-    planned, own = math.tan(0.5 * planned_rad), math.tan(0.5 * fov_rad)
-    return own < planned * (1.0 - max(0.005, 2.0 * focal_sigma))
 
 
 def _would_see(cover: CoverageGrid, views: Sequence[Any]) -> Flags:

@@ -143,20 +143,14 @@ class CameraEvent:
     position: Array | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Missing:
-    """Missing pictures."""
-
-    pictures: list[MissingPicture]  # missing pictures; those that have not arrived are named by their event's number
-    warnings: list[str]  # reasons why events could not be used
-
-
 def missing_by_events(
     views: Sequence[View], events: Iterable[CameraEvent], rejected: Iterable[Exposure] = ()
-) -> Missing:
+) -> tuple[list[MissingPicture], list[str]]:
     """Missing pictures of all vehicles; for vehicles without events only from holes in their legs.
 
     views: pictures that were placed. events: in any order. rejected: files that could not be used.
+
+    Returns the pictures, those that have not arrived named by their event's number, and why events could not be used.
     """
     lost = list(rejected)
     by_vehicle: dict[str, list[CameraEvent]] = defaultdict(list)
@@ -188,7 +182,7 @@ def missing_by_events(
         ]
     for vehicle in sorted(set(by_vehicle) - set(rows)):
         found += _none_arrived(vehicle, by_vehicle[vehicle], views)
-    return Missing(found, warnings)
+    return found, warnings
 
 
 def _none_arrived(vehicle: str, events: Sequence[CameraEvent], views: Sequence[View]) -> list[MissingPicture]:

@@ -34,7 +34,6 @@ _ROOF_SIGMAS: Final = 2.0  # ... if it also differs by more than so many standar
 class PatchTask:
     """A leg to be registered on the map; small, since it may be sent to another machine."""
 
-    vehicle: str
     leg: int  # its number
     frames: list[Frame]  # the leg's frames
     cameras: CameraBlock  # their coarse cameras
@@ -44,7 +43,6 @@ class PatchTask:
 class PatchFit:
     """Result of registering a leg's patch on the map."""
 
-    vehicle: str  # which leg
     leg: int  # which leg
     # float64 (3, 3), ground by the coarse cameras -> ground on the map, in metres relative to `centre`; None if the leg
     # was not found
@@ -94,7 +92,6 @@ def match_patch(task: PatchTask, *, basemap: MapWindow, origin: Array, options: 
                 homography = in_metres(found.homography, own, there, centre)
                 break
     return PatchFit(
-        vehicle=task.vehicle,
         leg=task.leg,
         homography=homography,
         centre=centre,

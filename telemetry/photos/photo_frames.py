@@ -6,7 +6,7 @@ as a single photo is ambiguous.
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Final
@@ -53,9 +53,8 @@ def frames_of(
     chosen: dict[int, tuple[Angles, str]] = {}
     for model in sorted({p.model for p in photos}):
         index = [i for i, p in enumerate(photos) if p.model == model]
-        decided = decide([photos[i] for i in index], course[index], vehicle)
-        findings += decided.findings
-        chosen.update((i, (angles, decided.yaw_origin)) for i, angles in zip(index, decided.angles, strict=True))
+        decided, yaw_origin = decide([photos[i] for i in index], course[index], vehicle, findings)
+        chosen.update((i, (angles, yaw_origin)) for i, angles in zip(index, decided, strict=True))
     yaw = np.array([math.nan if (y := chosen[i][0][0]) is None else y for i in range(len(photos))])
     findings += check_legs(yaw, straight_legs(ground, least_frames=4), vehicle)
     frames = []
@@ -170,35 +169,31 @@ def _heights(photos: Sequence[Photo], findings: list[Finding], vehicle: str) -> 
     return heights
 
 
-@dataclass(frozen=True, slots=True)
-class Decided:
-    """Yaw, pitch and roll of each photo in degrees (None where unknown), the yaw's source, and findings."""
-
-    angles: list[Angles]
-    yaw_origin: str
-    findings: list[Finding]
-
-
-def decide(photos: Sequence[Photo], course_deg: Array, vehicle: str) -> Decided:
+def decide(
+    photos: Sequence[Photo], course_deg: Array, vehicle: str, findings: list[Finding]
+) -> tuple[list[Angles], str]:
     """Choose the picture's angles for the photos of one vehicle and model.
 
-    photos: in order of time. course_deg: (N,) course over ground, NaN where unknown. vehicle: for messages.
+    photos: in order of time. course_deg: (N,) course over ground, NaN where unknown. findings: are appended here.
+
+    Returns yaw, pitch and roll of each photo in degrees (None where unknown), and the yaw's source.
     """
-    findings: list[Finding] = []
-    camera = _filled("gimbal", [p.camera_deg for p in photos], 1, findings)
-    flight = _filled("flight", [p.flight_deg for p in photos], 2, findings)
-    _repair_upside_down(camera, findings)
-    yaw, origin = _choose_yaw(camera[:, 0], flight[:, 0], course_deg, photos, findings)
+    found: list[Finding] = []
+    camera = _filled("gimbal", [p.camera_deg for p in photos], 1, found)
+    flight = _filled("flight", [p.flight_deg for p in photos], 2, found)
+    _repair_upside_down(camera, found)
+    yaw, origin = _choose_yaw(camera[:, 0], flight[:, 0], course_deg, photos, found)
     pitch = camera[:, 1]
     known = pitch[np.isfinite(pitch)]
     off = float(np.median(np.abs(known + 90.0))) if len(known) else 0.0
     if off > 5.0:
         text = f"the camera looks {off:.0f} degrees off nadir (median of the recorded pitch)"
-        findings.append(Finding("oblique", text))
+        found.append(Finding("oblique", text))
     angles: list[Angles] = [
         (_or_none(y), _or_none(p), _or_none(r)) for y, p, r in zip(wrap_deg(yaw), camera[:, 1], camera[:, 2])
     ]
-    return Decided(angles, origin, [replace(finding, vehicle=vehicle) for finding in findings])
+    findings += [replace(finding, vehicle=vehicle) for finding in found]
+    return angles, origin
 
 
 def _or_none(value: float) -> float | None:

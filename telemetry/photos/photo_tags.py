@@ -120,7 +120,10 @@ def read_photos(
         run: maps a function over items in processes, in order, where the photos are many and the disk is fast.
         progress: called with the number of photos done since the last call.
     """
-    chunks = [_chunk(paths[i : i + _CHUNK]) for i in range(0, len(paths), _CHUNK)]
+    chunks = []
+    for i in range(0, len(paths), _CHUNK):
+        own = paths[i : i + _CHUNK]
+        chunks.append((own, {path: file for path in own if is_stored(path) and (file := known(path)) is not None}))
     with ThreadPoolExecutor(max(1, workers)) as pool:
         for result in (run or pool.map)(_read_chunk, chunks):
             if progress is not None:
@@ -128,29 +131,14 @@ def read_photos(
             yield from result
 
 
-@dataclass(frozen=True, slots=True)
-class _Chunk:
-    """Photos to be read one after the other, and what is known about those in stores."""
-
-    paths: Sequence[Path]
-    stored: dict[Path, StoredFile]
-
-
-def _chunk(paths: Sequence[Path]) -> _Chunk:
-    found = ((path, known(path)) for path in paths if is_stored(path))
-    return _Chunk(paths, {path: file for path, file in found if file is not None})
-
-
-def _read_chunk(chunk: _Chunk) -> list[Photo | Unreadable | None]:
-    if not any(map(is_stored, chunk.paths)):
-        return list(map(_tags_or_reason, chunk.paths))
-    expect(chunk.stored)
+def _read_chunk(chunk: tuple[Sequence[Path], dict[Path, StoredFile]]) -> list[Photo | Unreadable | None]:
+    """Read photos one after the other, with what is known about those in stores."""
+    paths, stored = chunk
+    if not any(map(is_stored, paths)):
+        return [read_or_reason(read_photo, path) for path in paths]
+    expect(stored)
     with ThreadPoolExecutor(CONNECTIONS) as pool:  # a request mostly waits for the network
-        return list(pool.map(_tags_or_reason, chunk.paths))
-
-
-def _tags_or_reason(path: Path) -> Photo | Unreadable | None:
-    return read_or_reason(read_photo, path)
+        return list(pool.map(lambda path: read_or_reason(read_photo, path), paths))
 
 
 def tags_of(path: Path, container: Container) -> Photo:

@@ -153,10 +153,10 @@ def test_a_camera_follows_shift_turn_and_scale_of_its_ground(turn, scale, shift,
     ground = camera.to_ground(pixels)
     matrix = scale * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     corrected = (ground - camera.nadir) @ matrix.T + camera.nadir + shift
-    pose = fit_camera(camera, corrected, pixels)
-    assert pose.rms_m < 0.01
-    assert pose.camera.to_ground(pixels) == pytest.approx(corrected, abs=0.02)
-    assert pose.camera.position[2] == pytest.approx(80 * scale, rel=0.01)
+    moved, rms_m = fit_camera(camera, corrected, pixels)
+    assert rms_m < 0.01
+    assert moved.to_ground(pixels) == pytest.approx(corrected, abs=0.02)
+    assert moved.position[2] == pytest.approx(80 * scale, rel=0.01)
 
 
 def test_legs_that_were_not_found_lie_between_those_that_were():

@@ -165,8 +165,8 @@ def _read(path: Path, header_at: int, layout: _Layout, title: str) -> PoseTable:
         replaced = _NUMBERS if marks else frozenset()
         if layout.separator != ",":  # the comma before fractions of a second says nothing about other numbers
             replaced = replaced | {"time"}
-        cells = {key: _COMMA.sub(".", cell) if key in replaced else cell for key, cell in line.cells.items()}
-        _add_row(table, _Line(line.name, cells, line.factors))
+        pointed = {key: _COMMA.sub(".", cell) if key in replaced else cell for key, cell in line.cells.items()}
+        _add_row(table, _Line(line.name, pointed, line.factors))
     unclear = table.useless
     if "lat_deg" not in layout.keys:
         to_geographic(table, _projection(path, lines[: header_at + 1], table), path)

@@ -15,7 +15,7 @@ from orthoswarm.model.arrays import Array, Indices
 from telemetry.formats.log.log_data import FlightLog
 from telemetry.formats.log.mavlink_poses import fixed_camera
 from telemetry.photos.photo_tags import Photo
-from telemetry.photos.picture_motion import PictureFile, shifts_px
+from telemetry.photos.picture_motion import shifts_px
 from telemetry.samples.course import ground_track
 from telemetry.samples.sample import Sample
 from telemetry.samples.timeline import Timeline
@@ -189,8 +189,7 @@ def picture_motion(photos: Sequence[Photo], log: FlightLog, timeline: Timeline, 
     if len(poses) < 2 or not all(pose.has_position for pose in poses):
         return None
     poses = poses if log.has_gimbal else [fixed_camera(pose) for pose in poses]
-    files = [PictureFile(photo.path, photo.width, photo.height) for photo in photos]
-    return PictureMotion(_way_m(poses), lambda some: shifts_px([files[i] for i in some], workers))
+    return PictureMotion(_way_m(poses), lambda some: shifts_px([photos[i] for i in some], workers))
 
 
 def _way_m(poses: Sequence[Sample]) -> Array:
