@@ -1,14 +1,15 @@
 """Lists the inputs: pictures by folder, videos, pose tables, logs; names relative to the inputs' root."""
 
+import contextlib
 import hashlib
 import os
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 from orthoswarm.model.errors import InputError
 from orthoswarm.raster.picture_file import PICTURE_SUFFIXES
@@ -161,20 +162,19 @@ def discover(inputs: Sequence[Path], exclude: Sequence[Path] = ()) -> Discovery:
         folder.take_sidecars()
         folder.pictures.sort(key=lambda path: natural_key(path.name))
     ordered = [folders[path] for path in sorted(folders, key=lambda p: natural_key(str(p)))]
-    copies = copies_among([path for folder in ordered for path in folder.pictures])
-    for folder in ordered if copies.within else ():
-        folder.pictures = [path for path in folder.pictures if path not in copies.within]
+    within, elsewhere = copies_among([path for folder in ordered for path in folder.pictures])
+    for folder in ordered if within else ():
+        folder.pictures = [path for path in folder.pictures if path not in within]
     _name_vehicles(ordered, root)
     pictures = [(file, *why) for file, why in left_out.items() if file.suffix.lower() in PICTURE_SUFFIXES]
     left = [entry for entry in pictures if entry[0] not in sorted_in]
-    left += [(copy, _COPY, first.name) for copy, first in copies.within.items()]
+    left += [(copy, _COPY, first.name) for copy, first in within.items()]
     if unreadable and not ordered and not left:
         path, why = next(iter(unreadable.items()))
         raise InputError(f"no picture was found, and the folder {path} cannot be read ({why}); check its permissions")
     apart = _far_from_pictures(tops, ordered)
-    return Discovery(
-        root, ordered, left, _video_vehicles(ordered, root), apart, unreadable=unreadable, copies=copies.elsewhere
-    )
+    vehicles = _video_vehicles(ordered, root)
+    return Discovery(root, ordered, left, vehicles, apart, unreadable=unreadable, copies=elsewhere)
 
 
 def _twice(folder: Path, root: Path) -> str:
@@ -289,14 +289,7 @@ def _video_vehicles(folders: list[Folder], root: Path) -> dict[Path, str]:
     }
 
 
-class Copies(NamedTuple):
-    """Photos that are the same files as others, with these: in their own folder, and in an earlier one."""
-
-    within: dict[Path, Path]
-    elsewhere: dict[Path, Path]
-
-
-def copies_among(photos: Sequence[Path]) -> Copies:
+def copies_among(photos: Sequence[Path]) -> tuple[dict[Path, Path], dict[Path, Path]]:
     """Copies among the photos of all folders: in one folder, "DJI_0001 (1).JPG", or in a second one, under any names.
 
     Those in a second folder, a backup beside the original perhaps, are told and not left out: a folder is a vehicle,
@@ -307,10 +300,17 @@ def copies_among(photos: Sequence[Path]) -> Copies:
     Folders that have only one or two photos in common count as two. Only files that share their size with another are
     opened, and only those that begin like another are read beyond: raw pictures are all of one size, and each sample
     is a seek on a disk. Files in stores are not compared.
+
+    Returns photos that are the same files as others, with these: in their own folder, and in an earlier one.
     """
+    by_size: dict[int, list[Path]] = {}
+    for path in photos:
+        if not is_stored(path):
+            with contextlib.suppress(OSError):  # reading it says what is wrong
+                by_size.setdefault(os.stat(path).st_size, []).append(path)
     within: dict[Path, Path] = {}
     elsewhere: dict[Path, Path] = {}
-    for of_one_size in _of_one_size(photos):
+    for of_one_size in (alike for size, alike in by_size.items() if size and len(alike) > 1):
         for of_one_beginning in _alike(of_one_size, 0):
             for alike in _alike(of_one_beginning, _SAMPLES):
                 within |= _within(alike)
@@ -320,7 +320,7 @@ def copies_among(photos: Sequence[Path]) -> Copies:
     for copy, first in elsewhere.items():
         in_common.setdefault((copy.parent, first.parent), set()).add(first)
     many = {folders for folders, photos in in_common.items() if len(photos) >= _COPIED_LEAST}
-    return Copies(within, {c: first for c, first in elsewhere.items() if (c.parent, first.parent) in many})
+    return within, {c: first for c, first in elsewhere.items() if (c.parent, first.parent) in many}
 
 
 def _within(alike: Sequence[Path]) -> dict[Path, Path]:
@@ -340,17 +340,6 @@ def _within(alike: Sequence[Path]) -> dict[Path, Path]:
             if another or (named and _COPY_NAME.fullmatch(before + after)):
                 found[path] = first
     return found
-
-
-def _of_one_size(photos: Sequence[Path]) -> Iterator[list[Path]]:
-    by_size: dict[int, list[Path]] = {}
-    for path in photos:
-        if not is_stored(path):
-            try:
-                by_size.setdefault(os.stat(path).st_size, []).append(path)
-            except OSError:  # reading it says what is wrong
-                continue
-    return (alike for size, alike in by_size.items() if size and len(alike) > 1)
 
 
 def _alike(photos: Sequence[Path], samples: int) -> list[list[Path]]:

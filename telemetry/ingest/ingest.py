@@ -63,15 +63,13 @@ def load(inputs: Sequence[Path], *, progress: Progress | None = None, options: L
     """
     found = survey(inputs, progress=progress, options=options)
     told = [str(finding) for finding in found.findings if not finding.note]
-    told += [_told(finding, source) for source in found.sources for finding in source.findings if not finding.note]
-    warnings = dict.fromkeys(told)
-    return Ingest(found.frames(), found.rejected, list(warnings), found.unpositioned)
-
-
-def _told(finding: Finding, source: SourceInfo) -> str:
-    """A finding as a sentence that says what it is about, also where its source is not named above it."""
-    named = finding.vehicle or source.path.rsplit("/", 1)[-1] in finding.message
-    return str(finding) if named else f"{source.path}: {finding}"
+    for source in found.sources:
+        title = source.path.rsplit("/", 1)[-1]
+        for finding in source.findings:
+            if not finding.note:  # each says what it is about, also where its source is not named above it
+                named = finding.vehicle or title in finding.message
+                told.append(str(finding) if named else f"{source.path}: {finding}")
+    return Ingest(found.frames(), found.rejected, list(dict.fromkeys(told)), found.unpositioned)
 
 
 def survey(inputs: Sequence[Path], *, progress: Progress | None = None, options: LoadOptions | None = None) -> Survey:

@@ -208,17 +208,6 @@ def _event_span(log: FlightLog, offset_s: float) -> tuple[float, float]:
     return min(moments) + offset_s, max(moments) + offset_s
 
 
-def _use_log(
-    photos: Sequence[Photo], entry: LogSource, pairing: Pairing, vehicle: str, findings: list[Finding], *,
-    workers: int,
-) -> None:  # fmt: skip
-    """Assign photos the poses of a log's events; pictures are read where the times do not decide."""
-    if pairing.doubtful and not pairing.jumps:
-        motion = picture_motion(photos, entry.log, entry.timeline, workers)
-        pairing = _pair(photos, entry.log.events, motion) if motion is not None else pairing
-    _use_events(photos, pairing, entry, vehicle, findings)
-
-
 def _misfit(photos: Sequence[Photo], pairing: Pairing, entry: LogSource) -> float:
     """How badly a log fits photos: 0 if each has its event where it lies; leftovers, residuals and repeated use add."""
     events = entry.log.events
@@ -245,12 +234,16 @@ def _pair(photos: Sequence[Photo], events: Sequence[ExposureEvent], motion: Pict
     )
 
 
-def _use_events(
-    photos: Sequence[Photo], pairing: Pairing, entry: LogSource, vehicle: str, findings: list[Finding]
-) -> None:
-    """Assign photos the poses of their events."""
+def _use_log(
+    photos: Sequence[Photo], entry: LogSource, pairing: Pairing, vehicle: str, findings: list[Finding], *,
+    workers: int,
+) -> None:  # fmt: skip
+    """Assign photos the poses of a log's events; pictures are read where the times do not decide."""
     entry.used = True
     log = entry.log
+    if pairing.doubtful and not pairing.jumps:
+        motion = picture_motion(photos, log, entry.timeline, workers)
+        pairing = _pair(photos, log.events, motion) if motion is not None else pairing
     far = list[tuple[Photo, float | None]]()
     explain(photos, _NO_EVENT, log.path.name)  # those that get a position below need no reason
     explain([photos[i] for i in pairing.open], _SEVERAL_WAYS, log.path.name)

@@ -242,7 +242,8 @@ def extract(
             rows, columns = rgb.shape[:2]
             written.pictures.append(_WrittenPicture(picture.number, picture.packet, columns, rows, picture.damaged))
             _write(folder / written.pictures[-1].name, encode_jpeg(rgb))
-        _remember(folder, key, written)
+        document = {"key": key, **asdict(written), "pictures": [astuple(picture) for picture in written.pictures]}
+        _write(folder / _LIST, json.dumps(document).encode())  # once all pictures are in the folder
     result, lens = Extraction(), _LensKey(found)
     for one in written.pictures:
         pose = None if one.packet is None else poses.of(one.packet)
@@ -298,12 +299,6 @@ def _recall(folder: Path, key: str) -> _Written | None:
         return _Written(kept, **document) if all((folder / one.name).stat().st_size for one in kept) else None
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
-
-
-def _remember(folder: Path, key: str, written: _Written) -> None:
-    """Write the list, once all pictures are in the folder."""
-    document = {"key": key, **asdict(written), "pictures": [astuple(picture) for picture in written.pictures]}
-    _write(folder / _LIST, json.dumps(document).encode())
 
 
 def encode_jpeg(rgb: NDArray[np.uint8]) -> bytes:

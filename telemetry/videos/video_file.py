@@ -9,7 +9,6 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any, Final
@@ -246,19 +245,14 @@ def scan(path: Path) -> VideoScan:
         result.aspect = float(stream.sample_aspect_ratio or 1)
         contexts = [s.codec_context for s in moving_streams(container) if s is not stream]
         result.others = [(c.width, c.height) for c in contexts if c is not None]
-        result.rate = _rate(container, stream)
+        stated = context.framerate if container.format.name in _RAW_FORMATS else stream.average_rate
+        result.rate = float(stated) if stated else None  # of a raw stream without a rate FFmpeg would assume 25
         result.created_s = epoch_of(str(container.metadata.get("creation_time", "")))
         _scan_packets(container, stream, result)
     if not result.pictures:
         raise NotAVideo("the file holds no pictures; it may be cut off")
     result.turn = _turn(path)
     return result
-
-
-def _rate(container: Any, stream: Any) -> float | None:
-    """Pictures a second; of a raw stream what its sequence parameters state, without which FFmpeg assumes 25."""
-    stated = stream.codec_context.framerate if container.format.name in _RAW_FORMATS else stream.average_rate
-    return float(stated) if stated else None
 
 
 def _turn(path: Path) -> Turn:
@@ -303,7 +297,17 @@ def _scan_packets(container: Any, stream: Any, result: VideoScan) -> None:
     texts: list[tuple[float, float, str]] = []
     leftovers: dict[int, bytes] = {}
     ahead: list[tuple[Any, int, float | None]] = []  # metadata of a part whose pictures have not begun
-    read = partial(_scan_metadata, result=result, texts=texts, leftovers=leftovers)
+
+    def read(packet: Any, seconds: float | None) -> None:
+        if packet.stream.type == "data":
+            _scan_data(packet, seconds, result, leftovers)
+        elif seconds is not None:
+            data = bytes(packet)
+            if len(data) >= 2 and data[0] == 0 and int.from_bytes(data[:2], "big") <= len(data) - 2:
+                data = data[2 : 2 + int.from_bytes(data[:2], "big")]  # MP4's timed text leads it with its length
+            length = float((packet.duration or 0) * packet.time_base)
+            texts.append((seconds, seconds + length, data.decode("utf-8", "replace")))
+
     for packet in demux(container, wanted):
         if packet.size == 0:
             continue
@@ -317,8 +321,11 @@ def _scan_packets(container: Any, stream: Any, result: VideoScan) -> None:
         if len(result.pictures) >= _MAX_PICTURES:
             break
         parts = times.parts
-        note = _note(bytes(packet), form, times.picture(part, seconds), result.unknown_sei)
-        note.position = packet.pos
+        note = PictureNote(times.picture(part, seconds), position=packet.pos)
+        messages = [] if form is None else bitstream.sei_messages(bytes(packet), form)
+        result.unknown_sei.update(sei.unknown(messages))
+        if (reading := sei.read(messages)) is not None:
+            note.sample, note.decoders = reading.sample, reading.decoders
         result.pictures.append(note)
         if times.parts > parts:
             for other, its_part, moment in (each for each in ahead if each[1] < times.parts):
@@ -329,38 +336,6 @@ def _scan_packets(container: Any, stream: Any, result: VideoScan) -> None:
     result.joints_s = times.joints_s
     if texts:
         result.cues = srt.parse_cues(texts)
-
-
-def _scan_metadata(
-    packet: Any,
-    seconds: float | None,
-    result: VideoScan,
-    *,
-    texts: list[tuple[float, float, str]],
-    leftovers: dict[int, bytes],
-) -> None:
-    """A packet of subtitles or data."""
-    if packet.stream.type == "data":
-        _scan_data(packet, seconds, result, leftovers)
-    elif seconds is not None:
-        length = float((packet.duration or 0) * packet.time_base)
-        texts.append((seconds, seconds + length, _subtitle_text(bytes(packet))))
-
-
-def _note(
-    data: bytes, form: bitstream.StreamFormat | None, seconds: float | None, unknown: Counter[tuple[str, int]]
-) -> PictureNote:
-    messages = [] if form is None else bitstream.sei_messages(data, form)
-    reading = sei.read(messages)
-    unknown.update(sei.unknown(messages))
-    return PictureNote(seconds) if reading is None else PictureNote(seconds, reading.sample, reading.decoders)
-
-
-def _subtitle_text(data: bytes) -> str:
-    """Text of a subtitle packet: MP4's timed text leads it with a 16-bit length."""
-    if len(data) >= 2 and int.from_bytes(data[:2], "big") <= len(data) - 2 and data[0] == 0:
-        data = data[2 : 2 + int.from_bytes(data[:2], "big")]
-    return data.decode("utf-8", "replace")
 
 
 def _scan_data(packet: Any, seconds: float | None, result: VideoScan, leftovers: dict[int, bytes]) -> None:
