@@ -135,36 +135,15 @@ def _forbid(mine, begin, slacks, others, when, other_slacks, bins, raster, apart
                             marks[last + 1] -= 1
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Frozen:
-    """Samples of the placed flights in raster cells: around a start that the next one shares, or elsewhere."""
+_Placed = tuple[Array, Indices, Indices, tuple[Indices, Indices], Array]  # others, when, other_slacks, bins, raster
 
-    pad: bool
-    points: Array
-    when: Indices
-    slack: Indices
-    bins: tuple[Indices, Indices]
-    raster: Array
 
-    @classmethod
-    def of(cls, pad: bool, points: Array, when: Indices, slack: Indices, cell_m: float) -> "_Frozen":
-        low, high = points[:, :2].min(0), points[:, :2].max(0)
-        cell = max(cell_m, float((high - low).max()) / 1000.0)
-        shape = ((high - low) / cell).astype(np.int64) + 1
-        raster = np.array([*low, cell, *shape], np.float64)
-        bins = _bins(points, low, cell, shape)
-        return cls(pad=pad, points=points, when=when, slack=slack, bins=bins, raster=raster)
-
-    def forbid(
-        self,
-        points: Array,
-        when: Indices,
-        slack: Indices,
-        apart: Array,
-        marks: Indices,
-    ) -> None:
-        """Mark delays at which samples of another track come near; see `_forbid`."""
-        _forbid(points, when, slack, self.points, self.when, self.slack, self.bins, self.raster, apart, marks)
+def _in_cells(points: Array, when: Indices, slack: Indices, cell_m: float) -> _Placed:
+    """Samples of placed flights in raster cells, as `_forbid` takes them."""
+    low, high = points[:, :2].min(0), points[:, :2].max(0)
+    cell = max(cell_m, float((high - low).max()) / 1000.0)
+    shape = ((high - low) / cell).astype(np.int64) + 1
+    return points, when, slack, _bins(points, low, cell, shape), np.array([*low, cell, *shape], np.float64)
 
 
 class _Sky:
@@ -202,8 +181,8 @@ class _Sky:
         self._tracks.append((best[3], best[2]))
         return best[1]
 
-    def _frozen(self, home: Array) -> list[_Frozen]:
-        """The placed samples around a start shared with a vehicle at home, and all others."""
+    def _frozen(self, home: Array) -> list[tuple[bool, _Placed]]:
+        """The placed samples elsewhere, and around a start shared with a vehicle at home (True)."""
         if not self._tracks:
             return []
         points = np.concatenate([t.places for _, t in self._tracks])
@@ -212,7 +191,7 @@ class _Sky:
         slack = np.concatenate([t.slack for _, t in self._tracks])
         slack[~pad] = self._slack
         kinds = ((False, ~pad), (True, pad))
-        return [_Frozen.of(near, points[w], when[w], slack[w], self._reach) for near, w in kinds if w.any()]
+        return [(near, _in_cells(points[w], when[w], slack[w], self._reach)) for near, w in kinds if w.any()]
 
     @property
     def _slack(self) -> int:
@@ -234,21 +213,21 @@ class _Sky:
         """Two places of takeoff count as one start."""
         return bool(np.hypot(*(home - other)) < self._apart.pad_m)
 
-    def _meetings(self, track: _Track, ready: int, frozen: list[_Frozen], marks: Indices) -> None:
+    def _meetings(self, track: _Track, ready: int, frozen: list[tuple[bool, _Placed]], marks: Indices) -> None:
         """Mark delays that bring a track too near a placed one, or to the same start at the same time."""
         apart = self._apart
         # Layers are apart: the hair keeps neighbouring ones from clashing by rounding.
         limits = np.array([self._reach, apart.height_m - 0.01])
         when = ready + track.ground + np.arange(len(track.places))
         usual = np.full(len(when), self._slack)
-        for other in frozen:
-            away = ~track.pad if other.pad else np.ones(len(when), bool)
-            other.forbid(track.places[away], when[away], usual[away], limits, marks)
+        for near, placed in frozen:
+            away = ~track.pad if near else np.ones(len(when), bool)
+            _forbid(track.places[away], when[away], usual[away], *placed, limits, marks)
             if self._in_turn:
-                other.forbid(track.places[~away], when[~away], track.slack[~away], limits, marks)
-        for start, placed in self._tracks:
-            if self._shared(placed.home, track.home):
-                landing = start + placed.ground + len(placed.places) - track.ground - len(track.places)
+                _forbid(track.places[~away], when[~away], track.slack[~away], *placed, limits, marks)
+        for start, other in self._tracks:
+            if self._shared(other.home, track.home):
+                landing = start + other.ground + len(other.places) - track.ground - len(track.places)
                 _mark(marks, landing - ready, int(np.ceil(apart.launch_s / _STEP_S)) - 1)
 
 
