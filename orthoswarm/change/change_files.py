@@ -87,15 +87,16 @@ def figures_of(found: ChangeMap, objects: Sequence[ChangedObject]) -> dict[str, 
     grid, visible = LocalGrid(found.grid.epsg), found.visible
     inside, seen = int(found.inside.sum()), int(visible.sum())
     changed = int((visible & (found.probability > 127)).sum())
-    rows = [
-        {
+    rows = []
+    for one in objects[:_LISTED]:
+        west, south, east, north = one.outline.bounds
+        places = grid.to_geographic(np.array([[west, south], [east, north], one.place[:2]]))
+        (least_lat, least_lon), (most_lat, most_lon), (lat, lon) = ([round(float(v), 7) for v in p] for p in places)
+        rows.append({
             "area_m2": round(one.area_m2, 1), "probability": round(one.probability, 3), "kind": one.kind,
-            "lat_deg": lat, "lon_deg": lon, "bounds": _corners(one, grid),
+            "lat_deg": lat, "lon_deg": lon, "bounds": [least_lon, least_lat, most_lon, most_lat],
             "photos": [{"vehicle": vehicle, "image": image} for vehicle, image in one.photos],
-        }
-        for one in objects[:_LISTED]
-        for lat, lon in [[round(float(v), 7) for v in grid.to_geographic(one.place[:2])]]
-    ]  # fmt: skip
+        })  # fmt: skip
     return {
         "changed_share": changed / max(seen, 1),
         "not_visible_share": 1.0 - seen / max(inside, 1),
@@ -108,13 +109,6 @@ def figures_of(found: ChangeMap, objects: Sequence[ChangedObject]) -> dict[str, 
         "objects": rows,
         "time": datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
     }
-
-
-def _corners(one: ChangedObject, grid: LocalGrid) -> list[float]:
-    """West, south, east, north of an object, degrees."""
-    west, south, east, north = one.outline.bounds
-    places = grid.to_geographic(np.array([[west, south], [east, north]]))
-    return [round(float(v), 7) for v in (places[0, 1], places[0, 0], places[1, 1], places[1, 0])]
 
 
 def painted(chance: Bytes, visible: Bytes, inside: Bytes, threshold: float) -> Bytes:

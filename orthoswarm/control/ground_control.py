@@ -93,7 +93,8 @@ def place_on_control(
     if not fits:
         return refinement, result
     level = float(np.median(terrain.height(np.array([p.camera.nadir for p in placed]))))
-    base = _smallest_sigma(placed)
+    # The common error of the photos positioned by receivers.
+    base = min((p.sigma_m for p in placed if p.stage != "fine" and np.isfinite(p.sigma_m)), default=0.0)
 
     def moved(p: PlacedFrame) -> PlacedFrame:
         fit = fits.get(p.stage == "fine")
@@ -124,12 +125,6 @@ def _restated(legs: Sequence[Leg], placed: Sequence[PlacedFrame]) -> list[Leg]:
         replace(leg, sigma_m=float(np.median(sigma[leg.first : leg.last + 1]))) if leg.first < len(sigma) else leg
         for leg in legs
     ]
-
-
-def _smallest_sigma(placed: Sequence[PlacedFrame]) -> float:
-    """The common error of the photos positioned by receivers, metres: the smallest of their sigmas."""
-    values = [p.sigma_m for p in placed if p.stage != "fine" and np.isfinite(p.sigma_m)]
-    return min(values, default=0.0)
 
 
 def _moved(placed: PlacedFrame, fit: ControlFit, level_m: float, base_sigma_m: float) -> PlacedFrame:

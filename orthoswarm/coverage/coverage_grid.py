@@ -195,7 +195,8 @@ class CoverageGrid:
         if self.demands.sigma_m is not None and sigma > self.demands.sigma_m:
             flaws |= Flaw.POSITION
         coarsest = 0.0 if self.demands.gsd_m is None else self.demands.gsd_m
-        quality = np.array([2.0 * sigma, 2.0 * view.focal_sigma, float(flaws), coarsest, *_descents()])
+        descents = math.cos(math.radians(_OBLIQUE_DEG)), LEAST_DESCENT  # of what is not oblique, and of what is seen
+        quality = np.array([2.0 * sigma, 2.0 * view.focal_sigma, float(flaws), coarsest, *descents])
         ground, heights, corner = self.terrain, self._heights, (0, 0)
         if view.ground is not None:
             ground, heights, corner = view.ground, _heights(view.ground, self.cells.grid, box), (box[0], box[2])
@@ -225,11 +226,6 @@ class CoverageGrid:
             max(0, math.floor((grid.north - north) / s)), min(grid.height, math.ceil((grid.north - south) / s)),
             max(0, math.floor((west - grid.west) / s)), min(grid.width, math.ceil((east - grid.west) / s)),
         )  # fmt: skip
-
-
-def _descents() -> tuple[float, float]:
-    """Cosines of the largest off-nadir angle that is not oblique, and of the largest that sees the ground at all."""
-    return math.cos(math.radians(_OBLIQUE_DEG)), LEAST_DESCENT
 
 
 def _union(boxes: Sequence[Box]) -> Box:

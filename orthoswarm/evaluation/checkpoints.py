@@ -160,7 +160,8 @@ def evaluate_checkpoints(
     shared = shared_points(every, _control_of(folder) if control is None else control, table.name)
     points = [point for point in every if point.name not in shared]
     views = _Views.read(folder, ground_z_m) if any(p.marks for p in points) else None
-    grid = LocalGrid(views.epsg if views else _epsg(points))
+    lat_lon = [(p.surveyed if p.on_map is None else p.on_map)[::-1] for p in points]
+    grid = LocalGrid(views.epsg if views else area_epsg(*np.array(lat_lon, float).T))
     names, errors, sigmas, unused, how = [], [], [], [], set()
     findings = list(dict.fromkeys(f"points: {point.doubt}" for point in points if point.doubt))
     misses: list[float | None] = []
@@ -334,11 +335,6 @@ def _in_degrees(written: Coordinates, name: str) -> tuple[Array, str]:
 
 def _placed(grid: LocalGrid, lon_lat: Array) -> Array:
     return grid.to_grid(lon_lat[1], lon_lat[0])
-
-
-def _epsg(points: Iterable[Checkpoint]) -> int:
-    at = [p.surveyed if p.on_map is None else p.on_map for p in points]
-    return area_epsg([float(p[1]) for p in at], [float(p[0]) for p in at])
 
 
 @dataclass(frozen=True, slots=True)

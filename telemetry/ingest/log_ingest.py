@@ -159,7 +159,8 @@ def add_logs(
         workers: threads that read photos if their times do not decide which camera event they belong to.
     """
     near = [entry for entry in logs if folder.is_relative_to(entry.folder)]
-    if not near or not photos or all(_is_complete(photo) for photo in photos):
+    complete = (p.lat_deg is not None and p.height_m is not None and p.camera_deg[0] is not None for p in photos)
+    if not near or not photos or all(complete):
         return
     pairings: dict[int, Pairing] = {}
     matches = []
@@ -218,10 +219,6 @@ def _misfit(photos: Sequence[Photo], pairing: Pairing, entry: LogSource) -> floa
     # No zone explains more: another flight of the same mission.
     other_day = 2.0 * _LOG_SAME_FIT * (abs(pairing.offset_s or 0.0) > _MOST_ZONE_S)
     return 1.0 - share + clock + other_day + 0.6 * entry.used + away
-
-
-def _is_complete(photo: Photo) -> bool:
-    return photo.lat_deg is not None and photo.height_m is not None and photo.camera_deg[0] is not None
 
 
 def _pair(photos: Sequence[Photo], events: Sequence[ExposureEvent], motion: PictureMotion | None = None) -> Pairing:

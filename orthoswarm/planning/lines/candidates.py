@@ -82,9 +82,11 @@ def candidates(
         legs = _lay(field, angle, foot, method=method, router=router, multiple=1)
         if not len(legs):
             continue
-        count = stretches(np.hypot(*(legs[:, 1] - legs[:, 0]).T), foot.spacing_m)
+        lengths = np.hypot(*(legs[:, 1] - legs[:, 0]).T)
+        count = stretches(lengths, foot.spacing_m)
         few = few or count < 4 * vehicles
-        rough = _rough_cost(legs, turn_m)
+        ways = np.hypot(*(legs[1:, 0] - legs[:-1, 1]).T).sum()  # no-fly zones between legs left out
+        rough = float(lengths.sum() + ways + turn_m * len(legs))
         least = min(least, rough)
         if not few and rough > _HOPELESS * least:
             continue
@@ -97,12 +99,6 @@ def candidates(
                 yield from _finished(
                     field, denser, count, angle=angle, foot=foot, method=method, router=router, reach_m=reach_m
                 )
-
-
-def _rough_cost(legs: Array, turn_m: float) -> float:
-    """Metres to fly a row of legs, turns counted as metres, no-fly zones between legs left out."""
-    ways = np.hypot(*(legs[1:, 0] - legs[:-1, 1]).T).sum()
-    return float(np.hypot(*(legs[:, 1] - legs[:, 0]).T).sum() + ways + turn_m * len(legs))
 
 
 def _lay(field: Field, angle: float, foot: Footprint, *, method: Method, router: Router, multiple: int) -> Array:

@@ -160,7 +160,9 @@ def _read(path: Path, header_at: int, layout: _Layout, title: str) -> PoseTable:
         for cells in rows:
             found.append(_line(table, layout, cells))
     named = [line for line in found if line is not None]
-    marks = layout.separator != "," and not any(map(_has_point, named))
+    numbers = (cell for line in named for key, cell in line.cells.items() if key in _NUMBERS)
+    # The point in 1.047,5 divides thousands.
+    marks = layout.separator != "," and not any(_POINT.search(cell) and not _COMMA.search(cell) for cell in numbers)
     for line in named:
         replaced = _NUMBERS if marks else frozenset()
         if layout.separator != ",":  # the comma before fractions of a second says nothing about other numbers
@@ -243,11 +245,6 @@ def _is_shifted(separator: str, found: Mapping[str, str], extra: Sequence[str]) 
     if separator == " ":
         return more and any(_WHOLE.fullmatch(found.get(key, "")) for key in ("lat_deg", "lon_deg"))
     return more and separator == ","
-
-
-def _has_point(line: _Line) -> bool:
-    """Whether a number of a line has a decimal point; the point in 1.047,5 divides thousands."""
-    return any(_POINT.search(cell) and not _COMMA.search(cell) for key, cell in line.cells.items() if key in _NUMBERS)
 
 
 def _add_row(table: PoseTable, line: _Line) -> None:
