@@ -80,15 +80,9 @@ class View:
     ) -> "View":
         """The view of a camera; `more` are further attributes."""
         return cls(
-            image=image,
-            vehicle=vehicle,
-            time_s=time_s,
-            position=camera.position,
-            to_camera=camera.rotation.T.copy(),
-            lens=camera.lens,
-            sigma_m=sigma_m,
-            **more,
-        )
+            image=image, vehicle=vehicle, time_s=time_s, position=camera.position, to_camera=camera.rotation.T.copy(),
+            lens=camera.lens, sigma_m=sigma_m, **more,
+        )  # fmt: skip
 
     @classmethod
     def of_frame(cls, placed: PlacedFrame, focal_sigma: float = 0.0, ground: Terrain | None = None) -> "View":
@@ -131,16 +125,9 @@ class View:
         when = row.get("time")
         time_s = None if when is None else datetime.fromisoformat(when).timestamp()
         return cls(
-            image=str(row["image"]),
-            vehicle=str(row["vehicle"]),
-            time_s=time_s,
-            position=position,
-            to_camera=to_camera,
-            lens=lens,
-            sigma_m=sigma,
-            placed=row["stage"] != "realtime",
-            recorded_height_m=recorded_m,
-        )
+            image=str(row["image"]), vehicle=str(row["vehicle"]), time_s=time_s, position=position, to_camera=to_camera,
+            lens=lens, sigma_m=sigma, placed=row["stage"] != "realtime", recorded_height_m=recorded_m,
+        )  # fmt: skip
 
     def moved_to(self, position: Array, image: str, time_s: float | None = None) -> "View":
         """The same camera at another position: for a picture that was not taken or has not arrived."""

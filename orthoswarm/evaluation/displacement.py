@@ -229,20 +229,12 @@ def accuracy(displacements: Displacements, complete: float, step_px: float) -> A
     p50, p90, p95, most = np.percentile(length, [50, 90, 95, 100]).tolist() if found else [np.nan] * 4
     jumps = np.array(list(_jumps(displacements, step_px)))
     return Accuracy(
-        median_m=p50,
-        p90_m=p90,
-        p95_m=p95,
-        max_m=most,
-        mean_east_m=east,
-        mean_north_m=north,
+        median_m=p50, p90_m=p90, p95_m=p95, max_m=most, mean_east_m=east, mean_north_m=north,
         unmatched_share=1.0 - len(length) / count if found else 1.0,
-        share_within_1m=float((length <= 1.0).sum()) / max(count, 1),
-        blocks=count,
-        completeness=complete,
+        share_within_1m=float((length <= 1.0).sum()) / max(count, 1), blocks=count, completeness=complete,
         sharpness=float(np.median(displacements.contrast[matched])) if found else np.nan,
-        seam_p95_m=float(np.percentile(jumps, 95)) if len(jumps) else np.nan,
-        field=displacements,
-    )
+        seam_p95_m=float(np.percentile(jumps, 95)) if len(jumps) else np.nan, field=displacements,
+    )  # fmt: skip
 
 
 def _jumps(d: Displacements, step_px: float) -> Iterator[float]:

@@ -221,15 +221,9 @@ def pose_errors(
         turn = np.array(angles_from_rotation(camera.rotation)) - np.array(angles_from_rotation(true.rotation))
         angle[i] = wrap_deg(np.degrees(turn))
     return PoseErrors(
-        image=[p.image for p in placed],
-        vehicle=[p.vehicle for p in placed],
-        position_m=position,
-        angle_deg=angle,
-        fov_deg=fov,
-        center_m=center,
-        nadir_m=nadir,
-        sigma_m=sigma,
-    )
+        image=[p.image for p in placed], vehicle=[p.vehicle for p in placed], position_m=position, angle_deg=angle,
+        fov_deg=fov, center_m=center, nadir_m=nadir, sigma_m=sigma,
+    )  # fmt: skip
 
 
 def _apply(homography: Array, pixel: Array) -> Array:

@@ -95,17 +95,11 @@ def append_polygons(
     times = [name for name, kind in columns.items() if kind is np.datetime64]
     multi = len(shapes) > 0 and shapely.get_type_id(shapes[0]) == 6
     pyogrio.raw.write(
-        str(part),
-        shapely.to_wkb(shapes),
-        [_column([row.get(name) for row in rows], kind) for name, kind in columns.items()],
-        list(columns),
-        layer=layer,
-        driver="GPKG",
-        geometry_type="MultiPolygon" if multi else "Polygon",
-        crs=f"EPSG:{epsg}",
-        append=part.exists(),
+        str(part), shapely.to_wkb(shapes),
+        [_column([row.get(name) for row in rows], kind) for name, kind in columns.items()], list(columns), layer=layer,
+        driver="GPKG", geometry_type="MultiPolygon" if multi else "Polygon", crs=f"EPSG:{epsg}", append=part.exists(),
         gdal_tz_offsets={name: np.full(len(rows), _UTC) for name in times},
-    )
+    )  # fmt: skip
 
 
 def _column(values: list[Any], kind: type[np.generic]) -> NDArray[Any]:

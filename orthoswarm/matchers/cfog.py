@@ -160,10 +160,6 @@ class Cfog:
         centres = tile_centres(valid)
         wanted = centres + shift
         return match_tiles(
-            features(patch, valid),
-            features(window, known),
-            valid,
-            predict=wanted,
-            centres=centres,
+            features(patch, valid), features(window, known), valid, predict=wanted, centres=centres,
             search=_CFOG_SEARCH_PX,
-        )
+        )  # fmt: skip

@@ -181,14 +181,6 @@ def coarse_vehicle(frames: Sequence[Frame], *, epsg: int, origin: Array, options
     lens[0, F], lens[0, WIDTH], lens[0, HEIGHT] = focal_px(fov, width), width, height
     cameras = CameraBlock(position, rotation, np.zeros(len(frames), np.int32), lens)
     return CoarseVehicle(
-        vehicle=frames[0].vehicle,
-        frames=list(frames),
-        leg=leg,
-        lines=lines,
-        cameras=cameras,
-        sigma_m=sigma,
-        fov_sigma_rad=float(fov_sigma),
-        damaged=dict(pictures.damaged),
-        warnings=warnings,
-        cpu_s=process_time() - began,
-    )
+        vehicle=frames[0].vehicle, frames=list(frames), leg=leg, lines=lines, cameras=cameras, sigma_m=sigma,
+        fov_sigma_rad=float(fov_sigma), damaged=dict(pictures.damaged), warnings=warnings, cpu_s=process_time() - began,
+    )  # fmt: skip

@@ -92,16 +92,11 @@ def match_patch(task: PatchTask, *, basemap: MapWindow, origin: Array, options: 
                 homography = in_metres(found.homography, own, there, centre)
                 break
     return PatchFit(
-        leg=task.leg,
-        homography=homography,
-        centre=centre,
-        share=0.0 if found is None else found.share,
-        rms_m=float("nan") if found is None else found.rms_px * gsd,
-        gsd_m=gsd,
-        damaged={task.frames[i].image: why for i, why in pictures.damaged.items()},
-        cpu_s=process_time() - began,
+        leg=task.leg, homography=homography, centre=centre, share=0.0 if found is None else found.share,
+        rms_m=float("nan") if found is None else found.rms_px * gsd, gsd_m=gsd,
+        damaged={task.frames[i].image: why for i, why in pictures.damaged.items()}, cpu_s=process_time() - began,
         wall_s=perf_counter() - clock,
-    )
+    )  # fmt: skip
 
 
 def patch_gsd(cameras: CameraBlock, map_gsd_m: float) -> float:

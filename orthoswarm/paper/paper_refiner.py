@@ -178,19 +178,11 @@ def _solution(
     timings = {"relative": vehicle.cpu_s, "patches": sum(f.cpu_s for f in fits.values())}
     timings["cameras"] = process_time() - began
     return Solution(
-        vehicle=vehicle.vehicle,
-        placed=placed,
-        dropped=dropped,
-        legs=_legs(vehicle, fits, sigmas, shift is not None),
+        vehicle=vehicle.vehicle, placed=placed, dropped=dropped, legs=_legs(vehicle, fits, sigmas, shift is not None),
         fov_deg=float(np.degrees(vehicle.cameras.camera(0, origin).lens.fov_rad)),
-        fov_sigma_deg=float(np.degrees(vehicle.fov_sigma_rad)),
-        terrain=None,
-        ground_z_m=0.0,
-        map_lean=(0.0, 0.0),
-        state=state,
-        warnings=warnings,
-        timings=timings,
-    )
+        fov_sigma_deg=float(np.degrees(vehicle.fov_sigma_rad)), terrain=None, ground_z_m=0.0, map_lean=(0.0, 0.0),
+        state=state, warnings=warnings, timings=timings,
+    )  # fmt: skip
 
 
 def _carried(

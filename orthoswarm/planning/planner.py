@@ -107,14 +107,8 @@ def plan_area(
 
     progress("lines")
     best = _best_work(
-        area,
-        swarm,
-        foot,
-        method=method,
-        options=options,
-        router=router,
-        reach_m=min(foot.reach_m, 2.0 * clearance_m),
-    )
+        area, swarm, foot, method=method, options=options, router=router, reach_m=min(foot.reach_m, 2.0 * clearance_m),
+    )  # fmt: skip
     return _plan(
         method, best, swarm, over, grid=area.grid, options=options, progress=progress, area=area, said=incomplete
     )
@@ -331,16 +325,10 @@ def _sortie(slot: Slot, foot: Footprint, grid: LocalGrid, motion: Motion) -> Sor
     )
     length = np.hypot(*np.diff(_legs_of(flight), axis=1)[:, 0].T)
     return Sortie(
-        home_lat_deg=float(home[0]),
-        home_lon_deg=float(home[1]),
-        takeoff_height_m=flight.climb_m - flight.home_z_m,
-        waypoints=waypoints,
-        start_s=slot.start_s,
-        time_s=flight.time_s(motion),
-        length_m=flight.length_m,
-        turns=flight.turns,
-        photos=int((length / foot.trigger_m + 1e-6).astype(int).sum()) + len(length),
-    )
+        home_lat_deg=float(home[0]), home_lon_deg=float(home[1]), takeoff_height_m=flight.climb_m - flight.home_z_m,
+        waypoints=waypoints, start_s=slot.start_s, time_s=flight.time_s(motion), length_m=flight.length_m,
+        turns=flight.turns, photos=int((length / foot.trigger_m + 1e-6).astype(int).sum()) + len(length),
+    )  # fmt: skip
 
 
 def _plan(
@@ -377,23 +365,13 @@ def _plan(
         for number, row in enumerate(schedule.slots, start=1)
     )
     return Plan(
-        method=method,
-        vehicles=made,
-        altitude_m=level_m,
-        speed_m_s=options.motion.speed_m_s,
-        trigger_m=foot.trigger_m,
-        spacing_m=foot.spacing_m,
-        footprint_m=(foot.width_m, foot.height_m),
-        end=options.end,
-        epsg=grid.epsg,
-        area_m2=area_m2,
-        covered_share=share,
-        gaps=gaps,
-        separation=_separation_text(schedule, level_m, options.separation),
-        warnings=tuple(warnings),
+        method=method, vehicles=made, altitude_m=level_m, speed_m_s=options.motion.speed_m_s, trigger_m=foot.trigger_m,
+        spacing_m=foot.spacing_m, footprint_m=(foot.width_m, foot.height_m), end=options.end, epsg=grid.epsg,
+        area_m2=area_m2, covered_share=share, gaps=gaps,
+        separation=_separation_text(schedule, level_m, options.separation), warnings=tuple(warnings),
         over_ground=over.checked(schedule.slots),
         apart=Apart(options.separation.distance_m, options.separation.height_m),
-    )
+    )  # fmt: skip
 
 
 def _separation_text(schedule: Schedule, altitude_m: float, apart: Separation) -> str:
@@ -507,13 +485,7 @@ def over_ground(flights: Sequence[Flight], heights: FlightHeights, foot: Footpri
     forward = 1.0 - foot.trigger_m / (foot.height_m * float(above.min()) / foot_above_m)
     top = max(float(flight.track()[:, 2].max()) - flight.home_z_m for flight in flights)
     return OverGround(
-        follows=heights.follows,
-        by_vehicle=heights.by_vehicle,
-        nominal_m=heights.above_m,
-        least_m=float(above.min()),
-        most_m=float(above.max()),
-        way_least_m=least,
-        top_m=top,
-        side_overlap=(float(np.percentile(overlap, 5)), float(np.median(overlap))),
-        forward_overlap=forward,
-    )
+        follows=heights.follows, by_vehicle=heights.by_vehicle, nominal_m=heights.above_m, least_m=float(above.min()),
+        most_m=float(above.max()), way_least_m=least, top_m=top,
+        side_overlap=(float(np.percentile(overlap, 5)), float(np.median(overlap))), forward_overlap=forward,
+    )  # fmt: skip

@@ -86,13 +86,9 @@ def plan_over_relief(
             )
         kept_m = min(tolerance_m, _BY_VEHICLE_M) if by_vehicle else tolerance_m
         heights = GroundHeights(
-            ground=ground.terrain,
-            highest=ground.highest,
-            above_m=above_m,
-            tolerance_m=kept_m,
-            by_vehicle=by_vehicle,
+            ground=ground.terrain, highest=ground.highest, above_m=above_m, tolerance_m=kept_m, by_vehicle=by_vehicle,
             least_above_m=kept_above_m,
-        )
+        )  # fmt: skip
         plans.append(_closely_enough(make, lens, heights, least_m))
     if relief != "follow" and level_fits:
         level = LevelHeights(

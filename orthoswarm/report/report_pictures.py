@@ -289,14 +289,9 @@ def moved(ortho: Bytes, seen: Flags, basemap: Bytes, valid: Flags, grid: GroundG
     """
     step = max(_BLOCK_PX, float(np.sqrt(seen.sum() / _MOST_BLOCKS)))
     settings = FieldSettings(
-        gsd_m=grid.gsd_m,
-        block_m=_BLOCK_PX * grid.gsd_m,
-        step_m=step * grid.gsd_m,
-        search_m=_SEARCH_PX * grid.gsd_m,
-        apart_m=_APART_PX * grid.gsd_m,
-        min_cover=_LEAST_COVER,
-        min_peak=_LEAST_PEAK,
-    )
+        gsd_m=grid.gsd_m, block_m=_BLOCK_PX * grid.gsd_m, step_m=step * grid.gsd_m, search_m=_SEARCH_PX * grid.gsd_m,
+        apart_m=_APART_PX * grid.gsd_m, min_cover=_LEAST_COVER, min_peak=_LEAST_PEAK,
+    )  # fmt: skip
     field = Displacements.joined(list(_fields(ortho, seen, basemap, valid, settings)))
     found = field.matched
     shift = field.shift_m[found]

@@ -354,15 +354,9 @@ def _satellite(texture, dsm, dtm, tiles, wall, facade, sun, ambient, ca, sa, lea
                     wide, high = CELL_M * dsm.shape[1], CELL_M * dsm.shape[0]
                     rise = min(_rise_inside(x, lean_x, wide), _rise_inside(y, lean_y, high))
                     hr, hc, z, side = _march(
-                        dsm,
-                        tiles,
-                        x / CELL_M,
-                        y / CELL_M,
-                        float(ground),
-                        lean_x / CELL_M,
-                        lean_y / CELL_M,
+                        dsm, tiles, x / CELL_M, y / CELL_M, float(ground), lean_x / CELL_M, lean_y / CELL_M,
                         ground + rise,
-                    )
+                    )  # fmt: skip
                 if hr < 0:
                     rgb[0] = rgb[1] = rgb[2] = 0.0
                 elif side > 0 and dsm[hr, hc] - z > 0.45:

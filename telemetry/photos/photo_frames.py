@@ -108,31 +108,15 @@ def _frame(photo: Photo, vehicle: str, image: str, *, height_m: float | None, an
     if angles[0] is not None and yaw_origin:
         origin["yaw"] = f"{yaw_origin} ({origin.get('angles') or origin.get('flight_yaw', '')})"
     recorded = Sample(
-        lat_deg=photo.lat_deg,
-        lon_deg=photo.lon_deg,
-        height_m=height_m,
-        altitude_m=photo.altitude_m,
-        yaw_deg=angles[0],
-        pitch_deg=angles[1],
-        roll_deg=angles[2],
-        flight_yaw_deg=photo.flight_deg[0],
-        sigma_m=photo.position_sigma_m,
+        lat_deg=photo.lat_deg, lon_deg=photo.lon_deg, height_m=height_m, altitude_m=photo.altitude_m, yaw_deg=angles[0],
+        pitch_deg=angles[1], roll_deg=angles[2], flight_yaw_deg=photo.flight_deg[0], sigma_m=photo.position_sigma_m,
         height_is_ground=photo.height_is_ground,
-    )
+    )  # fmt: skip
     return Frame(
-        image=image,
-        path=photo.path,
-        vehicle=vehicle,
-        time_s=photo.time_s,
-        fix=fix_of(recorded),
-        width=photo.width,
-        height=photo.height,
-        camera=photo.camera,
-        fov_hint_rad=photo.fov_hint_rad,
-        origin=origin,
-        damaged=photo.damaged,
+        image=image, path=photo.path, vehicle=vehicle, time_s=photo.time_s, fix=fix_of(recorded), width=photo.width,
+        height=photo.height, camera=photo.camera, fov_hint_rad=photo.fov_hint_rad, origin=origin, damaged=photo.damaged,
         ambiguous=photo.ambiguous,
-    )
+    )  # fmt: skip
 
 
 def _heights(photos: Sequence[Photo], findings: list[Finding], vehicle: str) -> list[float | None]:

@@ -121,53 +121,31 @@ def frame_of(
     if sample.lat_deg is None or sample.lon_deg is None:
         return None
     return Frame(
-        image=image,
-        path=path,
-        vehicle=vehicle,
-        time_s=sample.time_s,
-        fix=fix_of(sample),
-        width=width,
-        height=height,
-        camera=camera or f"{width}x{height}",
-        fov_hint_rad=_radians(sample.fov_deg),
+        image=image, path=path, vehicle=vehicle, time_s=sample.time_s, fix=fix_of(sample), width=width, height=height,
+        camera=camera or f"{width}x{height}", fov_hint_rad=_radians(sample.fov_deg),
         origin={"position": origin, "angles": origin} if origin else {},
-    )
+    )  # fmt: skip
 
 
 def fix_of(sample: Sample) -> Fix:
     """The fix that a sample records; latitude 0 and longitude 0 where it has no position."""
     return Fix(
-        lat_deg=sample.lat_deg or 0.0,
-        lon_deg=sample.lon_deg or 0.0,
-        height_m=sample.height_m,
-        altitude_m=sample.altitude_m,
-        yaw_rad=_radians(sample.yaw_deg),
-        pitch_rad=_radians(sample.pitch_deg),
-        roll_rad=_radians(sample.roll_deg),
-        flight_yaw_rad=_radians(sample.flight_yaw_deg),
-        position_sigma_m=sample.sigma_m,
-        height_is_ground=sample.height_is_ground and sample.height_m is not None,
-    )
+        lat_deg=sample.lat_deg or 0.0, lon_deg=sample.lon_deg or 0.0, height_m=sample.height_m,
+        altitude_m=sample.altitude_m, yaw_rad=_radians(sample.yaw_deg), pitch_rad=_radians(sample.pitch_deg),
+        roll_rad=_radians(sample.roll_deg), flight_yaw_rad=_radians(sample.flight_yaw_deg),
+        position_sigma_m=sample.sigma_m, height_is_ground=sample.height_is_ground and sample.height_m is not None,
+    )  # fmt: skip
 
 
 def sample_of(frame: Frame) -> Sample:
     """The sample that a frame's fix records, in degrees to 13 digits: angles recorded in degrees come back exactly."""
     fix = frame.fix
     return Sample(
-        time_s=frame.time_s,
-        lat_deg=fix.lat_deg,
-        lon_deg=fix.lon_deg,
-        height_m=fix.height_m,
-        altitude_m=fix.altitude_m,
-        yaw_deg=_degrees(fix.yaw_rad),
-        pitch_deg=_degrees(fix.pitch_rad),
-        roll_deg=_degrees(fix.roll_rad),
-        flight_yaw_deg=_degrees(fix.flight_yaw_rad),
-        fov_deg=_degrees(frame.fov_hint_rad),
-        sigma_m=fix.position_sigma_m,
-        height_is_ground=fix.height_is_ground,
-        vehicle=frame.vehicle,
-    )
+        time_s=frame.time_s, lat_deg=fix.lat_deg, lon_deg=fix.lon_deg, height_m=fix.height_m, altitude_m=fix.altitude_m,
+        yaw_deg=_degrees(fix.yaw_rad), pitch_deg=_degrees(fix.pitch_rad), roll_deg=_degrees(fix.roll_rad),
+        flight_yaw_deg=_degrees(fix.flight_yaw_rad), fov_deg=_degrees(frame.fov_hint_rad), sigma_m=fix.position_sigma_m,
+        height_is_ground=fix.height_is_ground, vehicle=frame.vehicle,
+    )  # fmt: skip
 
 
 def _degrees(angle: float | None) -> float | None:

@@ -260,15 +260,9 @@ class Swarm:
     def _flight(self, legs: Array, home: Array, out_m: float, home_m: float, wait_s: float = 0.0) -> Flight:
         run_in = self._options.run_in_m
         flight = make_flight(
-            legs,
-            home,
-            self._heights,
-            router=self._router,
-            returns=self._returns,
-            out_m=out_m,
-            home_m=home_m,
+            legs, home, self._heights, router=self._router, returns=self._returns, out_m=out_m, home_m=home_m,
             run_in_m=run_in,
-        )
+        )  # fmt: skip
         return replace(flight, wait_s=wait_s) if wait_s else flight
 
     @property

@@ -139,16 +139,10 @@ def _raised(flat: list[tuple[Array, float, int]], start: Array, heights: FlightH
     above = np.array(mores) + heights.above_m if heights.follows else np.full(len(points), np.nan)
     home = start[:2]
     return Flight(
-        home=home,
-        climb_m=float(start[2]),
-        points=np.array(points),
-        camera=np.array(camera, np.int8),
-        returns=returns,
-        home_z_m=heights.ground_at(home),
-        above_m=above,
-        between=np.array(between, bool),
+        home=home, climb_m=float(start[2]), points=np.array(points), camera=np.array(camera, np.int8), returns=returns,
+        home_z_m=heights.ground_at(home), above_m=above, between=np.array(between, bool),
         ground_by_vehicle=heights.by_vehicle,
-    )
+    )  # fmt: skip
 
 
 def _entry(leg: Array, before: Array, router: Router, run_in_m: float) -> Array:

@@ -237,15 +237,9 @@ def sorties(
         return [(0, len(row.parts))]
     for flights in range(count, min(count + 4, len(row.parts)) + 1):
         cuts = _evenly(
-            row,
-            np.repeat(out, flights, 0),
-            np.repeat(home, flights, 0),
-            motion,
-            limits,
-            own=False,
-            returns=returns,
+            row, np.repeat(out, flights, 0), np.repeat(home, flights, 0), motion, limits, own=False, returns=returns,
             single=True,
-        )
+        )  # fmt: skip
         if cuts is not None:
             return _pairs(cuts)
     return None

@@ -35,15 +35,11 @@ class Scene:
         """A level, black scene on a texture grid whose sides are even."""
         rows, cols = grid.height // 2, grid.width // 2
         return cls(
-            grid=grid,
-            albedo=np.zeros((grid.height, grid.width, 3), np.uint8),
-            kind=np.zeros((grid.height, grid.width), np.uint8),
-            dsm=np.zeros((rows, cols), np.float32),
-            dtm=np.zeros((rows, cols), np.float32),
-            wall=np.zeros((rows, cols, 3), np.uint8),
-            facade=np.zeros((rows, cols), np.uint8),
-            angle_rad=angle_rad,
-        )
+            grid=grid, albedo=np.zeros((grid.height, grid.width, 3), np.uint8),
+            kind=np.zeros((grid.height, grid.width), np.uint8), dsm=np.zeros((rows, cols), np.float32),
+            dtm=np.zeros((rows, cols), np.float32), wall=np.zeros((rows, cols, 3), np.uint8),
+            facade=np.zeros((rows, cols), np.uint8), angle_rad=angle_rad,
+        )  # fmt: skip
 
     @property
     def wall_axis(self) -> tuple[float, float]:

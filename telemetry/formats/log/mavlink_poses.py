@@ -184,14 +184,9 @@ class MavlinkPoses:
 
     def _feedback(self, m: Any) -> ExposureEvent:
         sample = Sample(
-            lat_deg=m.lat * 1e-7,
-            lon_deg=m.lng * 1e-7,
-            altitude_m=m.alt_msl,
-            height_m=m.alt_rel,
-            flight_yaw_deg=m.yaw,
-            flight_pitch_deg=m.pitch,
-            flight_roll_deg=m.roll,
-        )
+            lat_deg=m.lat * 1e-7, lon_deg=m.lng * 1e-7, altitude_m=m.alt_msl, height_m=m.alt_rel, flight_yaw_deg=m.yaw,
+            flight_pitch_deg=m.pitch, flight_roll_deg=m.roll,
+        )  # fmt: skip
         return self._event(m, m.time_usec * 1e-6, m.img_idx, sample)
 
     def _captured(self, m: Any) -> ExposureEvent | None:

@@ -266,10 +266,6 @@ def parse_dji(note: bytes) -> Sample | None:
         return None
     pitch, yaw, roll, camera_pitch, camera_yaw, camera_roll = (floats.get(tag) for tag in range(6, 12))
     return Sample(
-        flight_pitch_deg=pitch,
-        flight_yaw_deg=yaw,
-        flight_roll_deg=roll,
-        pitch_deg=camera_pitch,
-        yaw_deg=camera_yaw,
+        flight_pitch_deg=pitch, flight_yaw_deg=yaw, flight_roll_deg=roll, pitch_deg=camera_pitch, yaw_deg=camera_yaw,
         roll_deg=camera_roll,
-    )
+    )  # fmt: skip

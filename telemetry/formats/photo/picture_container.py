@@ -214,11 +214,6 @@ def _tiff(parts: Parts) -> Container:
     )
     packet = tags.main.get(exif.XMP)
     return Container(
-        kind="tiff",
-        width=int(width),
-        height=int(height),
-        exif=tags,
-        xmp=packet if isinstance(packet, bytes) else b"",
-        georeferenced=geo,
-        raw=exif.DNG_VERSION in tags.main,
-    )
+        kind="tiff", width=int(width), height=int(height), exif=tags, xmp=packet if isinstance(packet, bytes) else b"",
+        georeferenced=geo, raw=exif.DNG_VERSION in tags.main,
+    )  # fmt: skip

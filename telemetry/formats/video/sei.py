@@ -217,14 +217,9 @@ def _decode_gimbal_camera(body: bytes) -> Sample | None:
     if 1 <= month <= 12 and 1 <= day <= 31 and 2000 <= year < 2200 and math.isfinite(second):
         time_s = calendar.timegm((year, month, day, hour, minute, 0, 0, 0, 0)) + second
     return Sample(
-        time_s=time_s,
-        lat_deg=lat,
-        lon_deg=lon,
-        altitude_m=altitude,
-        yaw_deg=yaw / 100.0,
-        pitch_deg=pitch / 100.0,
+        time_s=time_s, lat_deg=lat, lon_deg=lon, altitude_m=altitude, yaw_deg=yaw / 100.0, pitch_deg=pitch / 100.0,
         roll_deg=roll / 100.0,
-    )
+    )  # fmt: skip
 
 
 def _decode_dji(body: bytes) -> Sample | None:

@@ -135,18 +135,9 @@ def chains_of(
     phases, scales = (part.ravel() for part in np.meshgrid(reach, _CHAIN_SCALES, indexing="ij"))
     step_m = float(np.median(np.diff(path_m)))
     return Chains(
-        number=number,
-        along_px=along,
-        path_m=path_m,
-        e=e,
-        p=p,
-        resolution_s=resolution_s,
-        metres_a_pixel=scale[0],
-        sigma_m=scale[1],
-        step_m=step_m,
-        phases_s=phases,
-        scales=scales,
-    )
+        number=number, along_px=along, path_m=path_m, e=e, p=p, resolution_s=resolution_s, metres_a_pixel=scale[0],
+        sigma_m=scale[1], step_m=step_m, phases_s=phases, scales=scales,
+    )  # fmt: skip
 
 
 def _split(steps_px: Array) -> tuple[Indices, Array]:

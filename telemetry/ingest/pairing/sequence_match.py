@@ -149,15 +149,9 @@ def _alignment(model: SequenceModel, windows: list[Clock], single: Indices) -> S
         keep = max(0, min(probability.shape[1] - (at - lo), len(single) - at))
         shifted[i, :keep] = probability[i, at - lo : at - lo + keep]
     return SequenceMatch(
-        events=single,
-        first=inside,
-        probability=shifted,
-        offset_s=offset,
-        drift=drift,
-        resolution_s=model.resolution_s,
-        by_pictures=model.chains is not None,
-        other_clock=other_clock,
-    )
+        events=single, first=inside, probability=shifted, offset_s=offset, drift=drift, resolution_s=model.resolution_s,
+        by_pictures=model.chains is not None, other_clock=other_clock,
+    )  # fmt: skip
 
 
 def _decided(match: SequenceMatch) -> Flags:
