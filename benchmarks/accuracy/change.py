@@ -157,8 +157,8 @@ def fit(folders, kinds, target):
             case = truth(folder, grid)
             own, of = [], []
             for block in measured_blocks(compared, grid):
-                good = block.drawn & (block.found.seen > 0.5) & ~block.hidden
-                own.append(block.found.values[good])
+                good = block.drawn & (block.seen > 0.5) & ~block.hidden
+                own.append(block.values[good])
                 of.append(case[block.rows, block.columns][good])
             x, y = np.concatenate(own), np.concatenate(of)
             k = random.choice(len(x), min(len(x), SAMPLES * (3 if (y == CASE["collapse"]).any() else 1)), replace=False)

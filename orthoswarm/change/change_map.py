@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from orthoswarm.change.evidence import Block, Measured, measured, probabilities
+from orthoswarm.change.evidence import measured, probabilities
 from orthoswarm.change.looks import FINE, ToneModel, cell_looks, on_cells
 from orthoswarm.change.seen_ground import Read, heights_on, seen_ground
 from orthoswarm.change.structure import blurred, structure
@@ -76,7 +76,9 @@ class MeasuredBlock(NamedTuple):
 
     rows: slice  # which cells
     columns: slice  # which cells
-    found: Measured  # of these
+    values: Floats  # float32 (rows, columns, features), what the probability is computed from
+    seen: Floats  # float32, 0 to 1, how much of each pictures see and the map has
+    veil: Floats  # share of its light that is haze, less that of the map
     # drawn, hidden: bool, where the orthoimage shows them, and where the map shows what stands before them
     drawn: Flags
     hidden: Flags
@@ -96,11 +98,10 @@ def map_change(
     out = ChangeMap.blank(grid)
     of = -(-grid.height // _BLOCK) * -(-grid.width // _BLOCK)
     for done, block in enumerate(measured_blocks(scene, grid), start=1):
-        window, found = (block.rows, block.columns), block.found
-        chance = probabilities(found.values)
+        window, chance = (block.rows, block.columns), probabilities(block.values)
         out.inside[window] = block.drawn
         out.probability[window] = np.round(255 * (1.0 - chance[..., 0]))
-        out.visible[window] = block.drawn & (found.seen > _SEEN) & (found.veil < _THICK) & ~block.hidden
+        out.visible[window] = block.drawn & (block.seen > _SEEN) & (block.veil < _THICK) & ~block.hidden
         out.case[window] = 1 + cv2.medianBlur(chance[..., 1:].argmax(-1).astype(np.uint8), 5)
         out.height[window] = block.height
         progress(done, of)
@@ -152,14 +153,17 @@ def _measured_block(
         offset[np.hypot(offset[..., 0], offset[..., 1]) < _DISTORTED_PX] = 0.0
         gray = shifted(gray, offset)
         before = structure(gray, pixels.gsd_m)
-    block = Block(seen, before, gray, valid, cell_looks(picture), cell_looks(fine), drawn, per_cell, cell)
+    values, shown, veil = measured(
+        seen, before, gray, valid, cell_looks(picture), cell_looks(fine), drawn, tone, per_cell=per_cell, cell_m=cell
+    )
     height = np.zeros(drawn.shape, np.float32)
     if terrain.bare is not None:
         height = heights_on(own, terrain, terrain.z - terrain.bare)
     inner = np.s_[_MARGIN:-_MARGIN, _MARGIN:-_MARGIN]
-    found = Measured(*(part[inner] for part in measured(block, tone)))
     hidden = hidden_on_map(height, scene.lean, cell)
-    return MeasuredBlock(rows, columns, found, drawn[inner], hidden[inner], height[inner])
+    return MeasuredBlock(
+        rows, columns, values[inner], shown[inner], veil[inner], drawn[inner], hidden[inner], height[inner]
+    )
 
 
 def _thinned(views: Sequence[View], terrain: Terrain) -> list[View]:

@@ -3,7 +3,6 @@
 import dataclasses
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -76,33 +75,16 @@ def _field(
         s = dataclasses.replace(settings or FieldSettings(), gsd_m=pair.gsd_m)
         thin = max(1, round(1.2 / s.gsd_m))
         try:
-            for strip in pair.strips(s):
-                args = (strip.ortho, strip.ortho_valid, strip.reference, strip.comparable)
-                parts.append(displacement_field(*args, settings=s, offset=(strip.first_row, 0)))
-                own_ortho.append(strip.own_ortho[::thin, ::thin])
-                own_ground.append(strip.own_ground[::thin, ::thin])
+            for first_row, compared, strip_ortho, strip_ground in pair.strips(s):
+                parts.append(displacement_field(*compared, settings=s, offset=(first_row, 0)))
+                own_ortho.append(strip_ortho[::thin, ::thin])
+                own_ground.append(strip_ground[::thin, ::thin])
         except RasterioIOError:
             raise InputError(f"{ortho} or {reference} is damaged or cut short; copy or make it again") from None
     covered, ground = np.concatenate(own_ortho), np.concatenate(own_ground)
     if not (covered & ground).any():
         raise InputError(f"{ortho.name} and {reference.name} do not overlap; check that both show the same place")
     return Displacements.joined(parts), covered, ground, s
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Strip:
-    """Some rows of blocks: pictures with validity, and the validity of the rows that belong to this strip alone.
-
-    The orthoimage is larger than the reference by the search radius on every side.
-    """
-
-    first_row: int
-    ortho: Floats
-    ortho_valid: Mask
-    reference: Floats
-    comparable: Mask
-    own_ortho: Mask
-    own_ground: Mask
 
 
 class _Pair:
@@ -157,8 +139,12 @@ class _Pair:
         for file in [*self._views, *self._files]:
             file.close()
 
-    def strips(self, s: FieldSettings) -> Iterator[_Strip]:
-        """Strips of eight rows of blocks, from north to south."""
+    def strips(self, s: FieldSettings) -> Iterator[tuple[int, tuple[Floats, Mask, Floats, Mask], Mask, Mask]]:
+        """Strips of eight rows of blocks, from north to south: first row, what is compared, and validity.
+
+        Compared are orthoimage and reference, each with its validity; the orthoimage is larger by the search radius on
+        every side. The last two are the validity of both in the rows that belong to this strip alone.
+        """
         reach = max(1, round(s.search_m / s.gsd_m))
         side, step = round(s.block_m / s.gsd_m), max(1, round(s.step_m / s.gsd_m))
         rows = 8 * step
@@ -171,10 +157,7 @@ class _Pair:
                 comparable = ground & (self._views[2].read(1, window=Window(0, start, self.shape[1], stop - start)) > 0)
             own = min(rows, stop - start)
             inner = ortho_valid[reach : reach + own, reach : reach + self.shape[1]]
-            yield _Strip(
-                first_row=start, ortho=ortho, ortho_valid=ortho_valid, reference=reference, comparable=comparable,
-                own_ortho=inner, own_ground=ground[:own],
-            )  # fmt: skip
+            yield start, (ortho, ortho_valid, reference, comparable), inner, ground[:own]
 
     def _read(self, which: int, start: int, stop: int, spare: int = 0) -> tuple[Floats, Mask]:
         """Grey values and validity of some rows, with `spare` more pixels on every side, invalid beyond the grid."""

@@ -6,7 +6,6 @@ that every line crosses in one piece. Cells are then flown in an order, and ente
 between them.
 """
 
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -76,20 +75,17 @@ def _cut(polygon: Geometry, corner: Array) -> Geometry:
     return shapely.LineString([(corner[0], bottom - _INTO_M), (corner[0], top + _INTO_M)])
 
 
-@dataclass(frozen=True)
-class _Sweep:
-    """The lines of one cell."""
+def _variants(lines: list[Array]) -> list[Array]:
+    """Four ways to fly a cell: beginning at the first or the last line, upwards or downwards.
 
-    lines: list[Array]  # per line, its legs from low to high y, float64 (k, 2, 2)
-
-    def variants(self) -> list[Array]:
-        """Four ways to fly the cell: beginning at the first or the last line, upwards or downwards."""
-        result = []
-        for lines in (self.lines, self.lines[::-1]):
-            for up in (True, False):
-                legs = [line if up == (k % 2 == 0) else line[::-1, ::-1] for k, line in enumerate(lines)]
-                result.append(np.concatenate(legs))
-        return result
+    lines: for each its legs from low to high y, float64 (k, 2, 2).
+    """
+    result = []
+    for row in (lines, lines[::-1]):
+        for up in (True, False):
+            legs = [line if up == (k % 2 == 0) else line[::-1, ::-1] for k, line in enumerate(row)]
+            result.append(np.concatenate(legs))
+    return result
 
 
 def bcd_legs(field: Field, angle_rad: float, foot: Footprint, router: Router, multiple: int = 1) -> Array:
@@ -107,13 +103,10 @@ def bcd_legs(field: Field, angle_rad: float, foot: Footprint, router: Router, mu
     local = field.turned(frame)
     # A ragged coast has a critical point at every tooth, so cells are cut from a smoothed outline.
     parts = cells(local.ground.simplify(_TOOTH_SPACINGS * foot.spacing_m))
-    sweeps = [
-        _Sweep([frame.to_grid(np.array(line)) for line in lines])
-        for lines in _by_cell(lines_across(local, foot, multiple), parts)
-    ]
-    if not sweeps:
+    by_cell = _by_cell(lines_across(local, foot, multiple), parts)
+    if not by_cell:
         return np.empty((0, 2, 2))
-    variants = [sweep.variants() for sweep in sweeps]
+    variants = [_variants([frame.to_grid(np.array(line)) for line in lines]) for lines in by_cell]
     entry = np.array([[v[0, 0] for v in cell] for cell in variants]).reshape(-1, 2)
     exit_ = np.array([[v[-1, 1] for v in cell] for cell in variants]).reshape(-1, 2)
     ways = np.minimum(router.distances(exit_, entry), 1e9)
