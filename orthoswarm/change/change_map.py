@@ -154,8 +154,9 @@ def _measured_block(
         gray = shifted(gray, offset)
         before = structure(gray, pixels.gsd_m)
     values, shown, veil = measured(
-        seen, before, gray, valid, cell_looks(picture), cell_looks(fine), drawn, tone, per_cell=per_cell, cell_m=cell
-    )
+        seen, before, gray, valid, now=cell_looks(picture), then=cell_looks(fine), drawn=drawn, tone=tone,
+        per_cell=per_cell, cell_m=cell,
+    )  # fmt: skip
     height = np.zeros(drawn.shape, np.float32)
     if terrain.bare is not None:
         height = heights_on(own, terrain, terrain.z - terrain.bare)

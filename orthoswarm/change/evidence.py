@@ -50,8 +50,8 @@ def unveiled(contrast: Floats, gray: Floats, gsd_m: float) -> tuple[Floats, Floa
 
 
 def measured(
-    seen: SeenGround, before: Structure, gray: Floats, valid: Flags, now: CellLooks, then: CellLooks, drawn: Flags,
-    tone: ToneModel, *, per_cell: int, cell_m: float,
+    seen: SeenGround, before: Structure, gray: Floats, valid: Flags, *, now: CellLooks, then: CellLooks, drawn: Flags,
+    tone: ToneModel, per_cell: int, cell_m: float,
 ) -> tuple[Floats, Floats, Floats]:  # fmt: skip
     """Measure a block of cells.
 
